@@ -1,0 +1,66 @@
+# From nothing but python3 (3.11 or newer) and make: every target first builds .venv if needed.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+NOTEBOOKS := $(wildcard notebooks/*.ipynb)
+BENCHES := $(wildcard tests/benchmarks/bench_*.py)
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check bench format clean
+
+help: ## this list
+	@sed -n 's/^\([a-z]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | awk -F '\t' '{printf "make %-8s %s\n", $$1, $$2}'
+	@echo "Another interpreter: make demo PYTHON=python3.12 (after make clean)"
+
+demo: $(VENV)/.run-stamp ## the main job on logs with known truth, pictures in demo_out
+	$(BIN)/slipid demo --out demo_out
+
+test: $(VENV)/.dev-stamp ## the whole test suite
+	$(BIN)/python -m pytest
+
+check: $(VENV)/.dev-stamp ## format, lint, types, import rules, quick tests: before every push
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+ifneq ($(NOTEBOOKS),)
+	$(BIN)/nbstripout --verify $(NOTEBOOKS)
+endif
+	$(BIN)/python -m pytest -q -m "not slow"
+
+bench: $(VENV)/.dev-stamp ## speed, as ratios in one run
+ifneq ($(BENCHES),)
+	$(BIN)/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks
+else
+	@echo "no benchmark yet: they are files tests/benchmarks/bench_*.py"
+endif
+
+format: $(VENV)/.dev-stamp ## rewrite the sources in the project's format
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+clean: ## remove the environment, the caches and demo_out (never out/)
+	rm -rf $(VENV) .cache .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf demo_out build dist *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The demo needs the library only; tests and checks need the tools too.
+$(VENV)/.run-stamp: pyproject.toml
+	$(call install,.)
+	@touch $@
+
+$(VENV)/.dev-stamp: pyproject.toml
+	$(call install,.[dev])
+	@touch $@ $(VENV)/.run-stamp
+
+define install
+	@command -v $(PYTHON) >/dev/null || { \
+	  echo "slipid: no '$(PYTHON)' on the PATH; install Python 3.11 or newer, or name one: make PYTHON=..." >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "slipid: needs Python 3.11 or newer, '$(PYTHON)' is $$($(PYTHON) --version 2>&1); name a newer one: make PYTHON=python3.12" >&2; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { \
+	  echo "slipid: '$(PYTHON)' lacks venv or ensurepip; on Debian and Ubuntu: apt-get install python3-venv" >&2; exit 1; }
+	@test -x $(BIN)/pip || { echo "slipid: creating $(VENV) with $(PYTHON)"; $(PYTHON) -m venv $(VENV); }
+	@echo "slipid: installing $(1) into $(VENV) (about a minute the first time)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '$(1)'
+endef

@@ -1,0 +1,1 @@
+"""Command line, configuration, progress and plots: the only room that imports all others."""

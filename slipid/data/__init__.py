@@ -1,0 +1,1 @@
+"""Logs: readers, units, signals and the batched dataset."""

@@ -1,0 +1,1 @@
+"""Likelihood, staged fit, intervals and verdicts."""

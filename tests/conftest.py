@@ -1,0 +1,36 @@
+"""Settings every test runs under: float64, shape checks, one compilation cache, no display."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Set in the environment, so that commands and notebooks started by a test share them. The cache is
+# what keeps the second run of the suite short: most of the first is compilation.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ["MPLBACKEND"] = "Agg"
+
+import jax  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
+
+jax.config.update("jax_enable_x64", True)
+
+# Shapes and types of every annotated function of slipid are checked while tests run; under jit this
+# costs at tracing only. Must come before the first import of slipid.
+install_import_hook("slipid", "beartype.beartype")
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """Folder of the real logs: SLIPID_DATA, else ../shared/data beside the repository."""
+    folder = Path(os.environ.get("SLIPID_DATA") or ROOT.parent / "shared" / "data")
+    if not folder.is_dir():
+        pytest.skip(f"no real logs: {folder} is no folder (set SLIPID_DATA)")
+    return folder
