@@ -1,0 +1,117 @@
+"""One recorded run as a frozen value: SI units, REP-103 axes, named arrays."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+
+class DataError(ValueError):
+    """The user's data cannot be read; the message names file, row or column, and what was expected."""
+
+
+def bad_data(
+    path: Path | str,
+    found: str,
+    expected: str,
+    *,
+    row: int | tuple[int, int] | None = None,
+    column: str | None = None,
+) -> DataError:
+    """Data error in the one form all of them have: `file row 12, column 'x': found; expected ...`.
+
+    Args:
+        path: the file.
+        found: what is there.
+        expected: what should have been, or the choices.
+        row: line number in the file, counted from 1 (in Parquet the record), or first and last.
+        column: name of the column, as the file has it.
+    """
+    where = str(path)
+    if isinstance(row, tuple):
+        where += f" rows {row[0]}-{row[1]}" if row[0] != row[1] else f" row {row[0]}"
+    elif row is not None:
+        where += f" row {row}"
+    if column is not None:
+        where += f", column '{column}'"
+    return DataError(f"{where}: {found}; expected {expected}")
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """One run, every array sampled at `time`.
+
+    Attributes:
+        name: path relative to the data root, with forward slashes; `#03` follows where one file
+            holds several runs.
+        path: the file.
+        sha256: hash of the file's bytes.
+        time: [s], strictly increasing.
+        wheel_angle: [rad] at the wheel, cumulative from the first row; no columns where a log has
+            only poses.
+        wheel_speed: [rad/s] at the wheel as the robot reported it, or None.
+        wheel_speed_command: [rad/s] at the wheel, or None.
+        twist_command: x [m/s], y [m/s], yaw rate [rad/s], or None.
+        current: [A], or None.
+        current_is_signed: False where the log has magnitudes only.
+        voltage: [V] across each motor, or None.
+        duty: [1] of each motor's bridge, or None.
+        bus_voltage: [V], or None.
+        gyro: yaw rate [rad/s], or None.
+        pose: x [m], y [m], heading [rad] without wrap-around, in the scale of the logged camera,
+            or None.
+        pose_fresh: False where the row repeats the last camera frame (or was filled in).
+        surface: name of the floor, None where it is unknown.
+        load: name of the load set-up.
+        notes: what the reader repaired, one sentence each.
+    """
+
+    name: str
+    path: Path
+    sha256: str
+    time: Float[np.ndarray, " time"]
+    wheel_angle: Float[np.ndarray, "time wheel"]
+    wheel_speed: Float[np.ndarray, "time wheel"] | None
+    wheel_speed_command: Float[np.ndarray, "time wheel"] | None
+    twist_command: Float[np.ndarray, "time 3"] | None
+    current: Float[np.ndarray, "time wheel"] | None
+    current_is_signed: bool
+    voltage: Float[np.ndarray, "time wheel"] | None
+    duty: Float[np.ndarray, "time wheel"] | None
+    bus_voltage: Float[np.ndarray, " time"] | None
+    gyro: Float[np.ndarray, " time"] | None
+    pose: Float[np.ndarray, "time 3"] | None
+    pose_fresh: Bool[np.ndarray, " time"] | None
+    surface: str | None
+    load: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def samples(self) -> int:
+        """Number of rows."""
+        return len(self.time)
+
+    @property
+    def wheels(self) -> int:
+        """Number of wheels, 0 where only poses were logged."""
+        return self.wheel_angle.shape[1]
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last row [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def period(self) -> float:
+        """Median time between rows [s]."""
+        return float(np.median(np.diff(self.time)))
+
+    def __repr__(self) -> str:
+        """Name, size and what was measured, on one line."""
+        names = ("wheel_speed", "current", "voltage", "duty", "bus_voltage", "gyro", "pose")
+        has = [name for name in names if getattr(self, name) is not None]
+        return (
+            f"Log({self.name!r}, {self.samples} rows, {self.duration:.1f} s, {self.wheels} wheels, "
+            f"surface={self.surface!r}, load={self.load!r}, has {', '.join(has) or 'ticks only'})"
+        )

@@ -1,0 +1,83 @@
+"""Units of log columns: from the unit a column is declared in to SI, dimension checked."""
+
+from difflib import get_close_matches
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pint
+
+# The registry is our own, and small, for one reason: here an angle is a dimension. With an angle as
+# a pure number, as SI has it, "Hz" would silently pass as rad/s and a duty cycle as an angle.
+_PREFIXES = (
+    "micro- = 1e-6 = u- = µ-",
+    "milli- = 1e-3 = m-",
+    "centi- = 1e-2 = c-",
+    "kilo- = 1e3 = k-",
+)
+_UNITS = (
+    "meter = [length] = m = metre",
+    "second = [time] = s = sec",
+    "ampere = [current] = A = amp",
+    "volt = [voltage] = V",
+    "radian = [angle] = rad",
+    "tick = [tick] = _ = count = pulse",
+    "pixel = [pixel] = px = pix",
+    "inch = 0.0254 * meter = in",
+    "foot = 0.3048 * meter = ft",
+    "minute = 60 * second = min",
+    "hour = 3600 * second = h",
+    "degree = 3.141592653589793 / 180 * radian = deg",
+    "revolution = 6.283185307179586 * radian = rev = turn",
+    "rpm = revolution / minute",
+    "fraction = []",
+    "percent = 0.01 * fraction = %",
+)
+_ALIASES = {"%": "percent", "°": "degree", "°/s": "degree/s", "1": "fraction", "": "fraction"}
+_KNOWN = (
+    "s ms us min m mm cm inch rad deg rev rad/s deg/s rpm rev/s m/s mm/s "
+    "A mA V mV tick pixel percent 1"
+).split()
+
+
+@lru_cache(maxsize=1)
+def _registry() -> "pint.UnitRegistry[Any]":
+    # Late: importing pint takes as long as importing numpy, and most commands read no log.
+    import pint
+
+    registry: pint.UnitRegistry[Any] = pint.UnitRegistry(None)
+    for definition in (*_PREFIXES, *_UNITS):
+        registry.define(definition)
+    return registry
+
+
+@lru_cache(maxsize=256)
+def factor(unit: str, target: str) -> float:
+    """Number that turns a value in `unit` into one in `target`: value [target] = factor value [unit].
+
+    Args:
+        unit: a unit as people write it: "ms", "rpm", "mm/s", "%".
+        target: the unit wanted, of the same dimension.
+
+    Raises:
+        ValueError: where the unit is unknown, or of another dimension.
+    """
+    registry = _registry()
+    wanted = registry.parse_units(_ALIASES.get(target, target))
+    try:
+        given = registry.parse_units(_ALIASES.get(unit.strip(), unit.strip()))
+    except Exception as error:  # pint raises a dozen types, one of them tokenize's
+        near = get_close_matches(unit, _KNOWN, n=3, cutoff=0.5)
+        hint = f", did you mean {' or '.join(near)}?" if near else ""
+        raise ValueError(f"unknown unit '{unit}'{hint} (known: {', '.join(_KNOWN)})") from error
+    if given.dimensionality != wanted.dimensionality:
+        raise ValueError(f"unit '{unit}' cannot be converted to {target}")
+    return float(registry.Quantity(1.0, given).to(wanted).magnitude)
+
+
+def same_unit(one: str, other: str) -> bool:
+    """Whether two unit texts mean the same unit, as "pix" and "pixel" do; False where unreadable."""
+    try:
+        return abs(factor(one, other) - 1.0) < 1e-9
+    except ValueError:
+        return False
