@@ -1,0 +1,179 @@
+"""Slip, current and torque of one motor, from the authors' half-second means, by their recipe."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slipid.data.log import DataError
+
+SURFACES = ("gray", "blue", "red")
+MOTORS = (1, 2, 3)
+
+_COMMAND = ("X axis speed, mm/s", "Y axis speed, mm/s", "Rotational speed, deg/s")
+_DELTA = ("Delta X, mm", "Delta Y, mm", "Delta angle, deg")
+_DELTA_RESCALED = ("dX_new", "dY_new", "dANG")
+_TO_SI = np.array([1e-3, 1e-3, np.pi / 180.0])
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Every choice the authors made between the logged columns and the points of a figure.
+
+    w_eff = n J v / r; s = 1 - w_eff / w; U = C_e w + R I sign(w); M = U I / w, with w and w_eff at
+    the motor shaft.
+
+    Args:
+        wheel_radius: r [m].
+        base_radius: L [m].
+        gear_ratio: n [-].
+        azimuth_deg: wheel centres seen from the body's x axis [deg].
+        resistance: R [ohm], as in the authors' scripts.
+        back_emf: C_e [V s/rad], as in the authors' scripts.
+        row_period: time each row's pose delta is divided by [s]; the rows are about 0.45 s apart.
+        delta_columns: pose deltas used, x, y [mm] and heading [deg].
+        drop_rotation: leave out rows with a rotation command.
+        speed_limit: rows with any |w_eff| at or above it are taken for camera jumps [rpm, motor].
+        min_current: samples at or below it are taken for idling [A].
+        max_torque: samples above it are left out [N m].
+    """
+
+    wheel_radius: float = 0.040
+    base_radius: float = 0.125
+    gear_ratio: float = 16.0
+    azimuth_deg: tuple[float, ...] = (60.0, 180.0, 300.0)
+    resistance: float = 5.3361
+    back_emf: float = 0.0501
+    row_period: float = 0.5
+    delta_columns: tuple[str, str, str] = _DELTA
+    drop_rotation: bool = True
+    speed_limit: float = 1500.0
+    min_current: float = 0.25
+    max_torque: float = 0.5
+
+
+FIGURES_3_AND_4 = Recipe()
+# The whole-field figure keeps turning rows and idling wheels and uses the re-calibrated deltas.
+FIGURE_2 = Recipe(
+    delta_columns=_DELTA_RESCALED,
+    drop_rotation=False,
+    speed_limit=np.inf,
+    min_current=-np.inf,
+    max_torque=np.inf,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Points of one motor: current [A], torque M [N m, motor] and slip [-], all (sample,)."""
+
+    motor: int
+    current: np.ndarray
+    torque: np.ndarray
+    slip: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.slip)
+
+
+def pool(parts: Sequence[Samples]) -> Samples:
+    """All points of several sets of one motor, in order."""
+    return Samples(
+        motor=parts[0].motor,
+        current=np.concatenate([p.current for p in parts]),
+        torque=np.concatenate([p.torque for p in parts]),
+        slip=np.concatenate([p.slip for p in parts]),
+    )
+
+
+def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Samples:
+    """Points of one motor that survive the recipe.
+
+    Args:
+        table: logged columns by name, in the file's units.
+        motor: 1, 2 or 3.
+        recipe: the choices.
+    """
+    effective = effective_speed(table, recipe)
+    rpm = 2.0 * np.pi / 60.0
+    keep = np.all(np.abs(effective) < recipe.speed_limit * rpm, axis=1)
+    if recipe.drop_rotation:
+        keep &= table[_COMMAND[2]] == 0.0
+    speed = table[f"Motor {motor} velocity, rpm"] * rpm
+    current = table[f"Motor {motor} current, A"]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # A wheel at rest has no slip ratio: not finite here, so no comparison below keeps it.
+        slip = 1.0 - effective[:, motor - 1] / speed
+        voltage = recipe.back_emf * speed + recipe.resistance * current * np.sign(speed)
+        torque = voltage * current / speed
+        keep &= (current > recipe.min_current) & (slip > 0.0) & (slip <= 1.0)
+        keep &= torque <= recipe.max_torque
+    return Samples(motor=motor, current=current[keep], torque=torque[keep], slip=slip[keep])
+
+
+def effective_speed(table: dict[str, np.ndarray], recipe: Recipe) -> np.ndarray:
+    """Motor speeds at which wheels without slip would move the body as seen, w_eff = n J v / r.
+
+    A component of v whose command is 0 counts as 0, as the authors did.
+
+    Returns:
+        [rad/s, motor shaft], shape (row, motor).
+    """
+    command = np.stack([table[c] for c in _COMMAND], axis=1)
+    delta = np.stack([table[c] for c in recipe.delta_columns], axis=1)
+    velocity = delta * _TO_SI / recipe.row_period * (command != 0.0)
+    azimuth = np.radians(recipe.azimuth_deg)
+    rim = np.stack([-np.sin(azimuth), np.cos(azimuth), np.full(3, recipe.base_radius)], axis=1)
+    return velocity @ rim.T * recipe.gear_ratio / recipe.wheel_radius
+
+
+def read_table(path: Path, delimiter: str = ";") -> dict[str, np.ndarray]:
+    """Columns of a CSV file with one header row, by name, in the file's own units.
+
+    Args:
+        path: the file.
+        delimiter: between fields.
+
+    Raises:
+        DataError: if the file is absent or empty, or a field is missing or no finite number.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: no such file; expected one of the 2021 data set")
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    if len(lines) < 2:
+        raise DataError(f"{path}: {len(lines)} lines; expected a header row and at least one row")
+    names = [name.strip() for name in lines[0].split(delimiter)]
+    rows = [
+        _numbers(line, delimiter, names, path, number)
+        for number, line in enumerate(lines[1:], start=2)
+        if line.strip()
+    ]
+    return dict(zip(names, np.array(rows).T, strict=True))
+
+
+def _numbers(line: str, delimiter: str, names: list[str], path: Path, number: int) -> list[float]:
+    fields = line.split(delimiter)
+    if len(fields) != len(names):
+        raise DataError(f"{path} row {number}: {len(fields)} fields; expected {len(names)}")
+    try:
+        values = [float(field) for field in fields]
+    except ValueError as error:
+        raise DataError(f"{path} row {number}: {error}; expected numbers") from None
+    if not np.all(np.isfinite(values)):
+        name = names[int(np.argmin(np.isfinite(values)))]
+        raise DataError(f"{path} row {number}: column {name!r} is not finite; expected a number")
+    return values
+
+
+def require_columns(table: dict[str, np.ndarray], recipe: Recipe, path: Path) -> None:
+    """Refuse a table that lacks a column the recipe reads.
+
+    Raises:
+        DataError: naming the first missing column and those there are.
+    """
+    needed = [*_COMMAND, *recipe.delta_columns]
+    needed += [f"Motor {m} {what}" for m in MOTORS for what in ("velocity, rpm", "current, A")]
+    for name in needed:
+        if name not in table:
+            raise DataError(f"{path}: no column {name!r}; columns: {', '.join(table)}")
