@@ -1,7 +1,7 @@
-"""Layouts of log files: which column holds which channel, in which unit. One reader reads them all."""
+"""Layouts of log files: which column holds which channel, in which unit."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from typing import Any
 
@@ -76,8 +76,10 @@ class Layout:
         current_step: [A] of the analogue-to-digital converter, None where unknown.
         metres_per_pixel: of the camera along its x and y, [m].
         new_run: what tells that the next run starts inside the file.
+        drop_repeated_time: of rows with the same time keep the last, instead of refusing them.
         max_gap: [s] between rows before it is called a clock jump.
         max_pose_jump: [m] between rows before it is called a marker swap.
+        max_heading_jump: [rad] likewise.
     """
 
     name: str
@@ -95,8 +97,10 @@ class Layout:
     current_step: float | None = None
     metres_per_pixel: tuple[float, float] | None = None
     new_run: str = "never"
+    drop_repeated_time: bool = False
     max_gap: float = 1.0
     max_pose_jump: float = 0.5
+    max_heading_jump: float = 1.6
 
     @property
     def wheels(self) -> int:
@@ -110,7 +114,7 @@ class Layout:
         return tuple(dict.fromkeys(used))
 
     def to_si(self, channel: str) -> float:
-        """Factor from the channel's unit to the unit of `CHANNELS`; pixels by the camera's scale."""
+        """Factor from the channel's unit to that of `CHANNELS`; pixels by the camera's scale."""
         unit, target = self.channels[channel].unit, CHANNELS[channel]
         if channel in ("pose_x", "pose_y") and _converts(unit, "pixel"):
             if self.metres_per_pixel is None:
@@ -130,7 +134,7 @@ def preset(name: str) -> Layout:
 
 
 def layout_from_mapping(mapping: Mapping[str, Any], where: str) -> Layout:
-    """Layout declared in a config: `format` names a preset to start from, the rest overrides it.
+    """Layout declared in a config: `format` names a preset, the rest overrides it.
 
     `columns` maps each channel to `{columns = [...] or column = ..., unit, scale, offset}`; `false`
     takes a channel of the preset away.
@@ -200,9 +204,11 @@ _TYPES: dict[str, tuple[Any, str]] = {
     "new_run": (str, f"one of {', '.join(NEW_RUN)}"),
     "ticks_are_increments": (bool, "true or false"),
     "current_is_signed": (bool, "true or false"),
+    "drop_repeated_time": (bool, "true or false"),
     "metres_per_pixel": ((list, tuple, int, float), "a number of metres, or two"),
-    **{key: (int, "a whole number") for key in ("names_row", "units_row", "first_data_row")},
-    "tick_bits": (int, "a whole number"),
+    **dict.fromkeys(
+        ("names_row", "units_row", "first_data_row", "tick_bits"), (int, "a whole number")
+    ),
 }
 
 
@@ -246,7 +252,14 @@ def _checked(layout: Layout, where: str) -> Layout:
         problem = f"first_data_row {layout.first_data_row}; expected it below names and units"
     elif not layout.names_row and any(isinstance(c, str) for c in layout.columns):
         problem = "columns by name, but names_row is 0; expected positions from 0"
-    for key in ("row_period", "ticks_per_revolution", "gear_ratio", "max_gap", "max_pose_jump"):
+    for key in (
+        "row_period",
+        "ticks_per_revolution",
+        "gear_ratio",
+        "max_gap",
+        "max_pose_jump",
+        "max_heading_jump",
+    ):
         value = getattr(layout, key)
         if value is not None and not value > 0:
             problem = f"{key} = {value}; expected a number above 0"
@@ -258,7 +271,7 @@ def _checked(layout: Layout, where: str) -> Layout:
             problem = str(error)
     if problem is not None:
         raise DataError(f"{where}: {problem}")
-    return replace(layout, channels=dict(have))
+    return layout
 
 
 def _converts(unit: str, target: str) -> bool:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 
 class DataError(ValueError):
-    """The user's data cannot be read; the message names file, row or column, and what was expected."""
+    """The user's data cannot be read; the message names file, row or column, and the remedy."""
 
 
 def bad_data(

@@ -49,9 +49,12 @@ def read_logs(
 ) -> tuple[Log, ...]:
     """Every run in a file, where `layout.new_run` tells them apart; arguments as of `read_log`.
 
-    Parts of a file shorter than three rows hold no motion and are left out.
+    Parts of a file of a single row hold no motion and are left out.
     """
     table = read_table(path, layout)
+    if layout.drop_repeated_time:
+        last = np.append(np.diff(_time(table, layout)) != 0, True)
+        table = table.rows(last)
     starts = _run_starts(table, layout)
     if len(starts) == 1:
         return (_log(table, layout, _name(path, root), surface, load),)
@@ -59,7 +62,7 @@ def read_logs(
     pairs = [(a, b) for a, b in zip(starts, ends, strict=True) if b - a >= MIN_ROWS]
     width = len(str(len(pairs)))
     return tuple(
-        _log(table.rows(a, b), layout, f"{_name(path, root)}#{k:0{width}d}", surface, load)
+        _log(table.rows(slice(a, b)), layout, f"{_name(path, root)}#{k:0{width}d}", surface, load)
         for k, (a, b) in enumerate(pairs, start=1)
     )
 
@@ -100,13 +103,10 @@ def _run_starts(table: Table, layout: Layout) -> list[int]:
         time = table.stacked(layout.channels["time"])[:, 0]
         return [0, *(np.flatnonzero(np.diff(time) <= 0) + 1).tolist()]
     if layout.new_run == "ticks_restart":
-        ticks = table.stacked(layout.channels["wheel_ticks"])
-        return [0, *_restarts(ticks).tolist()]
+        # A run that only drives away from its start counts up in magnitude on its fastest wheel.
+        far = np.abs(table.stacked(layout.channels["wheel_ticks"])).max(axis=1)
+        return [0, *(np.flatnonzero(far[1:] < far[:-1]) + 1).tolist()]
     return [0]
-
-
-def _restarts(ticks: Float[np.ndarray, "row wheel"]) -> np.ndarray:
-    raise NotImplementedError
 
 
 def _log(table: Table, layout: Layout, name: str, surface: str | None, load: str) -> Log:

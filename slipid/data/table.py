@@ -1,4 +1,4 @@
-"""From the bytes of a CSV or Parquet file to columns of numbers, or to the exact cell that is wrong."""
+"""From the bytes of a CSV or Parquet file to columns of numbers, or to the cell that is wrong."""
 
 import hashlib
 import re
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from slipid.data.formats import Channel, Layout
 from slipid.data.log import DataError, bad_data
@@ -27,14 +27,14 @@ class Table:
         sha256: of its bytes.
         names: of the columns read, or their positions.
         values: the cells, NaN where a cell is empty.
-        first_row: line number of the first row of `values` (record number for Parquet), from 1.
+        lines: line number in the file of each row of `values` (record number for Parquet), from 1.
     """
 
     path: Path
     sha256: str
     names: tuple[str | int, ...]
     values: Float[np.ndarray, "row column"]
-    first_row: int
+    lines: Int[np.ndarray, " row"]
 
     def __getitem__(self, name: str | int) -> Float[np.ndarray, " row"]:
         return self.values[:, self.names.index(name)]
@@ -43,10 +43,9 @@ class Table:
         """Cells of a channel's columns, side by side."""
         return self.values[:, [self.names.index(c) for c in channel.columns]]
 
-    def rows(self, start: int, stop: int) -> "Table":
-        """The part from row `start` up to `stop`, both counted from 0 in this table."""
-        part = self.values[start:stop]
-        return replace(self, values=part, first_row=self.first_row + start)
+    def rows(self, which: slice | np.ndarray) -> "Table":
+        """The table with some of its rows."""
+        return replace(self, values=self.values[which], lines=self.lines[which])
 
 
 def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Table:
@@ -64,7 +63,7 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     sha256 = hashlib.sha256(raw).hexdigest()
     if path.suffix == ".parquet":
         names, values = _parquet(path, raw, layout, all_columns)
-        return Table(path, sha256, names, values, 1)
+        return Table(path, sha256, names, values, 1 + np.arange(len(values)))
     lines = _lines(path, raw)
     header = _header(path, lines, layout)
     names = _wanted(path, header, layout, all_columns)
@@ -74,12 +73,13 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     _check_fields(path, body, header, layout)
     if layout.units_row:
         _check_units(path, lines[layout.units_row - 1], header, layout)
-    where = [header.index(name) if layout.names_row else int(name) for name in names]
+    where = [header.index(str(name)) if layout.names_row else int(name) for name in names]
     try:
         values = np.loadtxt(body, delimiter=layout.delimiter, usecols=where, ndmin=2, comments=None)
     except ValueError:
         values = _cell_by_cell(path, body, names, where, layout)
-    return Table(path, sha256, names, values, layout.first_data_row)
+    lines_read = layout.first_data_row + np.arange(len(values))
+    return Table(path, sha256, names, values, lines_read)
 
 
 def _bytes(path: Path) -> bytes:

@@ -35,9 +35,9 @@ _UNITS = (
 )
 _ALIASES = {"%": "percent", "°": "degree", "°/s": "degree/s", "1": "fraction", "": "fraction"}
 _KNOWN = (
-    "s ms us min m mm cm inch rad deg rev rad/s deg/s rpm rev/s m/s mm/s "
-    "A mA V mV tick pixel percent 1"
-).split()
+    *("s", "ms", "us", "min", "m", "mm", "cm", "inch", "rad", "deg", "rev", "rad/s", "deg/s"),
+    *("rpm", "rev/s", "m/s", "mm/s", "A", "mA", "V", "mV", "tick", "pixel", "percent", "1"),
+)
 
 
 @lru_cache(maxsize=1)
@@ -53,7 +53,7 @@ def _registry() -> "pint.UnitRegistry[Any]":
 
 @lru_cache(maxsize=256)
 def factor(unit: str, target: str) -> float:
-    """Number that turns a value in `unit` into one in `target`: value [target] = factor value [unit].
+    """Factor between two units: value [target] = factor value [unit].
 
     Args:
         unit: a unit as people write it: "ms", "rpm", "mm/s", "%".
@@ -76,7 +76,7 @@ def factor(unit: str, target: str) -> float:
 
 
 def same_unit(one: str, other: str) -> bool:
-    """Whether two unit texts mean the same unit, as "pix" and "pixel" do; False where unreadable."""
+    """Whether two texts mean the same unit, as "pix" and "pixel" do; False where unreadable."""
     try:
         return abs(factor(one, other) - 1.0) < 1e-9
     except ValueError:

@@ -9,7 +9,7 @@ from slipid.data.formats import Layout
 from slipid.data.log import Log, bad_data
 from slipid.data.table import Table
 
-MIN_ROWS = 3
+MIN_ROWS = 2
 """Rows below which there is no motion to speak of."""
 MAX_FILLED = 3
 """Missing cells in a row that are filled by interpolation; more is a burst, and refused."""
@@ -33,7 +33,7 @@ def check_time(table: Table, layout: Layout, time: Float[np.ndarray, " row"]) ->
     column = str(layout.channels["time"].columns[0]) if "time" in layout.channels else None
 
     def fail(at: int, found: str, expected: str) -> None:
-        raise bad_data(table.path, found, expected, row=table.first_row + at, column=column)
+        raise bad_data(table.path, found, expected, row=int(table.lines[at]), column=column)
 
     if len(time) < MIN_ROWS:
         fail(0, f"{len(time)} row(s) of numbers", f"at least {MIN_ROWS}")
@@ -78,13 +78,13 @@ def filled(
         values = cells[:, j]
         infinite = np.flatnonzero(np.isinf(values))
         if len(infinite):
-            row = table.first_row + int(infinite[0])
+            row = int(table.lines[infinite[0]])
             raise bad_data(table.path, "an infinite value", "a number", row=row, column=str(column))
         missing = np.isnan(values)
         if not missing.any():
             continue
         first, last = _longest(missing)
-        rows = (table.first_row + first, table.first_row + last)
+        rows = (int(table.lines[first]), int(table.lines[last]))
         if last - first + 1 > MAX_FILLED:
             found = f"{last - first + 1} missing values in a row"
             expected = f"numbers (gaps up to {MAX_FILLED} rows are filled in)"
@@ -143,8 +143,8 @@ def _check_wheels(log: Log, table: Table, layout: Layout) -> None:
     if not log.wheels:
         return
     rates = np.abs(np.diff(log.wheel_angle, axis=0)) / np.diff(log.time)[:, None]
-    # Loops that stall and catch up make tenfold rates in sound logs; a counter that starts anew makes
-    # hundredfold ones.
+    # Telemetry that stalls and catches up makes tenfold rates in sound logs; a counter that starts
+    # anew makes hundredfold ones.
     limit = max(30.0, 20.0 * float(np.quantile(rates, 0.99)))
     if rates.max() > limit:
         i, j = _first(rates > limit)
@@ -180,10 +180,11 @@ def _check_pose(log: Log, table: Table, layout: Layout) -> None:
         )
         raise _at(table, layout, "pose_x", i + 1, 0, found, expected)
     turns = np.abs(np.diff(pose[:, 2]))
-    if turns.max() > np.pi / 2:
-        i = int(np.flatnonzero(turns > np.pi / 2)[0])
+    if turns.max() > layout.max_heading_jump:
+        i = int(np.flatnonzero(turns > layout.max_heading_jump)[0])
         found = f"the heading jumps by {np.degrees(turns[i]):.0f} deg"
-        expected = "at most 90 deg between rows; another marker, or a wrong unit?"
+        limit = np.degrees(layout.max_heading_jump)
+        expected = f"at most {limit:.0f} deg between rows; another marker, or a wrong unit?"
         raise _at(table, layout, "pose_heading", i + 1, 0, found, expected)
     turned = np.ptp(log.wheel_angle, axis=0).max(initial=0.0)
     if turned > 2.0 and np.ptp(pose, axis=0).max() == 0:
@@ -209,5 +210,5 @@ def _at(
     }.get(name, (name,))
     channel = next((layout.channels[n] for n in order if n in layout.channels), None)
     column = str(channel.columns[j]) if channel else None
-    row = None if i is None else table.first_row + i
+    row = None if i is None else int(table.lines[i])
     return bad_data(table.path, found, expected, row=row, column=column)
