@@ -16,13 +16,13 @@ from slipid.baselines.paper2021.samples import (
     SURFACES,
     Samples,
     effective_speed,
-    read_table,
+    read_columns,
     require_columns,
     slip_samples,
 )
 from slipid.baselines.paper2021.table import fit_form
-from slipid.baselines.paper2021.tracks import TrackFile
-from slipid.baselines.paper2021.transfer import window_samples
+from slipid.baselines.paper2021.tracks import TrackFile, read_track
+from slipid.baselines.paper2021.transfer import curve_points
 from slipid.data.log import DataError, Log
 
 RPM = 2 * np.pi / 60
@@ -48,6 +48,9 @@ def made_table(twist, slip, current, command=None):
     for m in range(3):
         table[f"Motor {m + 1} velocity, rpm"] = speed[:, m] / RPM
         table[f"Motor {m + 1} current, A"] = current[:, m]
+        table[f"Motor {m + 1} encoder, ticks"] = np.arange(len(twist)) * 100.0
+    for name in ("X coordinate, pixels", "Y coodinate, pixels", "Angle, deg"):
+        table[name] = np.arange(len(twist)) * 1.0
     return table
 
 
@@ -151,31 +154,38 @@ def test_too_few_samples_are_refused():
 @pytest.mark.parametrize(
     ("text", "fragments"),
     [
-        ("", ["0 lines", "header row"]),
-        ("a;b\n", ["1 lines", "at least one row"]),
-        ("a;b\n1;2\n3\n", ["row 3", "1 fields", "expected 2"]),
-        ("a;b\n1;x\n", ["row 2", "'x'", "expected numbers"]),
-        ("a;b\n1;nan\n", ["row 2", "'b'", "not finite"]),
+        ("", ["empty"]),
+        ("time_s,x_mm,y_mm,angle_deg\n0,1,2,3\n1,2\n", ["row 3"]),
+        ("time_s,x_mm,y_mm,angle_deg\n0,1,x,3\n", ["row 2", "y_mm", "'x'"]),
+        ("time_s,x_mm,y_mm,angle_deg\n0,1,2,3\n1,,2,3\n", ["row 3", "x_mm", "finite"]),
+        ("time_s,x_mm,angle_deg\n0,1,2\n", ["y_mm"]),
     ],
+    ids=["empty", "ragged", "word", "hole", "column"],
 )
-def test_broken_file_is_named_with_its_row(tmp_path, text, fragments):
+def test_broken_file_is_named_with_its_place(tmp_path, text, fragments):
     path = tmp_path / "broken.csv"
     path.write_text(text)
     with pytest.raises(DataError) as refusal:
-        read_table(path)
+        read_columns(path, "robotino2021_camera")
     for fragment in ["broken.csv", *fragments]:
         assert fragment in str(refusal.value)
 
 
-def test_absent_file_and_column_are_named(tmp_path, rng):
-    with pytest.raises(DataError, match=r"gone\.csv: no such file"):
-        read_table(tmp_path / "gone.csv")
+def test_absent_column_and_data_set_are_named(tmp_path, rng):
     table = made_table(*made_rows(rng))
-    del table["Motor 2 current, A"]
-    with pytest.raises(DataError, match="no column 'Motor 2 current, A'; columns: X axis speed"):
+    del table["Delta Y, mm"]
+    with pytest.raises(DataError, match=r"x\.csv, column 'Delta Y, mm': no such"):
         require_columns(table, FIGURES_3_AND_4, Path("x.csv"))
     with pytest.raises(DataError, match="no 2021 data set; expected robotino2021"):
         paper.find_folder(tmp_path)
+
+
+def test_short_track_is_refused(tmp_path):
+    file = TrackFile("made", "made", "made.csv", 9, 9, 1.0)
+    (tmp_path / "figure7").mkdir()
+    (tmp_path / "figure7" / "made.csv").write_text("time_s,x_mm,y_mm,angle_deg\n0,1,2,3\n1,1,2,3\n")
+    with pytest.raises(DataError, match=r"made\.csv: 2 frames; expected at least the 9"):
+        read_track(tmp_path, file)
 
 
 # stored and deployed models
@@ -291,13 +301,38 @@ def made_log(rng, surface, offset, slope, seconds=12.0):
     )
 
 
-def test_window_samples_find_the_slip_put_in(rng):
+def test_windows_find_the_slip_put_in(rng):
     log = made_log(rng, "a", 0.1, 0.5)
-    points = window_samples(log, paper.TransferRecipe())
-    assert (
-        len(points) == 3 * 23
-    )  # 12 s less 10 mm of start, in whole windows of 0.5 s, three wheels
+    current, slip = paper.wheel_windows(log, paper.WindowRecipe())
+    assert slip.shape == (23, 3)  # 12 s less 10 mm of start, in whole windows of 0.5 s
+    np.testing.assert_allclose(slip, 0.1 + 0.5 * current, rtol=1e-9)
+    points = curve_points(log, paper.WindowRecipe(), min_current=0.0)
     np.testing.assert_allclose(points[:, 1], 0.1 + 0.5 * points[:, 0], rtol=1e-9)
+    assert len(points) == 69
+
+
+def test_windows_apply_the_pose_scale_and_leave_resting_wheels_out(rng):
+    log = made_log(rng, "a", 0.1, 0.5)
+    _, plain = paper.wheel_windows(log, paper.WindowRecipe())
+    _, scaled = paper.wheel_windows(log, paper.WindowRecipe(pose_scale=1.1))
+    np.testing.assert_allclose(1 - scaled, 1.1 * (1 - plain), rtol=1e-9)
+    parked = replace(log, wheel_angle=log.wheel_angle * [1.0, 0.0, 1.0])
+    _, slip = paper.wheel_windows(parked, paper.WindowRecipe())
+    assert np.isnan(slip[:, 1]).all()
+    assert np.isfinite(slip[:, [0, 2]]).all()
+
+
+def test_refitted_deployed_model_is_the_law_put_in(rng):
+    logs = [made_log(rng, "a", 0.1, 0.5) for _ in range(6)]
+    model = paper.refit_deployed(logs, paper.WindowRecipe(), threshold=0.3)
+    np.testing.assert_allclose(model.gain, -0.5, rtol=1e-8)
+    np.testing.assert_allclose(model.offset, 0.9, rtol=1e-8)
+
+
+def test_windows_refuse_a_log_without_pose(rng):
+    blind = replace(made_log(rng, "a", 0.1, 0.5), pose=None)
+    with pytest.raises(ValueError, match=r"a\.csv: slip against current needs both"):
+        paper.wheel_windows(blind, paper.WindowRecipe())
 
 
 def test_transfer_tells_a_common_law_from_one_per_surface(rng):
@@ -336,6 +371,8 @@ def made_data(tmp_path, rng):
     for new, old in (("dX_new", "Delta X, mm"), ("dY_new", "Delta Y, mm")):
         field[new] = field[old]
     field["dANG"] = field["Delta angle, deg"]
+    field["Time, ms"] = np.arange(120) * 500.0
+    field["Z gyro"] = np.zeros(120)
     write_csv(folder / "experimental_data_on_whole_field.csv", field)
     for file in paper.TRACK_FILES:
         t = np.linspace(0, 1, 400)
@@ -359,7 +396,7 @@ def test_run_writes_report_and_figures(made_data, tmp_path):
 
 def test_run_leaves_nothing_where_a_file_is_broken(made_data, tmp_path):
     (made_data / "robotino2021" / "experimental_data_red.csv").write_text("a;b\n1;2\n")
-    with pytest.raises(DataError, match=r"experimental_data_red\.csv: no column"):
+    with pytest.raises(DataError, match=r"experimental_data_red\.csv.*column"):
         paper_plots.run(made_data, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -17,7 +17,8 @@ from slipid.baselines.paper2021.result import PaperResult, find_folder, regenera
 from slipid.baselines.paper2021.samples import FIGURE_2, FIGURES_3_AND_4, Recipe, Samples
 from slipid.baselines.paper2021.table import FittedForm, MotorTable, field_table, surface_tables
 from slipid.baselines.paper2021.tracks import TRACK_FILES, Track, read_tracks
-from slipid.baselines.paper2021.transfer import Transfer, TransferRecipe, leave_one_surface_out
+from slipid.baselines.paper2021.transfer import Transfer, leave_one_surface_out
+from slipid.baselines.paper2021.windows import WindowRecipe, refit_deployed, wheel_windows
 
 __all__ = [
     "CURRENT_SVR",
@@ -34,14 +35,16 @@ __all__ = [
     "Samples",
     "Track",
     "Transfer",
-    "TransferRecipe",
+    "WindowRecipe",
     "field_table",
     "find_folder",
     "fit_deployed",
     "leave_one_surface_out",
     "polynomial",
     "read_tracks",
+    "refit_deployed",
     "regenerate",
     "smooth_current",
     "surface_tables",
+    "wheel_windows",
 ]

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.data.log import DataError
+from slipid.data.formats import preset
+from slipid.data.log import bad_data
+from slipid.data.table import read_table
 
 SURFACES = ("gray", "blue", "red")
 MOTORS = (1, 2, 3)
@@ -128,42 +130,27 @@ def effective_speed(table: dict[str, np.ndarray], recipe: Recipe) -> np.ndarray:
     return velocity @ rim.T * recipe.gear_ratio / recipe.wheel_radius
 
 
-def read_table(path: Path, delimiter: str = ";") -> dict[str, np.ndarray]:
-    """Columns of a CSV file with one header row, by name, in the file's own units.
+def read_columns(path: Path, layout: str) -> dict[str, np.ndarray]:
+    """Every column of a file by name, in the file's own units, also those no channel reads.
 
     Args:
         path: the file.
-        delimiter: between fields.
+        layout: preset of the data reader.
 
     Raises:
-        DataError: if the file is absent or empty, or a field is missing or no finite number.
+        DataError: if the file cannot be read or holds a cell that is no finite number.
     """
-    if not path.is_file():
-        raise DataError(f"{path}: no such file; expected one of the 2021 data set")
-    lines = path.read_text(encoding="utf-8-sig").splitlines()
-    if len(lines) < 2:
-        raise DataError(f"{path}: {len(lines)} lines; expected a header row and at least one row")
-    names = [name.strip() for name in lines[0].split(delimiter)]
-    rows = [
-        _numbers(line, delimiter, names, path, number)
-        for number, line in enumerate(lines[1:], start=2)
-        if line.strip()
-    ]
-    return dict(zip(names, np.array(rows).T, strict=True))
-
-
-def _numbers(line: str, delimiter: str, names: list[str], path: Path, number: int) -> list[float]:
-    fields = line.split(delimiter)
-    if len(fields) != len(names):
-        raise DataError(f"{path} row {number}: {len(fields)} fields; expected {len(names)}")
-    try:
-        values = [float(field) for field in fields]
-    except ValueError as error:
-        raise DataError(f"{path} row {number}: {error}; expected numbers") from None
-    if not np.all(np.isfinite(values)):
-        name = names[int(np.argmin(np.isfinite(values)))]
-        raise DataError(f"{path} row {number}: column {name!r} is not finite; expected a number")
-    return values
+    table = read_table(path, preset(layout), all_columns=True)
+    rows, columns = np.nonzero(~np.isfinite(table.values))
+    if len(rows):
+        raise bad_data(
+            path,
+            "no finite number",
+            "one in every cell",
+            row=int(table.lines[rows[0]]),
+            column=str(table.names[columns[0]]),
+        )
+    return {str(name): column for name, column in zip(table.names, table.values.T, strict=True)}
 
 
 def require_columns(table: dict[str, np.ndarray], recipe: Recipe, path: Path) -> None:
@@ -176,4 +163,4 @@ def require_columns(table: dict[str, np.ndarray], recipe: Recipe, path: Path) ->
     needed += [f"Motor {m} {what}" for m in MOTORS for what in ("velocity, rpm", "current, A")]
     for name in needed:
         if name not in table:
-            raise DataError(f"{path}: no column {name!r}; columns: {', '.join(table)}")
+            raise bad_data(path, "no such column", f"one of {', '.join(table)}", column=name)

@@ -14,7 +14,7 @@ from slipid.baselines.paper2021.samples import (
     Recipe,
     Samples,
     pool,
-    read_table,
+    read_columns,
     require_columns,
     slip_samples,
 )
@@ -124,7 +124,7 @@ def surface_tables(folder: Path, recipe: Recipe = FIGURES_3_AND_4) -> dict[int, 
     tables = {}
     for surface in SURFACES:
         path = folder / f"experimental_data_{surface}.csv"
-        tables[surface] = read_table(path)
+        tables[surface] = read_columns(path, "robotino2021")
         require_columns(tables[surface], recipe, path)
     return {
         motor: fit_motor(
@@ -146,7 +146,7 @@ def field_table(folder: Path, recipe: Recipe = FIGURE_2) -> MotorTable:
         DataError: if the file or a column is missing.
     """
     path = folder / "experimental_data_on_whole_field.csv"
-    table = read_table(path)
+    table = read_columns(path, "robotino2021_field")
     require_columns(table, recipe, path)
     samples = slip_samples(table, 1, recipe)
     forms = {name: fit_form(samples, name) for name in ("affine in I", "constant")}

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.baselines.paper2021.samples import read_table
-from slipid.data.log import DataError
+from slipid.baselines.paper2021.samples import read_columns
+from slipid.data.log import bad_data
 
 
 @dataclass(frozen=True)
@@ -130,14 +130,12 @@ def read_track(folder: Path, file: TrackFile) -> Track:
         DataError: if the file or a column is missing or the track ends within its first side.
     """
     path = folder / "figure7" / file.file
-    table = read_table(path, delimiter=",")
-    for name in ("time_s", "x_mm", "y_mm", "angle_deg"):
-        if name not in table:
-            raise DataError(f"{path}: no column {name!r}; columns: {', '.join(table)}")
+    table = read_columns(path, "robotino2021_camera")
     if len(table["time_s"]) < file.side_frames:
-        raise DataError(
-            f"{path}: {len(table['time_s'])} frames; expected at least the {file.side_frames} "
-            "of the first side"
+        raise bad_data(
+            path,
+            f"{len(table['time_s'])} frames",
+            f"at least the {file.side_frames} of the first side",
         )
     return Track(
         file=file,

@@ -1,0 +1,112 @@
+"""Current and slip of every wheel over short windows of a run, against the overhead camera."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slipid.baselines.paper2021.models import DeployedModel, fit_deployed, smooth_current
+from slipid.data.log import Log
+
+
+@dataclass(frozen=True)
+class WindowRecipe:
+    """How a run is cut into samples; the defaults are the 2021 recipe carried to full logs.
+
+    Args:
+        wheel_radius: r [m].
+        base_radius: L [m].
+        azimuth_deg: wheel centres seen from the body's x axis [deg].
+        window: length of one sample [s], a row of the 2021 files.
+        moved: rim travel after which a run counts as under way [m].
+        min_speed: windows in which a wheel's rim is slower have no slip ratio there [m/s].
+        pose_scale: metres per logged metre of the camera [-]; 1 leaves it uncorrected.
+        memory: smoothing of the current before it is averaged [-], 0 for none.
+    """
+
+    wheel_radius: float = 0.040
+    base_radius: float = 0.125
+    azimuth_deg: tuple[float, ...] = (60.0, 180.0, 300.0)
+    window: float = 0.5
+    moved: float = 0.010
+    min_speed: float = 0.0
+    pose_scale: float = 1.0
+    memory: float = 0.0
+
+
+def wheel_windows(log: Log, recipe: WindowRecipe) -> tuple[np.ndarray, np.ndarray]:
+    """Mean current and slip of every wheel over a log's windows, nothing cut away.
+
+    s = 1 - J v / (r w), v the camera's body velocity over the window, w the encoders' mean speed.
+
+    Args:
+        log: one run with pose and current.
+        recipe: the choices.
+
+    Returns:
+        |current| [A] and slip [-], both (window, wheel); slip is not finite where a wheel rests.
+
+    Raises:
+        ValueError: if the log has no pose or no current.
+    """
+    if log.pose is None or log.current is None:
+        raise ValueError(f"{log.name}: slip against current needs both pose and current")
+    edges = _edges(log, recipe)
+    if len(edges) < 2:
+        return np.empty((0, log.wheels)), np.empty((0, log.wheels))
+    span = np.diff(log.time[edges])[:, None]
+    azimuth = np.radians(recipe.azimuth_deg)
+    arm = np.full(len(azimuth), recipe.base_radius)
+    rim = np.stack([-np.sin(azimuth), np.cos(azimuth), arm], axis=1)
+    effective = _body_steps(log.pose[edges], recipe.pose_scale) / span @ rim.T
+    driven = np.diff(log.wheel_angle[edges], axis=0) / span * recipe.wheel_radius
+    # Mean over the rows of each window, not the value at its edge: the current is 10-bit and rough.
+    magnitude = smooth_current(np.abs(log.current), recipe.memory)
+    current = np.add.reduceat(magnitude, edges, axis=0)[:-1] / np.diff(edges)[:, None]
+    moving = np.abs(driven) > recipe.min_speed
+    slip = np.full_like(driven, np.nan)
+    np.divide(effective, driven, out=slip, where=moving)
+    return current, 1.0 - slip
+
+
+def refit_deployed(
+    logs: Iterable[Log], recipe: WindowRecipe | None = None, threshold: float = 0.4
+) -> DeployedModel:
+    """The paper's deployed model with coefficients of its own for these runs.
+
+    No sample is cut for its slip: to drop slip outside (0, 1], as the authors did, is to select
+    on the very thing fitted.
+
+    Args:
+        logs: runs on one surface.
+        recipe: the choices; where None current is smoothed as on the robot, and wheels below
+            20 mm/s are left out.
+        threshold: current below which a wheel is taken not to slip [A].
+    """
+    recipe = recipe or WindowRecipe(min_speed=0.02, memory=0.97)
+    parts = [wheel_windows(log, recipe) for log in logs]
+    current = np.concatenate([part[0] for part in parts])
+    slip = np.concatenate([part[1] for part in parts])
+    memory = recipe.memory or 0.97
+    return fit_deployed(current, slip, threshold=threshold, memory=memory)
+
+
+def _edges(log: Log, recipe: WindowRecipe) -> np.ndarray:
+    travel = np.max(np.abs(log.wheel_angle - log.wheel_angle[0]), axis=1) * recipe.wheel_radius
+    moving = np.flatnonzero(travel >= recipe.moved)
+    if len(moving) == 0:
+        return np.empty(0, dtype=int)
+    starts = np.arange(log.time[moving[0]], log.time[-1], recipe.window)
+    # unique: where rows are further apart than a window, two windows would begin at the same row
+    return np.unique(np.searchsorted(log.time, starts))
+
+
+def _body_steps(pose: np.ndarray, scale: float) -> np.ndarray:
+    """Pose increments in the body frame, turned by the mean heading of each window."""
+    step = np.diff(pose, axis=0)
+    heading = 0.5 * (pose[1:, 2] + pose[:-1, 2])
+    c, s = np.cos(heading), np.sin(heading)
+    step[:, :2] *= scale
+    forward = c * step[:, 0] + s * step[:, 1]
+    left = -s * step[:, 0] + c * step[:, 1]
+    return np.stack([forward, left, step[:, 2]], axis=1)
