@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.formats import Layout
+from slipid.data.layout import Layout
 from slipid.data.log import DataError, Log, bad_data
 from slipid.data.table import Table, read_table
 from slipid.data.validate import MIN_ROWS, check_log, check_time, filled, unwrapped_ticks

@@ -75,6 +75,15 @@ def factor(unit: str, target: str) -> float:
     return float(registry.Quantity(1.0, given).to(wanted).magnitude)
 
 
+def converts(unit: str, target: str) -> bool:
+    """Whether a unit is known and of the dimension of another."""
+    try:
+        factor(unit, target)
+    except ValueError:
+        return False
+    return True
+
+
 def same_unit(one: str, other: str) -> bool:
     """Whether two texts mean the same unit, as "pix" and "pixel" do; False where unreadable."""
     try:

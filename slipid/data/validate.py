@@ -5,9 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.formats import Layout
+from slipid.data.layout import Layout
 from slipid.data.log import Log, bad_data
+from slipid.data.signal import interpolate
 from slipid.data.table import Table
+from slipid.data.wheel_order import best_wheel_order, describe, integrated_steps, step_edges
 
 MIN_ROWS = 2
 """Rows below which there is no motion to speak of."""
@@ -135,11 +137,13 @@ def check_log(log: Log, table: Table, layout: Layout) -> None:
         expected = "magnitudes only, as the layout says (current_is_signed = false)"
         raise _at(table, layout, "current", i, j, found, expected)
     _check_wheels(log, table, layout)
+    _check_order(log, table, layout)
     if log.pose is not None:
         _check_pose(log, table, layout)
 
 
 def _check_wheels(log: Log, table: Table, layout: Layout) -> None:
+    """Refuse angles no wheel can make, and a wheel that stands still when commanded."""
     if not log.wheels:
         return
     rates = np.abs(np.diff(log.wheel_angle, axis=0)) / np.diff(log.time)[:, None]
@@ -166,6 +170,24 @@ def _check_wheels(log: Log, table: Table, layout: Layout) -> None:
         j = int(dead[0])
         found = f"constant, though the wheel was commanded {commanded[j]:.3g} rad"
         raise _at(table, layout, "wheel", None, j, found, "a wheel that turns when commanded")
+
+
+def _check_order(log: Log, table: Table, layout: Layout) -> None:
+    """Refuse wheel columns in another order than those of the commanded or reported speeds."""
+    for name in ("wheel_speed_command", "wheel_speed"):
+        reference = getattr(log, name)
+        if reference is None:
+            continue
+        edges = step_edges(log.time)
+        measured = np.diff(interpolate(log.time, log.wheel_angle, edges), axis=0)
+        order = best_wheel_order(measured, integrated_steps(log.time, reference, edges))
+        if order.is_swapped:
+            other = np.flatnonzero(np.array(order.order) != np.arange(log.wheels))
+            turned = np.flatnonzero(np.array(order.signs) < 0)
+            j = int(other[0] if len(other) else turned[0])
+            found = f"the wheel does not move as its {name} says"
+            expected = f"wheels in the order {describe(order)} (swapped or reversed columns?)"
+            raise _at(table, layout, "wheel", None, j, found, expected)
 
 
 def _check_pose(log: Log, table: Table, layout: Layout) -> None:
