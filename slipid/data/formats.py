@@ -108,7 +108,8 @@ def _settings(given: Mapping[str, Any], where: str) -> dict[str, Any]:
         if key not in known:
             raise DataError(f"{where}: {_unknown('key', key, ['format', 'columns', *known])}")
         kind, wording = _TYPES.get(key, ((int, float), "a number"))
-        settings[key] = _expect(value, kind, f"{where} {key}", wording)
+        _expect(value, kind, f"{where} {key}", wording)
+        settings[key] = value if key in _TYPES else float(value)
     scale = settings.get("metres_per_pixel")
     if scale is not None:
         pair = tuple(scale) if isinstance(scale, (list, tuple)) else (scale, scale)

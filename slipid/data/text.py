@@ -72,7 +72,8 @@ def wanted_names(
         return tuple(range(len(header))) if all_columns else layout.columns
     for name in layout.columns:
         if name not in header:
-            near = get_close_matches(str(name), header, n=2)
+            unused = [other for other in header if other not in layout.columns]
+            near = get_close_matches(str(name), unused, n=2)
             hint = f"did you mean {' or '.join(near)}? It has" if near else "it has"
             expected = f"it among the names; {hint} {', '.join(filter(None, header))}"
             raise bad_data(path, "no such column", expected, row=layout.names_row, column=str(name))
