@@ -127,15 +127,19 @@ def quantum(values: Float[np.ndarray, " time"]) -> float | None:
     """Step of a quantised column, in its own unit; None where the values are not on a grid.
 
     All distinct values must be whole multiples of it, to 2 % of a step; digits lost in printing are
-    averaged out by a line through the origin.
+    averaged out by a line through the origin. Levels next to each other need not both occur: the
+    smallest gap may be up to four steps.
     """
     levels = np.unique(values)
     levels = levels - levels[np.argmin(np.abs(levels))] if len(levels) else levels
     if len(levels) < 3 or len(levels) > 0.5 * len(values):
         return None
-    step = float(np.diff(levels).min())
-    for _ in range(3):
-        multiples = np.round(levels / step)
-        step = float(levels @ multiples / (multiples @ multiples))
-    worst = float(np.abs(levels / step - multiples).max())
-    return step if worst < 0.02 else None
+    gap = float(np.diff(levels).min())
+    for parts in (1, 2, 3, 4):
+        step = gap / parts
+        for _ in range(3):
+            multiples = np.round(levels / step)
+            step = float(levels @ multiples / (multiples @ multiples))
+        if float(np.abs(levels / step - multiples).max()) < 0.02:
+            return step
+    return None

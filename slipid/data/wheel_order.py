@@ -9,8 +9,9 @@ from jaxtyping import Float
 from slipid.data.log import Log, bad_data
 from slipid.data.signal import interpolate
 
-_SUSPECT = 0.3
-"""Relative misfit from which the declared order is doubted; a good speed loop stays below 0.1."""
+_DOUBT, _DOUBT_OF_POSE = 0.05, 0.3
+"""Relative misfit from which the declared order is doubted. Speed loops keep below the first; what
+a slipping robot's pose says of its wheels may be off by the second."""
 _BETTER = 0.25
 """Another order must have less than this share of the declared one's misfit to be believed."""
 
@@ -23,17 +24,19 @@ class WheelOrder(NamedTuple):
         signs: +1, or -1 where it counts backwards.
         misfit: of this order, sum of squares relative to the reference's.
         misfit_as_declared: of the order in the log.
+        doubt: misfit from which the declared order is doubted.
     """
 
     order: tuple[int, ...]
     signs: tuple[int, ...]
     misfit: float
     misfit_as_declared: float
+    doubt: float = _DOUBT
 
     @property
     def is_swapped(self) -> bool:
         """Whether the declared order is wrong beyond doubt."""
-        doubtful = self.misfit_as_declared > _SUSPECT
+        doubtful = self.misfit_as_declared > self.doubt
         return doubtful and self.misfit < _BETTER * self.misfit_as_declared
 
 
@@ -71,6 +74,7 @@ def best_wheel_order(
         signs=tuple(-1 if value < 0 else 1 for value in along),
         misfit=misfit(float(np.abs(along).sum())),
         misfit_as_declared=misfit(float(np.trace(products))),
+        doubt=_DOUBT_OF_POSE if fit_gain else _DOUBT,
     )
 
 
