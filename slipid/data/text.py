@@ -141,7 +141,8 @@ def cell_by_cell(
                 values[i, j] = np.nan
                 continue
             try:
-                values[i, j] = float(cell)
+                # Python would read 1_000 as a thousand; no logger writes that on purpose.
+                values[i, j] = float(cell.replace("_", "?"))
             except ValueError:
                 row, column = layout.first_data_row + i, str(names[j])
                 raise _bad_cell(path, cell, row, column) from None
