@@ -103,7 +103,7 @@ def test_reported_speed_reads_high(robotino2022):
 
 
 def test_stalls_freeze_speeds_and_currents_too(robotino2022):
-    """Everything the robot reports stands still in a stall, on brown in most runs; elsewhere not."""
+    """All the robot reports stands still in a stall, on brown in most runs; on green in none."""
     stalls, frozen = 0, []
     for log in robotino2022["brown"]:
         _, stalled = bridge_stalls(log.time, log.wheel_angle)
