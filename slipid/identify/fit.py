@@ -1,0 +1,373 @@
+"""Maximum a posteriori over trajectories: whitened least squares and restricted maximum likelihood.
+
+Structural numbers are found by Levenberg-Marquardt (optimistix) on residuals whitened with the
+current variances and Student-t weights; variances by Fisher scoring of the restricted likelihood
+with the structural Jacobian taken into account; in turn, until neither moves.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from slipid.data.dataset import Windows
+from slipid.identify import likelihood as lk
+from slipid.model.robot import Robot
+from slipid.parameter import Choice, Space
+
+DEGREES = 8.0
+"""Degrees of freedom of the Student-t weight of a run."""
+_VARIANCE_SPREAD = 3.0
+"""Std of the prior of every log variance."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a fit stands; enough to go on from.
+
+    Attributes:
+        z: structural vector in the search space.
+        log_variance: of every variance component.
+        round: rounds done.
+        loss: minus log posterior up to a constant.
+        moved: largest step of the last round, in posterior stds.
+        stage: what it was doing, for progress.
+    """
+
+    z: Float[np.ndarray, " free"]
+    log_variance: Float[np.ndarray, " variance"]
+    round: int
+    loss: float
+    moved: float
+    stage: str
+
+
+class Problem:
+    """Likelihood of a set of windows as jitted functions of the search vector.
+
+    Args:
+        windows: of the runs, all of them; `keep` below chooses those that count.
+        robot: start values and what is fixed.
+        choices: free, fixed, priors.
+    """
+
+    def __init__(self, windows: Windows, robot: Robot, choices: list[Choice]):
+        self.windows = windows
+        self.space = Space(robot, choices)
+        self.robot = self.space.template
+        self.batch = lk.batch(windows, self.robot)
+        self.noise = lk.noise(windows, self.robot)
+        self._base = {k: jnp.asarray(c.base) for k, c in self.noise.blocks.items()}
+        self._which = {k: jnp.asarray(c.which) for k, c in self.noise.blocks.items()}
+        self._mean, self._std = jnp.asarray(self.space.prior_mean), jnp.asarray(self.space.prior_std)
+        self.solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)
+        self._step = eqx.filter_jit(partial(self.solver.step, self._stacked, options={}, tags=frozenset()))
+        self._start = eqx.filter_jit(self._init)
+
+    # residuals -------------------------------------------------------------------------------
+    def blocks(self, z: Float[Array, " free"], volt: Float[Array, ""]) -> dict[str, Array]:
+        """Residual blocks at a search vector."""
+        return lk.residuals(self.space.tree(z), self.batch, volt)
+
+    @partial(jax.jit, static_argnums=0)
+    def linear(self, z: Array, volt: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
+        return self.blocks(z, volt), jax.jacfwd(self.blocks)(z, volt)
+
+    def _stacked(self, y: Array, args: Any) -> tuple[Array, None]:
+        z0, mask, root, volt = args
+        z = z0 + mask * self._std * y
+        parts = [
+            jnp.einsum("nij,nj->ni", root[k], r).ravel() for k, r in self.blocks(z, volt).items()
+        ]
+        return jnp.concatenate([*parts, (z - self._mean) / self._std]), None
+
+    def _init(self, y: Array, args: Any) -> Any:
+        shape = jax.eval_shape(self._stacked, y, args)
+        return self.solver.init(self._stacked, y, args, {}, shape[0], shape[1], frozenset())
+
+    # weights ---------------------------------------------------------------------------------
+    @partial(jax.jit, static_argnums=0)
+    def whitening(self, blocks: dict[str, Array], log_v: Array, keep: Array) -> tuple[dict, dict, Array]:
+        """Roots W with W^T W = w V^-1 per piece, the weights w, and minus log likelihood."""
+        roots, weights, loss = {}, {}, 0.0
+        for k, r in blocks.items():
+            inverse = inverse_root(self._covariance(k, log_v))
+            m = inverse.shape[-1]
+            q = jnp.sum(jnp.einsum("nij,nj->ni", inverse, r) ** 2, axis=-1)
+            weights[k] = keep * (DEGREES + m) / (DEGREES + q)
+            roots[k] = jnp.sqrt(weights[k])[:, None, None] * inverse
+            log_det = -jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=-2, axis2=-1)), axis=-1)
+            loss += jnp.sum(keep * (log_det + 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)))
+        return roots, weights, loss
+
+    def _covariance(self, k: str, log_v: Array) -> Array:
+        v = jnp.exp(log_v)[self._which[k]]
+        m = self._base[k].shape[-1]
+        return jnp.einsum("nc,ncij->nij", v, self._base[k]) + lk.FLOOR[k] * jnp.eye(m)
+
+    @partial(jax.jit, static_argnums=0)
+    def precision(self, jacobian: dict[str, Array], log_v: Array, keep: Array) -> Array:
+        """Expected information of the search vector, prior included (free, free)."""
+        total = jnp.diag(1 / self._std**2)
+        for k, jac in jacobian.items():
+            m = jac.shape[1]
+            factor = keep * (DEGREES + m) / (DEGREES + m + 2)  # Fisher information of a t location
+            root = inverse_root(self._covariance(k, log_v)) * jnp.sqrt(factor)[:, None, None]
+            half = jnp.einsum("nij,njp->nip", root, jac)
+            flat = half.reshape(-1, half.shape[-1])
+            total += flat.T @ flat
+        return total
+
+    @partial(jax.jit, static_argnums=0)
+    def scored(
+        self, blocks: dict, jacobian: dict, log_v: Array, keep: Array, typical: Array
+    ) -> Array:
+        """One Fisher-scoring step of the restricted likelihood in the log variances."""
+        _, weights, _ = self.whitening(blocks, log_v, keep)
+        cov = jnp.linalg.inv(self.precision(jacobian, log_v, keep))
+        count = log_v.shape[0]
+        score, info = jnp.zeros(count), jnp.zeros((count, count))
+        for k, r in blocks.items():
+            root = inverse_root(self._covariance(k, log_v))
+            inverse = jnp.einsum("nji,njk->nik", root, root)
+            base, which = self._base[k], self._which[k]
+            v = jnp.exp(log_v)[which]
+            vr = jnp.einsum("nij,nj->ni", inverse, r)
+            fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
+            vb = jnp.einsum("nij,ncjk->ncik", inverse, base)
+            trace = jnp.einsum("ncii->nc", vb)
+            vj = jnp.einsum("nij,njp->nip", inverse, jacobian[k])
+            spent = jnp.einsum("nip,pq,njq->nij", vj, cov, vj)  # degrees of freedom of the structure
+            lost = jnp.einsum("nij,ncij->nc", spent, base)
+            score = score.at[which].add(0.5 * v * (fit + keep[:, None] * (lost - trace)))
+            cross = 0.5 * jnp.einsum("ncij,ndji->ncd", vb, vb) * (v[:, :, None] * v[:, None, :])
+            info = info.at[which[:, :, None], which[:, None, :]].add(keep[:, None, None] * cross)
+        score -= (log_v - typical) / _VARIANCE_SPREAD**2
+        info += jnp.eye(count) / _VARIANCE_SPREAD**2
+        return log_v + jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
+
+    # fitting ---------------------------------------------------------------------------------
+    def levenberg(
+        self, z: np.ndarray, root: dict, mask: np.ndarray, volt: float, most: int
+    ) -> tuple[np.ndarray, int]:
+        """Levenberg-Marquardt from z with fixed whitening; search vector and steps taken."""
+        args = (jnp.asarray(z), jnp.asarray(mask), root, jnp.asarray(volt))
+        y = jnp.zeros(self.space.size)
+        state = self._start(y, args)
+        for step in range(most):
+            y, state, _ = self._step(y=y, args=args, state=state)
+            done, _ = self.solver.terminate(self._stacked, y, args, {}, state, frozenset())
+            if bool(done):
+                break
+        return np.asarray(z + mask * np.asarray(self._std) * np.asarray(y)), step + 1
+
+    def loss(self, z: np.ndarray, log_v: np.ndarray, keep: np.ndarray) -> float:
+        """Minus log posterior of structure and variances, constants left out."""
+        zj = jnp.asarray(z)
+        _, _, nll = self.whitening(self.blocks_jit(zj, self.volt(log_v)), jnp.asarray(log_v), keep)
+        prior = 0.5 * np.sum(((z - self.space.prior_mean) / self.space.prior_std) ** 2)
+        typical = 2 * np.log(self.noise.typical)
+        return float(nll) + float(prior) + 0.5 * float(np.sum(((log_v - typical) / _VARIANCE_SPREAD) ** 2))
+
+    @partial(jax.jit, static_argnums=0)
+    def blocks_jit(self, z: Array, volt: Array) -> dict[str, Array]:
+        return self.blocks(z, volt)
+
+    def volt(self, log_v: np.ndarray) -> Array:
+        """Std of the voltage noise [V], 1 where none is logged."""
+        if "voltage" not in self.noise.blocks:
+            return jnp.asarray(1.0)
+        return jnp.exp(0.5 * jnp.asarray(log_v)[-1])
+
+    def round(
+        self, state: State, keep: np.ndarray, mask: np.ndarray, steps: int, scoring: int
+    ) -> State:
+        """Weights, structure, variances: one turn of each."""
+        log_v = jnp.asarray(state.log_variance)
+        keep_j = jnp.asarray(keep, dtype=float)
+        volt = self.volt(log_v)
+        blocks = self.blocks_jit(jnp.asarray(state.z), volt)
+        root, _, _ = self.whitening(blocks, log_v, keep_j)
+        z, _ = self.levenberg(state.z, root, mask, float(volt), steps)
+        typical = jnp.asarray(2 * np.log(self.noise.typical))
+        blocks, jacobian = self.linear(jnp.asarray(z), volt)
+        for _ in range(scoring):
+            log_v = self.scored(blocks, jacobian, log_v, keep_j, typical)
+        std = np.sqrt(np.diag(np.linalg.inv(np.asarray(self.precision(jacobian, log_v, keep_j)))))
+        moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
+        moved = max(moved, float(np.max(np.abs(np.asarray(log_v) - state.log_variance)) / 3))
+        return State(
+            z=z,
+            log_variance=np.asarray(log_v),
+            round=state.round + 1,
+            loss=self.loss(z, np.asarray(log_v), keep_j),
+            moved=moved,
+            stage=state.stage,
+        )
+
+
+def inverse_root(v: Float[Array, "piece m m"]) -> Float[Array, "piece m m"]:
+    """L^-1 of V = L L^T for many small matrices, all at once, column by column.
+
+    Written out because batched LAPACK calls that run beside each other inside one compiled function
+    can wait for each other for ever on a machine with two cores (seen with jax 0.10).
+    """
+    a = jnp.moveaxis(v, 0, -1)
+    m = a.shape[0]
+    low = jnp.zeros_like(a)
+    for j in range(m):
+        rest = a[j:, j] - jnp.sum(low[j:, :j] * low[j, :j], axis=1)
+        low = low.at[j:, j].set(rest / jnp.sqrt(rest[0]))
+    inverse = jnp.zeros_like(a)
+    eye = jnp.eye(m)
+    for i in range(m):
+        known = jnp.sum(low[i, :i, None] * inverse[:i], axis=0)
+        inverse = inverse.at[i].set((eye[i][:, None] - known) / low[i, i])
+    return jnp.moveaxis(inverse, -1, 0)
+
+
+CREEPS = (0.05, 0.4, 1.0)
+"""Starts of the creep of every floor; others end in poor minima (METHODS 3B)."""
+
+
+def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], None]) -> State:
+    """Motor by regression, then every floor by itself from several starts, best start per floor.
+
+    Floors share nothing while the shared numbers are held, so one masked fit of all floors is a fit
+    of each by itself.
+    """
+    space, names = problem.space, problem.space.names
+    floor_of = [n.split(".")[1] if n.startswith("surface.") else "" for n in names]
+    mask = np.array([float(f != "") for f in floor_of])
+    labels = problem.robot.surfaces.labels
+    log_v = 2 * np.log(problem.noise.typical)
+    for k, name in enumerate(problem.noise.names):  # far from the optimum every run is an outlier
+        if not name.startswith("camera"):
+            log_v[k] += 2 * np.log(3.0)
+    first = _motor_start(problem)
+    best: dict[str, tuple[float, np.ndarray]] = {}
+    floors = np.asarray(problem.batch.surface)
+    for attempt, creep in enumerate(CREEPS):
+        z = first.copy()
+        for k, name in enumerate(names):
+            if name.endswith(".creep") and floor_of[k]:
+                z[k] = np.log(creep)
+        state = State(z, log_v, 0, np.inf, np.inf, f"floor by floor, start {attempt + 1} of {len(CREEPS)}")
+        for _ in range(3):
+            state = problem.round(state, keep, mask, steps=6, scoring=0)
+            tell(state)
+        cost = _piece_cost(problem, state)
+        for f, label in enumerate(labels):
+            mine = float(np.sum(cost[(floors == f) & (keep > 0)]))
+            if label not in best or mine < best[label][0]:
+                best[label] = (mine, state.z)
+    z = first.copy()
+    for k, f in enumerate(floor_of):
+        if f:
+            z[k] = best[f][1][k]
+    return State(z, log_v, 0, np.inf, np.inf, "joint")
+
+
+def _piece_cost(problem: Problem, state: State) -> np.ndarray:
+    blocks = problem.blocks_jit(jnp.asarray(state.z), problem.volt(state.log_variance))
+    v = np.asarray(problem._covariance("motion", jnp.asarray(state.log_variance)))
+    r = np.asarray(blocks["motion"])
+    q = np.einsum("ni,ni->n", r, np.linalg.solve(v, r[..., None])[..., 0])
+    return 0.5 * (DEGREES + r.shape[1]) * np.log1p(q / DEGREES)
+
+
+def _motor_start(problem: Problem) -> np.ndarray:
+    """Search vector with R and C_e by regression of the voltage where it is logged."""
+    z = problem.space.start.copy()
+    w = problem.windows
+    if not (w.has_voltage and w.has_current):
+        return z
+    speed = (w.turn / w.dt[..., None]).ravel()
+    amps = w.current.ravel() if w.current_is_signed else (w.current.ravel() * np.sign(speed))
+    wm = speed * problem.robot.motor.gear_ratio
+    a, *_ = np.linalg.lstsq(np.stack([amps, wm], -1), w.voltage.ravel(), rcond=None)
+    for path, value in (("motor.resistance", a[0]), ("motor.back_emf", a[1])):
+        if path in problem.space.place and value > 0:
+            z[problem.space.place[path]] = np.log(value)
+    return z
+
+
+@dataclass(frozen=True)
+class Options:
+    """How long and how precisely to fit.
+
+    Attributes:
+        most_rounds: of weights, structure and variances.
+        tolerance: stop when no number moves more than this many posterior stds in a round.
+    """
+
+    most_rounds: int = 30
+    tolerance: float = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """End of a fit.
+
+    Attributes:
+        state: where it ended.
+        covariance: of the search vector (Laplace).
+        converged: whether the tolerance was met.
+        reason: why it stopped, for people.
+        history: loss after every round.
+    """
+
+    state: State
+    covariance: Float[np.ndarray, "free free"]
+    converged: bool
+    reason: str
+    history: tuple[float, ...]
+
+
+def optimise(
+    problem: Problem,
+    keep: np.ndarray | None = None,
+    start: State | None = None,
+    options: Options | None = None,
+    tell: Callable[[State], None] = lambda state: None,
+) -> Optimum:
+    """Maximum a posteriori from a staged start, or going on from a state.
+
+    Args:
+        problem: windows, robot and priors.
+        keep: weight of each piece, 1 or 0 (piece,); all by default. Folds of a cross-validation
+            differ in this only, so they share one compiled function.
+        start: goes on from here instead of the staged start.
+        tell: called after every round, for progress and checkpoints.
+    """
+    options = options or Options()
+    keep = np.ones(len(problem.windows)) if keep is None else np.asarray(keep, float)
+    state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
+    mask = np.ones(problem.space.size)
+    history: list[float] = []
+    reason = f"{options.most_rounds} rounds without settling"
+    while state.round < options.most_rounds:
+        early = state.round < 3
+        state = problem.round(state, keep, mask, steps=8 if early else 4, scoring=2 if early else 4)
+        history.append(state.loss)
+        tell(state)
+        if state.moved < options.tolerance:
+            reason = f"no number moved {options.tolerance:g} of its std in round {state.round}"
+            break
+    blocks_jac = problem.linear(jnp.asarray(state.z), problem.volt(state.log_variance))
+    info = problem.precision(blocks_jac[1], jnp.asarray(state.log_variance), jnp.asarray(keep))
+    return Optimum(
+        state=state,
+        covariance=np.linalg.inv(np.asarray(info)),
+        converged=state.moved < options.tolerance,
+        reason=reason,
+        history=tuple(history),
+    )

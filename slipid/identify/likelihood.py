@@ -1,0 +1,246 @@
+"""What a robot predicts of every piece of every run, and how the difference is weighed (METHODS 4).
+
+A piece is a few neighbouring windows of one run. Its residuals have the covariance
+
+    V = sum_c v_c B_c,   B from: camera place and heading noise, shared by neighbouring windows;
+                         process noise along, across and in yaw, growing with distance, per floor;
+                         the run's own effect along, across and in yaw, per floor
+
+so the run effects are marginalised. Structural numbers move the residuals, variances v_c the weights.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from slipid.data.dataset import Windows
+from slipid.model import robot as model
+from slipid.model.robot import Robot
+
+SMOOTH = 0.03
+"""Magnitude below which the mean of an unsigned current levels off [A]."""
+
+
+class Batch(eqx.Module):
+    """Windows as arrays a jitted function takes; names turned into indices of the robot's stacks."""
+
+    surface: Int[Array, " piece"]
+    load: Int[Array, " piece"]
+    session: Int[Array, " piece"]
+    dt: Float[Array, "piece window"]
+    turn: Float[Array, "piece window wheel"]
+    faster: Float[Array, "piece window wheel"]
+    pose: Float[Array, "piece edge 3"]
+    current: Float[Array, "piece window wheel"]
+    voltage: Float[Array, "piece window wheel"]
+    current_var: Float[Array, "piece window wheel"]
+    lag: Float[Array, ""]
+    has_current: bool = eqx.field(static=True)
+    has_voltage: bool = eqx.field(static=True)
+    signed: bool = eqx.field(static=True)
+
+
+def batch(windows: Windows, robot: Robot) -> Batch:
+    """Batch for a robot that knows the floors, loads and sessions of the windows."""
+    return Batch(
+        surface=jnp.asarray([robot.surface_index(s) for s in windows.surface]),
+        load=jnp.asarray([robot.load_index(s) for s in windows.load]),
+        session=jnp.asarray([robot.session_index(s) for s in windows.session]),
+        dt=jnp.asarray(windows.dt),
+        turn=jnp.asarray(windows.turn),
+        faster=jnp.asarray(windows.faster),
+        pose=jnp.asarray(windows.pose),
+        current=jnp.asarray(windows.current),
+        voltage=jnp.asarray(windows.voltage),
+        current_var=jnp.asarray(windows.current_var),
+        lag=jnp.asarray(windows.lag),
+        has_current=windows.has_current,
+        has_voltage=windows.has_voltage,
+        signed=windows.current_is_signed,
+    )
+
+
+class Predicted(eqx.Module):
+    """What the robot says of each window."""
+
+    increment: Float[Array, "piece window 3"]
+    current: Float[Array, "piece window wheel"]
+    twist: Float[Array, "piece window 3"]
+
+
+def predict(robot: Robot, b: Batch) -> Predicted:
+    """Marker increments [m, m, rad] and motor currents [A] of every window."""
+    frame = robot.geometry.frame()
+    speed = (b.turn - (robot.camera.lag - b.lag) * b.faster) / b.dt[..., None]
+
+    def window(w: Any, dt: Any, surface: Any, load: Any, session: Any) -> tuple[Any, Any, Any]:
+        xi = model.twist(robot, frame, w, surface, load)
+        increment = robot.camera.seen(model.advance(xi, dt), session)
+        if not b.has_current:
+            return increment, jnp.zeros_like(w), xi
+        torque = model.wheel_torque(robot, frame, xi, w, surface, load)
+        amps = robot.motor.current(torque, w)
+        if not b.signed:
+            amps = jnp.sqrt(amps**2 + SMOOTH**2) + robot.motor.current_offset
+        return increment, amps, xi
+
+    piece = jax.vmap(window, (0, 0, None, None, None))
+    return Predicted(*jax.vmap(piece)(speed, b.dt, b.surface, b.load, b.session))
+
+
+def measured(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, "piece window 3"]:
+    """Marker increments in the frame of each window's start, in corrected metres."""
+
+    def piece(edges: Float[Array, "edge 3"]) -> Float[Array, "window 3"]:
+        p = jax.vmap(robot.camera.corrected)(edges)
+        c, s = jnp.cos(p[:-1, 2]), jnp.sin(p[:-1, 2])
+        d = p[1:] - p[:-1]
+        return jnp.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], d[:, 2]], axis=-1)
+
+    return jax.vmap(piece)(pose)
+
+
+def residuals(robot: Robot, b: Batch, voltage_ratio: Float[Array, ""] | float) -> dict[str, Array]:
+    """Predicted less measured, one row per piece and block: `motion` [m, m, rad], `current`, `voltage`.
+
+    Args:
+        voltage_ratio: std of the voltage noise [V]; the noise of the measured current is carried
+            into the voltage equation by R, which keeps R from being attenuated.
+    """
+    p = predict(robot, b)
+    n = b.dt.shape[0]
+    out = {"motion": (p.increment - measured(robot, b.pose)).reshape(n, -1)}
+    if b.has_current:
+        out["current"] = (p.current - b.current).reshape(n, -1)
+    if b.has_current and b.has_voltage:
+        w = b.turn / b.dt[..., None]
+        amps = b.current
+        if not b.signed:
+            amps = (amps - robot.motor.current_offset) * jnp.tanh(w / 0.2)
+        gap = robot.motor.voltage(amps, w) - b.voltage
+        spread = jnp.sqrt(1.0 + robot.motor.resistance**2 * b.current_var / voltage_ratio**2)
+        out["voltage"] = (gap / spread).reshape(n, -1)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Covariance pieces of one block.
+
+    Attributes:
+        base: B_c (piece, component, m, m).
+        which: number of the variance each belongs to (piece, component).
+    """
+
+    base: Float[np.ndarray, "piece component m m"]
+    which: Int[np.ndarray, "piece component"]
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Variance components: their names, units, typical values and the matrices of each block.
+
+    Attributes:
+        names: `camera.place`, `process.<floor>.along`, `run.<floor>.yaw`, ...
+        unit: of the std, as text.
+        typical: std that the weak log-normal prior is centred on.
+        blocks: per block of residuals.
+    """
+
+    names: tuple[str, ...]
+    unit: tuple[str, ...]
+    typical: Float[np.ndarray, " variance"]
+    blocks: dict[str, Components]
+
+
+_MOTION = (("along", "m/sqrt(m)", 0.002), ("across", "m/sqrt(m)", 0.002), ("yaw", "rad/sqrt(m)", 0.01))
+_EFFECT = (("along", "m/m", 0.01), ("across", "m/m", 0.01), ("yaw", "rad/m", 0.03))
+
+
+def noise(windows: Windows, robot: Robot) -> Noise:
+    """Variance components for these windows, with distances and directions from the encoders."""
+    floors = robot.surfaces.labels
+    table = [("camera.place", "m", 0.0005), ("camera.heading", "rad", 0.003)]
+    for floor in floors:
+        table += [(f"process.{floor}.{n}", u, v) for n, u, v in _MOTION]
+        table += [(f"run.{floor}.{n}", u, v) for n, u, v in _EFFECT]
+    blocks = {"motion": _motion_components(windows, robot)}
+    if windows.has_current:
+        start = len(table)
+        for floor in floors:
+            table += [(f"current.{floor}.window", "A", 0.05), (f"current.{floor}.run", "A", 0.05)]
+        blocks["current"] = _current_components(windows, robot, start)
+    if windows.has_current and windows.has_voltage:
+        n, m = len(windows), windows.turn.shape[1] * windows.turn.shape[2]
+        base = np.broadcast_to(np.eye(m), (n, 1, m, m)).copy()
+        blocks["voltage"] = Components(base, np.full((n, 1), len(table)))
+        table.append(("voltage.window", "V", 0.05))
+    return Noise(
+        names=tuple(t[0] for t in table),
+        unit=tuple(t[1] for t in table),
+        typical=np.array([t[2] for t in table]),
+        blocks=blocks,
+    )
+
+
+def travel(windows: Windows, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of each window by the encoders (piece, window) [m], and its unit direction."""
+    j = np.linalg.pinv(np.asarray(robot.geometry.forward()))
+    step = windows.turn * float(robot.geometry.wheel_radius) @ j.T
+    far = np.linalg.norm(step[..., :2], axis=-1)
+    turned = np.abs(step[..., 2]) * float(robot.geometry.base_radius)
+    u = np.where(far[..., None] > 1e-6, step[..., :2] / np.maximum(far, 1e-9)[..., None], [1.0, 0.0])
+    return far + turned, u
+
+
+def _motion_components(windows: Windows, robot: Robot) -> Components:
+    far, u = travel(windows, robot)
+    n, k = far.shape
+    scale = float(robot.camera.scale)
+    place, heading = np.zeros((n, 3 * k, 2 * (k + 1))), np.zeros((n, 3 * k, k + 1))
+    for j in range(k):
+        th = windows.pose[:, j, 2]
+        back = np.stack([np.cos(th), np.sin(th), -np.sin(th), np.cos(th)], -1).reshape(n, 2, 2) * scale
+        place[:, 3 * j : 3 * j + 2, 2 * j : 2 * j + 2] = -back
+        place[:, 3 * j : 3 * j + 2, 2 * j + 2 : 2 * j + 4] = back
+        move = np.einsum("nij,nj->ni", back, windows.pose[:, j + 1, :2] - windows.pose[:, j, :2])
+        heading[:, 3 * j, j], heading[:, 3 * j + 1, j] = move[:, 1], -move[:, 0]
+        heading[:, 3 * j + 2, j], heading[:, 3 * j + 2, j + 1] = -1.0, 1.0
+    axes = np.zeros((3, n, 3 * k, k))  # direction of along, across, yaw in each window
+    for j in range(k):
+        axes[0, :, 3 * j : 3 * j + 2, j] = u[:, j]
+        axes[1, :, 3 * j, j], axes[1, :, 3 * j + 1, j] = -u[:, j, 1], u[:, j, 0]
+        axes[2, :, 3 * j + 2, j] = 1.0
+    grown = axes * np.sqrt(far)[None, :, None, :]
+    effect = (axes * far[None, :, None, :]).sum(-1, keepdims=True)
+    parts = [place, heading, *grown, *effect]
+    base = np.stack([p @ p.transpose(0, 2, 1) for p in parts], axis=1)
+    floor = np.array([robot.surface_index(s) for s in windows.surface])
+    which = np.concatenate(
+        [np.zeros((n, 1), int), np.ones((n, 1), int), 2 + 6 * floor[:, None] + np.arange(6)], axis=1
+    )
+    return Components(base, which)
+
+
+def _current_components(windows: Windows, robot: Robot, start: int) -> Components:
+    n, k, w = windows.turn.shape
+    same = np.kron(np.ones((k, k)), np.eye(w))
+    base = np.broadcast_to(np.stack([np.eye(k * w), same]), (n, 2, k * w, k * w)).copy()
+    floor = np.array([robot.surface_index(s) for s in windows.surface])
+    return Components(base, start + 2 * floor[:, None] + np.arange(2))
+
+
+FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
+"""Variance added to every residual: rounding of the logs [m^2, A^2, V^2]."""
+
+
+def covariance(c: Components, variance: Any, block: str) -> Any:
+    """V of every piece from the variances (variance,) ."""
+    v = jnp.asarray(variance)[jnp.asarray(c.which)]
+    m = c.base.shape[-1]
+    return jnp.einsum("nc,ncij->nij", v, jnp.asarray(c.base)) + FLOOR[block] * jnp.eye(m)

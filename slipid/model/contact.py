@@ -1,0 +1,267 @@
+"""Contact equilibrium: the body moves so that wheel traction, roller drag and scrub balance.
+
+With p_i the wheel places, N_i the load shares, forces in units of mu m g (METHODS 3B):
+
+    c_i   = sqrt((r w_i)^2 + q_i^2)                    wheel activity, q_i the roller speed
+    vs_i  = r w_i - J_i xi                             sliding speed
+    N     = N0 - P b v^                                contact patches lead the wheel centres by b
+    T_i   =  N_i [tanh(vs_i / (v0 + s0 c_i)) + kv vs_i - crr tanh(J_i xi / v1)]
+    D_i   = -N_i [cr tanh(q_i / (vr + sr c_i)) + kl q_i]
+    0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz tanh(W / W0)) - M (xi - xi_before)
+
+M = 0 is quasi-static. Creep is rate-independent (s0 is a slip *ratio*). The root is found by a fixed
+number of damped Newton steps with the analytic 3x3 Jacobian, continued in v0; its derivative comes
+from the implicit function theorem.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from slipid.model.geometry import Frame
+from slipid.parameter import parameter
+
+V0 = 0.002
+"""Sliding speed below which traction is viscous [m/s]."""
+VR = 0.001
+"""Roller speed below which roller drag is viscous [m/s]."""
+V1 = 0.02
+"""Rim speed below which rolling resistance is viscous [m/s]."""
+W0 = 0.05
+"""Yaw rate below which the scrub moment is viscous [rad/s]."""
+_CONTINUATION = ((0.03, 4), (0.008, 3), (0.0, 6))
+_DAMPING = (1.0, 0.5, 0.2, 0.05, 0.01)
+
+
+class ContactSurface(eqx.Module):
+    """What a floor does to rolling wheels; leaves may be stacked, one row per label.
+
+    Attributes:
+        labels: names of the stacked surfaces.
+    """
+
+    friction: Array = parameter(
+        unit="1", symbol="mu", start=0.4, lower=0.0, spread=0.5, doc="friction coefficient"
+    )
+    creep: Array = parameter(
+        unit="1", symbol="s0", start=0.3, lower=0.0, spread=1.5, doc="slip ratio of full traction"
+    )
+    roller_drag: Array = parameter(
+        unit="1", symbol="cr", start=0.3, lower=0.0, spread=1.5, doc="drag of sideways rolling"
+    )
+    roller_creep: Array = parameter(
+        unit="1", symbol="sr", start=0.2, lower=0.0, spread=1.5, doc="roller speed ratio of full drag"
+    )
+    rolling_resistance: Array = parameter(
+        unit="1", symbol="crr", start=0.005, lower=0.0, spread=2.0, doc="resistance along the drive"
+    )
+    slide_viscosity: Array = parameter(
+        unit="s/m", symbol="kv", start=0.02, lower=0.0, spread=2.0, doc="traction per sliding speed"
+    )
+    roller_viscosity: Array = parameter(
+        unit="s/m", symbol="kl", start=0.02, lower=0.0, spread=2.0, doc="drag per roller speed"
+    )
+    scrub: Array = parameter(
+        unit="m", symbol="cz", start=0.002, lower=0.0, spread=2.0, doc="moment against turning"
+    )
+    lead: Array = parameter(
+        unit="m", symbol="b", start=0.002, spread=0.01, doc="contact ahead of the wheel centre"
+    )
+    labels: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def at(self, index: Any) -> "ContactSurface":
+        """Surface number `index` of the stack (may be traced)."""
+        picked: ContactSurface = jax.tree.map(lambda leaf: leaf[index], self)
+        return picked
+
+
+class Contact(eqx.Module):
+    """Forces in the balance, in units of mu m g."""
+
+    traction: Float[Array, " wheel"]
+    drag: Float[Array, " wheel"]
+    load: Float[Array, " wheel"]
+
+
+def loads(
+    xi: Float[Array, " 3"], frame: Frame, surface: ContactSurface, rest: Float[Array, " wheel"]
+) -> Float[Array, " wheel"]:
+    """Load shares in motion: N0 shifted by contact patches that lead along the motion."""
+    v = xi[:2]
+    return rest - surface.lead * (frame.shift @ (v / jnp.sqrt(v @ v + 1e-8)))
+
+
+def _terms(xi: Any, rim: Any, frame: Frame, s: ContactSurface, rest: Any, v_extra: float) -> Any:
+    """Traction and drag per unit load, loads, and all their derivatives by xi."""
+    v = xi[:2]
+    inv = jax.lax.rsqrt(v @ v + 1e-8)
+    load = rest - s.lead * (frame.shift @ (v * inv))
+    d_load = -s.lead * (
+        frame.shift * inv - jnp.outer(frame.shift @ v, v) * inv**3
+    )  # (wheel, 2)
+    along, roll = frame.hold @ xi, frame.roll @ xi - rim * frame.slip_through
+    slide = rim * frame.pull - along
+    active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
+    # an ordinary wheel grips sideways as it does ahead
+    g = frame.grip
+    cr, kl = g + (1 - g) * s.roller_drag, g * s.slide_viscosity + (1 - g) * s.roller_viscosity
+    scale_t = V0 + v_extra + s.creep * active
+    scale_r = g * scale_t + (1 - g) * (VR + v_extra + s.roller_creep * active)
+    slope_r = g * s.creep + (1 - g) * s.roller_creep
+    t, h, u = jnp.tanh(slide / scale_t), jnp.tanh(roll / scale_r), jnp.tanh(along / V1)
+    traction = t + s.slide_viscosity * slide - s.rolling_resistance * u
+    drag = -(cr * h + kl * roll)
+    d_active = roll / active  # times d roll
+    t1, h1, u1 = 1 - t * t, 1 - h * h, 1 - u * u
+    # d traction = a d along + b d roll;   d drag = c d roll
+    a = -t1 / scale_t - s.slide_viscosity - s.rolling_resistance * u1 / V1
+    b = -t1 * slide * s.creep * d_active / scale_t**2
+    c = -(cr * h1 * (1 / scale_r - roll * slope_r * d_active / scale_r**2) + kl)
+    return traction, drag, load, d_load, a, b, c
+
+
+def _balance(xi: Any, args: Any, v_extra: float) -> tuple[Any, Any]:
+    """Residual of the force balance and its Jacobian by xi; the moment row is over the base radius."""
+    rim, frame, s, rest, mass, before = args
+    traction, drag, load, d_load, a, b, c = _terms(xi, rim, frame, s, rest, v_extra)
+    turn = jnp.tanh(xi[2] / W0)
+    force = frame.hold.T @ (load * traction) + frame.roll.T @ (load * drag)
+    force = force.at[2].add(-s.scrub * turn) - mass * (xi - before)
+    d_t = (load * a)[:, None] * frame.hold + (load * b)[:, None] * frame.roll
+    d_d = (load * c)[:, None] * frame.roll
+    d_t = d_t.at[:, :2].add(traction[:, None] * d_load)
+    d_d = d_d.at[:, :2].add(drag[:, None] * d_load)
+    jac = frame.hold.T @ d_t + frame.roll.T @ d_d - jnp.diag(mass)
+    jac = jac.at[2, 2].add(-s.scrub * (1 - turn**2) / W0)
+    row = jnp.array([1.0, 1.0, 1.0]).at[2].set(1.0 / frame.base)
+    return row * force, row[:, None] * jac
+
+
+def _solve3(m: Float[Array, "3 3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
+    """m^-1 b by the adjugate: no LAPACK call per row under vmap, and it exports to C."""
+    r0, r1, r2 = jnp.cross(m[1], m[2]), jnp.cross(m[2], m[0]), jnp.cross(m[0], m[1])
+    det = m[0] @ r0
+    det = jnp.where(jnp.abs(det) < 1e-30, 1e-30, det)
+    return (r0 * b[0] + r1 * b[1] + r2 * b[2]) / det
+
+
+def _newton(xi: Any, args: Any, v_extra: float, steps: int) -> Any:
+    damping = jnp.asarray(_DAMPING)
+
+    def step(x: Any, _: None) -> tuple[Any, None]:
+        f, jac = _balance(x, args, v_extra)
+        dx = _solve3(jac, f)
+
+        def merit(alpha: Any) -> Any:
+            g = _residual(x - alpha * dx, args, v_extra)
+            return jnp.where(jnp.all(jnp.isfinite(g)), g @ g, jnp.inf)
+
+        tried = jax.vmap(merit)(damping)
+        best = jnp.argmin(tried)
+        # a worse point is taken only with the smallest step: it leaves flat spots
+        return jnp.where(jnp.isfinite(tried[best]), x - damping[best] * dx, x), None
+
+    return jax.lax.scan(step, xi, None, length=steps)[0]
+
+
+def _residual(xi: Any, args: Any, v_extra: float) -> Any:
+    rim, frame, s, rest, mass, before = args
+    traction, drag, load, *_ = _terms(xi, rim, frame, s, rest, v_extra)
+    force = frame.hold.T @ (load * traction) + frame.roll.T @ (load * drag)
+    force = force.at[2].add(-s.scrub * jnp.tanh(xi[2] / W0)) - mass * (xi - before)
+    return force.at[2].divide(frame.base)
+
+
+@jax.custom_jvp
+def _root(args: Any) -> Any:
+    rim, frame, s, rest, mass, before = args
+    start = before
+    for v_extra, steps in _CONTINUATION:
+        start = _newton(start, args, v_extra, steps)
+    return start
+
+
+@_root.defjvp
+def _root_jvp(primals: Any, tangents: Any) -> Any:
+    (args,), (d_args,) = primals, tangents
+    xi = _root(args)
+    _, jac = _balance(xi, args, 0.0)
+    _, d_force = jax.jvp(lambda a: _residual(xi, a, 0.0), (args,), (d_args,))
+    return xi, -_solve3(jac, d_force)
+
+
+def guess(rim: Float[Array, " wheel"], frame: Frame) -> Float[Array, "3"]:
+    """Start of the root finder: the twist without slip, a little slower (least squares)."""
+    j = frame.hold
+    m = j.T @ j + 1e-6 * jnp.eye(3)
+    return 0.8 * _solve3(m, j.T @ (rim * frame.pull))
+
+
+def equilibrium(
+    rim: Float[Array, " wheel"],
+    frame: Frame,
+    surface: ContactSurface,
+    rest: Float[Array, " wheel"],
+) -> Float[Array, "3"]:
+    """Body twist (vx [m/s], vy [m/s], yaw rate [rad/s]) at which the contact forces balance.
+
+    Args:
+        rim: r w, rim speed of each wheel [m/s].
+        frame: wheel directions.
+        surface: one floor.
+        rest: load shares at rest, sum 1.
+
+    Source: METHODS 3B; quasi-static.
+    """
+    start = jax.lax.stop_gradient(guess(rim, frame))
+    return _root((rim, frame, surface, rest, jnp.zeros(3), start))
+
+
+def step_with_inertia(
+    rim: Float[Array, " wheel"],
+    frame: Frame,
+    surface: ContactSurface,
+    rest: Float[Array, " wheel"],
+    before: Float[Array, "3"],
+    inertia: Float[Array, "3"],
+    dt: Float[Array, ""] | float,
+) -> Float[Array, "3"]:
+    """Twist one implicit Euler step later, with body inertia.
+
+    Args:
+        before: twist at the start of the step.
+        inertia: (m, m, I_z) / (mu m g) [s^2/m, s^2/m, s^2 m/m].
+        dt: step [s].
+    """
+    return _root((rim, frame, surface, rest, inertia / dt, before))
+
+
+def forces(
+    xi: Float[Array, "3"],
+    rim: Float[Array, " wheel"],
+    frame: Frame,
+    surface: ContactSurface,
+    rest: Float[Array, " wheel"],
+) -> Contact:
+    """Traction the motors feel, roller drag and load shares at a twist [mu m g].
+
+    Rolling resistance brakes the body, not the motor, so traction is given without it.
+    """
+    traction, drag, load, *_ = _terms(xi, rim, frame, surface, rest, 0.0)
+    along = frame.hold @ xi
+    driven = traction + surface.rolling_resistance * jnp.tanh(along / V1)
+    return Contact(traction=load * driven, drag=load * drag, load=load)
+
+
+def residual(
+    xi: Float[Array, "3"],
+    rim: Float[Array, " wheel"],
+    frame: Frame,
+    surface: ContactSurface,
+    rest: Float[Array, " wheel"],
+) -> Float[Array, "3"]:
+    """Force balance at a twist, the moment over the base radius [mu m g]; zero at equilibrium."""
+    return _residual(xi, (rim, frame, surface, rest, jnp.zeros(3), jnp.zeros(3)), 0.0)

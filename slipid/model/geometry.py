@@ -1,0 +1,199 @@
+"""Where the wheels stand and which way they drive (METHODS 1; Indiveri 2009, IEEE T-RO 25(1))."""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.parameter import parameter
+
+
+class Geometry(eqx.Module):
+    """Wheels on a rigid body, REP-103 axes (x ahead, y left, yaw counter-clockwise).
+
+    A wheel has a place, a drive direction, and rollers that run freely at `roller_angle` from it:
+    90 deg for an omni wheel, 45 deg for mecanum; `grips` marks an ordinary wheel without rollers.
+
+    Attributes:
+        wheel_radius: r [m].
+        base_radius: L [m], multiplies `place`.
+        drive_offset: small rotation of each wheel's drive direction [rad].
+        place: wheel centres (wheel, 2) in units of the base radius.
+        drive_angle: direction of travel of a positive wheel speed (wheel,) [rad].
+        roller_angle: from the free rolling direction to the drive direction (wheel,) [rad].
+        grips: 1 for an ordinary wheel, 0 with rollers (wheel,).
+        gear_ratio: n, motor speed over wheel speed.
+    """
+
+    wheel_radius: Array = parameter(
+        unit="m", symbol="r", start=0.05, lower=0.0, spread=0.02, free=False, doc="wheel radius"
+    )
+    base_radius: Array = parameter(
+        unit="m", symbol="L", start=0.15, lower=0.0, spread=0.02, free=False, doc="base radius"
+    )
+    drive_offset: Array = parameter(
+        unit="rad", symbol="delta", start=0.0, spread=0.01, free=False, doc="drive direction offset"
+    )
+    place: tuple[tuple[float, float], ...] = eqx.field(static=True, default=())
+    drive_angle: tuple[float, ...] = eqx.field(static=True, default=())
+    roller_angle: tuple[float, ...] = eqx.field(static=True, default=())
+    grips: tuple[bool, ...] = eqx.field(static=True, default=())
+    gear_ratio: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self) -> None:
+        """Refuse roller angles that cannot drive."""
+        for k, (angle, grip) in enumerate(zip(self.roller_angle, self.grips, strict=True)):
+            if not grip and abs(math.sin(angle)) < 0.05:
+                raise ValueError(
+                    f"wheel {k + 1}: rollers at {math.degrees(angle):g} deg to the drive direction "
+                    "run freely along it, such a wheel cannot drive (singular; Indiveri 2009); "
+                    "expected 90 (omni), 45 (mecanum) or anything away from 0 and 180"
+                )
+
+    @property
+    def wheels(self) -> int:
+        """Number of wheels."""
+        return len(self.drive_angle)
+
+    def frame(self) -> "Frame":
+        """The wheels as rows of matrices, at the current radius, base and offsets."""
+        drive = jnp.asarray(self.drive_angle) + self.drive_offset
+        roller = jnp.asarray(self.roller_angle)
+        free = drive - roller
+        hold = free + 0.5 * math.pi
+        p = jnp.asarray(self.place) * self.base_radius
+
+        def row(angle: Float[Array, " wheel"]) -> Float[Array, "wheel 3"]:
+            c, s = jnp.cos(angle), jnp.sin(angle)
+            return jnp.stack([c, s, p[:, 0] * s - p[:, 1] * c], axis=-1)
+
+        # loads move when the contact patches do: N = N0 - shift @ (displacement), minimum change
+        lever = jnp.concatenate([jnp.ones((1, self.wheels)), p.T], axis=0)
+        return Frame(
+            hold=row(hold),
+            roll=row(free),
+            pull=jnp.sin(roller),
+            slip_through=jnp.cos(roller),
+            grip=jnp.asarray(self.grips, dtype=float),
+            shift=jnp.linalg.pinv(lever)[:, 1:],
+            radius=self.wheel_radius,
+            base=self.base_radius,
+        )
+
+    def forward(self) -> Float[Array, "wheel 3"]:
+        """J: rim speed of each wheel without slip [m/s] from the body twist."""
+        frame = self.frame()
+        return frame.hold / frame.pull[:, None]
+
+    def inverse(self) -> Float[Array, "3 wheel"]:
+        """J^+: body twist from rim speeds [m/s], least squares beyond three wheels.
+
+        Raises:
+            ValueError: the wheels do not fix all three parts of the twist (rank below 3).
+        """
+        j = np.asarray(self.forward())
+        if np.linalg.matrix_rank(j, tol=1e-6) < 3:
+            raise ValueError(
+                f"{self.wheels} wheels with these drive directions do not determine x, y and yaw: the "
+                "kinematics have rank below 3. Wheel-by-wheel inversion needs rank 3; "
+                "use model.slip = 'contact', which needs no inversion"
+            )
+        return jnp.linalg.pinv(self.forward())
+
+    def torques(self, force: Float[Array, " 3"]) -> Float[Array, " wheel"]:
+        """Wheel torques [N m] that give a body force [N] and moment [N m], tau = r (J^+)^T F."""
+        return self.wheel_radius * jnp.linalg.pinv(self.forward()).T @ force
+
+
+class Frame(eqx.Module):
+    """Wheel directions and levers as the force balance uses them.
+
+    Attributes:
+        hold: speed along the direction the rollers do not give way in (wheel, 3); for an omni wheel
+            this is the drive direction.
+        roll: speed along the free rolling direction (wheel, 3).
+        pull: share of the rim speed along `hold`, sin(roller angle).
+        slip_through: share along `roll`, cos(roller angle).
+        grip: 1 where the wheel has no rollers.
+        shift: change of load shares per contact displacement (wheel, 2) [1/m].
+        radius: wheel radius [m].
+        base: base radius [m], scales the moment.
+    """
+
+    hold: Float[Array, "wheel 3"]
+    roll: Float[Array, "wheel 3"]
+    pull: Float[Array, " wheel"]
+    slip_through: Float[Array, " wheel"]
+    grip: Float[Array, " wheel"]
+    shift: Float[Array, "wheel 2"]
+    radius: Float[Array, ""]
+    base: Float[Array, ""]
+
+
+def omni(
+    azimuth_deg: Sequence[float],
+    base_radius: float,
+    wheel_radius: float,
+    gear_ratio: float = 1.0,
+    roller_deg: float = 90.0,
+) -> Geometry:
+    """Omni robot of any number of wheels, each driving 90 deg ahead of its azimuth."""
+    d = np.radians(np.asarray(azimuth_deg, float))
+    return general(
+        np.stack([np.cos(d), np.sin(d)], -1) * base_radius,
+        np.degrees(d) + 90.0,
+        [roller_deg] * len(d),
+        wheel_radius,
+        gear_ratio,
+    )
+
+
+def mecanum(
+    half_length: float, half_width: float, wheel_radius: float, gear_ratio: float = 1.0
+) -> Geometry:
+    """Four mecanum wheels in X: front left, front right, rear left, rear right."""
+    a, b = half_length, half_width
+    return general(
+        [(a, b), (a, -b), (-a, b), (-a, -b)],
+        [0.0] * 4,
+        [135.0, 45.0, 45.0, 135.0],
+        wheel_radius,
+        gear_ratio,
+    )
+
+
+def skid_steer(
+    half_length: float, half_width: float, wheel_radius: float, gear_ratio: float = 1.0
+) -> Geometry:
+    """Four ordinary wheels that all point ahead: front left, front right, rear left, rear right."""
+    a, b = half_length, half_width
+    return general(
+        [(a, b), (a, -b), (-a, b), (-a, -b)], [0.0] * 4, [None] * 4, wheel_radius, gear_ratio
+    )
+
+
+def general(
+    place: Sequence[Sequence[float]] | np.ndarray,
+    drive_deg: Sequence[float] | np.ndarray,
+    roller_deg: Sequence[float | None],
+    wheel_radius: float,
+    gear_ratio: float = 1.0,
+) -> Geometry:
+    """Any wheels: centres [m], drive directions [deg], roller angles [deg] (None: ordinary wheel)."""
+    p = np.asarray(place, float)
+    base = float(np.sqrt((p**2).sum(axis=1).mean()))
+    if base <= 0:
+        raise ValueError("all wheels stand at the origin; expected their centres in metres")
+    return Geometry(
+        wheel_radius=wheel_radius,
+        base_radius=base,
+        drive_offset=np.zeros(len(p)),
+        place=tuple((float(x), float(y)) for x, y in p / base),
+        drive_angle=tuple(float(a) for a in np.radians(np.asarray(drive_deg, float))),
+        roller_angle=tuple(math.radians(90.0 if a is None else float(a)) for a in roller_deg),
+        grips=tuple(a is None for a in roller_deg),
+        gear_ratio=float(gear_ratio),
+    )

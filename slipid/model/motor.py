@@ -1,0 +1,100 @@
+"""DC motor with brushes: U = R I + C_e wm + L_a dI/dt + brush drop (METHODS 2)."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from slipid.parameter import parameter
+
+REST = 2.5
+"""Motor speed below which a sign is not trusted, about one speed quantum [rad/s]."""
+
+
+class Motor(eqx.Module):
+    """Brushed DC motor behind a gear; all wheels have the same.
+
+    Attributes:
+        gear_ratio: n, motor speed over wheel speed.
+    """
+
+    resistance: Array = parameter(
+        unit="ohm", symbol="R", start=1.0, lower=0.0, spread=0.5, doc="winding resistance"
+    )
+    back_emf: Array = parameter(
+        unit="V*s/rad", symbol="C_e", start=0.05, lower=0.0, spread=0.5, doc="back-EMF constant"
+    )
+    inductance: Array = parameter(
+        unit="H", symbol="L_a", start=0.005, lower=0.0, spread=1.0, free=False, doc="inductance"
+    )
+    brush_drop: Array = parameter(
+        unit="V", symbol="U_b", start=0.0, spread=0.5, free=False, doc="voltage drop of the brushes"
+    )
+    efficiency: Array = parameter(
+        unit="1", symbol="eta", start=0.9, lower=0.0, upper=1.001, spread=0.5, free=False, doc="gear"
+    )
+    coulomb_friction: Array = parameter(
+        unit="N*m", symbol="tau_c", start=0.02, lower=0.0, spread=1.5, doc="friction at the wheel"
+    )
+    viscous_friction: Array = parameter(
+        unit="N*m*s/rad", symbol="b_w", start=0.005, lower=0.0, spread=1.5, doc="friction per speed"
+    )
+    current_offset: Array = parameter(
+        unit="A", symbol="I_0", start=0.0, spread=0.05, free=False, doc="zero of the ammeter"
+    )
+    rotor_inertia: Array = parameter(
+        unit="kg*m^2", symbol="J_m", start=1e-5, lower=0.0, spread=1.0, free=False, doc="rotor"
+    )
+    gear_ratio: float = eqx.field(static=True, default=1.0)
+
+    def voltage(
+        self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
+    ) -> Float[Array, " *w"]:
+        """Steady terminal voltage [V] of signed current [A] and wheel speed [rad/s]."""
+        wm = self.gear_ratio * wheel_speed
+        drop = self.brush_drop * jnp.tanh(current / 0.05)
+        return self.resistance * current + self.back_emf * wm + drop
+
+    def current_rate(
+        self,
+        voltage: Float[Array, " *w"],
+        current: Float[Array, " *w"],
+        wheel_speed: Float[Array, " *w"],
+    ) -> Float[Array, " *w"]:
+        """dI/dt [A/s] with inductance."""
+        return (voltage - self.voltage(current, wheel_speed)) / self.inductance
+
+    def friction(self, wheel_speed: Float[Array, " *w"]) -> Float[Array, " *w"]:
+        """Friction torque at the wheel [N m], against the motion."""
+        return self.coulomb_friction * jnp.tanh(wheel_speed / 0.2) + self.viscous_friction * wheel_speed
+
+    def torque(
+        self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
+    ) -> Float[Array, " *w"]:
+        """Torque at the wheel [N m] of a signed current: n eta C_e I - friction."""
+        gain = self.gear_ratio * self.efficiency * self.back_emf
+        return gain * current - self.friction(wheel_speed)
+
+    def current(
+        self, torque: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
+    ) -> Float[Array, " *w"]:
+        """Signed current [A] that gives a wheel torque [N m], the inverse of `torque`."""
+        gain = self.gear_ratio * self.efficiency * self.back_emf
+        return (torque + self.friction(wheel_speed)) / gain
+
+    def characteristic(
+        self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
+    ) -> Float[Array, " *w"]:
+        """M = U I / wm = C_e I + R I^2 wm / (wm^2 + w0^2) [N m], regular at standstill.
+
+        Source: the paper's "torque characterising variable"; METHODS 2.
+        """
+        wm = self.gear_ratio * wheel_speed
+        return self.back_emf * current + self.resistance * current**2 * wm / (wm**2 + REST**2)
+
+
+def signed(
+    current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"], gear_ratio: float
+) -> Float[Array, " *w"]:
+    """Sign for the magnitudes of an unsigned log: I = |I| wm / sqrt(wm^2 + w0^2); braking is lost."""
+    wm = gear_ratio * wheel_speed
+    return jnp.abs(current) * wm / jnp.sqrt(wm**2 + REST**2)
