@@ -111,7 +111,9 @@ def parameter(
     """
     declaration = Declaration(unit, symbol, lower, upper, start, spread, free, shares, doc)
     return eqx.field(
-        converter=lambda x: jnp.asarray(x, dtype=float) if not isinstance(x, jax.core.Tracer) else x,
+        converter=lambda x: (
+            jnp.asarray(x, dtype=float) if not isinstance(x, jax.core.Tracer) else x
+        ),
         metadata={"parameter": declaration, "per": per},
         default_factory=lambda: jnp.asarray(start, dtype=float),
     )
@@ -218,7 +220,9 @@ class Space:
     def __init__(self, tree: Any, choices: Sequence[Choice] = ()):
         self.all = tuple(entries(tree))
         unknown = [
-            c.pattern for c in choices if not any(fnmatch.fnmatchcase(e.path, c.pattern) for e in self.all)
+            c.pattern
+            for c in choices
+            if not any(fnmatch.fnmatchcase(e.path, c.pattern) for e in self.all)
         ]
         if unknown:
             paths = ", ".join(e.path for e in self.all)
@@ -238,7 +242,9 @@ class Space:
         join = lambda parts: np.concatenate(parts) if parts else np.zeros(0)  # noqa: E731
         self.start, self.prior_mean, self.prior_std = join(starts), join(means), join(spreads)
         ends = np.cumsum([0, *(e.coordinates for e in free)])
-        self.place = {e.path: slice(int(a), int(b)) for e, a, b in zip(free, ends, ends[1:], strict=False)}
+        self.place = {
+            e.path: slice(int(a), int(b)) for e, a, b in zip(free, ends, ends[1:], strict=False)
+        }
 
     @property
     def size(self) -> int:
@@ -291,7 +297,9 @@ def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, A
     value = _inside(entry, value)
     mean = d.to_search(value if mean_si is None else mean_si)
     if mean_si is None:
-        mean = d.to_search(np.full(entry.size, 1 / entry.size) if d.shares else _default(entry, value))
+        mean = d.to_search(
+            np.full(entry.size, 1 / entry.size) if d.shares else _default(entry, value)
+        )
     if std_si is None:
         spread = np.full(entry.coordinates, d.spread)
     elif d.shares:
@@ -303,7 +311,9 @@ def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, A
 
 
 def _default(entry: Entry, value: Any) -> Any:
-    return np.full(entry.size, entry.declaration.start) if entry.size > 1 else entry.declaration.start
+    return (
+        np.full(entry.size, entry.declaration.start) if entry.size > 1 else entry.declaration.start
+    )
 
 
 def _inside(entry: Entry, value: Any) -> Any:
@@ -317,7 +327,11 @@ def _inside(entry: Entry, value: Any) -> Any:
     if d.shares:
         outside = ~((x > 0) & (abs(x.sum() - 1) < 1e-6))
     if outside.any():
-        rule = "positive shares that sum to 1" if d.shares else f"inside ({d.lower:g}, {d.upper:g}) {d.unit}"
+        rule = (
+            "positive shares that sum to 1"
+            if d.shares
+            else f"inside ({d.lower:g}, {d.upper:g}) {d.unit}"
+        )
         raise ValueError(f"{entry.path} = {value}: expected {rule}")
     return x.reshape(()) if entry.size == 1 else x
 

@@ -9,9 +9,9 @@ With p_i the wheel places, N_i the load shares, forces in units of mu m g (METHO
     D_i   = -N_i [cr tanh(q_i / (vr + sr c_i)) + kl q_i]
     0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz tanh(W / W0)) - M (xi - xi_before)
 
-M = 0 is quasi-static. Creep is rate-independent (s0 is a slip *ratio*). The root is found by a fixed
-number of damped Newton steps with the analytic 3x3 Jacobian, continued in v0; its derivative comes
-from the implicit function theorem.
+M = 0 is quasi-static. Creep is rate-independent (s0 is a slip *ratio*). The root is found by a
+fixed number of damped Newton steps with the analytic 3x3 Jacobian, continued in v0; its derivative
+comes from the implicit function theorem.
 """
 
 from typing import Any
@@ -53,7 +53,12 @@ class ContactSurface(eqx.Module):
         unit="1", symbol="cr", start=0.3, lower=0.0, spread=1.5, doc="drag of sideways rolling"
     )
     roller_creep: Array = parameter(
-        unit="1", symbol="sr", start=0.2, lower=0.0, spread=1.5, doc="roller speed ratio of full drag"
+        unit="1",
+        symbol="sr",
+        start=0.2,
+        lower=0.0,
+        spread=1.5,
+        doc="roller speed ratio of full drag",
     )
     rolling_resistance: Array = parameter(
         unit="1", symbol="crr", start=0.005, lower=0.0, spread=2.0, doc="resistance along the drive"
@@ -99,9 +104,7 @@ def _terms(xi: Any, rim: Any, frame: Frame, s: ContactSurface, rest: Any, v_extr
     v = xi[:2]
     inv = jax.lax.rsqrt(v @ v + 1e-8)
     load = rest - s.lead * (frame.shift @ (v * inv))
-    d_load = -s.lead * (
-        frame.shift * inv - jnp.outer(frame.shift @ v, v) * inv**3
-    )  # (wheel, 2)
+    d_load = -s.lead * (frame.shift * inv - jnp.outer(frame.shift @ v, v) * inv**3)  # (wheel, 2)
     along, roll = frame.hold @ xi, frame.roll @ xi - rim * frame.slip_through
     slide = rim * frame.pull - along
     active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
@@ -124,7 +127,7 @@ def _terms(xi: Any, rim: Any, frame: Frame, s: ContactSurface, rest: Any, v_extr
 
 
 def _balance(xi: Any, args: Any, v_extra: float) -> tuple[Any, Any]:
-    """Residual of the force balance and its Jacobian by xi; the moment row is over the base radius."""
+    """Residual of the force balance and its Jacobian by xi; moment row over the base radius."""
     rim, frame, s, rest, mass, before = args
     traction, drag, load, d_load, a, b, c = _terms(xi, rim, frame, s, rest, v_extra)
     turn = jnp.tanh(xi[2] / W0)
@@ -177,8 +180,7 @@ def _residual(xi: Any, args: Any, v_extra: float) -> Any:
 
 @jax.custom_jvp
 def _root(args: Any) -> Any:
-    rim, frame, s, rest, mass, before = args
-    start = before
+    start = args[-1]
     for v_extra, steps in _CONTINUATION:
         start = _newton(start, args, v_extra, steps)
     return start

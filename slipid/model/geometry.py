@@ -97,8 +97,8 @@ class Geometry(eqx.Module):
         j = np.asarray(self.forward())
         if np.linalg.matrix_rank(j, tol=1e-6) < 3:
             raise ValueError(
-                f"{self.wheels} wheels with these drive directions do not determine x, y and yaw: the "
-                "kinematics have rank below 3. Wheel-by-wheel inversion needs rank 3; "
+                f"{self.wheels} wheels with these drive directions do not determine x, y and yaw: "
+                "the kinematics have rank below 3. Wheel-by-wheel inversion needs rank 3; "
                 "use model.slip = 'contact', which needs no inversion"
             )
         return jnp.linalg.pinv(self.forward())
@@ -182,15 +182,15 @@ def general(
     wheel_radius: float,
     gear_ratio: float = 1.0,
 ) -> Geometry:
-    """Any wheels: centres [m], drive directions [deg], roller angles [deg] (None: ordinary wheel)."""
+    """Any wheels: centres [m], drive directions and roller angles [deg] (None: no rollers)."""
     p = np.asarray(place, float)
     base = float(np.sqrt((p**2).sum(axis=1).mean()))
     if base <= 0:
         raise ValueError("all wheels stand at the origin; expected their centres in metres")
     return Geometry(
-        wheel_radius=wheel_radius,
-        base_radius=base,
-        drive_offset=np.zeros(len(p)),
+        wheel_radius=jnp.asarray(wheel_radius, dtype=float),
+        base_radius=jnp.asarray(base, dtype=float),
+        drive_offset=jnp.zeros(len(p)),
         place=tuple((float(x), float(y)) for x, y in p / base),
         drive_angle=tuple(float(a) for a in np.radians(np.asarray(drive_deg, float))),
         roller_angle=tuple(math.radians(90.0 if a is None else float(a)) for a in roller_deg),

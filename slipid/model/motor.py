@@ -30,7 +30,14 @@ class Motor(eqx.Module):
         unit="V", symbol="U_b", start=0.0, spread=0.5, free=False, doc="voltage drop of the brushes"
     )
     efficiency: Array = parameter(
-        unit="1", symbol="eta", start=0.9, lower=0.0, upper=1.001, spread=0.5, free=False, doc="gear"
+        unit="1",
+        symbol="eta",
+        start=0.9,
+        lower=0.0,
+        upper=1.001,
+        spread=0.5,
+        free=False,
+        doc="gear",
     )
     coulomb_friction: Array = parameter(
         unit="N*m", symbol="tau_c", start=0.02, lower=0.0, spread=1.5, doc="friction at the wheel"
@@ -65,7 +72,10 @@ class Motor(eqx.Module):
 
     def friction(self, wheel_speed: Float[Array, " *w"]) -> Float[Array, " *w"]:
         """Friction torque at the wheel [N m], against the motion."""
-        return self.coulomb_friction * jnp.tanh(wheel_speed / 0.2) + self.viscous_friction * wheel_speed
+        return (
+            self.coulomb_friction * jnp.tanh(wheel_speed / 0.2)
+            + self.viscous_friction * wheel_speed
+        )
 
     def torque(
         self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
@@ -95,6 +105,6 @@ class Motor(eqx.Module):
 def signed(
     current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"], gear_ratio: float
 ) -> Float[Array, " *w"]:
-    """Sign for the magnitudes of an unsigned log: I = |I| wm / sqrt(wm^2 + w0^2); braking is lost."""
+    """Sign for magnitudes of an unsigned log: I = |I| wm / sqrt(wm^2 + w0^2); braking is lost."""
     wm = gear_ratio * wheel_speed
     return jnp.abs(current) * wm / jnp.sqrt(wm**2 + REST**2)

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from slipid.model import contact
@@ -49,22 +48,49 @@ class Camera(eqx.Module):
     """
 
     scale: Array = parameter(
-        unit="1", symbol="s", start=1.0, lower=0.0, spread=0.02, free=False, doc="true over logged length"
+        unit="1",
+        symbol="s",
+        start=1.0,
+        lower=0.0,
+        spread=0.02,
+        free=False,
+        doc="true over logged length",
     )
     lag: Array = parameter(
         unit="s", symbol="t_c", start=0.0, spread=0.03, free=False, doc="camera behind the encoders"
     )
     marker_yaw: Array = parameter(
-        unit="rad", symbol="psi", start=0.0, spread=0.03, free=False, doc="marker heading less body's"
+        unit="rad",
+        symbol="psi",
+        start=0.0,
+        spread=0.03,
+        free=False,
+        doc="marker heading less body's",
     )
     session_yaw: Array = parameter(
-        unit="rad", symbol="dpsi", start=0.0, spread=0.01, free=False, per="sessions", doc="its change"
+        unit="rad",
+        symbol="dpsi",
+        start=0.0,
+        spread=0.01,
+        free=False,
+        per="sessions",
+        doc="its change",
     )
     marker_place: Array = parameter(
-        unit="m", symbol="p_m", start=0.0, spread=0.02, free=False, doc="marker from the body's centre"
+        unit="m",
+        symbol="p_m",
+        start=0.0,
+        spread=0.02,
+        free=False,
+        doc="marker from the body's centre",
     )
     tilt: Array = parameter(
-        unit="1/m", symbol="h", start=0.0, spread=0.03, free=False, doc="perspective of a tilted camera"
+        unit="1/m",
+        symbol="h",
+        start=0.0,
+        spread=0.03,
+        free=False,
+        doc="perspective of a tilted camera",
     )
     radial: Array = parameter(
         unit="1/m^2", symbol="k", start=0.0, spread=0.02, free=False, doc="radial distortion"
@@ -91,7 +117,9 @@ class Camera(eqx.Module):
         own = jnp.where(session >= 0, self.session_yaw[session], 0.0)
         return self.marker_yaw + own
 
-    def seen(self, increment: Float[Array, "3"], session: Int[Array, ""] | int) -> Float[Array, "3"]:
+    def seen(
+        self, increment: Float[Array, "3"], session: Int[Array, ""] | int
+    ) -> Float[Array, "3"]:
         """Body-frame increment of the marker from the body's (x, y [m], yaw [rad])."""
         c, s = jnp.cos(increment[2]), jnp.sin(increment[2])
         px, py = self.marker_place[0], self.marker_place[1]
@@ -151,13 +179,13 @@ def build(
     wheels = geometry.wheels
     return Robot(
         geometry=geometry,
-        body=Body(load_share=np.full((len(loads), wheels), 1 / wheels), loads=tuple(loads)),
+        body=Body(load_share=jnp.full((len(loads), wheels), 1 / wheels), loads=tuple(loads)),
         motor=Motor(gear_ratio=geometry.gear_ratio),
         surfaces=ContactSurface(**stack, labels=tuple(names)),
         camera=Camera(
-            session_yaw=np.zeros(len(sessions)),
-            marker_place=np.zeros(2),
-            tilt=np.zeros(2),
+            session_yaw=jnp.zeros(len(sessions)),
+            marker_place=jnp.zeros(2),
+            tilt=jnp.zeros(2),
             centre=centre,
             sessions=tuple(sessions),
         ),
