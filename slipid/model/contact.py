@@ -10,8 +10,8 @@ With p_i the wheel places, N_i the load shares, forces in units of mu m g (METHO
     0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz tanh(W / W0)) - M (xi - xi_before)
 
 M = 0 is quasi-static. Creep is rate-independent (s0 is a slip *ratio*). The root is found by a
-fixed number of damped Newton steps with the analytic 3x3 Jacobian, continued in v0; its derivative
-comes from the implicit function theorem.
+fixed number of chord steps, which come near from anywhere, and then of damped Newton steps with the
+analytic 3x3 Jacobian; its derivative comes from the implicit function theorem.
 """
 
 from typing import Any
@@ -32,8 +32,10 @@ V1 = 0.02
 """Rim speed below which rolling resistance is viscous [m/s]."""
 W0 = 0.05
 """Yaw rate below which the scrub moment is viscous [rad/s]."""
-_CONTINUATION = ((0.03, 4), (0.008, 3), (0.0, 6))
-_DAMPING = (1.0, 0.5, 0.2, 0.05, 0.01)
+_CHORD_STEPS = 20
+_NEWTON_STEPS = 6
+_DAMPING = (1.0, 0.3, 0.05)
+_LEAST_LOAD = 1e-3
 
 
 class ContactSurface(eqx.Module):
@@ -99,21 +101,26 @@ def loads(
     return rest - surface.lead * (frame.shift @ (v / jnp.sqrt(v @ v + 1e-8)))
 
 
-def _terms(xi: Any, rim: Any, frame: Frame, s: ContactSurface, rest: Any, v_extra: float) -> Any:
+def _speeds(xi: Any, rim: Any, frame: Frame, s: ContactSurface) -> Any:
+    """Rim and roller speed, activity, drag coefficients, speeds of full traction and drag."""
+    along, roll = frame.hold @ xi, frame.roll @ xi - rim * frame.slip_through
+    active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
+    g = frame.grip  # an ordinary wheel grips sideways as it does ahead
+    cr, kl = g + (1 - g) * s.roller_drag, g * s.slide_viscosity + (1 - g) * s.roller_viscosity
+    scale_t = V0 + s.creep * active
+    scale_r = g * scale_t + (1 - g) * (VR + s.roller_creep * active)
+    return along, roll, active, cr, kl, scale_t, scale_r
+
+
+def _terms(xi: Any, rim: Any, frame: Frame, s: ContactSurface, rest: Any) -> Any:
     """Traction and drag per unit load, loads, and all their derivatives by xi."""
     v = xi[:2]
     inv = jax.lax.rsqrt(v @ v + 1e-8)
     load = rest - s.lead * (frame.shift @ (v * inv))
     d_load = -s.lead * (frame.shift * inv - jnp.outer(frame.shift @ v, v) * inv**3)  # (wheel, 2)
-    along, roll = frame.hold @ xi, frame.roll @ xi - rim * frame.slip_through
+    along, roll, active, cr, kl, scale_t, scale_r = _speeds(xi, rim, frame, s)
     slide = rim * frame.pull - along
-    active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
-    # an ordinary wheel grips sideways as it does ahead
-    g = frame.grip
-    cr, kl = g + (1 - g) * s.roller_drag, g * s.slide_viscosity + (1 - g) * s.roller_viscosity
-    scale_t = V0 + v_extra + s.creep * active
-    scale_r = g * scale_t + (1 - g) * (VR + v_extra + s.roller_creep * active)
-    slope_r = g * s.creep + (1 - g) * s.roller_creep
+    slope_r = frame.grip * s.creep + (1 - frame.grip) * s.roller_creep
     t, h, u = jnp.tanh(slide / scale_t), jnp.tanh(roll / scale_r), jnp.tanh(along / V1)
     traction = t + s.slide_viscosity * slide - s.rolling_resistance * u
     drag = -(cr * h + kl * roll)
@@ -126,10 +133,10 @@ def _terms(xi: Any, rim: Any, frame: Frame, s: ContactSurface, rest: Any, v_extr
     return traction, drag, load, d_load, a, b, c
 
 
-def _balance(xi: Any, args: Any, v_extra: float) -> tuple[Any, Any]:
+def _balance(xi: Any, args: Any) -> tuple[Any, Any]:
     """Residual of the force balance and its Jacobian by xi; moment row over the base radius."""
     rim, frame, s, rest, mass, before = args
-    traction, drag, load, d_load, a, b, c = _terms(xi, rim, frame, s, rest, v_extra)
+    traction, drag, load, d_load, a, b, c = _terms(xi, rim, frame, s, rest)
     turn = jnp.tanh(xi[2] / W0)
     force = frame.hold.T @ (load * traction) + frame.roll.T @ (load * drag)
     force = force.at[2].add(-s.scrub * turn) - mass * (xi - before)
@@ -151,28 +158,51 @@ def _solve3(m: Float[Array, "3 3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
     return (r0 * b[0] + r1 * b[1] + r2 * b[2]) / det
 
 
-def _newton(xi: Any, args: Any, v_extra: float, steps: int) -> Any:
-    damping = jnp.asarray(_DAMPING)
+def _chord(xi: Any, args: Any) -> Any:
+    """Twist that balances the forces when each is drawn as its chord from zero speed to xi.
 
-    def step(x: Any, _: None) -> tuple[Any, None]:
-        f, jac = _balance(x, args, v_extra)
-        dx = _solve3(jac, f)
-
-        def merit(alpha: Any) -> Any:
-            g = _residual(x - alpha * dx, args, v_extra)
-            return jnp.where(jnp.all(jnp.isfinite(g)), g @ g, jnp.inf)
-
-        tried = jax.vmap(merit)(damping)
-        best = jnp.argmin(tried)
-        # a worse point is taken only with the smallest step: it leaves flat spots
-        return jnp.where(jnp.isfinite(tried[best]), x - damping[best] * dx, x), None
-
-    return jax.lax.scan(step, xi, None, length=steps)[0]
-
-
-def _residual(xi: Any, args: Any, v_extra: float) -> Any:
+    tanh(x) / x falls with |x|, so that no step overshoots where Newton's does; near the root it is
+    slow (Weiszfeld's iteration).
+    """
     rim, frame, s, rest, mass, before = args
-    traction, drag, load, *_ = _terms(xi, rim, frame, s, rest, v_extra)
+    v = xi[:2]
+    load = rest - s.lead * (frame.shift @ (v * jax.lax.rsqrt(v @ v + 1e-8)))
+    load = jnp.maximum(load, _LEAST_LOAD)  # a lifted wheel would push the chord the wrong way
+    along, roll, _, cr, kl, scale_t, scale_r = _speeds(xi, rim, frame, s)
+
+    def slope(x: Any, scale: Any) -> Any:
+        flat = jnp.abs(x) < 1e-6 * scale
+        return jnp.where(flat, 1 / scale, jnp.tanh(x / scale) / jnp.where(flat, 1.0, x))
+
+    pulls = load * (slope(rim * frame.pull - along, scale_t) + s.slide_viscosity)
+    holds = load * (cr * slope(roll, scale_r) + kl)
+    brakes = load * s.rolling_resistance * slope(along, V1)
+    m = frame.hold.T @ ((pulls + brakes)[:, None] * frame.hold)
+    m += frame.roll.T @ (holds[:, None] * frame.roll) + jnp.diag(mass)
+    m = m.at[2, 2].add(s.scrub * slope(xi[2], W0))
+    drive = frame.hold.T @ (pulls * rim * frame.pull)
+    drive += frame.roll.T @ (holds * rim * frame.slip_through) + mass * before
+    return _solve3(m, drive)
+
+
+def _newton(xi: Any, args: Any) -> Any:
+    damping = jnp.asarray(_DAMPING)
+    f, jac = _balance(xi, args)
+    dx = _solve3(jac, f)
+
+    def merit(alpha: Any) -> Any:
+        g = _residual(xi - alpha * dx, args)
+        return jnp.where(jnp.all(jnp.isfinite(g)), g @ g, jnp.inf)
+
+    tried = jax.vmap(merit)(damping)
+    best = jnp.argmin(tried)
+    # a worse point may be taken, by the step that is least bad: it leaves flat spots
+    return jnp.where(jnp.isfinite(tried[best]), xi - damping[best] * dx, xi)
+
+
+def _residual(xi: Any, args: Any) -> Any:
+    rim, frame, s, rest, mass, before = args
+    traction, drag, load, *_ = _terms(xi, rim, frame, s, rest)
     force = frame.hold.T @ (load * traction) + frame.roll.T @ (load * drag)
     force = force.at[2].add(-s.scrub * jnp.tanh(xi[2] / W0)) - mass * (xi - before)
     return force.at[2].divide(frame.base)
@@ -180,18 +210,19 @@ def _residual(xi: Any, args: Any, v_extra: float) -> Any:
 
 @jax.custom_jvp
 def _root(args: Any) -> Any:
-    start = args[-1]
-    for v_extra, steps in _CONTINUATION:
-        start = _newton(start, args, v_extra, steps)
-    return start
+    def repeat(step: Any, xi: Any, times: int) -> Any:
+        return jax.lax.scan(lambda x, _: (step(x, args), None), xi, None, length=times)[0]
+
+    near = repeat(_chord, args[-1], _CHORD_STEPS)
+    return repeat(_newton, near, _NEWTON_STEPS)
 
 
 @_root.defjvp
 def _root_jvp(primals: Any, tangents: Any) -> Any:
     (args,), (d_args,) = primals, tangents
     xi = _root(args)
-    _, jac = _balance(xi, args, 0.0)
-    _, d_force = jax.jvp(lambda a: _residual(xi, a, 0.0), (args,), (d_args,))
+    _, jac = _balance(xi, args)
+    _, d_force = jax.jvp(lambda a: _residual(xi, a), (args,), (d_args,))
     return xi, -_solve3(jac, d_force)
 
 
@@ -252,7 +283,7 @@ def forces(
 
     Rolling resistance brakes the body, not the motor, so traction is given without it.
     """
-    traction, drag, load, *_ = _terms(xi, rim, frame, surface, rest, 0.0)
+    traction, drag, load, *_ = _terms(xi, rim, frame, surface, rest)
     along = frame.hold @ xi
     driven = traction + surface.rolling_resistance * jnp.tanh(along / V1)
     return Contact(traction=load * driven, drag=load * drag, load=load)
@@ -266,4 +297,4 @@ def residual(
     rest: Float[Array, " wheel"],
 ) -> Float[Array, "3"]:
     """Force balance at a twist, the moment over the base radius [mu m g]; zero at equilibrium."""
-    return _residual(xi, (rim, frame, surface, rest, jnp.zeros(3), jnp.zeros(3)), 0.0)
+    return _residual(xi, (rim, frame, surface, rest, jnp.zeros(3), jnp.zeros(3)))
