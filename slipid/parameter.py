@@ -10,6 +10,7 @@ free ones to a vector without bounds and back.
 
 import dataclasses
 import fnmatch
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -139,9 +140,7 @@ class Entry:
 
     def get(self, tree: Any) -> Any:
         """Value in a tree [SI], scalar or vector."""
-        leaf = tree
-        for name in self.leaf:
-            leaf = getattr(leaf, name)
+        leaf = _leaf(tree, self.leaf)
         return leaf if self.index is None else leaf[self.index]
 
     @property
@@ -266,7 +265,7 @@ class Space:
         for entry in self.free:
             leaf = changed.get(entry.leaf)
             if leaf is None:
-                leaf = Entry(entry.path, entry.declaration, entry.leaf, None, 0).get(self.template)
+                leaf = _leaf(self.template, entry.leaf)
             value = entry.declaration.to_si(z[self.place[entry.path]])
             if entry.size == 1 and value.shape[0] == 1:
                 value = value[0]
@@ -336,8 +335,13 @@ def _inside(entry: Entry, value: Any) -> Any:
     return x.reshape(()) if entry.size == 1 else x
 
 
+def _leaf(tree: Any, names: tuple[str, ...]) -> Any:
+    """What stands at the end of a chain of attribute names."""
+    return functools.reduce(getattr, names, tree)
+
+
 def _put(tree: Any, entry: Entry, value: Any) -> Any:
-    whole = Entry(entry.path, entry.declaration, entry.leaf, None, 0).get(tree)
+    whole = _leaf(tree, entry.leaf)
     new = jnp.asarray(value, dtype=whole.dtype)
     new = new.reshape(whole.shape) if entry.index is None else whole.at[entry.index].set(new)
     return _put_leaves(tree, {entry.leaf: new})
@@ -349,6 +353,6 @@ def _put_leaves(tree: Any, changed: dict[tuple[str, ...], Any]) -> Any:
     keys = list(changed)
 
     def where(t: Any) -> list[Any]:
-        return [Entry("", None, key, None, 0).get(t) for key in keys]  # type: ignore[arg-type]
+        return [_leaf(t, key) for key in keys]
 
     return eqx.tree_at(where, tree, [changed[k] for k in keys])
