@@ -1,0 +1,106 @@
+"""The command line. Imports are late: `slipid --help` answers before numpy is loaded."""
+
+import functools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(
+    name="slipid",
+    help="Identify motors, floors and wheel loads of a robot from its logs.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Config, a TOML file.")]
+OutFolder = Annotated[Path, typer.Argument(metavar="OUT", help="Folder identify wrote.")]
+DataFolder = Annotated[
+    Path, typer.Option("--data", metavar="DIR", help="Folder the globs of the config start from.")
+]
+Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write to.")]
+MaybeOut = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Folder to write to, if wanted.")
+]
+Json = Annotated[
+    str | None, typer.Option("--json", metavar="FILE", help="Also write JSON there; - is stdout.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
+
+
+def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Bad input is one message and exit code 2, an interrupt 130; neither is a traceback."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            code = command(*args, **kwargs)
+        except KeyboardInterrupt:
+            typer.echo("interrupted; the same command goes on from the last round", err=True)
+            raise typer.Exit(130) from None
+        except ValueError as error:
+            from slipid.data.log import DataError
+
+            if not isinstance(error, DataError):
+                raise
+            typer.echo(str(error), err=True)
+            raise typer.Exit(2) from None
+        raise typer.Exit(code or 0)
+
+    return run
+
+
+@app.command()
+@guarded
+def identify(
+    config: ConfigFile, data: DataFolder, out: Out, json: Json = None, quiet: Quiet = False
+) -> int:
+    """Fit motors, floors, loads and camera to the logs, end to end.
+
+    Writes identified.json, fit.json and pictures; goes on from a checkpoint after an interrupt.
+    """
+    from slipid.app import commands, tables
+    from slipid.app.progress import Reporter
+
+    with Reporter(quiet=quiet) as report:
+        done = commands.identify(config, data, out, report)
+    if json is not None:
+        _emit(json, done.fit.to_identified())
+    if json != "-":
+        tables.identified(done.fit, out, done.written)
+    return 0 if done.fit.converged else 1
+
+
+@app.command()
+@guarded
+def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet = False) -> int:
+    """Predict runs open loop and compare with the camera, model by model."""
+    from slipid.app import commands, tables
+    from slipid.app.progress import Reporter
+
+    with Reporter(quiet=quiet) as report:
+        found = commands.validate(out, data, report)
+    if json is not None:
+        _emit(json, found)
+    if json != "-":
+        tables.validation(found)
+    return 0
+
+
+def _emit(where: str, value: Any) -> None:
+    """JSON to a file, whole or not at all, or to stdout."""
+    from slipid.data.files import json_text, write_bytes
+
+    text = json_text(value)
+    if where == "-":
+        sys.stdout.write(text)
+    else:
+        write_bytes(Path(where), text.encode())
+
+
+def main() -> None:
+    """Entry point of the `slipid` command."""
+    app()

@@ -1,0 +1,158 @@
+"""What the commands do; `cli` only parses arguments and turns errors into exit codes."""
+
+import hashlib
+import time
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from slipid.app import files, runtime
+from slipid.app.config import Config, read_config
+from slipid.app.progress import Reporter
+from slipid.data.files import write_bytes, write_json
+from slipid.data.log import DataError
+
+CHECKPOINT = "checkpoint.npz"
+
+
+@dataclass(frozen=True, eq=False)
+class Done:
+    """End of `identify`: the fit, the runs it saw, and the files written."""
+
+    fit: Any
+    job: Any
+    written: tuple[str, ...]
+
+
+def identify(config_path: Path, data: Path, out: Path, report: Reporter) -> Done:
+    """Fit the robot of a config to its logs and write everything to `out`.
+
+    Raises:
+        DataError: config or logs are wrong; nothing was written then.
+    """
+    began = time.monotonic()
+    runtime.start()
+    config = read_config(config_path)
+    report.tolerance = config.content.fit.tolerance
+    report.stage("reading logs")
+    from slipid.app.job import read_job
+
+    job = read_job(config, data, report.count, report.line)
+    report.line(f"{len(job.dataset)} runs on {', '.join(job.robot.surfaces.labels)}")
+    report.stage("cutting windows")
+    problem = job.problem()
+    optimum = _optimise(job, problem, out, report)
+    report.stage("intervals and verdicts")
+    from slipid.identify.result import summarise
+
+    fit = summarise(problem, optimum, job.dataset, job.choices, config.content.fit.seed)
+    fit = _with_baselines(fit, job.dataset)
+    report.stage("writing")
+    _keep_run(config, job, data, out, time.monotonic() - began)
+    fit.save(out)
+    written = ["identified.json", "fit.json", "fit.npz", "run.json", "config.toml"]
+    written += _plots(fit, job.dataset, out)
+    (out / CHECKPOINT).unlink(missing_ok=True)
+    return Done(fit, job, tuple(written))
+
+
+def _optimise(job: Any, problem: Any, out: Path, report: Reporter) -> Any:
+    """Optimum, from the checkpoint of this very job where there is one."""
+    from slipid.identify.fit import Options, optimise
+
+    wanted = job.config.content.fit
+    key = hashlib.sha256(
+        "\n".join([job.config.hash, job.data_hash, *map(str, files.versions().items())]).encode()
+    ).hexdigest()
+    kept = files.load_checkpoint(out / CHECKPOINT, key)
+    history: list[float] = [] if kept is None else kept[1]
+    if kept is not None:
+        report.line(f"going on from round {kept[0].round} of {out / CHECKPOINT}")
+
+    def tell(state: Any) -> None:
+        report.state(state)
+        if state.stage == "joint":
+            history.append(state.loss)
+            files.save_checkpoint(out / CHECKPOINT, key, state, history)
+
+    report.stage("compiling")
+    rounds = wanted.rounds
+    if kept is not None and kept[0].moved < wanted.tolerance:
+        rounds = kept[0].round  # it had settled: only the last steps are missing
+    options = Options(most_rounds=rounds, tolerance=wanted.tolerance)
+    optimum = optimise(problem, start=kept and kept[0], options=options, tell=tell)
+    reason = optimum.reason
+    if optimum.converged:
+        round_ = optimum.state.round
+        reason = f"no number moved {wanted.tolerance:g} of its std in round {round_}"
+    return replace(optimum, history=tuple(history), reason=reason)
+
+
+def _with_baselines(fit: Any, dataset: Any) -> Any:
+    return fit
+
+
+def _keep_run(config: Config, job: Any, data: Path, out: Path, seconds: float) -> None:
+    """What later commands and readers need to know of this run."""
+    write_bytes(out / "config.toml", config.text.encode())
+    write_json(
+        out / "run.json",
+        {
+            "schema": "slipid.run/1",
+            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+            "seconds": round(seconds, 1),
+            "config": {"name": config.path.name, "sha256": config.hash},
+            "data": {
+                "folder": str(data),
+                "hash": job.data_hash,
+                "logs": {log.name: log.sha256 for log in job.dataset.logs},
+                "skipped": list(job.skipped),
+            },
+            "seed": config.content.fit.seed,
+            "versions": files.versions(),
+        },
+    )
+
+
+def _plots(fit: Any, dataset: Any, out: Path) -> list[str]:
+    try:
+        from slipid.app import plots
+    except ImportError:
+        return []
+    return [Path(p).name for p in plots.identify_plots(fit, dataset, out)]
+
+
+def validate(out: Path, data: Path, report: Reporter) -> dict[str, Any]:
+    """Open-loop prediction of runs by the fit in `out`, as the validation file has it.
+
+    Raises:
+        DataError: no fit there, or logs that it cannot predict.
+    """
+    runtime.start()
+    from slipid.app.job import read_dataset
+    from slipid.identify.result import load
+    from slipid.identify.validate import validation
+
+    fit = load(out)
+    config = read_config(out / "config.toml")
+    sections = config.content.validate_.logs or config.content.logs
+    report.stage("reading logs")
+    dataset, skipped = read_dataset(config, sections, data, report.count)
+    for sentence in skipped:
+        report.line(sentence)
+    for log in dataset.logs:
+        _known(log.name, "surface", log.surface or "unknown", fit.robot.surfaces.labels)
+        _known(log.name, "load set-up", log.load, fit.robot.body.loads)
+    seen = {sha for _, sha in fit.runs}
+    again = sum(log.sha256 in seen for log in dataset.logs)
+    if again:
+        report.line(f"{again} of {len(dataset)} runs were fitted: they say little about new ones")
+    report.stage("predicting")
+    found: dict[str, Any] = validation(fit, dataset)
+    return found
+
+
+def _known(name: str, what: str, found: str, known: tuple[str, ...]) -> None:
+    if found not in known:
+        raise DataError(f"{name}: no {what} '{found}'; identified: {', '.join(known)}")

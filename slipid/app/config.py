@@ -1,0 +1,309 @@
+"""The config of a job: what the TOML file may say, checked once, every mistake with its key.
+
+Units stand in the names of the keys; everything is optional that has a default here.
+"""
+
+import hashlib
+import tomllib
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from slipid.data.log import DataError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Numbers = Number | list[Number]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Omni(_Section):
+    """Wheels on a circle, each driving 90 deg ahead of its azimuth."""
+
+    drive: Literal["omni"]
+    wheel_radius_m: Positive
+    base_radius_m: Positive
+    wheel_azimuths_deg: list[Number] = Field(min_length=3)
+    roller_angle_deg: Number = 90.0
+    gear_ratio: Positive = 1.0
+    mass_kg: Positive | None = None
+
+
+class Mecanum(_Section):
+    """Four mecanum wheels in X: front left, front right, rear left, rear right."""
+
+    drive: Literal["mecanum"]
+    wheel_radius_m: Positive
+    half_length_m: Positive
+    half_width_m: Positive
+    gear_ratio: Positive = 1.0
+    mass_kg: Positive | None = None
+
+
+class Skid(_Section):
+    """Four ordinary wheels that point ahead, in the order of `Mecanum`."""
+
+    drive: Literal["skid"]
+    wheel_radius_m: Positive
+    half_length_m: Positive
+    half_width_m: Positive
+    gear_ratio: Positive = 1.0
+    mass_kg: Positive | None = None
+
+
+class General(_Section):
+    """Any wheels: centres, drive directions, roller angles ("none": an ordinary wheel)."""
+
+    drive: Literal["general"]
+    wheel_radius_m: Positive
+    wheel_places_m: list[Annotated[list[Number], Field(min_length=2, max_length=2)]] = Field(
+        min_length=2
+    )
+    drive_directions_deg: list[Number]
+    roller_angles_deg: list[Number | Literal["none"]]
+    gear_ratio: Positive = 1.0
+    mass_kg: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_per_wheel(self) -> "General":
+        wheels = len(self.wheel_places_m)
+        for key in ("drive_directions_deg", "roller_angles_deg"):
+            if len(getattr(self, key)) != wheels:
+                raise ValueError(
+                    f"{len(getattr(self, key))} {key}; expected {wheels}, one per wheel_places_m"
+                )
+        return self
+
+
+class Logs(_Section):
+    """Log files of one kind, found by a glob below the data folder."""
+
+    glob: str
+    format: str | None = None
+    layout: dict[str, Any] = Field(default_factory=dict)
+    surface: str = "folder"
+    load: str = "as_built"
+    session: Literal["surface/load/speed", "folder", "file"] = "surface/load/speed"
+
+    @model_validator(mode="after")
+    def _has_layout(self) -> "Logs":
+        if self.format is None and "columns" not in self.layout:
+            raise ValueError("neither format nor layout.columns; expected the name of a preset")
+        return self
+
+
+class Camera(_Section):
+    """The camera that saw the pose."""
+
+    image_centre_m: Annotated[list[Number], Field(min_length=2, max_length=2)] = [0.0, 0.0]
+
+
+class Prior(_Section):
+    """Gaussian prior, in SI around its mean."""
+
+    mean: Numbers
+    std: Positive | list[Positive]
+
+
+class Setting(_Section):
+    """What is wanted of the parameters that match a pattern."""
+
+    start: Numbers | None = None
+    fixed: Numbers | None = None
+    free: bool | None = None
+    prior: Prior | None = None
+
+    @model_validator(mode="after")
+    def _not_both(self) -> "Setting":
+        if self.fixed is not None and (self.prior is not None or self.free):
+            raise ValueError("fixed and free or prior at once; expected one of them")
+        return self
+
+
+class FitSection(_Section):
+    """How finely runs are cut and how long to fit."""
+
+    windows_per_piece: int = Field(4, ge=1, le=32)
+    longest_window_s: Positive = 6.0
+    rounds: int = Field(30, ge=1)
+    tolerance: Positive = 0.02
+    seed: int = Field(0, ge=0)
+
+
+class ValidateSection(_Section):
+    """Runs to predict where they differ from those that were fitted."""
+
+    logs: list[Logs] = Field(default_factory=list)
+
+
+class Content(_Section):
+    """The whole file."""
+
+    robot: Annotated[Omni | Mecanum | Skid | General, Field(discriminator="drive")]
+    logs: list[Logs] = Field(min_length=1)
+    camera: Camera = Camera()
+    parameters: dict[str, Setting] = Field(default_factory=dict)
+    fit: FitSection = FitSection()  # type: ignore[call-arg]
+    validate_: ValidateSection = Field(default_factory=ValidateSection, alias="validate")
+
+
+@dataclass(frozen=True)
+class Config:
+    """A config file that was read and found right.
+
+    Attributes:
+        path: the file.
+        text: as it was, to be kept beside the results.
+        content: what it says.
+    """
+
+    path: Path
+    text: str
+    content: Content
+
+    @property
+    def hash(self) -> str:
+        """Hash of the text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+
+def read_config(path: Path) -> Config:
+    """Config from a TOML file.
+
+    Raises:
+        DataError: unreadable, no TOML, unknown or missing keys, wrong values; every one on a line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; expected a config (TOML file)") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: no UTF-8 text; expected a config (TOML file)") from error
+    try:
+        mapping = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise DataError(f"{path}: no valid TOML: {error}") from error
+    try:
+        content = Content.model_validate(mapping)
+    except ValidationError as error:
+        lines = dict.fromkeys(_line(path, mapping, e) for e in error.errors())
+        raise DataError("\n".join(lines)) from None
+    return Config(path, text, content)
+
+
+def _line(path: Path, mapping: dict[str, Any], error: Any) -> str:
+    """One mistake as one line: file, key, what was found, what was expected."""
+    kind, given = error["type"], error["input"]
+    steps = _steps(mapping, error["loc"])
+    where = f"{path}: {_spelled(steps)}"
+    context = error.get("ctx", {})
+    if kind == "extra_forbidden":
+        known = _keys(_model_at(mapping, steps[:-1]))
+        near = get_close_matches(str(steps[-1]), known, n=2)
+        hint = f", did you mean {' or '.join(near)}?" if near else ""
+        return f"{where}: no such key{hint}; expected one of {', '.join(known)}"
+    if kind == "missing":
+        return f"{where}: missing; expected a value for it"
+    if kind == "union_tag_not_found":
+        return f"{where}.drive: missing; expected one of omni, mecanum, skid, general"
+    if kind == "union_tag_invalid":
+        near = get_close_matches(str(context["tag"]), ("omni", "mecanum", "skid", "general"), n=1)
+        hint = f", did you mean {near[0]}?" if near else ""
+        return (
+            f"{where}.drive: '{context['tag']}'{hint}; expected one of omni, mecanum, skid, general"
+        )
+    if kind == "value_error":
+        return f"{where}: {context['error']}"
+    if kind == "literal_error":
+        return f"{where}: {given!r}; expected one of {context['expected']}"
+    return f"{where}: {given!r}; expected: {error['msg'][0].lower()}{error['msg'][1:]}"
+
+
+def _steps(mapping: Any, loc: tuple[Any, ...]) -> list[Any]:
+    """The part of pydantic's location that is in the file: without names of union members."""
+    steps: list[Any] = []
+    here = mapping
+    for k, part in enumerate(loc):
+        if isinstance(here, dict) and part in here:
+            here = here[part]
+        elif isinstance(here, list) and isinstance(part, int) and part < len(here):
+            here = here[part]
+        elif k < len(loc) - 1 or not isinstance(here, dict):
+            continue
+        steps.append(part)
+    return steps
+
+
+def _spelled(steps: list[Any]) -> str:
+    out = ""
+    for step in steps:
+        if isinstance(step, int):
+            out += f"[{step + 1}]"
+        else:
+            name = (
+                f'"{step}"' if not str(step).replace("_", "").replace("-", "").isalnum() else step
+            )
+            out += f".{name}" if out else str(name)
+    return out or "the file"
+
+
+def _model_at(mapping: Any, steps: list[Any]) -> type[BaseModel]:
+    """The model that describes a place of the file."""
+    model: type[BaseModel] = Content
+    here = mapping
+    for step in steps:
+        here = here[step]
+        if isinstance(step, int):
+            continue
+        field = next((f for n, f in model.model_fields.items() if (f.alias or n) == step), None)
+        found = _models(field.annotation) if field is not None else []
+        if len(found) > 1:
+            found = [
+                m for m in found if get_args(m.model_fields["drive"].annotation)[0] == here["drive"]
+            ]
+        model = found[0] if found else Setting
+    return model
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    if get_origin(annotation) in (Union, UnionType, list, dict, Annotated):
+        return [m for a in get_args(annotation) for m in _models(a)]
+    return []
+
+
+def _keys(model: type[BaseModel]) -> list[str]:
+    return [f.alias or name for name, f in model.model_fields.items()]
+
+
+def geometry(robot: Omni | Mecanum | Skid | General) -> Any:
+    """Geometry of a `[robot]` section; ValueError where it cannot drive."""
+    from slipid.model import geometry as g
+
+    if isinstance(robot, Omni):
+        return g.omni(
+            robot.wheel_azimuths_deg,
+            robot.base_radius_m,
+            robot.wheel_radius_m,
+            robot.gear_ratio,
+            robot.roller_angle_deg,
+        )
+    if isinstance(robot, General):
+        rollers = [None if a == "none" else float(a) for a in robot.roller_angles_deg]
+        return g.general(
+            robot.wheel_places_m,
+            robot.drive_directions_deg,
+            rollers,
+            robot.wheel_radius_m,
+            robot.gear_ratio,
+        )
+    make = g.mecanum if isinstance(robot, Mecanum) else g.skid_steer
+    return make(robot.half_length_m, robot.half_width_m, robot.wheel_radius_m, robot.gear_ratio)

@@ -1,0 +1,66 @@
+"""What a job keeps beside its results: hashes, versions, the checkpoint of a running fit."""
+
+import platform
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from slipid.data.files import write_arrays
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {"python": platform.python_version()}
+    for name in ("slipid", "jax", "jaxlib", "equinox", "optimistix", "numpy"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def save_checkpoint(path: Path, key: str, state: Any, history: list[float]) -> None:
+    """Keep where a fit stands.
+
+    Args:
+        key: hash of everything the state depends on; a checkpoint with another one is not used.
+        state: of the fit, joint stage.
+    """
+    write_arrays(
+        path,
+        {
+            "key": np.array(key),
+            "z": state.z,
+            "log_variance": state.log_variance,
+            "round": np.array(state.round),
+            "loss": np.array(state.loss),
+            "moved": np.array(state.moved),
+            "stage": np.array(state.stage),
+            "history": np.asarray(history, float),
+        },
+    )
+
+
+def load_checkpoint(path: Path, key: str) -> tuple[Any, list[float]] | None:
+    """State and losses so far, or None where there is no checkpoint of this very job."""
+    from slipid.identify.fit import State
+
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            if str(kept["key"]) != key:
+                return None
+            state = State(
+                z=kept["z"],
+                log_variance=kept["log_variance"],
+                round=int(kept["round"]),
+                loss=float(kept["loss"]),
+                moved=float(kept["moved"]),
+                stage=str(kept["stage"]),
+            )
+            return state, [float(x) for x in kept["history"]]
+    except (OSError, KeyError, ValueError, BadZipFile):
+        return None

@@ -1,0 +1,199 @@
+"""From a config and a data folder to a fitting problem."""
+
+import fnmatch
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from pathlib import Path
+
+from slipid.app.config import Config, Logs, geometry
+from slipid.data.dataset import Dataset, collect, default_session, windows
+from slipid.data.formats import layout_from_mapping
+from slipid.data.log import DataError, Log
+from slipid.data.reader import find_logs, read_logs
+from slipid.identify.fit import Problem
+from slipid.identify.result import hash_of
+from slipid.model.robot import Robot, build
+from slipid.parameter import Choice, Space, entries
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What a config says about the logs that are there.
+
+    Attributes:
+        config: as read.
+        dataset: the runs.
+        robot: with the geometry of the config and every other number at its declared start.
+        choices: free, fixed, priors.
+        skipped: what the config names and the folder does not have, one line each.
+    """
+
+    config: Config
+    dataset: Dataset
+    robot: Robot
+    choices: tuple[Choice, ...]
+    skipped: tuple[str, ...]
+
+    @property
+    def data_hash(self) -> str:
+        """Hash of the runs and their files."""
+        return hash_of((log.name, log.sha256) for log in self.dataset.logs)
+
+    def problem(self) -> Problem:
+        """Likelihood of the runs, cut into windows as the config says."""
+        fit = self.config.content.fit
+        start = Space(self.robot, self.choices).template
+        cut = windows(
+            self.dataset,
+            float(start.geometry.wheel_radius),
+            lag=float(start.camera.lag),
+            per_piece=fit.windows_per_piece,
+            longest=fit.longest_window_s,
+        )
+        return Problem(cut, self.robot, list(self.choices))
+
+
+def read_job(config: Config, root: Path, tell: Callable[[int, int], None], line: Tell) -> Job:
+    """Read every log the config names and set up its robot.
+
+    Args:
+        root: data folder the globs are relative to.
+        tell: called with (files read, files in all).
+        line: takes each sentence for people.
+
+    Raises:
+        DataError: what is wrong with config or logs.
+    """
+    dataset, skipped = read_dataset(config, config.content.logs, root, tell)
+    try:
+        shape = geometry(config.content.robot)
+    except ValueError as error:
+        raise DataError(f"{config.path}: robot: {error}") from error
+    if shape.wheels != dataset.logs[0].wheels:
+        raise DataError(
+            f"{config.path}: robot: {shape.wheels} wheels, but {dataset.logs[0].name} has "
+            f"{dataset.logs[0].wheels}; expected the same"
+        )
+    robot = build(
+        shape,
+        sorted({log.surface or "unknown" for log in dataset.logs}),
+        sorted({log.load for log in dataset.logs}),
+        sorted(set(dataset.session)),
+        centre=tuple(config.content.camera.image_centre_m),  # type: ignore[arg-type]
+    )
+    choices, left_out = _choices(config, robot)
+    skipped += left_out
+    for sentence in skipped:
+        line(sentence)
+    return Job(config, dataset, robot, tuple(choices), tuple(skipped))
+
+
+def read_dataset(
+    config: Config, sections: Sequence[Logs], root: Path, tell: Callable[[int, int], None]
+) -> tuple[Dataset, list[str]]:
+    """Runs of some log sections, and a line for each section without files.
+
+    Raises:
+        DataError: no file at all, or one that cannot be read.
+    """
+    if not root.is_dir():
+        raise DataError(f"{root}: no such folder; expected the folder of the logs (--data)")
+    found: list[tuple[Logs, list[Path]]] = []
+    skipped: list[str] = []
+    for section in sections:
+        try:
+            found.append((section, find_logs(root, section.glob)))
+        except DataError as error:
+            skipped.append(f"skipped: {error}")
+        except (ValueError, NotImplementedError) as error:
+            raise DataError(f"{config.path}: logs.glob '{section.glob}': {error}") from error
+    if not found:
+        raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
+    count = sum(len(paths) for _, paths in found)
+    logs: list[Log] = []
+    session: dict[str, str] = {}
+    done = 0
+    for k, (section, paths) in enumerate(found, start=1):
+        mapping = dict(section.layout)
+        if section.format is not None:
+            mapping["format"] = section.format
+        layout = layout_from_mapping(mapping, f"{config.path} logs[{k}] layout")
+        for path in paths:
+            surface = _surface(section, path)
+            for log in read_logs(path, layout, root=root, surface=surface, load=section.load):
+                if log.name in session:
+                    raise DataError(
+                        f"{log.name}: found by two globs of {config.path}; expected it once"
+                    )
+                session[log.name] = _session(section, log)
+                logs.append(with_voltage(log))
+            done += 1
+            tell(done, count)
+    return collect(logs, session=lambda log: session[log.name]), skipped
+
+
+def _surface(section: Logs, path: Path) -> str:
+    """Name of the floor: as the config says, or of the folder the file lies in."""
+    if section.surface != "folder":
+        return section.surface
+    return path.parent.name.removesuffix("_surface")
+
+
+def _session(section: Logs, log: Log) -> str:
+    if section.session == "file":
+        return log.name
+    if section.session == "folder":
+        return log.name.rpartition("/")[0] or log.name
+    return default_session(log)
+
+
+def with_voltage(log: Log) -> Log:
+    """The log with voltage = duty x bus voltage where only those were logged."""
+    if log.voltage is None and log.duty is not None and log.bus_voltage is not None:
+        return replace(log, voltage=log.duty * log.bus_voltage[:, None])
+    return log
+
+
+def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
+    """The config's parameter settings, checked, less those of floors and loads that are absent."""
+    paths = [e.path for e in entries(robot)]
+    choices, skipped = [], []
+    if config.content.robot.mass_kg is not None:
+        choices.append(Choice("robot.mass", fixed=config.content.robot.mass_kg))
+    for pattern, setting in config.content.parameters.items():
+        if not fnmatch.filter(paths, pattern):
+            if fnmatch.filter(paths, _any_label(pattern)):
+                skipped.append(f"skipped: parameters '{pattern}': no run that has it")
+                continue
+            near = get_close_matches(pattern, paths, n=2)
+            hint = f", did you mean {' or '.join(near)}?" if near else ""
+            raise DataError(
+                f"{config.path}: parameters.'{pattern}': no such parameter{hint}; "
+                f"expected one of {', '.join(paths)}"
+            )
+        choice = Choice(
+            pattern,
+            start=setting.start,
+            fixed=setting.fixed,
+            free=setting.free,
+            prior_mean=None if setting.prior is None else setting.prior.mean,
+            prior_std=None if setting.prior is None else setting.prior.std,
+        )
+        try:
+            Space(robot, [choice])
+        except ValueError as error:
+            raise DataError(f"{config.path}: parameters.'{pattern}': {error}") from error
+        choices.append(choice)
+    return choices, skipped
+
+
+def _any_label(pattern: str) -> str:
+    """The pattern with the name of a floor, load or session replaced by any."""
+    head, at, _ = pattern.partition("@")
+    parts = head.split(".")
+    if parts[0] == "surface" and len(parts) == 3:
+        parts[1] = "*"
+    return ".".join(parts) + (f"{at}*" if at else "")

@@ -1,0 +1,112 @@
+"""Slip against torque of every floor, with its band, and what range the data saw."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.data.dataset import Dataset
+from slipid.identify import likelihood as lk
+from slipid.model import robot as model
+from slipid.model.contact import V0
+from slipid.model.robot import GRAVITY, Robot
+from slipid.parameter import Space
+
+POINTS = 41
+_SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])
+
+
+@jax.jit
+def seen(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
+    """Wheel speeds [rad/s] and wheel torques [N m] of every window (piece, window, wheel)."""
+    frame = robot.geometry.frame()
+    speed = (b.turn - (robot.camera.lag - b.lag) * b.faster) / b.dt[..., None]
+
+    def one(w: Array, surface: Array, load: Array) -> Array:
+        xi = model.twist(robot, frame, w, surface, load)
+        return model.wheel_torque(robot, frame, xi, w, surface, load)
+
+    torque = jax.vmap(jax.vmap(one, (0, None, None)))(speed, b.surface, b.load)
+    return speed, torque
+
+
+def torque_of_slip(robot: Robot, wheel_speed: Any, share: float) -> Float[Array, "surface slip"]:
+    """Torque [N m] of a wheel that slips by `_SLIP` along its drive direction, on every floor.
+
+    tau = r mu m g N (tanh(vs / (v0 + s0 r w)) + kv vs),  vs = s r w
+
+    Args:
+        wheel_speed: w (surface,) [rad/s].
+        share: N, of the weight on this wheel.
+
+    Source: contact equilibrium without sideways rolling, METHODS 3B.
+    """
+    floor = robot.surfaces
+    rim = (robot.geometry.wheel_radius * wheel_speed)[:, None]
+    slide = jnp.asarray(_SLIP) * rim
+    grip = jnp.tanh(slide / (V0 + floor.creep[:, None] * rim))
+    grip = grip + floor.slide_viscosity[:, None] * slide
+    weight = robot.body.mass * GRAVITY * share
+    return robot.geometry.wheel_radius * floor.friction[:, None] * weight * grip
+
+
+def curves(
+    space: Space,
+    z: Float[np.ndarray, " free"],
+    draws: Float[np.ndarray, "draw free"],
+    b: lk.Batch,
+) -> dict[str, dict[str, Any]]:
+    """Slip over torque per floor with a 90 % band, over the torques that occurred.
+
+    Taken at the median speed of the wheels that turned and an even load.
+    """
+    robot = space.tree(z)
+    speed, torque = (np.abs(np.asarray(x)) for x in seen(robot, b))
+    labels, floor = robot.surfaces.labels, np.asarray(b.surface)
+    share = 1.0 / speed.shape[-1]
+    median = []
+    for k in range(len(labels)):
+        mine = speed[floor == k]
+        turned = mine[mine > 0.05 * max(mine.max(initial=0.0), 1e-9)]
+        median.append(float(np.median(turned)) if turned.size else 1.0)
+    at = jnp.asarray(median)
+    best = np.asarray(torque_of_slip(robot, at, share))
+    band = np.asarray(
+        jax.jit(jax.vmap(lambda x: torque_of_slip(space.tree(x), at, share)))(jnp.asarray(draws))
+    )
+    out = {}
+    for k, label in enumerate(labels):
+        top = min(float(np.quantile(torque[floor == k], 0.98)), 0.999 * float(best[k].max()))
+        grid = np.linspace(0.0, top, POINTS)
+        each = np.stack([np.interp(grid, row, _SLIP) for row in band[:, k]])
+        low, high = np.quantile(each, [0.05, 0.95], axis=0)
+        out[label] = {
+            "torque_nm": grid.tolist(),
+            "slip": np.interp(grid, best[k], _SLIP).tolist(),
+            "slip_lo": low.tolist(),
+            "slip_hi": high.tolist(),
+            "at": {"wheel_speed": median[k], "load_share": share},
+        }
+    return out
+
+
+def validity(data: Dataset, robot: Robot, b: lk.Batch) -> dict[str, dict[str, Any]]:
+    """What each floor was seen with: outside of it the fit extrapolates."""
+    speed, torque = (np.abs(np.asarray(x)) for x in seen(robot, b))
+    floor = np.asarray(b.surface)
+    out: dict[str, dict[str, Any]] = {}
+    for k, label in enumerate(robot.surfaces.labels):
+        runs = [i for i, log in enumerate(data.logs) if (log.surface or "unknown") == label]
+        heading = np.degrees(data.heading[runs])
+        body = data.speed[runs]
+        out[label] = {
+            "runs": len(runs),
+            "loads": sorted({data.logs[i].load for i in runs}),
+            "wheel_speed": [0.0, float(speed[floor == k].max())],
+            "torque_nm": [0.0, float(torque[floor == k].max())],
+            "headings_deg": sorted({round(float(h), 1) for h in heading[np.isfinite(heading)]}),
+            "speeds": sorted({round(float(s), 3) for s in body[np.isfinite(body)]}),
+        }
+    return out

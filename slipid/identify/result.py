@@ -1,0 +1,358 @@
+"""The result of a fit: a frozen value that prints, saves and loads, identifiability included."""
+
+import hashlib
+import io
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.dataset import Dataset
+from slipid.data.files import json_text, read_json, write_bytes
+from slipid.data.log import DataError
+from slipid.identify import curves as curves_of
+from slipid.identify.fit import Optimum, Problem
+from slipid.identify.verdict import Estimate, Flat, estimates, flat_directions
+from slipid.model.geometry import Geometry
+from slipid.model.robot import Robot, build
+from slipid.parameter import Choice, Entry, Space, entries
+
+SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/1"
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What a fit found, how sure it is and how it went.
+
+    Attributes:
+        space: free and fixed numbers, priors; its template holds the fixed values.
+        choices: what the user wanted.
+        z: search vector at the optimum.
+        covariance: Laplace, of the search vector.
+        variance: every variance component by name [unit squared].
+        variance_unit: unit of each component's std.
+        runs: (name, sha256) of every run that was fitted.
+        piece_run: number of the run each residual row belongs to.
+        residual: predicted less measured, one row per piece, by block.
+        whitened: the same in units of its expected scatter.
+        weight: of each piece in the last round, by block; about 1, small for an outlier.
+        spectrum: singular values of the prior-scaled whitened Jacobian; 1 is as good as the prior.
+        has: which of current, voltage were logged.
+        curves: slip over torque per floor, as in identified.json.
+        validity: what each floor was seen with.
+        converged, reason, rounds, history: how the fit ended.
+        settings: of windows and seed, as used.
+        baselines: what simpler models learnt from the same runs, for comparison.
+    """
+
+    space: Space
+    choices: tuple[Choice, ...]
+    z: Float[np.ndarray, " free"]
+    covariance: Float[np.ndarray, "free free"]
+    variance: Mapping[str, float]
+    variance_unit: Mapping[str, str]
+    runs: tuple[tuple[str, str], ...]
+    piece_run: np.ndarray
+    residual: Mapping[str, np.ndarray]
+    whitened: Mapping[str, np.ndarray]
+    weight: Mapping[str, np.ndarray]
+    spectrum: Float[np.ndarray, " free"]
+    has: Mapping[str, bool]
+    curves: Mapping[str, Any]
+    validity: Mapping[str, Any]
+    converged: bool
+    reason: str
+    rounds: int
+    history: tuple[float, ...]
+    settings: Mapping[str, Any]
+    baselines: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def robot(self) -> Robot:
+        """The robot with every number at its fitted or fixed value."""
+        return self.space.tree(jnp.asarray(self.z))
+
+    @cached_property
+    def parameters(self) -> dict[str, Estimate]:
+        """Every number by path, with interval and verdict."""
+        found = estimates(self.space, self.choices, self.z, self.covariance, self.has["voltage"])
+        return {e.path: e for e in found}
+
+    @cached_property
+    def flat(self) -> tuple[Flat, ...]:
+        """Directions the data leave open."""
+        return flat_directions(
+            self.space, self.covariance, self.has["current"], self.has["voltage"]
+        )
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """What a reader of the numbers must know, one sentence each."""
+        said = [f.text for f in self.flat]
+        said += [
+            f"{e.path} ended at its bound ({e.value:.3g} {e.unit})"
+            for e in self.parameters.values()
+            if e.verdict == "at_bound" and isinstance(e.value, float)
+        ]
+        if not self.converged:
+            said.append(f"the fit did not converge: {self.reason}")
+        return tuple(said)
+
+    @property
+    def data_hash(self) -> str:
+        """Hash of the runs and their files."""
+        return hash_of(self.runs)
+
+    def draws(self, count: int, seed: int = 0) -> Float[np.ndarray, "draw free"]:
+        """Search vectors drawn from the Laplace posterior."""
+        return draws(self.z, self.covariance, count, seed)
+
+    def with_baselines(self, baselines: Mapping[str, Any]) -> "Fit":
+        """The fit, with what simpler models learnt (plain numbers, as JSON holds them)."""
+        return replace(self, baselines=dict(baselines))
+
+    def to_identified(self) -> dict[str, Any]:
+        """Content of identified.json."""
+        return {
+            "schema": SCHEMA,
+            "parameters": {
+                e.path: {
+                    "value": e.value,
+                    "unit": e.unit,
+                    "shape": [len(e.labels)] if e.labels else [],
+                    "labels": list(e.labels),
+                    "std": e.std,
+                    "interval90": e.interval90,
+                    "source": e.source,
+                    "verdict": e.verdict,
+                    "provenance": e.provenance,
+                }
+                for e in self.parameters.values()
+            },
+            "surfaces": list(self.robot.surfaces.labels),
+            "curves": dict(self.curves),
+            "validity": dict(self.validity),
+            "messages": list(self.messages),
+            "data": {"hash": self.data_hash, "runs": [name for name, _ in self.runs]},
+        }
+
+    def to_fit_json(self) -> dict[str, Any]:
+        """Content of fit.json: everything but the large arrays, which go to fit.npz."""
+        return {
+            "schema": SCHEMA_FIT,
+            "converged": self.converged,
+            "reason": self.reason,
+            "rounds": self.rounds,
+            "history": [x if np.isfinite(x) else None for x in self.history],
+            "parameters": {p: asdict(e) for p, e in self.parameters.items()},
+            "flat": [asdict(f) for f in self.flat],
+            "messages": list(self.messages),
+            "variances": {
+                name: {"std": float(np.sqrt(v)), "unit": self.variance_unit[name]}
+                for name, v in self.variance.items()
+            },
+            "spectrum": self.spectrum.tolist(),
+            "names": self.space.names,
+            "z": self.z.tolist(),
+            "robot": _robot_json(self.space.template),
+            "choices": [asdict(c) for c in self.choices],
+            "variance": dict(self.variance),
+            "has": dict(self.has),
+            "curves": dict(self.curves),
+            "validity": dict(self.validity),
+            "settings": dict(self.settings),
+            "baselines": dict(self.baselines),
+            "data": {"hash": self.data_hash, "runs": [list(r) for r in self.runs]},
+        }
+
+    def save(self, folder: Path) -> None:
+        """Write fit.json, fit.npz and identified.json, each whole or not at all."""
+        arrays = {"covariance": self.covariance, "piece_run": self.piece_run}
+        for name in ("residual", "whitened", "weight"):
+            arrays |= {f"{name}/{k}": v for k, v in getattr(self, name).items()}
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        texts = [json_text(self.to_fit_json()), json_text(self.to_identified())]
+        write_bytes(folder / "fit.npz", buffer.getvalue())
+        for name, text in zip(("fit.json", "identified.json"), texts, strict=True):
+            write_bytes(folder / name, text.encode())
+
+
+def load(folder: Path) -> Fit:
+    """Fit from the files `Fit.save` wrote.
+
+    Raises:
+        DataError: absent, damaged, or of another schema.
+    """
+    path = folder / "fit.json"
+    kept = read_json(path, "the result of `slipid identify`")
+    if not isinstance(kept, dict) or kept.get("schema") != SCHEMA_FIT:
+        raise DataError(f"{path}: no {SCHEMA_FIT}; expected the result of `slipid identify`")
+    try:
+        with np.load(folder / "fit.npz", allow_pickle=False) as npz:
+            arrays = {k: npz[k] for k in npz.files}
+        return _from_files(kept, arrays)
+    except OSError as error:
+        raise DataError(f"{folder / 'fit.npz'}: {error.strerror or error}") from error
+    except (KeyError, TypeError, ValueError, BadZipFile) as error:
+        raise DataError(
+            f"{folder}: fit.json and fit.npz do not belong together or are damaged ({error}); "
+            "expected them as `slipid identify` wrote them"
+        ) from error
+
+
+def _from_files(kept: dict[str, Any], arrays: dict[str, np.ndarray]) -> Fit:
+    choices = tuple(Choice(**c) for c in kept["choices"])
+    space = Space(_robot_of(kept["robot"]), choices)
+    if space.names != kept["names"]:
+        raise ValueError("other parameters than this version declares")
+
+    def of(name: str) -> dict[str, np.ndarray]:
+        start = f"{name}/"
+        return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
+
+    return Fit(
+        space=space,
+        choices=choices,
+        z=np.asarray(kept["z"], float),
+        covariance=arrays["covariance"],
+        variance=kept["variance"],
+        variance_unit={k: v["unit"] for k, v in kept["variances"].items()},
+        runs=tuple((str(name), str(sha)) for name, sha in kept["data"]["runs"]),
+        piece_run=arrays["piece_run"],
+        residual=of("residual"),
+        whitened=of("whitened"),
+        weight=of("weight"),
+        spectrum=np.asarray(kept["spectrum"], float),
+        has=kept["has"],
+        curves=kept["curves"],
+        validity=kept["validity"],
+        converged=kept["converged"],
+        reason=kept["reason"],
+        rounds=kept["rounds"],
+        history=tuple(np.inf if x is None else x for x in kept["history"]),
+        settings=kept["settings"],
+        baselines=kept["baselines"],
+    )
+
+
+def summarise(
+    problem: Problem, optimum: Optimum, data: Dataset, choices: Iterable[Choice], seed: int = 0
+) -> Fit:
+    """Fit from the end of an optimisation.
+
+    Args:
+        problem: as it was optimised.
+        optimum: where it ended.
+        data: the runs its windows were cut from.
+        choices: as the problem was given.
+        seed: of the draws the curves' bands are made of.
+    """
+    z, log_v = optimum.state.z, optimum.state.log_variance
+    volt = problem.volt(log_v)
+    blocks, jacobian = problem.linear(jnp.asarray(z), volt)
+    keep = jnp.ones(len(problem.windows))
+    roots, weights, _ = problem.whitening(blocks, jnp.asarray(log_v), keep)
+    scale = problem.space.prior_std
+    info = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep))
+    beyond = scale[:, None] * info * scale[None, :] - np.eye(len(scale))
+    whitened = {
+        k: np.einsum("nij,nj->ni", np.asarray(roots[k]), np.asarray(r))
+        / np.sqrt(np.asarray(weights[k]))[:, None]
+        for k, r in blocks.items()
+    }
+    windows = problem.windows
+    return Fit(
+        space=problem.space,
+        choices=tuple(choices),
+        z=np.asarray(z),
+        covariance=np.asarray(optimum.covariance),
+        variance={n: float(v) for n, v in zip(problem.noise.names, np.exp(log_v), strict=True)},
+        variance_unit=dict(zip(problem.noise.names, problem.noise.unit, strict=True)),
+        runs=tuple((log.name, log.sha256) for log in data.logs),
+        piece_run=np.asarray(windows.run),
+        residual={k: np.asarray(v) for k, v in blocks.items()},
+        whitened=whitened,
+        weight={k: np.asarray(v) for k, v in weights.items()},
+        spectrum=np.sqrt(np.maximum(np.linalg.eigvalsh(beyond)[::-1], 0.0)),
+        has={"current": bool(windows.has_current), "voltage": bool(windows.has_voltage)},
+        curves=curves_of.curves(
+            problem.space, z, draws(z, optimum.covariance, 400, seed), problem.batch
+        ),
+        validity=curves_of.validity(data, problem.space.tree(jnp.asarray(z)), problem.batch),
+        converged=bool(optimum.converged),
+        reason=optimum.reason,
+        rounds=int(optimum.state.round),
+        history=tuple(float(x) for x in optimum.history),
+        settings={
+            "lag": float(windows.lag),
+            "windows_per_piece": int(windows.dt.shape[1]),
+            "seed": seed,
+        },
+    )
+
+
+def draws(z: Any, covariance: Any, count: int, seed: int) -> Float[np.ndarray, "draw free"]:
+    """Draws of a Gaussian in the search space."""
+    rng = np.random.default_rng(seed)
+    root = np.linalg.cholesky(np.asarray(covariance))
+    return np.asarray(z) + rng.standard_normal((count, len(root))) @ root.T
+
+
+def hash_of(runs: Iterable[tuple[str, str]]) -> str:
+    """Hash of a set of runs from their names and file hashes, whatever their order."""
+    lines = "".join(f"{name} {sha}\n" for name, sha in sorted(runs))
+    return hashlib.sha256(lines.encode()).hexdigest()
+
+
+def _robot_json(robot: Robot) -> dict[str, Any]:
+    """A robot as plain values: its shape, its names, every number."""
+    shape = robot.geometry
+    return {
+        "geometry": {
+            "place": [list(p) for p in shape.place],
+            "drive_angle": list(shape.drive_angle),
+            "roller_angle": list(shape.roller_angle),
+            "grips": list(shape.grips),
+            "gear_ratio": shape.gear_ratio,
+        },
+        "surfaces": list(robot.surfaces.labels),
+        "loads": list(robot.body.loads),
+        "sessions": list(robot.camera.sessions),
+        "centre": list(robot.camera.centre),
+        "values": {e.path: np.asarray(e.get(robot)).tolist() for e in entries(robot)},
+    }
+
+
+def _robot_of(kept: Mapping[str, Any]) -> Robot:
+    shape = kept["geometry"]
+    geometry = Geometry(
+        drive_offset=np.zeros(len(shape["place"])),
+        place=tuple((p[0], p[1]) for p in shape["place"]),
+        drive_angle=tuple(shape["drive_angle"]),
+        roller_angle=tuple(shape["roller_angle"]),
+        grips=tuple(shape["grips"]),
+        gear_ratio=shape["gear_ratio"],
+    )
+    robot = build(
+        geometry, kept["surfaces"], kept["loads"], kept["sessions"], centre=tuple(kept["centre"])
+    )
+    leaves: dict[tuple[str, ...], list[Any]] = {}
+    whole: dict[tuple[str, ...], bool] = {}
+    for e in entries(robot):
+        leaves.setdefault(e.leaf, []).append(kept["values"][e.path])
+        whole[e.leaf] = e.index is None
+    values = [jnp.asarray(v[0] if whole[leaf] else v) for leaf, v in leaves.items()]
+
+    def where(tree: Any) -> list[Any]:
+        return [Entry("", None, leaf, None, 0).get(tree) for leaf in leaves]  # type: ignore[arg-type]
+
+    restored: Robot = eqx.tree_at(where, robot, values)
+    return restored
