@@ -1,12 +1,13 @@
 """Many ragged runs as one set of flat arrays, and the windows a likelihood sums over."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from slipid.data.log import DataError, Log
+from slipid.data.signal import bridge_stalls
 
 MOVED = 0.010
 """A run counts from where the fastest wheel's rim has moved this far [m]."""
@@ -20,7 +21,8 @@ class Dataset:
         logs: the runs; their arrays are views of the flat ones below.
         offset: where each run starts, one more than runs.
         time: [s] (sample,)
-        wheel_angle: [rad] (sample, wheel)
+        wheel_angle: [rad] (sample, wheel), stalls of the telemetry bridged.
+        live: False in the rows of a stall, whose currents are stale.
         pose: x [m], y [m], heading [rad], in the scale of the log.
         current: [A] or None, voltage: [V] or None.
         session: name per run, of the time the marker stayed as it was.
@@ -34,6 +36,7 @@ class Dataset:
     wheel_angle: Float[np.ndarray, "sample wheel"]
     pose: Float[np.ndarray, "sample 3"]
     fresh: Bool[np.ndarray, " sample"]
+    live: Bool[np.ndarray, " sample"]
     current: Float[np.ndarray, "sample wheel"] | None
     voltage: Float[np.ndarray, "sample wheel"] | None
     current_is_signed: bool
@@ -85,6 +88,7 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
         parts = [getattr(log, name) for log in logs]
         return None if any(p is None for p in parts) else np.concatenate(parts)
 
+    bridged = [bridge_stalls(log.time, log.wheel_angle) for log in logs]
     pose = flat("pose")
     assert pose is not None
     fresh = flat("pose_fresh")
@@ -92,9 +96,10 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
         logs=tuple(logs),
         offset=offset,
         time=np.concatenate([log.time for log in logs]),
-        wheel_angle=np.concatenate([log.wheel_angle for log in logs]),
+        wheel_angle=np.concatenate([angle for angle, _ in bridged]),
         pose=pose,
         fresh=np.ones(len(pose), bool) if fresh is None else fresh,
+        live=np.concatenate([~stalled for _, stalled in bridged]),
         current=flat("current"),
         voltage=flat("voltage"),
         current_is_signed=all(log.current_is_signed for log in logs),
@@ -155,6 +160,10 @@ class Windows:
 
     def __len__(self) -> int:
         return len(self.run)
+
+    def of_runs(self, run: Int[np.ndarray, " piece"]) -> "Windows":
+        """The same pieces, said to be of other runs (of the dataset a subset was taken from)."""
+        return replace(self, run=run)
 
 
 def windows(
@@ -265,22 +274,31 @@ def _cut(data: Dataset, run: int, edges: np.ndarray, lag: float, parts: dict[str
         np.maximum(np.searchsorted(t, at[1:]), np.searchsorted(t, at[:-1]) + 1),
     )
     zero = np.zeros((len(edges) - 1, angle.shape[1]))
-    mean_i, var_i = (zero, zero) if data.current is None else _mean(data.current[rows], lo, hi)
-    if data.current is not None and not data.current_is_signed:
-        mean_i, var_i = _mean(np.abs(data.current[rows]), lo, hi)
-    mean_v = zero if data.voltage is None else _mean(data.voltage[rows], lo, hi)[0]
+    live = data.live[rows].astype(float)[:, None]
+    mean_i = var_i = mean_v = zero
+    if data.current is not None:
+        amps = data.current[rows]
+        mean_i, var_i = _mean(amps if data.current_is_signed else np.abs(amps), live, lo, hi)
+    if data.voltage is not None:
+        mean_v, _ = _mean(data.voltage[rows], live, lo, hi)
     parts["I"].append(mean_i)
     parts["s2"].append(var_i)
     parts["V"].append(mean_v)
 
 
-def _mean(x: np.ndarray, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over rows lo..hi of each window, and the variance of that mean."""
-    one = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
-    two = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x * x, axis=0)])
+def _mean(
+    x: np.ndarray, live: np.ndarray, lo: np.ndarray, hi: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over the live rows lo..hi of each window, and the variance of that mean."""
+
+    def total(values: np.ndarray) -> np.ndarray:
+        summed = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+        return np.asarray(summed[hi] - summed[lo])
+
     lo, hi = np.minimum(lo, len(x) - 1), np.minimum(hi, len(x))
     hi = np.maximum(hi, lo + 1)
-    n = (hi - lo)[:, None]
-    mean = (one[hi] - one[lo]) / n
-    var = np.maximum((two[hi] - two[lo]) / n - mean**2, 0.0) / n
-    return mean, var
+    if (total(live) < 1).any():
+        live = np.ones_like(live)
+    n = total(live)
+    mean = total(x * live) / n
+    return mean, np.maximum(total(x * x * live) / n - mean**2, 0.0) / n

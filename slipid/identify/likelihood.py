@@ -158,7 +158,11 @@ class Noise:
     blocks: dict[str, Components]
 
 
-_MOTION = (("along", "m/sqrt(m)", 0.002), ("across", "m/sqrt(m)", 0.002), ("yaw", "rad/sqrt(m)", 0.01))
+_MOTION = (
+    ("along", "m/sqrt(m)", 0.002),
+    ("across", "m/sqrt(m)", 0.002),
+    ("yaw", "rad/sqrt(m)", 0.01),
+)
 _EFFECT = (("along", "m/m", 0.01), ("across", "m/m", 0.01), ("yaw", "rad/m", 0.03))
 
 
@@ -194,7 +198,9 @@ def travel(windows: Windows, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     step = windows.turn * float(robot.geometry.wheel_radius) @ j.T
     far = np.linalg.norm(step[..., :2], axis=-1)
     turned = np.abs(step[..., 2]) * float(robot.geometry.base_radius)
-    u = np.where(far[..., None] > 1e-6, step[..., :2] / np.maximum(far, 1e-9)[..., None], [1.0, 0.0])
+    u = np.where(
+        far[..., None] > 1e-6, step[..., :2] / np.maximum(far, 1e-9)[..., None], [1.0, 0.0]
+    )
     return far + turned, u
 
 
@@ -205,7 +211,9 @@ def _motion_components(windows: Windows, robot: Robot) -> Components:
     place, heading = np.zeros((n, 3 * k, 2 * (k + 1))), np.zeros((n, 3 * k, k + 1))
     for j in range(k):
         th = windows.pose[:, j, 2]
-        back = np.stack([np.cos(th), np.sin(th), -np.sin(th), np.cos(th)], -1).reshape(n, 2, 2) * scale
+        back = (
+            np.stack([np.cos(th), np.sin(th), -np.sin(th), np.cos(th)], -1).reshape(n, 2, 2) * scale
+        )
         place[:, 3 * j : 3 * j + 2, 2 * j : 2 * j + 2] = -back
         place[:, 3 * j : 3 * j + 2, 2 * j + 2 : 2 * j + 4] = back
         move = np.einsum("nij,nj->ni", back, windows.pose[:, j + 1, :2] - windows.pose[:, j, :2])

@@ -1,0 +1,326 @@
+"""Rungs below the force balance: encoders, slip curves wheel by wheel, and a lookup by heading.
+
+All share one interface, `fit(windows, robot)` then `increments(windows, robot)`, and are judged in
+the same corrected metres as the force balance (METHODS 3A, 3C, 6). Residuals are in displacement,
+so nothing is divided by a wheel speed.
+"""
+
+import abc
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares, lsq_linear
+
+from slipid.data.dataset import Windows
+from slipid.identify.likelihood import measured
+from slipid.model.motor import signed
+from slipid.model.robot import Robot, advance
+
+Increments = Float[np.ndarray, "piece window 3"]
+
+
+class Rung(abc.ABC):
+    """A model that turns wheel motion into marker increments."""
+
+    name: str
+    state: dict[str, np.ndarray]
+    """Fitted numbers of each floor; with the name enough to build the rung again."""
+
+    @abc.abstractmethod
+    def fit(self, w: Windows, robot: Robot) -> "Rung":
+        """The rung fitted to these windows, floor by floor."""
+
+    @abc.abstractmethod
+    def increments(self, w: Windows, robot: Robot) -> Increments:
+        """Marker increments of every window [m, m, rad]."""
+
+
+@jax.jit
+def _seen(robot: Robot, xi: Any, dt: Any, session: Any) -> Any:
+    one = lambda x, t, s: robot.camera.seen(advance(x, t), s)  # noqa: E731
+    return jax.vmap(jax.vmap(one, (0, 0, None)))(xi, dt, session)
+
+
+def as_increments(twist: np.ndarray, w: Windows, robot: Robot) -> Increments:
+    """Marker increments of body twists (piece, window, 3)."""
+    session = jnp.asarray([robot.session_index(s) for s in w.session])
+    return np.asarray(_seen(robot, jnp.asarray(twist), jnp.asarray(w.dt), session))
+
+
+def body_twist(w: Windows, robot: Robot) -> np.ndarray:
+    """Measured body twist of every window: the marker yaw taken out of the increment, over dt."""
+    seen = np.asarray(jax.jit(measured)(robot, jnp.asarray(w.pose)))
+    psi = np.array([float(robot.camera.yaw(robot.session_index(s))) for s in w.session])[:, None]
+    # a chord is the arc times sinc, and points half the turn away from its start
+    arc = 1.0 / np.sinc(seen[..., 2] / (2 * np.pi))
+    back = psi - 0.5 * seen[..., 2]
+    c0, s0 = np.cos(back), np.sin(back)
+    x = c0 * seen[..., 0] - s0 * seen[..., 1]
+    y = s0 * seen[..., 0] + c0 * seen[..., 1]
+    return np.stack([x * arc, y * arc, seen[..., 2]], -1) / w.dt[..., None]
+
+
+def _by_floor(w: Windows) -> dict[str, np.ndarray]:
+    floor = np.asarray(w.surface)
+    return {str(name): floor == name for name in dict.fromkeys(w.surface)}
+
+
+def _need(floors: dict[str, Any], name: str) -> Any:
+    if name not in floors:
+        raise ValueError(f"no surface '{name}'; identified: {', '.join(floors)}")
+    return floors[name]
+
+
+@dataclass(frozen=True)
+class Encoder(Rung):
+    """No slip: xi = J^+ r w."""
+
+    name: str = "encoder"
+    state: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def fit(self, w: Windows, robot: Robot) -> "Encoder":
+        return self
+
+    def increments(self, w: Windows, robot: Robot) -> Increments:
+        j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
+        return as_increments((w.turn / w.dt[..., None]) @ j.T, w, robot)
+
+
+Features = Callable[[np.ndarray], np.ndarray]
+"""From the regressor (...,) to features (..., k); slip is their weighted sum."""
+
+
+@dataclass(frozen=True)
+class Curve(Rung):
+    """Slip of each wheel as a function of its own current or torque, linear in coefficients.
+
+        s_i = sum_k beta_k phi_k(x_i),   xi = J^+ r (w (1 - s))
+
+    Attributes:
+        features: phi.
+        torque: x is M = C_e I + R I^2/wm [N m] instead of the current [A].
+        per_wheel: own coefficients for every wheel.
+        positive: coefficients from here on are not negative (a monotone curve).
+    """
+
+    name: str
+    features: Features
+    torque: bool = False
+    per_wheel: bool = False
+    positive: int | None = None
+    state: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def _design(self, w: Windows, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+        """Twist without slip, and its change per coefficient (piece, window, 3, k)."""
+        j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
+        speed = w.turn / w.dt[..., None]
+        phi = self.features(regressor(w, robot, speed, self.torque))
+        moved = np.einsum("aw,npw,npwk->npawk", j, speed, phi)
+        lost = moved.reshape(*moved.shape[:3], -1) if self.per_wheel else moved.sum(axis=3)
+        return speed @ j.T, lost
+
+    def fit(self, w: Windows, robot: Robot) -> "Curve":
+        free, lost = self._design(w, robot)
+        gap = (free - body_twist(w, robot)) * w.dt[..., None]
+        lost = lost * w.dt[..., None, None]
+        scale = np.array([1.0, 1.0, float(robot.geometry.base_radius)])
+        beta = {}
+        for name, mine in _by_floor(w).items():
+            a = (lost[mine] * scale[:, None]).reshape(-1, lost.shape[-1])
+            b = (gap[mine] * scale).ravel()
+            lower = np.full(a.shape[1], -np.inf)
+            if self.positive is not None:
+                lower[self.positive :] = 0.0
+            beta[name] = lsq_linear(a, b, (lower, np.inf)).x
+        return replace(self, state=beta)
+
+    def increments(self, w: Windows, robot: Robot) -> Increments:
+        free, lost = self._design(w, robot)
+        beta = np.stack([_need(self.state, s) for s in w.surface])
+        return as_increments(free - np.einsum("npak,nk->npa", lost, beta), w, robot)
+
+
+def regressor(w: Windows, robot: Robot, speed: np.ndarray, torque: bool) -> np.ndarray:
+    """|I| [A] or |M| [N m] of every wheel and window."""
+    if not w.has_current:
+        return np.zeros_like(speed)
+    amps = np.abs(w.current)
+    if not torque:
+        return amps
+    along = np.asarray(signed(jnp.asarray(amps), jnp.asarray(speed), robot.motor.gear_ratio))
+    return np.abs(np.asarray(robot.motor.characteristic(jnp.asarray(along), jnp.asarray(speed))))
+
+
+@dataclass(frozen=True)
+class Saturating(Rung):
+    """Janosi-Hanamoto read backwards: M = M_max (1 - exp(-s / kappa)), s on the rising branch.
+
+        s = -kappa log(1 - min(M / M_max, 0.98))
+
+    Source: Janosi and Hanamoto 1961; METHODS 3A.
+    """
+
+    name: str = "saturating"
+    state: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @staticmethod
+    def slip(m: np.ndarray, shape: np.ndarray) -> np.ndarray:
+        kappa, m_max = np.exp(shape[..., 0]), np.exp(shape[..., 1])
+        return -kappa * np.log1p(-np.minimum(m / m_max, 0.98))
+
+    def fit(self, w: Windows, robot: Robot) -> "Saturating":
+        j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
+        speed = w.turn / w.dt[..., None]
+        m, true = regressor(w, robot, speed, True), body_twist(w, robot)
+        scale = np.array([1.0, 1.0, float(robot.geometry.base_radius)])
+        shape = {}
+        for name, mine in _by_floor(w).items():
+
+            def gap(q: np.ndarray, mine: np.ndarray = mine) -> np.ndarray:
+                xi = (speed[mine] * (1 - self.slip(m[mine], q))) @ j.T
+                return np.asarray(((xi - true[mine]) * w.dt[mine][..., None] * scale).ravel())
+
+            top = float(np.log(max(m[mine].max(), 1e-3) * 1.5))
+            tries = [least_squares(gap, [np.log(k), top], max_nfev=200) for k in (0.05, 0.3, 1.0)]
+            shape[name] = min(tries, key=lambda r: r.cost).x
+        return replace(self, state=shape)
+
+    def increments(self, w: Windows, robot: Robot) -> Increments:
+        j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
+        speed = w.turn / w.dt[..., None]
+        shape = np.stack([_need(self.state, s) for s in w.surface])[:, None, None, :]
+        slip = self.slip(regressor(w, robot, speed, True), shape)
+        return as_increments((speed * (1 - slip)) @ j.T, w, robot)
+
+
+@dataclass(frozen=True)
+class HeadingLookup(Rung):
+    """Encoders corrected by a Fourier series in the direction of travel, per floor (METHODS 3C).
+
+    Displacement along and across the encoders' direction, and yaw, per metre of wheel motion. Order
+    by cross-validation over runs within the data it is fitted to.
+    """
+
+    name: str = "heading_lookup"
+    state: dict[str, np.ndarray] = field(default_factory=dict)
+    orders: Sequence[int] = (2, 3, 4, 6)
+
+    def fit(self, w: Windows, robot: Robot) -> "HeadingLookup":
+        angle, far, _ = _direction(w, robot)
+        true = body_twist(w, robot) * w.dt[..., None]
+        c, s = np.cos(angle), np.sin(angle)
+        along = c * true[..., 0] + s * true[..., 1]
+        across = -s * true[..., 0] + c * true[..., 1]
+        target = np.stack([along, across, true[..., 2]], -1)
+        out = {}
+        for name, mine in _by_floor(w).items():
+            far_m = far[mine]
+            best = min(
+                self.orders,
+                key=lambda k: self._cv(angle[mine], far_m, target[mine], k, w.run[mine]),
+            )
+            out[name] = _ridge(_fourier(angle[mine], best), far_m, target[mine])
+        return replace(self, state=out)
+
+    @staticmethod
+    def _cv(
+        angle: np.ndarray, far: np.ndarray, target: np.ndarray, order: int, run: np.ndarray
+    ) -> float:
+        phi, fold = _fourier(angle, order), run % 5
+        loss = 0.0
+        for k in range(5):
+            test = fold == k
+            if test.any() and not test.all():
+                beta = _ridge(phi[~test], far[~test], target[~test])
+                gap = target[test] - far[test][..., None] * (phi[test] @ beta)
+                loss += float((gap**2 * np.array([1.0, 1.0, 0.02])).sum())
+        return loss
+
+    def increments(self, w: Windows, robot: Robot) -> Increments:
+        angle, far, turn = _direction(w, robot)
+        out = np.zeros((*angle.shape, 3))
+        for n, floor in enumerate(w.surface):
+            beta = _need(self.state, floor)
+            out[n] = far[n][:, None] * (_fourier(angle[n], (len(beta) - 1) // 2) @ beta)
+        c, s = np.cos(angle), np.sin(angle)
+        x, y = c * out[..., 0] - s * out[..., 1], s * out[..., 0] + c * out[..., 1]
+        still = far < 1e-6
+        yaw = np.where(still, turn, out[..., 2])
+        return as_increments(np.stack([x, y, yaw], -1) / w.dt[..., None], w, robot)
+
+
+def _direction(w: Windows, robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
+    step = w.turn @ j.T
+    return (
+        np.arctan2(step[..., 1], step[..., 0]),
+        np.hypot(step[..., 0], step[..., 1]),
+        step[..., 2],
+    )
+
+
+def _fourier(angle: np.ndarray, order: int) -> np.ndarray:
+    waves = [f(k * angle) for k in range(1, order + 1) for f in (np.cos, np.sin)]
+    return np.stack([np.ones_like(angle), *waves], -1)
+
+
+def _ridge(phi: np.ndarray, far: np.ndarray, target: np.ndarray) -> np.ndarray:
+    a = (phi * far[..., None]).reshape(-1, phi.shape[-1])
+    penalty = 1e-3 * np.trace(a.T @ a) / a.shape[1] * np.eye(a.shape[1])
+    penalty[0, 0] = 0.0
+    return np.asarray(np.linalg.solve(a.T @ a + penalty, a.T @ target.reshape(-1, 3)))
+
+
+def _powers(*exponents: int) -> Features:
+    return lambda x: np.stack([x**k for k in exponents], -1)
+
+
+def _above(threshold: float) -> Features:
+    """The deployed form of the paper: affine above a current, no slip below (METHODS 6)."""
+    return lambda x: np.stack([np.where(x > threshold, x, 0.0), (x > threshold) * 1.0], -1)
+
+
+def _ramps(knots: Sequence[float]) -> Features:
+    """I-spline of degree 1: a constant and rising ramps between knots; monotone if weights >= 0."""
+    edges = np.asarray([*knots])
+
+    def phi(x: np.ndarray) -> np.ndarray:
+        ramps = [np.clip((x - a) / (b - a), 0, 1) for a, b in zip(edges, edges[1:], strict=False)]
+        return np.stack([np.ones_like(x), *ramps], -1)
+
+    return phi
+
+
+def rungs(has_current: bool) -> list[Rung]:
+    """Every rung that the logs allow, unfitted; `paper` is the form the authors ran on the robot."""
+    out: list[Rung] = [Encoder(), Curve("constant", _powers(0))]
+    if has_current:
+        out += [
+            Curve("linear", _powers(1), torque=True),
+            Curve("affine", _powers(0, 1), torque=True),
+            Curve("quadratic", _powers(0, 1, 2), torque=True),
+            Saturating(),
+            Curve(
+                "monotone_spline",
+                _ramps((0.0, 0.02, 0.04, 0.06, 0.1, 0.15, 0.25)),
+                torque=True,
+                positive=1,
+            ),
+            Curve("affine_current", _powers(0, 1)),
+            Curve("paper", _above(0.4), per_wheel=True),
+        ]
+    return [*out, HeadingLookup()]
+
+
+def restored(states: dict[str, dict[str, Any]]) -> list[Rung]:
+    """Rungs from their names and states, as `{rung.name: rung.state}` wrote them."""
+    known: dict[str, Any] = {rung.name: rung for rung in rungs(has_current=True)}
+    return [
+        replace(known[name], state={floor: np.asarray(v, float) for floor, v in state.items()})
+        for name, state in states.items()
+    ]
