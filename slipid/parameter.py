@@ -302,7 +302,11 @@ def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, A
     if std_si is None:
         spread = np.full(entry.coordinates, d.spread)
     elif d.shares:
-        spread = np.full(entry.coordinates, np.mean(std_si) * entry.size)
+        share = np.asarray(mean_si, float)
+        slopes = (np.diag(share) - np.outer(share, share)) @ share_basis(entry.size)
+        spread = np.full(
+            entry.coordinates, np.mean(std_si) / np.sqrt((slopes**2).sum(axis=1).mean())
+        )
     else:
         slope = [d.slope(float(v)) for v in np.atleast_1d(np.asarray(mean_si, float))]
         spread = np.broadcast_to(np.asarray(std_si, float), (entry.size,)) / np.asarray(slope)
