@@ -76,6 +76,28 @@ def identify(
 
 @app.command()
 @guarded
+def check(
+    config: ConfigFile,
+    data: DataFolder,
+    out: MaybeOut = None,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Read and validate logs; say what they can tell before anything is fitted."""
+    from slipid.app import commands, tables
+    from slipid.app.progress import Reporter
+
+    with Reporter(quiet=quiet) as report:
+        found = commands.check(config, data, out, report)
+    if json is not None:
+        _emit(json, found)
+    if json != "-":
+        tables.check(found)
+    return 0
+
+
+@app.command()
+@guarded
 def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet = False) -> int:
     """Predict runs open loop and compare with the camera, model by model."""
     from slipid.app import commands, tables

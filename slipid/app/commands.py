@@ -153,6 +153,43 @@ def validate(out: Path, data: Path, report: Reporter) -> dict[str, Any]:
     return found
 
 
+def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> dict[str, Any]:
+    """What the logs hold, and what they can be expected to tell, before any fit.
+
+    Raises:
+        DataError: config or logs are wrong.
+    """
+    runtime.start()
+    from slipid.app.check import expected, overview
+    from slipid.app.job import read_job
+
+    config = read_config(config_path)
+    report.stage("reading logs")
+    job = read_job(config, data, report.count, report.line)
+    report.stage("expected information")
+    estimates, flat = expected(job)
+    found = overview(job) | {
+        "parameters": {
+            e.path: {
+                "unit": e.unit,
+                "start": e.value,
+                "expected_std": e.std,
+                "ratio": e.ratio,
+                "verdict": e.verdict,
+            }
+            for e in estimates
+        },
+        "messages": [f.text for f in flat],
+    }
+    if out is not None:
+        from slipid.app.raw_plots import raw_plots
+
+        report.stage("drawing")
+        write_json(out / "check.json", found)
+        raw_plots(job.dataset, out)
+    return found
+
+
 def _known(name: str, what: str, found: str, known: tuple[str, ...]) -> None:
     if found not in known:
         raise DataError(f"{name}: no {what} '{found}'; identified: {', '.join(known)}")

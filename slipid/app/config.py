@@ -231,9 +231,9 @@ def _steps(mapping: Any, loc: tuple[Any, ...]) -> list[Any]:
     steps: list[Any] = []
     here = mapping
     for k, part in enumerate(loc):
-        if isinstance(here, dict) and part in here:
-            here = here[part]
-        elif isinstance(here, list) and isinstance(part, int) and part < len(here):
+        if (isinstance(here, dict) and part in here) or (
+            isinstance(here, list) and isinstance(part, int) and part < len(here)
+        ):
             here = here[part]
         elif k < len(loc) - 1 or not isinstance(here, dict):
             continue

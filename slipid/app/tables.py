@@ -6,44 +6,48 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 COLOUR = {"identified": "green", "weak": "yellow", "not_identified": "red", "at_bound": "magenta"}
 
 
 def _console() -> Console:
-    return Console(highlight=False)
+    found = Console(highlight=False)
+    if not found.is_terminal:  # a file or a pipe has no width: do not wrap
+        found = Console(highlight=False, width=140)
+    return found
 
 
-def number(x: Any, digits: int = 4) -> str:
-    """A number or a few, short."""
-    if x is None:
-        return ""
-    if isinstance(x, Sequence):
-        return " ".join(number(v, digits) for v in x)
-    return f"{x:.{digits}g}"
-
-
-def _interval(x: Any) -> str:
-    if x is None:
-        return ""
-    if isinstance(x[0], Sequence):
-        return "  ".join(_interval(pair) for pair in x)
-    return f"{x[0]:.4g} .. {x[1]:.4g}"
+def _rows(e: Any) -> list[tuple[str, Any, Any]]:
+    """Name, value and interval of a scalar, or of each entry of a vector."""
+    if not e.labels:
+        return [(e.path, e.value, e.interval90)]
+    intervals = e.interval90 or [None] * len(e.labels)
+    names = [e.path] + [""] * (len(e.labels) - 1)
+    return [
+        (f"{name} [{label}]".strip(), value, interval)
+        for name, label, value, interval in zip(names, e.labels, e.value, intervals, strict=True)
+    ]
 
 
 def estimates(items: Iterable[Any], title: str) -> Table:
-    """Table of estimates; numbers of single sessions are left to the files."""
-    table = Table(title=title, title_justify="left", show_edge=False, pad_edge=False)
+    """Table of estimates; numbers of single sessions and defaults are left to the files."""
+    table = Table(title=title, title_justify="left", show_edge=False, pad_edge=False, box=None)
     for name in ("parameter", "value", "unit", "90 % interval", "verdict", "from"):
-        table.add_column(name, overflow="fold")
+        table.add_column(name, justify="right" if name == "value" else "left")
     for e in items:
-        if "session_yaw" in e.path or e.verdict == "fixed" and e.provenance == "borrowed":
+        if "session_yaw" in e.path or (e.verdict == "fixed" and e.provenance == "borrowed"):
             continue
         colour = COLOUR.get(e.verdict, "dim")
-        verdict = f"[{colour}]{e.verdict.replace('_', ' ')}[/{colour}]"
-        table.add_row(
-            e.path, number(e.value), e.unit, _interval(e.interval90), verdict, e.provenance
-        )
+        for k, (name, value, interval) in enumerate(_rows(e)):
+            table.add_row(
+                Text(name),
+                f"{value:.4g}",
+                e.unit,
+                "" if interval is None else f"{interval[0]:.4g} .. {interval[1]:.4g}",
+                "" if k else f"[{colour}]{e.verdict.replace('_', ' ')}[/{colour}]",
+                "" if k else e.provenance,
+            )
     return table
 
 
@@ -58,9 +62,50 @@ def identified(fit: Any, out: Path, written: Sequence[str]) -> None:
     console.print(f"in {out}: {', '.join(written)}", markup=False, soft_wrap=True)
 
 
+def check(found: dict[str, Any]) -> None:
+    """What `check` found."""
+    console = _console()
+    table = Table(show_edge=False, pad_edge=False, box=None)
+    for name in ("surface", "load", "session", "runs", "minutes", "headings", "speeds [m/s]"):
+        table.add_column(name)
+    for row in found["groups"]:
+        speeds = " ".join(f"{v:g}" for v in row["speeds"])
+        table.add_row(
+            row["surface"],
+            row["load"],
+            Text(row["session"]),
+            str(row["runs"]),
+            f"{row['seconds'] / 60:.1f}",
+            str(row["headings"]),
+            speeds,
+        )
+    console.print(table)
+    console.print("channels: " + ", ".join(found["channels"]), markup=False, soft_wrap=True)
+    for note, count in found["notes"].items():
+        console.print(f"repaired in {count} runs: {note}", markup=False, soft_wrap=True)
+    before = Table(
+        title="before any fit: what the logs can be expected to tell",
+        title_justify="left",
+        show_edge=False,
+        pad_edge=False,
+        box=None,
+    )
+    for name in ("parameter", "unit", "std after / before", "verdict"):
+        before.add_column(name)
+    for path, e in found["parameters"].items():
+        if e["ratio"] is None or "session_yaw" in path:
+            continue
+        colour = COLOUR.get(e["verdict"], "dim")
+        verdict = f"[{colour}]{e['verdict'].replace('_', ' ')}[/{colour}]"
+        before.add_row(Text(path), e["unit"], f"{e['ratio']:.3f}", verdict)
+    console.print(before)
+    for sentence in found["messages"]:
+        console.print(f"note: {sentence}", markup=False, soft_wrap=True)
+
+
 def validation(found: dict[str, Any]) -> None:
     """Summary of a validation: one row per floor and model."""
-    table = Table(show_edge=False, pad_edge=False)
+    table = Table(show_edge=False, pad_edge=False, box=None)
     for name in ("surface", "model", "end-point error", "median", "length", "heading"):
         table.add_column(name)
     table.add_column("in 90 %")
@@ -84,3 +129,7 @@ def validation(found: dict[str, Any]) -> None:
 
 def _percent(x: float | None) -> str:
     return "" if x is None else f"{100 * x:.2f} %"
+
+
+def _degrees(x: float | None) -> str:
+    return "" if x is None else f"{x:.2f} deg"

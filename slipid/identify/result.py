@@ -4,7 +4,7 @@ import hashlib
 import io
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -22,9 +22,11 @@ from slipid.identify.fit import Optimum, Problem
 from slipid.identify.verdict import Estimate, Flat, estimates, flat_directions
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, build
-from slipid.parameter import Choice, Entry, Space, entries
+from slipid.parameter import Choice, Space, entries
 
 SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/1"
+CONFLICT = 4.0
+"""Prior stds from the prior mean beyond which a reader is told."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,14 @@ class Fit:
     def parameters(self) -> dict[str, Estimate]:
         """Every number by path, with interval and verdict."""
         found = estimates(self.space, self.choices, self.z, self.covariance, self.has["voltage"])
-        return {e.path: e for e in found}
+        # a number whose scale rests on another one's prior was not measured, however narrow
+        open_ = {path for f in self.flat for path in f.paths}
+        return {
+            e.path: replace(e, provenance="borrowed")
+            if e.path in open_ and e.provenance == "measured"
+            else e
+            for e in found
+        }
 
     @cached_property
     def flat(self) -> tuple[Flat, ...]:
@@ -100,6 +109,12 @@ class Fit:
             f"{e.path} ended at its bound ({e.value:.3g} {e.unit})"
             for e in self.parameters.values()
             if e.verdict == "at_bound" and isinstance(e.value, float)
+        ]
+        said += [
+            f"{e.path} lies {abs(e.pull):.1f} prior stds from its prior: "
+            "the prior is wrong, or the model lacks something"
+            for e in self.parameters.values()
+            if e.pull is not None and abs(e.pull) > CONFLICT and e.verdict != "at_bound"
         ]
         if not self.converged:
             said.append(f"the fit did not converge: {self.reason}")
@@ -352,7 +367,7 @@ def _robot_of(kept: Mapping[str, Any]) -> Robot:
     values = [jnp.asarray(v[0] if whole[leaf] else v) for leaf, v in leaves.items()]
 
     def where(tree: Any) -> list[Any]:
-        return [Entry("", None, leaf, None, 0).get(tree) for leaf in leaves]  # type: ignore[arg-type]
+        return [reduce(getattr, leaf, tree) for leaf in leaves]
 
     restored: Robot = eqx.tree_at(where, robot, values)
     return restored

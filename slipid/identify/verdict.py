@@ -12,8 +12,9 @@ from slipid.parameter import Choice, Entry, Space
 
 IDENTIFIED, WEAK = 0.3, 0.8
 """Largest std(posterior) / std(prior) of the verdicts, in the search space."""
-TAIL = 4.0
-"""Prior stds below which a positive number counts as being at 0."""
+TAIL, SMALL = 4.0, 0.05
+"""A positive number counts as being at 0 when it is so many prior stds below its prior mean, and
+below this part of it: a tight prior that the data contradict is something else."""
 NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
 """Without a voltage nothing sets the scale of these; a prior elsewhere must not lend them one."""
 _Z95 = 1.6448536269514722
@@ -28,9 +29,11 @@ class Estimate:
         value, std: [unit], a float or one per label; std is None where it was fixed.
         interval90: equal-tailed, (low, high), or one such pair per label.
         labels: of a vector's entries, () for a scalar.
-        verdict: identified, weak, not_identified, at_bound or fixed; of a vector its worst direction.
-        provenance: measured (data decide), borrowed (prior or datasheet decides), override (user).
+        verdict: identified, weak, not_identified, at_bound or fixed; of a vector the verdict of its
+            worst direction.
+        provenance: measured (data decide), borrowed (a prior decides), override (user).
         ratio: std(posterior) / std(prior) in the search space, None where it was fixed.
+        pull: (estimate - prior mean) / std(prior), of a vector the largest, None where fixed.
         prior_mean, prior_std: [unit], None where it was fixed.
     """
 
@@ -44,6 +47,7 @@ class Estimate:
     verdict: str
     provenance: str
     ratio: float | None
+    pull: float | None
     prior_mean: Any
     prior_std: Any
     source: str = "laplace"
@@ -111,6 +115,7 @@ def _fixed(entry: Entry, tree: Any, choices: Sequence[Choice]) -> Estimate:
         verdict="fixed",
         provenance="override" if chosen else "borrowed",
         ratio=None,
+        pull=None,
         prior_mean=None,
         prior_std=None,
     )
@@ -144,7 +149,8 @@ def _free(
         wide = np.array([d.slope(float(v)) for v in center]) * prior_std
     scaled = block / prior_std[:, None] / prior_std[None, :]
     ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
-    verdict = _verdict(entry, value, (mean - prior_mean) / prior_std, ratio, has_voltage)
+    pull = (mean - prior_mean) / prior_std
+    verdict = _verdict(entry, value, pull, prior_std, ratio, has_voltage)
     return Estimate(
         path=entry.path,
         unit=d.unit,
@@ -159,6 +165,7 @@ def _free(
         if verdict != "not_identified" and ratio < np.sqrt(0.5)
         else "borrowed",
         ratio=ratio,
+        pull=float(pull[np.argmax(np.abs(pull))]),
         prior_mean=_plain(center),
         prior_std=_plain(wide),
     )
@@ -176,7 +183,12 @@ def _pairs(low: np.ndarray, high: np.ndarray) -> Any:
 
 
 def _verdict(
-    entry: Entry, value: np.ndarray, place: np.ndarray, ratio: float, has_voltage: bool
+    entry: Entry,
+    value: np.ndarray,
+    place: np.ndarray,
+    prior_std: np.ndarray,
+    ratio: float,
+    has_voltage: bool,
 ) -> str:
     d = entry.declaration
     if entry.path in NEEDS_VOLTAGE and not has_voltage:
@@ -185,8 +197,10 @@ def _verdict(
         part = (value - d.lower) / (d.upper - d.lower)
         if (part < 0.01).any() or (part > 0.99).any():
             return "at_bound"
-    elif np.isfinite(d.lower) and not d.shares and (place < -TAIL).any():
-        return "at_bound"
+    elif np.isfinite(d.lower) and not d.shares:
+        below = place * prior_std
+        if ((place < -TAIL) & (below < np.log(SMALL))).any():
+            return "at_bound"
     if ratio < IDENTIFIED:
         return "identified"
     return "weak" if ratio < WEAK else "not_identified"
@@ -249,10 +263,19 @@ def _text(
     else:
         remedy = "drive with other loads and speeds, or weigh the robot"
     if len(paths) == 1:
-        return f"{paths[0]} is not touched by the data: {remedy}"
-    parts = [p if abs(k - 1) < 0.05 else f"{p}^{k:g}" for p, k in zip(paths, powers, strict=True)]
+        return f"the data say next to nothing of {paths[0]}: {remedy}"
     if all(abs(k - 1) < 0.05 for k in powers):
-        last, *others = sorted(paths, key=lambda p: (p == NEEDS_VOLTAGE[1], p), reverse=True)
-        ratios = ", ".join(f"{p}/{last}" for p in sorted(others))
-        return f"{', '.join(paths)} only as {ratios}: {remedy}"
-    return f"{' * '.join(parts)} (all times t to the power shown, any t): {remedy}"
+        short = _short(paths)
+        last = NEEDS_VOLTAGE[1] if NEEDS_VOLTAGE[1] in short else short[0]
+        ratios = ", ".join(f"{p}/{last}" for p in short if p != last)
+        return f"{', '.join(short)} only as {ratios}: {remedy}"
+    parts = [p if abs(k - 1) < 0.05 else f"{p}^{k:g}" for p, k in zip(paths, powers, strict=True)]
+    return f"{', '.join(parts)} (each times t to the power shown, any t): {remedy}"
+
+
+def _short(paths: tuple[str, ...]) -> list[str]:
+    """The paths, with one pattern in place of the frictions of several floors."""
+    floors = [p for p in paths if p.startswith("surface.")]
+    if len(floors) < 2:
+        return list(paths)
+    return [p for p in paths if p not in floors] + ["surface.*.friction"]
