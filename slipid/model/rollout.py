@@ -1,0 +1,266 @@
+"""One instant's physics over time: replay of measured wheels, simulation of commanded ones.
+
+Both integrate the body by implicit Euler on the twist and exactly on SE(2):
+
+    0 = contact forces(xi, r w) - M (xi - xi_before) / dt,     pose <- pose * exp(xi dt)
+
+with M = 0 (quasi-static) unless the body's inertia is asked for. `jax.vmap` lifts both over runs.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from slipid.model import contact
+from slipid.model.geometry import Frame
+from slipid.model.robot import GRAVITY, Robot, advance, compose, twist, wheel_torque
+
+_NEWTON = 6
+_DAMPING = (1.0, 0.5, 0.2, 0.05)
+
+
+class SpeedLoop(eqx.Module):
+    """PI control of each wheel's speed with feed-forward of the back-EMF, in volts.
+
+    U = clip(kf C_e n w_ref + kp (w_ref - w) + ki integral(w_ref - w) dt, -limit, limit)
+
+    Attributes:
+        proportional: kp [V s/rad] per wheel speed.
+        integral: ki [V/rad].
+        feed_forward: kf [1], share of the back-EMF at the set speed.
+        limit: largest voltage [V]; the integral rests while it is reached.
+    """
+
+    proportional: Float[Array, ""] = eqx.field(default=0.8, converter=jnp.asarray)
+    integral: Float[Array, ""] = eqx.field(default=8.0, converter=jnp.asarray)
+    feed_forward: Float[Array, ""] = eqx.field(default=1.0, converter=jnp.asarray)
+    limit: Float[Array, ""] = eqx.field(default=24.0, converter=jnp.asarray)
+
+
+class Simulated(eqx.Module):
+    """A simulated run, everything at the instants of `time`; voltages hold until the next one.
+
+    Attributes:
+        time: [s]; wheel_angle: [rad]; wheel_speed: [rad/s]; current: [A], signed; voltage: [V];
+            twist: of the body [m/s, m/s, rad/s]; pose: of the body [m, m, rad].
+    """
+
+    time: Float[Array, " time"]
+    wheel_angle: Float[Array, "time wheel"]
+    wheel_speed: Float[Array, "time wheel"]
+    current: Float[Array, "time wheel"]
+    voltage: Float[Array, "time wheel"]
+    twist: Float[Array, "time 3"]
+    pose: Float[Array, "time 3"]
+
+
+def inertia(robot: Robot, surface: Int[Array, ""] | int) -> Float[Array, "3"]:
+    """Mass, mass and yaw inertia in units of mu m g [s^2/m, s^2/m, s^2 m]."""
+    weight = robot.surfaces.at(surface).friction * robot.body.mass * GRAVITY
+    return jnp.stack([robot.body.mass, robot.body.mass, robot.body.yaw_inertia]) / weight
+
+
+def path(
+    xi: Float[Array, "step 3"], dt: Float[Array, " step"], start: Float[Array, "3"]
+) -> Float[Array, "edge 3"]:
+    """Poses before the first and after every step at constant twists (exact SE(2))."""
+
+    def step(pose: Array, increment: Array) -> tuple[Array, Array]:
+        pose = compose(pose, increment)
+        return pose, pose
+
+    poses = jax.lax.scan(step, start, jax.vmap(advance)(xi, dt))[1]
+    return jnp.concatenate([start[None], poses])
+
+
+def replay_twist(
+    robot: Robot,
+    dt: Float[Array, " step"],
+    wheel_speed: Float[Array, "step wheel"],
+    surface: Int[Array, ""] | Int[Array, " step"] | int,
+    load: Int[Array, ""] | int,
+    *,
+    body_inertia: bool = False,
+) -> Float[Array, "step 3"]:
+    """Body twists of a robot whose wheels turn at given speeds.
+
+    Args:
+        robot: its numbers.
+        dt: length of every step [s].
+        wheel_speed: mean over every step [rad/s].
+        surface: index of the floor, one or one per step.
+        load: index of the load set-up.
+        body_inertia: the body starts at rest and has mass; otherwise forces balance at once.
+
+    Source: METHODS 3B.
+    """
+    frame, load = robot.geometry.frame(), jnp.asarray(load)
+    floors = jnp.broadcast_to(jnp.asarray(surface), dt.shape)
+    if not body_inertia:
+        return jax.vmap(lambda w, floor: twist(robot, frame, w, floor, load))(wheel_speed, floors)
+    rest = robot.body.load_share[load]
+
+    def step(before: Array, now: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        w, floor, h = now
+        rim, mass = frame.radius * w, inertia(robot, floor)
+        xi = contact.step_with_inertia(rim, frame, robot.surfaces.at(floor), rest, before, mass, h)
+        return xi, xi
+
+    return jax.lax.scan(step, jnp.zeros(3), (wheel_speed, floors, dt))[1]
+
+
+def replay(
+    robot: Robot,
+    time: Float[Array, " time"],
+    wheel_angle: Float[Array, "time wheel"],
+    surface: Int[Array, ""] | Int[Array, " step"] | int,
+    load: Int[Array, ""] | int,
+    start: Float[Array, "3"] | None = None,
+    *,
+    body_inertia: bool = False,
+) -> Float[Array, "time 3"]:
+    """Body poses [m, m, rad] of a robot whose wheels turned as measured.
+
+    Args:
+        robot: its numbers.
+        time: [s], increasing.
+        wheel_angle: [rad] at every time.
+        surface: index of the floor, one or one per step between times.
+        load: index of the load set-up.
+        start: first pose, at the origin by default.
+        body_inertia: as of `replay_twist`.
+    """
+    dt = jnp.diff(time)
+    speed = jnp.diff(wheel_angle, axis=0) / dt[:, None]
+    xi = replay_twist(robot, dt, speed, surface, load, body_inertia=body_inertia)
+    return path(xi, dt, jnp.zeros(3) if start is None else start)
+
+
+def simulate(
+    robot: Robot,
+    loop: SpeedLoop,
+    command: Float[Array, "step wheel"],
+    dt: Float[Array, ""] | float,
+    surface: Int[Array, ""] | Int[Array, " step"] | int,
+    load: Int[Array, ""] | int,
+    start: Float[Array, "3"] | None = None,
+    *,
+    inductance: bool = False,
+    body_inertia: bool = True,
+) -> Simulated:
+    """Run from rest under speed commands, through speed loop, motor, wheel and contact.
+
+        L_a dI/dt = U - R I - C_e n w - brush drop          (L_a = 0 without `inductance`)
+        n^2 J_m dw/dt = n eta C_e I - friction(w) - traction torque(xi, w)
+
+    Args:
+        robot: its numbers.
+        loop: speed control, sampled once a step.
+        command: set speed of each wheel in each step [rad/s].
+        dt: step [s]; implicit Euler, so stiff floors are no bar, a millisecond or two is precise.
+        surface: index of the floor, one or one per step.
+        load: index of the load set-up.
+        start: first pose, at the origin by default.
+        inductance: the current takes L_a / R to rise.
+        body_inertia: the body has mass; otherwise its forces balance at once.
+    """
+    frame, load = robot.geometry.frame(), jnp.asarray(load)
+    floors = jnp.broadcast_to(jnp.asarray(surface), command.shape[:1])
+    still = jnp.zeros(command.shape[1])
+
+    def step(state: tuple[Array, ...], now: tuple[Array, Array]) -> tuple[Any, Any]:
+        xi, w, amps, angle, total = state
+        want, floor = now
+        volt, total = _control(robot, loop, want, w, total, dt)
+        mass = inertia(robot, floor) / dt if body_inertia else jnp.zeros(3)
+        henry = robot.motor.inductance if inductance else jnp.zeros(())
+        args = (robot, frame, floor, load, mass, henry, dt, volt, xi, w, amps)
+        w, amps = _wheels(args)
+        # the twist anew, by the robust root finder: exactly what `replay` makes of these wheels
+        rest, rim = robot.body.load_share[load], frame.radius * w
+        near = (rim, frame, robot.surfaces.at(floor), rest)
+        if body_inertia:
+            xi = contact.step_with_inertia(*near, xi, mass * dt, dt)
+        else:
+            xi = contact.equilibrium(*near)
+        angle = angle + w * dt
+        return (xi, w, amps, angle, total), (xi, w, amps, angle, volt)
+
+    first = (jnp.zeros(3), still, still, still, still)
+    _, (xi, w, amps, angle, volt) = jax.lax.scan(step, first, (command, floors))
+    steps = jnp.full(command.shape[:1], dt)
+    led = lambda x: jnp.concatenate([jnp.zeros((1, x.shape[1])), x])  # noqa: E731
+    return Simulated(
+        time=jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)]),
+        wheel_angle=led(angle),
+        wheel_speed=led(w),
+        current=led(amps),
+        voltage=jnp.concatenate([volt, volt[-1:]]),
+        twist=led(xi),
+        pose=path(xi, steps, jnp.zeros(3) if start is None else start),
+    )
+
+
+def _control(
+    robot: Robot, loop: SpeedLoop, want: Array, w: Array, total: Array, dt: Any
+) -> tuple[Array, Array]:
+    """Voltage of this step and the integral after it."""
+    gap = want - w
+    ahead = loop.feed_forward * robot.motor.back_emf * robot.motor.gear_ratio * want
+    asked = ahead + loop.proportional * gap + loop.integral * (total + gap * dt)
+    volt = jnp.clip(asked, -loop.limit, loop.limit)
+    return volt, jnp.where(volt == asked, total + gap * dt, total)
+
+
+def _wheels(args: tuple[Any, ...]) -> tuple[Array, Array]:
+    """Wheel speeds and currents one implicit Euler step later, solved together with the twist."""
+    *_, xi, w, amps = args
+    count = len(w)
+    y = jnp.concatenate([xi, w, amps])
+
+    def newton(y: Array, _: None) -> tuple[Array, None]:
+        f, jac = _balance(y, args), jax.jacfwd(_balance)(y, args)
+        dy = _eliminate(jac, f)
+
+        def merit(alpha: Array) -> Array:
+            g = _balance(y - alpha * dy, args)
+            return jnp.where(jnp.all(jnp.isfinite(g)), g @ g, jnp.inf)
+
+        damping = jnp.asarray(_DAMPING)
+        best = damping[jnp.argmin(jax.vmap(merit)(damping))]
+        return y - best * dy, None
+
+    y = jax.lax.scan(newton, y, None, length=_NEWTON)[0]
+    return y[3 : 3 + count], y[3 + count :]
+
+
+def _balance(y: Array, args: tuple[Any, ...]) -> Array:
+    """Residuals of contact [mu m g], wheels and motors [N m] of one step."""
+    robot, frame, floor, load, mass, henry, dt, volt, xi0, w0, amps0 = args
+    count = len(w0)
+    xi, w, amps = y[:3], y[3 : 3 + count], y[3 + count :]
+    motor, surface = robot.motor, robot.surfaces.at(floor)
+    held: Frame = frame
+    pushed = mass * (xi - xi0)
+    body = contact.residual(xi, held.radius * w, held, surface, robot.body.load_share[load])
+    body = body - pushed.at[2].divide(held.base)
+    rotor = motor.gear_ratio**2 * motor.rotor_inertia
+    load_torque = wheel_torque(robot, held, xi, w, floor, load)
+    wheel = motor.torque(amps, w) - load_torque - rotor * (w - w0) / dt
+    stall = motor.gear_ratio * motor.efficiency * motor.back_emf / motor.resistance  # [N m/V]
+    electric = stall * (volt - motor.voltage(amps, w) - henry * (amps - amps0) / dt)
+    return jnp.concatenate([body, wheel, electric])
+
+
+def _eliminate(m: Array, b: Array) -> Array:
+    """m^-1 b by Gauss-Jordan without pivots: implicit steps have heavy diagonals, and a batch of
+    LAPACK calls is slow and can stall under `vmap` on few cores.
+    """
+    a = jnp.concatenate([m, b[:, None]], axis=1)
+    for k in range(m.shape[0]):
+        row = a[k] / a[k, k]
+        a = (a - a[:, k : k + 1] * row).at[k].set(row)
+    return a[:, -1]
