@@ -180,7 +180,7 @@ def test_current_rises_with_the_electrical_time_constant():
     stuck = made(**{"motor.rotor_inertia": 1e3, "motor.inductance": 0.5})
     run = driven([0.2, 0.0, 0.0], robot=stuck, loop=SpeedLoop(integral=0.0), inductance=True)
     tau = float(stuck.motor.inductance / stuck.motor.resistance)
-    at = int(round(tau / DT))
+    at = round(tau / DT)
     volt = run.voltage[0, 2]
     want = volt / stuck.motor.resistance * (1 - (1 + DT / tau) ** -at)  # implicit Euler's decay
     assert float(run.current[at, 2]) == pytest.approx(float(want), rel=2e-3)

@@ -256,9 +256,7 @@ def _balance(y: Array, args: tuple[Any, ...]) -> Array:
 
 
 def _eliminate(m: Array, b: Array) -> Array:
-    """m^-1 b by Gauss-Jordan without pivots: implicit steps have heavy diagonals, and a batch of
-    LAPACK calls is slow and can stall under `vmap` on few cores.
-    """
+    """m^-1 b by Gauss-Jordan; without pivots, implicit steps have heavy diagonals."""
     a = jnp.concatenate([m, b[:, None]], axis=1)
     for k in range(m.shape[0]):
         row = a[k] / a[k, k]
