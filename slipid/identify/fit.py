@@ -5,6 +5,7 @@ current variances and Student-t weights; variances by Fisher scoring of the rest
 with the structural Jacobian taken into account; in turn, until neither moves.
 """
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -49,6 +50,19 @@ class State:
     stage: str
 
 
+class Data(eqx.Module):
+    """What differs between sets of windows of the same shapes; an argument of compiled functions.
+
+    Attributes:
+        batch: measured.
+        base, which: covariance pieces and the variance each belongs to, per block.
+    """
+
+    batch: lk.Batch
+    base: dict[str, Array]
+    which: dict[str, Array]
+
+
 class Problem:
     """Likelihood of a set of windows as jitted functions of the search vector.
 
@@ -69,16 +83,12 @@ class Problem:
         choices: list[Choice],
         current_informs_motion: bool = False,
     ):
-        self.windows = windows
         self.space = Space(robot, choices)
         electric = [n.startswith("motor.") or n.endswith(".friction") for n in self.space.names]
         self.electric = np.asarray(electric, bool)
         self.joint = current_informs_motion or not windows.has_current
         self.robot = self.space.template
-        self.batch = lk.batch(windows, self.robot)
-        self.noise = lk.noise(windows, self.robot)
-        self._base = {k: jnp.asarray(c.base) for k, c in self.noise.blocks.items()}
-        self._which = {k: jnp.asarray(c.which) for k, c in self.noise.blocks.items()}
+        self._read(windows)
         self._mean, self._std = (
             jnp.asarray(self.space.prior_mean),
             jnp.asarray(self.space.prior_std),
@@ -88,23 +98,58 @@ class Problem:
             partial(self.solver.step, self._stacked, options={}, tags=frozenset())
         )
         self._start = eqx.filter_jit(self._init)
+        self._form = self
+
+    def of(self, windows: Windows) -> "Problem":
+        """The same problem for other windows; those of the same shapes share what is compiled."""
+        other = copy.copy(self)
+        other._read(windows)
+        return other
+
+    def _read(self, windows: Windows) -> None:
+        self.windows = windows
+        self.noise = lk.noise(windows, self.robot)
+        self.data = Data(
+            batch=lk.batch(windows, self.robot),
+            base={k: jnp.asarray(c.base) for k, c in self.noise.blocks.items()},
+            which={k: jnp.asarray(c.which) for k, c in self.noise.blocks.items()},
+        )
+
+    @property
+    def batch(self) -> lk.Batch:
+        """The windows as arrays."""
+        return self.data.batch
 
     # residuals -------------------------------------------------------------------------------
     def blocks(self, z: Float[Array, " free"], volt: Float[Array, ""]) -> dict[str, Array]:
         """Residual blocks at a search vector."""
-        return lk.residuals(self.space.tree(z), self.batch, volt)
+        return self._blocks(self.data, z, volt)
 
-    @partial(jax.jit, static_argnums=0)
     def linear(self, z: Array, volt: Array) -> tuple[dict[str, Array], dict[str, Array]]:
         """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
-        return self.blocks(z, volt), jax.jacfwd(self.blocks)(z, volt)
+        return self._form._linear(self.data, z, volt)
+
+    def blocks_jit(self, z: Array, volt: Array) -> dict[str, Array]:
+        """`blocks`, compiled."""
+        return self._form._blocks_jit(self.data, z, volt)
+
+    def _blocks(self, data: Data, z: Array, volt: Array) -> dict[str, Array]:
+        return lk.residuals(self.space.tree(z), data.batch, volt)
+
+    @partial(jax.jit, static_argnums=0)
+    def _linear(self, data: Data, z: Array, volt: Array) -> tuple[dict, dict]:
+        return self._blocks(data, z, volt), jax.jacfwd(partial(self._blocks, data))(z, volt)
+
+    @partial(jax.jit, static_argnums=0)
+    def _blocks_jit(self, data: Data, z: Array, volt: Array) -> dict[str, Array]:
+        return self._blocks(data, z, volt)
 
     def _stacked(self, y: Array, args: Any) -> tuple[Array, None]:
-        z0, mask, root, volt = args
+        data, z0, mask, root, volt = args
         z = z0 + mask * self._std * y
-        blocks = self.blocks(z, volt)
+        blocks = self._blocks(data, z, volt)
         if not self.joint:
-            held = self.blocks(jnp.where(self.electric, z, z0), volt)
+            held = self._blocks(data, jnp.where(self.electric, z, z0), volt)
             blocks = {k: r if k == "motion" else held[k] for k, r in blocks.items()}
         parts = [jnp.einsum("nij,nj->ni", root[k], r).ravel() for k, r in blocks.items()]
         return jnp.concatenate([*parts, (z - self._mean) / self._std]), None
@@ -114,14 +159,19 @@ class Problem:
         return self.solver.init(self._stacked, y, args, {}, shape[0], shape[1], frozenset())
 
     # weights ---------------------------------------------------------------------------------
-    @partial(jax.jit, static_argnums=0)
     def whitening(
         self, blocks: dict[str, Array], log_v: Array, keep: Array
     ) -> tuple[dict, dict, Array]:
         """Roots W with W^T W = w V^-1 per piece, the weights w, and minus log likelihood."""
+        return self._form._whitening(self.data, blocks, log_v, keep)
+
+    @partial(jax.jit, static_argnums=0)
+    def _whitening(
+        self, data: Data, blocks: dict[str, Array], log_v: Array, keep: Array
+    ) -> tuple[dict, dict, Array]:
         roots, weights, loss = {}, {}, 0.0
         for k, r in blocks.items():
-            inverse = inverse_root(self._covariance(k, log_v))
+            inverse = inverse_root(self._covariance(data, k, log_v))
             m = inverse.shape[-1]
             q = jnp.sum(jnp.einsum("nij,nj->ni", inverse, r) ** 2, axis=-1)
             weights[k] = keep * (DEGREES + m) / (DEGREES + q)
@@ -130,19 +180,28 @@ class Problem:
             loss += jnp.sum(keep * (log_det + 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)))
         return roots, weights, loss
 
-    def _covariance(self, k: str, log_v: Array) -> Array:
-        v = jnp.exp(log_v)[self._which[k]]
-        m = self._base[k].shape[-1]
-        return jnp.einsum("nc,ncij->nij", v, self._base[k]) + lk.FLOOR[k] * jnp.eye(m)
+    def covariance(self, k: str, log_v: Array) -> Array:
+        """Covariance of the residuals of block k (piece, m, m)."""
+        return self._covariance(self.data, k, log_v)
 
-    @partial(jax.jit, static_argnums=0)
+    def _covariance(self, data: Data, k: str, log_v: Array) -> Array:
+        v = jnp.exp(log_v)[data.which[k]]
+        m = data.base[k].shape[-1]
+        return jnp.einsum("nc,ncij->nij", v, data.base[k]) + lk.FLOOR[k] * jnp.eye(m)
+
     def precision(self, jacobian: dict[str, Array], log_v: Array, keep: Array) -> Array:
         """Expected information of the search vector, prior included (free, free)."""
+        return self._form._precision(self.data, jacobian, log_v, keep)
+
+    @partial(jax.jit, static_argnums=0)
+    def _precision(
+        self, data: Data, jacobian: dict[str, Array], log_v: Array, keep: Array
+    ) -> Array:
         total, of_motion = jnp.diag(1 / self._std**2), jnp.diag(1 / self._std**2)
         for k, jac in jacobian.items():
             m = jac.shape[1]
             factor = keep * (DEGREES + m) / (DEGREES + m + 2)  # Fisher information of a t location
-            root = inverse_root(self._covariance(k, log_v)) * jnp.sqrt(factor)[:, None, None]
+            root = inverse_root(self._covariance(data, k, log_v)) * jnp.sqrt(factor)[:, None, None]
             half = jnp.einsum("nij,njp->nip", root, jac)
             flat = half.reshape(-1, half.shape[-1])
             total += flat.T @ flat
@@ -158,19 +217,24 @@ class Problem:
         motion = ~e[:, None] & ~e[None, :]
         return jnp.where(motion, of_motion + carried, total)
 
-    @partial(jax.jit, static_argnums=0)
     def scored(
         self, blocks: dict, jacobian: dict, log_v: Array, keep: Array, typical: Array
     ) -> Array:
         """One Fisher-scoring step of the restricted likelihood in the log variances."""
-        _, weights, _ = self.whitening(blocks, log_v, keep)
-        cov = jnp.linalg.inv(self.precision(jacobian, log_v, keep))
+        return self._form._scored(self.data, blocks, jacobian, log_v, keep, typical)
+
+    @partial(jax.jit, static_argnums=0)
+    def _scored(
+        self, data: Data, blocks: dict, jacobian: dict, log_v: Array, keep: Array, typical: Array
+    ) -> Array:
+        _, weights, _ = self._whitening(data, blocks, log_v, keep)
+        cov = jnp.linalg.inv(self._precision(data, jacobian, log_v, keep))
         count = log_v.shape[0]
         score, info = jnp.zeros(count), jnp.zeros((count, count))
         for k, r in blocks.items():
-            root = inverse_root(self._covariance(k, log_v))
+            root = inverse_root(self._covariance(data, k, log_v))
             inverse = jnp.einsum("nji,njk->nik", root, root)
-            base, which = self._base[k], self._which[k]
+            base, which = data.base[k], data.which[k]
             v = jnp.exp(log_v)[which]
             vr = jnp.einsum("nij,nj->ni", inverse, r)
             fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
@@ -191,17 +255,17 @@ class Problem:
     # fitting ---------------------------------------------------------------------------------
     def levenberg(
         self, z: np.ndarray, root: dict, mask: np.ndarray, volt: float, most: int
-    ) -> tuple[np.ndarray, int]:
-        """Levenberg-Marquardt from z with fixed whitening; search vector and steps taken."""
-        args = (jnp.asarray(z), jnp.asarray(mask), root, jnp.asarray(volt))
+    ) -> np.ndarray:
+        """Search vector after at most so many Levenberg-Marquardt steps with fixed whitening."""
+        args = (self.data, jnp.asarray(z), jnp.asarray(mask), root, jnp.asarray(volt))
         y = jnp.zeros(self.space.size)
         state = self._start(y, args)
-        for step in range(most):
+        for _ in range(most):
             y, state, _ = self._step(y=y, args=args, state=state)
             done, _ = self.solver.terminate(self._stacked, y, args, {}, state, frozenset())
             if bool(done):
                 break
-        return np.asarray(z + mask * np.asarray(self._std) * np.asarray(y)), step + 1
+        return np.asarray(z + mask * np.asarray(self._std) * np.asarray(y))
 
     def loss(self, z: np.ndarray, log_v: np.ndarray, keep: np.ndarray) -> float:
         """Minus log posterior of structure and variances, constants left out."""
@@ -214,10 +278,6 @@ class Problem:
             + float(prior)
             + 0.5 * float(np.sum(((log_v - typical) / _VARIANCE_SPREAD) ** 2))
         )
-
-    @partial(jax.jit, static_argnums=0)
-    def blocks_jit(self, z: Array, volt: Array) -> dict[str, Array]:
-        return self.blocks(z, volt)
 
     def volt(self, log_v: np.ndarray) -> Array:
         """Std of the voltage noise [V], 1 where none is logged."""
@@ -234,7 +294,7 @@ class Problem:
         volt = self.volt(log_v)
         blocks = self.blocks_jit(jnp.asarray(state.z), volt)
         root, _, _ = self.whitening(blocks, log_v, keep_j)
-        z, _ = self.levenberg(state.z, root, mask, float(volt), steps)
+        z = self.levenberg(state.z, root, mask, float(volt), steps)
         typical = jnp.asarray(2 * np.log(self.noise.typical))
         blocks, jacobian = self.linear(jnp.asarray(z), volt)
         for _ in range(scoring):
@@ -282,7 +342,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
     Floors share nothing while the shared numbers are held, so one masked fit of all floors is a fit
     of each by itself.
     """
-    space, names = problem.space, problem.space.names
+    names = problem.space.names
     floor_of = [n.split(".")[1] if n.startswith("surface.") else "" for n in names]
     mask = np.array([float(f != "") for f in floor_of])
     labels = problem.robot.surfaces.labels
@@ -318,7 +378,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
 
 def _piece_cost(problem: Problem, state: State) -> np.ndarray:
     blocks = problem.blocks_jit(jnp.asarray(state.z), problem.volt(state.log_variance))
-    v = np.asarray(problem._covariance("motion", jnp.asarray(state.log_variance)))
+    v = np.asarray(problem.covariance("motion", jnp.asarray(state.log_variance)))
     r = np.asarray(blocks["motion"])
     q = np.einsum("ni,ni->n", r, np.linalg.solve(v, r[..., None])[..., 0])
     return 0.5 * (DEGREES + r.shape[1]) * np.log1p(q / DEGREES)
