@@ -112,6 +112,25 @@ def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet =
     return 0
 
 
+@app.command()
+@guarded
+def demo(
+    out: Out = Path("demo_out"),
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the noise in the logs.")] = 0,
+    quiet: Quiet = False,
+) -> int:
+    """The whole job on logs with known truth, small: a folder to look at."""
+    from slipid.app import tables
+    from slipid.app.demo import demo as run
+    from slipid.app.demo import real_logs
+    from slipid.app.progress import Reporter
+
+    with Reporter(quiet=quiet) as report:
+        done, found, rows = run(out, seed, report)
+    tables.demo(out, done, found, rows, real_logs())
+    return 0 if done.fit.converged else 1
+
+
 def _emit(where: str, value: Any) -> None:
     """JSON to a file, whole or not at all, or to stdout."""
     from slipid.data.files import json_text, write_bytes

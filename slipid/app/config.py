@@ -86,17 +86,10 @@ class Logs(_Section):
     """Log files of one kind, found by a glob below the data folder."""
 
     glob: str
-    format: str | None = None
-    layout: dict[str, Any] = Field(default_factory=dict)
+    format: str
     surface: str = "folder"
     load: str = "as_built"
     session: Literal["surface/load/speed", "folder", "file"] = "surface/load/speed"
-
-    @model_validator(mode="after")
-    def _has_layout(self) -> "Logs":
-        if self.format is None and "columns" not in self.layout:
-            raise ValueError("neither format nor layout.columns; expected the name of a preset")
-        return self
 
 
 class Camera(_Section):
@@ -147,6 +140,7 @@ class Content(_Section):
     """The whole file."""
 
     robot: Annotated[Omni | Mecanum | Skid | General, Field(discriminator="drive")]
+    layouts: dict[str, dict[str, Any]] = Field(default_factory=dict)
     logs: list[Logs] = Field(min_length=1)
     camera: Camera = Camera()
     parameters: dict[str, Setting] = Field(default_factory=dict)

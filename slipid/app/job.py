@@ -8,7 +8,7 @@ from pathlib import Path
 
 from slipid.app.config import Config, Logs, geometry
 from slipid.data.dataset import Dataset, collect, default_session, windows
-from slipid.data.formats import layout_from_mapping
+from slipid.data.formats import PRESETS, Layout, layout_from_mapping, preset
 from slipid.data.log import DataError, Log
 from slipid.data.reader import find_logs, read_logs
 from slipid.identify.fit import Problem
@@ -116,11 +116,8 @@ def read_dataset(
     logs: list[Log] = []
     session: dict[str, str] = {}
     done = 0
-    for k, (section, paths) in enumerate(found, start=1):
-        mapping = dict(section.layout)
-        if section.format is not None:
-            mapping["format"] = section.format
-        layout = layout_from_mapping(mapping, f"{config.path} logs[{k}] layout")
+    for section, paths in found:
+        layout = _layout(config, section)
         for path in paths:
             surface = _surface(section, path)
             for log in read_logs(path, layout, root=root, surface=surface, load=section.load):
@@ -133,6 +130,23 @@ def read_dataset(
             done += 1
             tell(done, count)
     return collect(logs, session=lambda log: session[log.name]), skipped
+
+
+def _layout(config: Config, section: Logs) -> Layout:
+    """Layout a log section names: one of the config's own, else a preset."""
+    own = config.content.layouts
+    if section.format in own:
+        where = f"{config.path} layouts.{section.format}"
+        return layout_from_mapping(own[section.format], where)
+    if section.format not in PRESETS:
+        names = [*own, *PRESETS]
+        near = get_close_matches(section.format, names, n=2)
+        hint = f", did you mean {' or '.join(near)}?" if near else ""
+        raise DataError(
+            f"{config.path}: logs.format '{section.format}': no such layout{hint}; "
+            f"expected one of {', '.join(names)}"
+        )
+    return preset(section.format)
 
 
 def _surface(section: Logs, path: Path) -> str:

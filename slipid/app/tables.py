@@ -127,6 +127,44 @@ def validation(found: dict[str, Any]) -> None:
     _console().print(table)
 
 
+def demo(
+    out: Path, done: Any, found: dict[str, Any], rows: Sequence[Any], real: Path | None
+) -> None:
+    """Truth against estimate, prediction of unseen runs, and where to look."""
+    console = _console()
+    table = Table(show_edge=False, pad_edge=False, box=None)
+    for name in ("parameter", "truth", "identified", "unit", "90 % interval", "truth in it", ""):
+        table.add_column(name, justify="right" if name in ("truth", "identified") else "left")
+    for r in rows:
+        colour = COLOUR.get(r.verdict, "dim")
+        table.add_row(
+            Text(f"{r.path} [{r.label}]" if r.label else r.path),
+            f"{r.truth:.4g}",
+            f"{r.value:.4g}",
+            r.unit,
+            f"{r.interval[0]:.4g} .. {r.interval[1]:.4g}",
+            "yes" if r.inside else "no",
+            f"[{colour}]{r.verdict.replace('_', ' ')}[/{colour}]",
+        )
+    console.print(table)
+    inside = sum(r.inside for r in rows)
+    console.print(f"{inside} of {len(rows)} intervals hold the truth (90 % are meant to)\n")
+    console.print("runs it has not seen, predicted open loop:")
+    validation(found)
+    result = out / "result"
+    console.print(
+        f"\nlook at: {', '.join(str(result / n) for n in done.written if n.endswith('g'))}"
+    )
+    console.print(f"numbers: {result / 'identified.json'}, {result / 'validation.json'}")
+    if real is not None:
+        data = real / "robotino2022"
+        console.print("real logs are here; on them:", markup=False)
+        line = f"  slipid identify configs/robotino2022.toml --data {data} --out out/robotino2022"
+        console.print(line, markup=False, soft_wrap=True)
+        line = f"  slipid validate out/robotino2022 --data {data}"
+        console.print(line, markup=False, soft_wrap=True)
+
+
 def _percent(x: float | None) -> str:
     return "" if x is None else f"{100 * x:.2f} %"
 
