@@ -90,6 +90,7 @@ class Logs(_Section):
     surface: str = "folder"
     load: str = "as_built"
     session: Literal["surface/load/speed", "folder", "file"] = "surface/load/speed"
+    min_rows: int = Field(2, ge=2)
 
 
 class Camera(_Section):

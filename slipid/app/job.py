@@ -115,12 +115,15 @@ def read_dataset(
     count = sum(len(paths) for _, paths in found)
     logs: list[Log] = []
     session: dict[str, str] = {}
-    done = 0
+    done = short = 0
     for section, paths in found:
         layout = _layout(config, section)
         for path in paths:
             surface = _surface(section, path)
             for log in read_logs(path, layout, root=root, surface=surface, load=section.load):
+                if log.samples < section.min_rows:
+                    short += 1
+                    continue
                 if log.name in session:
                     raise DataError(
                         f"{log.name}: found by two globs of {config.path}; expected it once"
@@ -129,6 +132,8 @@ def read_dataset(
                 logs.append(with_voltage(log))
             done += 1
             tell(done, count)
+    if short:
+        skipped.append(f"skipped: {short} runs shorter than their min_rows")
     return collect(logs, session=lambda log: session[log.name]), skipped
 
 
