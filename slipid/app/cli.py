@@ -114,6 +114,47 @@ def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet =
 
 @app.command()
 @guarded
+def paper(
+    data: Annotated[
+        Path, typer.Option("--data", metavar="DIR", help="Folder that holds robotino2021.")
+    ],
+    out: Out,
+) -> int:
+    """Regenerate the 2021 paper's tables and figures from its own data."""
+    from slipid.app import paper_plots
+
+    for path in paper_plots.run(data, out):
+        typer.echo(str(path))
+    return 0
+
+
+@app.command()
+@guarded
+def new(
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Config to write.")],
+    drive: Annotated[str, typer.Option(help="omni, mecanum or skid.")] = "omni",
+    wheel_radius_m: Annotated[float, typer.Option(prompt="wheel radius [m]")] = 0.05,
+    base_m: Annotated[
+        float, typer.Option(prompt="wheel centres from the middle [m] (omni: radius)")
+    ] = 0.15,
+    gear_ratio: Annotated[float, typer.Option(prompt="motor turns per wheel turn")] = 1.0,
+    mass_kg: Annotated[float, typer.Option(prompt="mass [kg]")] = 10.0,
+    ticks_per_revolution: Annotated[
+        float, typer.Option(prompt="encoder ticks per motor turn")
+    ] = 1000.0,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False,
+) -> int:
+    """Write a commented config for your robot; asks what it needs to know."""
+    from slipid.app.new import write_new
+
+    write_new(out, drive, wheel_radius_m, base_m, gear_ratio, mass_kg, ticks_per_revolution, force)
+    typer.echo(f"{out}: name your columns below [layouts.mine.columns], then run")
+    typer.echo(f"  slipid check {out} --data DIR")
+    return 0
+
+
+@app.command()
+@guarded
 def demo(
     out: Out = Path("demo_out"),
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the noise in the logs.")] = 0,
