@@ -145,14 +145,21 @@ class Problem:
         return self._blocks(data, z, volt)
 
     def _stacked(self, y: Array, args: Any) -> tuple[Array, None]:
-        data, z0, mask, root, volt = args
+        data, z0, mask, root, volt, felt = args
         z = z0 + mask * self._std * y
-        blocks = self._blocks(data, z, volt)
-        if not self.joint:
-            held = self._blocks(data, jnp.where(self.electric, z, z0), volt)
-            blocks = {k: r if k == "motion" else held[k] for k, r in blocks.items()}
+        if self.joint:
+            blocks = self._blocks(data, z, volt)
+        else:  # motion by itself; currents and voltages given the motion of the round's start
+            robot = self.space.tree(z)
+            held = self.space.tree(jnp.where(self.electric, z, z0))
+            still = lk.motion_residual(robot, data.batch, lk.predict(robot, data.batch))
+            blocks = {"motion": still} | lk.electric_residuals(held, data.batch, felt, volt)
         parts = [jnp.einsum("nij,nj->ni", root[k], r).ravel() for k, r in blocks.items()]
         return jnp.concatenate([*parts, (z - self._mean) / self._std]), None
+
+    @partial(jax.jit, static_argnums=0)
+    def _felt(self, data: Data, z: Array) -> Array:
+        return lk.predict(self.space.tree(z), data.batch).felt
 
     def _init(self, y: Array, args: Any) -> Any:
         shape = jax.eval_shape(self._stacked, y, args)
@@ -257,7 +264,8 @@ class Problem:
         self, z: np.ndarray, root: dict, mask: np.ndarray, volt: float, most: int
     ) -> np.ndarray:
         """Search vector after at most so many Levenberg-Marquardt steps with fixed whitening."""
-        args = (self.data, jnp.asarray(z), jnp.asarray(mask), root, jnp.asarray(volt))
+        felt = self._form._felt(self.data, jnp.asarray(z))
+        args = (self.data, jnp.asarray(z), jnp.asarray(mask), root, jnp.asarray(volt), felt)
         y = jnp.zeros(self.space.size)
         state = self._start(y, args)
         for _ in range(most):

@@ -6,7 +6,7 @@ A piece is a few neighbouring windows of one run. Its residuals have the covaria
                          process noise along, across and in yaw, growing with distance, per floor;
                          the run's own effect along, across and in yaw, per floor
 
-so the run effects are marginalised. Structural numbers move the residuals, variances v_c the weights.
+so the run effects are marginalised. Structural numbers move the residuals, variances the weights.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ SMOOTH = 0.03
 
 
 class Batch(eqx.Module):
-    """Windows as arrays a jitted function takes; names turned into indices of the robot's stacks."""
+    """Windows as arrays for a jitted function; names are indices of the robot's stacks."""
 
     surface: Int[Array, " piece"]
     load: Int[Array, " piece"]
@@ -66,31 +66,47 @@ def batch(windows: Windows, robot: Robot) -> Batch:
 
 
 class Predicted(eqx.Module):
-    """What the robot says of each window."""
+    """What the robot says of each window.
+
+    Attributes:
+        increment: of the marker (x, y [m], yaw [rad]).
+        twist: of the body.
+        felt: traction of each wheel's motor in units of mu m g.
+    """
 
     increment: Float[Array, "piece window 3"]
-    current: Float[Array, "piece window wheel"]
     twist: Float[Array, "piece window 3"]
+    felt: Float[Array, "piece window wheel"]
+
+
+def wheel_speed(robot: Robot, b: Batch) -> Float[Array, "piece window wheel"]:
+    """Mean wheel speed of every window at the robot's camera lag [rad/s]."""
+    return (b.turn - (robot.camera.lag - b.lag) * b.faster) / b.dt[..., None]
 
 
 def predict(robot: Robot, b: Batch) -> Predicted:
-    """Marker increments [m, m, rad] and motor currents [A] of every window."""
+    """Contact equilibrium of every window."""
     frame = robot.geometry.frame()
-    speed = (b.turn - (robot.camera.lag - b.lag) * b.faster) / b.dt[..., None]
 
     def window(w: Any, dt: Any, surface: Any, load: Any, session: Any) -> tuple[Any, Any, Any]:
         xi = model.twist(robot, frame, w, surface, load)
         increment = robot.camera.seen(model.advance(xi, dt), session)
-        if not b.has_current:
-            return increment, jnp.zeros_like(w), xi
-        torque = model.wheel_torque(robot, frame, xi, w, surface, load)
-        amps = robot.motor.current(torque, w)
-        if not b.signed:
-            amps = jnp.sqrt(amps**2 + SMOOTH**2) + robot.motor.current_offset
-        return increment, amps, xi
+        return increment, xi, model.felt(robot, frame, xi, w, surface, load)
 
     piece = jax.vmap(window, (0, 0, None, None, None))
-    return Predicted(*jax.vmap(piece)(speed, b.dt, b.surface, b.load, b.session))
+    return Predicted(*jax.vmap(piece)(wheel_speed(robot, b), b.dt, b.surface, b.load, b.session))
+
+
+def predicted_current(
+    robot: Robot, b: Batch, felt: Float[Array, "piece window wheel"]
+) -> Float[Array, "piece window wheel"]:
+    """Motor current of every window [A] given the traction, a magnitude where the log has those."""
+    weight = robot.surfaces.friction[b.surface] * robot.body.mass * model.GRAVITY
+    torque = robot.geometry.wheel_radius * weight[:, None, None] * felt
+    amps = robot.motor.current(torque, wheel_speed(robot, b))
+    if b.signed:
+        return amps + robot.motor.current_offset
+    return jnp.sqrt(amps**2 + SMOOTH**2) + robot.motor.current_offset
 
 
 def measured(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, "piece window 3"]:
@@ -105,27 +121,44 @@ def measured(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, "
     return jax.vmap(piece)(pose)
 
 
-def residuals(robot: Robot, b: Batch, voltage_ratio: Float[Array, ""] | float) -> dict[str, Array]:
-    """Predicted less measured, one row per piece and block: `motion` [m, m, rad], `current`, `voltage`.
+def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "piece m"]:
+    """Predicted less measured marker increments, a row per piece [m, m, rad]."""
+    return (p.increment - measured(robot, b.pose)).reshape(b.dt.shape[0], -1)
+
+
+def electric_residuals(
+    robot: Robot,
+    b: Batch,
+    felt: Float[Array, "piece window wheel"],
+    voltage_std: Float[Array, ""] | float,
+) -> dict[str, Array]:
+    """Predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
 
     Args:
-        voltage_ratio: std of the voltage noise [V]; the noise of the measured current is carried
-            into the voltage equation by R, which keeps R from being attenuated.
+        felt: traction of each wheel's motor in units of mu m g.
+        voltage_std: of the voltage noise [V]; the noise of the measured current is carried into the
+            voltage equation by R, which keeps R from being attenuated.
     """
-    p = predict(robot, b)
     n = b.dt.shape[0]
-    out = {"motion": (p.increment - measured(robot, b.pose)).reshape(n, -1)}
+    out = {}
     if b.has_current:
-        out["current"] = (p.current - b.current).reshape(n, -1)
+        out["current"] = (predicted_current(robot, b, felt) - b.current).reshape(n, -1)
     if b.has_current and b.has_voltage:
         w = b.turn / b.dt[..., None]
-        amps = b.current
+        amps = b.current - robot.motor.current_offset
         if not b.signed:
-            amps = (amps - robot.motor.current_offset) * jnp.tanh(w / 0.2)
+            amps = amps * jnp.tanh(w / 0.2)
         gap = robot.motor.voltage(amps, w) - b.voltage
-        spread = jnp.sqrt(1.0 + robot.motor.resistance**2 * b.current_var / voltage_ratio**2)
+        spread = jnp.sqrt(1.0 + robot.motor.resistance**2 * b.current_var / voltage_std**2)
         out["voltage"] = (gap / spread).reshape(n, -1)
     return out
+
+
+def residuals(robot: Robot, b: Batch, voltage_std: Float[Array, ""] | float) -> dict[str, Array]:
+    """Every block of residuals, `motion` first."""
+    p = predict(robot, b)
+    motion = {"motion": motion_residual(robot, b, p)}
+    return motion | electric_residuals(robot, b, p.felt, voltage_std)
 
 
 @dataclass(frozen=True, eq=False)

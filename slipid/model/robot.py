@@ -200,6 +200,20 @@ def twist(
     return contact.equilibrium(rim, frame, robot.surfaces.at(surface), robot.body.load_share[load])
 
 
+def felt(
+    robot: Robot,
+    frame: Frame,
+    xi: Float[Array, "3"],
+    wheel_speed: Float[Array, " wheel"],
+    surface: Array,
+    load: Array,
+) -> Float[Array, " wheel"]:
+    """Traction each motor works against at a twist, in units of mu m g."""
+    rim = frame.radius * wheel_speed
+    floor = robot.surfaces.at(surface)
+    return contact.forces(xi, rim, frame, floor, robot.body.load_share[load]).traction
+
+
 def wheel_torque(
     robot: Robot,
     frame: Frame,
@@ -209,10 +223,8 @@ def wheel_torque(
     load: Array,
 ) -> Float[Array, " wheel"]:
     """Torque each motor delivers at the wheel, friction excluded: r mu m g T [N m]."""
-    rim = frame.radius * wheel_speed
-    floor = robot.surfaces.at(surface)
-    felt = contact.forces(xi, rim, frame, floor, robot.body.load_share[load]).traction
-    return frame.radius * floor.friction * robot.body.mass * GRAVITY * felt
+    force = robot.surfaces.friction[surface] * robot.body.mass * GRAVITY
+    return frame.radius * force * felt(robot, frame, xi, wheel_speed, surface, load)
 
 
 def advance(xi: Float[Array, "3"], dt: Float[Array, ""] | float) -> Float[Array, "3"]:
