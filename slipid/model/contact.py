@@ -32,10 +32,11 @@ V1 = 0.02
 """Rim speed below which rolling resistance is viscous [m/s]."""
 W0 = 0.05
 """Yaw rate below which the scrub moment is viscous [rad/s]."""
-_CHORD_STEPS = 20
-_NEWTON_STEPS = 6
+_CHORD_STEPS = 30
+_NEWTON_STEPS = 8
 _DAMPING = (1.0, 0.3, 0.05)
 _LEAST_LOAD = 1e-3
+_ROUNDING = 1e-20
 
 
 class ContactSurface(eqx.Module):
@@ -196,8 +197,9 @@ def _newton(xi: Any, args: Any) -> Any:
 
     tried = jax.vmap(merit)(damping)
     best = jnp.argmin(tried)
-    # a worse point may be taken, by the step that is least bad: it leaves flat spots
-    return jnp.where(jnp.isfinite(tried[best]), xi - damping[best] * dx, xi)
+    # where all wheels slide the balance is flat and Newton's direction leads far away
+    stuck = (tried[best] >= f @ f) & (f @ f > _ROUNDING)
+    return jnp.where(stuck, _chord(xi, args), xi - damping[best] * dx)
 
 
 def _residual(xi: Any, args: Any) -> Any:
