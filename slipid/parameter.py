@@ -259,8 +259,9 @@ class Space:
             for k in range(e.coordinates)
         ]
 
-    def tree(self, z: Float[Array, " free"]) -> Any:
+    def tree(self, z: Float[Array, " free"] | Float[np.ndarray, " free"]) -> Any:
         """Tree of SI values at a search-space vector; jit-able."""
+        z = jnp.asarray(z)
         changed: dict[tuple[str, ...], Any] = {}
         for entry in self.free:
             leaf = changed.get(entry.leaf)

@@ -47,7 +47,7 @@ def save_checkpoint(path: Path, key: str, state: Any, history: list[float]) -> N
 
 def load_checkpoint(path: Path, key: str) -> tuple[Any, list[float]] | None:
     """State and losses so far, or None where there is no checkpoint of this very job."""
-    from slipid.identify.fit import State
+    from slipid.identify.problem import State
 
     try:
         with np.load(path, allow_pickle=False) as kept:

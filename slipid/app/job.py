@@ -11,7 +11,8 @@ from slipid.data.dataset import Dataset, collect, default_session, windows
 from slipid.data.formats import PRESETS, Layout, layout_from_mapping, preset
 from slipid.data.log import DataError, Log
 from slipid.data.reader import find_logs, read_logs
-from slipid.identify.fit import Problem
+from slipid.identify.problem import Problem
+from slipid.identify.folds import still_viscosities
 from slipid.identify.result import hash_of
 from slipid.model.robot import Robot, build
 from slipid.parameter import Choice, Space, entries
@@ -86,6 +87,7 @@ def read_job(config: Config, root: Path, tell: Callable[[int, int], None], line:
     )
     choices, left_out = _choices(config, robot)
     skipped += left_out
+    choices = still_viscosities(dataset) + choices  # what the user says comes later and wins
     for sentence in skipped:
         line(sentence)
     return Job(config, dataset, robot, tuple(choices), tuple(skipped))

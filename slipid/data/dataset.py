@@ -1,7 +1,7 @@
 """Many ragged runs as one set of flat arrays, and the windows a likelihood sums over."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,7 +18,8 @@ class Dataset:
     """Runs laid end to end: one copy of the samples, each run a view.
 
     Attributes:
-        logs: the runs; their arrays are views of the flat ones below.
+        logs: the runs; their arrays are views of the flat ones below, but for raw wheel angles
+            where a stall was bridged.
         offset: where each run starts, one more than runs.
         time: [s] (sample,)
         wheel_angle: [rad] (sample, wheel), stalls of the telemetry bridged.
@@ -51,9 +52,9 @@ class Dataset:
         """Samples of one run in the flat arrays."""
         return slice(int(self.offset[run]), int(self.offset[run + 1]))
 
-    def subset(self, keep: Iterable[int]) -> "Dataset":
+    def subset(self, keep: Iterable[int] | np.ndarray) -> "Dataset":
         """Dataset of some runs, in the order given."""
-        index = list(keep)
+        index = [int(k) for k in keep]
         names = dict(zip((log.name for log in self.logs), self.session, strict=True))
         return collect([self.logs[i] for i in index], session=lambda log: names[log.name])
 
@@ -84,24 +85,34 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
     offset = np.concatenate([[0], np.cumsum([log.samples for log in logs])])
     heads = [_setting(log) for log in logs]
 
-    def flat(name: str) -> np.ndarray | None:
-        parts = [getattr(log, name) for log in logs]
-        return None if any(p is None for p in parts) else np.concatenate(parts)
-
     bridged = [bridge_stalls(log.time, log.wheel_angle) for log in logs]
-    pose = flat("pose")
-    assert pose is not None
-    fresh = flat("pose_fresh")
+    flat: dict[str, np.ndarray] = {}
+    for name in ("time", "pose", "current", "voltage"):
+        parts = [getattr(log, name) for log in logs]
+        if not any(p is None for p in parts):
+            flat[name] = np.concatenate(parts)
+    flat["wheel_angle"] = np.concatenate([angle for angle, _ in bridged])
+    flat["pose_fresh"] = np.concatenate(
+        [np.ones(log.samples, bool) if log.pose_fresh is None else log.pose_fresh for log in logs]
+    )
+
+    def view(k: int, log: Log) -> Log:
+        """The run with its arrays in the flat ones; a bridged one keeps its raw wheel angle."""
+        raw = bridged[k][0] is not log.wheel_angle
+        rows = slice(int(offset[k]), int(offset[k + 1]))
+        mine = {n: a[rows] for n, a in flat.items() if not (raw and n == "wheel_angle")}
+        return replace(log, **mine)  # type: ignore[arg-type]
+
     return Dataset(
-        logs=tuple(logs),
+        logs=tuple(view(k, log) for k, log in enumerate(logs)),
         offset=offset,
-        time=np.concatenate([log.time for log in logs]),
-        wheel_angle=np.concatenate([angle for angle, _ in bridged]),
-        pose=pose,
-        fresh=np.ones(len(pose), bool) if fresh is None else fresh,
+        time=flat["time"],
+        wheel_angle=flat["wheel_angle"],
+        pose=flat["pose"],
+        fresh=flat["pose_fresh"],
         live=np.concatenate([~stalled for _, stalled in bridged]),
-        current=flat("current"),
-        voltage=flat("voltage"),
+        current=flat.get("current"),
+        voltage=flat.get("voltage"),
         current_is_signed=all(log.current_is_signed for log in logs),
         session=tuple(pick(log) for log in logs),
         heading=np.array([h for h, _ in heads]),
@@ -160,6 +171,17 @@ class Windows:
 
     def __len__(self) -> int:
         return len(self.run)
+
+    def pieces(self, index: Int[np.ndarray, " some"]) -> "Windows":
+        """Some pieces, in the order given."""
+        kept = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                kept[field.name] = value[index]
+            elif isinstance(value, tuple):
+                kept[field.name] = tuple(value[i] for i in index)
+        return replace(self, **kept)
 
     def of_runs(self, run: Int[np.ndarray, " piece"]) -> "Windows":
         """The same pieces, said to be of other runs (of the dataset a subset was taken from)."""
@@ -224,7 +246,8 @@ def first_row(data: Dataset, run: int, wheel_radius: float) -> int:
     moved = np.abs(angle - angle[0]).max(axis=1) * wheel_radius >= MOVED
     if not moved.any():
         raise DataError(
-            f"{data.logs[run].name}: no wheel moves {MOVED * 1000:.0f} mm; expected a run in which the robot drives"
+            f"{data.logs[run].name}: no wheel moves {MOVED * 1000:.0f} mm; "
+            "expected a run in which the robot drives"
         )
     return int(np.argmax(moved))
 

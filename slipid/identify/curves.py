@@ -62,7 +62,7 @@ def curves(
 
     Taken at the median speed of the wheels that turned and an even load.
     """
-    robot = space.tree(z)
+    robot = space.tree(jnp.asarray(z))
     speed, torque = (np.abs(np.asarray(x)) for x in seen(robot, b))
     labels, floor = robot.surfaces.labels, np.asarray(b.surface)
     share = 1.0 / speed.shape[-1]

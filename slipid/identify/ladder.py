@@ -241,7 +241,7 @@ class HeadingLookup(Rung):
         return as_increments(np.stack([x, y, out[..., 2]], -1) / w.dt[..., None], w, robot)
 
     def _series(self, floor: str, load: str) -> np.ndarray:
-        """Of this floor and load set-up, else of the floor with the load it was first driven with."""
+        """Of this floor and load set-up, else of the load the floor was first driven with."""
         exact = self.state.get(f"{floor}@{load}")
         if exact is not None:
             return exact

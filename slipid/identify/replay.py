@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from slipid.data.dataset import Dataset, Windows, windows
 from slipid.identify import likelihood as lk
-from slipid.identify.fit import DEGREES
+from slipid.identify.problem import DEGREES
 from slipid.model.robot import Robot, compose
 
 STEP = 0.5

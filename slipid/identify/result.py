@@ -18,7 +18,8 @@ from slipid.data.dataset import Dataset
 from slipid.data.files import json_text, read_json, write_bytes
 from slipid.data.log import DataError
 from slipid.identify import curves as curves_of
-from slipid.identify.fit import Optimum, Problem
+from slipid.identify.fit import Optimum
+from slipid.identify.problem import Problem
 from slipid.identify.verdict import Estimate, Flat, estimates, flat_directions
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, build

@@ -61,7 +61,7 @@ def validation(fit: Frozen, data: Dataset) -> dict[str, Any]:
         cov = replay.end_covariance(fit.robot, w, tracks["identified"], fit.variance, of_parameters)
         for name, track in tracks.items():
             _score(rows, data, name, track, cov if name == "identified" else None)
-    return {"schema": SCHEMA, "summary": _summary(rows), "runs": rows}
+    return {"schema": SCHEMA, "summary": summary(rows), "runs": rows}
 
 
 def _contact(robot: Robot, w: Windows) -> replay.Tracks:
@@ -117,7 +117,7 @@ def _number(x: float) -> float | None:
     return float(x) if np.isfinite(x) else None
 
 
-def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Summary per floor; runs with another load set-up than the first are a floor of their own.
 
     A set-up other than the most common is written `<floor>@<load>`.

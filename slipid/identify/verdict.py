@@ -76,7 +76,7 @@ def estimates(
     has_voltage: bool,
 ) -> tuple[Estimate, ...]:
     """Every declared number with its interval and verdict, in order of declaration."""
-    tree = space.tree(z)
+    tree = space.tree(_jax(z))
     return tuple(
         _free(space, e, tree, z, covariance, has_voltage)
         if e.path in space.place
@@ -137,15 +137,15 @@ def _free(
     if d.shares:
         rng = np.random.default_rng(0)
         spread = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
-        draws = np.stack([np.asarray(d.to_si(s)) for s in _numpy(spread)])
+        draws = np.stack([np.asarray(d.to_si(s)) for s in _jax(spread)])
         low, high = np.quantile(draws, [0.05, 0.95], axis=0)
         std = draws.std(axis=0)
-        center = np.asarray(d.to_si(_numpy(prior_mean)))
+        center = np.asarray(d.to_si(_jax(prior_mean)))
         wide = np.full(entry.size, prior_std.mean() / entry.size)
     else:
-        low, high = (np.asarray(d.to_si(_numpy(mean + k * std_z))) for k in (-_Z95, _Z95))
+        low, high = (np.asarray(d.to_si(_jax(mean + k * std_z))) for k in (-_Z95, _Z95))
         std = np.array([d.slope(float(v)) for v in value]) * std_z
-        center = np.asarray(d.to_si(_numpy(prior_mean)))
+        center = np.asarray(d.to_si(_jax(prior_mean)))
         wide = np.array([d.slope(float(v)) for v in center]) * prior_std
     scaled = block / prior_std[:, None] / prior_std[None, :]
     ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
@@ -171,7 +171,7 @@ def _free(
     )
 
 
-def _numpy(x: np.ndarray) -> Any:
+def _jax(x: np.ndarray) -> Any:
     import jax.numpy as jnp
 
     return jnp.asarray(x)

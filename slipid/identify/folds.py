@@ -1,0 +1,109 @@
+"""Left-out runs: who is left out together, and what a fit of the others says of them.
+
+Runs of one heading stay in one fold at every speed and on every floor, so that nothing of a
+left-out heading is seen. Folds differ only in the weight of each piece: one compiled function
+serves all.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from slipid.data.dataset import Dataset
+from slipid.identify.fit import Optimum, Options, optimise
+from slipid.identify.ladder import rungs
+from slipid.identify.problem import Problem
+from slipid.identify.validate import Frozen, validation
+from slipid.parameter import Choice
+
+Fold = Int[np.ndarray, " run"]
+
+
+def sectors(data: Dataset, width_deg: float = 60.0) -> Fold:
+    """Fold of every run by the sector its commanded heading lies in."""
+    turn = np.degrees(data.heading) % 360.0
+    return (np.floor((turn + 1e-6) / width_deg) % round(360 / width_deg)).astype(int)
+
+
+def random_headings(data: Dataset, folds: int = 6, step_deg: float = 5.0, seed: int = 0) -> Fold:
+    """Fold of every run by its commanded heading, headings dealt at random."""
+    count = round(360 / step_deg)
+    dealt = np.random.default_rng(seed).permutation(count) % folds
+    return np.asarray(dealt[np.round(np.degrees(data.heading) / step_deg).astype(int) % count])
+
+
+def still_viscosities(
+    data: Dataset, runs: Iterable[int] | np.ndarray | None = None
+) -> list[Choice]:
+    """Viscous terms held near zero on every floor that was driven at one speed only.
+
+    With one speed they cannot be told from creep, and what they take from it is wrong at every
+    other speed (METHODS 3B).
+    """
+    seen: dict[str, list[float]] = {}
+    for k in range(len(data)) if runs is None else runs:
+        seen.setdefault(data.logs[k].surface or "unknown", []).append(float(data.speed[k]))
+    out = []
+    for floor, speeds in seen.items():
+        known = np.asarray(speeds)[np.isfinite(speeds)]
+        if len(known) == len(speeds) and known.max() < 1.3 * max(known.min(), 1e-3):
+            out.append(Choice(f"surface.{floor}.slide_viscosity", fixed=1e-4))
+            out.append(Choice(f"surface.{floor}.roller_viscosity", fixed=1e-4))
+    return out
+
+
+def left_out(
+    problem: Problem,
+    data: Dataset,
+    fold: Fold,
+    options: Options | None = None,
+    tell: Callable[[int, Optimum], None] = lambda fold, optimum: None,
+) -> list[dict[str, Any]]:
+    """Rows of the validation file of every run, each predicted by a fit that has not seen its fold.
+
+    Args:
+        problem: of all the runs of `data`.
+        data: the runs.
+        fold: of each run; negative runs are fitted always and never predicted.
+        tell: called after each fold.
+    """
+    rows: list[dict[str, Any]] = []
+    for k in sorted({int(f) for f in fold if f >= 0}):
+        fitted, judged = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
+        optimum, frozen = train(problem, data, fitted, options)
+        tell(k, optimum)
+        rows += validation(frozen, data.subset(judged))["runs"]
+    return rows
+
+
+def train(
+    problem: Problem, data: Dataset, runs: np.ndarray, options: Options | None = None
+) -> tuple[Optimum, Frozen]:
+    """Fit of some runs of a problem, every rung of the ladder included, ready to predict others."""
+    keep = np.isin(problem.windows.run, runs).astype(float)
+    optimum = optimise(problem, keep=keep, options=options)
+    robot = problem.space.tree(jnp.asarray(optimum.state.z))
+    w = problem.windows
+    mine = np.flatnonzero(keep > 0)
+    seen = w.pieces(mine)
+    frozen = Frozen(
+        robot=robot,
+        space=problem.space,
+        z=optimum.state.z,
+        covariance=optimum.covariance,
+        variance=dict(
+            zip(problem.noise.names, np.exp(optimum.state.log_variance).tolist(), strict=True)
+        ),
+        rungs=[rung.fit(seen, robot) for rung in rungs(w.has_current)],
+    )
+    return optimum, frozen
+
+
+def only(problem: Problem, z: np.ndarray, pattern: str) -> list[Choice]:
+    """Choices that hold every number at a fitted value and leave those of a pattern free."""
+    robot = problem.space.tree(jnp.asarray(z))
+    held = [Choice(e.path, fixed=np.asarray(e.get(robot)).tolist()) for e in problem.space.free]
+    return [*held, Choice(pattern, free=True)]

@@ -1,0 +1,322 @@
+"""Posterior of a robot given windows of its runs, compiled, and one round of its ascent.
+
+Structural numbers are found by Levenberg-Marquardt (optimistix) on residuals whitened with the
+current variances and Student-t weights; variances by Fisher scoring of the restricted likelihood
+with the structural Jacobian taken into account.
+"""
+
+import copy
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from slipid.data.dataset import Windows
+from slipid.identify import likelihood as lk
+from slipid.identify.linear import inverse_root
+from slipid.model.robot import Robot
+from slipid.parameter import Choice, Space
+
+Vector = Array | np.ndarray
+"""One-dimensional, of jax or numpy."""
+DEGREES = 8.0
+"""Degrees of freedom of the Student-t weight of a run."""
+_VARIANCE_SPREAD = 3.0
+"""Std of the prior of every log variance."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a fit stands; enough to go on from.
+
+    Attributes:
+        z: structural vector in the search space.
+        log_variance: of every variance component.
+        round: rounds done.
+        loss: minus log posterior up to a constant.
+        moved: largest step of the last round, in posterior stds.
+        stage: what it was doing, for progress.
+    """
+
+    z: Float[np.ndarray, " free"]
+    log_variance: Float[np.ndarray, " variance"]
+    round: int
+    loss: float
+    moved: float
+    stage: str
+
+
+class Data(eqx.Module):
+    """What differs between sets of windows of the same shapes; an argument of compiled functions.
+
+    Attributes:
+        batch: measured.
+        base, which: covariance pieces and the variance each belongs to, per block.
+    """
+
+    batch: lk.Batch
+    base: dict[str, Array]
+    which: dict[str, Array]
+
+
+class Problem:
+    """Likelihood of a set of windows as jitted functions of the search vector.
+
+    Args:
+        windows: of the runs, all of them; `keep` below chooses those that count.
+        robot: start values and what is fixed.
+        choices: free, fixed, priors.
+        current_informs_motion: let currents and voltages move the numbers of the motion, too. By
+            default they do not ("cut"): the torque scale is read from currents given the motion,
+            whose errors are carried along. A friction model good to 5 % in current would otherwise
+            outvote forces that motion shows to 1 %.
+    """
+
+    def __init__(
+        self,
+        windows: Windows,
+        robot: Robot,
+        choices: list[Choice],
+        current_informs_motion: bool = False,
+    ):
+        self.space = Space(robot, choices)
+        electric = [n.startswith("motor.") or n.endswith(".friction") for n in self.space.names]
+        self.electric = np.asarray(electric, bool)
+        self.joint = current_informs_motion or not windows.has_current
+        self.robot = self.space.template
+        self._read(windows)
+        self._mean, self._std = (
+            jnp.asarray(self.space.prior_mean),
+            jnp.asarray(self.space.prior_std),
+        )
+        self.solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)
+        self._step = eqx.filter_jit(
+            partial(self.solver.step, self._stacked, options={}, tags=frozenset())
+        )
+        self._start = eqx.filter_jit(self._init)
+        self._form = self
+
+    def of(self, windows: Windows) -> "Problem":
+        """The same problem for other windows; those of the same shapes share what is compiled."""
+        other = copy.copy(self)
+        other._read(windows)
+        return other
+
+    def _read(self, windows: Windows) -> None:
+        self.windows = windows
+        self.noise = lk.noise(windows, self.robot)
+        self.data = Data(
+            batch=lk.batch(windows, self.robot),
+            base={k: jnp.asarray(c.base) for k, c in self.noise.blocks.items()},
+            which={k: jnp.asarray(c.which) for k, c in self.noise.blocks.items()},
+        )
+
+    @property
+    def batch(self) -> lk.Batch:
+        """The windows as arrays."""
+        return self.data.batch
+
+    # residuals -------------------------------------------------------------------------------
+    def blocks(self, z: Vector, volt: Vector) -> dict[str, Array]:
+        """Residual blocks at a search vector."""
+        return self._blocks(self.data, z, volt)
+
+    def linear(self, z: Vector, volt: Vector) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
+        return self._form._linear(self.data, z, volt)
+
+    def blocks_jit(self, z: Vector, volt: Vector) -> dict[str, Array]:
+        """`blocks`, compiled."""
+        return self._form._blocks_jit(self.data, z, volt)
+
+    def _blocks(self, data: Data, z: Vector, volt: Vector) -> dict[str, Array]:
+        return lk.residuals(self.space.tree(z), data.batch, jnp.asarray(volt))
+
+    @partial(jax.jit, static_argnums=0)
+    def _linear(self, data: Data, z: Vector, volt: Vector) -> tuple[dict, dict]:
+        return self._blocks(data, z, volt), jax.jacfwd(partial(self._blocks, data))(z, volt)
+
+    @partial(jax.jit, static_argnums=0)
+    def _blocks_jit(self, data: Data, z: Vector, volt: Vector) -> dict[str, Array]:
+        return self._blocks(data, z, volt)
+
+    def _stacked(self, y: Array, args: Any) -> tuple[Array, None]:
+        data, z0, mask, root, volt, felt = args
+        z = z0 + mask * self._std * y
+        if self.joint:
+            blocks = self._blocks(data, z, volt)
+        else:  # motion by itself; currents and voltages given the motion of the round's start
+            robot = self.space.tree(z)
+            held = self.space.tree(jnp.where(self.electric, z, z0))
+            still = lk.motion_residual(robot, data.batch, lk.predict(robot, data.batch))
+            blocks = {"motion": still} | lk.electric_residuals(held, data.batch, felt, volt)
+        parts = [jnp.einsum("nij,nj->ni", root[k], r).ravel() for k, r in blocks.items()]
+        return jnp.concatenate([*parts, (z - self._mean) / self._std]), None
+
+    @partial(jax.jit, static_argnums=0)
+    def _felt(self, data: Data, z: Vector) -> Array:
+        return lk.predict(self.space.tree(z), data.batch).felt
+
+    def _init(self, y: Array, args: Any) -> Any:
+        shape = jax.eval_shape(self._stacked, y, args)
+        return self.solver.init(self._stacked, y, args, {}, shape[0], shape[1], frozenset())
+
+    # weights ---------------------------------------------------------------------------------
+    def whitening(
+        self, blocks: dict[str, Array], log_v: Vector, keep: Vector
+    ) -> tuple[dict, dict, Array]:
+        """Roots W with W^T W = w V^-1 per piece, the weights w, and minus log likelihood."""
+        return self._form._whitening(self.data, blocks, log_v, keep)
+
+    @partial(jax.jit, static_argnums=0)
+    def _whitening(
+        self, data: Data, blocks: dict[str, Array], log_v: Vector, keep: Vector
+    ) -> tuple[dict, dict, Array]:
+        roots, weights, loss = {}, {}, jnp.zeros(())
+        for k, r in blocks.items():
+            inverse = inverse_root(self._covariance(data, k, log_v))
+            m = inverse.shape[-1]
+            q = jnp.sum(jnp.einsum("nij,nj->ni", inverse, r) ** 2, axis=-1)
+            weights[k] = keep * (DEGREES + m) / (DEGREES + q)
+            roots[k] = jnp.sqrt(weights[k])[:, None, None] * inverse
+            log_det = -jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=-2, axis2=-1)), axis=-1)
+            loss += jnp.sum(keep * (log_det + 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)))
+        return roots, weights, loss
+
+    def covariance(self, k: str, log_v: Vector) -> Array:
+        """Covariance of the residuals of block k (piece, m, m)."""
+        return self._covariance(self.data, k, log_v)
+
+    def _covariance(self, data: Data, k: str, log_v: Vector) -> Array:
+        v = jnp.exp(log_v)[data.which[k]]
+        m = data.base[k].shape[-1]
+        return jnp.einsum("nc,ncij->nij", v, data.base[k]) + lk.FLOOR[k] * jnp.eye(m)
+
+    def precision(self, jacobian: dict[str, Array], log_v: Vector, keep: Vector) -> Array:
+        """Expected information of the search vector, prior included (free, free)."""
+        return self._form._precision(self.data, jacobian, log_v, keep)
+
+    @partial(jax.jit, static_argnums=0)
+    def _precision(
+        self, data: Data, jacobian: dict[str, Array], log_v: Vector, keep: Vector
+    ) -> Array:
+        total, of_motion = jnp.diag(1 / self._std**2), jnp.diag(1 / self._std**2)
+        for k, jac in jacobian.items():
+            m = jac.shape[1]
+            factor = keep * (DEGREES + m) / (DEGREES + m + 2)  # Fisher information of a t location
+            root = inverse_root(self._covariance(data, k, log_v)) * jnp.sqrt(factor)[:, None, None]
+            half = jnp.einsum("nij,njp->nip", root, jac)
+            flat = half.reshape(-1, half.shape[-1])
+            total += flat.T @ flat
+            of_motion += flat.T @ flat if k == "motion" else 0.0
+        return total if self.joint else self._cut(total, of_motion)
+
+    def _cut(self, total: Array, of_motion: Array) -> Array:
+        """Information when p(electric | motion, all data) multiplies p(motion | motion data)."""
+        e = jnp.asarray(self.electric)
+        own = jnp.where(e[:, None] & e[None, :], total, jnp.where(jnp.eye(len(e)) > 0, 1.0, 0.0))
+        cross = jnp.where(e[:, None] & ~e[None, :], total, 0.0)
+        carried = cross.T @ jnp.linalg.solve(own, cross)
+        motion = ~e[:, None] & ~e[None, :]
+        return jnp.where(motion, of_motion + carried, total)
+
+    def scored(
+        self, blocks: dict, jacobian: dict, log_v: Vector, keep: Vector, typical: Array
+    ) -> Array:
+        """One Fisher-scoring step of the restricted likelihood in the log variances."""
+        return self._form._scored(self.data, blocks, jacobian, log_v, keep, typical)
+
+    @partial(jax.jit, static_argnums=0)
+    def _scored(
+        self, data: Data, blocks: dict, jacobian: dict, log_v: Vector, keep: Vector, typical: Array
+    ) -> Array:
+        _, weights, _ = self._whitening(data, blocks, log_v, keep)
+        cov = jnp.linalg.inv(self._precision(data, jacobian, log_v, keep))
+        count = log_v.shape[0]
+        score, info = jnp.zeros(count), jnp.zeros((count, count))
+        for k, r in blocks.items():
+            root = inverse_root(self._covariance(data, k, log_v))
+            inverse = jnp.einsum("nji,njk->nik", root, root)
+            base, which = data.base[k], data.which[k]
+            v = jnp.exp(log_v)[which]
+            vr = jnp.einsum("nij,nj->ni", inverse, r)
+            fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
+            vb = jnp.einsum("nij,ncjk->ncik", inverse, base)
+            trace = jnp.einsum("ncii->nc", vb)
+            vj = jnp.einsum("nij,njp->nip", inverse, jacobian[k])
+            spent = jnp.einsum(
+                "nip,pq,njq->nij", vj, cov, vj
+            )  # degrees of freedom of the structure
+            lost = jnp.einsum("nij,ncij->nc", spent, base)
+            score = score.at[which].add(0.5 * v * (fit + keep[:, None] * (lost - trace)))
+            cross = 0.5 * jnp.einsum("ncij,ndji->ncd", vb, vb) * (v[:, :, None] * v[:, None, :])
+            info = info.at[which[:, :, None], which[:, None, :]].add(keep[:, None, None] * cross)
+        score -= (log_v - typical) / _VARIANCE_SPREAD**2
+        info += jnp.eye(count) / _VARIANCE_SPREAD**2
+        return jnp.asarray(log_v) + jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
+
+    # fitting ---------------------------------------------------------------------------------
+    def levenberg(
+        self, z: Vector, root: dict, mask: np.ndarray, volt: float, most: int
+    ) -> np.ndarray:
+        """Search vector after at most so many Levenberg-Marquardt steps with fixed whitening."""
+        felt = self._form._felt(self.data, jnp.asarray(z))
+        args = (self.data, jnp.asarray(z), jnp.asarray(mask), root, jnp.asarray(volt), felt)
+        y = jnp.zeros(self.space.size)
+        state = self._start(y, args)
+        for _ in range(most):
+            y, state, _ = self._step(y=y, args=args, state=state)
+            done, _ = self.solver.terminate(self._stacked, y, args, {}, state, frozenset())
+            if bool(done):
+                break
+        return np.asarray(z + mask * np.asarray(self._std) * np.asarray(y))
+
+    def loss(self, z: Vector, log_v: Vector, keep: Vector) -> float:
+        """Minus log posterior of structure and variances, constants left out."""
+        zj = jnp.asarray(z)
+        _, _, nll = self.whitening(self.blocks_jit(zj, self.volt(log_v)), jnp.asarray(log_v), keep)
+        prior = 0.5 * np.sum(((z - self.space.prior_mean) / self.space.prior_std) ** 2)
+        typical = 2 * np.log(self.noise.typical)
+        return (
+            float(nll)
+            + float(prior)
+            + 0.5 * float(np.sum(((log_v - typical) / _VARIANCE_SPREAD) ** 2))
+        )
+
+    def volt(self, log_v: Vector) -> Array:
+        """Std of the voltage noise [V], 1 where none is logged."""
+        if "voltage" not in self.noise.blocks:
+            return jnp.asarray(1.0)
+        return jnp.exp(0.5 * jnp.asarray(log_v)[-1])
+
+    def round(
+        self, state: State, keep: Vector, mask: np.ndarray, steps: int, scoring: int
+    ) -> State:
+        """Weights, structure, variances: one turn of each."""
+        log_v = jnp.asarray(state.log_variance)
+        keep_j = jnp.asarray(keep, dtype=float)
+        volt = self.volt(log_v)
+        blocks = self.blocks_jit(jnp.asarray(state.z), volt)
+        root, _, _ = self.whitening(blocks, log_v, keep_j)
+        z = self.levenberg(state.z, root, mask, float(volt), steps)
+        typical = jnp.asarray(2 * np.log(self.noise.typical))
+        blocks, jacobian = self.linear(jnp.asarray(z), volt)
+        for _ in range(scoring):
+            log_v = self.scored(blocks, jacobian, log_v, keep_j, typical)
+        std = np.sqrt(np.diag(np.linalg.inv(np.asarray(self.precision(jacobian, log_v, keep_j)))))
+        moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
+        moved = max(moved, float(np.max(np.abs(np.asarray(log_v) - state.log_variance)) / 3))
+        return State(
+            z=z,
+            log_variance=np.asarray(log_v),
+            round=state.round + 1,
+            loss=self.loss(z, np.asarray(log_v), keep_j),
+            moved=moved,
+            stage=state.stage,
+        )
