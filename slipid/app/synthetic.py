@@ -365,8 +365,7 @@ def _electric(
     """Logged current magnitudes [A], voltages [V] and reported speeds [rad/s] (run, row, wheel)."""
     level = np.array([s.of(f"current.{d.surface}.run") for d in drives])[:, None, None]
     amps = amps + level * rng.normal(size=(len(drives), 1, amps.shape[2])) * (speed != 0)
-    last = lambda x: np.concatenate([x, x[:, -1:]], axis=1)  # noqa: E731
-    true, w = last(amps), last(speed)
+    true, w = _at_rows(amps), _at_rows(speed)
     measured = np.abs(true + s.ripple * rng.normal(size=true.shape))
     current = np.round((measured + float(robot.motor.current_offset)) / s.current_step)
     noise = s.voltage_noise * rng.normal(size=true.shape)
@@ -374,6 +373,12 @@ def _electric(
     voltage = np.round(held / s.voltage_step) * s.voltage_step if s.has_voltage else None
     quantum = 2.83 / robot.geometry.gear_ratio  # as a Robotino reports it, 1.3 % high
     return current * s.current_step, voltage, np.round(1.013 * w / quantum) * quantum
+
+
+def _at_rows(x: Float[np.ndarray, "run step wheel"]) -> Float[np.ndarray, "run row wheel"]:
+    """What a sensor reads at the rows between steps: the mean of the two steps that meet there."""
+    ends = np.concatenate([x[:, :1], x, x[:, -1:]], axis=1)
+    return 0.5 * (ends[:, 1:] + ends[:, :-1])
 
 
 LAYOUT: dict[str, Any] = {
