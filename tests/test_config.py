@@ -181,9 +181,7 @@ def test_a_set_without_files_is_skipped_with_a_line(tmp_path):
     more = '[[logs]]\nglob = "wheel_load/*/*.csv"\nformat = "robotino2022"\nload = "moved"\n'
     settings = '"robot.load_share@moved" = { free = false }\n"surface.blue.creep" = { start = 0.2 }'
     lines: list[str] = []
-    job = job_of(
-        tmp_path, GOOD.replace("[parameters]", f"{more}\n[parameters]\n{settings}"), lines
-    )
+    job = job_of(tmp_path, GOOD.replace("[parameters]", f"{more}\n[parameters]\n{settings}"), lines)
     assert len(job.dataset) == 1
     assert [line.partition(":")[0] for line in lines] == ["skipped"] * 3
     assert "wheel_load" in lines[0]

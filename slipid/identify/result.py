@@ -46,7 +46,8 @@ class Fit:
         residual: predicted less measured, one row per piece, by block.
         whitened: the same in units of its expected scatter.
         weight: of each piece in the last round, by block; about 1, small for an outlier.
-        spectrum: singular values of the prior-scaled whitened Jacobian; 1 is as good as the prior.
+        spectrum: singular values of the prior-scaled whitened Jacobian; at 1 the data know as much
+            as the prior.
         has: which of current, voltage were logged.
         curves: slip over torque per floor, as in identified.json.
         validity: what each floor was seen with.
@@ -276,14 +277,15 @@ def summarise(
     blocks, jacobian = problem.linear(jnp.asarray(z), volt)
     keep = jnp.ones(len(problem.windows))
     roots, weights, _ = problem.whitening(blocks, jnp.asarray(log_v), keep)
-    scale = problem.space.prior_std
-    info = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep))
-    beyond = scale[:, None] * info * scale[None, :] - np.eye(len(scale))
-    whitened = {
-        k: np.einsum("nij,nj->ni", np.asarray(roots[k]), np.asarray(r))
-        / np.sqrt(np.asarray(weights[k]))[:, None]
-        for k, r in blocks.items()
+    plain = {  # roots of V^-1 without the weights of outliers
+        k: np.asarray(roots[k]) / np.sqrt(np.asarray(weights[k]))[:, None, None] for k in roots
     }
+    whitened = {k: np.einsum("nij,nj->ni", plain[k], np.asarray(r)) for k, r in blocks.items()}
+    gram = np.zeros((problem.space.size,) * 2)
+    for k, jac in jacobian.items():
+        half = np.einsum("nij,njp->nip", plain[k], np.asarray(jac)).reshape(-1, len(gram))
+        half = half * problem.space.prior_std
+        gram += half.T @ half
     windows = problem.windows
     return Fit(
         space=problem.space,
@@ -297,7 +299,7 @@ def summarise(
         residual={k: np.asarray(v) for k, v in blocks.items()},
         whitened=whitened,
         weight={k: np.asarray(v) for k, v in weights.items()},
-        spectrum=np.sqrt(np.maximum(np.linalg.eigvalsh(beyond)[::-1], 0.0)),
+        spectrum=np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0)),
         has={"current": bool(windows.has_current), "voltage": bool(windows.has_voltage)},
         curves=curves_of.curves(
             problem.space, z, draws(z, optimum.covariance, 400, seed), problem.batch

@@ -214,9 +214,9 @@ def flat_directions(
 ) -> tuple[Flat, ...]:
     """Directions in motor numbers, friction and mass that the data leave as wide as the prior.
 
-    Eigenvectors of the prior-scaled posterior covariance S^-1 C S^-1 with sqrt(eigenvalue) > 0.8.
-    Numbers that no datum touches at all come first, each by itself, so that they do not mix into
-    the directions of the others.
+    Eigenvectors of the prior-scaled posterior covariance S^-1 C S^-1 of these numbers, given the
+    others, with sqrt(eigenvalue) > 0.8: what more data of the same kind could not narrow. Numbers
+    that no datum touches come first, each by itself: they would mix into the directions of others.
     """
     names = [
         e.path
@@ -228,7 +228,8 @@ def flat_directions(
         return ()
     index = np.array([space.place[n].start for n in names])
     std = space.prior_std[index]
-    scaled = covariance[np.ix_(index, index)] / std[:, None] / std[None, :]
+    precision = np.linalg.inv(covariance)[np.ix_(index, index)]
+    scaled = np.linalg.inv(precision * std[:, None] * std[None, :])
     alone = np.diag(scaled) - np.abs(scaled - np.diag(np.diag(scaled))).max(axis=1, initial=0.0)
     alone_flat = (np.diag(scaled) > 0.98) & (alone > 0.97)
     found = [

@@ -1,0 +1,271 @@
+"""Verdicts, intervals, flat directions and files of a fit, on made logs with known truth."""
+
+from __future__ import annotations
+
+import functools
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import lognorm
+
+from slipid.app.synthetic import Sensors, blank, grid, make_logs, truth
+from slipid.data.dataset import collect, windows
+from slipid.data.log import DataError
+from slipid.identify.fit import Optimum
+from slipid.identify.problem import Problem, State
+from slipid.identify.result import Fit, hash_of, load, summarise
+from slipid.identify.verdict import estimates, flat_directions
+from slipid.parameter import Choice
+
+DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1,), turns=0)
+TRUTH = truth(DRIVES)
+CHOICES = (
+    Choice("camera.scale", prior_mean=1.117, prior_std=0.002),
+    Choice("camera.lag", prior_mean=0.05, prior_std=0.02),
+    Choice("camera.marker_place", free=True),
+    Choice("robot.mass", fixed=12.0),
+)
+
+
+@functools.cache
+def made(voltage: bool):
+    """A problem, its data, and the Laplace covariance at the truth."""
+    data = collect(make_logs(TRUTH, DRIVES, 1, Sensors(has_voltage=voltage)))
+    problem = Problem(windows(data, 0.04, lag=0.05), blank(DRIVES), list(CHOICES))
+    z = problem.space.vector(TRUTH)
+    log_v = 2 * np.log(problem.noise.typical)
+    _, jacobian = problem.linear(jnp.asarray(z), problem.volt(log_v))
+    keep = jnp.ones(len(problem.windows))
+    info = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep))
+    state = State(z, log_v, 7, -1.5, 0.01, "joint")
+    end = Optimum(state, np.linalg.inv(info), True, "it settled", (3.0, -1.5))
+    return problem, data, end
+
+
+@functools.cache
+def fit_of(voltage: bool) -> Fit:
+    problem, data, end = made(voltage)
+    return summarise(problem, end, data, CHOICES)
+
+
+def test_intervals_are_quantiles_of_the_transformed_gaussian():
+    fit = fit_of(True)
+    e = fit.parameters["surface.soft.creep"]  # positive: log-normal
+    at = fit.space.place[e.path]
+    std = np.sqrt(fit.covariance[at, at][0, 0])
+    exact = lognorm(std, scale=e.value).ppf([0.05, 0.95])
+    assert e.interval90 == pytest.approx(exact, rel=1e-12)
+    assert e.std == pytest.approx(e.value * std)
+    lead = fit.parameters["surface.soft.lead"]  # any sign: normal
+    assert lead.interval90[1] - lead.value == pytest.approx(1.6448536 * lead.std)
+
+
+def test_shares_sum_to_one_and_their_intervals_hold_them():
+    e = fit_of(True).parameters["robot.load_share@as_built"]
+    assert sum(e.value) == pytest.approx(1.0)
+    assert e.labels == ("wheel 1", "wheel 2", "wheel 3")
+    assert all(low < v < high for v, (low, high) in zip(e.value, e.interval90, strict=True))
+    # near a Gaussian the width is 2 x 1.645 stds
+    widths = np.array([high - low for low, high in e.interval90])
+    assert widths == pytest.approx(2 * 1.645 * np.array(e.std), rel=0.1)
+
+
+def verdicts(ratio: float, choices: tuple[Choice, ...] = CHOICES, shift: float = 0.0):
+    """Estimates when every posterior is `ratio` times its prior, `shift` prior stds from it."""
+    from slipid.parameter import Space
+
+    space = Space(blank(DRIVES), choices)
+    cov = np.diag((ratio * space.prior_std) ** 2)
+    z = space.prior_mean + shift * space.prior_std
+    return {e.path: e for e in estimates(space, choices, z, cov, has_voltage=True)}
+
+
+@pytest.mark.parametrize(
+    ("ratio", "verdict"),
+    [(0.29, "identified"), (0.31, "weak"), (0.79, "weak"), (0.81, "not_identified")],
+)
+def test_the_verdict_rule(ratio, verdict):
+    found = verdicts(ratio)
+    free = [e for e in found.values() if e.ratio is not None]
+    assert {e.verdict for e in free} == {verdict}
+    assert {round(e.ratio, 9) for e in free} == {ratio}
+
+
+def test_provenance():
+    found = verdicts(0.2, (*CHOICES, Choice("motor.efficiency", fixed=0.8)))
+    assert found["surface.soft.creep"].provenance == "measured"
+    assert found["motor.efficiency"].provenance == "override"
+    assert found["motor.inductance"].provenance == "borrowed"
+    assert (found["motor.inductance"].verdict, found["motor.inductance"].std) == ("fixed", None)
+    # half of the information from the prior is where measuring ends
+    assert verdicts(0.70)["surface.soft.creep"].provenance == "measured"
+    assert verdicts(0.72)["surface.soft.creep"].provenance == "borrowed"
+
+
+def test_a_number_that_runs_to_zero_is_at_its_bound_and_a_contradicted_prior_is_not():
+    found = verdicts(0.1, shift=-4.5)
+    assert found["surface.soft.creep"].verdict == "at_bound"  # exp(-6.75) of its prior mean
+    assert found["surface.soft.lead"].verdict == "identified"  # has no bound
+    assert found["camera.scale"].verdict == "identified"  # 1 % off, against a tight prior
+    assert found["camera.scale"].pull == pytest.approx(-4.5)
+    assert verdicts(0.1, shift=-3.5)["surface.soft.creep"].verdict == "identified"
+
+
+def test_without_voltage_neither_resistance_nor_back_emf_is_identified():
+    fit = fit_of(False)
+    assert fit.has["voltage"] is False
+    for path in ("motor.resistance", "motor.back_emf"):
+        e = fit.parameters[path]
+        assert (e.verdict, e.provenance) == ("not_identified", "borrowed")
+    text = " | ".join(fit.messages)
+    assert "motor.resistance: log the motor voltage (or duty and bus voltage)" in text
+    [joint] = [f for f in fit.flat if "motor.back_emf" in f.paths]
+    assert "surface.soft.friction" in joint.paths
+    assert joint.powers == pytest.approx([1.0] * len(joint.paths), abs=0.05)
+    assert "surface.soft.friction/motor.back_emf" in joint.text
+    # nothing whose scale hangs on another number's prior is called measured
+    assert {fit.parameters[p].provenance for p in joint.paths} == {"borrowed"}
+
+
+def test_no_prior_however_tight_lends_the_motor_a_verdict_without_voltage():
+    problem, _, end = made(False)
+    tight = end.covariance * 1e-6
+    found = estimates(problem.space, CHOICES, end.state.z, tight, has_voltage=False)
+    by = {e.path: e.verdict for e in found}
+    assert by["motor.resistance"] == by["motor.back_emf"] == "not_identified"
+    assert by["motor.coulomb_friction"] == "identified"
+
+
+def test_with_voltage_both_are_identified_and_no_flat_direction_holds_them():
+    fit = fit_of(True)
+    for path in ("motor.resistance", "motor.back_emf"):
+        assert fit.parameters[path].verdict == "identified"
+        assert fit.parameters[path].provenance == "measured"
+    assert not [f for f in fit.flat if {"motor.resistance", "motor.back_emf"} & set(f.paths)]
+
+
+def test_a_made_up_flat_direction_comes_out_with_its_powers():
+    problem, _, _ = made(True)
+    space = problem.space
+    std, names = space.prior_std, space.names
+    precision = np.diag(1 / std**2)
+    a, b = names.index("motor.back_emf"), names.index("surface.soft.friction")
+    held = np.zeros(len(names))
+    held[a], held[b] = 2.0, 1.0  # only back_emf^2 * friction is measured
+    precision += 1e6 * np.outer(held, held)
+    for k, name in enumerate(names):
+        if k not in (a, b):
+            precision[k, k] += 1e4 / std[k] ** 2
+        assert name
+    [flat] = flat_directions(space, np.linalg.inv(precision), True, True)
+    assert flat.paths == ("motor.back_emf", "surface.soft.friction")
+    assert flat.powers == pytest.approx((-0.5, 1.0), abs=0.02)
+
+
+def test_curves_rise_hold_their_line_and_end_where_the_data_end():
+    fit = fit_of(True)
+    curve = fit.curves["soft"]
+    torque, slip, low, high = (
+        np.array(curve[k]) for k in ("torque_nm", "slip", "slip_lo", "slip_hi")
+    )
+    assert (np.diff(torque) > 0).all()
+    assert (np.diff(slip) >= 0).all()
+    assert slip[0] == 0
+    assert (low <= slip + 1e-9).all()
+    assert (high >= slip - 1e-9).all()
+    assert torque[-1] <= fit.validity["soft"]["torque_nm"][1]
+    # the law itself, at a slip of the curve
+    floor, w, share = TRUTH.surfaces, curve["at"]["wheel_speed"], curve["at"]["load_share"]
+    rim, k = 0.04 * w, 30
+    grip = np.tanh(slip[k] * rim / (0.002 + float(floor.creep[0]) * rim))
+    grip += float(floor.slide_viscosity[0]) * slip[k] * rim
+    expected = 0.04 * float(floor.friction[0]) * 12.0 * 9.81 * share * grip
+    assert torque[k] == pytest.approx(expected, rel=2e-3)
+
+
+def test_spectrum_is_that_of_the_whitened_jacobian():
+    problem, _, end = made(True)
+    z, log_v = jnp.asarray(end.state.z), end.state.log_variance
+    _, jacobian = problem.linear(z, problem.volt(log_v))
+    rows = []
+    for k, jac in jacobian.items():
+        root = np.linalg.cholesky(np.asarray(problem.covariance(k, jnp.asarray(log_v))))
+        rows.append(np.linalg.solve(root, np.asarray(jac)).reshape(-1, problem.space.size))
+    whole = np.concatenate(rows) * problem.space.prior_std
+    expected = np.linalg.svd(whole, compute_uv=False)
+    found = fit_of(True).spectrum
+    assert found[expected > 1e-3] == pytest.approx(expected[expected > 1e-3], rel=1e-6)
+
+
+def test_whitened_residuals_have_the_scatter_they_are_given():
+    problem, _, _ = made(True)
+    z, log_v = fit_of(True).z, made(True)[2].state.log_variance
+    blocks = problem.blocks_jit(jnp.asarray(z), problem.volt(log_v))
+    for k, r in blocks.items():
+        cov = np.asarray(problem.covariance(k, jnp.asarray(log_v)))
+        q = np.einsum("ni,nij,nj->n", r, np.linalg.inv(cov), r)
+        assert (fit_of(True).whitened[k] ** 2).sum(axis=1) == pytest.approx(q, rel=1e-6)
+
+
+def test_identified_json_is_what_the_contract_says():
+    found = json.loads(json.dumps(fit_of(True).to_identified(), allow_nan=False))
+    assert found["schema"] == "slipid.identified/1"
+    keys = {"value", "unit", "shape", "labels", "std", "interval90", "source", "verdict"}
+    for e in found["parameters"].values():
+        assert set(e) == keys | {"provenance"}
+    shares = found["parameters"]["robot.load_share@as_built"]
+    assert (shares["shape"], len(shares["value"]), len(shares["interval90"])) == ([3], 3, 3)
+    assert found["parameters"]["motor.resistance"]["shape"] == []
+    assert found["surfaces"] == ["soft"]
+    assert set(found["curves"]["soft"]) == {"torque_nm", "slip", "slip_lo", "slip_hi", "at"}
+    assert found["data"]["runs"] == [log.name for log in made(True)[1].logs]
+
+
+def test_the_data_hash_knows_names_and_bytes_but_no_order():
+    runs = [("a", "1"), ("b", "2")]
+    assert hash_of(runs) == hash_of(runs[::-1])
+    assert len({hash_of(runs), hash_of(runs[:1]), hash_of([("a", "2"), ("b", "1")])}) == 3
+
+
+def test_a_saved_fit_comes_back_the_same(tmp_path):
+    fit = fit_of(True).with_baselines({"constant": {"soft": [0.25]}})
+    fit.save(tmp_path)
+    back = load(tmp_path)
+    assert back.to_identified() == fit.to_identified()
+    assert back.to_fit_json() == fit.to_fit_json()
+    for name in ("z", "covariance", "spectrum", "piece_run"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(fit, name))
+    for name in ("residual", "whitened", "weight"):
+        mine, other = getattr(fit, name), getattr(back, name)
+        assert set(mine) == set(other) == {"motion", "current", "voltage"}
+        assert all(np.array_equal(mine[k], other[k]) for k in mine)
+    first = (tmp_path / "fit.json").read_bytes()
+    back.save(tmp_path)
+    assert (tmp_path / "fit.json").read_bytes() == first
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["fit.json", "fit.npz", "identified.json"]
+
+
+def test_numbers_that_are_not_finite_never_reach_a_file(tmp_path):
+    import dataclasses
+
+    bad = dataclasses.replace(fit_of(True), settings={"lag": float("nan")})
+    with pytest.raises(ValueError, match="JSON"):
+        bad.save(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_results_are_refused_with_a_message(tmp_path):
+    with pytest.raises(DataError, match="expected the result of `slipid identify`"):
+        load(tmp_path)
+    fit_of(True).save(tmp_path)
+    (tmp_path / "fit.npz").write_bytes(b"PK no zip")
+    with pytest.raises(DataError, match="damaged"):
+        load(tmp_path)
+    (tmp_path / "fit.json").write_text('{"schema": "other/1"}')
+    with pytest.raises(DataError, match=r"no slipid\.fit/1"):
+        load(tmp_path)
+    (tmp_path / "fit.json").write_text("{")
+    with pytest.raises(DataError, match="no valid JSON"):
+        load(tmp_path)
