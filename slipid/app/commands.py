@@ -52,7 +52,10 @@ def identify(config_path: Path, data: Path, out: Path, report: Reporter) -> Done
     _keep_run(config, job, data, out, time.monotonic() - began)
     fit.save(out)
     written = ["identified.json", "fit.json", "fit.npz", "run.json", "config.toml"]
-    written += _plots(fit, job.dataset, out)
+    from slipid.app.plots import identify_plots
+
+    report.stage("drawing")
+    written += [path.name for path in identify_plots(fit, job.dataset, out)]
     (out / CHECKPOINT).unlink(missing_ok=True)
     return Done(fit, job, tuple(written))
 
@@ -134,16 +137,10 @@ def _keep_run(config: Config, job: Any, data: Path, out: Path, seconds: float) -
     )
 
 
-def _plots(fit: Any, dataset: Any, out: Path) -> list[str]:
-    try:
-        from slipid.app import plots
-    except ImportError:
-        return []
-    return [Path(p).name for p in plots.identify_plots(fit, dataset, out)]
-
-
 def validate(out: Path, data: Path, report: Reporter) -> dict[str, Any]:
     """Open-loop prediction of runs by the fit in `out`, as the validation file has it.
+
+    Pictures of it go to `out`.
 
     Raises:
         DataError: no fit there, or logs that it cannot predict.
@@ -174,7 +171,12 @@ def validate(out: Path, data: Path, report: Reporter) -> dict[str, Any]:
         variance=dict(fit.variance),
         rungs=restored(dict(fit.baselines)),
     )
-    return validation(frozen, dataset)
+    found = validation(frozen, dataset)
+    report.stage("drawing")
+    from slipid.app.plots import validate_plots
+
+    validate_plots(fit, dataset, found, out)
+    return found
 
 
 def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> dict[str, Any]:

@@ -1,0 +1,49 @@
+"""Every model's error side by side."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from slipid.app import drawing
+from slipid.app.drawing import Axes, Figure
+
+WORDS = {
+    "identified": "identified (force balance)",
+    "encoder": "encoders alone",
+    "heading_lookup": "lookup by heading",
+    "paper": "2021 paper, as deployed",
+}
+
+
+def ladder_figure(found: Mapping[str, Any], which: str) -> Figure:
+    """Mean end-point error of every model on every floor, a bar each.
+
+    Args:
+        found: content of a validation file.
+        which: runs these are, in words.
+    """
+    floors = found["summary"]
+    models = list(next(iter(floors.values())))
+    width = 2.7 * len(floors) + 2.4
+    made = drawing.figure(
+        max(width, 8.8),
+        1.7 + 0.32 * len(models),
+        f"How far from the camera's end each model ends, open loop; {which}",
+    )
+    axes = made.subplots(1, len(floors), sharey=True, squeeze=False)[0]
+    for ax, (floor, by) in zip(axes, floors.items(), strict=True):
+        _bars(ax, {model: 100 * by[model]["endpoint_error_mean"] for model in models})
+        ax.set_title(f"{floor}, {by[models[0]]['runs']} runs", fontsize=10)
+        ax.set_xlabel("mean end-point error\n[% of the way]")
+    axes[0].set_yticks(range(len(models)), [WORDS.get(m, m.replace("_", " ")) for m in models])
+    axes[0].invert_yaxis()
+    return made
+
+
+def _bars(ax: Axes, error: Mapping[str, float]) -> None:
+    drawing.plain(ax)
+    ax.grid(False, axis="y")
+    colours = [drawing.BLUE if model == "identified" else "#bbbbbb" for model in error]
+    values = list(error.values())
+    bars = ax.barh(range(len(values)), values, color=colours, height=0.75)
+    ax.bar_label(bars, [f"{v:.1f}" for v in values], padding=3, fontsize=9)
+    ax.set_xlim(0.0, 1.2 * max(values))
