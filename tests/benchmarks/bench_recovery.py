@@ -1,0 +1,56 @@
+"""Known truth over 40 seeds: errors, z-scores and their spread, starting two-fold off."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from tests import recovery
+
+SEEDS = 40
+
+
+def test_recovery_over_seeds():
+    found, began = [], time.perf_counter()
+    for seed in range(SEEDS):
+        found.append(recovery.recover(seed))
+        seconds = time.perf_counter() - began
+        print(f"seed {seed}: {seconds:.0f} s, converged {found[-1].converged}", flush=True)
+    summary(found)
+    z = np.stack([f.score for f in found])[:, recovery.design()]
+    for path in ("motor.resistance", "motor.back_emf"):
+        assert max(abs(f.relative_error(path)) for f in found) < 0.02
+    assert max(gap for f in found for gap in f.curve_gap.values()) < 0.02
+    assert 0.8 < z.std() < 1.25
+    assert np.abs(z).max() < 4
+    assert all(f.converged for f in found)
+
+
+def summary(found):
+    names, by_plan = found[0].names, recovery.design()
+    z = np.stack([f.score for f in found])
+    std = np.stack([f.std for f in found])
+    verdict = np.stack([f.identified for f in found])
+    print(f"{'coordinate':34}{'plan':>5}{'fits':>6}{'std':>8}{'z mean':>8}{'z std':>7}{'max':>6}")
+    for k, name in enumerate(names):
+        row = z[:, k]
+        print(
+            f"{name:34}{'yes' if by_plan[k] else '-':>5}{verdict[:, k].mean():6.0%}"
+            f"{np.median(std[:, k]):8.4f}{row.mean():+8.2f}{row.std():7.2f}{np.abs(row).max():6.2f}"
+        )
+    for path in ("motor.resistance", "motor.back_emf"):
+        worst = max(abs(f.relative_error(path)) for f in found)
+        print(f"{path}: largest error {worst:.2%}")
+    for floor in found[0].curve_gap:
+        gaps = [f.curve_gap[floor] for f in found]
+        print(
+            f"curve of {floor}: largest error {max(gaps):.4f} in slip, median {np.median(gaps):.4f}"
+        )
+    for label, chosen in (("by plan", np.broadcast_to(by_plan, z.shape)), ("by fit", verdict)):
+        picked = z[chosen]
+        print(
+            f"identified {label}: {picked.size} z-scores, std {picked.std():.3f}, "
+            f"rms {np.sqrt((picked**2).mean()):.3f}, largest {np.abs(picked).max():.2f}, "
+            f"{(np.abs(picked) > 4).sum()} above 4"
+        )
