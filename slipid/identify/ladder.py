@@ -227,8 +227,8 @@ class HeadingLookup(Rung):
         for name in dict.fromkeys(series.tolist()):
             mine = series == name
             data = phi[mine], gap[mine]
-            best = min(self.weights, key=lambda x, d=data, r=w.run[mine]: _left_out(*d, r, x))
-            out[name] = _ridge(*data, best)
+            loss = [_left_out(*data, w.run[mine], weight) for weight in self.weights]
+            out[name] = _ridge(*data, self.weights[int(np.argmin(loss))])
         return replace(self, state=out)
 
     def increments(self, w: Windows, robot: Robot) -> Increments:
