@@ -50,7 +50,8 @@ def load_checkpoint(path: Path, key: str) -> tuple[Any, list[float]] | None:
     from slipid.identify.problem import State
 
     try:
-        with np.load(path, allow_pickle=False) as kept:
+        # opened here: numpy leaves a damaged file open
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
             if str(kept["key"]) != key:
                 return None
             state = State(

@@ -213,7 +213,8 @@ def load(folder: Path) -> Fit:
     if not isinstance(kept, dict) or kept.get("schema") != SCHEMA_FIT:
         raise DataError(f"{path}: no {SCHEMA_FIT}; expected the result of `slipid identify`")
     try:
-        with np.load(folder / "fit.npz", allow_pickle=False) as npz:
+        # opened here: numpy leaves a damaged file open
+        with (folder / "fit.npz").open("rb") as file, np.load(file, allow_pickle=False) as npz:
             arrays = {k: npz[k] for k in npz.files}
         return _from_files(kept, arrays)
     except OSError as error:

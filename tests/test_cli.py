@@ -1,0 +1,403 @@
+"""The command line: files, exit codes, messages, interrupts; in process and as real processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from slipid.app.cli import app
+from slipid.app.demo import packaged_config
+from slipid.app.files import load_checkpoint, save_checkpoint
+from slipid.app.new import write_new
+from slipid.app.synthetic import Sensors, grid, make_logs, truth, write_logs
+from slipid.data.files import write_bytes, write_json
+from slipid.data.log import DataError
+from tests.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
+
+ROOT = Path(__file__).resolve().parents[1]
+DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
+UNSEEN = [type(d)(d.surface, d.load, d.heading + 0.4, d.speed) for d in DRIVES[:3]]
+
+
+def invoke(*words: object):
+    return CliRunner().invoke(app, [str(w) for w in words])
+
+
+def process(*words: object, **more):
+    command = [sys.executable, "-c", "from slipid.app.cli import main; main()"]
+    return subprocess.Popen(
+        [*command, *map(str, words)],
+        cwd=ROOT,
+        env={**os.environ, "JAX_ENABLE_X64": "0"},  # the command itself must switch it on
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **more,
+    )
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A folder with a config, made logs, unseen logs, and the result of identify on them."""
+    folder = tmp_path_factory.mktemp("small")
+    for name, drives, seed in (("logs", DRIVES, 1), ("unseen", UNSEEN, 2)):
+        robot = truth(drives)
+        write_logs(make_logs(robot, drives, seed, Sensors()), robot, folder / name, folder / "t")
+    (folder / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
+    args = ("identify", folder / "my.toml", "--data", folder / "logs", "--out", folder / "out")
+    return folder, invoke(*args)
+
+
+# help and usage ---------------------------------------------------------------------------------
+
+
+def test_help_names_every_command():
+    result = invoke("--help")
+    assert result.exit_code == 0
+    for command in ("new", "check", "identify", "validate", "paper", "demo"):
+        assert command in result.stdout
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys; from slipid.app.cli import app; from typer.testing import CliRunner; "
+        "r = CliRunner().invoke(app, ['--help']); assert r.exit_code == 0; "
+        "print(sorted({'jax', 'numpy', 'pydantic', 'matplotlib', 'scipy'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("identify",),
+        ("identify", "none.toml"),
+        ("nonsense",),
+        ("identify", "none.toml", "--data", ".", "--out", "o", "--unknown"),
+    ],
+)
+def test_wrong_usage_is_2(words):
+    assert invoke(*words).exit_code == 2
+
+
+@pytest.mark.parametrize("command", ["identify", "check"])
+def test_a_bad_config_is_2_and_a_message(tmp_path, command):
+    bad = tmp_path / "bad.toml"
+    bad.write_text('[robot]\ndrive = "omny"\n', encoding="utf-8")
+    out = tmp_path / "out"
+    result = invoke(command, bad, "--data", tmp_path, "--out", out)
+    assert result.exit_code == 2
+    assert f"{bad}: robot.drive: 'omny', did you mean omni?" in result.stderr
+    assert not out.exists()
+
+
+def test_no_data_folder_is_2(tmp_path):
+    config = ROOT / "configs" / "robotino2022.toml"
+    result = invoke("check", config, "--data", tmp_path / "none")
+    assert result.exit_code == 2
+    assert "no such folder; expected the folder of the logs" in result.stderr
+
+
+def test_validate_without_a_fit_is_2(tmp_path):
+    result = invoke("validate", tmp_path, "--data", tmp_path)
+    assert result.exit_code == 2
+    assert "expected the result of `slipid identify`" in result.stderr
+
+
+# broken logs ------------------------------------------------------------------------------------
+
+
+def toml(value: object) -> str:
+    """A value as inline TOML; JSON is TOML for strings, numbers and lists."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{k} = {toml(v)}" for k, v in value.items()) + " }"
+    return json.dumps(value)
+
+
+def config_of(case: Case, folder: Path) -> Path:
+    """A config that reads the case's file with the layout the case declares."""
+    layout = "\n".join(f"{k} = {toml(v)}" for k, v in case.mapping().items())
+    two = (
+        'drive = "general"\nwheel_places_m = [[0, 0.1], [0, -0.1]]\n'
+        'drive_directions_deg = [0, 0]\nroller_angles_deg = ["none", "none"]'
+    )
+    three = 'drive = "omni"\nbase_radius_m = 0.125\nwheel_azimuths_deg = [60, 180, 300]'
+    path = folder / "my.toml"
+    path.write_text(
+        f"[robot]\n{three if case.file == ROBOTINO else two}\nwheel_radius_m = 0.04\n"
+        f"[layouts.mine]\n{layout}\n"
+        f'[[logs]]\nglob = "{case.file}"\nformat = "mine"\nsurface = "gray"\n',
+        encoding="utf-8",
+    )
+    return path
+
+
+def words_of(case: Case) -> list[str]:
+    """What the message must hold; a glob does not see files that are no files."""
+    if case.name in ("folder", "missing file"):
+        return ["no file matches", "exp07.csv"]
+    return [w.replace("layout columns", "layouts.mine columns") for w in case.expected]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_a_broken_log_is_one_message_and_2(tmp_path, case: Case):
+    data = tmp_path / "data"
+    write_good(data)
+    case.breaker(data / case.file)
+    config, out = config_of(case, tmp_path), tmp_path / "out"
+    result = invoke("identify", config, "--data", data, "--out", out, "--quiet")
+    assert result.exit_code == 2
+    assert isinstance(result.exception, SystemExit)
+    assert [w for w in words_of(case) if w not in result.stderr] == [], result.stderr
+    assert result.stderr.count("\n") == 1
+    assert result.stdout == ""
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("name", ["empty file", "binary file", "missing column"])
+def test_a_broken_log_in_a_real_process(tmp_path, name):
+    [case] = [c for c in CASES if c.name == name]
+    data = tmp_path / "data"
+    write_good(data)
+    case.breaker(data / case.file)
+    config, out = config_of(case, tmp_path), tmp_path / "out"
+    run = process("identify", config, "--data", data, "--out", out)
+    stdout, stderr = run.communicate(timeout=120)
+    assert run.returncode == 2
+    assert [w for w in words_of(case) if w not in stderr] == []
+    assert "Traceback" not in stderr + stdout
+    assert not out.exists()
+
+
+def test_a_log_without_motion_is_refused_before_anything_is_written(tmp_path):
+    data = tmp_path / "data"
+    write_good(data)
+    path = data / GENERIC
+    still = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
+    for cells in still[1:]:
+        cells[1:5] = ["0", "0", "0", "0"]
+        cells[9:11] = ["5.0", "1.0"]
+    path.write_text("\n".join(",".join(c) for c in still) + "\n", encoding="utf-8")
+    config = config_of(Case("still", lambda p: None, (), GENERIC), tmp_path)
+    result = invoke("identify", config, "--data", data, "--out", tmp_path / "out", "--quiet")
+    assert result.exit_code == 2
+    assert "no wheel moves 10 mm" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+# the job end to end -----------------------------------------------------------------------------
+
+
+def test_identify_writes_what_the_contract_says(small):
+    folder, result = small
+    assert result.exit_code == 0, result.stderr
+    out = folder / "out"
+    names = {p.name for p in out.iterdir()}
+    assert names >= {"identified.json", "fit.json", "fit.npz", "run.json", "config.toml"}
+    assert not [n for n in names if n.startswith(".") or n.endswith(".part")]
+    assert "checkpoint.npz" not in names  # it is done with
+    assert (out / "config.toml").read_text() == (folder / "my.toml").read_text()
+    run = json.loads((out / "run.json").read_text())
+    assert set(run["data"]["logs"]) == {f"as_built/soft/run{k:03d}.csv" for k in range(12)}
+    assert run["seed"] == 0
+    assert {"python", "jax", "numpy", "slipid"} <= set(run["versions"])
+    found = json.loads((out / "identified.json").read_text(), parse_constant=pytest.fail)
+    assert found["data"]["hash"] == run["data"]["hash"]
+    assert json.loads((out / "fit.json").read_text(), parse_constant=pytest.fail)["converged"]
+    assert "motor.resistance" in result.stdout
+    assert "skipped" in result.stderr  # the config also names moved/
+
+
+def test_identify_finds_the_motor(small):
+    folder, _ = small
+    found = json.loads((folder / "out" / "identified.json").read_text())["parameters"]
+    # half and twice the truth to begin with, hardly any data
+    assert found["motor.resistance"]["value"] == pytest.approx(5.5, rel=0.03)
+    assert found["motor.back_emf"]["value"] == pytest.approx(0.0514, rel=0.03)
+    assert found["motor.resistance"]["verdict"] == "identified"
+
+
+def test_json_to_stdout_and_the_same_numbers_again(small, tmp_path):
+    folder, _ = small
+    config, data = folder / "my.toml", folder / "logs"
+    result = invoke("identify", config, "--data", data, "--out", tmp_path, "--json", "-", "--quiet")
+    assert result.exit_code == 0
+    assert json.loads(result.stdout) == json.loads((folder / "out/identified.json").read_text())
+
+
+def test_validate_predicts_unseen_runs(small, tmp_path):
+    folder, _ = small
+    target = tmp_path / "v.json"
+    result = invoke("validate", folder / "out", "--data", folder / "unseen", "--json", target)
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(target.read_text(), parse_constant=pytest.fail)
+    assert found["schema"] == "slipid.validation/1"
+    models = found["summary"]["soft"]
+    assert {"encoder", "paper", "heading_lookup", "identified"} <= set(models)
+    assert models["identified"]["runs"] == len(found["runs"]) == 3
+    # encoders are off by a quarter on this floor
+    assert models["identified"]["endpoint_error_mean"] < 0.05
+    assert models["encoder"]["endpoint_error_mean"] > 0.15
+    assert "were fitted" not in result.stderr
+
+
+def test_validate_says_when_runs_were_fitted_and_when_a_floor_is_unknown(small, tmp_path):
+    folder, _ = small
+    result = invoke("validate", folder / "out", "--data", folder / "logs")
+    assert result.exit_code == 0
+    assert "12 of 12 runs were fitted" in result.stderr
+    other = tmp_path / "as_built/ice/run000.csv"
+    other.parent.mkdir(parents=True)
+    other.write_bytes((folder / "logs/as_built/soft/run000.csv").read_bytes())
+    result = invoke("validate", folder / "out", "--data", tmp_path)
+    assert result.exit_code == 2
+    assert "'ice'" in result.stderr
+    assert "identified: soft" in result.stderr
+
+
+def test_check_tells_before_the_fit(small, tmp_path):
+    folder, _ = small
+    out = tmp_path / "check"
+    result = invoke("check", folder / "my.toml", "--data", folder / "logs", "--out", out)
+    assert result.exit_code == 0, result.stderr
+    found = json.loads((out / "check.json").read_text(), parse_constant=pytest.fail)
+    keys = ("surface", "load", "session", "runs", "headings", "speeds")
+    assert [tuple(group[k] for k in keys) for group in found["groups"]] == [
+        ("soft", "as_built", f"soft/as_built/{v:.2f}", 6, 6, [v]) for v in (0.1, 0.3)
+    ]
+    assert "voltage" in found["channels"]
+    assert "current (unsigned)" in found["channels"]
+    assert found["parameters"]["motor.resistance"]["verdict"] == "identified"
+    assert found["parameters"]["robot.mass"]["verdict"] == "fixed"
+    picture = (out / "raw_soft_as_built.png").read_bytes()
+    assert picture[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_a_fit_that_does_not_settle_is_1_and_says_so(small, tmp_path):
+    folder, _ = small
+    config = tmp_path / "short.toml"
+    text = packaged_config("robotino.toml").replace("rounds = 30 ", "rounds = 1  ")
+    config.write_text(text, encoding="utf-8")
+    result = invoke("identify", config, "--data", folder / "logs", "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "NOT converged: 1 rounds without settling" in result.stdout
+    assert json.loads((tmp_path / "out/fit.json").read_text())["converged"] is False
+
+
+# interrupts -------------------------------------------------------------------------------------
+
+
+def endless(folder: Path, target: Path) -> Path:
+    """The config of the small job with a tolerance that takes every round."""
+    text = packaged_config("robotino.toml").replace("tolerance = 0.02", "tolerance = 1e-12")
+    target.write_text(text.replace("rounds = 30 ", "rounds = 60 "), encoding="utf-8")
+    return target
+
+
+def stopped(config: Path, data: Path, out: Path, how: signal.Signals) -> subprocess.Popen:
+    """A fit stopped by a signal some rounds after its first checkpoint."""
+    run = process("identify", config, "--data", data, "--out", out)
+    deadline = time.monotonic() + 300
+    while not (out / "checkpoint.npz").exists():
+        assert run.poll() is None, run.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    run.send_signal(how)
+    return run
+
+
+@pytest.mark.slow
+def test_a_killed_fit_goes_on_and_ends_where_it_would_have(small, tmp_path):
+    folder, _ = small
+    config, data = endless(folder, tmp_path / "long.toml"), folder / "logs"
+    killed = stopped(config, data, tmp_path / "a", signal.SIGKILL)
+    killed.communicate(timeout=60)
+    assert killed.returncode == -signal.SIGKILL
+    assert [p.name for p in (tmp_path / "a").iterdir() if p.suffix == ".json"] == []
+    again = process("identify", config, "--data", data, "--out", tmp_path / "a")
+    _, stderr = again.communicate(timeout=300)
+    whole = process("identify", config, "--data", data, "--out", tmp_path / "b")
+    whole.communicate(timeout=300)
+    assert again.returncode == whole.returncode == 1  # the tolerance is out of reach
+    assert "going on from round" in stderr
+    one, other = (json.loads((tmp_path / k / "fit.json").read_text()) for k in "ab")
+    assert one["z"] == pytest.approx(other["z"], rel=1e-9, abs=1e-12)
+    assert one["history"] == pytest.approx(other["history"], rel=1e-9)
+    assert one["rounds"] == other["rounds"] == 60
+
+
+@pytest.mark.slow
+def test_an_interrupt_is_130_and_keeps_the_checkpoint(small, tmp_path):
+    folder, _ = small
+    config = endless(folder, tmp_path / "long.toml")
+    run = stopped(config, folder / "logs", tmp_path / "out", signal.SIGINT)
+    _, stderr = run.communicate(timeout=60)
+    assert run.returncode == 130
+    assert "interrupted" in stderr
+    assert "Traceback" not in stderr
+    assert (tmp_path / "out" / "checkpoint.npz").exists()
+    assert not (tmp_path / "out" / "identified.json").exists()
+
+
+def test_a_checkpoint_of_another_job_or_a_damaged_one_is_not_used(tmp_path):
+    from slipid.identify.problem import State
+
+    state = State(np.arange(3.0), np.array([-1.0]), 4, -2.5, 0.3, "joint")
+    path = tmp_path / "checkpoint.npz"
+    save_checkpoint(path, "key", state, [1.0, -2.5])
+    back, history = load_checkpoint(path, "key")
+    assert history == [1.0, -2.5]
+    assert (back.round, back.loss, back.moved, back.stage) == (4, -2.5, 0.3, "joint")
+    np.testing.assert_array_equal(back.z, state.z)
+    assert load_checkpoint(path, "other") is None
+    path.write_bytes(path.read_bytes()[:50])
+    assert load_checkpoint(path, "key") is None
+    assert load_checkpoint(tmp_path / "none.npz", "key") is None
+
+
+# files ------------------------------------------------------------------------------------------
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "a.json"
+    write_json(path, {"x": 1.5})
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(path, {"x": float("inf")})
+
+    def crash(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", crash)
+    with pytest.raises(OSError, match="disk full"):
+        write_bytes(path, b"new")
+    assert json.loads(path.read_text()) == {"x": 1.5}
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_new_writes_a_config_that_reads_and_never_overwrites(tmp_path):
+    path = tmp_path / "mine.toml"
+    flags = {"wheel-radius-m": 0.05, "base-m": 0.2, "gear-ratio": 12, "mass-kg": 9}
+    words = [w for k, v in flags.items() for w in (f"--{k}", v)]
+    result = invoke("new", "--out", path, *words, "--ticks-per-revolution", 500)
+    assert result.exit_code == 0, result.stderr
+    from slipid.app.config import read_config
+
+    assert read_config(path).content.robot.base_radius_m == 0.2
+    again = invoke("new", "--out", path, *words, "--ticks-per-revolution", 500)
+    assert again.exit_code == 2
+    assert "exists already" in again.stderr
+    for drive in ("mecanum", "skid"):
+        write_new(tmp_path / f"{drive}.toml", drive, 0.05, 0.2, 12.0, 9.0, 500.0, False)
+    with pytest.raises(DataError, match="greater than 0"):
+        write_new(tmp_path / "x.toml", "omni", -0.05, 0.2, 12.0, 9.0, 500.0, False)
+    assert not (tmp_path / "x.toml").exists()
