@@ -1,5 +1,6 @@
 """Linear algebra of many small matrices inside compiled functions."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -12,13 +13,17 @@ def inverse_root(v: Float[Array, "piece m m"]) -> Float[Array, "piece m m"]:
     """
     a = jnp.moveaxis(v, 0, -1)
     m = a.shape[0]
-    low = jnp.zeros_like(a)
-    for j in range(m):
-        rest = a[j:, j] - jnp.sum(low[j:, :j] * low[j, :j], axis=1)
-        low = low.at[j:, j].set(rest / jnp.sqrt(rest[0]))
-    inverse = jnp.zeros_like(a)
-    eye = jnp.eye(m)
-    for i in range(m):
-        known = jnp.sum(low[i, :i, None] * inverse[:i], axis=0)
-        inverse = inverse.at[i].set((eye[i][:, None] - known) / low[i, i])
+    rows = jnp.arange(m)[:, None]
+
+    def column(j: Array, low: Array) -> Array:
+        rest = a[:, j] - jnp.sum(low * low[j], axis=1)
+        return low.at[:, j].set(jnp.where(rows >= j, rest / jnp.sqrt(rest[j]), 0.0))
+
+    low = jax.lax.fori_loop(0, m, column, jnp.zeros_like(a))
+
+    def row(i: Array, inverse: Array) -> Array:
+        known = jnp.sum(low[i][:, None] * inverse, axis=0)
+        return inverse.at[i].set(((rows == i) - known) / low[i, i])
+
+    inverse = jax.lax.fori_loop(0, m, row, jnp.zeros_like(a))
     return jnp.moveaxis(inverse, -1, 0)

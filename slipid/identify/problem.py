@@ -13,6 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
@@ -95,11 +96,13 @@ class Problem:
             jnp.asarray(self.space.prior_mean),
             jnp.asarray(self.space.prior_std),
         )
-        self.solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)
+        self.solver = optx.LevenbergMarquardt(
+            rtol=1e-6, atol=1e-8, linear_solver=lx.Normal(lx.Cholesky())
+        )
         self._step = eqx.filter_jit(
             partial(self.solver.step, self._stacked, options={}, tags=frozenset())
         )
-        self._start = eqx.filter_jit(self._init)
+        self._begun: dict[Any, Any] = {}
         self._form = self
 
     def of(self, windows: Windows) -> "Problem":
@@ -129,7 +132,7 @@ class Problem:
 
     def linear(self, z: Vector, volt: Vector) -> tuple[dict[str, Array], dict[str, Array]]:
         """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
-        return self._form._linear(self.data, z, volt)
+        return self._form._linear(self.data, z, volt)[:2]
 
     def blocks_jit(self, z: Vector, volt: Vector) -> dict[str, Array]:
         """`blocks`, compiled."""
@@ -139,8 +142,16 @@ class Problem:
         return lk.residuals(self.space.tree(z), data.batch, jnp.asarray(volt))
 
     @partial(jax.jit, static_argnums=0)
-    def _linear(self, data: Data, z: Vector, volt: Vector) -> tuple[dict, dict]:
-        return self._blocks(data, z, volt), jax.jacfwd(partial(self._blocks, data))(z, volt)
+    def _linear(self, data: Data, z: Vector, volt: Vector) -> tuple[dict, dict, Array]:
+        def blocks(x: Vector) -> tuple[dict, tuple[dict, Array]]:
+            robot = self.space.tree(x)
+            p = lk.predict(robot, data.batch)
+            motion = {"motion": lk.motion_residual(robot, data.batch, p)}
+            out = motion | lk.electric_residuals(robot, data.batch, p.felt, jnp.asarray(volt))
+            return out, (out, p.felt)
+
+        jacobian, (out, felt) = jax.jacfwd(blocks, has_aux=True)(z)
+        return out, jacobian, felt
 
     @partial(jax.jit, static_argnums=0)
     def _blocks_jit(self, data: Data, z: Vector, volt: Vector) -> dict[str, Array]:
@@ -159,13 +170,15 @@ class Problem:
         parts = [jnp.einsum("nij,nj->ni", root[k], r).ravel() for k, r in blocks.items()]
         return jnp.concatenate([*parts, (z - self._mean) / self._std]), None
 
-    @partial(jax.jit, static_argnums=0)
-    def _felt(self, data: Data, z: Vector) -> Array:
-        return lk.predict(self.space.tree(z), data.batch).felt
-
-    def _init(self, y: Array, args: Any) -> Any:
-        shape = jax.eval_shape(self._stacked, y, args)
-        return self.solver.init(self._stacked, y, args, {}, shape[0], shape[1], frozenset())
+    def _begin(self, args: Any) -> Any:
+        """State of the solver before its first step; it depends on the shapes only."""
+        y = jnp.zeros(self.space.size)
+        shapes = jax.tree.structure(args), tuple(x.shape for x in jax.tree.leaves(args))
+        if shapes not in self._begun:
+            out, aux = jax.eval_shape(self._stacked, y, args)
+            begun = self.solver.init(self._stacked, y, args, {}, out, aux, frozenset())
+            self._begun[shapes] = begun
+        return self._begun[shapes]
 
     # weights ---------------------------------------------------------------------------------
     def whitening(
@@ -263,13 +276,12 @@ class Problem:
 
     # fitting ---------------------------------------------------------------------------------
     def levenberg(
-        self, z: Vector, root: dict, mask: np.ndarray, volt: float, most: int
+        self, z: Vector, root: dict, mask: np.ndarray, volt: Vector, felt: Array, most: int
     ) -> np.ndarray:
         """Search vector after at most so many Levenberg-Marquardt steps with fixed whitening."""
-        felt = self._form._felt(self.data, jnp.asarray(z))
         args = (self.data, jnp.asarray(z), jnp.asarray(mask), root, jnp.asarray(volt), felt)
         y = jnp.zeros(self.space.size)
-        state = self._start(y, args)
+        state = self._form._begin(args)
         for _ in range(most):
             y, state, _ = self._step(y=y, args=args, state=state)
             done, _ = self.solver.terminate(self._stacked, y, args, {}, state, frozenset())
@@ -277,17 +289,13 @@ class Problem:
                 break
         return np.asarray(z + mask * np.asarray(self._std) * np.asarray(y))
 
-    def loss(self, z: Vector, log_v: Vector, keep: Vector) -> float:
-        """Minus log posterior of structure and variances, constants left out."""
-        zj = jnp.asarray(z)
-        _, _, nll = self.whitening(self.blocks_jit(zj, self.volt(log_v)), jnp.asarray(log_v), keep)
-        prior = 0.5 * np.sum(((z - self.space.prior_mean) / self.space.prior_std) ** 2)
+    def loss(self, z: Vector, log_v: Vector, keep: Vector, blocks: dict[str, Array]) -> float:
+        """Minus log posterior of structure and variances given the residuals, less constants."""
+        nll = float(self.whitening(blocks, log_v, keep)[2])
+        pull = (np.asarray(z) - self.space.prior_mean) / self.space.prior_std
         typical = 2 * np.log(self.noise.typical)
-        return (
-            float(nll)
-            + float(prior)
-            + 0.5 * float(np.sum(((log_v - typical) / _VARIANCE_SPREAD) ** 2))
-        )
+        spread = (np.asarray(log_v) - typical) / _VARIANCE_SPREAD
+        return nll + 0.5 * float(np.sum(pull**2)) + 0.5 * float(np.sum(spread**2))
 
     def volt(self, log_v: Vector) -> Array:
         """Std of the voltage noise [V], 1 where none is logged."""
@@ -302,13 +310,15 @@ class Problem:
         log_v = jnp.asarray(state.log_variance)
         keep_j = jnp.asarray(keep, dtype=float)
         volt = self.volt(log_v)
-        blocks = self.blocks_jit(jnp.asarray(state.z), volt)
+        blocks, _, felt = self._form._linear(self.data, jnp.asarray(state.z), volt)
         root, _, _ = self.whitening(blocks, log_v, keep_j)
-        z = self.levenberg(state.z, root, mask, float(volt), steps)
+        z = self.levenberg(state.z, root, mask, volt, felt, steps)
         typical = jnp.asarray(2 * np.log(self.noise.typical))
         blocks, jacobian = self.linear(jnp.asarray(z), volt)
         for _ in range(scoring):
             log_v = self.scored(blocks, jacobian, log_v, keep_j, typical)
+        if "voltage" in blocks and scoring:  # its residual is in units of the noise just found
+            blocks, _ = self.linear(jnp.asarray(z), self.volt(log_v))
         std = np.sqrt(np.diag(np.linalg.inv(np.asarray(self.precision(jacobian, log_v, keep_j)))))
         moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
         moved = max(moved, float(np.max(np.abs(np.asarray(log_v) - state.log_variance)) / 3))
@@ -316,7 +326,7 @@ class Problem:
             z=z,
             log_variance=np.asarray(log_v),
             round=state.round + 1,
-            loss=self.loss(z, np.asarray(log_v), keep_j),
+            loss=self.loss(z, log_v, keep_j, blocks),
             moved=moved,
             stage=state.stage,
         )

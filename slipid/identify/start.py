@@ -52,7 +52,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
 
 
 def _piece_cost(problem: Problem, state: State) -> np.ndarray:
-    blocks = problem.blocks_jit(jnp.asarray(state.z), problem.volt(state.log_variance))
+    blocks, _ = problem.linear(jnp.asarray(state.z), problem.volt(state.log_variance))
     v = np.asarray(problem.covariance("motion", jnp.asarray(state.log_variance)))
     r = np.asarray(blocks["motion"])
     q = np.einsum("ni,ni->n", r, np.linalg.solve(v, r[..., None])[..., 0])
