@@ -131,7 +131,9 @@ def paper(
 @app.command()
 @guarded
 def new(
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Config to write.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Config to write.")] = Path(
+        "robot.toml"
+    ),
     drive: Annotated[str, typer.Option(help="omni, mecanum or skid.")] = "omni",
     wheel_radius_m: Annotated[float, typer.Option(prompt="wheel radius [m]")] = 0.05,
     base_m: Annotated[

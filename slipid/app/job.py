@@ -11,8 +11,8 @@ from slipid.data.dataset import Dataset, collect, default_session, windows
 from slipid.data.formats import PRESETS, Layout, layout_from_mapping, preset
 from slipid.data.log import DataError, Log
 from slipid.data.reader import find_logs, read_logs
-from slipid.identify.problem import Problem
 from slipid.identify.folds import still_viscosities
+from slipid.identify.problem import Problem
 from slipid.identify.result import hash_of
 from slipid.model.robot import Robot, build
 from slipid.parameter import Choice, Space, entries

@@ -195,7 +195,7 @@ class Fit:
         for name in ("residual", "whitened", "weight"):
             arrays |= {f"{name}/{k}": v for k, v in getattr(self, name).items()}
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        np.savez_compressed(buffer, allow_pickle=False, **arrays)
         texts = [json_text(self.to_fit_json()), json_text(self.to_identified())]
         write_bytes(folder / "fit.npz", buffer.getvalue())
         for name, text in zip(("fit.json", "identified.json"), texts, strict=True):
@@ -353,7 +353,7 @@ def _robot_json(robot: Robot) -> dict[str, Any]:
 def _robot_of(kept: Mapping[str, Any]) -> Robot:
     shape = kept["geometry"]
     geometry = Geometry(
-        drive_offset=np.zeros(len(shape["place"])),
+        drive_offset=jnp.zeros(len(shape["place"])),
         place=tuple((p[0], p[1]) for p in shape["place"]),
         drive_angle=tuple(shape["drive_angle"]),
         roller_angle=tuple(shape["roller_angle"]),
