@@ -9,6 +9,13 @@ from slipid.app.drawing import Axes, Figure
 WORDS = {
     "identified": "identified (force balance)",
     "encoder": "encoders alone",
+    "constant": "one slip for all",
+    "linear": "slip ~ torque",
+    "affine": "slip ~ 1 + torque",
+    "quadratic": "slip ~ 1 + torque + torque²",
+    "saturating": "slip ~ saturating torque",
+    "monotone_spline": "slip ~ any rising curve of torque",
+    "affine_current": "slip ~ 1 + current",
     "heading_lookup": "lookup by heading",
     "paper": "2021 paper, as deployed",
 }
