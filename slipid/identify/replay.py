@@ -5,6 +5,7 @@ start.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -19,6 +20,8 @@ from slipid.model.robot import Robot, compose
 
 STEP = 0.5
 """Longest step of a replay [s]."""
+TOGETHER = 32
+"""Runs replayed in one call."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +49,10 @@ class Tracks:
 
 
 def cuts(data: Dataset, robot: Robot) -> list[Windows]:
-    """The runs, each as one piece of short steps; runs of like length share a number of steps.
+    """The runs, each as one piece of short steps, `TOGETHER` at a time.
 
-    Numbers of steps are powers of two, so that few shapes are compiled.
+    Numbers of steps are powers of two and the last runs of a group are repeated to fill it up, so
+    that few shapes are compiled.
     """
     radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
     groups: dict[int, list[int]] = {}
@@ -60,8 +64,11 @@ def cuts(data: Dataset, robot: Robot) -> list[Windows]:
         groups.setdefault(want, []).append(k)
     out = []
     for steps, runs in sorted(groups.items()):
-        w = windows(data.subset(runs), radius, lag, per_piece=steps, longest=np.inf)
-        out.append(w.of_runs(np.asarray(runs)[w.run]))
+        for first in range(0, len(runs), TOGETHER):
+            some = runs[first : first + TOGETHER]
+            w = windows(data.subset(some), radius, lag, per_piece=steps, longest=np.inf)
+            filled = np.minimum(np.arange(TOGETHER), len(w) - 1)
+            out.append(w.of_runs(np.asarray(some)[w.run]).pieces(filled))
     return out
 
 
@@ -98,6 +105,11 @@ def follow(robot: Robot, w: Windows, increment: Float[np.ndarray, "piece window 
 @jax.jit
 def _end(robot: Robot, b: lk.Batch, start: Array) -> Array:
     return chain(start, lk.predict(robot, b).increment)[:, -1]
+
+
+@partial(jax.jit, static_argnums=0)
+def _end_jacobian(space: Any, z: Array, b: lk.Batch, start: Array) -> Array:
+    return jax.jacfwd(lambda x: _end(space.tree(x), b, start))(z)
 
 
 def end_covariance(
@@ -139,7 +151,7 @@ def parameter_covariance(
     """Part of the end's covariance that comes from the fitted numbers, linearised."""
     b = lk.batch(w, space.template)
     start = jnp.asarray(tracks.predicted[:, 0])
-    jac = np.asarray(jax.jit(jax.jacfwd(lambda x: _end(space.tree(x), b, start)))(jnp.asarray(z)))
+    jac = np.asarray(_end_jacobian(space, jnp.asarray(z), b, start))
     return np.asarray(np.einsum("nip,pq,njq->nij", jac[:, :2], covariance, jac[:, :2]))
 
 
