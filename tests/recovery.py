@@ -82,6 +82,7 @@ class Recovered:
     truth: np.ndarray
     identified: np.ndarray
     curve_gap: dict[str, float]
+    noise: dict[str, float]
     converged: bool
 
     @property
@@ -106,6 +107,7 @@ def recover(seed):
         truth=space.vector(TRUTH),
         identified=std / space.prior_std < IDENTIFIED,
         curve_gap=curve_gap(this, end.state.z),
+        noise=dict(zip(this.noise.names, np.exp(0.5 * end.state.log_variance), strict=True)),
         converged=end.converged,
     )
 

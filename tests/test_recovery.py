@@ -13,7 +13,7 @@ from slipid.identify.problem import State
 from slipid.identify.result import summarise
 from tests import recovery
 
-SEEDS = (0, 1, 2, 3)
+SEEDS = (0, 1, 2)
 NO_VOLTAGE = ("motor.resistance", "motor.back_emf")
 
 
@@ -47,7 +47,7 @@ def test_errors_are_as_large_as_the_fit_says():
     assert np.abs(z).max() < 4
     low, high = chi2.ppf([5e-4, 1 - 5e-4], z.size)  # as if none were correlated, which is stricter
     assert low < np.sum(z**2) < high
-    assert z.size >= 4 * 12
+    assert z.size >= 12 * len(SEEDS)
 
 
 @pytest.mark.slow
@@ -66,28 +66,21 @@ def test_another_start_ends_at_the_same_place():
     problem = recovery.problem()
     found = recovered(0)
     mirrored = 2 * problem.space.vector(recovery.TRUTH) - problem.space.start
-    names = problem.noise.names
     start = State(mirrored, 2 * np.log(3 * problem.noise.typical), 0, np.inf, np.inf, "joint")
     end = optimise(problem, start=start)
     assert end.converged
-    assert len(names) == len(end.state.log_variance)
     assert np.abs((end.state.z - found.z) / found.std).max() < 0.2
 
 
 @pytest.mark.slow
-def test_variances_are_recovered():
-    problem = recovery.problem()
-    end = optimise(problem, start=State(recovered(0).z, variances(problem), 0, 0.0, 0.0, "joint"))
-    found = dict(zip(problem.noise.names, np.exp(0.5 * end.state.log_variance), strict=True))
-    sensors = recovery.Sensors()
-    for name in ("camera.place", "camera.heading", "run.soft.yaw", "run.soft.across"):
-        assert found[name] == pytest.approx(sensors.of(name), rel=0.5), name
-    # 54 runs of 3 x 5 places: known to a few percent
-    assert found["camera.heading"] == pytest.approx(sensors.of("camera.heading"), rel=0.15)
-
-
-def variances(problem):
-    return 2 * np.log(problem.noise.typical)
+@pytest.mark.parametrize(
+    ("name", "scatter"),  # of one seed, relative, as measured over 40
+    [("camera.heading", 0.10), ("process.soft.across", 0.12), ("run.soft.yaw", 0.16)],
+)
+def test_noise_is_recovered(name, scatter):
+    found = np.mean([recovered(seed).noise[name] for seed in SEEDS])
+    sure = 4 * scatter / np.sqrt(len(SEEDS))
+    assert found == pytest.approx(recovery.Sensors().of(name), rel=sure)
 
 
 @functools.cache
@@ -111,7 +104,7 @@ def test_without_voltage_no_number_is_silent(path):
 @pytest.mark.slow
 def test_without_voltage_the_resistance_is_its_prior():
     problem, fit = without_voltage()
-    at = problem.space.place["motor.resistance"]
+    at = problem.space.place["motor.resistance"].start
     assert fit.z[at] == pytest.approx(problem.space.prior_mean[at], abs=1e-3)
     assert np.sqrt(fit.covariance[at, at]) == pytest.approx(problem.space.prior_std[at], rel=1e-6)
 
@@ -130,7 +123,7 @@ def test_motion_does_not_need_the_voltage():
 @pytest.mark.slow
 def test_windows_of_one_shape_share_what_is_compiled():
     problem = recovery.problem()
-    z, volt = problem.space.start, problem.volt(variances(problem))
+    z, volt = problem.space.start, problem.volt(2 * np.log(problem.noise.typical))
     problem.linear(z, volt)
     before = type(problem)._linear._cache_size()
     other = problem.of(windows(recovery.dataset(7), 0.04, recovery.LAG))

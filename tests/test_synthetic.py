@@ -99,10 +99,9 @@ def test_without_noise_the_likelihood_has_no_residual():
 def test_scatter_of_increments_is_the_likelihoods_covariance():
     """Whitened with the true variances, residuals at the truth have unit variance."""
     sensors = Sensors()
-    one = [Drive("soft", "as_built", h, 0.1) for h in np.linspace(0.1, 6, 40)]
-    robot = truth(one)
-    cut, gap = at_truth(robot, one, 11, sensors)
-    n = noise(cut, robot)
+    one = [Drive("soft", "as_built", h, 0.1) for h in np.linspace(0.1, 6, len(PLAN))]
+    cut, gap = at_truth(ROBOT, one, 11, sensors)
+    n = noise(cut, ROBOT)
     v = np.array([sensors.of(m) ** 2 if of_motion(m) else 0.0 for m in n.names])
     root = np.linalg.cholesky(np.asarray(covariance(n.blocks["motion"], jnp.asarray(v), "motion")))
     white = np.linalg.solve(root, gap["motion"][..., None])[..., 0]

@@ -47,6 +47,13 @@ def summary(found):
         print(
             f"curve of {floor}: largest error {max(gaps):.4f} in slip, median {np.median(gaps):.4f}"
         )
+    sensors = recovery.Sensors()
+    for name in found[0].noise:
+        if name.startswith(("camera", "process", "run")):
+            got = np.array([f.noise[name] for f in found])
+            print(
+                f"{name:24} true {sensors.of(name):.4f} mean {got.mean():.4f} std {got.std():.4f}"
+            )
     for label, chosen in (("by plan", np.broadcast_to(by_plan, z.shape)), ("by fit", verdict)):
         picked = z[chosen]
         print(
