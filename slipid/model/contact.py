@@ -87,7 +87,13 @@ class ContactSurface(eqx.Module):
 
 
 class Contact(eqx.Module):
-    """Forces in the balance, in units of mu m g."""
+    """Forces on the body, in units of mu m g.
+
+    Attributes:
+        traction: along the drive direction of each wheel, what its motor works against.
+        drag: along the rolling direction of the rollers.
+        load: share of the weight.
+    """
 
     traction: Float[Array, " wheel"]
     drag: Float[Array, " wheel"]
@@ -283,12 +289,14 @@ def forces(
 ) -> Contact:
     """Traction the motors feel, roller drag and load shares at a twist [mu m g].
 
-    Rolling resistance brakes the body, not the motor, so traction is given without it.
+    Rolling resistance brakes the body, not the motor, so traction is given without it. Rollers at
+    an angle (mecanum) pass on a part of what holds the wheel and a part of their drag.
     """
     traction, drag, load, *_ = _terms(xi, rim, frame, surface, rest)
     along = frame.hold @ xi
-    driven = traction + surface.rolling_resistance * jnp.tanh(along / V1)
-    return Contact(traction=load * driven, drag=load * drag, load=load)
+    held = traction + surface.rolling_resistance * jnp.tanh(along / V1)
+    felt = load * (held * frame.pull + drag * frame.slip_through)
+    return Contact(traction=felt, drag=load * drag, load=load)
 
 
 def residual(
