@@ -7,10 +7,7 @@ with ripple, quantised voltages, repeated camera frames, uneven rows, a delayed 
 """
 
 import hashlib
-import json
-import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,162 +16,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.app.synthetic_files import LAYOUT, write_logs
+from slipid.app.synthetic_plan import ROBOTINO, TRUTH, Drive, Sensors, blank, grid, truth
 from slipid.data.log import Log
-from slipid.model.geometry import omni
-from slipid.model.robot import Robot, build, compose, wheel_torque
+from slipid.model.robot import Robot, compose, wheel_torque
 from slipid.model.rollout import path, replay_twist
-from slipid.parameter import Choice, Space, entries
 
-ROBOTINO = (60.0, 180.0, 300.0)
-"""Azimuths of the wheels [deg]."""
-
-
-@dataclass(frozen=True)
-class Drive:
-    """One run: a constant command on one floor with one load set-up.
-
-    Attributes:
-        heading: of the commanded motion in the body frame [rad]; speed: [m/s]; turn: [rad/s].
-        distance: commanded length [m], arc of the rim where it only turns.
-    """
-
-    surface: str
-    load: str
-    heading: float
-    speed: float
-    turn: float = 0.0
-    distance: float = 0.7
-
-    @property
-    def session(self) -> str:
-        """Time in which the marker stayed as it was, as `slipid.data.dataset` names it."""
-        return f"{self.surface}/{self.load}/{self.speed:.2f}"
-
-
-def grid(
-    setups: Sequence[tuple[str, str]] = (
-        ("firm", "as_built"),
-        ("soft", "as_built"),
-        ("soft", "moved"),
-    ),
-    headings: int = 12,
-    speeds: Sequence[float] = (0.1, 0.2),
-    turns: int = 2,
-) -> tuple[Drive, ...]:
-    """Every heading at every speed on every (floor, load), and `turns` curved runs of each."""
-    drives = []
-    for surface, load in setups:
-        for speed in speeds:
-            ways = 2 * np.pi * np.arange(headings) / headings
-            drives += [Drive(surface, load, float(way), speed) for way in ways]
-            ways = 2 * np.pi * (np.arange(turns) + 0.5) / max(turns, 1)
-            drives += [
-                Drive(surface, load, float(way), speed, turn=(-1) ** k * 4.0 * speed)
-                for k, way in enumerate(ways)
-            ]
-    return tuple(drives)
-
-
-@dataclass(frozen=True)
-class Sensors:
-    """How the logs are disturbed; stds by the names of `slipid.identify.likelihood.noise`.
-
-    Attributes:
-        std: of every variance component; `floor` in a name stands for every floor without its own.
-        ripple: of the current from row to row [A]; voltage_noise: [V].
-        current_step, voltage_step: of the converters [A], [V]; ticks: per turn of the motor.
-        row_period, frame_period: of the log and the camera [s].
-        delay, ramp: from command to motion, and to full speed [s].
-        wobble: of the wheel's angle, as time [s]; a real speed loop is never quite still.
-        free_frames: frames come when the camera pleases, so that the lag differs by up to half a
-            row; otherwise every new frame is exactly `camera.lag` old.
-    """
-
-    std: Mapping[str, float] = field(
-        default_factory=lambda: {
-            "camera.place": 0.0005,
-            "camera.heading": 0.005,
-            "process.floor.along": 0.004,
-            "process.floor.across": 0.004,
-            "process.floor.yaw": 0.008,
-            "run.floor.along": 0.006,
-            "run.floor.across": 0.006,
-            "run.floor.yaw": 0.03,
-            "current.floor.run": 0.03,
-        }
-    )
-    ripple: float = 0.06
-    voltage_noise: float = 0.07
-    current_step: float = 1 / 39
-    voltage_step: float = 0.1
-    ticks: int = 2000
-    row_period: float = 0.031
-    frame_period: float = 1 / 29
-    delay: float = 0.12
-    ramp: float = 0.2
-    wobble: float = 0.002
-    has_voltage: bool = True
-    free_frames: bool = False
-
-    def of(self, name: str) -> float:
-        """Std of a variance component."""
-        head, _, last = name.partition(".")
-        return (
-            self.std[name] if name in self.std else self.std[f"{head}.floor.{last.split('.')[-1]}"]
-        )
-
-
-TRUTH: dict[str, Any] = {
-    "robot.mass": 12.0,
-    "robot.load_share@as_built": (0.29, 0.42, 0.29),
-    "robot.load_share@moved": (0.33, 0.35, 0.32),
-    "motor.resistance": 5.5,
-    "motor.back_emf": 0.0514,
-    "motor.inductance": 8.9e-3,
-    "motor.rotor_inertia": 7.1e-6,
-    "motor.coulomb_friction": 0.07,
-    "motor.viscous_friction": 0.006,
-    "camera.scale": 1.117,
-    "camera.lag": 0.056,
-    "camera.marker_yaw": -0.015,
-    "surface.firm.friction": 0.5,
-    "surface.firm.creep": 0.15,
-    "surface.firm.roller_drag": 0.18,
-    "surface.firm.roller_creep": 0.25,
-    "surface.firm.rolling_resistance": 0.008,
-    "surface.firm.slide_viscosity": 0.03,
-    "surface.firm.roller_viscosity": 0.03,
-    "surface.firm.scrub": 0.001,
-    "surface.firm.lead": 0.0015,
-    "surface.soft.friction": 0.8,
-    "surface.soft.creep": 0.45,
-    "surface.soft.roller_drag": 0.33,
-    "surface.soft.roller_creep": 0.2,
-    "surface.soft.rolling_resistance": 0.02,
-    "surface.soft.slide_viscosity": 0.05,
-    "surface.soft.roller_viscosity": 0.05,
-    "surface.soft.scrub": 0.002,
-    "surface.soft.lead": 0.0045,
-}
-"""Numbers of the default robot [SI], the rest as declared; of the size found on real logs."""
-
-
-def blank(drives: Sequence[Drive]) -> Robot:
-    """Robotino at declared starts that knows the floors, loads and sessions of a plan."""
-    return build(
-        omni(list(ROBOTINO), 0.125, 0.04, 16.0),
-        sorted({d.surface for d in drives}),
-        tuple(dict.fromkeys(d.load for d in drives)),
-        sorted({d.session for d in drives}),
-    )
-
-
-def truth(drives: Sequence[Drive], values: Mapping[str, Any] | None = None) -> Robot:
-    """Robotino with the numbers of `TRUTH`, or others; what the plan does not need is left out."""
-    robot = blank(drives)
-    known = {e.path for e in entries(robot)}
-    values = {**TRUTH, **(values or {})}
-    return Space(robot, [Choice(p, fixed=v) for p, v in values.items() if p in known]).template
+__all__ = [
+    "LAYOUT",
+    "ROBOTINO",
+    "TRUTH",
+    "Drive",
+    "Sensors",
+    "blank",
+    "grid",
+    "make_logs",
+    "truth",
+    "write_logs",
+]
 
 
 def make_logs(
@@ -379,92 +238,3 @@ def _at_rows(x: Float[np.ndarray, "run step wheel"]) -> Float[np.ndarray, "run r
     """What a sensor reads at the rows between steps: the mean of the two steps that meet there."""
     ends = np.concatenate([x[:, :1], x, x[:, -1:]], axis=1)
     return 0.5 * (ends[:, 1:] + ends[:, :-1])
-
-
-LAYOUT: dict[str, Any] = {
-    "ticks_per_revolution": 2000,
-    "gear_ratio": 16,
-    "current_is_signed": False,
-    "columns": {
-        "time": {"column": "time", "unit": "s"},
-        "twist_command_x": {"column": "command_x", "unit": "m/s"},
-        "twist_command_y": {"column": "command_y", "unit": "m/s"},
-        "twist_command_yaw": {"column": "command_yaw", "unit": "rad/s"},
-        "wheel_ticks": {"columns": ["ticks_1", "ticks_2", "ticks_3"], "unit": "tick"},
-        "current": {"columns": ["current_1", "current_2", "current_3"], "unit": "A"},
-        "voltage": {"columns": ["voltage_1", "voltage_2", "voltage_3"], "unit": "V"},
-        "pose_x": {"column": "x", "unit": "mm"},
-        "pose_y": {"column": "y", "unit": "mm"},
-        "pose_heading": {"column": "heading", "unit": "deg"},
-    },
-}
-"""Layout of the files `write_logs` writes, as a config declares it; `voltage = false` without."""
-
-
-def write_logs(logs: Sequence[Log], robot: Robot, out: Path, truth_dir: Path) -> list[Path]:
-    """Write `<load>/<surface>/runNNN.csv` below a folder, and truth.json into one of its own.
-
-    Args:
-        logs: as `make_logs` gives them.
-        robot: the truth.
-        out: data folder.
-        truth_dir: folder for truth.json, so that nothing that reads logs can find it by accident.
-    """
-    paths = []
-    for log in logs:
-        target = out / log.name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        _atomic(target, _csv(log, robot))
-        paths.append(target)
-    truth_dir.mkdir(parents=True, exist_ok=True)
-    values = {
-        e.path: {"value": np.asarray(e.get(robot)).tolist(), "unit": e.declaration.unit}
-        for e in entries(robot)
-    }
-    text = json.dumps({"schema": "slipid.truth/1", "parameters": values}, indent=1)
-    _atomic(truth_dir / "truth.json", text + "\n")
-    return paths
-
-
-def _csv(log: Log, robot: Robot) -> str:
-    assert log.twist_command is not None
-    assert log.current is not None
-    assert log.pose is not None
-    ticks = LAYOUT["ticks_per_revolution"] * robot.geometry.gear_ratio / (2 * np.pi)
-    columns = [log.time[:, None], log.twist_command, np.round(log.wheel_angle * ticks), log.current]
-    formats = ["%.4f", *["%.4f"] * 3, *["%d"] * log.wheels, *["%.4f"] * log.wheels]
-    names = ["time", "command_x", "command_y", "command_yaw"]
-    each = ["ticks", "current"]
-    if log.voltage is not None:
-        columns.append(log.voltage)
-        formats += ["%.2f"] * log.wheels
-        each.append("voltage")
-    names += [f"{what}_{k + 1}" for what in each for k in range(log.wheels)]
-    heading = np.degrees(log.pose[:, 2:])
-    columns += [1000 * log.pose[:, :2], heading]
-    formats += ["%.3f", "%.3f", "%.4f"]
-    names += ["x", "y", "heading"]
-    rows = np.concatenate(columns, axis=1)
-    lines = [",".join(f % v for f, v in zip(formats, row, strict=True)) for row in rows]
-    return "\n".join([",".join(names), *lines]) + "\n"
-
-
-def _atomic(target: Path, text: str) -> None:
-    part = target.with_name(target.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, target)
-
-
-def demo_logs(out: Path, truth_dir: Path, seed: int = 0, voltage: bool = True) -> list[Path]:
-    """The demo's data: two floors, one of them with two load set-ups, two speeds.
-
-    Args:
-        out: data folder.
-        truth_dir: folder of truth.json.
-        seed: of the noise.
-        voltage: whether the motor voltages are logged.
-    """
-    drives = grid()
-    robot = truth(drives)
-    sensors = replace(Sensors(), has_voltage=voltage)
-    return write_logs(make_logs(robot, drives, seed, sensors), robot, out, truth_dir)
