@@ -28,6 +28,8 @@ from slipid.parameter import Choice, Space, entries
 SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/1"
 CONFLICT = 4.0
 """Prior stds from the prior mean beyond which a reader is told."""
+REMAINING = 0.3
+"""Largest remaining Gauss-Newton step of a fit that may be called converged [posterior std]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +54,8 @@ class Fit:
         curves: slip over torque per floor, as in identified.json.
         validity: what each floor was seen with.
         converged, reason, rounds, history: how the fit ended.
+        remaining: largest step a full Gauss-Newton step would still take, in posterior stds; a
+            solver that finds no way ahead is not at an optimum because of it.
         settings: of windows and seed, as used.
         baselines: what simpler models learnt from the same runs, for comparison.
     """
@@ -74,6 +78,7 @@ class Fit:
     converged: bool
     reason: str
     rounds: int
+    remaining: float
     history: tuple[float, ...]
     settings: Mapping[str, Any]
     baselines: Mapping[str, Any] = field(default_factory=dict)
@@ -167,6 +172,7 @@ class Fit:
             "converged": self.converged,
             "reason": self.reason,
             "rounds": self.rounds,
+            "remaining": self.remaining,
             "history": [x if np.isfinite(x) else None for x in self.history],
             "parameters": {p: asdict(e) for p, e in self.parameters.items()},
             "flat": [asdict(f) for f in self.flat],
@@ -255,6 +261,7 @@ def _from_files(kept: dict[str, Any], arrays: dict[str, np.ndarray]) -> Fit:
         converged=kept["converged"],
         reason=kept["reason"],
         rounds=kept["rounds"],
+        remaining=kept["remaining"],
         history=tuple(np.inf if x is None else x for x in kept["history"]),
         settings=kept["settings"],
         baselines=kept["baselines"],
@@ -287,6 +294,9 @@ def summarise(
         half = np.einsum("nij,njp->nip", plain[k], np.asarray(jac)).reshape(-1, len(gram))
         half = half * problem.space.prior_std
         gram += half.T @ half
+    left, name = remaining(problem, z, blocks, jacobian, roots)
+    settled = left < REMAINING
+    stuck = f"the solver stopped {left:.2g} stds of {name} away from where its own step leads"
     windows = problem.windows
     return Fit(
         space=problem.space,
@@ -306,8 +316,9 @@ def summarise(
             problem.space, z, draws(z, optimum.covariance, 400, seed), problem.batch
         ),
         validity=curves_of.validity(data, problem.space.tree(jnp.asarray(z)), problem.batch),
-        converged=bool(optimum.converged),
-        reason=optimum.reason,
+        converged=bool(optimum.converged) and settled,
+        reason=optimum.reason if settled or not optimum.converged else stuck,
+        remaining=left,
         rounds=int(optimum.state.round),
         history=tuple(float(x) for x in optimum.history),
         settings={
@@ -316,6 +327,30 @@ def summarise(
             "seed": seed,
         },
     )
+
+
+def remaining(
+    problem: Problem, z: Any, blocks: Any, jacobian: Any, roots: Any
+) -> tuple[float, str]:
+    """Largest step of a full Gauss-Newton step in posterior stds, and the number that takes it.
+
+    delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean)), W with the weights of outliers; where
+    currents do not inform motion, their rows move the electric numbers only.
+    """
+    own = np.ones(len(z)) if problem.joint else problem.electric.astype(float)
+    prior = problem.space.prior_std**-2
+    gradient, info = prior * (z - problem.space.prior_mean), np.diag(prior)
+    for k, r in blocks.items():
+        root = np.asarray(roots[k])
+        white = np.einsum("nij,nj->ni", root, np.asarray(r)).ravel()
+        half = np.einsum("nij,njp->nip", root, np.asarray(jacobian[k])).reshape(-1, len(z))
+        half = half * (1.0 if k == "motion" else own)
+        gradient = gradient + half.T @ white
+        info = info + half.T @ half
+    std = np.sqrt(np.diag(np.linalg.inv(info)))
+    steps = np.abs(np.linalg.solve(info, gradient)) / std
+    worst = int(np.argmax(steps))
+    return float(steps[worst]), problem.space.names[worst]
 
 
 def draws(z: Any, covariance: Any, count: int, seed: int) -> Float[np.ndarray, "draw free"]:
