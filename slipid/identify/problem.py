@@ -28,6 +28,8 @@ Vector = Array | np.ndarray
 """One-dimensional, of jax or numpy."""
 DEGREES = 8.0
 """Degrees of freedom of the Student-t weight of a run."""
+_REFUSED = 12
+"""Steps of the solver that may be refused in a round."""
 _VARIANCE_SPREAD = 3.0
 """Std of the prior of every log variance."""
 
@@ -278,12 +280,21 @@ class Problem:
     def levenberg(
         self, z: Vector, root: dict, mask: np.ndarray, volt: Vector, felt: Array, most: int
     ) -> np.ndarray:
-        """Search vector after at most so many Levenberg-Marquardt steps with fixed whitening."""
+        """Search vector after at most so many Levenberg-Marquardt steps with fixed whitening.
+
+        Only steps that were taken count: one that is refused shrinks the next, and to stop among
+        refused ones would look like having arrived.
+        """
         args = (self.data, jnp.asarray(z), jnp.asarray(mask), root, jnp.asarray(volt), felt)
         y = jnp.zeros(self.space.size)
         state = self._form._begin(args)
-        for _ in range(most):
+        taken = 0
+        for _ in range(most + _REFUSED):
+            before = y
             y, state, _ = self._step(y=y, args=args, state=state)
+            taken += bool(jnp.any(y != before))
+            if taken == most:
+                break
             done, _ = self.solver.terminate(self._stacked, y, args, {}, state, frozenset())
             if bool(done):
                 break
