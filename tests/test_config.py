@@ -132,7 +132,7 @@ def test_general_needs_one_of_each_per_wheel(tmp_path):
 
 
 def test_absent_and_unreadable_files(tmp_path):
-    with pytest.raises(DataError, match="No such file.*expected a config"):
+    with pytest.raises(DataError, match=r"No such file.*expected a config"):
         read_config(tmp_path / "none.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(DataError, match="no UTF-8 text"):
