@@ -11,6 +11,7 @@ from slipid.app import files, runtime
 from slipid.app.config import Config, read_config
 from slipid.app.progress import Reporter
 from slipid.data.files import write_bytes, write_json
+from slipid.data.log import DataError
 
 CHECKPOINT = "checkpoint.npz"
 
@@ -55,7 +56,10 @@ def identify(config_path: Path, data: Path, out: Path, report: Reporter) -> Done
     from slipid.app.plots import identify_plots
 
     report.stage("drawing")
-    written += [path.name for path in identify_plots(fit, job.dataset, out)]
+    try:
+        written += [path.name for path in identify_plots(fit, job.dataset, out)]
+    except DataError as error:  # the numbers are written; a run too short to draw spoils none
+        report.line(f"no more pictures: {error}")
     (out / CHECKPOINT).unlink(missing_ok=True)
     return Done(fit, job, tuple(written))
 
