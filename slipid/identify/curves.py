@@ -41,7 +41,7 @@ def torque_of_slip(robot: Robot, wheel_speed: Any, share: float) -> Float[Array,
         wheel_speed: w (surface,) [rad/s].
         share: N, of the weight on this wheel.
 
-    Source: contact equilibrium without sideways rolling, METHODS 3B.
+    Source: `slipid.model.contact` without sideways rolling.
     """
     floor = robot.surfaces
     rim = (robot.geometry.wheel_radius * wheel_speed)[:, None]

@@ -41,7 +41,7 @@ def still_viscosities(
     """Viscous terms held near zero on every floor that was driven at one speed only.
 
     With one speed they cannot be told from creep, and what they take from it is wrong at every
-    other speed (METHODS 3B).
+    other speed.
     """
     seen: dict[str, list[float]] = {}
     for k in range(len(data)) if runs is None else runs:

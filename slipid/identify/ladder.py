@@ -1,7 +1,7 @@
 """Rungs below the force balance: encoders, slip curves wheel by wheel, and a lookup by heading.
 
 All share one interface, `fit(windows, robot)` then `increments(windows, robot)`, and are judged in
-the same corrected metres as the force balance (METHODS 3A, 3C, 6). Residuals are in displacement,
+the same corrected metres as the force balance. Residuals are in displacement,
 so nothing is divided by a wheel speed.
 """
 
@@ -163,7 +163,7 @@ class Saturating(Rung):
 
         s = -kappa log(1 - min(M / M_max, 0.98))
 
-    Source: Janosi and Hanamoto 1961; METHODS 3A.
+    Source: Janosi and Hanamoto 1961.
     """
 
     name: str = "saturating"
@@ -201,7 +201,7 @@ class Saturating(Rung):
 
 @dataclass(frozen=True)
 class HeadingLookup(Rung):
-    """Encoders corrected by a Fourier series in the direction of travel, per floor (METHODS 3C).
+    """Encoders corrected by a Fourier series in the direction of travel, per floor.
 
         (along, across, yaw) = (far, 0, turn) + far sum_k c_k phi_k(angle)
 
@@ -289,7 +289,7 @@ def _powers(*exponents: int) -> Features:
 
 
 def _above(threshold: float) -> Features:
-    """The deployed form of the paper: affine above a current, no slip below (METHODS 6)."""
+    """The deployed form of the paper: affine above a current, no slip below."""
     return lambda x: np.stack([np.where(x > threshold, x, 0.0), (x > threshold) * 1.0], -1)
 
 

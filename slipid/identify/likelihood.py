@@ -1,4 +1,4 @@
-"""What a robot predicts of every piece of every run, and how the difference is weighed (METHODS 4).
+"""What a robot predicts of every piece of every run, and how the difference is weighed.
 
 A piece is a few neighbouring windows of one run. Its residuals have the covariance
 

@@ -8,7 +8,7 @@ import numpy as np
 from slipid.identify.problem import DEGREES, Problem, State
 
 CREEPS = (0.05, 0.4, 1.0)
-"""Starts of the creep of every floor; others end in poor minima (METHODS 3B)."""
+"""Starts of the creep of every floor; others end in poor minima."""
 
 
 def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], None]) -> State:

@@ -1,4 +1,4 @@
-"""What may be said of every number: interval, verdict, flat directions (METHODS 5)."""
+"""What may be said of every number: interval, verdict, flat directions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

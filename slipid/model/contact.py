@@ -1,6 +1,6 @@
 """Contact equilibrium: the body moves so that wheel traction, roller drag and scrub balance.
 
-With p_i the wheel places, N_i the load shares, forces in units of mu m g (METHODS 3B):
+With p_i the wheel places, N_i the load shares, forces in units of mu m g:
 
     c_i   = sqrt((r w_i)^2 + q_i^2)                    wheel activity, q_i the roller speed
     vs_i  = r w_i - J_i xi                             sliding speed
@@ -255,7 +255,7 @@ def equilibrium(
         surface: one floor.
         rest: load shares at rest, sum 1.
 
-    Source: METHODS 3B; quasi-static.
+    Source: the balance at the head of this module with M = 0.
     """
     start = jax.lax.stop_gradient(guess(rim, frame))
     return _root((rim, frame, surface, rest, jnp.zeros(3), start))

@@ -1,4 +1,4 @@
-"""Where the wheels stand and which way they drive (METHODS 1; Indiveri 2009, IEEE T-RO 25(1))."""
+"""Where the wheels stand and which way they drive (Indiveri 2009, IEEE T-RO 25(1))."""
 
 import math
 from collections.abc import Sequence

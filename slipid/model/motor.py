@@ -1,4 +1,4 @@
-"""DC motor with brushes: U = R I + C_e wm + L_a dI/dt + brush drop (METHODS 2)."""
+"""DC motor with brushes: U = R I + C_e wm + L_a dI/dt + brush drop."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -96,7 +96,7 @@ class Motor(eqx.Module):
     ) -> Float[Array, " *w"]:
         """M = U I / wm = C_e I + R I^2 wm / (wm^2 + w0^2) [N m], regular at standstill.
 
-        Source: the paper's "torque characterising variable"; METHODS 2.
+        Source: the paper's "torque characterising variable" (Belyaev, Brylev, Ivanov 2021).
         """
         wm = self.gear_ratio * wheel_speed
         return self.back_emf * current + self.resistance * current**2 * wm / (wm**2 + REST**2)

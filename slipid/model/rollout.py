@@ -95,7 +95,7 @@ def replay_twist(
         load: index of the load set-up.
         body_inertia: the body starts at rest and has mass; otherwise forces balance at once.
 
-    Source: METHODS 3B.
+    Source: `slipid.model.contact`.
     """
     frame, load = robot.geometry.frame(), jnp.asarray(load)
     floors = jnp.broadcast_to(jnp.asarray(surface), dt.shape)
