@@ -138,7 +138,7 @@ def wheel_curve(
         wheel_speed: [rad/s].
         share: of the weight on this wheel.
 
-    Source: contact forces of `slipid.model.contact` at a twist that has just this slip at the first wheel.
+    Source: forces of `slipid.model.contact` at a twist that has just this slip at the first wheel.
     """
     frame, surface = robot.geometry.frame(), robot.surfaces.at(robot.surface_index(floor))
     rim = frame.radius * wheel_speed * frame.pull[0]
