@@ -53,14 +53,12 @@ def some(job: Job, runs: np.ndarray) -> tuple[Dataset, Problem]:
         sorted(set(data.session)),
         centre=job.robot.camera.centre,
     )
-    known = {choice.pattern.split("@")[0].split(".")[1] for choice in job.choices}
     floors = set(robot.surfaces.labels) | {"*"}
     choices = [
         c
         for c in job.choices
         if not (c.pattern.startswith("surface.") and c.pattern.split(".")[1] not in floors)
     ]
-    assert known
     part = replace(job, dataset=data, robot=robot, choices=tuple(still_viscosities(data) + choices))
     return data, part.problem()
 
