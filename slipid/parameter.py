@@ -194,7 +194,8 @@ class Choice:
         fixed: value it keeps [SI]; None leaves it free.
         free: True or False to say it without a value.
         prior_mean: centre of the prior [SI].
-        prior_std: std of the prior, in SI around `prior_mean`.
+        prior_std: std of the prior, in SI around its centre, which without `prior_mean` is the
+            declared start.
     """
 
     pattern: str
@@ -238,8 +239,9 @@ class Space:
                 spreads.append(spread)
         self.template = tree
         self.free: tuple[Entry, ...] = tuple(free)
-        join = lambda parts: np.concatenate(parts) if parts else np.zeros(0)  # noqa: E731
-        self.start, self.prior_mean, self.prior_std = join(starts), join(means), join(spreads)
+        self.start, self.prior_mean, self.prior_std = (
+            np.concatenate([np.zeros(0), *parts]) for parts in (starts, means, spreads)
+        )
         ends = np.cumsum([0, *(e.coordinates for e in free)])
         self.place = {
             e.path: slice(int(a), int(b)) for e, a, b in zip(free, ends, ends[1:], strict=False)
@@ -282,24 +284,22 @@ class Space:
 def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, Any, bool]:
     """Value, prior mean and std in the search space, and whether it is free."""
     d = entry.declaration
+    usual = np.full(entry.size, 1 / entry.size if d.shares else d.start)
     is_free, mean_si, std_si = d.free, None, None
     for c in picked:
         if c.fixed is not None:
-            value, is_free = _inside(entry, c.fixed), False
+            value, is_free = _inside(entry, c.fixed, bounds_too=True), False
         if c.start is not None:
             value = _inside(entry, c.start)
-        if c.prior_mean is not None:
-            mean_si, std_si = _inside(entry, c.prior_mean), c.prior_std
-            value = mean_si if c.start is None else value
+        if c.prior_mean is not None or c.prior_std is not None:
+            mean = usual if c.prior_mean is None else c.prior_mean
+            mean_si, std_si = _inside(entry, mean), c.prior_std
+            value = value if c.prior_mean is None or c.start is not None else mean_si
             is_free = True
         if c.free is not None:
             is_free = c.free
-    value = _inside(entry, value)
-    mean = d.to_search(value if mean_si is None else mean_si)
-    if mean_si is None:
-        mean = d.to_search(
-            np.full(entry.size, 1 / entry.size) if d.shares else _default(entry, value)
-        )
+    value = _inside(entry, value, bounds_too=not is_free)
+    mean = d.to_search(usual if mean_si is None else mean_si)
     if std_si is None:
         spread = np.full(entry.coordinates, d.spread)
     elif d.shares:
@@ -314,13 +314,8 @@ def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, A
     return value, mean, spread, is_free
 
 
-def _default(entry: Entry, value: Any) -> Any:
-    return (
-        np.full(entry.size, entry.declaration.start) if entry.size > 1 else entry.declaration.start
-    )
-
-
-def _inside(entry: Entry, value: Any) -> Any:
+def _inside(entry: Entry, value: Any, bounds_too: bool = False) -> Any:
+    """Value as an array, checked; only a fixed one may be a bound itself, as zero creep is."""
     x = np.asarray(value, float)
     d = entry.declaration
     if x.size == 1 and entry.size > 1:
@@ -328,6 +323,8 @@ def _inside(entry: Entry, value: Any) -> Any:
     if x.size != entry.size:
         raise ValueError(f"{entry.path} takes {entry.size} numbers, got {x.size}")
     outside = ~((x > d.lower) & (x < d.upper))
+    if bounds_too:
+        outside &= ~np.isfinite(x) | ((x != d.lower) & (x != d.upper))
     if d.shares:
         outside = ~((x > 0) & (abs(x.sum() - 1) < 1e-6))
     if outside.any():

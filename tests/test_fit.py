@@ -118,7 +118,7 @@ def test_camera_scale_is_that_of_weighted_least_squares(truth):
     problem = Problem(w, truth, choices)
     best = optimise(problem, start=begin(problem, problem.space.start + 0.1), options=PRECISE)
     assert best.converged, best.reason
-    r = np.asarray(problem.blocks_jit(best.state.z, jnp.asarray(1.0))["motion"])
+    r = np.asarray(problem.linear(best.state.z, jnp.asarray(1.0))[0]["motion"])
     scale = float(value(problem, best.state, "camera.scale"))
     raw = np.zeros((24, 2, 3))  # increments per unit of scale; yaw does not depend on it
     for k in range(2):
@@ -158,7 +158,7 @@ def test_the_optimum_is_one(surface_problem, surface_fit):
     log_v = best.state.log_variance
 
     def loss(z):
-        blocks = surface_problem.blocks_jit(z, jnp.asarray(1.0))
+        blocks = surface_problem.linear(z, jnp.asarray(1.0))[0]
         return surface_problem.loss(z, log_v, np.ones(48), blocks)
 
     lowest = loss(best.state.z)
@@ -219,7 +219,7 @@ def test_a_run_gone_wrong_hardly_counts(surface_problem, surface_fit):
     again = optimise(spoilt, start=begin(spoilt), options=PRECISE)
     std = np.sqrt(np.diag(best.covariance))
     assert (np.abs(again.state.z - best.state.z) / std).max() < 1.0
-    blocks = spoilt.blocks_jit(again.state.z, jnp.asarray(1.0))
+    blocks = spoilt.linear(again.state.z, jnp.asarray(1.0))[0]
     weight = spoilt.whitening(blocks, again.state.log_variance, np.ones(48))[1]["motion"]
     assert np.argmin(weight) == 5
     assert float(weight[5]) < 0.05 * float(np.median(weight))

@@ -81,7 +81,7 @@ def test_jacobians_are_those_of_finite_differences(everything):
     for k, name in enumerate(everything.space.names):
         h = 1e-5
         e = jnp.zeros(len(z)).at[k].set(h)
-        more, less = everything.blocks_jit(z + e, volt), everything.blocks_jit(z - e, volt)
+        more, less = everything.linear(z + e, volt)[0], everything.linear(z - e, volt)[0]
         for block in jacobian:
             numeric = np.asarray((more[block] - less[block]) / (2 * h))
             tolerance = 1e-6 * max(1.0, np.abs(numeric).max())
@@ -192,7 +192,7 @@ def test_inverse_root_is_numpy_s(size):
 def test_the_loss_is_a_student_t_per_run(everything):
     """Up to a constant, against scipy's multivariate t."""
     z = everything.space.start
-    blocks = everything.blocks_jit(z, jnp.asarray(0.05))
+    blocks = everything.linear(z, jnp.asarray(0.05))[0]
     typical = 2 * np.log(everything.noise.typical)
     keep = np.ones(24)
     keep[3:7] = 0.0
@@ -213,7 +213,7 @@ def test_the_loss_is_a_student_t_per_run(everything):
 
 
 def test_whitened_residuals_are_weighted_mahalanobis_distances(everything):
-    blocks = everything.blocks_jit(everything.space.start, jnp.asarray(0.05))
+    blocks = everything.linear(everything.space.start, jnp.asarray(0.05))[0]
     log_v = 2 * np.log(everything.noise.typical)
     root, weight, _ = everything.whitening(blocks, log_v, np.ones(24))
     for k, r in blocks.items():

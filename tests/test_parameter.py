@@ -264,6 +264,21 @@ def test_a_prior_on_shares_has_that_std_in_si(tree, share):
     np.testing.assert_allclose(draws.mean(axis=0), share, atol=0.001)
 
 
+def test_a_std_alone_is_a_prior_around_the_declared_start(tree):
+    space = Space(tree, [Choice("floor.b.creep", prior_std=0.06)])
+    at = space.place["floor.b.creep"]
+    np.testing.assert_allclose(space.prior_mean[at], math.log(0.3))
+    np.testing.assert_allclose(space.prior_std[at], 0.06 / 0.3)
+    np.testing.assert_allclose(space.start[at], math.log(0.2))
+
+
+def test_a_fixed_number_may_be_its_bound_and_a_free_one_may_not(tree):
+    space = Space(tree, [Choice("floor.a.creep", fixed=0.0)])
+    assert float(space.tree(space.start).floors.creep[0]) == 0.0
+    with pytest.raises(ValueError, match=r"floor\.a\.creep = 0\.0: expected inside"):
+        Space(tree, [Choice("floor.a.creep", fixed=0.0), Choice("floor.a.creep", free=True)])
+
+
 def test_nothing_free_is_an_empty_space(tree):
     space = Space(tree, [Choice("*", free=False)])
     assert space.size == 0

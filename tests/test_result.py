@@ -203,7 +203,7 @@ def test_spectrum_is_that_of_the_whitened_jacobian():
 def test_whitened_residuals_have_the_scatter_they_are_given():
     problem, _, _ = made(True)
     z, log_v = fit_of(True).z, made(True)[2].state.log_variance
-    blocks = problem.blocks_jit(jnp.asarray(z), problem.volt(log_v))
+    blocks = problem.linear(jnp.asarray(z), problem.volt(log_v))[0]
     for k, r in blocks.items():
         cov = np.asarray(problem.covariance(k, jnp.asarray(log_v)))
         q = np.einsum("ni,nij,nj->n", r, np.linalg.inv(cov), r)

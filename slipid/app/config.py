@@ -96,7 +96,7 @@ class Logs(_Section):
 class Camera(_Section):
     """The camera that saw the pose."""
 
-    image_centre_m: Annotated[list[Number], Field(min_length=2, max_length=2)] = [0.0, 0.0]
+    image_centre_m: tuple[Number, Number] = (0.0, 0.0)
 
 
 class Prior(_Section):

@@ -83,7 +83,7 @@ def read_job(config: Config, root: Path, tell: Callable[[int, int], None], line:
         sorted({log.surface or "unknown" for log in dataset.logs}),
         sorted({log.load for log in dataset.logs}),
         sorted(set(dataset.session)),
-        centre=tuple(config.content.camera.image_centre_m),  # type: ignore[arg-type]
+        centre=config.content.camera.image_centre_m,
     )
     choices, left_out = _choices(config, robot)
     skipped += left_out

@@ -81,7 +81,10 @@ def seen(robot: Robot, data: Dataset, per_piece: int) -> Seen:
     along = (u * true[:, :2]).sum(axis=1)
     across = u[:, 0] * true[:, 1] - u[:, 1] * true[:, 0]
     time = w.dt.sum(axis=1)
-    whole = lambda x: (np.asarray(x) * dt).sum(axis=1) / time[:, None]  # noqa: E731
+
+    def whole(x: Any) -> np.ndarray:
+        return np.asarray((np.asarray(x) * dt).sum(axis=1) / time[:, None])
+
     rim = radius * w.turn.sum(axis=1) * np.asarray(frame.pull)
     safe = np.where(np.abs(rim) > LEAST_WAY, rim, np.nan)
     pairs = list(zip(w.surface, w.load, strict=True))

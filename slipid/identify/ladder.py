@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares, lsq_linear
+from scipy import sparse
+from scipy.optimize import least_squares, linprog, lsq_linear
 
 from slipid.data.dataset import Windows
 from slipid.identify.likelihood import measured
@@ -43,7 +44,9 @@ class Rung(abc.ABC):
 
 @jax.jit
 def _seen(robot: Robot, xi: Any, dt: Any, session: Any) -> Any:
-    one = lambda x, t, s: robot.camera.seen(advance(x, t), s)  # noqa: E731
+    def one(x: Any, t: Any, s: Any) -> Any:
+        return robot.camera.seen(advance(x, t), s)
+
     return jax.vmap(jax.vmap(one, (0, 0, None)))(xi, dt, session)
 
 
@@ -54,16 +57,22 @@ def as_increments(twist: np.ndarray, w: Windows, robot: Robot) -> Increments:
 
 
 def body_twist(w: Windows, robot: Robot) -> np.ndarray:
-    """Measured body twist of every window: the marker yaw taken out of the increment, over dt."""
+    """Measured body twist of every window: yaw and place of the marker taken out, over dt."""
     seen = np.asarray(jax.jit(measured)(robot, jnp.asarray(w.pose)))
+    yaw = seen[..., 2]
     psi = np.array([float(robot.camera.yaw(robot.session_index(s))) for s in w.session])[:, None]
+    chord = _turned(psi, seen[..., :2])
+    place = np.broadcast_to(np.asarray(robot.camera.marker_place), chord.shape)
+    chord -= _turned(yaw, place) - place
     # a chord is the arc times sinc, and points half the turn away from its start
-    arc = 1.0 / np.sinc(seen[..., 2] / (2 * np.pi))
-    back = psi - 0.5 * seen[..., 2]
-    c0, s0 = np.cos(back), np.sin(back)
-    x = c0 * seen[..., 0] - s0 * seen[..., 1]
-    y = s0 * seen[..., 0] + c0 * seen[..., 1]
-    return np.stack([x * arc, y * arc, seen[..., 2]], -1) / w.dt[..., None]
+    arc = _turned(-0.5 * yaw, chord) / np.sinc(yaw / (2 * np.pi))[..., None]
+    return np.concatenate([arc, yaw[..., None]], -1) / w.dt[..., None]
+
+
+def _turned(angle: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Plane vectors (..., 2), each turned by its angle (...)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], -1)
 
 
 def _by_floor(w: Windows) -> dict[str, np.ndarray]:
@@ -107,6 +116,8 @@ class Curve(Rung):
         torque: x is M = C_e I + R I^2/wm [N m] instead of the current [A].
         per_wheel: own coefficients for every wheel.
         positive: coefficients from here on are not negative (a monotone curve).
+        insensitive: epsilon-insensitive loss instead of least squares, as support vector regression
+            with a linear kernel has it; epsilon is a tenth of a robust std of what slip takes away.
     """
 
     name: str
@@ -114,6 +125,7 @@ class Curve(Rung):
     torque: bool = False
     per_wheel: bool = False
     positive: int | None = None
+    insensitive: bool = False
     state: dict[str, np.ndarray] = field(default_factory=dict)
 
     def _design(self, w: Windows, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -137,13 +149,31 @@ class Curve(Rung):
             lower = np.full(a.shape[1], -np.inf)
             if self.positive is not None:
                 lower[self.positive :] = 0.0
-            beta[name] = lsq_linear(a, b, (lower, np.inf)).x
+            if self.insensitive:
+                beta[name] = insensitive(a, b)
+            else:
+                beta[name] = lsq_linear(a, b, (lower, np.inf), method="bvls").x
         return replace(self, state=beta)
 
     def increments(self, w: Windows, robot: Robot) -> Increments:
         free, lost = self._design(w, robot)
         beta = np.stack([_need(self.state, s) for s in w.surface])
         return as_increments(free - np.einsum("npak,nk->npa", lost, beta), w, robot)
+
+
+def insensitive(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Least sum of max(|a beta - b| - epsilon, 0), epsilon = iqr(b) / 13.49.
+
+    Support vector regression (Vapnik 1995) where its penalty on beta does not count, as a linear
+    program.
+    """
+    epsilon = float(np.subtract(*np.percentile(b, (75, 25)))) / 13.49
+    over = sparse.eye_array(len(b))
+    bound = np.concatenate([b + epsilon, epsilon - b])
+    sides = sparse.block_array([[a, -over], [-a, -over]], format="csr")
+    cost = np.concatenate([np.zeros(a.shape[1]), np.ones(len(b))])
+    limits = [(None, None)] * a.shape[1] + [(0, None)] * len(b)
+    return np.asarray(linprog(cost, sides, bound, bounds=limits).x[: a.shape[1]])
 
 
 def regressor(w: Windows, robot: Robot, speed: np.ndarray, torque: bool) -> np.ndarray:
@@ -311,6 +341,7 @@ def rungs(has_current: bool) -> list[Rung]:
         out += [
             Curve("linear", _powers(1), torque=True),
             Curve("affine", _powers(0, 1), torque=True),
+            Curve("svr", _powers(0, 1), torque=True, insensitive=True),
             Curve("quadratic", _powers(0, 1, 2), torque=True),
             Saturating(),
             Curve(

@@ -128,20 +128,9 @@ class Problem:
         return self.data.batch
 
     # residuals -------------------------------------------------------------------------------
-    def blocks(self, z: Vector, volt: Vector) -> dict[str, Array]:
-        """Residual blocks at a search vector."""
-        return self._blocks(self.data, z, volt)
-
     def linear(self, z: Vector, volt: Vector) -> tuple[dict[str, Array], dict[str, Array]]:
         """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
         return self._form._linear(self.data, z, volt)[:2]
-
-    def blocks_jit(self, z: Vector, volt: Vector) -> dict[str, Array]:
-        """`blocks`, compiled."""
-        return self._form._blocks_jit(self.data, z, volt)
-
-    def _blocks(self, data: Data, z: Vector, volt: Vector) -> dict[str, Array]:
-        return lk.residuals(self.space.tree(z), data.batch, jnp.asarray(volt))
 
     @partial(jax.jit, static_argnums=0)
     def _linear(self, data: Data, z: Vector, volt: Vector) -> tuple[dict, dict, Array]:
@@ -155,15 +144,11 @@ class Problem:
         jacobian, (out, felt) = jax.jacfwd(blocks, has_aux=True)(z)
         return out, jacobian, felt
 
-    @partial(jax.jit, static_argnums=0)
-    def _blocks_jit(self, data: Data, z: Vector, volt: Vector) -> dict[str, Array]:
-        return self._blocks(data, z, volt)
-
     def _stacked(self, y: Array, args: Any) -> tuple[Array, None]:
         data, z0, mask, root, volt, felt = args
         z = z0 + mask * self._std * y
         if self.joint:
-            blocks = self._blocks(data, z, volt)
+            blocks = lk.residuals(self.space.tree(z), data.batch, volt)
         else:  # motion by itself; currents and voltages given the motion of the round's start
             robot = self.space.tree(z)
             held = self.space.tree(jnp.where(self.electric, z, z0))

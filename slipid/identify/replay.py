@@ -130,7 +130,10 @@ def end_covariance(
     rest = p[:, -1:, :2] - p[:, 1:, :2]  # what a turn at each step moves
     lever = np.stack([-rest[..., 1], rest[..., 0]], -1)
     c, s = np.cos(p[:, :-1, 2]), np.sin(p[:, :-1, 2])
-    world = lambda v: np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], -1)  # noqa: E731
+
+    def world(v: np.ndarray) -> np.ndarray:
+        return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], -1)
+
     across = np.stack([-u[..., 1], u[..., 0]], -1)
     for name, axis in (("along", world(u)), ("across", world(across)), ("yaw", lever)):
         v = np.array([variance[f"process.{f}.{name}"] for f in w.surface])

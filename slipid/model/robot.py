@@ -41,10 +41,11 @@ class Body(eqx.Module):
 class Camera(eqx.Module):
     """From the body on the floor to the logged pose.
 
-    Logged places are corrected by `place`: true = scale * Q(q), q from the image centre, with
-    Q(q) = q (1 + k q.q) / (1 + tilt.q): perspective of a tilted camera and radial distortion. The
-    marker's heading is the body's plus `marker_yaw`, with an own deviation per session in which the
-    marker was put on.
+    Logged places are corrected by `corrected`: true = scale * Q(q), q from the image centre, with
+    Q(q) = (q (1 + k q.q) + p q.q + 2 q (p.q)) / (1 + tilt.q): perspective of a tilted camera,
+    radial and tangential distortion (Brown 1966, Conrady 1919; first order of each). The marker's
+    heading is the body's plus `marker_yaw`, with an own deviation per session in which it was put
+    on.
     """
 
     scale: Array = parameter(
@@ -95,6 +96,9 @@ class Camera(eqx.Module):
     radial: Array = parameter(
         unit="1/m^2", symbol="k", start=0.0, spread=0.02, free=False, doc="radial distortion"
     )
+    tangential: Array = parameter(
+        unit="1/m", symbol="p", start=0.0, spread=0.02, free=False, doc="decentred lens"
+    )
     centre: tuple[float, float] = eqx.field(static=True, default=(0.0, 0.0))
     sessions: tuple[str, ...] = eqx.field(static=True, default=())
 
@@ -103,7 +107,9 @@ class Camera(eqx.Module):
 
         def ground(p: Float[Array, "2"]) -> Float[Array, "2"]:
             q = p - jnp.asarray(self.centre)
-            return self.scale * q * (1 + self.radial * (q @ q)) / (1 + self.tilt @ q)
+            p, r2 = self.tangential, q @ q
+            bent = q * (1 + self.radial * r2) + p * r2 + 2 * q * (p @ q)
+            return self.scale * bent / (1 + self.tilt @ q)
 
         u = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
         place, turned = jax.jvp(ground, (pose[:2],), (u,))
@@ -186,6 +192,7 @@ def build(
             session_yaw=jnp.zeros(len(sessions)),
             marker_place=jnp.zeros(2),
             tilt=jnp.zeros(2),
+            tangential=jnp.zeros(2),
             centre=centre,
             sessions=tuple(sessions),
         ),

@@ -192,7 +192,10 @@ def simulate(
     first = (jnp.zeros(3), still, still, still, still)
     _, (xi, w, amps, angle, volt) = jax.lax.scan(step, first, (command, floors))
     steps = jnp.full(command.shape[:1], dt)
-    led = lambda x: jnp.concatenate([jnp.zeros((1, x.shape[1])), x])  # noqa: E731
+
+    def led(x: Array) -> Array:
+        return jnp.concatenate([jnp.zeros((1, x.shape[1])), x])
+
     return Simulated(
         time=jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)]),
         wheel_angle=led(angle),

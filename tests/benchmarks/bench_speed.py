@@ -141,11 +141,13 @@ class Rival:
         pose = np.asarray(self.b.pose)
         q = pose[..., :2] - np.asarray(self.camera.centre)
         u = np.stack([np.cos(pose[..., 2]), np.sin(pose[..., 2])], axis=-1)
-        k, h = v["camera", "radial"], v["camera", "tilt"]
-        up, down = 1 + k * (q * q).sum(-1, keepdims=True), 1 + (q @ h)[..., None]
-        place = v["camera", "scale"] * q * up / down
-        turned = u * up / down + q * 2 * k * (q * u).sum(-1, keepdims=True) / down
-        turned = v["camera", "scale"] * (turned - q * up * (u @ h)[..., None] / down**2)
+        k, h, p = (v["camera", name] for name in ("radial", "tilt", "tangential"))
+        r2, pq, down = (q * q).sum(-1, keepdims=True), (q @ p)[..., None], 1 + (q @ h)[..., None]
+        qu, pu = (q * u).sum(-1, keepdims=True), (u @ p)[..., None]
+        bent = q * (1 + k * r2) + p * r2 + 2 * q * pq
+        turned = u * (1 + k * r2) + 2 * k * q * qu + 2 * p * qu + 2 * u * pq + 2 * q * pu
+        turned = turned / down - bent * (u @ h)[..., None] / down**2
+        place = v["camera", "scale"] * bent / down
         turn = np.arctan2(
             u[..., 0] * turned[..., 1] - u[..., 1] * turned[..., 0], (u * turned).sum(-1)
         )
