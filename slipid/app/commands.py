@@ -69,9 +69,9 @@ def _optimise(job: Any, problem: Any, out: Path, report: Reporter) -> Any:
     from slipid.identify.fit import Options, optimise
 
     wanted = job.config.content.fit
-    key = hashlib.sha256(
-        "\n".join([job.config.hash, job.data_hash, *map(str, files.versions().items())]).encode()
-    ).hexdigest()
+    same = [job.config.hash, job.data_hash, *map(str, files.versions().items())]
+    same += [*problem.space.names, *problem.noise.names]
+    key = hashlib.sha256("\n".join(same).encode()).hexdigest()
     kept = files.load_checkpoint(out / CHECKPOINT, key)
     history: list[float] = [] if kept is None else kept[1]
     if kept is not None:

@@ -105,5 +105,5 @@ def train(
 def only(problem: Problem, z: np.ndarray, pattern: str) -> list[Choice]:
     """Choices that hold every number at a fitted value and leave those of a pattern free."""
     robot = problem.space.tree(jnp.asarray(z))
-    held = [Choice(e.path, fixed=np.asarray(e.get(robot)).tolist()) for e in problem.space.free]
+    held = [Choice(e.path, fixed=np.asarray(e.get(robot)).tolist()) for e in problem.space.all]
     return [*held, Choice(pattern, free=True)]

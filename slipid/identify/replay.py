@@ -59,7 +59,7 @@ def cuts(data: Dataset, robot: Robot) -> list[Windows]:
     for k, log in enumerate(data.logs):
         want = 2 ** int(np.ceil(np.log2(max(log.duration / STEP, 16))))
         frames = int(data.fresh[data.rows(k)].sum())
-        while want > 4 and want > frames // 3:
+        while want > 1 and want > frames // 3:
             want //= 2
         groups.setdefault(want, []).append(k)
     out = []

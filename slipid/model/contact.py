@@ -5,11 +5,13 @@ With p_i the wheel places, N_i the load shares, forces in units of mu m g:
     c_i   = sqrt((r w_i)^2 + q_i^2)                    wheel activity, q_i the roller speed
     vs_i  = r w_i - J_i xi                             sliding speed
     N     = N0 - P b v^                                contact patches lead the wheel centres by b
-    T_i   =  N_i [tanh(vs_i / (v0 + s0 c_i)) + kv vs_i - crr tanh(J_i xi / v1)]
+    T_i   =  N_i [tanh(vs_i / (v0 + s0 c_i)) + kv vs_i - crr tanh(J_i xi / (v0 + 0.2 c_i))]
     D_i   = -N_i [cr tanh(q_i / (vr + sr c_i)) + kl q_i]
     0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz tanh(W / W0)) - M (xi - xi_before)
 
-M = 0 is quasi-static. Creep is rate-independent (s0 is a slip *ratio*). The root is found by a
+M = 0 is quasi-static. Creep and rolling resistance are rate-independent (s0 is a slip *ratio*; a
+resistance that sets in at a fixed speed predicts other speeds worse than those it was fitted to).
+The root is found by a
 fixed number of chord steps, which come near from anywhere, and then of damped Newton steps with the
 analytic 3x3 Jacobian; its derivative comes from the implicit function theorem.
 """
@@ -28,8 +30,8 @@ V0 = 0.002
 """Sliding speed below which traction is viscous [m/s]."""
 VR = 0.001
 """Roller speed below which roller drag is viscous [m/s]."""
-V1 = 0.02
-"""Rim speed below which rolling resistance is viscous [m/s]."""
+S1 = 0.2
+"""Speed along the drive, over wheel activity, below which rolling resistance is viscous."""
 W0 = 0.05
 """Yaw rate below which the scrub moment is viscous [rad/s]."""
 _CHORD_STEPS = 30
@@ -109,14 +111,14 @@ def loads(
 
 
 def _speeds(xi: Any, rim: Any, frame: Frame, s: ContactSurface) -> Any:
-    """Rim and roller speed, activity, drag coefficients, speeds of full traction and drag."""
+    """Speeds along drive and rollers, activity, drag coefficients, speeds of full force."""
     along, roll = frame.hold @ xi, frame.roll @ xi - rim * frame.slip_through
     active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
     g = frame.grip  # an ordinary wheel grips sideways as it does ahead
     cr, kl = g + (1 - g) * s.roller_drag, g * s.slide_viscosity + (1 - g) * s.roller_viscosity
     scale_t = V0 + s.creep * active
     scale_r = g * scale_t + (1 - g) * (VR + s.roller_creep * active)
-    return along, roll, active, cr, kl, scale_t, scale_r
+    return along, roll, active, cr, kl, scale_t, scale_r, V0 + S1 * active
 
 
 def _terms(xi: Any, rim: Any, frame: Frame, s: ContactSurface, rest: Any) -> Any:
@@ -125,17 +127,18 @@ def _terms(xi: Any, rim: Any, frame: Frame, s: ContactSurface, rest: Any) -> Any
     inv = jax.lax.rsqrt(v @ v + 1e-8)
     load = rest - s.lead * (frame.shift @ (v * inv))
     d_load = -s.lead * (frame.shift * inv - jnp.outer(frame.shift @ v, v) * inv**3)  # (wheel, 2)
-    along, roll, active, cr, kl, scale_t, scale_r = _speeds(xi, rim, frame, s)
+    along, roll, active, cr, kl, scale_t, scale_r, scale_1 = _speeds(xi, rim, frame, s)
     slide = rim * frame.pull - along
     slope_r = frame.grip * s.creep + (1 - frame.grip) * s.roller_creep
-    t, h, u = jnp.tanh(slide / scale_t), jnp.tanh(roll / scale_r), jnp.tanh(along / V1)
+    t, h, u = jnp.tanh(slide / scale_t), jnp.tanh(roll / scale_r), jnp.tanh(along / scale_1)
     traction = t + s.slide_viscosity * slide - s.rolling_resistance * u
     drag = -(cr * h + kl * roll)
     d_active = roll / active  # times d roll
     t1, h1, u1 = 1 - t * t, 1 - h * h, 1 - u * u
     # d traction = a d along + b d roll;   d drag = c d roll
-    a = -t1 / scale_t - s.slide_viscosity - s.rolling_resistance * u1 / V1
-    b = -t1 * slide * s.creep * d_active / scale_t**2
+    brake = s.rolling_resistance * u1 / scale_1
+    a = -t1 / scale_t - s.slide_viscosity - brake
+    b = -t1 * slide * s.creep * d_active / scale_t**2 + brake * along * S1 * d_active / scale_1
     c = -(cr * h1 * (1 / scale_r - roll * slope_r * d_active / scale_r**2) + kl)
     return traction, drag, load, d_load, a, b, c
 
@@ -175,7 +178,7 @@ def _chord(xi: Any, args: Any) -> Any:
     v = xi[:2]
     load = rest - s.lead * (frame.shift @ (v * jax.lax.rsqrt(v @ v + 1e-8)))
     load = jnp.maximum(load, _LEAST_LOAD)  # a lifted wheel would push the chord the wrong way
-    along, roll, _, cr, kl, scale_t, scale_r = _speeds(xi, rim, frame, s)
+    along, roll, _, cr, kl, scale_t, scale_r, scale_1 = _speeds(xi, rim, frame, s)
 
     def slope(x: Any, scale: Any) -> Any:
         flat = jnp.abs(x) < 1e-6 * scale
@@ -183,7 +186,7 @@ def _chord(xi: Any, args: Any) -> Any:
 
     pulls = load * (slope(rim * frame.pull - along, scale_t) + s.slide_viscosity)
     holds = load * (cr * slope(roll, scale_r) + kl)
-    brakes = load * s.rolling_resistance * slope(along, V1)
+    brakes = load * s.rolling_resistance * slope(along, scale_1)
     m = frame.hold.T @ ((pulls + brakes)[:, None] * frame.hold)
     m += frame.roll.T @ (holds[:, None] * frame.roll) + jnp.diag(mass)
     m = m.at[2, 2].add(s.scrub * slope(xi[2], W0))
@@ -293,8 +296,8 @@ def forces(
     an angle (mecanum) pass on a part of what holds the wheel and a part of their drag.
     """
     traction, drag, load, *_ = _terms(xi, rim, frame, surface, rest)
-    along = frame.hold @ xi
-    held = traction + surface.rolling_resistance * jnp.tanh(along / V1)
+    along, *_, scale_1 = _speeds(xi, rim, frame, surface)
+    held = traction + surface.rolling_resistance * jnp.tanh(along / scale_1)
     felt = load * (held * frame.pull + drag * frame.slip_through)
     return Contact(traction=felt, drag=load * drag, load=load)
 

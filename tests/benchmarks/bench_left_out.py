@@ -3,12 +3,17 @@
     make bench
     .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks -k sectors
 
-Prints mean end-point errors in percent; asserts nothing but that every run was judged.
+(or random, speeds, moved, shares).
+
+Prints mean end-point errors in percent; asserts that every run was judged, and of the load shares
+that gray and green agree.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,8 +21,10 @@ import pytest
 from slipid.app.config import read_config
 from slipid.app.job import Job, read_job
 from slipid.data.dataset import Dataset
+from slipid.identify.fit import Optimum
 from slipid.identify.folds import left_out, only, random_headings, sectors, still_viscosities, train
 from slipid.identify.problem import Problem
+from slipid.identify.result import draws
 from slipid.identify.validate import summary, text_table, validation
 from slipid.model.robot import build
 
@@ -92,36 +99,58 @@ def test_speeds(job: Job, seen: tuple[float, ...]) -> None:
 
 def test_moved_load(job: Job) -> None:
     """Fit of one_surface; of the moved load only the shares, from a third of its headings."""
-    data = job.dataset
+    data, problem = job.dataset, job.problem()
     moved = np.array([log.load == "moved" for log in data.logs])
-    part, problem = some(job, np.flatnonzero(~moved))
-    optimum, first = train(problem, part, np.arange(len(part)))
-    third = np.flatnonzero(moved)[::3]
-    rest = np.setdiff1d(np.flatnonzero(moved), third)
-    again, shares = some(job, np.concatenate([np.flatnonzero(~moved), third]))
-    held = [
-        c
-        for c in only(problem, optimum.state.z, "robot.load_share@moved")
-        if not c.pattern.startswith("robot.load_share@as_built") or c.fixed is not None
-    ]
-    refit = Problem(shares.windows, shares.robot, [*job_choices(shares), *held])
-    is_third = np.isin([log.name for log in again.logs], [data.logs[k].name for k in third])
-    _, frozen = train(refit, again, np.flatnonzero(is_third))
+    built, (third, rest) = np.flatnonzero(~moved), thirds(data, np.flatnonzero(moved))
+    optimum, first = train(problem, data, built)
+    held = only(problem, optimum.state.z, "robot.load_share@moved")
+    refit = Problem(problem.windows, problem.robot, held)
+    assert refit.space.names == ["robot.load_share@moved[1]", "robot.load_share@moved[2]"]
+    again, frozen = train(refit, data, third)
     rows = validation(replace(frozen, rungs=first.rungs), data.subset(rest))["runs"]
     show("(c) moved load, shares from a third of its headings", rows)
-    share = refit.space.tree(jnp.asarray(frozen.z)).body.load_share
-    print("  load shares as_built, moved:", np.round(np.asarray(share), 4).tolist())
+    print_shares("shares of the third", refit, again, ("moved",))
     assert len(rows) == len(rest)
 
 
-def job_choices(problem: Problem) -> list:
-    """What was fixed stays fixed: only the pattern asked for is left free."""
-    from slipid.parameter import Choice
+def thirds(data: Dataset, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Every third heading of some runs, and the others."""
+    heading = np.round(np.degrees(data.heading[runs])) % 360
+    chosen = np.isin(heading, np.unique(heading)[::3])
+    return runs[chosen], runs[~chosen]
 
-    robot = problem.robot
-    free = {e.path for e in problem.space.free}
-    return [
-        Choice(e.path, fixed=np.asarray(e.get(robot)).tolist())
-        for e in problem.space.all
-        if e.path not in free
-    ] + [Choice("camera.session_yaw@gray/moved/0.10", fixed=0.0)]
+
+def test_load_shares(job: Job) -> None:
+    """Where the weight rests, from each carpet by itself and from all floors together."""
+    floor = np.array([str(log.surface) for log in job.dataset.logs])
+    print("\nload shares of the wheels with 90 % intervals")
+    found = {}
+    for name in ("gray", "green", None):
+        mine = np.arange(len(floor)) if name is None else np.flatnonzero(floor == name)
+        data, problem = some(job, mine)
+        optimum, _ = train(problem, data, np.arange(len(data)))
+        loads = sorted({log.load for log in data.logs})
+        found[name] = print_shares(name or "all floors", problem, optimum, loads)
+    apart = np.abs(found["gray"]["as_built"] - found["green"]["as_built"]).max()
+    print(f"  gray and green by themselves differ by at most {apart:.4f}")
+    assert apart < 0.01
+    for one in ("gray", None):
+        assert np.abs(found[one]["as_built"] - found[one]["moved"]).max() > 0.03
+
+
+def print_shares(
+    what: str, problem: Problem, optimum: Optimum, loads: Iterable[str]
+) -> dict[str, np.ndarray]:
+    """Prints shares with intervals; returns the shares of each load set-up."""
+    z, out = optimum.state.z, {}
+    for load in loads:
+        entry = next(e for e in problem.space.free if e.path == f"robot.load_share@{load}")
+        at = problem.space.place[entry.path]
+        some_z = draws(z, optimum.covariance, 4000, 0)[:, at]
+        low, high = np.quantile(jax.vmap(entry.declaration.to_si)(some_z), (0.05, 0.95), axis=0)
+        out[load] = np.asarray(entry.declaration.to_si(jnp.asarray(z[at])))
+        text = "   ".join(
+            f"{x:.4f} [{a:.4f}, {b:.4f}]" for x, a, b in zip(out[load], low, high, strict=True)
+        )
+        print(f"  {what:20} {load:9} {text}")
+    return out

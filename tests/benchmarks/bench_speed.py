@@ -118,7 +118,9 @@ class Rival:
         xi = equilibrium(rim, hold, roll, pull, shift, s, rest, base)
         motion = self.seen(advance(xi, self.dt), v) - self.measured(v)
         traction, _, load, *_ = terms(xi, rim, hold, roll, pull, shift, s, rest)
-        driven = traction + s["rolling_resistance"] * np.tanh(xi @ hold.T / contact.V1)
+        along, active = xi @ hold.T, np.sqrt(rim**2 + (xi @ roll.T) ** 2 + 1e-12)
+        sets_in = contact.V0 + contact.S1 * active
+        driven = traction + s["rolling_resistance"] * np.tanh(along / sets_in)
         weight = s["friction"] * v["body", "mass"] * 9.81
         torque = v["geometry", "wheel_radius"] * weight * load * driven
         m = {k[1]: x for k, x in v.items() if k[0] == "motor"}
@@ -180,12 +182,15 @@ def terms(xi, rim, hold, roll, pull, shift, s, rest):
     active = np.sqrt(rim**2 + side**2 + 1e-12)
     scale_t = contact.V0 + s["creep"] * active
     scale_r = contact.VR + s["roller_creep"] * active
-    t, h, u = np.tanh(slide / scale_t), np.tanh(side / scale_r), np.tanh(along / contact.V1)
+    sets_in = contact.V0 + contact.S1 * active
+    t, h, u = np.tanh(slide / scale_t), np.tanh(side / scale_r), np.tanh(along / sets_in)
     traction = t + s["slide_viscosity"] * slide - s["rolling_resistance"] * u
     drag = -(s["roller_drag"] * h + s["roller_viscosity"] * side)
     t1, h1 = 1 - t * t, 1 - h * h
-    a = -t1 / scale_t - s["slide_viscosity"] - s["rolling_resistance"] * (1 - u * u) / contact.V1
+    brake = s["rolling_resistance"] * (1 - u * u) / sets_in
+    a = -t1 / scale_t - s["slide_viscosity"] - brake
     b = -t1 * slide * s["creep"] * side / active / scale_t**2
+    b = b + brake * along * contact.S1 * side / active / sets_in
     c = 1 / scale_r - side * s["roller_creep"] * side / active / scale_r**2
     c = -(s["roller_drag"] * h1 * c + s["roller_viscosity"])
     return traction, drag, load, d_load, a, b, c
@@ -221,7 +226,7 @@ def equilibrium(rim, hold, roll, pull, shift, s, rest, base):
         pulls = slope(rim * pull - along, contact.V0 + s["creep"] * active) + s["slide_viscosity"]
         holds = s["roller_drag"] * slope(side, contact.VR + s["roller_creep"] * active)
         holds = load * (holds + s["roller_viscosity"])
-        brakes = load * s["rolling_resistance"] * slope(along, contact.V1)
+        brakes = load * s["rolling_resistance"] * slope(along, contact.V0 + contact.S1 * active)
         m = (hold.T * (load * pulls + brakes)[:, None]) @ hold + (roll.T * holds[:, None]) @ roll
         m[:, 2, 2] += s["scrub"][:, 0] * slope(xi[:, 2], contact.W0)
         return solve3(m, (load * pulls * rim * pull) @ hold)
