@@ -198,6 +198,7 @@ def test_a_log_without_motion_is_refused_before_anything_is_written(tmp_path):
 # the job end to end -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_identify_writes_what_the_contract_says(small):
     folder, result = small
     assert result.exit_code == 0, result.stderr
@@ -218,6 +219,7 @@ def test_identify_writes_what_the_contract_says(small):
     assert "skipped" in result.stderr  # the config also names moved/
 
 
+@pytest.mark.slow
 def test_identify_finds_the_motor(small):
     folder, _ = small
     found = json.loads((folder / "out" / "identified.json").read_text())["parameters"]
@@ -227,6 +229,7 @@ def test_identify_finds_the_motor(small):
     assert found["motor.resistance"]["verdict"] == "identified"
 
 
+@pytest.mark.slow
 def test_json_to_stdout_and_the_same_numbers_again(small, tmp_path):
     folder, _ = small
     config, data = folder / "my.toml", folder / "logs"
@@ -235,6 +238,7 @@ def test_json_to_stdout_and_the_same_numbers_again(small, tmp_path):
     assert json.loads(result.stdout) == json.loads((folder / "out/identified.json").read_text())
 
 
+@pytest.mark.slow
 def test_validate_predicts_unseen_runs(small, tmp_path):
     folder, _ = small
     target = tmp_path / "v.json"
@@ -251,6 +255,7 @@ def test_validate_predicts_unseen_runs(small, tmp_path):
     assert "were fitted" not in result.stderr
 
 
+@pytest.mark.slow
 def test_validate_says_when_runs_were_fitted_and_when_a_floor_is_unknown(small, tmp_path):
     folder, _ = small
     result = invoke("validate", folder / "out", "--data", folder / "logs")
@@ -265,6 +270,7 @@ def test_validate_says_when_runs_were_fitted_and_when_a_floor_is_unknown(small, 
     assert "identified: soft" in result.stderr
 
 
+@pytest.mark.slow
 def test_check_tells_before_the_fit(small, tmp_path):
     folder, _ = small
     out = tmp_path / "check"
@@ -283,6 +289,7 @@ def test_check_tells_before_the_fit(small, tmp_path):
     assert picture[:8] == b"\x89PNG\r\n\x1a\n"
 
 
+@pytest.mark.slow
 def test_a_fit_that_does_not_settle_is_1_and_says_so(small, tmp_path):
     folder, _ = small
     config = tmp_path / "short.toml"

@@ -117,6 +117,7 @@ def headings(speed, count=36):
 # it is a root
 
 
+@pytest.mark.slow
 def test_forces_balance_wherever_floors_are_as_found():
     floors, rim, rest = cases("ordinary", 20000)
     frame = ROBOTINO.frame()
@@ -125,6 +126,7 @@ def test_forces_balance_wherever_floors_are_as_found():
     assert (open_ > 1e-9).mean() <= 1e-4
 
 
+@pytest.mark.slow
 def test_forces_balance_in_all_but_a_few_of_the_hardest_cases():
     """Near a fold of the balance the root finder can be left behind: fewer than 1 in 2000."""
     floors, rim, rest = cases("hard", 50000)
@@ -137,6 +139,7 @@ def test_forces_balance_in_all_but_a_few_of_the_hardest_cases():
 
 
 @pytest.mark.parametrize("name", ["omni 4", "mecanum", "skid steer"])
+@pytest.mark.slow
 def test_forces_balance_on_other_wheels(name):
     g = GEOMETRIES[name]
     floors, rim, rest = cases("ordinary", 5000, g)
@@ -147,6 +150,7 @@ def test_forces_balance_on_other_wheels(name):
     assert np.mean(open_ > 1e-9) < 2e-3
 
 
+@pytest.mark.slow
 def test_another_root_finder_finds_the_same_twist():
     floors, rim, rest = cases("ordinary", 200, seed=5)
     frame = ROBOTINO.frame()
@@ -239,6 +243,7 @@ def test_the_implicit_derivative_is_that_of_finite_differences(floor, rim):
         np.testing.assert_allclose(jacobian[:, k], numeric, atol=tolerance, err_msg=f"number {k}")
 
 
+@pytest.mark.slow
 def test_reverse_and_forward_derivatives_agree():
     vector = everything(jnp.array([0.1, 0.0, -0.1]), FLOORS["gray"], EVEN)
     np.testing.assert_allclose(reverse(vector), forward(vector), rtol=1e-9, atol=1e-12)
@@ -248,6 +253,7 @@ def test_reverse_and_forward_derivatives_agree():
 
 
 @pytest.mark.parametrize("floor", FLOORS)
+@pytest.mark.slow
 def test_turning_the_travel_by_120_degrees_turns_the_twist(floor):
     rim = headings(0.2) + jnp.array([0.03, 0.03, 0.03])
     frame, count = ROBOTINO.frame(), len(rim)
@@ -260,6 +266,7 @@ def test_turning_the_travel_by_120_degrees_turns_the_twist(floor):
 
 
 @pytest.mark.parametrize("floor", FLOORS)
+@pytest.mark.slow
 def test_mirrored_wheels_and_loads_mirror_the_twist(floor):
     rim = headings(0.2) + jnp.array([0.03, 0.03, 0.03])
     frame, count = ROBOTINO.frame(), len(rim)
@@ -270,6 +277,7 @@ def test_mirrored_wheels_and_loads_mirror_the_twist(floor):
     np.testing.assert_allclose(there, here * [1.0, -1.0, -1.0], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_centred_loads_go_straight_along_the_axes_of_symmetry_only():
     frame, gray = ROBOTINO.frame(), FLOORS["gray"]
     drift = lambda rim, rest: np.asarray(equilibrium(rim, frame, gray, rest))  # noqa: E731
@@ -280,6 +288,7 @@ def test_centred_loads_go_straight_along_the_axes_of_symmetry_only():
 
 
 @pytest.mark.parametrize("name", ["omni 3", "omni 4", "mecanum"])
+@pytest.mark.slow
 def test_without_drag_there_is_no_slip(name):
     g = GEOMETRIES[name]
     free = surface(
@@ -355,6 +364,7 @@ def test_loads_carry_the_weight_at_the_centre_of_pressure():
 
 
 @pytest.mark.parametrize("name", GEOMETRIES)
+@pytest.mark.slow
 def test_energy_is_lost_at_every_wheel_and_the_motors_pay_for_it(name):
     """Power of the rims = sliding + rollers + rolling resistance + scrub, each of them positive."""
     g = GEOMETRIES[name]
@@ -452,6 +462,7 @@ def test_mecanum_goes_sideways():
 # inertia
 
 
+@pytest.mark.slow
 def test_inertia_is_newton_s_law_for_the_step():
     frame, gray = ROBOTINO.frame(), FLOORS["gray"]
     rim, rest = jnp.array([0.2, -0.05, -0.15]), jnp.array([0.3, 0.3, 0.4])
@@ -461,6 +472,7 @@ def test_inertia_is_newton_s_law_for_the_step():
     np.testing.assert_allclose(inertia * (after - before) / dt, force, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_much_inertia_keeps_the_twist_and_none_forgets_it():
     frame, gray = ROBOTINO.frame(), FLOORS["gray"]
     rim, rest = jnp.array([0.2, -0.05, -0.15]), EVEN

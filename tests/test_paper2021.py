@@ -486,6 +486,7 @@ def test_figure_7_tracks(result):
         assert 1.0 < t.path_length / t.file.printed_path_length < 1.05
 
 
+@pytest.mark.slow
 def test_no_curve_in_current_carries_over_to_an_unseen_surface(real_data):
     logs = paper_plots.read_runs(real_data / "robotino2022")
     if logs is None:

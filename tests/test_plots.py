@@ -23,6 +23,8 @@ from slipid.identify.problem import Problem, State
 from slipid.identify.result import Fit, summarise
 from slipid.parameter import Choice
 
+pytestmark = pytest.mark.slow  # traces whole fits
+
 DRIVES = grid(setups=(("soft", "as_built"), ("firm", "as_built")), headings=8, turns=0)
 ROBOT = truth(DRIVES)
 QUIET = Sensors(std=dict.fromkeys(Sensors().std, 0.0), ripple=0.0, voltage_noise=0.0, wobble=0.0)
@@ -99,7 +101,6 @@ def test_wheel_slip_and_torque_lie_on_the_curve_of_a_wheel():
     assert abs(p.torque[k, 0]) == pytest.approx(expected, rel=0.06)
 
 
-@pytest.mark.slow
 def test_curve_of_a_straight_wheel_is_the_published_one():
     for floor, curve in fit().curves.items():
         at = curve["at"]
@@ -120,7 +121,6 @@ def test_sideways_rolling_costs_slip():
     assert (wheel_curve(ROBOT, "soft", slip, 1.0, 3.0, 1 / 3) < straight).all()
 
 
-@pytest.mark.slow
 def test_identify_draws_every_picture(tmp_path):
     files = plots.identify_plots(fit(), data(), tmp_path)
     assert {f.name for f in files} == {
@@ -150,7 +150,6 @@ def test_turning_pieces_have_no_direction():
     assert not seen(robot, collect(make_logs(robot, drives, 0, QUIET)), 4).straight.any()
 
 
-@pytest.mark.slow
 def test_loads_are_written_at_their_wheels():
     made = plots_robot.load_figure(fit())
     texts = {t.get_text().split("\n")[0]: t for t in made.axes[0].texts}

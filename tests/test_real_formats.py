@@ -128,6 +128,7 @@ def test_stalls_of_the_telemetry_are_found_and_bridged(robotino2022):
     assert np.abs(speed[row - 2 : row + 3, 2]).max() < 1.4 * usual
 
 
+@pytest.mark.slow
 def test_the_camera_is_late_not_early(robotino2022):
     lags = []
     for log in robotino2022["gray"][::3]:
@@ -151,6 +152,7 @@ def test_the_camera_is_late_not_early(robotino2022):
         ("omni3_optitrack/*/*/*run*.csv", "omni3_optitrack", 11, 18081, 3),
     ],
 )
+@pytest.mark.slow
 def test_every_other_file_reads(real_data, pattern, name, runs, rows, wheels):
     layout = preset(name)
     logs = [
@@ -171,6 +173,7 @@ def test_ticks_of_the_motor_logs_do_not_accumulate(real_data):
         assert np.abs(table["m1pos"]).max() < 0.01 * np.abs(ticks).max()
 
 
+@pytest.mark.slow
 def test_rows_of_2021_are_0_45_s_apart(real_data):
     """Ticks between rows over the reported speed, which reads 1.3 % high."""
     periods = []

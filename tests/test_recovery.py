@@ -22,6 +22,7 @@ def recovered(seed):
     return recovery.recover(seed)
 
 
+@pytest.mark.slow
 def test_starts_are_two_fold_off_the_truth():
     space = recovery.problem().space
     off = space.start - space.vector(recovery.TRUTH)

@@ -20,6 +20,8 @@ from slipid.identify.result import Fit, hash_of, load, summarise
 from slipid.identify.verdict import estimates, flat_directions
 from slipid.parameter import Choice
 
+pytestmark = pytest.mark.slow  # traces whole fits
+
 DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1,), turns=0)
 TRUTH = truth(DRIVES)
 CHOICES = (

@@ -64,6 +64,7 @@ def curve():
 
 
 @pytest.mark.parametrize("body_inertia", [True, False])
+@pytest.mark.slow
 def test_replay_of_simulated_wheels_is_the_simulated_path(body_inertia):
     run = driven([0.15, 0.08, 0.6], body_inertia=body_inertia)
     pose = replayed(ROBOT, run.time, run.wheel_angle, body_inertia=body_inertia)
@@ -71,6 +72,7 @@ def test_replay_of_simulated_wheels_is_the_simulated_path(body_inertia):
     assert np.hypot(*run.pose[-1, :2]) > 0.1
 
 
+@pytest.mark.slow
 def test_wheels_obey_their_torque_balance_in_every_step(curve):
     frame, motor = ROBOT.geometry.frame(), ROBOT.motor
 
@@ -99,6 +101,7 @@ def test_body_obeys_newton_in_every_step(curve):
     np.testing.assert_allclose(pushed, mass * jnp.diff(curve.twist, axis=0) / DT, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_small_inertia_is_quasi_static():
     t = np.linspace(0, 2, 81)
     angle = jnp.asarray(np.outer(t + 0.2 * np.sin(3 * t), wheels_for([0.15, 0.05, 0.3])))
@@ -118,6 +121,7 @@ def test_small_inertia_is_quasi_static():
     assert gaps[2] < 1e-5
 
 
+@pytest.mark.slow
 def test_inertia_delays_but_ends_at_the_same_twist():
     steady = jnp.tile(jnp.asarray(wheels_for([0.2, 0.0, 0.0])), (400, 1))
     dt = jnp.full(400, 0.005)
@@ -127,6 +131,7 @@ def test_inertia_delays_but_ends_at_the_same_twist():
     np.testing.assert_allclose(xi[-1], at_once[-1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_smooth_motion_converges_with_the_step():
     def end(steps):
         t = np.linspace(0, 2, steps + 1)
@@ -141,6 +146,7 @@ def test_smooth_motion_converges_with_the_step():
     assert coarse[1] / coarse[2] > 1.8
 
 
+@pytest.mark.slow
 def test_floors_may_change_on_the_way():
     t = jnp.asarray(np.linspace(0, 2, 41))
     angle = jnp.asarray(np.outer(t, wheels_for([0.1, 0.0, 0.0])))
@@ -167,6 +173,7 @@ def test_electrical_energy_covers_the_mechanical(curve):
     assert mechanical > kinetic > 0.05
 
 
+@pytest.mark.slow
 def test_inductance_changes_the_start_and_not_the_end(curve):
     slow = driven([0.15, 0.08, 0.6], inductance=True, steps=2000)
     quick = driven([0.15, 0.08, 0.6], steps=2000)
@@ -176,6 +183,7 @@ def test_inductance_changes_the_start_and_not_the_end(curve):
     np.testing.assert_allclose(slow.twist[-1], quick.twist[-1], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_current_rises_with_the_electrical_time_constant():
     stuck = made(**{"motor.rotor_inertia": 1e3, "motor.inductance": 0.5})
     run = driven([0.2, 0.0, 0.0], robot=stuck, loop=SpeedLoop(integral=0.0), inductance=True)
@@ -186,6 +194,7 @@ def test_current_rises_with_the_electrical_time_constant():
     assert float(run.current[at, 2]) == pytest.approx(float(want), rel=2e-3)
 
 
+@pytest.mark.slow
 def test_wheels_settle_at_the_set_speed():
     run = driven([0.15, 0.08, 0.6], steps=2000)
     np.testing.assert_allclose(run.wheel_speed[-1], wheels_for([0.15, 0.08, 0.6]), rtol=2e-3)
@@ -200,6 +209,7 @@ def test_voltage_stays_inside_its_limit_and_the_integral_does_not_wind_up():
     assert float(weak.wheel_speed[-1, 2]) < 0.5 * wheels_for([0.6, 0.0, 0.0])[2]
 
 
+@pytest.mark.slow
 def test_standing_still_stays_still():
     run = driven([0.0, 0.0, 0.0])
     assert float(jnp.abs(run.pose).max()) < 1e-12
@@ -220,6 +230,7 @@ def test_turning_the_command_by_a_third_turns_the_path():
     np.testing.assert_allclose(turned.current, jnp.roll(start.current, 1, axis=1), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_vmap_over_runs_is_each_run_by_itself():
     twists = [0.1, 0.0, 0.0], [0.0, 0.1, 1.0]
     commands = jnp.asarray([np.tile(wheels_for(xi), (100, 1)) for xi in twists])
@@ -229,6 +240,7 @@ def test_vmap_over_runs_is_each_run_by_itself():
         np.testing.assert_allclose(together.pose[k], driven(xi, steps=100).pose, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_four_ordinary_wheels_drive_and_turn():
     geometry = skid_steer(0.1, 0.15, RADIUS, 16.0)
     robot = made(geometry)

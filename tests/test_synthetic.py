@@ -40,6 +40,7 @@ def test_plan_covers_every_setting_once():
     assert {d.load for d in PLAN} == {"as_built", "moved"}
 
 
+@pytest.mark.slow
 def test_seed_decides_everything(logs):
     again = make_logs(ROBOT, PLAN, seed=3)
     other = make_logs(ROBOT, PLAN, seed=4)
@@ -49,6 +50,7 @@ def test_seed_decides_everything(logs):
         assert np.abs(a.pose[-1] - c.pose[-1]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_logs_have_the_traps_of_real_ones(logs):
     log = logs[0]
     assert not log.current_is_signed
@@ -71,6 +73,7 @@ def test_sessions_are_those_a_dataset_finds(logs):
     assert set(ROBOT.camera.sessions) == {d.session for d in PLAN}
 
 
+@pytest.mark.slow
 def test_without_noise_the_likelihood_has_no_residual():
     fine = Sensors(
         std=STILL,
@@ -96,6 +99,7 @@ def test_without_noise_the_likelihood_has_no_residual():
     assert np.abs(volts[strong & turning[:, 1:]]).max() < 2e-2
 
 
+@pytest.mark.slow
 def test_scatter_of_increments_is_the_likelihoods_covariance():
     """Whitened with the true variances, residuals at the truth have unit variance."""
     sensors = Sensors()
