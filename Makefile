@@ -28,7 +28,7 @@ ifneq ($(NOTEBOOKS),)
 endif
 	$(BIN)/python -m pytest -q -m "not slow"
 
-bench: $(VENV)/.dev-stamp ## speed, as ratios in one run
+bench: $(VENV)/.dev-stamp ## speed, left-out errors, load shares, known truth (half an hour)
 ifneq ($(BENCHES),)
 	$(BIN)/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks
 else

@@ -190,7 +190,7 @@ class Choice:
 
     Attributes:
         pattern: path, `*` and `?` allowed: `surface.*.creep`.
-        start: value to begin with [SI].
+        start: value to begin with [SI]; a number that is fixed stays so, at this value.
         fixed: value it keeps [SI]; None leaves it free.
         free: True or False to say it without a value.
         prior_mean: centre of the prior [SI].
@@ -288,17 +288,17 @@ def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, A
     is_free, mean_si, std_si = d.free, None, None
     for c in picked:
         if c.fixed is not None:
-            value, is_free = _inside(entry, c.fixed, bounds_too=True), False
+            value, is_free = _inside(entry, c.fixed), False
         if c.start is not None:
             value = _inside(entry, c.start)
         if c.prior_mean is not None or c.prior_std is not None:
             mean = usual if c.prior_mean is None else c.prior_mean
-            mean_si, std_si = _inside(entry, mean), c.prior_std
+            mean_si, std_si = _inside(entry, mean), _spread(entry, c.prior_std)
             value = value if c.prior_mean is None or c.start is not None else mean_si
             is_free = True
         if c.free is not None:
             is_free = c.free
-    value = _inside(entry, value, bounds_too=not is_free)
+    value = _inside(entry, value)
     mean = d.to_search(usual if mean_si is None else mean_si)
     if std_si is None:
         spread = np.full(entry.coordinates, d.spread)
@@ -314,8 +314,18 @@ def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, A
     return value, mean, spread, is_free
 
 
-def _inside(entry: Entry, value: Any, bounds_too: bool = False) -> Any:
-    """Value as an array, checked; only a fixed one may be a bound itself, as zero creep is."""
+def _spread(entry: Entry, std: Any) -> Any:
+    """Std of a prior, checked; None where only its centre was given."""
+    if std is None:
+        return None
+    x = np.asarray(std, float)
+    if x.size not in (1, entry.size) or not (np.isfinite(x) & (x > 0)).all():
+        raise ValueError(f"{entry.path}: prior std {std}; expected 1 or {entry.size} above zero")
+    return x.ravel() if x.size > 1 else float(x.reshape(()))
+
+
+def _inside(entry: Entry, value: Any) -> Any:
+    """Value as an array, checked."""
     x = np.asarray(value, float)
     d = entry.declaration
     if x.size == 1 and entry.size > 1:
@@ -323,8 +333,6 @@ def _inside(entry: Entry, value: Any, bounds_too: bool = False) -> Any:
     if x.size != entry.size:
         raise ValueError(f"{entry.path} takes {entry.size} numbers, got {x.size}")
     outside = ~((x > d.lower) & (x < d.upper))
-    if bounds_too:
-        outside &= ~np.isfinite(x) | ((x != d.lower) & (x != d.upper))
     if d.shares:
         outside = ~((x > 0) & (abs(x.sum() - 1) < 1e-6))
     if outside.any():

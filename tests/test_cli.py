@@ -19,7 +19,7 @@ from slipid.app.demo import packaged_config
 from slipid.app.files import load_checkpoint, save_checkpoint
 from slipid.app.new import write_new
 from slipid.app.synthetic import Sensors, grid, make_logs, truth, write_logs
-from slipid.data.files import write_bytes, write_json
+from slipid.data.files import writable, write_bytes, write_json
 from slipid.data.log import DataError
 from tests.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
 
@@ -385,7 +385,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monke
         raise OSError("disk full")
 
     monkeypatch.setattr(os, "replace", crash)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(DataError, match=r"a\.json: cannot be written"):
         write_bytes(path, b"new")
     assert json.loads(path.read_text()) == {"x": 1.5}
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
@@ -408,3 +408,19 @@ def test_new_writes_a_config_that_reads_and_never_overwrites(tmp_path):
     with pytest.raises(DataError, match="greater than 0"):
         write_new(tmp_path / "x.toml", "omni", -0.05, 0.2, 12.0, 9.0, 500.0, False)
     assert not (tmp_path / "x.toml").exists()
+    before = path.read_bytes()
+    answers = [*words, "--ticks-per-revolution", 500, "--wheel-radius-m", -1]
+    bad = invoke("new", "--out", path, "--force", *answers)
+    assert bad.exit_code == 2
+    assert path.read_bytes() == before
+
+
+def test_a_place_that_cannot_be_written_to_is_said_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    path = tmp_path / "file" / "x.toml"
+    with pytest.raises(DataError, match=r"x\.toml: cannot be written"):
+        write_new(path, "omni", 0.05, 0.2, 12.0, 9.0, 500.0, force=False)
+    with pytest.raises(DataError, match="cannot be written"):
+        writable(tmp_path / "file" / "out")
+    writable(tmp_path / "new")
+    assert list((tmp_path / "new").iterdir()) == []

@@ -159,11 +159,35 @@ def test_a_job_reads_floors_from_folders_and_takes_the_mass(tmp_path):
         "one_surface/green_surface/exp01.csv",
     ]
     assert job.dataset.session == ("gray/as_built/0.10", "green/as_built/0.10")
-    assert ("robot.mass", 12.0) in [(c.pattern, c.fixed) for c in job.choices]
     problem = job.problem()
+    assert float(problem.robot.body.mass) == 12.0
+    assert not [p for p in problem.space.place if p.startswith("robot.") and "share" not in p]
     assert problem.windows.lag == pytest.approx(0.05)  # where the lag starts
     assert float(problem.robot.surfaces.lead[0]) == 0.001
     assert "surface.gray.lead" not in problem.space.place
+
+
+def test_what_the_robot_section_says_is_the_centre_of_its_prior(tmp_path):
+    write_good(tmp_path)
+    freed = '[parameters]\n"robot.*" = { free = true }\n"robot.base_radius" = { prior = '
+    text = GOOD.replace("[parameters]", f"{freed}{{ mean = 0.13, std = 0.005 }} }}")
+    space = job_of(tmp_path, text).problem().space
+
+    def prior(path):
+        at = space.place[path]
+        return np.exp(space.prior_mean[at]), space.prior_std[at]
+
+    np.testing.assert_allclose(prior("robot.wheel_radius"), [[0.04], [0.02]])
+    np.testing.assert_allclose(prior("robot.mass"), [[12.0], [0.1]])
+    np.testing.assert_allclose(prior("robot.base_radius"), [[0.13], [0.005 / 0.13]])
+
+
+def test_any_name_of_a_floor_will_do(tmp_path):
+    write_good(tmp_path)
+    (tmp_path / "one_surface/gray").rename(tmp_path / "one_surface/gray[1]*")
+    problem = job_of(tmp_path, GOOD).problem()
+    assert problem.robot.surfaces.labels == ("gray[1]*",)
+    assert "surface.gray[1]*.slide_viscosity" not in problem.space.place
 
 
 @pytest.mark.parametrize(

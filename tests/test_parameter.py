@@ -272,13 +272,6 @@ def test_a_std_alone_is_a_prior_around_the_declared_start(tree):
     np.testing.assert_allclose(space.start[at], math.log(0.2))
 
 
-def test_a_fixed_number_may_be_its_bound_and_a_free_one_may_not(tree):
-    space = Space(tree, [Choice("floor.a.creep", fixed=0.0)])
-    assert float(space.tree(space.start).floors.creep[0]) == 0.0
-    with pytest.raises(ValueError, match=r"floor\.a\.creep = 0\.0: expected inside"):
-        Space(tree, [Choice("floor.a.creep", fixed=0.0), Choice("floor.a.creep", free=True)])
-
-
 def test_nothing_free_is_an_empty_space(tree):
     space = Space(tree, [Choice("*", free=False)])
     assert space.size == 0
@@ -307,6 +300,9 @@ def test_an_unknown_path_is_refused_with_the_choices(tree):
         (Choice("share@full", fixed=(1.2, -0.1, -0.1)), "positive shares that sum to 1"),
         (Choice("share@full", start=(0.5, 0.5)), "takes 3 numbers, got 2"),
         (Choice("inner.place", start=(1.0, 2.0, 3.0)), "takes 2 numbers, got 3"),
+        (Choice("inner.gain", fixed=0.0), r"inner\.gain = 0\.0: expected inside"),
+        (Choice("inner.gain", prior_std=-1.0), r"inner\.gain: prior std -1\.0; expected 1 or 1"),
+        (Choice("inner.place", prior_std=(1.0, 1.0, 1.0)), "expected 1 or 2 above zero"),
     ],
 )
 def test_values_outside_are_refused_by_name(tree, choice, message):

@@ -13,12 +13,13 @@ from matplotlib.image import imread
 from slipid.app import plots, plots_robot
 from slipid.app.drawing import figure, save
 from slipid.app.plot_data import by_heading, seen
-from slipid.app.plots_ladder import ladder_figure
+from slipid.app.plots_ladder import WORDS, ladder_figure
 from slipid.app.plots_motion import heading_figure
 from slipid.app.plots_wheels import current_figure, driving_torque, wheel_curve
 from slipid.app.synthetic import Drive, Sensors, blank, grid, make_logs, truth
 from slipid.data.dataset import collect, windows
 from slipid.identify.fit import Optimum
+from slipid.identify.ladder import rungs
 from slipid.identify.problem import Problem, State
 from slipid.identify.result import Fit, summarise
 from slipid.parameter import Choice
@@ -159,6 +160,10 @@ def test_loads_are_written_at_their_wheels():
     # wheel 2 stands behind, wheel 1 ahead on the left
     assert texts["wheel 2"].get_position()[1] < 0
     assert texts["wheel 1"].get_position()[0] < 0 < texts["wheel 1"].get_position()[1]
+
+
+def test_every_rung_has_words_in_the_picture():
+    assert set(WORDS) == {"identified", *(rung.name for rung in rungs(has_current=True))}
 
 
 def test_errors_are_drawn_to_scale():

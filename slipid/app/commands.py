@@ -10,7 +10,7 @@ from typing import Any
 from slipid.app import files, runtime
 from slipid.app.config import Config, read_config
 from slipid.app.progress import Reporter
-from slipid.data.files import write_bytes, write_json
+from slipid.data.files import writable, write_bytes, write_json
 from slipid.data.log import DataError
 
 CHECKPOINT = "checkpoint.npz"
@@ -40,6 +40,7 @@ def identify(config_path: Path, data: Path, out: Path, report: Reporter) -> Done
 
     job = read_job(config, data, report.count, report.line)
     report.line(f"{len(job.dataset)} runs on {', '.join(job.robot.surfaces.labels)}")
+    writable(out)
     report.stage("cutting windows")
     problem = job.problem()
     optimum = _optimise(job, problem, out, report)
@@ -50,8 +51,8 @@ def identify(config_path: Path, data: Path, out: Path, report: Reporter) -> Done
     report.stage("simpler models, for comparison")
     fit = _with_baselines(fit, job)
     report.stage("writing")
-    _keep_run(config, job, data, out, time.monotonic() - began)
     fit.save(out)
+    _keep_run(config, job, data, out, time.monotonic() - began)
     written = ["identified.json", "fit.json", "fit.npz", "run.json", "config.toml"]
     from slipid.app.plots import identify_plots
 
@@ -151,7 +152,6 @@ def validate(out: Path, data: Path, report: Reporter) -> dict[str, Any]:
     """
     runtime.start()
     from slipid.app.job import read_dataset
-    from slipid.identify.ladder import restored
     from slipid.identify.result import load
     from slipid.identify.validate import Frozen, validation
 
@@ -173,14 +173,24 @@ def validate(out: Path, data: Path, report: Reporter) -> dict[str, Any]:
         z=fit.z,
         covariance=fit.covariance,
         variance=dict(fit.variance),
-        rungs=restored(dict(fit.baselines)),
+        rungs=_restored(fit.baselines, out),
     )
     found = validation(frozen, dataset)
     report.stage("drawing")
     from slipid.app.plots import validate_plots
 
-    validate_plots(fit, dataset, found, out)
+    drawn = validate_plots(fit, dataset, found, out)
+    report.line(f"in {out}: {', '.join(path.name for path in drawn)}")
     return found
+
+
+def _restored(states: Any, out: Path) -> Any:
+    from slipid.identify.ladder import restored
+
+    try:
+        return restored(dict(states))
+    except ValueError as error:
+        raise DataError(f"{out / 'fit.json'}: {error}") from error
 
 
 def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> dict[str, Any]:

@@ -181,6 +181,15 @@ def read_config(path: Path) -> Config:
         raise DataError(f"{path}: {error.strerror}; expected a config (TOML file)") from error
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: no UTF-8 text; expected a config (TOML file)") from error
+    return parsed(path, text)
+
+
+def parsed(path: Path, text: str) -> Config:
+    """Config from TOML text; the path is for messages.
+
+    Raises:
+        DataError: no TOML, unknown or missing keys, wrong values; every one on a line.
+    """
     try:
         mapping = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

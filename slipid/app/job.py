@@ -178,12 +178,20 @@ def with_voltage(log: Log) -> Log:
     return log
 
 
+_SAID = ("robot.wheel_radius", "robot.base_radius", "robot.mass")
+
+
 def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
     """The config's parameter settings, checked, less those of floors and loads that are absent."""
     paths = [e.path for e in entries(robot)]
     choices, skipped = [], []
+    # what [robot] says is held, and is the centre of the prior of what [parameters] frees
+    said = {e.path: (e, float(e.get(robot))) for e in entries(robot) if e.path in _SAID}
     if config.content.robot.mass_kg is not None:
-        choices.append(Choice("robot.mass", fixed=config.content.robot.mass_kg))
+        said["robot.mass"] = said["robot.mass"][0], config.content.robot.mass_kg
+    for path, (e, value) in said.items():
+        std = e.declaration.spread * value
+        choices.append(Choice(path, prior_mean=value, prior_std=std, free=False))
     for pattern, setting in config.content.parameters.items():
         if not fnmatch.filter(paths, pattern):
             if fnmatch.filter(paths, _any_label(pattern)):

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from slipid.app.config import read_config
+from slipid.app.config import parsed
 from slipid.data.files import write_bytes
 from slipid.data.log import DataError
 
@@ -74,7 +74,7 @@ def write_new(
     ticks: float,
     force: bool,
 ) -> None:
-    """Write a config and read it back.
+    """Write a config that reads.
 
     Raises:
         DataError: the file exists, or the answers make no robot.
@@ -103,9 +103,5 @@ def write_new(
         ticks=f"{ticks:g}",
         **columns,
     )
+    parsed(out, text)  # answers that make no robot overwrite nothing
     write_bytes(out, text.encode())
-    try:
-        read_config(out)
-    except DataError:
-        out.unlink()
-        raise

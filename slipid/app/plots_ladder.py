@@ -12,12 +12,13 @@ WORDS = {
     "constant": "one slip for all",
     "linear": "slip ~ torque",
     "affine": "slip ~ 1 + torque",
+    "svr": "slip ~ 1 + torque, SVR",
     "quadratic": "slip ~ 1 + torque + torque²",
     "saturating": "slip ~ saturating torque",
     "monotone_spline": "slip ~ any rising curve of torque",
     "affine_current": "slip ~ 1 + current",
     "heading_lookup": "lookup by heading",
-    "paper": "2021 paper, as deployed",
+    "paper": "form of 2021, refitted",
 }
 
 
@@ -40,7 +41,7 @@ def ladder_figure(found: Mapping[str, Any], which: str) -> Figure:
     for ax, (floor, by) in zip(axes, floors.items(), strict=True):
         _bars(ax, {model: 100 * by[model]["endpoint_error_mean"] for model in models})
         ax.set_title(f"{floor}, {by[models[0]]['runs']} runs", fontsize=10)
-        ax.set_xlabel("mean end-point error\n[% of the way]")
+        ax.set_xlabel("mean end-point error\n[% of the camera's displacement]")
     axes[0].set_yticks(range(len(models)), [WORDS.get(m, m.replace("_", " ")) for m in models])
     axes[0].invert_yaxis()
     return made

@@ -152,9 +152,9 @@ def demo(
     console.print("runs it has not seen, predicted open loop:")
     validation(found)
     result = out / "result"
-    console.print(
-        f"\nlook at: {', '.join(str(result / n) for n in done.written if n.endswith('g'))}"
-    )
+    pictures = [result / name for name in done.written if name.endswith(".png")]
+    pictures += sorted(result.glob("validation_*.png"))
+    console.print(f"\nlook at: {', '.join(map(str, pictures))}")
     console.print(f"numbers: {result / 'identified.json'}, {result / 'validation.json'}")
     if real is not None:
         data = real / "robotino2022"

@@ -13,7 +13,28 @@ from slipid.data.log import DataError
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file so that a reader, or a crash, sees the old one or the new one, never a part."""
+    """Write a file so that a reader, or a crash, sees the old one or the new one, never a part.
+
+    Raises:
+        DataError: nothing can be written there.
+    """
+    try:
+        _write(path, data)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def writable(folder: Path) -> None:
+    """Make a folder and try to write to it, before hours of work that end there.
+
+    Raises:
+        DataError: nothing can be written there.
+    """
+    write_bytes(folder / ".writable", b"")
+    (folder / ".writable").unlink()
+
+
+def _write(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:

@@ -6,6 +6,7 @@ serves all.
 """
 
 from collections.abc import Callable, Iterable
+from glob import escape
 from typing import Any
 
 import jax.numpy as jnp
@@ -50,8 +51,8 @@ def still_viscosities(
     for floor, speeds in seen.items():
         known = np.asarray(speeds)[np.isfinite(speeds)]
         if len(known) == len(speeds) and known.max() < 1.3 * max(known.min(), 1e-3):
-            out.append(Choice(f"surface.{floor}.slide_viscosity", fixed=1e-4))
-            out.append(Choice(f"surface.{floor}.roller_viscosity", fixed=1e-4))
+            names = (f"surface.{floor}.{name}" for name in ("slide_viscosity", "roller_viscosity"))
+            out += [Choice(escape(path), fixed=1e-4) for path in names]
     return out
 
 
@@ -103,7 +104,10 @@ def train(
 
 
 def only(problem: Problem, z: np.ndarray, pattern: str) -> list[Choice]:
-    """Choices that hold every number at a fitted value and leave those of a pattern free."""
+    """Choices that hold every number at a fitted value and leave those of a pattern free.
+
+    Those have their declared prior again.
+    """
     robot = problem.space.tree(jnp.asarray(z))
-    held = [Choice(e.path, fixed=np.asarray(e.get(robot)).tolist()) for e in problem.space.all]
-    return [*held, Choice(pattern, free=True)]
+    values = {e.path: np.asarray(e.get(robot)).tolist() for e in problem.space.all}
+    return [*(Choice(escape(p), fixed=v) for p, v in values.items()), Choice(pattern, free=True)]

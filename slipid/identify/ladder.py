@@ -173,7 +173,10 @@ def insensitive(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     sides = sparse.block_array([[a, -over], [-a, -over]], format="csr")
     cost = np.concatenate([np.zeros(a.shape[1]), np.ones(len(b))])
     limits = [(None, None)] * a.shape[1] + [(0, None)] * len(b)
-    return np.asarray(linprog(cost, sides, bound, bounds=limits).x[: a.shape[1]])
+    found = linprog(cost, sides, bound, bounds=limits)
+    if not found.success:
+        raise ValueError(f"support vector regression: {found.message}")
+    return np.asarray(found.x[: a.shape[1]])
 
 
 def regressor(w: Windows, robot: Robot, speed: np.ndarray, torque: bool) -> np.ndarray:
@@ -335,7 +338,10 @@ def _ramps(knots: Sequence[float]) -> Features:
 
 
 def rungs(has_current: bool) -> list[Rung]:
-    """Every rung the logs allow, unfitted; `paper` is the form the authors ran on the robot."""
+    """Every rung the logs allow, unfitted; `paper` is the form the authors ran on the robot.
+
+    Its threshold of 0.4 A and the spline's knots up to 0.25 N m are for motors of that size.
+    """
     out: list[Rung] = [Encoder(), Curve("constant", _powers(0))]
     if has_current:
         out += [
@@ -359,6 +365,8 @@ def rungs(has_current: bool) -> list[Rung]:
 def restored(states: dict[str, dict[str, Any]]) -> list[Rung]:
     """Rungs from their names and states, as `{rung.name: rung.state}` wrote them."""
     known: dict[str, Any] = {rung.name: rung for rung in rungs(has_current=True)}
+    if strange := sorted(set(states) - set(known)):
+        raise ValueError(f"no model '{strange[0]}'; there are: {', '.join(known)}")
     return [
         replace(known[name], state={floor: np.asarray(v, float) for floor, v in state.items()})
         for name, state in states.items()

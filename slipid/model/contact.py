@@ -1,19 +1,27 @@
 """Contact equilibrium: the body moves so that wheel traction, roller drag and scrub balance.
 
-With p_i the wheel places, N_i the load shares, forces in units of mu m g:
+With xi = (v_x, v_y, W) the body twist, r w_i the rim speed, J_i and K_i the rows that give the
+speed of wheel i along its drive and along its rollers' free direction, p_i its place, N_i its load
+share, v^ the direction of motion, and forces in units of mu m g:
 
-    c_i   = sqrt((r w_i)^2 + q_i^2)                    wheel activity, q_i the roller speed
+    q_i   = K_i xi                                     roller speed
+    c_i   = sqrt((r w_i)^2 + q_i^2)                    wheel activity
     vs_i  = r w_i - J_i xi                             sliding speed
-    N     = N0 - P b v^                                contact patches lead the wheel centres by b
-    T_i   =  N_i [tanh(vs_i / (v0 + s0 c_i)) + kv vs_i - crr tanh(J_i xi / (v0 + 0.2 c_i))]
+    N     = N0 - P b v^                                contact patches lead the wheel centres by b;
+                                                       P: loads that keep sum N and sum N (p + b v^)
+    T_i   =  N_i [tanh(vs_i / (v0 + s0 c_i)) + kv vs_i - crr tanh(J_i xi / (v0 + s1 c_i))]
     D_i   = -N_i [cr tanh(q_i / (vr + sr c_i)) + kl q_i]
     0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz tanh(W / W0)) - M (xi - xi_before)
 
-M = 0 is quasi-static. Creep and rolling resistance are rate-independent (s0 is a slip *ratio*; a
-resistance that sets in at a fixed speed predicts other speeds worse than those it was fitted to).
-The root is found by a
-fixed number of chord steps, which come near from anywhere, and then of damped Newton steps with the
-analytic 3x3 Jacobian; its derivative comes from the implicit function theorem.
+M is mass and inertia over the time step, zero in the quasi-static case. This is for omni wheels;
+where rollers stand at an angle g to the drive, vs_i is r w_i sin g less the speed along the
+direction in which the rollers do not give way, and r w_i cos g is taken off q_i. Ordinary wheels
+grip sideways as they do ahead.
+
+Creep and rolling resistance are rate-independent (s0 is a slip *ratio*): with a resistance that
+sets in at 20 mm/s instead, runs faster than the fitted ones are predicted worse. The root is found
+by a fixed number of chord steps, which come near from anywhere, and then of damped Newton steps
+with the analytic 3x3 Jacobian; its derivative comes from the implicit function theorem.
 """
 
 from typing import Any
@@ -292,8 +300,9 @@ def forces(
 ) -> Contact:
     """Traction the motors feel, roller drag and load shares at a twist [mu m g].
 
-    Rolling resistance brakes the body, not the motor, so traction is given without it. Rollers at
-    an angle (mecanum) pass on a part of what holds the wheel and a part of their drag.
+    Rolling resistance is counted as a force on the body that the motor does not feel; what the
+    motor bears of it is in its own friction. Rollers at an angle (mecanum) pass on a part of what
+    holds the wheel and a part of their drag.
     """
     traction, drag, load, *_ = _terms(xi, rim, frame, surface, rest)
     along, *_, scale_1 = _speeds(xi, rim, frame, surface)
