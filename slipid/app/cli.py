@@ -39,7 +39,9 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
         try:
             code = command(*args, **kwargs)
         except KeyboardInterrupt:
-            typer.echo("interrupted; the same command goes on from the last round", err=True)
+            typer.echo(
+                "interrupted; identify and demo, called again, go on from the last round", err=True
+            )
             raise typer.Exit(130) from None
         except ValueError as error:
             from slipid.data.log import DataError

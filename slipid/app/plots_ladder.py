@@ -40,7 +40,8 @@ def ladder_figure(found: Mapping[str, Any], which: str) -> Figure:
     axes = made.subplots(1, len(floors), sharey=True, squeeze=False)[0]
     for ax, (floor, by) in zip(axes, floors.items(), strict=True):
         _bars(ax, {model: 100 * by[model]["endpoint_error_mean"] for model in models})
-        ax.set_title(f"{floor}, {by[models[0]]['runs']} runs", fontsize=10)
+        name = floor.replace("@", ", load ")
+        ax.set_title(f"{name}\n{by[models[0]]['runs']} runs", fontsize=10)
         ax.set_xlabel("mean end-point error\n[% of the camera's displacement]")
     axes[0].set_yticks(range(len(models)), [WORDS.get(m, m.replace("_", " ")) for m in models])
     axes[0].invert_yaxis()

@@ -183,10 +183,12 @@ def current_figure(robot: Robot, seen: Seen) -> Figure | None:
     assert drawn is not None
     bar = made.colorbar(drawn, ax=axes, pad=0.01, aspect=50)
     bar.set_label("wheel speed [rad/s]")
-    handle = axes[0, 0].plot(
-        [], [], ".", color=drawing.ORANGE, label="predicted by the fitted motor"
-    )
-    made.legend(handles=handle, loc="outside lower center", frameon=False, markerscale=2)
+    blank = axes[0, 0]
+    handles = [
+        *blank.plot([], [], ".", color="#2a788e", ms=6, label="measured, coloured by speed"),
+        *blank.plot([], [], ".", color=drawing.ORANGE, ms=4, label="predicted by the fitted motor"),
+    ]
+    made.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
     return made
 
 

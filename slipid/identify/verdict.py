@@ -31,7 +31,8 @@ class Estimate:
         labels: of a vector's entries, () for a scalar.
         verdict: identified, weak, not_identified, at_bound or fixed; of a vector the verdict of its
             worst direction.
-        provenance: measured (data decide), borrowed (a prior decides), override (user).
+        provenance: measured (data decide), borrowed (a prior decides), override (a choice
+            fixed it: the user's, or slipid's where one speed cannot tell).
         ratio: std(posterior) / std(prior) in the search space, None where it was fixed.
         pull: (estimate - prior mean) / std(prior), of a vector the largest, None where fixed.
         prior_mean, prior_std: [unit], None where it was fixed.

@@ -285,7 +285,7 @@ def step_with_inertia(
 
     Args:
         before: twist at the start of the step.
-        inertia: (m, m, I_z) / (mu m g) [s^2/m, s^2/m, s^2 m/m].
+        inertia: (m, m, I_z) / (mu m g) [s^2/m, s^2/m, s^2 m].
         dt: step [s].
     """
     return _root((rim, frame, surface, rest, inertia / dt, before))

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from slipid.model import contact
-from slipid.model.geometry import Frame
 from slipid.model.robot import GRAVITY, Robot, advance, compose, twist, wheel_torque
 
 _NEWTON = 6
@@ -246,12 +245,11 @@ def _balance(y: Array, args: tuple[Any, ...]) -> Array:
     count = len(w0)
     xi, w, amps = y[:3], y[3 : 3 + count], y[3 + count :]
     motor, surface = robot.motor, robot.surfaces.at(floor)
-    held: Frame = frame
     pushed = mass * (xi - xi0)
-    body = contact.residual(xi, held.radius * w, held, surface, robot.body.load_share[load])
-    body = body - pushed.at[2].divide(held.base)
+    body = contact.residual(xi, frame.radius * w, frame, surface, robot.body.load_share[load])
+    body = body - pushed.at[2].divide(frame.base)
     rotor = motor.gear_ratio**2 * motor.rotor_inertia
-    load_torque = wheel_torque(robot, held, xi, w, floor, load)
+    load_torque = wheel_torque(robot, frame, xi, w, floor, load)
     wheel = motor.torque(amps, w) - load_torque - rotor * (w - w0) / dt
     stall = motor.gear_ratio * motor.efficiency * motor.back_emf / motor.resistance  # [N m/V]
     electric = stall * (volt - motor.voltage(amps, w) - henry * (amps - amps0) / dt)
