@@ -33,7 +33,9 @@ def invoke(*words: object):
 
 
 def process(*words: object, **more):
-    command = [sys.executable, "-c", "from slipid.app.cli import main; main()"]
+    # a suite started in the background hands on a SIGINT that is ignored
+    listen = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{listen}; from slipid.app.cli import main; main()"]
     return subprocess.Popen(
         [*command, *map(str, words)],
         cwd=ROOT,
