@@ -345,6 +345,34 @@ def test_a_killed_fit_goes_on_and_ends_where_it_would_have(small, tmp_path):
     assert one["rounds"] == other["rounds"] == len(one["history"]) > 10
 
 
+def test_an_interrupt_that_python_must_ignore_where_it_arrives_stops_the_command():
+    code = """if True:
+        import gc, signal, time
+        from slipid.app import cli, commands
+
+        def collecting(phase, info):
+            gc.callbacks.remove(collecting)
+            signal.raise_signal(signal.SIGINT)
+
+        def work(*_):
+            gc.callbacks.append(collecting)
+            gc.collect()
+            print("went on")
+            for _ in range(300):
+                time.sleep(0.1)
+
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        commands.check = work
+        cli.main()
+    """
+    words = [sys.executable, "-c", code, "check", "my.toml", "--data", "."]
+    run = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert run.stdout == "went on\n"
+    assert "interrupted" in run.stderr
+    assert "Traceback" not in run.stderr
+    assert run.returncode == 130
+
+
 @pytest.mark.slow
 def test_an_interrupt_is_130_and_keeps_the_checkpoint(small, tmp_path):
     folder, _ = small

@@ -1,7 +1,9 @@
 """The command line. Imports are late: `slipid --help` answers before numpy is loaded."""
 
+import _thread
 import functools
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -189,4 +191,16 @@ def _emit(where: str, value: Any) -> None:
 
 def main() -> None:
     """Entry point of the `slipid` command."""
+    sys.unraisablehook = _interrupt_again
     app()
+
+
+def _interrupt_again(lost: Any) -> None:
+    """Send an interrupt again that Python had to ignore where it arrived.
+
+    In a finaliser or a callback of the garbage collector (jax has one) no exception can be raised.
+    """
+    if lost.exc_type is KeyboardInterrupt:
+        threading.Timer(0.05, _thread.interrupt_main).start()
+    else:
+        sys.__unraisablehook__(lost)

@@ -40,9 +40,9 @@ def identify(config_path: Path, data: Path, out: Path, report: Reporter) -> Done
 
     job = read_job(config, data, report.count, report.line)
     report.line(f"{len(job.dataset)} runs on {', '.join(job.robot.surfaces.labels)}")
-    writable(out)
     report.stage("cutting windows")
     problem = job.problem()
+    writable(out)
     optimum = _optimise(job, problem, out, report)
     report.stage("intervals and verdicts")
     from slipid.identify.result import summarise
