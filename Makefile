@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 NOTEBOOKS := $(wildcard notebooks/*.ipynb)
 BENCHES := $(wildcard tests/benchmarks/bench_*.py)
+TWO := -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test check bench format clean
@@ -15,8 +16,8 @@ help: ## this list
 demo: $(VENV)/.run-stamp ## the main job on logs with known truth, pictures in demo_out
 	$(BIN)/slipid demo --out demo_out
 
-test: $(VENV)/.dev-stamp ## the whole test suite
-	$(BIN)/python -m pytest
+test: $(VENV)/.dev-stamp ## the whole test suite, a file at a time on two cores
+	$(BIN)/python -m pytest $(TWO)
 
 check: $(VENV)/.dev-stamp ## format, lint, types, import rules, quick tests: before every push
 	$(BIN)/ruff format --check .
@@ -26,7 +27,7 @@ check: $(VENV)/.dev-stamp ## format, lint, types, import rules, quick tests: bef
 ifneq ($(NOTEBOOKS),)
 	$(BIN)/nbstripout --verify $(NOTEBOOKS)
 endif
-	$(BIN)/python -m pytest -q -m "not slow"
+	$(BIN)/python -m pytest -q $(TWO) -m "not slow"
 
 bench: $(VENV)/.dev-stamp ## speed, left-out errors, load shares, known truth (half an hour)
 ifneq ($(BENCHES),)
