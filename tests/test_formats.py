@@ -227,8 +227,9 @@ def test_text_in_columns_nobody_asked_for_is_no_error(root):
 
 
 def test_parquet_reads_as_csv_does(root):
-    pyarrow = pytest.importorskip("pyarrow")
-    parquet = pytest.importorskip("pyarrow.parquet")
+    import pyarrow
+    from pyarrow import parquet
+
     layout = layout_from_mapping(GENERIC_LAYOUT, "layout")
     names, *rows = [line.split(",") for line in generic_text().splitlines()]
     columns = np.array(rows, dtype=float).T

@@ -201,6 +201,8 @@ def _interrupt_again(lost: Any) -> None:
     In a finaliser or a callback of the garbage collector (jax has one) no exception can be raised.
     """
     if lost.exc_type is KeyboardInterrupt:
-        threading.Timer(0.05, _thread.interrupt_main).start()
+        again = threading.Timer(0.05, _thread.interrupt_main)
+        again.daemon = True  # a command that has ended by then is left in peace
+        again.start()
     else:
         sys.__unraisablehook__(lost)
