@@ -197,6 +197,17 @@ def test_a_log_without_motion_is_refused_before_anything_is_written(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_identify_asks_for_a_place_to_write_before_it_fits(tmp_path):
+    data = tmp_path / "data"
+    write_good(data)
+    config = config_of(Case("good", lambda p: None, (), GENERIC), tmp_path)
+    (tmp_path / "file").write_text("")
+    result = invoke("identify", config, "--data", data, "--out", tmp_path / "file" / "out")
+    assert result.exit_code == 2
+    assert "cannot be written (Not a directory)" in result.stderr
+    assert "compiling" not in result.stderr
+
+
 # the job end to end -----------------------------------------------------------------------------
 
 
