@@ -77,6 +77,27 @@ def surface_fit(surface_problem):
     return best, told
 
 
+@pytest.mark.parametrize("path", ["camera.scale", "camera.radial", "motor.resistance"])
+def test_a_fit_ends_where_the_loss_is_level(truth, path):
+    """Also in numbers that transform the data: shrinking them must not count as fitting them."""
+    w = made(truth, runs=48, std={**NOISE, "run.along": 0.05, "process.along": 0.02})
+    w = replace(w, current_var=np.full_like(w.current_var, 0.02))
+    problem = Problem(w, truth, [NOTHING, Choice(path, free=True)])
+    best = optimise(problem, start=begin(problem), options=PRECISE)
+    assert best.converged
+    log_v, keep = jnp.asarray(best.state.log_variance), jnp.ones(len(w))
+    volt, std = problem.volt(log_v), float(np.sqrt(best.covariance[0, 0]))
+
+    def loss(z):
+        blocks, _ = problem.linear(jnp.asarray(z), volt)
+        return problem.loss(z, best.state.log_variance, keep, blocks)
+
+    z = best.state.z
+    rise = [loss(z + k * std) - loss(z) for k in (-1.0, 1.0)]
+    assert min(rise) > 0.2  # half a unit each, less what the tails of the t take
+    assert abs(rise[0] - rise[1]) < 0.1  # a slope would show here twice
+
+
 # exact cases
 
 
@@ -112,7 +133,10 @@ def test_resistance_and_brush_drop_are_those_of_linear_regression(truth, monkeyp
 
 
 def test_camera_scale_is_that_of_weighted_least_squares(truth):
-    """The residual is linear in the scale: the optimum solves the normal equation it weighs."""
+    """The residual is linear in the scale s: a s^2 - b s - n = 0 at the optimum, weights given.
+
+    n is the number of measured lengths: the density of the logged ones is s^n times the residuals'.
+    """
     w = replace(made(truth, std=NOISE), has_current=False, has_voltage=False)
     choices = [NOTHING, Choice("camera.scale", prior_mean=1.1, prior_std=10.0)]
     problem = Problem(w, truth, choices)
@@ -129,9 +153,8 @@ def test_camera_scale_is_that_of_weighted_least_squares(truth):
     y = r + scale * x  # what the robot predicts
     v = np.linalg.inv(np.asarray(problem.covariance("motion", best.state.log_variance)))
     weight = (DEGREES + 6) / (DEGREES + np.einsum("ni,nij,nj->n", r, v, r))
-    exact = np.einsum("n,ni,nij,nj->", weight, x, v, y) / np.einsum(
-        "n,ni,nij,nj->", weight, x, v, x
-    )
+    a, b = (np.einsum("n,ni,nij,nj->", weight, x, v, other) for other in (x, y))
+    exact = (b + np.sqrt(b**2 + 4 * a * 96)) / (2 * a)
     assert scale == pytest.approx(exact, rel=1e-6)
     assert scale == pytest.approx(1.1, abs=4 * np.sqrt(best.covariance[0, 0]) * 1.1)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,10 +114,44 @@ def test_the_noise_of_the_current_is_carried_into_the_voltage(truth):
     np.testing.assert_allclose(wide, expected, rtol=1e-10)
 
 
+def only_piece(b, k):
+    return jax.tree.map(lambda x: x[k : k + 1] if x.ndim else x, b)
+
+
 def replace_var(b, value):
     return jax.tree_util.tree_map(
         lambda x: x, replace(b, current_var=jnp.full_like(b.dt[..., None] * b.turn, value))
     )
+
+
+@pytest.mark.slow
+def test_log_jacobian_is_the_determinant_of_residuals_by_data(truth):
+    """Of the 3 numbers per window that a piece measures, its first pose given."""
+    bent = eqx.tree_at(
+        lambda r: (r.camera.tilt, r.camera.radial, r.camera.tangential),
+        truth,
+        (jnp.array([0.05, -0.08]), jnp.array(0.06), jnp.array([0.03, -0.02])),
+    )
+    w = made(truth, runs=6, std=NOISE)
+    b = lk.batch(w, bent)
+    b = replace(b, current_var=jnp.full_like(b.current, 0.02))
+    found = lk.log_jacobian(bent, b, 0.05)
+    for k in range(len(w)):
+        pose, one = jnp.asarray(w.pose[k]), only_piece(b, k)
+
+        def of_poses(later, first=pose[:1]):
+            return lk.measured(bent, jnp.concatenate([first, later])[None]).ravel()
+
+        def of_volts(volt, one=one):
+            still = jnp.zeros_like(one.current)
+            b = replace(one, voltage=volt[None])
+            return lk.electric_residuals(bent, b, still, 0.05)["voltage"].ravel()
+
+        expected = 0.0
+        for residual, data in ((of_poses, pose[1:]), (of_volts, b.voltage[k])):
+            square = np.asarray(jax.jacfwd(residual)(data)).reshape(6, 6)
+            expected += np.linalg.slogdet(square)[1]
+        np.testing.assert_allclose(found[k], expected, rtol=1e-10)
 
 
 # covariances

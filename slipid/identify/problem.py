@@ -144,8 +144,19 @@ class Problem:
         jacobian, (out, felt) = jax.jacfwd(blocks, has_aux=True)(z)
         return out, jacobian, felt
 
+    def log_jacobian(self, z: Vector, volt: Vector, keep: Vector) -> tuple[Array, Array]:
+        """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
+        return self._form._log_jacobian(self.data, jnp.asarray(z), volt, jnp.asarray(keep))
+
+    @partial(jax.jit, static_argnums=0)
+    def _log_jacobian(self, data: Data, z: Array, volt: Vector, keep: Array) -> tuple[Array, Array]:
+        def total(x: Array) -> Array:
+            return keep @ lk.log_jacobian(self.space.tree(x), data.batch, jnp.asarray(volt))
+
+        return jax.value_and_grad(total)(z)
+
     def _stacked(self, y: Array, args: Any) -> tuple[Array, None]:
-        data, z0, mask, root, volt, felt = args
+        data, z0, mask, root, volt, felt, slope = args
         z = z0 + mask * self._std * y
         if self.joint:
             blocks = lk.residuals(self.space.tree(z), data.batch, volt)
@@ -155,7 +166,8 @@ class Problem:
             still = lk.motion_residual(robot, data.batch, lk.predict(robot, data.batch))
             blocks = {"motion": still} | lk.electric_residuals(held, data.batch, felt, volt)
         parts = [jnp.einsum("nij,nj->ni", root[k], r).ravel() for k, r in blocks.items()]
-        return jnp.concatenate([*parts, (z - self._mean) / self._std]), None
+        mean = self._mean + self._std**2 * slope  # adds slope . z to the log posterior
+        return jnp.concatenate([*parts, (z - mean) / self._std]), None
 
     def _begin(self, args: Any) -> Any:
         """State of the solver before its first step; it depends on the shapes only."""
@@ -263,14 +275,21 @@ class Problem:
 
     # fitting ---------------------------------------------------------------------------------
     def levenberg(
-        self, z: Vector, root: dict, mask: np.ndarray, volt: Vector, felt: Array, most: int
+        self,
+        z: Vector,
+        root: dict,
+        mask: np.ndarray,
+        volt: Vector,
+        felt: Array,
+        slope: Array,
+        most: int,
     ) -> np.ndarray:
         """Search vector after at most so many Levenberg-Marquardt steps with fixed whitening.
 
         Only steps that were taken count: one that is refused shrinks the next, and to stop among
         refused ones would look like having arrived.
         """
-        args = (self.data, jnp.asarray(z), jnp.asarray(mask), root, jnp.asarray(volt), felt)
+        args = (self.data, jnp.asarray(z), jnp.asarray(mask), root, jnp.asarray(volt), felt, slope)
         y = jnp.zeros(self.space.size)
         state = self._form._begin(args)
         taken = 0
@@ -288,6 +307,7 @@ class Problem:
     def loss(self, z: Vector, log_v: Vector, keep: Vector, blocks: dict[str, Array]) -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
         nll = float(self.whitening(blocks, log_v, keep)[2])
+        nll -= float(self.log_jacobian(z, self.volt(log_v), keep)[0])
         pull = (np.asarray(z) - self.space.prior_mean) / self.space.prior_std
         typical = 2 * np.log(self.noise.typical)
         spread = (np.asarray(log_v) - typical) / _VARIANCE_SPREAD
@@ -308,7 +328,8 @@ class Problem:
         volt = self.volt(log_v)
         blocks, _, felt = self._form._linear(self.data, jnp.asarray(state.z), volt)
         root, _, _ = self.whitening(blocks, log_v, keep_j)
-        z = self.levenberg(state.z, root, mask, volt, felt, steps)
+        _, slope = self.log_jacobian(state.z, volt, keep_j)
+        z = self.levenberg(state.z, root, mask, volt, felt, slope, steps)
         typical = jnp.asarray(2 * np.log(self.noise.typical))
         blocks, jacobian = self.linear(jnp.asarray(z), volt)
         for _ in range(scoring):

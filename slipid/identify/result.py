@@ -294,7 +294,7 @@ def summarise(
         half = np.einsum("nij,njp->nip", plain[k], np.asarray(jac)).reshape(-1, len(gram))
         half = half * problem.space.prior_std
         gram += half.T @ half
-    left, name = remaining(problem, z, blocks, jacobian, roots)
+    left, name = remaining(problem, z, volt, blocks, jacobian, roots)
     settled = left < REMAINING
     stuck = f"the solver stopped {left:.2g} stds of {name} away from where its own step leads"
     windows = problem.windows
@@ -330,16 +330,19 @@ def summarise(
 
 
 def remaining(
-    problem: Problem, z: Any, blocks: Any, jacobian: Any, roots: Any
+    problem: Problem, z: Any, volt: Any, blocks: Any, jacobian: Any, roots: Any
 ) -> tuple[float, str]:
     """Largest step of a full Gauss-Newton step in posterior stds, and the number that takes it.
 
-    delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean)), W with the weights of outliers; where
-    currents do not inform motion, their rows move the electric numbers only.
+    delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), W with the weights of outliers, g
+    the slope of log |d residuals / d data|; where currents do not inform motion, their rows move
+    the electric numbers only.
     """
     own = np.ones(len(z)) if problem.joint else problem.electric.astype(float)
     prior = problem.space.prior_std**-2
-    gradient, info = prior * (z - problem.space.prior_mean), np.diag(prior)
+    _, slope = problem.log_jacobian(z, volt, np.ones(len(problem.windows)))
+    gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
+    info = np.diag(prior)
     for k, r in blocks.items():
         root = np.asarray(roots[k])
         white = np.einsum("nij,nj->ni", root, np.asarray(r)).ravel()

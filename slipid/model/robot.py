@@ -104,17 +104,28 @@ class Camera(eqx.Module):
 
     def corrected(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
         """Pose in true metres, heading turned as the map turns it; the marker yaw stays in."""
-
-        def ground(p: Float[Array, "2"]) -> Float[Array, "2"]:
-            q = p - jnp.asarray(self.centre)
-            p, r2 = self.tangential, q @ q
-            bent = q * (1 + self.radial * r2) + p * r2 + 2 * q * (p @ q)
-            return self.scale * bent / (1 + self.tilt @ q)
-
         u = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
-        place, turned = jax.jvp(ground, (pose[:2],), (u,))
+        place, turned = jax.jvp(self._ground, (pose[:2],), (u,))
         turn = jnp.arctan2(u[0] * turned[1] - u[1] * turned[0], u @ turned)
         return jnp.concatenate([place, (pose[2] + turn)[None]])
+
+    def log_jacobian(self, pose: Float[Array, "3"]) -> Float[Array, ""]:
+        """Log |d corrected / d pose|, which a density of logged poses has beside its residuals.
+
+        With m the derivative of the map of places and u the heading's direction the place gives
+        log |m|, the heading log(|m| / |m u|^2).
+        """
+        m = jax.jacfwd(self._ground)(pose[:2])
+        turned = m @ jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
+        area = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
+        return 2 * jnp.log(area) - jnp.log(turned @ turned)
+
+    def _ground(self, place: Float[Array, "2"]) -> Float[Array, "2"]:
+        """True place on the floor of a logged one."""
+        q = place - jnp.asarray(self.centre)
+        p, r2 = self.tangential, q @ q
+        bent = q * (1 + self.radial * r2) + p * r2 + 2 * q * (p @ q)
+        return self.scale * bent / (1 + self.tilt @ q)
 
     def yaw(self, session: Int[Array, ""] | int) -> Float[Array, ""]:
         """Marker heading less body heading in a session; an unknown one (-1) has the common yaw."""
