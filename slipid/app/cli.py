@@ -42,7 +42,8 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
             code = command(*args, **kwargs)
         except KeyboardInterrupt:
             typer.echo(
-                "interrupted; identify and demo, called again, go on from the last round", err=True
+                "interrupted; called again, identify, sample and demo go on from where they were",
+                err=True,
             )
             raise typer.Exit(130) from None
         except ValueError as error:
@@ -76,6 +77,36 @@ def identify(
     if json != "-":
         tables.identified(done.fit, out, done.written)
     return 0 if done.fit.converged else 1
+
+
+@app.command()
+@guarded
+def sample(
+    out: OutFolder,
+    data: Annotated[
+        Path | None, typer.Option("--data", metavar="DIR", help="Where the logs are now.")
+    ] = None,
+    draws: Annotated[
+        int, typer.Option("--draws", min=10, help="Kept of each of four ensembles.")
+    ] = 400,
+    most: Annotated[
+        int, typer.Option("--most", min=20, help="Blocks of 25 steps before it gives up.")
+    ] = 200,
+    seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Posterior of a fit by emcee: honest intervals, posterior.nc; goes on after an interrupt."""
+    from slipid.app import commands, tables
+    from slipid.app.progress import Reporter
+
+    with Reporter(quiet=quiet) as report:
+        done = commands.sample(out, data, draws, most, seed, report)
+    if json is not None:
+        _emit(json, done.content)
+    if json != "-":
+        tables.sampled(done, out)
+    return 0 if done.about["converged"] else 1
 
 
 @app.command()

@@ -193,6 +193,62 @@ def _restored(states: Any, out: Path) -> Any:
         raise DataError(f"{out / 'fit.json'}: {error}") from error
 
 
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """End of `sample`: numbers from the draws, how the chains did, and the files written."""
+
+    parameters: Any
+    content: dict[str, Any]
+    about: dict[str, Any]
+    written: tuple[str, ...]
+
+
+def sample(
+    out: Path, data: Path | None, draws: int, most: int, seed: int, report: Reporter
+) -> Sampled:
+    """Posterior of the fit in `out`: posterior.nc, sample.json, and intervals in identified.json.
+
+    Raises:
+        DataError: no fit there, other logs than it was made of, or the posterior extra is missing.
+    """
+    began = time.monotonic()
+    runtime.start()
+    try:
+        from slipid.app import posterior_file
+        from slipid.app import sample as job_of
+        from slipid.identify.sampler import Plan
+    except ImportError as error:
+        raise DataError(f"{error}; expected `pip install slipid[posterior]`") from error
+    from slipid.app.job import read_job
+    from slipid.identify.result import load
+
+    fit = load(out)
+    folder = job_of.where_the_logs_are(out, data)
+    report.stage("reading logs")
+    job = read_job(read_config(out / "config.toml"), folder, report.count, report.line)
+    job_of.same_logs(fit, job)
+    report.stage("compiling")
+    problem, plan = job.problem(), Plan(seed=seed, most=most)
+    found = job_of.sample(out, fit, problem, plan, draws, report)
+    report.stage("writing")
+    about = job_of.summary(found, plan, time.monotonic() - began)
+    content = job_of.identified(fit, found, problem)
+    marks = {k: str(v) for k, v in about.items() if not isinstance(v, dict)}
+    marks |= {"schema": posterior_file.SCHEMA, "data_hash": fit.data_hash}
+    runs = tuple(log.name for log in job.dataset.logs)
+    made = posterior_file.tree(problem, found, runs, marks)
+    posterior_file.write(made, out / "posterior.nc")
+    job_of.write(out, content, about)
+    from slipid.app.plots_posterior import posterior_plots
+
+    report.stage("drawing")
+    drawn = posterior_plots(fit, found, out)
+    if found.converged:
+        job_of.Blocks(out / job_of.FOLDER, "").remove()
+    written = ("posterior.nc", "sample.json", "identified.json", *(p.name for p in drawn))
+    return Sampled(job_of.estimates(fit, found), content, about, written)
+
+
 def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> dict[str, Any]:
     """What the logs hold, and what they can be expected to tell, before any fit.
 

@@ -15,7 +15,16 @@ def versions() -> dict[str, str]:
     from importlib.metadata import PackageNotFoundError, version
 
     found = {"python": platform.python_version()}
-    for name in ("slipid", "jax", "jaxlib", "equinox", "optimistix", "numpy"):
+    for name in (
+        "slipid",
+        "jax",
+        "jaxlib",
+        "equinox",
+        "optimistix",
+        "numpy",
+        "scikit-learn",
+        "emcee",
+    ):
         try:
             found[name] = version(name)
         except PackageNotFoundError:

@@ -62,6 +62,23 @@ def identified(fit: Any, out: Path, written: Sequence[str]) -> None:
     console.print(f"in {out}: {', '.join(written)}", markup=False, soft_wrap=True)
 
 
+def sampled(done: Any, out: Path) -> None:
+    """What `sample` found."""
+    console, about = _console(), done.about
+    console.print(estimates(done.parameters.values(), f"{about['draws']} draws"))
+    for sentence in done.content["messages"]:
+        console.print(f"note: {sentence}", markup=False, soft_wrap=True)
+    worst = about["worst"]
+    console.print(
+        f"{about['ensembles']} ensembles of {about['walkers']} walkers, {about['steps']} steps: "
+        f"worst R-hat {worst['r_hat']:.4f}, {worst['steps_per_tau']:.0f} steps per "
+        f"autocorrelation time, {worst['effective_draws']:.0f} effective draws"
+    )
+    state = "converged" if about["converged"] else "NOT converged, do not trust the intervals"
+    console.print(f"{state}: worst is {about['reason']}", markup=False, soft_wrap=True)
+    console.print(f"in {out}: {', '.join(done.written)}", markup=False, soft_wrap=True)
+
+
 def check(found: dict[str, Any]) -> None:
     """What `check` found."""
     console = _console()

@@ -87,8 +87,9 @@ def read_json(path: Path, what: str) -> Any:
         raise DataError(f"{path}: no valid JSON ({error}); expected {what}") from error
 
 
-def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+def write_arrays(path: Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:
     """Write named arrays to an .npz file, no pickle."""
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    save = np.savez_compressed if compress else np.savez
+    save(buffer, allow_pickle=False, **arrays)
     write_bytes(path, buffer.getvalue())

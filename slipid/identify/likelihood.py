@@ -84,17 +84,26 @@ def wheel_speed(robot: Robot, b: Batch) -> Float[Array, "piece window wheel"]:
     return (b.turn - (robot.camera.lag - b.lag) * b.faster) / b.dt[..., None]
 
 
-def predict(robot: Robot, b: Batch) -> Predicted:
-    """Contact equilibrium of every window."""
+def predict(
+    robot: Robot, b: Batch, near: Float[Array, "piece window 3"] | None = None
+) -> Predicted:
+    """Contact equilibrium of every window.
+
+    Args:
+        near: twists close to it, see `slipid.model.robot.twist`.
+    """
     frame = robot.geometry.frame()
 
-    def window(w: Any, dt: Any, surface: Any, load: Any, session: Any) -> tuple[Any, Any, Any]:
-        xi = model.twist(robot, frame, w, surface, load)
+    def window(w: Any, dt: Any, near: Any, surface: Any, load: Any, session: Any) -> Any:
+        xi = model.twist(robot, frame, w, surface, load, near)
         increment = robot.camera.seen(model.advance(xi, dt), session)
         return increment, xi, model.felt(robot, frame, xi, w, surface, load)
 
-    piece = jax.vmap(window, (0, 0, None, None, None))
-    return Predicted(*jax.vmap(piece)(wheel_speed(robot, b), b.dt, b.surface, b.load, b.session))
+    piece = jax.vmap(window, (0, 0, None if near is None else 0, None, None, None))
+    lanes = (0, 0, None if near is None else 0, 0, 0, 0)
+    return Predicted(
+        *jax.vmap(piece, lanes)(wheel_speed(robot, b), b.dt, near, b.surface, b.load, b.session)
+    )
 
 
 def predicted_current(
@@ -153,18 +162,18 @@ def electric_residuals(
     return out
 
 
-def log_jacobian(
+def log_jacobians(
     robot: Robot, b: Batch, voltage_std: Float[Array, ""] | float
-) -> Float[Array, " piece"]:
-    """Log |d residuals / d data| of every piece, where parameters transform the data.
+) -> tuple[Float[Array, " piece"], Float[Array, " piece"]]:
+    """Log |d residuals / d data| of the motion and of the voltage of every piece.
 
     The camera corrects measured places and the voltage residual is scaled by its own spread:
-    without this term a smaller scale would fit better only because it shrinks the residuals.
+    without these terms a smaller scale would fit better only because it shrinks the residuals.
     """
-    out = jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(b.pose[:, 1:]), axis=1)
-    if b.has_current and b.has_voltage:
-        out -= jnp.sum(jnp.log(_spread(robot, b, voltage_std)), axis=(1, 2))
-    return out
+    camera = jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(b.pose[:, 1:]), axis=1)
+    if not (b.has_current and b.has_voltage):
+        return camera, jnp.zeros_like(camera)
+    return camera, -jnp.sum(jnp.log(_spread(robot, b, voltage_std)), axis=(1, 2))
 
 
 def _spread(robot: Robot, b: Batch, voltage_std: Any) -> Float[Array, "piece window wheel"]:

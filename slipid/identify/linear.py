@@ -27,3 +27,25 @@ def inverse_root(v: Float[Array, "piece m m"]) -> Float[Array, "piece m m"]:
 
     inverse = jax.lax.fori_loop(0, m, row, jnp.zeros_like(a))
     return jnp.moveaxis(inverse, -1, 0)
+
+
+def squares(
+    v: Float[Array, "m m piece"], r: Float[Array, "m piece"]
+) -> tuple[Float[Array, " piece"], Float[Array, " piece"]]:
+    """Log |V| and r^T V^-1 r of many small matrices, pieces last.
+
+    Columns of L and of L^-1 r, one after the other; the columns are few enough to be written out.
+    """
+    rows = jnp.concatenate([v, r[None]])
+    columns: list[Array] = []
+    log_det, square = jnp.zeros(v.shape[-1]), jnp.zeros(v.shape[-1])
+    for j in range(v.shape[0]):
+        c = rows[j:, j]
+        if columns:
+            known = jnp.stack([old[j - k :] for k, old in enumerate(columns)], axis=1)
+            c = c - jnp.sum(known * known[:1], axis=1)
+        c = jax.lax.optimization_barrier(c * jax.lax.rsqrt(c[0]))
+        columns.append(c)
+        log_det += 2 * jnp.log(c[0])
+        square += c[-1] ** 2
+    return log_det, square

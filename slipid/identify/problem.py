@@ -30,7 +30,7 @@ DEGREES = 8.0
 """Degrees of freedom of the Student-t weight of a run."""
 _REFUSED = 12
 """Steps of the solver that may be refused in a round."""
-_VARIANCE_SPREAD = 3.0
+VARIANCE_SPREAD = 3.0
 """Std of the prior of every log variance."""
 
 
@@ -151,9 +151,22 @@ class Problem:
     @partial(jax.jit, static_argnums=0)
     def _log_jacobian(self, data: Data, z: Array, volt: Vector, keep: Array) -> tuple[Array, Array]:
         def total(x: Array) -> Array:
-            return keep @ lk.log_jacobian(self.space.tree(x), data.batch, jnp.asarray(volt))
+            return keep @ sum(lk.log_jacobians(self.space.tree(x), data.batch, jnp.asarray(volt)))
 
         return jax.value_and_grad(total)(z)
+
+    def twists(self, z: Vector) -> tuple[Array, Array]:
+        """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
+        return self._form._twists(self.data, jnp.asarray(z))
+
+    @partial(jax.jit, static_argnums=0)
+    def _twists(self, data: Data, z: Array) -> tuple[Array, Array]:
+        def twist(x: Array) -> tuple[Array, Array]:
+            xi = lk.predict(self.space.tree(x), data.batch).twist
+            return xi, xi
+
+        slope, xi = jax.jacfwd(twist, has_aux=True)(z)
+        return xi, slope
 
     def _stacked(self, y: Array, args: Any) -> tuple[Array, None]:
         data, z0, mask, root, volt, felt, slope = args
@@ -250,8 +263,7 @@ class Problem:
     ) -> Array:
         _, weights, _ = self._whitening(data, blocks, log_v, keep)
         cov = jnp.linalg.inv(self._precision(data, jacobian, log_v, keep))
-        count = log_v.shape[0]
-        score, info = jnp.zeros(count), jnp.zeros((count, count))
+        score = jnp.zeros(log_v.shape[0])
         for k, r in blocks.items():
             root = inverse_root(self._covariance(data, k, log_v))
             inverse = jnp.einsum("nji,njk->nik", root, root)
@@ -259,19 +271,32 @@ class Problem:
             v = jnp.exp(log_v)[which]
             vr = jnp.einsum("nij,nj->ni", inverse, r)
             fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
-            vb = jnp.einsum("nij,ncjk->ncik", inverse, base)
-            trace = jnp.einsum("ncii->nc", vb)
+            trace = jnp.einsum("nij,ncij->nc", inverse, base)
             vj = jnp.einsum("nij,njp->nip", inverse, jacobian[k])
             spent = jnp.einsum(
                 "nip,pq,njq->nij", vj, cov, vj
             )  # degrees of freedom of the structure
             lost = jnp.einsum("nij,ncij->nc", spent, base)
             score = score.at[which].add(0.5 * v * (fit + keep[:, None] * (lost - trace)))
+        score -= (log_v - typical) / VARIANCE_SPREAD**2
+        info = self._variance_precision(data, log_v, keep)
+        return jnp.asarray(log_v) + jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
+
+    def variance_precision(self, log_v: Vector, keep: Vector) -> Array:
+        """Expected information of the log variances, prior included (variance, variance)."""
+        return self._form._variance_precision(self.data, jnp.asarray(log_v), jnp.asarray(keep))
+
+    @partial(jax.jit, static_argnums=0)
+    def _variance_precision(self, data: Data, log_v: Array, keep: Array) -> Array:
+        info = jnp.eye(log_v.shape[0]) / VARIANCE_SPREAD**2
+        for k, base in data.base.items():
+            which = data.which[k]
+            root = inverse_root(self._covariance(data, k, log_v))
+            vb = jnp.einsum("nji,njk,nckl->ncil", root, root, base)
+            v = jnp.exp(log_v)[which]
             cross = 0.5 * jnp.einsum("ncij,ndji->ncd", vb, vb) * (v[:, :, None] * v[:, None, :])
             info = info.at[which[:, :, None], which[:, None, :]].add(keep[:, None, None] * cross)
-        score -= (log_v - typical) / _VARIANCE_SPREAD**2
-        info += jnp.eye(count) / _VARIANCE_SPREAD**2
-        return jnp.asarray(log_v) + jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
+        return info
 
     # fitting ---------------------------------------------------------------------------------
     def levenberg(
@@ -310,7 +335,7 @@ class Problem:
         nll -= float(self.log_jacobian(z, self.volt(log_v), keep)[0])
         pull = (np.asarray(z) - self.space.prior_mean) / self.space.prior_std
         typical = 2 * np.log(self.noise.typical)
-        spread = (np.asarray(log_v) - typical) / _VARIANCE_SPREAD
+        spread = (np.asarray(log_v) - typical) / VARIANCE_SPREAD
         return nll + 0.5 * float(np.sum(pull**2)) + 0.5 * float(np.sum(spread**2))
 
     def volt(self, log_v: Vector) -> Array:

@@ -202,6 +202,13 @@ def _verdict(
         below = place * prior_std
         if ((place < -TAIL) & (below < np.log(SMALL))).any():
             return "at_bound"
+    return by_ratio("", ratio)
+
+
+def by_ratio(before: str, ratio: float) -> str:
+    """Verdict of std(posterior) / std(prior), where another reason has not decided it before."""
+    if before in ("at_bound", "fixed"):
+        return before
     if ratio < IDENTIFIED:
         return "identified"
     return "weak" if ratio < WEAK else "not_identified"

@@ -47,6 +47,8 @@ _NEWTON_STEPS = 8
 _DAMPING = (1.0, 0.3, 0.05)
 _LEAST_LOAD = 1e-3
 _ROUNDING = 1e-20
+_NEAR = 1e-6
+_MOST_NEAR = 12
 
 
 class ContactSurface(eqx.Module):
@@ -236,13 +238,38 @@ def _root(args: Any) -> Any:
     return repeat(_newton, near, _NEWTON_STEPS)
 
 
-@_root.defjvp
-def _root_jvp(primals: Any, tangents: Any) -> Any:
-    (args,), (d_args,) = primals, tangents
-    xi = _root(args)
-    _, jac = _balance(xi, args)
-    _, d_force = jax.jvp(lambda a: _residual(xi, a), (args,), (d_args,))
-    return xi, -_solve3(jac, d_force)
+@jax.custom_jvp
+def _root_near(args: Any) -> Any:
+    def far(state: Any) -> Any:
+        _, step, count = state
+        return (jnp.max(jnp.abs(step)) > _NEAR) & (count < _MOST_NEAR)
+
+    def newton(state: Any) -> Any:
+        xi, _, count = state
+        f, jac = _balance(xi, args)
+        step = _solve3(jac, f)
+        return xi - step, step, count + 1
+
+    start = args[-1]
+    xi, step, _ = jax.lax.while_loop(far, newton, (start, jnp.full(3, jnp.inf), 0))
+    return jnp.where(jnp.max(jnp.abs(step)) > _NEAR, jnp.nan, xi)
+
+
+def _implicit(root: Any) -> Any:
+    """Derivative of a root of the balance by what it depends on."""
+
+    def rule(primals: Any, tangents: Any) -> Any:
+        (args,), (d_args,) = primals, tangents
+        xi = root(args)
+        _, jac = _balance(xi, args)
+        _, d_force = jax.jvp(lambda a: _residual(xi, a), (args,), (d_args,))
+        return xi, -_solve3(jac, d_force)
+
+    return rule
+
+
+_root.defjvp(_implicit(_root))
+_root_near.defjvp(_implicit(_root_near))
 
 
 def guess(rim: Float[Array, " wheel"], frame: Frame) -> Float[Array, "3"]:
@@ -270,6 +297,20 @@ def equilibrium(
     """
     start = jax.lax.stop_gradient(guess(rim, frame))
     return _root((rim, frame, surface, rest, jnp.zeros(3), start))
+
+
+def equilibrium_near(
+    start: Float[Array, "3"],
+    rim: Float[Array, " wheel"],
+    frame: Frame,
+    surface: ContactSurface,
+    rest: Float[Array, " wheel"],
+) -> Float[Array, "3"]:
+    """`equilibrium` by plain Newton steps from a twist nearby, NaN where they do not arrive.
+
+    About ten times cheaper; the last step is below 1e-6, which Newton's squares.
+    """
+    return _root_near((rim, frame, surface, rest, jnp.zeros(3), jax.lax.stop_gradient(start)))
 
 
 def step_with_inertia(

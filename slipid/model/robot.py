@@ -211,11 +211,23 @@ def build(
 
 
 def twist(
-    robot: Robot, frame: Frame, wheel_speed: Float[Array, " wheel"], surface: Array, load: Array
+    robot: Robot,
+    frame: Frame,
+    wheel_speed: Float[Array, " wheel"],
+    surface: Array,
+    load: Array,
+    near: Float[Array, "3"] | None = None,
 ) -> Float[Array, "3"]:
-    """Quasi-static body twist on floor `surface` (index) with load set-up `load` (index)."""
+    """Quasi-static body twist on floor `surface` (index) with load set-up `load` (index).
+
+    Args:
+        near: a twist so close that plain Newton steps arrive; NaN comes back where they do not.
+    """
+    floor, rest = robot.surfaces.at(surface), robot.body.load_share[load]
     rim = frame.radius * wheel_speed
-    return contact.equilibrium(rim, frame, robot.surfaces.at(surface), robot.body.load_share[load])
+    if near is None:
+        return contact.equilibrium(rim, frame, floor, rest)
+    return contact.equilibrium_near(near, rim, frame, floor, rest)
 
 
 def felt(

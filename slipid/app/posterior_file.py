@@ -1,0 +1,165 @@
+"""posterior.nc: draws in the layout of ArviZ, with names for everything."""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.data.log import DataError
+from slipid.identify.posterior import Posterior, likelihoods, replicates
+from slipid.identify.problem import Problem
+from slipid.parameter import Entry, Space
+
+SCHEMA = "slipid.posterior/1"
+REPLICATES = 50
+"""Replicated data sets of each ensemble."""
+_AXES = ("x", "y", "yaw")
+
+
+def tree(problem: Problem, found: Posterior, runs: tuple[str, ...], about: dict[str, Any]) -> Any:
+    """All groups of the file as an xarray DataTree.
+
+    Args:
+        runs: name of every run of the dataset.
+        about: attributes of the whole file.
+    """
+    from arviz_base import from_dict
+
+    w, robot = problem.windows, problem.robot
+    values, dims, units = _numbers(problem.space, found)
+    noise, noise_dims = _noise(problem, found)
+    per_run = likelihoods(problem, found)
+    run = np.unique(w.run)
+    onto = (np.asarray(w.run)[:, None] == run).astype(float)
+    measured, predicted, data_dims = _data(problem, found)
+    coords = {
+        "surface": list(robot.surfaces.labels),
+        "load": list(robot.body.loads),
+        "session": list(robot.camera.sessions),
+        "wheel": [f"wheel {k + 1}" for k in range(robot.geometry.wheels)],
+        "axis": list(_AXES[:2]),
+        "direction": list(_AXES),
+        "run": [runs[k] for k in run],
+        "coordinate": problem.space.names,
+        "component": list(problem.noise.names),
+    }
+    made = from_dict(
+        {
+            "posterior": values | noise,
+            "sample_stats": {"lp": found.log_prob},
+            "log_likelihood": {k: v @ onto for k, v in per_run.items()},
+            "posterior_predictive": predicted,
+            "observed_data": measured,
+            "unconstrained_posterior": {"z": found.z, "log_variance": found.log_variance},
+        },
+        coords=coords,
+        dims=dims
+        | noise_dims
+        | data_dims
+        | {"z": ["coordinate"], "log_variance": ["component"]}
+        | {k: ["run"] for k in per_run},
+    )
+    for name, unit in units.items():
+        made["posterior"][name].attrs["units"] = unit
+    made["observed_data"].attrs["run_of_piece"] = [runs[k] for k in w.run]
+    made.attrs.update(about)
+    return made
+
+
+def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
+    """Draws of every leaf with a free number, its dimensions and units."""
+    shape = found.z.shape[:2]
+    robots = jax.vmap(space.tree)(jnp.asarray(found.z.reshape(-1, space.size)))
+    values, dims, units = {}, {}, {}
+    for name, entry, of_label in _leaves(space):
+        leaf: Any = robots
+        for step in entry.leaf:
+            leaf = getattr(leaf, step)
+        values[name] = np.asarray(leaf).reshape(*shape, *np.shape(leaf)[1:])
+        dims[name] = [*of_label, *_of_vector(entry)]
+        units[name] = entry.declaration.unit
+    return values, dims, units
+
+
+def _leaves(space: Space) -> Iterator[tuple[str, Entry, list[str]]]:
+    """Name, an entry and the labelled dimension of every leaf with a free number."""
+    told = set()
+    for e in space.free:
+        if e.leaf in told:
+            continue
+        told.add(e.leaf)
+        if e.path.startswith("surface."):
+            yield f"surface.{e.path.split('.', 2)[2]}", e, ["surface"]
+        elif "@" in e.path:
+            label = "session" if "session" in e.path else "load"
+            yield e.path.split("@")[0], e, [label]
+        else:
+            yield e.path, e, []
+
+
+def _of_vector(entry: Entry) -> list[str]:
+    if entry.size == 1:
+        return []
+    return ["axis"] if entry.size == 2 else ["wheel"]
+
+
+def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
+    """Std of every noise component, floors side by side."""
+    floors = problem.robot.surfaces.labels
+    rows = np.moveaxis(np.exp(0.5 * found.log_variance), -1, 0)
+    std = dict(zip(problem.noise.names, rows, strict=True))
+    out: dict[str, Any] = {}
+    dims: dict[str, list[str]] = {}
+    for name in std:
+        parts = name.split(".")
+        if len(parts) == 2:
+            out[f"noise.{name}"], dims[f"noise.{name}"] = std[name], []
+            continue
+        short = f"noise.{parts[0]}.{parts[-1]}"
+        if short not in out:
+            all_floors = [std[f"{parts[0]}.{floor}.{parts[-1]}"] for floor in floors]
+            out[short], dims[short] = np.stack(all_floors, axis=-1), ["surface"]
+    return out, dims
+
+
+def _data(problem: Problem, found: Posterior) -> tuple[dict, dict, dict]:
+    """What was measured of every window, and replicates of it.
+
+    Marker increments are in metres corrected by the fitted camera.
+    """
+    from slipid.identify import likelihood as lk
+
+    w, new = problem.windows, replicates(problem, found, REPLICATES)
+    middle = problem.space.tree(jnp.asarray(found.z.mean(axis=(0, 1))))
+    measured = {"increment": np.asarray(jax.jit(lk.measured)(middle, problem.batch.pose))}
+    dims = {"increment": ["piece", "window", "direction"]}
+    gaps = {"increment": new["motion"]}
+    if w.has_current:
+        measured["current"], dims["current"] = np.asarray(w.current), ["piece", "window", "wheel"]
+        gaps["current"] = new["current"]
+    predicted = {k: gaps[k].reshape(*gaps[k].shape[:2], *y.shape) + y for k, y in measured.items()}
+    return measured, predicted, dims
+
+
+def write(made: Any, path: Path) -> None:
+    """Write the file, whole or not at all.
+
+    Raises:
+        DataError: nothing can be written there.
+    """
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    os.close(handle)
+    try:
+        made.to_netcdf(name, engine="h5netcdf")
+        with open(name, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(name, path)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+    finally:
+        Path(name).unlink(missing_ok=True)

@@ -1,0 +1,231 @@
+"""Posterior of a fit by sampling: motion first, then electric numbers given each draw of it.
+
+Where currents do not inform motion the posterior is p(motion | motion data) p(electric | motion,
+data), which no single density describes: its normaliser depends on the motion. It is drawn from in
+two stages; in the second every walker keeps its own draw of the motion.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.identify import sampler
+from slipid.identify.density import ELECTRIC, EVERYTHING, MOTION, Density
+from slipid.identify.moves import Target
+from slipid.identify.problem import DEGREES, Problem
+from slipid.identify.sampler import Block, Diagnosis, Plan
+
+Keep = Callable[[str, Block], None]
+STILL = 0.01
+"""Part of the walkers of the second stage that may never have moved."""
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Draws, and whether they may be believed.
+
+    Attributes:
+        z: search vectors (ensemble, draw, free).
+        log_variance: (ensemble, draw, variance).
+        log_prob: of the first stage.
+        names: of the coordinates of the first stage, as in `diagnosis`.
+        diagnosis: of the first stage, from all its steps.
+        accepted: part of the moves that moved something, by stage.
+        still: part of the second stage's walkers with a group that never moved.
+        converged, reason: the verdict.
+    """
+
+    z: Float[np.ndarray, "ensemble draw free"]
+    log_variance: Float[np.ndarray, "ensemble draw variance"]
+    log_prob: Float[np.ndarray, "ensemble draw"]
+    names: tuple[str, ...]
+    diagnosis: Diagnosis
+    accepted: dict[str, float]
+    still: float
+    converged: bool
+    reason: str
+
+
+def sample(
+    problem: Problem,
+    z: Float[np.ndarray, " free"],
+    log_variance: Float[np.ndarray, " variance"],
+    covariance: Float[np.ndarray, "free free"],
+    plan: Plan,
+    draws: int = 400,
+    done: Mapping[str, Sequence[Block]] | None = None,
+    keep: Keep = lambda part, block: None,
+    tell: Callable[[str, int], None] = lambda part, steps: None,
+) -> Posterior:
+    """Posterior around a fit.
+
+    Args:
+        problem: windows, robot, priors.
+        z, log_variance, covariance: where the fit ended, and its Laplace covariance.
+        plan: ensembles, bars, seed.
+        draws: that are kept of each ensemble.
+        done: blocks of each part that an earlier call has made.
+        keep: called with every new block.
+        tell: called with the part and the steps of a block that are done.
+    """
+    done = done or {}
+    parts = (EVERYTHING,) if problem.joint else (MOTION, ELECTRIC)
+    first = Density(problem, z, log_variance, covariance, parts[0])
+    target = Target(first.terms, first.coordinates.group, first.centre, first.covariance)
+    blocks = _blocks([target] * plan.ensembles, plan, parts[0], done, keep, tell)
+    chain = sampler.chain(blocks, plan)
+    found = sampler.diagnose(chain, plan)
+    x, log_prob = thinned(chain, blocks[plan.warm_up[-1] :], draws)
+    shape = (plan.ensembles, draws)
+    out_z = np.broadcast_to(z, (*shape, len(z))).copy()
+    out_v = np.broadcast_to(log_variance, (*shape, len(log_variance))).copy()
+    _put(first, x, out_z, out_v)
+    accepted = {parts[0]: float(np.mean([b.accepted for b in blocks]))}
+    still = 0.0
+    if len(parts) > 1:
+        second = Density(problem, z, log_variance, covariance, ELECTRIC)
+        if second.size:
+            later = _given(first, second, covariance, x, plan, done, keep, tell)
+            _put(second, later.x, out_z, out_v)
+            accepted[ELECTRIC], still = later.accepted, later.still
+    reason = f"{found.reason} ({first.names[found.worst]})"
+    if found.converged and still > STILL:
+        reason = f"{100 * still:.1f} % of the electric walkers never moved"
+    return Posterior(
+        z=out_z,
+        log_variance=out_v,
+        log_prob=log_prob,
+        names=first.names,
+        diagnosis=found,
+        accepted=accepted,
+        still=still,
+        converged=found.converged and still <= STILL,
+        reason=reason,
+    )
+
+
+def _blocks(
+    targets: Sequence[Target],
+    plan: Plan,
+    part: str,
+    done: Mapping[str, Sequence[Block]],
+    keep: Keep,
+    tell: Callable[[str, int], None],
+) -> list[Block]:
+    blocks = list(done.get(part, ()))
+    for block in sampler.run(targets, plan, blocks, lambda steps: tell(part, steps)):
+        blocks.append(block)
+        keep(part, block)
+    return blocks
+
+
+def likelihoods(
+    problem: Problem, found: Posterior
+) -> dict[str, Float[np.ndarray, "ensemble draw piece"]]:
+    """Log likelihood of every piece and draw, by block of residuals."""
+    density, x = _everything(problem, found)
+    shape = x.shape[:2]
+    out = density.pointwise(x.reshape(-1, x.shape[-1]))
+    return {k: v.reshape(*shape, -1) for k, v in out.items()}
+
+
+def replicates(
+    problem: Problem, found: Posterior, draws: int, seed: int = 0
+) -> dict[str, Float[np.ndarray, "ensemble draw piece m"]]:
+    """Replicated less measured data of every piece, from some draws of each ensemble.
+
+    What the model says, less what was measured, plus noise of the draw's own variances.
+    """
+    density, x = _everything(problem, found)
+    some = x[:, np.linspace(0, x.shape[1] - 1, draws).astype(int)]
+    rng = np.random.default_rng(seed)
+    flat = some.reshape(-1, x.shape[-1])
+    out = {k: np.array(v) for k, v in density.residuals(flat).items()}
+    for k, r in out.items():
+        for one, log_v in zip(r, flat[:, -len(problem.noise.names) :], strict=True):
+            root = np.linalg.cholesky(np.asarray(problem.covariance(k, log_v)))
+            normal = rng.standard_normal(one.shape)
+            normal *= np.sqrt(DEGREES / rng.chisquare(DEGREES, (len(normal), 1)))
+            one += np.einsum("nij,nj->ni", root, normal)
+    return {k: v.reshape(*some.shape[:2], *v.shape[1:]) for k, v in out.items()}
+
+
+def _everything(problem: Problem, found: Posterior) -> tuple[Density, np.ndarray]:
+    """A density of all numbers together, and the draws as its coordinates."""
+    z, log_v = found.z, found.log_variance
+    middle = z.mean(axis=(0, 1)), log_v.mean(axis=(0, 1))
+    density = Density(problem, *middle, np.eye(z.shape[-1]), EVERYTHING)
+    return density, np.concatenate([z, log_v], axis=-1)
+
+
+def thinned(
+    chain: sampler.Chain, blocks: Sequence[Block], draws: int
+) -> tuple[Float[np.ndarray, "ensemble draw size"], Float[np.ndarray, "ensemble draw"]]:
+    """Draws spread evenly over steps and walkers; more than there are repeat some."""
+    log_prob = np.concatenate([b.log_prob for b in blocks], axis=1)
+    _, steps, walkers, _ = chain.shape
+    step = ((np.arange(draws) + 0.5) / draws * steps).astype(int)
+    walker = np.arange(draws) * 7 % walkers if walkers % 7 else np.arange(draws) % walkers
+    return chain[:, step, walker], log_prob[:, step, walker]
+
+
+def _put(density: Density, x: np.ndarray, z: np.ndarray, log_variance: np.ndarray) -> None:
+    at = density.coordinates
+    z[..., at.structure] = x[..., : len(at.structure)]
+    log_variance[..., at.variance] = x[..., len(at.structure) :]
+
+
+@dataclass(frozen=True, eq=False)
+class _Later:
+    x: Float[np.ndarray, "ensemble draw size"]
+    accepted: float
+    still: float
+
+
+def _given(
+    first: Density,
+    second: Density,
+    covariance: Float[np.ndarray, "free free"],
+    x: Float[np.ndarray, "ensemble draw size"],
+    plan: Plan,
+    done: Mapping[str, Sequence[Block]],
+    keep: Keep,
+    tell: Callable[[str, int], None],
+) -> _Later:
+    """A draw of the electric numbers for every draw of the motion.
+
+    Walkers are in coordinates less their regression on the motion, in which they are all alike.
+    """
+    motion, electric = first.coordinates.structure, second.coordinates.structure
+    slope = np.linalg.solve(
+        covariance[np.ix_(motion, motion)], covariance[np.ix_(motion, electric)]
+    )
+    n = len(electric)
+    left = second.covariance.copy()
+    left[:n, :n] -= covariance[np.ix_(electric, motion)] @ slope
+    shift = np.zeros((*x.shape[:2], second.size))
+    shift[..., :n] = (x[..., : len(motion)] - first.centre[: len(motion)]) @ slope
+    targets = []
+    for of_ensemble, moved in zip(x, shift, strict=True):
+        held = first.hold(of_ensemble)
+
+        def terms(u: np.ndarray, moved: np.ndarray = moved, held: object = held) -> np.ndarray:
+            return second.terms(u + moved, held)
+
+        group = second.coordinates.group
+        targets.append(Target(terms, group, second.centre, left, apart=True))
+    later = replace(
+        plan, walkers=x.shape[1], seed=plan.seed + 1, block=15, warm_up=(1,), most=5, spread=1.0
+    )
+    blocks = _blocks(targets, later, ELECTRIC, done, keep, tell)
+    chain = sampler.chain(blocks, later)
+    moved = np.diff(chain, axis=1) != 0
+    groups = [g for g in [*targets[0].groups, targets[0].shared] if len(g)]
+    never = np.any([~moved[..., g].any(axis=(1, 3)) for g in groups], axis=0)
+    return _Later(
+        x=chain[:, -1] + shift,
+        accepted=float(np.mean([b.accepted for b in blocks])),
+        still=float(never.mean()),
+    )

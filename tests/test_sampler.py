@@ -1,0 +1,205 @@
+"""The sampler on targets whose moments are known, and its chains after an interrupt."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slipid.identify import sampler
+from slipid.identify.moves import Differential, Independence, Mixture, Target, Warp, laplace
+from slipid.identify.sampler import Plan, diagnose, packed, run, unpacked
+
+PLAN = Plan(ensembles=4, walkers=16, block=25, warm_up=(2, 4, 6), most=120)
+
+
+def gaussian():
+    """Two groups of three and two shared numbers, strongly correlated; Laplace is a little off."""
+    rng = np.random.default_rng(0)
+    group = np.array([-1, 0, 0, 0, -1, 1, 1, 1])
+    slope = rng.normal(size=(2, 8))
+    spread = np.array([1.0, 0.1, 2.0, 5.0, 0.3, 1.0, 0.02, 1.0])
+    shared = group < 0
+    mixing = np.eye(8)
+    for k in np.flatnonzero(~shared):
+        mixing[k, shared] = slope[:, k]
+    for k in (2, 3, 6, 7):
+        mixing[k, k - 1] = 0.9
+    root = spread[:, None] * mixing
+    mean = rng.normal(size=8)
+    covariance = root @ root.T
+    precision = np.linalg.inv(covariance)
+
+    def terms(x):
+        # the precision has no entries between groups: each group's own rows, and what is left
+        d = x - mean
+        out = np.zeros((len(x), 3))
+        for g in (0, 1):
+            own = group == g
+            inner = np.where(np.outer(own, own), precision, 0.0)
+            cross = np.where(np.outer(own, shared), precision, 0.0)
+            out[:, g] = -0.5 * np.einsum("ni,ij,nj->n", d, inner + 2 * cross, d)
+        rest = np.where(np.outer(shared, shared), precision, 0.0)
+        out[:, 2] = -0.5 * np.einsum("ni,ij,nj->n", d, rest, d)
+        return out
+
+    assert np.abs(precision[np.ix_(group == 0, group == 1)]).max() < 1e-9
+    off = mean + 0.7 * np.sqrt(np.diag(covariance))
+    return Target(terms, group, off, 0.6 * covariance), mean, np.sqrt(np.diag(covariance))
+
+
+def banana():
+    def terms(x):
+        bent = -0.5 * x[:, 0] ** 2 - 2.0 * (x[:, 1] - x[:, 0] ** 2) ** 2
+        return np.stack([bent, 0 * bent], axis=1)
+
+    target = Target(terms, np.zeros(2, int), np.zeros(2), np.diag([1.0, 0.25]))
+    return target, np.array([0.0, 1.0]), np.array([1.0, 1.5])
+
+
+def funnel():
+    """Width e^v/2 of three numbers, v shared."""
+
+    def terms(x):
+        v = x[:, 0]
+        own = -0.5 * (x[:, 1:] ** 2 * np.exp(-v)[:, None] + v[:, None])
+        return np.concatenate([own, -0.5 * v[:, None] ** 2], axis=1)
+
+    target = Target(terms, np.array([-1, 0, 1, 2]), np.zeros(4), np.eye(4))
+    return target, np.zeros(4), np.array([1.0, *[np.exp(0.25)] * 3])
+
+
+def two_modes():
+    """Three and seven tenths at -4 and 4; Laplace knows the first only."""
+
+    def terms(x):
+        d = np.logaddexp(
+            np.log(0.3) - 0.5 * (x[:, 0] + 4) ** 2, np.log(0.7) - 0.5 * (x[:, 0] - 4) ** 2
+        )
+        return np.stack([d - 0.5 * x[:, 1] ** 2, 0 * d], axis=1)
+
+    target = Target(terms, np.zeros(2, int), np.array([-4.0, 0.0]), np.eye(2))
+    return target, np.array([1.6, 0.0]), np.array([np.sqrt(1 + 16 * 4 * 0.3 * 0.7), 1.0])
+
+
+def sampled(target, plan=PLAN):
+    blocks = list(run([target] * plan.ensembles, plan))
+    chain = sampler.chain(blocks, plan)
+    return blocks, chain, diagnose(chain, plan)
+
+
+@pytest.mark.parametrize("known", [gaussian, banana, funnel, two_modes])
+def test_moments_are_within_three_monte_carlo_errors_or_it_says_so(known):
+    target, mean, std = known()
+    _, chain, found = sampled(target)
+    if not found.converged:
+        assert known is two_modes  # the only one that may be refused
+        return
+    flat = chain.reshape(-1, len(mean))
+    error = flat.std(axis=0) / np.sqrt(found.ess)
+    np.testing.assert_array_less(np.abs(flat.mean(axis=0) - mean) / error, 3.5)
+    kurtosis = ((flat - mean) ** 4).mean(axis=0) / std**4
+    of_std = std * np.sqrt((kurtosis - 1) / 4 / found.ess)
+    np.testing.assert_array_less(np.abs(flat.std(axis=0) - std) / of_std, 3.5)
+
+
+def test_ensembles_in_different_modes_are_not_reported():
+    """Modes so far apart that nothing leads from one to the other."""
+
+    def terms(x):
+        d = np.logaddexp(-0.5 * (x[:, 0] + 50) ** 2, -0.5 * (x[:, 0] - 50) ** 2)
+        return np.stack([d, 0 * d], axis=1)
+
+    target = Target(terms, np.zeros(1, int), np.zeros(1), np.eye(1))
+    plan = Plan(ensembles=4, walkers=4, block=25, warm_up=(2,), most=12, spread=30.0)
+    _, chain, found = sampled(target, plan)
+    assert {-1, 1} == set(np.sign(chain[:, -1, 0, 0]).astype(int)) or not found.converged
+    if len(set(np.sign(chain[..., 0]).mean(axis=(1, 2)).round(3))) > 1:
+        assert not found.converged
+
+
+def test_an_interrupted_chain_goes_on_as_if_it_had_not_been():
+    target, _, _ = gaussian()
+    plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=6)
+    whole = list(run([target] * 2, plan))
+    for stop in range(1, 6):
+        kept = [unpacked(dict(packed(b))) for b in whole[:stop]]
+        rest = list(run([target] * 2, plan, kept))
+        assert len(rest) == 6 - stop
+        for one, other in zip([*kept, *rest], whole, strict=True):
+            np.testing.assert_array_equal(one.chain, other.chain)
+            np.testing.assert_array_equal(one.log_prob, other.log_prob)
+
+
+def test_the_seed_decides():
+    target, _, _ = banana()
+    plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1,), most=3)
+    one, same = (np.concatenate([b.chain for b in run([target] * 2, plan)]) for _ in range(2))
+    other = np.concatenate([b.chain for b in run([target] * 2, Plan(**{**vars(plan), "seed": 1}))])
+    np.testing.assert_array_equal(one, same)
+    assert not np.array_equal(one, other)
+    assert not np.array_equal(one[0], one[1])  # ensembles differ
+
+
+def test_independence_accepts_everything_where_laplace_is_exact():
+    """But for the tails of the Student t, that is; shared numbers take the groups along."""
+    target, mean, _ = gaussian()
+    target = Target(target.terms, target.group, mean, target.covariance / 0.6)
+    random = np.random.RandomState(0)
+    x = mean + random.standard_normal((4000, 8)) @ np.linalg.cholesky(target.covariance).T
+    before = target.terms(x)
+    for of_groups in (True, False):
+        new, factor = Independence(target, laplace(target), of_groups).proposed(x, x, random)
+        after = target.terms(new)
+        gain = after[:, :-1] - before[:, :-1] if of_groups else (after - before).sum(1)[:, None]
+        assert np.minimum(1, np.exp(gain + factor)).mean() > 0.85
+        shared = target.group < 0
+        assert np.array_equal(new[:, shared], x[:, shared]) == of_groups
+
+
+def test_whole_differences_lead_from_mode_to_mode():
+    target, _, _ = two_modes()
+    move, random = Differential(target, laplace(target), True), np.random.RandomState(0)
+    still = np.concatenate([np.full((20, 2), -4.0), np.full((20, 2), 4.0)])
+    x = np.full((4000, 2), -4.0)
+    new, factor = move.proposed(x, still, random)
+    assert (factor == 0).all()
+    assert 0.01 < (np.abs(new[:, 0] - 4) < 0.5).mean() < 0.1
+
+
+def test_a_warp_is_undone_and_its_slope_is_a_derivative():
+    rng = np.random.default_rng(0)
+    draws = np.stack([rng.gamma(2.0, size=3000), -np.log(rng.gamma(1.0, size=3000))], axis=1)
+    warp = Warp.fitted(draws)
+    y = warp.forward(draws)
+    np.testing.assert_allclose(warp.back(y), draws, rtol=1e-9)
+    h = 1e-6
+    numeric = np.log((warp.back(y + h) - warp.back(y - h)) / (2 * h))
+    np.testing.assert_allclose(warp.log_slope(y), numeric, atol=1e-5)
+    from scipy.stats import skew
+
+    assert (np.abs(skew(draws)) > 0.9).all()
+    assert (np.abs(skew(y)) < 0.2).all()
+
+
+def test_a_mixture_has_the_density_it_draws_from():
+    """Integral of the density over a box against the share of draws there."""
+    random = np.random.RandomState(0)
+    root = np.array([[[1.0, 0], [0.5, 0.7]], [[0.3, 0], [0, 0.2]]])
+    mixture = Mixture(np.array([0.4, 0.6]), np.array([[0.0, 0.0], [1.0, 1.0]]), root)
+    draws = mixture.draw(random, 200_000)
+    edges = np.linspace(-0.5, 1.5, 201)
+    grid = np.stack(np.meshgrid(edges, edges), axis=-1).reshape(-1, 2)
+    density = np.exp(mixture.log_density(grid)).reshape(201, 201) / (2 * np.pi)
+    inside = np.trapezoid(np.trapezoid(density, edges), edges)
+    assert ((draws > -0.5) & (draws < 1.5)).all(axis=1).mean() == pytest.approx(inside, abs=0.005)
+
+
+def test_autocorrelation_time_is_that_of_a_known_process():
+    """tau = (1 + a) / (1 - a) of an autoregression; a walker that stands still raises it."""
+    rng = np.random.default_rng(0)
+    x = np.zeros((2, 4000, 8, 1))
+    for k in range(1, 4000):
+        x[:, k] = 0.8 * x[:, k - 1] + rng.normal(size=(2, 8, 1))
+    assert sampler.autocorrelation_time(x)[0] == pytest.approx(9.0, rel=0.1)
+    x[0, :, 0] = x[0, 0, 0] + 3.0
+    assert sampler.autocorrelation_time(x)[0] > 20
