@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -44,7 +46,8 @@ def gaussian():
 
     assert np.abs(precision[np.ix_(group == 0, group == 1)]).max() < 1e-9
     off = mean + 0.7 * np.sqrt(np.diag(covariance))
-    return Target(terms, group, off, 0.6 * covariance), mean, np.sqrt(np.diag(covariance))
+    kind = np.array([0, 0, 0, 1, 0, 1, 1, 1])
+    return Target(terms, group, kind, off, 0.6 * covariance), mean, np.sqrt(np.diag(covariance))
 
 
 def banana():
@@ -52,7 +55,7 @@ def banana():
         bent = -0.5 * x[:, 0] ** 2 - 2.0 * (x[:, 1] - x[:, 0] ** 2) ** 2
         return np.stack([bent, 0 * bent], axis=1)
 
-    target = Target(terms, np.zeros(2, int), np.zeros(2), np.diag([1.0, 0.25]))
+    target = Target(terms, np.zeros(2, int), np.zeros(2, int), np.zeros(2), np.diag([1.0, 0.25]))
     return target, np.array([0.0, 1.0]), np.array([1.0, 1.5])
 
 
@@ -64,7 +67,7 @@ def funnel():
         own = -0.5 * (x[:, 1:] ** 2 * np.exp(-v)[:, None] + v[:, None])
         return np.concatenate([own, -0.5 * v[:, None] ** 2], axis=1)
 
-    target = Target(terms, np.array([-1, 0, 1, 2]), np.zeros(4), np.eye(4))
+    target = Target(terms, np.array([-1, 0, 1, 2]), np.zeros(4, int), np.zeros(4), np.eye(4))
     return target, np.zeros(4), np.array([1.0, *[np.exp(0.25)] * 3])
 
 
@@ -77,7 +80,7 @@ def two_modes():
         )
         return np.stack([d - 0.5 * x[:, 1] ** 2, 0 * d], axis=1)
 
-    target = Target(terms, np.zeros(2, int), np.array([-4.0, 0.0]), np.eye(2))
+    target = Target(terms, np.zeros(2, int), np.zeros(2, int), np.array([-4.0, 0.0]), np.eye(2))
     return target, np.array([1.6, 0.0]), np.array([np.sqrt(1 + 16 * 4 * 0.3 * 0.7), 1.0])
 
 
@@ -109,7 +112,7 @@ def test_ensembles_in_different_modes_are_not_reported():
         d = np.logaddexp(-0.5 * (x[:, 0] + 50) ** 2, -0.5 * (x[:, 0] - 50) ** 2)
         return np.stack([d, 0 * d], axis=1)
 
-    target = Target(terms, np.zeros(1, int), np.zeros(1), np.eye(1))
+    target = Target(terms, np.zeros(1, int), np.zeros(1, int), np.zeros(1), np.eye(1))
     plan = Plan(ensembles=4, walkers=4, block=25, warm_up=(2,), most=12, spread=30.0)
     _, chain, found = sampled(target, plan)
     assert {-1, 1} == set(np.sign(chain[:, -1, 0, 0]).astype(int)) or not found.converged
@@ -143,13 +146,16 @@ def test_the_seed_decides():
 def test_independence_accepts_everything_where_laplace_is_exact():
     """But for the tails of the Student t, that is; shared numbers take the groups along."""
     target, mean, _ = gaussian()
-    target = Target(target.terms, target.group, mean, target.covariance / 0.6)
+    target = replace(target, centre=mean, covariance=target.covariance / 0.6)
     random = np.random.RandomState(0)
     x = mean + random.standard_normal((4000, 8)) @ np.linalg.cholesky(target.covariance).T
     before = target.terms(x)
-    for of_groups in (True, False):
-        new, factor = Independence(target, laplace(target), of_groups).proposed(x, x, random)
+    families = laplace(target).families
+    assert len(families) == 3  # two kinds of the groups' numbers, one of the shared ones
+    for family in families:
+        new, factor = Independence(target, family).proposed(x, x, random)
         after = target.terms(new)
+        of_groups = family.follow is None
         gain = after[:, :-1] - before[:, :-1] if of_groups else (after - before).sum(1)[:, None]
         assert np.minimum(1, np.exp(gain + factor)).mean() > 0.85
         shared = target.group < 0
@@ -158,7 +164,8 @@ def test_independence_accepts_everything_where_laplace_is_exact():
 
 def test_whole_differences_lead_from_mode_to_mode():
     target, _, _ = two_modes()
-    move, random = Differential(target, laplace(target), True), np.random.RandomState(0)
+    (family,) = laplace(target).families
+    move, random = Differential(target, family), np.random.RandomState(0)
     still = np.concatenate([np.full((20, 2), -4.0), np.full((20, 2), 4.0)])
     x = np.full((4000, 2), -4.0)
     new, factor = move.proposed(x, still, random)

@@ -110,12 +110,17 @@ class Density:
         """Number of coordinates."""
         return len(self.coordinates.names)
 
+    @property
+    def kind(self) -> np.ndarray:
+        """0 for structure, 1 for variances."""
+        return np.repeat([0, 1], [len(self.coordinates.structure), len(self.coordinates.variance)])
+
     def like(self, other: "Density") -> "Density":
         """This density with what another of the same shapes has compiled."""
         self._form = other._form
         return self
 
-    def full(self, x: Array) -> tuple[Array, Array]:
+    def full(self, x: Array | np.ndarray) -> tuple[Array, Array]:
         """Search vector and log variances of chain coordinates, the others as at the fit."""
         return self._full(self.anchor, jnp.asarray(x))
 

@@ -38,6 +38,7 @@ class Target:
     Attributes:
         terms: of vectors (walker, size) the terms (walker, group + 1), shared term last.
         group: of each coordinate, -1 where groups share it.
+        kind: of each coordinate; those of different kinds are moved by themselves.
         centre, covariance: of a Gaussian near it (Laplace).
         apart: every walker has a density of its own, so that all are evaluated together and in
             order, and none can be moved by what others do.
@@ -45,6 +46,7 @@ class Target:
 
     terms: Callable[[Matrix], Matrix]
     group: np.ndarray
+    kind: np.ndarray
     centre: Float[np.ndarray, " size"]
     covariance: Matrix
     apart: bool = False
@@ -55,9 +57,9 @@ class Target:
         return np.flatnonzero(self.group < 0)
 
     @property
-    def groups(self) -> list[np.ndarray]:
-        """Places of every group's coordinates, some may be empty."""
-        return [np.flatnonzero(self.group == g) for g in range(int(self.group.max()) + 1)]
+    def count(self) -> int:
+        """Number of groups."""
+        return int(self.group.max()) + 1
 
     def log_prob(self, x: Matrix) -> Matrix:
         """Log density and, as blobs, its terms."""
@@ -158,42 +160,96 @@ class Mixture:
 
 
 @dataclass(frozen=True, eq=False)
-class Proposal:
-    """What independence moves draw from.
+class Part:
+    """Some coordinates of one group, or some shared ones, and what is known of them.
 
     Attributes:
-        warp: to the coordinates in which all the rest holds.
-        slope: B (shared, size), of which columns of shared coordinates are not used.
-        parts: of the residuals of each group, then of the shared coordinates; None where empty.
+        own: their places.
+        given: places of those they are regressed on.
+        slope: of that regression (given, own).
+        mixture: distribution of what it leaves.
     """
 
-    warp: Warp
+    own: np.ndarray
+    given: np.ndarray
     slope: Matrix
-    parts: tuple[Mixture | None, ...]
+    mixture: Mixture
+
+    def left(self, x: Matrix) -> Matrix:
+        """Own coordinates less what the others say of them."""
+        return np.asarray(x[:, self.own] - x[:, self.given] @ self.slope)
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Parts that are moved together.
+
+    Attributes:
+        parts: one per group, None where a group has no such coordinates; or a single one of shared
+            coordinates.
+        follow: how much all other coordinates move with shared ones (own, size); None for groups.
+    """
+
+    parts: tuple[Part | None, ...]
+    follow: Matrix | None
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """What moves draw from: families, in coordinates that a warp has brought nearer to Gaussian."""
+
+    warp: Warp
+    families: tuple[Family, ...]
+
+
+Known = Callable[[np.ndarray, np.ndarray], tuple[Matrix, Mixture]]
+"""From own and given coordinates to the slope and the mixture of what is left."""
+
+
+def _families(target: Target, known: Known, follow: Matrix) -> tuple[Family, ...]:
+    """Families of every kind of coordinates, of groups and of shared ones."""
+
+    def part(own: np.ndarray, given: np.ndarray) -> Part | None:
+        places = np.flatnonzero(own), np.flatnonzero(given)
+        return Part(*places, *known(*places)) if own.any() else None
+
+    group, kind, found = target.group, target.kind, []
+    shared = group < 0
+    for k in np.unique(kind):
+        mine = kind == k
+        parts = [
+            part(mine & (group == g), (shared | (group == g)) & ~(mine & (group == g)))
+            for g in range(target.count)
+        ]
+        found.append(Family(tuple(parts), None))
+        own = part(mine & shared, ~mine & shared)
+        if own is not None:
+            found.append(Family((own,), follow[np.isin(np.flatnonzero(shared), own.own)]))
+    return tuple(f for f in found if any(f.parts))
 
 
 def laplace(target: Target) -> Proposal:
     """Proposal from the Gaussian near the target, as a Student t."""
-    shared, cov = target.shared, target.covariance
-    slope = np.zeros((len(shared), len(cov)))
-    if len(shared):
-        slope = np.linalg.solve(cov[np.ix_(shared, shared)], cov[shared])
-    left = cov - cov[:, shared] @ slope
-    residual = target.centre - target.centre[shared] @ slope
+    cov, mean = target.covariance, target.centre
 
-    def student(at: np.ndarray, mean: np.ndarray, cov: Matrix) -> Mixture | None:
-        if not len(at):
-            return None
-        return Mixture(np.ones(1), mean[at][None], np.linalg.cholesky(cov[np.ix_(at, at)])[None])
+    def slopes(given: np.ndarray, own: np.ndarray) -> Matrix:
+        if not len(given):
+            return np.zeros((0, len(own)))
+        return np.asarray(np.linalg.solve(cov[np.ix_(given, given)], cov[np.ix_(given, own)]))
 
-    parts = [student(g, residual, left) for g in target.groups]
-    return Proposal(Warp.none(len(cov)), slope, (*parts, student(shared, target.centre, cov)))
+    def known(own: np.ndarray, given: np.ndarray) -> tuple[Matrix, Mixture]:
+        slope = slopes(given, own)
+        left = cov[np.ix_(own, own)] - cov[np.ix_(own, given)] @ slope
+        middle = mean[own] - mean[given] @ slope
+        return slope, Mixture(np.ones(1), middle[None], np.linalg.cholesky(left)[None])
+
+    follow = slopes(target.shared, np.arange(len(mean)))
+    return Proposal(Warp.none(len(mean)), _families(target, known, follow))
 
 
 def warped(target: Target, warp: Warp) -> Target:
     """The same distribution in other coordinates; centre and covariance are left as they are."""
-    count = int(target.group.max()) + 1
-    onto = np.eye(count + 1)[np.where(target.group < 0, count, target.group)]
+    onto = np.eye(target.count + 1)[np.where(target.group < 0, target.count, target.group)]
 
     def terms(y: Matrix) -> Matrix:
         return np.asarray(target.terms(warp.back(y)) + warp.log_slope(y) @ onto)
@@ -209,37 +265,37 @@ def learnt(target: Target, draws: Matrix, parts: int, seed: int) -> Proposal:
     """
     from sklearn.mixture import GaussianMixture
 
-    warp, shared = Warp.fitted(draws), target.shared
-    draws = warp.forward(draws)
-    slope = np.zeros((len(shared), draws.shape[1]))
-    if len(shared):
-        about = draws - draws.mean(axis=0)
-        slope = np.linalg.lstsq(about[:, shared], about, rcond=None)[0]
+    warp = Warp.fitted(draws)
+    y = warp.forward(draws)
+    about = y - y.mean(axis=0)
 
-    def mixture(at: np.ndarray, x: Matrix) -> Mixture | None:
-        if not len(at):
-            return None
-        x = x[:, at]
-        root = np.linalg.cholesky(np.cov(x.T).reshape(len(at), len(at)))
+    def slopes(given: np.ndarray, own: np.ndarray) -> Matrix:
+        if not len(given):
+            return np.zeros((0, len(own)))
+        return np.asarray(np.linalg.lstsq(about[:, given], about[:, own], rcond=None)[0])
+
+    def known(own: np.ndarray, given: np.ndarray) -> tuple[Matrix, Mixture]:
+        slope = slopes(given, own)
+        x = y[:, own] - y[:, given] @ slope
+        root = np.linalg.cholesky(np.cov(x.T).reshape(len(own), len(own)))
         middle = x.mean(axis=0)
         white = np.linalg.solve(root, (x - middle).T).T
         found = GaussianMixture(parts, random_state=seed, reg_covar=1e-4, max_iter=60)
         with warnings.catch_warnings():  # a proposal need not be the best one
             warnings.simplefilter("ignore")
             found.fit(white)
-        return Mixture(
+        return slope, Mixture(
             weight=np.concatenate([[STUDENT_SHARE], (1 - STUDENT_SHARE) * found.weights_]),
             mean=np.concatenate([middle[None], middle + found.means_ @ root.T]),
             root=np.concatenate([root[None], root @ np.linalg.cholesky(found.covariances_)]),
         )
 
-    residual = draws - draws[:, shared] @ slope
-    blocks = [mixture(g, residual) for g in target.groups]
-    return Proposal(warp, slope, (*blocks, mixture(shared, draws)))
+    follow = slopes(target.shared, np.arange(y.shape[1]))
+    return Proposal(warp, _families(target, known, follow))
 
 
 class BlockMove(Move):
-    """Metropolis-Hastings of all groups at once, or of the shared coordinates.
+    """Metropolis-Hastings of a family.
 
     Attributes:
         halves: 2 where a proposal needs walkers that stand still, else 1.
@@ -247,12 +303,30 @@ class BlockMove(Move):
 
     halves = 1
 
-    def __init__(self, target: Target, proposal: Proposal, of_groups: bool):
-        self.target, self.proposal, self.of_groups = target, proposal, of_groups
+    def __init__(self, target: Target, family: Family):
+        self.target, self.family = target, family
+
+    def jump(
+        self, left: Matrix, still: Matrix, mixture: Mixture, random: Any
+    ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
+        """New residuals of a part, and log q(old | new) - log q(new | old)."""
+        raise NotImplementedError
 
     def proposed(self, x: Matrix, still: Matrix, random: Any) -> tuple[Matrix, Matrix]:
-        """Vectors, and log q(x | new) - log q(new | x) of every group, or of the shared ones."""
-        raise NotImplementedError
+        """New vectors, and the log factor of every part."""
+        new, factors = x.copy(), np.zeros((len(x), len(self.family.parts)))
+        for k, part in enumerate(self.family.parts):
+            if part is None:
+                continue
+            old = part.left(x)
+            left, factors[:, k] = self.jump(old, part.left(still), part.mixture, random)
+            if self.family.follow is not None:
+                new += (left - old) @ self.family.follow
+            new[:, part.own] = x[:, part.own] + left - old
+        if self.family.follow is not None:
+            others = np.setdiff1d(self.target.shared, self.family.parts[0].own)  # type: ignore
+            new[:, others] = x[:, others]
+        return new, factors
 
     def propose(self, model: Any, state: State) -> tuple[State, np.ndarray]:
         random, count = model.random, len(state.coords)
@@ -262,7 +336,7 @@ class BlockMove(Move):
             still = np.setdiff1d(order, mine)
             new, factor = self.proposed(state.coords[mine], state.coords[still], random)
             log_prob, terms = model.compute_log_prob_fn(new)
-            if self.of_groups:
+            if self.family.follow is None:
                 gain = terms[:, :-1] - state.blobs[mine, :-1] + factor
             else:
                 gain = (log_prob - state.log_prob[mine])[:, None] + factor
@@ -272,46 +346,44 @@ class BlockMove(Move):
         return state, accepted
 
     def _take(self, state: State, mine: Any, new: Matrix, terms: Matrix, took: np.ndarray) -> None:
-        if not self.of_groups:
+        if self.family.follow is not None:
             rows = mine[took[:, 0]]
             state.coords[rows], state.blobs[rows] = new[took[:, 0]], terms[took[:, 0]]
         else:
-            for g, at in enumerate(self.target.groups):
-                rows = mine[took[:, g]]
-                state.coords[np.ix_(rows, at)] = new[took[:, g]][:, at]
-                state.blobs[rows, g] = terms[took[:, g], g]
+            for g, part in enumerate(self.family.parts):
+                if part is not None:
+                    rows = mine[took[:, g]]
+                    state.coords[np.ix_(rows, part.own)] = new[took[:, g]][:, part.own]
+                    state.blobs[rows, g] = terms[took[:, g], g]
         state.log_prob[mine] = state.blobs[mine].sum(axis=1)
-
-    def follow(self, x: Matrix, shared: Matrix) -> Matrix:
-        """Vectors with new shared coordinates and the old residuals."""
-        at = self.target.shared
-        new = x + (shared - x[:, at]) @ self.proposal.slope
-        new[:, at] = shared
-        return new
 
 
 class Independence(BlockMove):
     """Draws that do not depend on where a walker is, from what is known of the target."""
 
-    def proposed(self, x: Matrix, still: Matrix, random: Any) -> tuple[Matrix, Matrix]:
-        at, slope = self.target.shared, self.proposal.slope
-        if not self.of_groups:
-            mixture = self.proposal.parts[-1]
-            assert mixture is not None
-            drawn = mixture.draw(random, len(x))
-            factor = mixture.log_density(x[:, at]) - mixture.log_density(drawn)
-            return self.follow(x, drawn), factor[:, None]
-        new, base = x.copy(), x[:, at] @ slope
-        groups = self.target.groups
-        factor = np.zeros((len(x), len(groups)))
-        for g, (own, mixture) in enumerate(zip(groups, self.proposal.parts, strict=False)):
-            if mixture is None:
-                continue
-            drawn = mixture.draw(random, len(x))
-            new[:, own] = base[:, own] + drawn
-            old = x[:, own] - base[:, own]
-            factor[:, g] = mixture.log_density(old) - mixture.log_density(drawn)
-        return new, factor
+    def jump(
+        self, left: Matrix, still: Matrix, mixture: Mixture, random: Any
+    ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
+        drawn = mixture.draw(random, len(left))
+        return drawn, mixture.log_density(left) - mixture.log_density(drawn)
+
+
+class Autoregressive(BlockMove):
+    """Part of the way from where a walker is towards a draw, exact for a Gaussian.
+
+        x' = m + sqrt(1 - b^2) (x - m) + b L xi,   b between 0.1 and 1
+
+    Source: preconditioned Crank-Nicolson, Cotter et al. 2013, Statistical Science 28, eq. 4.
+    """
+
+    def jump(
+        self, left: Matrix, still: Matrix, mixture: Mixture, random: Any
+    ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
+        mean, root = mixture.mean[0], mixture.root[0]
+        old = np.linalg.solve(root, (left - mean).T).T
+        step = 10 ** random.uniform(-1, 0, (len(left), 1))
+        new = np.sqrt(1 - step**2) * old + step * random.standard_normal(left.shape)
+        return mean + new @ root.T, 0.5 * (new**2 - old**2).sum(axis=1)
 
 
 class Differential(BlockMove):
@@ -323,36 +395,21 @@ class Differential(BlockMove):
     halves = 2
     whole = 0.1
 
-    def proposed(self, x: Matrix, still: Matrix, random: Any) -> tuple[Matrix, Matrix]:
-        groups, at = self.target.groups, self.target.shared
-        if self.of_groups:
-            new = x.copy()
-            for own in groups:
-                if len(own):
-                    new[:, own] += self._differences(still[:, own], len(x), random)
-            return new, np.zeros((len(x), len(groups)))
-        moved = x[:, at] + self._differences(still[:, at], len(x), random)
-        return self.follow(x, moved), np.zeros((len(x), 1))
-
-    def _differences(self, still: Matrix, count: int, random: Any) -> Matrix:
-        size = still.shape[1]
+    def jump(
+        self, left: Matrix, still: Matrix, mixture: Mixture, random: Any
+    ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
+        count, size = left.shape
         first = random.randint(len(still), size=count)
         second = (first + random.randint(1, len(still), size=count)) % len(still)
         usual = 2.38 / np.sqrt(2 * size) * np.exp(0.5 * random.standard_normal(count))
         scale = np.where(random.uniform(size=count) < self.whole, 1.0, usual)
         jitter = 1e-5 * still.std(axis=0) * random.standard_normal((count, size))
-        return np.asarray(scale[:, None] * (still[first] - still[second]) + jitter)
+        return left + scale[:, None] * (still[first] - still[second]) + jitter, np.zeros(count)
 
 
 def moves(target: Target, proposal: Proposal) -> list[tuple[Move, float]]:
     """Moves and how often each is made."""
-    kinds: list[tuple[type[BlockMove], float]] = [(Independence, 0.75), (Differential, 0.25)]
-    if target.apart:
-        kinds = [(Independence, 1.0)]
-    both = [len(target.shared) > 0, any(len(g) for g in target.groups)]
-    return [
-        (kind(target, proposal, of_groups), share / sum(both))
-        for kind, share in kinds
-        for there, of_groups in zip(both, (False, True), strict=True)
-        if there
-    ]
+    kinds: list[tuple[type[BlockMove], float]] = [(Independence, 0.5), (Autoregressive, 0.3)]
+    if not target.apart:
+        kinds.append((Differential, 0.2))
+    return [(kind(target, f), share) for kind, share in kinds for f in proposal.families]

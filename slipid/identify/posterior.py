@@ -73,7 +73,8 @@ def sample(
     done = done or {}
     parts = (EVERYTHING,) if problem.joint else (MOTION, ELECTRIC)
     first = Density(problem, z, log_variance, covariance, parts[0])
-    target = Target(first.terms, first.coordinates.group, first.centre, first.covariance)
+    group = first.coordinates.group
+    target = Target(first.terms, group, first.kind, first.centre, first.covariance)
     blocks = _blocks([target] * plan.ensembles, plan, parts[0], done, keep, tell)
     chain = sampler.chain(blocks, plan)
     found = sampler.diagnose(chain, plan)
@@ -215,15 +216,15 @@ def _given(
             return second.terms(u + moved, held)
 
         group = second.coordinates.group
-        targets.append(Target(terms, group, second.centre, left, apart=True))
+        targets.append(Target(terms, group, second.kind, second.centre, left, apart=True))
     later = replace(
         plan, walkers=x.shape[1], seed=plan.seed + 1, block=15, warm_up=(1,), most=5, spread=1.0
     )
     blocks = _blocks(targets, later, ELECTRIC, done, keep, tell)
     chain = sampler.chain(blocks, later)
     moved = np.diff(chain, axis=1) != 0
-    groups = [g for g in [*targets[0].groups, targets[0].shared] if len(g)]
-    never = np.any([~moved[..., g].any(axis=(1, 3)) for g in groups], axis=0)
+    groups = second.coordinates.group
+    never = np.any([~moved[..., groups == g].any(axis=(1, 3)) for g in np.unique(groups)], axis=0)
     return _Later(
         x=chain[:, -1] + shift,
         accepted=float(np.mean([b.accepted for b in blocks])),

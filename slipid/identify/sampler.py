@@ -18,7 +18,18 @@ import numpy as np
 from emcee.state import State
 from jaxtyping import Float
 
-from slipid.identify.moves import Mixture, Proposal, Target, Warp, laplace, learnt, moves, warped
+from slipid.identify.moves import (
+    Family,
+    Mixture,
+    Part,
+    Proposal,
+    Target,
+    Warp,
+    laplace,
+    learnt,
+    moves,
+    warped,
+)
 
 Chain = Float[np.ndarray, "ensemble step walker size"]
 
@@ -295,23 +306,33 @@ def autocorrelation_time(chain: Chain) -> Float[np.ndarray, " size"]:
 
 def unpacked(arrays: dict[str, np.ndarray]) -> Block:
     """Block from what `packed` gave."""
-    parts = []
-    for k in range(int(arrays["parts"])):
-        has = f"part{k}/weight" in arrays
-        of = [arrays[f"part{k}/{name}"] for name in ("weight", "mean", "root")] if has else []
-        parts.append(Mixture(*of) if has else None)
+
+    def part(name: str) -> Part | None:
+        if f"{name}/own" not in arrays:
+            return None
+        own, given, slope = (arrays[f"{name}/{key}"] for key in ("own", "given", "slope"))
+        return Part(own, given, slope, Mixture(*(arrays[f"{name}/{key}"] for key in _OF_MIXTURE)))
+
+    families = []
+    for k, count in enumerate(arrays["parts"]):
+        parts = tuple(part(f"{k}/{n}") for n in range(int(count)))
+        families.append(Family(parts, arrays.get(f"{k}/follow")))
     return Block(
         number=int(arrays["number"]),
         chain=arrays["chain"],
         log_prob=arrays["log_prob"],
         random=(arrays["random_key"], arrays["random_rest"]),
         accepted=arrays["accepted"],
-        proposal=Proposal(Warp(*arrays["warp"]), arrays["slope"], tuple(parts)),
+        proposal=Proposal(Warp(*arrays["warp"]), tuple(families)),
     )
+
+
+_OF_MIXTURE = ("weight", "mean", "root")
 
 
 def packed(block: Block) -> dict[str, Any]:
     """Plain arrays of a block, for a file."""
+    families = block.proposal.families
     out = {
         "number": np.asarray(block.number),
         "chain": block.chain,
@@ -320,10 +341,13 @@ def packed(block: Block) -> dict[str, Any]:
         "random_rest": block.random[1],
         "accepted": block.accepted,
         "warp": np.stack(list(vars(block.proposal.warp).values())),
-        "slope": block.proposal.slope,
-        "parts": np.asarray(len(block.proposal.parts)),
+        "parts": np.array([len(f.parts) for f in families]),
     }
-    for k, part in enumerate(block.proposal.parts):
-        if part is not None:
-            out |= {f"part{k}/{name}": getattr(part, name) for name in ("weight", "mean", "root")}
+    for k, family in enumerate(families):
+        if family.follow is not None:
+            out[f"{k}/follow"] = family.follow
+        for n, part in enumerate(family.parts):
+            if part is not None:
+                out |= {f"{k}/{n}/{key}": getattr(part, key) for key in ("own", "given", "slope")}
+                out |= {f"{k}/{n}/{key}": getattr(part.mixture, key) for key in _OF_MIXTURE}
     return out

@@ -1,0 +1,158 @@
+"""The density the sampler sees against the likelihood the fit maximises."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import multivariate_t, norm
+
+from slipid.identify import likelihood as lk
+from slipid.identify.density import ELECTRIC, EVERYTHING, MOTION, Density
+from slipid.identify.problem import DEGREES, VARIANCE_SPREAD, Problem
+from slipid.parameter import Choice
+from tests.made_windows import made, robot
+
+pytestmark = pytest.mark.slow  # compiles densities
+
+NOISE = {
+    "camera.place": 0.0005,
+    "process.along": 0.004,
+    "process.across": 0.004,
+    "process.yaw": 0.008,
+    "run.along": 0.008,
+    "run.across": 0.008,
+    "run.yaw": 0.03,
+    "current": 0.05,
+    "voltage": 0.07,
+}
+FREE = [
+    Choice("*", free=False),
+    Choice("surface.*.creep", free=True),
+    Choice("surface.*.roller_drag", free=True),
+    Choice("surface.*.friction", free=True),
+    Choice("robot.load_share@*", free=True),
+    Choice("camera.scale", free=True),
+    Choice("camera.session_yaw@*", free=True),
+    Choice("motor.resistance", free=True),
+]
+
+
+@pytest.fixture(scope="module")
+def problem():
+    truth = robot()
+    w = made(truth, std=NOISE)
+    w = replace(w, current_var=np.full_like(w.current_var, 1e-3))
+    return Problem(w, truth, FREE)
+
+
+def density(problem, part):
+    z, log_v = problem.space.start, 2 * np.log(problem.noise.typical)
+    return Density(problem, z, log_v, 0.01 * np.eye(len(z)), part)
+
+
+def near(d, count=4, width=0.1):
+    rng = np.random.default_rng(0)
+    return d.centre + width * rng.normal(size=(count, d.size))
+
+
+def expected(problem, z, log_v, blocks):
+    """Log likelihood of every piece by scipy, straight from the definition."""
+    volt = problem.volt(log_v)
+    tree = problem.space.tree(jnp.asarray(z))
+    residuals = jax.jit(lk.residuals)(tree, problem.batch, volt)
+    camera, spread = lk.log_jacobians(tree, problem.batch, volt)
+    out = np.zeros(len(problem.windows))
+    for k in blocks:
+        v = np.asarray(problem.covariance(k, log_v))
+        for n, r in enumerate(np.asarray(residuals[k])):
+            out[n] += multivariate_t.logpdf(r, shape=v[n], df=DEGREES)
+        out += np.asarray({"motion": camera, "voltage": spread}.get(k, 0.0))
+    return out
+
+
+def prior(problem, d, x):
+    at, space = d.coordinates, problem.space
+    typical = 2 * np.log(problem.noise.typical)
+    mean = np.concatenate([space.prior_mean[at.structure], typical[at.variance]])
+    wide = np.full(len(at.variance), VARIANCE_SPREAD)
+    std = np.concatenate([space.prior_std[at.structure], wide])
+    return norm.logpdf(x, mean, std)
+
+
+@pytest.mark.parametrize("part", [MOTION, EVERYTHING])
+def test_it_is_the_posterior_by_definition(problem, part):
+    d = density(problem, part)
+    x = near(d)
+    terms = d.terms(x)
+    blocks = ["motion"] if part == MOTION else ["motion", "current", "voltage"]
+    for one, found in zip(x, terms, strict=True):
+        z, log_v = d.full(one)
+        pieces = expected(problem, np.asarray(z), np.asarray(log_v), blocks)
+        of_prior = prior(problem, d, one)
+        group, floor = d.coordinates.group, np.asarray(problem.batch.surface)
+        for g in (0, 1):
+            total = pieces[floor == g].sum() + of_prior[group == g].sum()
+            assert found[g] == pytest.approx(total, rel=1e-9)
+        assert found[-1] == pytest.approx(of_prior[group < 0].sum(), rel=1e-9)
+    for k, each in d.pointwise(x).items():
+        z, log_v = d.full(x[0])
+        np.testing.assert_allclose(
+            each[0], expected(problem, np.asarray(z), np.asarray(log_v), [k]), rtol=1e-8
+        )
+
+
+def test_the_electric_part_holds_the_motion_of_each_walker(problem):
+    """log p(electric | motion) is that of everything less that of the motion, but for constants."""
+    motion, electric, all_ = (density(problem, p) for p in (MOTION, ELECTRIC, EVERYTHING))
+    of_motion, x = near(motion), near(electric)
+    found = electric.terms(x, motion.hold(of_motion)).sum(axis=1)
+    together = np.zeros((4, all_.size))
+    where = {name: k for k, name in enumerate(all_.names)}
+    together[:, [where[n] for n in motion.names]] = of_motion
+    together[:, [where[n] for n in electric.names]] = x
+    assert sorted([*motion.names, *electric.names]) == sorted(all_.names)
+    rest = all_.terms(together).sum(axis=1) - motion.terms(of_motion).sum(axis=1)
+    np.testing.assert_allclose(found, rest, rtol=1e-8)
+
+
+def test_numbers_of_one_floor_move_its_term_only(problem):
+    d = density(problem, EVERYTHING)
+    x = near(d, 1)[0]
+    base = d.terms(x[None])[0]
+    for k, (name, group) in enumerate(zip(d.names, d.coordinates.group, strict=True)):
+        moved = d.terms((x + 0.01 * np.eye(d.size)[k])[None])[0] - base
+        changed = set(np.flatnonzero(np.abs(moved) > 1e-9))
+        floor = next((f for f in ("firm", "soft") if f".{f}." in name), None)
+        assert group == (-1 if floor is None else d.floors.index(floor)), name
+        assert changed <= ({0, 1, 2} if group < 0 else {group}), name
+        assert changed, name
+
+
+def test_far_from_the_fit_the_root_is_found_from_scratch(problem):
+    d = density(problem, MOTION)
+    far = near(d, 3, width=2.0)
+    for one, found in zip(far, d.terms(far).sum(axis=1), strict=True):
+        z, log_v = d.full(one)
+        total = expected(problem, np.asarray(z), np.asarray(log_v), ["motion"]).sum()
+        assert found == pytest.approx(total + prior(problem, d, one).sum(), rel=1e-7)
+
+
+def test_gradients_are_those_of_finite_differences(problem):
+    d = density(problem, MOTION)
+    x = jnp.asarray(near(d, 1)[0])
+    slope = np.asarray(jax.jit(jax.grad(d.logpdf))(x))
+    x, h = np.asarray(x), 1e-5 * np.eye(d.size)
+    numeric = (d.terms(x + h).sum(axis=1) - d.terms(x - h).sum(axis=1)) / 2e-5
+    np.testing.assert_allclose(slope, numeric, rtol=1e-4, atol=1e-3)
+
+
+def test_a_single_floor_is_a_single_group():
+    truth = robot(floors=("firm",), loads=("as_built",), sessions=("one",))
+    w = replace(made(truth, std=NOISE), has_current=False, has_voltage=False)
+    d = density(Problem(w, truth, [FREE[0], Choice("surface.*.creep", free=True)]), EVERYTHING)
+    assert (d.coordinates.group == 0).all()
+    assert d.terms(near(d)).shape == (4, 2)
