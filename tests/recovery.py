@@ -13,8 +13,8 @@ from slipid.data.dataset import collect, windows
 from slipid.identify.curves import _SLIP as SLIP
 from slipid.identify.curves import curves, torque_of_slip
 from slipid.identify.fit import optimise
+from slipid.identify.identifiability import IDENTIFIED, expected_covariance
 from slipid.identify.problem import Problem
-from slipid.identify.verdict import IDENTIFIED
 from slipid.parameter import Choice, Space
 
 PLAN = grid(headings=8, turns=1)
@@ -63,10 +63,8 @@ def design():
         white.get(name, white["window"]) if name.endswith("window") else sensors.of(name)
         for name in this.noise.names
     ]
-    log_v = jnp.asarray(2 * np.log(std))
-    _, jacobian = this.linear(jnp.asarray(this.space.vector(TRUTH)), this.volt(log_v))
-    info = this.precision(jacobian, log_v, jnp.ones(len(this.windows)))
-    return np.sqrt(np.diag(np.linalg.inv(info))) / this.space.prior_std < IDENTIFIED
+    covariance = expected_covariance(this, this.space.vector(TRUTH), 2 * np.log(std))
+    return np.sqrt(np.diag(covariance)) / this.space.prior_std < IDENTIFIED
 
 
 @dataclass(frozen=True)

@@ -207,20 +207,7 @@ def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> 
     report.stage("reading logs")
     job = read_job(config, data, report.count, report.line)
     report.stage("expected information")
-    estimates, flat = expected(job)
-    found = overview(job) | {
-        "parameters": {
-            e.path: {
-                "unit": e.unit,
-                "start": e.value,
-                "expected_std": e.std,
-                "ratio": e.ratio,
-                "verdict": e.verdict,
-            }
-            for e in estimates
-        },
-        "messages": [f.text for f in flat],
-    }
+    found = overview(job) | expected(job, job.problem())
     if out is not None:
         from slipid.app.raw_plots import raw_plots
 
