@@ -60,7 +60,15 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
 @app.command()
 @guarded
 def identify(
-    config: ConfigFile, data: DataFolder, out: Out, json: Json = None, quiet: Quiet = False
+    config: ConfigFile,
+    data: DataFolder,
+    out: Out,
+    profile: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PATH", help="Also profile a number's likelihood; may be repeated."),
+    ] = None,
+    json: Json = None,
+    quiet: Quiet = False,
 ) -> int:
     """Fit motors, floors, loads and camera to the logs, end to end.
 
@@ -70,11 +78,11 @@ def identify(
     from slipid.app.progress import Reporter
 
     with Reporter(quiet=quiet) as report:
-        done = commands.identify(config, data, out, report)
+        done = commands.identify(config, data, out, report, profile or ())
     if json is not None:
         _emit(json, done.fit.to_identified())
     if json != "-":
-        tables.identified(done.fit, out, done.written)
+        tables.identified(done.fit, out, done.written, done.profiles)
     return 0 if done.fit.converged else 1
 
 

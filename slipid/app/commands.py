@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,15 +19,25 @@ CHECKPOINT = "checkpoint.npz"
 
 @dataclass(frozen=True, eq=False)
 class Done:
-    """End of `identify`: the fit, the runs it saw, and the files written."""
+    """End of `identify`: the fit, the runs it saw, the files written, the profiles asked for."""
 
     fit: Any
     job: Any
     written: tuple[str, ...]
+    profiles: tuple[Any, ...] = ()
 
 
-def identify(config_path: Path, data: Path, out: Path, report: Reporter) -> Done:
+def identify(
+    config_path: Path, data: Path, out: Path, report: Reporter, profile: Sequence[str] = ()
+) -> Done:
     """Fit the robot of a config to its logs and write everything to `out`.
+
+    Args:
+        config_path: of the job.
+        data: folder its globs start from.
+        out: folder to write to.
+        report: progress.
+        profile: paths of numbers whose profile likelihood is wanted, too.
 
     Raises:
         DataError: config or logs are wrong; nothing was written then.
@@ -42,6 +53,13 @@ def identify(config_path: Path, data: Path, out: Path, report: Reporter) -> Done
     report.line(f"{len(job.dataset)} runs on {', '.join(job.robot.surfaces.labels)}")
     report.stage("cutting windows")
     problem = job.problem()
+    from slipid.identify.profile import profiled
+
+    for path in profile:
+        try:
+            profiled(problem.space, path)
+        except ValueError as error:
+            raise DataError(f"--profile: {error}") from error
     writable(out)
     optimum = _optimise(job, problem, out, report)
     report.stage("intervals and verdicts")
@@ -61,8 +79,30 @@ def identify(config_path: Path, data: Path, out: Path, report: Reporter) -> Done
         written += [path.name for path in identify_plots(fit, job.dataset, out)]
     except DataError as error:  # the numbers are written; a run too short to draw spoils none
         report.line(f"no more pictures: {error}")
+    profiles = _profiles(problem, optimum, profile, out, report)
+    written += ["profile.json", "profile.png"] if profiles else []
     (out / CHECKPOINT).unlink(missing_ok=True)
-    return Done(fit, job, tuple(written))
+    return Done(fit, job, tuple(written), profiles)
+
+
+def _profiles(
+    problem: Any, optimum: Any, paths: Sequence[str], out: Path, report: Reporter
+) -> tuple[Any, ...]:
+    """Profiles of some numbers, written and drawn."""
+    if not paths:
+        return ()
+    from slipid.app import drawing
+    from slipid.app.plots_profile import profile_figure
+    from slipid.identify.profile import profile
+
+    found = []
+    for path in dict.fromkeys(paths):
+        report.stage(f"profile of {path}")
+        found.append(profile(problem, optimum, path, report.point))
+    each = {p.path: p.to_json() for p in found}
+    write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
+    drawing.save(profile_figure(found), out / "profile.png")
+    return tuple(found)
 
 
 def _optimise(job: Any, problem: Any, out: Path, report: Reporter) -> Any:

@@ -64,6 +64,11 @@ class Reporter:
         if self._bars is not None and self._task is not None:
             self._bars.update(self._task, completed=done, total=total, what=f"{done} of {total}")
 
+    def point(self, done: int, rise: float) -> None:
+        """A point of a profile is fitted."""
+        if self._bars is not None and self._task is not None:
+            self._bars.update(self._task, what=f"{done} points, rise {rise:.2f}")
+
     def state(self, state: Any) -> None:
         """A round of the fit is done."""
         self.stage(state.stage)

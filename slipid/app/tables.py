@@ -51,10 +51,13 @@ def estimates(items: Iterable[Any], title: str) -> Table:
     return table
 
 
-def identified(fit: Any, out: Path, written: Sequence[str]) -> None:
+def identified(fit: Any, out: Path, written: Sequence[str], profiles: Sequence[Any] = ()) -> None:
     """What `identify` found."""
     console = _console()
-    console.print(estimates(fit.parameters.values(), f"{len(fit.runs)} runs, {fit.rounds} rounds"))
+    items = [*fit.parameters.values(), *fit.derived.values()]
+    console.print(estimates(items, f"{len(fit.runs)} runs, {fit.rounds} rounds"))
+    for p in profiles:
+        console.print(f"profile: {p.said}", markup=False, soft_wrap=True)
     for sentence in fit.messages:
         console.print(f"note: {sentence}", markup=False, soft_wrap=True)
     state = "converged" if fit.converged else "NOT converged"
@@ -92,7 +95,7 @@ def check(found: dict[str, Any]) -> None:
     )
     for name in ("parameter", "unit", "std after / before", "verdict"):
         before.add_column(name)
-    for path, e in found["parameters"].items():
+    for path, e in (found["parameters"] | found["derived"]).items():
         if e["ratio"] is None or "session_yaw" in path:
             continue
         colour = COLOUR.get(e["verdict"], "dim")
