@@ -5,13 +5,11 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 
 from slipid.app.synthetic import Sensors, blank, grid, make_logs, truth
 from slipid.data.dataset import collect, windows
-from slipid.identify.curves import _SLIP as SLIP
-from slipid.identify.curves import curves, torque_of_slip
+from slipid.identify.curves import curves, slip_on
 from slipid.identify.fit import optimise
 from slipid.identify.identifiability import IDENTIFIED, expected_covariance
 from slipid.identify.problem import Problem
@@ -113,11 +111,7 @@ def recover(seed):
 def curve_gap(this, z):
     """Largest difference in slip to the true curve over the torques visited, per floor."""
     found = curves(this.space, z, z[None], this.batch)
-    gaps = {}
-    for k, floor in enumerate(TRUTH.surfaces.labels):
-        curve = found[floor]
-        at = jnp.full(len(TRUTH.surfaces.labels), curve["at"]["wheel_speed"])
-        true = torque_of_slip(TRUTH, at, curve["at"]["load_share"])[k]
-        slip = np.interp(curve["torque_nm"], np.asarray(true), SLIP)
-        gaps[floor] = float(np.abs(slip - curve["slip"]).max())
-    return gaps
+    return {
+        floor: float(np.abs(slip_on(TRUTH, floor, curve) - curve["slip"]).max())
+        for floor, curve in found.items()
+    }

@@ -42,7 +42,7 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
             code = command(*args, **kwargs)
         except KeyboardInterrupt:
             typer.echo(
-                "interrupted; identify and demo, called again, go on from the last round", err=True
+                "interrupted; identify, demo and selftest, called again, go on from there", err=True
             )
             raise typer.Exit(130) from None
         except ValueError as error:
@@ -106,6 +106,37 @@ def check(
     if json != "-":
         tables.check(found)
     return 0
+
+
+@app.command()
+@guarded
+def selftest(
+    config: ConfigFile,
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", metavar="DIR", help="Logs whose wheel motion is taken, if any."),
+    ] = None,
+    out: Out = Path("selftest_out"),
+    replicates: Annotated[int, typer.Option(min=1, help="Made experiments.")] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Of truths and noise.")] = 0,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Make this very experiment with known truth, fit it, and say what it recovers.
+
+    Without --data it is the plan of [selftest] in the config. Writes selftest.json; goes on from
+    the replicates that are done. Exit code 1 where a number that is wanted is not recovered.
+    """
+    from slipid.app import commands, tables
+    from slipid.app.progress import Reporter
+
+    with Reporter(quiet=quiet) as report:
+        found = commands.selftest(config, data, out, replicates, seed, report)
+    if json is not None:
+        _emit(json, found)
+    if json != "-":
+        tables.selftest(found, out)
+    return 0 if found["recovered"] else 1
 
 
 @app.command()

@@ -233,6 +233,65 @@ def _restored(states: Any, out: Path) -> Any:
         raise DataError(f"{out / 'fit.json'}: {error}") from error
 
 
+def selftest(
+    config_path: Path, data: Path | None, out: Path, count: int, seed: int, report: Reporter
+) -> dict[str, Any]:
+    """What an experiment can recover, by making it with known truth and fitting that.
+
+    Args:
+        config_path: of the experiment.
+        data: its logs, whose wheel motion is taken; without them a plan is made.
+        out: folder for selftest.json and the replicates, which a later call goes on from.
+        count: replicates.
+        seed: of truths and noise.
+        report: progress.
+
+    Raises:
+        DataError: config or logs are wrong.
+    """
+    runtime.start()
+    from slipid.app import selftest as test
+    from slipid.app.check import expected
+    from slipid.app.job import read_job
+    from slipid.app.selftest_summary import SCHEMA, summary, wanted_of
+
+    config = read_config(config_path)
+    if data is None:
+        job = test.planned(config, report.line)
+    else:
+        report.stage("reading logs")
+        job = read_job(config, data, report.count, report.line)
+    problem = job.problem()
+    wanted = wanted_of(config, problem)
+    test.plausible(job, problem)
+    writable(out)
+    report.stage("expected information")
+    before = expected(job, problem)
+    kept, key = out / "replicates.json", test.key_of(job, seed)
+    done = files.load_replicates(kept, key)
+    if done:
+        report.line(f"{min(len(done), count)} of {count} replicates are in {kept} already")
+    report.stage("replicates")
+
+    def tell(rows: list[dict[str, Any]]) -> None:
+        files.save_replicates(kept, key, rows)
+        report.part(len(rows), count)
+
+    rows = test.replicates(job, problem, count, seed, done, tell, report.round)
+    found = {
+        "schema": SCHEMA,
+        "source": "plan" if data is None else "logs",
+        "runs": len(job.dataset),
+        "seed": seed,
+        "noise": dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True)),
+        **summary(rows, wanted),
+        "messages": before["messages"],
+        "data": {"hash": job.data_hash},
+    }
+    write_json(out / "selftest.json", found)
+    return found
+
+
 def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> dict[str, Any]:
     """What the logs hold, and what they can be expected to tell, before any fit.
 

@@ -106,6 +106,59 @@ def check(found: dict[str, Any]) -> None:
         console.print(f"note: {sentence}", markup=False, soft_wrap=True)
 
 
+RECOVERED = {"yes": "green", "roughly": "yellow", "no": "red", "wrong": "magenta"}
+
+
+def selftest(found: dict[str, Any], out: Path) -> None:
+    """What `selftest` found."""
+    console = _console()
+    table = _plain_table(
+        ("parameter", "unit", "error", "of truth", "z rms", "in 90 %", "verdict", "recovered"),
+        f"{found['replicates']} made experiments like this one ({found['runs']} runs), "
+        f"{found['converged']} fits converged",
+    )
+    for path, e in found["parameters"].items():
+        share, colour = e["relative_error_rms"], RECOVERED[e["recovered"]]
+        table.add_row(
+            Text(path),
+            e["unit"],
+            f"{e['error_rms']:.2g}",
+            "" if share is None else f"{100 * share:.1f} %",
+            f"{e['z_rms']:.2f}",
+            f"{round(e['coverage90'] * e['intervals'])} of {e['intervals']}",
+            e["verdict"].replace("_", " "),
+            f"[{colour}]{e['recovered']}[/{colour}]" + (" *" if path in found["wanted"] else ""),
+        )
+    console.print(table)
+    console.print("* wanted; wrong: errors larger than the fits say\n", soft_wrap=True)
+    floors = _plain_table(
+        ("surface", "slip curve off by", "at most", "in its band", "prediction off by", "encoders")
+    )
+    for floor, c in found["curves"].items():
+        p = found["predictions"].get(floor, {})
+        floors.add_row(
+            floor,
+            f"{c['median_gap']:.4f}",
+            f"{c['largest_gap']:.4f}",
+            _percent(c["coverage90"]),
+            _percent(p.get("identified")),
+            _percent(p.get("encoder")),
+        )
+    console.print(floors)
+    for sentence in found["messages"]:
+        console.print(f"note: {sentence}", markup=False, soft_wrap=True)
+    if found["failed"]:
+        console.print(f"NOT recovered: {', '.join(found['failed'])}", markup=False, soft_wrap=True)
+    console.print(f"in {out}: selftest.json, replicates.json", markup=False, soft_wrap=True)
+
+
+def _plain_table(columns: Sequence[str], title: str | None = None) -> Table:
+    table = Table(title=title, title_justify="left", show_edge=False, pad_edge=False, box=None)
+    for name in columns:
+        table.add_column(name)
+    return table
+
+
 def validation(found: dict[str, Any]) -> None:
     """Summary of a validation: one row per floor and model."""
     table = Table(show_edge=False, pad_edge=False, box=None)

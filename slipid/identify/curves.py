@@ -98,6 +98,13 @@ def curves(
     return out
 
 
+def slip_on(robot: Robot, floor: str, curve: dict[str, Any]) -> Float[np.ndarray, " torque"]:
+    """Slip by a robot's own law at the torques, the speed and the load of a curve of `curves`."""
+    at = jnp.full(len(robot.surfaces.labels), curve["at"]["wheel_speed"])
+    torque = torque_of_slip(robot, at, curve["at"]["load_share"])[robot.surface_index(floor)]
+    return np.interp(curve["torque_nm"], np.asarray(torque), _SLIP)
+
+
 def validity(data: Dataset, robot: Robot, b: lk.Batch) -> dict[str, dict[str, Any]]:
     """What each floor was seen with: outside of it the fit extrapolates."""
     speed, torque, slip = (np.asarray(x) for x in seen(robot, b))
