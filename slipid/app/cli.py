@@ -195,6 +195,8 @@ def new(
     write_new(out, drive, wheel_radius_m, base_m, gear_ratio, mass_kg, ticks_per_revolution, force)
     typer.echo(f"{out}: name your columns below [layouts.mine.columns], then run")
     typer.echo(f"  slipid check {out} --data DIR")
+    typer.echo("or, before anything is driven, see what a plan of runs would tell:")
+    typer.echo(f"  slipid selftest {out}")
     return 0
 
 

@@ -17,6 +17,7 @@ def profile_figure(found: Sequence[Profile]) -> Figure:
     )
     for ax, profile in zip(axes, found, strict=True):
         _panel(ax, profile)
+    axes[0].legend(fontsize=8, loc="upper center")
     axes[0].set_ylabel("minus log likelihood above its lowest")
     return made
 
@@ -45,4 +46,3 @@ def _panel(ax: Axes, p: Profile) -> None:
     head, _, rest = p.said.partition(": ")
     given = f"\ngiven {p.given}" if p.given else ""
     ax.set_title(f"{head}\n{rest}{given}", fontsize=10)
-    ax.legend(fontsize=8, loc="upper right")

@@ -4,6 +4,9 @@ In coordinates scaled by the prior's stds the information P = S C^-1 S of prior 
 eigenvalue 1 where the data say nothing. A direction u is flat where u^T P u < 1 / 0.8^2: a step of
 one prior std along it is hardly noticed, whatever else is known. Of all such directions those that
 move few numbers are sought: a sparse basis, found by leaving numbers out one by one.
+
+Where currents do not inform motion, a direction of the motion alone is judged by what motion tells,
+whether or not the numbers that currents tell are known.
 """
 
 from collections.abc import Iterable, Mapping
@@ -65,12 +68,34 @@ class _Axis:
     is_log: bool
 
 
+class _Told:
+    """Information in prior-scaled coordinates.
+
+    Args:
+        given: of all coordinates, P.
+        electric: those that currents tell given the motion, where that is so.
+    """
+
+    def __init__(self, given: Float[np.ndarray, "free free"], electric: np.ndarray | None = None):
+        self.given, self.electric = given, electric
+        self.motion = np.zeros_like(given)
+        if electric is not None:
+            motion = np.ix_(~electric, ~electric)
+            self.motion[motion] = np.linalg.inv(np.linalg.inv(given)[motion])
+
+    def of(self, picked: list[int]) -> Float[np.ndarray, "some some"]:
+        """Information on some coordinates, the others being known."""
+        of_motion = self.electric is not None and not self.electric[picked].any()
+        return (self.motion if of_motion else self.given)[np.ix_(picked, picked)]
+
+
 def flat_directions(
     space: Space,
     covariance: Float[np.ndarray, "free free"],
     has_current: bool,
     has_voltage: bool,
     validity: Mapping[str, Any] | None = None,
+    current_informs_motion: bool = False,
 ) -> tuple[Flat, ...]:
     """Directions in which the data narrow the prior by less than a fifth.
 
@@ -84,18 +109,22 @@ def flat_directions(
         has_current, has_voltage: what was logged.
         validity: what every floor was driven with, as `curves.validity` says; makes the remedies
             definite.
+        current_informs_motion: as the `Problem` was told.
     """
     axes = [axis for e in space.free for axis in _axes(e)]
     kept = [k for k, axis in enumerate(axes) if not axis.path.startswith("camera.session_yaw")]
     electric = [k for k in kept if axes[k].path == "robot.mass" or is_electric(axes[k].path)]
     std = space.prior_std
-    scaled = np.linalg.inv(covariance) * std[:, None] * std[None, :]
+    outer = std[:, None] * std
+    told = _Told(np.linalg.inv(covariance) * outer)
+    if has_current and not current_informs_motion:
+        told = _Told(told.given, np.array([is_electric(axis.path) for axis in axes]))
     out = []
-    for picked, u in _sparse(scaled, kept, electric):
+    for picked, u in _sparse(told, kept, electric):
         mine = [axes[k] for k in picked]
-        main = _named(scaled, mine, picked, u, std[picked])
+        main = _named(told, mine, picked, u, std[picked])
         mine = [axis for axis, is_main in zip(mine, main, strict=True) if is_main]
-        step = _rounded(scaled, picked, u, std[picked], main)[main]
+        step = _rounded(told, picked, u, std[picked], main)[main]
         power = step / step[np.argmax(np.abs(step))]
         paths = tuple(axis.path for axis in mine)
         rest = len(picked) - len(mine)
@@ -124,7 +153,7 @@ def sentences(found: Iterable[Flat]) -> tuple[str, ...]:
 
 
 def _sparse(
-    information: Float[np.ndarray, "free free"], among: list[int], first: list[int]
+    told: _Told, among: list[int], first: list[int]
 ) -> list[tuple[list[int], Float[np.ndarray, " some"]]]:
     """Basis of the flat directions, each a unit vector that needs every coordinate it names.
 
@@ -132,16 +161,16 @@ def _sparse(
     from there on, as in Gaussian elimination; so the next one is another. Directions within
     `first` come before those of all of `among`.
     """
-    alone = [k for k in among if information[k, k] < NOTICED]
+    alone = [k for k in among if told.of([k])[0, 0] < NOTICED]
     found = [([k], np.ones(1)) for k in alone]
     known = set(alone)
     for group, limit in ((first, _UNSEEN), (among, _UNSEEN), (among, NOTICED)):
         while left := [k for k in group if k not in known]:
-            value, u = _flattest(information, left)
+            value, u = _flattest(told, left)
             if value >= limit:
                 break
             picked = left
-            while (fewer := _without_one(information, picked, u, limit)) is not None:
+            while (fewer := _without_one(told, picked, u, limit)) is not None:
                 picked, u = fewer
             found.append((picked, u))
             largest = np.abs(u) > 0.9 * np.abs(u).max()
@@ -150,20 +179,20 @@ def _sparse(
 
 
 def _without_one(
-    information: np.ndarray, picked: list[int], u: np.ndarray, limit: float
+    told: _Told, picked: list[int], u: np.ndarray, limit: float
 ) -> tuple[list[int], np.ndarray] | None:
     """A flat direction with a coordinate less, None where every one is needed."""
     for drop in np.argsort(np.abs(u)):
         fewer = [k for j, k in enumerate(picked) if j != drop]
         if fewer:
-            value, other = _flattest(information, fewer)
+            value, other = _flattest(told, fewer)
             if value < limit:
                 return fewer, other
     return None
 
 
 def _named(
-    information: np.ndarray, axes: list[_Axis], picked: list[int], u: np.ndarray, std: np.ndarray
+    told: _Told, axes: list[_Axis], picked: list[int], u: np.ndarray, std: np.ndarray
 ) -> np.ndarray:
     """Which numbers of a direction are worth naming.
 
@@ -171,31 +200,31 @@ def _named(
     power: a wide prior makes the part of a number small whose scale is as open as the others'.
     """
     main = np.abs(u) >= _PART * np.abs(u).max()
-    if _along(information, picked, u) < _UNSEEN and len({axis.is_log for axis in axes}) == 1:
+    if _along(told, picked, u) < _UNSEEN and len({axis.is_log for axis in axes}) == 1:
         power = np.abs(u * std)
         main |= power >= _PART * power.max()
     return np.asarray(main)
 
 
 def _rounded(
-    information: np.ndarray, picked: list[int], u: np.ndarray, std: np.ndarray, main: np.ndarray
+    told: _Told, picked: list[int], u: np.ndarray, std: np.ndarray, main: np.ndarray
 ) -> np.ndarray:
     """Step of one prior std, with the powers of those named in halves if it is still flat."""
     step = u * std
     top = float(np.abs(step[main]).max())
     halves = np.where(main, np.round(2 * step / top) / 2 * top, step)
     size = float(np.linalg.norm(halves / std))
-    if (halves[main] != 0).all() and _along(information, picked, halves / std / size) < NOTICED:
+    if (halves[main] != 0).all() and _along(told, picked, halves / std / size) < NOTICED:
         return halves / size
     return step
 
 
-def _along(information: np.ndarray, picked: list[int], u: np.ndarray) -> float:
-    return float(u @ information[np.ix_(picked, picked)] @ u)
+def _along(told: _Told, picked: list[int], u: np.ndarray) -> float:
+    return float(u @ told.of(picked) @ u)
 
 
-def _flattest(information: np.ndarray, picked: list[int]) -> tuple[float, np.ndarray]:
-    values, vectors = np.linalg.eigh(information[np.ix_(picked, picked)])
+def _flattest(told: _Told, picked: list[int]) -> tuple[float, np.ndarray]:
+    values, vectors = np.linalg.eigh(told.of(picked))
     return float(values[0]), vectors[:, 0]
 
 
@@ -240,7 +269,7 @@ def _formula(axes: list[_Axis], power: np.ndarray, step: np.ndarray) -> str:
     if not any(axis.is_log for axis in axes) and len({axis.unit for axis in axes}) == 1:
         return _sum(names, power)
     moves = [
-        f"{axis.label} x {np.exp(s):.3g}" if axis.is_log else f"{axis.label} {s:+.2g} {axis.unit}"
+        f"{axis.label} x {np.exp(s):.4g}" if axis.is_log else f"{axis.label} {s:+.2g} {axis.unit}"
         for axis, s in zip(axes, step, strict=True)
     ]
     return f"nearly unseen if together: {', '.join(moves)}"

@@ -51,7 +51,7 @@ RATIOS = (
     Ratio("motor.viscous_friction", "motor.back_emf", "A*s/rad", "current per wheel speed"),
     Ratio("camera.scale", "robot.wheel_radius", "1/m", "all that motion without slip tells"),
 )
-"""Quotients with a verdict of their own, shown where a number of them is free.
+"""Quotients with a verdict of their own, where both numbers are free.
 
 The resistance enters the voltage equation and nothing else: contact forces decide how the body
 moves, and currents follow from them with the torque constant. So without a voltage not even
@@ -233,45 +233,35 @@ def derived(
     """`RATIOS` with interval and verdict: the log of each is a difference of coordinates.
 
     Its std under the posterior, sqrt(c^T C c) with c = (.., 1, .., -1, ..), is compared with that
-    under the prior. Ratios of which both numbers are fixed are left out; that of scale and radius
-    also where one of them is.
+    under the prior.
     """
-    tree = space.tree(jnp.asarray(z))
-    known = {e.path: e for e in space.all}
-    out = []
-    for wanted in RATIOS:
-        for over in matching(known, wanted.over):
-            pair = known[over], known[wanted.under]
-            free = [e.path in space.place for e in pair]
-            if all(free) or (any(free) and wanted.unit != "1/m"):
-                out.append(_quotient(space, wanted, pair, tree, z, covariance, has_voltage))
-    return tuple(out)
+    return tuple(
+        _quotient(space, wanted, over, z, covariance, has_voltage)
+        for wanted in RATIOS
+        for over in matching(space.place, wanted.over)
+        if wanted.under in space.place
+    )
 
 
 def _quotient(
     space: Space,
     wanted: Ratio,
-    pair: tuple[Entry, Entry],
-    tree: Any,
+    over: str,
     z: np.ndarray,
     covariance: np.ndarray,
     has_voltage: bool,
 ) -> Estimate:
-    c, held = np.zeros(len(z)), 0.0
-    for sign, e in zip((1.0, -1.0), pair, strict=True):
-        if e.path in space.place:
-            c[space.place[e.path]] = sign
-        else:
-            held += sign * float(np.log(float(e.get(tree))))
-    log_value, log_prior = held + c @ z, held + c @ space.prior_mean
+    c = np.zeros(len(z))
+    c[space.place[over]], c[space.place[wanted.under]] = 1.0, -1.0
+    log_value, log_prior = c @ z, c @ space.prior_mean
     std = float(np.sqrt(c @ covariance @ c))
     prior_std = float(np.sqrt(np.sum((c * space.prior_std) ** 2)))
     value, ratio = float(np.exp(log_value)), std / prior_std
-    unknown = pair[0].path == NEEDS_VOLTAGE[0] and not has_voltage
+    unknown = over == NEEDS_VOLTAGE[0] and not has_voltage
     verdict = "not_identified" if unknown else _rule(ratio)
     low, high = (float(np.exp(log_value + k * std)) for k in (-_Z95, _Z95))
     return Estimate(
-        path=f"{pair[0].path}/{pair[1].path}",
+        path=f"{over}/{wanted.under}",
         unit=wanted.unit,
         doc=wanted.doc,
         labels=(),
