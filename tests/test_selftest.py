@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -13,13 +14,18 @@ import pytest
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from slipid.app import commands, files
+from slipid.app import files, selftest
 from slipid.app.cli import app
+from slipid.app.config import parsed
 from slipid.app.demo import packaged_config
+from slipid.app.job import Job
 from slipid.app.selftest_summary import judged, summary
 from slipid.app.synthetic_windows import measure
 from slipid.identify import likelihood as lk
+from slipid.identify.fit import Optimum
+from slipid.identify.problem import Problem
 from tests.made_windows import made, robot
+from tests.test_fit import begin
 
 BENT = eqx.tree_at(
     lambda r: (r.camera.tilt, r.camera.radial, r.camera.tangential, r.motor.current_offset),
@@ -135,6 +141,8 @@ def config(folder, more=""):
     text = packaged_config("robotino.toml")
     head, _, _ = text.partition("# slipid selftest:")
     head = head.replace("tolerance = 0.02", "tolerance = 0.1")
+    moved = head.index("[[logs]]", head.index("[[logs]]") + 1)
+    head = head[:moved] + head[head.index("# Patterns of parameter names") :]
     path = folder / "my.toml"
     path.write_text(head + PLAN + more, encoding="utf-8")
     return path
@@ -146,18 +154,37 @@ def invoke(*words):
 
 @pytest.fixture(scope="module")
 def tested(tmp_path_factory):
+    """A self-test that is interrupted after its first replicate, and called again."""
     folder = tmp_path_factory.mktemp("selftest")
-    out = folder / "out"
-    return out, invoke(config(folder), "--out", out, "--replicates", 2), config(folder)
+    path = config(folder, 'wanted = ["motor.resistance", "motor.back_emf"]')
+    out, keep, make, made_once = folder / "out", files.save_replicates, Job.problem, []
+
+    def problem(job):
+        """What the first call compiles serves the second."""
+        if not made_once:
+            made_once.append(make(job))
+        return made_once[0]
+
+    def interrupted(*args):
+        keep(*args)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Job, "problem", problem)
+        with patch.context() as stop:
+            stop.setattr(files, "save_replicates", interrupted)
+            stopped = invoke(path, "--out", out, "--replicates", 2)
+        left = {p.name: p.read_text() for p in out.iterdir()}
+        return out, stopped, left, invoke(path, "--out", out, "--replicates", 2)
 
 
 @pytest.mark.slow
 def test_a_plan_with_voltage_recovers_the_motor(tested):
-    out, result, _ = tested
+    out, _, _, result = tested
     assert result.exit_code == 0, result.output
     found = json.loads((out / "selftest.json").read_text(), parse_constant=pytest.fail)
     assert found["schema"] == "slipid.selftest/1"
-    assert (found["source"], found["replicates"], found["runs"]) == ("plan", 2, 28)
+    assert (found["source"], found["replicates"], found["runs"]) == ("plan", 2, 14)
     for path in ("motor.resistance", "motor.back_emf", "motor.resistance/motor.back_emf"):
         e = found["parameters"][path]
         assert e["recovered"] == "yes"
@@ -168,37 +195,50 @@ def test_a_plan_with_voltage_recovers_the_motor(tested):
     assert shares["intervals"] == 6
     assert found["predictions"]["soft"]["identified"] < found["predictions"]["soft"]["encoder"] / 5
     assert found["curves"]["soft"]["largest_gap"] < 0.1
-    assert "motor.resistance" in found["wanted"]
-    assert "1 of 2, about" in result.stderr
+    assert found["wanted"] == ["motor.resistance", "motor.back_emf"]
+    assert "  2 of 2" in result.stderr
     assert "in 90 %" in result.stdout
 
 
 @pytest.mark.slow
-def test_replicates_that_are_done_are_not_repeated(tested, tmp_path, monkeypatch):
-    out, _, path = tested
-    keep = files.save_replicates
-
-    def interrupted(where, key, rows):
-        keep(where, key, rows)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(commands.files, "save_replicates", interrupted)
-    stopped = invoke(path, "--out", tmp_path, "--replicates", 2)
+def test_replicates_that_are_done_are_not_repeated(tested):
+    out, stopped, left, again = tested
     assert stopped.exit_code == 130
     assert "selftest, called again, go on" in stopped.stderr
-    assert not (tmp_path / "selftest.json").exists()
-    before = json.loads((tmp_path / "replicates.json").read_text())["rows"]
-    assert len(before) == 1
-    monkeypatch.undo()
-    result = invoke(path, "--out", tmp_path, "--replicates", 2)
-    assert "1 of 2 replicates are in" in result.stderr
-    again, whole = (
-        json.loads((f / "replicates.json").read_text())["rows"] for f in (tmp_path, out)
-    )
-    assert again[0] == before[0]
-    for mine, other in zip(again, whole, strict=True):
-        for name, e in mine["parameters"].items():
-            assert e["value"] == pytest.approx(other["parameters"][name]["value"], rel=1e-9), name
+    assert list(left) == ["replicates.json"]
+    before = json.loads(left["replicates.json"])["rows"]
+    assert "1 of 2 replicates are in" in again.stderr
+    after = json.loads((out / "replicates.json").read_text())["rows"]
+    assert (len(before), len(after)) == (1, 2)
+    assert after[0] == before[0]
+
+
+@pytest.mark.slow
+def test_a_replicate_depends_on_seed_and_number_alone(monkeypatch):
+    """Whether it is made in one go with others or after an interrupt."""
+    truth = robot()
+    w = made(truth, runs=6, std={})
+    problem = Problem(w, truth, [])
+    settings = parsed(Path("my.toml"), packaged_config("robotino.toml"))
+    seen = []
+    monkeypatch.setattr(selftest, "measure", lambda t, w, rng, std: seen.append(rng.normal()) or w)
+    end = Optimum(begin(problem), np.eye(problem.space.size), True, "", ())
+    monkeypatch.setattr(selftest, "optimise", lambda *_, **__: end)
+    monkeypatch.setattr(selftest, "compared", lambda problem, choices, z, *_: {"z": z.tolist()})
+
+    def silent(_):
+        """Nobody watches."""
+
+    def run(count, done, seed=3):
+        return selftest.replicates(settings, (), problem, count, seed, done, silent, silent)
+
+    whole = run(4, [])
+    assert run(4, run(2, [])) == whole
+    assert seen[:4] == [*seen[4:6], *seen[6:8]]
+    assert run(2, whole) == whole[:2]
+    assert run(1, [], seed=4) != whole[:1]
+    spread = np.array([row["z"] for row in whole]) - problem.space.prior_mean
+    assert 0.2 < (spread / np.minimum(problem.space.prior_std, 0.5)).std() < 0.8
 
 
 @pytest.mark.parametrize(

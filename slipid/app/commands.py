@@ -263,7 +263,7 @@ def selftest(
         job = read_job(config, data, report.count, report.line)
     problem = job.problem()
     wanted = wanted_of(config, problem)
-    test.plausible(job, problem)
+    test.plausible(config, job.choices, problem)
     writable(out)
     report.stage("expected information")
     before = expected(job, problem)
@@ -277,7 +277,7 @@ def selftest(
         files.save_replicates(kept, key, rows)
         report.part(len(rows), count)
 
-    rows = test.replicates(job, problem, count, seed, done, tell, report.round)
+    rows = test.replicates(config, job.choices, problem, count, seed, done, tell, report.round)
     found = {
         "schema": SCHEMA,
         "source": "plan" if data is None else "logs",

@@ -80,7 +80,9 @@ def planned(config: Config, line: Tell) -> Job:
     return job_of(config, collect(logs), [], line)
 
 
-def plausible(job: Job, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+def plausible(
+    config: Config, choices: Sequence[Choice], problem: Problem
+) -> tuple[np.ndarray, np.ndarray]:
     """Centre and scatter of the true numbers, in the search space.
 
     The centre is the prior's, the scatter half its std; what `[selftest.truth]` gives is exactly
@@ -89,17 +91,17 @@ def plausible(job: Job, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         DataError: a truth for a number that does not exist, is fixed, or cannot have it.
     """
-    space, given = problem.space, job.config.content.selftest.truth
+    space, given = problem.space, config.content.selftest.truth
     center = space.prior_mean.copy()
     scatter = SCATTER * np.minimum(space.prior_std, MOST)
     for pattern, value in given.items():
-        where = f"{job.config.path}: selftest.truth.'{pattern}'"
+        where = f"{config.path}: selftest.truth.'{pattern}'"
         mine = [e for e in space.free if fnmatchcase(e.path, pattern)]
         if not mine:
             free = ", ".join(e.path for e in space.free)
             raise DataError(f"{where}: no such free parameter; expected one of {free}")
         try:
-            start = Space(problem.robot, [*job.choices, Choice(pattern, start=value)]).start
+            start = Space(problem.robot, [*choices, Choice(pattern, start=value)]).start
         except ValueError as error:
             raise DataError(f"{where}: {error}") from error
         for e in mine:
@@ -115,7 +117,8 @@ def key_of(job: Job, seed: int) -> str:
 
 
 def replicates(
-    job: Job,
+    config: Config,
+    choices: Sequence[Choice],
     problem: Problem,
     count: int,
     seed: int,
@@ -126,7 +129,8 @@ def replicates(
     """Replicates until there are so many; those done are not repeated.
 
     Args:
-        job: the experiment.
+        config: of the experiment.
+        choices: as the problem was given.
         problem: of its windows; what is compiled for it serves every replicate.
         count: how many there shall be.
         seed: with the replicate's number the seed of truth and noise.
@@ -134,9 +138,9 @@ def replicates(
         tell: called with all of them after each.
         each: called after every round of a fit.
     """
-    center, scatter = plausible(job, problem)
+    center, scatter = plausible(config, choices, problem)
     std = dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True))
-    fit = job.config.content.fit
+    fit = config.content.fit
     options = Options(most_rounds=fit.rounds, tolerance=fit.tolerance)
     rows = list(done[:count])
     for k in range(len(rows), count):
@@ -145,7 +149,7 @@ def replicates(
         made = measure(problem.space.tree(jnp.asarray(z)), problem.windows, rng, std)
         this = problem.of(made)
         end = optimise(this, options=options, tell=each)
-        row = compared(this, job.choices, z, end.state.z, end.covariance)
+        row = compared(this, choices, z, end.state.z, end.covariance)
         rows.append(row | {"converged": bool(end.converged), "reason": end.reason})
         tell(rows)
     return rows

@@ -11,26 +11,26 @@ whether or not the numbers that currents tell are known.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from slipid.identify.identifiability import NEEDS_VOLTAGE, WEAK
+from slipid.identify.formulas import NOTHING, SMALL, Axis, axes_of, formula
+from slipid.identify.identifiability import WEAK
 from slipid.identify.problem import is_electric
-from slipid.identify.remedies import listed, remedy
-from slipid.parameter import Declaration, Entry, Space
+from slipid.identify.remedies import remedy
+from slipid.parameter import Space
 
 NOTICED = 1 / WEAK**2
 """Information along a direction, that of the prior being 1, from which it is not flat."""
+TORQUE_SCALE = ("motor.back_emf", "motor.*_friction", "surface.*.friction")
+"""Numbers that may all be larger by one factor without any change of the currents."""
 _UNSEEN = 1.02
 """Below it the data say nothing at all: these directions come first, and with exact powers."""
 _PART = 0.3
 """Least part of the largest prior-scaled step, or of the largest power, that is named."""
-_LARGE = 10.0
-"""Powers that differ more are no formula for people."""
-_SAME = 0.05
-"""Powers that differ less are one."""
 
 
 @dataclass(frozen=True)
@@ -56,16 +56,6 @@ class Flat:
     def text(self) -> str:
         """One sentence."""
         return f"{self.formula}: {self.remedy}"
-
-
-@dataclass(frozen=True)
-class _Axis:
-    """One coordinate of the search space, as people call it."""
-
-    path: str
-    label: str
-    unit: str
-    is_log: bool
 
 
 class _Told:
@@ -111,16 +101,16 @@ def flat_directions(
             definite.
         current_informs_motion: as the `Problem` was told.
     """
-    axes = [axis for e in space.free for axis in _axes(e)]
+    axes = [axis for e in space.free for axis in axes_of(e)]
     kept = [k for k, axis in enumerate(axes) if not axis.path.startswith("camera.session_yaw")]
-    electric = [k for k in kept if axes[k].path == "robot.mass" or is_electric(axes[k].path)]
+    scale = [k for k in kept if any(fnmatchcase(axes[k].path, p) for p in TORQUE_SCALE)]
     std = space.prior_std
     outer = std[:, None] * std
     told = _Told(np.linalg.inv(covariance) * outer)
     if has_current and not current_informs_motion:
         told = _Told(told.given, np.array([is_electric(axis.path) for axis in axes]))
     out = []
-    for picked, u in _sparse(told, kept, electric):
+    for picked, u in _sparse(told, kept, scale, 1 / std):
         mine = [axes[k] for k in picked]
         main = _named(told, mine, picked, u, std[picked])
         mine = [axis for axis, is_main in zip(mine, main, strict=True) if is_main]
@@ -133,7 +123,7 @@ def flat_directions(
                 paths=paths,
                 powers=tuple(round(float(p), 2) for p in power),
                 others=rest,
-                formula=_formula(mine, power, step) + (_SMALL if rest and len(mine) > 1 else ""),
+                formula=formula(mine, power, step) + (SMALL if rest and len(mine) > 1 else ""),
                 remedy=remedy(paths, has_current, has_voltage, validity or {}),
             )
         )
@@ -146,26 +136,37 @@ def sentences(found: Iterable[Flat]) -> tuple[str, ...]:
     together = []
     for f in found:
         if len(f.paths) == 1:
-            alone.setdefault(f.remedy, []).append(f.formula.removeprefix(_NOTHING))
+            alone.setdefault(f.remedy, []).append(f.formula.removeprefix(NOTHING))
         else:
             together.append(f.text)
-    return (*(f"{_NOTHING}{', '.join(names)}: {cure}" for cure, names in alone.items()), *together)
+    return (*(f"{NOTHING}{', '.join(names)}: {cure}" for cure, names in alone.items()), *together)
 
 
 def _sparse(
-    told: _Told, among: list[int], first: list[int]
+    told: _Told, among: list[int], symmetry: list[int], move: Float[np.ndarray, " free"]
 ) -> list[tuple[list[int], Float[np.ndarray, " some"]]]:
     """Basis of the flat directions, each a unit vector that needs every coordinate it names.
 
     When one is found, its largest coordinate (the first, if several are as large) counts as known
-    from there on, as in Gaussian elimination; so the next one is another. Directions within
-    `first` come before those of all of `among`.
+    from there on, as in Gaussian elimination; so the next one is another. The symmetry, if it is
+    one in these data, comes first and whole: search would find parts of it.
+
+    Args:
+        told: information.
+        among: coordinates to look at.
+        symmetry: those that may move together.
+        move: prior-scaled step of each coordinate in it.
     """
     alone = [k for k in among if told.of([k])[0, 0] < NOTICED]
     found = [([k], np.ones(1)) for k in alone]
     known = set(alone)
-    for group, limit in ((first, _UNSEEN), (among, _UNSEEN), (among, NOTICED)):
-        while left := [k for k in group if k not in known]:
+    whole = [k for k in symmetry if k not in known]
+    along = move[whole] / np.linalg.norm(move[whole])
+    if len(whole) > 1 and _along(told, whole, along) < NOTICED:
+        found.append((whole, along))
+        known.add(whole[0])
+    for limit in (_UNSEEN, NOTICED):
+        while left := [k for k in among if k not in known]:
             value, u = _flattest(told, left)
             if value >= limit:
                 break
@@ -192,7 +193,7 @@ def _without_one(
 
 
 def _named(
-    told: _Told, axes: list[_Axis], picked: list[int], u: np.ndarray, std: np.ndarray
+    told: _Told, axes: list[Axis], picked: list[int], u: np.ndarray, std: np.ndarray
 ) -> np.ndarray:
     """Which numbers of a direction are worth naming.
 
@@ -226,97 +227,3 @@ def _along(told: _Told, picked: list[int], u: np.ndarray) -> float:
 def _flattest(told: _Told, picked: list[int]) -> tuple[float, np.ndarray]:
     values, vectors = np.linalg.eigh(told.of(picked))
     return float(values[0]), vectors[:, 0]
-
-
-# words -------------------------------------------------------------------------------------------
-
-_NOTHING = "the data say next to nothing of "
-_SMALL = ", while others move a little"
-
-
-def _axes(entry: Entry) -> list[_Axis]:
-    """The coordinates of a free number, of shares the log ratios that their basis is made of."""
-    d = entry.declaration
-    unit = "log-odds" if np.isfinite(d.upper) else d.unit
-    if entry.size == 1:
-        return [_Axis(entry.path, entry.path, unit, _is_log(d))]
-    if d.shares:
-        each = [
-            f"{'wheel' if k == 1 else 'wheels'} {_list(range(1, k + 1))} : wheel {k + 1}"
-            for k in range(1, entry.size)
-        ]
-        return [_Axis(entry.path, f"{entry.path} ({what})", d.unit, True) for what in each]
-    return [
-        _Axis(entry.path, f"{entry.path} [{label}]", unit, _is_log(d)) for label in entry.labels
-    ]
-
-
-def _list(numbers: Iterable[int]) -> str:
-    return ", ".join(map(str, numbers))
-
-
-def _is_log(d: Declaration) -> bool:
-    return bool(np.isfinite(d.lower) and not np.isfinite(d.upper))
-
-
-def _formula(axes: list[_Axis], power: np.ndarray, step: np.ndarray) -> str:
-    """Direction in words: powers relative to the largest, step of one prior std."""
-    names = [axis.label for axis in axes]
-    if len(axes) == 1:
-        return _NOTHING + names[0]
-    if all(axis.is_log for axis in axes) and np.ptp(np.log(np.abs(power))) < np.log(_LARGE):
-        return _product(names, power)
-    if not any(axis.is_log for axis in axes) and len({axis.unit for axis in axes}) == 1:
-        return _sum(names, power)
-    moves = [
-        f"{axis.label} x {np.exp(s):.4g}" if axis.is_log else f"{axis.label} {s:+.2g} {axis.unit}"
-        for axis, s in zip(axes, step, strict=True)
-    ]
-    return f"nearly unseen if together: {', '.join(moves)}"
-
-
-def _product(names: list[str], power: np.ndarray) -> str:
-    if (np.abs(power - 1) < _SAME).all():
-        short = _short(names)
-        last = NEEDS_VOLTAGE[1] if NEEDS_VOLTAGE[1] in short else short[0]
-        return f"{', '.join(short)} only as {', '.join(f'{p}/{last}' for p in short if p != last)}"
-    if len(names) == 2:
-        k = float(power[1] / power[0])  # b / a^k does not change
-        first, other = names if abs(k) >= 1 else names[::-1]
-        k = k if abs(k) >= 1 else 1 / k
-        held = _power(first, abs(k))
-        held = f"{held} * {other}" if k < 0 else f"{other} / {held}"
-        return f"{names[0]} and {names[1]} only as {held}"
-    if (np.abs(np.abs(power) - 1) < _SAME).all():
-        up, down = (
-            listed([n for n, k in zip(names, power, strict=True) if s * k > 0]) for s in (1, -1)
-        )
-        return f"unseen for any factor: {up} times it, {down} divided by it"
-    parts = [_power(p, k) for p, k in zip(names, power, strict=True)]
-    return f"{', '.join(parts)} (each times t to the power shown, any t)"
-
-
-def _power(name: str, k: float) -> str:
-    return name if abs(k - 1) < _SAME else f"{name}^{k:.2g}"
-
-
-def _sum(names: list[str], weight: np.ndarray) -> str:
-    if (np.abs(weight - 1) < _SAME).all():
-        return f"{', '.join(names)} only as their differences"
-    if len(names) == 2:
-        k = float(weight[1] / weight[0])  # b - k a does not change
-        first, other = names if abs(k) >= 1 else names[::-1]
-        k = k if abs(k) >= 1 else 1 / k
-        times = "" if abs(abs(k) - 1) < _SAME else f"{abs(k):.2g} "
-        sign = "+" if k < 0 else "-"
-        return f"{names[0]} and {names[1]} only as {other} {sign} {times}{first}"
-    parts = [f"{n} {k:+.2g} t" for n, k in zip(names, weight, strict=True)]
-    return f"unseen for any t: {', '.join(parts)}"
-
-
-def _short(paths: list[str]) -> list[str]:
-    """The paths, with one pattern in place of the frictions of several floors."""
-    floors = [p for p in paths if p.startswith("surface.") and p.endswith(".friction")]
-    if len(floors) < 2:
-        return list(paths)
-    return [p for p in paths if p not in floors] + ["surface.*.friction"]
