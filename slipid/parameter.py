@@ -144,6 +144,15 @@ class Entry:
         return leaf if self.index is None else leaf[self.index]
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of a vector's entries, none for a scalar."""
+        if self.size == 1:
+            return ()
+        if self.size == 2:
+            return ("x", "y")
+        return tuple(f"wheel {k + 1}" for k in range(self.size))
+
+    @property
     def coordinates(self) -> int:
         """How many search-space coordinates it takes when free."""
         return self.size - 1 if self.declaration.shares else self.size

@@ -5,16 +5,14 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 
 from slipid.app.synthetic import Sensors, blank, grid, make_logs, truth
 from slipid.data.dataset import collect, windows
-from slipid.identify.curves import _SLIP as SLIP
-from slipid.identify.curves import curves, torque_of_slip
+from slipid.identify.curves import curves, slip_on
 from slipid.identify.fit import optimise
+from slipid.identify.identifiability import IDENTIFIED, expected_covariance
 from slipid.identify.problem import Problem
-from slipid.identify.verdict import IDENTIFIED
 from slipid.parameter import Choice, Space
 
 PLAN = grid(headings=8, turns=1)
@@ -63,10 +61,8 @@ def design():
         white.get(name, white["window"]) if name.endswith("window") else sensors.of(name)
         for name in this.noise.names
     ]
-    log_v = jnp.asarray(2 * np.log(std))
-    _, jacobian = this.linear(jnp.asarray(this.space.vector(TRUTH)), this.volt(log_v))
-    info = this.precision(jacobian, log_v, jnp.ones(len(this.windows)))
-    return np.sqrt(np.diag(np.linalg.inv(info))) / this.space.prior_std < IDENTIFIED
+    covariance = expected_covariance(this, this.space.vector(TRUTH), 2 * np.log(std))
+    return np.sqrt(np.diag(covariance)) / this.space.prior_std < IDENTIFIED
 
 
 @dataclass(frozen=True)
@@ -115,11 +111,7 @@ def recover(seed):
 def curve_gap(this, z):
     """Largest difference in slip to the true curve over the torques visited, per floor."""
     found = curves(this.space, z, z[None], this.batch)
-    gaps = {}
-    for k, floor in enumerate(TRUTH.surfaces.labels):
-        curve = found[floor]
-        at = jnp.full(len(TRUTH.surfaces.labels), curve["at"]["wheel_speed"])
-        true = torque_of_slip(TRUTH, at, curve["at"]["load_share"])[k]
-        slip = np.interp(curve["torque_nm"], np.asarray(true), SLIP)
-        gaps[floor] = float(np.abs(slip - curve["slip"]).max())
-    return gaps
+    return {
+        floor: float(np.abs(slip_on(TRUTH, floor, curve) - curve["slip"]).max())
+        for floor, curve in found.items()
+    }

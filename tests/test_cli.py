@@ -65,7 +65,7 @@ def small(tmp_path_factory):
 def test_help_names_every_command():
     result = invoke("--help")
     assert result.exit_code == 0
-    for command in ("new", "check", "identify", "validate", "paper", "demo"):
+    for command in ("new", "check", "selftest", "identify", "validate", "paper", "demo"):
         assert command in result.stdout
 
 
@@ -240,15 +240,35 @@ def test_identify_finds_the_motor(small):
     assert found["motor.resistance"]["value"] == pytest.approx(5.5, rel=0.03)
     assert found["motor.back_emf"]["value"] == pytest.approx(0.0514, rel=0.03)
     assert found["motor.resistance"]["verdict"] == "identified"
+    ratios = json.loads((folder / "out" / "identified.json").read_text())["derived"]
+    assert ratios["motor.resistance/motor.back_emf"]["verdict"] == "identified"
+    assert ratios["motor.resistance/motor.back_emf"]["unit"] == "ohm*rad/(V*s)"
 
 
 @pytest.mark.slow
 def test_json_to_stdout_and_the_same_numbers_again(small, tmp_path):
     folder, _ = small
     config, data = folder / "my.toml", folder / "logs"
-    result = invoke("identify", config, "--data", data, "--out", tmp_path, "--json", "-", "--quiet")
+    words = ("--json", "-", "--quiet", "--profile", "motor.resistance")
+    result = invoke("identify", config, "--data", data, "--out", tmp_path, *words)
     assert result.exit_code == 0
     assert json.loads(result.stdout) == json.loads((folder / "out/identified.json").read_text())
+    kept = json.loads((tmp_path / "profile.json").read_text(), parse_constant=pytest.fail)
+    [(path, profile)] = kept["profiles"].items()
+    assert (kept["schema"], path) == ("slipid.profile/1", "motor.resistance")
+    low, high = profile["interval90"]
+    assert low < profile["estimate"] < high
+    assert (tmp_path / "profile.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.mark.slow
+def test_a_profile_of_what_is_not_fitted_is_2_before_the_fit(small, tmp_path):
+    folder, _ = small
+    words = ("--data", folder / "logs", "--out", tmp_path / "out", "--profile", "robot.mass")
+    result = invoke("identify", folder / "my.toml", *words)
+    assert result.exit_code == 2
+    assert "--profile: robot.mass is fixed; a profile is of one free number" in result.stderr
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
@@ -298,6 +318,7 @@ def test_check_tells_before_the_fit(small, tmp_path):
     assert "current (unsigned)" in found["channels"]
     assert found["parameters"]["motor.resistance"]["verdict"] == "identified"
     assert found["parameters"]["robot.mass"]["verdict"] == "fixed"
+    assert found["derived"]["motor.resistance/motor.back_emf"]["verdict"] == "identified"
     picture = (out / "raw_soft_as_built.png").read_bytes()
     assert picture[:8] == b"\x89PNG\r\n\x1a\n"
 

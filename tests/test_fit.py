@@ -25,8 +25,8 @@ NOISE = {
     "run.along": 0.008,
     "run.across": 0.008,
     "run.yaw": 0.03,
-    "current": 0.05,
-    "voltage": 0.07,
+    "current.window": 0.05,
+    "voltage.window": 0.07,
 }
 NOTHING = Choice("*", free=False)
 PRECISE = Options(most_rounds=60, tolerance=1e-4)

@@ -28,8 +28,8 @@ NOISE = {
     "run.along": 0.01,
     "run.across": 0.006,
     "run.yaw": 0.03,
-    "current": 0.05,
-    "voltage": 0.05,
+    "current.window": 0.05,
+    "voltage.window": 0.05,
 }
 
 

@@ -15,9 +15,10 @@ from slipid.app.synthetic import Sensors, blank, grid, make_logs, truth
 from slipid.data.dataset import collect, windows
 from slipid.data.log import DataError
 from slipid.identify.fit import Optimum
+from slipid.identify.flat import flat_directions
+from slipid.identify.identifiability import estimates, expected_covariance
 from slipid.identify.problem import Problem, State
 from slipid.identify.result import Fit, hash_of, load, summarise
-from slipid.identify.verdict import estimates, flat_directions
 from slipid.parameter import Choice
 
 pytestmark = pytest.mark.slow  # traces whole fits
@@ -38,12 +39,8 @@ def made(voltage: bool):
     data = collect(make_logs(TRUTH, DRIVES, 1, Sensors(has_voltage=voltage)))
     problem = Problem(windows(data, 0.04, lag=0.05), blank(DRIVES), list(CHOICES))
     z = problem.space.vector(TRUTH)
-    log_v = 2 * np.log(problem.noise.typical)
-    _, jacobian = problem.linear(jnp.asarray(z), problem.volt(log_v))
-    keep = jnp.ones(len(problem.windows))
-    info = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep))
-    state = State(z, log_v, 7, -1.5, 0.01, "joint")
-    end = Optimum(state, np.linalg.inv(info), True, "it settled", (3.0, -1.5))
+    state = State(z, 2 * np.log(problem.noise.typical), 7, -1.5, 0.01, "joint")
+    end = Optimum(state, expected_covariance(problem, z), True, "it settled", (3.0, -1.5))
     return problem, data, end
 
 

@@ -3,11 +3,15 @@
 from collections import Counter
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from slipid.app.job import Job
 from slipid.data.log import Log
-from slipid.identify.verdict import Estimate, Flat, estimates, flat_directions
+from slipid.identify import curves as curves_of
+from slipid.identify.flat import flat_directions, sentences
+from slipid.identify.identifiability import Estimate, derived, estimates, expected_covariance
+from slipid.identify.problem import Problem
 
 _CHANNELS = (
     "wheel_speed",
@@ -67,22 +71,31 @@ def _channel(logs: tuple[Log, ...], name: str) -> str:
     return f"{said} (unsigned)" if unsigned else said
 
 
-def expected(job: Job) -> tuple[tuple[Estimate, ...], tuple[Flat, ...]]:
+def expected(job: Job, problem: Problem) -> dict[str, Any]:
     """Verdicts from the information expected at the start values with typical noise.
 
-    The information is that of `slipid.identify.fit.Problem.precision`; what the data really hold
-    depends on where the fit ends.
+    Returns:
+        `parameters` and `derived` by path, `messages`: what stays open and what would close it.
     """
-    import jax.numpy as jnp
+    space, w = problem.space, problem.windows
+    covariance = expected_covariance(problem)
+    robot = space.tree(jnp.asarray(space.start))
+    validity = curves_of.validity(job.dataset, robot, problem.batch)
+    flat = flat_directions(space, covariance, w.has_current, w.has_voltage, validity)
+    found = estimates(space, job.choices, space.start, covariance, w.has_voltage)
+    ratios = derived(space, space.start, covariance, w.has_voltage)
+    return {
+        "parameters": {e.path: _before(e) for e in found},
+        "derived": {e.path: _before(e) for e in ratios},
+        "messages": list(sentences(flat)),
+    }
 
-    problem = job.problem()
-    z = problem.space.start
-    log_v = 2 * np.log(problem.noise.typical)
-    _, jacobian = problem.linear(jnp.asarray(z), problem.volt(log_v))
-    keep = jnp.ones(len(problem.windows))
-    info = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep))
-    covariance = np.linalg.inv(info)
-    windows = problem.windows
-    found = estimates(problem.space, job.choices, z, covariance, windows.has_voltage)
-    flat = flat_directions(problem.space, covariance, windows.has_current, windows.has_voltage)
-    return found, flat
+
+def _before(e: Estimate) -> dict[str, Any]:
+    return {
+        "unit": e.unit,
+        "start": e.value,
+        "expected_std": e.std,
+        "ratio": e.ratio,
+        "verdict": e.verdict,
+    }

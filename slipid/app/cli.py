@@ -42,7 +42,7 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
             code = command(*args, **kwargs)
         except KeyboardInterrupt:
             typer.echo(
-                "interrupted; called again, identify, sample and demo go on from where they were",
+                "interrupted; called again, it goes on from what was kept, if it keeps anything",
                 err=True,
             )
             raise typer.Exit(130) from None
@@ -61,7 +61,15 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
 @app.command()
 @guarded
 def identify(
-    config: ConfigFile, data: DataFolder, out: Out, json: Json = None, quiet: Quiet = False
+    config: ConfigFile,
+    data: DataFolder,
+    out: Out,
+    profile: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PATH", help="Also profile a number's likelihood; may be repeated."),
+    ] = None,
+    json: Json = None,
+    quiet: Quiet = False,
 ) -> int:
     """Fit motors, floors, loads and camera to the logs, end to end.
 
@@ -71,11 +79,11 @@ def identify(
     from slipid.app.progress import Reporter
 
     with Reporter(quiet=quiet) as report:
-        done = commands.identify(config, data, out, report)
+        done = commands.identify(config, data, out, report, profile or ())
     if json is not None:
         _emit(json, done.fit.to_identified())
     if json != "-":
-        tables.identified(done.fit, out, done.written)
+        tables.identified(done.fit, out, done.written, done.profiles)
     return 0 if done.fit.converged else 1
 
 
@@ -129,6 +137,37 @@ def check(
     if json != "-":
         tables.check(found)
     return 0
+
+
+@app.command()
+@guarded
+def selftest(
+    config: ConfigFile,
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", metavar="DIR", help="Logs whose wheel motion is taken, if any."),
+    ] = None,
+    out: Out = Path("selftest_out"),
+    replicates: Annotated[int, typer.Option(min=1, help="Made experiments.")] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Of truths and noise.")] = 0,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Make this very experiment with known truth, fit it, and say what it recovers.
+
+    Without --data it is the plan of [selftest] in the config. Writes selftest.json; goes on from
+    the replicates that are done. Exit code 1 where a number that is wanted is not recovered.
+    """
+    from slipid.app import commands, tables
+    from slipid.app.progress import Reporter
+
+    with Reporter(quiet=quiet) as report:
+        found = commands.selftest(config, data, out, replicates, seed, report)
+    if json is not None:
+        _emit(json, found)
+    if json != "-":
+        tables.selftest(found, out)
+    return 0 if found["recovered"] else 1
 
 
 @app.command()
@@ -187,6 +226,8 @@ def new(
     write_new(out, drive, wheel_radius_m, base_m, gear_ratio, mass_kg, ticks_per_revolution, force)
     typer.echo(f"{out}: name your columns below [layouts.mine.columns], then run")
     typer.echo(f"  slipid check {out} --data DIR")
+    typer.echo("or, before anything is driven, see what a plan of runs would tell:")
+    typer.echo(f"  slipid selftest {out}")
     return 0
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,15 +19,25 @@ CHECKPOINT = "checkpoint.npz"
 
 @dataclass(frozen=True, eq=False)
 class Done:
-    """End of `identify`: the fit, the runs it saw, and the files written."""
+    """End of `identify`: the fit, the runs it saw, the files written, the profiles asked for."""
 
     fit: Any
     job: Any
     written: tuple[str, ...]
+    profiles: tuple[Any, ...] = ()
 
 
-def identify(config_path: Path, data: Path, out: Path, report: Reporter) -> Done:
+def identify(
+    config_path: Path, data: Path, out: Path, report: Reporter, profile: Sequence[str] = ()
+) -> Done:
     """Fit the robot of a config to its logs and write everything to `out`.
+
+    Args:
+        config_path: of the job.
+        data: folder its globs start from.
+        out: folder to write to.
+        report: progress.
+        profile: paths of numbers whose profile likelihood is wanted, too.
 
     Raises:
         DataError: config or logs are wrong; nothing was written then.
@@ -42,6 +53,13 @@ def identify(config_path: Path, data: Path, out: Path, report: Reporter) -> Done
     report.line(f"{len(job.dataset)} runs on {', '.join(job.robot.surfaces.labels)}")
     report.stage("cutting windows")
     problem = job.problem()
+    from slipid.identify.profile import profiled
+
+    for path in profile:
+        try:
+            profiled(problem.space, path)
+        except ValueError as error:
+            raise DataError(f"--profile: {error}") from error
     writable(out)
     optimum = _optimise(job, problem, out, report)
     report.stage("intervals and verdicts")
@@ -61,8 +79,30 @@ def identify(config_path: Path, data: Path, out: Path, report: Reporter) -> Done
         written += [path.name for path in identify_plots(fit, job.dataset, out)]
     except DataError as error:  # the numbers are written; a run too short to draw spoils none
         report.line(f"no more pictures: {error}")
+    profiles = _profiles(problem, optimum, profile, out, report)
+    written += ["profile.json", "profile.png"] if profiles else []
     (out / CHECKPOINT).unlink(missing_ok=True)
-    return Done(fit, job, tuple(written))
+    return Done(fit, job, tuple(written), profiles)
+
+
+def _profiles(
+    problem: Any, optimum: Any, paths: Sequence[str], out: Path, report: Reporter
+) -> tuple[Any, ...]:
+    """Profiles of some numbers, written and drawn."""
+    if not paths:
+        return ()
+    from slipid.app import drawing
+    from slipid.app.plots_profile import profile_figure
+    from slipid.identify.profile import profile
+
+    found = []
+    for path in dict.fromkeys(paths):
+        report.stage(f"profile of {path}")
+        found.append(profile(problem, optimum, path, report.point))
+    each = {p.path: p.to_json() for p in found}
+    write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
+    drawing.save(profile_figure(found), out / "profile.png")
+    return tuple(found)
 
 
 def _optimise(job: Any, problem: Any, out: Path, report: Reporter) -> Any:
@@ -249,6 +289,65 @@ def sample(
     return Sampled(job_of.estimates(fit, found), content, about, written)
 
 
+def selftest(
+    config_path: Path, data: Path | None, out: Path, count: int, seed: int, report: Reporter
+) -> dict[str, Any]:
+    """What an experiment can recover, by making it with known truth and fitting that.
+
+    Args:
+        config_path: of the experiment.
+        data: its logs, whose wheel motion is taken; without them a plan is made.
+        out: folder for selftest.json and the replicates, which a later call goes on from.
+        count: replicates.
+        seed: of truths and noise.
+        report: progress.
+
+    Raises:
+        DataError: config or logs are wrong.
+    """
+    runtime.start()
+    from slipid.app import selftest as test
+    from slipid.app.check import expected
+    from slipid.app.job import read_job
+    from slipid.app.selftest_summary import SCHEMA, summary, wanted_of
+
+    config = read_config(config_path)
+    if data is None:
+        job = test.planned(config, report.line)
+    else:
+        report.stage("reading logs")
+        job = read_job(config, data, report.count, report.line)
+    problem = job.problem()
+    wanted = wanted_of(config, problem)
+    test.plausible(config, job.choices, problem)
+    writable(out)
+    report.stage("expected information")
+    before = expected(job, problem)
+    kept, key = out / "replicates.json", test.key_of(job, seed)
+    done = files.load_replicates(kept, key)
+    if done:
+        report.line(f"{min(len(done), count)} of {count} replicates are in {kept} already")
+    report.stage("replicates")
+
+    def tell(rows: list[dict[str, Any]]) -> None:
+        files.save_replicates(kept, key, rows)
+        report.part(len(rows), count)
+
+    rows = test.replicates(config, job.choices, problem, count, seed, done, tell, report.round)
+    found = {
+        "schema": SCHEMA,
+        "source": "plan" if data is None else "logs",
+        "runs": len(job.dataset),
+        "seed": seed,
+        "noise": dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True)),
+        **summary(rows, wanted),
+        "messages": before["messages"],
+        "data": {"hash": job.data_hash},
+    }
+    write_json(out / "selftest.json", found)
+    return found
+
+
 def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> dict[str, Any]:
     """What the logs hold, and what they can be expected to tell, before any fit.
 
@@ -263,20 +362,7 @@ def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> 
     report.stage("reading logs")
     job = read_job(config, data, report.count, report.line)
     report.stage("expected information")
-    estimates, flat = expected(job)
-    found = overview(job) | {
-        "parameters": {
-            e.path: {
-                "unit": e.unit,
-                "start": e.value,
-                "expected_std": e.std,
-                "ratio": e.ratio,
-                "verdict": e.verdict,
-            }
-            for e in estimates
-        },
-        "messages": [f.text for f in flat],
-    }
+    found = overview(job) | expected(job, job.problem())
     if out is not None:
         from slipid.app.raw_plots import raw_plots
 

@@ -137,6 +137,18 @@ class ValidateSection(_Section):
     logs: list[Logs] = Field(default_factory=list)
 
 
+class SelftestSection(_Section):
+    """What `selftest` drives where no logs are given, what it takes for true and asks for."""
+
+    surfaces: list[str] = Field(default=["firm", "soft"], min_length=1)
+    headings: int = Field(12, ge=1, le=360)
+    speeds_m_s: list[Positive] = Field(default=[0.1, 0.2], min_length=1)
+    turns: int = Field(2, ge=0)
+    distance_m: Positive = 0.7
+    truth: dict[str, Numbers] = Field(default_factory=dict)
+    wanted: list[str] | None = None
+
+
 class Content(_Section):
     """The whole file."""
 
@@ -146,6 +158,7 @@ class Content(_Section):
     camera: Camera = Camera()
     parameters: dict[str, Setting] = Field(default_factory=dict)
     fit: FitSection = FitSection()  # type: ignore[call-arg]
+    selftest: SelftestSection = SelftestSection()  # type: ignore[call-arg]
     validate_: ValidateSection = Field(default_factory=ValidateSection, alias="validate")
 
 

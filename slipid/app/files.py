@@ -7,7 +7,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from slipid.data.files import write_arrays
+from slipid.data.files import read_json, write_arrays, write_json
+from slipid.data.log import DataError
 
 
 def versions() -> dict[str, str]:
@@ -52,6 +53,22 @@ def save_checkpoint(path: Path, key: str, state: Any, history: list[float]) -> N
             "history": np.asarray(history, float),
         },
     )
+
+
+def save_replicates(path: Path, key: str, rows: list[dict[str, Any]]) -> None:
+    """Keep the replicates of a self-test that are done, whatever their number shall be."""
+    write_json(path, {"schema": "slipid.replicates/1", "key": key, "rows": rows})
+
+
+def load_replicates(path: Path, key: str) -> list[dict[str, Any]]:
+    """Replicates of this very self-test, none where the file is of another or damaged."""
+    try:
+        kept = read_json(path, "replicates")
+    except DataError:
+        return []
+    if not isinstance(kept, dict) or kept.get("key") != key:
+        return []
+    return list(kept["rows"])
 
 
 def load_checkpoint(path: Path, key: str) -> tuple[Any, list[float]] | None:

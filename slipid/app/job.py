@@ -14,6 +14,7 @@ from slipid.data.reader import find_logs, read_logs
 from slipid.identify.folds import still_viscosities
 from slipid.identify.problem import Problem
 from slipid.identify.result import hash_of
+from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, build
 from slipid.parameter import Choice, Space, entries
 
@@ -69,10 +70,16 @@ def read_job(config: Config, root: Path, tell: Callable[[int, int], None], line:
         DataError: what is wrong with config or logs.
     """
     dataset, skipped = read_dataset(config, config.content.logs, root, tell)
-    try:
-        shape = geometry(config.content.robot)
-    except ValueError as error:
-        raise DataError(f"{config.path}: robot: {error}") from error
+    return job_of(config, dataset, skipped, line)
+
+
+def job_of(config: Config, dataset: Dataset, skipped: Sequence[str], line: Tell) -> Job:
+    """Job of runs that are there already.
+
+    Raises:
+        DataError: config and runs do not belong together.
+    """
+    shape = shape_of(config)
     if shape.wheels != dataset.logs[0].wheels:
         raise DataError(
             f"{config.path}: robot: {shape.wheels} wheels, but {dataset.logs[0].name} has "
@@ -86,11 +93,24 @@ def read_job(config: Config, root: Path, tell: Callable[[int, int], None], line:
         centre=config.content.camera.image_centre_m,
     )
     choices, left_out = _choices(config, robot)
-    skipped += left_out
+    skipped = [*skipped, *left_out]
     choices = still_viscosities(dataset) + choices  # what the user says comes later and wins
     for sentence in skipped:
         line(sentence)
     return Job(config, dataset, robot, tuple(choices), tuple(skipped))
+
+
+def shape_of(config: Config) -> Geometry:
+    """Geometry of the config's robot.
+
+    Raises:
+        DataError: it cannot drive.
+    """
+    try:
+        shape: Geometry = geometry(config.content.robot)
+    except ValueError as error:
+        raise DataError(f"{config.path}: robot: {error}") from error
+    return shape
 
 
 def read_dataset(
@@ -119,7 +139,7 @@ def read_dataset(
     session: dict[str, str] = {}
     done = short = 0
     for section, paths in found:
-        layout = _layout(config, section)
+        layout = layout_of(config, section)
         for path in paths:
             surface = _surface(section, path)
             for log in read_logs(path, layout, root=root, surface=surface, load=section.load):
@@ -139,7 +159,7 @@ def read_dataset(
     return collect(logs, session=lambda log: session[log.name]), skipped
 
 
-def _layout(config: Config, section: Logs) -> Layout:
+def layout_of(config: Config, section: Logs) -> Layout:
     """Layout a log section names: one of the config's own, else a preset."""
     own = config.content.layouts
     if section.format in own:

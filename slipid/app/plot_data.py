@@ -67,7 +67,7 @@ def seen(robot: Robot, data: Dataset, per_piece: int) -> Seen:
     radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
     w = windows(data, radius, lag, per_piece=per_piece, longest=1.5)
     b, dt = lk.batch(w, robot), w.dt[..., None]
-    speed, torque = (np.asarray(x) for x in curves.seen(robot, b))
+    speed, torque = (np.asarray(x) for x in curves.seen(robot, b)[:2])
     amps = np.asarray(robot.motor.current(jnp.asarray(torque), jnp.asarray(speed)))
     if not w.current_is_signed:
         amps = np.sqrt(amps**2 + lk.SMOOTH**2)

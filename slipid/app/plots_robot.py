@@ -6,8 +6,8 @@ import numpy as np
 
 from slipid.app import drawing
 from slipid.app.drawing import Axes, Figure
+from slipid.identify.identifiability import Estimate
 from slipid.identify.result import Fit
-from slipid.identify.verdict import Estimate
 
 
 def load_figure(fit: Fit) -> Figure | None:

@@ -23,6 +23,7 @@ class Reporter:
         self._task: Any = None
         self._moved: list[tuple[float, float]] = []
         self._stage = ""
+        self._part, self._since = "", time.monotonic()
 
     def __enter__(self) -> "Reporter":
         if self.console.is_terminal and not self.quiet:
@@ -51,7 +52,7 @@ class Reporter:
         """A new part of the work begins."""
         if name == self._stage:
             return
-        self._stage, self._moved = name, []
+        self._stage, self._moved, self._part, self._since = name, [], "", time.monotonic()
         if self._bars is None:
             self.line(f"{name} ...")
             return
@@ -63,6 +64,27 @@ class Reporter:
         """So many of so many."""
         if self._bars is not None and self._task is not None:
             self._bars.update(self._task, completed=done, total=total, what=f"{done} of {total}")
+
+    def round(self, state: Any) -> None:
+        """A round of one of many fits is done."""
+        if self._bars is not None and self._task is not None:
+            self._bars.update(self._task, what=f"{self._part}, {state.stage}, round {state.round}")
+
+    def part(self, done: int, total: int) -> None:
+        """So many of so many equal parts are done; the rest takes as long as the last one each."""
+        now = time.monotonic()
+        left = (now - self._since) * (total - done)
+        self._since = now
+        self._part = f"{done} of {total}" + (f", about {left:.0f} s left" if done < total else "")
+        if self._bars is None:
+            self.line(f"  {self._part}")
+        else:
+            self._bars.update(self._task, completed=done, total=total, what=self._part)
+
+    def point(self, done: int, rise: float) -> None:
+        """A point of a profile is fitted."""
+        if self._bars is not None and self._task is not None:
+            self._bars.update(self._task, what=f"{done} points, rise {rise:.2f}")
 
     def state(self, state: Any) -> None:
         """A round of the fit is done."""

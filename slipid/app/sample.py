@@ -15,10 +15,10 @@ from slipid.app.progress import Reporter
 from slipid.data.files import read_json, write_arrays, write_json
 from slipid.data.log import DataError
 from slipid.identify import curves as curves_of
+from slipid.identify.identifiability import NEEDS_VOLTAGE, Estimate, by_ratio, derived
 from slipid.identify.posterior import Posterior
-from slipid.identify.result import Fit
+from slipid.identify.result import Fit, as_identified
 from slipid.identify.sampler import Block, Plan, packed, unpacked
-from slipid.identify.verdict import NEEDS_VOLTAGE, Estimate, by_ratio
 
 FOLDER = "sampling"
 
@@ -146,14 +146,14 @@ def estimates(fit: Fit, found: Posterior) -> dict[str, Estimate]:
         mean = np.asarray(d.to_si(jnp.asarray(z.mean(axis=0)))).tolist()
         std = values.std(axis=0).tolist()
         single = len(pairs) == 1
-        kept = e.path in NEEDS_VOLTAGE and not fit.has["voltage"]
+        kept = old.verdict == "at_bound" or (e.path in NEEDS_VOLTAGE and not fit.has["voltage"])
         out[e.path] = replace(
             old,
             value=mean[0] if single else tuple(mean),
             std=std[0] if single else tuple(std),
             interval90=pairs[0] if single else pairs,
             ratio=ratio,
-            verdict=old.verdict if kept else by_ratio(old.verdict, ratio),
+            verdict=old.verdict if kept else by_ratio(ratio),
             source="posterior",
         )
     return out
@@ -164,14 +164,10 @@ def identified(fit: Fit, found: Posterior, problem: Any) -> dict[str, Any]:
     numbers = estimates(fit, found)
     content = fit.to_identified()
     for path, e in numbers.items():
-        content["parameters"][path] |= {
-            "value": e.value,
-            "std": e.std,
-            "interval90": e.interval90,
-            "verdict": e.verdict,
-            "source": e.source,
-        }
+        content["parameters"][path] = as_identified(e)
     flat = found.z.reshape(-1, fit.space.size)
+    ratios = derived(fit.space, flat.mean(axis=0), np.cov(flat.T), fit.has["voltage"])
+    content["derived"] = {e.path: as_identified(replace(e, source="posterior")) for e in ratios}
     some = flat[:: max(1, len(flat) // 400)]
     content["curves"] = curves_of.curves(fit.space, flat.mean(axis=0), some, problem.batch)
     if not found.converged:

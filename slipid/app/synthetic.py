@@ -200,15 +200,10 @@ def _camera(
 
 @jax.jit
 def _as_logged(robot: Robot, pose: Array, yaw: Array) -> Array:
-    """What the camera logs of true body poses: the inverse of its correction, by iteration."""
+    """What the camera logs of true body poses."""
 
     def one(body: Array, psi: Array) -> Array:
-        marker = compose(body, jnp.stack([*robot.camera.marker_place, psi]))
-        q = marker.at[:2].divide(robot.camera.scale)
-        for _ in range(12):
-            gap = marker - robot.camera.corrected(q)
-            q = q + gap / jnp.stack([robot.camera.scale, robot.camera.scale, jnp.ones(())])
-        return q
+        return robot.camera.logged(compose(body, jnp.stack([*robot.camera.marker_place, psi])))
 
     return jax.vmap(lambda run, psi: jax.vmap(lambda p: one(p, psi))(run))(pose, yaw)
 

@@ -18,6 +18,14 @@ def _console() -> Console:
     return found
 
 
+def _table(columns: Sequence[str], title: str | None = None, right: Sequence[str] = ()) -> Table:
+    """Table without lines; the columns named in `right` are numbers."""
+    table = Table(title=title, title_justify="left", show_edge=False, pad_edge=False, box=None)
+    for name in columns:
+        table.add_column(name, justify="right" if name in right else "left")
+    return table
+
+
 def _rows(e: Any) -> list[tuple[str, Any, Any]]:
     """Name, value and interval of a scalar, or of each entry of a vector."""
     if not e.labels:
@@ -32,9 +40,8 @@ def _rows(e: Any) -> list[tuple[str, Any, Any]]:
 
 def estimates(items: Iterable[Any], title: str) -> Table:
     """Table of estimates; numbers of single sessions and defaults are left to the files."""
-    table = Table(title=title, title_justify="left", show_edge=False, pad_edge=False, box=None)
-    for name in ("parameter", "value", "unit", "90 % interval", "verdict", "from"):
-        table.add_column(name, justify="right" if name == "value" else "left")
+    columns = ("parameter", "value", "unit", "90 % interval", "verdict", "from")
+    table = _table(columns, title, right=("value",))
     for e in items:
         if "session_yaw" in e.path or (e.verdict == "fixed" and e.provenance == "borrowed"):
             continue
@@ -51,10 +58,14 @@ def estimates(items: Iterable[Any], title: str) -> Table:
     return table
 
 
-def identified(fit: Any, out: Path, written: Sequence[str]) -> None:
+def identified(fit: Any, out: Path, written: Sequence[str], profiles: Sequence[Any] = ()) -> None:
     """What `identify` found."""
     console = _console()
     console.print(estimates(fit.parameters.values(), f"{len(fit.runs)} runs, {fit.rounds} rounds"))
+    if fit.derived:
+        console.print(estimates(fit.derived.values(), "\nknown as ratios, or not even so"))
+    for p in profiles:
+        console.print(f"profile: {p.said}", markup=False, soft_wrap=True)
     for sentence in fit.messages:
         console.print(f"note: {sentence}", markup=False, soft_wrap=True)
     state = "converged" if fit.converged else "NOT converged"
@@ -82,9 +93,7 @@ def sampled(done: Any, out: Path) -> None:
 def check(found: dict[str, Any]) -> None:
     """What `check` found."""
     console = _console()
-    table = Table(show_edge=False, pad_edge=False, box=None)
-    for name in ("surface", "load", "session", "runs", "minutes", "headings", "speeds [m/s]"):
-        table.add_column(name)
+    table = _table(("surface", "load", "session", "runs", "minutes", "headings", "speeds [m/s]"))
     for row in found["groups"]:
         speeds = " ".join(f"{v:g}" for v in row["speeds"])
         table.add_row(
@@ -100,16 +109,11 @@ def check(found: dict[str, Any]) -> None:
     console.print("channels: " + ", ".join(found["channels"]), markup=False, soft_wrap=True)
     for note, count in found["notes"].items():
         console.print(f"repaired in {count} runs: {note}", markup=False, soft_wrap=True)
-    before = Table(
-        title="before any fit: what the logs can be expected to tell",
-        title_justify="left",
-        show_edge=False,
-        pad_edge=False,
-        box=None,
+    before = _table(
+        ("parameter", "unit", "std after / before", "verdict"),
+        "before any fit: what the logs can be expected to tell",
     )
-    for name in ("parameter", "unit", "std after / before", "verdict"):
-        before.add_column(name)
-    for path, e in found["parameters"].items():
+    for path, e in (found["parameters"] | found["derived"]).items():
         if e["ratio"] is None or "session_yaw" in path:
             continue
         colour = COLOUR.get(e["verdict"], "dim")
@@ -120,13 +124,57 @@ def check(found: dict[str, Any]) -> None:
         console.print(f"note: {sentence}", markup=False, soft_wrap=True)
 
 
+RECOVERED = {"yes": "green", "roughly": "yellow", "no": "red", "wrong": "magenta"}
+
+
+def selftest(found: dict[str, Any], out: Path) -> None:
+    """What `selftest` found."""
+    console = _console()
+    table = _table(
+        ("parameter", "unit", "error", "of truth", "z rms", "in 90 %", "verdict", "recovered"),
+        f"{found['replicates']} made experiments like this one ({found['runs']} runs), "
+        f"{found['converged']} fits converged",
+    )
+    for path, e in found["parameters"].items():
+        colour = RECOVERED[e["recovered"]]
+        share = None if e["recovered"] == "no" else e["relative_error_rms"]
+        table.add_row(
+            Text(path),
+            e["unit"],
+            f"{e['error_rms']:.2g}",
+            "" if share is None else f"{100 * share:.1f} %",
+            f"{e['z_rms']:.2f}",
+            f"{round(e['coverage90'] * e['intervals'])} of {e['intervals']}",
+            e["verdict"].replace("_", " "),
+            f"[{colour}]{e['recovered']}[/{colour}]" + (" *" if path in found["wanted"] else ""),
+        )
+    console.print(table)
+    console.print("* wanted; wrong: errors larger than the fits say\n", soft_wrap=True)
+    floors = _table(
+        ("surface", "slip curve off by", "at most", "in its band", "prediction off by", "encoders")
+    )
+    for floor, c in found["curves"].items():
+        p = found["predictions"].get(floor, {})
+        floors.add_row(
+            floor,
+            f"{c['median_gap']:.4f}",
+            f"{c['largest_gap']:.4f}",
+            _percent(c["coverage90"]),
+            _percent(p.get("identified")),
+            _percent(p.get("encoder")),
+        )
+    console.print(floors)
+    for sentence in found["messages"]:
+        console.print(f"note: {sentence}", markup=False, soft_wrap=True)
+    if found["failed"]:
+        console.print(f"NOT recovered: {', '.join(found['failed'])}", markup=False, soft_wrap=True)
+    console.print(f"in {out}: selftest.json, replicates.json", markup=False, soft_wrap=True)
+
+
 def validation(found: dict[str, Any]) -> None:
     """Summary of a validation: one row per floor and model."""
-    table = Table(show_edge=False, pad_edge=False, box=None)
-    for name in ("surface", "model", "end-point error", "median", "length", "heading"):
-        table.add_column(name)
-    table.add_column("in 90 %")
-    table.add_column("runs")
+    columns = ("surface", "model", "end-point error", "median", "length", "heading")
+    table = _table((*columns, "in 90 %", "runs"))
     for surface, models in found["summary"].items():
         for model, s in models.items():
             table.add_row(
@@ -149,9 +197,8 @@ def demo(
 ) -> None:
     """Truth against estimate, prediction of unseen runs, and where to look."""
     console = _console()
-    table = Table(show_edge=False, pad_edge=False, box=None)
-    for name in ("parameter", "truth", "identified", "unit", "90 % interval", "truth in it", ""):
-        table.add_column(name, justify="right" if name in ("truth", "identified") else "left")
+    columns = ("parameter", "truth", "identified", "unit", "90 % interval", "truth in it", "")
+    table = _table(columns, right=("truth", "identified"))
     for r in rows:
         colour = COLOUR.get(r.verdict, "dim")
         table.add_row(

@@ -19,17 +19,23 @@ _SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])
 
 
 @jax.jit
-def seen(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
-    """Wheel speeds [rad/s] and wheel torques [N m] of every window (piece, window, wheel)."""
+def seen(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
+    """Wheel speeds [rad/s], torques [N m] and slips of every window (piece, window, wheel).
+
+    The slip is the sliding speed over the wheel's activity, rim and roller speed together, so that
+    it stays finite at a wheel that stands.
+    """
     frame = robot.geometry.frame()
-    speed = (b.turn - (robot.camera.lag - b.lag) * b.faster) / b.dt[..., None]
+    speed = lk.wheel_speed(robot, b)
 
-    def one(w: Array, surface: Array, load: Array) -> Array:
+    def one(w: Array, surface: Array, load: Array) -> tuple[Array, Array]:
         xi = model.twist(robot, frame, w, surface, load)
-        return model.wheel_torque(robot, frame, xi, w, surface, load)
+        rim = frame.radius * w
+        active = jnp.sqrt(rim**2 + (frame.roll @ xi) ** 2 + 1e-12)
+        torque = model.wheel_torque(robot, frame, xi, w, surface, load)
+        return torque, (rim * frame.pull - frame.hold @ xi) / active
 
-    torque = jax.vmap(jax.vmap(one, (0, None, None)))(speed, b.surface, b.load)
-    return speed, torque
+    return speed, *jax.vmap(jax.vmap(one, (0, None, None)))(speed, b.surface, b.load)
 
 
 def torque_of_slip(robot: Robot, wheel_speed: Any, share: float) -> Float[Array, "surface slip"]:
@@ -63,7 +69,7 @@ def curves(
     Taken at the median speed of the wheels that turned and an even load.
     """
     robot = space.tree(jnp.asarray(z))
-    speed, torque = (np.abs(np.asarray(x)) for x in seen(robot, b))
+    speed, torque = (np.abs(np.asarray(x)) for x in seen(robot, b)[:2])
     labels, floor = robot.surfaces.labels, np.asarray(b.surface)
     share = 1.0 / speed.shape[-1]
     median = []
@@ -92,9 +98,19 @@ def curves(
     return out
 
 
+def slip_on(robot: Robot, floor: str, curve: dict[str, Any]) -> Float[np.ndarray, " torque"]:
+    """Slip by a robot's own law at the torques, the speed and the load of a curve of `curves`."""
+    at = jnp.full(len(robot.surfaces.labels), curve["at"]["wheel_speed"])
+    torque = torque_of_slip(robot, at, curve["at"]["load_share"])[robot.surface_index(floor)]
+    return np.interp(curve["torque_nm"], np.asarray(torque), _SLIP)
+
+
 def validity(data: Dataset, robot: Robot, b: lk.Batch) -> dict[str, dict[str, Any]]:
     """What each floor was seen with: outside of it the fit extrapolates."""
-    speed, torque = (np.abs(np.asarray(x)) for x in seen(robot, b))
+    speed, torque, slip = (np.asarray(x) for x in seen(robot, b))
+    back = np.linalg.pinv(np.asarray(robot.geometry.forward()))[2] * robot.geometry.wheel_radius
+    yaw = np.abs(speed @ np.asarray(back))  # by the encoders: what was driven, not how it slipped
+    speed, torque, slip = np.abs(speed), np.abs(torque), np.abs(slip)
     floor = np.asarray(b.surface)
     out: dict[str, dict[str, Any]] = {}
     for k, label in enumerate(robot.surfaces.labels):
@@ -106,6 +122,8 @@ def validity(data: Dataset, robot: Robot, b: lk.Batch) -> dict[str, dict[str, An
             "loads": sorted({data.logs[i].load for i in runs}),
             "wheel_speed": [0.0, float(speed[floor == k].max())],
             "torque_nm": [0.0, float(torque[floor == k].max())],
+            "slip": [0.0, float(slip[floor == k].max())],
+            "yaw_rate": [0.0, float(yaw[floor == k].max())],
             "headings_deg": sorted({round(float(h), 1) for h in heading[np.isfinite(heading)]}),
             "speeds": sorted({round(float(s), 3) for s in body[np.isfinite(body)]}),
         }

@@ -49,6 +49,8 @@ def optimise(
     start: State | None = None,
     options: Options | None = None,
     tell: Callable[[State], None] = lambda state: None,
+    free: np.ndarray | None = None,
+    variances: bool = True,
 ) -> Optimum:
     """Maximum a posteriori from a staged start, or going on from a state.
 
@@ -58,16 +60,19 @@ def optimise(
             differ in this only, so they share one compiled function.
         start: goes on from here instead of the staged start.
         tell: called after every round, for progress and checkpoints.
+        free: 1 for coordinates that may move from the start, 0 for those held there (free,).
+        variances: whether to fit those of the noise, too.
     """
     options = options or Options()
     keep = np.ones(len(problem.windows)) if keep is None else np.asarray(keep, float)
     state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
-    mask = np.ones(problem.space.size)
+    mask = np.ones(problem.space.size) if free is None else np.asarray(free, float)
     history: list[float] = []
     reason = f"{options.most_rounds} rounds without settling"
     while state.round < options.most_rounds:
         early = state.round < 3
-        state = problem.round(state, keep, mask, steps=8 if early else 4, scoring=2 if early else 4)
+        scoring = (2 if early else 4) if variances else 0
+        state = problem.round(state, keep, mask, steps=8 if early else 4, scoring=scoring)
         history.append(state.loss)
         tell(state)
         if state.moved < options.tolerance:

@@ -55,6 +55,11 @@ class State:
     stage: str
 
 
+def is_electric(path: str) -> bool:
+    """Whether a number is read from currents and voltages given the motion."""
+    return path.startswith("motor.") or path.endswith(".friction")
+
+
 class Data(eqx.Module):
     """What differs between sets of windows of the same shapes; an argument of compiled functions.
 
@@ -89,8 +94,7 @@ class Problem:
         current_informs_motion: bool = False,
     ):
         self.space = Space(robot, choices)
-        electric = [n.startswith("motor.") or n.endswith(".friction") for n in self.space.names]
-        self.electric = np.asarray(electric, bool)
+        self.electric = np.asarray([is_electric(n) for n in self.space.names], bool)
         self.joint = current_informs_motion or not windows.has_current
         self.robot = self.space.template
         self._read(windows)

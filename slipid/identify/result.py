@@ -19,8 +19,9 @@ from slipid.data.files import json_text, read_json, write_bytes
 from slipid.data.log import DataError
 from slipid.identify import curves as curves_of
 from slipid.identify.fit import Optimum
+from slipid.identify.flat import Flat, flat_directions, sentences
+from slipid.identify.identifiability import Estimate, derived, estimates
 from slipid.identify.problem import Problem
-from slipid.identify.verdict import Estimate, Flat, estimates, flat_directions
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, build
 from slipid.parameter import Choice, Space, entries
@@ -104,14 +105,19 @@ class Fit:
     @cached_property
     def flat(self) -> tuple[Flat, ...]:
         """Directions the data leave open."""
-        return flat_directions(
-            self.space, self.covariance, self.has["current"], self.has["voltage"]
-        )
+        has = self.has["current"], self.has["voltage"]
+        return flat_directions(self.space, self.covariance, *has, self.validity)
+
+    @cached_property
+    def derived(self) -> dict[str, Estimate]:
+        """Ratios that may be known where the numbers themselves are not."""
+        found = derived(self.space, self.z, self.covariance, self.has["voltage"])
+        return {e.path: e for e in found}
 
     @property
     def messages(self) -> tuple[str, ...]:
         """What a reader of the numbers must know, one sentence each."""
-        said = [f.text for f in self.flat]
+        said = list(sentences(self.flat))
         said += [
             f"{e.path} ended at its bound ({e.value:.3g} {e.unit})"
             for e in self.parameters.values()
@@ -144,20 +150,8 @@ class Fit:
         """Content of identified.json."""
         return {
             "schema": SCHEMA,
-            "parameters": {
-                e.path: {
-                    "value": e.value,
-                    "unit": e.unit,
-                    "shape": [len(e.labels)] if e.labels else [],
-                    "labels": list(e.labels),
-                    "std": e.std,
-                    "interval90": e.interval90,
-                    "source": e.source,
-                    "verdict": e.verdict,
-                    "provenance": e.provenance,
-                }
-                for e in self.parameters.values()
-            },
+            "parameters": {path: as_identified(e) for path, e in self.parameters.items()},
+            "derived": {path: as_identified(e) for path, e in self.derived.items()},
             "surfaces": list(self.robot.surfaces.labels),
             "curves": dict(self.curves),
             "validity": dict(self.validity),
@@ -175,7 +169,8 @@ class Fit:
             "remaining": self.remaining,
             "history": [x if np.isfinite(x) else None for x in self.history],
             "parameters": {p: asdict(e) for p, e in self.parameters.items()},
-            "flat": [asdict(f) for f in self.flat],
+            "derived": {p: asdict(e) for p, e in self.derived.items()},
+            "flat": [asdict(f) | {"text": f.text} for f in self.flat],
             "messages": list(self.messages),
             "variances": {
                 name: {"std": float(np.sqrt(v)), "unit": self.variance_unit[name]}
@@ -206,6 +201,21 @@ class Fit:
         write_bytes(folder / "fit.npz", buffer.getvalue())
         for name, text in zip(("fit.json", "identified.json"), texts, strict=True):
             write_bytes(folder / name, text.encode())
+
+
+def as_identified(e: Estimate) -> dict[str, Any]:
+    """An estimate as identified.json has it."""
+    return {
+        "value": e.value,
+        "unit": e.unit,
+        "shape": [len(e.labels)] if e.labels else [],
+        "labels": list(e.labels),
+        "std": e.std,
+        "interval90": e.interval90,
+        "source": e.source,
+        "verdict": e.verdict,
+        "provenance": e.provenance,
+    }
 
 
 def load(folder: Path) -> Fit:

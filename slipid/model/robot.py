@@ -109,6 +109,17 @@ class Camera(eqx.Module):
         turn = jnp.arctan2(u[0] * turned[1] - u[1] * turned[0], u @ turned)
         return jnp.concatenate([place, (pose[2] + turn)[None]])
 
+    def logged(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
+        """What is logged of a true pose: the inverse of `corrected`, by iteration.
+
+        Every step shrinks the error by the bend of the map, some percent across a picture.
+        """
+        step = jnp.stack([self.scale, self.scale, jnp.ones(())])
+        q = pose.at[:2].divide(self.scale)
+        for _ in range(12):
+            q = q + (pose - self.corrected(q)) / step
+        return q
+
     def log_jacobian(self, pose: Float[Array, "3"]) -> Float[Array, ""]:
         """Log |d corrected / d pose|, which a density of logged poses has beside its residuals.
 

@@ -1,13 +1,21 @@
-"""What may be said of every number: interval, verdict, flat directions."""
+"""What may be said of every number and of ratios of them: interval and verdict.
+
+Before a fit from the information expected at the start values, after it from the Laplace posterior.
+Directions in which nothing is said: `slipid.identify.flat`; a number's likelihood beyond Laplace:
+`slipid.identify.profile`.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fnmatch import filter as matching
 from fnmatch import fnmatchcase
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from slipid.identify.problem import Problem
 from slipid.parameter import Choice, Entry, Space
 
 IDENTIFIED, WEAK = 0.3, 0.8
@@ -18,6 +26,37 @@ below this part of it: a tight prior that the data contradict is something else.
 NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
 """Without a voltage nothing sets the scale of these; a prior elsewhere must not lend them one."""
 _Z95 = 1.6448536269514722
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A quotient of two positive numbers that may be known where neither of them is.
+
+    Attributes:
+        over, under: path or pattern of the numerator, path of the denominator.
+        unit: of the quotient, as pint reads it.
+        doc: one line for people.
+    """
+
+    over: str
+    under: str
+    unit: str
+    doc: str
+
+
+RATIOS = (
+    Ratio("motor.resistance", "motor.back_emf", "ohm*rad/(V*s)", "needs the voltage, as both do"),
+    Ratio("surface.*.friction", "motor.back_emf", "rad/(V*s)", "the torque scale currents fix"),
+    Ratio("motor.coulomb_friction", "motor.back_emf", "A", "current at crawling speed"),
+    Ratio("motor.viscous_friction", "motor.back_emf", "A*s/rad", "current per wheel speed"),
+    Ratio("camera.scale", "robot.wheel_radius", "1/m", "all that motion without slip tells"),
+)
+"""Quotients with a verdict of their own, where both numbers are free.
+
+The resistance enters the voltage equation and nothing else: contact forces decide how the body
+moves, and currents follow from them with the torque constant. So without a voltage not even
+R / C_e is known, other than in models that read slip from R I^2 + C_e I wm.
+"""
 
 
 @dataclass(frozen=True)
@@ -54,21 +93,6 @@ class Estimate:
     source: str = "laplace"
 
 
-@dataclass(frozen=True)
-class Flat:
-    """A direction in which the data do not hold the parameters.
-
-    Attributes:
-        paths: of the parameters that move together.
-        powers: each is multiplied by t to this power, for any t.
-        text: the formula, and which channel would fix it.
-    """
-
-    paths: tuple[str, ...]
-    powers: tuple[float, ...]
-    text: str
-
-
 def estimates(
     space: Space,
     choices: Sequence[Choice],
@@ -77,21 +101,13 @@ def estimates(
     has_voltage: bool,
 ) -> tuple[Estimate, ...]:
     """Every declared number with its interval and verdict, in order of declaration."""
-    tree = space.tree(_jax(z))
+    tree = space.tree(jnp.asarray(z))
     return tuple(
         _free(space, e, tree, z, covariance, has_voltage)
         if e.path in space.place
         else _fixed(e, tree, choices)
         for e in space.all
     )
-
-
-def _labels(entry: Entry) -> tuple[str, ...]:
-    if entry.size == 1:
-        return ()
-    if entry.size == 2:
-        return ("x", "y")
-    return tuple(f"wheel {k + 1}" for k in range(entry.size))
 
 
 def _plain(x: Any) -> Any:
@@ -109,7 +125,7 @@ def _fixed(entry: Entry, tree: Any, choices: Sequence[Choice]) -> Estimate:
         path=entry.path,
         unit=entry.declaration.unit,
         doc=entry.declaration.doc,
-        labels=_labels(entry),
+        labels=entry.labels,
         value=_plain(entry.get(tree)),
         std=None,
         interval90=None,
@@ -138,15 +154,15 @@ def _free(
     if d.shares:
         rng = np.random.default_rng(0)
         spread = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
-        draws = np.stack([np.asarray(d.to_si(s)) for s in _jax(spread)])
+        draws = np.stack([np.asarray(d.to_si(s)) for s in jnp.asarray(spread)])
         low, high = np.quantile(draws, [0.05, 0.95], axis=0)
         std = draws.std(axis=0)
-        center = np.asarray(d.to_si(_jax(prior_mean)))
+        center = np.asarray(d.to_si(jnp.asarray(prior_mean)))
         wide = np.full(entry.size, prior_std.mean() / entry.size)
     else:
-        low, high = (np.asarray(d.to_si(_jax(mean + k * std_z))) for k in (-_Z95, _Z95))
+        low, high = (np.asarray(d.to_si(jnp.asarray(mean + k * std_z))) for k in (-_Z95, _Z95))
         std = np.array([d.slope(float(v)) for v in value]) * std_z
-        center = np.asarray(d.to_si(_jax(prior_mean)))
+        center = np.asarray(d.to_si(jnp.asarray(prior_mean)))
         wide = np.array([d.slope(float(v)) for v in center]) * prior_std
     scaled = block / prior_std[:, None] / prior_std[None, :]
     ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
@@ -156,26 +172,17 @@ def _free(
         path=entry.path,
         unit=d.unit,
         doc=d.doc,
-        labels=_labels(entry),
+        labels=entry.labels,
         value=_plain(value),
         std=_plain(std),
         interval90=_pairs(low, high),
         verdict=verdict,
-        # below 1/sqrt(2) the data hold more information than the prior
-        provenance="measured"
-        if verdict != "not_identified" and ratio < np.sqrt(0.5)
-        else "borrowed",
+        provenance=_source(verdict, ratio),
         ratio=ratio,
         pull=float(pull[np.argmax(np.abs(pull))]),
         prior_mean=_plain(center),
         prior_std=_plain(wide),
     )
-
-
-def _jax(x: np.ndarray) -> Any:
-    import jax.numpy as jnp
-
-    return jnp.asarray(x)
 
 
 def _pairs(low: np.ndarray, high: np.ndarray) -> Any:
@@ -202,89 +209,89 @@ def _verdict(
         below = place * prior_std
         if ((place < -TAIL) & (below < np.log(SMALL))).any():
             return "at_bound"
-    return by_ratio("", ratio)
+    return by_ratio(ratio)
 
 
-def by_ratio(before: str, ratio: float) -> str:
-    """Verdict of std(posterior) / std(prior), where another reason has not decided it before."""
-    if before in ("at_bound", "fixed"):
-        return before
+def by_ratio(ratio: float) -> str:
+    """Verdict of std(posterior) / std(prior)."""
     if ratio < IDENTIFIED:
         return "identified"
     return "weak" if ratio < WEAK else "not_identified"
 
 
-def flat_directions(
+def _source(verdict: str, ratio: float) -> str:
+    """Below 1/sqrt(2) the data hold more information than the prior."""
+    held = verdict != "not_identified" and ratio < np.sqrt(0.5)
+    return "measured" if held else "borrowed"
+
+
+def derived(
     space: Space,
+    z: Float[np.ndarray, " free"],
     covariance: Float[np.ndarray, "free free"],
-    has_current: bool,
     has_voltage: bool,
-) -> tuple[Flat, ...]:
-    """Directions in motor numbers, friction and mass that the data leave as wide as the prior.
+) -> tuple[Estimate, ...]:
+    """`RATIOS` with interval and verdict: the log of each is a difference of coordinates.
 
-    Eigenvectors of the prior-scaled posterior covariance S^-1 C S^-1 of these numbers, given the
-    others, with sqrt(eigenvalue) > 0.8: what more data of the same kind could not narrow. Numbers
-    that no datum touches come first, each by itself: they would mix into the directions of others.
+    Its std under the posterior, sqrt(c^T C c) with c = (.., 1, .., -1, ..), is compared with that
+    under the prior.
     """
-    names = [
-        e.path
-        for e in space.free
-        if e.coordinates == 1
-        and (e.path.startswith("motor.") or e.path.endswith(".friction") or e.path == "robot.mass")
-    ]
-    if not names:
-        return ()
-    index = np.array([space.place[n].start for n in names])
-    std = space.prior_std[index]
-    precision = np.linalg.inv(covariance)[np.ix_(index, index)]
-    scaled = np.linalg.inv(precision * std[:, None] * std[None, :])
-    alone = np.diag(scaled) - np.abs(scaled - np.diag(np.diag(scaled))).max(axis=1, initial=0.0)
-    alone_flat = (np.diag(scaled) > 0.98) & (alone > 0.97)
-    found = [
-        Flat((names[k],), (1.0,), _text((names[k],), (1.0,), has_current, has_voltage))
-        for k in np.flatnonzero(alone_flat)
-    ]
-    rest = np.flatnonzero(~alone_flat)
-    if len(rest) > 1:
-        values, vectors = np.linalg.eigh(scaled[np.ix_(rest, rest)])
-        for value, vector in zip(values, vectors.T, strict=True):
-            if np.sqrt(max(value, 0.0)) <= WEAK:
-                continue
-            moved = vector * std[rest]
-            moved = moved / moved[np.argmax(np.abs(moved))]
-            pick = np.flatnonzero(np.abs(moved) > 0.2)
-            if len(pick) > 1:
-                paths = tuple(names[rest[k]] for k in pick)
-                powers = tuple(round(float(moved[k]), 2) for k in pick)
-                text = _text(paths, powers, has_current, has_voltage)
-                found.append(Flat(paths, powers, text))
-    return tuple(found)
+    return tuple(
+        _quotient(space, wanted, over, z, covariance, has_voltage)
+        for wanted in RATIOS
+        for over in matching(space.place, wanted.over)
+        if wanted.under in space.place
+    )
 
 
-def _text(
-    paths: tuple[str, ...], powers: tuple[float, ...], has_current: bool, has_voltage: bool
-) -> str:
-    electric = any(p.startswith("motor.") for p in paths)
-    if not has_current:
-        remedy = "log the motor currents, and the motor voltage (or duty and bus voltage)"
-    elif electric and not has_voltage:
-        remedy = "log the motor voltage (or duty and bus voltage)"
-    else:
-        remedy = "drive with other loads and speeds, or weigh the robot"
-    if len(paths) == 1:
-        return f"the data say next to nothing of {paths[0]}: {remedy}"
-    if all(abs(k - 1) < 0.05 for k in powers):
-        short = _short(paths)
-        last = NEEDS_VOLTAGE[1] if NEEDS_VOLTAGE[1] in short else short[0]
-        ratios = ", ".join(f"{p}/{last}" for p in short if p != last)
-        return f"{', '.join(short)} only as {ratios}: {remedy}"
-    parts = [p if abs(k - 1) < 0.05 else f"{p}^{k:g}" for p, k in zip(paths, powers, strict=True)]
-    return f"{', '.join(parts)} (each times t to the power shown, any t): {remedy}"
+def _quotient(
+    space: Space,
+    wanted: Ratio,
+    over: str,
+    z: np.ndarray,
+    covariance: np.ndarray,
+    has_voltage: bool,
+) -> Estimate:
+    c = np.zeros(len(z))
+    c[space.place[over]], c[space.place[wanted.under]] = 1.0, -1.0
+    log_value, log_prior = c @ z, c @ space.prior_mean
+    std = float(np.sqrt(c @ covariance @ c))
+    prior_std = float(np.sqrt(np.sum((c * space.prior_std) ** 2)))
+    value, ratio = float(np.exp(log_value)), std / prior_std
+    unknown = over == NEEDS_VOLTAGE[0] and not has_voltage
+    verdict = "not_identified" if unknown else by_ratio(ratio)
+    low, high = (float(np.exp(log_value + k * std)) for k in (-_Z95, _Z95))
+    return Estimate(
+        path=f"{over}/{wanted.under}",
+        unit=wanted.unit,
+        doc=wanted.doc,
+        labels=(),
+        value=value,
+        std=value * std,
+        interval90=(low, high),
+        verdict=verdict,
+        provenance=_source(verdict, ratio),
+        ratio=ratio,
+        pull=float((log_value - log_prior) / prior_std),
+        prior_mean=float(np.exp(log_prior)),
+        prior_std=float(np.exp(log_prior)) * prior_std,
+    )
 
 
-def _short(paths: tuple[str, ...]) -> list[str]:
-    """The paths, with one pattern in place of the frictions of several floors."""
-    floors = [p for p in paths if p.startswith("surface.")]
-    if len(floors) < 2:
-        return list(paths)
-    return [p for p in paths if p not in floors] + ["surface.*.friction"]
+def expected_covariance(
+    problem: Problem,
+    z: Float[np.ndarray, " free"] | None = None,
+    log_variance: Float[np.ndarray, " variance"] | None = None,
+) -> Float[np.ndarray, "free free"]:
+    """Posterior covariance to be expected of these windows: inverse information, prior included.
+
+    Args:
+        problem: windows, robot and priors.
+        z: where; the start by default. What the data really hold depends on where the fit ends.
+        log_variance: of every noise component; the typical ones by default.
+    """
+    z = problem.space.start if z is None else z
+    log_v = 2 * np.log(problem.noise.typical) if log_variance is None else log_variance
+    _, jacobian = problem.linear(jnp.asarray(z), problem.volt(log_v))
+    keep = jnp.ones(len(problem.windows))
+    return np.linalg.inv(np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep)))
