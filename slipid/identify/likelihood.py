@@ -97,6 +97,17 @@ def predict(robot: Robot, b: Batch) -> Predicted:
     return Predicted(*jax.vmap(piece)(wheel_speed(robot, b), b.dt, b.surface, b.load, b.session))
 
 
+def seen(
+    robot: Robot, b: Batch, twist: Float[Array, "piece window 3"]
+) -> Float[Array, "piece window 3"]:
+    """Marker increments of every window for given body twists."""
+
+    def window(xi: Any, dt: Any, session: Any) -> Array:
+        return robot.camera.seen(model.advance(xi, dt), session)
+
+    return jax.vmap(jax.vmap(window, (0, 0, None)))(twist, b.dt, b.session)
+
+
 def predicted_current(
     robot: Robot, b: Batch, felt: Float[Array, "piece window wheel"]
 ) -> Float[Array, "piece window wheel"]:
@@ -161,10 +172,17 @@ def log_jacobian(
     The camera corrects measured places and the voltage residual is scaled by its own spread:
     without this term a smaller scale would fit better only because it shrinks the residuals.
     """
-    out = jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(b.pose[:, 1:]), axis=1)
+    out = camera_log_jacobian(robot, b.pose)
     if b.has_current and b.has_voltage:
         out -= jnp.sum(jnp.log(_spread(robot, b, voltage_std)), axis=(1, 2))
     return out
+
+
+def camera_log_jacobian(
+    robot: Robot, pose: Float[Array, "piece edge 3"]
+) -> Float[Array, " piece"]:
+    """Log |d motion residuals / d logged poses| of every piece; its first pose is given."""
+    return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
 
 
 def _spread(robot: Robot, b: Batch, voltage_std: Any) -> Float[Array, "piece window wheel"]:

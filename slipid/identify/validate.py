@@ -91,7 +91,7 @@ def _score(
     cov: Float[np.ndarray, "run 2 2"] | None,
 ) -> None:
     gap = tracks.gap
-    inside, energy = replay.scores(gap[:, :2], cov)
+    level, energy = replay.scores(gap[:, :2], cov)
     ahead = np.linalg.norm((tracks.predicted[:, -1] - tracks.predicted[:, 0])[:, :2], axis=1)
     for n, k in enumerate(tracks.run):
         log, chord = data.logs[int(k)], float(tracks.chord[n])
@@ -108,7 +108,7 @@ def _score(
             "endpoint_error": float(np.hypot(*gap[n, :2])) / max(chord, 1e-9),
             "length_error": abs(float(ahead[n]) / max(chord, 1e-9) - 1.0),
             "heading_error_deg": abs(float(np.degrees(gap[n, 2]))),
-            "covered90": None if inside is None else bool(inside[n]),
+            "covered90": None if level is None else bool(level[n] <= 0.9),
             "energy_score": float(energy[n]),
         }
 
