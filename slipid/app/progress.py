@@ -64,6 +64,11 @@ class Reporter:
         if self._bars is not None and self._task is not None:
             self._bars.update(self._task, completed=done, total=total, what=f"{done} of {total}")
 
+    def beside(self, text: str) -> None:
+        """What is going on at this moment, on the bar of a terminal only."""
+        if self._bars is not None and self._task is not None:
+            self._bars.update(self._task, what=text)
+
     def state(self, state: Any) -> None:
         """A round of the fit is done."""
         self.stage(state.stage)

@@ -52,6 +52,11 @@ class Predictive(abc.ABC):
     log_variance: Float[np.ndarray, " variance"]
     variance: dict[str, float]
 
+    @property
+    @abc.abstractmethod
+    def numbers(self) -> dict[str, int]:
+        """How many were fitted: of every floor, and `shared` by all, the camera's not counted."""
+
     @abc.abstractmethod
     def gaps(self, problem: Problem) -> tuple[Gaps, Covariances]:
         """Predicted less measured increments of every piece, and their covariance from what was
@@ -102,6 +107,14 @@ class Contact(Predictive):
     variance: dict[str, float]
     name: str = "identified"
 
+    @property
+    def numbers(self) -> dict[str, int]:
+        names, electric = self.problem.space.names, self.problem.electric
+        own = [n for n, e in zip(names, electric, strict=True) if not e and "camera." not in n]
+        starts = {floor: f"surface.{floor}." for floor in self.robot.surfaces.labels}
+        out = {floor: sum(n.startswith(start) for n in own) for floor, start in starts.items()}
+        return out | {"shared": sum(not n.startswith("surface.") for n in own)}
+
     def gaps(self, problem: Problem) -> tuple[Gaps, Covariances]:
         volt = problem.volt(self.log_variance)
         blocks, jacobian = problem.linear(jnp.asarray(self.z), volt)
@@ -138,6 +151,13 @@ class Noisy(Predictive):
     @property
     def name(self) -> str:  # type: ignore[override]
         return self.rung.name
+
+    @property
+    def numbers(self) -> dict[str, int]:
+        sizes = {floor: 0 for floor in self.robot.surfaces.labels}
+        for key, value in self.rung.state.items():
+            sizes[next(f for f in sizes if key == f or key.startswith(f"{f}@"))] += value.size
+        return sizes | {"shared": 0}
 
     def gaps(self, problem: Problem) -> tuple[Gaps, Covariances]:
         gap, slope, camera = _linear(self.rung, self.contact, problem)
@@ -189,7 +209,7 @@ def with_noise(rung: Rung, contact: Contact, keep: Float[np.ndarray, " piece"]) 
     of freedom of the rung's own numbers are taken off.
     """
     problem, robot = contact.problem, contact.robot
-    seen = at_lag(problem.windows, robot).pieces(np.flatnonzero(keep > 0))
+    seen = problem.windows.at_lag(float(robot.camera.lag)).pieces(np.flatnonzero(keep > 0))
     rung = rung.fit(seen, robot)
     held = rung.stiffness(seen, robot)
     gap, slope, camera = _linear(rung, contact, problem)
@@ -216,12 +236,6 @@ def with_noise(rung: Rung, contact: Contact, keep: Float[np.ndarray, " piece"]) 
         own=own,
         follows=follows,
     )
-
-
-def at_lag(w: Windows, robot: Robot) -> Windows:
-    """The windows with wheel rotations at the robot's camera lag."""
-    lag = float(robot.camera.lag)
-    return replace(w, turn=w.turn - (lag - w.lag) * w.faster, lag=lag)
 
 
 def slopes(rung: Rung, of: Any) -> np.ndarray:
@@ -291,7 +305,7 @@ def _linear(
 ) -> tuple[Gaps, np.ndarray, np.ndarray]:
     """Gaps of all pieces of a problem, their slopes by the rung's numbers and by the camera's."""
     robot, b = contact.robot, problem.batch
-    w = at_lag(problem.windows, robot)
+    w = problem.windows.at_lag(float(robot.camera.lag))
 
     def gap(some: Rung) -> np.ndarray:
         twist = jnp.asarray(some.twist(w, robot))
