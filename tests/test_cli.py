@@ -65,7 +65,7 @@ def small(tmp_path_factory):
 def test_help_names_every_command():
     result = invoke("--help")
     assert result.exit_code == 0
-    for command in ("new", "check", "identify", "validate", "paper", "demo"):
+    for command in ("new", "check", "identify", "validate", "compare", "paper", "demo"):
         assert command in result.stdout
 
 

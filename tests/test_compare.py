@@ -1,4 +1,4 @@
-"""Left-out comparison: densities, errors of differences, verdicts, importance sampling, restarts."""
+"""Left-out comparison: densities, errors of differences, verdicts, restarts."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from slipid.identify.loo import exact_loo, psis_loo
 from slipid.identify.predictive import contact_of, log_student, slopes, with_noise
 from slipid.identify.problem import DEGREES, Problem, State
 from slipid.identify.ranking import mean_error, ranking
+from slipid.identify.sessions import Linear, shared
 from slipid.identify.transfer import transfer
 from slipid.parameter import Choice
 from tests.made_windows import SCALE, made
@@ -32,7 +33,16 @@ from tests.made_windows import robot as made_robot
 
 ROBOT = made_robot(sessions=("one",))
 ALL = {rung.name: rung for rung in rungs(has_current=True)}
-STD = {"run.along": 0.02, "run.across": 0.02, "run.yaw": 0.05, "process.along": 0.004}
+STD = {
+    "run.along": 0.02,
+    "run.across": 0.02,
+    "run.yaw": 0.05,
+    "process.along": 0.006,
+    "process.across": 0.004,
+    "process.yaw": 0.02,
+    "camera.place": 0.0005,
+    "camera.heading": 0.003,
+}
 HELD = [Choice("camera.scale", fixed=SCALE)]
 
 
@@ -107,10 +117,12 @@ def test_a_clear_winner_is_named_and_a_difference_within_its_error_is_not():
 
 
 def test_errors_that_neighbouring_headings_share_do_not_make_a_winner():
-    """A difference that is one sector's luck, 12 runs of it, is clear per run and not per sector."""
+    """A difference that is one sector's luck is clear per run and not per sector."""
     base = np.full(36, 30.0)
     luck = np.where(np.arange(36) < 9, 1.0, 0.01)
-    one = ranking(rows({"identified": base, "constant": base - luck}))["floor"]["models"]["constant"]
+    one = ranking(rows({"identified": base, "constant": base - luck}))["floor"]["models"][
+        "constant"
+    ]
     assert abs(one["difference"]) > 2 * one["se"]
     assert one["verdict"] == "tied"
 
@@ -164,8 +176,7 @@ def test_linear_slip_is_told_from_constant_slip():
         assert "worse" not in (verdict["linear"], verdict["affine"])  # affine contains linear
     # the distribution of runs it has not seen is as wide as it has to be
     linear = models["linear"]
-    gap, spread = linear.gaps(problem)
-    scale = np.asarray(problem.covariance("motion", jnp.asarray(linear.log_variance))) + spread
+    gap, scale = linear.scale(problem)
     q = np.einsum("ni,ni->n", gap, np.linalg.solve(scale, gap[..., None])[..., 0])[half == 1]
     assert q.mean() / gap.shape[1] == pytest.approx(1.1, abs=0.25)
     for axis in ("along", "across", "yaw"):
@@ -184,12 +195,11 @@ def test_models_that_say_the_same_cannot_be_told_apart():
 def test_slopes_by_a_rungs_numbers_are_those_of_a_step_in_them(name):
     w = made(ROBOT, runs=24, count=2, seed=5, voltage=False)
     rung = ALL[name].fit(w, ROBOT)
-    slope = slopes(rung, lambda r: r.twist(w, ROBOT))
+    slope = slopes(rung, w, lambda r: r.twist(w, ROBOT))
     rng = np.random.default_rng(0)
     step = {key: rng.normal(size=value.shape) for key, value in rung.state.items()}
     moved = replace(rung, state={key: rung.state[key] + step[key] for key in step})
-    keys = [rung.series(s, load) for s, load in zip(w.surface, w.load, strict=True)]
-    expected = np.stack([slope[n] @ step[key].ravel() for n, key in enumerate(keys)])
+    expected = slope @ np.concatenate([v.ravel() for v in step.values()])
     np.testing.assert_allclose(moved.twist(w, ROBOT) - rung.twist(w, ROBOT), expected, atol=1e-6)
 
 
@@ -197,19 +207,21 @@ def test_slopes_by_a_rungs_numbers_are_those_of_a_step_in_them(name):
 
 
 def test_importance_sampling_is_the_exact_leave_one_out():
-    w = made(ROBOT, runs=48, count=2, seed=6, voltage=False, std=STD)
+    w = made(ROBOT, runs=96, count=2, seed=6, voltage=False, std=STD)
     problem = Problem(w, ROBOT, HELD)
-    optimum = optimise(problem)
+    z = problem.space.vector(ROBOT)
+    near = State(z, 2 * np.log(problem.noise.typical), 0, np.inf, np.inf, "joint")
+    optimum = optimise(problem, start=near)
     contact = contact_of(problem, optimum.state, optimum.covariance)
     found = psis_loo(contact)
     reliable = np.flatnonzero(found.pareto_k < found.good_k)
-    assert len(reliable) > 40
+    assert len(reliable) > 90
     picked = reliable[:: len(reliable) // 6]
     exact = np.array([exact_loo(contact, int(k)) for k in picked])
     inside = contact.log_density(problem)[picked]
-    np.testing.assert_allclose(found.log_density[picked], exact, atol=0.15)
+    np.testing.assert_allclose(found.log_density[picked], exact, atol=0.1)
     # leaving out costs something, and that is what is found
-    assert np.abs(found.log_density[picked] - exact).mean() < 0.4 * np.abs(inside - exact).mean()
+    assert np.abs(found.log_density[picked] - exact).mean() < 0.5 * np.abs(inside - exact).mean()
 
 
 # transfer ---------------------------------------------------------------------------------------
@@ -282,3 +294,53 @@ def test_compare_goes_on_where_it_was_and_ends_the_same(tmp_path, logs):
         for one in kept["questions"]["speeds"]["cost"].values():
             del one["fit_s"], one["predict_s"]
     assert after == before
+
+
+# sessions ---------------------------------------------------------------------------------------
+
+
+def with_sessions(std, seed, runs=240):
+    """A linear model of runs in eight sessions on one floor whose effects have this std."""
+    rng = np.random.default_rng(seed)
+    session = np.arange(runs) % 8
+    effect = np.broadcast_to(np.eye(6, 3), (runs, 6, 3)).copy()
+    effect[:, 3:] = np.eye(3)
+    run, noise = np.array([0.02, 0.02, 0.05]), 0.005
+    slope = rng.normal(size=(runs, 6, 2))
+    each = rng.normal(size=(runs, 3)) * run + (rng.normal(size=(8, 3)) * std)[session]
+    gap = np.einsum("nma,na->nm", effect, each) + noise * rng.normal(size=(runs, 6))
+    scale = np.einsum("nma,a,nla->nml", effect, run**2, effect) + noise**2 * np.eye(6)
+    info = np.einsum("nmp,nml,nlq->pq", slope, np.linalg.inv(scale), slope)
+    model = Linear(
+        gap=gap,
+        slope=slope,
+        covariance=np.linalg.inv(info),
+        wide=100.0 * np.eye(2),
+        scale=scale,
+        effect=effect,
+        run=np.broadcast_to(run**2, (runs, 3)).copy(),
+    )
+    w = made(made_robot(floors=("firm",), sessions=("one",)), runs=runs, count=2, voltage=False)
+    return model, replace(w, session=tuple(f"s{k}" for k in session))
+
+
+def test_what_sessions_share_is_found_and_widens_what_was_fitted():
+    std = np.array([0.03, 0.02, 0.08])
+    found = []
+    for seed in range(6):
+        model, w = with_sessions(std, seed, runs=80)
+        variance, covariance = shared(model, w, np.ones(len(w)))
+        found.append(list(variance.values()))
+        assert np.linalg.eigvalsh(covariance - model.covariance).min() > -1e-12
+    # 8 sessions know their std to a quarter, six times as many to a tenth
+    np.testing.assert_allclose(np.sqrt(np.mean(found, axis=0)), std, rtol=0.3)
+
+
+def test_runs_that_share_nothing_are_left_as_they_are():
+    model, w = with_sessions(0.0, 7)
+    variance, covariance = shared(model, w, np.ones(len(w)))
+    assert list(variance) == [f"session.firm.{axis}" for axis in ("along", "across", "yaw")]
+    assert (np.array(list(variance.values())) < 0.1 * model.run[0]).all()
+    np.testing.assert_allclose(covariance, model.covariance, rtol=0.3)
+    alone = replace(w, session=("one",) * len(w))
+    assert shared(model, alone, np.ones(len(w)))[0] == {}

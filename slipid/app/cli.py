@@ -42,8 +42,8 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
             code = command(*args, **kwargs)
         except KeyboardInterrupt:
             typer.echo(
-                "interrupted; called again, identify and demo go on from the last round, compare from "
-                "the last fold",
+                "interrupted; called again, identify and demo go on from the last round, "
+                "compare from the last fold",
                 err=True,
             )
             raise typer.Exit(130) from None

@@ -1,4 +1,4 @@
-"""The hypothesis ladder of a config: folds kept one by one, then tables, sentences and a picture."""
+"""The hypothesis ladder of a config: folds kept one by one, then verdicts and a picture."""
 
 import hashlib
 import time
@@ -50,7 +50,9 @@ def compare(
         report.line(f"skipped: {name}: no floor has runs in two of them")
         del asked[name]
     if not asked:
-        raise DataError(f"{config.path}: no run can be left out; expected several headings or speeds")
+        raise DataError(
+            f"{config.path}: no run can be left out; expected several headings or speeds"
+        )
     report.stage("cutting windows")
     problem = job.problem()
     writable(out)

@@ -172,7 +172,7 @@ def comparison(found: dict[str, Any]) -> None:
         console.print(
             f"contact equilibrium with one run left out (PSIS-LOO): {loo['elpd']:.2f} nats per "
             f"run, Pareto k up to {loo['pareto_k_max']:.2f} ({loo['unreliable']} above "
-            f"{loo['good_k']:.2f}); off by at most {off:.2f} where checked by a fit without the run",
+            f"{loo['good_k']:.2f}); off by at most {off:.2f} where checked by a fit without it",
             soft_wrap=True,
         )
 

@@ -78,7 +78,7 @@ def judge(
     keep = np.isin(problem.windows.run, fitted).astype(float)
     began = time.perf_counter()
     optimum = optimise(problem, keep=keep, options=options, tell=tell)
-    contact = contact_of(problem, optimum.state, optimum.covariance)
+    contact = contact_of(problem, optimum.state, optimum.covariance, keep)
     models: list[Predictive] = [contact]
     seconds = {contact.name: {"fit": time.perf_counter() - began}}
     for rung in rungs(problem.windows.has_current):
@@ -106,8 +106,6 @@ def judge(
     }
 
 
-def _by_run(
-    model: Predictive, problem: Problem, runs: np.ndarray
-) -> Float[np.ndarray, " run"]:
+def _by_run(model: Predictive, problem: Problem, runs: np.ndarray) -> Float[np.ndarray, " run"]:
     density, run = model.log_density(problem), problem.windows.run
     return np.array([density[run == k].sum() for k in runs])

@@ -32,7 +32,7 @@ def sectors(data: Dataset, width_deg: float = 60.0) -> Fold:
 
 
 def random_headings(data: Dataset, folds: int = 6, step_deg: float = 5.0, seed: int = 0) -> Fold:
-    """Fold of every run by its commanded heading, headings dealt at random, -1 where it has none."""
+    """Fold of every run by its heading, headings dealt at random, -1 where it has none."""
     count = round(360 / step_deg)
     dealt = np.random.default_rng(seed).permutation(count) % folds
     known = np.isfinite(data.heading)

@@ -178,9 +178,7 @@ def log_jacobian(
     return out
 
 
-def camera_log_jacobian(
-    robot: Robot, pose: Float[Array, "piece edge 3"]
-) -> Float[Array, " piece"]:
+def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, " piece"]:
     """Log |d motion residuals / d logged poses| of every piece; its first pose is given."""
     return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
 
@@ -288,13 +286,9 @@ def _motion_components(windows: Windows, robot: Robot) -> Components:
         move = np.einsum("nij,nj->ni", back, windows.pose[:, j + 1, :2] - windows.pose[:, j, :2])
         heading[:, 3 * j, j], heading[:, 3 * j + 1, j] = move[:, 1], -move[:, 0]
         heading[:, 3 * j + 2, j], heading[:, 3 * j + 2, j + 1] = -1.0, 1.0
-    axes = np.zeros((3, n, 3 * k, k))  # direction of along, across, yaw in each window
-    for j in range(k):
-        axes[0, :, 3 * j : 3 * j + 2, j] = u[:, j]
-        axes[1, :, 3 * j, j], axes[1, :, 3 * j + 1, j] = -u[:, j, 1], u[:, j, 0]
-        axes[2, :, 3 * j + 2, j] = 1.0
+    axes = _axes(u)
     grown = axes * np.sqrt(far)[None, :, None, :]
-    effect = (axes * far[None, :, None, :]).sum(-1, keepdims=True)
+    effect = effects(windows, robot).transpose(2, 0, 1)[..., None]
     parts = [place, heading, *grown, *effect]
     base = np.stack([p @ p.transpose(0, 2, 1) for p in parts], axis=1)
     floor = np.array([robot.surface_index(s) for s in windows.surface])
@@ -302,6 +296,23 @@ def _motion_components(windows: Windows, robot: Robot) -> Components:
         [np.zeros((n, 1), int), np.ones((n, 1), int), 2 + 6 * floor[:, None] + np.arange(6)], axis=1
     )
     return Components(base, which)
+
+
+def _axes(u: np.ndarray) -> np.ndarray:
+    """Direction of along, across and yaw in each window (axis, piece, 3 window, window)."""
+    n, k, _ = u.shape
+    axes = np.zeros((3, n, 3 * k, k))
+    for j in range(k):
+        axes[0, :, 3 * j : 3 * j + 2, j] = u[:, j]
+        axes[1, :, 3 * j, j], axes[1, :, 3 * j + 1, j] = -u[:, j, 1], u[:, j, 0]
+        axes[2, :, 3 * j + 2, j] = 1.0
+    return axes
+
+
+def effects(windows: Windows, robot: Robot) -> Float[np.ndarray, "piece m 3"]:
+    """What one unit of an effect along, across and in yaw moves in the residuals of a piece."""
+    far, u = travel(windows, robot)
+    return (_axes(u) * far[None, :, None, :]).sum(-1).transpose(1, 2, 0)
 
 
 def _current_components(windows: Windows, robot: Robot, start: int) -> Components:

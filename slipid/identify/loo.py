@@ -2,8 +2,9 @@
 
 Draws of the Laplace posterior are weighted towards the posterior without a run, both of the model
 made linear at its optimum: where a number is hardly known (a viscosity at its bound) draws of that
-posterior are none of the true one, and their weights have no mean. It asks what a fit says of one run when all its neighbours in heading were
-seen: less than left-out sectors ask. Variances are held where the whole fit left them.
+posterior are none of the true one, and their weights have no mean. It asks what a fit says of one
+run when all its neighbours in heading were seen: less than left-out sectors ask. Variances are held
+where the whole fit left them.
 
 Only the force balance has such draws: least squares, support vectors and ridges, by which the other
 rungs are fitted, are no posterior of this likelihood. Exact cross-validation serves all.
@@ -22,7 +23,7 @@ from jaxtyping import Array, Float
 from slipid.data.log import DataError
 from slipid.identify import likelihood as lk
 from slipid.identify.predictive import Contact, contact_of, log_student
-from slipid.identify.problem import DEGREES, State
+from slipid.identify.problem import State
 from slipid.identify.result import draws
 
 TOGETHER = 50
@@ -50,7 +51,7 @@ def psis_loo(contact: Contact, count: int = 1000, seed: int = 0) -> Loo:
     """Leave-one-run-out density of every run of the problem, in order of their numbers.
 
     Args:
-        contact: fitted to all runs of its problem.
+        contact: fitted to all runs of its problem, without what sessions share.
         count: draws.
 
     Raises:
@@ -60,7 +61,7 @@ def psis_loo(contact: Contact, count: int = 1000, seed: int = 0) -> Loo:
     """
     try:
         from arviz_base import from_dict
-        from arviz_stats import loo
+        from arviz_stats.loo import loo
     except ImportError as error:
         raise DataError(
             "PSIS-LOO needs arviz-stats; install it by: pip install 'slipid[posterior]'"

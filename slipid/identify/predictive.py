@@ -2,17 +2,17 @@
 
 Every model gets the same predictive distribution: a Student t around what it predicts, with scale
 
-    V + J C J^T + A S A^T,    A = G - J C sum_n J_n^T V_n^-1 G_n
+    V + E diag(v) E^T + J C J^T
 
 V of its own camera, process and run variances, found by restricted likelihood from its own
-residuals; J the slope by its own numbers and C their covariance; G the slope by the camera that all
-models share, S the camera's covariance, and A the slope by the camera once the model's numbers have
-followed it. The force balance has its camera in J and C.
+residuals; v what runs of a session share (`slipid.identify.sessions`), E what that moves; J the
+slope by its own numbers and the camera's, C their covariance. All models share the fitted camera;
+a rung's numbers follow it.
 """
 
 import abc
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -25,32 +25,39 @@ from slipid.identify import likelihood as lk
 from slipid.identify import replay
 from slipid.identify.ladder import Rung
 from slipid.identify.problem import DEGREES, Problem, State
+from slipid.identify.sessions import AXES, Linear, shared
 from slipid.model.robot import Robot
 
 Gaps = Float[np.ndarray, "piece m"]
-Covariances = Float[np.ndarray, "piece m m"]
-MOST_SCORING, SETTLED = 40, 0.01
-"""Steps of a rung's log variances, and the largest that counts as rest."""
+Slopes = Float[np.ndarray, "piece m number"]
+MOST_TURNS, SCORING, SETTLED = 15, 4, 0.02
+"""Turns of a rung's covariance and so many steps of its log variances, and what counts as rest."""
 VAGUE = 1e-2
 """Precision of a rung's number before any data: of slips below one, a std of 10 says nothing."""
 STEP = 1e-4
 """Of the difference quotients by a rung's numbers."""
 
 
+@dataclass(frozen=True, eq=False)
 class Predictive(abc.ABC):
     """A fitted model with noise of its own.
 
     Attributes:
-        name: of the model.
         robot: whose camera sees what the model predicts.
         log_variance: of every noise component of the problem.
-        variance: the same by name, not as logarithms.
+        variance: the same by name, not as logarithms, and what sessions share.
+        covariance: of the model's numbers and the camera's.
     """
 
-    name: str
     robot: Robot
     log_variance: Float[np.ndarray, " variance"]
     variance: dict[str, float]
+    covariance: Float[np.ndarray, "number number"]
+
+    @property
+    @abc.abstractmethod
+    def name(self) -> str:
+        """Of the model."""
 
     @property
     @abc.abstractmethod
@@ -58,23 +65,31 @@ class Predictive(abc.ABC):
         """How many were fitted: of every floor, and `shared` by all, the camera's not counted."""
 
     @abc.abstractmethod
-    def gaps(self, problem: Problem) -> tuple[Gaps, Covariances]:
-        """Predicted less measured increments of every piece, and their covariance from what was
-        fitted."""
+    def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
+        """Predicted less measured increments of every piece, and their slope."""
 
     @abc.abstractmethod
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
         """Tracks of whole runs, and the covariance of their ends, scale matrix of a Student t."""
 
+    def scale(self, problem: Problem) -> tuple[Gaps, Float[np.ndarray, "piece m m"]]:
+        """Gaps of every piece, and the scale matrix of their distribution."""
+        gap, slope = self.linear(problem)
+        noise = np.asarray(problem.covariance("motion", jnp.asarray(self.log_variance)))
+        e = lk.effects(problem.windows, problem.robot)
+        v = _by_axis(self.variance, "session", problem.windows)
+        return gap, noise + np.einsum("nma,na,nla->nml", e, v, e) + _around(slope, self.covariance)
+
     def log_density(self, problem: Problem) -> Float[np.ndarray, " piece"]:
         """Log density of every piece's logged poses but the first, in logged units."""
-        gap, spread = self.gaps(problem)
-        scale = np.asarray(problem.covariance("motion", jnp.asarray(self.log_variance))) + spread
-        camera = jax.jit(lk.camera_log_jacobian)(self.robot, problem.batch.pose)
-        return log_student(gap, scale) + np.asarray(camera)
+        return log_student(*self.scale(problem)) + np.asarray(
+            _camera_log_jacobian(self.robot, problem.batch.pose)
+        )
 
 
-def log_student(gap: Gaps, scale: Covariances) -> Float[np.ndarray, " piece"]:
+def log_student(
+    gap: Gaps, scale: Float[np.ndarray, "piece m m"] | Float[np.ndarray, "m m"]
+) -> Float[np.ndarray, " piece"]:
     """Log density of a multivariate Student t around zero with `DEGREES` degrees of freedom.
 
     Source: Kotz and Nadarajah 2004, Multivariate t Distributions, eq. 1.1.
@@ -90,22 +105,24 @@ def log_student(gap: Gaps, scale: Covariances) -> Float[np.ndarray, " piece"]:
     return np.asarray(norm - log_det - tail)
 
 
+_camera_log_jacobian = jax.jit(lk.camera_log_jacobian)
+
+
 @dataclass(frozen=True, eq=False)
 class Contact(Predictive):
     """The force balance where a fit has left it.
 
     Attributes:
         problem: that was fitted.
-        z, covariance: search vector, and its covariance.
+        z: search vector.
     """
 
-    robot: Robot
     problem: Problem
     z: Float[np.ndarray, " free"]
-    covariance: Float[np.ndarray, "free free"]
-    log_variance: Float[np.ndarray, " variance"]
-    variance: dict[str, float]
-    name: str = "identified"
+
+    @property
+    def name(self) -> str:
+        return "identified"
 
     @property
     def numbers(self) -> dict[str, int]:
@@ -115,11 +132,15 @@ class Contact(Predictive):
         out = {floor: sum(n.startswith(start) for n in own) for floor, start in starts.items()}
         return out | {"shared": sum(not n.startswith("surface.") for n in own)}
 
-    def gaps(self, problem: Problem) -> tuple[Gaps, Covariances]:
-        volt = problem.volt(self.log_variance)
-        blocks, jacobian = problem.linear(jnp.asarray(self.z), volt)
-        jac = np.asarray(jacobian["motion"])
-        return np.asarray(blocks["motion"]), _quadratic(jac, self.covariance)
+    @cached_property
+    def camera(self) -> np.ndarray:
+        """Coordinates of the search vector that belong to the camera."""
+        names = self.problem.space.names
+        return np.flatnonzero([name.startswith("camera.") for name in names])
+
+    def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
+        blocks, jac = problem.linear(jnp.asarray(self.z), problem.volt(self.log_variance))
+        return np.asarray(blocks["motion"]), np.asarray(jac["motion"])
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
         step = replay.contact_increments(self.robot, lk.batch(w, self.robot))
@@ -131,75 +152,76 @@ class Contact(Predictive):
 
 @dataclass(frozen=True, eq=False)
 class Noisy(Predictive):
-    """A rung with noise of its own and the camera of the force balance.
+    """A rung with noise of its own; its numbers come first, then the camera's.
 
     Attributes:
         rung: fitted.
         contact: whose camera it shares.
-        own: covariance of the rung's numbers of each key of its state (number, number).
-        follows: how they move with the camera's (number, coordinate).
     """
 
-    robot: Robot
     rung: Rung
     contact: Contact
-    log_variance: Float[np.ndarray, " variance"]
-    variance: dict[str, float]
-    own: dict[str, np.ndarray]
-    follows: dict[str, np.ndarray]
 
     @property
-    def name(self) -> str:  # type: ignore[override]
+    def name(self) -> str:
         return self.rung.name
 
     @property
     def numbers(self) -> dict[str, int]:
-        sizes = {floor: 0 for floor in self.robot.surfaces.labels}
+        sizes = dict.fromkeys(self.robot.surfaces.labels, 0)
         for key, value in self.rung.state.items():
             sizes[next(f for f in sizes if key == f or key.startswith(f"{f}@"))] += value.size
         return sizes | {"shared": 0}
 
-    def gaps(self, problem: Problem) -> tuple[Gaps, Covariances]:
-        gap, slope, camera = _linear(self.rung, self.contact, problem)
-        keys = _keys(self.rung, problem.windows)
-        return gap, self._spread(keys, slope, camera)
+    def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
+        return _linear(self.rung, self.contact, problem)
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
         robot, contact = self.robot, self.contact
 
         def end(rung: Rung) -> np.ndarray:
-            step = rung.increments(w, robot)
-            return replay.follow(robot, w, step).predicted[:, -1, :2]
+            return replay.follow(robot, w, rung.increments(w, robot)).predicted[:, -1, :2]
 
-        twist = self.rung.twist(w, robot)
         tracks = replay.follow(robot, w, self.rung.increments(w, robot))
         camera = replay.twist_end_jacobian(
             contact.problem.space,
             jnp.asarray(contact.z),
-            jnp.asarray(twist),
+            jnp.asarray(self.rung.twist(w, robot)),
             lk.batch(w, robot),
             jnp.asarray(tracks.predicted[:, 0]),
         )
-        at = _camera(contact)
-        own = self._spread(_keys(self.rung, w), slopes(self.rung, end), np.asarray(camera)[..., at])
+        jac = np.concatenate(
+            [slopes(self.rung, w, end), np.asarray(camera)[..., contact.camera]], axis=-1
+        )
+        own = _around(jac, self.covariance)
         return tracks, replay.end_covariance(robot, w, tracks, self.variance, own)
 
-    def _spread(self, keys: list[str], slope: np.ndarray, camera: np.ndarray) -> np.ndarray:
-        at = _camera(self.contact)
-        common = self.contact.covariance[np.ix_(at, at)]
-        return spread_of(keys, slope, camera, common, self.own, self.follows)
 
+def contact_of(
+    problem: Problem,
+    state: State,
+    covariance: Float[np.ndarray, "free free"],
+    keep: Float[np.ndarray, " piece"] | None = None,
+) -> Contact:
+    """The force balance at the end of a fit.
 
-def contact_of(problem: Problem, state: State, covariance: np.ndarray) -> Contact:
-    """The force balance at the end of a fit."""
-    return Contact(
+    Args:
+        keep: of the pieces that were fitted; None leaves out what sessions share.
+    """
+    plain = Contact(
         robot=problem.space.tree(jnp.asarray(state.z)),
-        problem=problem,
-        z=np.asarray(state.z),
-        covariance=np.asarray(covariance),
         log_variance=np.asarray(state.log_variance),
         variance=_by_name(problem, state.log_variance),
+        covariance=np.asarray(covariance),
+        problem=problem,
+        z=np.asarray(state.z),
     )
+    if keep is None:
+        return plain
+    of_floor = np.array([name.startswith("surface.") for name in problem.space.names])
+    wide = np.where(of_floor[:, None] | of_floor, 0.0, plain.covariance)
+    wide[of_floor, of_floor] = problem.space.prior_std[of_floor] ** 2
+    return _with_sessions(plain, problem, wide, keep)
 
 
 def with_noise(rung: Rung, contact: Contact, keep: Float[np.ndarray, " piece"]) -> Noisy:
@@ -209,111 +231,95 @@ def with_noise(rung: Rung, contact: Contact, keep: Float[np.ndarray, " piece"]) 
     of freedom of the rung's own numbers are taken off.
     """
     problem, robot = contact.problem, contact.robot
-    seen = problem.windows.at_lag(float(robot.camera.lag)).pieces(np.flatnonzero(keep > 0))
+    lag = float(robot.camera.lag)
+    seen = problem.windows.at_lag(lag).pieces(np.flatnonzero(keep > 0))
     rung = rung.fit(seen, robot)
-    held = rung.stiffness(seen, robot)
-    gap, slope, camera = _linear(rung, contact, problem)
-    keys = _keys(rung, problem.windows)
-    at = _camera(contact)
-    common = contact.covariance[np.ix_(at, at)]
+    before = _before(rung, seen, robot)
+    gap, slope = _linear(rung, contact, problem)
+    common = contact.covariance[np.ix_(contact.camera, contact.camera)]
     typical = jnp.asarray(2 * np.log(problem.noise.typical))
     log_v, count = jnp.asarray(contact.log_variance), jnp.asarray(keep, float)
-    for _ in range(MOST_SCORING):
-        before = log_v
+    for _ in range(MOST_TURNS):
+        last = log_v
         scale = np.asarray(problem.covariance("motion", log_v))
-        own, follows = _numbers(rung, keys, scale, slope, camera, keep, held)
-        spread = spread_of(keys, slope, camera, common, own, follows)
-        blocks = {"motion": jnp.asarray(gap)}, {"motion": jnp.asarray(spread)}
-        log_v = problem.scored_given(*blocks, log_v, count, typical)
-        if float(jnp.abs(log_v - before).max()) < SETTLED:
+        covariance = _numbers(before, common, scale, slope, keep)
+        spread = jnp.asarray(_around(slope, covariance))
+        blocks = {"motion": jnp.asarray(gap)}, {"motion": spread}
+        for _ in range(SCORING):
+            log_v = problem.scored_given(*blocks, log_v, count, typical)
+        if float(jnp.abs(log_v - last).max()) < SETTLED:
             break
-    return Noisy(
+    plain = Noisy(
         robot=robot,
-        rung=rung,
-        contact=contact,
         log_variance=np.asarray(log_v),
         variance=_by_name(problem, log_v),
-        own=own,
-        follows=follows,
+        covariance=covariance,
+        rung=rung,
+        contact=contact,
     )
+    own = len(before)
+    wide = np.zeros_like(covariance)
+    wide[:own, :own], wide[own:, own:] = np.linalg.inv(before), common
+    return _with_sessions(plain, problem, wide, keep)
 
 
-def slopes(rung: Rung, of: Any) -> np.ndarray:
-    """Slope of a function of a rung by the numbers of each piece's own key (piece, ..., number).
-
-    Keys share no number, so all are moved at once.
-    """
-    width = max((v.size for v in rung.state.values()), default=0)
-
-    def moved(k: int, by: float) -> Rung:
-        state = {}
-        for key, value in rung.state.items():
-            flat = np.array(value, float).ravel()
-            flat[k : k + 1] += by
-            state[key] = flat.reshape(value.shape)
-        return replace(rung, state=state)  # type: ignore[type-var]
-
-    if not width:
-        return np.zeros((*of(rung).shape, 0))
-    quotients = [(of(moved(k, STEP)) - of(moved(k, -STEP))) / (2 * STEP) for k in range(width)]
-    return np.stack(quotients, axis=-1)
+def _with_sessions(plain: Any, problem: Problem, wide: np.ndarray, keep: np.ndarray) -> Any:
+    """The model with what runs of a session share in its variances and in its covariance."""
+    gap, slope = plain.linear(problem)
+    model = Linear(
+        gap=gap,
+        slope=slope,
+        covariance=plain.covariance,
+        wide=wide,
+        scale=np.asarray(problem.covariance("motion", jnp.asarray(plain.log_variance))),
+        effect=lk.effects(problem.windows, problem.robot),
+        run=_by_axis(plain.variance, "run", problem.windows),
+    )
+    variance, covariance = shared(model, problem.windows, np.asarray(keep, float))
+    return replace(plain, variance=plain.variance | variance, covariance=covariance)
 
 
-def spread_of(
-    keys: list[str],
-    slope: Float[np.ndarray, "piece m number"],
-    camera: Float[np.ndarray, "piece m coordinate"],
-    common: Float[np.ndarray, "coordinate coordinate"],
-    own: dict[str, np.ndarray],
-    follows: dict[str, np.ndarray],
-) -> Covariances:
-    """J C J^T + A S A^T of every piece."""
-    out = np.zeros((len(slope), slope.shape[1], slope.shape[1]))
-    for key in dict.fromkeys(keys):
-        mine = np.array([k == key for k in keys])
-        jac = slope[mine][..., : len(own[key])]
-        both = camera[mine] + jac @ follows[key]
-        out[mine] = _quadratic(jac, own[key]) + _quadratic(both, common)
+def _before(rung: Rung, w: Windows, robot: Robot) -> np.ndarray:
+    """Precision of a rung's numbers without the data."""
+    held, at = rung.stiffness(w, robot), _places(rung)
+    out = VAGUE * np.eye(sum(v.size for v in rung.state.values()))
+    for key, precision in held.items():
+        out[at[key], at[key]] += precision
     return out
 
 
 def _numbers(
-    rung: Rung,
-    keys: list[str],
-    scale: Covariances,
-    slope: np.ndarray,
-    camera: np.ndarray,
+    before: np.ndarray,
+    common: np.ndarray,
+    scale: np.ndarray,
+    slope: Slopes,
     keep: np.ndarray,
-    held: dict[str, np.ndarray],
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Covariance of a rung's numbers of each key, and how they follow the camera."""
-    m, own, follows = slope.shape[1], {}, {}
-    inverse = np.linalg.inv(scale) * (keep * (DEGREES + m) / (DEGREES + m + 2))[:, None, None]
-    for key in dict.fromkeys(keys):
-        mine = np.array([k == key for k in keys])
-        size = rung.state[key].size if rung.state else 0
-        jac = slope[mine][..., :size]
-        weighted = np.einsum("nij,njp->nip", inverse[mine], jac)
-        info = np.einsum("nip,niq->pq", weighted, jac) + VAGUE * np.eye(size)
-        own[key] = np.linalg.inv(info + held.get(key, 0.0))
-        follows[key] = -own[key] @ np.einsum("nip,nic->pc", weighted, camera[mine])
-    return own, follows
+) -> np.ndarray:
+    """Covariance of a rung's numbers and the camera's; the former follow the latter."""
+    own, m = len(before), slope.shape[1]
+    factor = keep * (DEGREES + m) / (DEGREES + m + 2)
+    weighted = np.linalg.solve(scale, slope[..., :own]) * factor[:, None, None]
+    rows = len(slope) * m
+    to_own = weighted.reshape(rows, own).T @ slope.reshape(rows, -1)
+    alone = np.linalg.inv(before + to_own[:, :own])
+    follows = -alone @ to_own[:, own:]
+    both = np.concatenate([follows, np.eye(len(common))])
+    out = both @ common @ both.T
+    out[:own, :own] += alone
+    return np.asarray(0.5 * (out + out.T))
 
 
-def _linear(
-    rung: Rung, contact: Contact, problem: Problem
-) -> tuple[Gaps, np.ndarray, np.ndarray]:
-    """Gaps of all pieces of a problem, their slopes by the rung's numbers and by the camera's."""
-    robot, b = contact.robot, problem.batch
+def _linear(rung: Rung, contact: Contact, problem: Problem) -> tuple[Gaps, Slopes]:
+    """Gaps of all pieces of a problem, and their slope by the rung's numbers and the camera's."""
+    robot, b, z = contact.robot, problem.batch, jnp.asarray(contact.z)
     w = problem.windows.at_lag(float(robot.camera.lag))
 
     def gap(some: Rung) -> np.ndarray:
-        twist = jnp.asarray(some.twist(w, robot))
-        return np.asarray(_gap(problem.space, jnp.asarray(contact.z), twist, b))
+        return np.asarray(_gap(problem.space, z, jnp.asarray(some.twist(w, robot)), b))
 
-    twist = jnp.asarray(rung.twist(w, robot))
-    camera = _gap_jacobian(problem.space, jnp.asarray(contact.z), twist, b)
-    return gap(rung), slopes(rung, gap), np.asarray(camera)[..., _camera(contact)]
+    camera = _gap_jacobian(problem.space, z, jnp.asarray(rung.twist(w, robot)), b)
+    by_camera = np.asarray(camera)[..., contact.camera]
+    return gap(rung), np.concatenate([slopes(rung, w, gap), by_camera], axis=-1)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -328,19 +334,55 @@ def _gap_jacobian(space: Any, z: Array, twist: Array, b: lk.Batch) -> Array:
     return jax.jacfwd(lambda x: _gap(space, x, twist, b))(z)
 
 
-def _keys(rung: Rung, w: Windows) -> list[str]:
-    return [rung.series(s, load) for s, load in zip(w.surface, w.load, strict=True)]
+def slopes(rung: Rung, w: Windows, of: Any) -> np.ndarray:
+    """Slope of a function of a rung by its numbers, key after key (piece, ..., number).
+
+    Keys share no piece, so one number of each is moved at once.
+    """
+    at = _places(rung)
+    now = of(rung)
+    out = np.zeros((*now.shape, sum(v.size for v in rung.state.values())))
+    keys = np.array([rung.series(s, load) for s, load in zip(w.surface, w.load, strict=True)])
+    for k in range(max((v.size for v in rung.state.values()), default=0)):
+        quotient = (of(_moved(rung, k, STEP)) - now) / STEP
+        for key, place in at.items():
+            if place.start + k < place.stop:
+                out[keys == key, ..., place.start + k] = quotient[keys == key]
+    return out
 
 
-def _camera(contact: Contact) -> np.ndarray:
-    """Coordinates of the search vector that belong to the camera."""
-    names = contact.problem.space.names
-    return np.flatnonzero([name.startswith("camera.") for name in names])
+def _moved(rung: Rung, k: int, by: float) -> Rung:
+    """The rung with the k-th number of every key moved."""
+    state = {}
+    for key, value in rung.state.items():
+        flat = np.array(value, float).ravel()
+        flat[k : k + 1] += by
+        state[key] = flat.reshape(value.shape)
+    return replace(rung, state=state)  # type: ignore[type-var]
 
 
-def _quadratic(jac: np.ndarray, cov: np.ndarray) -> np.ndarray:
-    return np.asarray((jac @ cov) @ np.swapaxes(jac, -1, -2))
+def _places(rung: Rung) -> dict[str, slice]:
+    """Where the numbers of each key lie in the vector of all."""
+    ends = np.cumsum([0, *(v.size for v in rung.state.values())])
+    return {key: slice(int(ends[i]), int(ends[i + 1])) for i, key in enumerate(rung.state)}
+
+
+def _around(jac: Slopes, cov: np.ndarray) -> np.ndarray:
+    """J C J^T of every piece, without the columns that are zero for it."""
+    used = (jac != 0.0).any(axis=1)
+    patterns, which = np.unique(used, axis=0, return_inverse=True)
+    out = np.zeros((len(jac), jac.shape[1], jac.shape[1]))
+    for k, columns in enumerate(patterns):
+        mine = which.ravel() == k
+        some = jac[mine][..., columns]
+        out[mine] = (some @ cov[np.ix_(columns, columns)]) @ np.swapaxes(some, -1, -2)
+    return out
 
 
 def _by_name(problem: Problem, log_v: Any) -> dict[str, float]:
     return dict(zip(problem.noise.names, np.exp(np.asarray(log_v)).tolist(), strict=True))
+
+
+def _by_axis(variance: dict[str, float], kind: str, w: Windows) -> Float[np.ndarray, "piece 3"]:
+    """Variances of an effect of every piece, zero where there is none."""
+    return np.array([[variance.get(f"{kind}.{f}.{axis}", 0.0) for axis in AXES] for f in w.surface])

@@ -7,8 +7,13 @@ from jaxtyping import Float, Int
 
 from slipid.identify.validate import by_floor
 
-SURE = 2.0
-"""Standard errors from which on a difference counts."""
+SURE, SMALL = 2.0, 4.0
+"""A difference counts from so many standard errors on, and so many nats over all runs together.
+
+Below four nats models predict alike, and the standard error of their difference is not to be relied
+on: one with an idle number more loses a little in every run.
+Source: Sivula, Magnusson, Matamoros and Vehtari 2020, arXiv:2008.10296.
+"""
 CLUSTER_DEG = 30.0
 """Neighbouring headings share their errors (they are correlated by a half at 5 degrees, by nothing
 at 30): runs of one such sector are one observation of the clustered standard error."""
@@ -53,7 +58,7 @@ def ranking(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
     The score is the expected log predictive density of a run's logged poses [nats per run], every
     run predicted by a fit that has not seen it. A model is tied with the best where the difference
-    is less than `SURE` clustered standard errors.
+    is less than `SURE` clustered standard errors or, over all runs, less than `SMALL` nats.
     """
     return {floor: _floor(floor, mine) for floor, mine in by_floor(rows).items()}
 
@@ -72,7 +77,8 @@ def _floor(floor: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
         far, _, far_se = mean_error(column(m, "endpoint_error"), cluster)
         level = column(m, "level")
         verdict = "best" if m == best else "worse"
-        if m != best and not abs(difference) >= SURE * clustered:
+        total = abs(difference) * len(rows)
+        if m != best and not (abs(difference) >= SURE * clustered and total >= SMALL):
             verdict = "tied"
         models[m] = {
             "elpd": float(density[m].mean()),

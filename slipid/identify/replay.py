@@ -131,8 +131,9 @@ def end_covariance(
 ) -> Float[np.ndarray, "piece 2 2"]:
     """Covariance of the gap between predicted and measured end [m^2], scale matrix of a Student t.
 
-    Process noise, the run's own effect, camera noise at both ends and in the start heading, and the
-    parameters' uncertainty, each carried to the end along the predicted path.
+    Process noise, the run's own effect and its session's, camera noise at both ends and in the
+    start heading, and the parameters' uncertainty, each carried to the end along the predicted
+    path.
     """
     far, u = lk.travel(w, robot)
     p = tracks.predicted
@@ -148,7 +149,8 @@ def end_covariance(
     for name, axis in (("along", world(u)), ("across", world(across)), ("yaw", lever)):
         v = np.array([variance[f"process.{f}.{name}"] for f in w.surface])
         cov += np.einsum("n,nk,nki,nkj->nij", v, far, axis, axis)
-        v = np.array([variance[f"run.{f}.{name}"] for f in w.surface])
+        shared = [variance.get(f"session.{f}.{name}", 0.0) for f in w.surface]
+        v = np.array([variance[f"run.{f}.{name}"] for f in w.surface]) + shared
         whole = np.einsum("nk,nki->ni", far, axis)
         cov += v[:, None, None] * whole[:, :, None] * whole[:, None, :]
     all_way = p[:, -1, :2] - p[:, 0, :2]

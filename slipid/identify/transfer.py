@@ -1,7 +1,7 @@
 """Does slip against current carry over to a floor it was not fitted on?
 
-One curve s = b0 + b1 |I| for all wheels, fitted to all floors but one and judged on that one, beside
-a constant fitted to the same floors and a curve fitted to the floor itself.
+One curve s = b0 + b1 |I| for all wheels, fitted to all floors but one and judged on that one,
+beside a constant fitted to the same floors and a curve fitted to the floor itself.
 """
 
 from typing import Any
