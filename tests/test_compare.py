@@ -286,7 +286,6 @@ def test_compare_goes_on_where_it_was_and_ends_the_same(tmp_path, logs):
     assert floor["runs"] == len(PLAN)
     assert floor["models"]["identified"]["endpoint_error"] < 0.05
     assert floor["models"]["encoder"]["verdict"] == "worse"
-    assert all(abs(e["psis"] - e["exact"]) < 0.5 for e in before["loo"]["exact"])
     (out / "folds" / "speeds_1.json").unlink()
     again = CliRunner().invoke(app, [*words, "--json", "-"])
     after = json.loads(again.stdout)

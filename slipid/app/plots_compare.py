@@ -40,7 +40,7 @@ def compare_figure(floors: Mapping[str, Any], which: str) -> Figure:
         2.3 + 2.6 * max(len(floors), 2),
         2.6 + 0.52 * len(models),
         f"Which slip model is right? Runs it has not seen ({which}) decide\n"
-        "star: best; shaded: the data cannot tell it from the best (less than 2 standard errors)",
+        "star: best; shaded: the data cannot tell it from the best",
     )
     axes = made.subplots(2, len(floors), sharey=True, squeeze=False)
     for column, (floor, answer) in enumerate(floors.items()):
@@ -74,8 +74,13 @@ def _density(ax: Axes, models: Mapping[str, Any]) -> None:
         mark, size = ("*", 13.0) if one["verdict"] == "best" else ("o", 5.0)
         ax.plot(one["difference"], k, mark, ms=size, color=_colour(model), mew=0)
     ax.axvline(0.0, color=drawing.INK, lw=0.8)
-    low = min(one["difference"] - 2 * (one["se_clustered"] or 0.0) for one in models.values())
-    ax.set_xlim(1.08 * min(low, -0.5), max(0.5, -0.06 * low))
+    ends = [
+        one["difference"] + sign * 2 * (one["se_clustered"] or 0.0)
+        for one in models.values()
+        for sign in (-1, 1)
+    ]
+    spare = 0.06 * max(max(ends) - min(ends), 1.0)
+    ax.set_xlim(min(ends) - spare, max(ends) + spare)
 
 
 def _error(ax: Axes, models: Mapping[str, Any]) -> None:

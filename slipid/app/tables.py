@@ -132,16 +132,18 @@ def comparison(found: dict[str, Any]) -> None:
     console = _console()
     for question, answer in found["questions"].items():
         floors, cost = answer["floors"], answer["cost"]
-        title = (
-            f"{question} left out: log density less the best's [nats per run] +- clustered "
-            "standard error, mean end-point error, ends in the 90 % region"
+        console.print(
+            f"{question} left out: log density less the best's ± clustered standard error (nats "
+            "per run), mean end-point error (%), ends in the 90 % region (%)",
+            markup=False,
+            soft_wrap=True,
         )
-        table = Table(title=title, title_justify="left", show_edge=False, pad_edge=False, box=None)
-        table.add_column("model")
+        table = Table(show_edge=False, pad_edge=False, box=None)
+        table.add_column("model", no_wrap=True)
         for floor, one in floors.items():
-            table.add_column(Text(f"{floor} ({one['runs']})"), justify="right")
-        table.add_column("numbers", justify="right")
-        table.add_column("s to fit", justify="right")
+            table.add_column(Text(f"{floor} ({one['runs']})"), justify="right", no_wrap=True)
+        table.add_column("numbers", justify="right", no_wrap=True)
+        table.add_column("fit [s]", justify="right", no_wrap=True)
         for model, spent in cost.items():
             cells = [_judged(one["models"][model]) for one in floors.values()]
             table.add_row(model, *cells, _numbers(spent["numbers"]), f"{spent['fit_s']:.1f}")
@@ -149,13 +151,13 @@ def comparison(found: dict[str, Any]) -> None:
         for one in floors.values():
             console.print(one["sentence"], markup=False, soft_wrap=True)
             missed = [
-                f"{model} {_percent(m['coverage90'])}"
+                f"{model} {100 * m['coverage90']:.0f}"
                 for model, m in one["models"].items()
                 if not one["band90"][0] <= m["coverage90"] <= one["band90"][1]
             ]
             if missed:
                 low, high = (f"{100 * x:.0f}" for x in one["band90"])
-                said = f"  90 % regions hold too few or too many ends (not {low} to {high} %): "
+                said = f"  not in {low} to {high} %, where honest 90 % regions hold ends: "
                 console.print(said + ", ".join(missed), markup=False, soft_wrap=True)
         console.print()
     if found["surfaces"]:
@@ -183,9 +185,9 @@ def _judged(m: dict[str, Any]) -> str:
     if m["verdict"] == "best":
         apart = "best"
     else:
-        apart = f"{m['difference']:.1f} +- {'?' if se is None else format(se, '.1f')}"
+        apart = f"{m['difference']:.1f} ± {'?' if se is None else format(se, '.1f')}"
     far, inside = 100 * m["endpoint_error"], 100 * m["coverage90"]
-    return f"[{colour}]{apart}[/{colour}]  {far:.1f} %  {inside:.0f}"
+    return f"[{colour}]{apart}[/{colour}] {far:5.1f} {inside:3.0f}"
 
 
 def _numbers(count: dict[str, int]) -> str:

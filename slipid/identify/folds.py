@@ -16,6 +16,7 @@ from jaxtyping import Int
 from slipid.data.dataset import Dataset
 from slipid.identify.fit import Optimum, Options, optimise
 from slipid.identify.ladder import rungs
+from slipid.identify.predictive import contact_of
 from slipid.identify.problem import Problem
 from slipid.identify.validate import Frozen, validation
 from slipid.parameter import Choice
@@ -103,17 +104,16 @@ def train(
     """Fit of some runs of a problem, every rung of the ladder included, ready to predict others."""
     keep = np.isin(problem.windows.run, runs).astype(float)
     optimum = optimise(problem, keep=keep, options=options)
-    robot = problem.space.tree(jnp.asarray(optimum.state.z))
+    contact = contact_of(problem, optimum.state, optimum.covariance, keep)
+    robot = contact.robot
     w = problem.windows.at_lag(float(robot.camera.lag))
     seen = w.pieces(np.flatnonzero(keep > 0))
     frozen = Frozen(
         robot=robot,
         space=problem.space,
-        z=optimum.state.z,
-        covariance=optimum.covariance,
-        variance=dict(
-            zip(problem.noise.names, np.exp(optimum.state.log_variance).tolist(), strict=True)
-        ),
+        z=contact.z,
+        covariance=contact.covariance,
+        variance=contact.variance,
         rungs=[rung.fit(seen, robot) for rung in rungs(w.has_current)],
     )
     return optimum, frozen
