@@ -11,6 +11,7 @@ import pytest
 from scipy.stats import multivariate_t
 from typer.testing import CliRunner
 
+from slipid.app import comparison
 from slipid.app.cli import app
 from slipid.app.comparison import kept_fold
 from slipid.app.demo import packaged_config
@@ -272,7 +273,8 @@ def test_a_fold_is_kept_whole_and_only_for_the_job_it_is_of(tmp_path):
 
 
 @pytest.mark.slow
-def test_compare_goes_on_where_it_was_and_ends_the_same(tmp_path, logs):
+def test_compare_goes_on_where_it_was_and_ends_the_same(tmp_path, logs, monkeypatch):
+    monkeypatch.setattr(comparison, "EXACT", 1)
     write_logs(logs, truth(PLAN), tmp_path / "logs", tmp_path / "truth")
     (tmp_path / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
     out = tmp_path / "out"
