@@ -65,7 +65,10 @@ def small(tmp_path_factory):
 def test_help_names_every_command():
     result = invoke("--help")
     assert result.exit_code == 0
-    for command in ("new", "check", "selftest", "identify", "validate", "paper", "demo"):
+    for command in (
+        *("new", "check", "selftest", "identify", "sample", "validate"),
+        *("compare", "paper", "demo"),
+    ):
         assert command in result.stdout
 
 

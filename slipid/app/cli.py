@@ -188,6 +188,36 @@ def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet =
 
 @app.command()
 @guarded
+def compare(
+    config: ConfigFile,
+    data: DataFolder,
+    out: Out,
+    folds: Annotated[
+        str, typer.Option("--folds", metavar="NAMES", help="What is left out, by commas.")
+    ] = "sectors,speeds,random",
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Say which slip model is right for each floor, or that the data cannot tell.
+
+    Every model is fitted without some runs and judged on them. Writes comparison.json and a
+    picture; finished folds are kept and not done again.
+    """
+    from slipid.app import tables
+    from slipid.app.comparison import compare as run
+    from slipid.app.progress import Reporter
+
+    with Reporter(quiet=quiet) as report:
+        found = run(config, data, out, folds.replace(" ", "").split(","), report)
+    if json is not None:
+        _emit(json, found)
+    if json != "-":
+        tables.comparison(found)
+    return 0 if all(q["converged"] for q in found["questions"].values()) else 1
+
+
+@app.command()
+@guarded
 def paper(
     data: Annotated[
         Path, typer.Option("--data", metavar="DIR", help="Folder that holds robotino2021.")

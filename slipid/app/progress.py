@@ -86,6 +86,11 @@ class Reporter:
         if self._bars is not None and self._task is not None:
             self._bars.update(self._task, what=f"{done} points, rise {rise:.2f}")
 
+    def beside(self, text: str) -> None:
+        """What is going on at this moment, on the bar of a terminal only."""
+        if self._bars is not None and self._task is not None:
+            self._bars.update(self._task, what=text)
+
     def state(self, state: Any) -> None:
         """A round of the fit is done."""
         self.stage(state.stage)

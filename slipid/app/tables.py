@@ -192,6 +192,76 @@ def validation(found: dict[str, Any]) -> None:
     _console().print(table)
 
 
+def comparison(found: dict[str, Any]) -> None:
+    """Every question: a line per model, a column per floor, then a sentence per floor."""
+    console = _console()
+    for question, answer in found["questions"].items():
+        floors, cost = answer["floors"], answer["cost"]
+        console.print(
+            f"{question} left out: log density less the best's ± clustered standard error (nats "
+            "per run), mean end-point error (%), ends in the 90 % region (%)",
+            markup=False,
+            soft_wrap=True,
+        )
+        table = Table(show_edge=False, pad_edge=False, box=None)
+        table.add_column("model", no_wrap=True)
+        for floor, one in floors.items():
+            table.add_column(Text(f"{floor} ({one['runs']})"), justify="right", no_wrap=True)
+        table.add_column("numbers", justify="right", no_wrap=True)
+        table.add_column("fit [s]", justify="right", no_wrap=True)
+        for model, spent in cost.items():
+            cells = [_judged(one["models"][model]) for one in floors.values()]
+            table.add_row(model, *cells, _numbers(spent["numbers"]), f"{spent['fit_s']:.1f}")
+        console.print(table)
+        for one in floors.values():
+            console.print(one["sentence"], markup=False, soft_wrap=True)
+            missed = [
+                f"{model} {100 * m['coverage90']:.0f}"
+                for model, m in one["models"].items()
+                if not one["band90"][0] <= m["coverage90"] <= one["band90"][1]
+            ]
+            if missed:
+                low, high = (f"{100 * x:.0f}" for x in one["band90"])
+                said = f"  not in {low} to {high} %, where honest 90 % regions hold ends: "
+                console.print(said + ", ".join(missed), markup=False, soft_wrap=True)
+        console.print()
+    if found["surfaces"]:
+        one = found["surfaces"]["all"]
+        console.print(
+            "slip of a floor that was not fitted, root mean square over floors: one curve of "
+            f"current {one['pooled']['floors']:.3f}, a constant {one['constant']['floors']:.3f}, "
+            f"the floor's own curve {one['per_surface']['floors']:.3f}",
+            soft_wrap=True,
+        )
+    loo = found["loo"]
+    if "elpd" in loo:
+        off = max(abs(e["psis"] - e["exact"]) for e in loo["exact"])
+        console.print(
+            f"contact equilibrium with one run left out (PSIS-LOO): {loo['elpd']:.2f} nats per "
+            f"run, Pareto k up to {loo['pareto_k_max']:.2f} ({loo['unreliable']} above "
+            f"{loo['good_k']:.2f}); off by at most {off:.2f} where checked by a fit without it",
+            soft_wrap=True,
+        )
+
+
+def _judged(m: dict[str, Any]) -> str:
+    colour = {"best": "bold green", "tied": "green"}.get(m["verdict"], "default")
+    se = m["se_clustered"]
+    if m["verdict"] == "best":
+        apart = "best"
+    else:
+        apart = f"{m['difference']:.1f} ± {'?' if se is None else format(se, '.1f')}"
+    far, inside = 100 * m["endpoint_error"], 100 * m["coverage90"]
+    return f"[{colour}]{apart}[/{colour}] {far:5.1f} {inside:3.0f}"
+
+
+def _numbers(count: dict[str, int]) -> str:
+    """Fitted numbers of a floor, and of all floors together."""
+    floors = sorted({n for floor, n in count.items() if floor != "shared"})
+    own = f"{floors[0]}" if len(floors) == 1 else f"{floors[0]}-{floors[-1]}"
+    return f"{own} + {count['shared']}" if count["shared"] else own
+
+
 def demo(
     out: Path, done: Any, found: dict[str, Any], rows: Sequence[Any], real: Path | None
 ) -> None:

@@ -183,6 +183,10 @@ class Windows:
                 kept[field.name] = tuple(value[i] for i in index)
         return replace(self, **kept)
 
+    def at_lag(self, lag: float) -> "Windows":
+        """The same windows at another lag of the camera, to first order [s]."""
+        return replace(self, turn=self.turn - (lag - self.lag) * self.faster, lag=lag)
+
     def of_runs(self, run: Int[np.ndarray, " piece"]) -> "Windows":
         """The same pieces, said to be of other runs (of the dataset a subset was taken from)."""
         return replace(self, run=run)

@@ -16,6 +16,7 @@ from jaxtyping import Int
 from slipid.data.dataset import Dataset
 from slipid.identify.fit import Optimum, Options, optimise
 from slipid.identify.ladder import rungs
+from slipid.identify.predictive import contact_of
 from slipid.identify.problem import Problem
 from slipid.identify.validate import Frozen, validation
 from slipid.parameter import Choice
@@ -24,16 +25,33 @@ Fold = Int[np.ndarray, " run"]
 
 
 def sectors(data: Dataset, width_deg: float = 60.0) -> Fold:
-    """Fold of every run by the sector its commanded heading lies in."""
-    turn = np.degrees(data.heading) % 360.0
-    return (np.floor((turn + 1e-6) / width_deg) % round(360 / width_deg)).astype(int)
+    """Fold of every run by the sector its commanded heading lies in, -1 where it has none."""
+    known = np.isfinite(data.heading)
+    turn = np.degrees(np.where(known, data.heading, 0.0)) % 360.0
+    sector = (np.floor((turn + 1e-6) / width_deg) % round(360 / width_deg)).astype(int)
+    return np.where(known, sector, -1)
 
 
 def random_headings(data: Dataset, folds: int = 6, step_deg: float = 5.0, seed: int = 0) -> Fold:
-    """Fold of every run by its commanded heading, headings dealt at random."""
+    """Fold of every run by its heading, headings dealt at random, -1 where it has none."""
     count = round(360 / step_deg)
     dealt = np.random.default_rng(seed).permutation(count) % folds
-    return np.asarray(dealt[np.round(np.degrees(data.heading) / step_deg).astype(int) % count])
+    known = np.isfinite(data.heading)
+    way = np.degrees(np.where(known, data.heading, 0.0))
+    return np.where(known, dealt[np.round(way / step_deg).astype(int) % count], -1)
+
+
+def speeds(data: Dataset) -> Fold:
+    """Fold of every run by its commanded speed, -1 where its floor and load saw one speed only."""
+    speed = np.round(data.speed, 3)
+    group = np.array([f"{log.surface}@{log.load}" for log in data.logs])
+    out = np.full(len(data), -1)
+    every = np.unique(speed[np.isfinite(speed)])
+    for name in np.unique(group):
+        mine = (group == name) & np.isfinite(speed)
+        if len(np.unique(speed[mine])) > 1:
+            out[mine] = np.searchsorted(every, speed[mine])
+    return out
 
 
 def still_viscosities(
@@ -86,18 +104,16 @@ def train(
     """Fit of some runs of a problem, every rung of the ladder included, ready to predict others."""
     keep = np.isin(problem.windows.run, runs).astype(float)
     optimum = optimise(problem, keep=keep, options=options)
-    robot = problem.space.tree(jnp.asarray(optimum.state.z))
-    w = problem.windows
-    mine = np.flatnonzero(keep > 0)
-    seen = w.pieces(mine)
+    contact = contact_of(problem, optimum.state, optimum.covariance, keep)
+    robot = contact.robot
+    w = problem.windows.at_lag(float(robot.camera.lag))
+    seen = w.pieces(np.flatnonzero(keep > 0))
     frozen = Frozen(
         robot=robot,
         space=problem.space,
-        z=optimum.state.z,
-        covariance=optimum.covariance,
-        variance=dict(
-            zip(problem.noise.names, np.exp(optimum.state.log_variance).tolist(), strict=True)
-        ),
+        z=contact.z,
+        covariance=contact.covariance,
+        variance=contact.variance,
         rungs=[rung.fit(seen, robot) for rung in rungs(w.has_current)],
     )
     return optimum, frozen

@@ -6,7 +6,7 @@ so nothing is divided by a wheel speed.
 """
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -24,6 +24,8 @@ from slipid.model.motor import signed
 from slipid.model.robot import Robot, advance
 
 Increments = Float[np.ndarray, "piece window 3"]
+HELD = 1e12
+"""Precision of a coefficient that rests on its bound."""
 
 
 class Rung(abc.ABC):
@@ -38,8 +40,25 @@ class Rung(abc.ABC):
         """The rung fitted to these windows, floor by floor."""
 
     @abc.abstractmethod
+    def twist(self, w: Windows, robot: Robot) -> np.ndarray:
+        """Body twist of every window (piece, window, 3) [m/s, m/s, rad/s]."""
+
     def increments(self, w: Windows, robot: Robot) -> Increments:
         """Marker increments of every window [m, m, rad]."""
+        return as_increments(self.twist(w, robot), w, robot)
+
+    def series(self, surface: str, load: str) -> str:
+        """Key in `state` of the numbers that speak of a floor and load set-up.
+
+        Raises:
+            ValueError: no such floor was fitted.
+        """
+        _need(self.state, surface)
+        return surface
+
+    def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
+        """What holds the fitted numbers besides the data: precision of each key's flat numbers."""
+        return {}
 
 
 @jax.jit
@@ -96,9 +115,12 @@ class Encoder(Rung):
     def fit(self, w: Windows, robot: Robot) -> "Encoder":
         return self
 
-    def increments(self, w: Windows, robot: Robot) -> Increments:
+    def twist(self, w: Windows, robot: Robot) -> np.ndarray:
         j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
-        return as_increments((w.turn / w.dt[..., None]) @ j.T, w, robot)
+        return np.asarray((w.turn / w.dt[..., None]) @ j.T)
+
+    def series(self, surface: str, load: str) -> str:
+        return surface
 
 
 Features = Callable[[np.ndarray], np.ndarray]
@@ -155,10 +177,17 @@ class Curve(Rung):
                 beta[name] = lsq_linear(a, b, (lower, np.inf), method="bvls").x
         return replace(self, state=beta)
 
-    def increments(self, w: Windows, robot: Robot) -> Increments:
+    def twist(self, w: Windows, robot: Robot) -> np.ndarray:
         free, lost = self._design(w, robot)
         beta = np.stack([_need(self.state, s) for s in w.surface])
-        return as_increments(free - np.einsum("npak,nk->npa", lost, beta), w, robot)
+        return np.asarray(free - np.einsum("npak,nk->npa", lost, beta))
+
+    def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
+        """A coefficient that rests on its bound does not move with the data."""
+        if self.positive is None:
+            return {}
+        edge = np.arange(len(next(iter(self.state.values())))) >= self.positive
+        return {key: np.diag((edge & (b <= 0)) * HELD) for key, b in self.state.items()}
 
 
 def insensitive(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -224,12 +253,12 @@ class Saturating(Rung):
             shape[name] = min(tries, key=lambda r: r.cost).x
         return replace(self, state=shape)
 
-    def increments(self, w: Windows, robot: Robot) -> Increments:
+    def twist(self, w: Windows, robot: Robot) -> np.ndarray:
         j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
         speed = w.turn / w.dt[..., None]
         shape = np.stack([_need(self.state, s) for s in w.surface])[:, None, None, :]
         slip = self.slip(regressor(w, robot, speed, True), shape)
-        return as_increments((speed * (1 - slip)) @ j.T, w, robot)
+        return np.asarray((speed * (1 - slip)) @ j.T)
 
 
 @dataclass(frozen=True)
@@ -249,37 +278,49 @@ class HeadingLookup(Rung):
     weights: Sequence[float] = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 
     def fit(self, w: Windows, robot: Robot) -> "HeadingLookup":
+        out = {}
+        for key, phi, gap, run in self._each(w, robot):
+            out[key] = _ridge(phi, gap, _best_weight(phi, gap, run, self.weights))
+        return replace(self, state=out)
+
+    def _each(self, w: Windows, robot: Robot) -> Iterator[tuple[str, Any, Any, Any]]:
+        """Key, features, what they have to explain, and runs of every floor and load set-up."""
         angle, plain = _encoders(w, robot)
         true = body_twist(w, robot) * w.dt[..., None]
         c, s = np.cos(angle), np.sin(angle)
         along = c * true[..., 0] + s * true[..., 1]
         across = -s * true[..., 0] + c * true[..., 1]
         gap = np.stack([along, across, true[..., 2]], -1) - plain
-        phi, out = _fourier(angle, plain[..., 0]), {}
+        phi = _fourier(angle, plain[..., 0])
         series = np.asarray([f"{a}@{b}" for a, b in zip(w.surface, w.load, strict=True)])
-        for name in dict.fromkeys(series.tolist()):
-            mine = series == name
-            data = phi[mine], gap[mine]
-            loss = [_left_out(*data, w.run[mine], weight) for weight in self.weights]
-            out[name] = _ridge(*data, self.weights[int(np.argmin(loss))])
-        return replace(self, state=out)
+        for key in dict.fromkeys(series.tolist()):
+            mine = series == key
+            yield key, phi[mine], gap[mine], w.run[mine]
 
-    def increments(self, w: Windows, robot: Robot) -> Increments:
+    def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
+        """The ridge as a Gaussian prior: its penalty over the mean square of what is left."""
+        out = {}
+        for key, phi, gap, run in self._each(w, robot):
+            penalty = _penalty(phi, _best_weight(phi, gap, run, self.weights))
+            left = np.mean((gap - phi @ self.state[key]) ** 2, axis=(0, 1))
+            out[key] = np.kron(penalty, np.diag(1 / np.maximum(left, 1e-12)))
+        return out
+
+    def twist(self, w: Windows, robot: Robot) -> np.ndarray:
         angle, out = _encoders(w, robot)
         phi = _fourier(angle, out[..., 0])
         for n, (floor, load) in enumerate(zip(w.surface, w.load, strict=True)):
-            out[n] += phi[n] @ self._series(floor, load)
+            out[n] += phi[n] @ self.state[self.series(floor, load)]
         c, s = np.cos(angle), np.sin(angle)
         x, y = c * out[..., 0] - s * out[..., 1], s * out[..., 0] + c * out[..., 1]
-        return as_increments(np.stack([x, y, out[..., 2]], -1) / w.dt[..., None], w, robot)
+        return np.stack([x, y, out[..., 2]], -1) / w.dt[..., None]
 
-    def _series(self, floor: str, load: str) -> np.ndarray:
+    def series(self, surface: str, load: str) -> str:
         """Of this floor and load set-up, else of the load the floor was first driven with."""
-        exact = self.state.get(f"{floor}@{load}")
-        if exact is not None:
+        if (exact := f"{surface}@{load}") in self.state:
             return exact
-        others = {key.rsplit("@", 1)[0]: value for key, value in reversed(self.state.items())}
-        return np.asarray(_need(others, floor))
+        first = {key.rsplit("@", 1)[0]: key for key in reversed(self.state)}
+        return str(_need(first, surface))
 
 
 def _encoders(w: Windows, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -301,9 +342,19 @@ def _fourier(angle: np.ndarray, far: np.ndarray) -> np.ndarray:
 
 def _ridge(phi: np.ndarray, target: np.ndarray, weight: float) -> np.ndarray:
     a = phi.reshape(-1, phi.shape[-1])
+    gram = a.T @ a + _penalty(phi, weight)
+    return np.asarray(np.linalg.solve(gram, a.T @ target.reshape(-1, 3)))
+
+
+def _penalty(phi: np.ndarray, weight: float) -> np.ndarray:
     rough = np.concatenate([[0.0], np.repeat(np.arange(1.0, HARMONICS + 1) ** 4, 2)])
-    penalty = weight * np.sum(a[:, 0] ** 2) * np.diag(rough)
-    return np.asarray(np.linalg.solve(a.T @ a + penalty, a.T @ target.reshape(-1, 3)))
+    return np.asarray(weight * np.sum(phi[..., 0] ** 2) * np.diag(rough))
+
+
+def _best_weight(
+    phi: np.ndarray, gap: np.ndarray, run: np.ndarray, weights: Sequence[float]
+) -> float:
+    return min(weights, key=lambda weight: _left_out(phi, gap, run, weight))
 
 
 def _left_out(phi: np.ndarray, target: np.ndarray, run: np.ndarray, weight: float) -> float:

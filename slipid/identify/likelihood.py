@@ -106,6 +106,17 @@ def predict(
     )
 
 
+def seen(
+    robot: Robot, b: Batch, twist: Float[Array, "piece window 3"]
+) -> Float[Array, "piece window 3"]:
+    """Marker increments of every window for given body twists."""
+
+    def window(xi: Any, dt: Any, session: Any) -> Array:
+        return robot.camera.seen(model.advance(xi, dt), session)
+
+    return jax.vmap(jax.vmap(window, (0, 0, None)))(twist, b.dt, b.session)
+
+
 def predicted_current(
     robot: Robot, b: Batch, felt: Float[Array, "piece window wheel"]
 ) -> Float[Array, "piece window wheel"]:
@@ -170,10 +181,15 @@ def log_jacobians(
     The camera corrects measured places and the voltage residual is scaled by its own spread:
     without these terms a smaller scale would fit better only because it shrinks the residuals.
     """
-    camera = jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(b.pose[:, 1:]), axis=1)
+    camera = camera_log_jacobian(robot, b.pose)
     if not (b.has_current and b.has_voltage):
         return camera, jnp.zeros_like(camera)
     return camera, -jnp.sum(jnp.log(_spread(robot, b, voltage_std)), axis=(1, 2))
+
+
+def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, " piece"]:
+    """Log |d motion residuals / d logged poses| of every piece; its first pose is given."""
+    return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
 
 
 def _spread(robot: Robot, b: Batch, voltage_std: Any) -> Float[Array, "piece window wheel"]:
@@ -279,13 +295,9 @@ def _motion_components(windows: Windows, robot: Robot) -> Components:
         move = np.einsum("nij,nj->ni", back, windows.pose[:, j + 1, :2] - windows.pose[:, j, :2])
         heading[:, 3 * j, j], heading[:, 3 * j + 1, j] = move[:, 1], -move[:, 0]
         heading[:, 3 * j + 2, j], heading[:, 3 * j + 2, j + 1] = -1.0, 1.0
-    axes = np.zeros((3, n, 3 * k, k))  # direction of along, across, yaw in each window
-    for j in range(k):
-        axes[0, :, 3 * j : 3 * j + 2, j] = u[:, j]
-        axes[1, :, 3 * j, j], axes[1, :, 3 * j + 1, j] = -u[:, j, 1], u[:, j, 0]
-        axes[2, :, 3 * j + 2, j] = 1.0
+    axes = _axes(u)
     grown = axes * np.sqrt(far)[None, :, None, :]
-    effect = (axes * far[None, :, None, :]).sum(-1, keepdims=True)
+    effect = effects(windows, robot).transpose(2, 0, 1)[..., None]
     parts = [place, heading, *grown, *effect]
     base = np.stack([p @ p.transpose(0, 2, 1) for p in parts], axis=1)
     floor = np.array([robot.surface_index(s) for s in windows.surface])
@@ -293,6 +305,23 @@ def _motion_components(windows: Windows, robot: Robot) -> Components:
         [np.zeros((n, 1), int), np.ones((n, 1), int), 2 + 6 * floor[:, None] + np.arange(6)], axis=1
     )
     return Components(base, which)
+
+
+def _axes(u: np.ndarray) -> np.ndarray:
+    """Direction of along, across and yaw in each window (axis, piece, 3 window, window)."""
+    n, k, _ = u.shape
+    axes = np.zeros((3, n, 3 * k, k))
+    for j in range(k):
+        axes[0, :, 3 * j : 3 * j + 2, j] = u[:, j]
+        axes[1, :, 3 * j, j], axes[1, :, 3 * j + 1, j] = -u[:, j, 1], u[:, j, 0]
+        axes[2, :, 3 * j + 2, j] = 1.0
+    return axes
+
+
+def effects(windows: Windows, robot: Robot) -> Float[np.ndarray, "piece m 3"]:
+    """What one unit of an effect along, across and in yaw moves in the residuals of a piece."""
+    far, u = travel(windows, robot)
+    return (_axes(u) * far[None, :, None, :]).sum(-1).transpose(1, 2, 0)
 
 
 def _current_components(windows: Windows, robot: Robot, start: int) -> Components:

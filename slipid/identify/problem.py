@@ -265,8 +265,27 @@ class Problem:
     def _scored(
         self, data: Data, blocks: dict, jacobian: dict, log_v: Vector, keep: Vector, typical: Array
     ) -> Array:
-        _, weights, _ = self._whitening(data, blocks, log_v, keep)
         cov = jnp.linalg.inv(self._precision(data, jacobian, log_v, keep))
+        spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in jacobian.items()}
+        return self._scored_given(data, blocks, spread, log_v, keep, typical)
+
+    def scored_given(
+        self, blocks: dict, spread: dict, log_v: Vector, keep: Vector, typical: Array
+    ) -> Array:
+        """The same for a model that is not this problem's own.
+
+        Args:
+            blocks: residuals of the model (piece, m).
+            spread: their covariance from the model's fitted numbers (piece, m, m); the degrees of
+                freedom it stands for are not the variances' to have.
+        """
+        return self._form._scored_given(self.data, blocks, spread, log_v, keep, typical)
+
+    @partial(jax.jit, static_argnums=0)
+    def _scored_given(
+        self, data: Data, blocks: dict, spread: dict, log_v: Vector, keep: Vector, typical: Array
+    ) -> Array:
+        _, weights, _ = self._whitening(data, blocks, log_v, keep)
         score = jnp.zeros(log_v.shape[0])
         for k, r in blocks.items():
             root = inverse_root(self._covariance(data, k, log_v))
@@ -276,10 +295,7 @@ class Problem:
             vr = jnp.einsum("nij,nj->ni", inverse, r)
             fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
             trace = jnp.einsum("nij,ncij->nc", inverse, base)
-            vj = jnp.einsum("nij,njp->nip", inverse, jacobian[k])
-            spent = jnp.einsum(
-                "nip,pq,njq->nij", vj, cov, vj
-            )  # degrees of freedom of the structure
+            spent = jnp.einsum("nij,njk,nkl->nil", inverse, spread[k], inverse)
             lost = jnp.einsum("nij,ncij->nc", spent, base)
             score = score.at[which].add(0.5 * v * (fit + keep[:, None] * (lost - trace)))
         score -= (log_v - typical) / VARIANCE_SPREAD**2

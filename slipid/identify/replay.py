@@ -108,6 +108,16 @@ def _end(robot: Robot, b: lk.Batch, start: Array) -> Array:
 
 
 @partial(jax.jit, static_argnums=0)
+def twist_end_jacobian(space: Any, z: Array, twist: Array, w: lk.Batch, start: Array) -> Array:
+    """Slope of the ends by the search vector where the body's twists are given (piece, 2, free)."""
+
+    def end(x: Array) -> Array:
+        return chain(start, lk.seen(space.tree(x), w, twist))[:, -1, :2]
+
+    return jax.jacfwd(end)(z)
+
+
+@partial(jax.jit, static_argnums=0)
 def _end_jacobian(space: Any, z: Array, b: lk.Batch, start: Array) -> Array:
     return jax.jacfwd(lambda x: _end(space.tree(x), b, start))(z)
 
@@ -121,8 +131,9 @@ def end_covariance(
 ) -> Float[np.ndarray, "piece 2 2"]:
     """Covariance of the gap between predicted and measured end [m^2], scale matrix of a Student t.
 
-    Process noise, the run's own effect, camera noise at both ends and in the start heading, and the
-    parameters' uncertainty, each carried to the end along the predicted path.
+    Process noise, the run's own effect and its session's, camera noise at both ends and in the
+    start heading, and the parameters' uncertainty, each carried to the end along the predicted
+    path.
     """
     far, u = lk.travel(w, robot)
     p = tracks.predicted
@@ -138,7 +149,8 @@ def end_covariance(
     for name, axis in (("along", world(u)), ("across", world(across)), ("yaw", lever)):
         v = np.array([variance[f"process.{f}.{name}"] for f in w.surface])
         cov += np.einsum("n,nk,nki,nkj->nij", v, far, axis, axis)
-        v = np.array([variance[f"run.{f}.{name}"] for f in w.surface])
+        shared = [variance.get(f"session.{f}.{name}", 0.0) for f in w.surface]
+        v = np.array([variance[f"run.{f}.{name}"] for f in w.surface]) + shared
         whole = np.einsum("nk,nki->ni", far, axis)
         cov += v[:, None, None] * whole[:, :, None] * whole[:, None, :]
     all_way = p[:, -1, :2] - p[:, 0, :2]
@@ -161,10 +173,11 @@ def parameter_covariance(
 def scores(
     gap: Float[np.ndarray, "run 2"], cov: Float[np.ndarray, "run 2 2"] | None, seed: int = 0
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """Whether each end lies in the 90 % region, and the energy score of each [m].
+    """Probability of the region whose edge each end lies on, and the energy score of each [m].
 
-    The predictive distribution is a Student t with `DEGREES` degrees of freedom; without one (None)
-    the energy score is the distance itself, as for a point forecast.
+    An end lies in the 90 % region where the first is at most 0.9. The predictive distribution is a
+    Student t with `DEGREES` degrees of freedom; without one (None) the energy score is the distance
+    itself, as for a point forecast.
     Source: Gneiting and Raftery 2007, JASA 102, eq. 22.
     """
     if cov is None:
@@ -172,11 +185,11 @@ def scores(
     from scipy.stats import f as fisher
 
     q = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(cov), gap)
-    inside = q / 2 <= fisher.ppf(0.9, 2, DEGREES)
+    level = fisher.cdf(q / 2, 2, DEGREES)
     rng = np.random.default_rng(seed)
     count = 500
     normal = rng.normal(size=(count, 2)) / np.sqrt(rng.chisquare(DEGREES, (count, 1)) / DEGREES)
     draws = np.einsum("nij,kj->nki", np.linalg.cholesky(cov), normal)
     near = np.linalg.norm(draws - gap[:, None], axis=2).mean(axis=1)
     apart = np.linalg.norm(draws[:, : count // 2] - draws[:, count // 2 :], axis=2).mean(axis=1)
-    return inside, near - 0.5 * apart
+    return level, near - 0.5 * apart

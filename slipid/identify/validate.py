@@ -60,7 +60,7 @@ def validation(fit: Frozen, data: Dataset) -> dict[str, Any]:
         )
         cov = replay.end_covariance(fit.robot, w, tracks["identified"], fit.variance, of_parameters)
         for name, track in tracks.items():
-            _score(rows, data, name, track, cov if name == "identified" else None)
+            score(rows, data, name, track, cov if name == "identified" else None)
     return {"schema": SCHEMA, "summary": summary(rows), "runs": rows}
 
 
@@ -83,15 +83,21 @@ def _known(robot: Robot, data: Dataset) -> None:
             )
 
 
-def _score(
+def score(
     rows: list[dict[str, Any]],
     data: Dataset,
     model: str,
     tracks: replay.Tracks,
     cov: Float[np.ndarray, "run 2 2"] | None,
 ) -> None:
+    """Write what a model's tracks are worth into the rows of their runs.
+
+    Args:
+        rows: of every run of `data`.
+        cov: of the ends, None for a model without.
+    """
     gap = tracks.gap
-    inside, energy = replay.scores(gap[:, :2], cov)
+    level, energy = replay.scores(gap[:, :2], cov)
     ahead = np.linalg.norm((tracks.predicted[:, -1] - tracks.predicted[:, 0])[:, :2], axis=1)
     for n, k in enumerate(tracks.run):
         log, chord = data.logs[int(k)], float(tracks.chord[n])
@@ -108,7 +114,8 @@ def _score(
             "endpoint_error": float(np.hypot(*gap[n, :2])) / max(chord, 1e-9),
             "length_error": abs(float(ahead[n]) / max(chord, 1e-9) - 1.0),
             "heading_error_deg": abs(float(np.degrees(gap[n, 2]))),
-            "covered90": None if inside is None else bool(inside[n]),
+            "level": None if level is None else float(level[n]),
+            "covered90": None if level is None else bool(level[n] <= 0.9),
             "energy_score": float(energy[n]),
         }
 
@@ -122,6 +129,14 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
     A set-up other than the most common is written `<floor>@<load>`.
     """
+    return {
+        name: {model: _mean([r["models"][model] for r in group]) for model in group[0]["models"]}
+        for name, group in by_floor(rows).items()
+    }
+
+
+def by_floor(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Rows of every floor, those of other load set-ups by themselves."""
     loads = [row["load"] for row in rows]
     main = max(sorted(set(loads)), key=loads.count)
     if "as_built" in loads:
@@ -130,10 +145,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     for row in rows:
         name = row["surface"] if row["load"] == main else f"{row['surface']}@{row['load']}"
         groups.setdefault(name, []).append(row)
-    return {
-        name: {model: _mean([r["models"][model] for r in group]) for model in group[0]["models"]}
-        for name, group in sorted(groups.items())
-    }
+    return dict(sorted(groups.items()))
 
 
 def _mean(scores: list[dict[str, Any]]) -> dict[str, Any]:

@@ -1,0 +1,125 @@
+"""What the runs of one session share beyond the model, and how much less they then tell.
+
+Runs driven on one floor at one time slip a little more or less than the model says, all of them
+together: the fit takes runs for independent. After a fit the effects that are left in its runs,
+
+    a_i = (E_i^T W_i E_i)^-1 E_i^T W_i r_i     along, across, yaw
+
+have a part that is common to the session (E_i moves the residuals by an effect, W_i weighs
+without the run effects). Its variance v is found per floor and axis by restricted
+likelihood, the run effects' own held; the covariance C of the fitted numbers grows to
+
+    C + C (sum_s v u_s u_s^T) C,    u_s = sum_{i in s} J_i^T V_i^-1 E_i
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize_scalar
+
+from slipid.data.dataset import Windows
+from slipid.identify.problem import DEGREES
+
+AXES = ("along", "across", "yaw")
+SPREAD = 3.0
+"""Std of the prior of a log variance, around that of the run effects."""
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """A fitted model made linear at its fit, on all pieces of a problem.
+
+    Attributes:
+        gap: predicted less measured (piece, m).
+        slope: by the fitted numbers (piece, m, number).
+        covariance: of the numbers.
+        wide: of the numbers as they were before a floor's own runs were seen.
+        scale: noise covariance of each piece, the run's own effect included (piece, m, m).
+        effect: what one unit of an effect along, across and in yaw moves (piece, m, 3).
+        run: variance of these effects (piece, 3).
+    """
+
+    gap: Float[np.ndarray, "piece m"]
+    slope: Float[np.ndarray, "piece m number"]
+    covariance: Float[np.ndarray, "number number"]
+    wide: Float[np.ndarray, "number number"]
+    scale: Float[np.ndarray, "piece m m"]
+    effect: Float[np.ndarray, "piece m 3"]
+    run: Float[np.ndarray, "piece 3"]
+
+
+def shared(
+    model: Linear, w: Windows, keep: Float[np.ndarray, " piece"]
+) -> tuple[dict[str, float], Float[np.ndarray, "number number"]]:
+    """Variances `session.<floor>.<axis>`, and the covariance of the numbers with them.
+
+    A floor that was driven in one session only has none: what it shares is in the floor's numbers.
+    """
+    session, floor = np.asarray(w.session), np.asarray(w.surface)
+    weight = _weights(model)
+    left, noise, slope = _left(model)
+    variance: dict[str, float] = {}
+    for name in dict.fromkeys(floor[keep > 0].tolist()):
+        mine = (floor == name) & (keep > 0)
+        if len(set(session[mine].tolist())) < 2:
+            continue
+        member = (session[mine][:, None] == np.unique(session[mine])).astype(float)
+        for k, axis in enumerate(AXES):
+            run = model.run[mine, k]
+            own = np.diag((noise[mine, k] + run) / weight[mine])
+            own += slope[mine, k] @ model.wide @ slope[mine, k].T
+            found = _variance(left[mine, k], own, member, float(np.log(run.mean())))
+            variance[f"session.{name}.{axis}"] = found
+    weighted = np.swapaxes(model.effect, 1, 2) @ np.linalg.solve(model.scale, model.slope)
+    pulls = weighted * (weight * keep)[:, None, None]
+    meat = np.zeros_like(model.covariance)
+    for name in dict.fromkeys(session[keep > 0].tolist()):
+        mine = (session == name) & (keep > 0)
+        u = pulls[mine].sum(axis=0)
+        on = str(floor[mine][0])
+        v = [variance.get(f"session.{on}.{axis}", 0.0) for axis in AXES]
+        meat += u.T @ (np.asarray(v)[:, None] * u)
+    return variance, model.covariance + model.covariance @ meat @ model.covariance
+
+
+def _weights(model: Linear) -> np.ndarray:
+    """Student-t weight of every piece."""
+    white = np.linalg.solve(model.scale, model.gap[..., None])[..., 0]
+    q, m = np.sum(model.gap * white, axis=1), model.gap.shape[1]
+    return np.asarray((DEGREES + m) / (DEGREES + q))
+
+
+def _left(model: Linear) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Effects left in each run (piece, 3), their variance by camera and process, their slope."""
+    e = model.effect
+    plain = model.scale - np.einsum("nma,na,nla->nml", e, model.run, e)
+    by_noise = np.linalg.solve(plain, e)
+    cov = np.linalg.inv(np.swapaxes(e, 1, 2) @ by_noise)
+    take = cov @ np.swapaxes(by_noise, 1, 2)
+    left = np.einsum("nam,nm->na", take, model.gap)
+    return left, np.diagonal(cov, axis1=1, axis2=2), take @ model.slope
+
+
+def _variance(left: np.ndarray, own: np.ndarray, member: np.ndarray, centre: float) -> float:
+    """Most likely variance of what the members of each session share.
+
+    Args:
+        left: effects of runs.
+        own: their covariance without it.
+        member: 1 where a run is of a session, else 0 (run, session).
+        centre: of the prior of the log variance.
+    """
+    root = np.linalg.cholesky(own)
+    white = np.linalg.solve(root, np.concatenate([left[:, None], member], axis=1))
+    scale, turn = np.linalg.eigh(white[:, 1:].T @ white[:, 1:])
+    along = turn.T @ (white[:, 1:].T @ white[:, 0])
+
+    def loss(log_v: float) -> float:
+        grown = 1.0 + np.exp(log_v) * scale
+        told = np.exp(log_v) * np.sum(along**2 / grown)
+        pull = (log_v - centre) / SPREAD
+        return float(0.5 * (np.log(grown).sum() - told + pull**2))
+
+    span = (centre - 4 * SPREAD, centre + 4 * SPREAD)
+    return float(np.exp(minimize_scalar(loss, bounds=span, method="bounded").x))
