@@ -96,6 +96,7 @@ def validity(data: Dataset, robot: Robot, b: lk.Batch) -> dict[str, dict[str, An
     """What each floor was seen with: outside of it the fit extrapolates."""
     speed, torque = (np.abs(np.asarray(x)) for x in seen(robot, b))
     floor = np.asarray(b.surface)
+    far = lk.travel(b, robot)[0].sum(axis=1)
     out: dict[str, dict[str, Any]] = {}
     for k, label in enumerate(robot.surfaces.labels):
         runs = [i for i, log in enumerate(data.logs) if (log.surface or "unknown") == label]
@@ -108,5 +109,7 @@ def validity(data: Dataset, robot: Robot, b: lk.Batch) -> dict[str, dict[str, An
             "torque_nm": [0.0, float(torque[floor == k].max())],
             "headings_deg": sorted({round(float(h), 1) for h in heading[np.isfinite(heading)]}),
             "speeds": sorted({round(float(s), 3) for s in body[np.isfinite(body)]}),
+            "turn_rates": sorted({round(float(t), 2) for t in data.turn[runs] if np.isfinite(t)}),
+            "distance": round(float(far[floor == k].sum()) / max(len(runs), 1), 3),
         }
     return out

@@ -109,6 +109,15 @@ class Camera(eqx.Module):
         turn = jnp.arctan2(u[0] * turned[1] - u[1] * turned[0], u @ turned)
         return jnp.concatenate([place, (pose[2] + turn)[None]])
 
+    def logged(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
+        """What is logged of a marker pose in true metres: `corrected` inverted, by iteration."""
+        one = jnp.ones(())
+        guess = pose / jnp.stack([self.scale, self.scale, one])
+        q = guess.at[:2].add(jnp.asarray(self.centre))
+        for _ in range(12):
+            q = q + (pose - self.corrected(q)) / jnp.stack([self.scale, self.scale, one])
+        return q
+
     def log_jacobian(self, pose: Float[Array, "3"]) -> Float[Array, ""]:
         """Log |d corrected / d pose|, which a density of logged poses has beside its residuals.
 
