@@ -21,6 +21,8 @@ REACHED = 0.9
 MOST_SPEEDS = 4
 ORDERS = 8
 """Random orders of a grid that are averaged."""
+POINTS = 40
+"""Numbers of runs at which the curve of a grid is given."""
 WEAK = ("surface.", "robot.", "motor.")
 """Beginnings of the names of weakly identified numbers that are shrunk by default."""
 ASSUMPTIONS = (
@@ -285,7 +287,7 @@ def design(fit: Fit, wish: Wish) -> Design:
         content["runs"] = _runs(
             scope, planner, goals, now, rows, [offered[k] for k in chosen], chosen
         )
-        content["runs_saved"] = saved(scope, planner, goal, offered, rows)
+        content["runs_saved"] = saved(scope, planner, goals, goal, offered, rows)
     drives = tuple(offered[k] for k in chosen)
     content["messages"] = [*lost.values(), *_extrapolated(fit, drives)]
     content["data"] = {"hash": fit.data_hash, "runs": len(fit.runs)}
@@ -392,21 +394,32 @@ def _extrapolated(fit: Fit, drives: Sequence[Drive]) -> list[str]:
 
 
 def saved(
-    scope: _Scope, planner: Planner, goal: np.ndarray, offered: Sequence[Drive], rows: info.Rows
+    scope: _Scope,
+    planner: Planner,
+    goals: Sequence[Goal],
+    goal: np.ndarray,
+    offered: Sequence[Drive],
+    rows: info.Rows,
 ) -> dict[str, Any]:
     """How many runs, chosen one after another from nothing, tell as much as whole grids.
 
-    They are chosen from the candidates and the grid's own runs; the grids are driven on every floor
-    with every load that was driven.
+    They are chosen from the candidates and the grid's own runs. The grids are driven wherever it
+    was driven before, but only with the floors and loads the goals are about.
     """
-    own = replace(scope, wish=Wish(distance=scope.wish.distance))
+    setups = [s for s in scope.setups if any(g.is_about(s) for g in goals)]
+    setups = [s for s in setups if s in scope.driven] or setups or list(scope.setups)
+    straight = replace(scope, wish=replace(scope.wish, speeds=None)).speeds
     grids = {
-        "paper grid": dr.paper_grid(scope.driven, own.distance),
-        "headings every 5 deg": dr.heading_grid(scope.driven, own.speeds, own.distance),
+        "paper_grid": ("the 2021 paper's grid", dr.paper_grid(setups, scope.distance)),
+        "heading_grid": (
+            "the 2022 grid of headings every 5 deg",
+            dr.heading_grid(setups, straight, scope.distance),
+        ),
     }
     return {
-        name: _against(planner, goal, dr.drivable(grid, scope.fit.robot), offered, rows, scope.base)
-        for name, grid in grids.items()
+        key: {"name": name, "setups": [list(s) for s in setups]}
+        | _against(planner, goal, dr.drivable(grid, scope.fit.robot), offered, rows, scope.base)
+        for key, (name, grid) in grids.items()
     }
 
 
@@ -419,25 +432,27 @@ def _against(
     base: float,
 ) -> dict[str, Any]:
     of_grid, start = planner.rows(grid), planner.nothing()
-    in_order = info.path(start, of_grid, goal, range(len(grid)))
+    target = start.plus(of_grid).criterion(goal)
     both, drives = rows.joined(of_grid), [*offered, *grid]
-    chosen, found = info.greedy(start, both, goal, len(grid), in_order[-1])
-    count = len(chosen)
-    random = [
-        info.path(start, of_grid, goal, np.random.default_rng(k).permutation(len(grid)))
-        for k in range(ORDERS)
-    ]
-    mean = np.mean(random, axis=0)
-    reached = found[-1] <= in_order[-1]
+    chosen, found = info.greedy(start, both, goal, len(grid), target)
+    count, reached = len(chosen), found[-1] <= target
+    at = sorted({*np.geomspace(1, len(grid), POINTS).round().astype(int).tolist(), count})
+    orders = [np.random.default_rng(k).permutation(len(grid)) for k in range(ORDERS)]
+    random = np.mean([info.path(start, of_grid, goal, order, at) for order in orders], axis=0)
+    in_order = info.path(start, of_grid, goal, np.arange(len(grid)), at)
     return {
         "grid_runs": len(grid),
         "greedy_runs": count if reached else None,
         "ratio": count / len(grid) if reached else None,
         "grid_minutes": sum(d.seconds(base) for d in grid) / 60,
         "greedy_minutes": sum(drives[k].seconds(base) for k in chosen) / 60,
-        "criterion": in_order[-1],
-        "criterion_random_order": float(mean[count]),
-        "curves": {"greedy": found, "grid": in_order, "random_order": mean.tolist()},
+        "criterion": target,
+        "criterion_random_order": float(random[at.index(count)]),
+        "curves": {
+            "greedy": {"runs": list(range(1, count + 1)), "criterion": found[1:]},
+            "grid": {"runs": at, "criterion": in_order},
+            "random_order": {"runs": at, "criterion": random.tolist()},
+        },
     }
 
 

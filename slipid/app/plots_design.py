@@ -34,7 +34,9 @@ def design_figure(found: Design) -> Figure:
         _commands(ax, found, setup, mine, order, reach)
     for spare in axes[len(setups) :]:
         spare.remove()
-    _falling(right.subplots(), found.content["runs_saved"]["paper grid"])
+    words = "numbers: in which order (x3: three times)\nbent or round arrows: turning as it drives"
+    left.supxlabel(f"{words}\ngray dots: driven already", fontsize=9, color=drawing.SHADE)
+    _falling(right.subplots(), found.content["runs_saved"]["paper_grid"])
     return made
 
 
@@ -47,8 +49,8 @@ def _title(found: Design) -> str:
     if len(goals) > 1:
         return head + f"uncertainty falls to {kept:.0%} of what it is now"
     g = goals[0]
-    scale, unit = (100, "%") if g["unit"] == "1" else (1, g["unit"])
-    return head + f"std falls from {scale * g['now']:.3g} to {scale * last[g['name']]:.3g} {unit}"
+    scale, unit = (100, " %") if g["unit"] == "m/m" else (1, "" if g["unit"] == "1" else g["unit"])
+    return head + f"std falls from {scale * g['now']:.3g} to {scale * last[g['name']]:.3g}{unit}"
 
 
 def _rim(d: Drive, base: float) -> float:
@@ -93,14 +95,14 @@ def _arrow(ax: Axes, d: Drive, base: float, beyond: float) -> tuple[float, float
     if d.speed:
         style["connectionstyle"] = f"arc3,rad={0.25 * way}"
         end, start = (float(d.command[0]), float(d.command[1])), (0.0, 0.0)
-        side = d.heading + 0.35 * way
+        side = d.heading + 0.2 * way
         place = (d.speed + beyond) * np.array([np.cos(side), np.sin(side)])
     else:
         size = abs(d.turn) * base
         style["connectionstyle"] = f"arc3,rad={0.9 * way}"
         low, high = (0.0, -size), (0.0, size)
         start, end = (low, high) if way > 0 else (high, low)
-        place = np.array([way * (size + beyond), 0.0])
+        place = np.array([way * (size + 1.3 * beyond), 0.0])
     ax.annotate("", end, start, arrowprops=style)
     return float(place[0]), float(place[1])
 
@@ -113,23 +115,27 @@ def _colour(d: Drive) -> str:
 
 def _falling(ax: Axes, saved: dict[str, Any]) -> None:
     """Uncertainty against runs, from nothing."""
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
+
     for key, colour, style, label in CURVES:
-        found = np.sqrt(saved["curves"][key])[1:]
-        ax.plot(np.arange(1, len(found) + 1), found, style, color=colour, lw=1.8, label=label)
+        curve = saved["curves"][key]
+        std = np.sqrt(curve["criterion"])
+        ax.plot(curve["runs"], std, style, color=colour, lw=1.8, label=label)
     end = math.sqrt(saved["criterion"])
     ax.axhline(end, color=drawing.INK, lw=0.8, ls=":")
     ax.plot(saved["grid_runs"], end, "o", color=drawing.ORANGE, ms=6)
+    title = f"from no run at all: the grid's {saved['grid_runs']} runs tell"
     if saved["greedy_runs"]:
-        ax.plot(saved["greedy_runs"], end, "o", color=drawing.BLUE, ms=6)
-        ax.annotate(
-            f"{saved['greedy_runs']} runs instead of {saved['grid_runs']}",
-            (saved["greedy_runs"], end),
-            (0.05, 0.06),
-            textcoords="axes fraction",
-            arrowprops={"arrowstyle": "->", "color": drawing.INK, "lw": 0.8},
-        )
-    ax.set(xscale="log", yscale="log", xlabel="runs, starting from none")
+        last = math.sqrt(saved["curves"]["greedy"]["criterion"][-1])
+        ax.plot(saved["greedy_runs"], last, "o", color=drawing.BLUE, ms=6)
+        ax.set_title(f"{title} as much as {saved['greedy_runs']} chosen ones", fontsize=11)
+    else:
+        ax.set_title(f"{title} more than any chosen ones", fontsize=11)
+    ax.set(xscale="log", yscale="log", xlabel="runs")
     ax.set(ylabel="uncertainty (1: the present fit)")
-    ax.set_title("how fast runs tell it, from nothing")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(FormatStrFormatter("%g"))
+        axis.set_minor_locator(NullLocator())
     drawing.plain(ax)
     ax.legend(frameon=False)

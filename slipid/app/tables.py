@@ -162,26 +162,26 @@ def design(found: dict[str, Any], out: Path, written: Sequence[str]) -> None:
             console.print(f"std after each run; {rest} more goals are in design.json")
         else:
             console.print("std after each run")
-    for name, s in found["runs_saved"].items():
-        console.print(_saving(name, s), markup=False, soft_wrap=True)
+    for s in found["runs_saved"].values():
+        console.print(_saving(s), markup=False, soft_wrap=True)
     for sentence in found["messages"]:
         console.print(f"note: {sentence}", markup=False, soft_wrap=True)
     console.print(f"in {out}: {', '.join(written)}", markup=False, soft_wrap=True)
 
 
 def _uncertain(std: float, unit: str) -> str:
-    return f"{100 * std:.3g} %" if unit == "1" else f"{std:.3g} {unit}"
+    return f"{100 * std:.3g} %" if unit == "m/m" else f"{std:.3g}"
 
 
-def _saving(name: str, s: dict[str, Any]) -> str:
+def _saving(s: dict[str, Any]) -> str:
     """One sentence on runs saved."""
+    whole = f"{s['name']} ({s['grid_runs']} runs)"
     if s["greedy_runs"] is None:
-        return f"from nothing: no fewer runs than the {name}'s {s['grid_runs']} tell as much"
+        return f"from nothing: no fewer chosen runs tell as much as {whole}"
     worse = s["criterion_random_order"] / s["criterion"]
     return (
-        f"from nothing: {s['greedy_runs']} chosen runs tell as much as the {s['grid_runs']} of the "
-        f"{name} ({s['ratio']:.0%}); as many of those in random order leave {worse:.2g} x the "
-        "variance"
+        f"from nothing: {s['greedy_runs']} chosen runs tell as much as {whole}: {s['ratio']:.0%}; "
+        f"the first {s['greedy_runs']} of it in random order leave {worse:.2g} times the variance"
     )
 
 

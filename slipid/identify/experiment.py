@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.identify import likelihood as lk
-from slipid.identify.drives import SESSION, Drive, steady_windows
+from slipid.identify.drives import SESSION, Drive, Setup, steady_windows
 from slipid.identify.information import Knowledge, Rows, known
 from slipid.identify.problem import Problem
 from slipid.identify.replay import end_jacobian
@@ -169,11 +169,19 @@ class Goal:
         name: for tables and files.
         unit: of the number.
         rows: G (k, free).
+        floors, loads: it is about; empty for any.
     """
 
     name: str
     unit: str
     rows: Float[np.ndarray, "k free"]
+    floors: frozenset[str] = frozenset()
+    loads: frozenset[str] = frozenset()
+
+    def is_about(self, setup: Setup) -> bool:
+        """Whether runs with this floor and load are the ordinary way to it."""
+        floor, load = setup
+        return floor in (self.floors or {floor}) and load in (self.loads or {load})
 
     def std(self, knowledge: Knowledge) -> float:
         """What is uncertain about it."""
@@ -184,13 +192,27 @@ def parameter_goal(planner: Planner, path: str) -> Goal:
     """Std of a parameter [its unit], of a short vector the root mean square of its entries."""
     entry = next(e for e in planner.space.free if e.path == path)
     rows = planner.derivative(path)
-    return Goal(path, entry.declaration.unit, rows / np.sqrt(len(rows)))
+    head, _, load = path.partition("@")
+    floors = head.split(".")[1:2] if head.startswith("surface.") else []
+    return Goal(
+        path,
+        entry.declaration.unit,
+        rows / np.sqrt(len(rows)),
+        floors=frozenset(floors),
+        loads=frozenset([load] if load else []),
+    )
 
 
 def prediction_goal(planner: Planner, name: str, drives: Sequence[Drive]) -> Goal:
     """Root mean square end-point error of runs that comes from the parameters, over distance."""
     rows = planner.ends(drives)
-    return Goal(name, "1", _compact(rows.reshape(-1, rows.shape[-1])) / np.sqrt(len(drives)))
+    return Goal(
+        name,
+        "m/m",
+        _compact(rows.reshape(-1, rows.shape[-1])) / np.sqrt(len(drives)),
+        floors=frozenset(d.surface for d in drives),
+        loads=frozenset(d.load for d in drives),
+    )
 
 
 def weighed(goals: Sequence[Goal], now: Knowledge, weight: Sequence[float]) -> np.ndarray:

@@ -12,7 +12,7 @@ numbers count as m. A criterion is tr(G cov G^T) of a matrix G (Fedorov 1972; At
 Tobias 2007, Optimum Experimental Designs, sections 10 and 12: c- and A-optimality, exchange).
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -104,25 +104,23 @@ class Knowledge:
     ) -> Float[np.ndarray, " run"]:
         """Criterion after one more run, for every candidate.
 
-        M^-1 after a run by its rank: M^-1 - W (1 + J W)^-1 W^T with W = M^-1 J^T (Woodbury).
+        By Woodbury's identity (M + J^T J)^-1 = M^-1 - W^T (1 + W J^T)^-1 W with W = J M^-1, so what
+        is inverted has the size of a run, not of all numbers.
         """
         of_motion, of_electric = goal[:, ~self.is_electric], goal[:, self.is_electric]
-        rest = np.zeros(len(rows))
+        rest: np.ndarray | float = 0.0
         lean = of_motion
         if of_electric.any():
-            e = rows.electric
-            own = self.own + e.transpose(0, 2, 1) @ e
-            cross = self.cross + e.transpose(0, 2, 1) @ rows.carried
-            part = np.linalg.solve(
-                own, np.broadcast_to(of_electric.T, (*own.shape[:1], *of_electric.T.shape))
-            )
+            e = rows.electric.transpose(0, 2, 1)
+            own, cross = self.own + e @ rows.electric, self.cross + e @ rows.carried
+            part = np.linalg.inv(own) @ of_electric.T
             rest = np.einsum("ke,nek->n", of_electric, part)
             lean = of_motion - part.transpose(0, 2, 1) @ cross
+        square = np.swapaxes(lean, -1, -2) @ lean
         w = rows.motion @ self.of_motion
         s = w @ rows.motion.transpose(0, 2, 1) + np.eye(rows.motion.shape[1])
-        v = w @ np.swapaxes(lean, -1, -2)
-        gain = (v * np.linalg.solve(s, v)).sum(axis=(1, 2))
-        before = ((lean @ self.of_motion) * lean).sum(axis=(-1, -2))
+        gain = np.einsum("nii->n", np.linalg.solve(s, (w @ square) @ w.transpose(0, 2, 1)))
+        before = np.einsum("ij,...ij->...", self.of_motion, square)
         return np.asarray(before + rest - gain)
 
 
@@ -138,11 +136,18 @@ def known(
     return Knowledge(np.asarray(is_electric, bool), motion, own, own @ lean)
 
 
-def path(start: Knowledge, rows: Rows, goal: np.ndarray, order: Iterable[int]) -> list[float]:
-    """Criterion before and after each run of an order."""
-    found, now = [start.criterion(goal)], start
-    for k in order:
-        now = now.plus(rows.pick([k]))
+def path(
+    start: Knowledge,
+    rows: Rows,
+    goal: np.ndarray,
+    order: Sequence[int] | np.ndarray,
+    at: Sequence[int] | None = None,
+) -> list[float]:
+    """Criterion after so many runs of an order: before and after each, or at chosen numbers."""
+    counts = range(len(order) + 1) if at is None else at
+    found, now, done = [], start, 0
+    for count in counts:
+        now, done = now.plus(rows.pick(order[done:count])), count
         found.append(now.criterion(goal))
     return found
 
