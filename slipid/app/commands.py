@@ -209,6 +209,8 @@ def design(out: Path, wanted: Any, report: Reporter) -> tuple[Any, list[str]]:
     report.stage("drawing")
     write_json(out / "design.json", found.content)
     written = ["design.json"]
+    for old in ("design_commands.csv", "design.png"):
+        (out / old).unlink(missing_ok=True)
     if found.drives:
         from slipid.app.drawing import save
         from slipid.app.plots_design import design_figure

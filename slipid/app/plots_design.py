@@ -21,17 +21,16 @@ CURVES = (
 def design_figure(found: Design) -> Figure:
     """Proposed runs by floor and load on what was driven (left), uncertainty by runs (right)."""
     setups = list(dict.fromkeys((d.surface, d.load) for d in found.drives))
-    columns = 1 if len(setups) == 1 else 2
+    columns = min(len(setups), 2 if len(setups) < 5 else 3)
     rows = math.ceil(len(setups) / columns)
     made = drawing.figure(3.6 * columns + 5.6, max(3.7 * rows, 4.4) + 0.8, _title(found))
     halves = made.subfigures(1, 2, width_ratios=(3.6 * columns, 5.4), squeeze=False)
     left, right = halves[0]
     axes = list(left.subplots(rows, columns, squeeze=False).flat)
     order = {d: k for k, d in reversed(list(enumerate(found.drives, 1)))}
-    reach = 1.35 * max(_rim(d, found.base_radius) for d in found.drives)
     for ax, setup in zip(axes, setups, strict=False):
         mine = Counter(d for d in found.drives if (d.surface, d.load) == setup)
-        _commands(ax, found, setup, mine, order, reach)
+        _commands(ax, found, setup, mine, order)
     for spare in axes[len(setups) :]:
         spare.remove()
     words = "numbers: in which order (x3: three times)\nbent or round arrows: turning as it drives"
@@ -53,21 +52,17 @@ def _title(found: Design) -> str:
     return head + f"std falls from {scale * g['now']:.3g} to {scale * last[g['name']]:.3g}{unit}"
 
 
-def _rim(d: Drive, base: float) -> float:
-    return d.speed or abs(d.turn) * base
-
-
 def _commands(
     ax: Axes,
     found: Design,
     setup: tuple[str, str],
     mine: Counter[Drive],
     order: dict[Drive, int],
-    reach: float,
 ) -> None:
     """Commanded velocities of one floor and load."""
     floor, load = setup
     seen = found.seen[floor]
+    reach = 1.4 * max(d.speed or abs(d.turn) * found.base_radius for d in mine)
     if load in seen["loads"]:
         angle = np.radians(seen["headings_deg"])
         for speed in seen["speeds"]:
@@ -75,7 +70,7 @@ def _commands(
                 speed * np.cos(angle), speed * np.sin(angle), ".", color="#bbbbbb", ms=3.5, mew=0
             )
     for d, times in mine.items():
-        text = f"{order[d]} x{times}" if times > 1 else f"{order[d]}"
+        text = f"{order[d]}" + f" x{times}" * (times > 1) + "\nspin" * (not d.speed)
         at = _arrow(ax, d, found.base_radius, 0.1 * reach)
         ax.text(at[0], at[1], text, ha="center", va="center", fontsize=9, color=_colour(d))
     drawing.plain(ax)
@@ -95,7 +90,7 @@ def _arrow(ax: Axes, d: Drive, base: float, beyond: float) -> tuple[float, float
     if d.speed:
         style["connectionstyle"] = f"arc3,rad={0.25 * way}"
         end, start = (float(d.command[0]), float(d.command[1])), (0.0, 0.0)
-        side = d.heading + 0.2 * way
+        side = d.heading + 0.12 * way
         place = (d.speed + beyond) * np.array([np.cos(side), np.sin(side)])
     else:
         size = abs(d.turn) * base
@@ -128,9 +123,9 @@ def _falling(ax: Axes, saved: dict[str, Any]) -> None:
     if saved["greedy_runs"]:
         last = math.sqrt(saved["curves"]["greedy"]["criterion"][-1])
         ax.plot(saved["greedy_runs"], last, "o", color=drawing.BLUE, ms=6)
-        ax.set_title(f"{title} as much as {saved['greedy_runs']} chosen ones", fontsize=11)
+        ax.set_title(f"{title}\nas much as {saved['greedy_runs']} chosen ones", fontsize=11)
     else:
-        ax.set_title(f"{title} more than any chosen ones", fontsize=11)
+        ax.set_title(f"{title}\nmore than as many chosen ones", fontsize=11)
     ax.set(xscale="log", yscale="log", xlabel="runs")
     ax.set(ylabel="uncertainty (1: the present fit)")
     for axis in (ax.xaxis, ax.yaxis):

@@ -16,7 +16,7 @@ from slipid.model.robot import Robot
 
 SESSION = "next"
 """The time in which new runs are driven: the marker is put on once more, and stays."""
-HEADINGS = tuple(range(0, 360, 15))
+HEADINGS = tuple(15.0 * k for k in range(24))
 """Headings of candidate runs and of predictions [deg]."""
 BEND = 0.5
 """Rim speed of a curved candidate's turn, per speed ahead."""

@@ -199,7 +199,7 @@ def endless(start: Knowledge, rows: Rows) -> Knowledge:
 
 
 def _flat(x: np.ndarray) -> np.ndarray:
-    return x.reshape(-1, x.shape[-1])
+    return x.reshape(x.shape[0] * x.shape[1], x.shape[2])
 
 
 def _inverse(a: np.ndarray) -> np.ndarray:
