@@ -218,6 +218,73 @@ def compare(
 
 @app.command()
 @guarded
+def design(
+    out: OutFolder,
+    parameter: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME", help="Parameter to sharpen; * and ? allowed; may be repeated."
+        ),
+    ] = None,
+    predict: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FLOOR[@LOAD][:SPEED[:HEADING]]",
+            help="Prediction to sharpen, as gray:0.3:45 [m/s, deg]; may be repeated.",
+        ),
+    ] = None,
+    runs: Annotated[int, typer.Option(min=1, max=1000, help="How many to propose.")] = 12,
+    headings: Annotated[
+        str | None, typer.Option(metavar="LIST", help="Of candidates, as 0,45,90 [deg].")
+    ] = None,
+    speeds: Annotated[
+        str | None, typer.Option(metavar="LIST", help="Of candidates, as 0.1,0.2 [m/s].")
+    ] = None,
+    turns: Annotated[
+        str | None, typer.Option(metavar="LIST", help="Turning rates, as -40,0,40 [deg/s].")
+    ] = None,
+    distance: Annotated[
+        float | None, typer.Option(metavar="M", help="Of every run [m]; as driven by default.")
+    ] = None,
+    floor: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Floor that can be driven on.")
+    ] = None,
+    load: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Load set-up that can be driven.")
+    ] = None,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Propose the next runs: those that shrink a parameter or a prediction most.
+
+    Writes design.json, design.png and design_commands.csv to OUT.
+    """
+    from slipid.app import commands, tables
+    from slipid.app.design import wish
+    from slipid.app.progress import Reporter
+
+    wanted = wish(
+        parameter or (),
+        predict or (),
+        runs,
+        headings,
+        speeds,
+        turns,
+        distance,
+        floor or (),
+        load or (),
+    )
+    with Reporter(quiet=quiet) as report:
+        found, written = commands.design(out, wanted, report)
+    if json is not None:
+        _emit(json, found.content)
+    if json != "-":
+        tables.design(found.content, out, written)
+    return 0 if found.reached else 1
+
+
+@app.command()
+@guarded
 def paper(
     data: Annotated[
         Path, typer.Option("--data", metavar="DIR", help="Folder that holds robotino2021.")

@@ -348,6 +348,34 @@ def selftest(
     return found
 
 
+def design(out: Path, wanted: Any, report: Reporter) -> tuple[Any, list[str]]:
+    """Runs to drive next for the fit in `out`, and the files written there.
+
+    Raises:
+        DataError: no fit there, or something is wanted that it does not have.
+    """
+    runtime.start()
+    from slipid.app import design as job
+    from slipid.identify.result import load
+
+    fit = load(out)
+    report.stage("simulating candidate runs")
+    found = job.design(fit, wanted)
+    report.stage("drawing")
+    write_json(out / "design.json", found.content)
+    written = ["design.json"]
+    for old in ("design_commands.csv", "design.png"):
+        (out / old).unlink(missing_ok=True)
+    if found.drives:
+        from slipid.app.drawing import save
+        from slipid.app.plots_design import design_figure
+
+        write_bytes(out / "design_commands.csv", job.commands(found).encode())
+        save(design_figure(found), out / "design.png")
+        written += ["design_commands.csv", "design.png"]
+    return found, written
+
+
 def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> dict[str, Any]:
     """What the logs hold, and what they can be expected to tell, before any fit.
 

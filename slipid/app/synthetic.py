@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.app.synthetic_files import LAYOUT, write_logs
-from slipid.app.synthetic_plan import ROBOTINO, TRUTH, Drive, Sensors, blank, grid, truth
+from slipid.app.synthetic_plan import ROBOTINO, TRUTH, Sensors, blank, grid, truth
 from slipid.data.log import Log
+from slipid.identify.drives import Drive
 from slipid.model.robot import Robot, compose, wheel_torque
 from slipid.model.rollout import path, replay_twist
 
@@ -49,7 +50,7 @@ def make_logs(
     """
     sensors = sensors or Sensors()
     rng = np.random.default_rng(seed)
-    longest = max(_duration(d, robot) for d in drives) + sensors.delay + sensors.ramp
+    longest = max(d.seconds(_base(robot)) for d in drives) + sensors.delay + sensors.ramp
     rows = int(np.ceil(longest / sensors.row_period)) + 2
     time, angle = _wheels(robot, drives, sensors, rows, rng)
     floor = jnp.asarray([robot.surface_index(d.surface) for d in drives])
@@ -63,7 +64,7 @@ def make_logs(
     tick = 2 * np.pi / (sensors.ticks * robot.geometry.gear_ratio)
     logs = []
     for k, d in enumerate(drives):
-        n = int(np.searchsorted(time[k], _duration(d, robot) + sensors.delay + sensors.ramp))
+        n = int(np.searchsorted(time[k], d.seconds(_base(robot)) + sensors.delay + sensors.ramp))
         whole = np.floor(angle[k, :n] / tick) * tick
         current, voltage, reported = (None if c is None else c[k, :n] for c in channels)
         logs.append(
@@ -75,7 +76,7 @@ def make_logs(
                 wheel_angle=whole - whole[0],
                 wheel_speed=reported,
                 wheel_speed_command=None,
-                twist_command=np.tile(_command(d), (n, 1)),
+                twist_command=np.tile(d.command, (n, 1)),
                 current=current,
                 current_is_signed=False,
                 voltage=voltage,
@@ -91,12 +92,8 @@ def make_logs(
     return logs
 
 
-def _command(d: Drive) -> np.ndarray:
-    return np.array([d.speed * np.cos(d.heading), d.speed * np.sin(d.heading), d.turn])
-
-
-def _duration(d: Drive, robot: Robot) -> float:
-    return d.distance / (d.speed + abs(d.turn) * float(robot.geometry.base_radius) * (d.speed == 0))
+def _base(robot: Robot) -> float:
+    return float(robot.geometry.base_radius)
 
 
 def _wheels(
@@ -104,7 +101,7 @@ def _wheels(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times (run, row) and true wheel angles (run, row, wheel)."""
     n, j = len(drives), np.asarray(robot.geometry.forward())
-    want = np.stack([_command(d) for d in drives]) @ j.T / float(robot.geometry.wheel_radius)
+    want = np.stack([d.command for d in drives]) @ j.T / float(robot.geometry.wheel_radius)
     uneven = rng.uniform(0.9, 1.1, (n, rows))
     time = np.cumsum(uneven * s.row_period, axis=1)
     time -= time[:, :1]

@@ -6,34 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from slipid.identify.drives import Drive
 from slipid.model.geometry import omni
 from slipid.model.robot import Robot, build
 from slipid.parameter import Choice, Space, entries
 
 ROBOTINO = (60.0, 180.0, 300.0)
 """Azimuths of the wheels [deg]."""
-
-
-@dataclass(frozen=True)
-class Drive:
-    """One run: a constant command on one floor with one load set-up.
-
-    Attributes:
-        heading: of the commanded motion in the body frame [rad]; speed: [m/s]; turn: [rad/s].
-        distance: commanded length [m], arc of the rim where it only turns.
-    """
-
-    surface: str
-    load: str
-    heading: float
-    speed: float
-    turn: float = 0.0
-    distance: float = 0.7
-
-    @property
-    def session(self) -> str:
-        """Time in which the marker stayed as it was, as `slipid.data.dataset` names it."""
-        return f"{self.surface}/{self.load}/{self.speed:.2f}"
 
 
 def grid(

@@ -1,5 +1,6 @@
 """Results as tables for people, on stdout."""
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -260,6 +261,63 @@ def _numbers(count: dict[str, int]) -> str:
     floors = sorted({n for floor, n in count.items() if floor != "shared"})
     own = f"{floors[0]}" if len(floors) == 1 else f"{floors[0]}-{floors[-1]}"
     return f"{own} + {count['shared']}" if count["shared"] else own
+
+
+SHOWN = 3
+"""Goals that have a column of their own."""
+
+
+def design(found: dict[str, Any], out: Path, written: Sequence[str]) -> None:
+    """Runs to drive next, what they shrink, and what they save."""
+    console = _console()
+    goals = [g for g in found["goals"] if g["reachable"]][:SHOWN]
+    if found["runs"]:
+        table = Table(show_edge=False, pad_edge=False, box=None)
+        for name in ("run", "floor", "load", "heading", "m/s", "turn", "m", "seconds"):
+            table.add_column(name, justify="left" if name in ("floor", "load") else "right")
+        for g in goals:
+            table.add_column(Text(f"{g['name']} [{g['unit']}]"), justify="right")
+        before = [_uncertain(g["now"], g["unit"]) for g in goals]
+        table.add_row("", "now", *[""] * 6, *before)
+        for k, run in enumerate(found["runs"], 1):
+            table.add_row(
+                str(k),
+                Text(run["floor"]),
+                Text(run["load"]),
+                f"{run['heading_deg']:.0f} deg" if run["speed"] else "",
+                f"{run['speed']:g}" if run["speed"] else "",
+                f"{math.degrees(run['turn_rate']):.0f} deg/s" if run["turn_rate"] else "",
+                f"{run['distance']:.2g}",
+                f"{run['seconds']:.1f}",
+                *(_uncertain(run["expected"][g["name"]], g["unit"]) for g in goals),
+            )
+        console.print(table)
+        rest = len([g for g in found["goals"] if g["reachable"]]) - len(goals)
+        if rest:
+            console.print(f"std after each run; {rest} more goals are in design.json")
+        else:
+            console.print("std after each run")
+    for s in found["runs_saved"].values():
+        console.print(_saving(s), markup=False, soft_wrap=True)
+    for sentence in found["messages"]:
+        console.print(f"note: {sentence}", markup=False, soft_wrap=True)
+    console.print(f"in {out}: {', '.join(written)}", markup=False, soft_wrap=True)
+
+
+def _uncertain(std: float, unit: str) -> str:
+    return f"{100 * std:.3g} %" if unit == "m/m" else f"{std:.3g}"
+
+
+def _saving(s: dict[str, Any]) -> str:
+    """One sentence on runs saved."""
+    whole = f"{s['name']} ({s['grid_runs']} runs)"
+    if s["greedy_runs"] is None:
+        return f"from nothing: no fewer chosen runs tell as much as {whole}"
+    worse = s["criterion_random_order"] / s["criterion"]
+    return (
+        f"from nothing: {s['greedy_runs']} chosen runs tell as much as {whole}: {s['ratio']:.0%}; "
+        f"the first {s['greedy_runs']} of it in random order leave {worse:.2g} times the variance"
+    )
 
 
 def demo(

@@ -29,6 +29,7 @@ class Dataset:
         session: name per run, of the time the marker stayed as it was.
         heading: direction of travel the command asks for, per run [rad]; nan where it turns.
         speed: commanded speed, per run [m/s].
+        turn: commanded yaw rate, per run [rad/s]; nan where no command was logged.
     """
 
     logs: tuple[Log, ...]
@@ -44,6 +45,7 @@ class Dataset:
     session: tuple[str, ...]
     heading: Float[np.ndarray, " run"]
     speed: Float[np.ndarray, " run"]
+    turn: Float[np.ndarray, " run"]
 
     def __len__(self) -> int:
         return len(self.logs)
@@ -115,8 +117,9 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
         voltage=flat.get("voltage"),
         current_is_signed=all(log.current_is_signed for log in logs),
         session=tuple(pick(log) for log in logs),
-        heading=np.array([h for h, _ in heads]),
-        speed=np.array([s for _, s in heads]),
+        heading=np.array([h for h, _, _ in heads]),
+        speed=np.array([s for _, s, _ in heads]),
+        turn=np.array([t for _, _, t in heads]),
     )
 
 
@@ -127,12 +130,14 @@ def default_session(log: Log) -> str:
     return "/".join(parts)
 
 
-def _setting(log: Log) -> tuple[float, float]:
+def _setting(log: Log) -> tuple[float, float, float]:
+    """Heading [rad], speed [m/s] and yaw rate [rad/s] of the command."""
     if log.twist_command is None:
-        return float("nan"), float("nan")
+        return (float("nan"),) * 3
     command = np.median(log.twist_command, axis=0)
     speed = float(np.hypot(command[0], command[1]))
-    return (float(np.arctan2(command[1], command[0])) if speed > 1e-4 else float("nan")), speed
+    heading = float(np.arctan2(command[1], command[0])) if speed > 1e-4 else float("nan")
+    return heading, speed, float(command[2])
 
 
 @dataclass(frozen=True, eq=False)

@@ -112,6 +112,7 @@ def validity(data: Dataset, robot: Robot, b: lk.Batch) -> dict[str, dict[str, An
     yaw = np.abs(speed @ np.asarray(back))  # by the encoders: what was driven, not how it slipped
     speed, torque, slip = np.abs(speed), np.abs(torque), np.abs(slip)
     floor = np.asarray(b.surface)
+    far = lk.travel(b, robot)[0].sum(axis=1)
     out: dict[str, dict[str, Any]] = {}
     for k, label in enumerate(robot.surfaces.labels):
         runs = [i for i, log in enumerate(data.logs) if (log.surface or "unknown") == label]
@@ -126,5 +127,7 @@ def validity(data: Dataset, robot: Robot, b: lk.Batch) -> dict[str, dict[str, An
             "yaw_rate": [0.0, float(yaw[floor == k].max())],
             "headings_deg": sorted({round(float(h), 1) for h in heading[np.isfinite(heading)]}),
             "speeds": sorted({round(float(s), 3) for s in body[np.isfinite(body)]}),
+            "turn_rates": sorted({round(float(t), 2) for t in data.turn[runs] if np.isfinite(t)}),
+            "distance": round(float(far[floor == k].sum()) / max(len(runs), 1), 3),
         }
     return out

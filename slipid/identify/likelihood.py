@@ -268,10 +268,10 @@ def noise(windows: Windows, robot: Robot) -> Noise:
     )
 
 
-def travel(windows: Windows, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+def travel(windows: Windows | Batch, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Distance of each window by the encoders (piece, window) [m], and its unit direction."""
     j = np.linalg.pinv(np.asarray(robot.geometry.forward()))
-    step = windows.turn * float(robot.geometry.wheel_radius) @ j.T
+    step = np.asarray(windows.turn) * float(robot.geometry.wheel_radius) @ j.T
     far = np.linalg.norm(step[..., :2], axis=-1)
     turned = np.abs(step[..., 2]) * float(robot.geometry.base_radius)
     u = np.where(

@@ -236,15 +236,28 @@ class Problem:
         self, data: Data, jacobian: dict[str, Array], log_v: Vector, keep: Vector
     ) -> Array:
         total, of_motion = jnp.diag(1 / self._std**2), jnp.diag(1 / self._std**2)
-        for k, jac in jacobian.items():
-            m = jac.shape[1]
-            factor = keep * (DEGREES + m) / (DEGREES + m + 2)  # Fisher information of a t location
-            root = inverse_root(self._covariance(data, k, log_v)) * jnp.sqrt(factor)[:, None, None]
-            half = jnp.einsum("nij,njp->nip", root, jac)
+        for k, half in self._whitened(data, jacobian, log_v, keep).items():
             flat = half.reshape(-1, half.shape[-1])
             total += flat.T @ flat
             of_motion += flat.T @ flat if k == "motion" else 0.0
         return total if self.joint else self._cut(total, of_motion)
+
+    def whitened(self, jacobian: dict[str, Array], log_v: Vector) -> dict[str, Array]:
+        """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
+        keep = jnp.ones(len(self.windows))
+        return self._form._whitened(self.data, jacobian, jnp.asarray(log_v), keep)
+
+    @partial(jax.jit, static_argnums=0)
+    def _whitened(
+        self, data: Data, jacobian: dict[str, Array], log_v: Vector, keep: Vector
+    ) -> dict[str, Array]:
+        out = {}
+        for k, jac in jacobian.items():
+            m = jac.shape[1]
+            factor = keep * (DEGREES + m) / (DEGREES + m + 2)  # Fisher information of a t location
+            root = inverse_root(self._covariance(data, k, log_v)) * jnp.sqrt(factor)[:, None, None]
+            out[k] = jnp.einsum("nij,njp->nip", root, jac)
+        return out
 
     def _cut(self, total: Array, of_motion: Array) -> Array:
         """Information when p(electric | motion, all data) multiplies p(motion | motion data)."""

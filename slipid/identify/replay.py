@@ -118,7 +118,8 @@ def twist_end_jacobian(space: Any, z: Array, twist: Array, w: lk.Batch, start: A
 
 
 @partial(jax.jit, static_argnums=0)
-def _end_jacobian(space: Any, z: Array, b: lk.Batch, start: Array) -> Array:
+def end_jacobian(space: Any, z: Array, b: lk.Batch, start: Array) -> Array:
+    """Derivative of the end pose (piece, 3) by the search vector, from given start poses."""
     return jax.jacfwd(lambda x: _end(space.tree(x), b, start))(z)
 
 
@@ -166,7 +167,7 @@ def parameter_covariance(
     """Part of the end's covariance that comes from the fitted numbers, linearised."""
     b = lk.batch(w, space.template)
     start = jnp.asarray(tracks.predicted[:, 0])
-    jac = np.asarray(_end_jacobian(space, jnp.asarray(z), b, start))
+    jac = np.asarray(end_jacobian(space, jnp.asarray(z), b, start))
     return np.asarray(np.einsum("nip,pq,njq->nij", jac[:, :2], covariance, jac[:, :2]))
 
 

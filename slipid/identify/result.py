@@ -334,6 +334,7 @@ def summarise(
         settings={
             "lag": float(windows.lag),
             "windows_per_piece": int(windows.dt.shape[1]),
+            "current_is_signed": bool(windows.current_is_signed),
             "seed": seed,
         },
     )

@@ -115,7 +115,7 @@ class Camera(eqx.Module):
         Every step shrinks the error by the bend of the map, some percent across a picture.
         """
         step = jnp.stack([self.scale, self.scale, jnp.ones(())])
-        q = pose.at[:2].divide(self.scale)
+        q = (pose / step).at[:2].add(jnp.asarray(self.centre))
         for _ in range(12):
             q = q + (pose - self.corrected(q)) / step
         return q

@@ -1,0 +1,208 @@
+"""What a set of runs tells: information that adds up over runs, and which runs add most.
+
+Numbers of the motion m are informed by the motion residuals, electric numbers e by currents and
+voltages given the motion, as in the fit. With whitened Jacobians J of the motion and (E, C) of
+currents and voltages by e and m,
+
+    M = M0 + sum J^T J,   O = O0 + sum E^T E,   X = X0 + sum E^T C
+    cov(m) = M^-1,   e = e(m) - L (m - m^),  L = O^-1 X,   cov(e) = O^-1 + L M^-1 L^T
+
+so M, O and X of different runs add. Where currents inform the motion, or there are none, all
+numbers count as m. A criterion is tr(G cov G^T) of a matrix G (Fedorov 1972; Atkinson, Donev and
+Tobias 2007, Optimum Experimental Designs, sections 10 and 12: c- and A-optimality, exchange).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+ENDLESS = 1e3
+"""Times that every candidate is driven where "endless" is meant."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Whitened Jacobians of runs.
+
+    Attributes:
+        motion: J (run, m, motion).
+        electric, carried: E (run, k, electric) and C (run, k, motion), k is 0 without currents.
+    """
+
+    motion: Float[np.ndarray, "run m motion"]
+    electric: Float[np.ndarray, "run k electric"]
+    carried: Float[np.ndarray, "run k motion"]
+
+    def __len__(self) -> int:
+        return len(self.motion)
+
+    def pick(self, index: Sequence[int] | np.ndarray) -> "Rows":
+        """Some runs, in the order given; a run may come several times."""
+        at = np.asarray(index, int)
+        return Rows(self.motion[at], self.electric[at], self.carried[at])
+
+    def joined(self, *others: "Rows") -> "Rows":
+        """These runs and others."""
+        every = (self, *others)
+        return Rows(
+            np.concatenate([r.motion for r in every]),
+            np.concatenate([r.electric for r in every]),
+            np.concatenate([r.carried for r in every]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """Information on all numbers.
+
+    Attributes:
+        is_electric: which of the numbers are (free,).
+        motion, own, cross: M, O and X.
+    """
+
+    is_electric: Bool[np.ndarray, " free"]
+    motion: Float[np.ndarray, "motion motion"]
+    own: Float[np.ndarray, "electric electric"]
+    cross: Float[np.ndarray, "electric motion"]
+
+    def plus(self, rows: Rows, times: float = 1.0) -> "Knowledge":
+        """After these runs as well, each so many times; -1 takes them away."""
+        j, e, c = (_flat(x) for x in (rows.motion, rows.electric, rows.carried))
+        return Knowledge(
+            self.is_electric,
+            self.motion + times * (j.T @ j),
+            self.own + times * (e.T @ e),
+            self.cross + times * (e.T @ c),
+        )
+
+    @cached_property
+    def of_motion(self) -> Float[np.ndarray, "motion motion"]:
+        """Covariance of the motion's numbers."""
+        return _inverse(self.motion)
+
+    @cached_property
+    def covariance(self) -> Float[np.ndarray, "free free"]:
+        """Covariance of all numbers."""
+        e, m = np.flatnonzero(self.is_electric), np.flatnonzero(~self.is_electric)
+        lean = np.linalg.solve(self.own, self.cross)
+        out = np.empty((len(self.is_electric),) * 2)
+        out[np.ix_(m, m)] = self.of_motion
+        out[np.ix_(e, m)] = -lean @ self.of_motion
+        out[np.ix_(m, e)] = out[np.ix_(e, m)].T
+        out[np.ix_(e, e)] = _inverse(self.own) + lean @ self.of_motion @ lean.T
+        return out
+
+    def criterion(self, goal: Float[np.ndarray, "k free"]) -> float:
+        """tr(G cov G^T)."""
+        return float(np.einsum("ki,ij,kj->", goal, self.covariance, goal))
+
+    def after_each(
+        self, rows: Rows, goal: Float[np.ndarray, "k free"]
+    ) -> Float[np.ndarray, " run"]:
+        """Criterion after one more run, for every candidate.
+
+        By Woodbury's identity (M + J^T J)^-1 = M^-1 - W^T (1 + W J^T)^-1 W with W = J M^-1, so what
+        is inverted has the size of a run, not of all numbers.
+        """
+        of_motion, of_electric = goal[:, ~self.is_electric], goal[:, self.is_electric]
+        rest: np.ndarray | float = 0.0
+        lean = of_motion
+        if of_electric.any():
+            e = rows.electric.transpose(0, 2, 1)
+            own, cross = self.own + e @ rows.electric, self.cross + e @ rows.carried
+            part = np.linalg.inv(own) @ of_electric.T
+            rest = np.einsum("ke,nek->n", of_electric, part)
+            lean = of_motion - part.transpose(0, 2, 1) @ cross
+        square = np.swapaxes(lean, -1, -2) @ lean
+        w = rows.motion @ self.of_motion
+        s = w @ rows.motion.transpose(0, 2, 1) + np.eye(rows.motion.shape[1])
+        gain = np.einsum("nii->n", np.linalg.solve(s, (w @ square) @ w.transpose(0, 2, 1)))
+        before = np.einsum("ij,...ij->...", self.of_motion, square)
+        return np.asarray(before + rest - gain)
+
+
+def known(
+    covariance: Float[np.ndarray, "free free"], is_electric: Bool[np.ndarray, " free"]
+) -> Knowledge:
+    """Knowledge with this covariance."""
+    e, m = np.flatnonzero(is_electric), np.flatnonzero(~is_electric)
+    of_motion = covariance[np.ix_(m, m)]
+    motion = _inverse(of_motion)
+    lean = -covariance[np.ix_(e, m)] @ motion
+    own = _inverse(covariance[np.ix_(e, e)] - lean @ of_motion @ lean.T)
+    return Knowledge(np.asarray(is_electric, bool), motion, own, own @ lean)
+
+
+def path(
+    start: Knowledge,
+    rows: Rows,
+    goal: np.ndarray,
+    order: Sequence[int] | np.ndarray,
+    at: Sequence[int] | None = None,
+) -> list[float]:
+    """Criterion after so many runs of an order: before and after each, or at chosen numbers."""
+    counts = range(len(order) + 1) if at is None else at
+    found, now, done = [], start, 0
+    for count in counts:
+        now, done = now.plus(rows.pick(order[done:count])), count
+        found.append(now.criterion(goal))
+    return found
+
+
+def greedy(
+    start: Knowledge, rows: Rows, goal: np.ndarray, most: int, target: float = 0.0
+) -> tuple[list[int], list[float]]:
+    """One run after another, each the one that lowers the criterion most; any may come again.
+
+    Args:
+        start: before the first.
+        rows: candidates.
+        goal: G (k, free).
+        most: runs at most.
+        target: criterion at which to stop.
+
+    Returns:
+        the runs, and the criterion before and after each.
+    """
+    now, chosen, found = start, [], [start.criterion(goal)]
+    while len(chosen) < most and found[-1] > target:
+        best = int(np.argmin(now.after_each(rows, goal)))
+        now = now.plus(rows.pick([best]))
+        chosen.append(best)
+        found.append(now.criterion(goal))
+    return chosen, found
+
+
+def exchanged(start: Knowledge, rows: Rows, goal: np.ndarray, chosen: Sequence[int]) -> list[int]:
+    """The runs after each was once exchanged for the best in its place, the most useful first."""
+    kept = list(chosen)
+    for k in range(len(kept)):
+        others = start.plus(rows.pick(kept[:k] + kept[k + 1 :]))
+        each = others.after_each(rows, goal)
+        best = int(np.argmin(each))
+        if each[best] < each[kept[k]] * (1 - 1e-9):
+            kept[k] = best
+    ordered, now = [], start
+    while kept:
+        first = int(np.argmin(now.after_each(rows.pick(kept), goal)))
+        ordered.append(kept.pop(first))
+        now = now.plus(rows.pick(ordered[-1:]))
+    return ordered
+
+
+def endless(start: Knowledge, rows: Rows) -> Knowledge:
+    """After every candidate was driven `ENDLESS` times: what is left then no run can take away."""
+    return start.plus(rows, ENDLESS)
+
+
+def _flat(x: np.ndarray) -> np.ndarray:
+    return x.reshape(x.shape[0] * x.shape[1], x.shape[2])
+
+
+def _inverse(a: np.ndarray) -> np.ndarray:
+    """Inverse of a symmetric positive matrix whose numbers differ widely in size."""
+    scale = 1 / np.sqrt(np.diag(a))
+    return np.asarray(np.linalg.inv(a * scale[:, None] * scale) * scale[:, None] * scale)
