@@ -15,6 +15,7 @@ from slipid.app.progress import Reporter
 from slipid.data.files import read_json, write_arrays, write_json
 from slipid.data.log import DataError
 from slipid.identify import curves as curves_of
+from slipid.identify.density import ELECTRIC, EVERYTHING, MOTION
 from slipid.identify.identifiability import NEEDS_VOLTAGE, Estimate, by_ratio, derived
 from slipid.identify.posterior import Posterior
 from slipid.identify.result import Fit, as_identified
@@ -78,7 +79,6 @@ def sample(
 ) -> Posterior:
     """Posterior of a fit, going on from the blocks an earlier call has left in `out`."""
     from slipid.identify import posterior
-    from slipid.identify.density import ELECTRIC, EVERYTHING, MOTION
 
     kept = Blocks(out / FOLDER, key(fit, plan, draws))
     done = {part: kept.read(part) for part in (MOTION, ELECTRIC, EVERYTHING)}
@@ -119,7 +119,8 @@ class Watch:
     def block(self, part: str, block: Block) -> None:
         """A block is done and kept."""
         count = block.number + 1
-        warm = "warm-up, " if count <= self.plan.warm_up[-1] else ""
+        first = part != ELECTRIC
+        warm = "warm-up, " if first and count <= self.plan.warm_up[-1] else ""
         self.report.line(
             f"  block {count}: {warm}{count * block.chain.shape[1]} steps, "
             f"{100 * block.accepted.mean():.0f} % moved, "
