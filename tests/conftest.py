@@ -34,3 +34,16 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real logs: {folder} is no folder (set SLIPID_DATA)")
     return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _room_for_compiled_code():
+    """Everything compiled is forgotten before the kernel's limit of memory maps ends the process.
+
+    Compiled functions hold maps; at vm.max_map_count (65 530 by default) the next compilation is a
+    segmentation fault.
+    """
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 15_000:
+        jax.clear_caches()

@@ -8,7 +8,9 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import multivariate_t
+from scipy.integrate import quad
+from scipy.optimize import brentq
+from scipy.stats import chi2, multivariate_t
 from typer.testing import CliRunner
 
 from slipid.app import comparison
@@ -167,22 +169,35 @@ def judged(w, names):
     return out, dict(zip(names, models, strict=True)), problem, half
 
 
+def width_of_student(m):
+    """Mean of q / m where a Student t's scale was fitted to m Gaussian numbers."""
+
+    def slope(width):
+        def weighed(q):
+            return (DEGREES + m) * width * q / (DEGREES + width * q) * chi2.pdf(q, m)
+
+        return quad(weighed, 0, np.inf)[0] - m
+
+    return brentq(slope, 0.5, 3.0)
+
+
 def test_linear_slip_is_told_from_constant_slip():
     told, models, problem, half = judged(
-        driven("linear", ([1.0], [3.0]), 3), ("encoder", "constant", "linear", "affine")
+        driven("linear", ([1.0], [3.0]), 3, runs=480), ("encoder", "constant", "linear", "affine")
     )
     for floor in ranking(told).values():
         verdict = {name: one["verdict"] for name, one in floor["models"].items()}
         assert verdict["encoder"] == verdict["constant"] == "worse"
         assert "worse" not in (verdict["linear"], verdict["affine"])  # affine contains linear
-    # the distribution of runs it has not seen is as wide as it has to be
+    # the distribution of runs it has not seen is as wide as it has to be: as a Student t fitted to
+    # Gaussian gaps is, and 0.13 is three stds of the mean
     linear = models["linear"]
     gap, scale = linear.scale(problem)
     q = np.einsum("ni,ni->n", gap, np.linalg.solve(scale, gap[..., None])[..., 0])[half == 1]
-    assert q.mean() / gap.shape[1] == pytest.approx(1.1, abs=0.25)
+    assert q.mean() / gap.shape[1] == pytest.approx(width_of_student(gap.shape[1]), abs=0.13)
     for axis in ("along", "across", "yaw"):
         found = [np.sqrt(linear.variance[f"run.{f}.{axis}"]) for f in ROBOT.surfaces.labels]
-        np.testing.assert_allclose(found, STD[f"run.{axis}"], rtol=0.35)
+        np.testing.assert_allclose(found, STD[f"run.{axis}"], rtol=0.25)
 
 
 def test_models_that_say_the_same_cannot_be_told_apart():
