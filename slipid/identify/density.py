@@ -152,6 +152,20 @@ class Density:
 
         return jax.lax.map(one, (x, held))
 
+    def slope(
+        self, x: Float[np.ndarray, "walker size"], held: Any = None
+    ) -> Float[np.ndarray, "walker size"]:
+        """Derivative of the log posterior of every walker, arguments as of `terms`."""
+        return np.array(self._form._slope(self.anchor, jnp.asarray(x), held))
+
+    @partial(jax.jit, static_argnums=0)
+    def _slope(self, anchor: Anchor, x: Array, held: Any) -> Array:
+        def one(args: Any) -> Array:
+            x, held = args
+            return jax.grad(lambda x: jnp.sum(self._sums(anchor, x, held)))(x)
+
+        return jax.lax.map(one, (x, held))
+
     def logpdf(self, x: Float[Array, " size"]) -> Float[Array, ""]:
         """Log posterior of one vector, differentiable, for samplers that want gradients."""
         return jnp.sum(self._sums(self.anchor, x, None))

@@ -1,17 +1,12 @@
-"""Moves of an ensemble of walkers that know which coordinates depend on each other.
+"""Moves of an ensemble of walkers in coordinates in which its target is nearly a Gaussian.
 
 A target's log density is a sum of one term per group of coordinates, given those that groups share,
-and a term of the shared ones. All groups are moved in one evaluation, each accepted or not by its
-own term. Shared coordinates are moved with the residuals
-
-    e_g = x_g - B_g x_shared
-
-held, so that groups follow them; where the density is Gaussian and B its regression, every proposal
-of the independence moves is accepted. Differential evolution (ter Braak 2006) does what they cannot
-where the density is far from what they know.
+and a term of the shared ones. In the coordinates of `slipid.identify.transport` independence moves
+and differential evolution move all groups in one evaluation, each accepted or not by its own term,
+or the shared ones, which groups then follow. Hamiltonian moves take all coordinates far along the
+gradient where the density still bends.
 """
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,15 +15,20 @@ import numpy as np
 from emcee.moves import Move
 from emcee.state import State
 from jaxtyping import Float
-from scipy.optimize import minimize
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln
+
+from slipid.identify.transport import Transport, gaussian
 
 Matrix = Float[np.ndarray, "_ _"]
-Matrices = Float[np.ndarray, "..."]
-STUDENT_SHARE = 0.2
-"""Part of the draws of a learnt proposal that come from a Student t."""
+STUDENT = 0.2
+"""Part of independent draws that come from a Student t, so that no tail is left out."""
 DEGREES = 8.0
 """Of that Student t."""
+WAY = 0.5 * np.pi
+"""Of a Hamiltonian move [rad]: a quarter turn leads to an independent draw of a Gaussian."""
+MOST_STEPS = 12
+STEEPEST = 100.0
+"""Kicks are bounded by this many times the step, so that walkers far out are not thrown away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +37,7 @@ class Target:
 
     Attributes:
         terms: of vectors (walker, size) the terms (walker, group + 1), shared term last.
+        slope: of vectors the derivative of the sum of terms (walker, size).
         group: of each coordinate, -1 where groups share it.
         kind: of each coordinate; those of different kinds are moved by themselves.
         centre, covariance: of a Gaussian near it (Laplace).
@@ -45,16 +46,12 @@ class Target:
     """
 
     terms: Callable[[Matrix], Matrix]
+    slope: Callable[[Matrix], Matrix]
     group: np.ndarray
     kind: np.ndarray
     centre: Float[np.ndarray, " size"]
     covariance: Matrix
     apart: bool = False
-
-    @property
-    def shared(self) -> np.ndarray:
-        """Places of the shared coordinates."""
-        return np.flatnonzero(self.group < 0)
 
     @property
     def count(self) -> int:
@@ -66,235 +63,53 @@ class Target:
         terms = self.terms(x)
         return np.concatenate([terms.sum(axis=1, keepdims=True), terms], axis=1)
 
+    def laplace(self) -> Transport:
+        """Map of the Gaussian near it."""
+        return gaussian(self.centre, self.covariance, self.group, self.kind, self.covariance)
 
-@dataclass(frozen=True, eq=False)
-class Warp:
-    """Sinh-arcsinh map of every coordinate to one that is nearer to a Gaussian.
+    def seen_by(self, map: Transport) -> "Target":
+        """The same distribution in other coordinates; centre and covariance are left alone."""
+        onto = np.eye(self.count + 1)[np.where(self.group < 0, self.count, self.group)]
 
-        y = sinh(tail arcsinh((x - place) / scale) - skew)
+        def terms(u: Matrix) -> Matrix:
+            x, log = map.placed(u)
+            return np.asarray(self.terms(x) + log @ onto)
 
-    Source: Jones and Pewsey 2009, Biometrika 96, eq. 2.
-    """
+        def slope(u: Matrix) -> Matrix:
+            x = map.back(u)
+            return map.pull(u, x, self.slope(x))
 
-    place: Float[np.ndarray, " size"]
-    scale: Float[np.ndarray, " size"]
-    skew: Float[np.ndarray, " size"]
-    tail: Float[np.ndarray, " size"]
-
-    def forward(self, x: Matrices) -> Matrices:
-        return np.sinh(self.tail * np.arcsinh((x - self.place) / self.scale) - self.skew)
-
-    def back(self, y: Matrices) -> Matrices:
-        return self.place + self.scale * np.sinh((np.arcsinh(y) + self.skew) / self.tail)
-
-    def log_slope(self, y: Matrices) -> Matrices:
-        """Log dx/dy of every coordinate."""
-        inner = (np.arcsinh(y) + self.skew) / self.tail
-        # cosh without overflow
-        cosh = np.abs(inner) + np.log1p(np.exp(-2 * np.abs(inner))) - np.log(2)
-        return np.log(self.scale / self.tail) + cosh - 0.5 * np.log1p(y**2)
-
-    @staticmethod
-    def none(size: int) -> "Warp":
-        one, zero = np.ones(size), np.zeros(size)
-        return Warp(zero, one, zero, one)
-
-    @staticmethod
-    def fitted(draws: Matrix, most: int = 2000) -> "Warp":
-        """Maximum likelihood, column by column."""
-        some = draws[:: max(1, len(draws) // most)]
-        return Warp(*np.array([_sinh_arcsinh(column) for column in some.T]).T)
+        return replace(self, terms=terms, slope=slope)
 
 
-def _sinh_arcsinh(x: Float[np.ndarray, " draw"]) -> tuple[float, float, float, float]:
-    middle, width = float(np.median(x)), float(x.std())
-    t = (x - middle) / width
-
-    def loss(q: np.ndarray) -> float:
-        inner = np.arcsinh((t - q[0]) / np.exp(q[1]))
-        y = np.exp(q[3]) * inner - q[2]
-        density = -0.5 * np.sinh(y) ** 2 + np.log(np.cosh(y)) + q[3] - q[1]
-        spread = np.mean(density - 0.5 * np.log1p(((t - q[0]) / np.exp(q[1])) ** 2))
-        return float(-spread + 1e-3 * (q @ q))
-
-    with np.errstate(over="ignore"):
-        q = minimize(loss, np.zeros(4), method="BFGS").x
-    return middle + width * q[0], width * float(np.exp(q[1])), q[2], float(np.exp(q[3]))
-
-
-@dataclass(frozen=True, eq=False)
-class Mixture:
-    """Mixture of a Student t (the first part) and Gaussians.
-
-    Attributes:
-        weight: of each part.
-        mean: (part, size).
-        root: Cholesky factors of the parts' scale matrices (part, size, size).
-    """
-
-    weight: Float[np.ndarray, " part"]
-    mean: Matrix
-    root: Float[np.ndarray, "part size size"]
-
-    def draw(self, random: np.random.RandomState, count: int) -> Matrix:
-        part = random.choice(len(self.weight), count, p=self.weight)
-        normal = random.standard_normal((count, self.mean.shape[1]))
-        stretch = np.sqrt(DEGREES / random.chisquare(DEGREES, count))
-        normal *= np.where(part == 0, stretch, 1.0)[:, None]
-        return np.asarray(self.mean[part] + np.einsum("nij,nj->ni", self.root[part], normal))
-
-    def log_density(self, x: Matrix) -> Float[np.ndarray, " row"]:
-        size, out = x.shape[1], []
-        for k, (weight, mean, root) in enumerate(
-            zip(self.weight, self.mean, self.root, strict=True)
-        ):
-            q = (np.linalg.solve(root, (x - mean).T) ** 2).sum(axis=0)
-            scale = np.log(weight) - np.log(np.diag(root)).sum()
-            if k == 0:
-                scale += gammaln(0.5 * (DEGREES + size)) - gammaln(0.5 * DEGREES)
-                scale -= 0.5 * size * np.log(DEGREES / 2)  # less the Gaussian's 2 pi
-                out.append(scale - 0.5 * (DEGREES + size) * np.log1p(q / DEGREES))
-            else:
-                out.append(scale - 0.5 * q)
-        return np.asarray(logsumexp(out, axis=0))
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """Some coordinates of one group, or some shared ones, and what is known of them.
-
-    Attributes:
-        own: their places.
-        given: places of those they are regressed on.
-        slope: of that regression (given, own).
-        mixture: distribution of what it leaves.
-    """
-
-    own: np.ndarray
-    given: np.ndarray
-    slope: Matrix
-    mixture: Mixture
-
-    def left(self, x: Matrix) -> Matrix:
-        """Own coordinates less what the others say of them."""
-        return np.asarray(x[:, self.own] - x[:, self.given] @ self.slope)
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Family:
-    """Parts that are moved together.
+    """Coordinates that are moved together.
 
     Attributes:
-        parts: one per group, None where a group has no such coordinates; or a single one of shared
-            coordinates.
-        follow: how much all other coordinates move with shared ones (own, size); None for groups.
+        places: of each group's, or of the shared ones alone.
+        groups: number of each; None for shared ones.
     """
 
-    parts: tuple[Part | None, ...]
-    follow: Matrix | None
+    places: tuple[np.ndarray, ...]
+    groups: tuple[int, ...] | None
 
 
-@dataclass(frozen=True, eq=False)
-class Proposal:
-    """What moves draw from: families, in coordinates that a warp has brought nearer to Gaussian."""
-
-    warp: Warp
-    families: tuple[Family, ...]
-
-
-Known = Callable[[np.ndarray, np.ndarray], tuple[Matrix, Mixture]]
-"""From own and given coordinates to the slope and the mixture of what is left."""
-
-
-def _families(target: Target, known: Known, follow: Matrix) -> tuple[Family, ...]:
-    """Families of every kind of coordinates, of groups and of shared ones."""
-
-    def part(own: np.ndarray, given: np.ndarray) -> Part | None:
-        places = np.flatnonzero(own), np.flatnonzero(given)
-        return Part(*places, *known(*places)) if own.any() else None
-
-    group, kind, found = target.group, target.kind, []
-    shared = group < 0
-    for k in np.unique(kind):
-        mine = kind == k
-        parts = [
-            part(mine & (group == g), (shared | (group == g)) & ~(mine & (group == g)))
-            for g in range(target.count)
-        ]
-        found.append(Family(tuple(parts), None))
-        own = part(mine & shared, ~mine & shared)
-        if own is not None:
-            found.append(Family((own,), follow[np.isin(np.flatnonzero(shared), own.own)]))
-    return tuple(f for f in found if any(f.parts))
+def families(target: Target) -> list[Family]:
+    """Coordinates of every kind, of all groups and shared."""
+    found = []
+    for k in np.unique(target.kind):
+        groups = tuple(int(g) for g in np.unique(target.group[target.kind == k]) if g >= 0)
+        places = [np.flatnonzero((target.kind == k) & (target.group == g)) for g in groups]
+        if groups:
+            found.append(Family(tuple(places), groups))
+        shared = np.flatnonzero((target.kind == k) & (target.group < 0))
+        if len(shared):
+            found.append(Family((shared,), None))
+    return found
 
 
-def laplace(target: Target) -> Proposal:
-    """Proposal from the Gaussian near the target, as a Student t."""
-    cov, mean = target.covariance, target.centre
-
-    def slopes(given: np.ndarray, own: np.ndarray) -> Matrix:
-        if not len(given):
-            return np.zeros((0, len(own)))
-        return np.asarray(np.linalg.solve(cov[np.ix_(given, given)], cov[np.ix_(given, own)]))
-
-    def known(own: np.ndarray, given: np.ndarray) -> tuple[Matrix, Mixture]:
-        slope = slopes(given, own)
-        left = cov[np.ix_(own, own)] - cov[np.ix_(own, given)] @ slope
-        middle = mean[own] - mean[given] @ slope
-        return slope, Mixture(np.ones(1), middle[None], np.linalg.cholesky(left)[None])
-
-    follow = slopes(target.shared, np.arange(len(mean)))
-    return Proposal(Warp.none(len(mean)), _families(target, known, follow))
-
-
-def warped(target: Target, warp: Warp) -> Target:
-    """The same distribution in other coordinates; centre and covariance are left as they are."""
-    onto = np.eye(target.count + 1)[np.where(target.group < 0, target.count, target.group)]
-
-    def terms(y: Matrix) -> Matrix:
-        return np.asarray(target.terms(warp.back(y)) + warp.log_slope(y) @ onto)
-
-    return replace(target, terms=terms)
-
-
-def learnt(target: Target, draws: Matrix, parts: int, seed: int) -> Proposal:
-    """Proposal from draws of an earlier part of the chains.
-
-    Coordinates warped one by one, then Gaussian mixtures (scikit-learn) of the residuals with a
-    Student t of their covariance as one more part.
-    """
-    from sklearn.mixture import GaussianMixture
-
-    warp = Warp.fitted(draws)
-    y = warp.forward(draws)
-    about = y - y.mean(axis=0)
-
-    def slopes(given: np.ndarray, own: np.ndarray) -> Matrix:
-        if not len(given):
-            return np.zeros((0, len(own)))
-        return np.asarray(np.linalg.lstsq(about[:, given], about[:, own], rcond=None)[0])
-
-    def known(own: np.ndarray, given: np.ndarray) -> tuple[Matrix, Mixture]:
-        slope = slopes(given, own)
-        x = y[:, own] - y[:, given] @ slope
-        root = np.linalg.cholesky(np.cov(x.T).reshape(len(own), len(own)))
-        middle = x.mean(axis=0)
-        white = np.linalg.solve(root, (x - middle).T).T
-        found = GaussianMixture(parts, random_state=seed, reg_covar=1e-4, max_iter=60)
-        with warnings.catch_warnings():  # a proposal need not be the best one
-            warnings.simplefilter("ignore")
-            found.fit(white)
-        return slope, Mixture(
-            weight=np.concatenate([[STUDENT_SHARE], (1 - STUDENT_SHARE) * found.weights_]),
-            mean=np.concatenate([middle[None], middle + found.means_ @ root.T]),
-            root=np.concatenate([root[None], root @ np.linalg.cholesky(found.covariances_)]),
-        )
-
-    follow = slopes(target.shared, np.arange(y.shape[1]))
-    return Proposal(warp, _families(target, known, follow))
-
-
-class BlockMove(Move):
+class FamilyMove(Move):
     """Metropolis-Hastings of a family.
 
     Attributes:
@@ -303,90 +118,72 @@ class BlockMove(Move):
 
     halves = 1
 
-    def __init__(self, target: Target, family: Family):
-        self.target, self.family = target, family
+    def __init__(self, family: Family):
+        self.family = family
 
     def jump(
-        self, left: Matrix, still: Matrix, mixture: Mixture, random: Any
+        self, old: Matrix, still: Matrix, random: Any
     ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
-        """New residuals of a part, and log q(old | new) - log q(new | old)."""
+        """New coordinates of some places, and log q(old | new) - log q(new | old)."""
         raise NotImplementedError
 
     def proposed(self, x: Matrix, still: Matrix, random: Any) -> tuple[Matrix, Matrix]:
-        """New vectors, and the log factor of every part."""
-        new, factors = x.copy(), np.zeros((len(x), len(self.family.parts)))
-        for k, part in enumerate(self.family.parts):
-            if part is None:
-                continue
-            old = part.left(x)
-            left, factors[:, k] = self.jump(old, part.left(still), part.mixture, random)
-            if self.family.follow is not None:
-                new += (left - old) @ self.family.follow
-            new[:, part.own] = x[:, part.own] + left - old
-        if self.family.follow is not None:
-            others = np.setdiff1d(self.target.shared, self.family.parts[0].own)  # type: ignore
-            new[:, others] = x[:, others]
-        return new, factors
+        """New vectors, and the log factor of each group's part or of the shared one."""
+        new, factor = x.copy(), np.empty((len(x), len(self.family.places)))
+        for k, own in enumerate(self.family.places):
+            new[:, own], factor[:, k] = self.jump(x[:, own], still[:, own], random)
+        return new, factor
 
     def propose(self, model: Any, state: State) -> tuple[State, np.ndarray]:
         random, count = model.random, len(state.coords)
         accepted = np.zeros(count, bool)
         order = random.permutation(count) if self.halves == 2 else np.arange(count)
         for mine in np.array_split(order, self.halves):
-            still = np.setdiff1d(order, mine)
-            new, factor = self.proposed(state.coords[mine], state.coords[still], random)
+            still = state.coords[np.setdiff1d(order, mine)]
+            new, factor = self.proposed(state.coords[mine], still, random)
             log_prob, terms = model.compute_log_prob_fn(new)
-            if self.family.follow is None:
-                gain = terms[:, :-1] - state.blobs[mine, :-1] + factor
-            else:
+            if self.family.groups is None:
                 gain = (log_prob - state.log_prob[mine])[:, None] + factor
+            else:
+                own_terms = list(self.family.groups)
+                gain = terms[:, own_terms] - state.blobs[mine][:, own_terms] + factor
             took = np.log(random.uniform(size=gain.shape)) < np.where(np.isnan(gain), -1e9, gain)
             self._take(state, mine, new, terms, took)
             accepted[mine] = took.any(axis=1)
         return state, accepted
 
     def _take(self, state: State, mine: Any, new: Matrix, terms: Matrix, took: np.ndarray) -> None:
-        if self.family.follow is not None:
-            rows = mine[took[:, 0]]
-            state.coords[rows], state.blobs[rows] = new[took[:, 0]], terms[took[:, 0]]
-        else:
-            for g, part in enumerate(self.family.parts):
-                if part is not None:
-                    rows = mine[took[:, g]]
-                    state.coords[np.ix_(rows, part.own)] = new[took[:, g]][:, part.own]
-                    state.blobs[rows, g] = terms[took[:, g], g]
+        for k, own in enumerate(self.family.places):
+            rows = mine[took[:, k]]
+            state.coords[np.ix_(rows, own)] = new[took[:, k]][:, own]
+            of = slice(None) if self.family.groups is None else self.family.groups[k]
+            state.blobs[rows, of] = terms[took[:, k], of]
         state.log_prob[mine] = state.blobs[mine].sum(axis=1)
 
 
-class Independence(BlockMove):
-    """Draws that do not depend on where a walker is, from what is known of the target."""
+class Independence(FamilyMove):
+    """Draws that do not depend on where a walker is: Gaussian, or Student t of as many degrees."""
 
     def jump(
-        self, left: Matrix, still: Matrix, mixture: Mixture, random: Any
+        self, old: Matrix, still: Matrix, random: Any
     ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
-        drawn = mixture.draw(random, len(left))
-        return drawn, mixture.log_density(left) - mixture.log_density(drawn)
+        count = len(old)
+        new = random.standard_normal(old.shape)
+        stretch = np.sqrt(DEGREES / random.chisquare(DEGREES, count))
+        new *= np.where(random.uniform(size=count) < STUDENT, stretch, 1.0)[:, None]
+        return new, _log_density(old) - _log_density(new)
 
 
-class Autoregressive(BlockMove):
-    """Part of the way from where a walker is towards a draw, exact for a Gaussian.
-
-        x' = m + sqrt(1 - b^2) (x - m) + b L xi,   b between 0.1 and 1
-
-    Source: preconditioned Crank-Nicolson, Cotter et al. 2013, Statistical Science 28, eq. 4.
-    """
-
-    def jump(
-        self, left: Matrix, still: Matrix, mixture: Mixture, random: Any
-    ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
-        mean, root = mixture.mean[0], mixture.root[0]
-        old = np.linalg.solve(root, (left - mean).T).T
-        step = 10 ** random.uniform(-1, 0, (len(left), 1))
-        new = np.sqrt(1 - step**2) * old + step * random.standard_normal(left.shape)
-        return mean + new @ root.T, 0.5 * (new**2 - old**2).sum(axis=1)
+def _log_density(u: Matrix) -> Float[np.ndarray, " walker"]:
+    """Of the mixture that independence moves draw from, up to a constant."""
+    size, q = u.shape[1], (u**2).sum(axis=1)
+    of_t = gammaln(0.5 * (DEGREES + size)) - gammaln(0.5 * DEGREES)
+    of_t -= 0.5 * size * np.log(DEGREES / 2)  # less the Gaussian's 2 pi
+    of_t -= 0.5 * (DEGREES + size) * np.log1p(q / DEGREES)
+    return np.asarray(np.logaddexp(np.log(1 - STUDENT) - 0.5 * q, np.log(STUDENT) + of_t))
 
 
-class Differential(BlockMove):
+class Differential(FamilyMove):
     """Differential evolution: differences of walkers that stand still, at times whole ones.
 
     Source: ter Braak 2006, Statistics and Computing 16; whole differences lead from mode to mode.
@@ -396,20 +193,64 @@ class Differential(BlockMove):
     whole = 0.1
 
     def jump(
-        self, left: Matrix, still: Matrix, mixture: Mixture, random: Any
+        self, old: Matrix, still: Matrix, random: Any
     ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
-        count, size = left.shape
+        count, size = old.shape
         first = random.randint(len(still), size=count)
         second = (first + random.randint(1, len(still), size=count)) % len(still)
         usual = 2.38 / np.sqrt(2 * size) * np.exp(0.5 * random.standard_normal(count))
         scale = np.where(random.uniform(size=count) < self.whole, 1.0, usual)
         jitter = 1e-5 * still.std(axis=0) * random.standard_normal((count, size))
-        return left + scale[:, None] * (still[first] - still[second]) + jitter, np.zeros(count)
+        return old + scale[:, None] * (still[first] - still[second]) + jitter, np.zeros(count)
 
 
-def moves(target: Target, proposal: Proposal) -> list[tuple[Move, float]]:
-    """Moves and how often each is made."""
-    kinds: list[tuple[type[BlockMove], float]] = [(Independence, 0.5), (Autoregressive, 0.3)]
+class Hamiltonian(Move):
+    """Turns of position and momentum that suit a Gaussian, kicked by what it does not know.
+
+    With momentum p and the log density l, steps of
+
+        turn (u, p) by h/2;    p += h (dl/du + u);    turn (u, p) by h/2
+
+    Source: Beskos et al. 2011, Stochastic Processes and their Applications 121, section 4.
+    """
+
+    def __init__(self, target: Target, angle: float):
+        self.target, self.angle = target, angle
+        self.accepted: list[float] = []
+
+    def propose(self, model: Any, state: State) -> tuple[State, np.ndarray]:
+        random, (count, size) = model.random, state.coords.shape
+        # shorter steps, now and then, for walkers where the density is steep
+        h = self.angle * (1 - 0.8 * random.uniform(size=(count, 1)) ** 3)
+        steps = int(np.clip(random.uniform(1.0, 1.4) * WAY / self.angle, 1, MOST_STEPS))
+        u, start = state.coords, random.standard_normal((count, size))
+        u, p = _turn(u, start, h / 2)
+        for step in range(steps):
+            kick = np.nan_to_num(self.target.slope(u)) + u
+            most = np.linalg.norm(kick, axis=1, keepdims=True) / STEEPEST
+            p = p + h * kick / np.maximum(most, 1.0)
+            u, p = _turn(u, p, h if step < steps - 1 else h / 2)
+        log_prob, terms = model.compute_log_prob_fn(u)
+        gain = log_prob - state.log_prob + 0.5 * (start**2 - p**2).sum(axis=1)
+        took = np.log(random.uniform(size=count)) < np.where(np.isnan(gain), -np.inf, gain)
+        state.coords[took], state.blobs[took] = u[took], terms[took]
+        state.log_prob[took] = log_prob[took]
+        self.accepted.append(float(took.mean()))
+        return state, took
+
+
+def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
+    c, s = np.cos(angle), np.sin(angle)
+    return c * u + s * p, c * p - s * u
+
+
+def moves(target: Target, angle: float) -> list[tuple[Move, float]]:
+    """Moves in the target's coordinates, and how often each is made."""
+    of_family = families(target)
+    kinds: list[tuple[type[FamilyMove], float]] = [(Independence, 0.4)]
     if not target.apart:
-        kinds.append((Differential, 0.2))
-    return [(kind(target, f), share) for kind, share in kinds for f in proposal.families]
+        kinds.append((Differential, 0.1))
+    found: list[tuple[Move, float]] = [
+        (kind(family), share / len(of_family)) for kind, share in kinds for family in of_family
+    ]
+    return [*found, (Hamiltonian(target, angle), 0.5)]

@@ -74,7 +74,7 @@ def sample(
     parts = (EVERYTHING,) if problem.joint else (MOTION, ELECTRIC)
     first = Density(problem, z, log_variance, covariance, parts[0])
     group = first.coordinates.group
-    target = Target(first.terms, group, first.kind, first.centre, first.covariance)
+    target = Target(first.terms, first.slope, group, first.kind, first.centre, first.covariance)
     blocks = _blocks([target] * plan.ensembles, plan, parts[0], done, keep, tell)
     chain = sampler.chain(blocks, plan)
     found = sampler.diagnose(chain, plan)
@@ -215,8 +215,11 @@ def _given(
         def terms(u: np.ndarray, moved: np.ndarray = moved, held: object = held) -> np.ndarray:
             return second.terms(u + moved, held)
 
+        def slope(u: np.ndarray, moved: np.ndarray = moved, held: object = held) -> np.ndarray:
+            return second.slope(u + moved, held)
+
         group = second.coordinates.group
-        targets.append(Target(terms, group, second.kind, second.centre, left, apart=True))
+        targets.append(Target(terms, slope, group, second.kind, second.centre, left, apart=True))
     later = replace(
         plan, walkers=x.shape[1], seed=plan.seed + 1, block=15, warm_up=(1,), most=5, spread=1.0
     )

@@ -10,7 +10,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import emcee
@@ -18,20 +18,16 @@ import numpy as np
 from emcee.state import State
 from jaxtyping import Float
 
-from slipid.identify.moves import (
-    Family,
-    Mixture,
-    Part,
-    Proposal,
-    Target,
-    Warp,
-    laplace,
-    learnt,
-    moves,
-    warped,
-)
+from slipid.identify.moves import WAY, Hamiltonian, Target, moves
+from slipid.identify.transport import Bend, Stair, Transport, Warp, learnt
 
 Chain = Float[np.ndarray, "ensemble step walker size"]
+ACCEPTED = 0.7
+"""Part of Hamiltonian moves that shall be accepted; their step is adapted in the warm-up."""
+FIRST_ANGLE, LEAST_ANGLE = 0.15, 0.03
+"""Of a step of Hamiltonian moves [rad]."""
+DRAWS_PER_EFFECTIVE = 4.0
+"""Draws of the warm-up that tell as much as an independent one, about."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +68,8 @@ class Block:
         log_prob: of them (ensemble, step, walker).
         random: Mersenne twister key (ensemble, 624), and (place, has Gaussian, Gaussian) of each.
         accepted: part of the moves that moved something, per ensemble.
-        proposal: for the next block.
+        map: to the coordinates of the next block.
+        angle: of a step of its Hamiltonian moves [rad].
     """
 
     number: int
@@ -80,7 +77,8 @@ class Block:
     log_prob: np.ndarray
     random: tuple[np.ndarray, np.ndarray]
     accepted: np.ndarray
-    proposal: Proposal
+    map: Transport
+    angle: float
 
 
 def run(
@@ -125,17 +123,17 @@ def chain(blocks: Sequence[Block], plan: Plan) -> Chain:
 def _block(
     targets: Sequence[Target], plan: Plan, blocks: list[Block], tell: Callable[[int], None]
 ) -> Block:
-    states, proposal = _begin(targets, plan, blocks)
-    warp = proposal.warp
+    states, map, angle = _begin(targets, plan, blocks)
     stop, told = threading.Event(), [0] * plan.ensembles
 
-    def ensemble(k: int) -> tuple[np.ndarray, np.ndarray, State, float]:
-        inner = warped(targets[k], warp)
+    def ensemble(k: int) -> tuple[np.ndarray, np.ndarray, State, float, list[float]]:
+        inner = targets[k].seen_by(map)
+        made = moves(inner, angle)
         sampler = emcee.EnsembleSampler(
             plan.walkers,
             len(inner.centre),
             inner.log_prob,
-            moves=moves(inner, proposal),
+            moves=made,
             vectorize=True,
             blobs_dtype=float,
         )
@@ -152,7 +150,8 @@ def _block(
             before = places[-1]
             told[k] += 1
             tell(min(told))
-        return np.stack(places), np.stack(log_probs), state, moved
+        turns = [a for move, _ in made if isinstance(move, Hamiltonian) for a in move.accepted]
+        return np.stack(places), np.stack(log_probs), state, moved, turns
 
     with ThreadPoolExecutor(min(os.cpu_count() or 1, plan.ensembles)) as pool:
         try:
@@ -161,43 +160,47 @@ def _block(
             stop.set()  # an interrupt of the caller ends the others at their next step
     ends = [f[2] for f in found]
     places = np.stack([f[0] for f in found])
+    x, log = map.placed(places.reshape(-1, places.shape[-1]))
     block = Block(
         number=len(blocks),
-        chain=warp.back(places),
-        log_prob=np.stack([f[1] for f in found]) - warp.log_slope(places).sum(axis=-1),
+        chain=x.reshape(places.shape),
+        log_prob=np.stack([f[1] for f in found]) - log.sum(axis=1).reshape(places.shape[:-1]),
         random=(
             np.stack([s.random_state[1] for s in ends]),
             np.array([s.random_state[2:] for s in ends], float),
         ),
         accepted=np.array([f[3] for f in found]),
-        proposal=proposal,
+        map=map,
+        angle=angle,
     )
-    return _with_learnt(block, targets[0], plan, blocks)
+    turns = [a for f in found for a in f[4]]
+    return _with_learnt(block, targets[0], plan, blocks, turns)
 
 
 def _begin(
     targets: Sequence[Target], plan: Plan, blocks: list[Block]
-) -> tuple[list[State], Proposal]:
-    """State of every ensemble in warped coordinates, and the proposal."""
+) -> tuple[list[State], Transport, float]:
+    """State of every ensemble in mapped coordinates, the map, and the angle."""
     if not blocks:
-        return [_start(t, plan, k) for k, t in enumerate(targets)], laplace(targets[0])
+        map = targets[0].laplace()
+        starts = [_start(t, plan, k) for k, t in enumerate(targets)]
+        return [State(map.forward(x), random_state=r) for x, r in starts], map, FIRST_ANGLE
     last = blocks[-1]
-    warp = last.proposal.warp
     states = [
         State(
-            warp.forward(last.chain[k, -1]),
+            last.map.forward(last.chain[k, -1]),
             random_state=_random_state(last.random[0][k], last.random[1][k]),
         )
         for k in range(plan.ensembles)
     ]
-    return states, last.proposal
+    return states, last.map, last.angle
 
 
 def _random_state(key: np.ndarray, rest: np.ndarray) -> tuple[Any, ...]:
     return ("MT19937", key, int(rest[0]), int(rest[1]), float(rest[2]))
 
 
-def _start(target: Target, plan: Plan, ensemble: int) -> State:
+def _start(target: Target, plan: Plan, ensemble: int) -> tuple[np.ndarray, Any]:
     """Walkers spread wider than the fit's own uncertainty, at places with a density."""
     root = np.linalg.cholesky(target.covariance)
     wide = plan.spread * np.geomspace(0.25, 1.0, plan.walkers)[:, None]
@@ -212,20 +215,28 @@ def _start(target: Target, plan: Plan, ensemble: int) -> State:
         x[lost & found] = tried[lost & found]
         lost &= ~found
         if not lost.any():
-            return State(x, random_state=random.get_state(legacy=True))
+            return x, random.get_state(legacy=True)
     raise ValueError("the log density is not finite anywhere near the fit")
 
 
-def _with_learnt(block: Block, target: Target, plan: Plan, blocks: list[Block]) -> Block:
-    """The block with a new proposal, where the plan says that it is time to learn."""
+def _with_learnt(
+    block: Block, target: Target, plan: Plan, blocks: list[Block], turns: list[float]
+) -> Block:
+    """The block with what the warm-up has learnt for the next."""
     count = block.number + 1
-    if count not in plan.warm_up:
+    if count > plan.warm_up[-1]:
         return block
-    stage = plan.warm_up.index(count)
-    recent = [b.chain for b in [*blocks, block][count // 2 :]]
-    draws = np.concatenate(recent, axis=1).reshape(-1, len(target.centre))
-    proposal = learnt(target, draws, parts=2 + stage, seed=plan.seed + stage)
-    return Block(**{**vars(block), "proposal": proposal})
+    if turns:
+        angle = block.angle * np.exp(np.mean(turns) - ACCEPTED)
+        block = replace(block, angle=float(np.clip(angle, LEAST_ANGLE, WAY)))
+    if count in plan.warm_up:
+        recent = [b.chain for b in [*blocks, block][count // 2 :]]
+        draws = np.concatenate(recent, axis=1).reshape(-1, len(target.centre))
+        map = learnt(
+            draws, len(draws) / DRAWS_PER_EFFECTIVE, target.covariance, target.group, target.kind
+        )
+        block = replace(block, map=map)
+    return block
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,35 +315,8 @@ def autocorrelation_time(chain: Chain) -> Float[np.ndarray, " size"]:
     return np.asarray(np.maximum(sums[window, np.arange(sums.shape[1])], 1e-3))
 
 
-def unpacked(arrays: dict[str, np.ndarray]) -> Block:
-    """Block from what `packed` gave."""
-
-    def part(name: str) -> Part | None:
-        if f"{name}/own" not in arrays:
-            return None
-        own, given, slope = (arrays[f"{name}/{key}"] for key in ("own", "given", "slope"))
-        return Part(own, given, slope, Mixture(*(arrays[f"{name}/{key}"] for key in _OF_MIXTURE)))
-
-    families = []
-    for k, count in enumerate(arrays["parts"]):
-        parts = tuple(part(f"{k}/{n}") for n in range(int(count)))
-        families.append(Family(parts, arrays.get(f"{k}/follow")))
-    return Block(
-        number=int(arrays["number"]),
-        chain=arrays["chain"],
-        log_prob=arrays["log_prob"],
-        random=(arrays["random_key"], arrays["random_rest"]),
-        accepted=arrays["accepted"],
-        proposal=Proposal(Warp(*arrays["warp"]), tuple(families)),
-    )
-
-
-_OF_MIXTURE = ("weight", "mean", "root")
-
-
 def packed(block: Block) -> dict[str, Any]:
     """Plain arrays of a block, for a file."""
-    families = block.proposal.families
     out = {
         "number": np.asarray(block.number),
         "chain": block.chain,
@@ -340,14 +324,35 @@ def packed(block: Block) -> dict[str, Any]:
         "random_key": block.random[0],
         "random_rest": block.random[1],
         "accepted": block.accepted,
-        "warp": np.stack(list(vars(block.proposal.warp).values())),
-        "parts": np.array([len(f.parts) for f in families]),
+        "angle": np.asarray(block.angle),
+        "mean": block.map.mean,
+        "warp": np.stack(list(vars(block.map.warp).values())),
     }
-    for k, family in enumerate(families):
-        if family.follow is not None:
-            out[f"{k}/follow"] = family.follow
-        for n, part in enumerate(family.parts):
-            if part is not None:
-                out |= {f"{k}/{n}/{key}": getattr(part, key) for key in ("own", "given", "slope")}
-                out |= {f"{k}/{n}/{key}": getattr(part.mixture, key) for key in _OF_MIXTURE}
+    for k, stair in enumerate(block.map.stairs):
+        out |= {f"{k}/{name}": getattr(stair, name) for name in _OF_STAIR}
+        if stair.bend:
+            out |= {f"{k}/bend/{name}": value for name, value in vars(stair.bend).items()}
     return out
+
+
+def unpacked(arrays: dict[str, np.ndarray]) -> Block:
+    """Block from what `packed` gave."""
+    stairs = []
+    while f"{len(stairs)}/own" in arrays:
+        k = len(stairs)
+        bend = {n: arrays[f"{k}/bend/{n}"] for n in _OF_BEND if f"{k}/bend/{n}" in arrays}
+        values = {n: arrays[f"{k}/{n}"] for n in _OF_STAIR}
+        stairs.append(Stair(**values, bend=Bend(**bend) if bend else None))
+    return Block(
+        number=int(arrays["number"]),
+        chain=arrays["chain"],
+        log_prob=arrays["log_prob"],
+        random=(arrays["random_key"], arrays["random_rest"]),
+        accepted=arrays["accepted"],
+        map=Transport(arrays["mean"], tuple(stairs), Warp(*arrays["warp"])),
+        angle=float(arrays["angle"]),
+    )
+
+
+_OF_STAIR = ("own", "given", "slope", "root")
+_OF_BEND = ("factors", "shift", "scale")

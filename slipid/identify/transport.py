@@ -1,0 +1,308 @@
+"""Coordinates in which a posterior is nearly a standard Gaussian, learnt from draws of it.
+
+A triangular map (Knothe-Rosenblatt) from coordinates x to u, in three steps:
+
+    shared ones       w = L^-1 (x - m)
+    those of a group  w = R^-1 (x - m - B (x_given - m_given)), widest first
+                      v_i = (w_i - a_i(w_1 .. w_i-1)) exp(-b_i(w_1 .. w_i-1))
+    all               u = sinh(tail arcsinh((v - place) / scale) - skew)
+
+with polynomials a and b. Groups follow the shared coordinates and are bent by themselves, so that
+groups that are independent given the shared ones stay so. The third step is the sinh-arcsinh map of
+Jones and Pewsey 2009 (Biometrika 96, eq. 2), the whole one of Marzouk et al. 2016 (Sampling via
+measure transport, section 3).
+"""
+
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize
+
+Matrix = Float[np.ndarray, "_ _"]
+Cube = Float[np.ndarray, "_ _ _"]
+Vector = Float[np.ndarray, " _"]
+FAR = 4.0
+"""Polynomials stay what they are beyond this many stds."""
+SQUARED = 5
+CUBED = 3
+"""Coordinates of a group, the widest first, that polynomials have squares and cubes of."""
+MOST_DRAWS = 4000
+RIDGE = 40.0
+"""Draws of no bend at all that count beside those that are learnt from."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bend:
+    """Polynomials a and b of a group's coordinates.
+
+    Attributes:
+        factors: columns whose product each monomial is, from (w, 1) (monomial, 3).
+        shift, scale: coefficients of a and b (coordinate, monomial).
+    """
+
+    factors: np.ndarray
+    shift: Matrix
+    scale: Matrix
+
+    def monomials(self, w: Matrix) -> Matrix:
+        """Products of columns (row, monomial)."""
+        columns = np.column_stack([np.clip(w, -FAR, FAR), np.ones(len(w))])
+        return np.asarray(columns[:, self.factors].prod(axis=2))
+
+    def slopes(self, w: Matrix) -> Cube:
+        """Their derivatives by the columns (row, monomial, coordinate)."""
+        columns = np.column_stack([np.clip(w, -FAR, FAR), np.ones(len(w))])
+        size, out = w.shape[1], np.zeros((len(w), len(self.factors), w.shape[1] + 1))
+        for slot in range(3):
+            others = columns[:, np.delete(self.factors, slot, axis=1)].prod(axis=2)
+            out += others[..., None] * np.eye(size + 1)[self.factors[:, slot]]
+        return np.asarray(out[..., :size] * (np.abs(w) < FAR)[:, None, :])
+
+    def forward(self, w: Matrix) -> Matrix:
+        f = self.monomials(w)
+        return np.asarray((w - f @ self.shift.T) * np.exp(-f @ self.scale.T))
+
+    def back(self, v: Matrix) -> Matrix:
+        w = np.zeros_like(v)
+        for i in range(v.shape[1]):  # monomials of coordinate i have earlier ones only
+            f = self.monomials(w)
+            w[:, i] = f @ self.shift[i] + np.exp(f @ self.scale[i]) * v[:, i]
+        return w
+
+    def log_slope(self, w: Matrix) -> Matrix:
+        """Log dw_i/dv_i."""
+        return np.asarray(self.monomials(w) @ self.scale.T)
+
+    def pull(self, w: Matrix, slope: Matrix) -> Matrix:
+        """Derivative by v of what has the derivative `slope` by w, plus that of the log slopes."""
+        f, d = self.monomials(w), self.slopes(w)
+        shrink = np.exp(-f @ self.scale.T)
+        v = (w - f @ self.shift.T) * shrink
+        of_scale = np.einsum("if,nfk->nik", self.scale, d)
+        of_shift = np.einsum("if,nfk->nik", self.shift, d)
+        jacobian = shrink[..., None] * (np.eye(w.shape[1]) - of_shift) - v[..., None] * of_scale
+        total = slope + of_scale.sum(axis=1)
+        return np.asarray(np.linalg.solve(jacobian.transpose(0, 2, 1), total[..., None])[..., 0])
+
+    @staticmethod
+    def learnt(w: Matrix) -> "Bend":
+        """Most likely polynomials for draws, shrunk towards none."""
+        size = w.shape[1]
+        factors = [(size, size, size)] + [(k, size, size) for k in range(size)]
+        squared, cubed = range(min(SQUARED, size - 1)), range(min(CUBED, size - 1))
+        factors += [(*pair, size) for pair in combinations_with_replacement(squared, 2)]
+        factors += [(k, k, k) for k in cubed]
+        kept = np.array(factors)
+        bend = Bend(kept, np.zeros((size, len(kept))), np.zeros((size, len(kept))))
+        f = bend.monomials(w)
+        reach = np.where(kept == size, -1, kept).max(axis=1)
+        for i in range(size):
+            own = np.flatnonzero(reach < i)
+            bend.shift[i, own], bend.scale[i, own] = _regression(f[:, own], w[:, i])
+        return bend
+
+
+def _regression(f: Matrix, w: Vector) -> tuple[Vector, Vector]:
+    """Coefficients of the mean and of the log std of a Gaussian (row, monomial) -> row."""
+    penalty = RIDGE * np.diag(np.append(1e-6, np.ones(f.shape[1] - 1)))
+    scale = np.zeros(f.shape[1])
+    shift = np.linalg.solve(f.T @ f + penalty, f.T @ w)
+    scale[0] = np.log(np.std(w - f @ shift) + 1e-12)
+    for _ in range(12):
+        left = (w - f @ shift) ** 2 * np.exp(-2 * f @ scale)
+        slope = f.T @ (1 - left) + penalty @ (scale * (np.arange(len(scale)) > 0))
+        # Fisher's information of a log std is 2
+        step = np.linalg.solve(2 * f.T @ f + penalty, slope)
+        scale = scale - step * min(1.0, 1.0 / (np.abs(f @ step).max() + 1e-9))
+        weight = np.exp(-2 * np.clip(f @ scale - scale[0], -3, 3))
+        shift = np.linalg.solve((f.T * weight) @ f + penalty, f.T @ (weight * w))
+    return shift, scale
+
+
+@dataclass(frozen=True, eq=False)
+class Warp:
+    """Sinh-arcsinh map of every coordinate."""
+
+    place: Vector
+    scale: Vector
+    skew: Vector
+    tail: Vector
+
+    def forward(self, v: Matrix) -> Matrix:
+        return np.sinh(self.tail * np.arcsinh((v - self.place) / self.scale) - self.skew)
+
+    def back(self, u: Matrix) -> Matrix:
+        return self.place + self.scale * np.sinh((np.arcsinh(u) + self.skew) / self.tail)
+
+    def log_slope(self, u: Matrix) -> Matrix:
+        """Log dv/du of every coordinate."""
+        inner = (np.arcsinh(u) + self.skew) / self.tail
+        # cosh without overflow
+        cosh = np.abs(inner) + np.log1p(np.exp(-2 * np.abs(inner))) - np.log(2)
+        return np.asarray(np.log(self.scale / self.tail) + cosh - 0.5 * np.log1p(u**2))
+
+    def pull(self, u: Matrix, slope: Matrix) -> Matrix:
+        """Derivative by u of what has the derivative `slope` by v, plus that of the log slopes."""
+        inner = (np.arcsinh(u) + self.skew) / self.tail
+        bend = np.tanh(inner) / (self.tail * np.sqrt(1 + u**2)) - u / (1 + u**2)
+        return np.asarray(slope * np.exp(self.log_slope(u)) + bend)
+
+    @staticmethod
+    def none(size: int) -> "Warp":
+        one, zero = np.ones(size), np.zeros(size)
+        return Warp(zero, one, zero, one)
+
+    @staticmethod
+    def learnt(draws: Matrix) -> "Warp":
+        """Maximum likelihood, column by column."""
+        return Warp(*np.array([_sinh_arcsinh(column) for column in draws.T]).T)
+
+
+def _sinh_arcsinh(x: Vector) -> tuple[float, float, float, float]:
+    middle, width = float(np.median(x)), float(x.std())
+    t = (x - middle) / width
+
+    def loss(q: np.ndarray) -> float:
+        inner = np.arcsinh((t - q[0]) / np.exp(q[1]))
+        y = np.exp(q[3]) * inner - q[2]
+        density = -0.5 * np.sinh(y) ** 2 + np.log(np.cosh(y)) + q[3] - q[1]
+        spread = np.mean(density - 0.5 * np.log1p(((t - q[0]) / np.exp(q[1])) ** 2))
+        return float(-spread + 1e-3 * (q @ q))
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        q = minimize(loss, np.zeros(4), method="BFGS").x
+    return middle + width * q[0], width * float(np.exp(q[1])), q[2], float(np.exp(q[3]))
+
+
+@dataclass(frozen=True, eq=False)
+class Stair:
+    """Some coordinates, after those they follow.
+
+    Attributes:
+        own, given: places.
+        slope: of own ones by given ones (given, own).
+        root: of what is left.
+        bend: of it; None for shared coordinates.
+    """
+
+    own: np.ndarray
+    given: np.ndarray
+    slope: Matrix
+    root: Matrix
+    bend: Bend | None
+
+
+@dataclass(frozen=True, eq=False)
+class Transport:
+    """The whole map, of vectors x (row, size) to and from u (row, size).
+
+    Attributes:
+        mean: of x.
+        stairs: every coordinate is in one.
+        warp: the last step.
+    """
+
+    mean: Vector
+    stairs: tuple[Stair, ...]
+    warp: Warp
+
+    def forward(self, x: Matrix) -> Matrix:
+        return self.warp.forward(self._straight(x))
+
+    def _straight(self, x: Matrix) -> Matrix:
+        about, v = x - self.mean, np.empty_like(x)
+        for s in self.stairs:
+            w = np.linalg.solve(s.root, (about[:, s.own] - about[:, s.given] @ s.slope).T).T
+            v[:, s.own] = s.bend.forward(w) if s.bend else w
+        return v
+
+    def back(self, u: Matrix) -> Matrix:
+        return self.placed(u)[0]
+
+    def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
+        """x, and the part of log |dx/du| of every coordinate (row, size)."""
+        v, log = self.warp.back(u), self.warp.log_slope(u)
+        about = np.empty_like(u)
+        for s in self.stairs:
+            w = v[:, s.own]
+            if s.bend:
+                w = s.bend.back(w)
+                log[:, s.own] += s.bend.log_slope(w)
+            about[:, s.own] = about[:, s.given] @ s.slope + w @ s.root.T
+            log[:, s.own] += np.linalg.slogdet(s.root)[1] / len(s.own)
+        return self.mean + about, log
+
+    def pull(self, u: Matrix, x: Matrix, slope: Matrix) -> Matrix:
+        """Derivative by u of what has the derivative `slope` by x, plus that of log |dx/du|."""
+        about, by_x, by_v = x - self.mean, slope.copy(), np.empty_like(u)
+        for s in reversed(self.stairs):
+            own = by_x[:, s.own]
+            by_x[:, s.given] += own @ s.slope.T
+            by_v[:, s.own] = own @ s.root
+            if s.bend:
+                w = np.linalg.solve(s.root, (about[:, s.own] - about[:, s.given] @ s.slope).T).T
+                by_v[:, s.own] = s.bend.pull(w, by_v[:, s.own])
+        return self.warp.pull(u, by_v)
+
+
+def gaussian(
+    mean: Vector, covariance: Matrix, group: np.ndarray, kind: np.ndarray, at_mode: Matrix
+) -> Transport:
+    """Map of a Gaussian.
+
+    Args:
+        group: of each coordinate, -1 where groups share it.
+        kind: of each coordinate; of a group's, those of a higher kind follow those of lower ones.
+        at_mode: covariance whose widest directions come first in a stair (size, size). A valley
+            has its direction at the mode, where draws are as wide across as they are bent.
+    """
+    shared, stairs = np.flatnonzero(group < 0), []
+
+    def stair(own: np.ndarray, given: np.ndarray) -> Stair:
+        slope, left = _given(covariance, own, given)
+        length, way = np.linalg.eigh(_given(at_mode, own, given)[1])
+        root = (way * np.sqrt(length))[:, ::-1]
+        inner = np.linalg.solve(root, np.linalg.solve(root, left).T)
+        return Stair(own, given, slope, root @ np.linalg.cholesky(inner), None)
+
+    for k in np.unique(kind[shared]):
+        own = shared[kind[shared] == k]
+        stairs.append(stair(own, shared[kind[shared] < k]))
+    for g in range(group.max() + 1):
+        for k in np.unique(kind[group == g]):
+            before = np.flatnonzero((group == g) & (kind < k))
+            own = np.flatnonzero((group == g) & (kind == k))
+            stairs.append(stair(own, np.concatenate([shared, before])))
+    return Transport(mean, tuple(stairs), Warp.none(len(mean)))
+
+
+def _given(covariance: Matrix, own: np.ndarray, given: np.ndarray) -> tuple[Matrix, Matrix]:
+    """Slope of own coordinates by given ones, and the covariance of what is left."""
+    cross = covariance[np.ix_(given, own)]
+    slope = np.linalg.solve(covariance[np.ix_(given, given)], cross)
+    return slope, covariance[np.ix_(own, own)] - cross.T @ slope
+
+
+def learnt(
+    draws: Matrix, effective: float, covariance: Matrix, group: np.ndarray, kind: np.ndarray
+) -> Transport:
+    """Map learnt from draws.
+
+    Args:
+        draws: (draw, size).
+        effective: number of independent ones that they are worth, about.
+        covariance: Laplace; counts as many draws as there are coordinates.
+    """
+    some = draws[:: max(1, len(draws) // MOST_DRAWS)]
+    size = draws.shape[1]
+    both = effective * np.cov(draws.T).reshape(size, size) + size * covariance
+    flat = gaussian(draws.mean(axis=0), both / (effective + size), group, kind, covariance)
+    w = flat._straight(some)
+    bent = [
+        replace(s, bend=Bend.learnt(w[:, s.own])) if group[s.own[0]] >= 0 and len(s.own) > 1 else s
+        for s in flat.stairs
+    ]
+    found = replace(flat, stairs=tuple(bent))
+    return replace(found, warp=Warp.learnt(found._straight(some)))
