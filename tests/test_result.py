@@ -9,7 +9,8 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import binom, lognorm
+from scipy.stats import binom, chi2, lognorm
+from scipy.stats import f as fisher
 
 from slipid.app.synthetic import Drive, Sensors, blank, grid, make_logs, truth
 from slipid.data.dataset import collect, windows
@@ -17,7 +18,7 @@ from slipid.data.log import DataError
 from slipid.identify.fit import Optimum
 from slipid.identify.flat import flat_directions
 from slipid.identify.identifiability import estimates, expected_covariance
-from slipid.identify.problem import Problem, State
+from slipid.identify.problem import DEGREES, Problem, State
 from slipid.identify.result import Fit, hash_of, load, summarise
 from slipid.identify.validate import Frozen, validation
 from slipid.parameter import Choice
@@ -334,7 +335,9 @@ def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
         frozen = Frozen(fit.robot, fit.space, fit.z, covariance, variance, ())
         return validation(frozen, new)["summary"]["soft"]["identified"]["coverage90"]
 
-    low, high = binom.interval(0.99, 200, 0.9)
+    # what is drawn is Gaussian: the 90 % region of a Student t holds more of it
+    held = chi2.cdf(2 * fisher.ppf(0.9, 2, DEGREES), 2)
+    low, high = binom.interval(0.99, 200, held)
     assert low <= 200 * covered(fit.covariance, dict(fit.variance)) <= high
     assert covered(fit.laplace, alone) < 0.7
 
