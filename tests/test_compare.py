@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
-from scipy.stats import chi2, multivariate_t
+from scipy.stats import binom, chi2, multivariate_t
 from typer.testing import CliRunner
 
 from slipid.app import comparison
@@ -315,15 +315,17 @@ def test_compare_goes_on_where_it_was_and_ends_the_same(tmp_path, logs, monkeypa
 # sessions ---------------------------------------------------------------------------------------
 
 
-def with_sessions(std, seed, runs=240):
-    """A linear model of runs in eight sessions on one floor whose effects have this std."""
+def with_sessions(std, seed, session):
+    """A linear model of runs on one floor; what those of one session share has this std."""
     rng = np.random.default_rng(seed)
-    session = np.arange(runs) % 8
+    runs = len(session)
     effect = np.broadcast_to(np.eye(6, 3), (runs, 6, 3)).copy()
     effect[:, 3:] = np.eye(3)
     run, noise = np.array([0.02, 0.02, 0.05]), 0.005
     slope = rng.normal(size=(runs, 6, 2))
-    each = rng.normal(size=(runs, 3)) * run + (rng.normal(size=(8, 3)) * std)[session]
+    each = (
+        rng.normal(size=(runs, 3)) * run + (rng.normal(size=(session.max() + 1, 3)) * std)[session]
+    )
     gap = np.einsum("nma,na->nm", effect, each) + noise * rng.normal(size=(runs, 6))
     scale = np.einsum("nma,a,nla->nml", effect, run**2, effect) + noise**2 * np.eye(6)
     info = np.einsum("nmp,nml,nlq->pq", slope, np.linalg.inv(scale), slope)
@@ -344,7 +346,7 @@ def test_what_sessions_share_is_found_and_widens_what_was_fitted():
     std = np.array([0.03, 0.02, 0.08])
     found = []
     for seed in range(6):
-        model, w = with_sessions(std, seed, runs=80)
+        model, w = with_sessions(std, seed, np.arange(80) % 8)
         variance, covariance = shared(model, w, np.ones(len(w)))
         found.append(list(variance.values()))
         assert np.linalg.eigvalsh(covariance - model.covariance).min() > -1e-12
@@ -352,8 +354,33 @@ def test_what_sessions_share_is_found_and_widens_what_was_fitted():
     np.testing.assert_allclose(np.sqrt(np.mean(found, axis=0)), std, rtol=0.3)
 
 
+def test_regions_hold_runs_of_other_sessions_as_often_as_they_say():
+    std = np.array([0.03, 0.02, 0.08])
+    # of 40 sessions four runs each are fitted; 200 more have a session of their own each
+    model, w = with_sessions(std, 8, np.append(np.arange(160) % 40, 40 + np.arange(200)))
+    keep, judged = np.arange(360) < 160, np.arange(360) >= 160
+    pull = np.swapaxes(model.slope, 1, 2) @ np.linalg.inv(model.scale)
+    own = np.linalg.inv((pull @ model.slope)[keep].sum(axis=0))
+    z = -own @ (pull @ model.gap[..., None])[keep].sum(axis=0)
+    model = replace(model, covariance=own, gap=model.gap + (model.slope @ z)[..., 0])
+    variance, covariance = shared(model, w, keep.astype(float))
+    e, j = model.effect[judged], model.slope[judged]
+
+    def covered(v, c):
+        """Part of the judged runs in their 90 % regions; all that is drawn is Gaussian."""
+        scale = model.scale[judged] + np.einsum("nma,a,nla->nml", e, v, e)
+        scale += np.einsum("nmp,pq,nlq->nml", j, c, j)
+        gap = model.gap[judged]
+        q = np.einsum("nm,nm->n", gap, np.linalg.solve(scale, gap[..., None])[..., 0])
+        return (chi2.cdf(q, gap.shape[1]) <= 0.9).mean()
+
+    low, high = binom.interval(0.99, 200, 0.9)
+    assert low <= 200 * covered(np.array(list(variance.values())), covariance) <= high
+    assert covered(np.zeros(3), own) < 0.6
+
+
 def test_runs_that_share_nothing_are_left_as_they_are():
-    model, w = with_sessions(0.0, 7)
+    model, w = with_sessions(0.0, 7, np.arange(240) % 8)
     variance, covariance = shared(model, w, np.ones(len(w)))
     assert list(variance) == [f"session.firm.{axis}" for axis in ("along", "across", "yaw")]
     assert (np.array(list(variance.values())) < 0.1 * model.run[0]).all()

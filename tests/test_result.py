@@ -9,16 +9,18 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import lognorm
+from scipy.stats import binom, chi2, lognorm
+from scipy.stats import f as fisher
 
-from slipid.app.synthetic import Sensors, blank, grid, make_logs, truth
+from slipid.app.synthetic import Drive, Sensors, blank, grid, make_logs, truth
 from slipid.data.dataset import collect, windows
 from slipid.data.log import DataError
 from slipid.identify.fit import Optimum
 from slipid.identify.flat import flat_directions
 from slipid.identify.identifiability import estimates, expected_covariance
-from slipid.identify.problem import Problem, State
+from slipid.identify.problem import DEGREES, Problem, State
 from slipid.identify.result import Fit, hash_of, load, summarise
+from slipid.identify.validate import Frozen, validation
 from slipid.parameter import Choice
 
 pytestmark = pytest.mark.slow  # traces whole fits
@@ -265,6 +267,79 @@ def test_a_saved_fit_comes_back_the_same(tmp_path):
     back.save(tmp_path)
     assert (tmp_path / "fit.json").read_bytes() == first
     assert sorted(p.name for p in tmp_path.iterdir()) == ["fit.json", "fit.npz", "identified.json"]
+
+
+def test_a_result_from_before_sessions_had_effects_is_read_as_one_without(tmp_path):
+    fit = fit_of(True)
+    fit.save(tmp_path)
+    with np.load(tmp_path / "fit.npz") as npz:
+        before = {name: npz[name] for name in npz.files if name != "laplace"}
+    np.savez(tmp_path / "fit.npz", **before)
+    back = load(tmp_path)
+    np.testing.assert_array_equal(back.laplace, back.covariance)
+    assert not [name for name in back.variance if name.startswith("session.")]
+
+
+# sessions ---------------------------------------------------------------------------------------
+
+SHARED = {"along": 0.02, "across": 0.01}
+"""Stds of what runs of one session share [m/m]: thrice and twice as much as a run has alone."""
+
+
+def in_sessions(session, seed):
+    """Runs in these sessions, whose ends are off by what the runs of each share."""
+    rng = np.random.default_rng(seed)
+    drives = [Drive("soft", "as_built", h, 0.1) for h in rng.uniform(0, 2 * np.pi, len(session))]
+    logs = make_logs(TRUTH, drives, seed, Sensors(has_voltage=False))
+    effect = rng.normal(size=(max(session) + 1, 2)) * [*SHARED.values()]
+    moved = []
+    for log, drive, (along, across) in zip(logs, drives, effect[session], strict=True):
+        back = np.linalg.pinv(np.asarray(TRUTH.geometry.forward()))
+        step = log.wheel_angle * float(TRUTH.geometry.wheel_radius) @ back.T
+        seen_at = log.time - float(TRUTH.camera.lag)
+        far = np.interp(seen_at, log.time, np.hypot(*step.T[:2])) / float(TRUTH.camera.scale)
+        way = log.pose[0, 2] + drive.heading
+        turn = np.array([[np.cos(way), np.sin(way)], [-np.sin(way), np.cos(way)]])
+        pose = log.pose.copy()
+        pose[:, :2] += far[:, None] * (np.array([along, across]) @ turn)
+        moved.append(dataclasses.replace(log, pose=pose))
+    of = {log.name: f"s{k}" for log, k in zip(moved, session, strict=True)}
+    return collect(moved, session=lambda log: of[log.name])
+
+
+def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
+    """At the truth, so that all that is off is noise: 200 runs, each in a session of its own."""
+    data = in_sessions(np.arange(160) % 40, 1)
+    problem = Problem(windows(data, 0.04, lag=0.056), blank(DRIVES), list(CHOICES))
+    z, sensors = problem.space.vector(TRUTH), Sensors()
+    std = problem.noise.typical.copy()
+    for k, name in enumerate(problem.noise.names):
+        if not name.startswith("current."):
+            std[k] = sensors.of(name)
+    log_v = 2 * np.log(std)
+    laplace = expected_covariance(problem, z, log_v)
+    end = Optimum(State(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
+    summarise(problem, end, data, CHOICES).save(tmp_path)
+    fit = load(tmp_path)
+    kept = fit.to_fit_json()["variances"]
+    for axis, true in SHARED.items():
+        found = kept[f"session.soft.{axis}"]
+        assert found["unit"] == kept[f"run.soft.{axis}"]["unit"] == "m/m"
+        assert found["std"] == pytest.approx(true, rel=0.35)  # 40 sessions: three stds of a std
+    assert kept["session.soft.yaw"]["unit"] == "rad/m"
+    assert np.linalg.eigvalsh(fit.covariance - fit.laplace).min() > -1e-12
+    new = in_sessions(np.arange(200), 2)
+    alone = {name: v for name, v in fit.variance.items() if not name.startswith("session.")}
+
+    def covered(covariance, variance):
+        frozen = Frozen(fit.robot, fit.space, fit.z, covariance, variance, ())
+        return validation(frozen, new)["summary"]["soft"]["identified"]["coverage90"]
+
+    # what is drawn is Gaussian: the 90 % region of a Student t holds more of it
+    held = chi2.cdf(2 * fisher.ppf(0.9, 2, DEGREES), 2)
+    low, high = binom.interval(0.99, 200, held)
+    assert low <= 200 * covered(fit.covariance, dict(fit.variance)) <= high
+    assert covered(fit.laplace, alone) < 0.7
 
 
 def test_numbers_that_are_not_finite_never_reach_a_file(tmp_path):

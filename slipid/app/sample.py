@@ -69,7 +69,7 @@ class Blocks:
 def key(fit: Fit, plan: Plan, draws: int) -> str:
     """Hash of everything a chain depends on."""
     same = [fit.data_hash, *map(str, files.versions().items()), str(replace(plan, most=0))]
-    same += [str(draws), fit.z.tobytes().hex(), np.asarray(fit.covariance).tobytes().hex()]
+    same += [str(draws), fit.z.tobytes().hex(), np.asarray(fit.laplace).tobytes().hex()]
     same += [f"{k} {v!r}" for k, v in fit.variance.items()]
     return hashlib.sha256("\n".join(same).encode()).hexdigest()
 
@@ -96,7 +96,7 @@ def sample(
         problem,
         fit.z,
         np.log(variance),
-        fit.covariance,
+        fit.laplace,
         plan,
         draws=draws,
         done=done,

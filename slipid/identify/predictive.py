@@ -25,7 +25,7 @@ from slipid.identify import likelihood as lk
 from slipid.identify import replay
 from slipid.identify.ladder import Rung
 from slipid.identify.problem import DEGREES, Problem, State
-from slipid.identify.sessions import AXES, Linear, shared
+from slipid.identify.sessions import Linear, by_axis, shared
 from slipid.model.robot import Robot
 
 Gaps = Float[np.ndarray, "piece m"]
@@ -77,7 +77,7 @@ class Predictive(abc.ABC):
         gap, slope = self.linear(problem)
         noise = np.asarray(problem.covariance("motion", jnp.asarray(self.log_variance)))
         e = lk.effects(problem.windows, problem.robot)
-        v = _by_axis(self.variance, "session", problem.windows)
+        v = by_axis(self.variance, "session", problem.windows)
         return gap, noise + np.einsum("nma,na,nla->nml", e, v, e) + _around(slope, self.covariance)
 
     def log_density(self, problem: Problem) -> Float[np.ndarray, " piece"]:
@@ -273,7 +273,7 @@ def _with_sessions(plain: Any, problem: Problem, wide: np.ndarray, keep: np.ndar
         wide=wide,
         scale=np.asarray(problem.covariance("motion", jnp.asarray(plain.log_variance))),
         effect=lk.effects(problem.windows, problem.robot),
-        run=_by_axis(plain.variance, "run", problem.windows),
+        run=by_axis(plain.variance, "run", problem.windows),
     )
     variance, covariance = shared(model, problem.windows, np.asarray(keep, float))
     return replace(plain, variance=plain.variance | variance, covariance=covariance)
@@ -381,8 +381,3 @@ def _around(jac: Slopes, cov: np.ndarray) -> np.ndarray:
 
 def _by_name(problem: Problem, log_v: Any) -> dict[str, float]:
     return dict(zip(problem.noise.names, np.exp(np.asarray(log_v)).tolist(), strict=True))
-
-
-def _by_axis(variance: dict[str, float], kind: str, w: Windows) -> Float[np.ndarray, "piece 3"]:
-    """Variances of an effect of every piece, zero where there is none."""
-    return np.array([[variance.get(f"{kind}.{f}.{axis}", 0.0) for axis in AXES] for f in w.surface])

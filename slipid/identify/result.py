@@ -21,6 +21,7 @@ from slipid.identify import curves as curves_of
 from slipid.identify.fit import Optimum
 from slipid.identify.flat import Flat, flat_directions, sentences
 from slipid.identify.identifiability import Estimate, derived, estimates
+from slipid.identify.predictive import contact_of
 from slipid.identify.problem import Problem
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, build
@@ -41,8 +42,10 @@ class Fit:
         space: free and fixed numbers, priors; its template holds the fixed values.
         choices: what the user wanted.
         z: search vector at the optimum.
-        covariance: Laplace, of the search vector.
-        variance: every variance component by name [unit squared].
+        covariance: of the search vector: Laplace, grown by what runs of a session share
+            (`slipid.identify.sessions`).
+        laplace: without what they share, the curvature of the likelihood alone.
+        variance: every variance component by name, those of sessions included [unit squared].
         variance_unit: unit of each component's std.
         runs: (name, sha256) of every run that was fitted.
         piece_run: number of the run each residual row belongs to.
@@ -65,6 +68,7 @@ class Fit:
     choices: tuple[Choice, ...]
     z: Float[np.ndarray, " free"]
     covariance: Float[np.ndarray, "free free"]
+    laplace: Float[np.ndarray, "free free"]
     variance: Mapping[str, float]
     variance_unit: Mapping[str, str]
     runs: tuple[tuple[str, str], ...]
@@ -104,9 +108,9 @@ class Fit:
 
     @cached_property
     def flat(self) -> tuple[Flat, ...]:
-        """Directions the data leave open."""
+        """Directions the likelihood leaves open; what sessions share blurs numbers, opens none."""
         has = self.has["current"], self.has["voltage"]
-        return flat_directions(self.space, self.covariance, *has, self.validity)
+        return flat_directions(self.space, self.laplace, *has, self.validity)
 
     @cached_property
     def derived(self) -> dict[str, Estimate]:
@@ -139,7 +143,7 @@ class Fit:
         return hash_of(self.runs)
 
     def draws(self, count: int, seed: int = 0) -> Float[np.ndarray, "draw free"]:
-        """Search vectors drawn from the Laplace posterior."""
+        """Search vectors drawn from the Gaussian of z and covariance."""
         return draws(self.z, self.covariance, count, seed)
 
     def with_baselines(self, baselines: Mapping[str, Any]) -> "Fit":
@@ -192,7 +196,7 @@ class Fit:
 
     def save(self, folder: Path) -> None:
         """Write fit.json, fit.npz and identified.json, each whole or not at all."""
-        arrays = {"covariance": self.covariance, "piece_run": self.piece_run}
+        arrays = {name: getattr(self, name) for name in ("covariance", "laplace", "piece_run")}
         for name in ("residual", "whitened", "weight"):
             arrays |= {f"{name}/{k}": v for k, v in getattr(self, name).items()}
         buffer = io.BytesIO()
@@ -220,6 +224,8 @@ def as_identified(e: Estimate) -> dict[str, Any]:
 
 def load(folder: Path) -> Fit:
     """Fit from the files `Fit.save` wrote.
+
+    One that knows nothing of sessions, of a version before they had effects, has none.
 
     Raises:
         DataError: absent, damaged, or of another schema.
@@ -257,6 +263,7 @@ def _from_files(kept: dict[str, Any], arrays: dict[str, np.ndarray]) -> Fit:
         choices=choices,
         z=np.asarray(kept["z"], float),
         covariance=arrays["covariance"],
+        laplace=arrays.get("laplace", arrays["covariance"]),
         variance=kept["variance"],
         variance_unit={k: v["unit"] for k, v in kept["variances"].items()},
         runs=tuple((str(name), str(sha)) for name, sha in kept["data"]["runs"]),
@@ -281,7 +288,7 @@ def _from_files(kept: dict[str, Any], arrays: dict[str, np.ndarray]) -> Fit:
 def summarise(
     problem: Problem, optimum: Optimum, data: Dataset, choices: Iterable[Choice], seed: int = 0
 ) -> Fit:
-    """Fit from the end of an optimisation.
+    """Fit from the end of an optimisation, and what runs of one session were found to share.
 
     Args:
         problem: as it was optimised.
@@ -293,8 +300,9 @@ def summarise(
     z, log_v = optimum.state.z, optimum.state.log_variance
     volt = problem.volt(log_v)
     blocks, jacobian = problem.linear(jnp.asarray(z), volt)
-    keep = jnp.ones(len(problem.windows))
+    keep = np.ones(len(problem.windows))
     roots, weights, _ = problem.whitening(blocks, jnp.asarray(log_v), keep)
+    contact = contact_of(problem, optimum.state, optimum.covariance, keep)
     plain = {  # roots of V^-1 without the weights of outliers
         k: np.asarray(roots[k]) / np.sqrt(np.asarray(weights[k]))[:, None, None] for k in roots
     }
@@ -308,13 +316,17 @@ def summarise(
     settled = left < REMAINING
     stuck = f"the solver stopped {left:.2g} stds of {name} away from where its own step leads"
     windows = problem.windows
+    unit = dict(zip(problem.noise.names, problem.noise.unit, strict=True))
+    effects = {name: u for name, u in unit.items() if name.startswith("run.")}
+    unit |= {f"session.{name.removeprefix('run.')}": u for name, u in effects.items()}
     return Fit(
         space=problem.space,
         choices=tuple(choices),
         z=np.asarray(z),
-        covariance=np.asarray(optimum.covariance),
-        variance={n: float(v) for n, v in zip(problem.noise.names, np.exp(log_v), strict=True)},
-        variance_unit=dict(zip(problem.noise.names, problem.noise.unit, strict=True)),
+        covariance=contact.covariance,
+        laplace=np.asarray(optimum.covariance),
+        variance=contact.variance,
+        variance_unit={name: unit[name] for name in contact.variance},
         runs=tuple((log.name, log.sha256) for log in data.logs),
         piece_run=np.asarray(windows.run),
         residual={k: np.asarray(v) for k, v in blocks.items()},
@@ -323,7 +335,7 @@ def summarise(
         spectrum=np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0)),
         has={"current": bool(windows.has_current), "voltage": bool(windows.has_voltage)},
         curves=curves_of.curves(
-            problem.space, z, draws(z, optimum.covariance, 400, seed), problem.batch
+            problem.space, z, draws(z, contact.covariance, 400, seed), problem.batch
         ),
         validity=curves_of.validity(data, problem.space.tree(jnp.asarray(z)), problem.batch),
         converged=bool(optimum.converged) and settled,

@@ -7,7 +7,8 @@ together: the fit takes runs for independent. After a fit the effects that are l
 
 have a part that is common to the session (E_i moves the residuals by an effect, W_i weighs
 without the run effects). Its variance v is found per floor and axis by restricted
-likelihood, the run effects' own held; the covariance C of the fitted numbers grows to
+likelihood, the run effects' own held, in turn with the Student-t weights of the runs, which are
+outliers only for what their session does not share; the covariance C of the fitted numbers grows to
 
     C + C (sum_s v u_s u_s^T) C,    u_s = sum_{i in s} J_i^T V_i^-1 E_i
 """
@@ -24,6 +25,8 @@ from slipid.identify.problem import DEGREES
 AXES = ("along", "across", "yaw")
 SPREAD = 3.0
 """Std of the prior of a log variance, around that of the run effects."""
+TURNS = 4
+"""Of weights and variances, each given the other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +59,29 @@ def shared(
 
     A floor that was driven in one session only has none: what it shares is in the floor's numbers.
     """
+    session = np.asarray(w.session)
+    variance: dict[str, float] = {}
+    for _ in range(TURNS):
+        variance = _variances(model, w, keep, _weights(model, by_axis(variance, "session", w)))
+    weighted = np.swapaxes(model.effect, 1, 2) @ np.linalg.solve(model.scale, model.slope)
+    pulls = weighted * (_weights(model, np.zeros_like(model.run)) * keep)[:, None, None]
+    of_session = by_axis(variance, "session", w)
+    meat = np.zeros_like(model.covariance)
+    for name in dict.fromkeys(session[keep > 0].tolist()):
+        mine = (session == name) & (keep > 0)
+        u = pulls[mine].sum(axis=0)
+        meat += u.T @ (of_session[mine][0][:, None] * u)
+    return variance, model.covariance + model.covariance @ meat @ model.covariance
+
+
+def by_axis(variance: dict[str, float], kind: str, w: Windows) -> Float[np.ndarray, "piece 3"]:
+    """Variances of an effect of every piece, zero where there is none."""
+    return np.array([[variance.get(f"{kind}.{f}.{axis}", 0.0) for axis in AXES] for f in w.surface])
+
+
+def _variances(model: Linear, w: Windows, keep: np.ndarray, weight: np.ndarray) -> dict[str, float]:
+    """Variance per floor and axis, given the weights of the runs."""
     session, floor = np.asarray(w.session), np.asarray(w.surface)
-    weight = _weights(model)
     left, noise, slope = _left(model)
     variance: dict[str, float] = {}
     for name in dict.fromkeys(floor[keep > 0].tolist()):
@@ -71,21 +95,14 @@ def shared(
             own += slope[mine, k] @ model.wide @ slope[mine, k].T
             found = _variance(left[mine, k], own, member, float(np.log(run.mean())))
             variance[f"session.{name}.{axis}"] = found
-    weighted = np.swapaxes(model.effect, 1, 2) @ np.linalg.solve(model.scale, model.slope)
-    pulls = weighted * (weight * keep)[:, None, None]
-    meat = np.zeros_like(model.covariance)
-    for name in dict.fromkeys(session[keep > 0].tolist()):
-        mine = (session == name) & (keep > 0)
-        u = pulls[mine].sum(axis=0)
-        on = str(floor[mine][0])
-        v = [variance.get(f"session.{on}.{axis}", 0.0) for axis in AXES]
-        meat += u.T @ (np.asarray(v)[:, None] * u)
-    return variance, model.covariance + model.covariance @ meat @ model.covariance
+    return variance
 
 
-def _weights(model: Linear) -> np.ndarray:
-    """Student-t weight of every piece."""
-    white = np.linalg.solve(model.scale, model.gap[..., None])[..., 0]
+def _weights(model: Linear, more: np.ndarray) -> np.ndarray:
+    """Student-t weight of every piece, given the variances of effects beyond its scale."""
+    e = model.effect
+    scale = model.scale + np.einsum("nma,na,nla->nml", e, more, e)
+    white = np.linalg.solve(scale, model.gap[..., None])[..., 0]
     q, m = np.sum(model.gap * white, axis=1), model.gap.shape[1]
     return np.asarray((DEGREES + m) / (DEGREES + q))
 

@@ -27,7 +27,7 @@ class Frozen:
         space: of the free ones.
         z: where they are in it.
         covariance: of z.
-        variance: of every noise component by name.
+        variance: of every noise component by name, and of what sessions share; none is none.
         rungs: fitted on the same runs.
     """
 
@@ -41,6 +41,10 @@ class Frozen:
 
 def validation(fit: Frozen, data: Dataset) -> dict[str, Any]:
     """Validation file for runs of known floors: one row per run and model, and a summary per floor.
+
+    As in `slipid.identify.compare`, every run is predicted as of a session of its own: what its
+    session shares widens its region by the variance found in fitting, whether or not other runs of
+    that session were fitted.
 
     Args:
         fit: of other runs.
