@@ -9,7 +9,12 @@ import nbformat
 import pytest
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
-FIGURES = {"01_one_wheel": 5, "02_a_real_log": 8}
+FIGURES = {
+    "01_one_wheel": 5,
+    "02_a_real_log": 8,
+    "03_fit_and_identifiability": 7,
+    "05_linear_or_nonlinear": 5,
+}
 
 
 def run(name: str, where: Path) -> list[bytes]:
