@@ -235,7 +235,10 @@ def test_a_map_makes_draws_gaussian(bent):
     map, x = bent
     u = map.forward(x)
     np.testing.assert_allclose(u.std(axis=0), 1.0, atol=0.05)
-    assert (np.abs((u**4).mean(axis=0) - 3) < 0.6).all()
+    before = ((x - x.mean(axis=0)) ** 4).mean(axis=0) / x.var(axis=0) ** 2
+    after = (u**4).mean(axis=0)
+    assert (before[[3, 4, 8]] > 6).all()
+    assert (np.abs(after - 3) < 1).all()
     bend = np.corrcoef(u[:, 2] ** 2, u[:, 3])[0, 1]
     width = np.corrcoef(u[:, 2], u[:, 4] ** 2)[0, 1]
     assert max(abs(bend), abs(width)) < 0.06
@@ -256,7 +259,7 @@ def test_a_map_is_undone_and_has_the_slopes_that_it_says(bent):
     jacobian = np.stack([(map.back(u + s) - map.back(u - s)) / 2e-6 for s in step], axis=2)
     np.testing.assert_allclose(log.sum(axis=1), np.linalg.slogdet(jacobian)[1], atol=1e-7)
     numeric = np.stack([(value(u + s) - value(u - s)) / 2e-6 for s in step], axis=1)
-    np.testing.assert_allclose(map.pull(u, back, -back), numeric, atol=1e-7)
+    np.testing.assert_allclose(map.pull(u, -back), numeric, atol=1e-7)
 
 
 def test_a_warp_is_undone_and_its_slope_is_a_derivative():

@@ -29,23 +29,49 @@ def inverse_root(v: Float[Array, "piece m m"]) -> Float[Array, "piece m m"]:
     return jnp.moveaxis(inverse, -1, 0)
 
 
+@jax.custom_vjp
 def squares(
     v: Float[Array, "m m piece"], r: Float[Array, "m piece"]
 ) -> tuple[Float[Array, " piece"], Float[Array, " piece"]]:
     """Log |V| and r^T V^-1 r of many small matrices, pieces last.
 
     Columns of L and of L^-1 r, one after the other; the columns are few enough to be written out.
+    The derivative backwards is V^-1 and -V^-1 r r^T V^-1 (reverse mode only): going back through
+    the columns takes longer.
     """
-    rows = jnp.concatenate([v, r[None]])
+    columns = _columns(jnp.concatenate([v, r[None]]))
+    log_det = jnp.sum(jnp.stack([2 * jnp.log(c[0]) for c in columns]), axis=0)
+    return log_det, jnp.sum(jnp.stack([c[-1] ** 2 for c in columns]), axis=0)
+
+
+def _columns(rows: Float[Array, "row m piece"]) -> list[Array]:
+    """Columns of L from the diagonal on; rows after the m-th are L^-1 times what they were."""
     columns: list[Array] = []
-    log_det, square = jnp.zeros(v.shape[-1]), jnp.zeros(v.shape[-1])
-    for j in range(v.shape[0]):
+    for j in range(rows.shape[1]):
         c = rows[j:, j]
         if columns:
             known = jnp.stack([old[j - k :] for k, old in enumerate(columns)], axis=1)
             c = c - jnp.sum(known * known[:1], axis=1)
-        c = jax.lax.optimization_barrier(c * jax.lax.rsqrt(c[0]))
-        columns.append(c)
-        log_det += 2 * jnp.log(c[0])
-        square += c[-1] ** 2
-    return log_det, square
+        columns.append(jax.lax.optimization_barrier(c * jax.lax.rsqrt(c[0])))
+    return columns
+
+
+def _squares_forward(v: Array, r: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    return squares(v, r), (v, r)
+
+
+def _squares_backward(kept: tuple[Array, Array], slope: tuple[Array, Array]) -> tuple[Array, Array]:
+    v, r = kept
+    low, inverse = _columns(v), []
+    for i in range(len(low)):  # rows of L^-1
+        row = jnp.zeros_like(v[0]).at[i].set(1.0)
+        for k in range(i):
+            row = row.at[: k + 1].add(-low[k][i - k] * inverse[k][: k + 1])
+        inverse.append(jax.lax.optimization_barrier(row / low[i][0]))
+    root = jnp.stack(inverse)
+    precision = jnp.einsum("iap,ibp->abp", root, root)
+    w = jnp.sum(precision * r, axis=1)
+    return slope[0] * precision - slope[1] * w[:, None] * w, 2 * slope[1] * w
+
+
+squares.defvjp(_squares_forward, _squares_backward)

@@ -65,7 +65,7 @@ class Target:
 
     def laplace(self) -> Transport:
         """Map of the Gaussian near it."""
-        return gaussian(self.centre, self.covariance, self.group, self.kind, self.covariance)
+        return gaussian(self.centre, self.covariance, self.group, self.kind)
 
     def seen_by(self, map: Transport) -> "Target":
         """The same distribution in other coordinates; centre and covariance are left alone."""
@@ -76,8 +76,7 @@ class Target:
             return np.asarray(self.terms(x) + log @ onto)
 
         def slope(u: Matrix) -> Matrix:
-            x = map.back(u)
-            return map.pull(u, x, self.slope(x))
+            return map.pull(u, self.slope(map.back(u)))
 
         return replace(self, terms=terms, slope=slope)
 

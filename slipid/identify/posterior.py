@@ -215,11 +215,11 @@ def _given(
         def terms(u: np.ndarray, moved: np.ndarray = moved, held: object = held) -> np.ndarray:
             return second.terms(u + moved, held)
 
-        def slope(u: np.ndarray, moved: np.ndarray = moved, held: object = held) -> np.ndarray:
+        def steep(u: np.ndarray, moved: np.ndarray = moved, held: object = held) -> np.ndarray:
             return second.slope(u + moved, held)
 
         group = second.coordinates.group
-        targets.append(Target(terms, slope, group, second.kind, second.centre, left, apart=True))
+        targets.append(Target(terms, steep, group, second.kind, second.centre, left, apart=True))
     later = replace(
         plan, walkers=x.shape[1], seed=plan.seed + 1, block=15, warm_up=(1,), most=5, spread=1.0
     )

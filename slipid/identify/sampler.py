@@ -26,7 +26,7 @@ ACCEPTED = 0.7
 """Part of Hamiltonian moves that shall be accepted; their step is adapted in the warm-up."""
 FIRST_ANGLE, LEAST_ANGLE = 0.15, 0.03
 """Of a step of Hamiltonian moves [rad]."""
-DRAWS_PER_EFFECTIVE = 4.0
+DRAWS_PER_EFFECTIVE = 12.0
 """Draws of the warm-up that tell as much as an independent one, about."""
 
 
@@ -349,7 +349,7 @@ def unpacked(arrays: dict[str, np.ndarray]) -> Block:
         log_prob=arrays["log_prob"],
         random=(arrays["random_key"], arrays["random_rest"]),
         accepted=arrays["accepted"],
-        map=Transport(arrays["mean"], tuple(stairs), Warp(*arrays["warp"])),
+        map=Transport(Warp(*arrays["warp"]), arrays["mean"], tuple(stairs)),
         angle=float(arrays["angle"]),
     )
 

@@ -2,14 +2,15 @@
 
 A triangular map (Knothe-Rosenblatt) from coordinates x to u, in three steps:
 
-    shared ones       w = L^-1 (x - m)
-    those of a group  w = R^-1 (x - m - B (x_given - m_given)), widest first
-                      v_i = (w_i - a_i(w_1 .. w_i-1)) exp(-b_i(w_1 .. w_i-1))
-    all               u = sinh(tail arcsinh((v - place) / scale) - skew)
+    all               y = sinh(tail arcsinh((x - place) / scale) - skew)
+    shared ones       u = L^-1 (y - m)
+    those of a group  w = L^-1 (y - m - B (y_given - m_given)), widest first
+                      u_i = (w_i - a_i(w_1 .. w_i-1)) exp(-b_i(w_1 .. w_i-1))
 
 with polynomials a and b. Groups follow the shared coordinates and are bent by themselves, so that
-groups that are independent given the shared ones stay so. The third step is the sinh-arcsinh map of
-Jones and Pewsey 2009 (Biometrika 96, eq. 2), the whole one of Marzouk et al. 2016 (Sampling via
+groups that are independent given the shared ones stay so. The first step is the sinh-arcsinh map of
+Jones and Pewsey 2009 (Biometrika 96, eq. 2): what acts through its value and is kept as a logarithm
+becomes straight, or nearly. The whole is one of the maps of Marzouk et al. 2016 (Sampling via
 measure transport, section 3).
 """
 
@@ -29,8 +30,10 @@ SQUARED = 5
 CUBED = 3
 """Coordinates of a group, the widest first, that polynomials have squares and cubes of."""
 MOST_DRAWS = 4000
-RIDGE = 40.0
-"""Draws of no bend at all that count beside those that are learnt from."""
+WORTH = 3.0
+"""Nats that a monomial must be worth."""
+MOST_MONOMIALS = 12
+"""Of a coordinate's mean and std."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +90,8 @@ class Bend:
         return np.asarray(np.linalg.solve(jacobian.transpose(0, 2, 1), total[..., None])[..., 0])
 
     @staticmethod
-    def learnt(w: Matrix) -> "Bend":
-        """Most likely polynomials for draws, shrunk towards none."""
+    def learnt(w: Matrix, effective: float) -> "Bend":
+        """Polynomials for draws that are worth so many independent ones."""
         size = w.shape[1]
         factors = [(size, size, size)] + [(k, size, size) for k in range(size)]
         squared, cubed = range(min(SQUARED, size - 1)), range(min(CUBED, size - 1))
@@ -100,25 +103,48 @@ class Bend:
         reach = np.where(kept == size, -1, kept).max(axis=1)
         for i in range(size):
             own = np.flatnonzero(reach < i)
-            bend.shift[i, own], bend.scale[i, own] = _regression(f[:, own], w[:, i])
+            bend.shift[i, own], bend.scale[i, own] = _regression(f[:, own], w[:, i], effective)
         return bend
 
 
-def _regression(f: Matrix, w: Vector) -> tuple[Vector, Vector]:
-    """Coefficients of the mean and of the log std of a Gaussian (row, monomial) -> row."""
-    penalty = RIDGE * np.diag(np.append(1e-6, np.ones(f.shape[1] - 1)))
-    scale = np.zeros(f.shape[1])
-    shift = np.linalg.solve(f.T @ f + penalty, f.T @ w)
-    scale[0] = np.log(np.std(w - f @ shift) + 1e-12)
-    for _ in range(12):
-        left = (w - f @ shift) ** 2 * np.exp(-2 * f @ scale)
-        slope = f.T @ (1 - left) + penalty @ (scale * (np.arange(len(scale)) > 0))
-        # Fisher's information of a log std is 2
-        step = np.linalg.solve(2 * f.T @ f + penalty, slope)
-        scale = scale - step * min(1.0, 1.0 / (np.abs(f @ step).max() + 1e-9))
-        weight = np.exp(-2 * np.clip(f @ scale - scale[0], -3, 3))
-        shift = np.linalg.solve((f.T * weight) @ f + penalty, f.T @ (weight * w))
+def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]:
+    """Coefficients of the mean and of the log std of a Gaussian, most of them zero.
+
+    Monomials are taken in one by one, that of the largest score statistic first, while one is worth
+    more than `WORTH` nats to as many independent rows as these are.
+    """
+    shift, scale, means, spreads = np.zeros(f.shape[1]), np.zeros(f.shape[1]), [0], [0]
+    share = effective / len(w)
+    for _ in range(MOST_MONOMIALS):
+        for _ in range(6):
+            weight = np.exp(-2 * f @ scale)
+            by = f[:, means].T * weight
+            shift[means] = np.linalg.solve(by @ f[:, means], by @ w)
+            excess = (w - f @ shift) ** 2 * weight - 1
+            # Fisher's information of a log std is 2
+            of = f[:, spreads]
+            step = np.linalg.solve(2 * of.T @ of, of.T @ excess)
+            scale[spreads] += step * min(1.0, 1.0 / (np.abs(of @ step).max() + 1e-9))
+        root = np.sqrt(weight)
+        gains = np.stack(
+            [
+                0.50 * share * _scores(f * root[:, None], means, root * (w - f @ shift)),
+                0.25 * share * _scores(f, spreads, excess),
+            ]
+        )
+        which, best = np.unravel_index(np.argmax(gains), gains.shape)
+        if gains[which, best] < WORTH:
+            break
+        (means, spreads)[which].append(int(best))
     return shift, scale
+
+
+def _scores(f: Matrix, taken: list[int], left: Vector) -> Vector:
+    """Square of what is left along each column, the part of those taken removed from it."""
+    others = f - f[:, taken] @ np.linalg.lstsq(f[:, taken], f, rcond=None)[0]
+    square = (others**2).sum(axis=0)
+    known = square < 1e-6 * (f**2).sum(axis=0)
+    return np.where(known, 0.0, (others.T @ left) ** 2 / np.where(known, 1.0, square))
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +195,7 @@ def _sinh_arcsinh(x: Vector) -> tuple[float, float, float, float]:
         y = np.exp(q[3]) * inner - q[2]
         density = -0.5 * np.sinh(y) ** 2 + np.log(np.cosh(y)) + q[3] - q[1]
         spread = np.mean(density - 0.5 * np.log1p(((t - q[0]) / np.exp(q[1])) ** 2))
-        return float(-spread + 1e-3 * (q @ q))
+        return float(-spread + 1e-2 * (q @ q))
 
     with np.errstate(over="ignore", invalid="ignore"):
         q = minimize(loss, np.zeros(4), method="BFGS").x
@@ -183,7 +209,7 @@ class Stair:
     Attributes:
         own, given: places.
         slope: of own ones by given ones (given, own).
-        root: of what is left.
+        root: Cholesky factor of the covariance of what is left.
         bend: of it; None for shared coordinates.
     """
 
@@ -193,40 +219,46 @@ class Stair:
     root: Matrix
     bend: Bend | None
 
+    def left(self, about: Matrix) -> Matrix:
+        """What others do not say of own coordinates, by the root; from all less their means."""
+        left = about[:, self.own] - about[:, self.given] @ self.slope
+        return np.asarray(np.linalg.solve(self.root, left.T).T)
+
 
 @dataclass(frozen=True, eq=False)
 class Transport:
     """The whole map, of vectors x (row, size) to and from u (row, size).
 
     Attributes:
-        mean: of x.
+        warp: the first step, to y.
+        mean: of y.
         stairs: every coordinate is in one.
-        warp: the last step.
     """
 
+    warp: Warp
     mean: Vector
     stairs: tuple[Stair, ...]
-    warp: Warp
 
     def forward(self, x: Matrix) -> Matrix:
-        return self.warp.forward(self._straight(x))
-
-    def _straight(self, x: Matrix) -> Matrix:
-        about, v = x - self.mean, np.empty_like(x)
+        about = self.warp.forward(x) - self.mean
+        u = np.empty_like(about)
         for s in self.stairs:
-            w = np.linalg.solve(s.root, (about[:, s.own] - about[:, s.given] @ s.slope).T).T
-            v[:, s.own] = s.bend.forward(w) if s.bend else w
-        return v
+            w = s.left(about)
+            u[:, s.own] = s.bend.forward(w) if s.bend else w
+        return u
 
     def back(self, u: Matrix) -> Matrix:
         return self.placed(u)[0]
 
     def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
         """x, and the part of log |dx/du| of every coordinate (row, size)."""
-        v, log = self.warp.back(u), self.warp.log_slope(u)
-        about = np.empty_like(u)
+        y, log = self._warped(u)
+        return self.warp.back(y), log + self.warp.log_slope(y)
+
+    def _warped(self, u: Matrix) -> tuple[Matrix, Matrix]:
+        about, log = np.empty_like(u), np.zeros_like(u)
         for s in self.stairs:
-            w = v[:, s.own]
+            w = u[:, s.own]
             if s.bend:
                 w = s.bend.back(w)
                 log[:, s.own] += s.bend.log_slope(w)
@@ -234,48 +266,51 @@ class Transport:
             log[:, s.own] += np.linalg.slogdet(s.root)[1] / len(s.own)
         return self.mean + about, log
 
-    def pull(self, u: Matrix, x: Matrix, slope: Matrix) -> Matrix:
+    def pull(self, u: Matrix, slope: Matrix) -> Matrix:
         """Derivative by u of what has the derivative `slope` by x, plus that of log |dx/du|."""
-        about, by_x, by_v = x - self.mean, slope.copy(), np.empty_like(u)
+        y, _ = self._warped(u)
+        by_y, by_u = self.warp.pull(y, slope), np.empty_like(u)
         for s in reversed(self.stairs):
-            own = by_x[:, s.own]
-            by_x[:, s.given] += own @ s.slope.T
-            by_v[:, s.own] = own @ s.root
+            own = by_y[:, s.own]
+            by_y[:, s.given] += own @ s.slope.T
+            by_u[:, s.own] = own @ s.root
             if s.bend:
-                w = np.linalg.solve(s.root, (about[:, s.own] - about[:, s.given] @ s.slope).T).T
-                by_v[:, s.own] = s.bend.pull(w, by_v[:, s.own])
-        return self.warp.pull(u, by_v)
+                by_u[:, s.own] = s.bend.pull(s.left(y - self.mean), by_u[:, s.own])
+        return by_u
 
 
-def gaussian(
-    mean: Vector, covariance: Matrix, group: np.ndarray, kind: np.ndarray, at_mode: Matrix
-) -> Transport:
+def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray, kind: np.ndarray) -> Transport:
     """Map of a Gaussian.
 
     Args:
         group: of each coordinate, -1 where groups share it.
         kind: of each coordinate; of a group's, those of a higher kind follow those of lower ones.
-        at_mode: covariance whose widest directions come first in a stair (size, size). A valley
-            has its direction at the mode, where draws are as wide across as they are bent.
+    """
+    return Transport(Warp.none(len(mean)), mean, _stairs(covariance, group, kind, covariance))
+
+
+def _stairs(
+    covariance: Matrix, group: np.ndarray, kind: np.ndarray, at_mode: Matrix
+) -> tuple[Stair, ...]:
+    """Of a Gaussian; the coordinates that are widest at the mode come first in a stair.
+
+    A valley has its direction at the mode, where draws are as wide across as they are bent.
     """
     shared, stairs = np.flatnonzero(group < 0), []
 
-    def stair(own: np.ndarray, given: np.ndarray) -> Stair:
-        slope, left = _given(covariance, own, given)
-        length, way = np.linalg.eigh(_given(at_mode, own, given)[1])
-        root = (way * np.sqrt(length))[:, ::-1]
-        inner = np.linalg.solve(root, np.linalg.solve(root, left).T)
-        return Stair(own, given, slope, root @ np.linalg.cholesky(inner), None)
+    def stair(own: np.ndarray, given: np.ndarray) -> None:
+        if len(own):
+            own = own[np.argsort(-np.diag(_given(at_mode, own, given)[1]))]
+            slope, left = _given(covariance, own, given)
+            stairs.append(Stair(own, given, slope, np.linalg.cholesky(left), None))
 
-    for k in np.unique(kind[shared]):
-        own = shared[kind[shared] == k]
-        stairs.append(stair(own, shared[kind[shared] < k]))
+    for k in np.unique(kind):
+        stair(shared[kind[shared] == k], shared[kind[shared] < k])
     for g in range(group.max() + 1):
-        for k in np.unique(kind[group == g]):
+        for k in np.unique(kind):
             before = np.flatnonzero((group == g) & (kind < k))
-            own = np.flatnonzero((group == g) & (kind == k))
-            stairs.append(stair(own, np.concatenate([shared, before])))
-    return Transport(mean, tuple(stairs), Warp.none(len(mean)))
+            stair(np.flatnonzero((group == g) & (kind == k)), np.concatenate([shared, before]))
+    return tuple(stairs)
 
 
 def _given(covariance: Matrix, own: np.ndarray, given: np.ndarray) -> tuple[Matrix, Matrix]:
@@ -296,13 +331,17 @@ def learnt(
         covariance: Laplace; counts as many draws as there are coordinates.
     """
     some = draws[:: max(1, len(draws) // MOST_DRAWS)]
-    size = draws.shape[1]
-    both = effective * np.cov(draws.T).reshape(size, size) + size * covariance
-    flat = gaussian(draws.mean(axis=0), both / (effective + size), group, kind, covariance)
-    w = flat._straight(some)
+    warp = Warp.learnt(some)
+    y = warp.forward(some)
+    middle, size = y.mean(axis=0), draws.shape[1]
+    step = np.exp(warp.log_slope(warp.forward(draws.mean(axis=0, keepdims=True))))[0]
+    at_mode = covariance / np.outer(step, step)
+    both = effective * np.cov(y.T).reshape(size, size) + size * at_mode
+    stairs = _stairs(both / (effective + size), group, kind, at_mode)
     bent = [
-        replace(s, bend=Bend.learnt(w[:, s.own])) if group[s.own[0]] >= 0 and len(s.own) > 1 else s
-        for s in flat.stairs
+        replace(s, bend=Bend.learnt(s.left(y - middle), effective))
+        if group[s.own[0]] >= 0 and len(s.own) > 1
+        else s
+        for s in stairs
     ]
-    found = replace(flat, stairs=tuple(bent))
-    return replace(found, warp=Warp.learnt(found._straight(some)))
+    return Transport(warp, middle, tuple(bent))
