@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -435,6 +436,110 @@ def test_a_checkpoint_of_another_job_or_a_damaged_one_is_not_used(tmp_path):
     path.write_bytes(path.read_bytes()[:50])
     assert load_checkpoint(path, "key") is None
     assert load_checkpoint(tmp_path / "none.npz", "key") is None
+
+
+# posterior --------------------------------------------------------------------------------------
+
+FEW = ("--draws", "20", "--most", "24", "--block", "2", "--quiet")  # blocks: 20 are to warm up
+
+
+@pytest.fixture(scope="module")
+def sampled(small, tmp_path_factory):
+    """A copy of the fit, and the end of a `sample` that has far too few steps."""
+    out = tmp_path_factory.mktemp("sampled") / "out"
+    shutil.copytree(small[0] / "out", out)
+    return out, invoke("sample", out, *FEW)
+
+
+@pytest.mark.slow
+def test_a_posterior_that_has_not_converged_says_so_everywhere(sampled):
+    out, result = sampled
+    assert result.exit_code == 1, result.output
+    assert "NOT converged" in result.stdout
+    about = json.loads((out / "sample.json").read_text())
+    assert about["converged"] is False
+    found = json.loads((out / "identified.json").read_text())
+    assert any("did not converge" in said for said in found["messages"])
+    import xarray
+
+    with xarray.open_datatree(out / "posterior.nc", engine="h5netcdf") as tree:
+        assert tree.attrs["converged"] == "False"
+
+
+@pytest.mark.slow
+def test_posterior_nc_has_the_groups_of_arviz_and_names_for_everything(sampled):
+    import xarray
+
+    out, _ = sampled
+    found = json.loads((out / "identified.json").read_text())
+    with xarray.open_datatree(out / "posterior.nc", engine="h5netcdf") as tree:
+        assert set(tree.children) == {
+            *("posterior", "sample_stats", "log_likelihood", "posterior_predictive"),
+            *("observed_data", "unconstrained_posterior"),
+        }
+        posterior = tree["posterior"]
+        assert posterior["robot.load_share"].dims == ("chain", "draw", "load", "wheel")
+        np.testing.assert_allclose(posterior["robot.load_share"].sum("wheel"), 1.0)
+        creep = posterior["surface.creep"]
+        assert creep.dims == ("chain", "draw", "surface")
+        assert creep.shape[:2] == (4, 20)
+        floor = str(creep.surface[0].values)
+        low, high = found["parameters"][f"surface.{floor}.creep"]["interval90"]
+        draws = creep.sel(surface=floor).values.ravel()
+        assert [low, high] == pytest.approx(np.quantile(draws, [0.05, 0.95]).tolist())
+        runs = tree["log_likelihood"]["motion"]
+        assert runs.dims == ("chain", "draw", "run")
+        assert sorted(runs.run.values) == sorted(found["data"]["runs"])
+        measured, new = (
+            tree[group]["increment"] for group in ("observed_data", "posterior_predictive")
+        )
+        assert new.dims[2:] == measured.dims == ("piece", "window", "direction")
+        inside = (new.quantile(0.05, ("chain", "draw")) < measured) & (
+            measured < new.quantile(0.95, ("chain", "draw"))
+        )
+        assert 0.8 < float(inside.mean()) < 1.0
+    sources = {p["source"] for p in found["parameters"].values() if p["verdict"] != "fixed"}
+    assert sources == {"posterior"}
+
+
+@pytest.mark.slow
+def test_sampling_that_was_killed_ends_as_if_it_had_not_been(sampled, small, tmp_path):
+    whole, _ = sampled
+    out = tmp_path / "out"
+    shutil.copytree(small[0] / "out", out)
+    run = process("sample", out, *FEW)
+    deadline = time.monotonic() + 120
+    while len(list(out.glob("sampling/*.npz"))) < 3:
+        assert run.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    run.kill()
+    run.communicate()
+    kept = len(list(out.glob("sampling/*.npz")))
+    result = invoke("sample", out, *[w for w in FEW if w != "--quiet"])
+    assert f"going on from block {kept} " in result.output
+    import xarray
+
+    with (
+        xarray.open_datatree(whole / "posterior.nc", engine="h5netcdf") as one,
+        xarray.open_datatree(out / "posterior.nc", engine="h5netcdf") as other,
+    ):
+        for group in ("unconstrained_posterior", "sample_stats"):
+            xarray.testing.assert_equal(one[group].to_dataset(), other[group].to_dataset())
+
+
+@pytest.mark.slow
+def test_sample_refuses_logs_that_were_not_fitted(small, tmp_path):
+    folder, _ = small
+    out = tmp_path / "out"
+    shutil.copytree(folder / "out", out)
+    result = invoke("sample", out, "--data", folder / "unseen")
+    assert result.exit_code == 2
+    assert "since the fit" in result.stderr
+    assert not (out / "sampling").exists()
+    result = invoke("sample", tmp_path / "nothing")
+    assert result.exit_code == 2
+    assert "slipid identify" in result.stderr
 
 
 # files ------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from slipid.identify.moves import Differential, Hamiltonian, Independence, Targe
 from slipid.identify.sampler import Plan, diagnose, packed, run, unpacked
 from slipid.identify.transport import Warp, learnt
 
-PLAN = Plan(ensembles=4, walkers=16, block=25, warm_up=(2, 4, 6), most=120)
+PLAN = Plan(ensembles=4, walkers=16, block=25, warm_up=(2, 4, 6), most=120, spread=6.0)
 
 
 def known(terms, group, kind, centre, covariance):

@@ -97,9 +97,10 @@ def sample(
     draws: Annotated[
         int, typer.Option("--draws", min=10, help="Kept of each of four ensembles.")
     ] = 400,
-    most: Annotated[
-        int, typer.Option("--most", min=20, help="Blocks of 25 steps before it gives up.")
-    ] = 200,
+    most: Annotated[int, typer.Option("--most", min=24, help="Blocks before it gives up.")] = 200,
+    block: Annotated[
+        int, typer.Option("--block", min=1, help="Steps of a block, which are kept together.")
+    ] = 10,
     seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
     json: Json = None,
     quiet: Quiet = False,
@@ -109,7 +110,7 @@ def sample(
     from slipid.app.progress import Reporter
 
     with Reporter(quiet=quiet) as report:
-        done = commands.sample(out, data, draws, most, seed, report)
+        done = commands.sample(out, data, draws, most, block, seed, report)
     if json is not None:
         _emit(json, done.content)
     if json != "-":

@@ -244,7 +244,7 @@ class Sampled:
 
 
 def sample(
-    out: Path, data: Path | None, draws: int, most: int, seed: int, report: Reporter
+    out: Path, data: Path | None, draws: int, most: int, block: int, seed: int, report: Reporter
 ) -> Sampled:
     """Posterior of the fit in `out`: posterior.nc, sample.json, and intervals in identified.json.
 
@@ -268,7 +268,7 @@ def sample(
     job = read_job(read_config(out / "config.toml"), folder, report.count, report.line)
     job_of.same_logs(fit, job)
     report.stage("compiling")
-    problem, plan = job.problem(), Plan(seed=seed, most=most)
+    problem, plan = job.problem(), Plan(seed=seed, most=most, block=block)
     found = job_of.sample(out, fit, problem, plan, draws, report)
     report.stage("writing")
     about = job_of.summary(found, plan, time.monotonic() - began)

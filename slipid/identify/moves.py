@@ -245,11 +245,11 @@ def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
 
 def moves(target: Target, angle: float) -> list[tuple[Move, float]]:
     """Moves in the target's coordinates, and how often each is made."""
+    kinds: list[tuple[type[FamilyMove], float]] = [(Independence, 0.4), (Differential, 0.1)]
+    if target.apart:  # none can be moved by others, and each starts near its own draw
+        kinds = [(Independence, 0.8)]
     of_family = families(target)
-    kinds: list[tuple[type[FamilyMove], float]] = [(Independence, 0.4)]
-    if not target.apart:
-        kinds.append((Differential, 0.1))
     found: list[tuple[Move, float]] = [
         (kind(family), share / len(of_family)) for kind, share in kinds for family in of_family
     ]
-    return [*found, (Hamiltonian(target, angle), 0.5)]
+    return [*found, (Hamiltonian(target, angle), 1 - sum(share for _, share in kinds))]

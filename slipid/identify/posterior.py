@@ -221,7 +221,7 @@ def _given(
         group = second.coordinates.group
         targets.append(Target(terms, steep, group, second.kind, second.centre, left, apart=True))
     later = replace(
-        plan, walkers=x.shape[1], seed=plan.seed + 1, block=15, warm_up=(1,), most=5, spread=1.0
+        plan, walkers=x.shape[1], seed=plan.seed + 1, block=8, warm_up=(1, 2), most=5, spread=1.0
     )
     blocks = _blocks(targets, later, ELECTRIC, done, keep, tell)
     chain = sampler.chain(blocks, later)

@@ -47,11 +47,11 @@ class Plan:
     """
 
     ensembles: int = 4
-    walkers: int = 20
-    block: int = 25
-    warm_up: tuple[int, ...] = (3, 6, 10)
+    walkers: int = 8
+    block: int = 10
+    warm_up: tuple[int, ...] = (4, 8, 12, 20)
     most: int = 400
-    spread: float = 6.0
+    spread: float = 4.0
     r_hat: float = 1.01
     steps_per_tau: float = 50.0
     least_draws: float = 1000.0
