@@ -9,7 +9,7 @@ import pytest
 from arviz_stats.base import array_stats
 
 from slipid.identify import sampler
-from slipid.identify.moves import Differential, Hamiltonian, Independence, Target, families
+from slipid.identify.moves import Along, Differential, Hamiltonian, Independence, Target, families
 from slipid.identify.sampler import Plan, diagnose, packed, run, unpacked
 from slipid.identify.transport import Warp, learnt
 
@@ -182,6 +182,29 @@ def test_independence_accepts_nearly_everything_where_laplace_is_exact(exact):
         np.testing.assert_array_equal(new[:, others], u[:, others])
 
 
+@pytest.fixture(scope="module")
+def bent():
+    """A map learnt from draws with a parabola, a funnel and a shared number in them."""
+    group, kind = np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1]), np.array([0, 1, 0, 0, 0, 1, 0, 0, 1])
+    x = np.random.default_rng(0).normal(size=(5000, 9))
+    x[:, 3] += x[:, 2] ** 2
+    x[:, 4] *= np.exp(0.5 * x[:, 2])
+    x[:, 2] += x[:, 0]
+    x[:, 8] = np.exp(0.5 * x[:, 8])
+    return learnt(x, 1250.0, np.eye(9), group, kind), x
+
+
+def made_gaussian(map, group, kind):
+    """Target that is a standard Gaussian in the coordinates of a map."""
+    onto = np.eye(3)[np.where(group < 0, 2, group)]
+
+    def terms(u):
+        return -0.5 * u**2 @ onto
+
+    centre, covariance = np.zeros(len(group)), np.eye(len(group))
+    return Target(terms, np.negative, group, kind, centre, covariance, map=map)
+
+
 class Model:
     """What emcee gives to moves."""
 
@@ -208,6 +231,28 @@ def test_a_hamiltonian_move_is_exact_and_independent_for_a_gaussian(exact):
     assert np.abs(together).max() < 0.7  # some way towards a quarter turn
 
 
+@pytest.mark.parametrize("groups", [(0, 1), None])
+def test_walking_along_a_coordinate_keeps_the_distribution(bent, groups):
+    """Exact draws of what a bent map makes of a Gaussian stay that."""
+    map, _ = bent
+    group, kind = np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1]), np.array([0, 1, 0, 0, 0, 1, 0, 0, 1])
+    target = made_gaussian(map, group, kind)
+    model, u = Model(target), np.random.RandomState(1).standard_normal((4000, 9))
+    log_prob, terms = model.compute_log_prob_fn(u)
+    from emcee.state import State
+
+    state, moved = State(u, log_prob=log_prob, blobs=terms, copy=True), 0.0
+    move = Along(target, groups)
+    for _ in range(8):
+        state, took = move.propose(model, state)
+        moved += took.mean() / 8
+    assert moved > 0.15
+    np.testing.assert_allclose(state.coords.mean(axis=0), 0.0, atol=0.08)
+    np.testing.assert_allclose(state.coords.std(axis=0), 1.0, atol=0.05)
+    np.testing.assert_allclose(np.corrcoef(state.coords.T), np.eye(9), atol=0.08)
+    np.testing.assert_allclose(state.log_prob, target.terms(state.coords).sum(axis=1), atol=1e-9)
+
+
 def test_whole_differences_lead_from_mode_to_mode():
     target, _, _ = two_modes()
     (family,) = families(target)
@@ -217,18 +262,6 @@ def test_whole_differences_lead_from_mode_to_mode():
     new, factor = move.proposed(x, still, random)
     assert (factor == 0).all()
     assert 0.01 < (np.abs(new[:, 0] - 4) < 0.5).mean() < 0.1
-
-
-@pytest.fixture(scope="module")
-def bent():
-    """A map learnt from draws with a parabola, a funnel and a shared number in them."""
-    group, kind = np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1]), np.array([0, 1, 0, 0, 0, 1, 0, 0, 1])
-    x = np.random.default_rng(0).normal(size=(5000, 9))
-    x[:, 3] += x[:, 2] ** 2
-    x[:, 4] *= np.exp(0.5 * x[:, 2])
-    x[:, 2] += x[:, 0]
-    x[:, 8] = np.exp(0.5 * x[:, 8])
-    return learnt(x, 1250.0, np.eye(9), group, kind), x
 
 
 def test_a_map_makes_draws_gaussian(bent):

@@ -27,6 +27,8 @@ DEGREES = 8.0
 WAY = 0.5 * np.pi
 """Of a Hamiltonian move [rad]: a quarter turn leads to an independent draw of a Gaussian."""
 MOST_STEPS = 12
+ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN, HAMILTONIAN_APART = 0.2, 0.4, 0.1, 0.4, 0.15
+"""How often, relatively, moves of each kind are made."""
 STEEPEST = 100.0
 """Kicks are bounded by this many times the step, so that walkers far out are not thrown away."""
 
@@ -43,6 +45,7 @@ class Target:
         centre, covariance: of a Gaussian near it (Laplace).
         apart: every walker has a density of its own, so that all are evaluated together and in
             order, and none can be moved by what others do.
+        map: what it is seen through; None for x itself.
     """
 
     terms: Callable[[Matrix], Matrix]
@@ -52,6 +55,7 @@ class Target:
     centre: Float[np.ndarray, " size"]
     covariance: Matrix
     apart: bool = False
+    map: Transport | None = None
 
     @property
     def count(self) -> int:
@@ -78,7 +82,7 @@ class Target:
         def slope(u: Matrix) -> Matrix:
             return map.pull(u, self.slope(map.back(u)))
 
-        return replace(self, terms=terms, slope=slope)
+        return replace(self, terms=terms, slope=slope, map=map)
 
 
 @dataclass(frozen=True)
@@ -203,6 +207,34 @@ class Differential(FamilyMove):
         return old + scale[:, None] * (still[first] - still[second]) + jitter, np.zeros(count)
 
 
+class Along(FamilyMove):
+    """Random walk of one coordinate of each group, or of a shared one, the others of x held.
+
+    Where data say no more than that a number is small, its logarithm may be anything: a plateau
+    that no map of the whole has straight, but along which this walks.
+    """
+
+    def __init__(self, target: Target, groups: tuple[int, ...] | None):
+        everything = np.arange(len(target.group))
+        of_group = [np.flatnonzero(target.group == g) for g in groups or ()]
+        super().__init__(Family(tuple(of_group or [everything]), groups))
+        self.map = target.map
+        self.mine = tuple(of_group or [np.flatnonzero(target.group < 0)])
+        self.std = np.sqrt(np.diag(target.covariance))
+
+    def proposed(self, u: Matrix, still: Matrix, random: Any) -> tuple[Matrix, Matrix]:
+        assert self.map
+        rows = np.arange(len(u))
+        x, before = self.map.placed(u)
+        for mine in self.mine:
+            which = random.choice(mine, len(u))
+            reach = 10 ** random.uniform(-0.5, 1.0, len(u)) * self.std[which]
+            x[rows, which] += reach * random.standard_normal(len(u))
+        new = self.map.forward(x)
+        change = before - self.map.placed(new)[1]
+        return new, np.stack([change[:, own].sum(axis=1) for own in self.family.places], axis=1)
+
+
 class Hamiltonian(Move):
     """Turns of position and momentum that suit a Gaussian, kicked by what it does not know.
 
@@ -245,11 +277,17 @@ def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
 
 def moves(target: Target, angle: float) -> list[tuple[Move, float]]:
     """Moves in the target's coordinates, and how often each is made."""
-    kinds: list[tuple[type[FamilyMove], float]] = [(Independence, 0.4), (Differential, 0.1)]
-    if target.apart:  # none can be moved by others, and each starts near its own draw
-        kinds = [(Independence, 0.8)]
-    of_family = families(target)
-    found: list[tuple[Move, float]] = [
+    of_family, groups = families(target), tuple(range(target.count))
+    found: list[tuple[Move, float]] = [(Along(target, groups), ALONG)]
+    if (target.group < 0).any():
+        found.append((Along(target, None), ALONG))
+    kinds: list[tuple[type[FamilyMove], float]] = [(Independence, INDEPENDENT)]
+    if not target.apart:
+        kinds.append((Differential, DIFFERENTIAL))
+    found += [
         (kind(family), share / len(of_family)) for kind, share in kinds for family in of_family
     ]
-    return [*found, (Hamiltonian(target, angle), 1 - sum(share for _, share in kinds))]
+    return [
+        *found,
+        (Hamiltonian(target, angle), HAMILTONIAN_APART if target.apart else HAMILTONIAN),
+    ]
