@@ -27,7 +27,7 @@ DEGREES = 8.0
 WAY = 0.5 * np.pi
 """Of a Hamiltonian move [rad]: a quarter turn leads to an independent draw of a Gaussian."""
 MOST_STEPS = 12
-ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN, HAMILTONIAN_APART = 0.2, 0.4, 0.1, 0.4, 0.15
+ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN, HAMILTONIAN_APART = 0.1, 0.3, 0.1, 0.6, 0.15
 """How often, relatively, moves of each kind are made."""
 STEEPEST = 100.0
 """Kicks are bounded by this many times the step, so that walkers far out are not thrown away."""
