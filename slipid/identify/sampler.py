@@ -326,7 +326,8 @@ def packed(block: Block) -> dict[str, Any]:
         "accepted": block.accepted,
         "angle": np.asarray(block.angle),
         "mean": block.map.mean,
-        "warp": np.stack(list(vars(block.map.warp).values())),
+        "first": np.stack(list(vars(block.map.first).values())),
+        "last": np.stack(list(vars(block.map.last).values())),
     }
     for k, stair in enumerate(block.map.stairs):
         out |= {f"{k}/{name}": getattr(stair, name) for name in _OF_STAIR}
@@ -349,7 +350,7 @@ def unpacked(arrays: dict[str, np.ndarray]) -> Block:
         log_prob=arrays["log_prob"],
         random=(arrays["random_key"], arrays["random_rest"]),
         accepted=arrays["accepted"],
-        map=Transport(Warp(*arrays["warp"]), arrays["mean"], tuple(stairs)),
+        map=Transport(Warp(*arrays["first"]), arrays["mean"], tuple(stairs), Warp(*arrays["last"])),
         angle=float(arrays["angle"]),
     )
 

@@ -1,17 +1,21 @@
 """Coordinates in which a posterior is nearly a standard Gaussian, learnt from draws of it.
 
-A triangular map (Knothe-Rosenblatt) from coordinates x to u, in three steps:
+A triangular map (Knothe-Rosenblatt) from coordinates x to u:
 
-    all               y = sinh(tail arcsinh((x - place) / scale) - skew)
-    shared ones       u = L^-1 (y - m)
+    shared ones       v = L^-1 (y - m)
     those of a group  w = L^-1 (y - m - B (y_given - m_given)), widest first
-                      u_i = (w_i - a_i(w_1 .. w_i-1)) exp(-b_i(w_1 .. w_i-1))
+                      v_i = (w_i - a_i(w_1 .. w_i-1)) exp(-b_i(w_1 .. w_i-1))
 
-with polynomials a and b. Groups follow the shared coordinates and are bent by themselves, so that
-groups that are independent given the shared ones stay so. The first step is the sinh-arcsinh map of
-Jones and Pewsey 2009 (Biometrika 96, eq. 2): what acts through its value and is kept as a logarithm
-becomes straight, or nearly. The whole is one of the maps of Marzouk et al. 2016 (Sampling via
-measure transport, section 3).
+with polynomials a and b, and a sinh-arcsinh map (Jones and Pewsey 2009, Biometrika 96, eq. 2) of
+every coordinate,
+
+    sinh(tail arcsinh((x - place) / scale) - skew)
+
+from x to y or from v to u: first, where numbers act through their values and are kept as
+logarithms; last, where the density is bent in x. Draws that were not learnt from decide. Groups
+follow the shared coordinates and are bent by themselves, so that groups that are independent given
+the shared ones stay so. It is one of the maps of Marzouk et al. 2016 (Sampling via measure
+transport, section 3).
 """
 
 from dataclasses import dataclass, replace
@@ -230,22 +234,24 @@ class Transport:
     """The whole map, of vectors x (row, size) to and from u (row, size).
 
     Attributes:
-        warp: the first step, to y.
+        first: from x to y.
         mean: of y.
-        stairs: every coordinate is in one.
+        stairs: from y to v; every coordinate is in one.
+        last: from v to u.
     """
 
-    warp: Warp
+    first: Warp
     mean: Vector
     stairs: tuple[Stair, ...]
+    last: Warp
 
     def forward(self, x: Matrix) -> Matrix:
-        about = self.warp.forward(x) - self.mean
-        u = np.empty_like(about)
+        about = self.first.forward(x) - self.mean
+        v = np.empty_like(about)
         for s in self.stairs:
             w = s.left(about)
-            u[:, s.own] = s.bend.forward(w) if s.bend else w
-        return u
+            v[:, s.own] = s.bend.forward(w) if s.bend else w
+        return self.last.forward(v)
 
     def back(self, u: Matrix) -> Matrix:
         return self.placed(u)[0]
@@ -253,12 +259,14 @@ class Transport:
     def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
         """x, and the part of log |dx/du| of every coordinate (row, size)."""
         y, log = self._warped(u)
-        return self.warp.back(y), log + self.warp.log_slope(y)
+        return self.first.back(y), log + self.first.log_slope(y)
 
     def _warped(self, u: Matrix) -> tuple[Matrix, Matrix]:
-        about, log = np.empty_like(u), np.zeros_like(u)
+        """y, and the part of log |dy/du|."""
+        v, log = self.last.back(u), self.last.log_slope(u)
+        about = np.empty_like(u)
         for s in self.stairs:
-            w = u[:, s.own]
+            w = v[:, s.own]
             if s.bend:
                 w = s.bend.back(w)
                 log[:, s.own] += s.bend.log_slope(w)
@@ -269,14 +277,19 @@ class Transport:
     def pull(self, u: Matrix, slope: Matrix) -> Matrix:
         """Derivative by u of what has the derivative `slope` by x, plus that of log |dx/du|."""
         y, _ = self._warped(u)
-        by_y, by_u = self.warp.pull(y, slope), np.empty_like(u)
+        by_y, by_v = self.first.pull(y, slope), np.empty_like(u)
         for s in reversed(self.stairs):
             own = by_y[:, s.own]
             by_y[:, s.given] += own @ s.slope.T
-            by_u[:, s.own] = own @ s.root
+            by_v[:, s.own] = own @ s.root
             if s.bend:
-                by_u[:, s.own] = s.bend.pull(s.left(y - self.mean), by_u[:, s.own])
-        return by_u
+                by_v[:, s.own] = s.bend.pull(s.left(y - self.mean), by_v[:, s.own])
+        return self.last.pull(u, by_v)
+
+    def log_density(self, x: Matrix) -> Vector:
+        """Of what is a standard Gaussian in u, up to a constant."""
+        u = self.forward(x)
+        return np.asarray((-0.5 * u**2 - self.placed(u)[1]).sum(axis=1))
 
 
 def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray, kind: np.ndarray) -> Transport:
@@ -286,7 +299,8 @@ def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray, kind: np.ndarr
         group: of each coordinate, -1 where groups share it.
         kind: of each coordinate; of a group's, those of a higher kind follow those of lower ones.
     """
-    return Transport(Warp.none(len(mean)), mean, _stairs(covariance, group, kind, covariance))
+    stairs = _stairs(covariance, group, kind, covariance)
+    return Transport(Warp.none(len(mean)), mean, stairs, Warp.none(len(mean)))
 
 
 def _stairs(
@@ -326,22 +340,34 @@ def learnt(
     """Map learnt from draws.
 
     Args:
-        draws: (draw, size).
+        draws: (draw, size), its halves from chains that do not know of each other.
         effective: number of independent ones that they are worth, about.
         covariance: Laplace; counts as many draws as there are coordinates.
     """
     some = draws[:: max(1, len(draws) // MOST_DRAWS)]
-    warp = Warp.learnt(some)
-    y = warp.forward(some)
-    middle, size = y.mean(axis=0), draws.shape[1]
-    step = np.exp(warp.log_slope(warp.forward(draws.mean(axis=0, keepdims=True))))[0]
-    at_mode = covariance / np.outer(step, step)
-    both = effective * np.cov(y.T).reshape(size, size) + size * at_mode
-    stairs = _stairs(both / (effective + size), group, kind, at_mode)
-    bent = [
-        replace(s, bend=Bend.learnt(s.left(y - middle), effective))
-        if group[s.own[0]] >= 0 and len(s.own) > 1
-        else s
-        for s in stairs
-    ]
-    return Transport(warp, middle, tuple(bent))
+    halves = some[: len(some) // 2], some[len(some) // 2 :]
+
+    def made(rows: Matrix, effective: float, warp_first: bool) -> Transport:
+        size = rows.shape[1]
+        first = Warp.learnt(rows) if warp_first else Warp.none(size)
+        y = first.forward(rows)
+        middle = y.mean(axis=0)
+        step = np.exp(first.log_slope(first.forward(rows.mean(axis=0, keepdims=True))))[0]
+        at_mode = covariance / np.outer(step, step)
+        both = effective * np.cov(y.T).reshape(size, size) + size * at_mode
+        stairs = tuple(
+            replace(s, bend=Bend.learnt(s.left(y - middle), effective))
+            if group[s.own[0]] >= 0 and len(s.own) > 1
+            else s
+            for s in _stairs(both / (effective + size), group, kind, at_mode)
+        )
+        found = Transport(first, middle, stairs, Warp.none(size))
+        return found if warp_first else replace(found, last=Warp.learnt(found.forward(rows)))
+
+    def worth(warp_first: bool) -> float:
+        pairs = halves, halves[::-1]
+        return float(
+            sum(made(a, effective / 2, warp_first).log_density(b).mean() for a, b in pairs)
+        )
+
+    return made(some, effective, worth(True) > worth(False))
