@@ -103,6 +103,7 @@ def sampled(target, plan=PLAN):
     return blocks, chain, diagnose(chain, plan)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [gaussian, banana, funnel, two_modes])
 def test_moments_are_within_three_monte_carlo_errors_or_it_says_so(case):
     target, mean, std = case()
