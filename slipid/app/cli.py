@@ -99,7 +99,7 @@ def sample(
     ] = 400,
     most: Annotated[int, typer.Option("--most", min=24, help="Blocks before it gives up.")] = 200,
     block: Annotated[
-        int, typer.Option("--block", min=1, help="Steps of a block, which are kept together.")
+        int, typer.Option("--block", min=1, hidden=True, help="Steps that are kept together.")
     ] = 10,
     seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
     json: Json = None,

@@ -23,7 +23,7 @@ def versions() -> dict[str, str]:
         "equinox",
         "optimistix",
         "numpy",
-        "scikit-learn",
+        "scipy",
         "emcee",
     ):
         try:

@@ -4,7 +4,7 @@ A target's log density is a sum of one term per group of coordinates, given thos
 and a term of the shared ones. In the coordinates of `slipid.identify.transport` independence moves
 and differential evolution move all groups in one evaluation, each accepted or not by its own term,
 or the shared ones, which groups then follow. Hamiltonian moves take all coordinates far along the
-gradient where the density still bends.
+gradient where the density still bends, and walks along a single one cross its plateaus.
 """
 
 from collections.abc import Callable
