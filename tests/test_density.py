@@ -11,8 +11,9 @@ import pytest
 from scipy.stats import multivariate_t, norm
 
 from slipid.identify import likelihood as lk
-from slipid.identify.density import ELECTRIC, EVERYTHING, MOTION, Density
+from slipid.identify.density import ELECTRIC, EVERYTHING, MOTION, Density, Fitted
 from slipid.identify.problem import DEGREES, VARIANCE_SPREAD, Problem
+from slipid.identify.sessions import AXES
 from slipid.parameter import Choice
 from tests.made_windows import made, robot
 
@@ -49,9 +50,9 @@ def problem():
     return Problem(w, truth, FREE)
 
 
-def density(problem, part):
+def density(problem, part, session=None):
     z, log_v = problem.space.start, 2 * np.log(problem.noise.typical)
-    return Density(problem, z, log_v, 0.01 * np.eye(len(z)), part)
+    return Density(problem, Fitted(z, log_v, 0.01 * np.eye(len(z)), session or {}), part)
 
 
 def near(d, count=4, width=0.1):
@@ -117,6 +118,68 @@ def test_the_electric_part_holds_the_motion_of_each_walker(problem):
     assert sorted([*motion.names, *electric.names]) == sorted(all_.names)
     rest = all_.terms(together).sum(axis=1) - motion.terms(of_motion).sum(axis=1)
     np.testing.assert_allclose(found, rest, rtol=1e-8)
+
+
+SHARED = {f"session.soft.{axis}": v for axis, v in zip(AXES, (4e-4, 1e-4, 9e-4), strict=True)}
+
+
+def test_runs_of_a_session_share_effects_with_the_priors_that_were_found(problem):
+    """Residuals less E a, a = std e; e standard normal beforehand; the other floor is untouched."""
+    plain, d = density(problem, MOTION), density(problem, MOTION, SHARED)
+    assert d.names[: plain.size] == plain.names
+    assert d.names[plain.size] == "session.soft.along@one"
+    assert d.size == plain.size + 6
+    assert (d.coordinates.group[plain.size :] == d.floors.index("soft")).all()
+    x = near(d, 2, width=0.7)
+    z, log_v = d.full(x[0])
+    tree = problem.space.tree(jnp.asarray(z))
+    residual = np.array(jax.jit(lk.residuals)(tree, problem.batch, 1.0)["motion"])
+    effect, w = lk.effects(problem.windows, problem.robot), problem.windows
+    std, found = np.array([0.02, 0.01, 0.03]), np.zeros(3)
+    for n, r in enumerate(residual):
+        if w.surface[n] == "soft":
+            first = plain.size + 3 * ("one", "two").index(w.session[n])
+            r = r - effect[n] @ (std * x[0, first : first + 3])
+        v = np.asarray(problem.covariance("motion", log_v))[n]
+        found[problem.batch.surface[n]] += multivariate_t.logpdf(r, shape=v, df=DEGREES)
+        found[problem.batch.surface[n]] += lk.log_jacobians(tree, problem.batch, 1.0)[0][n]
+    of_prior = norm.logpdf(x[0, plain.size :]).sum()
+    alone = plain.terms(x[:1, : plain.size])[0]
+    soft = d.floors.index("soft")
+    known = prior(problem, plain, x[0, : plain.size])
+    found[soft] += of_prior
+    for g in (0, 1):
+        found[g] += known[plain.coordinates.group == g].sum()
+    terms = d.terms(x[:1])[0]
+    np.testing.assert_allclose(terms[:2], found[:2], rtol=1e-9)
+    assert terms[1 - soft] == pytest.approx(alone[1 - soft], rel=1e-12)
+    assert terms[-1] == pytest.approx(alone[-1], rel=1e-12)
+
+
+def test_sessions_widen_the_curvature_as_the_fit_says(problem):
+    """Marginal of the joint curvature: C + C (sum_s v u u^T) C where effects are told by little."""
+    d, small = density(problem, MOTION), {k: 1e-6 * v for k, v in SHARED.items()}
+    n = len(d.coordinates.structure)
+    z, log_v = problem.space.start, 2 * np.log(problem.noise.typical)
+    _, jacobian = problem.linear(z, problem.volt(log_v))
+    precision = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), np.ones(24)))
+    fitted = Fitted(z, log_v, np.linalg.inv(precision), small)
+    grown = Density(problem, fitted, MOTION).covariance[:n, :n]
+    at = d.coordinates.structure
+    laplace = fitted.covariance[np.ix_(at, at)]
+    v = np.asarray(problem.covariance("motion", log_v))
+    weight = (DEGREES + 6) / (DEGREES + 8)
+    meat, w = np.zeros_like(laplace), problem.windows
+    for name in ("one", "two"):
+        u = np.zeros((3, n))
+        for k in range(24):
+            if (w.surface[k], w.session[k]) == ("soft", name):
+                e = lk.effects(w, problem.robot)[k]
+                u += weight * e.T @ np.linalg.solve(v[k], np.asarray(jacobian["motion"])[k][:, at])
+        meat += u.T @ np.diag(list(small.values())) @ u
+    more = laplace @ meat @ laplace
+    assert np.abs(more).max() > 0
+    np.testing.assert_allclose(grown - laplace, more, atol=2e-3 * np.abs(more).max())
 
 
 def test_numbers_of_one_floor_move_its_term_only(problem):

@@ -32,7 +32,7 @@ def interval_figure(fit: Fit, z: np.ndarray) -> Figure:
     chosen = [k for k, n in enumerate(fit.space.names) if "session_yaw" not in n]
     mean, std = fit.space.prior_mean[chosen], fit.space.prior_std[chosen]
     low, middle, high = (np.quantile(z[:, chosen], (0.05, 0.5, 0.95), axis=0) - mean) / std
-    half = 1.645 * np.sqrt(np.diag(fit.laplace))[chosen] / std
+    half = 1.645 * np.sqrt(np.diag(fit.covariance))[chosen] / std
     fitted = (fit.z[chosen] - mean) / std
     made = drawing.figure(
         8.8,
@@ -71,7 +71,7 @@ def pair_figure(fit: Fit, z: np.ndarray) -> Figure:
     for ax, (i, j) in zip(axes, pairs, strict=True):
         drawing.plain(ax)
         ax.plot(some[:, i], some[:, j], ".", ms=2, color=drawing.BLUE, alpha=0.4)
-        _ellipse(ax, fit.z[[i, j]], fit.laplace[np.ix_([i, j], [i, j])])
+        _ellipse(ax, fit.z[[i, j]], fit.covariance[np.ix_([i, j], [i, j])])
         for name, put in ((fit.space.names[i], ax.set_xlabel), (fit.space.names[j], ax.set_ylabel)):
             put(name.removeprefix("surface."), fontsize=8)
     return made

@@ -37,6 +37,9 @@ def tree(problem: Problem, found: Posterior, runs: tuple[str, ...], about: dict[
     run = np.unique(w.run)
     onto = (np.asarray(w.run)[:, None] == run).astype(float)
     measured, predicted, data_dims = _data(problem, found)
+    unconstrained = {"z": found.z, "log_variance": found.log_variance}
+    if found.effects.shape[-1]:
+        unconstrained["effects"] = found.effects
     coords = {
         "surface": list(robot.surfaces.labels),
         "load": list(robot.body.loads),
@@ -47,6 +50,7 @@ def tree(problem: Problem, found: Posterior, runs: tuple[str, ...], about: dict[
         "run": [runs[k] for k in run],
         "coordinate": problem.space.names,
         "component": list(problem.noise.names),
+        "shared": [n for n in found.names if n.startswith("session.")],
     }
     made = from_dict(
         {
@@ -55,13 +59,13 @@ def tree(problem: Problem, found: Posterior, runs: tuple[str, ...], about: dict[
             "log_likelihood": {k: v @ onto for k, v in per_run.items()},
             "posterior_predictive": predicted,
             "observed_data": measured,
-            "unconstrained_posterior": {"z": found.z, "log_variance": found.log_variance},
+            "unconstrained_posterior": unconstrained,
         },
         coords=coords,
         dims=dims
         | noise_dims
         | data_dims
-        | {"z": ["coordinate"], "log_variance": ["component"]}
+        | {"z": ["coordinate"], "log_variance": ["component"], "effects": ["shared"]}
         | {k: ["run"] for k in per_run},
     )
     for name, unit in units.items():

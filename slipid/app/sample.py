@@ -15,7 +15,7 @@ from slipid.app.progress import Reporter
 from slipid.data.files import read_json, write_arrays, write_json
 from slipid.data.log import DataError
 from slipid.identify import curves as curves_of
-from slipid.identify.density import ELECTRIC, EVERYTHING, MOTION
+from slipid.identify.density import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.identify.identifiability import NEEDS_VOLTAGE, Estimate, by_ratio, derived
 from slipid.identify.posterior import Posterior
 from slipid.identify.result import Fit, as_identified
@@ -92,11 +92,10 @@ def sample(
         watch.block(part, block)
 
     variance = np.array([fit.variance[name] for name in problem.noise.names])
+    shared = {k: v for k, v in fit.variance.items() if k.startswith("session.")}
     return posterior.sample(
         problem,
-        fit.z,
-        np.log(variance),
-        fit.laplace,
+        Fitted(fit.z, np.log(variance), fit.laplace, shared),
         plan,
         draws=draws,
         done=done,

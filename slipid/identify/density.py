@@ -1,14 +1,16 @@
 """Log posterior of many walkers at a time, for samplers: what the fit maximises, as a density.
 
-A coordinate is a free number of the search space or the log of a variance component. Floors share
-some of them and have the others to themselves, so that the log posterior is a sum
+A coordinate is a free number of the search space, the log of a variance component, or what the
+runs of a session share along, across or in yaw, in stds that are held. Floors share some of them
+and have the others to themselves, so that the log posterior is a sum
 
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
 
 and numbers of several floors can be moved, and accepted or not, in one evaluation.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -17,13 +19,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from slipid.identify import likelihood as lk
 from slipid.identify.linear import squares
 from slipid.identify.problem import DEGREES, VARIANCE_SPREAD, Problem
+from slipid.identify.sessions import AXES, by_axis, pairs
 
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Where a fit ended.
+
+    Attributes:
+        z, log_variance: search vector, log variances of the components.
+        covariance: Laplace, of the search vector, as if sessions shared nothing; where currents do
+            not inform motion it is that of p(electric | motion, data) p(motion | motion data).
+        session: variances of what the runs of a session share, `session.<floor>.<axis>`.
+    """
+
+    z: np.ndarray
+    log_variance: np.ndarray
+    covariance: Float[np.ndarray, "free free"]
+    session: Mapping[str, float] = field(default_factory=dict)
 
 
 class Anchor(eqx.Module):
@@ -36,6 +56,8 @@ class Anchor(eqx.Module):
         z, log_variance: at the fit.
         twist: of every window there, and its derivative by the search vector.
         typical: centre of the prior of the log variances.
+        shares: what effects of one std move in the residuals of a piece (piece, m, 3).
+        session: place of the piece's session among those that have effects.
     """
 
     batch: lk.Batch
@@ -46,6 +68,8 @@ class Anchor(eqx.Module):
     twist: Float[Array, "piece window 3"]
     twist_slope: Float[Array, "piece window 3 free"]
     typical: Array
+    shares: Float[Array, "piece m 3"]
+    session: Int[Array, " piece"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +80,21 @@ class Coordinates:
         names: of the chain's coordinates.
         structure: places in the search vector of the first of them.
         variance: numbers of the variance components that follow.
+        sessions: floor and session of the effects that come last, along, across, yaw of each.
         group: floor each belongs to, -1 where several floors share it.
     """
 
     names: tuple[str, ...]
     structure: np.ndarray
     variance: np.ndarray
+    sessions: tuple[tuple[str, str], ...]
     group: np.ndarray
+
+    def parts(self, x: Any) -> tuple[Any, Any, Any]:
+        """Structure, log variances and effects of coordinates (..., size)."""
+        n = len(self.structure)
+        end = n + len(self.variance)
+        return x[..., :n], x[..., n:end], x[..., end:]
 
 
 class Density:
@@ -70,35 +102,52 @@ class Density:
 
     Args:
         problem: windows, robot, priors.
-        z, log_variance: at the fit.
-        covariance: Laplace, of the search vector; where currents do not inform motion it is that of
-            p(electric | motion, data) p(motion | motion data).
+        fitted: what the chain starts around and takes effects of sessions from.
         part: "motion", "electric" or "everything"; where currents do not inform motion the last is
             no posterior, but has the likelihoods.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        z: np.ndarray,
-        log_variance: np.ndarray,
-        covariance: Float[np.ndarray, "free free"],
-        part: str,
-    ):
+    def __init__(self, problem: Problem, fitted: Fitted, part: str):
         self.problem, self.part = problem, part
         self.floors = problem.robot.surfaces.labels
-        self.coordinates = _coordinates(problem, z, log_variance, part)
-        self.anchor = _anchor(problem, z, log_variance)
-        self._form = self
+        self.coordinates = _coordinates(problem, fitted, part)
+        self.anchor = _anchor(problem, fitted, self.coordinates.sessions)
+        # the first of its form compiles for all
+        form = part, self.coordinates.names, self.coordinates.group.tobytes()
+        self._form: Density = problem.compiled.setdefault(form, self)
         at = self.coordinates
-        of_variance = np.linalg.inv(
-            np.asarray(problem.variance_precision(log_variance, np.ones(len(problem.windows))))
-        )
-        self.centre = np.concatenate([np.asarray(z)[at.structure], log_variance[at.variance]])
-        self.covariance = np.zeros((self.size, self.size))
-        n = len(at.structure)
-        self.covariance[:n, :n] = np.asarray(covariance)[np.ix_(at.structure, at.structure)]
-        self.covariance[n:, n:] = of_variance[np.ix_(at.variance, at.variance)]
+        effects = np.zeros(len(at.sessions) * len(AXES))
+        z, log_v = np.asarray(fitted.z), np.asarray(fitted.log_variance)
+        self.centre = np.concatenate([z[at.structure], log_v[at.variance], effects])
+        self.covariance = self._laplace(fitted)
+
+    def _laplace(self, fitted: Fitted) -> np.ndarray:
+        """Covariance of all coordinates near the fit; variances are apart from the others."""
+        problem, at = self.problem, self.coordinates
+        n, v = len(at.structure), len(at.variance)
+        out = np.zeros((self.size, self.size))
+        log_v = jnp.asarray(fitted.log_variance)
+        keep = np.ones(len(problem.windows))
+        of_variance = np.linalg.inv(np.asarray(problem.variance_precision(log_v, keep)))
+        out[n : n + v, n : n + v] = of_variance[np.ix_(at.variance, at.variance)]
+        own = np.asarray(fitted.covariance)[np.ix_(at.structure, at.structure)]
+        mean = np.concatenate([np.arange(n), np.arange(n + v, self.size)])
+        precision = np.zeros((len(mean), len(mean)))
+        precision[:n, :n] = np.linalg.inv(own)
+        if at.sessions:
+            _, jacobian = problem.linear(jnp.asarray(fitted.z), problem.volt(log_v))
+            shares = np.asarray(self.anchor.shares)
+            member = np.eye(len(at.sessions))[np.asarray(self.anchor.session)]
+            moved = -shares[:, :, None, :] * member[:, None, :, None]
+            both = [jacobian["motion"][..., at.structure], moved.reshape(*shares.shape[:2], -1)]
+            half = problem.whitened({"motion": jnp.concatenate(both, axis=-1)}, log_v)["motion"]
+            flat = np.asarray(half).reshape(-1, len(mean))
+            told = flat.T @ flat
+            told[:n, :n] = 0.0  # is in the Laplace covariance already
+            precision += told
+            precision[n:, n:] += np.eye(len(mean) - n)
+        out[np.ix_(mean, mean)] = np.linalg.inv(precision)
+        return out
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -112,13 +161,10 @@ class Density:
 
     @property
     def kind(self) -> np.ndarray:
-        """0 for structure, 1 for variances."""
-        return np.repeat([0, 1], [len(self.coordinates.structure), len(self.coordinates.variance)])
-
-    def like(self, other: "Density") -> "Density":
-        """This density with what another of the same shapes has compiled."""
-        self._form = other._form
-        return self
+        """0 for structure and effects, 1 for variances."""
+        at = self.coordinates
+        n, v = len(at.structure), len(at.variance)
+        return np.repeat([0, 1, 0], [n, v, self.size - n - v])
 
     def full(self, x: Array | np.ndarray) -> tuple[Array, Array]:
         """Search vector and log variances of chain coordinates, the others as at the fit."""
@@ -126,9 +172,9 @@ class Density:
 
     def _full(self, anchor: Anchor, x: Array) -> tuple[Array, Array]:
         at = self.coordinates
-        n = len(at.structure)
-        z = anchor.z.at[at.structure].set(x[:n])
-        return z, anchor.log_variance.at[at.variance].set(x[n:])
+        structure, variance, _ = at.parts(x)
+        z = anchor.z.at[at.structure].set(structure)
+        return z, anchor.log_variance.at[at.variance].set(variance)
 
     def terms(
         self, x: Float[np.ndarray, "walker size"], held: Any = None
@@ -174,9 +220,12 @@ class Density:
         likelihood = sum(self._pieces(anchor, x, held).values())
         at = self.coordinates
         space = self.problem.space
-        mean = jnp.concatenate([space.prior_mean[at.structure], anchor.typical[at.variance]])
-        spread = np.full(len(at.variance), VARIANCE_SPREAD)
-        std = np.concatenate([space.prior_std[at.structure], spread])
+        n, v = len(at.structure), len(at.variance)
+        unit = np.ones(self.size - n - v)
+        mean = jnp.concatenate(
+            [space.prior_mean[at.structure], anchor.typical[at.variance], 0 * unit]
+        )
+        std = np.concatenate([space.prior_std[at.structure], np.full(v, VARIANCE_SPREAD), unit])
         prior = -0.5 * ((x - mean) / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi)
         count = len(self.floors)
         out = jnp.zeros(count + 1).at[anchor.batch.surface].add(likelihood)
@@ -195,7 +244,8 @@ class Density:
 
     def _pieces(self, anchor: Anchor, x: Array, held: Any) -> dict[str, Array]:
         z, log_v = self._full(anchor, x)
-        residuals, robot, volt = self._residuals(anchor, z, log_v, held)
+        effects = self.coordinates.parts(x)[2]
+        residuals, robot, volt = self._residuals(anchor, z, log_v, effects, held)
         out = {k: _student(anchor, k, r, log_v) for k, r in residuals.items()}
         camera, spread = lk.log_jacobians(robot, anchor.batch, volt)
         if "motion" in out:
@@ -211,11 +261,12 @@ class Density:
     @partial(jax.jit, static_argnums=0)
     def _many_residuals(self, anchor: Anchor, x: Array) -> dict[str, Array]:
         def one(x: Array) -> dict[str, Array]:
-            return self._residuals(anchor, *self._full(anchor, x), None)[0]
+            effects = self.coordinates.parts(x)[2]
+            return self._residuals(anchor, *self._full(anchor, x), effects, None)[0]
 
         return jax.lax.map(one, x)
 
-    def _residuals(self, anchor: Anchor, z: Array, log_v: Array, held: Any) -> Any:
+    def _residuals(self, anchor: Anchor, z: Array, log_v: Array, effects: Array, held: Any) -> Any:
         b, at = anchor.batch, self.coordinates
         volt = jnp.exp(0.5 * log_v[-1]) if b.has_current and b.has_voltage else jnp.asarray(1.0)
         if self.part == ELECTRIC:
@@ -225,6 +276,9 @@ class Density:
         robot = self.problem.space.tree(z)
         p = _predict(robot, anchor, z)
         out = {"motion": lk.motion_residual(robot, b, p)}
+        if at.sessions:
+            shared = effects.reshape(-1, len(AXES))[anchor.session]
+            out["motion"] -= jnp.sum(anchor.shares * shared[:, None], axis=-1)
         if self.part == EVERYTHING:
             out |= lk.electric_residuals(robot, b, p.felt, volt)
         # or the root finder is computed again for every consumer
@@ -265,27 +319,29 @@ def _student(anchor: Anchor, k: str, r: Array, log_v: Array) -> Array:
     return constant - 0.5 * log_det - 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)
 
 
-def _anchor(problem: Problem, z: np.ndarray, log_variance: np.ndarray) -> Anchor:
-    twist, slope = problem.twists(z)
-    data = problem.data
+def _anchor(problem: Problem, fitted: Fitted, sessions: tuple[tuple[str, str], ...]) -> Anchor:
+    twist, slope = problem.twists(jnp.asarray(fitted.z))
+    data, w = problem.data, problem.windows
+    shares = lk.effects(w, problem.robot) * np.sqrt(by_axis(fitted.session, "session", w))[:, None]
+    place = {pair: k for k, pair in enumerate(sessions)}
     return Anchor(
         batch=data.batch,
         base={k: jnp.moveaxis(b, 0, -1) for k, b in data.base.items()},
         which={k: w.T for k, w in data.which.items()},
-        z=jnp.asarray(z),
-        log_variance=jnp.asarray(log_variance),
+        z=jnp.asarray(fitted.z),
+        log_variance=jnp.asarray(fitted.log_variance),
         twist=twist,
         twist_slope=slope,
         typical=jnp.asarray(2 * np.log(problem.noise.typical)),
+        shares=jnp.asarray(shares),
+        session=jnp.asarray([place.get(pair, 0) for pair in pairs(w)]),
     )
 
 
-def _coordinates(
-    problem: Problem, z: np.ndarray, log_variance: np.ndarray, part: str
-) -> Coordinates:
+def _coordinates(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
     """Coordinates of a part; the floors each touches are read off the Jacobian at the fit."""
-    volt = problem.volt(jnp.asarray(log_variance))
-    _, jacobian = problem.linear(jnp.asarray(z), volt)
+    volt = problem.volt(jnp.asarray(fitted.log_variance))
+    _, jacobian = problem.linear(jnp.asarray(fitted.z), volt)
     blocks = {
         MOTION: ["motion"],
         ELECTRIC: [k for k in jacobian if k != "motion"],
@@ -302,14 +358,20 @@ def _coordinates(
     mine = {MOTION: ~problem.electric, ELECTRIC: problem.electric}
     structure = np.flatnonzero(mine.get(part, np.ones(problem.space.size, bool)))
     variance = np.flatnonzero(seen.any(axis=1))
-    names = [problem.space.names[k] for k in structure] + [
-        f"noise.{problem.noise.names[k]}" for k in variance
-    ]
+    shared = by_axis(fitted.session, "session", problem.windows)
+    found = {pair for pair, v in zip(pairs(problem.windows), shared, strict=True) if v.any()}
+    sessions = tuple(sorted(found)) if part != ELECTRIC else ()
+    labels = problem.robot.surfaces.labels
+    on = [[label == floor for label in labels] for floor, _ in sessions for _ in AXES]
+    names = [problem.space.names[k] for k in structure]
+    names += [f"noise.{problem.noise.names[k]}" for k in variance]
+    names += [f"session.{floor}.{axis}@{name}" for floor, name in sessions for axis in AXES]
     return Coordinates(
         names=tuple(names),
         structure=structure,
         variance=variance,
-        group=_groups(np.concatenate([touched[structure], seen[variance]])),
+        sessions=sessions,
+        group=_groups(np.array([*touched[structure], *seen[variance], *on])),
     )
 
 

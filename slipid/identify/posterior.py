@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.identify import sampler
-from slipid.identify.density import ELECTRIC, EVERYTHING, MOTION, Density
+from slipid.identify.density import ELECTRIC, EVERYTHING, MOTION, Density, Fitted
 from slipid.identify.moves import Target
 from slipid.identify.problem import DEGREES, Problem
 from slipid.identify.sampler import Block, Diagnosis, Plan
@@ -29,6 +29,8 @@ class Posterior:
     Attributes:
         z: search vectors (ensemble, draw, free).
         log_variance: (ensemble, draw, variance).
+        effects: of sessions, in stds of what they share (ensemble, draw, effect).
+        fitted: what was sampled around.
         log_prob: of the first stage.
         names: of the coordinates of the first stage, as in `diagnosis`.
         diagnosis: of the first stage, from all its steps.
@@ -39,6 +41,8 @@ class Posterior:
 
     z: Float[np.ndarray, "ensemble draw free"]
     log_variance: Float[np.ndarray, "ensemble draw variance"]
+    effects: Float[np.ndarray, "ensemble draw effect"]
+    fitted: Fitted
     log_prob: Float[np.ndarray, "ensemble draw"]
     names: tuple[str, ...]
     diagnosis: Diagnosis
@@ -50,9 +54,7 @@ class Posterior:
 
 def sample(
     problem: Problem,
-    z: Float[np.ndarray, " free"],
-    log_variance: Float[np.ndarray, " variance"],
-    covariance: Float[np.ndarray, "free free"],
+    fitted: Fitted,
     plan: Plan,
     draws: int = 400,
     done: Mapping[str, Sequence[Block]] | None = None,
@@ -63,7 +65,7 @@ def sample(
 
     Args:
         problem: windows, robot, priors.
-        z, log_variance, covariance: where the fit ended, and its Laplace covariance.
+        fitted: where the fit ended.
         plan: ensembles, bars, seed.
         draws: that are kept of each ensemble.
         done: blocks of each part that an earlier call has made.
@@ -72,7 +74,7 @@ def sample(
     """
     done = done or {}
     parts = (EVERYTHING,) if problem.joint else (MOTION, ELECTRIC)
-    first = Density(problem, z, log_variance, covariance, parts[0])
+    first = Density(problem, fitted, parts[0])
     group = first.coordinates.group
     target = Target(first.terms, first.slope, group, first.kind, first.centre, first.covariance)
     blocks = _blocks([target] * plan.ensembles, plan, parts[0], done, keep, tell)
@@ -80,15 +82,15 @@ def sample(
     found = sampler.diagnose(chain, plan)
     x, log_prob = thinned(chain, blocks[plan.warm_up[-1] :], draws)
     shape = (plan.ensembles, draws)
-    out_z = np.broadcast_to(z, (*shape, len(z))).copy()
-    out_v = np.broadcast_to(log_variance, (*shape, len(log_variance))).copy()
+    out_z = np.broadcast_to(fitted.z, (*shape, len(fitted.z))).copy()
+    out_v = np.broadcast_to(fitted.log_variance, (*shape, len(fitted.log_variance))).copy()
     _put(first, x, out_z, out_v)
     accepted = {parts[0]: float(np.mean([b.accepted for b in blocks]))}
     still = 0.0
     if len(parts) > 1:
-        second = Density(problem, z, log_variance, covariance, ELECTRIC)
+        second = Density(problem, fitted, ELECTRIC)
         if second.size:
-            later = _given(first, second, covariance, x, plan, done, keep, tell)
+            later = _given(first, second, fitted.covariance, x, plan, done, keep, tell)
             _put(second, later.x, out_z, out_v)
             accepted[ELECTRIC], still = later.accepted, later.still
     reason = f"{found.reason} ({first.names[found.worst]})"
@@ -97,6 +99,8 @@ def sample(
     return Posterior(
         z=out_z,
         log_variance=out_v,
+        effects=first.coordinates.parts(x)[2],
+        fitted=fitted,
         log_prob=log_prob,
         names=first.names,
         diagnosis=found,
@@ -145,7 +149,7 @@ def replicates(
     flat = some.reshape(-1, x.shape[-1])
     out = {k: np.array(v) for k, v in density.residuals(flat).items()}
     for k, r in out.items():
-        for one, log_v in zip(r, flat[:, -len(problem.noise.names) :], strict=True):
+        for one, log_v in zip(r, density.coordinates.parts(flat)[1], strict=True):
             root = np.linalg.cholesky(np.asarray(problem.covariance(k, log_v)))
             normal = rng.standard_normal(one.shape)
             normal *= np.sqrt(DEGREES / rng.chisquare(DEGREES, (len(normal), 1)))
@@ -155,10 +159,13 @@ def replicates(
 
 def _everything(problem: Problem, found: Posterior) -> tuple[Density, np.ndarray]:
     """A density of all numbers together, and the draws as its coordinates."""
-    z, log_v = found.z, found.log_variance
-    middle = z.mean(axis=(0, 1)), log_v.mean(axis=(0, 1))
-    density = Density(problem, *middle, np.eye(z.shape[-1]), EVERYTHING)
-    return density, np.concatenate([z, log_v], axis=-1)
+    middle = replace(
+        found.fitted,
+        z=found.z.mean(axis=(0, 1)),
+        log_variance=found.log_variance.mean(axis=(0, 1)),
+    )
+    density = Density(problem, middle, EVERYTHING)
+    return density, np.concatenate([found.z, found.log_variance, found.effects], axis=-1)
 
 
 def thinned(
@@ -174,8 +181,7 @@ def thinned(
 
 def _put(density: Density, x: np.ndarray, z: np.ndarray, log_variance: np.ndarray) -> None:
     at = density.coordinates
-    z[..., at.structure] = x[..., : len(at.structure)]
-    log_variance[..., at.variance] = x[..., len(at.structure) :]
+    z[..., at.structure], log_variance[..., at.variance], _ = at.parts(x)
 
 
 @dataclass(frozen=True, eq=False)

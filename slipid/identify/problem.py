@@ -84,6 +84,9 @@ class Problem:
             default they do not ("cut"): the torque scale is read from currents given the motion,
             whose errors are carried along. A friction model good to 5 % in current would otherwise
             outvote forces that motion shows to 1 %.
+
+    Attributes:
+        compiled: what was compiled for windows of these shapes by others, under their own keys.
     """
 
     def __init__(
@@ -110,6 +113,7 @@ class Problem:
         )
         self._begun: dict[Any, Any] = {}
         self._form = self
+        self.compiled: dict[Any, Any] = {}
 
     def of(self, windows: Windows) -> "Problem":
         """The same problem for other windows; those of the same shapes share what is compiled."""

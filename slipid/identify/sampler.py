@@ -22,11 +22,11 @@ from slipid.identify.moves import WAY, Hamiltonian, Target, moves
 from slipid.identify.transport import Bend, Stair, Transport, Warp, learnt
 
 Chain = Float[np.ndarray, "ensemble step walker size"]
-ACCEPTED = 0.7
+ACCEPTED = 0.8
 """Part of Hamiltonian moves that shall be accepted; their step is adapted in the warm-up."""
 FIRST_ANGLE, LEAST_ANGLE = 0.15, 0.03
 """Of a step of Hamiltonian moves [rad]."""
-DRAWS_PER_EFFECTIVE = 12.0
+DRAWS_PER_EFFECTIVE = 24.0
 """Draws of the warm-up that tell as much as an independent one, about."""
 
 
@@ -37,7 +37,8 @@ class Plan:
     Attributes:
         ensembles, walkers: number of ensembles and of walkers of each.
         block: steps of a block.
-        warm_up: number of blocks after which proposals are learnt; the last ends the warm-up.
+        warm_up: number of blocks after which proposals are learnt; the last ends the warm-up, of
+            which it leaves a part for the step of Hamiltonian moves to suit the last proposals.
         most: blocks after which it ends without having converged.
         spread: of the start around the fit, in stds, of the walker that starts widest; the first
             starts at a quarter of it. Wide starts find modes that the fit has not seen.
@@ -48,8 +49,8 @@ class Plan:
 
     ensembles: int = 4
     walkers: int = 8
-    block: int = 10
-    warm_up: tuple[int, ...] = (4, 8, 12, 20)
+    block: int = 20
+    warm_up: tuple[int, ...] = (3, 6, 10, 16, 20)
     most: int = 400
     spread: float = 4.0
     r_hat: float = 1.01
@@ -229,7 +230,7 @@ def _with_learnt(
     if turns:
         angle = block.angle * np.exp(np.mean(turns) - ACCEPTED)
         block = replace(block, angle=float(np.clip(angle, LEAST_ANGLE, WAY)))
-    if count in plan.warm_up:
+    if count in plan.warm_up[:-1]:
         recent = [b.chain for b in [*blocks, block][count // 2 :]]
         draws = np.concatenate(recent, axis=1).reshape(-1, len(target.centre))
         map = learnt(

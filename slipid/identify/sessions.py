@@ -13,6 +13,7 @@ outliers only for what their session does not share; the covariance C of the fit
     C + C (sum_s v u_s u_s^T) C,    u_s = sum_{i in s} J_i^T V_i^-1 E_i
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +60,6 @@ def shared(
 
     A floor that was driven in one session only has none: what it shares is in the floor's numbers.
     """
-    session = np.asarray(w.session)
     variance: dict[str, float] = {}
     for _ in range(TURNS):
         variance = _variances(model, w, keep, _weights(model, by_axis(variance, "session", w)))
@@ -67,14 +67,22 @@ def shared(
     pulls = weighted * (_weights(model, np.zeros_like(model.run)) * keep)[:, None, None]
     of_session = by_axis(variance, "session", w)
     meat = np.zeros_like(model.covariance)
-    for name in dict.fromkeys(session[keep > 0].tolist()):
-        mine = (session == name) & (keep > 0)
+    of_piece = pairs(w)
+    for pair in dict.fromkeys(of_piece):
+        mine = np.array([other == pair for other in of_piece]) & (keep > 0)
+        if not mine.any():
+            continue
         u = pulls[mine].sum(axis=0)
         meat += u.T @ (of_session[mine][0][:, None] * u)
     return variance, model.covariance + model.covariance @ meat @ model.covariance
 
 
-def by_axis(variance: dict[str, float], kind: str, w: Windows) -> Float[np.ndarray, "piece 3"]:
+def pairs(w: Windows) -> list[tuple[str, str]]:
+    """Floor and session of every piece; what is shared is shared by these."""
+    return list(zip(w.surface, w.session, strict=True))
+
+
+def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.ndarray, "piece 3"]:
     """Variances of an effect of every piece, zero where there is none."""
     return np.array([[variance.get(f"{kind}.{f}.{axis}", 0.0) for axis in AXES] for f in w.surface])
 

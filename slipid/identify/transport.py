@@ -18,6 +18,7 @@ the shared ones stay so. It is one of the maps of Marzouk et al. 2016 (Sampling 
 transport, section 3).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 
@@ -108,7 +109,8 @@ class Bend:
         for i in range(size):
             own = np.flatnonzero(reach < i)
             bend.shift[i, own], bend.scale[i, own] = _regression(f[:, own], w[:, i], effective)
-        return bend
+        used = (bend.shift != 0).any(axis=0) | (bend.scale != 0).any(axis=0)
+        return Bend(kept[used], bend.shift[:, used], bend.scale[:, used])
 
 
 def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]:
@@ -258,32 +260,33 @@ class Transport:
 
     def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
         """x, and the part of log |dx/du| of every coordinate (row, size)."""
-        y, log = self._warped(u)
+        y, log, _ = self._warped(u)
         return self.first.back(y), log + self.first.log_slope(y)
 
-    def _warped(self, u: Matrix) -> tuple[Matrix, Matrix]:
-        """y, and the part of log |dy/du|."""
+    def _warped(self, u: Matrix) -> tuple[Matrix, Matrix, list[Matrix]]:
+        """y, the part of log |dy/du|, and w of every stair."""
         v, log = self.last.back(u), self.last.log_slope(u)
-        about = np.empty_like(u)
+        about, ws = np.empty_like(u), []
         for s in self.stairs:
             w = v[:, s.own]
             if s.bend:
                 w = s.bend.back(w)
                 log[:, s.own] += s.bend.log_slope(w)
+            ws.append(w)
             about[:, s.own] = about[:, s.given] @ s.slope + w @ s.root.T
             log[:, s.own] += np.linalg.slogdet(s.root)[1] / len(s.own)
-        return self.mean + about, log
+        return self.mean + about, log, ws
 
-    def pull(self, u: Matrix, slope: Matrix) -> Matrix:
-        """Derivative by u of what has the derivative `slope` by x, plus that of log |dx/du|."""
-        y, _ = self._warped(u)
-        by_y, by_v = self.first.pull(y, slope), np.empty_like(u)
-        for s in reversed(self.stairs):
+    def pull(self, u: Matrix, slope: Callable[[Matrix], Matrix]) -> Matrix:
+        """Derivative by u of what has the derivative slope(x) by x, plus that of log |dx/du|."""
+        y, _, ws = self._warped(u)
+        by_y, by_v = self.first.pull(y, slope(self.first.back(y))), np.empty_like(u)
+        for s, w in zip(reversed(self.stairs), reversed(ws), strict=True):
             own = by_y[:, s.own]
             by_y[:, s.given] += own @ s.slope.T
             by_v[:, s.own] = own @ s.root
             if s.bend:
-                by_v[:, s.own] = s.bend.pull(s.left(y - self.mean), by_v[:, s.own])
+                by_v[:, s.own] = s.bend.pull(w, by_v[:, s.own])
         return self.last.pull(u, by_v)
 
     def log_density(self, x: Matrix) -> Vector:

@@ -1,0 +1,80 @@
+"""Do intervals hold what they say? 200 made experiments with truths from the fit's own prior.
+
+Ranks and intervals of every replicate are kept in the folder that SLIPID_BENCH names, if any, so
+that an interrupted run goes on; the picture of the ranks goes there, too.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import binom, chi2
+
+from tests import calibration
+
+REPLICATES = 200
+BINS = 10
+
+
+def test_coverage_and_ranks():
+    folder = Path(os.environ.get("SLIPID_BENCH") or "/nonexistent")
+    kept = folder / "calibration.jsonl"
+    rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
+    began = time.perf_counter()
+    for seed in range(len(rows), REPLICATES):
+        rows.append(calibration.row(calibration.replicate(seed)))
+        if folder.is_dir():
+            with kept.open("a") as file:
+                file.write(json.dumps(rows[-1]) + "\n")
+        took = time.perf_counter() - began
+        print(f"{seed + 1}: {took:.0f} s, R-hat {rows[-1]['r_hat']:.3f}", flush=True)
+    report(rows, folder)
+
+
+def report(rows, folder):
+    names = rows[0]["names"]
+    rank, inside, ratio = (np.array([r[k] for r in rows]) for k in ("rank", "inside", "ratio"))
+    count = len(rows)
+    low, high = calibration.band(count, len(names))
+    bins = np.stack([np.histogram(c, BINS, (0, 1))[0] for c in rank.T])
+    uneven = ((bins - count / BINS) ** 2 / (count / BINS)).sum(axis=1)
+    most = chi2.ppf(1 - 0.01 / len(names), BINS - 1)
+    print(f"\n{count} replicates, R-hat {np.max([r['r_hat'] for r in rows]):.3f} at most")
+    print(f"coverage must be {low:.3f} to {high:.3f}, chi square of the ranks below {most:.1f}")
+    print(f"{'coordinate':32}{'std/prior':>10}{'coverage':>10}{'chi2':>7}  ranks")
+    for k, name in enumerate(names):
+        print(
+            f"{name:32}{np.median(ratio[:, k]):10.3f}{inside[:, k].mean():10.3f}{uneven[k]:7.1f}  "
+            + " ".join(f"{n:3d}" for n in bins[k])
+        )
+    print(f"all together: coverage {inside.mean():.4f}")
+    if folder.is_dir():
+        draw(names, bins, count, folder / "ranks.png")
+    assert ((low <= inside.mean(axis=0)) & (inside.mean(axis=0) <= high)).all()
+    assert (uneven < most).all()
+
+
+def draw(names, bins, count, path):
+    """Rank histograms with the band that 99 % of uniform ones stay in."""
+    from slipid.app import drawing
+
+    made, axes = drawing.panels(
+        len(names),
+        2.1,
+        1.5,
+        f"Ranks of the truth among draws, {count} made experiments\n"
+        "(gray: where 99 % of bins of a right posterior are)",
+    )
+    low, high = binom.ppf((0.005, 0.995), count, 1 / BINS)
+    for ax, name, row in zip(axes, names, bins, strict=False):
+        drawing.plain(ax)
+        ax.axhspan(low, high, color="#dddddd", zorder=0)
+        ax.bar((np.arange(BINS) + 0.5) / BINS, row, 0.09, color=drawing.BLUE)
+        ax.set_title(name.removeprefix("surface."), fontsize=7)
+        ax.set_xticks([0, 1])
+        ax.tick_params(labelsize=7)
+    drawing.save(made, path)

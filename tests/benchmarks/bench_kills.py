@@ -1,0 +1,49 @@
+"""`slipid sample` killed twenty times at random moments, against the same run left in peace."""
+
+from __future__ import annotations
+
+import shutil
+import time
+
+import numpy as np
+import xarray
+
+from tests.test_cli import process, small  # noqa: F401  a fixture
+
+KILLS = 20
+JOB = ("--draws", "40", "--most", "80", "--block", "4", "--quiet")
+
+
+def test_twenty_kills(small, tmp_path):  # noqa: F811
+    rng = np.random.default_rng(0)
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    for folder in (whole, out):
+        shutil.copytree(small[0] / "out", folder)
+    began = time.perf_counter()
+    run = process("sample", whole, *JOB)
+    while run.poll() is None and not list(whole.glob("sampling/*.npz")):
+        time.sleep(0.05)
+    start = time.perf_counter() - began
+    run.communicate()
+    took = time.perf_counter() - began - start
+    print(f"\nleft in peace: {start:.0f} s to the first block, {took:.0f} s more, {run.returncode}")
+    kept, killed = [], 0
+    while killed < KILLS:
+        again = process("sample", out, *JOB)
+        time.sleep(rng.uniform(0.5 * start, start + 2 * took / KILLS))
+        assert again.poll() is None, "done before it could be killed so often: a longer job is due"
+        again.kill()
+        again.communicate()
+        killed += 1
+        kept.append(len(list(out.glob("sampling/*.npz"))))
+    print(f"killed {killed} times, blocks then on disk: {kept}")
+    last = process("sample", out, *JOB)
+    last.communicate()
+    assert last.returncode == run.returncode
+    with (
+        xarray.open_datatree(whole / "posterior.nc", engine="h5netcdf") as one,
+        xarray.open_datatree(out / "posterior.nc", engine="h5netcdf") as other,
+    ):
+        for group in one.children:
+            xarray.testing.assert_identical(one[group].to_dataset(), other[group].to_dataset())
+    print("all groups of posterior.nc are identical")

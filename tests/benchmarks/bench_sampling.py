@@ -1,0 +1,207 @@
+"""The posterior of one real floor by slipid, by NUTS and by stock emcee: do they agree, how fast?
+
+All three see the motion part of the same posterior (2022 logs of one floor, what sessions share
+included) and begin at its Laplace approximation, whose covariance NUTS has as its metric. emcee has
+its default move and the same likelihood in vectorised numpy. Time is that of sampling after the
+warm-up; reading, fitting and compiling are left out.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = Path(os.environ.get("SLIPID_DATA") or ROOT.parent / "shared" / "data") / "robotino2022"
+FLOOR = os.environ.get("SLIPID_BENCH_FLOOR", "brown")
+STRETCH_S, NUTS_WARM_UP, NUTS_DRAWS, CHAINS = 400.0, 400, 2000, 2
+
+pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no real logs: {DATA} is no folder")
+
+
+def problem_of(floor):
+    """Likelihood of the runs on one floor."""
+    from slipid.app import runtime
+    from slipid.app.config import read_config
+    from slipid.app.job import job_of, read_dataset
+
+    runtime.start()
+    config = read_config(ROOT / "configs" / "robotino2022.toml")
+    logs = config.content.logs
+    dataset, _ = read_dataset(config, logs, DATA, lambda *_: None)
+    mine = [k for k, log in enumerate(dataset.logs) if log.surface == floor]
+    return job_of(config, dataset.subset(mine), [], lambda _: None).problem()
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """The problem, where its fit ended, and a file of the latter."""
+    from slipid.identify.density import Fitted
+    from slipid.identify.fit import optimise
+    from slipid.identify.predictive import contact_of
+
+    problem = problem_of(FLOOR)
+    optimum = optimise(problem)
+    keep = np.ones(len(problem.windows))
+    variance = contact_of(problem, optimum.state, optimum.covariance, keep).variance
+    shared = {k: v for k, v in variance.items() if k.startswith("session.")}
+    found = Fitted(optimum.state.z, optimum.state.log_variance, optimum.covariance, shared)
+    path = tmp_path_factory.mktemp("fit") / "fitted.pickle"
+    path.write_bytes(pickle.dumps(found))
+    return problem, found, path
+
+
+def density_of(problem, found):
+    from slipid.identify.density import MOTION, Density
+
+    return Density(problem, found, MOTION)
+
+
+def ess_of(chain):
+    """Effective draws of every coordinate, bulk or tails (chain, draw, coordinate)."""
+    from arviz_stats.base import array_stats
+
+    return np.minimum(
+        array_stats.ess(chain, chain_axis=0, draw_axis=1, method="bulk"),
+        array_stats.ess(chain, chain_axis=0, draw_axis=1, method="tail", prob=0.9),
+    )
+
+
+def by_slipid(density):
+    """Chains (chain, draw, coordinate), seconds of sampling, seconds of the warm-up."""
+    from slipid.identify import sampler
+    from slipid.identify.moves import Target
+
+    d = density
+    target = Target(d.terms, d.slope, d.coordinates.group, d.kind, d.centre, d.covariance)
+    plan = sampler.Plan()
+    x = np.repeat(d.centre[None], plan.walkers, axis=0)
+    d.terms(x), d.slope(x)  # compiles
+    blocks, times = [], [time.perf_counter()]
+    for block in sampler.run([target] * plan.ensembles, plan):
+        blocks.append(block)
+        times.append(time.perf_counter())
+    warm = plan.warm_up[-1]
+    chain = sampler.chain(blocks, plan)
+    found = sampler.diagnose(chain, plan)
+    print(f"slipid: {found.steps} steps, R-hat {found.r_hat.max():.4f}, {found.converged=}")
+    walkers = chain.transpose(0, 2, 1, 3).reshape(-1, chain.shape[1], d.size)
+    return walkers, times[-1] - times[warm], times[warm] - times[0]
+
+
+def by_nuts(path):
+    """The same by numpyro, each chain in a process of its own, side by side."""
+    files = [path.with_name(f"nuts{k}.npz") for k in range(CHAINS)]
+    runs = [
+        subprocess.Popen([sys.executable, __file__, str(path), str(k), str(file)], cwd=ROOT)
+        for k, file in enumerate(files)
+    ]
+    assert [run.wait() for run in runs] == [0] * CHAINS
+    made = [np.load(file) for file in files]
+    seconds = max(float(m["seconds"]) for m in made)
+    return np.stack([m["x"] for m in made]), seconds, max(float(m["warm_up"]) for m in made)
+
+
+def nuts(path, seed, out):
+    """One chain of NUTS."""
+    import jax
+    import jax.numpy as jnp
+    from numpyro.infer import MCMC, NUTS
+
+    density = density_of(problem_of(FLOOR), pickle.loads(Path(path).read_bytes()))
+    root = jnp.asarray(np.linalg.cholesky(density.covariance))
+    centre = jnp.asarray(density.centre)
+
+    @jax.jit
+    def potential(u):
+        return -density.logpdf(centre + root @ u)
+
+    kernel = NUTS(potential_fn=potential, dense_mass=False)
+    chain = MCMC(kernel, num_warmup=NUTS_WARM_UP, num_samples=NUTS_DRAWS, progress_bar=False)
+    first = jnp.asarray(np.random.default_rng(seed).standard_normal(density.size))
+    key = jax.random.PRNGKey(seed)
+    began = time.perf_counter()
+    chain.warmup(key, init_params=first)
+    warm = time.perf_counter()
+    chain.run(chain.post_warmup_state.rng_key)
+    u = np.asarray(chain.get_samples())
+    seconds = time.perf_counter() - warm
+    x = np.asarray(centre) + u @ np.asarray(root).T
+    np.savez(out, x=x, seconds=seconds, warm_up=warm - began)
+
+
+def by_stretch(density):
+    """The same by emcee as it comes: autocorrelation time counts, not what chains seem to share."""
+    import emcee
+    from threadpoolctl import threadpool_limits
+
+    from slipid.identify import sampler
+    from tests.numpy_model import Posterior
+
+    rival, size = Posterior(density), density.size
+    rng = np.random.default_rng(0)
+    x = density.centre + rng.standard_normal((4, size)) @ np.linalg.cholesky(density.covariance).T
+    np.testing.assert_allclose(rival(x), density.terms(x).sum(axis=1), atol=1e-5)
+    walkers = 2 * size
+    start = rng.standard_normal((walkers, size)) @ np.linalg.cholesky(density.covariance).T
+    ensemble = emcee.EnsembleSampler(walkers, size, rival, vectorize=True)
+    places, began = [], time.perf_counter()
+    with threadpool_limits(1):
+        for state in ensemble.sample(density.centre + start, iterations=10**9, store=False):
+            places.append(state.coords.copy())
+            if time.perf_counter() - began > STRETCH_S:
+                break
+    seconds = time.perf_counter() - began
+    half = np.stack(places)[len(places) // 2 :]  # the first half is its warm-up
+    tau = sampler.autocorrelation_time(half[None])
+    print(
+        f"stretch: {len(places)} steps of {walkers} walkers, "
+        f"{1e3 * seconds / len(places) / walkers:.2f} ms an evaluation, "
+        f"autocorrelation time up to {tau.max():.0f} steps"
+    )
+    return walkers * len(half) / tau.max(), seconds / 2
+
+
+def test_agreement_and_speed(fitted):
+    problem, found, path = fitted
+    density = density_of(problem, found)
+    print(f"\n{FLOOR}: {len(problem.windows)} pieces, {density.size} coordinates")
+    ours, seconds, warm = by_slipid(density)
+    theirs, nuts_seconds, nuts_warm = by_nuts(path)
+    a, b = (chain.reshape(-1, density.size) for chain in (ours, theirs))
+    mean, std = np.abs(a.mean(0) - b.mean(0)) / b.std(0), a.std(0) / b.std(0)
+    rows = {
+        "slipid": (ess_of(ours), seconds, warm),
+        "NUTS": (ess_of(theirs), nuts_seconds, nuts_warm),
+    }
+    speed = {}
+    for name, (ess, took, before) in rows.items():
+        speed[name] = ess.min() / took
+        print(
+            f"{name:8} {took:6.0f} s after {before:4.0f} s of warm-up: effective draws "
+            f"{ess.min():6.0f} ({density.names[int(ess.argmin())]}), median {np.median(ess):6.0f}; "
+            f"{speed[name]:.2f} a second"
+        )
+    worst = int(mean.argmax())
+    print(f"means differ by at most {mean.max():.3f} std ({density.names[worst]})")
+    print(f"stds: ratio {std.min():.3f} to {std.max():.3f}")
+    draws, took = by_stretch(density)
+    speed["stretch"] = draws / took
+    print(f"stretch  {draws:.0f} effective draws in {took:.0f} s, {speed['stretch']:.4f} a second")
+    for name in ("NUTS", "stretch"):
+        print(f"slipid is {speed['slipid'] / speed[name]:.1f} times as fast as {name}")
+    assert mean.max() < 0.1
+    assert np.abs(std - 1).max() < 0.1
+    assert speed["slipid"] > 3 * speed["NUTS"]
+    assert speed["slipid"] > 100 * speed["stretch"]
+
+
+if __name__ == "__main__":
+    nuts(sys.argv[1], int(sys.argv[2]), sys.argv[3])
