@@ -11,24 +11,28 @@ every coordinate,
 
     sinh(tail arcsinh((x - place) / scale) - skew)
 
-from x to y or from v to u: first, where numbers act through their values and are kept as
-logarithms; last, where the density is bent in x. Draws that were not learnt from decide. Groups
-follow the shared coordinates and are bent by themselves, so that groups that are independent given
-the shared ones stay so. It is one of the maps of Marzouk et al. 2016 (Sampling via measure
-transport, section 3).
+from v to u, and from x to y where draws that were not learnt from say so: where numbers act
+through their values and are kept as logarithms. Groups follow the shared coordinates and are bent
+by themselves, so that groups that are independent given the shared ones stay so. It is one of the
+maps of Marzouk et al. 2016 (Sampling via measure transport, section 3).
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations_with_replacement
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
 Matrix = Float[np.ndarray, "_ _"]
-Cube = Float[np.ndarray, "_ _ _"]
 Vector = Float[np.ndarray, " _"]
+Leaf = Any
+"""An array of numpy, or of jax where the map is computed with."""
 FAR = 4.0
 """Polynomials stay what they are beyond this many stds."""
 SQUARED = 5
@@ -41,6 +45,7 @@ MOST_MONOMIALS = 12
 """Of a coordinate's mean and std."""
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Bend:
     """Polynomials a and b of a group's coordinates.
@@ -50,67 +55,55 @@ class Bend:
         shift, scale: coefficients of a and b (coordinate, monomial).
     """
 
-    factors: np.ndarray
-    shift: Matrix
-    scale: Matrix
+    factors: Leaf
+    shift: Leaf
+    scale: Leaf
 
-    def monomials(self, w: Matrix) -> Matrix:
+    def monomials(self, w: Any) -> Any:
         """Products of columns (row, monomial)."""
-        columns = np.column_stack([np.clip(w, -FAR, FAR), np.ones(len(w))])
-        return np.asarray(columns[:, self.factors].prod(axis=2))
-
-    def slopes(self, w: Matrix) -> Cube:
-        """Their derivatives by the columns (row, monomial, coordinate)."""
-        columns = np.column_stack([np.clip(w, -FAR, FAR), np.ones(len(w))])
-        size, out = w.shape[1], np.zeros((len(w), len(self.factors), w.shape[1] + 1))
-        for slot in range(3):
-            others = columns[:, np.delete(self.factors, slot, axis=1)].prod(axis=2)
-            out += others[..., None] * np.eye(size + 1)[self.factors[:, slot]]
-        return np.asarray(out[..., :size] * (np.abs(w) < FAR)[:, None, :])
+        xp = w.__array_namespace__()
+        columns = xp.concat([xp.clip(w, -FAR, FAR), xp.ones((len(w), 1))], axis=1)
+        return columns[:, self.factors].prod(axis=2)
 
     def forward(self, w: Matrix) -> Matrix:
+        """From w to v."""
         f = self.monomials(w)
         return np.asarray((w - f @ self.shift.T) * np.exp(-f @ self.scale.T))
 
-    def back(self, v: Matrix) -> Matrix:
-        w = np.zeros_like(v)
-        for i in range(v.shape[1]):  # monomials of coordinate i have earlier ones only
+    def back(self, v: Array) -> Array:
+        """From v to w, coordinate after coordinate: monomials of each have earlier ones only."""
+
+        def one(i: Array, w: Array) -> Array:
             f = self.monomials(w)
-            w[:, i] = f @ self.shift[i] + np.exp(f @ self.scale[i]) * v[:, i]
-        return w
+            return w.at[:, i].set(f @ self.shift[i] + jnp.exp(f @ self.scale[i]) * v[:, i])
 
-    def log_slope(self, w: Matrix) -> Matrix:
+        return jnp.asarray(jax.lax.fori_loop(0, v.shape[1], one, jnp.zeros_like(v)))
+
+    def log_slope(self, w: Any) -> Any:
         """Log dw_i/dv_i."""
-        return np.asarray(self.monomials(w) @ self.scale.T)
+        return self.monomials(w) @ self.scale.T
 
-    def pull(self, w: Matrix, slope: Matrix) -> Matrix:
-        """Derivative by v of what has the derivative `slope` by w, plus that of the log slopes."""
-        f, d = self.monomials(w), self.slopes(w)
-        shrink = np.exp(-f @ self.scale.T)
-        v = (w - f @ self.shift.T) * shrink
-        of_scale = np.einsum("if,nfk->nik", self.scale, d)
-        of_shift = np.einsum("if,nfk->nik", self.shift, d)
-        jacobian = shrink[..., None] * (np.eye(w.shape[1]) - of_shift) - v[..., None] * of_scale
-        total = slope + of_scale.sum(axis=1)
-        return np.asarray(np.linalg.solve(jacobian.transpose(0, 2, 1), total[..., None])[..., 0])
+    @staticmethod
+    def none(size: int) -> "Bend":
+        """Of nothing, with all monomials there can be."""
+        factors = [(size, size, size)] + [(k, size, size) for k in range(size)]
+        squared, cubed = range(min(SQUARED, size - 1)), range(min(CUBED, size - 1))
+        factors += [(*pair, size) for pair in combinations_with_replacement(squared, 2)]
+        factors += [(k, k, k) for k in cubed]
+        nothing = np.zeros((size, len(factors)))
+        return Bend(np.array(factors), nothing, nothing.copy())
 
     @staticmethod
     def learnt(w: Matrix, effective: float) -> "Bend":
         """Polynomials for draws that are worth so many independent ones."""
         size = w.shape[1]
-        factors = [(size, size, size)] + [(k, size, size) for k in range(size)]
-        squared, cubed = range(min(SQUARED, size - 1)), range(min(CUBED, size - 1))
-        factors += [(*pair, size) for pair in combinations_with_replacement(squared, 2)]
-        factors += [(k, k, k) for k in cubed]
-        kept = np.array(factors)
-        bend = Bend(kept, np.zeros((size, len(kept))), np.zeros((size, len(kept))))
+        bend = Bend.none(size)
         f = bend.monomials(w)
-        reach = np.where(kept == size, -1, kept).max(axis=1)
+        reach = np.where(bend.factors == size, -1, bend.factors).max(axis=1)
         for i in range(size):
             own = np.flatnonzero(reach < i)
             bend.shift[i, own], bend.scale[i, own] = _regression(f[:, own], w[:, i], effective)
-        used = (bend.shift != 0).any(axis=0) | (bend.scale != 0).any(axis=0)
-        return Bend(kept[used], bend.shift[:, used], bend.scale[:, used])
+        return bend
 
 
 def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]:
@@ -153,33 +146,32 @@ def _scores(f: Matrix, taken: list[int], left: Vector) -> Vector:
     return np.where(known, 0.0, (others.T @ left) ** 2 / np.where(known, 1.0, square))
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Warp:
     """Sinh-arcsinh map of every coordinate."""
 
-    place: Vector
-    scale: Vector
-    skew: Vector
-    tail: Vector
+    place: Leaf
+    scale: Leaf
+    skew: Leaf
+    tail: Leaf
 
     def forward(self, v: Matrix) -> Matrix:
-        return np.sinh(self.tail * np.arcsinh((v - self.place) / self.scale) - self.skew)
+        """From v to u."""
+        return np.asarray(
+            np.sinh(self.tail * np.arcsinh((v - self.place) / self.scale) - self.skew)
+        )
 
-    def back(self, u: Matrix) -> Matrix:
-        return self.place + self.scale * np.sinh((np.arcsinh(u) + self.skew) / self.tail)
+    def back(self, u: Any) -> Any:
+        """From u to v."""
+        return self.place + self.scale * jnp.sinh((jnp.arcsinh(u) + self.skew) / self.tail)
 
-    def log_slope(self, u: Matrix) -> Matrix:
+    def log_slope(self, u: Any) -> Any:
         """Log dv/du of every coordinate."""
-        inner = (np.arcsinh(u) + self.skew) / self.tail
-        # cosh without overflow
-        cosh = np.abs(inner) + np.log1p(np.exp(-2 * np.abs(inner))) - np.log(2)
-        return np.asarray(np.log(self.scale / self.tail) + cosh - 0.5 * np.log1p(u**2))
-
-    def pull(self, u: Matrix, slope: Matrix) -> Matrix:
-        """Derivative by u of what has the derivative `slope` by v, plus that of the log slopes."""
-        inner = (np.arcsinh(u) + self.skew) / self.tail
-        bend = np.tanh(inner) / (self.tail * np.sqrt(1 + u**2)) - u / (1 + u**2)
-        return np.asarray(slope * np.exp(self.log_slope(u)) + bend)
+        xp = u.__array_namespace__()
+        inner = xp.abs((xp.asinh(u) + self.skew) / self.tail)
+        cosh = inner + xp.log1p(xp.exp(-2 * inner)) - np.log(2)  # without overflow
+        return xp.log(self.scale / self.tail) + cosh - 0.5 * xp.log1p(u**2)
 
     @staticmethod
     def none(size: int) -> "Warp":
@@ -208,6 +200,7 @@ def _sinh_arcsinh(x: Vector) -> tuple[float, float, float, float]:
     return middle + width * q[0], width * float(np.exp(q[1])), q[2], float(np.exp(q[3]))
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Stair:
     """Some coordinates, after those they follow.
@@ -219,10 +212,10 @@ class Stair:
         bend: of it; None for shared coordinates.
     """
 
-    own: np.ndarray
-    given: np.ndarray
-    slope: Matrix
-    root: Matrix
+    own: Leaf
+    given: Leaf
+    slope: Leaf
+    root: Leaf
     bend: Bend | None
 
     def left(self, about: Matrix) -> Matrix:
@@ -231,6 +224,7 @@ class Stair:
         return np.asarray(np.linalg.solve(self.root, left.T).T)
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Transport:
     """The whole map, of vectors x (row, size) to and from u (row, size).
@@ -243,56 +237,67 @@ class Transport:
     """
 
     first: Warp
-    mean: Vector
+    mean: Leaf
     stairs: tuple[Stair, ...]
     last: Warp
 
     def forward(self, x: Matrix) -> Matrix:
-        about = self.first.forward(x) - self.mean
+        """From x to u."""
+        return self._forward(x)[0]
+
+    def _forward(self, x: Matrix) -> tuple[Matrix, Matrix]:
+        """From x to u, and the part of log |dx/du| of every coordinate (row, size)."""
+        y = self.first.forward(x)
+        about, log = y - self.mean, self.first.log_slope(y)
         v = np.empty_like(about)
         for s in self.stairs:
             w = s.left(about)
             v[:, s.own] = s.bend.forward(w) if s.bend else w
-        return self.last.forward(v)
-
-    def back(self, u: Matrix) -> Matrix:
-        return self.placed(u)[0]
+            log[:, s.own] += np.log(np.diag(s.root)) + (s.bend.log_slope(w) if s.bend else 0.0)
+        u = self.last.forward(v)
+        return u, log + self.last.log_slope(u)
 
     def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
         """x, and the part of log |dx/du| of every coordinate (row, size)."""
-        y, log, _ = self._warped(u)
-        return self.first.back(y), log + self.first.log_slope(y)
-
-    def _warped(self, u: Matrix) -> tuple[Matrix, Matrix, list[Matrix]]:
-        """y, the part of log |dy/du|, and w of every stair."""
-        v, log = self.last.back(u), self.last.log_slope(u)
-        about, ws = np.empty_like(u), []
-        for s in self.stairs:
-            w = v[:, s.own]
-            if s.bend:
-                w = s.bend.back(w)
-                log[:, s.own] += s.bend.log_slope(w)
-            ws.append(w)
-            about[:, s.own] = about[:, s.given] @ s.slope + w @ s.root.T
-            log[:, s.own] += np.linalg.slogdet(s.root)[1] / len(s.own)
-        return self.mean + about, log, ws
+        x, log = _placed(self._there, u)
+        return np.array(x), np.array(log)
 
     def pull(self, u: Matrix, slope: Callable[[Matrix], Matrix]) -> Matrix:
         """Derivative by u of what has the derivative slope(x) by x, plus that of log |dx/du|."""
-        y, _, ws = self._warped(u)
-        by_y, by_v = self.first.pull(y, slope(self.first.back(y))), np.empty_like(u)
-        for s, w in zip(reversed(self.stairs), reversed(ws), strict=True):
-            own = by_y[:, s.own]
-            by_y[:, s.given] += own @ s.slope.T
-            by_v[:, s.own] = own @ s.root
-            if s.bend:
-                by_v[:, s.own] = s.bend.pull(w, by_v[:, s.own])
-        return self.last.pull(u, by_v)
+        return np.array(_pulled(self._there, u, slope(self.placed(u)[0])))
+
+    @cached_property
+    def _there(self) -> "Transport":
+        """The map where it is computed with."""
+        there: Transport = jax.device_put(self)
+        return there
 
     def log_density(self, x: Matrix) -> Vector:
         """Of what is a standard Gaussian in u, up to a constant."""
-        u = self.forward(x)
-        return np.asarray((-0.5 * u**2 - self.placed(u)[1]).sum(axis=1))
+        u, log = self._forward(x)
+        return np.asarray((-0.5 * u**2 - log).sum(axis=1))
+
+
+@jax.jit
+def _placed(map: Transport, u: Array) -> tuple[Array, Array]:
+    v, log = map.last.back(u), map.last.log_slope(u)
+    about = jnp.zeros_like(u)
+    for s in map.stairs:
+        w = v[:, s.own]
+        if s.bend:
+            w = s.bend.back(w)
+            log = log.at[:, s.own].add(s.bend.log_slope(w))
+        about = about.at[:, s.own].set(about[:, s.given] @ s.slope + w @ s.root.T)
+        log = log.at[:, s.own].add(jnp.log(jnp.diag(s.root)))
+    y = map.mean + about
+    return map.first.back(y), log + map.first.log_slope(y)
+
+
+@jax.jit
+def _pulled(map: Transport, u: Array, slope: Array) -> Array:
+    (_, log), back = jax.vjp(lambda u: _placed(map, u), u)
+    (out,) = back((slope, jnp.ones_like(log)))
+    return jnp.asarray(out)
 
 
 def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray, kind: np.ndarray) -> Transport:
@@ -319,7 +324,8 @@ def _stairs(
         if len(own):
             own = own[np.argsort(-np.diag(_given(at_mode, own, given)[1]))]
             slope, left = _given(covariance, own, given)
-            stairs.append(Stair(own, given, slope, np.linalg.cholesky(left), None))
+            bend = Bend.none(len(own)) if group[own[0]] >= 0 else None
+            stairs.append(Stair(own, given, slope, np.linalg.cholesky(left), bend))
 
     for k in np.unique(kind):
         stair(shared[kind[shared] == k], shared[kind[shared] < k])
@@ -359,13 +365,11 @@ def learnt(
         at_mode = covariance / np.outer(step, step)
         both = effective * np.cov(y.T).reshape(size, size) + size * at_mode
         stairs = tuple(
-            replace(s, bend=Bend.learnt(s.left(y - middle), effective))
-            if group[s.own[0]] >= 0 and len(s.own) > 1
-            else s
+            replace(s, bend=Bend.learnt(s.left(y - middle), effective)) if s.bend else s
             for s in _stairs(both / (effective + size), group, kind, at_mode)
         )
         found = Transport(first, middle, stairs, Warp.none(size))
-        return found if warp_first else replace(found, last=Warp.learnt(found.forward(rows)))
+        return replace(found, last=Warp.learnt(found.forward(rows)))
 
     def worth(warp_first: bool) -> float:
         pairs = halves, halves[::-1]

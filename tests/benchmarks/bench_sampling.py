@@ -21,7 +21,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("SLIPID_DATA") or ROOT.parent / "shared" / "data") / "robotino2022"
 FLOOR = os.environ.get("SLIPID_BENCH_FLOOR", "brown")
-STRETCH_S, NUTS_WARM_UP, NUTS_DRAWS, CHAINS = 400.0, 400, 2000, 2
+STRETCH_S, NUTS_WARM_UP, NUTS_DRAWS, CHAINS = 240.0, 400, 1500, 2
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no real logs: {DATA} is no folder")
 
