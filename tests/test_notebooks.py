@@ -13,6 +13,7 @@ FIGURES = {
     "01_one_wheel": 5,
     "02_a_real_log": 8,
     "03_fit_and_identifiability": 7,
+    "04_posterior": 5,
     "05_linear_or_nonlinear": 5,
 }
 
