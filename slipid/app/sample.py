@@ -188,6 +188,7 @@ def summary(found: Posterior, plan: Plan, seconds: float) -> dict[str, Any]:
         "draws": int(np.prod(found.log_prob.shape)),
         "seconds": round(seconds, 1),
         "accepted": found.accepted,
+        "electric_unsettled": found.unsettled,
         "seed": plan.seed,
         "worst": {
             "r_hat": float(np.max(d.r_hat)),

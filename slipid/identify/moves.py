@@ -27,7 +27,7 @@ DEGREES = 8.0
 WAY = 0.5 * np.pi
 """Of a Hamiltonian move [rad]: a quarter turn leads to an independent draw of a Gaussian."""
 MOST_STEPS = 12
-ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.1, 1.2, 0.1, 0.35
+ALONG, ALONG_APART, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.1, 0.6, 1.2, 0.1, 0.35
 """How often, relatively, moves of each kind are made; a Hamiltonian one takes ten times longer."""
 STEEPEST = 100.0
 """Kicks are bounded by this many times the step, so that walkers far out are not thrown away."""
@@ -278,9 +278,10 @@ def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
 def moves(target: Target, angle: float) -> list[tuple[Move, float]]:
     """Moves in the target's coordinates, and how often each is made."""
     of_family, groups = families(target), tuple(range(target.count))
-    found: list[tuple[Move, float]] = [(Along(target, groups), ALONG)]
+    along = ALONG_APART if target.apart else ALONG
+    found: list[tuple[Move, float]] = [(Along(target, groups), along)]
     if (target.group < 0).any():
-        found.append((Along(target, None), ALONG))
+        found.append((Along(target, None), along))
     kinds: list[tuple[type[FamilyMove], float]] = [(Independence, INDEPENDENT)]
     if not target.apart:
         kinds.append((Differential, DIFFERENTIAL))

@@ -20,6 +20,11 @@ from slipid.identify.sampler import Block, Diagnosis, Plan
 Keep = Callable[[str, Block], None]
 STILL = 0.01
 """Part of the walkers of the second stage that may never have moved."""
+FEWEST, MORE, MOST = 9, 4, 33
+"""Blocks of the second stage: at first, then so many more until it has settled, at most."""
+DRIFT, MEMORY = 4.0, 0.5
+"""Standard errors by which means and stds of its walkers may still move in the second half of the
+chain, and correlation that they may still have with where they were in its middle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +41,7 @@ class Posterior:
         diagnosis: of the first stage, from all its steps.
         accepted: part of the moves that moved something, by stage.
         still: part of the second stage's walkers with a group that never moved.
+        unsettled: drift and memory of the second stage's walkers over what they may be, the worst.
         converged, reason: the verdict.
     """
 
@@ -48,6 +54,7 @@ class Posterior:
     diagnosis: Diagnosis
     accepted: dict[str, float]
     still: float
+    unsettled: float
     converged: bool
     reason: str
 
@@ -86,14 +93,18 @@ def sample(
     out_v = np.broadcast_to(fitted.log_variance, (*shape, len(fitted.log_variance))).copy()
     _put(first, x, out_z, out_v)
     accepted = {parts[0]: float(np.mean([b.accepted for b in blocks]))}
-    still = 0.0
+    still = unsettled = 0.0
+    reason = f"{found.reason} ({first.names[found.worst]})"
     if len(parts) > 1:
         second = Density(problem, fitted, ELECTRIC)
         if second.size:
             later = _given(first, second, fitted.covariance, x, plan, done, keep, tell)
             _put(second, later.x, out_z, out_v)
             accepted[ELECTRIC], still = later.accepted, later.still
-    reason = f"{found.reason} ({first.names[found.worst]})"
+            unsettled = float(later.unsettled.max())
+            if found.converged and unsettled > 1:
+                worst = second.names[int(later.unsettled.argmax())]
+                reason = f"electric walkers have not settled ({worst})"
     if found.converged and still > STILL:
         reason = f"{100 * still:.1f} % of the electric walkers never moved"
     return Posterior(
@@ -106,7 +117,8 @@ def sample(
         diagnosis=found,
         accepted=accepted,
         still=still,
-        converged=found.converged and still <= STILL,
+        unsettled=unsettled,
+        converged=found.converged and still <= STILL and unsettled <= 1,
         reason=reason,
     )
 
@@ -189,6 +201,7 @@ class _Later:
     x: Float[np.ndarray, "ensemble draw size"]
     accepted: float
     still: float
+    unsettled: Float[np.ndarray, " size"]
 
 
 def _given(
@@ -227,10 +240,21 @@ def _given(
         group = second.coordinates.group
         targets.append(Target(terms, steep, group, second.kind, second.centre, left, apart=True))
     later = replace(
-        plan, walkers=x.shape[1], seed=plan.seed + 1, block=8, warm_up=(1, 2), most=5, spread=1.0
+        plan,
+        walkers=x.shape[1],
+        seed=plan.seed + 1,
+        block=8,
+        warm_up=(1, 2, 3, 5),
+        most=FEWEST,
     )
-    blocks = _blocks(targets, later, ELECTRIC, done, keep, tell)
-    chain = sampler.chain(blocks, later)
+    blocks: list[Block] = list(done.get(ELECTRIC, ()))
+    while True:
+        blocks = _blocks(targets, later, ELECTRIC, {ELECTRIC: blocks}, keep, tell)
+        chain = sampler.chain(blocks, later)
+        unsettled = _unsettled(chain)
+        if len(blocks) >= MOST or unsettled.max() < 1:
+            break
+        later = replace(later, most=len(blocks) + MORE)
     moved = np.diff(chain, axis=1) != 0
     groups = second.coordinates.group
     never = np.any([~moved[..., groups == g].any(axis=(1, 3)) for g in np.unique(groups)], axis=0)
@@ -238,4 +262,21 @@ def _given(
         x=chain[:, -1] + shift,
         accepted=float(np.mean([b.accepted for b in blocks])),
         still=float(never.mean()),
+        unsettled=unsettled,
     )
+
+
+def _unsettled(chain: sampler.Chain) -> Float[np.ndarray, " size"]:
+    """Drift and memory of walkers over the second half of a chain, the worse of the two; 1: enough.
+
+    Walkers of the second stage know nothing of each other and have, less what the motion tells of
+    them, one distribution: they are many independent draws of where a chain is after so many steps.
+    """
+    steps = chain.shape[1]
+    middle, end = (chain[:, k].reshape(-1, chain.shape[-1]) for k in (steps // 2, steps - 1))
+    std, before = end.std(axis=0) + 1e-300, middle.std(axis=0) + 1e-300
+    error = np.sqrt(2 / len(end))  # of a difference of means; of one of log stds it is smaller
+    of_mean = np.abs(end.mean(axis=0) - middle.mean(axis=0)) / std / error
+    drift = np.maximum(of_mean, np.abs(np.log(std / before)) / error)
+    together = ((end - end.mean(axis=0)) * (middle - middle.mean(axis=0))).mean(axis=0)
+    return np.asarray(np.maximum(drift / DRIFT, together / std / before / MEMORY))
