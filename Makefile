@@ -29,7 +29,7 @@ ifneq ($(NOTEBOOKS),)
 endif
 	$(BIN)/python -m pytest -q $(TWO) -m "not slow"
 
-bench: $(VENV)/.dev-stamp ## speed, left-out errors, load shares, known truth (half an hour)
+bench: $(VENV)/.dev-stamp ## speed, left-out errors, load shares, known truth, posteriors (hours)
 ifneq ($(BENCHES),)
 	$(BIN)/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks
 else

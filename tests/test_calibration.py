@@ -1,0 +1,46 @@
+"""Intervals and ranks over a few made experiments; `benchmarks/bench_calibration.py` has many."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slipid.identify.posterior import _unsettled
+from tests import calibration
+
+SEEDS = range(5)
+
+
+@pytest.fixture(scope="module")
+def replicates():
+    return [calibration.replicate(seed) for seed in SEEDS]
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth_as_often_as_they_say(replicates):
+    inside = np.concatenate([r.inside for r in replicates])
+    rank = np.concatenate([r.rank for r in replicates])
+    low, high = calibration.band(len(inside), 1)
+    assert low <= inside.mean() <= high
+    # four standard errors of the mean of uniform ranks
+    assert rank.mean() == pytest.approx(0.5, abs=4 / np.sqrt(12 * len(rank)))
+
+
+@pytest.mark.slow
+def test_a_variance_that_may_be_anything_small_is_not_held_near_the_fit(replicates):
+    """In experiments 1 and 4 the ammeter hides the voltmeter's noise, whose truth is tiny."""
+    place = replicates[0].names.index("noise.voltage.window")
+    for k in (1, 4):
+        assert replicates[k].rank[place] > 0.02
+        assert replicates[k].draws[..., place].std() > 0.9
+
+
+def test_walkers_that_drift_or_remember_have_not_settled():
+    rng = np.random.default_rng(0)
+    free = rng.normal(size=(4, 40, 50, 3))
+    assert (_unsettled(free) < 1).all()
+    stuck, drifting = free.copy(), free.copy()
+    stuck[..., 1] = stuck[:, :1, :, 1]
+    drifting[..., 2] += np.linspace(0, 2, 40)[:, None]
+    assert (_unsettled(stuck) > 1).tolist() == [False, True, False]
+    assert (_unsettled(drifting) > 1).tolist() == [False, False, True]
