@@ -80,8 +80,8 @@ def problem() -> Problem:
     return Problem(windows, blank, CHOICES)
 
 
-def replicate(seed: int, plan: Plan = PLAN) -> Replicate:
-    """Draw a truth, fill the windows, fit, sample."""
+def experiment(seed: int) -> tuple[Problem, Fitted, np.ndarray]:
+    """A truth drawn, windows filled and fitted; the truth of numbers and log variances."""
     rng, common = np.random.default_rng(seed), problem()
     space, typical = common.space, 2 * np.log(common.noise.typical)
     z = space.prior_mean + space.prior_std * rng.standard_normal(space.size)
@@ -89,12 +89,19 @@ def replicate(seed: int, plan: Plan = PLAN) -> Replicate:
     this = common.of(filled(common, z, log_v, rng))
     optimum = optimise(this)
     fitted = Fitted(optimum.state.z, np.asarray(optimum.state.log_variance), optimum.covariance)
+    return this, fitted, np.concatenate([z, log_v])
+
+
+def replicate(seed: int, plan: Plan = PLAN) -> Replicate:
+    """An experiment and draws of its posterior."""
+    this, fitted, truth = experiment(seed)
+    space, names = this.space, this.noise.names
     found = posterior.sample(this, fitted, replace(plan, seed=seed), draws=DRAWS)
     draws = np.concatenate([found.z, found.log_variance], axis=-1)
-    prior_std = np.concatenate([space.prior_std, np.full(len(typical), VARIANCE_SPREAD)])
+    prior_std = np.concatenate([space.prior_std, np.full(len(names), VARIANCE_SPREAD)])
     return Replicate(
-        names=(*space.names, *(f"noise.{name}" for name in common.noise.names)),
-        truth=np.concatenate([z, log_v]),
+        names=(*space.names, *(f"noise.{name}" for name in names)),
+        truth=truth,
         draws=draws,
         ratio=draws.std(axis=(0, 1)) / prior_std,
         r_hat=float(found.diagnosis.r_hat.max()),

@@ -5,21 +5,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from slipid.identify import posterior
+from slipid.identify.density import ELECTRIC, MOTION
 from slipid.identify.posterior import _unsettled
+from slipid.identify.sampler import Plan
 from tests import calibration
 
-SEEDS = range(5)
+SEEDS = (0, 1, 4)
 
 
 @pytest.fixture(scope="module")
 def replicates():
-    return [calibration.replicate(seed) for seed in SEEDS]
+    return {seed: calibration.replicate(seed) for seed in SEEDS}
 
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say(replicates):
-    inside = np.concatenate([r.inside for r in replicates])
-    rank = np.concatenate([r.rank for r in replicates])
+    inside = np.concatenate([r.inside for r in replicates.values()])
+    rank = np.concatenate([r.rank for r in replicates.values()])
     low, high = calibration.band(len(inside), 1)
     assert low <= inside.mean() <= high
     # four standard errors of the mean of uniform ranks
@@ -33,6 +36,30 @@ def test_a_variance_that_may_be_anything_small_is_not_held_near_the_fit(replicat
     for k in (1, 4):
         assert replicates[k].rank[place] > 0.02
         assert replicates[k].draws[..., place].std() > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 7, 10])
+def test_the_second_stage_goes_on_from_any_block_as_if_it_had_not_ended(whole, count):
+    experiment, plan, blocks, found = whole
+    done = {MOTION: blocks[MOTION], ELECTRIC: blocks[ELECTRIC][:count]}
+    again = posterior.sample(*experiment, plan, draws=10, done=done)
+    np.testing.assert_array_equal(again.z, found.z)
+    np.testing.assert_array_equal(again.log_variance, found.log_variance)
+    assert again.unsettled == found.unsettled
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """An experiment, and a posterior of it whose second stage needs more than the fewest blocks."""
+    *experiment, _ = calibration.experiment(12)
+    plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=3)
+    blocks = {MOTION: [], ELECTRIC: []}
+    found = posterior.sample(
+        *experiment, plan, draws=10, keep=lambda part, block: blocks[part].append(block)
+    )
+    assert len(blocks[ELECTRIC]) > 10
+    return experiment, plan, blocks, found
 
 
 def test_walkers_that_drift_or_remember_have_not_settled():

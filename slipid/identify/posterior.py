@@ -240,21 +240,19 @@ def _given(
         group = second.coordinates.group
         targets.append(Target(terms, steep, group, second.kind, second.centre, left, apart=True))
     later = replace(
-        plan,
-        walkers=x.shape[1],
-        seed=plan.seed + 1,
-        block=8,
-        warm_up=(1, 2, 3, 5),
-        most=FEWEST,
+        plan, walkers=x.shape[1], seed=plan.seed + 1, block=8, warm_up=(1, 2, 3, 5), most=FEWEST
     )
     blocks: list[Block] = list(done.get(ELECTRIC, ()))
     while True:
+        # asked after these numbers of blocks only, wherever an earlier call was interrupted
+        while later.most < len(blocks):
+            later = replace(later, most=later.most + MORE)
         blocks = _blocks(targets, later, ELECTRIC, {ELECTRIC: blocks}, keep, tell)
         chain = sampler.chain(blocks, later)
         unsettled = _unsettled(chain)
         if len(blocks) >= MOST or unsettled.max() < 1:
             break
-        later = replace(later, most=len(blocks) + MORE)
+        later = replace(later, most=later.most + MORE)
     moved = np.diff(chain, axis=1) != 0
     groups = second.coordinates.group
     never = np.any([~moved[..., groups == g].any(axis=(1, 3)) for g in np.unique(groups)], axis=0)
