@@ -100,7 +100,7 @@ def sample(
     most: Annotated[int, typer.Option("--most", min=24, help="Blocks before it gives up.")] = 200,
     block: Annotated[
         int, typer.Option("--block", min=1, hidden=True, help="Steps that are kept together.")
-    ] = 10,
+    ] = 20,
     seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
     json: Json = None,
     quiet: Quiet = False,

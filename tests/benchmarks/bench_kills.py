@@ -8,19 +8,21 @@ import time
 import numpy as np
 import xarray
 
-from tests.test_cli import process, small  # noqa: F401  a fixture
+from tests import test_cli
+
+small = test_cli.small  # the fixture: a fit of made logs
 
 KILLS = 20
 JOB = ("--draws", "40", "--most", "80", "--block", "4", "--quiet")
 
 
-def test_twenty_kills(small, tmp_path):  # noqa: F811
+def test_twenty_kills(small, tmp_path):
     rng = np.random.default_rng(0)
     whole, out = tmp_path / "whole", tmp_path / "out"
     for folder in (whole, out):
         shutil.copytree(small[0] / "out", folder)
     began = time.perf_counter()
-    run = process("sample", whole, *JOB)
+    run = test_cli.process("sample", whole, *JOB)
     while run.poll() is None and not list(whole.glob("sampling/*.npz")):
         time.sleep(0.05)
     start = time.perf_counter() - began
@@ -29,7 +31,7 @@ def test_twenty_kills(small, tmp_path):  # noqa: F811
     print(f"\nleft in peace: {start:.0f} s to the first block, {took:.0f} s more, {run.returncode}")
     kept, killed = [], 0
     while killed < KILLS:
-        again = process("sample", out, *JOB)
+        again = test_cli.process("sample", out, *JOB)
         time.sleep(rng.uniform(0.5 * start, start + 2 * took / KILLS))
         assert again.poll() is None, "done before it could be killed so often: a longer job is due"
         again.kill()
@@ -37,7 +39,7 @@ def test_twenty_kills(small, tmp_path):  # noqa: F811
         killed += 1
         kept.append(len(list(out.glob("sampling/*.npz"))))
     print(f"killed {killed} times, blocks then on disk: {kept}")
-    last = process("sample", out, *JOB)
+    last = test_cli.process("sample", out, *JOB)
     last.communicate()
     assert last.returncode == run.returncode
     with (
