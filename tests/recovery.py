@@ -11,7 +11,7 @@ from slipid.app.synthetic import Sensors, blank, grid, make_logs, truth
 from slipid.data.dataset import collect, windows
 from slipid.identify.curves import curves, slip_on
 from slipid.identify.fit import optimise
-from slipid.identify.identifiability import IDENTIFIED, expected_covariance
+from slipid.identify.identifiability import by_ratio, expected_covariance, from_zero
 from slipid.identify.problem import Problem
 from slipid.parameter import Choice, Space
 
@@ -62,7 +62,18 @@ def design():
         for name in this.noise.names
     ]
     covariance = expected_covariance(this, this.space.vector(TRUTH), 2 * np.log(std))
-    return np.sqrt(np.diag(covariance)) / this.space.prior_std < IDENTIFIED
+    return said_identified(this.space, np.sqrt(np.diag(covariance)))
+
+
+def said_identified(space, std):
+    """Which coordinates the verdict of Laplace stds calls identified."""
+    said = np.zeros(space.size, bool)
+    for e in space.free:
+        at = space.place[e.path]
+        for k in range(at.start, at.stop):
+            ratio, apart = std[k] / space.prior_std[k], from_zero(e.declaration, std[k : k + 1])
+            said[k] = by_ratio(ratio, apart) == "identified"
+    return said
 
 
 @dataclass(frozen=True)
@@ -101,7 +112,7 @@ def recover(seed):
         z=end.state.z,
         std=std,
         truth=space.vector(TRUTH),
-        identified=std / space.prior_std < IDENTIFIED,
+        identified=said_identified(space, std),
         curve_gap=curve_gap(this, end.state.z),
         noise=dict(zip(this.noise.names, np.exp(0.5 * end.state.log_variance), strict=True)),
         converged=end.converged,

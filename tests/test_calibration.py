@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from slipid.identify import posterior
-from slipid.identify.density import ELECTRIC, MOTION
+from slipid.identify.density import MOTION
 from slipid.identify.posterior import _unsettled
 from slipid.identify.sampler import Plan
 from tests import calibration
@@ -42,11 +45,21 @@ def test_a_variance_that_may_be_anything_small_is_not_held_near_the_fit(replicat
 @pytest.mark.parametrize("count", [1, 7, 10])
 def test_the_second_stage_goes_on_from_any_block_as_if_it_had_not_ended(whole, count):
     experiment, plan, blocks, found = whole
-    done = {MOTION: blocks[MOTION], ELECTRIC: blocks[ELECTRIC][:count]}
-    again = posterior.sample(*experiment, plan, draws=10, done=done)
+    kept = {part: b if part == MOTION else b[:count] for part, b in blocks.items()}
+    again = posterior.sample(*experiment, plan, draws=10, done=lambda part: kept[part])
     np.testing.assert_array_equal(again.z, found.z)
     np.testing.assert_array_equal(again.log_variance, found.log_variance)
     assert again.unsettled == found.unsettled
+
+
+@pytest.mark.slow
+def test_a_longer_first_stage_begins_the_second_anew(whole):
+    """Electric draws are of the very draws of the motion they were made with."""
+    experiment, plan, blocks, _ = whole
+    longer = replace(plan, most=plan.most + 1)
+    anew = posterior.sample(*experiment, longer, draws=10)
+    again = posterior.sample(*experiment, longer, draws=10, done=lambda part: blocks.get(part, ()))
+    np.testing.assert_array_equal(again.z, anew.z)
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +67,11 @@ def whole():
     """An experiment, and a posterior of it whose second stage needs more than the fewest blocks."""
     *experiment, _ = calibration.experiment(12)
     plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=3)
-    blocks = {MOTION: [], ELECTRIC: []}
+    blocks = defaultdict(list)
     found = posterior.sample(
         *experiment, plan, draws=10, keep=lambda part, block: blocks[part].append(block)
     )
-    assert len(blocks[ELECTRIC]) > 10
+    assert max(map(len, blocks.values())) > 10
     return experiment, plan, blocks, found
 
 

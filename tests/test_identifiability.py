@@ -16,7 +16,7 @@ from slipid.identify.fit import Options, optimise
 from slipid.identify.flat import NOTICED, flat_directions, sentences
 from slipid.identify.identifiability import RATIOS, derived, expected_covariance
 from slipid.identify.problem import Problem
-from slipid.identify.profile import RISE, profile, profiled
+from slipid.identify.profile import RISE, _Walk, profile, profiled
 from slipid.identify.remedies import VOLTAGE, remedy
 from slipid.parameter import Choice, Space
 from tests.made_windows import made, robot
@@ -325,6 +325,30 @@ def test_a_profile_without_a_lower_end_says_bound():
     assert p.interval90[0] == 0.0
     assert p.interval90[1] < p.value[-1]
     assert "is at its bound: the data only put it below" in p.said
+
+
+@pytest.mark.slow
+def test_a_profile_goes_back_where_it_stepped_over_the_end_of_a_flat_stretch(monkeypatch):
+    """Level for a prior's std and a half, then a wall: points close in on it."""
+    this, end = fitted()
+    at = this.space.place["motor.inductance"].start
+    start, std = end.state.z[at], this.space.prior_std[at]
+
+    def optimised(problem, start, **_):
+        return replace(end, state=start)
+
+    def loss(walk, state):
+        return 50.0 * max((start - state.z[at]) / std - 1.5, 0.0) ** 2
+
+    monkeypatch.setattr("slipid.identify.profile.optimise", optimised)
+    monkeypatch.setattr(_Walk, "loss", loss)
+    walk = _Walk(this, end, at, lambda points, rise: None)
+    z, rise = np.array(sorted(walk.side(-1.0), reverse=True)).T
+    z, rise = (start - z) / std, rise - 0.5 * ((z - this.space.prior_mean[at]) / std) ** 2
+    k = np.flatnonzero(rise - rise[0] > RISE)[0]
+    assert rise[k] - rise[0] < 3 * RISE
+    assert z[k] - z[k - 1] < 0.7
+    assert z[k - 1] < 1.5 + np.sqrt(RISE / 50) < z[k]
 
 
 @pytest.mark.slow

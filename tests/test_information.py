@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from slipid.identify import information as info
 from slipid.identify import likelihood as lk
@@ -85,6 +86,41 @@ def test_is_what_the_likelihood_says_of_the_same_windows(current, voltage):
         np.testing.assert_allclose(
             found / std / std[:, None], np.linalg.inv(precision) / std / std[:, None], atol=1e-8
         )
+
+
+def test_runs_of_a_session_cannot_average_away_what_they_share():
+    """Against the covariance of all runs together, written out."""
+    plain = planner(False, False)
+    shared = {"session.firm.along": 1e-4, "session.firm.across": 4e-4, "session.firm.yaw": 1e-3}
+    this = Planner(robot(), CHOICES, {**plain.variance, **shared}, Channels(False))
+    runs = [0, 1, 2, 3, 2, 2]
+    w = windows([DRIVES[k] for k in runs], False, False)
+    problem = Problem(w, robot(), CHOICES)
+    log_v = jnp.asarray(2 * np.log(problem.noise.typical))
+    _, jacobian = problem.linear(jnp.asarray(this.z), problem.volt(log_v))
+    j = np.asarray(jacobian["motion"]).reshape(-1, this.space.size)
+    effect = np.asarray(lk.effects(w, robot()))
+    on = np.array([DRIVES[k].surface == "firm" for k in runs])[:, None, None]
+    effect = (effect * on).reshape(-1, 3)
+    assert on.any()
+    assert not on.all()
+    # the information of a Student t, a Gaussian's at its start
+    blocks = np.asarray(problem.covariance("motion", log_v))
+    weight = np.asarray(problem.precision(jacobian, log_v, jnp.ones(len(runs))))
+    prior = np.diag(1 / this.space.prior_std**2)
+    gauss = j.T @ np.linalg.solve(block_diag(*blocks), j)
+    factor = np.trace(weight - prior) / np.trace(gauss)
+    np.testing.assert_allclose(weight - prior, factor * gauss, rtol=1e-6, atol=1e-6 * gauss.max())
+    whole = block_diag(*blocks) / factor + effect * list(shared.values()) @ effect.T
+    expected = np.linalg.inv(prior + j.T @ np.linalg.solve(whole, j))
+    known = info.known(
+        block_diag(np.diag(this.space.prior_std**2), np.eye(this.effects)), this.is_electric
+    )
+    n, std = this.space.size, this.space.prior_std
+    found = known.plus(this.rows(DRIVES).pick(runs)).covariance[:n, :n]
+    np.testing.assert_allclose(found / std / std[:, None], expected / std / std[:, None], atol=1e-8)
+    apart = start(False, False).plus(rows(False, False).pick(runs)).covariance
+    assert (np.diag(found) > 1.05 * np.diag(apart)).any()
 
 
 def test_known_undoes_covariance():

@@ -74,11 +74,21 @@ def test_shares_sum_to_one_and_their_intervals_hold_them():
     assert widths == pytest.approx(2 * 1.645 * np.array(e.std), rel=0.1)
 
 
-def verdicts(ratio: float, choices: tuple[Choice, ...] = CHOICES, shift: float = 0.0):
-    """Estimates when every posterior is `ratio` times its prior, `shift` prior stds from it."""
+def verdicts(
+    ratio: float,
+    choices: tuple[Choice, ...] = CHOICES,
+    shift: float = 0.0,
+    prior_std: float | None = None,
+):
+    """Estimates when every posterior is `ratio` times its prior, `shift` prior stds from it.
+
+    `prior_std` in the search space is the declared one, or one for all.
+    """
     from slipid.parameter import Space
 
     space = Space(blank(DRIVES), choices)
+    if prior_std:
+        space.prior_std = np.full(space.size, prior_std)
     cov = np.diag((ratio * space.prior_std) ** 2)
     z = space.prior_mean + shift * space.prior_std
     return {e.path: e for e in estimates(space, choices, z, cov, has_voltage=True)}
@@ -89,10 +99,18 @@ def verdicts(ratio: float, choices: tuple[Choice, ...] = CHOICES, shift: float =
     [(0.29, "identified"), (0.31, "weak"), (0.79, "weak"), (0.81, "not_identified")],
 )
 def test_the_verdict_rule(ratio, verdict):
-    found = verdicts(ratio)
+    found = verdicts(ratio, prior_std=1.0)
     free = [e for e in found.values() if e.ratio is not None]
     assert {e.verdict for e in free} == {verdict}
     assert {round(e.ratio, 9) for e in free} == {ratio}
+
+
+@pytest.mark.parametrize(("std", "verdict"), [(0.33, "identified"), (0.34, "weak")])
+def test_a_positive_number_within_three_stds_of_zero_is_not_identified(std, verdict):
+    # a wide prior, of which a wide interval is a small part; one that takes any sign is not asked
+    found = verdicts(std / 4, prior_std=4.0)
+    assert found["surface.soft.creep"].verdict == verdict
+    assert found["surface.soft.lead"].verdict == "identified"
 
 
 def test_provenance():

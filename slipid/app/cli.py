@@ -32,6 +32,9 @@ Json = Annotated[
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
 
+AGAIN_S = 0.05
+"""After which an interrupt is sent again that Python had to ignore."""
+
 
 def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
     """Bad input is one message and exit code 2, an interrupt 130; neither is a traceback."""
@@ -371,7 +374,7 @@ def _interrupt_again(lost: Any) -> None:
     In a finaliser or a callback of the garbage collector (jax has one) no exception can be raised.
     """
     if lost.exc_type is KeyboardInterrupt:
-        again = threading.Timer(0.05, _thread.interrupt_main)
+        again = threading.Timer(AGAIN_S, _thread.interrupt_main)
         again.daemon = True  # a command that has ended by then is left in peace
         again.start()
     else:

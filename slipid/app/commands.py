@@ -1,6 +1,7 @@
 """What the commands do; `cli` only parses arguments and turns errors into exit codes."""
 
 import hashlib
+import importlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -254,6 +255,8 @@ def sample(
     began = time.monotonic()
     runtime.start()
     try:
+        for module in ("arviz_base", "arviz_stats", "h5netcdf", "threadpoolctl"):
+            importlib.import_module(module)  # used after hours of work
         from slipid.app import posterior_file
         from slipid.app import sample as job_of
         from slipid.identify.sampler import Plan

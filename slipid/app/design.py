@@ -27,6 +27,7 @@ WEAK = ("surface.", "robot.", "motor.")
 """Beginnings of the names of weakly identified numbers that are shrunk by default."""
 ASSUMPTIONS = (
     "noise and run effects as fitted; a run is one piece however long it is",
+    "all new runs are of one session, whose own offset they cannot average away",
     "linear around the fitted numbers; what the fit holds fixed stays fixed",
     "steady wheel speeds: nothing is learnt from starting and stopping",
     "runs start with the marker's heading at zero and are centred in the image",

@@ -89,5 +89,5 @@ def load_checkpoint(path: Path, key: str) -> tuple[Any, list[float]] | None:
                 stage=str(kept["stage"]),
             )
             return state, [float(x) for x in kept["history"]]
-    except (OSError, KeyError, ValueError, BadZipFile):
+    except (OSError, EOFError, KeyError, ValueError, BadZipFile):
         return None

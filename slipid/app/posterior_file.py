@@ -1,6 +1,5 @@
 """posterior.nc: draws in the layout of ArviZ, with names for everything."""
 
-import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.data.log import DataError
+from slipid.data.files import write_bytes
 from slipid.identify.posterior import Posterior, likelihoods, replicates
 from slipid.identify.problem import Problem
 from slipid.parameter import Entry, Space
@@ -156,14 +155,7 @@ def write(made: Any, path: Path) -> None:
     Raises:
         DataError: nothing can be written there.
     """
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
-    try:
-        made.to_netcdf(name, engine="h5netcdf")
-        with open(name, "rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(name, path)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror})") from error
-    finally:
-        Path(name).unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / path.name
+        made.to_netcdf(whole, engine="h5netcdf")
+        write_bytes(path, whole.read_bytes())

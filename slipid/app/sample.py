@@ -15,8 +15,15 @@ from slipid.app.progress import Reporter
 from slipid.data.files import read_json, write_arrays, write_json
 from slipid.data.log import DataError
 from slipid.identify import curves as curves_of
-from slipid.identify.density import ELECTRIC, EVERYTHING, MOTION, Fitted
-from slipid.identify.identifiability import NEEDS_VOLTAGE, Estimate, by_ratio, derived
+from slipid.identify.density import ELECTRIC, Fitted
+from slipid.identify.identifiability import (
+    NEEDS_VOLTAGE,
+    Estimate,
+    by_ratio,
+    derived,
+    from_zero,
+    provenance,
+)
 from slipid.identify.posterior import Posterior
 from slipid.identify.result import Fit, as_identified
 from slipid.identify.sampler import Block, Plan, packed, unpacked
@@ -55,7 +62,7 @@ class Blocks:
                 if str(kept["key"]) != self.key:
                     return None
                 return unpacked({k: kept[k] for k in kept.files})
-        except (OSError, KeyError, ValueError, BadZipFile):
+        except (OSError, EOFError, KeyError, ValueError, BadZipFile):
             return None
 
     def remove(self) -> None:
@@ -81,11 +88,13 @@ def sample(
     from slipid.identify import posterior
 
     kept = Blocks(out / FOLDER, key(fit, plan, draws))
-    done = {part: kept.read(part) for part in (MOTION, ELECTRIC, EVERYTHING)}
-    for part, blocks in done.items():
+    watch = Watch(plan, report)
+
+    def done(part: str) -> list[Block]:
+        blocks = kept.read(part)
         if blocks:
             report.line(f"going on from block {len(blocks)} ({part}) of {kept.folder}")
-    watch = Watch(plan, report)
+        return blocks
 
     def keep(part: str, block: Block) -> None:
         kept.keep(part, block)
@@ -105,11 +114,11 @@ def sample(
 
 
 class Watch:
-    """Progress of a chain: how far it is, and how long it will take if it goes on like this."""
+    """Progress of a chain: how far it is, and how long it takes at most if it goes on like this."""
 
     def __init__(self, plan: Plan, report: Reporter):
         self.plan, self.report = plan, report
-        self.began = time.monotonic()
+        self.began, self.made = time.monotonic(), 0
 
     def steps(self, part: str, steps: int) -> None:
         """Every ensemble has done so many steps of a block."""
@@ -118,12 +127,16 @@ class Watch:
     def block(self, part: str, block: Block) -> None:
         """A block is done and kept."""
         count = block.number + 1
-        first = part != ELECTRIC
-        warm = "warm-up, " if first and count <= self.plan.warm_up[-1] else ""
+        self.made += 1
+        warm = left = ""
+        if not part.startswith(ELECTRIC):
+            warm = "warm-up, " if count <= self.plan.warm_up[-1] else ""
+            each = (time.monotonic() - self.began) / self.made
+            left = f", {max(self.plan.most - count, 0) * each / 60:.0f} min more at most"
         self.report.line(
             f"  block {count}: {warm}{count * block.chain.shape[1]} steps, "
             f"{100 * block.accepted.mean():.0f} % moved, "
-            f"log density {block.log_prob[:, -1].mean():.1f}"
+            f"log density {block.log_prob[:, -1].mean():.1f}{left}"
         )
 
 
@@ -147,16 +160,29 @@ def estimates(fit: Fit, found: Posterior) -> dict[str, Estimate]:
         std = values.std(axis=0).tolist()
         single = len(pairs) == 1
         kept = old.verdict == "at_bound" or (e.path in NEEDS_VOLTAGE and not fit.has["voltage"])
+        verdict = old.verdict if kept else by_ratio(ratio, from_zero(d, z.std(axis=0)))
+        pull = (z.mean(axis=0) - fit.space.prior_mean[at]) / fit.space.prior_std[at]
         out[e.path] = replace(
             old,
             value=mean[0] if single else tuple(mean),
             std=std[0] if single else tuple(std),
             interval90=pairs[0] if single else pairs,
             ratio=ratio,
-            verdict=old.verdict if kept else by_ratio(ratio),
+            verdict=verdict,
+            provenance=provenance(verdict, ratio),
+            pull=float(pull[np.argmax(np.abs(pull))]),
             source="posterior",
         )
     return out
+
+
+def _drawn(ratio: Estimate, fit: Fit, flat: np.ndarray) -> Estimate:
+    """A quotient with the interval and the std of its draws."""
+    over, under = (fit.space.place[path] for path in ratio.path.rsplit("/", 1))
+    draws = np.exp(flat[:, over] - flat[:, under])
+    low, high = np.quantile(draws, [0.05, 0.95]).tolist()
+    std = float(draws.std())
+    return replace(ratio, std=std, interval90=(low, high), source="posterior")
 
 
 def identified(fit: Fit, found: Posterior, problem: Any) -> dict[str, Any]:
@@ -167,7 +193,7 @@ def identified(fit: Fit, found: Posterior, problem: Any) -> dict[str, Any]:
         content["parameters"][path] = as_identified(e)
     flat = found.z.reshape(-1, fit.space.size)
     ratios = derived(fit.space, flat.mean(axis=0), np.cov(flat.T), fit.has["voltage"])
-    content["derived"] = {e.path: as_identified(replace(e, source="posterior")) for e in ratios}
+    content["derived"] = {e.path: as_identified(_drawn(e, fit, flat)) for e in ratios}
     some = flat[:: max(1, len(flat) // 400)]
     content["curves"] = curves_of.curves(fit.space, flat.mean(axis=0), some, problem.batch)
     if not found.converged:

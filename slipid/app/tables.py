@@ -87,7 +87,8 @@ def sampled(done: Any, out: Path) -> None:
         f"autocorrelation time, {worst['effective_draws']:.0f} effective draws"
     )
     state = "converged" if about["converged"] else "NOT converged, do not trust the intervals"
-    console.print(f"{state}: worst is {about['reason']}", markup=False, soft_wrap=True)
+    more = "" if about["converged"] else "; a larger --most goes on from here"
+    console.print(f"{state}: worst is {about['reason']}{more}", markup=False, soft_wrap=True)
     console.print(f"in {out}: {', '.join(done.written)}", markup=False, soft_wrap=True)
 
 

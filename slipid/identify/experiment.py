@@ -1,8 +1,9 @@
 """Which runs to drive next: the fitted robot simulates them, Fisher information judges them.
 
 What is assumed: noise as fitted, run effects marginalised (a run driven twice is worth its share, a
-long one does not count as many); everything linear around the fitted numbers; steady wheel speeds,
-so nothing is learnt from starting and stopping; the marker is put on once more for the new runs.
+long one does not count as many); all new runs are of one session and share what runs of a session
+share; everything linear around the fitted numbers; steady wheel speeds, so nothing is learnt from
+starting and stopping; the marker is put on once more for the new runs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
 from slipid.identify import likelihood as lk
 from slipid.identify.drives import SESSION, Drive, Setup, steady_windows
@@ -21,6 +23,7 @@ from slipid.identify.information import Knowledge, Rows, known
 from slipid.identify.problem import Problem
 from slipid.identify.replay import end_jacobian
 from slipid.identify.result import Fit
+from slipid.identify.sessions import AXES, by_axis
 from slipid.model.robot import Robot
 from slipid.parameter import Choice, entries
 
@@ -49,8 +52,11 @@ class Planner:
     Args:
         robot: as fitted; its sessions are over, new runs have one of their own.
         choices: free, fixed, priors, as fitted.
-        variance: of every noise component by name.
+        variance: of every noise component by name, and of what runs of a session share.
         channels: as fitted.
+
+    Its vectors hold the numbers of the search space and then, in stds of what they share along,
+    across and in yaw, the effects of the new session on floors where sessions are known to differ.
     """
 
     def __init__(
@@ -70,7 +76,13 @@ class Planner:
         self.space = self._problem.space
         self.z = self.space.vector(self.robot)
         joint = self._problem.joint
-        self.is_electric = np.zeros(self.space.size, bool) if joint else self._problem.electric
+        electric = np.zeros(self.space.size, bool) if joint else self._problem.electric
+        labels = self.robot.surfaces.labels
+        self._differ = np.array(
+            [any(self.variance.get(f"session.{x}.{a}") for a in AXES) for x in labels]
+        )
+        self.effects = len(AXES) * int(self._differ.sum())
+        self.is_electric = np.concatenate([electric, np.zeros(self.effects, bool)])
         self._log_v = np.log([self.variance[name] for name in self._problem.noise.names])
 
     @classmethod
@@ -98,7 +110,7 @@ class Planner:
         """Before any run: the prior; of a single session the marker's yaw is the common one."""
         single = np.array([n.startswith("camera.session_yaw@") for n in self.space.names])
         std = np.where(single, 1e-6, self.space.prior_std)
-        return known(np.diag(std**2), self.is_electric)
+        return self._known(np.diag(std**2))
 
     def after(self, fit: Fit) -> Knowledge:
         """After a fit; what it learnt of its own sessions' marker is of no more use."""
@@ -107,7 +119,10 @@ class Planner:
         theirs = [place[self.space.names[k]] for k in mine]
         covariance = np.diag(self.space.prior_std**2)
         covariance[np.ix_(mine, mine)] = fit.covariance[np.ix_(theirs, theirs)]
-        return known(covariance, self.is_electric)
+        return self._known(covariance)
+
+    def _known(self, covariance: Float[np.ndarray, "free free"]) -> Knowledge:
+        return known(block_diag(covariance, np.eye(self.effects)), self.is_electric)
 
     def rows(self, drives: Sequence[Drive]) -> Rows:
         """What each run would tell."""
@@ -119,8 +134,16 @@ class Planner:
     def _rows(self, drives: Sequence[Drive]) -> Rows:
         # always as many at once, so that one compiled function serves
         filled = [*drives, *[drives[-1]] * (_TOGETHER - len(drives))]
-        this = self._problem.of(self._windows(filled))
+        windows = self._windows(filled)
+        this = self._problem.of(windows)
         _, jacobian = this.linear(jnp.asarray(self.z), this.volt(self._log_v))
+        std = np.sqrt(by_axis(self.variance, "session", windows))
+        felt = lk.effects(windows, self.robot) * std[:, None]
+        on = np.eye(len(self._differ))[np.asarray(this.batch.surface)][:, self._differ]
+        moved = (felt[:, :, None, :] * on[:, None, :, None]).reshape(*felt.shape[:2], -1)
+        nothing = {k: np.zeros((*j.shape[:2], self.effects)) for k, j in jacobian.items()}
+        effects = nothing | {"motion": -moved}
+        jacobian = {k: jnp.concatenate([j, effects[k]], axis=2) for k, j in jacobian.items()}
         halves = {
             k: np.asarray(h)[: len(drives)] for k, h in this.whitened(jacobian, self._log_v).items()
         }
@@ -135,21 +158,22 @@ class Planner:
             electric[..., ~self.is_electric],
         )
 
-    def ends(self, drives: Sequence[Drive]) -> Float[np.ndarray, "run 2 free"]:
-        """Derivative of each run's end point, over its distance, by the search vector.
+    def ends(self, drives: Sequence[Drive]) -> Float[np.ndarray, "run 2 number"]:
+        """Derivative of each run's end point, over its distance, by the numbers.
 
-        The marker is on as on average: its deviation in a session is no part of a prediction.
+        What is of one session, the marker's deviation too, is no part of a prediction.
         """
         b = lk.batch(self._windows(drives, session=""), self.robot)
         start = jnp.zeros((len(drives), 3))
-        jacobian = np.asarray(end_jacobian(self.space, jnp.asarray(self.z), b, start))[:, :2]
-        return jacobian / np.array([d.distance for d in drives])[:, None, None]
+        jacobian = np.array(end_jacobian(self.space, jnp.asarray(self.z), b, start))[:, :2]
+        jacobian /= np.array([d.distance for d in drives])[:, None, None]
+        return np.pad(jacobian, ((0, 0), (0, 0), (0, self.effects)))
 
-    def derivative(self, path: str) -> Float[np.ndarray, "number free"]:
-        """Derivative of a free parameter's numbers [SI] by the search vector."""
+    def derivative(self, path: str) -> Float[np.ndarray, "entry number"]:
+        """Derivative of a free parameter's entries [SI] by the numbers."""
         entry = next(e for e in self.space.free if e.path == path)
         at = self.space.place[path]
-        out = np.zeros((entry.size, self.space.size))
+        out = np.zeros((entry.size, len(self.is_electric)))
         out[:, at] = jax.jacfwd(entry.declaration.to_si)(jnp.asarray(self.z[at]))
         return out
 

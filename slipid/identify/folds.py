@@ -42,8 +42,11 @@ def random_headings(data: Dataset, folds: int = 6, step_deg: float = 5.0, seed: 
 
 
 def speeds(data: Dataset) -> Fold:
-    """Fold of every run by its commanded speed, -1 where its floor and load saw one speed only."""
-    speed = np.round(data.speed, 3)
+    """Fold of every run by its commanded speed, -1 where its floor and load saw one speed only.
+
+    Turns on the spot have no speed to leave out.
+    """
+    speed = np.round(np.where(data.speed > 0, data.speed, np.nan), 3)
     group = np.array([f"{log.surface}@{log.load}" for log in data.logs])
     out = np.full(len(data), -1)
     every = np.unique(speed[np.isfinite(speed)])

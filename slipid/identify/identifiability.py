@@ -16,10 +16,13 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.identify.problem import Problem
-from slipid.parameter import Choice, Entry, Space
+from slipid.parameter import Choice, Declaration, Entry, Space
 
 IDENTIFIED, WEAK = 0.3, 0.8
 """Largest std(posterior) / std(prior) of the verdicts, in the search space."""
+FROM_ZERO = 3.0
+"""Stds, in its own unit, by which an identified positive number is away from 0: the likelihood of a
+number that is small rises no further towards 0, however narrow the interval of its logarithm is."""
 TAIL, SMALL = 4.0, 0.05
 """A positive number counts as being at 0 when it is so many prior stds below its prior mean, and
 below this part of it: a tight prior that the data contradict is something else."""
@@ -167,7 +170,7 @@ def _free(
     scaled = block / prior_std[:, None] / prior_std[None, :]
     ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
     pull = (mean - prior_mean) / prior_std
-    verdict = _verdict(entry, value, pull, prior_std, ratio, has_voltage)
+    verdict = _verdict(entry, value, pull, prior_std, std_z, ratio, has_voltage)
     return Estimate(
         path=entry.path,
         unit=d.unit,
@@ -177,7 +180,7 @@ def _free(
         std=_plain(std),
         interval90=_pairs(low, high),
         verdict=verdict,
-        provenance=_source(verdict, ratio),
+        provenance=provenance(verdict, ratio),
         ratio=ratio,
         pull=float(pull[np.argmax(np.abs(pull))]),
         prior_mean=_plain(center),
@@ -195,6 +198,7 @@ def _verdict(
     value: np.ndarray,
     place: np.ndarray,
     prior_std: np.ndarray,
+    std_z: np.ndarray,
     ratio: float,
     has_voltage: bool,
 ) -> str:
@@ -209,17 +213,27 @@ def _verdict(
         below = place * prior_std
         if ((place < -TAIL) & (below < np.log(SMALL))).any():
             return "at_bound"
-    return by_ratio(ratio)
+    return by_ratio(ratio, from_zero(d, std_z))
 
 
-def by_ratio(ratio: float) -> str:
-    """Verdict of std(posterior) / std(prior)."""
-    if ratio < IDENTIFIED:
+def from_zero(declaration: Declaration, std_z: Float[np.ndarray, " coordinate"]) -> float:
+    """Stds by which a positive number is away from 0; infinite for others.
+
+    Args:
+        std_z: in the search space, that of the logarithm.
+    """
+    positive = np.isfinite(declaration.lower) and not np.isfinite(declaration.upper)
+    return float(1 / std_z.max()) if positive and not declaration.shares else np.inf
+
+
+def by_ratio(ratio: float, from_zero: float = np.inf) -> str:
+    """Verdict of std(posterior) / std(prior), and of how many stds a positive number is from 0."""
+    if ratio < IDENTIFIED and from_zero >= FROM_ZERO:
         return "identified"
     return "weak" if ratio < WEAK else "not_identified"
 
 
-def _source(verdict: str, ratio: float) -> str:
+def provenance(verdict: str, ratio: float) -> str:
     """Below 1/sqrt(2) the data hold more information than the prior."""
     held = verdict != "not_identified" and ratio < np.sqrt(0.5)
     return "measured" if held else "borrowed"
@@ -259,7 +273,7 @@ def _quotient(
     prior_std = float(np.sqrt(np.sum((c * space.prior_std) ** 2)))
     value, ratio = float(np.exp(log_value)), std / prior_std
     unknown = over == NEEDS_VOLTAGE[0] and not has_voltage
-    verdict = "not_identified" if unknown else by_ratio(ratio)
+    verdict = "not_identified" if unknown else by_ratio(ratio, 1 / std)
     low, high = (float(np.exp(log_value + k * std)) for k in (-_Z95, _Z95))
     return Estimate(
         path=f"{over}/{wanted.under}",
@@ -270,7 +284,7 @@ def _quotient(
         std=value * std,
         interval90=(low, high),
         verdict=verdict,
-        provenance=_source(verdict, ratio),
+        provenance=provenance(verdict, ratio),
         ratio=ratio,
         pull=float((log_value - log_prior) / prior_std),
         prior_mean=float(np.exp(log_prior)),

@@ -5,7 +5,8 @@ data), which no single density describes: its normaliser depends on the motion. 
 two stages; in the second every walker keeps its own draw of the motion.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import hashlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,10 +19,12 @@ from slipid.identify.problem import DEGREES, Problem
 from slipid.identify.sampler import Block, Diagnosis, Plan
 
 Keep = Callable[[str, Block], None]
+Done = Callable[[str], Sequence[Block]]
 STILL = 0.01
 """Part of the walkers of the second stage that may never have moved."""
 FEWEST, MORE, MOST = 9, 4, 33
-"""Blocks of the second stage: at first, then so many more until it has settled, at most."""
+"""Blocks of the second stage: at first, then so many more until it has settled, at most (or a sixth
+of the first stage's most)."""
 DRIFT, MEMORY = 4.0, 0.5
 """Standard errors by which means and stds of its walkers may still move in the second half of the
 chain, and correlation that they may still have with where they were in its middle."""
@@ -64,7 +67,7 @@ def sample(
     fitted: Fitted,
     plan: Plan,
     draws: int = 400,
-    done: Mapping[str, Sequence[Block]] | None = None,
+    done: Done = lambda part: (),
     keep: Keep = lambda part, block: None,
     tell: Callable[[str, int], None] = lambda part, steps: None,
 ) -> Posterior:
@@ -75,16 +78,16 @@ def sample(
         fitted: where the fit ended.
         plan: ensembles, bars, seed.
         draws: that are kept of each ensemble.
-        done: blocks of each part that an earlier call has made.
+        done: blocks of a part that an earlier call has made. The second part's name tells which
+            draws of the first its blocks are of.
         keep: called with every new block.
         tell: called with the part and the steps of a block that are done.
     """
-    done = done or {}
     parts = (EVERYTHING,) if problem.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
     group = first.coordinates.group
     target = Target(first.terms, first.slope, group, first.kind, first.centre, first.covariance)
-    blocks = _blocks([target] * plan.ensembles, plan, parts[0], done, keep, tell)
+    blocks = _blocks([target] * plan.ensembles, plan, parts[0], done(parts[0]), keep, tell)
     chain = sampler.chain(blocks, plan)
     found = sampler.diagnose(chain, plan)
     x, log_prob = thinned(chain, blocks[plan.warm_up[-1] :], draws)
@@ -104,9 +107,9 @@ def sample(
             unsettled = float(later.unsettled.max())
             if found.converged and unsettled > 1:
                 worst = second.names[int(later.unsettled.argmax())]
-                reason = f"electric walkers have not settled ({worst})"
+                reason = f"electric walkers that have not settled ({worst})"
     if found.converged and still > STILL:
-        reason = f"{100 * still:.1f} % of the electric walkers never moved"
+        reason = f"{100 * still:.1f} % of the electric walkers, which never moved"
     return Posterior(
         z=out_z,
         log_variance=out_v,
@@ -127,11 +130,11 @@ def _blocks(
     targets: Sequence[Target],
     plan: Plan,
     part: str,
-    done: Mapping[str, Sequence[Block]],
+    done: Sequence[Block],
     keep: Keep,
     tell: Callable[[str, int], None],
 ) -> list[Block]:
-    blocks = list(done.get(part, ()))
+    blocks = list(done)
     for block in sampler.run(targets, plan, blocks, lambda steps: tell(part, steps)):
         blocks.append(block)
         keep(part, block)
@@ -210,7 +213,7 @@ def _given(
     covariance: Float[np.ndarray, "free free"],
     x: Float[np.ndarray, "ensemble draw size"],
     plan: Plan,
-    done: Mapping[str, Sequence[Block]],
+    done: Done,
     keep: Keep,
     tell: Callable[[str, int], None],
 ) -> _Later:
@@ -242,15 +245,17 @@ def _given(
     later = replace(
         plan, walkers=x.shape[1], seed=plan.seed + 1, block=8, warm_up=(1, 2, 3, 5), most=FEWEST
     )
-    blocks: list[Block] = list(done.get(ELECTRIC, ()))
+    part = f"{ELECTRIC}-of-{hashlib.sha256(x.tobytes()).hexdigest()[:12]}"
+    blocks = list(done(part))
+    longest = max(MOST, plan.most // 6)
     while True:
         # asked after these numbers of blocks only, wherever an earlier call was interrupted
         while later.most < len(blocks):
             later = replace(later, most=later.most + MORE)
-        blocks = _blocks(targets, later, ELECTRIC, {ELECTRIC: blocks}, keep, tell)
+        blocks = _blocks(targets, later, part, blocks, keep, lambda _, k: tell(ELECTRIC, k))
         chain = sampler.chain(blocks, later)
         unsettled = _unsettled(chain)
-        if len(blocks) >= MOST or unsettled.max() < 1:
+        if len(blocks) >= longest or unsettled.max() < 1:
             break
         later = replace(later, most=later.most + MORE)
     moved = np.diff(chain, axis=1) != 0

@@ -30,8 +30,12 @@ RISE = float(chi2.ppf(0.9, 1)) / 2
 """Rise of minus log likelihood at the ends of the 90 % interval."""
 _ENOUGH = 1.5 * RISE
 """Rise at which a side is done."""
+_TOO_FAR = 3 * RISE
+"""Rise after a point inside the interval that tells that its end was stepped over."""
 _FAR = 3.0
 """A side ends so many prior stds from the prior mean: beyond it, nobody expects the number."""
+_LEAST = 0.1
+"""Laplace stds: no step is halved below that."""
 _MOST = 24
 """Points on a side."""
 
@@ -164,6 +168,7 @@ class _Walk:
         base = self.lowest - 0.5 * ((self.start - mean) / wide) ** 2
         reach = max(sign * mean + _FAR * wide, sign * self.start + _FAR * self.std)
         options = Options(most_rounds=12, tolerance=0.02)
+        growth = 1.5
         while len(points) < _MOST:
             z = np.array(state.z)
             z[self.at] += sign * step
@@ -173,17 +178,20 @@ class _Walk:
             end = optimise(
                 self.problem, start=held, options=options, free=self.free, variances=False
             )
-            state, loss = end.state, self.loss(end.state)
+            loss = self.loss(end.state)
             points.append((float(z[self.at]), loss))
             self.settled &= end.converged
             rise = loss - 0.5 * ((z[self.at] - mean) / wide) ** 2 - base
             self.count += 1
             self.tell(self.count, rise)
+            if rise > _TOO_FAR and before < RISE and step > _LEAST * self.std:
+                step, growth = 0.5 * step, 1.0
+                continue
             if rise > _ENOUGH:
                 break
             if rise - before < 0.2 * RISE:
-                step *= 1.5
-            before = rise
+                step *= growth
+            state, before = end.state, rise
         return points
 
 
@@ -224,7 +232,8 @@ def _told(
         laplace90=(si(walk.start - half), si(walk.start + half)),
         given="" if problem.joint or walk.of_motion else "the motion as fitted",
         settled=walk.settled,
-        said=_sentence(entry, interval, ends, problem.windows.has_voltage),
+        said=_sentence(entry, interval, ends, problem.windows.has_voltage)
+        + ("" if walk.settled else "; some refits did not settle: it may be wider"),
     )
 
 

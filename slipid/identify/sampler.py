@@ -277,7 +277,7 @@ def diagnose(chain: Chain, plan: Plan) -> Diagnosis:
     r_hat = array_stats.rhat(by_ensemble, chain_axis=0, draw_axis=1, method="rank")
     ess = np.minimum(
         array_stats.ess(by_walker, chain_axis=0, draw_axis=1, method="bulk"),
-        array_stats.ess(by_walker, chain_axis=0, draw_axis=1, method="tail", prob=0.9),
+        array_stats.ess(by_walker, chain_axis=0, draw_axis=1, method="tail", prob=(0.05, 0.95)),
     )
     bars = [
         (np.nan_to_num(r_hat - 1, nan=np.inf) / (plan.r_hat - 1), r_hat, "R-hat {:.4f}"),
