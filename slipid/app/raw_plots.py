@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slipid.app.drawing import save
 from slipid.data.dataset import Dataset
 
 
@@ -45,8 +46,4 @@ def _group(data: Dataset, runs: list[int], title: str, path: Path) -> Path:
     for w in range(wheels):
         axes[0, 1 + w].set(title=f"wheel {w + 1}", ylabel="speed [rad/s]" if w == 0 else "")
         axes[1, 1 + w].set(xlabel="time [s]", ylabel="current [A]" if w == 0 else "")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    figure.savefig(part, dpi=110, format="png")
-    part.replace(path)
-    return path
+    return save(figure, path)
