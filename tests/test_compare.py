@@ -22,6 +22,7 @@ from slipid.data.dataset import collect
 from slipid.data.log import DataError
 from slipid.identify import replay
 from slipid.identify.compare import folds_of
+from slipid.identify.drives import Drive
 from slipid.identify.fit import optimise
 from slipid.identify.ladder import rungs
 from slipid.identify.loo import exact_loo, psis_loo
@@ -259,6 +260,13 @@ PLAN = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns
 @pytest.fixture(scope="module")
 def logs():
     return make_logs(truth(PLAN), PLAN, 1, Sensors())
+
+
+def test_a_turn_on_the_spot_has_no_speed_to_leave_out(logs):
+    spin = make_logs(truth(PLAN), [Drive("soft", "as_built", 0.0, 0.0, 0.5)], 1, Sensors())
+    fold = folds_of(collect([*logs, *spin]), "speeds")
+    assert sorted(set(fold[:-1])) == [0, 1]
+    assert fold[-1] == -1
 
 
 def test_runs_that_nothing_could_be_fitted_for_are_never_left_out(logs):

@@ -46,7 +46,8 @@ def speeds(data: Dataset) -> Fold:
 
     Turns on the spot have no speed to leave out.
     """
-    speed = np.round(np.where(data.speed > 0, data.speed, np.nan), 3)
+    speed = np.round(data.speed, 3)
+    speed[speed == 0] = np.nan
     group = np.array([f"{log.surface}@{log.load}" for log in data.logs])
     out = np.full(len(data), -1)
     every = np.unique(speed[np.isfinite(speed)])
