@@ -97,6 +97,28 @@ def two_modes():
     return target, np.array([1.6, 0.0]), np.array([np.sqrt(1 + 16 * 4 * 0.3 * 0.7), 1.0])
 
 
+def plateau():
+    """Log of a number of which data say little more than that it is small; another follows it."""
+
+    def below(x):
+        return -0.5 * ((x + 1) / 2) ** 2 - 0.5 * ((np.exp(x) - 1) / 0.4) ** 2
+
+    def terms(x):
+        with np.errstate(over="ignore"):
+            own = below(x[:, 0]) - 0.5 * ((x[:, 1] - 1 + 3 * np.exp(x[:, 0])) / 0.1) ** 2
+        return np.stack([own, 0 * own], axis=1)
+
+    grid = np.linspace(-12, 3, 20001)
+    weight = np.exp(below(grid))
+    weight /= weight.sum()
+    about = np.stack([grid, 1 - 3 * np.exp(grid)])
+    mean = about @ weight
+    var = (about - mean[:, None]) ** 2 @ weight + np.array([0.0, 0.01])
+    covariance = np.array([[0.16, -0.48], [-0.48, 1.45]])
+    group, kind = np.zeros(2, int), np.zeros(2, int)
+    return known(terms, group, kind, np.array([0.0, -2.0]), covariance), mean, np.sqrt(var)
+
+
 def sampled(target, plan=PLAN):
     blocks = list(run([target] * plan.ensembles, plan))
     chain = sampler.chain(blocks, plan)
@@ -106,7 +128,16 @@ def sampled(target, plan=PLAN):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "seed"),
-    [(gaussian, 0), (banana, 0), (banana, 1), (banana, 3), (funnel, 0), (two_modes, 0)],
+    [
+        (gaussian, 0),
+        (banana, 0),
+        (banana, 1),
+        (banana, 3),
+        (funnel, 0),
+        (two_modes, 0),
+        (plateau, 0),
+        (plateau, 1),
+    ],
 )
 def test_moments_are_within_three_monte_carlo_errors_or_it_says_so(case, seed):
     target, mean, std = case()
@@ -188,13 +219,15 @@ def test_independence_accepts_nearly_everything_where_laplace_is_exact(exact):
 
 @pytest.fixture(scope="module")
 def bent():
-    """A map learnt from draws with a parabola, a funnel and a shared number in them."""
+    """A map learnt from draws with a parabola, a funnel, a plateau and a shared number."""
     group, kind = np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1]), np.array([0, 1, 0, 0, 0, 1, 0, 0, 1])
     x = np.random.default_rng(0).normal(size=(5000, 9))
     x[:, 3] += x[:, 2] ** 2
     x[:, 4] *= np.exp(0.5 * x[:, 2])
     x[:, 2] += x[:, 0]
     x[:, 8] = np.exp(0.5 * x[:, 8])
+    x[:, 6] = np.log(np.abs(x[:, 6]))
+    x[:, 7] = 0.5 * x[:, 7] + 3 * np.exp(x[:, 6])
     return learnt(x, 1250.0, np.eye(9), group, kind), x
 
 
@@ -280,6 +313,17 @@ def test_a_map_makes_draws_gaussian(bent):
     width = np.corrcoef(u[:, 2], u[:, 4] ** 2)[0, 1]
     assert max(abs(bend), abs(width)) < 0.06
     assert np.abs(np.corrcoef(u.T) - np.eye(9)).max() < 0.06
+
+
+def test_others_follow_the_number_where_its_logarithm_goes_far_down(bent):
+    map, _ = bent
+    np.testing.assert_array_equal(np.flatnonzero(map.values.plateau), [6])
+    u = map.forward(np.random.default_rng(3).normal(size=(1, 9)))
+    x = np.array([map.placed(np.where(np.arange(9) == 6, a, u))[0][0] for a in (-2.5, -3.5)])
+    assert x[1, 6] < x[0, 6] - 0.5
+    np.testing.assert_allclose(x[0, 7], x[1, 7], atol=0.15)
+    top = map.placed(np.where(np.arange(9) == 6, 1.0, u))[0][0]
+    assert abs(top[7] - x[0, 7]) > 1
 
 
 def test_a_map_is_undone_and_has_the_slopes_that_it_says(bent):

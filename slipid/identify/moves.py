@@ -27,8 +27,10 @@ DEGREES = 8.0
 WAY = 0.5 * np.pi
 """Of a Hamiltonian move [rad]: a quarter turn leads to an independent draw of a Gaussian."""
 MOST_STEPS = 12
-ALONG, ALONG_APART, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.1, 0.6, 1.2, 0.1, 0.35
+ALONG, ALONG_APART, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 0.6, 1.2, 0.1, 0.35
 """How often, relatively, moves of each kind are made; a Hamiltonian one takes ten times longer."""
+ALONE = 0.5
+"""Part of walks along a coordinate that no other one of x follows."""
 STEEPEST = 100.0
 """Kicks are bounded by this many times the step, so that walkers far out are not thrown away."""
 
@@ -208,30 +210,39 @@ class Differential(FamilyMove):
 
 
 class Along(FamilyMove):
-    """Random walk of one coordinate of each group, or of a shared one, the others of x held.
+    """Random walk of x of one coordinate of each group, or of a shared one.
 
     Where data say no more than that a number is small, its logarithm may be anything: a plateau
-    that no map of the whole has straight, but along which this walks.
+    that no map of the whole has straight, but along which this walks. The others of u are held, so
+    that those of x follow as the map says, or now and then the others of x.
     """
 
     def __init__(self, target: Target, groups: tuple[int, ...] | None):
+        assert target.map
         everything = np.arange(len(target.group))
         of_group = [np.flatnonzero(target.group == g) for g in groups or ()]
         super().__init__(Family(tuple(of_group or [everything]), groups))
         self.map = target.map
         self.mine = tuple(of_group or [np.flatnonzero(target.group < 0)])
         self.std = np.sqrt(np.diag(target.covariance))
+        flat = self.map.values.plateau
+        # every other walk is along a plateau, where there are any
+        self.often = [
+            np.where(flat[m] > 0, 1 / max(flat[m].sum(), 1), 1 / len(m)) for m in self.mine
+        ]
 
     def proposed(self, u: Matrix, still: Matrix, random: Any) -> tuple[Matrix, Matrix]:
-        assert self.map
         rows = np.arange(len(u))
         x, before = self.map.placed(u)
-        for mine in self.mine:
-            which = random.choice(mine, len(u))
+        moved = np.zeros(u.shape, bool)
+        for mine, often in zip(self.mine, self.often, strict=True):
+            which = random.choice(mine, len(u), p=often / often.sum())
             reach = 10 ** random.uniform(-0.5, 1.0, len(u)) * self.std[which]
             x[rows, which] += reach * random.standard_normal(len(u))
-        new = self.map.forward(x)
-        change = before - self.map.placed(new)[1]
+            moved[rows, which] = True
+        moved |= random.uniform(size=(len(u), 1)) < ALONE
+        new = np.where(moved, self.map.forward(x), u)
+        change = np.where(moved, before - self.map.placed(new)[1], 0.0)
         return new, np.stack([change[:, own].sum(axis=1) for own in self.family.places], axis=1)
 
 

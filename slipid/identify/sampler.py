@@ -19,7 +19,7 @@ from emcee.state import State
 from jaxtyping import Float
 
 from slipid.identify.moves import WAY, Hamiltonian, Target, moves
-from slipid.identify.transport import Bend, Stair, Transport, Warp, learnt
+from slipid.identify.transport import Bend, Stair, Transport, Values, Warp, learnt
 
 Chain = Float[np.ndarray, "ensemble step walker size"]
 ACCEPTED = 0.8
@@ -327,7 +327,7 @@ def packed(block: Block) -> dict[str, Any]:
         "accepted": block.accepted,
         "angle": np.asarray(block.angle),
         "mean": block.map.mean,
-        "first": np.stack(list(vars(block.map.first).values())),
+        "values": np.stack(list(vars(block.map.values).values())),
         "last": np.stack(list(vars(block.map.last).values())),
     }
     for k, stair in enumerate(block.map.stairs):
@@ -351,10 +351,12 @@ def unpacked(arrays: dict[str, np.ndarray]) -> Block:
         log_prob=arrays["log_prob"],
         random=(arrays["random_key"], arrays["random_rest"]),
         accepted=arrays["accepted"],
-        map=Transport(Warp(*arrays["first"]), arrays["mean"], tuple(stairs), Warp(*arrays["last"])),
+        map=Transport(
+            arrays["mean"], Values(*arrays["values"]), tuple(stairs), Warp(*arrays["last"])
+        ),
         angle=float(arrays["angle"]),
     )
 
 
-_OF_STAIR = ("own", "given", "slope", "root")
+_OF_STAIR = ("own", "given", "slope", "root", "told")
 _OF_BEND = ("factors", "shift", "scale")

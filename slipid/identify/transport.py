@@ -2,19 +2,20 @@
 
 A triangular map (Knothe-Rosenblatt) from coordinates x to u:
 
-    shared ones       v = L^-1 (y - m)
-    those of a group  w = L^-1 (y - m - B (y_given - m_given)), widest first
-                      v_i = (w_i - a_i(w_1 .. w_i-1)) exp(-b_i(w_1 .. w_i-1))
+    shared ones       v = L^-1 (x - m - B s)
+    those of a group  w = L^-1 (x - m - B s), widest first
+                      v_i = (w_i - a_i(w_1 .. w_i-1, s)) exp(-b_i(w_1 .. w_i-1, s))
 
 with polynomials a and b, and a sinh-arcsinh map (Jones and Pewsey 2009, Biometrika 96, eq. 2) of
-every coordinate,
+every coordinate from v to u,
 
-    sinh(tail arcsinh((x - place) / scale) - skew)
+    sinh(tail arcsinh((v - place) / scale) - skew)
 
-from v to u, and from x to y where draws that were not learnt from say so: where numbers act
-through their values and are kept as logarithms. Groups follow the shared coordinates and are bent
-by themselves, so that groups that are independent given the shared ones stay so. It is one of the
-maps of Marzouk et al. 2016 (Sampling via measure transport, section 3).
+What a coordinate says to those that follow it, s, is x - m; or, where x is the logarithm of a
+number of which data say no more than that it is small, the number itself: x may then be anything
+far below, and others stay where they are. Groups follow the shared coordinates and are bent by
+themselves, so that groups that are independent given the shared ones stay so. It is one of the maps
+of Marzouk et al. 2016 (Sampling via measure transport, section 3).
 """
 
 from collections.abc import Callable
@@ -41,6 +42,10 @@ CUBED = 3
 MOST_DRAWS = 4000
 WORTH = 3.0
 """Nats that a monomial must be worth."""
+SKEW = -0.8
+"""Where draws of a logarithm are more skewed than this, others follow its number."""
+MOST_VALUE = 3.0
+"""Numbers stay what they are beyond exp of this, in units of their median."""
 MOST_MONOMIALS = 12
 """Of a coordinate's mean and std."""
 
@@ -51,7 +56,8 @@ class Bend:
     """Polynomials a and b of a group's coordinates.
 
     Attributes:
-        factors: columns whose product each monomial is, from (w, 1) (monomial, 3).
+        factors: columns whose product each monomial is, from (w, told, 1) (monomial, 3), with told
+            what plateaus say.
         shift, scale: coefficients of a and b (coordinate, monomial).
     """
 
@@ -59,47 +65,49 @@ class Bend:
     shift: Leaf
     scale: Leaf
 
-    def monomials(self, w: Any) -> Any:
+    def monomials(self, w: Any, told: Any) -> Any:
         """Products of columns (row, monomial)."""
         xp = w.__array_namespace__()
-        columns = xp.concat([xp.clip(w, -FAR, FAR), xp.ones((len(w), 1))], axis=1)
-        return columns[:, self.factors].prod(axis=2)
+        columns = xp.clip(xp.concat([w, told], axis=1), -FAR, FAR)
+        return xp.concat([columns, xp.ones((len(w), 1))], axis=1)[:, self.factors].prod(axis=2)
 
-    def forward(self, w: Matrix) -> Matrix:
+    def forward(self, w: Matrix, told: Matrix) -> Matrix:
         """From w to v."""
-        f = self.monomials(w)
+        f = self.monomials(w, told)
         return np.asarray((w - f @ self.shift.T) * np.exp(-f @ self.scale.T))
 
-    def back(self, v: Array) -> Array:
+    def back(self, v: Array, told: Array) -> Array:
         """From v to w, coordinate after coordinate: monomials of each have earlier ones only."""
 
         def one(i: Array, w: Array) -> Array:
-            f = self.monomials(w)
+            f = self.monomials(w, told)
             return w.at[:, i].set(f @ self.shift[i] + jnp.exp(f @ self.scale[i]) * v[:, i])
 
         return jnp.asarray(jax.lax.fori_loop(0, v.shape[1], one, jnp.zeros_like(v)))
 
-    def log_slope(self, w: Any) -> Any:
+    def log_slope(self, w: Any, told: Any) -> Any:
         """Log dw_i/dv_i."""
-        return self.monomials(w) @ self.scale.T
+        return self.monomials(w, told) @ self.scale.T
 
     @staticmethod
-    def none(size: int) -> "Bend":
+    def none(size: int, told: int) -> "Bend":
         """Of nothing, with all monomials there can be."""
-        factors = [(size, size, size)] + [(k, size, size) for k in range(size)]
-        squared, cubed = range(min(SQUARED, size - 1)), range(min(CUBED, size - 1))
-        factors += [(*pair, size) for pair in combinations_with_replacement(squared, 2)]
+        one, values = size + told, range(size, size + told)
+        factors = [(one, one, one)] + [(k, one, one) for k in range(one)]
+        squared = [*values, *range(min(SQUARED, size - 1))]
+        cubed = [*values, *range(min(CUBED, size - 1))]
+        factors += [(*pair, one) for pair in combinations_with_replacement(squared, 2)]
         factors += [(k, k, k) for k in cubed]
         nothing = np.zeros((size, len(factors)))
         return Bend(np.array(factors), nothing, nothing.copy())
 
     @staticmethod
-    def learnt(w: Matrix, effective: float) -> "Bend":
+    def learnt(w: Matrix, told: Matrix, effective: float) -> "Bend":
         """Polynomials for draws that are worth so many independent ones."""
         size = w.shape[1]
-        bend = Bend.none(size)
-        f = bend.monomials(w)
-        reach = np.where(bend.factors == size, -1, bend.factors).max(axis=1)
+        bend = Bend.none(size, told.shape[1])
+        f = bend.monomials(w, told)
+        reach = np.where(bend.factors >= size, -1, bend.factors).max(axis=1)
         for i in range(size):
             own = np.flatnonzero(reach < i)
             bend.shift[i, own], bend.scale[i, own] = _regression(f[:, own], w[:, i], effective)
@@ -207,9 +215,10 @@ class Stair:
 
     Attributes:
         own, given: places.
-        slope: of own ones by given ones (given, own).
+        slope: of own ones by what given ones say (given, own).
         root: Cholesky factor of the covariance of what is left.
         bend: of it; None for shared coordinates.
+        told: places of plateaus of its group among the given, whose numbers bend it.
     """
 
     own: Leaf
@@ -217,11 +226,52 @@ class Stair:
     slope: Leaf
     root: Leaf
     bend: Bend | None
+    told: Leaf
 
-    def left(self, about: Matrix) -> Matrix:
+    def left(self, about: Matrix, said: Matrix) -> Matrix:
         """What others do not say of own coordinates, by the root; from all less their means."""
-        left = about[:, self.own] - about[:, self.given] @ self.slope
+        left = about[:, self.own] - said[:, self.given] @ self.slope
         return np.asarray(np.linalg.solve(self.root, left.T).T)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Values:
+    """What coordinates say to those that follow: themselves, or numbers they are logarithms of.
+
+    Attributes:
+        plateau: 1 where it is the number, which may go far down; others of the stair follow it.
+        middle: median of each, less its mean.
+        mean, std: of the number, in units of its median.
+    """
+
+    plateau: Leaf
+    middle: Leaf
+    mean: Leaf
+    std: Leaf
+
+    def said(self, about: Any) -> Any:
+        """From all less their means."""
+        xp = about.__array_namespace__()
+        value = (xp.exp(xp.clip(about - self.middle, None, MOST_VALUE)) - self.mean) / self.std
+        return xp.where(self.plateau > 0, value, about)
+
+    def slope(self) -> Vector:
+        """Of what is said, in the middle."""
+        return np.where(self.plateau > 0, 1.0 / self.std, 1.0)
+
+    @staticmethod
+    def none(size: int) -> "Values":
+        zero = np.zeros(size)
+        return Values(zero, zero, zero, zero + 1.0)
+
+    @staticmethod
+    def learnt(about: Matrix) -> "Values":
+        """From draws less their means: plateaus are where the way down is long."""
+        skew = (about**3).mean(axis=0) / about.std(axis=0) ** 3
+        middle = np.median(about, axis=0)
+        value = np.exp(np.minimum(about - middle, MOST_VALUE))
+        return Values((skew < SKEW) * 1.0, middle, value.mean(axis=0), value.std(axis=0))
 
 
 @jax.tree_util.register_dataclass
@@ -230,14 +280,14 @@ class Transport:
     """The whole map, of vectors x (row, size) to and from u (row, size).
 
     Attributes:
-        first: from x to y.
-        mean: of y.
-        stairs: from y to v; every coordinate is in one.
+        mean: of x.
+        values: what coordinates say to those that follow.
+        stairs: from x to v; every coordinate is in one.
         last: from v to u.
     """
 
-    first: Warp
     mean: Leaf
+    values: Values
     stairs: tuple[Stair, ...]
     last: Warp
 
@@ -247,13 +297,14 @@ class Transport:
 
     def _forward(self, x: Matrix) -> tuple[Matrix, Matrix]:
         """From x to u, and the part of log |dx/du| of every coordinate (row, size)."""
-        y = self.first.forward(x)
-        about, log = y - self.mean, self.first.log_slope(y)
-        v = np.empty_like(about)
+        about = x - self.mean
+        said = self.values.said(about)
+        v, log = np.empty_like(about), np.empty_like(about)
         for s in self.stairs:
-            w = s.left(about)
-            v[:, s.own] = s.bend.forward(w) if s.bend else w
-            log[:, s.own] += np.log(np.diag(s.root)) + (s.bend.log_slope(w) if s.bend else 0.0)
+            w, told = s.left(about, said), said[:, s.told]
+            v[:, s.own] = s.bend.forward(w, told) if s.bend else w
+            bent = s.bend.log_slope(w, told) if s.bend else 0.0
+            log[:, s.own] = np.log(np.diag(s.root)) + bent
         u = self.last.forward(v)
         return u, log + self.last.log_slope(u)
 
@@ -281,16 +332,17 @@ class Transport:
 @jax.jit
 def _placed(map: Transport, u: Array) -> tuple[Array, Array]:
     v, log = map.last.back(u), map.last.log_slope(u)
-    about = jnp.zeros_like(u)
+    about = said = jnp.zeros_like(u)
     for s in map.stairs:
         w = v[:, s.own]
         if s.bend:
-            w = s.bend.back(w)
-            log = log.at[:, s.own].add(s.bend.log_slope(w))
-        about = about.at[:, s.own].set(about[:, s.given] @ s.slope + w @ s.root.T)
+            told = said[:, s.told]
+            w = s.bend.back(w, told)
+            log = log.at[:, s.own].add(s.bend.log_slope(w, told))
+        about = about.at[:, s.own].set(said[:, s.given] @ s.slope + w @ s.root.T)
+        said = map.values.said(about)
         log = log.at[:, s.own].add(jnp.log(jnp.diag(s.root)))
-    y = map.mean + about
-    return map.first.back(y), log + map.first.log_slope(y)
+    return map.mean + about, log
 
 
 @jax.jit
@@ -307,32 +359,44 @@ def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray, kind: np.ndarr
         group: of each coordinate, -1 where groups share it.
         kind: of each coordinate; of a group's, those of a higher kind follow those of lower ones.
     """
-    stairs = _stairs(covariance, group, kind, covariance)
-    return Transport(Warp.none(len(mean)), mean, stairs, Warp.none(len(mean)))
+    values = Values.none(len(mean))
+    stairs = _stairs(np.tile(covariance, (2, 2)), group, kind, values, covariance)
+    return Transport(mean, values, stairs, Warp.none(len(mean)))
+
+
+def _order(
+    group: np.ndarray, kind: np.ndarray, values: Values
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Coordinates of every stair, and those before it that they are given."""
+    plateau, found = values.plateau > 0, []
+    for g in range(-1, int(group.max()) + 1):
+        before = np.flatnonzero(group < 0) if g >= 0 else np.zeros(0, int)
+        for k in np.unique(kind):
+            for first in (True, False):
+                own = np.flatnonzero((group == g) & (kind == k) & (plateau == first))
+                if len(own):
+                    found.append((own, before))
+                    before = np.concatenate([before, own])
+    return found
 
 
 def _stairs(
-    covariance: Matrix, group: np.ndarray, kind: np.ndarray, at_mode: Matrix
+    covariance: Matrix, group: np.ndarray, kind: np.ndarray, values: Values, at_mode: Matrix
 ) -> tuple[Stair, ...]:
     """Of a Gaussian; the coordinates that are widest at the mode come first in a stair.
 
     A valley has its direction at the mode, where draws are as wide across as they are bent.
+
+    Args:
+        covariance: of all coordinates, and of what they say after them.
     """
-    shared, stairs = np.flatnonzero(group < 0), []
-
-    def stair(own: np.ndarray, given: np.ndarray) -> None:
-        if len(own):
-            own = own[np.argsort(-np.diag(_given(at_mode, own, given)[1]))]
-            slope, left = _given(covariance, own, given)
-            bend = Bend.none(len(own)) if group[own[0]] >= 0 else None
-            stairs.append(Stair(own, given, slope, np.linalg.cholesky(left), bend))
-
-    for k in np.unique(kind):
-        stair(shared[kind[shared] == k], shared[kind[shared] < k])
-    for g in range(group.max() + 1):
-        for k in np.unique(kind):
-            before = np.flatnonzero((group == g) & (kind < k))
-            stair(np.flatnonzero((group == g) & (kind == k)), np.concatenate([shared, before]))
+    stairs = []
+    for own, given in _order(group, kind, values):
+        own = own[np.argsort(-np.diag(_given(at_mode, own, given)[1]))]
+        slope, left = _given(covariance, own, given + len(group))
+        told = given[(values.plateau[given] > 0) & (group[given] >= 0)]
+        bend = Bend.none(len(own), len(told)) if group[own[0]] >= 0 else None
+        stairs.append(Stair(own, given, slope, np.linalg.cholesky(left), bend, told))
     return tuple(stairs)
 
 
@@ -349,32 +413,23 @@ def learnt(
     """Map learnt from draws.
 
     Args:
-        draws: (draw, size), its halves from chains that do not know of each other.
+        draws: (draw, size).
         effective: number of independent ones that they are worth, about.
         covariance: Laplace; counts as many draws as there are coordinates.
     """
     some = draws[:: max(1, len(draws) // MOST_DRAWS)]
-    halves = some[: len(some) // 2], some[len(some) // 2 :]
-
-    def made(rows: Matrix, effective: float, warp_first: bool) -> Transport:
-        size = rows.shape[1]
-        first = Warp.learnt(rows) if warp_first else Warp.none(size)
-        y = first.forward(rows)
-        middle = y.mean(axis=0)
-        step = np.exp(first.log_slope(first.forward(rows.mean(axis=0, keepdims=True))))[0]
-        at_mode = covariance / np.outer(step, step)
-        both = effective * np.cov(y.T).reshape(size, size) + size * at_mode
-        stairs = tuple(
-            replace(s, bend=Bend.learnt(s.left(y - middle), effective)) if s.bend else s
-            for s in _stairs(both / (effective + size), group, kind, at_mode)
-        )
-        found = Transport(first, middle, stairs, Warp.none(size))
-        return replace(found, last=Warp.learnt(found.forward(rows)))
-
-    def worth(warp_first: bool) -> float:
-        pairs = halves, halves[::-1]
-        return float(
-            sum(made(a, effective / 2, warp_first).log_density(b).mean() for a, b in pairs)
-        )
-
-    return made(some, effective, worth(True) > worth(False))
+    size, mean = some.shape[1], some.mean(axis=0)
+    about = some - mean
+    values = Values.learnt(about)
+    said = values.said(about)
+    steps = np.concatenate([np.ones(size), values.slope()])
+    at_mode = np.tile(covariance, (2, 2)) * np.outer(steps, steps)
+    both = effective * np.cov(np.concatenate([about, said], axis=1).T) + size * at_mode
+    stairs = tuple(
+        replace(s, bend=Bend.learnt(s.left(about, said), said[:, s.told], effective))
+        if s.bend
+        else s
+        for s in _stairs(both / (effective + size), group, kind, values, covariance)
+    )
+    found = Transport(mean, values, stairs, Warp.none(size))
+    return replace(found, last=Warp.learnt(found.forward(some)))
