@@ -111,7 +111,7 @@ def _ended(blocks: list[Block], plan: Plan) -> bool:
     if len(blocks) >= plan.most:
         return True
     # looked at every fourth block at first, then less often: looking costs, too
-    if after < 4 or after % max(4, 2 ** int(np.log2(after) - 2)):
+    if after < 4 or after % max(4, 2 ** int(np.log2(after) - 3)):
         return False
     return diagnose(chain(blocks, plan), plan).converged
 
