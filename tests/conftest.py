@@ -9,6 +9,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+LONG = ("test_cli", "test_calibration", "test_notebooks", "test_compare")
+"""Files that take longest."""
+PLAIN = ("test_cli", "test_compare", "test_density", "test_fit", "test_likelihood", "test_result")
+"""Files that compile more than they compute: plainer code is compiled in half the time."""
 
 # Set in the environment, so that commands and notebooks started by a test share them. The cache is
 # what keeps the second run of the suite short: most of the first is compilation.
@@ -39,6 +43,16 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real logs: {folder} is no folder (set SLIPID_DATA)")
     return folder
+
+
+def pytest_collection_modifyitems(items):
+    """Files that take longest come first, so that two workers end together."""
+    items.sort(key=lambda item: item.path.stem not in LONG)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _plain_where_it_pays(request):
+    jax.config.update("jax_disable_most_optimizations", request.path.stem in PLAIN)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -345,6 +345,20 @@ def test_a_map_is_undone_and_has_the_slopes_that_it_says(bent):
     np.testing.assert_allclose(map.pull(u, np.negative), numeric, atol=1e-7)
 
 
+def test_a_map_is_kept_whole(bent, tmp_path):
+    map, _ = bent
+    chain, log_prob = np.zeros((1, 2, 3, 9)), np.zeros((1, 2, 3))
+    random = np.zeros((1, 624), np.uint32), np.zeros((1, 3))
+    block = sampler.Block(7, chain, log_prob, random, np.zeros(1), map, 0.3)
+    np.savez(tmp_path / "block.npz", **packed(block))
+    with np.load(tmp_path / "block.npz", allow_pickle=False) as kept:
+        again = unpacked(dict(kept))
+    assert any(len(stair.plateaus) for stair in again.map.stairs)
+    u = np.random.default_rng(4).normal(size=(6, 9))
+    for one, other in zip(map.placed(u), again.map.placed(u), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_a_warp_is_undone_and_its_slope_is_a_derivative():
     rng = np.random.default_rng(0)
     draws = np.stack([rng.gamma(2.0, size=3000), -np.log(rng.gamma(1.0, size=3000))], axis=1)

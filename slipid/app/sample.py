@@ -26,7 +26,7 @@ from slipid.identify.identifiability import (
 )
 from slipid.identify.posterior import Posterior
 from slipid.identify.result import Fit, as_identified
-from slipid.identify.sampler import Block, Plan, packed, unpacked
+from slipid.identify.sampler import FORMAT, Block, Plan, packed, unpacked
 
 FOLDER = "sampling"
 
@@ -62,7 +62,7 @@ class Blocks:
                 if str(kept["key"]) != self.key:
                     return None
                 return unpacked({k: kept[k] for k in kept.files})
-        except (OSError, EOFError, KeyError, ValueError, BadZipFile):
+        except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile):
             return None
 
     def remove(self) -> None:
@@ -75,8 +75,13 @@ class Blocks:
 
 def key(fit: Fit, plan: Plan, draws: int) -> str:
     """Hash of everything a chain depends on."""
-    same = [fit.data_hash, *map(str, files.versions().items()), str(replace(plan, most=0))]
-    same += [str(draws), fit.z.tobytes().hex(), np.asarray(fit.laplace).tobytes().hex()]
+    same = [f"blocks {FORMAT}", fit.data_hash, str(replace(plan, most=0))]
+    same += [
+        *map(str, files.versions().items()),
+        str(draws),
+        fit.z.tobytes().hex(),
+        np.asarray(fit.laplace).tobytes().hex(),
+    ]
     same += [f"{k} {v!r}" for k, v in fit.variance.items()]
     return hashlib.sha256("\n".join(same).encode()).hexdigest()
 

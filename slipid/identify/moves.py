@@ -214,22 +214,20 @@ class Along(FamilyMove):
 
     Where data say no more than that a number is small, its logarithm may be anything: a plateau
     that no map of the whole has straight, but along which this walks. The others of u are held, so
-    that those of x follow as the map says, or now and then the others of x.
+    that those of x follow as the map says, or else the others of x.
     """
 
     def __init__(self, target: Target, groups: tuple[int, ...] | None):
-        assert target.map
+        assert target.map, "a target that is seen by a map"
         everything = np.arange(len(target.group))
         of_group = [np.flatnonzero(target.group == g) for g in groups or ()]
         super().__init__(Family(tuple(of_group or [everything]), groups))
         self.map = target.map
         self.mine = tuple(of_group or [np.flatnonzero(target.group < 0)])
         self.std = np.sqrt(np.diag(target.covariance))
-        flat = self.map.values.plateau
         # every other walk is along a plateau, where there are any
-        self.often = [
-            np.where(flat[m] > 0, 1 / max(flat[m].sum(), 1), 1 / len(m)) for m in self.mine
-        ]
+        flat = [self.map.values.plateau[mine] > 0 for mine in self.mine]
+        self.often = [np.where(f, 1 / max(f.sum(), 1), 1 / max((~f).sum(), 1)) for f in flat]
 
     def proposed(self, u: Matrix, still: Matrix, random: Any) -> tuple[Matrix, Matrix]:
         rows = np.arange(len(u))
@@ -288,9 +286,10 @@ def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
 
 def moves(target: Target, angle: float) -> list[tuple[Move, float]]:
     """Moves in the target's coordinates, and how often each is made."""
-    of_family, groups = families(target), tuple(range(target.count))
+    of_family = families(target)
+    groups = tuple(int(g) for g in np.unique(target.group) if g >= 0)
     along = ALONG_APART if target.apart else ALONG
-    found: list[tuple[Move, float]] = [(Along(target, groups), along)]
+    found: list[tuple[Move, float]] = [(Along(target, groups), along)] if groups else []
     if (target.group < 0).any():
         found.append((Along(target, None), along))
     kinds: list[tuple[type[FamilyMove], float]] = [(Independence, INDEPENDENT)]

@@ -21,6 +21,8 @@ from jaxtyping import Float
 from slipid.identify.moves import WAY, Hamiltonian, Target, moves
 from slipid.identify.transport import Bend, Stair, Transport, Values, Warp, learnt
 
+FORMAT = 2
+"""Of blocks; to be raised with what they hold and with how they are made."""
 Chain = Float[np.ndarray, "ensemble step walker size"]
 ACCEPTED = 0.8
 """Part of Hamiltonian moves that shall be accepted; their step is adapted in the warm-up."""
@@ -343,8 +345,8 @@ def unpacked(arrays: dict[str, np.ndarray]) -> Block:
     while f"{len(stairs)}/own" in arrays:
         k = len(stairs)
         bend = {n: arrays[f"{k}/bend/{n}"] for n in _OF_BEND if f"{k}/bend/{n}" in arrays}
-        values = {n: arrays[f"{k}/{n}"] for n in _OF_STAIR}
-        stairs.append(Stair(**values, bend=Bend(**bend) if bend else None))
+        fields = {n: arrays[f"{k}/{n}"] for n in _OF_STAIR}
+        stairs.append(Stair(**fields, bend=Bend(**bend) if bend else None))
     return Block(
         number=int(arrays["number"]),
         chain=arrays["chain"],
@@ -358,5 +360,5 @@ def unpacked(arrays: dict[str, np.ndarray]) -> Block:
     )
 
 
-_OF_STAIR = ("own", "given", "slope", "root", "told")
+_OF_STAIR = ("own", "given", "slope", "root", "plateaus")
 _OF_BEND = ("factors", "shift", "scale")

@@ -4,18 +4,19 @@ A triangular map (Knothe-Rosenblatt) from coordinates x to u:
 
     shared ones       v = L^-1 (x - m - B s)
     those of a group  w = L^-1 (x - m - B s), widest first
-                      v_i = (w_i - a_i(w_1 .. w_i-1, s)) exp(-b_i(w_1 .. w_i-1, s))
+                      v_i = (w_i - a_i(w_1 .. w_i-1, t)) exp(-b_i(w_1 .. w_i-1, t))
 
-with polynomials a and b, and a sinh-arcsinh map (Jones and Pewsey 2009, Biometrika 96, eq. 2) of
-every coordinate from v to u,
+with polynomials a and b, s what coordinates before them say, t the part of it that plateaus of the
+group say, and a sinh-arcsinh map (Jones and Pewsey 2009, Biometrika 96, eq. 2) of every coordinate
+from v to u,
 
     sinh(tail arcsinh((v - place) / scale) - skew)
 
-What a coordinate says to those that follow it, s, is x - m; or, where x is the logarithm of a
-number of which data say no more than that it is small, the number itself: x may then be anything
-far below, and others stay where they are. Groups follow the shared coordinates and are bent by
-themselves, so that groups that are independent given the shared ones stay so. It is one of the maps
-of Marzouk et al. 2016 (Sampling via measure transport, section 3).
+A coordinate says x - m; or, on a plateau, where x is the logarithm of a number of which data say no
+more than that it is small, that number: x may then be anything far below, and those that follow
+stay where they are (other plateaus of its stair follow the logarithm). Groups follow the shared
+coordinates and are bent by themselves, so that groups that are independent given the shared ones
+stay so. It is one of the maps of Marzouk et al. 2016 (Sampling via measure transport, section 3).
 """
 
 from collections.abc import Callable
@@ -43,7 +44,7 @@ MOST_DRAWS = 4000
 WORTH = 3.0
 """Nats that a monomial must be worth."""
 SKEW = -0.8
-"""Where draws of a logarithm are more skewed than this, others follow its number."""
+"""Coordinates with draws more skewed than this are taken for plateaus. A wrong guess costs pace."""
 MOST_VALUE = 3.0
 """Numbers stay what they are beyond exp of this, in units of their median."""
 MOST_MONOMIALS = 12
@@ -90,9 +91,9 @@ class Bend:
         return self.monomials(w, told) @ self.scale.T
 
     @staticmethod
-    def none(size: int, told: int) -> "Bend":
+    def none(size: int, plateaus: int) -> "Bend":
         """Of nothing, with all monomials there can be."""
-        one, values = size + told, range(size, size + told)
+        one, values = size + plateaus, range(size, size + plateaus)
         factors = [(one, one, one)] + [(k, one, one) for k in range(one)]
         squared = [*values, *range(min(SQUARED, size - 1))]
         cubed = [*values, *range(min(CUBED, size - 1))]
@@ -218,7 +219,7 @@ class Stair:
         slope: of own ones by what given ones say (given, own).
         root: Cholesky factor of the covariance of what is left.
         bend: of it; None for shared coordinates.
-        told: places of plateaus of its group among the given, whose numbers bend it.
+        plateaus: places of those of its group among the given, whose numbers bend it.
     """
 
     own: Leaf
@@ -226,7 +227,7 @@ class Stair:
     slope: Leaf
     root: Leaf
     bend: Bend | None
-    told: Leaf
+    plateaus: Leaf
 
     def left(self, about: Matrix, said: Matrix) -> Matrix:
         """What others do not say of own coordinates, by the root; from all less their means."""
@@ -240,7 +241,8 @@ class Values:
     """What coordinates say to those that follow: themselves, or numbers they are logarithms of.
 
     Attributes:
-        plateau: 1 where it is the number, which may go far down; others of the stair follow it.
+        plateau: 1 where it is the number; these have a stair of their own, which the others of
+            their kind and group follow.
         middle: median of each, less its mean.
         mean, std: of the number, in units of its median.
     """
@@ -293,20 +295,12 @@ class Transport:
 
     def forward(self, x: Matrix) -> Matrix:
         """From x to u."""
-        return self._forward(x)[0]
-
-    def _forward(self, x: Matrix) -> tuple[Matrix, Matrix]:
-        """From x to u, and the part of log |dx/du| of every coordinate (row, size)."""
         about = x - self.mean
-        said = self.values.said(about)
-        v, log = np.empty_like(about), np.empty_like(about)
+        said, v = self.values.said(about), np.empty_like(about)
         for s in self.stairs:
-            w, told = s.left(about, said), said[:, s.told]
-            v[:, s.own] = s.bend.forward(w, told) if s.bend else w
-            bent = s.bend.log_slope(w, told) if s.bend else 0.0
-            log[:, s.own] = np.log(np.diag(s.root)) + bent
-        u = self.last.forward(v)
-        return u, log + self.last.log_slope(u)
+            w = s.left(about, said)
+            v[:, s.own] = s.bend.forward(w, said[:, s.plateaus]) if s.bend else w
+        return self.last.forward(v)
 
     def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
         """x, and the part of log |dx/du| of every coordinate (row, size)."""
@@ -323,11 +317,6 @@ class Transport:
         there: Transport = jax.device_put(self)
         return there
 
-    def log_density(self, x: Matrix) -> Vector:
-        """Of what is a standard Gaussian in u, up to a constant."""
-        u, log = self._forward(x)
-        return np.asarray((-0.5 * u**2 - log).sum(axis=1))
-
 
 @jax.jit
 def _placed(map: Transport, u: Array) -> tuple[Array, Array]:
@@ -336,7 +325,7 @@ def _placed(map: Transport, u: Array) -> tuple[Array, Array]:
     for s in map.stairs:
         w = v[:, s.own]
         if s.bend:
-            told = said[:, s.told]
+            told = said[:, s.plateaus]
             w = s.bend.back(w, told)
             log = log.at[:, s.own].add(s.bend.log_slope(w, told))
         about = about.at[:, s.own].set(said[:, s.given] @ s.slope + w @ s.root.T)
@@ -394,9 +383,9 @@ def _stairs(
     for own, given in _order(group, kind, values):
         own = own[np.argsort(-np.diag(_given(at_mode, own, given)[1]))]
         slope, left = _given(covariance, own, given + len(group))
-        told = given[(values.plateau[given] > 0) & (group[given] >= 0)]
-        bend = Bend.none(len(own), len(told)) if group[own[0]] >= 0 else None
-        stairs.append(Stair(own, given, slope, np.linalg.cholesky(left), bend, told))
+        plateaus = given[(values.plateau[given] > 0) & (group[given] >= 0)]
+        bend = Bend.none(len(own), len(plateaus)) if group[own[0]] >= 0 else None
+        stairs.append(Stair(own, given, slope, np.linalg.cholesky(left), bend, plateaus))
     return tuple(stairs)
 
 
@@ -426,7 +415,7 @@ def learnt(
     at_mode = np.tile(covariance, (2, 2)) * np.outer(steps, steps)
     both = effective * np.cov(np.concatenate([about, said], axis=1).T) + size * at_mode
     stairs = tuple(
-        replace(s, bend=Bend.learnt(s.left(about, said), said[:, s.told], effective))
+        replace(s, bend=Bend.learnt(s.left(about, said), said[:, s.plateaus], effective))
         if s.bend
         else s
         for s in _stairs(both / (effective + size), group, kind, values, covariance)
