@@ -11,8 +11,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LONG = ("test_cli", "test_calibration", "test_notebooks", "test_compare")
 """Files that take longest."""
-PLAIN = ("test_cli", "test_compare", "test_density", "test_fit", "test_likelihood", "test_result")
-"""Files that compile more than they compute: plainer code is compiled in half the time."""
+PLAIN = ("test_compare", "test_density", "test_fit", "test_likelihood", "test_result")
+"""Files that compile more than they compute, in one process: plainer code is compiled sooner."""
 
 # Set in the environment, so that commands and notebooks started by a test share them. The cache is
 # what keeps the second run of the suite short: most of the first is compilation.
