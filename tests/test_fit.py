@@ -98,6 +98,23 @@ def test_a_fit_ends_where_the_loss_is_level(truth, path):
     assert abs(rise[0] - rise[1]) < 0.1  # a slope would show here twice
 
 
+@pytest.mark.slow
+def test_a_voltage_without_noise_of_its_own_leaves_the_motor_alone(truth):
+    """The ammeter claims a variance that explains every gap of the voltage."""
+    w = made(truth, runs=48, std={**NOISE, "voltage.window": 0.002})
+    w = replace(w, current_var=np.full_like(w.current_var, 2e-5))
+    numbers = ("resistance", "back_emf")
+    choices = [NOTHING, *(Choice(f"motor.{name}", free=True) for name in numbers)]
+    problem = Problem(w, truth, choices)
+    best = optimise(problem, start=begin(problem), options=Options(most_rounds=40))
+    assert best.converged
+    found = problem.space.tree(best.state.z).motor
+    for name in numbers:
+        assert float(getattr(found, name)) == pytest.approx(
+            float(getattr(truth.motor, name)), rel=0.01
+        )
+
+
 # exact cases
 
 

@@ -19,6 +19,7 @@ from slipid.parameter import Choice
 from tests.made_windows import made, robot
 
 EVERYTHING = [Choice("*", free=True)]
+NOTHING = Choice("*", free=False)
 NOISE = {
     "camera.place": 0.0005,
     "camera.heading": 0.003,
@@ -435,3 +436,29 @@ def fitted(problem, jacobian, y, std):
     info = np.einsum("nip,nij,njq->pq", jacobian, v, jacobian)
     info += np.diag(1 / problem.space.prior_std**2)
     return jacobian @ np.linalg.solve(info, np.einsum("nip,nij,nj->p", jacobian, v, y))
+
+
+# voltage noise: the ammeter's noise lies in the same residuals
+
+
+def test_the_score_of_the_voltage_noise_is_the_slope_of_the_loss(truth):
+    w = made(truth, runs=48, std={**NOISE, "voltage.window": 0.05})
+    w = replace(w, current_var=np.random.default_rng(0).uniform(0, 2e-4, w.current_var.shape))
+    problem = Problem(w, truth, [NOTHING, Choice("motor.resistance", free=True)])
+    z, keep = problem.space.start, np.ones(len(w))
+    typical = jnp.asarray(2 * np.log(problem.noise.typical))
+    log_v = np.array(typical)
+
+    def loss(last):
+        at = np.array([*log_v[:-1], last])
+        blocks, _ = problem.linear(z, problem.volt(at))
+        return problem.loss(z, jnp.asarray(at), keep, blocks)
+
+    slope = (loss(log_v[-1] + 1e-4) - loss(log_v[-1] - 1e-4)) / 2e-4
+    blocks, jacobian = problem.linear(z, problem.volt(log_v))
+    known = {k: jnp.zeros_like(j) for k, j in jacobian.items()}  # no degree of freedom is spent
+    step = problem.scored(blocks, known, log_v, keep, typical, problem.own(z, log_v)) - log_v
+    assert abs(step[-1]) < 1.5  # else it was cut short
+    # it divides by the expected information, or by more where others explain the residuals
+    score = np.asarray(problem.variance_precision(log_v, keep, z) @ step)[-1]
+    assert score == pytest.approx(-slope, rel=1e-3)

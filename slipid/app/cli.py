@@ -334,6 +334,39 @@ def new(
 
 @app.command()
 @guarded
+def simulate(
+    config: ConfigFile,
+    out: Out,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", min=1, help="Processes at once; by default all cores.")
+    ] = None,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Logs from the virtual test site, whose physics is MuJoCo's; needs slipid[testsite].
+
+    Writes logs, a config that identifies them, floor maps, and the truth in a folder of its own.
+    Runs that are done are kept and not driven again.
+    """
+    import os
+
+    from slipid.app import tables
+    from slipid.app.progress import Reporter
+    from slipid.app.simulate import simulate as run
+    from slipid.app.simulate_config import read_plan
+
+    plan = read_plan(config)
+    with Reporter(quiet=quiet) as report:
+        found = run(plan, out, jobs or os.cpu_count() or 1, report)
+    if json is not None:
+        _emit(json, found)
+    if json != "-":
+        tables.simulated(found, plan, out)
+    return 0
+
+
+@app.command()
+@guarded
 def demo(
     out: Out = Path("demo_out"),
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the noise in the logs.")] = 0,

@@ -4,16 +4,13 @@ Units stand in the names of the keys; everything is optional that has a default 
 """
 
 import hashlib
-import tomllib
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from slipid.data.log import DataError
+from slipid.app.toml_file import content, text_of
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -188,13 +185,7 @@ def read_config(path: Path) -> Config:
     Raises:
         DataError: unreadable, no TOML, unknown or missing keys, wrong values; every one on a line.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; expected a config (TOML file)") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: no UTF-8 text; expected a config (TOML file)") from error
-    return parsed(path, text)
+    return parsed(path, text_of(path))
 
 
 def parsed(path: Path, text: str) -> Config:
@@ -203,102 +194,7 @@ def parsed(path: Path, text: str) -> Config:
     Raises:
         DataError: no TOML, unknown or missing keys, wrong values; every one on a line.
     """
-    try:
-        mapping = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise DataError(f"{path}: no valid TOML: {error}") from error
-    try:
-        content = Content.model_validate(mapping)
-    except ValidationError as error:
-        lines = dict.fromkeys(_line(path, mapping, e) for e in error.errors())
-        raise DataError("\n".join(lines)) from None
-    return Config(path, text, content)
-
-
-def _line(path: Path, mapping: dict[str, Any], error: Any) -> str:
-    """One mistake as one line: file, key, what was found, what was expected."""
-    kind, given = error["type"], error["input"]
-    steps = _steps(mapping, error["loc"])
-    where = f"{path}: {_spelled(steps)}"
-    context = error.get("ctx", {})
-    if kind == "extra_forbidden":
-        known = _keys(_model_at(mapping, steps[:-1]))
-        near = get_close_matches(str(steps[-1]), known, n=2)
-        hint = f", did you mean {' or '.join(near)}?" if near else ""
-        return f"{where}: no such key{hint}; expected one of {', '.join(known)}"
-    if kind == "missing":
-        return f"{where}: missing; expected a value for it"
-    if kind == "union_tag_not_found":
-        return f"{where}.drive: missing; expected one of omni, mecanum, skid, general"
-    if kind == "union_tag_invalid":
-        near = get_close_matches(str(context["tag"]), ("omni", "mecanum", "skid", "general"), n=1)
-        hint = f", did you mean {near[0]}?" if near else ""
-        return (
-            f"{where}.drive: '{context['tag']}'{hint}; expected one of omni, mecanum, skid, general"
-        )
-    if kind == "value_error":
-        return f"{where}: {context['error']}"
-    if kind == "literal_error":
-        return f"{where}: {given!r}; expected one of {context['expected']}"
-    return f"{where}: {given!r}; expected: {error['msg'][0].lower()}{error['msg'][1:]}"
-
-
-def _steps(mapping: Any, loc: tuple[Any, ...]) -> list[Any]:
-    """The part of pydantic's location that is in the file: without names of union members."""
-    steps: list[Any] = []
-    here = mapping
-    for k, part in enumerate(loc):
-        if (isinstance(here, dict) and part in here) or (
-            isinstance(here, list) and isinstance(part, int) and part < len(here)
-        ):
-            here = here[part]
-        elif k < len(loc) - 1 or not isinstance(here, dict):
-            continue
-        steps.append(part)
-    return steps
-
-
-def _spelled(steps: list[Any]) -> str:
-    out = ""
-    for step in steps:
-        if isinstance(step, int):
-            out += f"[{step + 1}]"
-        else:
-            name = (
-                f'"{step}"' if not str(step).replace("_", "").replace("-", "").isalnum() else step
-            )
-            out += f".{name}" if out else str(name)
-    return out or "the file"
-
-
-def _model_at(mapping: Any, steps: list[Any]) -> type[BaseModel]:
-    """The model that describes a place of the file."""
-    model: type[BaseModel] = Content
-    here = mapping
-    for step in steps:
-        here = here[step]
-        if isinstance(step, int):
-            continue
-        field = next((f for n, f in model.model_fields.items() if (f.alias or n) == step), None)
-        found = _models(field.annotation) if field is not None else []
-        if len(found) > 1:
-            found = [
-                m for m in found if get_args(m.model_fields["drive"].annotation)[0] == here["drive"]
-            ]
-        model = found[0] if found else Setting
-    return model
-
-
-def _models(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    if get_origin(annotation) in (Union, UnionType, list, dict, Annotated):
-        return [m for a in get_args(annotation) for m in _models(a)]
-    return []
-
-
-def _keys(model: type[BaseModel]) -> list[str]:
-    return [f.alias or name for name, f in model.model_fields.items()]
+    return Config(path, text, content(path, text, Content))
 
 
 def geometry(robot: Omni | Mecanum | Skid | General) -> Any:

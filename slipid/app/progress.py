@@ -81,6 +81,14 @@ class Reporter:
         else:
             self._bars.update(self._task, completed=done, total=total, what=self._part)
 
+    def step(self, done: int, total: int, what: str) -> None:
+        """So many of so many are done; elsewhere than on a terminal a line now and then."""
+        if self._bars is not None and self._task is not None:
+            text = f"{done} of {total}, {what}"
+            self._bars.update(self._task, completed=done, total=total, what=text)
+        elif done == total or done % max(1, total // 10) == 0:
+            self.line(f"  {done} of {total}, {what}")
+
     def point(self, done: int, rise: float) -> None:
         """A point of a profile is fitted."""
         if self._bars is not None and self._task is not None:

@@ -321,6 +321,26 @@ def _saving(s: dict[str, Any]) -> str:
     )
 
 
+def simulated(found: dict[str, Any], plan: Any, out: Path) -> None:
+    """How much was driven, and what to do with it."""
+    console = _console()
+    console.print(f"{len(found['runs'])} runs, {found['driven']} of them driven now")
+    if found["pace"] is not None:
+        console.print(f"{found['seconds']:.0f} s at {found['pace']:.1f} times real time")
+    console.print(f"truth, which nothing reads that fits: {out / 'truth'}", soft_wrap=True)
+    if "slipid" in plan.content.formats:
+        line = (
+            f"  slipid identify {out / 'robot.toml'} --data {out / 'logs'} --out {out / 'result'}"
+        )
+        console.print(line, markup=False, soft_wrap=True)
+    if "robotino2022" in plan.content.formats:
+        data = out / "robotino2022"
+        line = (
+            f"  slipid identify configs/robotino2022.toml --data {data} --out {out / 'result2022'}"
+        )
+        console.print(line, markup=False, soft_wrap=True)
+
+
 def demo(
     out: Path, done: Any, found: dict[str, Any], rows: Sequence[Any], real: Path | None
 ) -> None:

@@ -126,16 +126,16 @@ class Density:
         problem, at = self.problem, self.coordinates
         n, v = len(at.structure), len(at.variance)
         out = np.zeros((self.size, self.size))
-        log_v = jnp.asarray(fitted.log_variance)
+        z, log_v = jnp.asarray(fitted.z), jnp.asarray(fitted.log_variance)
         keep = np.ones(len(problem.windows))
-        of_variance = np.linalg.inv(np.asarray(problem.variance_precision(log_v, keep)))
+        of_variance = np.linalg.inv(np.asarray(problem.variance_precision(log_v, keep, z)))
         out[n : n + v, n : n + v] = of_variance[np.ix_(at.variance, at.variance)]
         own = np.asarray(fitted.covariance)[np.ix_(at.structure, at.structure)]
         mean = np.concatenate([np.arange(n), np.arange(n + v, self.size)])
         precision = np.zeros((len(mean), len(mean)))
         precision[:n, :n] = np.linalg.inv(own)
         if at.sessions:
-            _, jacobian = problem.linear(jnp.asarray(fitted.z), problem.volt(log_v))
+            _, jacobian = problem.linear(z, problem.volt(log_v))
             shares = np.asarray(self.anchor.shares)
             member = np.eye(len(at.sessions))[np.asarray(self.anchor.session)]
             moved = -shares[:, :, None, :] * member[:, None, :, None]
@@ -268,7 +268,7 @@ class Density:
 
     def _residuals(self, anchor: Anchor, z: Array, log_v: Array, effects: Array, held: Any) -> Any:
         b, at = anchor.batch, self.coordinates
-        volt = jnp.exp(0.5 * log_v[-1]) if b.has_current and b.has_voltage else jnp.asarray(1.0)
+        volt = lk.voltage_std(log_v[-1]) if b.has_current and b.has_voltage else jnp.asarray(1.0)
         if self.part == ELECTRIC:
             motion, felt = held
             robot = self.problem.space.tree(motion.at[at.structure].set(z[at.structure]))

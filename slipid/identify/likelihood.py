@@ -336,6 +336,21 @@ FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
 """Variance added to every residual: rounding of the logs [m^2, A^2, V^2]."""
 
 
+def voltage_std(log_variance: Any) -> Array:
+    """Std of the voltage noise, rounding included, from the log of its variance [V].
+
+    The voltage residual is in units of it: without the floor it would vanish with the noise.
+    """
+    return jnp.sqrt(jnp.exp(log_variance) + FLOOR["voltage"])
+
+
+def voltage_share(
+    robot: Robot, b: Batch, voltage_std: Float[Array, ""] | float
+) -> Float[Array, "piece m"]:
+    """Part that the voltage's own noise has in the variance of every voltage residual."""
+    return (1 / _spread(robot, b, voltage_std) ** 2).reshape(b.dt.shape[0], -1)
+
+
 def covariance(c: Components, variance: Any, block: str) -> Any:
     """V of every piece from the variances (variance,) ."""
     v = jnp.asarray(variance)[jnp.asarray(c.which)]

@@ -273,18 +273,39 @@ class Problem:
         return jnp.where(motion, of_motion + carried, total)
 
     def scored(
-        self, blocks: dict, jacobian: dict, log_v: Vector, keep: Vector, typical: Array
+        self,
+        blocks: dict,
+        jacobian: dict,
+        log_v: Vector,
+        keep: Vector,
+        typical: Array,
+        own: dict[str, Array] | None = None,
     ) -> Array:
-        """One Fisher-scoring step of the restricted likelihood in the log variances."""
-        return self._form._scored(self.data, blocks, jacobian, log_v, keep, typical)
+        """One Fisher-scoring step of the restricted likelihood in the log variances.
+
+        Args:
+            blocks, jacobian: of `linear`.
+            log_v: where to start.
+            keep: weight of each piece.
+            typical: centre of the prior of the log variances.
+            own: of `own`; by default the residuals' variance is all the components'.
+        """
+        return self._form._scored(self.data, blocks, jacobian, log_v, keep, typical, own or {})
 
     @partial(jax.jit, static_argnums=0)
     def _scored(
-        self, data: Data, blocks: dict, jacobian: dict, log_v: Vector, keep: Vector, typical: Array
+        self,
+        data: Data,
+        blocks: dict,
+        jacobian: dict,
+        log_v: Vector,
+        keep: Vector,
+        typical: Array,
+        own: dict,
     ) -> Array:
         cov = jnp.linalg.inv(self._precision(data, jacobian, log_v, keep))
         spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in jacobian.items()}
-        return self._scored_given(data, blocks, spread, log_v, keep, typical)
+        return self._scored_given(data, blocks, spread, log_v, keep, typical, own)
 
     def scored_given(
         self, blocks: dict, spread: dict, log_v: Vector, keep: Vector, typical: Array
@@ -296,38 +317,51 @@ class Problem:
             spread: their covariance from the model's fitted numbers (piece, m, m); the degrees of
                 freedom it stands for are not the variances' to have.
         """
-        return self._form._scored_given(self.data, blocks, spread, log_v, keep, typical)
+        return self._form._scored_given(self.data, blocks, spread, log_v, keep, typical, {})
 
     @partial(jax.jit, static_argnums=0)
     def _scored_given(
-        self, data: Data, blocks: dict, spread: dict, log_v: Vector, keep: Vector, typical: Array
+        self,
+        data: Data,
+        blocks: dict,
+        spread: dict,
+        log_v: Vector,
+        keep: Vector,
+        typical: Array,
+        own: dict,
     ) -> Array:
         _, weights, _ = self._whitening(data, blocks, log_v, keep)
-        score = jnp.zeros(log_v.shape[0])
+        score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])
         for k, r in blocks.items():
             root = inverse_root(self._covariance(data, k, log_v))
             inverse = jnp.einsum("nji,njk->nik", root, root)
-            base, which = data.base[k], data.which[k]
+            base, which = _shared(data.base[k], own.get(k)), data.which[k]
             v = jnp.exp(log_v)[which]
             vr = jnp.einsum("nij,nj->ni", inverse, r)
             fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
             trace = jnp.einsum("nij,ncij->nc", inverse, base)
             spent = jnp.einsum("nij,njk,nkl->nil", inverse, spread[k], inverse)
             lost = jnp.einsum("nij,ncij->nc", spent, base)
-            score = score.at[which].add(0.5 * v * (fit + keep[:, None] * (lost - trace)))
+            slope = 0.5 * v * (fit + keep[:, None] * (lost - trace))
+            score = score.at[which].add(slope)
+            if k in own:  # where others explain the residual the loss bends more than expected
+                rest = jnp.clip(1 - 2 * jnp.mean(own[k], axis=1), 0.0)
+                steeper = steeper.at[which].add(-rest[:, None] * slope)
         score -= (log_v - typical) / VARIANCE_SPREAD**2
-        info = self._variance_precision(data, log_v, keep)
+        info = self._variance_precision(data, log_v, keep, own)
+        info += jnp.diag(jnp.maximum(steeper, 0.0))
         return jnp.asarray(log_v) + jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
 
-    def variance_precision(self, log_v: Vector, keep: Vector) -> Array:
-        """Expected information of the log variances, prior included (variance, variance)."""
-        return self._form._variance_precision(self.data, jnp.asarray(log_v), jnp.asarray(keep))
+    def variance_precision(self, log_v: Vector, keep: Vector, z: Vector) -> Array:
+        """Expected information of the log variances at z, prior included (variance, variance)."""
+        log_v, own = jnp.asarray(log_v), self.own(z, log_v)
+        return self._form._variance_precision(self.data, log_v, jnp.asarray(keep), own)
 
     @partial(jax.jit, static_argnums=0)
-    def _variance_precision(self, data: Data, log_v: Array, keep: Array) -> Array:
+    def _variance_precision(self, data: Data, log_v: Array, keep: Array, own: dict) -> Array:
         info = jnp.eye(log_v.shape[0]) / VARIANCE_SPREAD**2
         for k, base in data.base.items():
-            which = data.which[k]
+            base, which = _shared(base, own.get(k)), data.which[k]
             root = inverse_root(self._covariance(data, k, log_v))
             vb = jnp.einsum("nji,njk,nckl->ncil", root, root, base)
             v = jnp.exp(log_v)[which]
@@ -379,7 +413,20 @@ class Problem:
         """Std of the voltage noise [V], 1 where none is logged."""
         if "voltage" not in self.noise.blocks:
             return jnp.asarray(1.0)
-        return jnp.exp(0.5 * jnp.asarray(log_v)[-1])
+        return lk.voltage_std(jnp.asarray(log_v)[-1])
+
+    def own(self, z: Vector, log_v: Vector) -> dict[str, Array]:
+        """Part that the variance components have in the variance of residuals, where not all.
+
+        The ammeter's noise is known and lies in the voltage residual, too (`electric_residuals`).
+        """
+        if "voltage" not in self.noise.blocks:
+            return {}
+        return {"voltage": self._form._share(self.data, jnp.asarray(z), self.volt(log_v))}
+
+    @partial(jax.jit, static_argnums=0)
+    def _share(self, data: Data, z: Array, volt: Array) -> Array:
+        return lk.voltage_share(self.space.tree(z), data.batch, volt)
 
     def round(
         self, state: State, keep: Vector, mask: np.ndarray, steps: int, scoring: int
@@ -394,10 +441,14 @@ class Problem:
         z = self.levenberg(state.z, root, mask, volt, felt, slope, steps)
         typical = jnp.asarray(2 * np.log(self.noise.typical))
         blocks, jacobian = self.linear(jnp.asarray(z), volt)
+        own = self.own(z, log_v)
         for _ in range(scoring):
-            log_v = self.scored(blocks, jacobian, log_v, keep_j, typical)
-        if "voltage" in blocks and scoring:  # its residual is in units of the noise just found
-            blocks, _ = self.linear(jnp.asarray(z), self.volt(log_v))
+            log_v = self.scored(blocks, jacobian, log_v, keep_j, typical, own)
+            before, own = own, self.own(z, log_v)
+            for k, share in own.items():  # these residuals are in units of the noise just found
+                scale = jnp.sqrt(share / before[k])
+                blocks = blocks | {k: blocks[k] * scale}
+                jacobian = jacobian | {k: jacobian[k] * scale[..., None]}
         std = np.sqrt(np.diag(np.linalg.inv(np.asarray(self.precision(jacobian, log_v, keep_j)))))
         moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
         moved = max(moved, float(np.max(np.abs(np.asarray(log_v) - state.log_variance)) / 3))
@@ -409,3 +460,8 @@ class Problem:
             moved=moved,
             stage=state.stage,
         )
+
+
+def _shared(base: Array, own: Array | None) -> Array:
+    """How the covariance of residuals grows with each variance, of which only a part is in them."""
+    return base if own is None else base * own[:, None, :, None]

@@ -1,0 +1,234 @@
+"""The config of `slipid simulate`: robot, floors and runs of the virtual test site."""
+
+import hashlib
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from slipid.app.config import Positive, _Section
+from slipid.app.toml_file import checked, mapping_of, text_of
+from slipid.data import terrain
+from slipid.data.log import DataError
+from slipid.testsite import experiments as ex
+from slipid.testsite.drive import Motor, SpeedLoop
+from slipid.testsite.ground import GROUNDS, Ground
+from slipid.testsite.machine import Machine
+from slipid.testsite.sensors import Sensors
+
+Speeds = Annotated[list[Positive], Field(min_length=1)]
+
+
+class FileMap(_Section):
+    """A floor map's file, beside the config."""
+
+    kind: Literal["file"]
+    file: str
+
+
+class Patchwork(_Section):
+    """Random patches, by default smaller than the robot."""
+
+    kind: Literal["patchwork"]
+    surfaces: list[str] = Field(min_length=1)
+    seed: int = Field(0, ge=0)
+    patch_m: Positive = 0.25
+    half_m: Positive = 1.2
+
+
+class FourZones(_Section):
+    """Four surfaces around the middle of the rectangle, as in the 2021 paper's trial."""
+
+    kind: Literal["four_zones"]
+    surfaces: list[str] = Field(min_length=4, max_length=4)
+
+
+Map = Annotated[FileMap | Patchwork | FourZones, Field(discriminator="kind")]
+
+
+class Headings(_Section):
+    """Straight runs in evenly spread directions."""
+
+    kind: Literal["headings"]
+    surface: str
+    load: str = "as_built"
+    step_deg: Positive = 15.0
+    speeds_m_s: Speeds = Field(default=[0.1, 0.2])
+    distance_m: Positive = 0.7
+
+
+class Curves(_Section):
+    """Arcs, to the left and to the right in turn."""
+
+    kind: Literal["curves"]
+    surface: str
+    load: str = "as_built"
+    count: int = Field(4, ge=1)
+    speeds_m_s: Speeds = Field(default=[0.1, 0.2])
+    distance_m: Positive = 0.7
+
+
+class PaperGrid(_Section):
+    """The 2021 paper's grid of commands."""
+
+    kind: Literal["paper_grid"]
+    surface: str
+    load: str = "as_built"
+    seconds: Positive = 3.0
+
+
+class Wander(_Section):
+    """Random way-points on a map."""
+
+    kind: Literal["wander"]
+    map: str
+    load: str = "as_built"
+    count: int = Field(8, ge=1)
+    points: int = Field(4, ge=1)
+    by: Literal["camera", "encoders"] = "camera"
+
+
+class Rectangle(_Section):
+    """The 2021 paper's 900 x 400 mm rectangle on a map."""
+
+    kind: Literal["rectangle"]
+    map: str
+    load: str = "as_built"
+    by: Literal["camera", "encoders"] = "encoders"
+    repeats: int = Field(1, ge=1)
+    speed_m_s: Positive = 0.2
+
+
+Runs = Annotated[Headings | Curves | PaperGrid | Wander | Rectangle, Field(discriminator="kind")]
+
+
+class Content(_Section):
+    """The whole file."""
+
+    seed: int = Field(0, ge=0)
+    formats: list[Literal["slipid", "robotino2022"]] = Field(default=["slipid"], min_length=1)
+    heading_jitter_deg: float = Field(5.0, ge=0, le=180)
+    command_delay_s: float = Field(0.12, ge=0)
+    acceleration_m_s2: Positive = 1.0
+    robot: Machine = Field(default_factory=Machine)
+    motor: Motor = Motor()
+    speed_loop: SpeedLoop = SpeedLoop()
+    sensors: Sensors = Sensors()
+    surfaces: dict[str, Ground] = Field(default_factory=dict)
+    maps: dict[str, Map] = Field(default_factory=dict)
+    runs: list[Runs] = Field(min_length=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is to be simulated.
+
+    Attributes:
+        hash: of the config and of the map files it names.
+        content: the config.
+        site: robot and floors.
+        maps: floors with several surfaces, by name.
+        runs: name and run of each.
+    """
+
+    hash: str
+    content: Content
+    site: ex.Site
+    maps: dict[str, terrain.FloorMap]
+    runs: tuple[tuple[str, ex.Run], ...]
+
+
+def read_plan(path: Path) -> Plan:
+    """Plan of a config file.
+
+    Raises:
+        DataError: wrong in the file or in a map it names; every mistake on a line.
+    """
+    return plan(path, text_of(path))
+
+
+def plan(path: Path, text: str) -> Plan:
+    """Plan of a config; the path is for messages, and maps lie beside it.
+
+    Raises:
+        DataError: wrong in the text or in a map it names; every mistake on a line.
+    """
+    mapping = mapping_of(path, text)
+    surfaces = mapping.get("surfaces", {})
+    if isinstance(surfaces, dict):  # a surface that slipid knows is changed, not made anew
+        known = {
+            name: {**asdict(GROUNDS[name]), **given}
+            for name, given in surfaces.items()
+            if name in GROUNDS and isinstance(given, dict)
+        }
+        mapping = {**mapping, "surfaces": {**surfaces, **known}}
+    content = checked(path, mapping, Content)
+    site = ex.Site(
+        content.robot,
+        content.motor,
+        content.speed_loop,
+        content.sensors,
+        {**GROUNDS, **content.surfaces},
+        content.command_delay_s,
+        content.acceleration_m_s2,
+    )
+    maps = {name: _floor(path, m) for name, m in content.maps.items()}
+    for k, runs in enumerate(content.runs, 1):
+        _known(path, f"runs[{k}].load", runs.load, site.machine.centres_m)
+        if isinstance(runs, Wander | Rectangle):
+            _known(path, f"runs[{k}].map", runs.map, maps)
+        else:
+            _known(path, f"runs[{k}].surface", runs.surface, site.grounds)
+    for name, floor in maps.items():
+        for surface in floor.surfaces:
+            _known(path, f"maps.{name}", surface, site.grounds)
+    everything = [r for k, one in enumerate(content.runs) for r in _runs(one, maps, content, k)]
+    jitter = float(np.radians(content.heading_jitter_deg))
+    digest = hashlib.sha256(text.encode())
+    for floor in maps.values():
+        digest.update(floor.cells.tobytes())
+    return Plan(
+        digest.hexdigest(),
+        content,
+        site,
+        maps,
+        tuple(ex.numbered(everything, jitter, content.seed)),
+    )
+
+
+def _known(path: Path, where: str, name: str, choices: Any) -> None:
+    if name not in choices:
+        raise DataError(
+            f"{path}: {where}: '{name}'; expected one of {', '.join(choices) or 'none'}"
+        )
+
+
+def _floor(path: Path, given: Any) -> terrain.FloorMap:
+    if isinstance(given, FileMap):
+        return terrain.read_map(path.parent / given.file)
+    if isinstance(given, Patchwork):
+        return terrain.patchwork(given.surfaces, given.seed, given.patch_m, given.half_m)
+    return terrain.four_zones(given.surfaces)
+
+
+def _runs(
+    given: Any, maps: dict[str, terrain.FloorMap], content: Content, place: int
+) -> list[ex.Run]:
+    if isinstance(given, Headings):
+        return ex.headings(
+            given.surface, given.load, given.step_deg, given.speeds_m_s, given.distance_m
+        )
+    if isinstance(given, Curves):
+        return ex.curves(given.surface, given.load, given.count, given.speeds_m_s, given.distance_m)
+    if isinstance(given, PaperGrid):
+        return ex.paper_grid(given.surface, given.load, given.seconds)
+    floor = maps[given.map]
+    if isinstance(given, Wander):
+        seed = 1000 * content.seed + place
+        return ex.wander(floor, given.map, given.load, given.count, seed, given.points, given.by)
+    return [
+        ex.rectangle(floor, given.map, given.load, by=given.by, speed=given.speed_m_s)
+        for _ in range(given.repeats)
+    ]

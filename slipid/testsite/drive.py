@@ -1,0 +1,141 @@
+"""DC motors on one supply, and the speed loop that is built into the robot."""
+
+from dataclasses import dataclass
+from math import exp, floor, pi
+from typing import Literal
+
+from slipid.testsite.refuse import not_negative, positive
+
+
+@dataclass(frozen=True)
+class Motor:
+    """A brushed DC motor with its gear.
+
+    Attributes:
+        resistance_ohm, inductance_h: of the winding.
+        back_emf_vs: [V s/rad], which is its torque per current as well.
+        rotor_inertia_kg_m2: at the motor shaft.
+        coulomb_nm, viscous_nms: friction at the wheel [N m], [N m s].
+        efficiency: of the gear, while the motor drives.
+        supply_v, supply_ohm: of the battery that all motors share.
+        ticks_per_revolution: of the encoder on the motor shaft.
+    """
+
+    resistance_ohm: float = 5.5
+    inductance_h: float = 8.9e-3
+    back_emf_vs: float = 0.0514
+    rotor_inertia_kg_m2: float = 7.1e-6
+    coulomb_nm: float = 0.07
+    viscous_nms: float = 0.006
+    efficiency: float = 0.9
+    supply_v: float = 24.0
+    supply_ohm: float = 0.15
+    ticks_per_revolution: int = 2000
+
+    def __post_init__(self) -> None:
+        positive(self, "resistance_ohm", "inductance_h", "back_emf_vs", "rotor_inertia_kg_m2")
+        positive(self, "efficiency", "supply_v", "ticks_per_revolution")
+        not_negative(self, "coulomb_nm", "viscous_nms", "supply_ohm")
+        if self.efficiency > 1:
+            raise ValueError(f"efficiency = {self.efficiency}; expected at most 1")
+
+
+@dataclass(frozen=True)
+class SpeedLoop:
+    """The built-in controller of wheel speed, at the engine's time step.
+
+    Attributes:
+        kind: `pi`; `feed_forward` (proportional, and the back-EMF of the wanted speed); `cascade`
+            (PI to a current, and a current loop below it).
+        gain: of the error in motor speed [V s/rad]; in a cascade [A s/rad].
+        integral: per second of it [V/rad]; in a cascade [A/rad].
+        current_gain: of the cascade's inner loop [V/A].
+        current_limit_a: of the cascade.
+        filter_s: time constant of the measured speed.
+    """
+
+    kind: Literal["pi", "feed_forward", "cascade"] = "pi"
+    gain: float = 0.08
+    integral: float = 0.8
+    current_gain: float = 4.0
+    current_limit_a: float = 3.0
+    filter_s: float = 0.004
+
+    def __post_init__(self) -> None:
+        not_negative(self, "gain", "integral", "current_gain", "filter_s")
+        positive(self, "current_limit_a")
+
+
+class Drive:
+    """Currents and voltages of all wheels, a step at a time.
+
+    Args:
+        motor: the same for every wheel.
+        loop: likewise.
+        gear_ratio: turns of the motor per turn of the wheel.
+        wheels: how many.
+        dt: time step [s].
+    """
+
+    def __init__(self, motor: Motor, loop: SpeedLoop, gear_ratio: float, wheels: int, dt: float):
+        self.motor, self.loop, self.gear, self.dt = motor, loop, gear_ratio, dt
+        self._per_tick = 2 * pi / (motor.ticks_per_revolution * gear_ratio)
+        self._decay = exp(-dt * motor.resistance_ohm / motor.inductance_h)
+        self._blend = 1 - exp(-dt / loop.filter_s) if loop.filter_s > 0 else 1.0
+        self.current = [0.0] * wheels
+        self.voltage = [0.0] * wheels
+        self.bus = motor.supply_v
+        self._integral = [0.0] * wheels
+        self._speed = [0.0] * wheels
+        self._ticks: list[int] | None = None
+
+    def step(self, wanted: list[float], angle: list[float], speed: list[float]) -> list[float]:
+        """Torques at the wheels [N m] over one step.
+
+        Args:
+            wanted: wheel speeds [rad/s].
+            angle: of the wheels [rad]; the loop sees whole ticks of it.
+            speed: of the wheels [rad/s], for the back-EMF.
+        """
+        m = self.motor
+        ticks = [floor(a / self._per_tick) for a in angle]
+        before = self._ticks or ticks
+        self._ticks = ticks
+        out = []
+        drawn = 0.0
+        for k, target in enumerate(wanted):
+            seen = (ticks[k] - before[k]) * self._per_tick / self.dt
+            self._speed[k] += self._blend * (seen - self._speed[k])
+            volts = self._voltage(k, target * self.gear, self._speed[k] * self.gear)
+            turning = speed[k] * self.gear
+            settled = (volts - m.back_emf_vs * turning) / m.resistance_ohm
+            amps = settled + (self.current[k] - settled) * self._decay
+            torque = self.gear * m.back_emf_vs * 0.5 * (amps + self.current[k])
+            self.voltage[k], self.current[k] = volts, amps
+            drawn += amps * volts / self.bus
+            out.append(torque * m.efficiency if torque * turning > 0 else torque)
+        self.bus = m.supply_v - m.supply_ohm * max(drawn, 0.0)
+        return out
+
+    def _voltage(self, k: int, wanted: float, measured: float) -> float:
+        """The loop's wish within the bus voltage; where that ends the integral is held."""
+        loop, m = self.loop, self.motor
+        error = wanted - measured
+        stored = self._integral[k] + loop.integral * error * self.dt
+        if loop.kind == "pi":
+            wish = loop.gain * error + stored
+        elif loop.kind == "feed_forward":
+            wish = loop.gain * error + m.back_emf_vs * wanted
+        else:
+            amps = loop.gain * error + stored
+            held = min(max(amps, -loop.current_limit_a), loop.current_limit_a)
+            stored = stored if held == amps else self._integral[k]
+            wish = (
+                m.resistance_ohm * held
+                + m.back_emf_vs * measured
+                + loop.current_gain * (held - self.current[k])
+            )
+        volts = min(max(wish, -self.bus), self.bus)
+        if volts == wish:
+            self._integral[k] = stored
+        return volts

@@ -1,0 +1,20 @@
+"""Numbers that make no robot are refused where they are given."""
+
+from math import isfinite
+from typing import Any
+
+
+def positive(thing: Any, *names: str) -> None:
+    """ValueError unless these attributes are above 0."""
+    for name in names:
+        value = getattr(thing, name)
+        if not (value > 0 and isfinite(value)):
+            raise ValueError(f"{name} = {value}; expected a number above 0")
+
+
+def not_negative(thing: Any, *names: str) -> None:
+    """ValueError unless these attributes are 0 or above."""
+    for name in names:
+        value = getattr(thing, name)
+        if not (value >= 0 and isfinite(value)):
+            raise ValueError(f"{name} = {value}; expected 0 or above")
