@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from ctypes.util import find_library
 from importlib.metadata import version
 from pathlib import Path
 
@@ -25,6 +26,9 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 if version("jaxlib").startswith("0.10."):
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 os.environ["MPLBACKEND"] = "Agg"
+# MuJoCo chooses at its first import what it draws with; without EGL it must not be told to use it.
+if find_library("EGL"):
+    os.environ.setdefault("MUJOCO_GL", "egl")
 
 import jax  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402

@@ -42,7 +42,7 @@ def test_a_variance_that_may_be_anything_small_is_not_held_near_the_fit(replicat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [7, 10])
+@pytest.mark.parametrize("count", [7, 8])
 def test_the_second_stage_goes_on_from_any_block_as_if_it_had_not_ended(whole, count):
     experiment, plan, blocks, found = whole
     kept = {part: b if part == MOTION else b[:count] for part, b in blocks.items()}
@@ -71,7 +71,7 @@ def whole():
     found = posterior.sample(
         *experiment, plan, draws=10, keep=lambda part, block: blocks[part].append(block)
     )
-    assert max(map(len, blocks.values())) > 10
+    assert max(map(len, blocks.values())) > 8
     return experiment, plan, blocks, found
 
 

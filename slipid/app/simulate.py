@@ -2,7 +2,7 @@
 
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
@@ -17,6 +17,7 @@ from slipid.data.files import read_json, write_arrays, write_bytes, write_json
 from slipid.data.log import DataError
 from slipid.data.terrain import write_map
 from slipid.data.write import OPTIONAL, own_csv, own_layout, robotino2022_csv
+from slipid.testsite.camera import Camera, Studio, film
 from slipid.testsite.experiments import Run, Site, drive
 from slipid.testsite.plant import Trace, engine
 from slipid.testsite.sensors import observe
@@ -77,24 +78,64 @@ def simulate(plan: Plan, out: Path, jobs: int, report: Reporter) -> dict[str, An
     report.stage(f"driving {len(todo)} of {len(every)} runs")
     began = time.monotonic()
     seconds = 0.0
-    for done, (job, driven) in enumerate(_driven(todo, jobs), 1):
+    for done, (job, driven) in enumerate(_spread(drive_and_write, todo, min(jobs, len(todo))), 1):
         seconds += driven
         left = (time.monotonic() - began) / done * (len(todo) - done)
         report.step(done, len(todo), f"{job.name}, about {left:.0f} s left")
     pace = seconds / max(time.monotonic() - began, 1e-9)
+    _film([job for job in every if job.name in plan.filmed], plan.content.camera, jobs, report)
     content = {**about, "runs": [name for name, _ in plan.runs]}
     write_json(manifest, content)
     return {**content, "driven": len(todo), "seconds": seconds, "pace": pace if todo else None}
 
 
-def _driven(todo: Sequence[Job], jobs: int) -> Any:
-    """Jobs and how many seconds each robot drove, in the order they are finished."""
-    if jobs == 1 or len(todo) < 2:
-        yield from ((job, drive_and_write(job)) for job in todo)
+def _film(jobs: Sequence[Job], camera: Camera, processes: int, report: Reporter) -> None:
+    """Videos of the runs that have none yet, with the camera's numbers beside them."""
+    if not jobs:
+        return
+    write_json(jobs[0].out / "video" / "camera.json", camera.as_dict())
+    todo = [(job, camera) for job in jobs if not _video(job.out, job.name).is_file()]
+    report.stage(f"filming {len(todo)} of {len(jobs)} runs")
+    if not todo:
+        return
+    began = time.monotonic()
+    # in processes of their own, also one by one: what draws has to be chosen before MuJoCo is there
+    for done, ((job, _), _) in enumerate(
+        _spread(film_and_write, todo, min(processes, len(todo))), 1
+    ):
+        left = (time.monotonic() - began) / done * (len(todo) - done)
+        report.step(done, len(todo), f"{job.name}, about {left:.0f} s left")
+
+
+def film_and_write(what: tuple[Job, Camera]) -> int:
+    """Film one run that was driven; how many frames. The video is written last."""
+    job, camera = what
+    site, run = job.site, job.run
+    with np.load(_truth(job.out, job.name)) as true:
+        studio = Studio(site.machine, run.load, run.map, site.grounds, camera, job.seed)
+        path = _video(job.out, job.name)
+        frames = np.arange(true["time"][0], true["time"][-1], camera.frame_s)
+        rows = "".join(f"{k},{t:.4f}\n" for k, t in enumerate(frames))
+        write_bytes(path.with_suffix(".csv"), f"frame,time\n{rows}".encode())
+        film(studio, true["time"], true["pose"], true["wheel_angle"], frames, path)
+        studio.close()
+    return len(frames)
+
+
+def _video(out: Path, name: str) -> Path:
+    return out / "video" / f"{name}.avi"
+
+
+def _spread(
+    work: Callable[[Any], Any], todo: Sequence[Any], jobs: int
+) -> Iterator[tuple[Any, Any]]:
+    """Pieces of work and their results, in the order they are finished."""
+    if work is drive_and_write and jobs <= 1:
+        yield from ((job, work(job)) for job in todo)
         return
     # forked processes would inherit the threads of whatever the caller has loaded
     with ProcessPoolExecutor(jobs, get_context("spawn"), _leave_interrupts) as pool:
-        waiting = {pool.submit(drive_and_write, job): job for job in todo}
+        waiting = {pool.submit(work, job): job for job in todo}
         try:
             for future in as_completed(waiting):
                 yield waiting[future], future.result()

@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import asdict, dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,6 +14,7 @@ from slipid.app.toml_file import checked, mapping_of, text_of
 from slipid.data import terrain
 from slipid.data.log import DataError
 from slipid.testsite import experiments as ex
+from slipid.testsite.camera import Camera
 from slipid.testsite.drive import Motor, SpeedLoop
 from slipid.testsite.ground import GROUNDS, Ground
 from slipid.testsite.machine import Machine
@@ -55,6 +57,7 @@ class Headings(_Section):
     surface: str
     load: str = "as_built"
     step_deg: Positive = 15.0
+    first_deg: float = Field(0.0, allow_inf_nan=False)
     speeds_m_s: Speeds = Field(default=[0.1, 0.2])
     distance_m: Positive = 0.7
 
@@ -116,6 +119,8 @@ class Content(_Section):
     motor: Motor = Motor()
     speed_loop: SpeedLoop = SpeedLoop()
     sensors: Sensors = Sensors()
+    video: list[str] = Field(default_factory=list)
+    camera: Camera = Camera()
     surfaces: dict[str, Ground] = Field(default_factory=dict)
     maps: dict[str, Map] = Field(default_factory=dict)
     runs: list[Runs] = Field(min_length=1)
@@ -131,6 +136,7 @@ class Plan:
         site: robot and floors.
         maps: floors with several surfaces, by name.
         runs: name and run of each.
+        filmed: names of the runs that are filmed.
     """
 
     hash: str
@@ -138,6 +144,7 @@ class Plan:
     site: ex.Site
     maps: dict[str, terrain.FloorMap]
     runs: tuple[tuple[str, ex.Run], ...]
+    filmed: tuple[str, ...]
 
 
 def read_plan(path: Path) -> Plan:
@@ -186,6 +193,13 @@ def plan(path: Path, text: str) -> Plan:
             _known(path, f"maps.{name}", surface, site.grounds)
     everything = [r for k, one in enumerate(content.runs) for r in _runs(one, maps, content, k)]
     jitter = float(np.radians(content.heading_jitter_deg))
+    named = tuple(ex.numbered(everything, jitter, content.seed))
+    for pattern in content.video:
+        if not any(fnmatch(name, pattern) for name, _ in named):
+            folders = ", ".join(dict.fromkeys(f"{name[:-3]}*" for name, _ in named))
+            raise DataError(
+                f"{path}: video: no run is named '{pattern}'; expected some of {folders}"
+            )
     digest = hashlib.sha256(text.encode())
     for floor in maps.values():
         digest.update(floor.cells.tobytes())
@@ -194,7 +208,8 @@ def plan(path: Path, text: str) -> Plan:
         content,
         site,
         maps,
-        tuple(ex.numbered(everything, jitter, content.seed)),
+        named,
+        tuple(n for n, _ in named if any(fnmatch(n, pattern) for pattern in content.video)),
     )
 
 
@@ -218,7 +233,12 @@ def _runs(
 ) -> list[ex.Run]:
     if isinstance(given, Headings):
         return ex.headings(
-            given.surface, given.load, given.step_deg, given.speeds_m_s, given.distance_m
+            given.surface,
+            given.load,
+            given.step_deg,
+            given.speeds_m_s,
+            given.distance_m,
+            given.first_deg,
         )
     if isinstance(given, Curves):
         return ex.curves(given.surface, given.load, given.count, given.speeds_m_s, given.distance_m)

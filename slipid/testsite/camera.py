@@ -229,18 +229,18 @@ def film(
     time: Float[np.ndarray, " step"],
     pose: Float[np.ndarray, "step 3"],
     wheel_angle: Float[np.ndarray, "step wheel"],
+    frames: Float[np.ndarray, " frame"],
     path: Path,
-    said: Callable[[int, int], None] = lambda done, total: None,
-) -> Float[np.ndarray, " frame"]:
-    """Write a video of a run; the times of its frames.
+) -> None:
+    """Write a video of a run, whole or not at all.
 
     Args:
         studio: draws.
         time: of the truth [s].
         pose: of the body.
         wheel_angle: of the wheels.
+        frames: times of its frames [s].
         path: of the video (.avi, Motion JPEG).
-        said: called with the frames that are done, and with how many there are.
 
     Raises:
         DataError: the video cannot be written.
@@ -252,7 +252,6 @@ def film(
     def at(values: np.ndarray, t: float) -> np.ndarray:
         return np.array([np.interp(t, time, column) for column in values.T])
 
-    frames = np.arange(float(time[0]), float(time[-1]), c.frame_s)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial.avi")
     code = cv2.VideoWriter.fourcc(*"MJPG")
@@ -260,17 +259,15 @@ def film(
     if not video.isOpened():
         raise DataError(f"{path}: OpenCV cannot write a video there")
     try:
-        for done, t in enumerate(frames, 1):
+        for t in frames:
             video.write(
                 studio.exposed(float(t), lambda s: at(pose, s), lambda s: at(wheel_angle, s))
             )
-            said(done, len(frames))
         video.release()
         os.replace(partial, path)
     finally:
         video.release()
         partial.unlink(missing_ok=True)
-    return frames
 
 
 def _drawing() -> tuple[Any, Any]:

@@ -140,10 +140,15 @@ def straight(
 
 
 def headings(
-    surface: str, load: str, step_deg: float, speeds: Sequence[float], distance: float
+    surface: str,
+    load: str,
+    step_deg: float,
+    speeds: Sequence[float],
+    distance: float,
+    first_deg: float = 0.0,
 ) -> list[Run]:
     """Straight runs in directions so many degrees apart, at every speed: the 2022 logs' plan."""
-    ways = np.radians(np.arange(0.0, 360.0, step_deg))
+    ways = np.radians(first_deg + np.arange(0.0, 360.0, step_deg))
     return [straight(surface, load, float(a), v, distance) for v in speeds for a in ways]
 
 
