@@ -369,17 +369,24 @@ def simulate(
 @guarded
 def demo(
     out: Out = Path("demo_out"),
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the noise in the logs.")] = 0,
+    plant: Annotated[
+        str, typer.Option(metavar="NAME", help="recorded, or mujoco to drive the logs anew.")
+    ] = "recorded",
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, help="Of the runs that are driven anew.")
+    ] = 0,
     quiet: Quiet = False,
 ) -> int:
-    """The whole job on logs with known truth, small: a folder to look at."""
+    """The whole job on logs of the virtual test site, small: a folder to look at."""
+    import os
+
     from slipid.app import tables
     from slipid.app.demo import demo as run
     from slipid.app.demo import real_logs
     from slipid.app.progress import Reporter
 
     with Reporter(quiet=quiet) as report:
-        done, found, rows = run(out, seed, report)
+        done, found, rows = run(out, plant, seed, os.cpu_count() or 1, report)
     tables.demo(out, done, found, rows, real_logs())
     return 0 if done.fit.converged else 1
 

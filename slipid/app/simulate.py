@@ -219,7 +219,7 @@ def _describe(plan: Plan, out: Path) -> None:
     write_json(
         out / "truth" / "truth.json",
         {
-            "schema": "slipid.truth/2",
+            "schema": "slipid.truth/1",
             "parameters": truth(site),
             "site": asdict(replace(site, grounds=dict(site.grounds))),
         },

@@ -1,4 +1,4 @@
-"""Logs made from a robot whose every number is known: for the demo and for tests of recovery.
+"""Logs made from a robot whose every number is known: for selftests and tests of recovery.
 
 Straight and turning runs of a grid like a Robotino's under an overhead camera. The noise is the one
 the likelihood assumes (camera, process growing with distance, run effects, current level per run);
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.app.synthetic_files import LAYOUT, write_logs
+from slipid.app.synthetic_files import LAYOUT, numbers, write_logs
 from slipid.app.synthetic_plan import ROBOTINO, TRUTH, Sensors, blank, grid, truth
 from slipid.data.log import Log
 from slipid.identify.drives import Drive
@@ -32,6 +32,7 @@ __all__ = [
     "blank",
     "grid",
     "make_logs",
+    "numbers",
     "truth",
     "write_logs",
 ]

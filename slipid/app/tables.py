@@ -361,7 +361,10 @@ def demo(
         )
     console.print(table)
     inside = sum(r.inside for r in rows)
-    console.print(f"{inside} of {len(rows)} intervals hold the truth (90 % are meant to)\n")
+    console.print(
+        f"{inside} of {len(rows)} intervals hold the truth: the logs come from another physics "
+        "(MuJoCo's rollers) than the model's, and intervals know nothing of that\n"
+    )
     console.print("runs it has not seen, predicted open loop:")
     validation(found)
     result = out / "result"

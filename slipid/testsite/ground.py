@@ -74,7 +74,7 @@ GROUNDS: dict[str, Ground] = {
         shear_n_m=2.2e3,
         compaction=3e3,
         body_drag_n=0.5,
-        unevenness=0.2,
+        unevenness=0.15,
         colour="#1f6b45",
     ),
     "ribbed": Ground(

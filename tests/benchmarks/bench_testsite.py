@@ -1,0 +1,437 @@
+"""The virtual test site against the real logs, and slipid's claims against its truth.
+
+    .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks/bench_testsite.py
+
+(-k speed, sectors, mixed, figures or coverage). Pictures and tables go to out/bench_testsite.
+"""
+
+import json
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from slipid.app.config import parsed
+from slipid.app.job import read_job
+from slipid.app.progress import Reporter
+from slipid.app.simulate import logged, simulate, truth
+from slipid.app.simulate_config import plan
+from slipid.data.terrain import FloorMap, four_zones, patchwork
+from slipid.identify.folds import left_out, sectors
+from slipid.identify.validate import summary, text_table
+from slipid.testsite.experiments import (
+    Run,
+    Site,
+    Timed,
+    drive,
+    headings,
+    paper_grid,
+    rectangle,
+    straight,
+    wander,
+)
+from slipid.testsite.ground import GROUNDS
+from slipid.testsite.machine import Machine
+from slipid.testsite.plant import Plant
+
+ROOT = Path(__file__).resolve().parents[2]
+OUT = ROOT / "out" / "bench_testsite"
+SEEDS = int(os.environ.get("SLIPID_BENCH_SEEDS", "40"))
+
+HEADINGS = """
+[[runs]]
+kind = "headings"
+surface = "{surface}"
+load = "{load}"
+step_deg = {step}
+speeds_m_s = {speeds}
+distance_m = 0.6
+"""
+CURVES = """
+[[runs]]
+kind = "curves"
+surface = "{surface}"
+load = "{load}"
+count = 2
+speeds_m_s = [0.2]
+distance_m = 0.6
+"""
+
+
+def driven(text: str, out: Path):
+    """The plan of a config, driven below a folder."""
+    made = plan(out / "site.toml", text)
+    with Reporter(quiet=True) as report:
+        simulate(made, out, os.cpu_count() or 1, report)
+    return made
+
+
+def job_of(out: Path):
+    """The identification job that the simulation wrote beside its logs."""
+    path = out / "robot.toml"
+    config = parsed(path, path.read_text(encoding="utf-8"))
+    return read_job(config, out / "logs", lambda done, count: None, lambda line: None)
+
+
+# speed
+
+
+def test_speed_on_one_core() -> None:
+    """Seconds of robot per second, by surface, and where the time goes."""
+    print("\nsurface   times real time   us a step: engine  motors  floor")
+    for surface in GROUNDS:
+        site = Site()
+        run = straight(surface, "as_built", 1.0, 0.2, 0.8)
+        paces = []
+        for _ in range(3):
+            began = time.perf_counter()
+            trace = drive(run, site, 0)
+            paces.append(float(trace.time[-1]) / (time.perf_counter() - began))
+        parts = _profile(surface)
+        print(f"{surface:8}  {max(paces):10.1f}   " + "  ".join(f"{p:14.1f}" for p in parts))
+        assert max(paces) > 4.0
+
+
+def _profile(surface: str) -> list[float]:
+    """Microseconds a step of engine, motors and floor."""
+    site = Site()
+    run = straight(surface, "as_built", 1.0, 0.2, 0.5)
+    plant = Plant(site.machine, site.motor, site.loop, run.map, site.grounds, "as_built")
+    wanted = (site.machine.wheel_from_twist @ np.array([0.1, 0.1, 0.0])).tolist()
+    spent = [0.0, 0.0, 0.0]
+    engine, motors, look = plant._step, plant.drive.step, plant._look
+
+    def timed(k, f):
+        def run_it(*args):
+            began = time.perf_counter()
+            result = f(*args)
+            spent[k] += time.perf_counter() - began
+            return result
+
+        return run_it
+
+    plant._step, plant.drive.step = timed(0, engine), timed(1, motors)  # type: ignore[method-assign]
+    plant._look = timed(2, look)  # type: ignore[method-assign]
+    for _ in range(2000):
+        plant.step(wanted)
+    return [1e6 * s / 2000 for s in spent]
+
+
+# identification
+
+
+def test_left_out_sectors() -> None:
+    """Six 60-degree sectors, each predicted by a fit that has not seen it on any floor."""
+    text = "seed = 11\n" + "".join(
+        HEADINGS.format(surface=s, load="as_built", step=15, speeds=[0.1, 0.2])
+        for s in ("firm", "medium", "soft")
+    )
+    out = OUT / "sectors"
+    driven(text, out)
+    job = job_of(out)
+    rows = left_out(job.problem(), job.dataset, sectors(job.dataset))
+    report = {"summary": summary(rows)}
+    print(f"\n{text_table(report)}")
+    for floor, by in report["summary"].items():
+        mine, encoder = (by[m]["endpoint_error_mean"] for m in ("identified", "encoder"))
+        print(
+            f"{floor}: {encoder / mine:.1f} times better than encoders, 90 % regions hold "
+            f"{100 * by['identified']['coverage90']:.0f} %"
+        )
+    soft = report["summary"]["soft"]
+    assert soft["encoder"]["endpoint_error_mean"] > 4 * soft["identified"]["endpoint_error_mean"]
+
+
+def _experiment(seed: int) -> dict:
+    """One experiment with a robot of its own: estimates, stds and truths by name."""
+    jax.config.update("jax_enable_x64", True)
+    from slipid.identify.fit import optimise
+    from slipid.identify.result import summarise
+
+    rng = np.random.default_rng([7, seed])
+    resistance, back_emf = rng.uniform(4.5, 6.5), rng.uniform(0.045, 0.058)
+    centres = [
+        [float(v) for v in rng.uniform(0.004, 0.022) * np.array([np.cos(a), np.sin(a)])]
+        for a in rng.uniform(-np.pi, np.pi, 2)
+    ]
+    text = (
+        f"seed = {seed}\n[robot]\ncentres_m = {{ as_built = {centres[0]}, moved = {centres[1]} }}\n"
+        f"[motor]\nresistance_ohm = {resistance}\nback_emf_vs = {back_emf}\n"
+    )
+    for load in ("as_built", "moved"):
+        text += HEADINGS.format(surface="soft", load=load, step=30, speeds=[0.2])
+        text += CURVES.format(surface="soft", load=load)
+    text += HEADINGS.format(surface="firm", load="as_built", step=60, speeds=[0.2])
+    out = OUT / "coverage" / f"seed{seed:02d}"
+    made = driven(text, out)
+    job = job_of(out)
+    problem = job.problem()
+    best = optimise(problem)
+    found = summarise(problem, best, job.dataset, job.choices)
+    known = truth(made.site)
+    rows = {}
+    for path, p in found.parameters.items():
+        if path in known and path != "camera.marker_yaw" and p.verdict != "fixed":
+            values = np.atleast_1d(p.value)
+            for k, true in enumerate(np.atleast_1d(known[path]["value"])):
+                low, high = p.interval90[k] if p.labels else p.interval90
+                rows[f"{path}[{k + 1}]" if p.labels else path] = (
+                    float(values[k]),
+                    low,
+                    high,
+                    float(true),
+                )
+    return {"seed": seed, "converged": best.converged, "numbers": rows}
+
+
+def test_coverage_over_seeds() -> None:
+    """R, C_e and load shares of robots drawn anew, every run with a floor and noise of its own."""
+    found = []
+    for seed in range(SEEDS):
+        path = OUT / "coverage" / f"seed{seed:02d}.json"
+        if not path.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(_experiment(seed)))
+        found.append(json.loads(path.read_text()))
+        print(f"  {seed + 1} of {SEEDS}", flush=True)
+    names = list(found[0]["numbers"])
+    print(f"\n{len(found)} experiments, {sum(f['converged'] for f in found)} converged")
+    print(f"{'':30} mean error  rms error   largest   in 90 %   interval's half width")
+    for name in names:
+        value, low, high, true = np.array([f["numbers"][name] for f in found]).T
+        relative = name.startswith("motor.")
+        error = (value - true) / (true if relative else 1.0)
+        inside = np.mean((low <= true) & (true <= high))
+        half = np.mean(0.5 * (high - low) / (true if relative else 1.0))
+        form = (lambda x: f"{100 * x:8.2f} %") if relative else (lambda x: f"{x:9.4f} ")
+        print(
+            f"{name:30} {form(error.mean())} {form(np.sqrt(np.mean(error**2)))} "
+            f"{form(np.abs(error).max())} {100 * inside:6.0f} %   {form(half)}"
+        )
+    _exaggeration(found)
+    for name in names:
+        value, _, _, true = np.array([f["numbers"][name] for f in found]).T
+        if name.startswith("motor."):
+            assert np.abs(value / true - 1).max() < 0.03
+
+
+def _exaggeration(found: list[dict]) -> None:
+    """How far off the middle the fit puts the load, over how far it is."""
+    for load in ("as_built", "moved"):
+        each = np.array(
+            [[f["numbers"][f"robot.load_share@{load}[{k}]"] for k in (1, 2, 3)] for f in found]
+        )
+        off, true = each[..., 0] - 1 / 3, each[..., 3] - 1 / 3
+        slope = float(np.sum(off * true) / np.sum(true**2))
+        rest = float(np.sqrt(np.mean((off - slope * true) ** 2)))
+        print(
+            f"{load}: shares lie {slope:.2f} times as far from a third as they are, "
+            f"with that taken out {rest:.4f} rms"
+        )
+
+
+# the paper's observation
+
+
+def test_currents_on_mixed_surfaces() -> None:
+    """Wheels of a pair on two surfaces: does each draw the current of the floor beneath it?"""
+    machine = replace(Machine(), centres_m={"as_built": (0.0, 0.0)})
+    site = Site(machine=machine)
+    seeds = range(6)
+
+    def currents(floor: FloorMap | None, surface: str | None, speed: float) -> np.ndarray:
+        """Mean |current| of wheels 1 and 3, which x motion drives alike (seed, 2)."""
+        program = Timed((((speed, 0.0, 0.0), 3.0),))
+        start = (-1.5 * speed, 0.0, 0.0)
+        runs = [Run(surface, "as_built", program, start, floor, "mixed") for _ in seeds]
+        each = []
+        for seed, run in zip(seeds, runs, strict=True):
+            trace = drive(run, site, seed)
+            steady = (trace.time > 1.0) & (trace.time < 2.5)
+            each.append(np.abs(trace.current[steady][:, [0, 2]]).mean(axis=0))
+        return np.array(each)
+
+    print("\nA: wheel 1 on the first surface, wheel 3 on the second, wheel 2 on the border between")
+    print(
+        "surfaces       m/s   first alone  second alone  mixed: wheel 1  wheel 3   "
+        "difference over that of the floors"
+    )
+    for pair in (("soft", "firm"), ("medium", "firm"), ("soft", "medium")):
+        halves = FloorMap(pair, np.array([[1], [0]]), (-2.0, -2.0), 2.0)  # y > 0 is the first
+        for speed in (0.1, 0.3):
+            first, second = (currents(None, s, speed).mean() for s in pair)
+            both = currents(halves, None, speed)
+            ratio = (both[:, 0] - both[:, 1]) / (first - second)
+            error = ratio.std(ddof=1) / np.sqrt(len(ratio))
+            print(
+                f"{pair[0]:7}{pair[1]:7} {speed:4.1f} {first:11.2f} {second:13.2f} "
+                f"{both[:, 0].mean():14.2f} {both[:, 1].mean():9.2f} "
+                f"{ratio.mean():12.2f} +- {error:.2f}"
+            )
+
+
+# pictures
+
+
+def test_figures_beside_the_real_ones(real_data: Path) -> None:
+    """Figures 2, 3, 4 and 7 and slip against heading, real on the left, test site on the right."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from slipid.app.paper_plots import _floor
+    from slipid.baselines.paper2021 import regenerate
+    from slipid.data.formats import preset
+    from slipid.data.reader import find_logs, read_log
+
+    OUT.mkdir(parents=True, exist_ok=True)
+    real = regenerate(real_data / "robotino2021", None)
+    site = Site(sensors=replace(Site().sensors, voltage=False))
+    logs = _figure_logs(site)
+    figure = Figure(figsize=(13, 24), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(5, 2)
+    colours = {"gray": "#666666", "blue": "#0072B2", "red": "#D55E00"}
+    colours |= {"table": "#999999", "brown": "#8a5a35", "green": "#1f6b45"}
+    colours |= {"firm": "#E69F00", "short": "#8a5a35", "medium": "#666666", "soft": "#1f6b45"}
+    # figure 2: the whole field
+    for ax, (current, slip), title in (
+        (axes[0, 0], (real.field.samples.current, real.field.samples.slip), "real whole site"),
+        (axes[0, 1], _points(logs["site"])[:2], "test site, random patches"),
+    ):
+        ax.plot(current, slip, ".", ms=3, alpha=0.5, color="#56B4E9")
+        ax.set(
+            xlim=(0, 2.2),
+            ylim=(0, 1),
+            title=f"figure 2: {title}, motor 1",
+            xlabel="current [A]",
+            ylabel="slip",
+        )
+    # figures 3 and 4
+    for row, what, limit in ((1, "current", 2.2), (2, "torque", 0.5)):
+        for surface, part in real.motors[1].by_surface.items():
+            axes[row, 0].plot(
+                getattr(part, what),
+                part.slip,
+                ".",
+                ms=3,
+                alpha=0.4,
+                color=colours[surface],
+                label=surface,
+            )
+        for surface in ("firm", "medium", "soft"):
+            current, slip, torque = _points(logs[surface])
+            axes[row, 1].plot(
+                current if what == "current" else torque,
+                slip,
+                ".",
+                ms=3,
+                alpha=0.4,
+                color=colours[surface],
+                label=surface,
+            )
+        for ax, where in zip(axes[row], ("real", "test site"), strict=True):
+            unit = "current [A]" if what == "current" else "M [N m]"
+            ax.set(
+                xlim=(0, limit),
+                ylim=(0, 1),
+                xlabel=unit,
+                ylabel="slip",
+                title=f"figure {row + 2}: {where}, motor 1",
+            )
+            ax.legend(markerscale=3)
+    # figure 7
+    track = next(t for t in real.tracks if t.file.name == "encoders")
+    axes[3, 0].plot(*_floor(track).T, lw=2, label="encoders only")
+    for seed, trace in enumerate(logs["rectangle"]):
+        label = "encoders only, six runs" if seed == 0 else None
+        x, y = 1000 * trace.pose[:, :2].T
+        axes[3, 1].plot(-y, x, lw=1.5, label=label, color="C0", alpha=0.6)
+    for ax, where in zip(axes[3], ("real", "test site, four zones"), strict=True):
+        ax.plot([0, 400, 400, 0, 0], [0, 0, 900, 900, 0], "k--", lw=1, label="commanded")
+        ax.set(title=f"figure 7: {where}", xlabel="mm to the right", ylabel="mm ahead")
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.legend(loc="upper right")
+    # slip against heading
+    folder = real_data / "robotino2022"
+    for surface in ("table", "brown", "gray", "green"):
+        paths = find_logs(folder, f"one_surface/{surface}/*.csv")
+        seen = [read_log(p, preset("robotino2022"), root=folder, surface=surface) for p in paths]
+        _by_heading(axes[4, 0], seen, colours[surface], surface)
+    for surface in ("firm", "short", "medium", "soft"):
+        _by_heading(axes[4, 1], logs[f"{surface} headings"], colours[surface], surface)
+    for ax, where in zip(axes[4], ("real 2022 logs", "test site, as built"), strict=True):
+        ax.set(
+            xlim=(0, 360),
+            ylim=(-0.05, 0.7),
+            xlabel="heading [deg]",
+            ylabel="slip of the body",
+            title=where,
+        )
+        ax.legend(loc="upper right", ncols=4)
+    path = OUT / "beside_the_real_ones.png"
+    figure.savefig(path, dpi=80)
+    print(f"\n{path}")
+
+
+def _figure_logs(site: Site) -> dict:
+    """Logs and traces for the figures."""
+    floor = patchwork(["firm", "short", "medium", "soft"], seed=2)
+    zones = four_zones(["firm", "medium", "soft", "short"])
+    plans = {
+        "site": wander(floor, "site", "as_built", 12, seed=4),
+        "rectangle": [rectangle(zones, "zones", "as_built") for _ in range(6)],
+    }
+    for surface in ("firm", "medium", "soft"):
+        plans[surface] = paper_grid(surface, "as_built")
+    for surface in ("firm", "short", "medium", "soft"):
+        plans[f"{surface} headings"] = headings(surface, "as_built", 10.0, (0.2,), 0.6)
+    jobs = [(key, k, run) for key, runs in plans.items() for k, run in enumerate(runs)]
+    out: dict = {key: [] for key in plans}
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        traces = pool.map(
+            drive, [run for *_, run in jobs], [site] * len(jobs), [k for _, k, _ in jobs]
+        )
+        for (key, k, run), trace in zip(jobs, traces, strict=True):
+            out[key].append(
+                trace if key == "rectangle" else logged(trace, site, f"{key}/{k}", run, k)
+            )
+    return out
+
+
+def _points(logs: list) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Current, slip and torque variable M of motor 1 over half seconds, cut as the authors did."""
+    from slipid.baselines.paper2021 import FIGURES_3_AND_4, WindowRecipe, wheel_windows
+
+    recipe = WindowRecipe(pose_scale=1.117, min_speed=0.01)
+    currents, slips, speeds = [], [], []
+    for log in logs:
+        current, slip = wheel_windows(log, recipe)
+        currents.append(current[:, 0])
+        slips.append(slip[:, 0])
+        edges = np.linspace(0, log.samples - 1, len(current) + 1).astype(int)
+        turned = np.abs(np.diff(log.wheel_angle[edges, 0])) / np.diff(log.time[edges])
+        speeds.append(16 * turned)
+    current, slip, speed = (np.concatenate(x) for x in (currents, slips, speeds))
+    r = FIGURES_3_AND_4
+    with np.errstate(divide="ignore", invalid="ignore"):
+        torque = (r.back_emf * speed + r.resistance * current) * current / speed
+        keep = (current > 0.25) & (slip > 0) & (slip <= 1) & (torque <= 0.5)
+    return current[keep], slip[keep], torque[keep]
+
+
+def _by_heading(ax, logs: list, colour: str, label: str) -> None:
+    """Slip of the body against the direction of travel of every run."""
+    back = np.linalg.pinv(Machine().wheel_from_twist)
+    way, slip = [], []
+    for log in logs:
+        far = back @ log.wheel_angle[-1]
+        size = np.hypot(*far[:2])
+        seen = 1.117 * np.hypot(*(log.pose[-1, :2] - log.pose[0, :2]))
+        way.append(np.degrees(np.arctan2(far[1], far[0])) % 360)
+        slip.append(1 - seen / size)
+    ax.plot(way, slip, ".", color=colour, ms=5, label=label)
