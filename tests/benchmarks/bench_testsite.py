@@ -84,17 +84,21 @@ def job_of(out: Path):
 def test_speed_on_one_core() -> None:
     """Seconds of robot per second, by surface, and where the time goes."""
     print("\nsurface   times real time   us a step: engine  motors  floor")
-    for surface in GROUNDS:
-        site = Site()
-        run = straight(surface, "as_built", 1.0, 0.2, 0.8)
-        paces = []
-        for _ in range(3):
-            began = time.perf_counter()
-            trace = drive(run, site, 0)
-            paces.append(float(trace.time[-1]) / (time.perf_counter() - began))
-        parts = _profile(surface)
-        print(f"{surface:8}  {max(paces):10.1f}   " + "  ".join(f"{p:14.1f}" for p in parts))
-        assert max(paces) > 4.0
+    # in a process of its own: in this one every call's types are checked
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        for surface, (pace, parts) in zip(GROUNDS, pool.map(_pace, GROUNDS), strict=True):
+            print(f"{surface:8}  {pace:10.1f}   " + "  ".join(f"{p:14.1f}" for p in parts))
+            assert pace > 4.0
+
+
+def _pace(surface: str) -> tuple[float, list[float]]:
+    """Best of three times real time, with sensors and files left out; and the profile."""
+    run, paces = straight(surface, "as_built", 1.0, 0.2, 0.8), []
+    for _ in range(3):
+        began = time.perf_counter()
+        trace = drive(run, Site(), 0)
+        paces.append(float(trace.time[-1]) / (time.perf_counter() - began))
+    return max(paces), _profile(surface)
 
 
 def _profile(surface: str) -> list[float]:
