@@ -13,7 +13,7 @@ help: ## this list
 	@sed -n 's/^\([a-z]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | awk -F '\t' '{printf "make %-8s %s\n", $$1, $$2}'
 	@echo "Another interpreter: make demo PYTHON=python3.12 (after make clean)"
 
-demo: $(VENV)/.run-stamp ## the main job on logs with known truth, pictures in demo_out
+demo: $(VENV)/.run-stamp ## the main job on logs of the virtual test site, pictures in demo_out
 	$(BIN)/slipid demo --out demo_out
 
 test: $(VENV)/.dev-stamp ## the whole test suite, a file at a time on two cores

@@ -70,7 +70,7 @@ def test_help_names_every_command():
     assert result.exit_code == 0
     for command in (
         *("new", "check", "selftest", "identify", "sample", "validate"),
-        *("compare", "paper", "demo"),
+        *("compare", "paper", "demo", "simulate"),
     ):
         assert command in result.stdout
 
