@@ -1,6 +1,8 @@
 """The demo: recorded logs of the test site, and what slipid makes of a physics it does not know."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -53,7 +55,38 @@ def test_the_recording_is_what_its_config_drives():
 
 def test_a_plant_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(DataError, match="no plant 'gazebo'; expected recorded or mujoco"):
-        demo.demo(tmp_path, "gazebo", 0, 1, Reporter(quiet=True))
+        demo.demo(tmp_path, "gazebo", None, 1, Reporter(quiet=True))
+
+
+def test_a_seed_for_what_is_recorded_is_refused(tmp_path):
+    with pytest.raises(DataError, match="expected --plant mujoco with it"):
+        demo.demo(tmp_path, "recorded", 3, 1, Reporter(quiet=True))
+
+
+def test_the_recording_needs_neither_mujoco_nor_opencv(tmp_path):
+    code = (
+        "import sys\n"
+        "class Absent:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in ('mujoco', 'cv2'):\n"
+        "            raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Absent())\n"
+        "from pathlib import Path\n"
+        "from slipid.app.demo import packaged_config, unpack\n"
+        "from slipid.app.progress import Reporter\n"
+        "from slipid.app.simulate import simulate\n"
+        "from slipid.app.simulate_config import plan\n"
+        "from slipid.data.log import DataError\n"
+        f"unpack(Path({str(tmp_path)!r}))\n"
+        "made = plan(Path('x'), packaged_config('testsite_unseen.toml'))\n"
+        "try:\n"
+        f"    simulate(made, Path({str(tmp_path / 'out')!r}), 1, Reporter(quiet=True))\n"
+        "except DataError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "the virtual test site needs MuJoCo; expected: pip install" in done.stdout
+    assert (tmp_path / "fit" / "truth" / "truth.json").is_file()
 
 
 def test_a_missing_recording_is_said(tmp_path, monkeypatch):
@@ -78,7 +111,7 @@ def test_driving_anew_drives_what_ships(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_demo_finds_the_motor_weighs_the_robot_and_beats_the_encoders(tmp_path):
     """Bars for logs whose physics slipid's model does not share; left-out headings."""
-    done, found, rows = demo.demo(tmp_path, "recorded", 0, 1, Reporter(quiet=True))
+    done, found, rows = demo.demo(tmp_path, "recorded", None, 1, Reporter(quiet=True))
     assert done.fit.converged
     errors = {(r.path, r.label): r.value - r.truth for r in rows}
     for path in ("motor.resistance", "motor.back_emf"):

@@ -6,13 +6,17 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from slipid.app.cli import app
 from slipid.app.progress import Reporter
-from slipid.app.simulate import simulate, truth
+from slipid.app.simulate import Job, _place, can_identify, simulate, truth
 from slipid.app.simulate_config import plan, read_plan
 from slipid.data.formats import preset
 from slipid.data.log import DataError
@@ -98,7 +102,7 @@ def test_the_same_seed_writes_the_same_bytes_with_any_number_of_processes(config
     folder = tmp_path / "one/robotino2022"
     path = folder / "two_surfaces/zones/exp000.csv"
     log = read_log(path, preset("robotino2022"), root=folder, surface=None)
-    x = np.interp(log.time + 0.0 - 0.056, at, pose[:, 0])
+    x = np.interp(log.time - 0.056, at, pose[:, 0])
     seen = 1.117 * (log.pose[:, 0] + 1.7668435)
     assert np.median(np.abs(seen - x)) < 0.003
     floor = read_map(tmp_path / "one/maps/zones.toml")
@@ -106,20 +110,36 @@ def test_the_same_seed_writes_the_same_bytes_with_any_number_of_processes(config
     assert floor.surface_at(0.8, 0.0) == "soft"
 
 
+def children(pid):
+    """Processes that another one started."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            if int(path.read_text().rpartition(")")[2].split()[1]) == pid:
+                found.append(int(path.parent.name))
+    return found
+
+
 @pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 def test_a_killed_simulation_goes_on(config, tmp_path):
     config.write_text(SMALL.replace("step_deg = 180", "step_deg = 30"))
-    command = [sys.executable, "-m", "slipid.app.cli"]
     code = "from slipid.app.cli import main; main()"
     command = [sys.executable, "-c", code, "simulate", str(config), "--out", str(tmp_path / "out")]
-    run = subprocess.Popen([*command, "--jobs", "1", "--quiet"], env=dict(os.environ), cwd=ROOT)
+    run = subprocess.Popen([*command, "--jobs", "2", "--quiet"], env=dict(os.environ), cwd=ROOT)
     try:
         until = time.monotonic() + 120
         while len(list((tmp_path / "out").rglob("run*.npz"))) < 3 and time.monotonic() < until:
-            time.sleep(0.05)
+            time.sleep(0.02)
+        workers = children(run.pid)
         run.send_signal(signal.SIGKILL)
     finally:
         run.wait()
+    assert len(workers) >= 2
+    until = time.monotonic() + 20
+    while any(Path(f"/proc/{pid}").exists() for pid in workers) and time.monotonic() < until:
+        time.sleep(0.1)  # those that drove notice that nobody waits for them
+    assert not any(Path(f"/proc/{pid}").exists() for pid in workers)
     done = len(list((tmp_path / "out").rglob("run*.npz")))
     assert 3 <= done < 13
     assert quietly(config, tmp_path / "out")["driven"] == 13 - done
@@ -148,6 +168,20 @@ def test_known_surfaces_are_changed_and_others_made_anew(config):
     assert found.runs[0][1].start[2] != found.runs[1][1].start[2]
 
 
+def test_a_map_is_read_from_its_file_beside_the_config(tmp_path):
+    (tmp_path / "floor.toml").write_text(
+        'schema = "slipid.map/1"\nbase = "firm"\nextent_m = [-1.0, -1.0, 1.0, 1.0]\n'
+        '[[patch]]\nsurface = "soft"\npolygon = [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]]\n'
+    )
+    text = SMALL.replace('kind = "four_zones", surfaces = ["firm", "soft", "medium", "short"]', "x")
+    text = text.replace("{ x }", '{ kind = "file", file = "floor.toml" }')
+    found = plan(tmp_path / "site.toml", text)
+    assert found.maps["zones"].surface_at(0.4, 0.1) == "soft"
+    other = (tmp_path / "floor.toml").read_text().replace("0.5, 0.5", "0.5, 0.9")
+    (tmp_path / "floor.toml").write_text(other)
+    assert plan(tmp_path / "site.toml", text).hash != found.hash
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("testsite*.toml")))
 def test_the_configs_that_ship_are_good(path):
     assert read_plan(path).runs
@@ -166,13 +200,92 @@ def test_the_configs_that_ship_are_good(path):
         (("seed = 3", 'seed = 3\nvideo = ["*/lawn/*"]'), "no run is named '.*lawn/"),
         (('"four_zones", surfaces', '"file", file'), "maps.zones.file"),
         (("seed = 3", "seed = -3"), "seed: -3; expected"),
+        (("[surfaces.snow]", '[surfaces."my snow"]'), "surfaces.*my snow.*expected"),
+        (
+            ("[maps]", '[maps]\nsoft = { kind = "patchwork", surfaces = ["firm"] }'),
+            "maps.soft: also the name of a surface",
+        ),
+        (("friction = 0.7", 'colour = "#8f9194"'), "maps.zones: two surfaces have one colour"),
+        (("gyro = true", "current_is_signed = true"), "formats: robotino2022 is for three wheels"),
+        (("[maps]", '[robot]\ncentres_m = { "../x" = [0, 0] }\n[maps]'), "load '../x'"),
+        (("[maps]", "[robot]\ncentres_m = { as_built = [nan, 0] }\n[maps]"), "centre of mass"),
+        (("[maps]", "[robot]\nwheel_azimuths_deg = [60, 60, 60]\n[maps]"), "expected them spread"),
+        (("step_deg = 180", "step_deg = 1e-9"), "step_deg: 1e-09"),
+        (("distance_m = 0.1", "distance_m = inf"), "distance_m: inf"),
+        (
+            ("rolling_m = 0.002", "body_drag_n = 1e9"),
+            "body_drag_n = 1000000000.0; expected at most",
+        ),
+        (
+            (
+                'kind = "four_zones", surfaces = ["firm", "soft", "medium", "short"]',
+                'kind = "patchwork", surfaces = ["firm"], half_m = 0.1',
+            ),
+            "half_m: 0.1",
+        ),
+        (
+            (
+                'kind = "four_zones", surfaces = ["firm", "soft", "medium", "short"]',
+                'kind = "patchwork", surfaces = ["firm"], half_m = 20.0, patch_m = 0.01',
+            ),
+            "maps.zones: .*cells; expected|maps.zones: .*patches; expected",
+        ),
     ],
 )
 def test_mistakes_are_named_with_their_key(tmp_path, change, match):
     text = SMALL.replace(*change)
     assert text != SMALL
-    with pytest.raises(DataError, match=match):
+    with pytest.raises(DataError, match=match) as error:
         plan(tmp_path / "site.toml", text)
+    assert str(error.value).startswith(str(tmp_path / "site.toml"))
+
+
+def test_a_bad_config_ends_with_2_and_a_line(tmp_path):
+    bad = tmp_path / "bad.toml"
+    bad.write_text(SMALL.replace('load = "moved"', 'load = "far"'))
+    result = CliRunner().invoke(app, ["simulate", str(bad), "--out", str(tmp_path / "out")])
+    assert result.exit_code == 2
+    assert "runs[1].load: 'far'; expected one of as_built, moved" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_same_hash_means_the_same_runs(tmp_path):
+    first = plan(tmp_path / "x", SMALL).hash
+    assert plan(tmp_path / "x", "# a word\n" + SMALL).hash == first
+    assert plan(tmp_path / "x", 'video = ["*zones*"]\n' + SMALL).hash == first  # later, too
+    for change in (("seed = 3", "seed = 4"), ("0.7", "0.71"), ('"firm", "soft"', '"soft", "firm"')):
+        assert plan(tmp_path / "x", SMALL.replace(*change)).hash != first
+
+
+def test_loads_on_one_map_do_not_overwrite_each_other(tmp_path):
+    text = SMALL + '[[runs]]\nkind = "rectangle"\nmap = "zones"\nload = "moved"\n'
+    made = plan(tmp_path / "x", text)
+    jobs = [Job(name, run, made.site, 0, (), tmp_path) for name, run in made.runs]
+    for form in ("slipid", "robotino2022"):
+        places = [_place(form, job) for job in jobs]
+        assert len(set(places)) == len(places)
+
+
+def test_an_unstable_simulation_is_no_log(tmp_path, capfd):
+    text = (
+        SMALL.replace("rolling_m = 0.002", "shear_n_m = 1e5")
+        .replace("gyro = true", "gyro = true\n[robot]\nmount_n_m = 1e9\nroller_mass_kg = 1e-4")
+        .replace("friction = 0.3", "friction = 0.3\nsoftness_m = 1e-9")
+    )
+    config = tmp_path / "x.toml"
+    config.write_text(text.replace("shear_n_m = 1e5", "shear_n_m = 1e12"))
+    with pytest.raises(DataError, match="moved/snow/run000: the simulation became unstable"):
+        quietly(config, tmp_path / "out")
+    assert not list((tmp_path / "out").rglob("run*"))
+    assert not (Path.cwd() / "MUJOCO_LOG.TXT").exists()
+
+
+def test_only_runs_that_a_fit_can_use_get_a_config_for_it(tmp_path):
+    config = tmp_path / "x.toml"
+    start = SMALL.index("[[runs]]")
+    config.write_text(SMALL[:start] + SMALL[SMALL.index("[[runs]]", start + 1) :])
+    assert not can_identify(read_plan(config))
+    assert can_identify(plan(config, SMALL))
 
 
 def test_the_truth_has_the_names_of_a_fit():

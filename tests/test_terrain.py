@@ -1,5 +1,6 @@
 """Floor maps: polygons, pictures, files, and what is wrong with some of them."""
 
+import cv2
 import numpy as np
 import pytest
 from matplotlib.image import imsave
@@ -76,6 +77,15 @@ def test_a_picture_tells_surfaces_by_the_nearest_colour(tmp_path):
     np.testing.assert_array_equal(read_map(tmp_path / "site.toml").cells, floor.cells)
 
 
+def test_a_picture_may_be_grey(tmp_path):
+    cv2.imwrite(str(tmp_path / "top.png"), np.array([[0, 255]], np.uint8))
+    (tmp_path / "site.toml").write_text(
+        'schema = "slipid.map/1"\npicture = "top.png"\nmetres_per_pixel = 0.1\n'
+        '[colours]\ndark = "#101010"\nlight = "#f0f0f0"\n'
+    )
+    assert read_map(tmp_path / "site.toml").cells.tolist() == [[0, 1]]
+
+
 def test_a_patchwork_has_patches_of_its_size_and_is_the_same_again():
     floor = patchwork(["a", "b"], seed=1, patch=0.2)
     np.testing.assert_array_equal(floor.cells, patchwork(["a", "b"], seed=1, patch=0.2).cells)
@@ -88,7 +98,7 @@ def test_a_patchwork_has_patches_of_its_size_and_is_the_same_again():
 
 def test_the_four_zones_meet_in_the_middle_of_the_rectangle():
     floor = four_zones(["a", "b", "c", "d"])
-    around = [floor.surface_at(x, y) for x, y in ((0.1, 0), (0.8, 0), (0.8, -0.4), (0.1, -0.4))]
+    around = [floor.surface_at(x, y) for x, y in ((0.1, 0.0), (0.8, 0.0), (0.8, -0.4), (0.1, -0.4))]
     assert around == ["a", "b", "c", "d"]
 
 
@@ -105,6 +115,8 @@ def test_the_four_zones_meet_in_the_middle_of_the_rectangle():
         ((", [0.6, 0.6], [0.2, 0.6]]", "]"), "patch 1: 2 corners; expected three or more"),
         (("[0.2, 0.2], [0.6, 0.2]", '["a", 0.2], [0.6, 0.2]'), "polygon of patch 1"),
         (("schema", "= ="), "no valid TOML"),
+        (("polygon", "polygn"), "patch 1: no such key 'polygn'"),
+        (("cell_m = 0.01", "cell_m = 0.0001"), "100000000 cells; expected at most"),
     ],
 )
 def test_what_is_wrong_with_a_map_is_said(tmp_path, change, match):
@@ -127,6 +139,12 @@ def test_absent_and_broken_pictures_are_said(tmp_path):
         read_map(path)
     path.write_text(text + '[colours]\na = "red"\n')
     with pytest.raises(DataError, match="colour of a is 'red'"):
+        read_map(path)
+    path.write_text(text.replace("0.1", "-0.1") + '[colours]\na = "#ff0000"\n')
+    with pytest.raises(DataError, match=r"metres_per_pixel -0\.1; expected"):
+        read_map(path)
+    path.write_text('base = "a"\n' + text + '[colours]\na = "#ff0000"\n')
+    with pytest.raises(DataError, match="base beside picture"):
         read_map(path)
     path.write_text(text + '[colours]\na = "#ff0000"\n')
     with pytest.raises(DataError, match=r"picture .*top\.png"):

@@ -24,7 +24,7 @@ from slipid.testsite.experiments import (
 )
 from slipid.testsite.ground import GRAVITY, GROUNDS, Ground
 from slipid.testsite.machine import Machine
-from slipid.testsite.plant import Plant, Trace, ribs
+from slipid.testsite.plant import LEVELS, Plant, Trace, ribs
 
 EVEN = {name: replace(g, unevenness=0.0) for name, g in GROUNDS.items()}
 CENTRED = replace(Machine(), centres_m={"as_built": (0.0, 0.0)})
@@ -197,6 +197,33 @@ def test_every_roller_feels_the_floor_beneath_it():
     assert plant.sinkage[0] > 2 * plant.sinkage[1]
 
 
+def test_a_map_is_felt_up_to_its_edges():
+    cells = np.array([[0, 1]])
+    floor = FloorMap(("firm", "soft"), cells, (-3.0, -3.0), 3.0)
+    plant = Plant(CENTRED, Motor(), SpeedLoop(), floor, EVEN, "as_built", (-2.8, 1.0, 0.0))
+    places = np.stack([np.linspace(-3.5, 3.5, 90), np.full(90, 1.2)], axis=1)
+    places = places[np.abs(places[:, 0]) > 0.01]  # looked up in cells of some millimetres
+    np.testing.assert_array_equal(plant._kind(places) // LEVELS, floor.at(places))
+
+
+def test_the_centre_of_mass_is_where_it_is_put_also_with_uneven_wheels():
+    machine = replace(
+        Machine(), wheel_azimuths_deg=(0.0, 90.0, 210.0), centres_m={"as_built": (0.01, 0.01)}
+    )
+    plant = standing("firm", machine)
+    mujoco.mj_comPos(plant.model, plant.data)
+    x, y, _ = plant.pose
+    centre = plant.data.subtree_com[plant.model.body("chassis").id, :2] - (x, y)
+    np.testing.assert_allclose(centre, [0.01, 0.01], atol=1e-3)
+
+
+def test_a_command_arrives_after_its_delay():
+    for delay in (0.02, 0.12):
+        trace = drive(straight("firm", "as_built", 0.0, 0.2, 0.1), Site(command_delay_s=delay), 0)
+        first = trace.time[np.argmax(np.abs(trace.wheel_command[:, 0]) > 0)]
+        assert first == pytest.approx(delay, abs=0.0015)
+
+
 def test_compaction_and_body_drag_slow_a_robot():
     run = straight("soft", "as_built", 1.0, 0.2, 0.5)
     free = replace(EVEN["soft"], compaction=0.0, body_drag_n=0.0)
@@ -301,7 +328,6 @@ def test_a_timed_program_ends():
     assert program.command(0.5, np.zeros(3)) == (0.1, 0.0, 0.0)
     assert program.command(1.2, np.zeros(3)) == (0.0, 0.0, 0.2)
     assert program.command(1.5, np.zeros(3)) is None
-    assert program.longest_s == 1.5
 
 
 def test_the_rectangle_is_driven_by_encoders_and_better_by_camera():

@@ -373,8 +373,8 @@ def demo(
         str, typer.Option(metavar="NAME", help="recorded, or mujoco to drive the logs anew.")
     ] = "recorded",
     seed: Annotated[
-        int, typer.Option("--seed", min=0, help="Of the runs that are driven anew.")
-    ] = 0,
+        int | None, typer.Option("--seed", min=0, help="Of the runs that are driven anew.")
+    ] = None,
     quiet: Quiet = False,
 ) -> int:
     """The whole job on logs of the virtual test site, small: a folder to look at."""

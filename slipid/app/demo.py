@@ -52,34 +52,39 @@ def packaged_config(name: str) -> str:
 
 
 def demo(
-    out: Path, plant: str, seed: int, jobs: int, report: Reporter
+    out: Path, plant: str, seed: int | None, jobs: int, report: Reporter
 ) -> tuple[Any, dict[str, Any], list[Row]]:
     """Logs of the test site, identify, predict unseen runs; fit, validation and comparison.
 
     Args:
         out: folder to write to.
         plant: `recorded` for the logs that ship with slipid, `mujoco` to drive them anew.
-        seed: of the runs that are driven anew.
+        seed: of the runs that are driven anew, by default that of the recorded ones.
         jobs: processes that drive at once.
         report: progress.
 
     Raises:
-        DataError: no such plant, or MuJoCo is missing.
+        DataError: no such plant, a seed for what is recorded, or MuJoCo is missing.
     """
+    if plant not in ("recorded", "mujoco"):
+        raise DataError(f"no plant '{plant}'; expected recorded or mujoco")
+    if plant == "recorded" and seed is not None:
+        raise DataError("--seed is for runs that are driven anew; expected --plant mujoco with it")
+    source = out / plant
     if plant == "recorded":
         report.stage("unpacking recorded logs")
-        unpack(out)
-    elif plant == "mujoco":
-        drive_anew(out, seed, jobs, report)
+        unpack(source)
     else:
-        raise DataError(f"no plant '{plant}'; expected recorded or mujoco")
+        drive_anew(source, seed or 0, jobs, report)
     runtime.start()
     write_bytes(out / "robotino.toml", packaged_config("robotino.toml").encode())
     result = out / "result"
-    done = commands.identify(out / "robotino.toml", out / "fit" / "logs", result, report)
-    found = commands.validate(result, out / "unseen" / "logs", report)
+    done = commands.identify(out / "robotino.toml", source / "fit" / "logs", result, report)
+    found = commands.validate(result, source / "unseen" / "logs", report)
     write_json(result / "validation.json", found)
-    truth = read_json(out / "fit" / "truth" / "truth.json", "the truth that slipid simulate wrote")
+    truth = read_json(
+        source / "fit" / "truth" / "truth.json", "the truth that slipid simulate wrote"
+    )
     known = {path: p["value"] for path, p in truth["parameters"].items()}
     return done, found, compared(done.fit, known)
 

@@ -1,11 +1,15 @@
 """`slipid simulate`: logs from the virtual test site, in parallel, with the truth apart."""
 
+import os
 import signal
+import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +66,7 @@ def simulate(plan: Plan, out: Path, jobs: int, report: Reporter) -> dict[str, An
     about = {"schema": SCHEMA, "config_hash": plan.hash, "mujoco": version}
     if manifest.is_file():
         before = read_json(manifest, "what slipid simulate wrote")
+        before = before if isinstance(before, dict) else {}
         for key, what in (("config_hash", "config"), ("mujoco", "version of MuJoCo")):
             if before.get(key) != about[key]:
                 raise DataError(
@@ -78,10 +83,11 @@ def simulate(plan: Plan, out: Path, jobs: int, report: Reporter) -> dict[str, An
     report.stage(f"driving {len(todo)} of {len(every)} runs")
     began = time.monotonic()
     seconds = 0.0
-    for done, (job, driven) in enumerate(_spread(drive_and_write, todo, min(jobs, len(todo))), 1):
-        seconds += driven
-        left = (time.monotonic() - began) / done * (len(todo) - done)
-        report.step(done, len(todo), f"{job.name}, about {left:.0f} s left")
+    with closing(_spread(drive_and_write, todo, min(jobs, len(todo)))) as finished:
+        for done, (job, driven) in enumerate(finished, 1):
+            seconds += driven
+            left = (time.monotonic() - began) / done * (len(todo) - done)
+            report.step(done, len(todo), f"{job.name}, about {left:.0f} s left")
     pace = seconds / max(time.monotonic() - began, 1e-9)
     _film([job for job in every if job.name in plan.filmed], plan.content.camera, jobs, report)
     content = {**about, "runs": [name for name, _ in plan.runs]}
@@ -100,11 +106,10 @@ def _film(jobs: Sequence[Job], camera: Camera, processes: int, report: Reporter)
         return
     began = time.monotonic()
     # in processes of their own, also one by one: what draws has to be chosen before MuJoCo is there
-    for done, ((job, _), _) in enumerate(
-        _spread(film_and_write, todo, min(processes, len(todo))), 1
-    ):
-        left = (time.monotonic() - began) / done * (len(todo) - done)
-        report.step(done, len(todo), f"{job.name}, about {left:.0f} s left")
+    with closing(_spread(film_and_write, todo, min(processes, len(todo)))) as finished:
+        for done, ((job, _), _) in enumerate(finished, 1):
+            left = (time.monotonic() - began) / done * (len(todo) - done)
+            report.step(done, len(todo), f"{job.name}, about {left:.0f} s left")
 
 
 def film_and_write(what: tuple[Job, Camera]) -> int:
@@ -117,8 +122,8 @@ def film_and_write(what: tuple[Job, Camera]) -> int:
         frames = np.arange(true["time"][0], true["time"][-1], camera.frame_s)
         rows = "".join(f"{k},{t:.4f}\n" for k, t in enumerate(frames))
         write_bytes(path.with_suffix(".csv"), f"frame,time\n{rows}".encode())
-        film(studio, true["time"], true["pose"], true["wheel_angle"], frames, path)
-        studio.close()
+        with closing(studio):
+            film(studio, true["time"], true["pose"], true["wheel_angle"], frames, path)
     return len(frames)
 
 
@@ -128,29 +133,64 @@ def _video(out: Path, name: str) -> Path:
 
 def _spread(
     work: Callable[[Any], Any], todo: Sequence[Any], jobs: int
-) -> Iterator[tuple[Any, Any]]:
-    """Pieces of work and their results, in the order they are finished."""
+) -> Generator[tuple[Any, Any], None, None]:
+    """Pieces of work and their results, in the order they are finished; to be closed.
+
+    Raises:
+        DataError: a process was ended by the system.
+    """
     if work is drive_and_write and jobs <= 1:
         yield from ((job, work(job)) for job in todo)
         return
     # forked processes would inherit the threads of whatever the caller has loaded
-    with ProcessPoolExecutor(jobs, get_context("spawn"), _leave_interrupts) as pool:
-        waiting = {pool.submit(work, job): job for job in todo}
-        try:
-            for future in as_completed(waiting):
-                yield waiting[future], future.result()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _work_for, (os.getpid(),))
+    try:
+        with _deaf():  # Ctrl-C is for this process, from the start of the others on
+            waiting = {pool.submit(work, job): job for job in todo}
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()
+        pool.shutdown()
+    except BrokenProcessPool as error:
+        raise DataError(
+            "a process ended before its work did (memory?); called again, it goes on from there"
+        ) from error
+    finally:  # what is half done is nothing yet: files come whole
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in active_children():
+            child.terminate()
 
 
-def _leave_interrupts() -> None:
-    """Ctrl-C is for the process that started this one."""
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """No interrupts; processes started meanwhile never hear any."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _work_for(parent: int) -> None:
+    """Leave interrupts to the parent, and end when it has been killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def drive_and_write(job: Job) -> float:
     """Drive one run and write its log and its truth; the seconds it drove."""
-    trace = drive(job.run, job.site, job.seed)
+    try:
+        trace = drive(job.run, job.site, job.seed)
+    except ValueError as error:  # also the engine's, of a robot that it cannot build
+        raise DataError(f"{job.name}: {error}") from error
     site = job.site
     gear, ticks = site.machine.gear_ratio, site.motor.ticks_per_revolution
     log = logged(trace, site, job.name, job.run, job.seed)
@@ -187,10 +227,9 @@ def _place(form: str, job: Job) -> str:
     if form == "slipid":
         return f"{job.name}.csv"
     load, folder, number = job.name.split("/")
+    kind = {"as_built": "one_surface", "moved": "wheel_load"}.get(load, load)
     if job.run.surface is None:
-        kind = "two_surfaces"
-    else:
-        kind = {"as_built": "one_surface", "moved": "wheel_load"}.get(load, load)
+        kind = "two_surfaces" if load == "as_built" else f"two_surfaces/{load}"
     return f"{kind}/{folder}/exp{number.removeprefix('run')}.csv"
 
 
@@ -224,8 +263,14 @@ def _describe(plan: Plan, out: Path) -> None:
             "site": asdict(replace(site, grounds=dict(site.grounds))),
         },
     )
-    if "slipid" in plan.content.formats:
-        write_bytes(out / "robot.toml", identify_config(plan).encode())
+    robot = out / "robot.toml"
+    if can_identify(plan) and not robot.is_file():  # it may have been edited since
+        write_bytes(robot, identify_config(plan).encode())
+
+
+def can_identify(plan: Plan) -> bool:
+    """Whether there are logs in slipid's own columns that a fit can use."""
+    return "slipid" in plan.content.formats and any(r.surface is not None for _, r in plan.runs)
 
 
 def truth(site: Site) -> dict[str, dict[str, Any]]:
@@ -267,7 +312,7 @@ current_is_signed = {signed}
 {columns}
 {sets}
 [parameters]
-"camera.scale" = {{ prior = {{ mean = {scale}, std = 0.002 }} }}      # from a measured length
+"camera.scale" = {{ prior = {{ mean = {scale}, std = 0.002 }} }}      # measured, with an error
 "camera.lag" = {{ prior = {{ mean = 0.05, std = 0.02 }} }}
 "camera.marker_yaw" = {{ free = true }}
 "motor.resistance" = {{ start = 11.0, prior = {{ mean = 8.0, std = 4.0 }} }}
@@ -278,6 +323,7 @@ current_is_signed = {signed}
 def identify_config(plan: Plan) -> str:
     """Text of a config for `slipid identify` that fits the logs in slipid's own columns."""
     machine, sensors = plan.site.machine, plan.site.sensors
+    measured = 0.0015 * float(np.random.default_rng([plan.content.seed, 2]).normal())
     layout = own_layout(
         len(machine.wheel_azimuths_deg),
         machine.gear_ratio,
@@ -302,7 +348,7 @@ def identify_config(plan: Plan) -> str:
         signed="true" if layout["current_is_signed"] else "false",
         columns=columns,
         sets=sets,
-        scale=sensors.camera_scale,
+        scale=round(sensors.camera_scale * (1 + measured), 4),
     )
 
 

@@ -1,15 +1,19 @@
 """The config of `slipid simulate`: robot, floors and runs of the virtual test site."""
 
-import hashlib
+import json
+import re
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatch
+from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from slipid.app.config import Positive, _Section
+from slipid.app.config import _Section
 from slipid.app.toml_file import checked, mapping_of, text_of
 from slipid.data import terrain
 from slipid.data.log import DataError
@@ -20,7 +24,13 @@ from slipid.testsite.ground import GROUNDS, Ground
 from slipid.testsite.machine import Machine
 from slipid.testsite.sensors import Sensors
 
-Speeds = Annotated[list[Positive], Field(min_length=1)]
+Speed = Annotated[float, Field(gt=0, le=3)]
+Speeds = Annotated[list[Speed], Field(min_length=1)]
+Distance = Annotated[float, Field(gt=0, le=100)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+"""Of surfaces, loads and maps: they name files and folders."""
+RESERVED = ("one_surface", "two_surfaces", "wheel_load")
+"""Folders of the 2022 layout."""
 
 
 class FileMap(_Section):
@@ -36,8 +46,8 @@ class Patchwork(_Section):
     kind: Literal["patchwork"]
     surfaces: list[str] = Field(min_length=1)
     seed: int = Field(0, ge=0)
-    patch_m: Positive = 0.25
-    half_m: Positive = 1.2
+    patch_m: float = Field(0.25, ge=0.01, le=10)
+    half_m: float = Field(1.2, ge=0.4, le=20)
 
 
 class FourZones(_Section):
@@ -56,10 +66,10 @@ class Headings(_Section):
     kind: Literal["headings"]
     surface: str
     load: str = "as_built"
-    step_deg: Positive = 15.0
+    step_deg: float = Field(15.0, ge=0.1, le=360)
     first_deg: float = Field(0.0, allow_inf_nan=False)
     speeds_m_s: Speeds = Field(default=[0.1, 0.2])
-    distance_m: Positive = 0.7
+    distance_m: Distance = 0.7
 
 
 class Curves(_Section):
@@ -68,9 +78,9 @@ class Curves(_Section):
     kind: Literal["curves"]
     surface: str
     load: str = "as_built"
-    count: int = Field(4, ge=1)
+    count: int = Field(4, ge=1, le=10_000)
     speeds_m_s: Speeds = Field(default=[0.1, 0.2])
-    distance_m: Positive = 0.7
+    distance_m: Distance = 0.7
 
 
 class PaperGrid(_Section):
@@ -79,7 +89,7 @@ class PaperGrid(_Section):
     kind: Literal["paper_grid"]
     surface: str
     load: str = "as_built"
-    seconds: Positive = 3.0
+    seconds: float = Field(3.0, gt=0, le=3600)
 
 
 class Wander(_Section):
@@ -88,8 +98,8 @@ class Wander(_Section):
     kind: Literal["wander"]
     map: str
     load: str = "as_built"
-    count: int = Field(8, ge=1)
-    points: int = Field(4, ge=1)
+    count: int = Field(8, ge=1, le=10_000)
+    points: int = Field(4, ge=1, le=1000)
     by: Literal["camera", "encoders"] = "camera"
 
 
@@ -100,8 +110,8 @@ class Rectangle(_Section):
     map: str
     load: str = "as_built"
     by: Literal["camera", "encoders"] = "encoders"
-    repeats: int = Field(1, ge=1)
-    speed_m_s: Positive = 0.2
+    repeats: int = Field(1, ge=1, le=10_000)
+    speed_m_s: Speed = 0.2
 
 
 Runs = Annotated[Headings | Curves | PaperGrid | Wander | Rectangle, Field(discriminator="kind")]
@@ -113,16 +123,16 @@ class Content(_Section):
     seed: int = Field(0, ge=0)
     formats: list[Literal["slipid", "robotino2022"]] = Field(default=["slipid"], min_length=1)
     heading_jitter_deg: float = Field(5.0, ge=0, le=180)
-    command_delay_s: float = Field(0.12, ge=0)
-    acceleration_m_s2: Positive = 1.0
+    command_delay_s: float = Field(0.12, ge=0, le=10)
+    acceleration_m_s2: float = Field(1.0, ge=0.01, le=1000)
     robot: Machine = Field(default_factory=Machine)
     motor: Motor = Motor()
     speed_loop: SpeedLoop = SpeedLoop()
     sensors: Sensors = Sensors()
     video: list[str] = Field(default_factory=list)
     camera: Camera = Camera()
-    surfaces: dict[str, Ground] = Field(default_factory=dict)
-    maps: dict[str, Map] = Field(default_factory=dict)
+    surfaces: dict[Name, Ground] = Field(default_factory=dict)
+    maps: dict[Name, Map] = Field(default_factory=dict)
     runs: list[Runs] = Field(min_length=1)
 
 
@@ -181,17 +191,14 @@ def plan(path: Path, text: str) -> Plan:
         content.command_delay_s,
         content.acceleration_m_s2,
     )
-    maps = {name: _floor(path, m) for name, m in content.maps.items()}
-    for k, runs in enumerate(content.runs, 1):
-        _known(path, f"runs[{k}].load", runs.load, site.machine.centres_m)
-        if isinstance(runs, Wander | Rectangle):
-            _known(path, f"runs[{k}].map", runs.map, maps)
-        else:
-            _known(path, f"runs[{k}].surface", runs.surface, site.grounds)
-    for name, floor in maps.items():
-        for surface in floor.surfaces:
-            _known(path, f"maps.{name}", surface, site.grounds)
-    everything = [r for k, one in enumerate(content.runs) for r in _runs(one, maps, content, k)]
+    maps = {name: _floor(path, name, m) for name, m in content.maps.items()}
+    _check(path, content, site, maps)
+    everything: list[ex.Run] = []
+    for k, one in enumerate(content.runs, 1):
+        try:
+            everything += _runs(one, maps, content, k)
+        except ValueError as error:
+            raise DataError(f"{path}: runs[{k}]: {error}") from error
     jitter = float(np.radians(content.heading_jitter_deg))
     named = tuple(ex.numbered(everything, jitter, content.seed))
     for pattern in content.video:
@@ -200,17 +207,60 @@ def plan(path: Path, text: str) -> Plan:
             raise DataError(
                 f"{path}: video: no run is named '{pattern}'; expected some of {folders}"
             )
-    digest = hashlib.sha256(text.encode())
-    for floor in maps.values():
-        digest.update(floor.cells.tobytes())
     return Plan(
-        digest.hexdigest(),
+        _hash(content, site, maps),
         content,
         site,
         maps,
         named,
         tuple(n for n, _ in named if any(fnmatch(n, pattern) for pattern in content.video)),
     )
+
+
+def _check(
+    path: Path, content: Content, site: ex.Site, maps: Mapping[str, terrain.FloorMap]
+) -> None:
+    """DataError where parts of a config do not go together."""
+    for load in site.machine.centres_m:
+        if not re.fullmatch("[A-Za-z0-9_-]+", load) or load in RESERVED:
+            raise DataError(
+                f"{path}: robot.centres_m: load '{load}'; expected letters, digits, _ and -, "
+                f"none of {', '.join(RESERVED)}"
+            )
+    for k, runs in enumerate(content.runs, 1):
+        _known(path, f"runs[{k}].load", runs.load, site.machine.centres_m)
+        if isinstance(runs, Wander | Rectangle):
+            _known(path, f"runs[{k}].map", runs.map, maps)
+        else:
+            _known(path, f"runs[{k}].surface", runs.surface, site.grounds)
+    for name, floor in maps.items():
+        if name in site.grounds:
+            raise DataError(f"{path}: maps.{name}: also the name of a surface; expected another")
+        for surface in floor.surfaces:
+            _known(path, f"maps.{name}", surface, site.grounds)
+        colours = [site.grounds[s].colour.lower() for s in floor.surfaces]
+        if len(set(colours)) < len(colours):
+            raise DataError(f"{path}: maps.{name}: two surfaces have one colour; expected others")
+    if "robotino2022" in content.formats:
+        robot, sensors = site.machine, site.sensors
+        fits = len(robot.wheel_azimuths_deg) == 3 and robot.gear_ratio == 16
+        fits &= site.motor.ticks_per_revolution == 2000 and not sensors.current_is_signed
+        if not fits:
+            raise DataError(
+                f"{path}: formats: robotino2022 is for three wheels, gear 16, 2000 ticks and "
+                "unsigned current; expected slipid alone for other robots"
+            )
+
+
+def _hash(content: Content, site: ex.Site, maps: Mapping[str, terrain.FloorMap]) -> str:
+    """Of all that decides what is driven and logged; videos may be asked for later."""
+    said = content.model_dump(mode="json", exclude={"video", "camera"})
+    floors = {
+        name: [f.surfaces, f.corner, f.cell, f.cells.shape, sha256(f.cells.tobytes()).hexdigest()]
+        for name, f in maps.items()
+    }
+    everything = {"said": said, "site": asdict(site), "maps": floors, "slipid": version("slipid")}
+    return sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
 
 
 def _known(path: Path, where: str, name: str, choices: Any) -> None:
@@ -220,12 +270,15 @@ def _known(path: Path, where: str, name: str, choices: Any) -> None:
         )
 
 
-def _floor(path: Path, given: Any) -> terrain.FloorMap:
+def _floor(path: Path, name: str, given: Any) -> terrain.FloorMap:
     if isinstance(given, FileMap):
         return terrain.read_map(path.parent / given.file)
-    if isinstance(given, Patchwork):
+    if isinstance(given, FourZones):
+        return terrain.four_zones(given.surfaces)
+    try:
         return terrain.patchwork(given.surfaces, given.seed, given.patch_m, given.half_m)
-    return terrain.four_zones(given.surfaces)
+    except ValueError as error:
+        raise DataError(f"{path}: maps.{name}: {error}") from error
 
 
 def _runs(
@@ -245,6 +298,12 @@ def _runs(
     if isinstance(given, PaperGrid):
         return ex.paper_grid(given.surface, given.load, given.seconds)
     floor = maps[given.map]
+    x0, y0, x1, y1 = floor.extent
+    if isinstance(given, Rectangle) and not (x0 <= 0 <= x1 and y0 <= 0 <= y1):
+        raise ValueError(
+            f"it starts at 0, 0, but map {given.map} reaches from {x0:g}, {y0:g} to "
+            f"{x1:g}, {y1:g}; expected a map around the start"
+        )
     if isinstance(given, Wander):
         seed = 1000 * content.seed + place
         return ex.wander(floor, given.map, given.load, given.count, seed, given.points, given.by)

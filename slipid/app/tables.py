@@ -323,12 +323,14 @@ def _saving(s: dict[str, Any]) -> str:
 
 def simulated(found: dict[str, Any], plan: Any, out: Path) -> None:
     """How much was driven, and what to do with it."""
+    from slipid.app.simulate import can_identify
+
     console = _console()
     console.print(f"{len(found['runs'])} runs, {found['driven']} of them driven now")
     if found["pace"] is not None:
         console.print(f"{found['seconds']:.0f} s at {found['pace']:.1f} times real time")
     console.print(f"truth, which nothing reads that fits: {out / 'truth'}", soft_wrap=True)
-    if "slipid" in plan.content.formats:
+    if can_identify(plan):
         line = (
             f"  slipid identify {out / 'robot.toml'} --data {out / 'logs'} --out {out / 'result'}"
         )

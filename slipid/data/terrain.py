@@ -14,6 +14,9 @@ from slipid.data.files import write_bytes
 from slipid.data.log import DataError
 
 SCHEMA = "slipid.map/1"
+MOST_CELLS = 16_000_000
+"""Of one map."""
+_PATCH = ("surface", "polygon")
 _KEYS = (
     "schema",
     "base",
@@ -80,11 +83,15 @@ def from_polygons(
         patches: surface and corners (x, y) [m] of each.
         extent: lowest x, lowest y, highest x, highest y [m].
         cell: edge of a cell [m].
+
+    Raises:
+        ValueError: more than `MOST_CELLS` cells.
     """
     from matplotlib.path import Path as Outline
 
     surfaces = tuple(dict.fromkeys([base, *(name for name, _ in patches)]))
     columns, rows = (max(1, round((extent[2 + k] - extent[k]) / cell)) for k in range(2))
+    _few(rows * columns)
     x = extent[0] + (np.arange(columns) + 0.5) * cell
     y = extent[1] + (np.arange(rows) + 0.5) * cell
     centres = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
@@ -129,9 +136,15 @@ def patchwork(
         patch: mean distance of neighbouring patches [m].
         half: half of the site's edge [m].
         cell: edge of a cell [m].
+
+    Raises:
+        ValueError: too many cells or patches.
     """
-    rng = np.random.default_rng(seed)
+    _few(round(2 * half / cell) ** 2)
     count = int(np.ceil(2 * half / patch)) + 2
+    if count > 500:
+        raise ValueError(f"{count} x {count} patches; expected at most 500 x 500")
+    rng = np.random.default_rng(seed)
     grid = (np.arange(count) - 0.5 * (count - 1)) * patch
     seeds = np.stack(np.meshgrid(grid, grid), -1).reshape(-1, 2)
     seeds = seeds + rng.uniform(-0.35, 0.35, seeds.shape) * patch
@@ -195,6 +208,10 @@ def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
         path: of the TOML file; the picture has its name.
         floor: the map.
         colours: of every surface, as `#rrggbb`, all different.
+
+    Raises:
+        ValueError: two surfaces have one colour.
+        DataError: nothing can be written there.
     """
     from matplotlib.image import imsave
 
@@ -211,7 +228,7 @@ def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
         f"corner_m = [{floor.corner[0]}, {floor.corner[1]}]",
         "",
         "[colours]",
-        *(f'{name} = "{colours[name]}"' for name in floor.surfaces),
+        *(f'"{name}" = "{colours[name]}"' for name in floor.surfaces),
     ]
     write_bytes(path, ("\n".join(lines) + "\n").encode())
 
@@ -229,15 +246,24 @@ def _patched(path: Path, content: Mapping[str, Any]) -> FloorMap:
     if not 0 < cell <= 1:
         raise DataError(f"{path}: cell_m {cell}; expected above 0, at most 1")
     patches = []
-    for k, patch in enumerate(content.get("patch", []), 1):
+    given = content.get("patch", [])
+    if not isinstance(given, list):
+        raise DataError(f"{path}: patch {given!r}; expected sections [[patch]]")
+    for k, patch in enumerate(given, 1):
         if not isinstance(patch, Mapping) or not isinstance(patch.get("surface"), str):
             raise DataError(f"{path}: patch {k} has no surface; expected a name")
+        for key in patch:
+            if key not in _PATCH:
+                raise DataError(f"{path}: patch {k}: no such key '{key}'; expected {_PATCH}")
         corners = _numbers(path, f"polygon of patch {k}", patch.get("polygon"), (None, 2))
         if len(corners) < 3:
             raise DataError(f"{path}: patch {k}: {len(corners)} corners; expected three or more")
         patches.append((patch["surface"], corners.tolist()))
     x0, y0, x1, y1 = (float(v) for v in extent)
-    return from_polygons(base, patches, (x0, y0, x1, y1), cell)
+    try:
+        return from_polygons(base, patches, (x0, y0, x1, y1), cell)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}") from error
 
 
 def _pictured(path: Path, content: Mapping[str, Any]) -> FloorMap:
@@ -250,12 +276,21 @@ def _pictured(path: Path, content: Mapping[str, Any]) -> FloorMap:
         if not isinstance(colour, str) or len(colour) != 7 or colour[0] != "#":
             raise DataError(f"{path}: colour of {name} is {colour!r}; expected '#rrggbb'")
     scale = float(_numbers(path, "metres_per_pixel", content.get("metres_per_pixel"), ()))
+    if not 1e-5 <= scale <= 1:
+        raise DataError(f"{path}: metres_per_pixel {scale}; expected 0.00001 to 1")
+    for key in ("base", "patch", "cell_m", "extent_m"):
+        if key in content:
+            raise DataError(f"{path}: {key} beside picture; expected one or the other")
     corner = _numbers(path, "corner_m", content.get("corner_m", [0.0, 0.0]), (2,))
     source = path.parent / str(content["picture"])
     try:
         picture = np.asarray(imread(source), float)
     except (OSError, ValueError, SyntaxError) as error:
         raise DataError(f"{path}: picture {source}: {error}; expected a PNG or JPEG") from error
+    if picture.ndim == 2:  # shades of grey
+        picture = np.repeat(picture[..., None], 3, axis=2)
+    if picture.shape[0] * picture.shape[1] > MOST_CELLS:
+        raise DataError(f"{path}: picture {source}: expected at most {MOST_CELLS} pixels")
     picture = picture[..., :3] if picture.max() <= 1 else picture[..., :3] / 255
     try:
         return from_picture(picture, colours, scale, (float(corner[0]), float(corner[1])))
@@ -277,6 +312,11 @@ def _numbers(path: Path, key: str, value: Any, shape: tuple[int | None, ...]) ->
         )
         raise DataError(f"{path}: {key} {value!r}; expected {wanted}")
     return found
+
+
+def _few(cells: int) -> None:
+    if cells > MOST_CELLS:
+        raise ValueError(f"{cells} cells; expected at most {MOST_CELLS}: a larger cell, less floor")
 
 
 def _rgb(colour: str) -> list[float]:

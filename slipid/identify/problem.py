@@ -449,6 +449,8 @@ class Problem:
                 scale = jnp.sqrt(share / before[k])
                 blocks = blocks | {k: blocks[k] * scale}
                 jacobian = jacobian | {k: jacobian[k] * scale[..., None]}
+        if own and scoring:  # the Jacobian by R changes by more than its scale
+            blocks, jacobian = self.linear(jnp.asarray(z), self.volt(log_v))
         std = np.sqrt(np.diag(np.linalg.inv(np.asarray(self.precision(jacobian, log_v, keep_j)))))
         moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
         moved = max(moved, float(np.max(np.abs(np.asarray(log_v) - state.log_variance)) / 3))
@@ -464,4 +466,7 @@ class Problem:
 
 def _shared(base: Array, own: Array | None) -> Array:
     """How the covariance of residuals grows with each variance, of which only a part is in them."""
-    return base if own is None else base * own[:, None, :, None]
+    if own is None:
+        return base
+    root = jnp.sqrt(own)
+    return base * root[:, None, :, None] * root[:, None, None, :]

@@ -43,7 +43,7 @@ class Camera:
         blur_px: std of the blur [pixel].
         noise: std of every pixel [grey levels of 255].
         flicker: how much the light changes within some seconds, as a part of it.
-        exposure_s: how long a frame is exposed; what moves smears.
+        exposure_s: how long a frame is exposed; what moves is seen twice, at both ends.
         frame_s: between frames.
     """
 
@@ -62,6 +62,10 @@ class Camera:
 
     def __post_init__(self) -> None:
         positive(self, "height_m", "focal_px", "width_px", "height_px", "frame_s")
+        if not np.isfinite([*self.centre_m, *self.tilt_deg, *self.distortion]).all():
+            raise ValueError("centre_m, tilt_deg and distortion: expected finite numbers")
+        if max(map(abs, self.tilt_deg)) > 10:
+            raise ValueError(f"tilt_deg = {self.tilt_deg}; expected at most 10 degrees")
         not_negative(self, "blur_px", "noise", "flicker", "exposure_s")
 
     @property
@@ -270,6 +274,11 @@ def film(
                 studio.exposed(float(t), lambda s: at(pose, s), lambda s: at(wheel_angle, s))
             )
         video.release()
+        written = cv2.VideoCapture(str(partial)).get(cv2.CAP_PROP_FRAME_COUNT)
+        if written != len(frames):
+            raise DataError(
+                f"{path}: {written:.0f} of {len(frames)} frames written; is there room?"
+            )
         os.replace(partial, path)
     finally:
         video.release()

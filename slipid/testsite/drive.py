@@ -17,7 +17,8 @@ class Motor:
         rotor_inertia_kg_m2: at the motor shaft.
         coulomb_nm, viscous_nms: friction at the wheel [N m], [N m s].
         efficiency: of the gear, while the motor drives.
-        supply_v, supply_ohm: of the battery that all motors share.
+        supply_v, supply_ohm: of the battery that all motors share; it never falls below a
+            twentieth.
         ticks_per_revolution: of the encoder on the motor shaft.
     """
 
@@ -36,6 +37,10 @@ class Motor:
         positive(self, "resistance_ohm", "inductance_h", "back_emf_vs", "rotor_inertia_kg_m2")
         positive(self, "efficiency", "supply_v", "ticks_per_revolution")
         not_negative(self, "coulomb_nm", "viscous_nms", "supply_ohm")
+        if self.ticks_per_revolution < 10:
+            raise ValueError(
+                f"ticks_per_revolution = {self.ticks_per_revolution}; expected 10 or more"
+            )
         if self.efficiency > 1:
             raise ValueError(f"efficiency = {self.efficiency}; expected at most 1")
 
@@ -114,7 +119,7 @@ class Drive:
             self.voltage[k], self.current[k] = volts, amps
             drawn += amps * volts / self.bus
             out.append(torque * m.efficiency if torque * turning > 0 else torque)
-        self.bus = m.supply_v - m.supply_ohm * max(drawn, 0.0)
+        self.bus = max(m.supply_v - m.supply_ohm * max(drawn, 0.0), 0.05 * m.supply_v)
         return out
 
     def _voltage(self, k: int, wanted: float, measured: float) -> float:

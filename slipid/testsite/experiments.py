@@ -47,10 +47,6 @@ class Timed:
 
     legs: tuple[tuple[Twist, float], ...]
 
-    @property
-    def longest_s(self) -> float:
-        return sum(seconds for _, seconds in self.legs)
-
     def command(self, time: float, pose: Float[np.ndarray, "3"]) -> Twist | None:
         """Twist at a time, None when it is over."""
         for twist, seconds in self.legs:
@@ -69,14 +65,14 @@ class Waypoints:
         speed: [m/s].
         by: the pose that is believed: `encoders` from the start on, or `camera` (the true one).
         within_m: from a place it is reached.
-        longest_s: after which it is given up.
+        longest_s: after which it is given up; by default thrice the time without slip and 10 s.
     """
 
     places: tuple[tuple[float, float], ...]
     speed: float = 0.2
     by: str = "encoders"
     within_m: float = 0.02
-    longest_s: float = 60.0
+    longest_s: float | None = None
 
     def __post_init__(self) -> None:
         if self.by not in ("encoders", "camera"):
@@ -200,6 +196,8 @@ def wander(
     rng = np.random.default_rng(seed)
     x0, y0, x1, y1 = floor.extent
     low, high = np.array([x0, y0]) + 0.3, np.array([x1, y1]) - 0.3
+    if (low >= high).any():
+        raise ValueError(f"a floor of {x1 - x0:g} x {y1 - y0:g} m; expected more than 0.6 x 0.6 m")
     out = []
     for _ in range(count):
         places = rng.uniform(low, high, (points + 1, 2))
@@ -240,6 +238,9 @@ def drive(run: Run, site: Site, seed: int, timestep: float | None = None) -> Tra
         site: robot and floors.
         seed: of how the wheels stand and of the floor's unevenness.
         timestep: of the engine [s], by default `plant.TIMESTEP`.
+
+    Raises:
+        DataError: MuJoCo is missing, a surface has no physics, or the simulation became unstable.
     """
     more = {} if timestep is None else {"timestep": timestep}
     plant = Plant(
@@ -259,8 +260,8 @@ def drive(run: Run, site: Site, seed: int, timestep: float | None = None) -> Tra
     believed = np.zeros(3)
     before = plant.wheel_angle
     every = round(PERIOD / plant.dt)
-    waiting = [np.zeros(3)] * round(site.command_delay_s / PERIOD)
-    wheels = np.zeros(len(before))
+    waiting: list[tuple[float, Float[np.ndarray, " wheel"]]] = []
+    wheels = wanted = np.zeros(len(before))
     slew = site.acceleration * plant.dt / machine.wheel_radius_m
     goal = 0
     sent = np.zeros(3)
@@ -276,13 +277,16 @@ def drive(run: Run, site: Site, seed: int, timestep: float | None = None) -> Tra
             twist = program.command(plant.time, believed)
         if twist is None:
             break
-        waiting.append(np.array(twist))
-        sent, wanted = np.array(twist), machine.wheel_from_twist @ waiting.pop(0)
+        sent = np.array(twist)
+        waiting.append((plant.time + site.command_delay_s, machine.wheel_from_twist @ sent))
         for _ in range(every):
+            while waiting and waiting[0][0] <= plant.time + 1e-9:
+                wanted = waiting.pop(0)[1]
             wheels = wheels + np.clip(wanted - wheels, -slew, slew)
             recorder.record(wheels, sent)
             plant.step(wheels.tolist())
     recorder.record(wheels, sent)
+    plant.check()
     return recorder.trace()
 
 
@@ -296,7 +300,12 @@ def _towards(
         if size > program.within_m:
             break
         goal += 1
-    if goal == len(program.places) or time > program.longest_s:
+    longest = program.longest_s
+    if longest is None:
+        corners = np.array([program.places[-1], *program.places])  # at least as long as the way
+        steps = np.diff(corners, axis=0)
+        longest = 10.0 + 3 * float(np.hypot(*steps.T).sum()) / program.speed
+    if goal == len(program.places) or time > longest:
         return goal, None
     speed = min(program.speed, max(0.05, 2.0 * size))
     c, s = np.cos(pose[2]), np.sin(pose[2])

@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 
-from slipid.testsite.refuse import not_negative, positive
+from slipid.testsite.refuse import at_most, not_negative, positive
 
 GRAVITY = 9.81
 
@@ -38,6 +38,10 @@ class Ground:
     def __post_init__(self) -> None:
         positive(self, "friction", "softness_m", "shear_n_m", "rib_distance_m")
         not_negative(self, "rolling_m", "compaction", "body_drag_n", "rib_height_m", "unevenness")
+        at_most(self, friction=10.0, rolling_m=0.05, softness_m=0.03, compaction=1e7)
+        at_most(self, body_drag_n=1000.0, rib_height_m=0.02, unevenness=1.0)
+        if self.shear_n_m < 50:
+            raise ValueError(f"shear_n_m = {self.shear_n_m}; expected 50 or above")
         if re.fullmatch("#[0-9a-fA-F]{6}", self.colour) is None:
             raise ValueError(f"colour = {self.colour!r}; expected '#rrggbb'")
 

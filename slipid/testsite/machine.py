@@ -62,10 +62,25 @@ class Machine:
             raise ValueError(f"{self.rollers} rollers; expected an even number, 6 or more")
         if self.roller_radius_m >= self.wheel_radius_m:
             raise ValueError("rollers as large as the wheel; expected smaller ones")
+        positive(self, "body_radius_m")
         if self.own_mass_kg <= 0:
             raise ValueError(f"{self.mass_kg} kg is less than the wheels weigh; expected more")
+        if not np.isfinite([*self.wheel_azimuths_deg, self.marker_yaw_deg]).all():
+            raise ValueError("wheel_azimuths_deg and marker_yaw_deg: expected finite numbers")
+        if np.linalg.cond(self.wheel_from_twist * self.wheel_radius_m) > 100:
+            raise ValueError(
+                f"wheel_azimuths_deg = {self.wheel_azimuths_deg}; expected them spread"
+            )
+        if self.roller_mass_kg < 1e-4 or self.centre_height_m > 0.5:
+            raise ValueError("expected roller_mass_kg of 1e-4 or above, centre_height_m up to 0.5")
+        if self.marker_height_m < self.wheel_radius_m + 0.08:
+            raise ValueError(
+                f"marker_height_m = {self.marker_height_m}; expected it 0.08 above the axes"
+            )
+        if not self.centres_m:
+            raise ValueError("no centres_m; expected a place for every load set-up")
         for name in self.centres_m:
-            if self.load_share(name).min() <= 0.02:
+            if not self.load_share(name).min() > 0.02:
                 raise ValueError(f"load {name}: the centre of mass is not within the wheels")
 
     @property
@@ -117,8 +132,9 @@ def mjcf(
         floor_looks: XML attributes of the floor's plane.
     """
     m = machine
-    share = m.own_mass_kg / m.mass_kg
-    x, y = (v / share for v in m.centres_m[load])  # wheels are centred
+    # the chassis makes up for wheels that are not spread evenly
+    wheels = (m.mass_kg - m.own_mass_kg) * m.places.mean(axis=0)
+    x, y = (m.mass_kg * np.array(m.centres_m[load]) - wheels) / m.own_mass_kg
     inertia = m.own_mass_kg * np.array([0.012, 0.012, 0.016])
     parts = [
         f'<mujoco><option timestep="{timestep}" cone="elliptic" impratio="10" '

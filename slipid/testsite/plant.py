@@ -22,9 +22,11 @@ LEVELS = 7
 LOOK = 5
 """Time steps between two looks at what is beneath the rollers."""
 ARENA = 1.6
-"""Half of the edge of the square around the start that a floor is looked up in [m]."""
+"""Half of the edge of the square around the start in which one surface is uneven [m]."""
 GRID = 0.005
-"""Cells of it [m]."""
+"""Cells in which the floor is looked up [m], larger on the largest floors."""
+MOST_CELLS = 16_000_000
+"""Of one floor."""
 CREEP = 0.02
 """Speed at which an added force has reached 0.7 of its size [m/s]."""
 
@@ -72,6 +74,10 @@ class Trace:
     twist_command: Float[np.ndarray, "step 3"]
 
 
+def _quiet(text: str) -> None:
+    """Warnings are counted by the engine; `Plant.check` reads them."""
+
+
 def heading_of(quaternion: Float[np.ndarray, "*batch 4"]) -> Any:
     """Angle about the vertical of a quaternion w, x, y, z [rad]."""
     w, x, y, z = np.moveaxis(np.asarray(quaternion), -1, 0)
@@ -114,6 +120,7 @@ class Plant:
                 raise DataError(f"no physics of surface '{name}'; expected one of {choices}")
         self.machine, self.floor, self.dt = machine, floor, timestep
         mujoco = engine()
+        mujoco.set_mju_user_warning(_quiet)  # else it writes a file to the working directory
         self._step = mujoco.mj_step
         self.model = mujoco.MjModel.from_xml_string(
             mjcf(machine, load, timestep, ribs(floor, grounds, start))
@@ -169,6 +176,18 @@ class Plant:
         d.qfrc_applied[self.wheel_dof] = self.drive.step(wanted, angle, speed)
         self._step(self.model, d)
 
+    def check(self) -> None:
+        """DataError where the engine lost the robot: it starts again from somewhere and goes on."""
+        mujoco = engine()
+        kinds = [f"mjWARN_BAD{what}" for what in ("QPOS", "QVEL", "QACC")]
+        numbers = [int(getattr(mujoco.mjtWarning, kind)) for kind in kinds]
+        lost = any(self.data.warning[k].number for k in numbers)
+        if lost or not np.isfinite([*self.pose, *self.drive.current]).all():
+            raise DataError(
+                f"the simulation became unstable before {self.time:.2f} s; "
+                "expected smaller forces, gains or stiffness"
+            )
+
     def loads(self) -> Float[np.ndarray, " wheel"]:
         """Vertical force of the floor on each wheel at this moment [N]."""
         mujoco = engine()
@@ -217,9 +236,11 @@ class Plant:
         self._compaction = [g.compaction for g in own]
         self._body_drag = [g.body_drag_n for g in own]
         self._resists = any(self._compaction) or any(self._body_drag)
-        self._corner = np.array(start[:2]) - ARENA
-        side = np.arange(round(2 * ARENA / GRID)) * GRID
-        x, y = self._corner[0] + side, self._corner[1] + side
+        x0, y0, x1, y1 = arena(self.floor, start)
+        self._corner = np.array([x0, y0])
+        self._cell = max(GRID, ((x1 - x0) * (y1 - y0) / MOST_CELLS) ** 0.5)
+        x = np.arange(x0, x1, self._cell) + 0.5 * self._cell
+        y = np.arange(y0, y1, self._cell) + 0.5 * self._cell
         surface = self.floor.at(np.stack(np.meshgrid(x, y), -1))
         self._kinds = surface * LEVELS + _uneven(x, y, rng)
         self._beneath = np.full(len(self._roller), -1)
@@ -235,8 +256,9 @@ class Plant:
 
     def _kind(self, xy: Float[np.ndarray, "place 2"]) -> np.ndarray:
         """Surface and level of unevenness at places."""
-        column, row = ((xy - self._corner) * (1 / GRID)).astype(np.intp).T
-        return self._kinds.take(row * len(self._kinds) + column, mode="clip")
+        column, row = ((xy - self._corner) * (1 / self._cell)).astype(np.intp).T
+        rows, columns = self._kinds.shape
+        return self._kinds[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
 
     def _look(self) -> None:
         """Give every roller the contact parameters of the floor beneath it.
@@ -298,20 +320,26 @@ def _uneven(
     return np.clip(np.rint((field + 1.5) / 3 * (LEVELS - 1)), 0, LEVELS - 1).astype(np.intp)
 
 
+def arena(floor: FloorMap, start: tuple[float, float, float]) -> tuple[float, float, float, float]:
+    """Lowest x, y, highest x, y [m] of where a floor is made: all of a map, or around the start."""
+    if len(floor.surfaces) > 1:
+        return floor.extent
+    x, y, _ = start
+    return x - ARENA, y - ARENA, x + ARENA, y + ARENA
+
+
 def ribs(
     floor: FloorMap, grounds: Mapping[str, Ground], start: tuple[float, float, float]
 ) -> list[tuple[float, float, float, float]]:
-    """Ribs along y: x, lowest y, highest y, height [m] of each; within 1.5 m of the start."""
+    """Ribs along y: x, lowest y, highest y, height [m] of each; none beyond `arena`."""
     out: list[tuple[float, float, float, float]] = []
-    x0, y0, x1, y1 = floor.extent
-    low, high = max(y0, start[1] - 1.5), min(y1, start[1] + 1.5)
+    left, low, right, high = arena(floor, start)
     fine = min(floor.cell, 0.02)
     y = np.arange(low + 0.5 * fine, high, fine)
     for number, name in enumerate(floor.surfaces):
         ground = grounds[name]
         if ground.rib_height_m <= 0:
             continue
-        left, right = max(x0, start[0] - 1.5), min(x1, start[0] + 1.5)
         for x in np.arange(left, right, ground.rib_distance_m):
             on = floor.at(np.stack([np.full_like(y, x), y], 1)) == number
             ends = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))

@@ -12,6 +12,14 @@ def positive(thing: Any, *names: str) -> None:
             raise ValueError(f"{name} = {value}; expected a number above 0")
 
 
+def at_most(thing: Any, **limits: float) -> None:
+    """ValueError where these attributes are above their limits."""
+    for name, limit in limits.items():
+        value = getattr(thing, name)
+        if not value <= limit:
+            raise ValueError(f"{name} = {value}; expected at most {limit:g}")
+
+
 def not_negative(thing: Any, *names: str) -> None:
     """ValueError unless these attributes are 0 or above."""
     for name in names:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from slipid.data.log import Log
 from slipid.testsite.plant import Trace
-from slipid.testsite.refuse import not_negative, positive
+from slipid.testsite.refuse import at_most, not_negative, positive
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,10 @@ class Sensors:
         positive(self, "frame_s", "camera_scale")
         not_negative(self, "current_noise_a", "voltage_noise_v", "gyro_noise", "gyro_bias")
         not_negative(self, "average_s", "camera_noise_m", "camera_noise_rad", "outlier_m")
+        at_most(self, row_s=1.0, average_s=1.0, camera_scale=100.0, frame_s=1.0)
+        for name in ("row_s", "frame_s", "camera_scale"):
+            if getattr(self, name) < 1e-3:
+                raise ValueError(f"{name} = {getattr(self, name)}; expected 0.001 or above")
         for name in ("row_jitter", "dropout", "outlier"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)}; expected 0 or above, below 1")
@@ -160,8 +164,9 @@ def _camera(
 ) -> tuple[Float[np.ndarray, "row 3"], Bool[np.ndarray, " row"]]:
     """Marker poses as the rows hold them, and which rows bring a new frame."""
     delay = s.lag_s - 0.5 * s.frame_s
-    taken = np.arange(-0.5, trace.time[-1] + s.frame_s, s.frame_s) + rng.uniform(0, s.frame_s)
-    taken = taken[(rng.uniform(size=len(taken)) >= s.dropout) | (taken < -0.2)]
+    first = -(s.lag_s + 3 * s.frame_s)  # so that there is one to be logged when it starts
+    taken = np.arange(first, trace.time[-1] + s.frame_s, s.frame_s) + rng.uniform(0, s.frame_s)
+    taken = taken[(rng.uniform(size=len(taken)) >= s.dropout) | (taken + delay <= 0.0)]
     seen = np.stack([np.interp(taken, trace.time, trace.pose[:, k]) for k in range(3)], axis=1)
     seen[:, 2] += marker_yaw
     seen[:, :2] += s.camera_noise_m * rng.normal(size=(len(taken), 2))

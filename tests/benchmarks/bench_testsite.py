@@ -217,25 +217,27 @@ def test_coverage_over_seeds() -> None:
             f"{name:30} {form(error.mean())} {form(np.sqrt(np.mean(error**2)))} "
             f"{form(np.abs(error).max())} {100 * inside:6.0f} %   {form(half)}"
         )
-    _exaggeration(found)
+    _power(found)
     for name in names:
         value, _, _, true = np.array([f["numbers"][name] for f in found]).T
         if name.startswith("motor."):
             assert np.abs(value / true - 1).max() < 0.03
 
 
-def _exaggeration(found: list[dict]) -> None:
-    """How far off the middle the fit puts the load, over how far it is."""
+def _power(found: list[dict]) -> None:
+    """As which power of the true loads wheels seem to carry, and what is left of the error then."""
     for load in ("as_built", "moved"):
         each = np.array(
             [[f["numbers"][f"robot.load_share@{load}[{k}]"] for k in (1, 2, 3)] for f in found]
         )
-        off, true = each[..., 0] - 1 / 3, each[..., 3] - 1 / 3
-        slope = float(np.sum(off * true) / np.sum(true**2))
-        rest = float(np.sqrt(np.mean((off - slope * true) ** 2)))
+        seen, true = each[..., 0], each[..., 3]
+        a, b = (np.log(x) - np.log(x).mean(axis=1, keepdims=True) for x in (seen, true))
+        power = float(np.sum(a * b) / np.sum(b**2))
+        acted = true**power / np.sum(true**power, axis=1, keepdims=True)
+        rms, rest = (float(np.sqrt(np.mean((seen - x) ** 2))) for x in (true, acted))
         print(
-            f"{load}: shares lie {slope:.2f} times as far from a third as they are, "
-            f"with that taken out {rest:.4f} rms"
+            f"{load}: loads seem to act as their power {power:.2f}: rms error {rms:.4f}, "
+            f"from that power {rest:.4f}"
         )
 
 
