@@ -15,10 +15,11 @@ class Ground:
     Attributes:
         friction: Coulomb coefficient of a roller on it [1].
         rolling_m: lever arm of the rolling friction, about both axes of a roller [m].
-        softness_m: how deep a wheel that carries a third of the robot sinks, about [m].
+        softness_m: how deep a wheel that carries a third of the robot sinks, about, whatever the
+            robot weighs [m].
         shear_n_m: horizontal stiffness of the floor beneath one roller [N/m].
         compaction: resistance of a sunk wheel per sinkage to the power of 1.5 [N/m^1.5].
-        body_drag_n: resistance of what touches the body [N].
+        body_drag_n: resistance of what touches the body, against its motion but not its turning [N].
         rib_height_m, rib_distance_m: of ribs along y, none by default [m].
         unevenness: std of the logarithm of rolling friction and shear stiffness over the floor [1].
         colour: in pictures.

@@ -2,7 +2,7 @@
 
     .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks/bench_testsite.py
 
-(-k speed, sectors, mixed, figures or coverage). Pictures and tables go to out/bench_testsite.
+(-k speed, sectors, mixed, figures or coverage). Pictures and tables go to out/bench_testsite/CODE, where coverage goes on after an interrupt.
 """
 
 import json
@@ -11,6 +11,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
+from hashlib import sha256
 from pathlib import Path
 
 import jax
@@ -40,7 +41,8 @@ from slipid.testsite.machine import Machine
 from slipid.testsite.plant import Plant
 
 ROOT = Path(__file__).resolve().parents[2]
-OUT = ROOT / "out" / "bench_testsite"
+CODE = sha256(b"".join(p.read_bytes() for p in sorted((ROOT / "slipid").rglob("*.py"))))
+OUT = ROOT / "out" / "bench_testsite" / CODE.hexdigest()[:8]  # nothing of other code is reused
 SEEDS = int(os.environ.get("SLIPID_BENCH_SEEDS", "40"))
 
 HEADINGS = """
@@ -180,7 +182,7 @@ def _experiment(seed: int) -> dict:
     known = truth(made.site)
     rows = {}
     for path, p in found.parameters.items():
-        if path in known and path != "camera.marker_yaw" and p.verdict != "fixed":
+        if path in known and not path.startswith("camera.") and p.verdict != "fixed":
             values = np.atleast_1d(p.value)
             for k, true in enumerate(np.atleast_1d(known[path]["value"])):
                 low, high = p.interval90[k] if p.labels else p.interval90
