@@ -14,7 +14,7 @@ from slipid.app.demo import PARTS, RECORDED, drive_anew, pack, packaged_config, 
 from slipid.app.progress import Reporter
 from slipid.app.simulate_config import plan
 from slipid.data.log import DataError
-from slipid.testsite.experiments import drive
+from slipid.testsite.driving import drive
 
 
 def test_the_recording_holds_logs_and_truth(tmp_path):

@@ -23,7 +23,7 @@ from slipid.data.log import DataError
 from slipid.data.reader import read_log
 from slipid.data.terrain import four_zones, read_map
 from slipid.testsite.camera import MARKER, Camera, Studio, film
-from slipid.testsite.experiments import Site
+from slipid.testsite.driving import Site
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.machine import Machine
 from tests.conftest import ROOT

@@ -8,13 +8,11 @@ import pytest
 
 from slipid.data.log import DataError
 from slipid.data.terrain import FloorMap, four_zones, uniform
-from slipid.testsite.drive import Drive, Motor, SpeedLoop
+from slipid.testsite.driving import Site, drive
 from slipid.testsite.experiments import (
-    Site,
     Timed,
     Waypoints,
     curves,
-    drive,
     headings,
     numbered,
     paper_grid,
@@ -24,6 +22,7 @@ from slipid.testsite.experiments import (
 )
 from slipid.testsite.ground import GRAVITY, GROUNDS, Ground
 from slipid.testsite.machine import Machine
+from slipid.testsite.motors import Drive, Motor, SpeedLoop
 from slipid.testsite.plant import LEVELS, Plant, Trace, ribs
 
 EVEN = {name: replace(g, unevenness=0.0) for name, g in GROUNDS.items()}

@@ -22,7 +22,8 @@ from slipid.data.log import DataError
 from slipid.data.terrain import write_map
 from slipid.data.write import OPTIONAL, own_csv, own_layout, robotino2022_csv
 from slipid.testsite.camera import Camera, Studio, film
-from slipid.testsite.experiments import Run, Site, drive
+from slipid.testsite.driving import Site, drive
+from slipid.testsite.experiments import Run
 from slipid.testsite.plant import Trace, engine
 from slipid.testsite.sensors import observe
 

@@ -19,9 +19,10 @@ from slipid.data import terrain
 from slipid.data.log import DataError
 from slipid.testsite import experiments as ex
 from slipid.testsite.camera import Camera
-from slipid.testsite.drive import Motor, SpeedLoop
+from slipid.testsite.driving import Site
 from slipid.testsite.ground import GROUNDS, Ground
 from slipid.testsite.machine import Machine
+from slipid.testsite.motors import Motor, SpeedLoop
 from slipid.testsite.sensors import Sensors
 
 Speed = Annotated[float, Field(gt=0, le=3)]
@@ -151,7 +152,7 @@ class Plan:
 
     hash: str
     content: Content
-    site: ex.Site
+    site: Site
     maps: dict[str, terrain.FloorMap]
     runs: tuple[tuple[str, ex.Run], ...]
     filmed: tuple[str, ...]
@@ -182,7 +183,7 @@ def plan(path: Path, text: str) -> Plan:
         }
         mapping = {**mapping, "surfaces": {**surfaces, **known}}
     content = checked(path, mapping, Content)
-    site = ex.Site(
+    site = Site(
         content.robot,
         content.motor,
         content.speed_loop,
@@ -217,9 +218,7 @@ def plan(path: Path, text: str) -> Plan:
     )
 
 
-def _check(
-    path: Path, content: Content, site: ex.Site, maps: Mapping[str, terrain.FloorMap]
-) -> None:
+def _check(path: Path, content: Content, site: Site, maps: Mapping[str, terrain.FloorMap]) -> None:
     """DataError where parts of a config do not go together."""
     for load in site.machine.centres_m:
         if not re.fullmatch("[A-Za-z0-9_-]+", load) or load in RESERVED:
@@ -252,7 +251,7 @@ def _check(
             )
 
 
-def _hash(content: Content, site: ex.Site, maps: Mapping[str, terrain.FloorMap]) -> str:
+def _hash(content: Content, site: Site, maps: Mapping[str, terrain.FloorMap]) -> str:
     """Of all that decides what is driven and logged; videos may be asked for later."""
     said = content.model_dump(mode="json", exclude={"video", "camera"})
     floors = {

@@ -10,8 +10,8 @@ cone, so a roller that rolls against its rolling friction creeps under any force
 proportion to how fast it rolls. On `soft` the robot loses 36 % of its way (mean of six directions,
 no unevenness); 31 % if the floor does not give under shear, 28 % if nothing resists but contact
 either, 11 % if friction is ten times as large as well. It is a slip by the ratio of speeds, as the
-model's creep is, with another formula. Sinkage comes from the engine's springs, which it scales with
-the robot: the same `softness_m` is as deep beneath a heavier robot of the same build.
+model's creep is, with another formula. Sinkage comes from the engine's springs, which it scales
+with the robot: the same `softness_m` is as deep beneath a heavier robot of the same build.
 
 What is added to the engine, in other forms than those of `slipid.model`: a floor that gives under
 shear is a spring of the roller's mount whose stiffness is the floor's; compaction ahead of a sunk

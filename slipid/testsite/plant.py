@@ -9,9 +9,9 @@ from jaxtyping import Float
 
 from slipid.data.log import DataError
 from slipid.data.terrain import FloorMap
-from slipid.testsite.drive import Drive, Motor, SpeedLoop
 from slipid.testsite.ground import Ground
 from slipid.testsite.machine import Machine, mjcf
+from slipid.testsite.motors import Drive, Motor, SpeedLoop
 
 TIMESTEP = 1e-3
 """Of the engine and of the speed loop [s]."""

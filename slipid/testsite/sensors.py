@@ -70,6 +70,8 @@ class Sensors:
         for name in ("row_jitter", "dropout", "outlier"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)}; expected 0 or above, below 1")
+        if self.voltage_step_v < 0.01:
+            raise ValueError(f"voltage_step_v = {self.voltage_step_v}; expected 0.01 or above")
         if not 0.5 * self.frame_s <= self.lag_s <= 0.4:
             raise ValueError(f"lag_s = {self.lag_s}; expected half of frame_s or above, up to 0.4")
 

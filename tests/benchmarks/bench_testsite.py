@@ -2,7 +2,8 @@
 
     .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks/bench_testsite.py
 
-(-k speed, sectors, mixed, figures or coverage). Pictures and tables go to out/bench_testsite/CODE, where coverage goes on after an interrupt.
+(-k speed, sectors, mixed, figures or coverage). Pictures and experiments go to
+out/bench_testsite/CODE, where coverage goes on after an interrupt.
 """
 
 import json
@@ -10,8 +11,8 @@ import os
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from hashlib import sha256
+from multiprocessing import get_context
 from pathlib import Path
 
 import jax
@@ -25,11 +26,10 @@ from slipid.app.simulate_config import plan
 from slipid.data.terrain import FloorMap, four_zones, patchwork
 from slipid.identify.folds import left_out, sectors
 from slipid.identify.validate import summary, text_table
+from slipid.testsite.driving import Site, drive
 from slipid.testsite.experiments import (
     Run,
-    Site,
     Timed,
-    drive,
     headings,
     paper_grid,
     rectangle,
