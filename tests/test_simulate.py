@@ -68,7 +68,8 @@ def quietly(config, out, jobs=1):
 
 
 def sums(folder):
-    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    # what a kill leaves of a file that was being written begins with a dot, and nobody reads it
+    files = sorted(p for p in folder.rglob("[!.]*") if p.is_file())
     return {p.relative_to(folder): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
