@@ -156,9 +156,6 @@ def test_left_out_sectors() -> None:
 def _experiment(seed: int) -> dict:
     """One experiment with a robot of its own: estimates, stds and truths by name."""
     jax.config.update("jax_enable_x64", True)
-    from slipid.identify.fit import optimise
-    from slipid.identify.result import summarise
-
     rng = np.random.default_rng([7, seed])
     resistance, back_emf = rng.uniform(4.5, 6.5), rng.uniform(0.045, 0.058)
     centres = [
@@ -175,10 +172,7 @@ def _experiment(seed: int) -> dict:
     text += HEADINGS.format(surface="firm", load="as_built", step=60, speeds=[0.2])
     out = OUT / "coverage" / f"seed{seed:02d}"
     made = driven(text, out)
-    job = job_of(out)
-    problem = job.problem()
-    best = optimise(problem)
-    found = summarise(problem, best, job.dataset, job.choices)
+    found = _fitted(job_of(out))
     known = truth(made.site)
     rows = {}
     for path, p in found.parameters.items():
@@ -192,7 +186,16 @@ def _experiment(seed: int) -> dict:
                     high,
                     float(true),
                 )
-    return {"seed": seed, "converged": best.converged, "numbers": rows}
+    return {"seed": seed, "converged": found.converged, "numbers": rows}
+
+
+def _fitted(job):
+    """What `identify` finds of a job, without the simpler models."""
+    from slipid.identify.fit import optimise
+    from slipid.identify.result import summarise
+
+    problem = job.problem()
+    return summarise(problem, optimise(problem), job.dataset, job.choices)
 
 
 def test_coverage_over_seeds() -> None:
@@ -241,6 +244,34 @@ def _power(found: list[dict]) -> None:
             f"{load}: loads seem to act as their power {power:.2f}: rms error {rms:.4f}, "
             f"from that power {rest:.4f}"
         )
+
+
+BIAS = {
+    "soft": "",
+    "no added forces": "compaction = 0\nbody_drag_n = 0",
+    "shallow (1 mm)": "softness_m = 0.001",
+    "stiff (shear 1e5 N/m)": "shear_n_m = 1e5",
+}
+
+
+def test_what_biases_load_shares() -> None:
+    """Shares of one robot on floors that differ in one thing from `soft`."""
+    print(f"\n{'floor':24} largest error of a share as built, moved   largest half width")
+    for k, (name, change) in enumerate(BIAS.items()):
+        text = f"seed = 5\n[surfaces.soft]\n{change}\n"
+        for load in ("as_built", "moved"):
+            text += HEADINGS.format(surface="soft", load=load, step=30, speeds=[0.1, 0.2])
+            text += CURVES.format(surface="soft", load=load)
+        made = driven(text, OUT / "bias" / str(k))
+        fit = _fitted(job_of(OUT / "bias" / str(k)))
+        known = truth(made.site)
+        errors, widths = [], []
+        for load in ("as_built", "moved"):
+            found = fit.parameters[f"robot.load_share@{load}"]
+            true = known[f"robot.load_share@{load}"]["value"]
+            errors.append(float(np.abs(np.array(found.value) - true).max()))
+            widths.append(float(np.ptp(np.array(found.interval90), axis=1).max() / 2))
+        print(f"{name:24} {errors[0]:24.3f} {errors[1]:14.3f} {max(widths):20.3f}", flush=True)
 
 
 # the paper's observation
