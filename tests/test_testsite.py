@@ -108,6 +108,7 @@ def test_the_floor_carries_the_weight_as_statics_say():
     np.testing.assert_allclose(mean / weight, Machine().load_share("as_built"), atol=0.012)
 
 
+@pytest.mark.slow
 def test_a_centred_robot_looks_the_same_from_every_wheel():
     site = Site(machine=CENTRED, grounds=EVEN)
     ends = []
@@ -123,6 +124,7 @@ def test_a_centred_robot_looks_the_same_from_every_wheel():
     np.testing.assert_allclose(ends, np.broadcast_to(np.mean(ends, axis=0), (3, 3)), atol=0.008)
 
 
+@pytest.mark.slow
 def test_wheels_roll_where_the_floor_is_firm():
     site = Site()
     back = np.linalg.pinv(site.machine.wheel_from_twist)
@@ -138,6 +140,7 @@ def test_wheels_roll_where_the_floor_is_firm():
         np.testing.assert_allclose(trace.wheel_speed[steady].mean(axis=0), wanted, atol=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", ["firm", "soft"])
 def test_half_the_time_step_ends_at_the_same_place(surface):
     site = Site()
@@ -147,6 +150,7 @@ def test_half_the_time_step_ends_at_the_same_place(surface):
         assert np.hypot(*(ends[0] - ends[1])) < 0.02 * 0.5
 
 
+@pytest.mark.slow
 def test_slip_grows_with_softness_and_depends_on_the_direction():
     site = Site()
     found = {}
@@ -329,6 +333,7 @@ def test_a_timed_program_ends():
     assert program.command(1.5, np.zeros(3)) is None
 
 
+@pytest.mark.slow
 def test_the_rectangle_is_driven_by_encoders_and_better_by_camera():
     site = Site()
     floor = four_zones(["firm", "medium", "soft", "short"])
