@@ -346,9 +346,15 @@ def test_the_floor_has_its_colours_where_its_patches_are(studio):
 
 
 def test_light_changes_and_motion_smears(studio):
-    still = lambda t: np.array([0.3, 0.2, 0.4])  # noqa: E731
-    moving = lambda t: np.array([0.3 + 1.0 * t, 0.2, 0.4])  # noqa: E731
-    wheels = lambda t: np.zeros(3)  # noqa: E731
+    def still(t):
+        return np.array([0.3, 0.2, 0.4])
+
+    def moving(t):
+        return np.array([0.3 + 1.0 * t, 0.2, 0.4])
+
+    def wheels(t):
+        return np.zeros(3)
+
     bright = [studio.exposed(t, still, wheels).mean() for t in np.arange(0.0, 8.0, 1.0)]
     assert np.ptp(bright) > 0.03 * np.mean(bright)
     x, y = corners(still(0.0), Machine(), HALF).mean(axis=0).round().astype(int)

@@ -82,7 +82,7 @@ def drive(run: Run, site: Site, seed: int, timestep: float | None = None) -> Tra
             pose = believed if program.by == "encoders" else np.array(plant.pose)
             goal, twist = _towards(program, goal, pose, plant.time)
         else:
-            twist = program.command(plant.time, believed)
+            twist = program.command(plant.time)
         if twist is None:
             break
         sent = np.array(twist)

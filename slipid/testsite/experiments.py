@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from slipid.data.terrain import FloorMap, uniform
 
@@ -18,7 +17,7 @@ class Timed:
 
     legs: tuple[tuple[Twist, float], ...]
 
-    def command(self, time: float, pose: Float[np.ndarray, "3"]) -> Twist | None:
+    def command(self, time: float) -> Twist | None:
         """Twist at a time, None when it is over."""
         for twist, seconds in self.legs:
             if time < seconds - 1e-9:

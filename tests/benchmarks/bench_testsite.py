@@ -121,8 +121,8 @@ def _profile(surface: str) -> list[float]:
 
         return run_it
 
-    plant._step, plant.drive.step = timed(0, engine), timed(1, motors)  # type: ignore[method-assign]
-    plant._look = timed(2, look)  # type: ignore[method-assign]
+    plant._step, plant.drive.step = timed(0, engine), timed(1, motors)
+    plant._look = timed(2, look)
     for _ in range(2000):
         plant.step(wanted)
     return [1e6 * s / 2000 for s in spent]
@@ -272,6 +272,8 @@ def test_what_biases_load_shares() -> None:
             errors.append(float(np.abs(np.array(found.value) - true).max()))
             widths.append(float(np.ptp(np.array(found.interval90), axis=1).max() / 2))
         print(f"{name:24} {errors[0]:24.3f} {errors[1]:14.3f} {max(widths):20.3f}", flush=True)
+        if name == "soft":
+            assert max(errors) < 0.03
 
 
 # the paper's observation
@@ -307,6 +309,7 @@ def test_currents_on_mixed_surfaces() -> None:
             both = currents(halves, None, speed)
             ratio = (both[:, 0] - both[:, 1]) / (first - second)
             error = ratio.std(ddof=1) / np.sqrt(len(ratio))
+            assert abs(ratio.mean()) < 0.5  # 1 if each drew the current of the floor beneath it
             print(
                 f"{pair[0]:7}{pair[1]:7} {speed:4.1f} {first:11.2f} {second:13.2f} "
                 f"{both[:, 0].mean():14.2f} {both[:, 1].mean():9.2f} "
@@ -396,13 +399,16 @@ def test_figures_beside_the_real_ones(real_data: Path) -> None:
         ax.set_aspect("equal", adjustable="datalim")
         ax.legend(loc="upper right")
     # slip against heading
+    slips: dict[str, np.ndarray] = {}
     folder = real_data / "robotino2022"
     for surface in ("table", "brown", "gray", "green"):
         paths = find_logs(folder, f"one_surface/{surface}/*.csv")
         seen = [read_log(p, preset("robotino2022"), root=folder, surface=surface) for p in paths]
         _by_heading(axes[4, 0], seen, colours[surface], surface)
     for surface in ("firm", "short", "medium", "soft"):
-        _by_heading(axes[4, 1], logs[f"{surface} headings"], colours[surface], surface)
+        slips[surface] = _by_heading(
+            axes[4, 1], logs[f"{surface} headings"], colours[surface], surface
+        )
     for ax, where in zip(axes[4], ("real 2022 logs", "test site, as built"), strict=True):
         ax.set(
             xlim=(0, 360),
@@ -415,6 +421,9 @@ def test_figures_beside_the_real_ones(real_data: Path) -> None:
     path = OUT / "beside_the_real_ones.png"
     figure.savefig(path, dpi=80)
     print(f"\n{path}")
+    assert 0.01 < np.median(slips["firm"]) < 0.03
+    assert 0.2 < np.median(slips["soft"]) < 0.5
+    assert np.ptp(slips["soft"]) > 0.15  # the load is off the middle
 
 
 def _figure_logs(site: Site) -> dict:
@@ -463,8 +472,8 @@ def _points(logs: list) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return current[keep], slip[keep], torque[keep]
 
 
-def _by_heading(ax, logs: list, colour: str, label: str) -> None:
-    """Slip of the body against the direction of travel of every run."""
+def _by_heading(ax, logs: list, colour: str, label: str) -> np.ndarray:
+    """Draw the slip of the body against the direction of travel of every run; the slips."""
     back = np.linalg.pinv(Machine().wheel_from_twist)
     way, slip = [], []
     for log in logs:
@@ -474,3 +483,4 @@ def _by_heading(ax, logs: list, colour: str, label: str) -> None:
         way.append(np.degrees(np.arctan2(far[1], far[0])) % 360)
         slip.append(1 - seen / size)
     ax.plot(way, slip, ".", color=colour, ms=5, label=label)
+    return np.array(slip)
