@@ -18,6 +18,10 @@ where rollers stand at an angle g to the drive, vs_i is r w_i sin g less the spe
 direction in which the rollers do not give way, and r w_i cos g is taken off q_i. Ordinary wheels
 grip sideways as they do ahead.
 
+Wheels may stand on different floors: a `ContactSurface` whose leaves have one entry per wheel. Forces
+are then in units of mean(mu) m g, each wheel's weighted by mu_i / mean(mu), and b and cz are means
+over the loads.
+
 Creep and rolling resistance are rate-independent (s0 is a slip *ratio*): with a resistance that
 sets in at 20 mm/s instead, runs faster than the fitted ones are predicted worse. The root is found
 by a fixed number of chord steps, which come near from anywhere, and then of damped Newton steps
@@ -53,6 +57,8 @@ _MOST_NEAR = 12
 
 class ContactSurface(eqx.Module):
     """What a floor does to rolling wheels; leaves may be stacked, one row per label.
+
+    In the force balance leaves are numbers, or one per wheel where wheels stand on several floors.
 
     Attributes:
         labels: names of the stacked surfaces.
@@ -93,7 +99,7 @@ class ContactSurface(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True, default=())
 
     def at(self, index: Any) -> "ContactSurface":
-        """Surface number `index` of the stack (may be traced)."""
+        """Surface number `index` of the stack (may be traced), or those under each wheel."""
         picked: ContactSurface = jax.tree.map(lambda leaf: leaf[index], self)
         return picked
 
@@ -117,7 +123,17 @@ def loads(
 ) -> Float[Array, " wheel"]:
     """Load shares in motion: N0 shifted by contact patches that lead along the motion."""
     v = xi[:2]
-    return rest - surface.lead * (frame.shift @ (v / jnp.sqrt(v @ v + 1e-8)))
+    return rest - _mean(surface.lead, rest) * (frame.shift @ (v / jnp.sqrt(v @ v + 1e-8)))
+
+
+def _mean(leaf: Array, rest: Array) -> Array:
+    """Of a floor's number over the loads, where it is one per wheel."""
+    return leaf if jnp.ndim(leaf) == 0 else rest @ leaf
+
+
+def _held(load: Array, s: ContactSurface) -> Array:
+    """Loads (.., wheel) as forces count them: times mu_i / mean(mu) on several floors."""
+    return load if jnp.ndim(s.friction) == 0 else load * s.friction / jnp.mean(s.friction)
 
 
 def _speeds(xi: Any, rim: Any, frame: Frame, s: ContactSurface) -> Any:
@@ -135,8 +151,10 @@ def _terms(xi: Any, rim: Any, frame: Frame, s: ContactSurface, rest: Any) -> Any
     """Traction and drag per unit load, loads, and all their derivatives by xi."""
     v = xi[:2]
     inv = jax.lax.rsqrt(v @ v + 1e-8)
-    load = rest - s.lead * (frame.shift @ (v * inv))
-    d_load = -s.lead * (frame.shift * inv - jnp.outer(frame.shift @ v, v) * inv**3)  # (wheel, 2)
+    lead = _mean(s.lead, rest)
+    load = _held(rest - lead * (frame.shift @ (v * inv)), s)
+    d_load = -lead * (frame.shift * inv - jnp.outer(frame.shift @ v, v) * inv**3)  # (wheel, 2)
+    d_load = _held(d_load.T, s).T
     along, roll, active, cr, kl, scale_t, scale_r, scale_1 = _speeds(xi, rim, frame, s)
     slide = rim * frame.pull - along
     slope_r = frame.grip * s.creep + (1 - frame.grip) * s.roller_creep
@@ -159,13 +177,13 @@ def _balance(xi: Any, args: Any) -> tuple[Any, Any]:
     traction, drag, load, d_load, a, b, c = _terms(xi, rim, frame, s, rest)
     turn = jnp.tanh(xi[2] / W0)
     force = frame.hold.T @ (load * traction) + frame.roll.T @ (load * drag)
-    force = force.at[2].add(-s.scrub * turn) - mass * (xi - before)
+    force = force.at[2].add(-_mean(s.scrub, rest) * turn) - mass * (xi - before)
     d_t = (load * a)[:, None] * frame.hold + (load * b)[:, None] * frame.roll
     d_d = (load * c)[:, None] * frame.roll
     d_t = d_t.at[:, :2].add(traction[:, None] * d_load)
     d_d = d_d.at[:, :2].add(drag[:, None] * d_load)
     jac = frame.hold.T @ d_t + frame.roll.T @ d_d - jnp.diag(mass)
-    jac = jac.at[2, 2].add(-s.scrub * (1 - turn**2) / W0)
+    jac = jac.at[2, 2].add(-_mean(s.scrub, rest) * (1 - turn**2) / W0)
     row = jnp.array([1.0, 1.0, 1.0]).at[2].set(1.0 / frame.base)
     return row * force, row[:, None] * jac
 
@@ -186,8 +204,8 @@ def _chord(xi: Any, args: Any) -> Any:
     """
     rim, frame, s, rest, mass, before = args
     v = xi[:2]
-    load = rest - s.lead * (frame.shift @ (v * jax.lax.rsqrt(v @ v + 1e-8)))
-    load = jnp.maximum(load, _LEAST_LOAD)  # a lifted wheel would push the chord the wrong way
+    load = rest - _mean(s.lead, rest) * (frame.shift @ (v * jax.lax.rsqrt(v @ v + 1e-8)))
+    load = _held(jnp.maximum(load, _LEAST_LOAD), s)  # a lifted wheel would push the chord the wrong way
     along, roll, _, cr, kl, scale_t, scale_r, scale_1 = _speeds(xi, rim, frame, s)
 
     def slope(x: Any, scale: Any) -> Any:
@@ -199,7 +217,7 @@ def _chord(xi: Any, args: Any) -> Any:
     brakes = load * s.rolling_resistance * slope(along, scale_1)
     m = frame.hold.T @ ((pulls + brakes)[:, None] * frame.hold)
     m += frame.roll.T @ (holds[:, None] * frame.roll) + jnp.diag(mass)
-    m = m.at[2, 2].add(s.scrub * slope(xi[2], W0))
+    m = m.at[2, 2].add(_mean(s.scrub, rest) * slope(xi[2], W0))
     drive = frame.hold.T @ (pulls * rim * frame.pull)
     drive += frame.roll.T @ (holds * rim * frame.slip_through) + mass * before
     return _solve3(m, drive)
@@ -225,7 +243,7 @@ def _residual(xi: Any, args: Any) -> Any:
     rim, frame, s, rest, mass, before = args
     traction, drag, load, *_ = _terms(xi, rim, frame, s, rest)
     force = frame.hold.T @ (load * traction) + frame.roll.T @ (load * drag)
-    force = force.at[2].add(-s.scrub * jnp.tanh(xi[2] / W0)) - mass * (xi - before)
+    force = force.at[2].add(-_mean(s.scrub, rest) * jnp.tanh(xi[2] / W0)) - mass * (xi - before)
     return force.at[2].divide(frame.base)
 
 
@@ -349,7 +367,8 @@ def forces(
     along, *_, scale_1 = _speeds(xi, rim, frame, surface)
     held = traction + surface.rolling_resistance * jnp.tanh(along / scale_1)
     felt = load * (held * frame.pull + drag * frame.slip_through)
-    return Contact(traction=felt, drag=load * drag, load=load)
+    share = loads(xi, frame, surface, rest)
+    return Contact(traction=felt, drag=load * drag, load=share)
 
 
 def residual(

@@ -231,6 +231,8 @@ def twist(
 ) -> Float[Array, "3"]:
     """Quasi-static body twist on floor `surface` (index) with load set-up `load` (index).
 
+    `surface` may have one index per wheel, here and below.
+
     Args:
         near: a twist so close that plain Newton steps arrive; NaN comes back where they do not.
     """
@@ -249,7 +251,7 @@ def felt(
     surface: Array,
     load: Array,
 ) -> Float[Array, " wheel"]:
-    """Traction each motor works against at a twist, in units of mu m g."""
+    """Traction each motor works against at a twist, in units of mean(mu) m g."""
     rim = frame.radius * wheel_speed
     floor = robot.surfaces.at(surface)
     return contact.forces(xi, rim, frame, floor, robot.body.load_share[load]).traction
@@ -264,7 +266,7 @@ def wheel_torque(
     load: Array,
 ) -> Float[Array, " wheel"]:
     """Torque each motor delivers at the wheel, friction excluded: r mu m g T [N m]."""
-    force = robot.surfaces.friction[surface] * robot.body.mass * GRAVITY
+    force = jnp.mean(robot.surfaces.friction[surface]) * robot.body.mass * GRAVITY
     return frame.radius * force * felt(robot, frame, xi, wheel_speed, surface, load)
 
 

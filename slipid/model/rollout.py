@@ -57,8 +57,8 @@ class Simulated(eqx.Module):
 
 
 def inertia(robot: Robot, surface: Int[Array, ""] | int) -> Float[Array, "3"]:
-    """Mass, mass and yaw inertia in units of mu m g [s^2/m, s^2/m, s^2 m]."""
-    weight = robot.surfaces.at(surface).friction * robot.body.mass * GRAVITY
+    """Mass, mass and yaw inertia in units of mean(mu) m g [s^2/m, s^2/m, s^2 m]."""
+    weight = jnp.mean(robot.surfaces.at(surface).friction) * robot.body.mass * GRAVITY
     return jnp.stack([robot.body.mass, robot.body.mass, robot.body.yaw_inertia]) / weight
 
 
