@@ -1,0 +1,1 @@
+"""What runs on the robot: frozen estimator, controllers, closed loop. Needs jax alone."""

@@ -1,0 +1,152 @@
+"""Paths in time: where the robot should be and how fast, and when to wait for it."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+STEP = 0.02
+"""Between rows of a path [s]."""
+PATIENT, LOST = 0.02, 0.12
+"""Distance from the reference up to which it goes on, and from which it waits [m]."""
+
+
+class Path(eqx.Module):
+    """Pose and twist in the world over a path's own time, which waits for a robot that lags.
+
+    Attributes:
+        rows: x, y [m], heading [rad], their rates [m/s, m/s, rad/s], a row every `STEP`.
+        marks: times at which a side ends, the robot having had time to settle [s].
+        corners: where it then should be (mark, 2) [m].
+    """
+
+    rows: Float[Array, "row 6"]
+    marks: tuple[float, ...] = eqx.field(static=True)
+    corners: tuple[tuple[float, float], ...] = eqx.field(static=True)
+
+    @property
+    def duration(self) -> float:
+        """Own time of the path [s]."""
+        return (len(self.rows) - 1) * STEP
+
+    def at(self, time: Float[Array, ""] | float) -> Float[Array, "6"]:
+        """Pose and rates at a time of the path; beyond its ends, at rest there."""
+        place = jnp.clip(jnp.asarray(time) / STEP, 0.0, len(self.rows) - 1.000001)
+        low = jnp.floor(place).astype(jnp.int32)
+        part = place - low
+        return (1 - part) * self.rows[low] + part * self.rows[jnp.minimum(low + 1, len(self.rows) - 1)]
+
+    def after(
+        self, time: Float[Array, ""], pose: Float[Array, "3"], dt: Float[Array, ""] | float
+    ) -> Float[Array, ""]:
+        """Time of the path one step later: it slows down where the robot is believed to lag."""
+        off = jnp.sqrt(jnp.sum((self.at(time)[:2] - pose[:2]) ** 2) + 1e-12)
+        pace = jnp.clip((LOST - off) / (LOST - PATIENT), 0.0, 1.0)
+        return jnp.asarray(time) + pace * dt
+
+    def moved(self, start: Sequence[float]) -> "Path":
+        """The path as it lies for a robot that starts at a pose (x, y [m], heading [rad])."""
+        x, y, heading = (float(v) for v in start)
+        c, s = np.cos(heading), np.sin(heading)
+        turn = np.array([[c, s], [-s, c]])
+        rows = np.array(self.rows)
+        rows[:, :2] = rows[:, :2] @ turn + [x, y]
+        rows[:, 2] += heading
+        rows[:, 3:5] = rows[:, 3:5] @ turn
+        corners = np.asarray(self.corners).reshape(-1, 2) @ turn + [x, y]
+        return Path(jnp.asarray(rows), self.marks, tuple((float(a), float(b)) for a, b in corners))
+
+
+def waypoints(
+    places: Sequence[Sequence[float]],
+    speed: float = 0.2,
+    acceleration: float = 0.5,
+    pause: float = 0.6,
+    heading: float = 0.0,
+) -> Path:
+    """Straight from place to place with a stop at each, without turning.
+
+    Args:
+        places: x, y [m], the first one is where it starts.
+        speed: between stops [m/s].
+        acceleration: [m/s^2].
+        pause: at every place [s].
+        heading: all the way [rad].
+
+    Raises:
+        ValueError: fewer than two places, or neighbours that are the same.
+    """
+    p = np.asarray(places, float)
+    if p.ndim != 2 or len(p) < 2 or p.shape[1] != 2:
+        raise ValueError(f"way-points {p.tolist()}; expected two or more places x, y")
+    parts, marks, time = [np.array([[*p[0], heading, 0.0, 0.0, 0.0]])], [], 0.0
+    for a, b in zip(p[:-1], p[1:], strict=True):
+        far = float(np.hypot(*(b - a)))
+        if far < 1e-9:
+            raise ValueError(f"way-point {b.tolist()} twice in a row; expected another place")
+        gone, pace = _trapezoid(far, speed, acceleration, pause)
+        u = (b - a) / far
+        turned = np.full((len(gone), 1), heading)
+        still = np.zeros((len(gone), 1))
+        parts.append(np.hstack([a + gone[:, None] * u, turned, pace[:, None] * u, still]))
+        time += len(gone) * STEP
+        marks.append(time)
+    rows = np.concatenate(parts)
+    return Path(jnp.asarray(rows), tuple(marks), tuple((float(x), float(y)) for x, y in p[1:]))
+
+
+def rectangle(length: float = 0.9, width: float = 0.4, speed: float = 0.2) -> Path:
+    """The 2021 paper's trial (figure 7): ahead, to the right, back, to the left.
+
+    Args:
+        length: of the first side [m]; width: of the second [m].
+        speed: [m/s].
+    """
+    return waypoints([(0, 0), (length, 0), (length, -width), (0, -width), (0, 0)], speed)
+
+
+def circle(radius: float = 0.4, speed: float = 0.2, turning: bool = False) -> Path:
+    """Once around a circle that touches the start, to the left; `turning` along with it."""
+    return _smooth(lambda u: (radius * np.sin(u), radius * (1 - np.cos(u))), speed, turning)
+
+
+def figure_eight(size: float = 0.5, speed: float = 0.2, turning: bool = False) -> Path:
+    """Once through a lying eight (lemniscate of Gerono), `size` to each side."""
+    return _smooth(lambda u: (size * np.sin(u), size * np.sin(u) * np.cos(u)), speed, turning)
+
+
+def _trapezoid(
+    far: float, speed: float, acceleration: float, pause: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distance and speed every `STEP` on a straight line with a rest at its end."""
+    top = min(speed, float(np.sqrt(far * acceleration)))
+    ramp = top / acceleration
+    whole = far / top + ramp
+    t = np.arange(1, int(np.ceil((whole + pause) / STEP)) + 1) * STEP
+    up, down = np.minimum(t, ramp), np.clip(t - (whole - ramp), 0.0, ramp)
+    level = np.clip(t - ramp, 0.0, whole - 2 * ramp)
+    gone = 0.5 * acceleration * up**2 + top * level + top * down - 0.5 * acceleration * down**2
+    pace = np.where(t < whole, acceleration * up - acceleration * down, 0.0)
+    return np.minimum(gone, far), pace
+
+
+def _smooth(place: object, speed: float, turning: bool) -> Path:
+    """A closed curve at constant speed but for its ends, by arc length."""
+    u = np.linspace(0.0, 2 * np.pi, 4001)
+    xy = np.stack(place(u), axis=-1)  # type: ignore[operator]
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    gone, _ = _trapezoid(float(arc[-1]), speed, 0.5, 0.6)
+    gone = np.concatenate([[0.0], gone])
+    x, y = (np.interp(gone, arc, xy[:, k]) for k in range(2))
+    way = np.unwrap(np.arctan2(np.gradient(xy[:, 1], u), np.gradient(xy[:, 0], u)))
+    heading = np.interp(gone, arc, way) if turning else np.zeros_like(x)
+    pose = np.stack([x, y, heading], axis=-1)
+    if turning:  # it starts along the x axis of the robot
+        c, s = np.cos(way[0]), np.sin(way[0])
+        pose[:, :2] = pose[:, :2] @ np.array([[c, -s], [s, c]])
+        pose[:, 2] -= way[0]
+    rates = np.gradient(pose, STEP, axis=0)
+    end = (float(pose[-1, 0]), float(pose[-1, 1]))
+    return Path(jnp.asarray(np.hstack([pose, rates])), ((len(pose) - 1) * STEP,), (end,))

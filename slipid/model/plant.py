@@ -1,0 +1,65 @@
+"""What a closed loop needs of the world: a plant to drive, and which floor lies where."""
+
+from typing import Protocol
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+
+class Plant(Protocol):
+    """A robot that takes wheel speeds and gives back what its sensors read.
+
+    Sensor readings are one flat array as `slipid.control.estimator.Sensed` lays it out.
+    """
+
+    def reset(self) -> Float[np.ndarray, " sensed"]:
+        """First readings, of the robot at rest."""
+        ...
+
+    def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Float[np.ndarray, " sensed"]:
+        """Readings one control period later, with these wheel speeds commanded [rad/s]."""
+        ...
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """True x, y [m] and heading [rad]; for the judge, no controller sees it."""
+        ...
+
+
+class Floor(eqx.Module):
+    """Which surface lies where, as arrays a jitted function can look up.
+
+    Attributes:
+        cells: index of the surface in every square cell (row, column), row 0 at the lowest y.
+        corner: x, y of the corner with the lowest coordinates [m].
+        cell: edge of a cell [m].
+    """
+
+    cells: Int[Array, "row column"]
+    corner: Float[Array, "2"]
+    cell: Float[Array, ""]
+
+    def at(self, place: Float[Array, "*batch 2"]) -> Int[Array, "*batch"]:
+        """Surface at places [m]; beyond the edge that of the nearest cell."""
+        steps = jnp.floor((place - self.corner) / self.cell).astype(jnp.int32)
+        rows, columns = self.cells.shape
+        return self.cells[
+            jnp.clip(steps[..., 1], 0, rows - 1), jnp.clip(steps[..., 0], 0, columns - 1)
+        ]
+
+    def under(
+        self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
+    ) -> Int[Array, " wheel"]:
+        """Surface under each wheel of a robot at a pose [m, m, rad].
+
+        Args:
+            pose: of the body.
+            wheels: wheel centres in the body frame [m].
+        """
+        c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+        turned = jnp.stack(
+            [c * wheels[:, 0] - s * wheels[:, 1], s * wheels[:, 0] + c * wheels[:, 1]], axis=-1
+        )
+        return self.at(pose[:2] + turned)
