@@ -117,8 +117,9 @@ def read_wheels(
     by_angle = jnp.isfinite(turned) & (jnp.abs(turned) < most) & (dt > 0)
     by_speed = jnp.isfinite(z.wheel_speed) & (jnp.abs(z.wheel_speed) < most)
     read = jnp.where(by_angle, turned, jnp.where(by_speed, z.wheel_speed, old.speed))
-    good = by_angle | by_speed
     known = jnp.isfinite(z.wheel_angle) & (jnp.abs(z.wheel_angle) < 1e7)
+    first = known & ~jnp.isfinite(old.angle) & ~by_speed  # nothing to compare with: it stands
+    good = by_angle | by_speed | first
     angle = jnp.where(known, z.wheel_angle, old.angle)
     age = jnp.where(good, 0.0, jnp.minimum(old.age + dt, 1e3))
     return jnp.where(age > settings.stale_s, 0.0, read), angle, age
@@ -164,6 +165,7 @@ class Estimator(eqx.Module):
                 ("amps", (w,)),
                 ("belief", (c + 1,)),
                 ("twist", (c, 3)),
+                ("apart", (c, 3)),
                 ("pose", (3,)),
                 ("more", (n - 3,)),
                 ("covariance", (n, n)),
@@ -204,6 +206,7 @@ class Estimator(eqx.Module):
             amps=jnp.zeros(w),
             belief=jnp.concatenate([prior * 0.99, jnp.asarray([0.01])]),
             twist=jnp.zeros((k**w, 3)),
+            apart=jnp.zeros((k**w, 3)),
             pose=start,
             more=jnp.zeros(3 * k + 1),
             covariance=jnp.diag(diagonal),
@@ -239,10 +242,11 @@ class Estimator(eqx.Module):
         rim = jnp.max(jnp.abs(f.frame.radius * w))
         moves = rim > s.still_m_s
         turn = gyro - old.more[-1]
-        belief = self._filter(old, xi, predicted, amps, heard, noise, turn, dt, faster, moves)
-        return self._finish(
-            old, z, dt, w, angle, age, amps, xi, belief, gyro, moves
+        noise += self._stiction(w)
+        belief, apart = self._filter(
+            old, xi, predicted, amps, heard, noise, turn, dt, faster, moves
         )
+        return self._finish(old, z, dt, w, angle, age, amps, xi, belief, apart, gyro, moves)
 
     def _prior(self) -> Float[Array, " hypothesis"]:
         """Probability of every hypothesis before anything is measured."""
@@ -269,6 +273,12 @@ class Estimator(eqx.Module):
         noise = share**2 * var_i + (1 - share) ** 2 * var_u
         # with a voltage the sign is known; without, and unsigned, only the size
         return amps, jnp.where(heard, jnp.where(volts | s.current_is_signed, 2, 1), 0), noise
+
+    def _stiction(self, w: Array) -> Array:
+        """Variance of the current that holds a standing wheel, between friction's bounds [A^2]."""
+        motor = self.frozen.motor
+        gain = motor.gear_ratio * motor.efficiency * motor.back_emf
+        return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / gain) ** 2 / 3
 
     def _solve(self, near: Array, w: Array) -> tuple[Array, Array]:
         """Twist and currents of every hypothesis, from the last step's twists."""
@@ -297,8 +307,13 @@ class Estimator(eqx.Module):
         dt: Array,
         faster: Array,
         moves: Array,
-    ) -> Array:
-        """Probability of every hypothesis and of none after this step."""
+    ) -> tuple[Array, Array]:
+        """Probability of every hypothesis and of none, and how far each one's way is from the mean.
+
+        A hypothesis keeps the way it would have gone: when currents later speak for it, the pose is
+        corrected by what was not believed in time (interacting multiple models; Blom and
+        Bar-Shalom 1988).
+        """
         f, s = self.frozen, self.settings
         std = f.current_std[jnp.asarray(self.hypotheses)]
         size = jnp.sqrt(predicted**2 + 0.03**2)
@@ -321,7 +336,11 @@ class Estimator(eqx.Module):
         known, unknown = old.belief[:-1], old.belief[-1]
         mean = known @ xi / jnp.maximum(jnp.sum(known), 1e-12)
         change = 1 - jnp.exp(-jnp.linalg.norm(mean[:2]) * dt / s.patch_m)
-        moved = self._change(known, change)
+        way = old.apart + jnp.where(moves, dt, 0.0) * (xi - mean)
+        whole = jnp.concatenate([known[:, None], known[:, None] * way], axis=1)
+        whole = jax.vmap(self._change, (1, None), 1)(whole, change)
+        moved = whole[:, 0]
+        way = whole[:, 1:] / jnp.maximum(moved, 1e-9)[:, None]
         prior = jnp.concatenate(
             [
                 moved * (1 - 0.05 * change) + 0.2 * change * unknown * self._prior(),
@@ -329,7 +348,7 @@ class Estimator(eqx.Module):
             ]
         )
         log = jnp.log(jnp.maximum(prior, 1e-12)) + weight * jnp.append(told, none)
-        return jax.nn.softmax(log)
+        return jax.nn.softmax(log), way
 
     def _change(self, p: Array, change: Array) -> Array:
         """Every wheel may come to another floor, as likely as the prior says given the others."""
@@ -352,6 +371,7 @@ class Estimator(eqx.Module):
         amps: Array,
         xi: Array,
         belief: Array,
+        apart: Array,
         gyro: Array,
         moves: Array,
     ) -> tuple[Array, Array]:
@@ -377,8 +397,10 @@ class Estimator(eqx.Module):
             jnp.where(has, measured, jnp.where(moves, twist[2], 0.0))
         )
         twist = jnp.where(still > 0.1, 0.0, twist)
-        step = advance(twist, dt)
-        pose = compose(old.pose, step)
+        late_news = known @ apart
+        apart = apart - late_news
+        late_news = late_news.at[2].multiply(jnp.where(has, 0.0, 1.0))
+        pose = compose(old.pose, advance(twist, dt) + late_news)
         cov = self._grow(old, pose, dt, speed, slope, axes, share, scatter, has, moves)
         more = old.more
         # at rest a gyro reads its bias; what differs from what is known is a robot that creeps
@@ -415,6 +437,7 @@ class Estimator(eqx.Module):
             amps=amps,
             belief=belief,
             twist=xi,
+            apart=apart,
             pose=pose,
             more=more,
             covariance=cov,

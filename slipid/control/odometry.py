@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.control.estimator import Settings, estimated, sensed
+from slipid.control.estimator import Settings, estimated, read_wheels, sensed
 from slipid.control.frozen import Frozen
 from slipid.control.packed import Layout
 from slipid.model.robot import advance, compose

@@ -23,8 +23,8 @@ class Path(eqx.Module):
     """
 
     rows: Float[Array, "row 6"]
-    marks: tuple[float, ...] = eqx.field(static=True)
-    corners: tuple[tuple[float, float], ...] = eqx.field(static=True)
+    marks: Float[Array, " mark"]
+    corners: Float[Array, "mark 2"]
 
     @property
     def duration(self) -> float:
@@ -56,7 +56,15 @@ class Path(eqx.Module):
         rows[:, 2] += heading
         rows[:, 3:5] = rows[:, 3:5] @ turn
         corners = np.asarray(self.corners).reshape(-1, 2) @ turn + [x, y]
-        return Path(jnp.asarray(rows), self.marks, tuple((float(a), float(b)) for a, b in corners))
+        return Path(jnp.asarray(rows), self.marks, jnp.asarray(corners))
+
+    def waiting(self, seconds: float) -> "Path":
+        """The path after so long a rest at its start."""
+        count = round(seconds / STEP)
+        still = jnp.broadcast_to(self.rows[0].at[3:].set(0.0), (count, 6))
+        return Path(
+            jnp.concatenate([still, self.rows]), self.marks + count * STEP, self.corners
+        )
 
 
 def waypoints(
@@ -94,7 +102,7 @@ def waypoints(
         time += len(gone) * STEP
         marks.append(time)
     rows = np.concatenate(parts)
-    return Path(jnp.asarray(rows), tuple(marks), tuple((float(x), float(y)) for x, y in p[1:]))
+    return Path(jnp.asarray(rows), jnp.asarray(marks), jnp.asarray(p[1:]))
 
 
 def rectangle(length: float = 0.9, width: float = 0.4, speed: float = 0.2) -> Path:
@@ -148,5 +156,5 @@ def _smooth(place: object, speed: float, turning: bool) -> Path:
         pose[:, :2] = pose[:, :2] @ np.array([[c, -s], [s, c]])
         pose[:, 2] -= way[0]
     rates = np.gradient(pose, STEP, axis=0)
-    end = (float(pose[-1, 0]), float(pose[-1, 1]))
-    return Path(jnp.asarray(np.hstack([pose, rates])), ((len(pose) - 1) * STEP,), (end,))
+    end = jnp.asarray([(len(pose) - 1) * STEP])
+    return Path(jnp.asarray(np.hstack([pose, rates])), end, jnp.asarray(pose[-1:, :2]))

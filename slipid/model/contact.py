@@ -53,7 +53,7 @@ _LEAST_LOAD = 1e-3
 _ROUNDING = 1e-20
 _NEAR = 1e-6
 _MOST_NEAR = 12
-_SETTLE_CHORD, _SETTLE_NEWTON, _SETTLE_FAR = 2, 3, 0.3
+_SETTLE_CHORD, _SETTLE_NEWTON = 2, 3
 
 
 class ContactSurface(eqx.Module):
@@ -392,14 +392,17 @@ def settle(
 ) -> Float[Array, "3"]:
     """`equilibrium` in a few steps from the twist of a moment ago, for a robot's computer.
 
-    Two chord steps, then three of Newton's that are not let far; where a number is lost it is the
-    twist without slip. What a jump of the wheel speeds leaves over, the next call settles.
+    Chord steps, then Newton's where these come nearer; where a number is lost it is the twist
+    without slip. What a jump of the wheel speeds leaves over, the next call settles.
     """
     args = (rim, frame, surface, rest, jnp.zeros(3), jnp.zeros(3))
-    xi = start
+    near = start
     for _ in range(_SETTLE_CHORD):
-        xi = _chord(xi, args)
+        near = _chord(near, args)
+    xi = near
     for _ in range(_SETTLE_NEWTON):
         f, jac = _balance(xi, args)
-        xi = xi - jnp.clip(_solve3(jac, f), -_SETTLE_FAR, _SETTLE_FAR)
+        xi = xi - _solve3(jac, f)
+    left, before = _residual(xi, args), _residual(near, args)
+    xi = jnp.where(left @ left <= before @ before, xi, near)  # NaN is not smaller either
     return jnp.where(jnp.all(jnp.isfinite(xi)), xi, guess(rim, frame))
