@@ -22,6 +22,7 @@ from slipid.app.synthetic import Sensors, grid, make_logs, truth, write_logs
 from slipid.data.dataset import Windows, collect
 from slipid.data.log import DataError
 from slipid.data.terrain import from_polygons, uniform
+from slipid.identify import crossing as cut
 from slipid.identify import likelihood as lk
 from slipid.identify import mixed
 from slipid.identify.result import load
@@ -91,7 +92,7 @@ def crossed(truth_, runs, seed, per_run=40):
     pose += rng.normal(size=pose.shape) * [PLACE, PLACE, HEADING]
     w = replace(w, pose=pose, current=np.asarray(amps) + CURRENT * rng.normal(size=amps.shape))
     runs_ = tuple((f"site/run{k}.csv", f"{k:x}") for k in range(runs))
-    return mixed.Crossing(w, floor, np.tile(np.arange(per_run), runs), runs_)
+    return cut.Crossing(w, floor, np.tile(np.arange(per_run), runs), runs_)
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +201,7 @@ def test_wheels_stand_where_the_camera_says_less_the_marker():
     px, py = np.asarray(true.camera.marker_place)
     marker = jnp.array([x - py, y + px, heading + 0.1])
     logged = np.asarray(true.camera.logged(marker))
-    found = mixed.wheel_places(true, replace(w, pose=np.tile(logged, (1, 2, 1))))
+    found = cut.wheel_places(true, replace(w, pose=np.tile(logged, (1, 2, 1))))
     place = 0.125 * np.asarray(true.geometry.place)
     expected = np.stack([x - place[:, 1], y + place[:, 0]], 1)
     assert found.shape == (1, 3, 3, 2)
@@ -221,23 +222,23 @@ RIGHT = [[0.0, -9.0], [9.0, -9.0], [9.0, 9.0], [0.0, 9.0]]
 def test_windows_in_which_no_wheel_changes_floors(driven):
     true, data = driven
     half = from_polygons("soft", [("firm", RIGHT)], (-3.0, -3.0, 3.0, 3.0))
-    whole = mixed.crossing(data, uniform("soft", 3.0), true)
-    some = mixed.crossing(data, half, true)
+    whole = cut.crossing(data, uniform("soft", 3.0), true)
+    some = cut.crossing(data, half, true)
     assert set(whole.floor.ravel()) == {true.surface_index("soft")}
     assert len(some.windows) < len(whole.windows)
-    x = mixed.wheel_places(true, some.windows)[..., 0]
+    x = cut.wheel_places(true, some.windows)[..., 0]
     assert ((x > 0) == (some.floor == true.surface_index("firm"))[:, None]).all()
-    assert whole.windows.dt.max() < 2 * mixed.WINDOW
+    assert whole.windows.dt.max() < 2 * cut.WINDOW
     assert (np.diff(whole.place)[np.diff(whole.windows.run) == 0] > 0).all()
     rim = 0.04 * np.abs(whole.windows.turn[:, 0]) / whole.windows.dt
-    assert rim.max(axis=1).min() >= mixed.LEAST_SPEED
+    assert rim.max(axis=1).min() >= cut.LEAST_SPEED
 
 
 def test_runs_without_a_window_are_refused(driven, monkeypatch):
     true, data = driven
-    monkeypatch.setattr(mixed, "LEAST_SPEED", 9.0)
+    monkeypatch.setattr(cut, "LEAST_SPEED", 9.0)
     with pytest.raises(DataError, match=r"no 0\.25 s in which .*expected larger patches"):
-        mixed.crossing(data, uniform("soft", 3.0), true)
+        cut.crossing(data, uniform("soft", 3.0), true)
 
 
 # configs ----------------------------------------------------------------------------------------

@@ -146,7 +146,8 @@ def _with_mixed(fit: Any, job: Any, problem: Any, optimum: Any, report: Reporter
     """The fit, with what runs over several floors add to it."""
     if not job.mixed:
         return fit
-    from slipid.identify.mixed import crossing, update
+    from slipid.identify.crossing import crossing
+    from slipid.identify.mixed import update
     from slipid.identify.result import updated
 
     report.stage("runs over several floors")
