@@ -15,8 +15,9 @@ import pytest
 from typer.testing import CliRunner
 
 from slipid.app.cli import app
+from slipid.app.config import parsed
 from slipid.app.progress import Reporter
-from slipid.app.simulate import Job, _place, can_identify, simulate, truth
+from slipid.app.simulate import Job, _place, can_identify, identify_config, simulate, truth
 from slipid.app.simulate_config import plan, read_plan
 from slipid.data.formats import preset
 from slipid.data.log import DataError
@@ -287,6 +288,41 @@ def test_only_runs_that_a_fit_can_use_get_a_config_for_it(tmp_path):
     config.write_text(SMALL[:start] + SMALL[SMALL.index("[[runs]]", start + 1) :])
     assert not can_identify(read_plan(config))
     assert can_identify(plan(config, SMALL))
+
+
+MIXED = """
+[maps]
+site = { kind = "patchwork", surfaces = ["firm", "soft"], half_m = 0.5 }
+other = { kind = "patchwork", surfaces = ["firm", "medium"], half_m = 0.5 }
+[[runs]]
+kind = "headings"
+surface = "firm"
+[[runs]]
+kind = "headings"
+surface = "soft"
+[[runs]]
+kind = "wander"
+map = "site"
+count = 1
+[[runs]]
+kind = "wander"
+map = "other"
+count = 1
+"""
+
+
+def test_runs_on_a_map_of_floors_that_were_driven_are_fitted_with_it(tmp_path):
+    found = parsed(tmp_path / "robot.toml", identify_config(plan(tmp_path / "x", MIXED))).content
+    said = [(logs.glob, logs.map) for logs in found.logs]
+    assert said == [
+        ("as_built/firm/*.csv", None),
+        ("as_built/soft/*.csv", None),
+        ("as_built/site/*.csv", "maps/site.toml"),
+    ]
+    # a load that no run on one floor had
+    text = MIXED.replace('map = "site"', 'map = "site"\nload = "moved"')
+    found = parsed(tmp_path / "robot.toml", identify_config(plan(tmp_path / "x", text))).content
+    assert len(found.logs) == 2
 
 
 def test_the_truth_has_the_names_of_a_fit():

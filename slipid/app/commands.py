@@ -48,10 +48,11 @@ def identify(
     config = read_config(config_path)
     report.tolerance = config.content.fit.tolerance
     report.stage("reading logs")
-    from slipid.app.job import read_job
+    from slipid.app.job import read_job, with_mixed
 
     job = read_job(config, data, report.count, report.line)
     report.line(f"{len(job.dataset)} runs on {', '.join(job.robot.surfaces.labels)}")
+    job = with_mixed(job, data, report.count, report.line)
     report.stage("cutting windows")
     problem = job.problem()
     from slipid.identify.profile import profiled
@@ -67,6 +68,7 @@ def identify(
     from slipid.identify.result import summarise
 
     fit = summarise(problem, optimum, job.dataset, job.choices, config.content.fit.seed)
+    fit = _with_mixed(fit, job, problem, optimum, report)
     report.stage("simpler models, for comparison")
     fit = _with_baselines(fit, job)
     report.stage("writing")
@@ -80,6 +82,8 @@ def identify(
         written += [path.name for path in identify_plots(fit, job.dataset, out)]
     except DataError as error:  # the numbers are written; a run too short to draw spoils none
         report.line(f"no more pictures: {error}")
+    if profile and job.mixed:
+        report.line("profiles are of the runs on one floor each")
     profiles = _profiles(problem, optimum, profile, out, report)
     written += ["profile.json", "profile.png"] if profiles else []
     (out / CHECKPOINT).unlink(missing_ok=True)
@@ -138,6 +142,33 @@ def _optimise(job: Any, problem: Any, out: Path, report: Reporter) -> Any:
     return replace(optimum, history=tuple(history), reason=reason)
 
 
+def _with_mixed(fit: Any, job: Any, problem: Any, optimum: Any, report: Reporter) -> Any:
+    """The fit, with what runs over several floors add to it."""
+    if not job.mixed:
+        return fit
+    from slipid.identify.crossing import crossing
+    from slipid.identify.mixed import update
+    from slipid.identify.result import updated
+
+    report.stage("runs over several floors")
+    sets = [crossing(data, floor, fit.robot) for data, floor in job.mixed]
+    found = update(fit.space, fit.z, fit.covariance, sets)
+    report.line(_judged(found.about))
+    return updated(fit, found, problem, optimum, job.dataset)
+
+
+def _judged(about: Any) -> str:
+    """What runs over several floors told, as a sentence."""
+
+    def off(errors: Any) -> str:
+        return f"{errors['yaw_rate']:.3f} rad/s and {1000 * errors['speed']:.1f} mm/s"
+
+    said = f"{about['runs']} runs over several floors: predicted within {off(about['before'])}"
+    if about["after"] is None:
+        return f"{said} by the others; one run cannot judge what it taught"
+    return f"{said} by the others, {off(about['after'])} when half has taught the other"
+
+
 def _with_baselines(fit: Any, job: Any) -> Any:
     """The fit, with every simpler model learnt from the same runs at the fitted camera and lag."""
     from slipid.data.dataset import windows
@@ -174,7 +205,7 @@ def _keep_run(config: Config, job: Any, data: Path, out: Path, seconds: float) -
             "data": {
                 "folder": str(data),
                 "hash": job.data_hash,
-                "logs": {log.name: log.sha256 for log in job.dataset.logs},
+                "logs": {log.name: log.sha256 for log in job.logs},
                 "skipped": list(job.skipped),
             },
             "seed": config.content.fit.seed,
@@ -192,13 +223,14 @@ def validate(out: Path, data: Path, report: Reporter) -> dict[str, Any]:
         DataError: no fit there, or logs that it cannot predict.
     """
     runtime.start()
+    from slipid.app.config import one_floor
     from slipid.app.job import read_dataset
     from slipid.identify.result import load
     from slipid.identify.validate import Frozen, validation
 
     fit = load(out)
     config = read_config(out / "config.toml")
-    sections = config.content.validate_.logs or config.content.logs
+    sections = one_floor(config.content.validate_.logs or config.content.logs)
     report.stage("reading logs")
     dataset, skipped = read_dataset(config, sections, data, report.count)
     for sentence in skipped:
@@ -266,6 +298,7 @@ def sample(
     from slipid.identify.result import load
 
     fit = load(out)
+    job_of.on_one_floor(fit)
     folder = job_of.where_the_logs_are(out, data)
     report.stage("reading logs")
     job = read_job(read_config(out / "config.toml"), folder, report.count, report.line)

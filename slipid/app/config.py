@@ -4,6 +4,7 @@ Units stand in the names of the keys; everything is optional that has a default 
 """
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -80,14 +81,25 @@ class General(_Section):
 
 
 class Logs(_Section):
-    """Log files of one kind, found by a glob below the data folder."""
+    """Log files of one kind, found by a glob below the data folder.
+
+    Runs of a section with a `map` (its file, relative to the config) cross the floors it shows;
+    their poses are in its frame.
+    """
 
     glob: str
     format: str
     surface: str = "folder"
+    map: str | None = None
     load: str = "as_built"
     session: Literal["surface/load/speed", "folder", "file"] = "surface/load/speed"
     min_rows: int = Field(2, ge=2)
+
+    @model_validator(mode="after")
+    def _one_floor_or_many(self) -> "Logs":
+        if self.map is not None and self.surface != "folder":
+            raise ValueError("surface and map at once; expected one of them")
+        return self
 
 
 class Camera(_Section):
@@ -157,6 +169,20 @@ class Content(_Section):
     fit: FitSection = FitSection()  # type: ignore[call-arg]
     selftest: SelftestSection = SelftestSection()  # type: ignore[call-arg]
     validate_: ValidateSection = Field(default_factory=ValidateSection, alias="validate")
+
+    @model_validator(mode="after")
+    def _floors_one_by_one(self) -> "Content":
+        for name, sections in (("logs", self.logs), ("validate.logs", self.validate_.logs)):
+            if sections and not one_floor(sections):
+                raise ValueError(
+                    f"{name}: every section has a map; expected one without, of runs on one floor"
+                )
+        return self
+
+
+def one_floor(sections: Sequence[Logs]) -> list[Logs]:
+    """Sections whose runs keep to one floor each."""
+    return [section for section in sections if section.map is None]
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 
-from slipid.app.config import Config, Logs, geometry
+from slipid.app.config import Config, Logs, geometry, one_floor
 from slipid.data.dataset import Dataset, collect, default_session, windows
 from slipid.data.formats import PRESETS, Layout, layout_from_mapping, preset
 from slipid.data.log import DataError, Log
 from slipid.data.reader import find_logs, read_logs
+from slipid.data.terrain import FloorMap, read_map
 from slipid.identify.folds import still_viscosities
 from slipid.identify.problem import Problem
 from slipid.identify.result import hash_of
@@ -27,10 +28,11 @@ class Job:
 
     Attributes:
         config: as read.
-        dataset: the runs.
+        dataset: the runs, each on one floor.
         robot: with the geometry of the config and every other number at its declared start.
         choices: free, fixed, priors.
         skipped: what the config names and the folder does not have, one line each.
+        mixed: runs over several floors, with the map of each set.
     """
 
     config: Config
@@ -38,11 +40,17 @@ class Job:
     robot: Robot
     choices: tuple[Choice, ...]
     skipped: tuple[str, ...]
+    mixed: tuple[tuple[Dataset, FloorMap], ...] = ()
+
+    @property
+    def logs(self) -> tuple[Log, ...]:
+        """Every run, those over several floors last."""
+        return self.dataset.logs + tuple(log for data, _ in self.mixed for log in data.logs)
 
     @property
     def data_hash(self) -> str:
         """Hash of the runs and their files."""
-        return hash_of((log.name, log.sha256) for log in self.dataset.logs)
+        return hash_of((log.name, log.sha256) for log in self.logs)
 
     def problem(self) -> Problem:
         """Likelihood of the runs, cut into windows as the config says."""
@@ -59,7 +67,7 @@ class Job:
 
 
 def read_job(config: Config, root: Path, tell: Callable[[int, int], None], line: Tell) -> Job:
-    """Read every log the config names and set up its robot.
+    """Read every log of runs on one floor that the config names and set up its robot.
 
     Args:
         root: data folder the globs are relative to.
@@ -69,8 +77,63 @@ def read_job(config: Config, root: Path, tell: Callable[[int, int], None], line:
     Raises:
         DataError: what is wrong with config or logs.
     """
-    dataset, skipped = read_dataset(config, config.content.logs, root, tell)
+    dataset, skipped = read_dataset(config, one_floor(config.content.logs), root, tell)
     return job_of(config, dataset, skipped, line)
+
+
+def with_mixed(job: Job, root: Path, tell: Callable[[int, int], None], line: Tell) -> Job:
+    """The job with the runs over several floors that its config names, arguments as of `read_job`.
+
+    Raises:
+        DataError: what is wrong with maps or logs.
+    """
+    wanted = [section for section in job.config.content.logs if section.map is not None]
+    found, absent = _found(job.config, wanted, root)
+    sets = []
+    for section, _ in found:
+        floor = _map(job, section)
+        data, short = read_dataset(job.config, [section], root, tell)
+        absent += short
+        _go_together(job, data)
+        sets.append((data, floor))
+        job = replace(job, mixed=tuple(sets))
+    for sentence in absent:
+        line(sentence)
+    return replace(job, skipped=(*job.skipped, *absent))
+
+
+def _map(job: Job, section: Logs) -> FloorMap:
+    """Map of a log section.
+
+    Raises:
+        DataError: unreadable, or of a floor that no run keeps to.
+    """
+    path = job.config.path.parent / str(section.map)
+    floor = read_map(path)
+    known = job.robot.surfaces.labels
+    for name in floor.surfaces:
+        if name not in known:
+            raise DataError(
+                f"{path}: surface '{name}': no run on it alone; expected some of {', '.join(known)}"
+            )
+    return floor
+
+
+def _go_together(job: Job, data: Dataset) -> None:
+    """DataError where runs over several floors need what those on one floor do not tell."""
+    seen, first = {log.name for log in job.logs}, job.dataset.logs[0]
+    for log in data.logs:
+        if log.name in seen:
+            raise DataError(
+                f"{log.name}: found by two globs of {job.config.path}; expected it once"
+            )
+        if log.load not in job.robot.body.loads:
+            raise DataError(
+                f"{log.name}: load set-up '{log.load}': no run with it on one floor; "
+                f"expected one of {', '.join(job.robot.body.loads)}"
+            )
+        if log.wheels != first.wheels:
+            raise DataError(f"{log.name}: {log.wheels} wheels; expected {first.wheels}")
 
 
 def job_of(config: Config, dataset: Dataset, skipped: Sequence[str], line: Tell) -> Job:
@@ -123,15 +186,7 @@ def read_dataset(
     """
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; expected the folder of the logs (--data)")
-    found: list[tuple[Logs, list[Path]]] = []
-    skipped: list[str] = []
-    for section in sections:
-        try:
-            found.append((section, find_logs(root, section.glob)))
-        except DataError as error:
-            skipped.append(f"skipped: {error}")
-        except (ValueError, NotImplementedError) as error:
-            raise DataError(f"{config.path}: logs.glob '{section.glob}': {error}") from error
+    found, skipped = _found(config, sections, root)
     if not found:
         raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
     count = sum(len(paths) for _, paths in found)
@@ -159,6 +214,22 @@ def read_dataset(
     return collect(logs, session=lambda log: session[log.name]), skipped
 
 
+def _found(
+    config: Config, sections: Sequence[Logs], root: Path
+) -> tuple[list[tuple[Logs, list[Path]]], list[str]]:
+    """Files of every section that has some, and a line for each that has none."""
+    found: list[tuple[Logs, list[Path]]] = []
+    skipped: list[str] = []
+    for section in sections:
+        try:
+            found.append((section, find_logs(root, section.glob)))
+        except DataError as error:
+            skipped.append(f"skipped: {error}")
+        except (ValueError, NotImplementedError) as error:
+            raise DataError(f"{config.path}: logs.glob '{section.glob}': {error}") from error
+    return found, skipped
+
+
 def layout_of(config: Config, section: Logs) -> Layout:
     """Layout a log section names: one of the config's own, else a preset."""
     own = config.content.layouts
@@ -176,8 +247,10 @@ def layout_of(config: Config, section: Logs) -> Layout:
     return preset(section.format)
 
 
-def _surface(section: Logs, path: Path) -> str:
+def _surface(section: Logs, path: Path) -> str | None:
     """Name of the floor: as the config says, or of the folder the file lies in."""
+    if section.map is not None:
+        return None
     if section.surface != "folder":
         return section.surface
     return path.parent.name.removesuffix("_surface")

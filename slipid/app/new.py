@@ -48,6 +48,7 @@ glob = "*/*.csv"                      # below --data
 format = "mine"
 surface = "folder"                    # the folder names the floor; or write a name here
 load = "as_built"                     # one name per way the robot was loaded
+# map = "maps/site.toml"              # instead of surface: a floor map, for runs that cross floors
 
 # Patterns of parameter names. fixed = value; start = value; free = true or false; prior is Gaussian
 # in the parameter's own unit. `slipid check` lists the names.

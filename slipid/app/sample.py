@@ -249,6 +249,19 @@ def where_the_logs_are(out: Path, data: Path | None) -> Path:
     return folder
 
 
+def on_one_floor(fit: Fit) -> None:
+    """Refuse a fit that learnt from runs over several floors: their likelihood is not sampled.
+
+    Raises:
+        DataError: it did.
+    """
+    if "mixed" in fit.settings:
+        raise DataError(
+            "the fit learnt from runs over several floors, which are not sampled yet; "
+            "expected a fit without the log sections that have a map (identify again without them)"
+        )
+
+
 def same_logs(fit: Fit, job: Any) -> None:
     """Refuse logs other than those that were fitted.
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.app import files
-from slipid.app.config import Config
+from slipid.app.config import Config, one_floor
 from slipid.app.job import Job, Tell, job_of, layout_of, shape_of
 from slipid.app.synthetic_windows import measure
 from slipid.data.dataset import Windows, collect
@@ -52,7 +52,8 @@ def planned(config: Config, line: Tell) -> Job:
     from slipid.app.synthetic import Sensors, grid, make_logs
 
     wanted, shape = config.content.selftest, shape_of(config)
-    loads = list(dict.fromkeys(section.load for section in config.content.logs))
+    sections = one_floor(config.content.logs)
+    loads = list(dict.fromkeys(section.load for section in sections))
     drives = [
         replace(d, distance=wanted.distance_m)
         for d in grid(
@@ -63,7 +64,7 @@ def planned(config: Config, line: Tell) -> Job:
         )
     ]
     robot = build(shape, wanted.surfaces, loads, sorted({d.session for d in drives}))
-    layouts = [layout_of(config, section) for section in config.content.logs]
+    layouts = [layout_of(config, section) for section in sections]
     channels = [set(layout.channels) for layout in layouts]
     has_current = all("current" in c for c in channels)
     has_voltage = all("voltage" in c or {"duty", "bus_voltage"} <= c for c in channels)

@@ -339,6 +339,11 @@ def identify_config(plan: Plan) -> str:
         f'surface = "folder"\nload = "{load}"\n'
         for load, surface in sorted(one)
     )
+    sets += "".join(
+        f'\n[[logs]]\nglob = "{load}/{name}/*.csv"\nformat = "testsite"\n'
+        f'map = "maps/{name}.toml"\nload = "{load}"\n'
+        for load, name in _mapped(plan)
+    )
     return _IDENTIFY.format(
         azimuths=list(machine.wheel_azimuths_deg),
         base=machine.base_radius_m,
@@ -350,6 +355,21 @@ def identify_config(plan: Plan) -> str:
         columns=columns,
         sets=sets,
         scale=round(sensors.camera_scale * (1 + measured), 4),
+    )
+
+
+def _mapped(plan: Plan) -> list[tuple[str, str]]:
+    """Load and map of runs over several floors, where runs on one floor tell of each and the load.
+
+    Whatever steered them, the camera logs their poses in the frame of the map.
+    """
+    one = [run for _, run in plan.runs if run.surface is not None]
+    floors, loads = {run.surface for run in one}, {run.load for run in one}
+    pairs = {(run.load, name.split("/")[1]) for name, run in plan.runs if run.surface is None}
+    return sorted(
+        (load, name)
+        for load, name in pairs
+        if load in loads and set(plan.maps[name].surfaces) <= floors
     )
 
 

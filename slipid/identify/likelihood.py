@@ -27,9 +27,13 @@ SMOOTH = 0.03
 
 
 class Batch(eqx.Module):
-    """Windows as arrays for a jitted function; names are indices of the robot's stacks."""
+    """Windows as arrays for a jitted function; names are indices of the robot's stacks.
 
-    surface: Int[Array, " piece"]
+    Attributes:
+        surface: under the robot (piece,), or under each of its wheels (piece, wheel).
+    """
+
+    surface: Int[Array, "piece *wheel"]
     load: Int[Array, " piece"]
     session: Int[Array, " piece"]
     dt: Float[Array, "piece window"]
@@ -45,10 +49,18 @@ class Batch(eqx.Module):
     signed: bool = eqx.field(static=True)
 
 
-def batch(windows: Windows, robot: Robot) -> Batch:
-    """Batch for a robot that knows the floors, loads and sessions of the windows."""
+def batch(
+    windows: Windows, robot: Robot, floor: Int[np.ndarray, "piece wheel"] | None = None
+) -> Batch:
+    """Batch for a robot that knows the floors, loads and sessions of the windows.
+
+    Args:
+        floor: surface under each wheel, where the windows do not know theirs.
+    """
+    if floor is None:
+        floor = np.asarray([robot.surface_index(s) for s in windows.surface])
     return Batch(
-        surface=jnp.asarray([robot.surface_index(s) for s in windows.surface]),
+        surface=jnp.asarray(floor),
         load=jnp.asarray([robot.load_index(s) for s in windows.load]),
         session=jnp.asarray([robot.session_index(s) for s in windows.session]),
         dt=jnp.asarray(windows.dt),
@@ -121,7 +133,8 @@ def predicted_current(
     robot: Robot, b: Batch, felt: Float[Array, "piece window wheel"]
 ) -> Float[Array, "piece window wheel"]:
     """Motor current of every window [A] given the traction, a magnitude where the log has those."""
-    weight = robot.surfaces.friction[b.surface] * robot.body.mass * model.GRAVITY
+    friction = robot.surfaces.friction[b.surface].reshape(b.dt.shape[0], -1).mean(axis=1)
+    weight = friction * robot.body.mass * model.GRAVITY
     torque = robot.geometry.wheel_radius * weight[:, None, None] * felt
     amps = robot.motor.current(torque, wheel_speed(robot, b))
     if b.signed:

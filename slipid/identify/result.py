@@ -21,6 +21,7 @@ from slipid.identify import curves as curves_of
 from slipid.identify.fit import Optimum
 from slipid.identify.flat import Flat, flat_directions, sentences
 from slipid.identify.identifiability import Estimate, derived, estimates
+from slipid.identify.mixed import Update, informed
 from slipid.identify.predictive import contact_of
 from slipid.identify.problem import Problem
 from slipid.model.geometry import Geometry
@@ -47,7 +48,7 @@ class Fit:
         laplace: without what they share, the curvature of the likelihood alone.
         variance: every variance component by name, those of sessions included [unit squared].
         variance_unit: unit of each component's std.
-        runs: (name, sha256) of every run that was fitted.
+        runs: (name, sha256) of every run that was fitted, those over several floors last.
         piece_run: number of the run each residual row belongs to.
         residual: predicted less measured, one row per piece, by block.
         whitened: the same in units of its expected scatter.
@@ -60,7 +61,7 @@ class Fit:
         converged, reason, rounds, history: how the fit ended.
         remaining: largest step a full Gauss-Newton step would still take, in posterior stds; a
             solver that finds no way ahead is not at an optimum because of it.
-        settings: of windows and seed, as used.
+        settings: of windows and seed, as used; `mixed` says what runs over several floors did.
         baselines: what simpler models learnt from the same runs, for comparison.
     """
 
@@ -299,20 +300,9 @@ def summarise(
     """
     z, log_v = optimum.state.z, optimum.state.log_variance
     volt = problem.volt(log_v)
-    blocks, jacobian = problem.linear(jnp.asarray(z), volt)
-    keep = np.ones(len(problem.windows))
-    roots, weights, _ = problem.whitening(blocks, jnp.asarray(log_v), keep)
-    contact = contact_of(problem, optimum.state, optimum.covariance, keep)
-    plain = {  # roots of V^-1 without the weights of outliers
-        k: np.asarray(roots[k]) / np.sqrt(np.asarray(weights[k]))[:, None, None] for k in roots
-    }
-    whitened = {k: np.einsum("nij,nj->ni", plain[k], np.asarray(r)) for k, r in blocks.items()}
-    gram = np.zeros((problem.space.size,) * 2)
-    for k, jac in jacobian.items():
-        half = np.einsum("nij,njp->nip", plain[k], np.asarray(jac)).reshape(-1, len(gram))
-        half = half * problem.space.prior_std
-        gram += half.T @ half
-    left, name = remaining(problem, z, volt, blocks, jacobian, roots)
+    rows = _rows(problem, z, log_v)
+    contact = contact_of(problem, optimum.state, optimum.covariance, np.ones(len(problem.windows)))
+    left, name = remaining(problem, z, volt, rows.residual, rows.jacobian, rows.roots)
     settled = left < REMAINING
     stuck = f"the solver stopped {left:.2g} stds of {name} away from where its own step leads"
     windows = problem.windows
@@ -329,10 +319,10 @@ def summarise(
         variance_unit={name: unit[name] for name in contact.variance},
         runs=tuple((log.name, log.sha256) for log in data.logs),
         piece_run=np.asarray(windows.run),
-        residual={k: np.asarray(v) for k, v in blocks.items()},
-        whitened=whitened,
-        weight={k: np.asarray(v) for k, v in weights.items()},
-        spectrum=np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0)),
+        residual=rows.residual,
+        whitened=rows.whitened,
+        weight=rows.weight,
+        spectrum=_spectrum(rows.gram),
         has={"current": bool(windows.has_current), "voltage": bool(windows.has_voltage)},
         curves=curves_of.curves(
             problem.space, z, draws(z, contact.covariance, 400, seed), problem.batch
@@ -349,6 +339,82 @@ def summarise(
             "current_is_signed": bool(windows.current_is_signed),
             "seed": seed,
         },
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Residuals at a search vector, with what they are weighed by; attributes as of `Fit`.
+
+    Attributes:
+        jacobian: of the residuals.
+        roots: of their inverse covariance, weights of outliers included.
+        gram: information of all of them without those weights, in prior stds.
+    """
+
+    residual: dict[str, np.ndarray]
+    jacobian: dict[str, np.ndarray]
+    roots: dict[str, np.ndarray]
+    weight: dict[str, np.ndarray]
+    whitened: dict[str, np.ndarray]
+    gram: Float[np.ndarray, "free free"]
+
+
+def _rows(problem: Problem, z: Any, log_v: Any) -> _Rows:
+    blocks, jacobian = problem.linear(jnp.asarray(z), problem.volt(log_v))
+    keep = np.ones(len(problem.windows))
+    roots, weights, _ = problem.whitening(blocks, jnp.asarray(log_v), keep)
+    plain = {  # roots of V^-1 without the weights of outliers
+        k: np.asarray(roots[k]) / np.sqrt(np.asarray(weights[k]))[:, None, None] for k in roots
+    }
+    gram = np.zeros((problem.space.size,) * 2)
+    for k, jac in jacobian.items():
+        half = np.einsum("nij,njp->nip", plain[k], np.asarray(jac)).reshape(-1, len(gram))
+        half = half * problem.space.prior_std
+        gram += half.T @ half
+    return _Rows(
+        residual={k: np.asarray(v) for k, v in blocks.items()},
+        jacobian={k: np.asarray(v) for k, v in jacobian.items()},
+        roots={k: np.asarray(v) for k, v in roots.items()},
+        weight={k: np.asarray(v) for k, v in weights.items()},
+        whitened={k: np.einsum("nij,nj->ni", plain[k], np.asarray(r)) for k, r in blocks.items()},
+        gram=gram,
+    )
+
+
+def _spectrum(gram: np.ndarray) -> Float[np.ndarray, " free"]:
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0))
+
+
+def updated(fit: Fit, new: Update, problem: Problem, optimum: Optimum, data: Dataset) -> Fit:
+    """The fit after runs over several floors.
+
+    Args:
+        fit: of `summarise`.
+        new: what those runs make of it.
+        problem, optimum, data: as given to `summarise`; residuals are still those of its runs.
+    """
+    rows = _rows(problem, new.z, optimum.state.log_variance)
+    outer = problem.space.prior_std[:, None] * problem.space.prior_std
+    several = draws(new.z, new.covariance, 400, fit.settings["seed"])
+    unsettled = "the runs over several floors: no rest after all steps"
+    return replace(
+        fit,
+        z=np.asarray(new.z),
+        covariance=new.covariance,
+        laplace=informed(fit.space, fit.laplace, new.information),
+        variance=dict(fit.variance) | dict(new.variance),
+        variance_unit=dict(fit.variance_unit) | dict(new.unit),
+        runs=fit.runs + new.runs,
+        residual=rows.residual,
+        whitened=rows.whitened,
+        weight=rows.weight,
+        spectrum=_spectrum(rows.gram + outer * new.information),
+        curves=curves_of.curves(problem.space, new.z, several, problem.batch),
+        validity=curves_of.validity(data, problem.space.tree(jnp.asarray(new.z)), problem.batch),
+        converged=fit.converged and new.settled,
+        reason=fit.reason if new.settled or not fit.converged else unsettled,
+        settings=dict(fit.settings) | {"mixed": dict(new.about)},
     )
 
 

@@ -18,9 +18,9 @@ where rollers stand at an angle g to the drive, vs_i is r w_i sin g less the spe
 direction in which the rollers do not give way, and r w_i cos g is taken off q_i. Ordinary wheels
 grip sideways as they do ahead.
 
-Wheels may stand on different floors: a `ContactSurface` whose leaves have one entry per wheel. Forces
-are then in units of mean(mu) m g, each wheel's weighted by mu_i / mean(mu), and b and cz are means
-over the loads.
+Wheels may stand on different floors: a `ContactSurface` whose leaves have one entry per wheel.
+Forces are then in units of mean(mu) m g, each wheel's weighted by mu_i / mean(mu), and b and cz are
+means over the loads.
 
 Creep and rolling resistance are rate-independent (s0 is a slip *ratio*): with a resistance that
 sets in at 20 mm/s instead, runs faster than the fitted ones are predicted worse. The root is found
@@ -206,7 +206,9 @@ def _chord(xi: Any, args: Any) -> Any:
     rim, frame, s, rest, mass, before = args
     v = xi[:2]
     load = rest - _mean(s.lead, rest) * (frame.shift @ (v * jax.lax.rsqrt(v @ v + 1e-8)))
-    load = _held(jnp.maximum(load, _LEAST_LOAD), s)  # a lifted wheel would push the chord the wrong way
+    load = _held(
+        jnp.maximum(load, _LEAST_LOAD), s
+    )  # a lifted wheel would push the chord the wrong way
     along, roll, _, cr, kl, scale_t, scale_r, scale_1 = _speeds(xi, rim, frame, s)
 
     def slope(x: Any, scale: Any) -> Any:

@@ -1,0 +1,362 @@
+"""Runs over several floors, as a second stage after a fit of runs that each kept to one.
+
+How hard a floor grips is not to be seen where all wheels stand on it: the forces balance whatever
+they are in units of. Where wheels stand on different floors the ratio of their frictions turns the
+robot. The first fit is the prior, a Gaussian of its search vector, whose flat directions these runs
+inform; with J the slope of the residuals r of short windows,
+
+    information = C^-1 + sum_c J_c^T W J_c / (f_c v_c)
+
+over along, across, yaw and currents. Variances v and Student-t weights W are those of the
+residuals. Neighbouring windows err alike (a floor that is uneven, a body that still speeds up), so
+each channel counts for its windows over f, what the residuals' correlation makes of their number:
+without it the intervals would be too narrow. It knows correlation within runs, no bias that all
+runs share. The camera keeps what the first fit knew of it, its uncertainty carried along: what the
+contact law lacks would bend a length sooner than a lens does.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from slipid.identify import likelihood as lk
+from slipid.identify.crossing import Crossing
+from slipid.identify.problem import DEGREES
+from slipid.model.robot import Robot
+from slipid.parameter import Space
+
+CHANNELS = ("along", "across", "yaw")
+TOLERANCE = 0.02
+"""Settled when a step is at most so many posterior stds."""
+_MOST_STEPS = 25
+_HALVINGS = 6
+_TOGETHER = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """What runs over several floors make of a fit.
+
+    Attributes:
+        z: search vector.
+        covariance: of it.
+        information: what was added to the inverse covariance.
+        variance, unit: of the residuals by channel, `mixed.yaw` and so on; unit of the std.
+        runs: (name, sha256) of the runs.
+        settled: whether the last step was within `TOLERANCE`.
+        about: runs, windows, root mean square errors before and after, correlation factors.
+    """
+
+    z: Float[np.ndarray, " free"]
+    covariance: Float[np.ndarray, "free free"]
+    information: Float[np.ndarray, "free free"]
+    variance: Mapping[str, float]
+    unit: Mapping[str, str]
+    runs: tuple[tuple[str, str], ...]
+    settled: bool
+    about: Mapping[str, Any]
+
+
+class _Evidence:
+    """Residuals of all windows, and how they scatter.
+
+    Rows are windows, columns along, across [m/s], yaw [rad/s] and the current of each wheel [A];
+    a set without currents has none there.
+    """
+
+    def __init__(self, space: Space, sets: Sequence[Crossing]):
+        self.space, self.sets = space, sets
+        first = np.cumsum([0, *(len(s.runs) for s in sets)])
+        self.run = np.concatenate([s.windows.run + k for s, k in zip(sets, first, strict=False)])
+        self.place = np.concatenate([s.place for s in sets])
+        self.has_current = np.concatenate(
+            [np.full(len(s.windows), s.windows.has_current) for s in sets]
+        )
+        self.chunks = [chunk for s in sets for chunk in _chunks(s, space.template)]
+
+    def linear(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (window, channel) and their slope by the search vector (.., free)."""
+        parts = [_linear(self.space, jnp.asarray(z), b, u) for b, u, _ in self.chunks]
+        return self._joined(0, parts), self._joined(1, parts)
+
+    def residual(self, z: np.ndarray) -> np.ndarray:
+        """Residuals alone."""
+        return self._joined(
+            0, [(_residual(self.space, jnp.asarray(z), b, u),) for b, u, _ in self.chunks]
+        )
+
+    def _joined(self, k: int, parts: Sequence[Sequence[Array]]) -> np.ndarray:
+        kept = [np.asarray(p[k])[:count] for p, (*_, count) in zip(parts, self.chunks, strict=True)]
+        return np.concatenate(kept)
+
+
+def _chunks(s: Crossing, robot: Robot) -> list[tuple[lk.Batch, Array, int]]:
+    """Batches of one size, with directions of travel and how many of their windows count."""
+    out = []
+    for first in range(0, len(s.windows), _TOGETHER):
+        index = np.arange(first, first + _TOGETHER)
+        some = np.minimum(index, len(s.windows) - 1)
+        w = s.windows.pieces(some)
+        u = lk.travel(w, robot)[1][:, 0]
+        count = int((index < len(s.windows)).sum())
+        out.append((lk.batch(w, robot, s.floor[some]), jnp.asarray(u), count))
+    return out
+
+
+@partial(jax.jit, static_argnums=0)
+def _residual(space: Space, z: Array, b: lk.Batch, u: Array) -> Float[Array, "piece channel"]:
+    """Predicted less measured speeds along and across the way, yaw rates and currents."""
+    robot = space.tree(z)
+    p = lk.predict(robot, b)
+    rate = lk.motion_residual(robot, b, p) / b.dt
+    along = u[:, 0] * rate[:, 0] + u[:, 1] * rate[:, 1]
+    across = u[:, 0] * rate[:, 1] - u[:, 1] * rate[:, 0]
+    amps = jnp.zeros_like(b.current)
+    if b.has_current:
+        amps = lk.predicted_current(robot, b, p.felt) - b.current
+    return jnp.concatenate([jnp.stack([along, across, rate[:, 2]], axis=1), amps[:, 0]], axis=1)
+
+
+@partial(jax.jit, static_argnums=0)
+def _linear(space: Space, z: Array, b: lk.Batch, u: Array) -> tuple[Array, Array]:
+    def both(x: Array) -> tuple[Array, Array]:
+        r = _residual(space, x, b, u)
+        return r, r
+
+    slope, r = jax.jacfwd(both, has_aux=True)(z)
+    return r, slope
+
+
+@dataclass(frozen=True, eq=False)
+class _Scatter:
+    """How residuals scatter: what each counts for.
+
+    Attributes:
+        weight: of every residual, the t weight of its block; 0 where nothing was measured.
+        expected: mean of it where the scatter is as found.
+        variance: of every column, wheels alike.
+        factor: windows over the number they are worth, per column.
+    """
+
+    weight: Float[np.ndarray, "window channel"]
+    expected: Float[np.ndarray, "window channel"]
+    variance: Float[np.ndarray, " channel"]
+    factor: Float[np.ndarray, " channel"]
+
+    def counted(self, weight: np.ndarray) -> np.ndarray:
+        return np.asarray(weight / (self.variance * self.factor))
+
+
+def _scatter(e: _Evidence, r: np.ndarray) -> _Scatter:
+    """Variances and weights of residuals in turn, from their mean squares, then correlation."""
+    motion = np.arange(r.shape[1]) < len(CHANNELS)
+    counts = np.where(motion, 1.0, e.has_current[:, None])
+    blocks = [motion, ~motion]
+    weight, expected = counts.copy(), counts.copy()
+    for _ in range(5):
+        variance = _pooled(weight * r**2, counts)
+        for block in blocks:
+            m = int(block.sum())
+            q = (r[:, block] ** 2 / variance[block]).sum(axis=1)
+            t = (DEGREES + m) / (DEGREES + q)
+            weight[:, block] = counts[:, block] * t[:, None]
+            expected[:, block] = counts[:, block] * (DEGREES + m) / (DEGREES + m + 2)
+    scaled = np.where(counts > 0, np.sqrt(weight) * r / np.sqrt(variance), np.nan)
+    factor = np.array([_dilution(column, e.run, e.place) for column in scaled.T])
+    factor[~motion] = factor[~motion].max(initial=1.0)
+    return _Scatter(weight, expected, variance, factor)
+
+
+def _pooled(square: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, " channel"]:
+    """Mean squares of the columns; wheels share that of their currents."""
+    total, number = square.sum(axis=0), counts.sum(axis=0)
+    k = len(CHANNELS)
+    total[k:], number[k:] = total[k:].sum(), number[k:].sum()
+    return np.asarray(np.maximum(total / np.maximum(number, 1.0), 1e-12))
+
+
+def _dilution(x: np.ndarray, run: np.ndarray, place: np.ndarray) -> float:
+    """Windows over the number of independent ones that tell as much; at least 1.
+
+    1 + 2 sum of the correlations over lags within runs, in pairs of lags while these are positive
+    (Geyer 1992, Stat. Sci. 7, section 3.3). Residuals are taken about zero: what a whole run has
+    in common counts as correlation.
+
+    Args:
+        x: one residual per window, nan where nothing was measured.
+        run, place: which run each is of, and where in it.
+    """
+    grid = np.full((run.max() + 1, place.max() + 2), np.nan)
+    grid[run, place] = x
+    if not np.isfinite(grid).any():
+        return 1.0
+    power, longest = np.nanmean(grid**2), grid.shape[1]
+
+    def correlation(lag: int) -> float:
+        pairs = grid[:, lag:] * grid[:, : longest - lag]
+        share = np.isfinite(pairs).sum() / np.isfinite(grid).sum()  # few pairs say little
+        return float(np.nanmean(pairs) / power * share) if share > 0 else 0.0
+
+    total = -1.0
+    for lag in range(0, longest - 1, 2):
+        pair = correlation(lag) + correlation(lag + 1)
+        if pair <= 0:
+            break
+        total += 2 * pair
+    return max(1.0, total)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """End of the steps: where, what the data added, how residuals scatter there."""
+
+    z: np.ndarray
+    information: np.ndarray
+    scatter: _Scatter
+    settled: bool
+
+
+def _maximise(e: _Evidence, mean: np.ndarray, covariance: np.ndarray) -> _Found:
+    """Gauss-Newton steps from the prior mean, halved until they help; scatter anew at each."""
+    prior, z, settled = np.linalg.inv(covariance), np.asarray(mean, float), False
+    moving = ~held(e.space)
+    for _ in range(_MOST_STEPS):
+        r, slope = e.linear(z)
+        scatter = _scatter(e, r)
+        count = scatter.counted(scatter.weight)
+        gradient = np.einsum("nc,nc,ncp->p", count, r, slope) + prior @ (z - mean)
+        hessian = _gram(slope, count) + prior
+        own = np.linalg.inv(hessian[np.ix_(moving, moving)])
+        step = np.zeros_like(z)
+        step[moving] = -own @ gradient[moving]
+        settled = bool((np.abs(step[moving]) <= TOLERANCE * np.sqrt(np.diag(own))).all())
+        if settled:
+            break
+
+        def loss(x: np.ndarray, count: np.ndarray = count) -> float:
+            away = x - mean
+            return float(0.5 * (count * e.residual(x) ** 2).sum() + 0.5 * away @ prior @ away)
+
+        z = _shorter(loss, z, step, float(np.abs(step).max()))
+    information = _gram(slope, scatter.counted(scatter.expected))
+    return _Found(z, information, scatter, settled)
+
+
+def _shorter(loss: Any, z: np.ndarray, step: np.ndarray, size: float) -> np.ndarray:
+    """The end of the first of a step's halvings that lowers the loss."""
+    now, part = loss(z), min(1.0, 2.0 / size)  # beyond two in a logarithm nothing is linear
+    for _ in range(_HALVINGS):
+        if loss(z + part * step) < now:
+            break
+        part /= 2
+    return z + part * step
+
+
+def _gram(slope: np.ndarray, count: np.ndarray) -> Float[np.ndarray, "free free"]:
+    flat = (np.sqrt(count)[..., None] * slope).reshape(-1, slope.shape[-1])
+    return np.asarray(flat.T @ flat)
+
+
+def held(space: Space) -> Bool[np.ndarray, " free"]:
+    """Coordinates that keep what the first fit knew of them."""
+    return np.array([name.startswith("camera.") for name in space.names], bool)
+
+
+def informed(
+    space: Space,
+    covariance: Float[np.ndarray, "free free"],
+    information: Float[np.ndarray, "free free"],
+) -> Float[np.ndarray, "free free"]:
+    """Covariance after more information on all numbers but those held, given these.
+
+    With h held and m the others, H = C^-1 + information: C_hh stays, z_m = -H_mm^-1 H_mh z_h + e.
+    """
+    h = held(space)
+    total = np.linalg.inv(covariance) + information
+    own = np.linalg.inv(total[np.ix_(~h, ~h)])
+    carried = -own @ total[np.ix_(~h, h)]
+    kept = covariance[np.ix_(h, h)]
+    out = np.empty_like(covariance)
+    out[np.ix_(h, h)] = kept
+    out[np.ix_(~h, h)] = carried @ kept
+    out[np.ix_(h, ~h)] = (carried @ kept).T
+    out[np.ix_(~h, ~h)] = own + carried @ kept @ carried.T
+    return out
+
+
+def update(
+    space: Space,
+    mean: Float[np.ndarray, " free"],
+    covariance: Float[np.ndarray, "free free"],
+    sets: Sequence[Crossing],
+) -> Update:
+    """Posterior of the search vector given windows over several floors.
+
+    Errors `before` and `after` are of runs left out: each half of the runs is judged by what the
+    other half made of the fit. A single run has no `after`.
+
+    Args:
+        space: free numbers.
+        mean, covariance: of the fit without these runs.
+        sets: of every map.
+    """
+    e = _Evidence(space, sets)
+    found = _maximise(e, mean, covariance)
+    before, after = _left_out(space, mean, covariance, sets)
+    names = [*CHANNELS, *(["current"] if e.has_current.any() else [])]
+    column = [*range(len(CHANNELS)), len(CHANNELS)][: len(names)]
+    scatter = found.scatter
+    unit = dict(zip(names, ("m/s", "m/s", "rad/s", "A"), strict=False))
+    runs = tuple(run for s in sets for run in s.runs)
+    return Update(
+        z=found.z,
+        covariance=informed(space, covariance, found.information),
+        information=found.information,
+        variance={
+            f"mixed.{n}": float(scatter.variance[k]) for n, k in zip(names, column, strict=True)
+        },
+        unit={f"mixed.{n}": unit[n] for n in names},
+        runs=runs,
+        settled=found.settled,
+        about={
+            "runs": len(runs),
+            "windows": len(e.run),
+            "before": before,
+            "after": after,
+            "correlation": {
+                n: float(scatter.factor[k]) for n, k in zip(names, column, strict=True)
+            },
+        },
+    )
+
+
+def _left_out(
+    space: Space, mean: np.ndarray, covariance: np.ndarray, sets: Sequence[Crossing]
+) -> tuple[dict[str, float], dict[str, float] | None]:
+    """Errors before, and after learning from the other half of the runs of each set."""
+    halves = [[s.of((s.windows.run + j) % 2 == k) for j, s in enumerate(sets)] for k in range(2)]
+    ends = [_Evidence(space, h) for h in halves if sum(len(s.windows) for s in h)]
+    has = np.concatenate([e.has_current for e in ends])
+    before = errors(np.concatenate([e.residual(mean) for e in ends]), has)
+    if len(ends) < 2:
+        return before, None
+    learnt = [_maximise(e, mean, covariance).z for e in ends]
+    after = [e.residual(z) for e, z in zip(ends, learnt[::-1], strict=True)]
+    return before, errors(np.concatenate(after), has)
+
+
+def errors(r: Float[np.ndarray, "window channel"], has_current: np.ndarray) -> dict[str, float]:
+    """Root mean squares: `speed` [m/s], `yaw_rate` [rad/s] and, where logged, `current` [A]."""
+    found = {
+        "speed": float(np.sqrt((r[:, :2] ** 2).sum(axis=1).mean())),
+        "yaw_rate": float(np.sqrt((r[:, 2] ** 2).mean())),
+    }
+    if has_current.any():
+        found["current"] = float(np.sqrt((r[has_current, len(CHANNELS) :] ** 2).mean()))
+    return found
