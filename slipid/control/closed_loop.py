@@ -49,15 +49,19 @@ class Pilot(eqx.Module):
         )
 
     def step(
-        self, path: Path, state: Float[Array, " state"], measurement: Float[Array, " sensed"], dt: Any
+        self,
+        path: Path,
+        state: Float[Array, " state"],
+        measurement: Float[Array, " sensed"],
+        dt: Any,
     ) -> tuple[Float[Array, " state"], Float[Array, " out"]]:
         """Next state, and command, estimate and time of the path in one array."""
         cut = self.controller.init().shape[0]
         seen, held, time = state[: -cut - 1], state[-cut - 1 : -1], state[-1]
         seen, estimate = self.observer.step(seen, measurement, dt)
         pose = self.controller.estimated.of(estimate).pose
-        time = path.after(time, jnp.where(jnp.isfinite(pose), pose, 1e3), dt)
-        held, command = self.controller.step(held, path.at(time), estimate, dt)
+        time, reference = path.follow(time, jnp.where(jnp.isfinite(pose), pose, 1e3), dt)
+        held, command = self.controller.step(held, reference, estimate, dt)
         return (
             jnp.concatenate([seen, held, time[None]]),
             jnp.concatenate([command, estimate, time[None]]),

@@ -184,9 +184,7 @@ class Controller(eqx.Module):
         """
         f, old, e = self.frozen, self._kept.of(state), self.estimated.of(estimate)
         place, yaw, integral, ahead, observer = self.gains
-        safe = (
-            jnp.all(jnp.isfinite(estimate)) & jnp.all(jnp.isfinite(reference)) & (e.stale < 0.5)
-        )
+        safe = jnp.all(jnp.isfinite(estimate)) & jnp.all(jnp.isfinite(reference)) & (e.stale < 0.5)
         pose = jnp.where(safe, e.pose, 0.0)
         ref = jnp.where(safe, reference, 0.0)
         dt = jnp.asarray(dt, dtype=float)
@@ -247,7 +245,9 @@ class Controller(eqx.Module):
         else:
             u = wanted[:2] / jnp.sqrt(wanted[:2] @ wanted[:2] + 1e-8)
             straight = jnp.abs(wanted[2]) < 0.05
-            off = force.at[:2].add(-(force[:2] @ u) * u).at[2].multiply(jnp.where(straight, 1.0, 0.0))
+            off = (
+                force.at[:2].add(-(force[:2] @ u) * u).at[2].multiply(jnp.where(straight, 1.0, 0.0))
+            )
         if self.correction == "torque":
             moment = f.frame.radius * f.inverse.T @ off
         else:  # as printed: the lever is divided by, not multiplied

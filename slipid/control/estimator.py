@@ -264,7 +264,9 @@ class Estimator(eqx.Module):
         var_i, var_u = s.ammeter_std_a**2, (s.voltmeter_std_v / motor.resistance) ** 2
         zero = z.current - motor.current_offset
         sign = jnp.where(by_volts < 0, -1.0, 1.0)
-        ammeter = zero if s.current_is_signed else jnp.where(volts, sign * jnp.abs(zero), jnp.abs(zero))
+        ammeter = (
+            zero if s.current_is_signed else jnp.where(volts, sign * jnp.abs(zero), jnp.abs(zero))
+        )
         share = jnp.where(known & volts, var_u / (var_i + var_u), jnp.where(volts, 0.0, 1.0))
         now = share * jnp.where(known, ammeter, 0.0) + (1 - share) * jnp.where(volts, by_volts, 0.0)
         heard = known | volts
@@ -393,8 +395,10 @@ class Estimator(eqx.Module):
         late = self._past(old, s.gyro_delay_s)[4]
         measured = twist[2] + jnp.where(has, gyro - old.more[-1] - late, 0.0)
         free = twist[2]
-        twist = jnp.where(moves, twist, 0.0).at[2].set(
-            jnp.where(has, measured, jnp.where(moves, twist[2], 0.0))
+        twist = (
+            jnp.where(moves, twist, 0.0)
+            .at[2]
+            .set(jnp.where(has, measured, jnp.where(moves, twist[2], 0.0)))
         )
         twist = jnp.where(still > 0.1, 0.0, twist)
         late_news = known @ apart

@@ -92,7 +92,9 @@ def freeze(
     effect = jnp.sqrt(of("run", (0.01, 0.01, 0.03)) ** 2 + of("session", (0.0, 0.0, 0.0)) ** 2)
     if draws is not None:
         effect = jnp.sqrt(effect**2 + _spread(draws, frame, k) ** 2)
-    kinds = [(std.get(f"current.{f}.window", 0.05), std.get(f"current.{f}.run", 0.05)) for f in labels]
+    kinds = [
+        (std.get(f"current.{f}.window", 0.05), std.get(f"current.{f}.run", 0.05)) for f in labels
+    ]
     top = 20.0 if highest_speed is None else highest_speed
     speed, amps, slip = _circle(robot, frame, k, top)
     return Frozen(
@@ -163,9 +165,9 @@ def _spread(draws: Any, frame: Frame, load: int) -> Array:
         way = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
         rim = 0.2 * way @ robot.geometry.forward().T
         rest = robot.body.load_share[load]
-        xi = jax.vmap(
-            lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim)
-        )(robot.surfaces)
+        xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
+            robot.surfaces
+        )
         along = jnp.einsum("fkc,kc->fk", xi, way)
         across = xi[..., 1] * way[:, 0] - xi[..., 0] * way[:, 1]
         return jnp.stack([along, across, xi[..., 2]], axis=-1) / 0.2

@@ -36,15 +36,28 @@ class Path(eqx.Module):
         place = jnp.clip(jnp.asarray(time) / STEP, 0.0, len(self.rows) - 1.000001)
         low = jnp.floor(place).astype(jnp.int32)
         part = place - low
-        return (1 - part) * self.rows[low] + part * self.rows[jnp.minimum(low + 1, len(self.rows) - 1)]
+        return (1 - part) * self.rows[low] + part * self.rows[
+            jnp.minimum(low + 1, len(self.rows) - 1)
+        ]
 
-    def after(
+    def follow(
         self, time: Float[Array, ""], pose: Float[Array, "3"], dt: Float[Array, ""] | float
-    ) -> Float[Array, ""]:
-        """Time of the path one step later: it slows down where the robot is believed to lag."""
-        off = jnp.sqrt(jnp.sum((self.at(time)[:2] - pose[:2]) ** 2) + 1e-12)
+    ) -> tuple[Float[Array, ""], Float[Array, "6"]]:
+        """Time of the path one step later, and the reference there for a robot at a pose.
+
+        The path slows down, and its rates with it, while the robot is believed to lag behind or
+        beside it; one that is ahead is no reason to wait.
+        """
+        here = self.at(time)
+        gap, v = here[:2] - pose[:2], here[3:5]
+        size = jnp.sqrt(v @ v + 1e-12)
+        ahead = jnp.minimum(gap @ v / size, 0.0)
+        off = jnp.sqrt(
+            jnp.maximum(gap @ gap - jnp.where(size > 1e-3, ahead, 0.0) ** 2, 0.0) + 1e-12
+        )
         pace = jnp.clip((LOST - off) / (LOST - PATIENT), 0.0, 1.0)
-        return jnp.asarray(time) + pace * dt
+        time = jnp.asarray(time) + pace * dt
+        return time, self.at(time) * jnp.ones(6).at[3:].set(pace)
 
     def moved(self, start: Sequence[float]) -> "Path":
         """The path as it lies for a robot that starts at a pose (x, y [m], heading [rad])."""
@@ -62,9 +75,7 @@ class Path(eqx.Module):
         """The path after so long a rest at its start."""
         count = round(seconds / STEP)
         still = jnp.broadcast_to(self.rows[0].at[3:].set(0.0), (count, 6))
-        return Path(
-            jnp.concatenate([still, self.rows]), self.marks + count * STEP, self.corners
-        )
+        return Path(jnp.concatenate([still, self.rows]), self.marks + count * STEP, self.corners)
 
 
 def waypoints(
