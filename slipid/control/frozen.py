@@ -116,6 +116,7 @@ def freeze(
     )
 
 
+@eqx.filter_jit
 def _circle(robot: Robot, frame: Frame, load: int, top: float) -> tuple[Array, Array, Array]:
     """Wheel speeds, currents, slip ratios on every floor in all directions (.., wheel)."""
     angle = jnp.linspace(0.0, 2 * jnp.pi, 36, endpoint=False)
@@ -138,6 +139,7 @@ def _circle(robot: Robot, frame: Frame, load: int, top: float) -> tuple[Array, A
     return jnp.broadcast_to(flat, amps.shape), amps, slip
 
 
+@eqx.filter_jit
 def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
     """Least squares of the slip speed on a + b |I|, wheel by wheel, over all floors.
 
@@ -156,6 +158,7 @@ def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
     return jax.vmap(wheel, 1)(*flat)
 
 
+@eqx.filter_jit
 def _spread(draws: Any, frame: Frame, load: int) -> Array:
     """Std over posterior draws of the motion per metre, a row per floor (along, across, yaw)."""
 
