@@ -327,7 +327,7 @@ class Estimator(eqx.Module):
         none = jnp.sum(
             jnp.where(heard > 0, -0.5 * (s.unknown_std**2 + jnp.log(jnp.mean(var, axis=0))), 0.0)
         )
-        yaw = jnp.mean(f.effect[:, 2]) * jnp.maximum(jnp.linalg.norm(xi[:, :2], axis=1), 0.02)
+        yaw = jnp.mean(f.effect[:, 2]) * jnp.maximum(_size(xi[:, :2]), 0.02)
         gyro_var = s.gyro_std**2 + yaw**2
         off = jnp.minimum((xi[:, 2] - turn) ** 2 / gyro_var, worst)
         has = jnp.isfinite(turn)
@@ -337,7 +337,7 @@ class Estimator(eqx.Module):
         weight = jnp.where(moves, dt / s.forget_s, 0.0) / (1 + (faster / 10.0) ** 2)
         known, unknown = old.belief[:-1], old.belief[-1]
         mean = known @ xi / jnp.maximum(jnp.sum(known), 1e-12)
-        change = 1 - jnp.exp(-jnp.linalg.norm(mean[:2]) * dt / s.patch_m)
+        change = 1 - jnp.exp(-_size(mean[:2]) * dt / s.patch_m)
         way = old.apart + jnp.where(moves, dt, 0.0) * (xi - mean)
         whole = jnp.concatenate([known[:, None], known[:, None] * way], axis=1)
         whole = jax.vmap(self._change, (1, None), 1)(whole, change)
@@ -384,8 +384,8 @@ class Estimator(eqx.Module):
         scatter = (xi - mean).T @ (known[:, None] * (xi - mean))
         under = self._marginal(known)  # (wheel, floor)
         share = f.rest @ under
-        speed = jnp.linalg.norm(mean[:2]) + f.frame.base * jnp.abs(mean[2])
-        u = jnp.where(speed > 1e-6, mean[:2] / jnp.maximum(jnp.linalg.norm(mean[:2]), 1e-9), 0.0)
+        speed = _size(mean[:2]) + f.frame.base * jnp.abs(mean[2])
+        u = jnp.where(speed > 1e-6, mean[:2] / jnp.maximum(_size(mean[:2]), 1e-9), 0.0)
         axes = jnp.array([[u[0], -u[1], 0.0], [u[1], u[0], 0.0], [0.0, 0.0, 1.0]])
         # d twist / d effects, a column per floor and axis
         slope = speed * (share[:, None, None] * axes.T).reshape(-1, 3).T
@@ -425,8 +425,8 @@ class Estimator(eqx.Module):
             1 - f.forward @ twist / (f.frame.radius * jnp.where(jnp.abs(w) > 1e-3, w, 1.0)),
             0.0,
         )
-        free_speed = jnp.linalg.norm((f.inverse @ (f.frame.radius * w))[:2])
-        blocked = moves & (free_speed > 0.02) & (jnp.linalg.norm(twist[:2]) < 0.2 * free_speed)
+        free_speed = _size((f.inverse @ (f.frame.radius * w))[:2])
+        blocked = moves & (free_speed > 0.02) & (_size(twist[:2]) < 0.2 * free_speed)
         stuck = jnp.where(blocked, jnp.minimum(old.stuck + dt, 1e3), 0.0)
         beyond = (
             (jnp.max(jnp.abs(w)) > 1.3 * f.highest[0])
@@ -545,6 +545,11 @@ class Estimator(eqx.Module):
         moved = change[:2] + change[2] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
         history = history.at[:, 1:3].add(moved).at[:, 3].add(change[2])
         return pose + change[:3], more + change[3:], cov, history
+
+
+def _size(v: Float[Array, "*batch axis"]) -> Float[Array, "*batch"]:
+    """Length of a vector, with a derivative at zero."""
+    return jnp.sqrt(jnp.sum(v * v, axis=-1) + 1e-24)
 
 
 def _inverse(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:

@@ -276,6 +276,21 @@ def _root_near(args: Any) -> Any:
     return jnp.where(jnp.max(jnp.abs(step)) > _NEAR, jnp.nan, xi)
 
 
+@jax.custom_jvp
+def _root_settled(args: Any) -> Any:
+    rim, frame, *_, start = args
+    near = start
+    for _ in range(_SETTLE_CHORD):
+        near = _chord(near, args)
+    xi = near
+    for _ in range(_SETTLE_NEWTON):
+        f, jac = _balance(xi, args)
+        xi = xi - _solve3(jac, f)
+    left, before = _residual(xi, args), _residual(near, args)
+    xi = jnp.where(left @ left <= before @ before, xi, near)  # NaN is not smaller either
+    return jnp.where(jnp.all(jnp.isfinite(xi)), xi, guess(rim, frame))
+
+
 def _implicit(root: Any) -> Any:
     """Derivative of a root of the balance by what it depends on."""
 
@@ -291,6 +306,7 @@ def _implicit(root: Any) -> Any:
 
 _root.defjvp(_implicit(_root))
 _root_near.defjvp(_implicit(_root_near))
+_root_settled.defjvp(_implicit(_root_settled))
 
 
 def guess(rim: Float[Array, " wheel"], frame: Frame) -> Float[Array, "3"]:
@@ -395,16 +411,8 @@ def settle(
     """`equilibrium` in a few steps from the twist of a moment ago, for a robot's computer.
 
     Chord steps, then Newton's where these come nearer; where a number is lost it is the twist
-    without slip. What a jump of the wheel speeds leaves over, the next call settles.
+    without slip. What a jump of the wheel speeds leaves over, the next call settles. Its derivative
+    is that of the root, whatever is left over.
     """
-    args = (rim, frame, surface, rest, jnp.zeros(3), jnp.zeros(3))
-    near = start
-    for _ in range(_SETTLE_CHORD):
-        near = _chord(near, args)
-    xi = near
-    for _ in range(_SETTLE_NEWTON):
-        f, jac = _balance(xi, args)
-        xi = xi - _solve3(jac, f)
-    left, before = _residual(xi, args), _residual(near, args)
-    xi = jnp.where(left @ left <= before @ before, xi, near)  # NaN is not smaller either
-    return jnp.where(jnp.all(jnp.isfinite(xi)), xi, guess(rim, frame))
+    before = jax.lax.stop_gradient(start)
+    return _root_settled((rim, frame, surface, rest, jnp.zeros(3), before))

@@ -1,0 +1,315 @@
+"""The identified robot as a plant: what closed-loop runs are tuned and rehearsed on.
+
+Commands reach the wheels late, a slew and a lag after; wheels on several floors move the body as
+the contact says, and what the fit says the model misses is drawn anew for every run:
+
+    set <- set + clip(command(t - delay) - set, slew h),   w <- w + (1 - exp(-h / lag)) (set - w)
+    xi = equilibrium(r w; floor under each wheel)
+    pose <- pose * exp(xi h + |xi| h effect + sqrt(|xi| h) process)
+
+Everything is differentiable but for which floor a wheel is on; ticks pass derivatives through.
+Differentiate forwards (`jax.jvp`, `jax.jacfwd`): there are few gains, and readings that are no
+numbers would spoil a backward pass.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.control.closed_loop import PERIOD, Pilot
+from slipid.control.estimator import sensed
+from slipid.control.frozen import Frozen
+from slipid.control.packed import Layout
+from slipid.control.reference import Path
+from slipid.model import contact
+from slipid.model.plant import Floor
+from slipid.model.robot import GRAVITY, advance, compose
+
+RING = 6
+"""Commands that are kept: a delay may be up to `RING` - 1 periods."""
+
+
+@dataclass(frozen=True)
+class Habits:
+    """What no fit tells: how wheels follow and what sensors are like.
+
+    Attributes:
+        delay_s: from a command to the wheels [s].
+        slew: of the wheels [rad/s^2]; lag_s: of their speed control [s].
+        ticks: of an encoder per turn of the wheel.
+        ammeter_a: noise of a current [A]; drift_s: how long currents stay off the model's [s].
+        voltmeter_v: noise of a voltage [V]; voltage: whether it is measured.
+        gyro_noise, gyro_bias: of a yaw rate [rad/s]; gyro: whether it is measured.
+        signed: whether currents have signs.
+        substeps: of wheels and body in a control period.
+        smooth: encoders without ticks.
+    """
+
+    delay_s: float = 0.12
+    slew: float = 25.0
+    lag_s: float = 0.03
+    ticks: float = 32000.0
+    ammeter_a: float = 0.05
+    drift_s: float = 0.1
+    voltmeter_v: float = 0.05
+    voltage: bool = True
+    gyro_noise: float = 0.004
+    gyro_bias: float = 0.005
+    gyro: bool = False
+    signed: bool = False
+    substeps: int = 2
+    smooth: bool = False
+
+
+def held(delay: float, period: float, substeps: int) -> Float[np.ndarray, "substep command"]:
+    """Share of each of the last commands, the newest first, in the mean over every substep.
+
+    Commands hold for a period and arrive so late; exact, and linear in the delay.
+    """
+    h = period / substeps
+    begin = np.arange(substeps)[:, None] * h - delay
+    since = -np.arange(RING)[None, :] * period
+    share = np.clip(np.minimum(begin + h, since + period) - np.maximum(begin, since), 0.0, None) / h
+    share[:, -1] += 1.0 - share.sum(axis=1)  # what is older counts as the oldest
+    return share
+
+
+class Twin(eqx.Module):
+    """A robot on a floor, its state one flat array.
+
+    Attributes:
+        frozen: the robot as it is.
+        floor: which surface lies where, by number in `frozen.labels`.
+        habits: what no fit tells.
+        period: between commands [s].
+    """
+
+    frozen: Frozen
+    floor: Floor
+    habits: Habits = eqx.field(static=True, default=Habits())
+    period: float = eqx.field(static=True, default=PERIOD)
+
+    def __check_init__(self) -> None:
+        """Refuse a delay that the ring cannot hold."""
+        if not 0 <= self.habits.delay_s <= (RING - 1) * self.period:
+            most = (RING - 1) * self.period
+            raise ValueError(f"delay_s = {self.habits.delay_s}; expected 0 to {most:g}")
+
+    @property
+    def kept(self) -> Layout:
+        """Layout of the state."""
+        w, k = self.frozen.wheels, len(self.frozen.labels)
+        fields = (("pose", (3,)), ("twist", (3,)), ("set", (w,)), ("speed", (w,)), ("angle", (w,)))
+        run = (("effect", (k, 3)), ("offset", (w,)), ("drift", (w,)), ("bias", ()))
+        return Layout((*fields, ("ring", (RING, w)), *run))
+
+    @property
+    def noises(self) -> int:
+        """Standard normal numbers of a step."""
+        return 3 * self.frozen.wheels + 1 + 3 * self.habits.substeps
+
+    def noise(self, key: Array, number: Any) -> Float[Array, " noise"]:
+        """Those of a step by its number; 0 is the reading at rest."""
+        drawn: Array = jax.random.normal(jax.random.fold_in(key, number), (self.noises,))
+        return drawn
+
+    def init(self, pose: Any, key: Array) -> Float[Array, " state"]:
+        """State at rest at a pose [m, m, rad], with what this run has of its own."""
+        f, w = self.frozen, (self.frozen.wheels,)
+        one, two, three = jax.random.split(jax.random.fold_in(key, 2**31 - 1), 3)
+        off = jax.random.normal(two, w) * jnp.mean(f.current_std) / jnp.sqrt(2.0)
+        zero = jnp.zeros(w)
+        return self.kept.pack(
+            pose=jnp.asarray(pose, dtype=float),
+            twist=jnp.zeros(3),
+            set=zero,
+            speed=zero,
+            angle=zero,
+            effect=f.effect * jax.random.normal(one, f.effect.shape),
+            offset=off,
+            drift=zero,
+            bias=self.habits.gyro_bias * jax.random.normal(three),
+            ring=jnp.zeros((RING, *w)),
+        )
+
+    def step(
+        self,
+        state: Float[Array, " state"],
+        command: Float[Array, " wheel"],
+        noise: Float[Array, " noise"],
+    ) -> tuple[Float[Array, " state"], Float[Array, " sensed"]]:
+        """State and readings a period after a command [rad/s]."""
+        old, h = self.kept.of(state), self.period / self.habits.substeps
+        ring = jnp.concatenate([command[None], old.ring[:-1]])
+        shares = jnp.asarray(held(self.habits.delay_s, self.period, self.habits.substeps))
+        pushes = noise[: 3 * self.habits.substeps].reshape(-1, 3)
+        follow = 1 - np.exp(-h / max(self.habits.lag_s, 1e-6))
+        moved = (old.pose, old.twist, old.set, old.speed, old.angle)
+        for k in range(self.habits.substeps):
+            pose, xi, wanted, w, angle = moved
+            jump = self.habits.slew * h
+            wanted = wanted + jnp.clip(shares[k] @ ring - wanted, -jump, jump)
+            w = w + follow * (wanted - w)
+            pose, xi = self._roll(pose, xi, w, old.effect, pushes[k], h)
+            moved = (pose, xi, wanted, w, angle + h * w)
+        pose, xi, wanted, w, angle = moved
+        amps, drift = self._amps(pose, xi, w, old, noise[3 * self.habits.substeps :])
+        turned = (pose[2] - old.pose[2]) / self.period
+        state = self.kept.pack(
+            pose=pose,
+            twist=xi,
+            set=wanted,
+            speed=w,
+            angle=angle,
+            effect=old.effect,
+            offset=old.offset,
+            drift=drift,
+            bias=old.bias,
+            ring=ring,
+        )
+        return state, self._read(angle, w, amps, turned + old.bias, noise)
+
+    def first(self, state: Float[Array, " state"], noise: Array) -> Float[Array, " sensed"]:
+        """Readings of a robot at rest."""
+        s = self.kept.of(state)
+        return self._read(s.angle, s.speed, jnp.zeros_like(s.speed), s.bias, noise)
+
+    def _roll(
+        self, pose: Array, xi: Array, w: Array, effect: Array, push: Array, h: float
+    ) -> tuple[Array, Array]:
+        """Pose and twist a substep later."""
+        f = self.frozen
+        under = self.floor.under(pose, f.places)
+        rim = f.frame.radius * w
+        xi = contact.settle(xi, rim, f.frame, f.floors.at(under), f.rest)
+        size = jnp.sqrt(xi[:2] @ xi[:2] + 1e-12)
+        u, far = xi[:2] / size, (size + f.frame.base * jnp.abs(xi[2])) * h
+        share = f.rest[:, None]
+        off = far * jnp.sum(share * effect[under], axis=0)
+        off += jnp.sqrt(far + 1e-12) * push * jnp.sqrt(jnp.sum(share * f.process[under] ** 2, 0))
+        turned = jnp.stack([u[0] * off[0] - u[1] * off[1], u[1] * off[0] + u[0] * off[1], off[2]])
+        return compose(pose, advance(xi + turned / h, h)), xi
+
+    def _amps(
+        self, pose: Array, xi: Array, w: Array, old: Any, noise: Array
+    ) -> tuple[Array, Array]:
+        """Signed currents [A], and how far they have drifted from the model's."""
+        f, wheels = self.frozen, self.frozen.wheels
+        under = self.floor.under(pose, f.places)
+        floor = f.floors.at(under)
+        traction = contact.forces(xi, f.frame.radius * w, f.frame, floor, f.rest).traction
+        force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
+        keep = float(np.exp(-self.period / self.habits.drift_s))
+        fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
+        drift = keep * old.drift + fresh
+        moves = jnp.tanh(w / 0.2) ** 2  # a motor that stands draws nothing
+        return f.motor.current(force * traction, w) + moves * (old.offset + drift), drift
+
+    def _read(self, angle: Array, w: Array, amps: Array, turn: Array, noise: Array) -> Array:
+        """Readings as `slipid.control.estimator.sensed` lays them out."""
+        b, wheels = self.habits, self.frozen.wheels
+        _, by_amps, by_volts, by_turn = jnp.split(
+            noise[3 * b.substeps :], [wheels, 2 * wheels, 3 * wheels]
+        )
+        tick = 2 * np.pi / b.ticks
+        whole = jax.lax.stop_gradient(jnp.floor(angle / tick) * tick - angle)
+        read = amps + self.frozen.motor.current_offset + b.ammeter_a * by_amps
+        volts = self.frozen.motor.voltage(amps, w) + b.voltmeter_v * by_volts
+        nothing = jnp.full(wheels, jnp.nan)
+        return sensed(wheels).pack(
+            wheel_angle=angle if b.smooth else angle + whole,
+            wheel_speed=nothing,
+            current=read if b.signed else jnp.abs(read),
+            voltage=volts if b.voltage else nothing,
+            gyro=turn + b.gyro_noise * by_turn[0] if b.gyro else jnp.nan,
+            fix=jnp.full(3, jnp.nan),
+            fix_std=jnp.full(2, jnp.nan),
+            fix_age=jnp.nan,
+        )
+
+
+class Rolled(eqx.Module):
+    """A rollout, a row per period, as `slipid.control.closed_loop.Course` has it.
+
+    Attributes:
+        pose: true [m, m, rad]; own: time of the path [s].
+        command: [rad/s]; estimate: as the estimator laid it out.
+    """
+
+    pose: Float[Array, "step 3"]
+    command: Float[Array, "step wheel"]
+    estimate: Float[Array, "step estimated"]
+    own: Float[Array, " step"]
+
+
+def rollout(pilot: Pilot, path: Path, twin: Twin, start: Any, key: Array, steps: int) -> Rolled:
+    """A pilot on a twin for a fixed number of steps; a path that is over is a rest at its end.
+
+    Args:
+        pilot: estimator and controller.
+        path: as it lies for the start.
+        twin: robot and floor.
+        start: where it stands and believes to stand [m, m, rad].
+        key: of all that is drawn.
+        steps: of a period each.
+    """
+    noise = jax.vmap(partial(twin.noise, key))(jnp.arange(steps + 1))
+    state = twin.init(start, key)
+    reading = twin.first(state, noise[0])
+
+    def step(carry: Any, drawn: Array) -> Any:
+        state, held, reading = carry
+        pose = twin.kept.of(state).pose
+        held, out = pilot.step(path, held, reading, twin.period)
+        wheels = twin.frozen.wheels
+        state, reading = twin.step(state, out[:wheels], drawn)
+        return (state, held, reading), jnp.concatenate([pose, out])
+
+    first = (state, pilot.init(start), reading)
+    a, wheels = jax.lax.scan(step, first, noise[1:])[1], twin.frozen.wheels
+    return Rolled(
+        pose=a[:, :3], command=a[:, 3 : 3 + wheels], estimate=a[:, 3 + wheels : -1], own=a[:, -1]
+    )
+
+
+class TwinPlant:
+    """A twin behind `slipid.model.plant.Plant`; the same key gives the same run as `rollout`.
+
+    Args:
+        twin: robot and floor.
+        start: pose [m, m, rad].
+        key: of all that is drawn.
+    """
+
+    def __init__(self, twin: Twin, start: Any, key: Array):
+        self.twin, self.start, self.key = twin, start, key
+        self._state, self._count = twin.init(start, key), 0
+
+    def reset(self) -> Float[np.ndarray, " sensed"]:
+        """First readings, of the robot at rest."""
+        self._state, self._count = self.twin.init(self.start, self.key), 0
+        return np.asarray(self.twin.first(self._state, self.twin.noise(self.key, 0)))
+
+    def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Float[np.ndarray, " sensed"]:
+        """Readings one period later, with these wheel speeds commanded [rad/s]."""
+        self._count += 1
+        command, count = jnp.asarray(wheel_speed), jnp.asarray(self._count)
+        self._state, reading = _stepped(self.twin, self._state, command, self.key, count)
+        return np.asarray(reading)
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """True x, y [m] and heading [rad]."""
+        x, y, heading = np.asarray(self.twin.kept.of(self._state).pose).tolist()
+        return x, y, heading
+
+
+@eqx.filter_jit
+def _stepped(twin: Twin, state: Array, command: Array, key: Array, count: Array) -> Any:
+    return twin.step(state, command, twin.noise(key, count))
