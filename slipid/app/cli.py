@@ -289,6 +289,40 @@ def design(
 
 @app.command()
 @guarded
+def tune(
+    out: OutFolder,
+    load: Annotated[
+        str | None,
+        typer.Option("--load", metavar="NAME", help="Load set-up; the first by default."),
+    ] = None,
+    method: Annotated[str, typer.Option("--method", help="gradient or pso.")] = "gradient",
+    rollouts: Annotated[
+        int, typer.Option("--rollouts", min=1, help="Rehearsals it may spend.")
+    ] = 3840,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of draws, floors and search.")] = 0,
+    gyro: Annotated[bool, typer.Option("--gyro/--no-gyro", help="The robot has a gyro.")] = False,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Tune the controller's gains on the fit's own twin: draws of the robot, floors and noise.
+
+    Writes gains.json; goes on after an interrupt. Exit code 1 where gains set by hand are better.
+    """
+    from slipid.app import commands, tables
+    from slipid.app.progress import Reporter
+
+    wanted = {"load": load, "method": method, "rollouts": rollouts, "seed": seed, "gyro": gyro}
+    with Reporter(quiet=quiet) as report:
+        found = commands.tune(out, wanted, report)
+    if json is not None:
+        _emit(json, found)
+    if json != "-":
+        tables.tuned(found, out)
+    return 0 if found["loss"]["tuned"] <= found["loss"]["hand"] else 1
+
+
+@app.command()
+@guarded
 def paper(
     data: Annotated[
         Path, typer.Option("--data", metavar="DIR", help="Folder that holds robotino2021.")

@@ -412,6 +412,24 @@ def design(out: Path, wanted: Any, report: Reporter) -> tuple[Any, list[str]]:
     return found, written
 
 
+def tune(out: Path, wanted: Any, report: Reporter) -> dict[str, Any]:
+    """Gains for the robot that a folder holds.
+
+    Args:
+        out: folder `identify` wrote.
+        wanted: load set-up, method, rollouts, seed, gyro, by name.
+        report: told what is going on.
+    """
+    report.stage("reading the fit")
+    runtime.start()
+    from slipid.app.tune import tune as run
+    from slipid.identify.result import load
+
+    fit = load(out)
+    writable(out)
+    return run(fit, out, **wanted, report=report)
+
+
 def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> dict[str, Any]:
     """What the logs hold, and what they can be expected to tell, before any fit.
 

@@ -321,6 +321,27 @@ def _saving(s: dict[str, Any]) -> str:
     )
 
 
+def tuned(found: dict[str, Any], out: Path) -> None:
+    """Gains, what they bring on cases they were not tuned on, and how stable the loop is."""
+    console = _console()
+    table = _table(("gain", "value", "spread", "by hand", "unit"), right=("value", "spread"))
+    hand = found["settings"]["hand"]
+    for name, g in found["gains"].items():
+        row = (f"{g['value']:.3f}", f"{g['spread']:.3f}", f"{hand[name]:g}", g["unit"])
+        table.add_row(name, *row)
+    console.print(table)
+    loss, margin = found["loss"], found["stability_margin"]
+    console.print(
+        f"loss on {found['settings']['judged_on']} cases not tuned on: by hand {loss['hand']:.1f} "
+        f"mm, tuned {loss['tuned']:.1f} mm; better in {found['better_than_hand']:.0%} of them"
+    )
+    console.print(
+        f"stability margin (1 - spectral radius): worst {margin['worst']:.4f}, "
+        f"median {margin['median']:.4f}"
+    )
+    console.print(f"in {out}: gains.json", markup=False, soft_wrap=True)
+
+
 def simulated(found: dict[str, Any], plan: Any, out: Path) -> None:
     """How much was driven, and what to do with it."""
     from slipid.app.simulate import can_identify

@@ -1,0 +1,164 @@
+"""Is the sampled loop of controller, delay, wheels and floor stable? Its linearisation says.
+
+At constant speed on one floor, with the pose known, a period maps the state (pose error, integral,
+observer, wheel speeds, commands on their way) to the next; at the point it settles at this map has
+a Jacobian A, and the loop is stable where the spectral radius
+
+    rho(A) = lim |A^k|^(1/k),   k = 2^16 by repeated squaring (Gelfand 1941)
+
+is below 1. The margin is 1 - rho. Gains may be out by a factor, so what is asked of a loop is asked
+with all gains `SPARE` times as large.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.control.controller import Controller
+from slipid.control.frozen import Frozen
+from slipid.control.habits import RING, Habits, held
+from slipid.control.packed import Layout
+from slipid.model import contact
+from slipid.model.robot import advance, compose
+
+SPARE = 1.5
+"""Factor by which gains may be too large."""
+SPEED = 0.1
+"""At which the loop is linearised, far from the limits of the wheels [m/s]."""
+WAYS = (0.0, 0.5, 1.0)
+"""Directions of motion [rad]."""
+SETTLING = 200
+"""Steps until the loop with mild gains stands still."""
+
+
+def spectral_radius(a: Float[Array, "n n"]) -> Float[Array, ""]:
+    """Largest absolute eigenvalue, with a derivative where eigenvectors have none."""
+
+    def square(carry: Any, _: None) -> Any:
+        m, log = carry
+        size = jnp.sqrt(jnp.sum(m * m) + 1e-200)
+        m = m / size
+        return (m @ m, 2 * (log + jnp.log(size))), None
+
+    (m, log), _ = jax.lax.scan(square, (a, jnp.zeros(())), None, length=16)
+    return jnp.exp((log + 0.5 * jnp.log(jnp.sum(m * m) + 1e-200)) / 2**16)
+
+
+class Loop(eqx.Module):
+    """One period of a controller on a robot at constant speed; the reference rests at the origin.
+
+    Attributes:
+        controller: with its gains.
+        truth: the robot it drives.
+        surface: number of the floor.
+        rates: of the reference [m/s, m/s, rad/s].
+        habits: of the wheels.
+        period: [s].
+    """
+
+    controller: Controller
+    truth: Frozen
+    surface: Array
+    rates: Float[Array, "3"]
+    habits: Habits = eqx.field(static=True)
+    period: float = eqx.field(static=True)
+
+    @property
+    def kept(self) -> Layout:
+        """Layout of the state."""
+        w, c = self.truth.wheels, self.controller.init().shape[0]
+        return Layout((("pose", (3,)), ("speed", (w,)), ("ring", (RING, w)), ("control", (c,))))
+
+    def start(self) -> Float[Array, " state"]:
+        """Moving without error."""
+        w = self.truth.forward @ self.rates / self.truth.frame.radius
+        ring = jnp.broadcast_to(w, (RING, *w.shape))
+        first = self.controller.init()
+        return self.kept.pack(pose=jnp.zeros(3), speed=w, ring=ring, control=first)
+
+    def step(self, state: Float[Array, " state"]) -> Float[Array, " state"]:
+        """State one period later."""
+        old, h = self.kept.of(state), self.period / self.habits.substeps
+        reference = jnp.concatenate([jnp.zeros(3), self.rates])
+        seen = self._estimate(old)
+        control, command = self.controller.step(old.control, reference, seen, self.period)
+        ring = jnp.concatenate([command[None], old.ring[:-1]])
+        wanted = jnp.asarray(held(self.habits.delay_s, self.period, self.habits.substeps)) @ ring
+        follow = 1 - np.exp(-h / max(self.habits.lag_s, 1e-6))
+        pose, w = old.pose, old.speed
+        for k in range(self.habits.substeps):
+            w = w + follow * (wanted[k] - w)
+            pose = compose(pose, advance(self._twist(self.truth, w), h))
+        pose = pose - self.rates * self.period
+        return self.kept.pack(pose=pose, speed=w, ring=ring, control=control)
+
+    def _twist(self, robot: Frozen, w: Array) -> Array:
+        floor = robot.floors.at(self.surface)
+        return contact.settle(self.rates, robot.frame.radius * w, robot.frame, floor, robot.rest)
+
+    def _estimate(self, old: Any) -> Array:
+        """Of an observer that knows pose, wheel speeds and floor."""
+        f = self.controller.frozen
+        kinds = len(f.labels)
+        surface = jnp.zeros((f.wheels, kinds + 1)).at[:, self.surface].set(1.0)
+        return self.controller.estimated.pack(
+            pose=old.pose,
+            twist=self._twist(f, old.speed),
+            slip=jnp.zeros(f.wheels),
+            wheel_speed=old.speed,
+            current=jnp.zeros(f.wheels),
+            surface=surface,
+            covariance=jnp.zeros((3, 3)),
+            stale=0.0,
+            immobilised=0.0,
+            out_of_range=0.0,
+        )
+
+
+def linearised(loop: Loop) -> Float[Array, "state state"]:
+    """Jacobian of a period where the loop settles.
+
+    It is found with mild gains, its pose error then scaled to the gains; an integral without gain
+    is no state.
+    """
+    gains = loop.controller.gains
+    mild = jnp.stack([jnp.ones(()), jnp.ones(()), jnp.zeros(()), gains[3], jnp.zeros(())])
+    calm = eqx.tree_at(lambda x: x.controller.gains, loop, mild)
+    state = jax.lax.scan(lambda s, _: (calm.step(s), None), loop.start(), None, length=SETTLING)[0]
+    place = loop.kept.place("pose")
+    state = state.at[place].divide(jnp.maximum(jnp.stack([gains[0], gains[0], gains[1]]), 0.1))
+    a = jax.jacfwd(loop.step)(jax.lax.stop_gradient(state))
+    first = loop.kept.place("control").start + loop.truth.wheels
+    integral = np.zeros(len(a), bool)
+    integral[first : first + 2] = True
+    idle = integral & (gains[2] < 1e-6)
+    return jnp.where(idle[:, None] | idle[None, :], 0.0, a)
+
+
+@eqx.filter_jit
+def radii(
+    controller: Controller, truths: Frozen, habits: Habits, period: float, spare: float = 1.0
+) -> Float[Array, "draw floor way"]:
+    """Spectral radius of the loop for every draw of the robot, floor and direction.
+
+    Args:
+        controller: with its gains.
+        truths: robots it may drive, stacked.
+        habits: of the wheels; period: [s].
+        spare: factor on the pose, heading, integral and observer gains.
+    """
+    more = jnp.array([spare, spare, spare, 1.0, spare]) * controller.gains
+    ready = eqx.tree_at(lambda c: c.gains, controller, more)
+
+    def one(truth: Frozen, surface: Array, way: Array) -> Array:
+        rates = SPEED * jnp.stack([jnp.cos(way), jnp.sin(way), jnp.zeros(())])
+        return spectral_radius(linearised(Loop(ready, truth, surface, rates, habits, period)))
+
+    floors, ways = jnp.arange(len(controller.frozen.labels)), jnp.asarray(WAYS)
+    over = jax.vmap(jax.vmap(jax.vmap(one, (None, None, 0)), (None, 0, None)), (0, None, None))
+    found: Array = over(truths, floors, ways)
+    return found

@@ -1,0 +1,196 @@
+"""Gains from rehearsals on the twin: over draws of the robot, floors and noise.
+
+One case is a draw of the robot, a floor, a start and noise; its loss is the root of the mean over
+the path of squared true errors along, across and in heading, and of the effort, in mm. What is
+minimised is
+
+    mean over cases + mean of their worst tenth + penalty of a loop that is hardly stable
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.control.closed_loop import PERIOD, Pilot
+from slipid.control.controller import GAINS, Controller, Limits
+from slipid.control.estimator import Estimator, Settings
+from slipid.control.frozen import Frozen
+from slipid.control.habits import Habits
+from slipid.control.reference import Path
+from slipid.control.stability import SPARE, radii
+from slipid.control.twin import Twin, rollout
+from slipid.model.plant import Floor
+
+HAND = (1.5, 1.5, 0.0, 1.0, 0.0)
+"""Gains set by hand, in the order of `GAINS`."""
+LOWEST, HIGHEST = np.array([0.2, 0.2, 0.0, 0.0, 0.0]), np.array([5.0, 5.0, 1.5, 1.5, 1.0])
+"""Of the gains; the first two are searched in their logarithm."""
+BATCH = 16
+"""Cases that are rolled out together."""
+LARGEST_RADIUS, PENALTY = 0.9995, 1000.0
+"""Spectral radius from which, with gains `SPARE` times as large, a loop costs [mm]."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What counts how much in a case's loss.
+
+    Attributes:
+        along, across: of squared errors; heading: of those times the base radius.
+        effort_s: rim speed a command changes by in a period, times this, counts as error [s].
+        late: each second of the path that is not reached counts so much [mm].
+    """
+
+    along: float = 1.0
+    across: float = 1.0
+    heading: float = 1.0
+    effort_s: float = 0.05
+    late: float = 20.0
+
+
+class Cases(eqx.Module):
+    """What gains are tried on, stacked.
+
+    Attributes:
+        truth: robots; floor: maps of the same size; path: as they lie for the starts.
+        start: poses [m, m, rad]; key: of all that is drawn.
+    """
+
+    truth: Frozen
+    floor: Floor
+    path: Path
+    start: Float[Array, "case 3"]
+    key: Array
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def at(self, index: Any) -> "Cases":
+        """Those of an index."""
+        picked: Cases = jax.tree.map(lambda x: x[index], self)
+        return picked
+
+
+class Task(eqx.Module):
+    """What is tuned.
+
+    Attributes:
+        frozen: the robot as the pilot knows it.
+        settings: of the estimator; habits: of the twin; limits: of the commands.
+        weights: of the loss.
+        steps: of a rollout; period: [s].
+    """
+
+    frozen: Frozen
+    settings: Settings = eqx.field(static=True, default=Settings())
+    habits: Habits = eqx.field(static=True, default=Habits())
+    limits: Limits = eqx.field(static=True, default=Limits())
+    weights: Weights = eqx.field(static=True, default=Weights())
+    steps: int = eqx.field(static=True, default=120)
+    period: float = eqx.field(static=True, default=PERIOD)
+
+    def loss(self, gains: Float[Array, "5"], case: Cases) -> Float[Array, ""]:
+        """Of one case [mm]."""
+        controller = Controller(self.frozen, gains, self.limits)
+        pilot = Pilot(Estimator(self.frozen, self.settings), controller)
+        habits = replace(self.habits, smooth=True)
+        twin = Twin(case.truth, case.floor, habits, self.period)
+        run = rollout(pilot, case.path, twin, case.start, case.key, self.steps)
+        wanted = jax.vmap(case.path.at)(run.own)
+        gap, v = run.pose[:, :2] - wanted[:, :2], wanted[:, 3:5]
+        pace = jnp.sum(v * v, axis=1)
+        along = jnp.sum(gap * v, axis=1) ** 2 / jnp.maximum(pace, 1e-6)
+        across = jnp.sum(gap * gap, axis=1) - along
+        turned = self.frozen.frame.base * jnp.sin(run.pose[:, 2] - wanted[:, 2])
+        jump = self.frozen.frame.radius * jnp.diff(run.command, axis=0)
+        w = self.weights
+        squares = jnp.mean(w.along * along + w.across * across + w.heading * turned**2)
+        effort = w.effort_s**2 * jnp.mean(jnp.sum(jump**2, axis=1))
+        missing = jax.nn.relu(case.path.duration - run.own[-1])
+        return 1000.0 * jnp.sqrt(squares + effort + 1e-12) + w.late * missing
+
+    def penalty(self, gains: Float[Array, "5"], truths: Frozen) -> Float[Array, ""]:
+        """Of a loop that is hardly stable [mm]; continues a little below the bound."""
+        rho = radii(self._controller(gains), truths, self.habits, self.period, SPARE)
+        return PENALTY * jax.nn.relu(jnp.max(rho) - LARGEST_RADIUS)
+
+    def margins(self, gains: Float[Array, "5"], truths: Frozen) -> Float[np.ndarray, " loop"]:
+        """1 - spectral radius of every draw, floor and direction, gains as they are."""
+        rho = radii(self._controller(gains), truths, self.habits, self.period)
+        return 1.0 - np.asarray(rho).reshape(-1)
+
+    def _controller(self, gains: Array) -> Controller:
+        return Controller(self.frozen, gains, self.limits)
+
+
+def gains_at(x: Float[Array, "*batch 5"]) -> Float[Array, "*batch 5"]:
+    """Gains at places of the unit box."""
+    low, high = jnp.asarray(LOWEST), jnp.asarray(HIGHEST)
+    ratio = jnp.where(low > 0, high / jnp.where(low > 0, low, 1.0), 1.0)
+    return jnp.where(low > 0, low * ratio**x, low + (high - low) * x)
+
+
+def box_of(gains: Any) -> Float[np.ndarray, " 5"]:
+    """Place of gains in the unit box, the nearest one."""
+    g = np.clip(np.asarray(gains, float), LOWEST, HIGHEST)
+    logs = np.log(np.maximum(g, 1e-9) / np.maximum(LOWEST, 1e-9))
+    logs = logs / np.log(HIGHEST / np.maximum(LOWEST, 1e-9))
+    return np.where(LOWEST > 0, logs, (g - LOWEST) / (HIGHEST - LOWEST))
+
+
+def combined(losses: Float[Array, " case"]) -> Float[Array, ""]:
+    """Mean and mean of the worst tenth together."""
+    worst = max(1, -(-len(losses) // 10))
+    return jnp.mean(losses) + jnp.mean(jax.lax.top_k(losses, worst)[0])
+
+
+@eqx.filter_jit
+def losses(task: Task, x: Float[Array, "5"], cases: Cases) -> Float[Array, " case"]:
+    """Loss of every case at a place of the box [mm]."""
+    gains = gains_at(x)
+    found: Array = jax.vmap(lambda case: task.loss(gains, case))(cases)
+    return found
+
+
+@eqx.filter_jit
+def slopes(
+    task: Task, x: Float[Array, "5"], cases: Cases
+) -> tuple[Float[Array, "case 5"], Float[Array, " case"]]:
+    """Derivatives of the losses by the place, and the losses; forwards."""
+
+    def one(case: Cases, x: Array) -> tuple[Array, Array]:
+        value = task.loss(gains_at(x), case)
+        return value, value
+
+    return jax.vmap(lambda case: jax.jacfwd(lambda x: one(case, x), has_aux=True)(x))(cases)
+
+
+@eqx.filter_jit
+def penalty_slope(task: Task, x: Float[Array, "5"], truths: Frozen) -> Float[Array, "5"]:
+    """Derivative of the penalty by the place [mm]."""
+    slope: Array = jax.jacfwd(lambda x: task.penalty(gains_at(x), truths))(x)
+    return slope
+
+
+@eqx.filter_jit
+def penalty(task: Task, x: Float[Array, "5"], truths: Frozen) -> Float[Array, ""]:
+    """Penalty at a place of the box [mm]."""
+    return task.penalty(gains_at(x), truths)
+
+
+def evaluate(task: Task, gains: Any, cases: Cases) -> Float[np.ndarray, " case"]:
+    """Loss of every case at some gains [mm], `BATCH` cases at a time."""
+    x, count = jnp.asarray(box_of(gains)), len(cases)
+    rows = np.arange(-(-count // BATCH) * BATCH) % count
+    parts = [losses(task, x, cases.at(part)) for part in rows.reshape(-1, BATCH)]
+    return np.concatenate([np.asarray(p) for p in parts])[:count]
+
+
+def named(values: Any) -> dict[str, float]:
+    """Gains by name."""
+    return {name: float(v) for name, v in zip(GAINS, np.asarray(values), strict=True)}
