@@ -401,6 +401,49 @@ def simulate(
 
 @app.command()
 @guarded
+def trial(
+    out: OutFolder,
+    plant: Annotated[
+        str, typer.Option(metavar="NAME", help="testsite (MuJoCo), or twin: the fit itself.")
+    ] = "testsite",
+    map: Annotated[
+        Path | None, typer.Option("--map", metavar="FILE", help="Floor map; else made of patches.")
+    ] = None,
+    controllers: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="By commas; all by default.")
+    ] = None,
+    starts: Annotated[int, typer.Option(min=1, max=99, help="Poses to start from.")] = 20,
+    load: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Load set-up; the first by default.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", min=1, help="Processes at once; by default all cores.")
+    ] = None,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Drive the 2021 paper's rectangle with every controller and say which one to deploy.
+
+    Gains are those of gains.json where `slipid tune` wrote one. Writes trial.json and trial.png to
+    OUT; runs that are done are kept and not driven again.
+    """
+    from slipid.app import tables
+    from slipid.app.progress import Reporter
+    from slipid.app.trial import Wish, names_of, processes
+    from slipid.app.trial import trial as run
+
+    wish = Wish(plant, map, names_of(controllers), starts, load, processes(jobs))
+    with Reporter(quiet=quiet) as report:
+        found = run(out, wish, report)
+    if json is not None:
+        _emit(json, found)
+    if json != "-":
+        tables.trial(found, out)
+    return 0
+
+
+@app.command()
+@guarded
 def demo(
     out: Out = Path("demo_out"),
     plant: Annotated[

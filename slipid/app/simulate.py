@@ -1,15 +1,9 @@
 """`slipid simulate`: logs from the virtual test site, in parallel, with the truth apart."""
 
-import os
-import signal
-import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +11,7 @@ import numpy as np
 
 from slipid.app.progress import Reporter
 from slipid.app.simulate_config import Plan
+from slipid.app.spread import spread
 from slipid.data.files import read_json, write_arrays, write_bytes, write_json
 from slipid.data.log import DataError
 from slipid.data.terrain import write_map
@@ -84,7 +79,7 @@ def simulate(plan: Plan, out: Path, jobs: int, report: Reporter) -> dict[str, An
     report.stage(f"driving {len(todo)} of {len(every)} runs")
     began = time.monotonic()
     seconds = 0.0
-    with closing(_spread(drive_and_write, todo, min(jobs, len(todo)))) as finished:
+    with closing(spread(drive_and_write, todo, min(jobs, len(todo)), alone=True)) as finished:
         for done, (job, driven) in enumerate(finished, 1):
             seconds += driven
             left = (time.monotonic() - began) / done * (len(todo) - done)
@@ -107,7 +102,7 @@ def _film(jobs: Sequence[Job], camera: Camera, processes: int, report: Reporter)
         return
     began = time.monotonic()
     # in processes of their own, also one by one: what draws has to be chosen before MuJoCo is there
-    with closing(_spread(film_and_write, todo, min(processes, len(todo)))) as finished:
+    with closing(spread(film_and_write, todo, min(processes, len(todo)))) as finished:
         for done, ((job, _), _) in enumerate(finished, 1):
             left = (time.monotonic() - began) / done * (len(todo) - done)
             report.step(done, len(todo), f"{job.name}, about {left:.0f} s left")
@@ -130,60 +125,6 @@ def film_and_write(what: tuple[Job, Camera]) -> int:
 
 def _video(out: Path, name: str) -> Path:
     return out / "video" / f"{name}.avi"
-
-
-def _spread(
-    work: Callable[[Any], Any], todo: Sequence[Any], jobs: int
-) -> Generator[tuple[Any, Any], None, None]:
-    """Pieces of work and their results, in the order they are finished; to be closed.
-
-    Raises:
-        DataError: a process was ended by the system.
-    """
-    if work is drive_and_write and jobs <= 1:
-        yield from ((job, work(job)) for job in todo)
-        return
-    # forked processes would inherit the threads of whatever the caller has loaded
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _work_for, (os.getpid(),))
-    try:
-        with _deaf():  # Ctrl-C is for this process, from the start of the others on
-            waiting = {pool.submit(work, job): job for job in todo}
-        for future in as_completed(waiting):
-            yield waiting[future], future.result()
-        pool.shutdown()
-    except BrokenProcessPool as error:
-        raise DataError(
-            "a process ended before its work did (memory?); called again, it goes on from there"
-        ) from error
-    finally:  # what is half done is nothing yet: files come whole
-        pool.shutdown(wait=False, cancel_futures=True)
-        for child in active_children():
-            child.terminate()
-
-
-@contextmanager
-def _deaf() -> Iterator[None]:
-    """No interrupts; processes started meanwhile never hear any."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _work_for(parent: int) -> None:
-    """Leave interrupts to the parent, and end when it has been killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(1.0)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 def drive_and_write(job: Job) -> float:

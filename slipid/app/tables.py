@@ -364,6 +364,37 @@ def simulated(found: dict[str, Any], plan: Any, out: Path) -> None:
         console.print(line, markup=False, soft_wrap=True)
 
 
+def trial(found: dict[str, Any], out: Path) -> None:
+    """What every controller came to, medians over the starts."""
+    console = _console()
+    heads = (
+        "controller",
+        "closure",
+        "cross-track",
+        "first side",
+        "heading",
+        "path",
+        "of encoders'",
+    )
+    table = _table(heads, right=heads[1:])
+    for name, row in found["summary"].items():
+        ratio = row.get("to_encoder", {}).get("closure_error_median")
+        told = "" if ratio is None else f"{100 * ratio['value']:.0f} % closure"
+        table.add_row(
+            name,
+            f"{row['closure_error_median']:.0f} mm",
+            f"{row['cross_track_rmse']:.0f} mm",
+            f"{row['first_side_along_track_mm']:.0f} mm",
+            f"{row['heading_error_deg']:.1f} deg",
+            f"{row['path_length_mm']:.0f} mm",
+            told,
+        )
+    console.print(table)
+    count = min(row["runs"] for row in found["summary"].values())
+    console.print(f"medians of {count} starts; 90 % intervals and every run: {out / 'trial.json'}")
+    console.print(f"look at: {out / 'trial.png'}", soft_wrap=True)
+
+
 def demo(
     out: Path, done: Any, found: dict[str, Any], rows: Sequence[Any], real: Path | None
 ) -> None:

@@ -1,7 +1,7 @@
 """A controller, an estimator and a plant in a loop, and what became of the path."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,23 +19,11 @@ LONGEST = 2.0
 """Times the path's own duration after which a run is given up."""
 
 
-class Observer(Protocol):
-    """Anything with the interface of `Estimator`."""
-
-    def init(self, pose: Any) -> Array:
-        """State at rest at a pose."""
-        ...
-
-    def step(self, state: Array, measurement: Array, dt: Any) -> tuple[Array, Array]:
-        """State and estimate after a measurement."""
-        ...
-
-
 class Pilot(eqx.Module):
     """An estimator and a controller as one pure function, the state one flat array.
 
     Attributes:
-        observer: an estimator.
+        observer: an `Estimator`, or anything with its interface.
         controller: a controller.
     """
 

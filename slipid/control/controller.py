@@ -1,8 +1,8 @@
 """Controllers: from where the robot should be and what is estimated to wheel speed commands.
 
-All share one interface, `init() -> state` and `step(state, reference, estimate, dt) -> (state, wheel
-speeds)`, one limiter that keeps the direction of motion, and one safe stop. They differ in what they
-do beyond the pose loop
+All share one interface, `init() -> state` and `step(state, reference, estimate, dt) -> (state,
+wheel speeds)`, one limiter that keeps the direction of motion, and one safe stop. They differ in
+what they do beyond the pose loop
 
     v = R(-heading) (v_ref + k (p_ref - p)),   W = W_ref + k_yaw sin(heading_ref - heading)
 """

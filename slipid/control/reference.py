@@ -1,6 +1,7 @@
 """Paths in time: where the robot should be and how fast, and when to wait for it."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -101,7 +102,7 @@ def waypoints(
     if p.ndim != 2 or len(p) < 2 or p.shape[1] != 2:
         raise ValueError(f"way-points {p.tolist()}; expected two or more places x, y")
     parts, marks, time = [np.array([[*p[0], heading, 0.0, 0.0, 0.0]])], [], 0.0
-    for a, b in zip(p[:-1], p[1:], strict=True):
+    for a, b in pairwise(p):
         far = float(np.hypot(*(b - a)))
         if far < 1e-9:
             raise ValueError(f"way-point {b.tolist()} twice in a row; expected another place")
@@ -123,7 +124,9 @@ def rectangle(length: float = 0.9, width: float = 0.4, speed: float = 0.2) -> Pa
         length: of the first side [m]; width: of the second [m].
         speed: [m/s].
     """
-    return waypoints([(0, 0), (length, 0), (length, -width), (0, -width), (0, 0)], speed)
+    return waypoints(
+        [(0.0, 0.0), (length, 0.0), (length, -width), (0.0, -width), (0.0, 0.0)], speed
+    )
 
 
 def circle(radius: float = 0.4, speed: float = 0.2, turning: bool = False) -> Path:

@@ -34,8 +34,7 @@ from slipid.parameter import Space
 CHANNELS = ("along", "across", "yaw")
 TOLERANCE = 0.02
 """Settled when a step is at most so many posterior stds."""
-_MOST_STEPS = 25
-_HALVINGS = 6
+_MOST_STEPS, _FACTOR_STEPS, _TRIES = 40, 4, 8
 _TOGETHER = 256
 
 
@@ -153,8 +152,11 @@ class _Scatter:
         return np.asarray(weight / (self.variance * self.factor))
 
 
-def _scatter(e: _Evidence, r: np.ndarray) -> _Scatter:
-    """Variances and weights of residuals in turn, from their mean squares, then correlation."""
+def _scatter(e: _Evidence, r: np.ndarray, factor: np.ndarray | None) -> _Scatter:
+    """Variances and weights of residuals in turn, from their mean squares, then correlation.
+
+    A factor that is given is kept: which lags count changes by jumps, and steps would not settle.
+    """
     motion = np.arange(r.shape[1]) < len(CHANNELS)
     counts = np.where(motion, 1.0, e.has_current[:, None])
     blocks = [motion, ~motion]
@@ -168,9 +170,23 @@ def _scatter(e: _Evidence, r: np.ndarray) -> _Scatter:
             weight[:, block] = counts[:, block] * t[:, None]
             expected[:, block] = counts[:, block] * (DEGREES + m) / (DEGREES + m + 2)
     scaled = np.where(counts > 0, np.sqrt(weight) * r / np.sqrt(variance), np.nan)
+    if factor is not None:
+        return _Scatter(weight, expected, variance, factor)
+    # what a motor's current is off all run long is the motor's: no floor is known better without it
+    scaled[:, ~motion] -= _mean_of_runs(scaled[:, ~motion], e.run)
     factor = np.array([_dilution(column, e.run, e.place) for column in scaled.T])
     factor[~motion] = factor[~motion].max(initial=1.0)
     return _Scatter(weight, expected, variance, factor)
+
+
+def _mean_of_runs(x: np.ndarray, run: np.ndarray) -> Float[np.ndarray, "window channel"]:
+    """Mean of every column over the run a window is of; nan counts for nothing."""
+    there = np.isfinite(x)
+    total = np.zeros((run.max() + 1, x.shape[1]))
+    count = np.zeros_like(total)
+    np.add.at(total, run, np.where(there, x, 0.0))
+    np.add.at(count, run, there.astype(float))
+    return np.asarray((total / np.maximum(count, 1.0))[run])
 
 
 def _pooled(square: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, " channel"]:
@@ -185,8 +201,8 @@ def _dilution(x: np.ndarray, run: np.ndarray, place: np.ndarray) -> float:
     """Windows over the number of independent ones that tell as much; at least 1.
 
     1 + 2 sum of the correlations over lags within runs, in pairs of lags while these are positive
-    (Geyer 1992, Stat. Sci. 7, section 3.3). Residuals are taken about zero: what a whole run has
-    in common counts as correlation.
+    (Geyer 1992, Stat. Sci. 7, section 3.3). Residuals are taken about zero: of motion, what a whole
+    run has in common counts as correlation.
 
     Args:
         x: one residual per window, nan where nothing was measured.
@@ -223,19 +239,20 @@ class _Found:
 
 
 def _maximise(e: _Evidence, mean: np.ndarray, covariance: np.ndarray) -> _Found:
-    """Gauss-Newton steps from the prior mean, halved until they help; scatter anew at each."""
+    """Levenberg-Marquardt steps from the prior mean; scatter anew at each."""
     prior, z, settled = np.linalg.inv(covariance), np.asarray(mean, float), False
     moving = ~held(e.space)
-    for _ in range(_MOST_STEPS):
+    factor: np.ndarray | None = None
+    damping = 0.0
+    for turn in range(_MOST_STEPS):
         r, slope = e.linear(z)
-        scatter = _scatter(e, r)
+        scatter = _scatter(e, r, factor)
+        factor = scatter.factor if turn >= _FACTOR_STEPS else None
         count = scatter.counted(scatter.weight)
-        gradient = np.einsum("nc,nc,ncp->p", count, r, slope) + prior @ (z - mean)
-        hessian = _gram(slope, count) + prior
-        own = np.linalg.inv(hessian[np.ix_(moving, moving)])
-        step = np.zeros_like(z)
-        step[moving] = -own @ gradient[moving]
-        settled = bool((np.abs(step[moving]) <= TOLERANCE * np.sqrt(np.diag(own))).all())
+        gradient = (np.einsum("nc,nc,ncp->p", count, r, slope) + prior @ (z - mean))[moving]
+        hessian = (_gram(slope, count) + prior)[np.ix_(moving, moving)]
+        std = np.sqrt(np.diag(np.linalg.inv(hessian)))
+        settled = bool((np.abs(np.linalg.solve(hessian, gradient)) <= TOLERANCE * std).all())
         if settled:
             break
 
@@ -243,19 +260,24 @@ def _maximise(e: _Evidence, mean: np.ndarray, covariance: np.ndarray) -> _Found:
             away = x - mean
             return float(0.5 * (count * e.residual(x) ** 2).sum() + 0.5 * away @ prior @ away)
 
-        z = _shorter(loss, z, step, float(np.abs(step).max()))
+        now = loss(z)
+        for _ in range(_TRIES):
+            step = np.zeros_like(z)
+            damped = hessian + damping * np.diag(np.diag(hessian))
+            step[moving] = -np.linalg.solve(damped, gradient)
+            step *= min(
+                1.0, 2.0 / np.abs(step).max()
+            )  # beyond two in a logarithm nothing is linear
+            expected = -(gradient @ step[moving] + 0.5 * step[moving] @ hessian @ step[moving])
+            gained = (now - loss(z + step)) / max(expected, 1e-12)
+            damping = (
+                damping / 4 if gained > 0.7 else max(4 * damping, 0.01) if gained < 0.3 else damping
+            )
+            if gained > 0:
+                z = z + step
+                break
     information = _gram(slope, scatter.counted(scatter.expected))
     return _Found(z, information, scatter, settled)
-
-
-def _shorter(loss: Any, z: np.ndarray, step: np.ndarray, size: float) -> np.ndarray:
-    """The end of the first of a step's halvings that lowers the loss."""
-    now, part = loss(z), min(1.0, 2.0 / size)  # beyond two in a logarithm nothing is linear
-    for _ in range(_HALVINGS):
-        if loss(z + part * step) < now:
-            break
-        part /= 2
-    return z + part * step
 
 
 def _gram(slope: np.ndarray, count: np.ndarray) -> Float[np.ndarray, "free free"]:

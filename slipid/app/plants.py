@@ -1,0 +1,84 @@
+"""Plants for the closed loop: the virtual test site, and the identified model itself."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.control.estimator import sensed
+from slipid.data.terrain import FloorMap
+from slipid.testsite.driving import Site
+from slipid.testsite.live import Live, Reading
+
+
+class SitePlant:
+    """The virtual test site as a `slipid.model.plant.Plant`.
+
+    Args:
+        floor: which surface lies where.
+        load: name of the load set-up.
+        start: x, y [m], heading [rad].
+        seed: of unevenness and noise.
+        gyro: whether the robot has one.
+        site: robot, floors and sensors; by default as they are.
+    """
+
+    def __init__(
+        self,
+        floor: FloorMap,
+        load: str,
+        start: tuple[float, float, float],
+        seed: int,
+        gyro: bool,
+        site: Site | None = None,
+    ):
+        site = Site() if site is None else site
+        site = replace(site, sensors=replace(site.sensors, gyro=gyro))
+        self._live = Live(site, floor, load, start, seed)
+        self._layout = sensed(len(site.machine.wheel_azimuths_deg))
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """True pose [m, m, rad]."""
+        return self._live.pose
+
+    @property
+    def power(self) -> float:
+        """Electric power of the motors [W]."""
+        return self._live.power
+
+    def reset(self) -> Float[np.ndarray, " sensed"]:
+        """First readings."""
+        return self._packed(self._live.read())
+
+    def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Float[np.ndarray, " sensed"]:
+        """Readings one period later."""
+        return self._packed(self._live.step(wheel_speed))
+
+    def _packed(self, reading: Reading) -> np.ndarray:
+        out = np.full(self._layout.size, np.nan)
+        for name in ("wheel_angle", "current", "voltage", "gyro"):
+            out[self._layout.place(name)] = getattr(reading, name)
+        return out
+
+
+def twin(frozen: Any, floor: FloorMap, start: Any, seed: int, gyro: bool) -> Any:
+    """The identified model as a plant, see `slipid.control.twin`."""
+    from slipid.control.twin import TwinPlant
+
+    return TwinPlant(frozen, floor_of(floor, frozen.labels), start, seed, gyro=gyro)
+
+
+def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Any:
+    """A map as arrays, its surfaces counted as the fit counts them."""
+    import jax.numpy as jnp
+
+    from slipid.model.plant import Floor
+
+    index = np.array([labels.index(name) for name in floor.surfaces])
+    return Floor(
+        cells=jnp.asarray(index[floor.cells]),
+        corner=jnp.asarray(floor.corner),
+        cell=jnp.asarray(floor.cell),
+    )

@@ -1,0 +1,230 @@
+"""Paths, metrics and the trial command."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from slipid.app import trial as tr
+from slipid.app.plants import floor_of
+from slipid.control import closed_loop, reference
+from slipid.control.controller import GAINS, Controller
+from slipid.control.frozen import freeze
+from slipid.control.odometry import Odometry
+from slipid.data.log import DataError
+from slipid.data.terrain import four_zones, uniform
+from slipid.model.geometry import omni
+from slipid.model.robot import build
+from slipid.testsite.driving import Site
+from slipid.testsite.live import Live
+
+
+@pytest.fixture(scope="module")
+def frozen():
+    robot = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"])
+    return freeze(robot, "as_built", {}, None, 7.5)
+
+
+def test_the_rectangle_is_that_of_the_paper_and_stops_at_its_corners():
+    path = reference.rectangle()
+    rows = np.asarray(path.rows)
+    length = np.hypot(*np.diff(rows[:, :2], axis=0).T).sum()
+    assert length == pytest.approx(2 * (0.9 + 0.4), abs=1e-3)
+    corners = np.asarray([np.asarray(path.at(t)) for t in np.asarray(path.marks)])
+    np.testing.assert_allclose(
+        corners[:, :2], [[0.9, 0], [0.9, -0.4], [0, -0.4], [0, 0]], atol=1e-9
+    )
+    np.testing.assert_allclose(corners[:, 3:], 0.0, atol=1e-9)
+    # rates are the derivatives of places
+    np.testing.assert_allclose(
+        np.gradient(rows[:, :2], reference.STEP, axis=0)[5:-5], rows[5:-5, 3:5], atol=0.011
+    )
+    assert np.hypot(rows[:, 3], rows[:, 4]).max() <= 0.2 + 1e-9
+
+
+def test_a_path_moved_to_a_start_has_its_shape():
+    start = (0.3, -0.2, 2.0)
+    path = reference.rectangle()
+    moved = path.moved(start)
+    c, s = np.cos(2.0), np.sin(2.0)
+    back = (np.asarray(moved.rows)[:, :2] - start[:2]) @ np.array([[c, -s], [s, c]])
+    np.testing.assert_allclose(back, np.asarray(path.rows)[:, :2], atol=1e-12)
+    assert np.asarray(moved.rows)[0, 2] == pytest.approx(2.0)
+
+
+def test_a_path_waits_for_a_robot_that_lags_and_not_for_one_that_is_ahead():
+    path = reference.waypoints([(0.0, 0.0), (1.0, 0.0)], pause=0.0)
+    now = jnp.asarray(2.0)
+    here = np.asarray(path.at(2.0))
+    on, rates = path.follow(now, jnp.asarray(here[:3]), 0.05)
+    assert float(on) == pytest.approx(2.05)
+    assert float(rates[3]) == pytest.approx(0.2)
+    far_behind = here[:3] - [0.2, 0.0, 0.0]
+    stays, rates = path.follow(now, jnp.asarray(far_behind), 0.05)
+    assert float(stays) == pytest.approx(2.0)
+    np.testing.assert_allclose(rates[3:], 0.0)
+    ahead, _ = path.follow(now, jnp.asarray(here[:3] + np.array([0.2, 0.0, 0.0])), 0.05)
+    assert float(ahead) == pytest.approx(2.05)
+
+
+def test_way_points_are_refused_with_the_reason():
+    with pytest.raises(ValueError, match="two or more places"):
+        reference.waypoints([(0.0, 0.0)])
+    with pytest.raises(ValueError, match="twice in a row"):
+        reference.waypoints([(0.0, 0.0), (0.0, 0.0)])
+
+
+@pytest.mark.parametrize("turning", [False, True])
+def test_smooth_paths_close(turning):
+    for path in (reference.circle(0.3, turning=turning), reference.figure_eight(turning=turning)):
+        rows = np.asarray(path.rows)
+        np.testing.assert_allclose(rows[-1, :2], rows[0, :2], atol=2e-3)
+        assert np.hypot(rows[:, 3], rows[:, 4]).max() < 0.25
+
+
+class Perfect:
+    """A plant without slip, whose wheels turn as they are told."""
+
+    def __init__(self, frozen, start, travelled=1.0):
+        self.frozen, self._pose, self.travelled = frozen, np.array(start, float), travelled
+        self.angle = np.zeros(3)
+
+    @property
+    def pose(self):
+        return tuple(float(v) for v in self._pose)
+
+    def reset(self):
+        return self.step(np.zeros(3))
+
+    def step(self, wheel_speed):
+        self.angle = self.angle + np.asarray(wheel_speed) * closed_loop.PERIOD
+        v = np.asarray(self.frozen.inverse) @ np.asarray(wheel_speed) * 0.04 * closed_loop.PERIOD
+        v = v * [self.travelled, self.travelled, 1.0]
+        c, s = np.cos(self._pose[2]), np.sin(self._pose[2])
+        self._pose += [c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]]
+        out = np.full(Odometry(self.frozen).sensed.size, np.nan)
+        out[:3], out[6:9] = self.angle, 0.5
+        return out
+
+
+def pilot(frozen):
+    gains = jnp.asarray([{**tr.HAND, "ahead": 0.0}[name] for name in GAINS])
+    return closed_loop.Pilot(Odometry(frozen), Controller(frozen, gains))
+
+
+def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(frozen):
+    start = (0.2, 0.1, -1.0)
+    path = reference.rectangle().moved(start)
+    course = closed_loop.drive(pilot(frozen), path, Perfect(frozen, start), start)
+    found = closed_loop.metrics(course)
+    assert found["finished"]
+    assert found["closure_mm"] < 5
+    assert found["cross_track_rmse_mm"] < 12
+    assert np.abs(found["along_track_mm"]).max() < 10
+    assert abs(found["heading_error_deg"]) < 0.5
+    assert found["path_length_mm"] == pytest.approx(2600, rel=0.03)
+
+
+def test_metrics_see_a_robot_that_travels_only_part_of_its_way(frozen):
+    start = (0.0, 0.0, 0.0)
+    path = reference.rectangle()
+    course = closed_loop.drive(pilot(frozen), path, Perfect(frozen, start, 0.8), start)
+    found = closed_loop.metrics(course)
+    assert found["along_track_mm"][0] == pytest.approx(-180, abs=12)
+    assert found["along_track_mm"][1] == pytest.approx(-80, abs=12)
+    assert found["closure_mm"] < 12  # every side is as short as its opposite
+    assert found["cross_track_rmse_mm"] > 30
+
+
+def test_starts_are_spread_and_the_same_for_everyone():
+    floor = uniform("firm", 2.0)
+    every = tr.starts(20, floor)
+    assert every == tr.starts(20, floor)
+    headings = np.sort([s[2] for s in every])
+    assert np.diff(headings).max() < 2 * 2 * np.pi / 20
+    middles = []
+    for x, y, h in every:
+        c, s = np.cos(h), np.sin(h)
+        middles.append((x + 0.45 * c + 0.2 * s, y + 0.45 * s - 0.2 * c))
+    assert np.abs(middles).max() <= 1.2 + 1e-9
+    assert np.std(middles, axis=0).min() > 0.4
+
+
+def test_a_map_is_looked_up_under_the_wheels(frozen):
+    floor = four_zones(["firm", "soft", "firm", "soft"], middle=(0.0, 0.0))
+    lookup = floor_of(floor, ("firm", "soft"))
+    pose = jnp.asarray([0.02, -0.01, 0.7])
+    under = np.asarray(lookup.under(pose, frozen.places))
+    c, s = np.cos(0.7), np.sin(0.7)
+    turned = np.asarray(frozen.places) @ np.array([[c, s], [-s, c]]) + [0.02, -0.01]
+    names = [("firm", "soft")[k] for k in under]
+    assert names == [floor.surface_at(float(x), float(y)) for x, y in turned]
+    assert len(set(names)) == 2
+
+
+def test_what_a_trial_cannot_do_is_said(tmp_path):
+    with pytest.raises(DataError, match="expected testsite or twin"):
+        tr._jobs(tmp_path, tr.Wish(plant="moon"))
+    with pytest.raises(DataError, match="no controller 'magic'; expected some of encoder"):
+        tr._jobs(tmp_path, tr.Wish(controllers=("magic",)))
+    with pytest.raises(DataError, match="has no surface 'gray'; it has firm"):
+        tr._known_grounds(uniform("gray"))
+    (tmp_path / "gains.json").write_text(json.dumps({"gains": {"place": {"value": 1}}}))
+    with pytest.raises(DataError, match="no gains"):
+        tr.gains_of(tmp_path)
+
+
+def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path):
+    assert tr.gains_of(tmp_path) == tr.HAND
+    tuned = {name: {"value": k + 0.5} for k, name in enumerate(GAINS)}
+    (tmp_path / "gains.json").write_text(json.dumps({"gains": tuned}))
+    assert tr.gains_of(tmp_path) == {name: k + 0.5 for k, name in enumerate(GAINS)}
+
+
+def test_the_summary_is_of_medians_over_starts_with_intervals():
+    rng = np.random.default_rng(0)
+
+    def run(name, k, closure):
+        return {
+            "controller": name,
+            "along_track_mm": [-90.0 * (1 + 0.1 * k), 0, 0, 0],
+            "closure_mm": closure,
+            "cross_track_rmse_mm": closure / 2,
+            "heading_error_deg": -3.0,
+            "path_length_mm": 2500.0,
+            "energy_j": 10.0,
+            "effort": 0.1,
+            "seconds": 19.0,
+            "finished": True,
+            "believed_error_mm": 1.0,
+        }
+
+    base = rng.uniform(100, 200, 20)
+    runs = [run("encoder", k, b) for k, b in enumerate(base)]
+    runs += [run("contact", k, 0.4 * b) for k, b in enumerate(base)]
+    found = tr.summary(runs)
+    assert found["encoder"]["closure_error_median"] == pytest.approx(np.median(base))
+    assert found["encoder"]["heading_error_deg"] == 3.0
+    ratio = found["contact"]["to_encoder"]["closure_error_median"]
+    assert ratio["value"] == pytest.approx(0.4)
+    assert ratio["interval90"] == pytest.approx([0.4, 0.4])
+    low, high = found["encoder"]["interval90"]["closure_error_median"]
+    assert low < np.median(base) < high
+
+
+def test_live_readings_are_as_the_sensors_log_them():
+    pytest.importorskip("mujoco")
+    site = Site()
+    live = Live(site, uniform("firm"), "as_built", (0.0, 0.0, 0.0), seed=1)
+    forward = site.machine.wheel_from_twist @ np.array([0.2, 0.0, 0.0])
+    for _ in range(20):
+        reading = live.step(forward)
+    tick = 2 * np.pi / (2000 * 16)
+    np.testing.assert_allclose(
+        reading.wheel_angle / tick, np.round(reading.wheel_angle / tick), atol=1e-6
+    )
+    assert (reading.current >= 0).all()  # magnitudes
+    assert np.isnan(reading.gyro)
+    assert live.plant.time == pytest.approx(20 * live.period)
+    assert live.pose[0] > 0.1  # a delay and a slew, then 0.2 m/s
