@@ -15,6 +15,7 @@ FIGURES = {
     "03_fit_and_identifiability": 7,
     "04_posterior": 5,
     "05_linear_or_nonlinear": 5,
+    "06_compensation": 4,
 }
 
 

@@ -1,13 +1,18 @@
 """Plants for the closed loop: the virtual test site, and the identified model itself."""
 
 from dataclasses import replace
-from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from slipid.control.estimator import sensed
+from slipid.control.frozen import Frozen
+from slipid.control.habits import Habits
+from slipid.control.twin import Twin, TwinPlant
 from slipid.data.terrain import FloorMap
+from slipid.model.plant import Floor
 from slipid.testsite.driving import Site
 from slipid.testsite.live import Live, Reading
 
@@ -63,19 +68,16 @@ class SitePlant:
         return out
 
 
-def twin(frozen: Any, floor: FloorMap, start: Any, seed: int, gyro: bool) -> Any:
-    """The identified model as a plant, see `slipid.control.twin`."""
-    from slipid.control.twin import TwinPlant
+def twin(
+    frozen: Frozen, floor: FloorMap, start: tuple[float, float, float], seed: int, gyro: bool
+) -> TwinPlant:
+    """The identified model itself as a plant, see `slipid.control.twin`."""
+    made = Twin(frozen, floor_of(floor, frozen.labels), Habits(gyro=gyro))
+    return TwinPlant(made, jnp.asarray(start), jax.random.key(seed))
 
-    return TwinPlant(frozen, floor_of(floor, frozen.labels), start, seed, gyro=gyro)
 
-
-def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Any:
+def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Floor:
     """A map as arrays, its surfaces counted as the fit counts them."""
-    import jax.numpy as jnp
-
-    from slipid.model.plant import Floor
-
     index = np.array([labels.index(name) for name in floor.surfaces])
     return Floor(
         cells=jnp.asarray(index[floor.cells]),

@@ -34,6 +34,8 @@ from slipid.parameter import Space
 CHANNELS = ("along", "across", "yaw")
 TOLERANCE = 0.02
 """Settled when a step is at most so many posterior stds."""
+_GAIN, _IDLE = 0.1, 6
+"""Or when so many steps on end have gained less than this in log density."""
 _MOST_STEPS, _FACTOR_STEPS, _TRIES = 40, 4, 8
 _TOGETHER = 256
 
@@ -243,7 +245,7 @@ def _maximise(e: _Evidence, mean: np.ndarray, covariance: np.ndarray) -> _Found:
     prior, z, settled = np.linalg.inv(covariance), np.asarray(mean, float), False
     moving = ~held(e.space)
     factor: np.ndarray | None = None
-    damping = 0.0
+    damping, idle = 0.0, 0
     for turn in range(_MOST_STEPS):
         r, slope = e.linear(z)
         scatter = _scatter(e, r, factor)
@@ -253,6 +255,7 @@ def _maximise(e: _Evidence, mean: np.ndarray, covariance: np.ndarray) -> _Found:
         hessian = (_gram(slope, count) + prior)[np.ix_(moving, moving)]
         std = np.sqrt(np.diag(np.linalg.inv(hessian)))
         settled = bool((np.abs(np.linalg.solve(hessian, gradient)) <= TOLERANCE * std).all())
+        settled |= idle >= _IDLE  # on a bent ridge no whole step is small, yet none gains
         if settled:
             break
 
@@ -275,7 +278,10 @@ def _maximise(e: _Evidence, mean: np.ndarray, covariance: np.ndarray) -> _Found:
             )
             if gained > 0:
                 z = z + step
+                idle = idle + 1 if gained * expected < _GAIN else 0
                 break
+        else:
+            idle += 1
     information = _gram(slope, scatter.counted(scatter.expected))
     return _Found(z, information, scatter, settled)
 
