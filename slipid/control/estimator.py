@@ -3,14 +3,14 @@
 A robot whose wheels stand on several floors moves as one body, so every hypothesis is one floor per
 wheel, all of them together (27 with three wheels on three floors), and one that says "unknown":
 
-    xi_c, I_c     contact equilibrium and motor currents of hypothesis c at the measured wheel speeds
+    xi_c, I_c    contact equilibrium and motor currents of hypothesis c at the measured wheel speeds
     p_c <- p_c * p(I | I_c) p(gyro | xi_c)^(dt / tau)   after a step in which wheels change floors
     xi = sum_c p_c xi_c,   pose <- pose * exp(xi dt)
 
 A wheel's current shows its share of the whole drag, not the drag beneath it; only together do they
 tell the floors. What the fit says the model misses (process noise, effects that stay) is carried
-along as the covariance of the pose, with a gyro's bias and the effects as further unknowns that pose
-fixes and rest correct.
+along as the covariance of the pose, with a gyro's bias and the effects as further unknowns that
+pose fixes and rest correct.
 """
 
 import itertools
@@ -288,7 +288,7 @@ class Estimator(eqx.Module):
         floors = combine(f.frame, f.floors, self.hypotheses, f.rest, f.inverse)
         twist, pull = settle(near.T, f.frame.radius * w, floors)
         torque = floors.friction * f.mass * GRAVITY * f.frame.radius * pull
-        return twist.T, f.motor.current(torque.T, w)
+        return twist.T, f.motor.current(torque.T, jnp.broadcast_to(w, torque.T.shape))
 
     def _filter(
         self,

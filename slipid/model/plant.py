@@ -1,6 +1,6 @@
 """What a closed loop needs of the world: a plant to drive, and which floor lies where."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 
+@runtime_checkable
 class Plant(Protocol):
     """A robot that takes wheel speeds and gives back what its sensors read.
 
