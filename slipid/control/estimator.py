@@ -25,8 +25,8 @@ from jaxtyping import Array, Float
 
 from slipid.control.frozen import Frozen
 from slipid.control.packed import Layout
-from slipid.model import contact
 from slipid.model.robot import GRAVITY, advance, compose
+from slipid.model.settle import combine, settle
 
 HISTORY = 48
 """Steps a delayed measurement may reach back."""
@@ -285,17 +285,10 @@ class Estimator(eqx.Module):
     def _solve(self, near: Array, w: Array) -> tuple[Array, Array]:
         """Twist and currents of every hypothesis, from the last step's twists."""
         f = self.frozen
-        floors = f.floors.at(jnp.asarray(self.hypotheses))
-        rim = f.frame.radius * w
-
-        def one(start: Array, floor: Any) -> tuple[Array, Array]:
-            xi = contact.settle(start, rim, f.frame, floor, f.rest)
-            force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
-            pull = contact.forces(xi, rim, f.frame, floor, f.rest).traction
-            return xi, f.motor.current(force * pull, w)
-
-        twist, amps = jax.vmap(one)(near, floors)
-        return twist, amps
+        floors = combine(f.frame, f.floors, self.hypotheses, f.rest, f.inverse)
+        twist, pull = settle(near.T, f.frame.radius * w, floors)
+        torque = floors.friction * f.mass * GRAVITY * f.frame.radius * pull
+        return twist.T, f.motor.current(torque.T, jnp.broadcast_to(w, torque.T.shape))
 
     def _filter(
         self,
@@ -525,26 +518,38 @@ class Estimator(eqx.Module):
             & jnp.all(std > 0)
             & (age < time - history[-1, 0] + 1e-6)
         )
-        fix, std = jnp.where(has, z.fix, pose), jnp.where(has, jnp.clip(std, 1e-4, 10.0), 1.0)
         then = history[jnp.argmin(jnp.abs(history[:, 0] - (time - age)))]
-        gap = fix - jnp.where(has, then[1:4], pose)
-        gap = gap.at[2].set(jnp.arctan2(jnp.sin(gap[2]), jnp.cos(gap[2])))
-        gone = jnp.where(has, pose[:2] - then[1:3], 0.0)
-        look = jnp.zeros((3, cov.shape[0])).at[:, :3].set(jnp.eye(3))
-        look = look.at[0, 2].set(gone[1]).at[1, 2].set(-gone[0])
-        noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2)
-        total = look @ cov @ look.T + noise
-        # a fix far from what is believed counts less, yet counts
-        far = gap @ _inverse(total) @ gap
-        total = total + noise * jnp.maximum(far / 9.0 - 1.0, 0.0)
-        gain = jnp.where(has, cov @ look.T @ _inverse(total), 0.0)
-        change = gain @ gap
-        cov = cov - gain @ look @ cov
-        cov = 0.5 * (cov + cov.T)
-        back = history[:, 1:3] - pose[:2]
-        moved = change[:2] + change[2] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
-        history = history.at[:, 1:3].add(moved).at[:, 3].add(change[2])
-        return pose + change[:3], more + change[3:], cov, history
+
+        def corrected() -> tuple[Array, Array, Array, Array]:
+            return _correct(z.fix, jnp.clip(std, 1e-4, 10.0), then, pose, more, cov, history)
+
+        kept = (pose, more, cov, history)
+        found: tuple[Array, Array, Array, Array] = jax.lax.cond(has, corrected, lambda: kept)
+        return found
+
+
+def _correct(
+    fix: Array, std: Array, then: Array, pose: Array, more: Array, cov: Array, history: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Pose, further unknowns, covariance and history after a fix of the pose of `then`."""
+    gap = fix - then[1:4]
+    gap = gap.at[2].set(jnp.arctan2(jnp.sin(gap[2]), jnp.cos(gap[2])))
+    gone = pose[:2] - then[1:3]
+    look = jnp.zeros((3, cov.shape[0])).at[:, :3].set(jnp.eye(3))
+    look = look.at[0, 2].set(gone[1]).at[1, 2].set(-gone[0])
+    noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2)
+    total = look @ cov @ look.T + noise
+    # a fix far from what is believed counts less, yet counts
+    far = gap @ _inverse(total) @ gap
+    total = total + noise * jnp.maximum(far / 9.0 - 1.0, 0.0)
+    gain = cov @ look.T @ _inverse(total)
+    change = gain @ gap
+    cov = cov - gain @ look @ cov
+    cov = 0.5 * (cov + cov.T)
+    back = history[:, 1:3] - pose[:2]
+    moved = change[:2] + change[2] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
+    history = history.at[:, 1:3].add(moved).at[:, 3].add(change[2])
+    return pose + change[:3], more + change[3:], cov, history
 
 
 def _size(v: Float[Array, "*batch axis"]) -> Float[Array, "*batch"]:

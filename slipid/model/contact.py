@@ -53,7 +53,6 @@ _LEAST_LOAD = 1e-3
 _ROUNDING = 1e-20
 _NEAR = 1e-6
 _MOST_NEAR = 12
-_SETTLE_CHORD, _SETTLE_NEWTON = 2, 3
 
 
 class ContactSurface(eqx.Module):
@@ -399,20 +398,3 @@ def residual(
 ) -> Float[Array, "3"]:
     """Force balance at a twist, the moment over the base radius [mu m g]; zero at equilibrium."""
     return _residual(xi, (rim, frame, surface, rest, jnp.zeros(3), jnp.zeros(3)))
-
-
-def settle(
-    start: Float[Array, "3"],
-    rim: Float[Array, " wheel"],
-    frame: Frame,
-    surface: ContactSurface,
-    rest: Float[Array, " wheel"],
-) -> Float[Array, "3"]:
-    """`equilibrium` in a few steps from the twist of a moment ago, for a robot's computer.
-
-    Chord steps, then Newton's where these come nearer; where a number is lost it is the twist
-    without slip. What a jump of the wheel speeds leaves over, the next call settles. Its derivative
-    is that of the root, whatever is left over.
-    """
-    before = jax.lax.stop_gradient(start)
-    return _root_settled((rim, frame, surface, rest, jnp.zeros(3), before))
