@@ -104,11 +104,11 @@ class Twin(eqx.Module):
         follow = 1 - np.exp(-h / max(self.habits.lag_s, 1e-6))
         moved = (old.pose, old.twist, old.set, old.speed, old.angle)
         for k in range(self.habits.substeps):
-            pose, xi, wanted, w, angle = moved
+            pose, _, wanted, w, angle = moved
             jump = self.habits.slew * h
             wanted = wanted + jnp.clip(shares[k] @ ring - wanted, -jump, jump)
             w = w + follow * (wanted - w)
-            pose, xi = self._roll(pose, xi, w, old.effect, pushes[k], h)
+            pose, xi = self._roll(pose, w, old.effect, pushes[k], h)
             moved = (pose, xi, wanted, w, angle + h * w)
         pose, xi, wanted, w, angle = moved
         amps, drift = self._amps(pose, xi, w, old, noise[3 * self.habits.substeps :])
@@ -133,13 +133,13 @@ class Twin(eqx.Module):
         return self._read(s.angle, s.speed, jnp.zeros_like(s.speed), s.bias, noise)
 
     def _roll(
-        self, pose: Array, xi: Array, w: Array, effect: Array, push: Array, h: float
+        self, pose: Array, w: Array, effect: Array, push: Array, h: float
     ) -> tuple[Array, Array]:
         """Pose and twist a substep later."""
         f = self.frozen
         under = self.floor.under(pose, f.places)
         rim = f.frame.radius * w
-        xi = contact.settle(xi, rim, f.frame, f.floors.at(under), f.rest)
+        xi = contact.equilibrium(rim, f.frame, f.floors.at(under), f.rest)
         size = jnp.sqrt(xi[:2] @ xi[:2] + 1e-12)
         u, far = xi[:2] / size, (size + f.frame.base * jnp.abs(xi[2])) * h
         share = f.rest[:, None]
