@@ -275,21 +275,6 @@ def _root_near(args: Any) -> Any:
     return jnp.where(jnp.max(jnp.abs(step)) > _NEAR, jnp.nan, xi)
 
 
-@jax.custom_jvp
-def _root_settled(args: Any) -> Any:
-    rim, frame, *_, start = args
-    near = start
-    for _ in range(_SETTLE_CHORD):
-        near = _chord(near, args)
-    xi = near
-    for _ in range(_SETTLE_NEWTON):
-        f, jac = _balance(xi, args)
-        xi = xi - _solve3(jac, f)
-    left, before = _residual(xi, args), _residual(near, args)
-    xi = jnp.where(left @ left <= before @ before, xi, near)  # NaN is not smaller either
-    return jnp.where(jnp.all(jnp.isfinite(xi)), xi, guess(rim, frame))
-
-
 def _implicit(root: Any) -> Any:
     """Derivative of a root of the balance by what it depends on."""
 
@@ -305,7 +290,6 @@ def _implicit(root: Any) -> Any:
 
 _root.defjvp(_implicit(_root))
 _root_near.defjvp(_implicit(_root_near))
-_root_settled.defjvp(_implicit(_root_settled))
 
 
 def guess(rim: Float[Array, " wheel"], frame: Frame) -> Float[Array, "3"]:
