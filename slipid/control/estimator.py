@@ -295,7 +295,8 @@ class Estimator(eqx.Module):
             return xi, f.motor.current(force * pull, w)
 
         twist, amps = jax.vmap(one)(near, floors)
-        return twist, amps
+        more = f.current_trend @ jnp.stack([1.0, jnp.linalg.norm((f.inverse @ rim)[:2])])
+        return twist, amps + jnp.sign(amps) * more
 
     def _filter(
         self,
