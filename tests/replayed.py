@@ -18,9 +18,10 @@ from scipy.stats import chi2
 
 from slipid.control.estimator import Settings
 from slipid.control.frozen import Frozen, freeze
-from slipid.data.dataset import Dataset, first_row
+from slipid.data.dataset import Dataset, Windows, first_row
 from slipid.data.log import Log
 from slipid.data.terrain import FloorMap
+from slipid.identify import likelihood as lk
 from slipid.model.robot import Robot, compose
 from slipid.parameter import Space
 
@@ -39,7 +40,13 @@ STARTS = 0.001
 
 
 def frozen(
-    space: Space, z: Any, covariance: Any, variance: dict[str, float], load: str, top: float
+    space: Space,
+    z: Any,
+    covariance: Any,
+    variance: dict[str, float],
+    load: str,
+    top: float,
+    trend: tuple[float, float],
 ) -> Frozen:
     """Frozen form of a fit.
 
@@ -48,13 +55,23 @@ def frozen(
         variance: of every noise component, by name.
         load: set-up it drives with.
         top: highest wheel speed in the fitted runs [rad/s].
+        trend: of the currents in the fitted runs, see `current_trend`.
     """
     rng = np.random.default_rng(0)
     root = np.linalg.cholesky(np.asarray(covariance))
     several = np.asarray(z) + rng.standard_normal((24, len(root))) @ root.T
     draws = jax.vmap(space.tree)(jnp.asarray(several))
     std = {name: float(np.sqrt(v)) for name, v in variance.items()}
-    return freeze(space.tree(jnp.asarray(z)), load, std, draws, top)
+    return freeze(space.tree(jnp.asarray(z)), load, std, draws, top, trend)
+
+
+def current_trend(robot: Robot, w: Windows) -> tuple[float, float]:
+    """Least squares a + b v of measured less predicted currents, v the encoders' speed."""
+    b = lk.batch(w, robot)
+    gap = np.asarray(b.current - lk.predicted_current(robot, b, lk.predict(robot, b).felt))
+    speed = np.broadcast_to((lk.travel(w, robot)[0] / w.dt)[..., None], gap.shape).ravel()
+    a, slope = np.linalg.lstsq(np.stack([np.ones_like(speed), speed], 1), gap.ravel())[0]
+    return float(a), float(slope)
 
 
 def heard(estimator: Any, log: Log) -> tuple[np.ndarray, np.ndarray]:

@@ -35,7 +35,7 @@ def robot() -> Robot:
 
 @pytest.fixture(scope="module")
 def data(real_data: Path) -> Dataset:
-    """Eight runs on each floor, 0 to 40 deg at 0.1 m/s; the worst sixth of the circle on green."""
+    """Eight runs on each floor, 0 to 40 deg at 0.1 m/s; the worst sixth of the circle on carpets."""
     folder = real_data / "robotino2022" / "one_surface"
     paths = sorted(folder.glob("*/exp0[0-8].csv"))
     layout = preset("robotino2022")
@@ -44,8 +44,10 @@ def data(real_data: Path) -> Dataset:
 
 @pytest.fixture(scope="module")
 def rows(robot: Robot, data: Dataset) -> list[replayed.Judged]:
-    std = json.loads(FIT.read_text())["std"]
-    est = Estimator(freeze(robot, "as_built", std, highest_speed=8.0), replayed.SETTINGS)
+    kept = json.loads(FIT.read_text())
+    std, trend = kept["std"], tuple(kept["current_trend"])
+    frozen = freeze(robot, "as_built", std, highest_speed=8.0, current_trend=trend)
+    est = Estimator(frozen, replayed.SETTINGS)
     said = replayed.replay(est, data.logs)
     noise = {name: value**2 for name, value in std.items()}
     return replayed.judged(robot, est.frozen.labels, data, said, noise)
@@ -57,13 +59,13 @@ def test_floors_are_recognised_within_a_second(rows: list[replayed.Judged]) -> N
 
 
 @pytest.mark.parametrize(
-    ("floor", "most"), [("table", 0.02), ("brown", 0.04), ("gray", 0.08), ("green", 0.40)]
+    ("floor", "most"), [("table", 0.02), ("brown", 0.04), ("gray", 0.17), ("green", 0.40)]
 )
 def test_end_points_are_predicted(rows: list[replayed.Judged], floor: str, most: float) -> None:
     some = [r for r in rows if r.surface == floor]
     error, straight = (np.mean([getattr(r, k) for r in some]) for k in ("error", "straight"))
     assert error < most
-    assert floor in ("table", "brown") or error < straight / 2
+    assert floor in ("table", "brown") or error < 0.7 * straight
 
 
 def test_regions_are_not_too_narrow(rows: list[replayed.Judged]) -> None:

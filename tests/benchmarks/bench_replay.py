@@ -91,9 +91,12 @@ def fitted(job: Job, runs: np.ndarray) -> Part:
     return np.asarray(contact.z), np.asarray(contact.covariance), dict(contact.variance)
 
 
-def estimator(job: Job, part: Part) -> Estimator:
-    space = job.problem().space
-    return Estimator(replayed.frozen(space, *part, "as_built", TOP), SETTINGS)
+def estimator(job: Job, part: Part, runs: np.ndarray) -> Estimator:
+    """Frozen from a part; `runs` on one floor are those it was fitted to."""
+    problem = job.problem()
+    seen = problem.windows.pieces(np.flatnonzero(np.isin(problem.windows.run, runs)))
+    trend = replayed.current_trend(problem.space.tree(jnp.asarray(part[0])), seen)
+    return Estimator(replayed.frozen(problem.space, *part, "as_built", TOP, trend), SETTINGS)
 
 
 def show(rows: list[Judged]) -> None:
@@ -129,7 +132,7 @@ def test_one_floor(job: Job) -> None:
     rows: list[Judged] = []
     for k in range(3):
         part = kept(f"fold{k}", lambda k=k: fitted(job, np.flatnonzero(fold != k)))
-        est = estimator(job, part)
+        est = estimator(job, part, np.flatnonzero(fold != k))
         some = data.subset(np.flatnonzero(built & (fold == k)))
         robot = job.problem().space.tree(jnp.asarray(part[0]))
         said = replayed.replay(est, some.logs)
@@ -139,10 +142,8 @@ def test_one_floor(job: Job) -> None:
     assert len(rows) == built.sum()
     for name, bar in BARS.items():
         some = [r for r in rows if r.surface == name]
-        assert np.mean([r.error for r in some]) < min(
-            1.5 * bar, np.mean([r.straight for r in some])
-        )
-    assert np.mean([r.told == r.surface for r in rows]) > TOLD - 0.07
+        assert np.mean([r.error for r in some]) < bar
+    assert np.mean([r.told == r.surface for r in rows]) > TOLD
 
 
 def test_two_floors(job: Job) -> None:
@@ -155,7 +156,7 @@ def test_two_floors(job: Job) -> None:
         found = update(space, first[0], first[1], [some])
         return found.z, found.covariance, first[2]
 
-    halves = np.arange(len(data)) % 2
+    halves, everything = np.arange(len(data)) % 2, np.arange(len(job.dataset))
     print("\nacross green and table, wheel by wheel; bars: a third of the encoders' error, 80 %")
     for title, parts in (
         ("one floor each", [(first, halves >= 0)]),
@@ -163,7 +164,7 @@ def test_two_floors(job: Job) -> None:
     ):
         found: list[Any] = []
         for part, judged in parts:
-            est, robot = estimator(job, part), space.tree(jnp.asarray(part[0]))
+            est, robot = estimator(job, part, everything), space.tree(jnp.asarray(part[0]))
             some = data.subset(np.flatnonzero(judged))
             said = replayed.replay(est, some.logs)
             rows = replayed.judged(robot, est.frozen.labels, some, said, part[2])
