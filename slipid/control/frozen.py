@@ -33,7 +33,7 @@ class Frozen(eqx.Module):
         effect: std of what it misses all the way, [m/m], [m/m], [rad/m]; the spread of the fitted
             numbers included.
         current_std: of a measured current from the model's [A].
-        current_trend: a + b v by which measured currents exceed the model's at speed v [A, A s/m].
+        current_trend: a + b v, measured currents over the model's at speed v [A, A s/m].
         highest: wheel speed [rad/s], current [A] up to which the fit has seen the robot.
         wheel_curve: a + b |I|, the slip ratio of each wheel, of all floors together (wheel, 2).
     """
