@@ -35,7 +35,7 @@ def robot() -> Robot:
 
 @pytest.fixture(scope="module")
 def data(real_data: Path) -> Dataset:
-    """Eight runs on each floor, 0 to 40 deg at 0.1 m/s; the worst sixth of the circle on carpets."""
+    """Eight runs on each floor at 0.1 m/s, 0 to 40 deg: the worst sixth on carpets."""
     folder = real_data / "robotino2022" / "one_surface"
     paths = sorted(folder.glob("*/exp0[0-8].csv"))
     layout = preset("robotino2022")
