@@ -286,9 +286,12 @@ class Estimator(eqx.Module):
         """Twist and currents of every hypothesis, from the last step's twists."""
         f = self.frozen
         floors = combine(f.frame, f.floors, self.hypotheses, f.rest, f.inverse)
-        twist, pull = settle(near.T, f.frame.radius * w, floors)
+        rim = f.frame.radius * w
+        twist, pull = settle(near.T, rim, floors)
         torque = floors.friction * f.mass * GRAVITY * f.frame.radius * pull
-        return twist.T, f.motor.current(torque.T, jnp.broadcast_to(w, torque.T.shape))
+        amps = f.motor.current(torque.T, jnp.broadcast_to(w, torque.T.shape))
+        more = f.current_trend @ jnp.stack([1.0, jnp.linalg.norm((f.inverse @ rim)[:2])])
+        return twist.T, amps + jnp.sign(amps) * more
 
     def _filter(
         self,
