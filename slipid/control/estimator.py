@@ -465,8 +465,10 @@ class Estimator(eqx.Module):
         others = [tuple(k for k in range(wheels) if k != axis) for axis in range(wheels)]
         return jnp.stack([jnp.sum(p, axis=o) for o in others])
 
-    def _past(self, old: Any, age: Any) -> Array:
+    def _past(self, old: Any, age: float) -> Array:
         """Entry of the history that is so old (time, x, y, heading, yaw rate), the nearest."""
+        if age == 0.0:
+            return old.history[0]
         return old.history[jnp.argmin(jnp.abs(old.history[:, 0] - (old.time - age)))]
 
     def _grow(
@@ -520,9 +522,9 @@ class Estimator(eqx.Module):
             & jnp.all(std > 0)
             & (age < time - history[-1, 0] + 1e-6)
         )
-        then = history[jnp.argmin(jnp.abs(history[:, 0] - (time - age)))]
 
         def corrected() -> tuple[Array, Array, Array, Array]:
+            then = history[jnp.argmin(jnp.abs(history[:, 0] - (time - age)))]
             return _correct(z.fix, jnp.clip(std, 1e-4, 10.0), then, pose, more, cov, history)
 
         kept = (pose, more, cov, history)
