@@ -468,8 +468,10 @@ class Estimator(eqx.Module):
         others = [tuple(k for k in range(wheels) if k != axis) for axis in range(wheels)]
         return jnp.stack([jnp.sum(p, axis=o) for o in others])
 
-    def _past(self, old: Any, age: Any) -> Array:
+    def _past(self, old: Any, age: float) -> Array:
         """Entry of the history that is so old (time, x, y, heading, yaw rate), the nearest."""
+        if age == 0.0:
+            return old.history[0]
         return old.history[jnp.argmin(jnp.abs(old.history[:, 0] - (old.time - age)))]
 
     def _grow(
@@ -487,7 +489,6 @@ class Estimator(eqx.Module):
     ) -> Array:
         """Covariance of pose, effects and gyro bias after the step."""
         f, s = self.frozen, self.settings
-        n = old.covariance.shape[0]
         middle = old.pose[2] + 0.5 * (pose[2] - old.pose[2])
         c, sn = jnp.cos(middle), jnp.sin(middle)
         world = jnp.array([[c, -sn, 0.0], [sn, c, 0.0], [0.0, 0.0, 1.0]])
@@ -496,17 +497,20 @@ class Estimator(eqx.Module):
         by_gyro = jnp.array([1.0, 1.0, 0.0])
         keep = jnp.where(has, by_gyro, jnp.ones(3))  # yaw comes from the gyro, not from the floor
         push = world @ (keep[:, None] * slope) * on
-        phi = jnp.eye(n).at[0, 2].set(-gone[1]).at[1, 2].set(gone[0])
-        phi = phi.at[:3, 3 : n - 1].set(push).at[2, n - 1].set(jnp.where(has, -dt, 0.0))
+        drift = jnp.array([[0.0], [0.0], [1.0]]) * jnp.where(has, -dt, 0.0)
+        turned = jnp.array([[1.0, 0.0, -gone[1]], [0.0, 1.0, gone[0]], [0.0, 0.0, 1.0]])
+        by = jnp.concatenate([turned, push, drift], axis=1)  # d pose / d (pose, effects, bias)
         far = speed * on
         grown = (share @ f.process**2) * far
-        turned = world @ (keep[:, None] * axes)
+        floor_axes = world @ (keep[:, None] * axes)
         # which floor it is stays in doubt for about a patch
         doubt = scatter * keep[:, None] * keep[None, :] * on * s.patch_m / jnp.maximum(speed, 0.02)
-        noise = (turned * grown) @ turned.T + world @ doubt @ world.T
+        noise = (floor_axes * grown) @ floor_axes.T + world @ doubt @ world.T
         noise = noise.at[2, 2].add(jnp.where(has, (s.gyro_std * dt) ** 2, 0.0))
-        out = phi @ old.covariance @ phi.T
-        return out.at[:3, :3].add(noise)
+        rows = by @ old.covariance  # what is not the pose stays as it is
+        pose_rows = jnp.concatenate([rows @ by.T + noise, rows[:, 3:]], axis=1)
+        rest = jnp.concatenate([rows[:, 3:].T, old.covariance[3:, 3:]], axis=1)
+        return jnp.concatenate([pose_rows, rest])
 
     def _fix(
         self, z: Any, time: Array, pose: Array, more: Array, cov: Array, history: Array
@@ -521,9 +525,9 @@ class Estimator(eqx.Module):
             & jnp.all(std > 0)
             & (age < time - history[-1, 0] + 1e-6)
         )
-        then = history[jnp.argmin(jnp.abs(history[:, 0] - (time - age)))]
 
         def corrected() -> tuple[Array, Array, Array, Array]:
+            then = history[jnp.argmin(jnp.abs(history[:, 0] - (time - age)))]
             return _correct(z.fix, jnp.clip(std, 1e-4, 10.0), then, pose, more, cov, history)
 
         kept = (pose, more, cov, history)
