@@ -136,22 +136,6 @@ def test_derivative_by_gains_is_that_of_finite_differences():
     np.testing.assert_allclose(slope, by_hand, atol=1e-6 + 2e-4 * np.abs(by_hand).max())
 
 
-def test_a_settled_contact_has_the_derivative_of_its_equilibrium():
-    robot = frozen()
-    mixed = robot.floors.at(jnp.array([0, 1, 0]))
-
-    def settled(rim):
-        start = jax.lax.stop_gradient(contact.equilibrium(rim, robot.frame, mixed, robot.rest))
-        return contact.settle(start * 0.9, rim, robot.frame, mixed, robot.rest)
-
-    def root(rim):
-        return contact.equilibrium(rim, robot.frame, mixed, robot.rest)
-
-    rims = jnp.asarray(np.random.default_rng(1).uniform(-0.3, 0.3, (20, 3)))
-    found = jax.jit(jax.vmap(jax.jacfwd(settled)))(rims)
-    np.testing.assert_allclose(found, jax.jit(jax.vmap(jax.jacfwd(root)))(rims), atol=1e-4)
-
-
 def test_many_twins_at_once():
     twins = stacked([Twin(frozen(), c, SILENT) for c in (floor([[0]]), floor([[1]]))])
     command = jnp.full(3, 3.0)

@@ -1,5 +1,6 @@
 """A controller, an estimator and a plant in a loop, and what became of the path."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,9 +80,33 @@ class Course:
     energy: Float[np.ndarray, " step"]
 
 
-@eqx.filter_jit
-def _step(pilot: Pilot, path: Path, state: Array, measurement: Array, dt: Array) -> Any:
-    return pilot.step(path, state, measurement, dt)
+def compiled(pilot: Pilot, path: Path) -> Callable[[Any, Any, float], tuple[Any, Any]]:
+    """A pilot's step on numpy arrays, cheapest to call: (state, measurement, dt) to both arrays.
+
+    The robot's numbers and the path become constants of the compiled code, and one flat array goes
+    in and one comes out; handing over the pilot's leaves at every call costs 100 us. Where
+    `jax_cpu_enable_async_dispatch` is off before JAX starts, nothing waits for another thread
+    (8 us less, more on a busy machine).
+
+    Args:
+        pilot: estimator and controller.
+        path: as it lies for the start.
+    """
+    state = np.asarray(pilot.init(jnp.zeros(3)))
+    size, last = len(state), len(state) + pilot.observer.sensed.size
+    given = np.zeros(last + 1, state.dtype)
+
+    def step(flat: Array) -> Array:
+        return jnp.concatenate(pilot.step(path, flat[:size], flat[size:last], flat[last]))
+
+    run = jax.jit(step)
+
+    def call(state: Any, measurement: Any, dt: float) -> tuple[Any, Any]:
+        given[:size], given[size:last], given[last] = state, measurement, dt
+        both = np.asarray(run(given))
+        return both[:size], both[size:]
+
+    return call
 
 
 def drive(pilot: Pilot, path: Path, plant: Plant, start: Any, period: float = PERIOD) -> Course:
@@ -94,13 +119,12 @@ def drive(pilot: Pilot, path: Path, plant: Plant, start: Any, period: float = PE
         start: where the pilot believes it stands [m, m, rad].
         period: of the plant [s].
     """
-    state, reading = pilot.init(start), plant.reset()
+    step, state, reading = compiled(pilot, path), pilot.init(start), plant.reset()
     rows: list[np.ndarray] = []
     energy, own, begun = 0.0, 0.0, 0.0
     wheels = pilot.controller.frozen.wheels
     while own < path.duration - 1e-6 and begun < LONGEST * path.duration + 10.0:
-        state, out = _step(pilot, path, state, jnp.asarray(reading), jnp.asarray(period))
-        said = np.asarray(out)
+        state, said = step(state, reading, period)
         own = float(said[-1])
         command = said[:wheels]
         rows.append(np.concatenate([[begun, energy], plant.pose, said]))

@@ -30,6 +30,8 @@ OBSERVE_S = 0.4
 """Time constant of the disturbance observer [s]."""
 LONGEST_I = 0.06
 """Largest velocity the integral may ask for [m/s]."""
+_PASSES = 3
+"""Of the inverse model; 99 % of twists are then met within 0.1 mm/s, with one within 10 mm/s."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,8 @@ def inverse_contact(
         T = -(J^T)^+ (K^T D(xi) + scrub),   r w = J xi + (v0 + s0 c) atanh(T / N)
 
     weighted by the probability of every floor. A traction above 0.9 of what the floor holds is
-    taken for 0.9.
+    taken for 0.9. Drag falls with the rim speed, and so with the sliding that it causes: each pass
+    goes by the last one's.
 
     Args:
         frozen: the identified robot.
@@ -109,25 +112,34 @@ def inverse_contact(
     size = jnp.sqrt(xi[:2] @ xi[:2] + 1e-8)
     lead = frozen.rest @ (surface @ s.lead)
     load = jnp.maximum(frozen.rest - lead * (f.shift @ (xi[:2] / size)), 0.02)
-    along, roll = f.hold @ xi, f.roll @ xi
-    active = jnp.sqrt(along**2 + roll**2 + 1e-12)
-    # (wheel, floor): forces in units of m g
-    mu = load[:, None] * s.friction
-    scale_r = contact.VR + s.roller_creep * active[:, None]
-    drag = -mu * (s.roller_drag * jnp.tanh(roll[:, None] / scale_r))
-    drag = drag - mu * s.roller_viscosity * roll[:, None]
-    scale_1 = contact.V0 + contact.S1 * active[:, None]
-    brake = mu * s.rolling_resistance * jnp.tanh(along[:, None] / scale_1)
-    total = f.roll.T @ jnp.sum(surface * drag, axis=1)
-    scrub = frozen.rest @ (surface @ (s.friction * s.scrub)) * jnp.tanh(xi[2] / contact.W0)
-    pull = -(frozen.inverse.T @ total.at[2].add(-scrub)) + jnp.sum(surface * brake, axis=1)
-    ratio = jnp.clip(pull[:, None] / mu, -0.9, 0.9)
-    slide = jnp.zeros_like(ratio)
-    for _ in range(3):  # activity grows with the sliding it causes
-        speed = along[:, None] + slide
-        scale = contact.V0 + s.creep * jnp.sqrt(speed**2 + roll[:, None] ** 2 + 1e-12)
-        slide = scale * jnp.arctanh(ratio)
-    return (along + jnp.sum(surface * slide, axis=1)) / f.radius
+    along, roll = (f.hold @ xi)[:, None], (f.roll @ xi)[:, None]
+    mu = load[:, None] * s.friction  # (wheel, floor): forces in units of m g
+    scrub = jnp.mean(surface @ s.friction) * (frozen.rest @ (surface @ s.scrub))
+    scrub = scrub * jnp.tanh(xi[2] / contact.W0)
+    slide = jnp.zeros_like(mu)
+    for _ in range(_PASSES):
+        active = jnp.sqrt((along + slide) ** 2 + roll**2 + 1e-12)
+        drag = s.roller_drag * jnp.tanh(roll / (contact.VR + s.roller_creep * active))
+        drag = -mu * (drag + s.roller_viscosity * roll)
+        brake = jnp.tanh(along / (contact.V0 + contact.S1 * active))
+        brake = mu * s.rolling_resistance * brake
+        total = (f.roll.T @ jnp.sum(surface * drag, axis=1)).at[2].add(-scrub)
+        pull = jnp.sum(surface * brake, axis=1) - frozen.inverse.T @ total
+        slide = _sliding(pull[:, None] / mu - s.slide_viscosity * slide, along, roll, s.creep)
+    return (along[:, 0] + jnp.sum(surface * slide, axis=1)) / f.radius
+
+
+def _sliding(ratio: Array, along: Array, roll: Array, creep: Array) -> Array:
+    """Sliding speed at which a wheel has so much of its traction [m/s].
+
+    vs = (v0 + s0 c) atanh(ratio) with c^2 = (along + vs)^2 + roll^2, a quadratic in the rim speed;
+    which has no root where s0 atanh(ratio) reaches 1: the wheel spins on the spot.
+    """
+    held = jnp.arctanh(jnp.clip(ratio, -0.9, 0.9))
+    k = jnp.clip(creep * held, -0.9, 0.9)
+    at = along + contact.V0 * held
+    left = 1 - k * k
+    return (at + k * jnp.sqrt(at**2 + left * roll**2 + 1e-12)) / left - along
 
 
 class Controller(eqx.Module):

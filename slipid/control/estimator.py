@@ -25,8 +25,8 @@ from jaxtyping import Array, Float
 
 from slipid.control.frozen import Frozen
 from slipid.control.packed import Layout
-from slipid.model import contact
 from slipid.model.robot import GRAVITY, advance, compose
+from slipid.model.settle import combine, settle
 
 HISTORY = 48
 """Steps a delayed measurement may reach back."""
@@ -285,17 +285,13 @@ class Estimator(eqx.Module):
     def _solve(self, near: Array, w: Array) -> tuple[Array, Array]:
         """Twist and currents of every hypothesis, from the last step's twists."""
         f = self.frozen
-        floors = f.floors.at(jnp.asarray(self.hypotheses))
+        floors = combine(f.frame, f.floors, self.hypotheses, f.rest, f.inverse)
         rim = f.frame.radius * w
-
-        def one(start: Array, floor: Any) -> tuple[Array, Array]:
-            xi = contact.settle(start, rim, f.frame, floor, f.rest)
-            force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
-            pull = contact.forces(xi, rim, f.frame, floor, f.rest).traction
-            return xi, f.motor.current(force * pull, w)
-
-        twist, amps = jax.vmap(one)(near, floors)
-        return twist, amps
+        twist, pull = settle(near.T, rim, floors)
+        torque = floors.friction * f.mass * GRAVITY * f.frame.radius * pull
+        amps = f.motor.current(torque.T, jnp.broadcast_to(w, torque.T.shape))
+        more = f.current_trend @ jnp.stack([1.0, jnp.linalg.norm((f.inverse @ rim)[:2])])
+        return twist.T, amps + jnp.sign(amps) * more
 
     def _filter(
         self,
@@ -472,8 +468,10 @@ class Estimator(eqx.Module):
         others = [tuple(k for k in range(wheels) if k != axis) for axis in range(wheels)]
         return jnp.stack([jnp.sum(p, axis=o) for o in others])
 
-    def _past(self, old: Any, age: Any) -> Array:
+    def _past(self, old: Any, age: float) -> Array:
         """Entry of the history that is so old (time, x, y, heading, yaw rate), the nearest."""
+        if age == 0.0:
+            return old.history[0]
         return old.history[jnp.argmin(jnp.abs(old.history[:, 0] - (old.time - age)))]
 
     def _grow(
@@ -491,7 +489,6 @@ class Estimator(eqx.Module):
     ) -> Array:
         """Covariance of pose, effects and gyro bias after the step."""
         f, s = self.frozen, self.settings
-        n = old.covariance.shape[0]
         middle = old.pose[2] + 0.5 * (pose[2] - old.pose[2])
         c, sn = jnp.cos(middle), jnp.sin(middle)
         world = jnp.array([[c, -sn, 0.0], [sn, c, 0.0], [0.0, 0.0, 1.0]])
@@ -500,17 +497,20 @@ class Estimator(eqx.Module):
         by_gyro = jnp.array([1.0, 1.0, 0.0])
         keep = jnp.where(has, by_gyro, jnp.ones(3))  # yaw comes from the gyro, not from the floor
         push = world @ (keep[:, None] * slope) * on
-        phi = jnp.eye(n).at[0, 2].set(-gone[1]).at[1, 2].set(gone[0])
-        phi = phi.at[:3, 3 : n - 1].set(push).at[2, n - 1].set(jnp.where(has, -dt, 0.0))
+        drift = jnp.array([[0.0], [0.0], [1.0]]) * jnp.where(has, -dt, 0.0)
+        turned = jnp.array([[1.0, 0.0, -gone[1]], [0.0, 1.0, gone[0]], [0.0, 0.0, 1.0]])
+        by = jnp.concatenate([turned, push, drift], axis=1)  # d pose / d (pose, effects, bias)
         far = speed * on
         grown = (share @ f.process**2) * far
-        turned = world @ (keep[:, None] * axes)
+        floor_axes = world @ (keep[:, None] * axes)
         # which floor it is stays in doubt for about a patch
         doubt = scatter * keep[:, None] * keep[None, :] * on * s.patch_m / jnp.maximum(speed, 0.02)
-        noise = (turned * grown) @ turned.T + world @ doubt @ world.T
+        noise = (floor_axes * grown) @ floor_axes.T + world @ doubt @ world.T
         noise = noise.at[2, 2].add(jnp.where(has, (s.gyro_std * dt) ** 2, 0.0))
-        out = phi @ old.covariance @ phi.T
-        return out.at[:3, :3].add(noise)
+        rows = by @ old.covariance  # what is not the pose stays as it is
+        pose_rows = jnp.concatenate([rows @ by.T + noise, rows[:, 3:]], axis=1)
+        rest = jnp.concatenate([rows[:, 3:].T, old.covariance[3:, 3:]], axis=1)
+        return jnp.concatenate([pose_rows, rest])
 
     def _fix(
         self, z: Any, time: Array, pose: Array, more: Array, cov: Array, history: Array
@@ -525,26 +525,38 @@ class Estimator(eqx.Module):
             & jnp.all(std > 0)
             & (age < time - history[-1, 0] + 1e-6)
         )
-        fix, std = jnp.where(has, z.fix, pose), jnp.where(has, jnp.clip(std, 1e-4, 10.0), 1.0)
-        then = history[jnp.argmin(jnp.abs(history[:, 0] - (time - age)))]
-        gap = fix - jnp.where(has, then[1:4], pose)
-        gap = gap.at[2].set(jnp.arctan2(jnp.sin(gap[2]), jnp.cos(gap[2])))
-        gone = jnp.where(has, pose[:2] - then[1:3], 0.0)
-        look = jnp.zeros((3, cov.shape[0])).at[:, :3].set(jnp.eye(3))
-        look = look.at[0, 2].set(gone[1]).at[1, 2].set(-gone[0])
-        noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2)
-        total = look @ cov @ look.T + noise
-        # a fix far from what is believed counts less, yet counts
-        far = gap @ _inverse(total) @ gap
-        total = total + noise * jnp.maximum(far / 9.0 - 1.0, 0.0)
-        gain = jnp.where(has, cov @ look.T @ _inverse(total), 0.0)
-        change = gain @ gap
-        cov = cov - gain @ look @ cov
-        cov = 0.5 * (cov + cov.T)
-        back = history[:, 1:3] - pose[:2]
-        moved = change[:2] + change[2] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
-        history = history.at[:, 1:3].add(moved).at[:, 3].add(change[2])
-        return pose + change[:3], more + change[3:], cov, history
+
+        def corrected() -> tuple[Array, Array, Array, Array]:
+            then = history[jnp.argmin(jnp.abs(history[:, 0] - (time - age)))]
+            return _correct(z.fix, jnp.clip(std, 1e-4, 10.0), then, pose, more, cov, history)
+
+        kept = (pose, more, cov, history)
+        found: tuple[Array, Array, Array, Array] = jax.lax.cond(has, corrected, lambda: kept)
+        return found
+
+
+def _correct(
+    fix: Array, std: Array, then: Array, pose: Array, more: Array, cov: Array, history: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Pose, further unknowns, covariance and history after a fix of the pose of `then`."""
+    gap = fix - then[1:4]
+    gap = gap.at[2].set(jnp.arctan2(jnp.sin(gap[2]), jnp.cos(gap[2])))
+    gone = pose[:2] - then[1:3]
+    look = jnp.zeros((3, cov.shape[0])).at[:, :3].set(jnp.eye(3))
+    look = look.at[0, 2].set(gone[1]).at[1, 2].set(-gone[0])
+    noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2)
+    total = look @ cov @ look.T + noise
+    # a fix far from what is believed counts less, yet counts
+    far = gap @ _inverse(total) @ gap
+    total = total + noise * jnp.maximum(far / 9.0 - 1.0, 0.0)
+    gain = cov @ look.T @ _inverse(total)
+    change = gain @ gap
+    cov = cov - gain @ look @ cov
+    cov = 0.5 * (cov + cov.T)
+    back = history[:, 1:3] - pose[:2]
+    moved = change[:2] + change[2] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
+    history = history.at[:, 1:3].add(moved).at[:, 3].add(change[2])
+    return pose + change[:3], more + change[3:], cov, history
 
 
 def _size(v: Float[Array, "*batch axis"]) -> Float[Array, "*batch"]:

@@ -33,6 +33,7 @@ class Frozen(eqx.Module):
         effect: std of what it misses all the way, [m/m], [m/m], [rad/m]; the spread of the fitted
             numbers included.
         current_std: of a measured current from the model's [A].
+        current_trend: a + b v, measured currents over the model's at speed v [A, A s/m].
         highest: wheel speed [rad/s], current [A] up to which the fit has seen the robot.
         wheel_curve: a + b |I|, the slip ratio of each wheel, of all floors together (wheel, 2).
     """
@@ -49,6 +50,7 @@ class Frozen(eqx.Module):
     process: Float[Array, "floor 3"]
     effect: Float[Array, "floor 3"]
     current_std: Float[Array, " floor"]
+    current_trend: Float[Array, "2"]
     highest: Float[Array, "2"]
     wheel_curve: Float[Array, "wheel 2"]
     labels: tuple[str, ...] = eqx.field(static=True)
@@ -65,6 +67,7 @@ def freeze(
     std: Mapping[str, float],
     draws: Any = None,
     highest_speed: float | None = None,
+    current_trend: tuple[float, float] = (0.0, 0.0),
 ) -> Frozen:
     """Frozen form of a fitted robot.
 
@@ -75,6 +78,7 @@ def freeze(
         draws: the robot's posterior as a batched tree (leading axis), for what the uncertainty of
             the numbers adds to `effect`; None for nothing.
         highest_speed: of the wheels in the fitted runs [rad/s].
+        current_trend: of currents over the model's in the fitted runs, all floors [A], [A s/m].
 
     Raises:
         ValueError: no such load set-up, or wheels whose kinematics have rank below 3.
@@ -110,6 +114,7 @@ def freeze(
         process=of("process", (0.005, 0.002, 0.01)),
         effect=effect,
         current_std=jnp.asarray([(a * a + b * b) ** 0.5 for a, b in kinds]),
+        current_trend=jnp.asarray(current_trend, dtype=float),
         highest=jnp.stack([jnp.asarray(top, dtype=float), jnp.max(jnp.abs(amps))]),
         wheel_curve=_wheel_curve(speed, amps, slip),
         labels=labels,

@@ -1,7 +1,7 @@
 """Paths in time: where the robot should be and how fast, and when to wait for it."""
 
+import itertools
 from collections.abc import Sequence
-from itertools import pairwise
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,6 +12,8 @@ STEP = 0.02
 """Between rows of a path [s]."""
 PATIENT, LOST = 0.02, 0.12
 """Distance from the reference up to which it goes on, and from which it waits [m]."""
+LONGEST = 0.5
+"""Time step beyond which a path does not run ahead of its robot [s]."""
 
 
 class Path(eqx.Module):
@@ -47,8 +49,11 @@ class Path(eqx.Module):
         """Time of the path one step later, and the reference there for a robot at a pose.
 
         The path slows down, and its rates with it, while the robot is believed to lag behind or
-        beside it; one that is ahead is no reason to wait.
+        beside it; one that is ahead is no reason to wait. Where dt is no positive number, no time
+        has passed; it moves on by `LONGEST` at most.
         """
+        dt = jnp.asarray(dt, dtype=float)
+        dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, LONGEST), 0.0)
         here = self.at(time)
         gap, v = here[:2] - pose[:2], here[3:5]
         size = jnp.sqrt(v @ v + 1e-12)
@@ -102,7 +107,7 @@ def waypoints(
     if p.ndim != 2 or len(p) < 2 or p.shape[1] != 2:
         raise ValueError(f"way-points {p.tolist()}; expected two or more places x, y")
     parts, marks, time = [np.array([[*p[0], heading, 0.0, 0.0, 0.0]])], [], 0.0
-    for a, b in pairwise(p):
+    for a, b in itertools.pairwise(p):
         far = float(np.hypot(*(b - a)))
         if far < 1e-9:
             raise ValueError(f"way-point {b.tolist()} twice in a row; expected another place")
@@ -124,9 +129,8 @@ def rectangle(length: float = 0.9, width: float = 0.4, speed: float = 0.2) -> Pa
         length: of the first side [m]; width: of the second [m].
         speed: [m/s].
     """
-    return waypoints(
-        [(0.0, 0.0), (length, 0.0), (length, -width), (0.0, -width), (0.0, 0.0)], speed
-    )
+    corners = [(0.0, 0.0), (length, 0.0), (length, -width), (0.0, -width), (0.0, 0.0)]
+    return waypoints(corners, speed)
 
 
 def circle(radius: float = 0.4, speed: float = 0.2, turning: bool = False) -> Path:

@@ -53,7 +53,6 @@ _LEAST_LOAD = 1e-3
 _ROUNDING = 1e-20
 _NEAR = 1e-6
 _MOST_NEAR = 12
-_SETTLE_CHORD, _SETTLE_NEWTON = 2, 3
 
 
 class ContactSurface(eqx.Module):
@@ -276,21 +275,6 @@ def _root_near(args: Any) -> Any:
     return jnp.where(jnp.max(jnp.abs(step)) > _NEAR, jnp.nan, xi)
 
 
-@jax.custom_jvp
-def _root_settled(args: Any) -> Any:
-    rim, frame, *_, start = args
-    near = start
-    for _ in range(_SETTLE_CHORD):
-        near = _chord(near, args)
-    xi = near
-    for _ in range(_SETTLE_NEWTON):
-        f, jac = _balance(xi, args)
-        xi = xi - _solve3(jac, f)
-    left, before = _residual(xi, args), _residual(near, args)
-    xi = jnp.where(left @ left <= before @ before, xi, near)  # NaN is not smaller either
-    return jnp.where(jnp.all(jnp.isfinite(xi)), xi, guess(rim, frame))
-
-
 def _implicit(root: Any) -> Any:
     """Derivative of a root of the balance by what it depends on."""
 
@@ -306,7 +290,6 @@ def _implicit(root: Any) -> Any:
 
 _root.defjvp(_implicit(_root))
 _root_near.defjvp(_implicit(_root_near))
-_root_settled.defjvp(_implicit(_root_settled))
 
 
 def guess(rim: Float[Array, " wheel"], frame: Frame) -> Float[Array, "3"]:
@@ -399,20 +382,3 @@ def residual(
 ) -> Float[Array, "3"]:
     """Force balance at a twist, the moment over the base radius [mu m g]; zero at equilibrium."""
     return _residual(xi, (rim, frame, surface, rest, jnp.zeros(3), jnp.zeros(3)))
-
-
-def settle(
-    start: Float[Array, "3"],
-    rim: Float[Array, " wheel"],
-    frame: Frame,
-    surface: ContactSurface,
-    rest: Float[Array, " wheel"],
-) -> Float[Array, "3"]:
-    """`equilibrium` in a few steps from the twist of a moment ago, for a robot's computer.
-
-    Chord steps, then Newton's where these come nearer; where a number is lost it is the twist
-    without slip. What a jump of the wheel speeds leaves over, the next call settles. Its derivative
-    is that of the root, whatever is left over.
-    """
-    before = jax.lax.stop_gradient(start)
-    return _root_settled((rim, frame, surface, rest, jnp.zeros(3), before))

@@ -1,0 +1,196 @@
+"""Unseen real runs through the deployed estimator, floor unknown.
+
+    .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks/bench_replay.py
+
+(-k one_floor or two_floors). Fits of the parts, half a minute to two minutes each, are kept in
+out/bench_replay/CODE.
+
+One floor: fits of two opposite pairs of 60-degree sectors, the third pair judged, three times over,
+so that no judged heading was fitted on any floor. 64 joint hypotheses; the pose is used once, where
+the wheels have moved 10 mm. Two floors: frozen from runs on one floor each, and after learning from
+half of the runs across the edge (the other half judged).
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from slipid.app.config import parsed
+from slipid.app.job import Job, read_job, with_mixed
+from slipid.control.estimator import Estimator
+from slipid.identify.crossing import crossing
+from slipid.identify.fit import optimise
+from slipid.identify.folds import sectors
+from slipid.identify.mixed import update
+from slipid.identify.predictive import contact_of
+from tests import replayed
+from tests.replayed import SETTINGS, Judged
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = ROOT / "configs" / "robotino2022.toml"
+CODE = sha256(
+    b"".join(
+        p.read_bytes()
+        for part in ("data", "identify", "model")
+        for p in sorted((ROOT / "slipid" / part).rglob("*.py"))
+    )
+    + CONFIG.read_bytes()
+)
+OUT = ROOT / "out" / "bench_replay" / CODE.hexdigest()[:8]
+TOP = 8.0
+"""Highest wheel speed of the fitted runs [rad/s]."""
+BARS = {"table": 0.02, "brown": 0.03, "gray": 0.065, "green": 0.11}
+"""Mean end-point error over the camera's chord."""
+TOLD, SHARE_OF_ENCODERS, ACCURACY = 0.92, 1 / 3, 0.8
+ACROSS = """
+[[logs]]
+glob = "two_surfaces/green_table/*.csv"
+format = "robotino2022"
+map = "maps/green_table.toml"
+load = "as_built"
+"""
+Part = tuple[np.ndarray, np.ndarray, dict[str, float]]
+"""Search vector, its covariance, variance of every noise component."""
+
+
+@pytest.fixture(scope="module")
+def job(real_data: Path) -> Job:
+    config = parsed(CONFIG, CONFIG.read_text(encoding="utf-8") + ACROSS)
+    root = real_data / "robotino2022"
+    return with_mixed(
+        read_job(config, root, lambda a, b: None, print), root, lambda a, b: None, print
+    )
+
+
+def kept(name: str, make: Callable[[], Part]) -> Part:
+    """A fit, made once."""
+    path = OUT / f"{name}.npz"
+    if not path.is_file():
+        z, covariance, variance = make()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(path, z=z, covariance=covariance, variance=json.dumps(variance))
+    with np.load(path) as found:
+        return found["z"], found["covariance"], json.loads(str(found["variance"]))
+
+
+def fitted(job: Job, runs: np.ndarray) -> Part:
+    """Fit of some of the runs on one floor."""
+    problem = job.problem()
+    keep = np.isin(problem.windows.run, runs).astype(float)
+    optimum = optimise(problem, keep=keep)
+    contact = contact_of(problem, optimum.state, optimum.covariance, keep)
+    return np.asarray(contact.z), np.asarray(contact.covariance), dict(contact.variance)
+
+
+def estimator(job: Job, part: Part, runs: np.ndarray) -> Estimator:
+    """Frozen from a part; `runs` on one floor are those it was fitted to."""
+    problem = job.problem()
+    seen = problem.windows.pieces(np.flatnonzero(np.isin(problem.windows.run, runs)))
+    trend = replayed.current_trend(problem.space.tree(jnp.asarray(part[0])), seen)
+    return Estimator(replayed.frozen(problem.space, *part, "as_built", TOP, trend), SETTINGS)
+
+
+def show(rows: list[Judged]) -> None:
+    print(f"{'':8}runs   told in 1 s   end-point error   median   encoders   in 90 % region")
+    for name in (*BARS, None):
+        some = [r for r in rows if name in (None, r.surface)]
+        told = np.mean([r.told == r.surface for r in some])
+        error, straight = ([getattr(r, k) for r in some] for k in ("error", "straight"))
+        inside = np.mean([r.level <= 0.9 for r in some])
+        print(
+            f"{name or 'all':8}{len(some):4d}{100 * told:12.1f} %{100 * np.mean(error):15.2f} %"
+            f"{100 * np.median(error):9.2f}{100 * np.mean(straight):10.1f}{100 * inside:12.0f} %"
+        )
+    names = list(BARS)
+    table = Counter((r.surface, r.told) for r in rows)
+    print("floor, and what it was told to be: " + "  ".join(names))
+    for name in names:
+        print(f"  {name:8}" + "".join(f"{table[name, other]:8d}" for other in names))
+    for speed in (0.1, 0.2, 0.3):
+        line = f"  at {speed} m/s:"
+        for name in ("gray", "green"):
+            some = [r for r in rows if r.surface == name and abs(r.speed - speed) < 0.05]
+            right = 100 * np.mean([r.told == name for r in some])
+            error = 100 * np.mean([r.error for r in some])
+            line += f"   {name} told {right:.0f} %, error {error:.1f} %"
+        print(line)
+
+
+def test_one_floor(job: Job) -> None:
+    data = job.dataset
+    fold = sectors(data) % 3
+    built = np.array([log.load == "as_built" for log in data.logs])
+    rows: list[Judged] = []
+    for k in range(3):
+        part = kept(f"fold{k}", lambda k=k: fitted(job, np.flatnonzero(fold != k)))
+        est = estimator(job, part, np.flatnonzero(fold != k))
+        some = data.subset(np.flatnonzero(built & (fold == k)))
+        robot = job.problem().space.tree(jnp.asarray(part[0]))
+        said = replayed.replay(est, some.logs)
+        rows += replayed.judged(robot, est.frozen.labels, some, said, part[2])
+    print("\nruns on one floor, none of whose headings was fitted")
+    show(rows)
+    assert len(rows) == built.sum()
+    for name, bar in BARS.items():
+        some = [r for r in rows if r.surface == name]
+        assert np.mean([r.error for r in some]) < bar
+    assert np.mean([r.told == r.surface for r in rows]) > TOLD
+
+
+def test_two_floors(job: Job) -> None:
+    (data, floor), space = job.mixed[0], job.problem().space
+    first = kept("all", lambda: fitted(job, np.arange(len(job.dataset))))
+    cross = crossing(data, floor, space.tree(jnp.asarray(first[0])))
+
+    def learnt(half: int) -> Part:
+        some = cross.of(cross.windows.run % 2 == half)
+        found = update(space, first[0], first[1], [some])
+        return found.z, found.covariance, first[2]
+
+    halves, everything = np.arange(len(data)) % 2, np.arange(len(job.dataset))
+    print("\nacross green and table, wheel by wheel; bars: a third of the encoders' error, 80 %")
+    for title, parts in (
+        ("one floor each", [(first, halves >= 0)]),
+        ("half of them", [(kept(f"half{h}", lambda h=h: learnt(h)), halves != h) for h in (0, 1)]),
+    ):
+        found: list[Any] = []
+        for part, judged in parts:
+            est, robot = estimator(job, part, everything), space.tree(jnp.asarray(part[0]))
+            some = data.subset(np.flatnonzero(judged))
+            said = replayed.replay(est, some.logs)
+            rows = replayed.judged(robot, est.frozen.labels, some, said, part[2])
+            found.append((rows, replayed.wheels(robot, est.frozen.labels, floor, some, said)))
+        every = [r for rows, _ in found for r in rows]
+        error, straight = (np.mean([getattr(r, k) for r in every]) for k in ("error", "straight"))
+        truth, said_of = (np.concatenate([f[1][k] for f in found]) for k in (0, 1))
+        labels = est.frozen.labels
+        pair = [labels.index(n) for n in ("green", "table")]
+        print(
+            f"learnt from {title}: error {100 * error:.1f} %, encoders {100 * straight:.1f} %, "
+            f"in 90 % region {100 * np.mean([r.level <= 0.9 for r in every]):.0f} %; "
+            f"accuracy of four floors {100 * balanced(truth, said_of, range(4)):.0f} %, "
+            f"of these two {100 * balanced(truth, said_of, pair):.0f} %"
+        )
+        for f in pair:
+            share = np.bincount(said_of[truth == f][:, :4].argmax(axis=1), minlength=4)
+            text = "  ".join(
+                f"{n} {s:.2f}" for n, s in zip(labels, share / share.sum(), strict=True)
+            )
+            print(f"  on {labels[f]}: {text}")
+        assert error < 0.75 * straight
+
+
+def balanced(truth: np.ndarray, belief: np.ndarray, among: Any) -> float:
+    """Mean over the floors that are there of how often the most probable of some floors is it."""
+    among = np.asarray(list(among))
+    told = among[belief[:, among].argmax(axis=1)]
+    return float(np.mean([np.mean(told[truth == f] == f) for f in np.unique(truth)]))

@@ -1,0 +1,347 @@
+"""Estimator and controllers under sensors that fail, lie or stop: no NaN, nothing beyond limits."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from slipid.control.closed_loop import Pilot
+from slipid.control.controller import Controller, Limits, inverse_contact, limited
+from slipid.control.estimator import Estimator, Settings
+from slipid.control.frozen import freeze
+from slipid.control.odometry import Odometry
+from slipid.control.reference import rectangle
+from slipid.model import contact
+from slipid.model.geometry import omni
+from slipid.model.robot import build
+
+PATH = rectangle()
+LIMITS = Limits()
+DT = 0.05
+KINDS = ("contact", "curve")
+BAD = (np.nan, np.inf, -np.inf, 1e300, -1e300, 1e-310, 0.0, -1.0, 1e9, 3e7, 50.0)
+
+
+@cache
+def robot():
+    """A robot of three omni wheels on floors that differ in friction, creep and drag."""
+    made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ("a", "b", "c"))
+    values = ([0.3, 0.45, 0.6], [0.2, 0.4, 0.9], [0.12, 0.25, 0.4], [0.15, 0.2, 0.4])
+    made = eqx.tree_at(
+        lambda r: (
+            r.surfaces.friction,
+            r.surfaces.creep,
+            r.surfaces.roller_drag,
+            r.surfaces.roller_creep,
+        ),
+        made,
+        [jnp.asarray(v) for v in values],
+    )
+    return freeze(made, "as_built", {}, highest_speed=13.0)
+
+
+@cache
+def pilot(kind):
+    frozen = robot()
+    if kind == "curve":
+        gains = jnp.array([2.0, 2.0, 0.2, 0.0, 0.0])
+        return Pilot(Odometry(frozen, curve=True), Controller(frozen, gains))
+    return Pilot(Estimator(frozen), Controller(frozen, jnp.array([2.0, 2.0, 0.2, 1.0, 0.3])))
+
+
+@cache
+def step(kind):
+    p = pilot(kind)
+    return jax.jit(lambda state, z, dt: p.step(PATH, state, z, dt))
+
+
+def reading(kind="contact", **known):
+    """A measurement with only what is given."""
+    fields = {n: jnp.full(s, jnp.nan) for n, s in pilot(kind).observer.sensed.fields}
+    return pilot(kind).observer.sensed.pack(**(fields | known))
+
+
+def parts(kind, state):
+    """State of the observer and of the controller by name."""
+    p = pilot(kind)
+    cut = p.observer._kept.size
+    return p.observer._kept.of(state[..., :cut]), p.controller._kept.of(state[..., cut:-1])
+
+
+def sane(kind, state, said, before, dt):
+    """Whether everything is finite and the command within its limits, for one robot."""
+    p = pilot(kind)
+    f, place = p.controller.frozen, p.observer._kept.place("angle")
+    last, now = parts(kind, before)[1], parts(kind, state)[1]
+    # an angle that was never read is NaN
+    rest = jnp.concatenate([state[: place.start], state[place.stop :]])
+    finite = jnp.all(jnp.isfinite(rest)) & jnp.all(jnp.isfinite(said))
+    finite &= ~jnp.any(jnp.isinf(state[place]))
+    command = said[: f.wheels]
+    amps = p.controller.estimated.of(said[f.wheels : -1]).current
+    passed = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, 0.5), 0.0)
+    allowed = LIMITS.acceleration * passed + 1e-9
+    slow = jnp.all(jnp.abs(command) <= LIMITS.wheel_speed + 1e-9)
+    gentle = jnp.all(jnp.abs(command - last.command) <= allowed) | (last.begun < 0.5)
+    left = jnp.maximum(LIMITS.voltage - f.motor.resistance * jnp.abs(amps), 0.2 * LIMITS.voltage)
+    most = jnp.min(left) / (f.motor.gear_ratio * f.motor.back_emf)
+    had = jnp.where(last.begun < 0.5, LIMITS.wheel_speed, jnp.max(jnp.abs(last.command)))
+    held = jnp.max(jnp.abs(command)) <= jnp.maximum(most, had) + 1e-9
+    return jnp.stack([finite, slow, gentle, held, jnp.all(command == now.command)])
+
+
+@cache
+def check(kind):
+    return jax.jit(lambda *a: sane(kind, *a))
+
+
+# whatever comes in ---------------------------------------------------------------------------
+
+
+def adversary(kind, key, count, angle):
+    """Readings and time steps of so many robots, most of them broken in some way."""
+    sensed = pilot(kind).observer.sensed
+    k = jax.random.split(key, 9)
+    speed = jax.random.uniform(k[0], (count, 3), minval=-12.0, maxval=12.0)
+    angle = angle + DT * speed
+    # a reset or a jump of one encoder in a hundred, another hundredth stuck
+    reset = jax.random.bernoulli(k[1], 0.01, (count, 3))
+    angle = jnp.where(reset, jax.random.normal(k[2], (count, 3)) * 1e3, angle)
+    good = jax.random.normal(k[3], (count, sensed.size)) * 3.0
+    good = good.at[:, sensed.place("wheel_angle")].set(angle)
+    good = good.at[:, sensed.place("wheel_speed")].set(speed)
+    std = sensed.place("fix_std")
+    good = good.at[:, std].set(jnp.abs(good[:, std]) * 0.01)
+    bad = jax.random.choice(k[4], jnp.asarray(BAD), (count, sensed.size))
+    rate = jax.random.choice(k[5], jnp.array([0.0, 0.05, 0.5, 1.0]), (count, 1))
+    z = jnp.where(jax.random.uniform(k[6], (count, sensed.size)) < rate, bad, good)
+    dt = jnp.where(
+        jax.random.uniform(k[7], (count,)) < 0.1,
+        jax.random.choice(k[8], jnp.asarray(BAD), (count,)),
+        DT,
+    )
+    return z, dt, angle
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "steps"), [("contact", 1200), ("curve", 8800)])
+def test_a_million_adversarial_steps_of_both(kind, steps):
+    p, robots = pilot(kind), 100
+
+    def one(carry, key):
+        state, angle = carry
+        z, dt, angle = adversary(kind, key, robots, angle)
+        new, ok = jax.lax.map(of_one, (state, z, dt))  # vmap takes minutes to compile
+        return (new, angle), jnp.all(ok, axis=0)
+
+    def of_one(given):
+        new, said = p.step(PATH, *given)
+        return new, sane(kind, new, said, given[0], given[2])
+
+    begin = jnp.broadcast_to(p.init(jnp.zeros(3)), (robots, p.init(jnp.zeros(3)).size))
+    keys = jax.random.split(jax.random.key(0), steps)
+    _, ok = jax.jit(lambda s, k: jax.lax.scan(one, (s, jnp.zeros((robots, 3))), k))(begin, keys)
+    names = ("finite", "speed", "acceleration", "voltage", "kept")
+    np.testing.assert_array_equal(np.asarray(ok).all(0), True, err_msg=str(names))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=25, deadline=None)
+@given(data=st.data())
+def test_any_reading_leaves_a_sound_state(kind, data):
+    value = st.one_of(st.sampled_from(BAD), st.floats(), st.floats(-20, 20))
+    state = pilot(kind).init(jnp.zeros(3))
+    size = pilot(kind).observer.sensed.size
+    for _ in range(4):
+        z = jnp.array(data.draw(st.lists(value, min_size=size, max_size=size)))
+        dt = data.draw(st.one_of(st.just(DT), value))
+        new, said = step(kind)(state, z, dt)
+        assert np.asarray(check(kind)(new, said, state, dt)).all(), (z, dt)
+        state = new
+
+
+# a wheel that is not heard -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_stops_where_a_wheel_falls_silent_and_goes_on_without_a_bump(kind):
+    state, angle, command, rows = pilot(kind).init(jnp.zeros(3)), np.zeros(3), np.zeros(3), []
+    for k in range(160):
+        angle = angle + command * DT
+        heard = angle.copy()
+        if 60 <= k < 100:
+            heard[1] = np.nan
+        z = reading(kind, wheel_angle=heard, current=np.full(3, 0.3))
+        state, said = step(kind)(state, z, DT)
+        command = np.asarray(said[:3])
+        rows.append(command)
+    rows, quiet = np.array(rows), 60 + int(0.3 / DT) + 1
+    assert np.abs(rows[55]).max() > 2.0, "it drives before"
+    assert np.abs(np.diff(rows, axis=0)).max() <= LIMITS.acceleration * DT + 1e-9
+    brake = int(np.ceil(LIMITS.wheel_speed / LIMITS.acceleration / DT)) + 1
+    np.testing.assert_array_equal(rows[quiet + brake : 100], 0.0)
+    assert np.abs(rows[100] - rows[99]).max() <= LIMITS.acceleration * DT + 1e-9
+    assert np.abs(rows[120:]).max() > 1.0, "it drives again"
+    assert float(said[-1]) > 0
+
+
+def test_a_pilot_that_wakes_on_a_moving_robot_starts_from_its_wheels():
+    state, speed = pilot("contact").init(jnp.zeros(3)), np.array([4.0, -3.0, 2.0])
+    state, said = step("contact")(state, reading(wheel_speed=speed), DT)
+    assert np.abs(np.asarray(said[:3]) - speed).max() <= LIMITS.acceleration * DT + 1e-9
+
+
+# the parts -----------------------------------------------------------------------------------
+
+
+def test_saturation_keeps_the_direction():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        wanted = rng.normal(size=3) * 30
+        got = np.asarray(
+            limited(jnp.asarray(wanted), jnp.zeros(3), jnp.zeros(3), robot(), LIMITS, 0.5)
+        )
+        np.testing.assert_allclose(np.cross(got, wanted), 0.0, atol=1e-9)
+        assert got @ wanted > 0
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_the_inverse_model_inverts_the_contact(mixed):
+    f, rng, checked = robot(), np.random.default_rng(1), 0
+    there = jax.jit(lambda xi, p: inverse_contact(f, xi, p))
+    back = jax.jit(lambda rim, s: contact.equilibrium(rim, f.frame, s, f.rest))
+    pull = jax.jit(lambda xi, rim, s: contact.forces(xi, rim, f.frame, s, f.rest))
+    for _ in range(20):
+        index = rng.integers(0, 3, 3) if mixed else np.full(3, rng.integers(0, 3))
+        floor = f.floors.at(jnp.asarray(index))
+        xi = jnp.asarray(rng.uniform(-1, 1, 3) * [0.3, 0.3, 0.8])
+        rim = f.frame.radius * there(xi, jnp.eye(3)[index])
+        force = pull(xi, rim, floor)
+        held = force.traction / (force.load * floor.friction / jnp.mean(floor.friction))
+        if jnp.max(floor.creep * jnp.arctanh(jnp.clip(jnp.abs(held), 0.0, 0.99))) > 0.85:
+            continue  # a wheel about to spin on the spot
+        checked += 1
+        off = jnp.abs(back(rim, floor) - xi) * jnp.array([1.0, 1.0, f.frame.base])
+        assert off.max() < 0.001, (index, xi, off)
+    assert checked > 15
+
+
+@cache
+def watch(s=None):
+    est = Estimator(robot(), s or Settings())
+    return est, jax.jit(lambda state, z, dt: est.step(state, z, dt))
+
+
+def drive(state, count, speed=(0.0, 0.0, 0.0), angle=None, **known):
+    """States and estimates of an estimator over so many steps."""
+    est, run = watch()
+    said = []
+    for _ in range(count):
+        state, e = run(state, reading(wheel_speed=np.asarray(speed), **known), DT)
+        said.append(est.estimated.of(e))
+    return state, said
+
+
+def wheels(twist):
+    return np.asarray(robot().forward @ np.asarray(twist) / robot().frame.radius)
+
+
+def test_without_slip_it_is_the_encoders():
+    f = robot()
+    sticky = replace_floor(f)
+    est = Estimator(sticky)
+    run = jax.jit(lambda state, z: est.step(state, z, DT))
+    state = est.init()
+    for _ in range(40):
+        state, e = run(state, reading(wheel_speed=wheels([0.2, 0.1, 0.3])))
+    twist = np.asarray(est.estimated.of(e).twist)
+    np.testing.assert_allclose(twist, [0.2, 0.1, 0.3], atol=2e-3)
+
+
+def replace_floor(f):
+    """The robot on floors that neither drag nor let slip."""
+    names = ("creep", "roller_drag", "roller_viscosity", "rolling_resistance", "scrub", "lead")
+    where = lambda r: [getattr(r.floors, n) for n in names]  # noqa: E731
+    return eqx.tree_at(where, f, [jnp.full(3, 1e-6)] * len(names))
+
+
+def test_the_covariance_grows_and_a_fix_shrinks_it():
+    est, _ = watch()
+    state, said = drive(est.init(), 60, wheels([0.2, 0.0, 0.0]))
+    size = [float(np.trace(np.asarray(e.covariance)[:2, :2])) for e in said]
+    assert (np.diff(size) > 0).all()
+    fix = np.asarray(said[-1].pose)
+    _, after = drive(state, 1, fix=fix, fix_std=np.array([0.002, 0.004]), fix_age=0.0)
+    assert np.trace(np.asarray(after[0].covariance)[:2, :2]) < 0.2 * size[-1]
+    eigen = np.linalg.eigvalsh(np.asarray(after[0].covariance))
+    assert eigen.min() > -1e-12
+
+
+def test_a_late_fix_corrects_as_a_prompt_one_does():
+    est, _ = watch()
+    off, speed = np.array([0.05, -0.03, 0.1]), wheels([0.2, 0.05, 0.2])
+    state, _ = drive(est.init(std=(0.1, 0.2)), 20, speed)
+    state, more = drive(state, 10, speed)
+    std = np.array([0.002, 0.004])
+    now = np.asarray(more[-1].pose)
+    was = np.asarray(more[-5].pose)
+
+    def moved(pose):  # the whole way lies turned and shifted by a constant error
+        c, s = np.cos(off[2]), np.sin(off[2])
+        return np.array([c * pose[0] - s * pose[1], s * pose[0] + c * pose[1], pose[2]]) + off
+
+    one = {"fix_std": std}
+    # the step that brings the fix advances time by DT, the robot standing
+    _, prompt = drive(state, 1, fix=moved(now), fix_age=0.0, **one)
+    _, late = drive(state, 1, fix=moved(was), fix_age=5 * DT, **one)
+    np.testing.assert_allclose(prompt[0].pose, moved(now), atol=0.01)
+    np.testing.assert_allclose(late[0].pose, prompt[0].pose, atol=0.01)
+
+
+def test_the_gyro_bias_is_learnt_at_rest_and_not_while_it_creeps():
+    est, _ = watch()
+    at = est._kept.place("more").stop - 1
+    state, _ = drive(est.init(), 60, gyro=0.012)
+    assert abs(float(state[at]) - 0.012) < 0.002
+    state, _ = drive(est.init(), 60, wheels([0.01, 0.0, 0.0]), gyro=0.012)
+    assert abs(float(state[at])) < 1e-9
+    state, _ = drive(est.init(), 60, gyro=0.1)  # wheels stand, the robot is turned by hand
+    assert abs(float(state[at])) < 1e-9
+
+
+def test_flags_come_on_and_go_off():
+    est, _ = watch()
+    speed = wheels([0.2, 0.0, 0.0])
+    state, said = drive(est.init(), 40, speed)
+    assert not any(float(x) for e in said[5:] for x in (e.stale, e.immobilised))
+    state, said = drive(state, 10, np.full(3, np.nan))
+    assert float(said[-1].stale) == 1
+    state, said = drive(state, 5, speed)
+    assert float(said[-1].stale) == 0
+    fast = 1.4 * 13.0 * speed / np.abs(speed).max()
+    assert float(drive(state, 1, fast)[1][-1].out_of_range) == 1
+    # currents no floor explains
+    _, said = drive(state, 100, speed, current=jnp.full(3, 1.25 * float(robot().highest[1])))
+    assert float(said[-1].out_of_range) == 1
+    assert np.asarray(said[-1].surface)[0, -1] > 0.5
+
+
+def test_a_robot_that_spins_its_wheels_in_place_is_immobilised():
+    slick = eqx.tree_at(
+        lambda r: (r.floors.roller_drag, r.floors.creep),
+        robot(),
+        (jnp.full(3, 4.0), jnp.full(3, 0.2)),
+    )
+    est = Estimator(slick, Settings())
+    run = jax.jit(lambda state, z: est.step(state, z, DT))
+    state = est.init()
+    for _ in range(30):
+        state, e = run(state, reading(wheel_speed=wheels([0.2, 0.0, 0.0])))
+    assert float(est.estimated.of(e).immobilised) == 1
