@@ -27,8 +27,8 @@ from slipid.control.tuning import (
 )
 
 Method = Literal["gradient", "pso"]
-GRADIENT = 5
-"""Rollouts that a gradient by five gains takes as long as, measured."""
+GRADIENT = 6
+"""Rollouts that a gradient by five gains takes."""
 PARTICLES = 30
 INERTIA, OWN, OTHERS = 0.7, 1.5, 1.5
 """Of a particle's speed, its pull to its own best place and to that of all."""
