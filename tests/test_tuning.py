@@ -90,7 +90,7 @@ def test_the_same_budget_is_the_same_number_of_rollouts(robots, cases):
 
 
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("method", ["gradient", "pso"])
+@pytest.mark.parametrize("method", [pytest.param("gradient", marks=pytest.mark.slow), "pso"])
 def test_a_search_betters_gains_by_hand_and_can_be_left(
     robots, cases, method, tmp_path, monkeypatch
 ):
@@ -124,7 +124,7 @@ def test_a_search_betters_gains_by_hand_and_can_be_left(
 
 @pytest.mark.usefixtures("quick")
 def test_what_is_written_names_every_gain(robots, cases):
-    search = searched(robots, cases, "gradient", 40)
+    search = searched(robots, cases, "pso", 40)
     content = app._content(search, search.step(search.start()), cases, robots)
     assert content["schema"] == "slipid.gains/1"
     assert tuple(content["gains"]) == GAINS

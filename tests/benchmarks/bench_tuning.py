@@ -1,0 +1,81 @@
+"""Gains by gradient, by a particle swarm on the same budget, and by hand, on cases not tuned on.
+
+Needs a folder `slipid identify` wrote, named by SLIPID_FIT. Every seed is another draw of robots,
+floors, starts, noise and of the search; intervals are over seeds. A case's gain over the hand set
+gains is compared with itself, since floors differ more than controllers do.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+SEEDS, ROLLOUTS, JUDGED = 5, 3840, 96
+
+
+def test_gradient_against_swarm_and_hand():
+    folder = os.environ.get("SLIPID_FIT")
+    if not folder:
+        pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
+    from slipid.identify.result import load
+
+    rows = compared(load(Path(folder)))
+    report(rows)
+
+
+def compared(fit, seeds=SEEDS, rollouts=ROLLOUTS):
+    """Losses of every method and seed on cases that no search has seen."""
+    from slipid.app import tune
+    from slipid.app.freeze import frozen_draws
+    from slipid.control.search import Search
+    from slipid.control.tuning import HAND, evaluate
+
+    name = tune.load_of(fit, None)
+    task = tune.task_of(fit, name, gyro=False)
+    judged = tune.cases(frozen_draws(fit, name, tune.DRAWS, 1000), JUDGED, 1000)
+    rows = {"hand": [(evaluate(task, HAND, judged), np.asarray(HAND), 0.0)]}
+    for seed in range(seeds):
+        robots = frozen_draws(fit, name, tune.DRAWS, seed)
+        stable = jax.tree.map(lambda x: x[: tune.STABLE], robots)
+        cases = tune.cases(robots, tune.TRIED, seed)
+        for method in ("gradient", "pso"):
+            search = Search(task, cases, stable, method, rollouts, seed)
+            state, began = search.start(), time.perf_counter()
+            while not search.done(state):
+                state = search.step(state)
+            best = search.best(state)
+            took = time.perf_counter() - began
+            margin = float(task.margins(jnp.asarray(best), stable).min())
+            rows.setdefault(method, []).append((evaluate(task, best, judged), best, margin))
+            print(f"{method} {seed}: {np.round(best, 3)}, {took:.0f} s", flush=True)
+    return rows
+
+
+def report(rows):
+    """Print the table."""
+    from slipid.control.tuning import combined
+
+    hand = rows["hand"][0][0]
+    print(f"\n{'':10}{'mean [mm]':>20}{'mean + worst tenth':>22}{'better in':>11}{'margin':>9}")
+    for method, found in rows.items():
+        mean = [losses.mean() for losses, *_ in found]
+        both = [float(combined(jnp.asarray(losses))) for losses, *_ in found]
+        wins = np.mean([(losses < hand).mean() for losses, *_ in found])
+        margin = min(m for *_, m in found)
+        print(f"{method:10}{_interval(mean):>20}{_interval(both):>22}{wins:11.0%}{margin:9.4f}")
+
+
+def _interval(values):
+    """Mean, and what it is uncertain by over seeds (90 %)."""
+    if len(values) == 1:
+        return f"{values[0]:.1f}"
+    from scipy.stats import t
+
+    half = t.ppf(0.95, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
+    return f"{np.mean(values):.1f} +- {half:.1f}"
