@@ -18,7 +18,7 @@ from slipid.app import runtime
 from slipid.app.freeze import frozen_of
 from slipid.app.progress import Reporter
 from slipid.app.spread import spread
-from slipid.control import closed_loop, reference
+from slipid.control import closed_loop, reference, tuning
 from slipid.control.controller import GAINS, Controller, Correction
 from slipid.control.estimator import Estimator, Settings
 from slipid.control.frozen import Frozen
@@ -34,7 +34,7 @@ FOLDER = "trial"
 SITE_SEED, STARTS_SEED = 7, 2021
 REST_S = 1.0
 """For which the robot stands before it drives: a gyro learns its zero [s]."""
-HAND = {"place": 1.5, "yaw": 1.5, "integral": 0.0, "ahead": 0.0, "observer": 0.0}
+HAND = dict(zip(GAINS, tuning.HAND, strict=True))
 """Gains where none were tuned."""
 PLANTS = ("testsite", "twin")
 
