@@ -292,7 +292,7 @@ class Estimator(eqx.Module):
         twist, pull = settle(near.T, rim, floors)
         torque = floors.friction * f.mass * GRAVITY * f.frame.radius * pull
         amps = f.motor.current(torque.T, jnp.broadcast_to(w, torque.T.shape))
-        more = f.current_trend @ jnp.stack([1.0, jnp.linalg.norm((f.inverse @ rim)[:2])])
+        more = f.current_trend @ jnp.stack([1.0, _size((f.inverse @ rim)[:2])])
         return twist.T, amps + jnp.sign(amps) * more
 
     def _filter(

@@ -161,7 +161,10 @@ class Twin(eqx.Module):
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
         drift = keep * old.drift + fresh
         moves = jnp.tanh(w / 0.2) ** 2  # a motor that stands draws nothing
-        return f.motor.current(force * traction, w) + moves * (old.offset + drift), drift
+        model = f.motor.current(force * traction, w)
+        free = (f.inverse @ (f.frame.radius * w))[:2]
+        more = f.current_trend @ jnp.stack([1.0, jnp.sqrt(free @ free + 1e-24)])
+        return model + moves * (jnp.sign(model) * more + old.offset + drift), drift
 
     def _read(self, angle: Array, w: Array, amps: Array, turn: Array, noise: Array) -> Array:
         """Readings as `slipid.control.estimator.sensed` lays them out."""
