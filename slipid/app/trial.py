@@ -18,7 +18,7 @@ from slipid.app import runtime
 from slipid.app.freeze import frozen_of
 from slipid.app.progress import Reporter
 from slipid.app.spread import spread
-from slipid.control import closed_loop, reference
+from slipid.control import closed_loop, reference, tuning
 from slipid.control.controller import GAINS, Controller, Correction
 from slipid.control.estimator import Estimator, Settings
 from slipid.control.frozen import Frozen
@@ -34,7 +34,7 @@ FOLDER = "trial"
 SITE_SEED, STARTS_SEED = 7, 2021
 REST_S = 1.0
 """For which the robot stands before it drives: a gyro learns its zero [s]."""
-HAND = {"place": 1.5, "yaw": 1.5, "integral": 0.0, "ahead": 1.0, "observer": 0.0}
+HAND = dict(zip(GAINS, tuning.HAND, strict=True))
 """Gains where none were tuned."""
 PLANTS = ("testsite", "twin")
 
@@ -46,7 +46,8 @@ class Row:
     Attributes:
         observer: `encoder`, `curve` (slip over current, wheel by wheel) or `contact`.
         correction: of the 2021 paper.
-        ahead: whether wheel speeds come from the inverse contact model.
+        tuned: whether it has the gains of `slipid tune`, where there are any.
+        ahead: whether wheel speeds come from the inverse contact model, whatever the gains say.
         gyro: whether the robot has one.
         about: one sentence for people.
     """
@@ -54,6 +55,7 @@ class Row:
     observer: str
     about: str
     correction: Correction = "none"
+    tuned: bool = False
     ahead: bool = False
     gyro: bool = False
 
@@ -64,10 +66,10 @@ ROWS: Mapping[str, Row] = {
     "paper_print": Row("curve", "and torque correction as printed", "paper_print"),
     "paper_code": Row("curve", "and torque correction as its authors ran it", "paper_code"),
     "torque": Row("curve", "and torque correction, corrected", "torque"),
-    "lyapunov": Row("contact", "Lyapunov law on the contact estimator"),
-    "contact": Row("contact", "contact estimator and inverse contact model", ahead=True),
-    "lyapunov_gyro": Row("contact", "Lyapunov law, with a gyro", gyro=True),
-    "contact_gyro": Row("contact", "contact, with a gyro", ahead=True, gyro=True),
+    "lyapunov": Row("contact", "Lyapunov law on the contact estimator, gains set by hand"),
+    "contact_ahead": Row("contact", "and wheel speeds of the inverse contact model", ahead=True),
+    "contact": Row("contact", "contact estimator, tuned gains where there are any", tuned=True),
+    "contact_gyro": Row("contact", "contact, with a gyro", tuned=True, gyro=True),
 }
 
 
@@ -282,7 +284,7 @@ def pilot_of(frozen: Frozen, row: Row, gains: Mapping[str, float]) -> closed_loo
     observer: Any = Estimator(frozen, settings)
     if row.observer != "contact":
         observer = Odometry(frozen, settings, curve=row.observer == "curve")
-    own = dict(gains) if row.ahead else {**HAND, "ahead": 0.0}
+    own = {**HAND, **(gains if row.tuned else {}), **({"ahead": 1.0} if row.ahead else {})}
     values = jnp.asarray([own[name] for name in GAINS])
     return closed_loop.Pilot(observer, Controller(frozen, values, correction=row.correction))
 

@@ -109,6 +109,12 @@ def compiled(pilot: Pilot, path: Path) -> Callable[[Any, Any, float], tuple[Any,
     return call
 
 
+@eqx.filter_jit
+def _step(pilot: Pilot, path: Path, state: Array, measurement: Array, dt: Any) -> Any:
+    """The step with its numbers as arguments: compiled once for all pilots and starts alike."""
+    return pilot.step(path, state, measurement, dt)
+
+
 def drive(pilot: Pilot, path: Path, plant: Plant, start: Any, period: float = PERIOD) -> Course:
     """Run a pilot on a plant until its path is over.
 
@@ -119,12 +125,13 @@ def drive(pilot: Pilot, path: Path, plant: Plant, start: Any, period: float = PE
         start: where the pilot believes it stands [m, m, rad].
         period: of the plant [s].
     """
-    step, state, reading = compiled(pilot, path), pilot.init(start), plant.reset()
+    state, reading, dt = pilot.init(start), plant.reset(), jnp.asarray(period)
     rows: list[np.ndarray] = []
     energy, own, begun = 0.0, 0.0, 0.0
     wheels = pilot.controller.frozen.wheels
     while own < path.duration - 1e-6 and begun < LONGEST * path.duration + 10.0:
-        state, said = step(state, reading, period)
+        state, out = _step(pilot, path, state, jnp.asarray(reading), dt)
+        said = np.asarray(out)
         own = float(said[-1])
         command = said[:wheels]
         rows.append(np.concatenate([[begun, energy], plant.pose, said]))

@@ -30,6 +30,8 @@ from slipid.model.settle import combine, settle
 
 HISTORY = 48
 """Steps a delayed measurement may reach back."""
+HASTE = 10.0
+"""Wheel acceleration from which inertia, which the equilibrium lacks, hides floors [rad/s^2]."""
 FLAGS = ("stale", "immobilised", "out_of_range")
 
 
@@ -330,7 +332,7 @@ class Estimator(eqx.Module):
         told += jnp.where(has, -0.5 * (off + jnp.log(gyro_var)), 0.0)
         none += jnp.where(has, -0.5 * (s.unknown_std**2 + jnp.log(jnp.mean(gyro_var))), 0.0)
         # what the equilibrium does not know, inertia, weighs little while wheels speed up
-        weight = jnp.where(moves, dt / s.forget_s, 0.0) / (1 + (faster / 10.0) ** 2)
+        weight = jnp.where(moves, dt / s.forget_s, 0.0) / (1 + (faster / HASTE) ** 2)
         known, unknown = old.belief[:-1], old.belief[-1]
         mean = known @ xi / jnp.maximum(jnp.sum(known), 1e-12)
         change = 1 - jnp.exp(-_size(mean[:2]) * dt / s.patch_m)

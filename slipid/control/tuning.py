@@ -26,7 +26,7 @@ from slipid.control.stability import SPARE, radii
 from slipid.control.twin import Twin, rollout
 from slipid.model.plant import Floor
 
-HAND = (1.5, 1.5, 0.0, 1.0, 0.0)
+HAND = (1.5, 1.5, 0.0, 0.0, 0.0)
 """Gains set by hand, in the order of `GAINS`."""
 LOWEST, HIGHEST = np.array([0.2, 0.2, 0.0, 0.0, 0.0]), np.array([5.0, 5.0, 1.5, 1.5, 1.0])
 """Of the gains; the first two are searched in their logarithm."""

@@ -104,9 +104,9 @@ def _speeds(xi: Any, rim: Array, f: Floors) -> Any:
     """Speeds along drive and rollers, activity, sliding speed, speeds of full force."""
     frame = f.frame
     along = _moved(frame.hold, xi)
-    roll = _moved(frame.roll, xi) - (rim * frame.slip_through)[:, None]
-    active = jnp.sqrt((rim**2)[:, None] + roll**2 + 1e-12)
-    slide = (rim * frame.pull)[:, None] - along
+    roll = _moved(frame.roll, xi) - rim * frame.slip_through[:, None]
+    active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
+    slide = rim * frame.pull[:, None] - along
     g = frame.grip[:, None]
     scale_r = V0 * g + VR * (1 - g) + f.roller_creep * active
     return along, roll, active, slide, V0 + f.creep * active, scale_r, V0 + S1 * active
@@ -148,8 +148,8 @@ def _chord(xi: Any, rim: Array, f: Floors) -> tuple[Array, Array, Array]:
     holds = load * (f.drag * slope(roll, scale_r) + f.roller_viscosity)
     both = pulls + load * f.resistance * slope(along, scale_1)
     push, through = (
-        pulls * (rim * f.frame.pull)[:, None],
-        holds * (rim * f.frame.slip_through)[:, None],
+        pulls * rim * f.frame.pull[:, None],
+        holds * rim * f.frame.slip_through[:, None],
     )
 
     def entry(a: int, b: int) -> Array:
@@ -216,7 +216,7 @@ def _size(force: Any, f: Floors) -> Array:
 
 
 def settle(
-    start: Float[Array, "3 floors"], rim: Float[Array, " wheel"], f: Floors
+    start: Float[Array, "3 floors"], rim: Array, f: Floors
 ) -> tuple[Float[Array, "3 floors"], Float[Array, "wheel floors"]]:
     """`contact.equilibrium` from the twist of a moment ago, and the traction its motors feel.
 
@@ -225,12 +225,13 @@ def settle(
 
     Args:
         start: twists [m/s, m/s, rad/s].
-        rim: rim speeds [m/s].
+        rim: rim speeds of one robot (wheel,), or of one for every column (wheel, floors) [m/s].
         f: from `combine`.
 
     Returns:
         Twists, and tractions [m g mean(mu)].
     """
+    rim = rim.reshape(len(f.rest), -1)
     near: Any = tuple(start)
     for _ in range(CHORD):
         near = _chord(near, rim, f)
@@ -243,7 +244,7 @@ def settle(
         xi = tuple(x - d for x, d in zip(xi, change, strict=True))
     force, _, felt = _balance(xi, rim, f)
     better = _size(force, f) <= before  # NaN is not
-    plain = [_total(f.plain[a] * rim) for a in range(3)]
+    plain = [_total(f.plain[a, :, None] * rim) for a in range(3)]
     found = [jnp.where(better, x, n) for x, n in zip(xi, near, strict=True)]
     sound = jnp.isfinite(found[0] + found[1] + found[2])
     twist = jnp.stack([jnp.where(sound, x, p) for x, p in zip(found, plain, strict=True)])

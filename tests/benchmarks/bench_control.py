@@ -1,0 +1,194 @@
+"""Time of one control step, dispatch included, and of rollouts beside their twin in C.
+
+Every measurement has a process of its own: checks of types and shapes, which the suite switches on
+at import, would be measured too.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import shutil
+import subprocess
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+TWIN = Path(__file__).with_name("twin.c")
+STEPS, SECONDS = 1_000_000, 120.0
+BARS = {"contact": 100.0, "curve": 15.0}
+"""Medians to stay below [us]."""
+
+
+def alone(function, *given):
+    """Result of a function in a fresh process."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(function, *given).result()
+
+
+def frozen():
+    """A robot of three omni wheels on three floors; JAX is started here, one core, float64."""
+    import os
+
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    os.environ.pop("XLA_FLAGS", None)  # of the suite, which compiles for short runs
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    import equinox as eqx
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    import jax.numpy as jnp
+
+    from slipid.control.frozen import freeze
+    from slipid.model.geometry import omni
+    from slipid.model.robot import build
+
+    made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ("a", "b", "c"))
+    numbers = ([0.3, 0.45, 0.6], [0.2, 0.4, 0.9], [0.12, 0.25, 0.4])
+    made = eqx.tree_at(
+        lambda r: (r.surfaces.friction, r.surfaces.creep, r.surfaces.roller_drag),
+        made,
+        [jnp.asarray(v) for v in numbers],
+    )
+    return freeze(made, "as_built", {}, highest_speed=13.0)
+
+
+# one step ------------------------------------------------------------------------------------
+
+
+def steps_of(kind):
+    """Times of steps [us], readings of a robot that drives about, and the time to compile [s]."""
+    f = frozen()
+    import jax.numpy as jnp
+
+    from slipid.control.closed_loop import Pilot, compiled
+    from slipid.control.controller import Controller
+    from slipid.control.estimator import Estimator
+    from slipid.control.odometry import Odometry
+    from slipid.control.reference import rectangle
+
+    contact = kind == "contact"
+    observer = Estimator(f) if contact else Odometry(f, curve=True)
+    gains = jnp.array([2.0, 2.0, 0.2, 1.0 if contact else 0.0, 0.0])
+    pilot, path = Pilot(observer, Controller(f, gains)), rectangle()
+    rng, sensed = np.random.default_rng(0), observer.sensed
+    speed = np.asarray(f.forward @ jnp.array([0.2, 0.05, 0.1]) / f.frame.radius)
+    readings = np.full((1000, sensed.size), np.nan)
+    speeds = speed + rng.normal(size=(1000, 3)) * 0.3
+    readings[:, sensed.place("wheel_angle")] = np.cumsum(0.05 * speeds, axis=0)
+    readings[:, sensed.place("current")] = np.abs(rng.normal(0.4, 0.1, (1000, 3)))
+    readings[:, sensed.place("gyro")] = rng.normal(0.1, 0.004, (1000, 1))
+    state, began = np.asarray(pilot.init(jnp.zeros(3))), time.perf_counter()
+    step = compiled(pilot, path)
+    state, _ = step(state, readings[0], 0.05)
+    compiling, took, end = time.perf_counter() - began, [], time.perf_counter() + SECONDS
+    for row in itertools.cycle(readings):
+        start = time.perf_counter()
+        state, _ = step(state, row, 0.05)
+        took.append(time.perf_counter() - start)
+        if len(took) == STEPS or start > end:
+            break
+    return 1e6 * np.array(took), compiling
+
+
+@pytest.mark.parametrize("kind", BARS)
+def test_one_step(kind):
+    took, compiling = alone(steps_of, kind)
+    middle, high, higher = np.percentile(took, [50, 99, 99.9])
+    print(
+        f"\n{kind}: {len(took)} steps, median {middle:.1f} us ({middle / BARS[kind]:.2f} of the bar"
+        f" of {BARS[kind]:.0f}), 99 % {high:.1f}, 99.9 % {higher:.1f}, least {took.min():.1f};"
+        f" compiled in {compiling:.1f} s"
+    )
+
+
+# rollouts ------------------------------------------------------------------------------------
+
+
+def rollouts(folder, robots, steps):
+    """Best times [s] of the same rollouts, in turns, and the largest difference from C's.
+
+    Robots on all combinations of floors follow wheel speeds of their own: contact settles from the
+    step before, motor work is summed, the pose moves on.
+    """
+    f = frozen()
+    import jax
+    import jax.numpy as jnp
+
+    from slipid.model import settle as module
+    from slipid.model.robot import advance, compose
+
+    every = np.array(list(itertools.product(range(3), repeat=3)))
+    index = every[np.arange(robots) % len(every)]
+    floors = module.combine(f.frame, f.floors, index, f.rest, f.inverse)
+    rng = np.random.default_rng(0)
+    speed = 3 * rng.normal(size=(1, 3, robots)) + 0.2 * rng.normal(size=(steps, 3, robots)).cumsum(
+        0
+    )
+    rims, dt = jnp.asarray(0.04 * speed), 0.05
+    move = jax.vmap(lambda p, x: compose(p, advance(x, dt)), (-1, -1), -1)
+
+    def ours(rims):
+        def one(carry, rim):
+            twist, pose, sum_ = carry
+            twist, felt = module.settle(twist, rim, floors)
+            return (twist, move(pose, twist), sum_ + jnp.sum(felt**2, axis=0)), None
+
+        start = (jnp.zeros((3, robots)), jnp.zeros((3, robots)), jnp.zeros(robots))
+        return jax.lax.scan(one, start, rims)[0]
+
+    # a loop as XLA's older emitter writes it takes a third of the time
+    older = jax.jit(ours, compiler_options={"xla_cpu_use_fusion_emitters": False})
+    ways = {"jax": jax.jit(ours), "older": older}
+
+    library = Path(folder) / "twin.so"
+    compiler = shutil.which("gcc") or shutil.which("cc")
+    words = [compiler, "-O3", "-march=native", "-shared", "-fPIC", "-o", library, TWIN, "-lm"]
+    subprocess.run(words, check=True)
+    rollout = ctypes.CDLL(library).rollout
+    one = [f.frame.hold, f.frame.roll, f.frame.shift, f.rest, f.inverse, f.frame.base]
+    one = np.concatenate([np.asarray(x).ravel() for x in one])
+    own = [floors.held, floors.creep, floors.drag, floors.roller_creep, floors.resistance]
+    own += [floors.viscosity, floors.roller_viscosity, floors.scrub[None], floors.lead[None]]
+    columns = np.concatenate([np.asarray(x) for x in own]).T
+    table = np.ascontiguousarray(np.hstack([np.tile(one, (robots, 1)), columns]))
+    flat = np.ascontiguousarray(np.asarray(rims).transpose(0, 2, 1))
+
+    def theirs():
+        twist, pose, total = np.zeros((robots, 3)), np.zeros((robots, 3)), np.zeros(robots)
+        at = [x.ctypes.data_as(ctypes.c_void_p) for x in (flat, table, pose, twist, total)]
+        counts = (steps, robots, module.CHORD, module.NEWTON)
+        rollout(*counts, ctypes.c_double(dt), *at)
+        return twist.T, pose.T, total
+
+    ways = {name: lambda run=run: jax.block_until_ready(run(rims)) for name, run in ways.items()}
+    ways["c"] = theirs
+    took, found = {name: [] for name in ways}, {}
+    for _ in range(6):  # the first is not counted: JAX compiles
+        for name, run in ways.items():
+            began = time.perf_counter()
+            found[name] = run()
+            took[name].append(time.perf_counter() - began)
+    pairs = [zip(found[n], found["c"], strict=True) for n in ("jax", "older")]
+    apart = max(float(np.abs(a - b).max()) for pair in pairs for a, b in pair)
+    return {name: min(times[1:]) for name, times in took.items()}, apart
+
+
+@pytest.mark.skipif(not (shutil.which("gcc") or shutil.which("cc")), reason="no C compiler")
+@pytest.mark.parametrize("robots", [27, 256, 1024])
+def test_rollouts_beside_their_twin_in_c(tmp_path, robots):
+    steps = 100_000 // robots
+    took, apart = alone(rollouts, str(tmp_path), robots, steps)
+    each = {name: 1e9 * t / (steps * robots) for name, t in took.items()}
+    print(
+        f"\n{robots} robots, {steps} steps, ns a robot and step: C {each['c']:.0f}; JAX "
+        f"{each['jax']:.0f}, ratio {took['jax'] / took['c']:.2f}; without XLA's fusion emitters "
+        f"{each['older']:.0f}, ratio {took['older'] / took['c']:.2f} (bar 2); apart {apart:.1e}"
+    )
+    assert apart < 1e-4  # rounding may take a robot that spins its wheels to the other branch once
