@@ -8,8 +8,8 @@ the contact says, and what the fit says the model misses is drawn anew for every
     pose <- pose * exp(xi h + |xi| h effect + sqrt(|xi| h) process)
 
 Everything is differentiable but for which floor a wheel is on; ticks pass derivatives through.
-Differentiate forwards (`jax.jvp`, `jax.jacfwd`): readings that are no numbers would spoil a backward
-pass.
+Differentiate forwards (`jax.jvp`, `jax.jacfwd`): readings that are no numbers would spoil a pass
+backwards.
 """
 
 from functools import partial
