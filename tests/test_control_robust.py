@@ -268,8 +268,9 @@ def test_without_slip_it_is_the_encoders():
 def replace_floor(f):
     """The robot on floors that neither drag nor let slip."""
     names = ("creep", "roller_drag", "roller_viscosity", "rolling_resistance", "scrub", "lead")
-    where = lambda r: [getattr(r.floors, n) for n in names]  # noqa: E731
-    return eqx.tree_at(where, f, [jnp.full(3, 1e-6)] * len(names))
+    return eqx.tree_at(
+        lambda r: [getattr(r.floors, n) for n in names], f, [jnp.full(3, 1e-6)] * len(names)
+    )
 
 
 def test_the_covariance_grows_and_a_fix_shrinks_it():
@@ -314,6 +315,40 @@ def test_the_gyro_bias_is_learnt_at_rest_and_not_while_it_creeps():
     assert abs(float(state[at])) < 1e-9
     state, _ = drive(est.init(), 60, gyro=0.1)  # wheels stand, the robot is turned by hand
     assert abs(float(state[at])) < 1e-9
+
+
+def test_heading_is_the_integral_of_the_gyro_whatever_is_believed_of_the_floors():
+    est, _ = watch()
+    rng = np.random.default_rng(0)
+    state, rates, pose = est.init(), rng.uniform(-0.4, 0.4, 50), None
+    for k, rate in enumerate(rates):  # currents say another thing at every step
+        amps = rng.uniform(0.0, float(robot().highest[1]), 3)
+        speed = wheels([0.2 * np.cos(k), 0.2 * np.sin(k), 0.0])
+        state, said = drive(state, 1, speed, gyro=rate, current=amps)
+        assert float(said[0].twist[2]) == pytest.approx(rate, abs=1e-9)
+        pose = said[0].pose
+    assert float(pose[2]) == pytest.approx(rates.sum() * DT, abs=1e-9)
+
+
+def test_a_late_gyro_is_taken_for_its_own_time():
+    late = 3
+    est, run = watch(Settings(gyro_delay_s=late * DT))
+    turn = np.concatenate([np.zeros(10), np.full(40, 0.3), np.zeros(20)])
+    state = est.init()
+    for k, rate in enumerate(turn):
+        z = reading(wheel_speed=wheels([0.0, 0.0, rate]), gyro=turn[k - late] if k >= late else 0.0)
+        state, e = run(state, z, DT)
+    # the model's turns before and after the delay are the same: what is left is the gyro's integral
+    assert float(est.estimated.of(e).pose[2]) == pytest.approx(turn.sum() * DT, abs=0.01)
+
+
+def test_a_robot_at_rest_turns_as_its_gyro_says_less_the_bias():
+    est, _ = watch()
+    state, said = drive(est.init(), 80, gyro=0.012)
+    # what the heading drifted before the bias was known is taken back with it
+    assert abs(float(said[-1].pose[2])) < 0.002
+    _, said = drive(state, 20, gyro=0.012 + 0.2)  # by hand
+    assert float(said[-1].pose[2]) == pytest.approx(0.2 * 20 * DT, abs=0.01)
 
 
 def test_flags_come_on_and_go_off():

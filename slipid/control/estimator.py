@@ -387,50 +387,21 @@ class Estimator(eqx.Module):
         axes = jnp.array([[u[0], -u[1], 0.0], [u[1], u[0], 0.0], [0.0, 0.0, 1.0]])
         # d twist / d effects, a column per floor and axis
         slope = speed * (share[:, None, None] * axes.T).reshape(-1, 3).T
-        twist = mean + slope @ old.more[:-1]
-        still = jnp.where(moves, 0.0, jnp.minimum(old.still + dt, 1e3))
+        free = jnp.where(moves, mean + slope @ old.more[:-1], 0.0)
         has = jnp.isfinite(gyro)
-        late = self._past(old, s.gyro_delay_s)[4]
-        measured = twist[2] + jnp.where(has, gyro - old.more[-1] - late, 0.0)
-        free = twist[2]
-        twist = (
-            jnp.where(moves, twist, 0.0)
-            .at[2]
-            .set(jnp.where(has, measured, jnp.where(moves, twist[2], 0.0)))
-        )
-        twist = jnp.where(still > 0.1, 0.0, twist)
+        time = old.time + dt
+        twist = free.at[2].set(self._turned(old, time, free[2], gyro))
         late_news = known @ apart
         apart = apart - late_news
         late_news = late_news.at[2].multiply(jnp.where(has, 0.0, 1.0))
         pose = compose(old.pose, advance(twist, dt) + late_news)
         cov = self._grow(old, pose, dt, speed, slope, axes, share, scatter, has, moves)
-        more = old.more
-        # at rest a gyro reads its bias; what differs from what is known is a robot that creeps
-        gap = gyro - more[-1]
-        var = cov[-1, -1] + s.gyro_std**2
-        rests = has & (still > 0.3) & (gap**2 < 9.0 * var)
-        gain = jnp.where(rests, cov[:, -1] / var, 0.0)
-        gap = jnp.where(rests, gap, 0.0)
-        change = gain * gap
-        pose, more = pose + change[:3], more + change[3:]
-        cov = cov - jnp.outer(gain, cov[-1])
-        time = old.time + dt
-        entry = jnp.concatenate([time[None], pose, jnp.where(moves, free, 0.0)[None]])
+        still = jnp.where(moves, 0.0, jnp.minimum(old.still + dt, 1e3))
+        pose, more, cov = self._rest(still, gyro, pose, old.more, cov)
+        entry = jnp.concatenate([time[None], pose, free[2:]])
         history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
         pose, more, cov, history = self._fix(z, time, pose, more, cov, history)
-        slip = jnp.where(
-            jnp.abs(w) > 1e-3,
-            1 - f.forward @ twist / (f.frame.radius * jnp.where(jnp.abs(w) > 1e-3, w, 1.0)),
-            0.0,
-        )
-        free_speed = _size((f.inverse @ (f.frame.radius * w))[:2])
-        blocked = moves & (free_speed > 0.02) & (_size(twist[:2]) < 0.2 * free_speed)
-        stuck = jnp.where(blocked, jnp.minimum(old.stuck + dt, 1e3), 0.0)
-        beyond = (
-            (jnp.max(jnp.abs(w)) > 1.3 * f.highest[0])
-            | (jnp.max(jnp.abs(amps)) > 1.3 * f.highest[1])
-            | (belief[-1] > 0.5)
-        )
+        stuck = self._stuck(old, w, twist, dt, moves)
         state = self._kept.pack(
             time=time,
             angle=angle,
@@ -450,7 +421,7 @@ class Estimator(eqx.Module):
         said = self.estimated.pack(
             pose=pose,
             twist=twist,
-            slip=jnp.clip(slip, -2.0, 2.0),
+            slip=self._slip(w, twist),
             wheel_speed=w,
             current=amps,
             surface=jnp.concatenate(
@@ -459,9 +430,58 @@ class Estimator(eqx.Module):
             covariance=cov[:3, :3],
             stale=jnp.any(age > s.stale_s),
             immobilised=stuck > 0.4,
-            out_of_range=beyond,
+            out_of_range=self._beyond(w, amps, belief),
         )
         return state, said
+
+    def _turned(self, old: Any, time: Array, free: Array, gyro: Array) -> Array:
+        """Yaw rate: the gyro's less its bias; over its delay, as the contact model goes on from it.
+
+        Args:
+            old: state before the step; time: after it [s].
+            free: yaw rate of the contact model [rad/s].
+            gyro: reading, NaN where there is none [rad/s].
+        """
+        delay = self.settings.gyro_delay_s
+        then = free if delay == 0.0 else _nearest(old.history, time - delay)[4]
+        return jnp.where(jnp.isfinite(gyro), free + gyro - old.more[-1] - then, free)
+
+    def _rest(
+        self, still: Array, gyro: Array, pose: Array, more: Array, cov: Array
+    ) -> tuple[Array, Array, Array]:
+        """Learn the gyro's bias while the robot rests.
+
+        A reading that differs from what is known is a robot that creeps on an edge or is turned by
+        hand, no bias.
+        """
+        gap = gyro - more[-1]
+        var = cov[-1, -1] + self.settings.gyro_std**2
+        rests = jnp.isfinite(gyro) & (still > 0.3) & (gap**2 < 9.0 * var)
+        gain = jnp.where(rests, cov[:, -1] / var, 0.0)
+        change = gain * jnp.where(rests, gap, 0.0)
+        return pose + change[:3], more + change[3:], cov - jnp.outer(gain, cov[-1])
+
+    def _slip(self, w: Array, twist: Array) -> Array:
+        """Slip ratio of each wheel, 0 for one that stands."""
+        f, turns = self.frozen, jnp.abs(w) > 1e-3
+        rim = f.frame.radius * jnp.where(turns, w, 1.0)
+        return jnp.where(turns, jnp.clip(1 - f.forward @ twist / rim, -2.0, 2.0), 0.0)
+
+    def _stuck(self, old: Any, w: Array, twist: Array, dt: Array, moves: Array) -> Array:
+        """For how long the body has hardly moved while its wheels turn [s].
+
+        Source: Ward and Iagnemma 2008, below a fifth of the wheels' speed.
+        """
+        f = self.frozen
+        speed = _size((f.inverse @ (f.frame.radius * w))[:2])
+        blocked = moves & (speed > 0.02) & (_size(twist[:2]) < 0.2 * speed)
+        return jnp.where(blocked, jnp.minimum(old.stuck + dt, 1e3), 0.0)
+
+    def _beyond(self, w: Array, amps: Array, belief: Array) -> Array:
+        """Whether speed or currents leave what the fit has seen, or no floor explains them."""
+        highest = self.frozen.highest
+        fast = jnp.max(jnp.abs(w)) > 1.3 * highest[0]
+        return fast | (jnp.max(jnp.abs(amps)) > 1.3 * highest[1]) | (belief[-1] > 0.5)
 
     def _marginal(self, known: Array) -> Array:
         """Probability of each floor under each wheel (wheel, floor)."""
@@ -469,12 +489,6 @@ class Estimator(eqx.Module):
         p = known.reshape((floors,) * wheels)
         others = [tuple(k for k in range(wheels) if k != axis) for axis in range(wheels)]
         return jnp.stack([jnp.sum(p, axis=o) for o in others])
-
-    def _past(self, old: Any, age: float) -> Array:
-        """Entry of the history that is so old (time, x, y, heading, yaw rate), the nearest."""
-        if age == 0.0:
-            return old.history[0]
-        return old.history[jnp.argmin(jnp.abs(old.history[:, 0] - (old.time - age)))]
 
     def _grow(
         self,
@@ -529,7 +543,7 @@ class Estimator(eqx.Module):
         )
 
         def corrected() -> tuple[Array, Array, Array, Array]:
-            then = history[jnp.argmin(jnp.abs(history[:, 0] - (time - age)))]
+            then = _nearest(history, time - age)
             return _correct(z.fix, jnp.clip(std, 1e-4, 10.0), then, pose, more, cov, history)
 
         kept = (pose, more, cov, history)
@@ -559,6 +573,11 @@ def _correct(
     moved = change[:2] + change[2] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
     history = history.at[:, 1:3].add(moved).at[:, 3].add(change[2])
     return pose + change[:3], more + change[3:], cov, history
+
+
+def _nearest(history: Array, time: Array) -> Array:
+    """Entry nearest to a time: time, x, y, heading, yaw rate of the contact model."""
+    return history[jnp.argmin(jnp.abs(history[:, 0] - time))]
 
 
 def _size(v: Float[Array, "*batch axis"]) -> Float[Array, "*batch"]:

@@ -40,9 +40,7 @@ class Odometry(eqx.Module):
     @property
     def _kept(self) -> Layout:
         w = (self.frozen.wheels,)
-        return Layout(
-            (("pose", (3,)), ("angle", w), ("speed", w), ("age", w), ("amps", w), ("still", ()))
-        )
+        return Layout((("pose", (3,)), ("angle", w), ("speed", w), ("age", w), ("amps", w)))
 
     def init(self, pose: Float[Array, "3"]) -> Float[Array, " state"]:
         """State of a robot at rest at a pose [m, m, rad]."""
@@ -53,7 +51,6 @@ class Odometry(eqx.Module):
             speed=jnp.zeros(w),
             age=jnp.full(w, 10 * self.settings.stale_s),
             amps=jnp.zeros(w),
-            still=0.0,
         )
 
     def step(
@@ -77,7 +74,7 @@ class Odometry(eqx.Module):
             slip = jnp.where(amps > CURRENT_FROM, jnp.clip(line, 0.0, 0.95), 0.0)
         twist = f.inverse @ (f.frame.radius * w * (1 - slip))
         pose = compose(old.pose, advance(twist, dt))
-        state = self._kept.pack(pose=pose, angle=angle, speed=w, age=age, amps=amps, still=0.0)
+        state = self._kept.pack(pose=pose, angle=angle, speed=w, age=age, amps=amps)
         unknown = jnp.zeros((f.wheels, len(f.labels) + 1)).at[:, -1].set(1.0)
         said = self.estimated.pack(
             pose=pose,
