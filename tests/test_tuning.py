@@ -122,6 +122,21 @@ def test_a_search_betters_gains_by_hand_and_can_be_left(
     assert app._kept(path, "key") is None
 
 
+def test_gains_that_are_handed_over_are_stable(robots, cases):
+    search = searched(robots, cases, "gradient")
+
+    def push(gains):
+        place = jnp.asarray(box_of(gains))[None].repeat(6, axis=0)
+        return float(tuning.penalties(search.task, place, robots)[0])
+
+    assert push(HIGHEST) > 0
+    assert push(HAND) == 0
+    found = search.best({**search.start(), "way": np.ones((3, 5))})
+    assert push(found) == 0
+    assert np.all(found >= HAND)  # on the way there
+    assert np.any(found > HAND)
+
+
 @pytest.mark.usefixtures("quick")
 def test_what_is_written_names_every_gain(robots, cases):
     search = searched(robots, cases, "pso", 40)

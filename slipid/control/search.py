@@ -34,6 +34,8 @@ INERTIA, OWN, OTHERS = 0.7, 1.5, 1.5
 """Of a particle's speed, its pull to its own best place and to that of all."""
 RATE = 0.06
 """First step of Adam, in parts of the box; it falls to a tenth along a cosine."""
+_HALTS = 6
+"""Places between the end of a search and the gains by hand where stability is asked for."""
 State = dict[str, np.ndarray]
 """Of a search: plain arrays, so that it can be kept in a file."""
 
@@ -95,8 +97,13 @@ class Search:
         return self._adam(state) if self.method == "gradient" else self._swarm(state)
 
     def best(self, state: State) -> Float[np.ndarray, " 5"]:
-        """Gains a search has come to."""
-        return np.asarray(gains_at(jnp.asarray(self._places(state).mean(axis=0))))
+        """Gains a search has come to, as far on the way there from those by hand as is stable."""
+        end, hand = self._places(state).mean(axis=0), box_of(HAND)
+        way = hand + np.linspace(1.0, 0.0, _HALTS)[:, None] * (end - hand)
+        push = np.asarray(penalties(self.task, jnp.asarray(way), self.stable))
+        stable = np.flatnonzero(push <= 0)
+        at = way[stable[0] if len(stable) else int(np.argmin(push))]
+        return np.asarray(gains_at(jnp.asarray(at)))
 
     def spread(self, state: State) -> Float[np.ndarray, " 5"]:
         """Std of the gains: over Adam's last third, whose cases change, or the best particles."""

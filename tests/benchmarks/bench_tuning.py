@@ -28,6 +28,10 @@ def test_gradient_against_swarm_and_hand():
 
     rows = compared(load(Path(folder)))
     report(rows)
+    # which one wins is what the table says; gains that are handed over must be stable
+    for method in ("gradient", "pso"):
+        assert len(rows[method]) == SEEDS
+        assert min(margin for *_, margin in rows[method]) > 0
 
 
 def compared(fit, seeds=SEEDS, rollouts=ROLLOUTS):
