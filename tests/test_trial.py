@@ -214,7 +214,6 @@ def test_the_summary_is_of_medians_over_starts_with_intervals():
 
 
 def test_live_readings_are_as_the_sensors_log_them():
-    pytest.importorskip("mujoco")
     site = Site()
     live = Live(site, uniform("firm"), "as_built", (0.0, 0.0, 0.0), seed=1)
     forward = site.machine.wheel_from_twist @ np.array([0.2, 0.0, 0.0])

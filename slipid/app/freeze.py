@@ -5,9 +5,23 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from slipid.control.estimator import Settings
 from slipid.control.frozen import Frozen, freeze
+from slipid.control.habits import Habits
 from slipid.data.log import DataError
 from slipid.identify.result import Fit
+
+
+def sensors_of(fit: Fit, gyro: bool) -> tuple[Settings, Habits]:
+    """What the estimator and the twin of a fit's robot count on: the sensors of its logs.
+
+    Args:
+        fit: as `slipid identify` left it.
+        gyro: whether the robot has one.
+    """
+    signed = bool(fit.settings["current_is_signed"])
+    habits = Habits(voltage=bool(fit.has["voltage"]), gyro=gyro, signed=signed)
+    return Settings(current_is_signed=signed), habits
 
 
 def load_of(fit: Fit, load: str | None) -> str:

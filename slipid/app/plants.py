@@ -69,10 +69,10 @@ class SitePlant:
 
 
 def twin(
-    frozen: Frozen, floor: FloorMap, start: tuple[float, float, float], seed: int, gyro: bool
+    frozen: Frozen, floor: FloorMap, start: tuple[float, float, float], seed: int, habits: Habits
 ) -> TwinPlant:
     """The identified model itself as a plant, see `slipid.control.twin`."""
-    made = Twin(frozen, floor_of(floor, frozen.labels), Habits(gyro=gyro))
+    made = Twin(frozen, floor_of(floor, frozen.labels), habits)
     return TwinPlant(made, jnp.asarray(start), jax.random.key(seed))
 
 

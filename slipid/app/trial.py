@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
@@ -15,13 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.app import runtime
-from slipid.app.freeze import frozen_of
+from slipid.app.freeze import frozen_of, load_of, sensors_of
 from slipid.app.progress import Reporter
 from slipid.app.spread import spread
 from slipid.control import closed_loop, reference, tuning
 from slipid.control.controller import GAINS, Controller, Correction
 from slipid.control.estimator import Estimator, Settings
 from slipid.control.frozen import Frozen
+from slipid.control.habits import Habits
 from slipid.control.odometry import Odometry
 from slipid.data.files import read_json, write_arrays, write_json
 from slipid.data.log import DataError
@@ -85,6 +86,8 @@ class Job:
     load: str
     floor: FloorMap
     frozen: Frozen
+    settings: Settings
+    habits: Habits
     gains: Mapping[str, float]
     out: Path
 
@@ -203,11 +206,16 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
     else:
         _known_grounds(floor)
     gains = gains_of(out)
-    name = fit.robot.body.loads[0] if wish.load is None else wish.load
+    name = load_of(fit, wish.load)
+    # the test site has the sensors it has, whatever the logs of the fit had
+    settings, habits = (
+        sensors_of(fit, gyro=False) if wish.plant == "twin" else (Settings(), Habits())
+    )
     mark = sha256()
     for leaf in jax.tree.leaves(frozen):
         mark.update(np.ascontiguousarray(leaf).tobytes())
     mark.update(repr((wish.plant, name, floor.surfaces, floor.corner, floor.cell, gains)).encode())
+    mark.update(repr((settings, habits)).encode())
     mark.update(floor.cells.tobytes() + _code())
     folder = out / FOLDER / mark.hexdigest()[:12]
     return [
@@ -220,6 +228,8 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
             load=name,
             floor=floor,
             frozen=frozen,
+            settings=settings,
+            habits=habits,
             gains=gains,
             out=folder / f"of{wish.starts}",
         )
@@ -234,6 +244,7 @@ def _code() -> bytes:
     files = sorted(
         p for part in ("control", "model", "testsite") for p in (root / part).glob("*.py")
     )
+    files += [Path(__file__), Path(__file__).with_name("plants.py")]
     return sha256(b"".join(p.read_bytes() for p in files)).digest()
 
 
@@ -278,9 +289,10 @@ def _kept(job: Job) -> dict[str, Any]:
     return content
 
 
-def pilot_of(frozen: Frozen, row: Row, gains: Mapping[str, float]) -> closed_loop.Pilot:
+def pilot_of(
+    frozen: Frozen, settings: Settings, row: Row, gains: Mapping[str, float]
+) -> closed_loop.Pilot:
     """Estimator and controller of a row."""
-    settings = Settings()
     observer: Any = Estimator(frozen, settings)
     if row.observer != "contact":
         observer = Odometry(frozen, settings, curve=row.observer == "curve")
@@ -296,7 +308,8 @@ def drive(job: Job) -> float:
     frozen = jax.tree.map(jnp.asarray, job.frozen)
     path = reference.rectangle().moved(job.start).waiting(REST_S)
     plant = _plant(job, row.gyro, frozen)
-    course = closed_loop.drive(pilot_of(frozen, row, job.gains), path, plant, job.start)
+    pilot = pilot_of(frozen, job.settings, row, job.gains)
+    course = closed_loop.drive(pilot, path, plant, job.start)
     found = closed_loop.metrics(course)
     off = course.pose[-1] - course.believed[-1]
     found["believed_error_mm"] = 1000 * float(np.hypot(off[0], off[1]))
@@ -319,7 +332,7 @@ def _plant(job: Job, gyro: bool, frozen: Frozen) -> Any:
     if job.plant == "twin":
         from slipid.app.plants import twin
 
-        return twin(frozen, job.floor, job.start, job.seed, gyro)
+        return twin(frozen, job.floor, job.start, job.seed, replace(job.habits, gyro=gyro))
     from slipid.app.plants import SitePlant
 
     return SitePlant(job.floor, job.load, job.start, job.seed, gyro)

@@ -11,14 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.app import files
-from slipid.app.freeze import frozen_draws, frozen_of, load_of
+from slipid.app.freeze import frozen_draws, frozen_of, load_of, sensors_of
 from slipid.app.progress import Reporter
 from slipid.control import reference
 from slipid.control.closed_loop import PERIOD
 from slipid.control.controller import GAINS
-from slipid.control.estimator import Settings
 from slipid.control.frozen import Frozen
-from slipid.control.habits import Habits
 from slipid.control.search import GRADIENT, Method, Search, State
 from slipid.control.tuning import BATCH, HAND, Cases, Task, combined, evaluate
 from slipid.data.files import write_arrays, write_json
@@ -70,10 +68,8 @@ def floor(labels: tuple[str, ...], seed: int) -> Floor:
 
 def task_of(fit: Fit, load: str, gyro: bool) -> Task:
     """What is tuned for a fit: its sensors, its robot, the rehearsed path."""
-    signed = bool(fit.settings["current_is_signed"])
-    habits = Habits(voltage=bool(fit.has["voltage"]), gyro=gyro, signed=signed)
+    settings, habits = sensors_of(fit, gyro)
     steps = int(np.ceil(SLACK * reference.waypoints(CORNERS).duration / PERIOD))
-    settings = Settings(current_is_signed=signed)
     return Task(frozen_of(fit, load), settings, habits, steps=steps)
 
 

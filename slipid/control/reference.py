@@ -1,7 +1,7 @@
 """Paths in time: where the robot should be and how fast, and when to wait for it."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -158,10 +158,12 @@ def _trapezoid(
     return np.minimum(gone, far), pace
 
 
-def _smooth(place: object, speed: float, turning: bool) -> Path:
+def _smooth(
+    place: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], speed: float, turning: bool
+) -> Path:
     """A closed curve at constant speed but for its ends, by arc length."""
     u = np.linspace(0.0, 2 * np.pi, 4001)
-    xy = np.stack(place(u), axis=-1)  # type: ignore[operator]
+    xy = np.stack(place(u), axis=-1)
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
     gone, _ = _trapezoid(float(arc[-1]), speed, 0.5, 0.6)
     gone = np.concatenate([[0.0], gone])
