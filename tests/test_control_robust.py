@@ -51,7 +51,7 @@ def robot():
 def pilot(kind):
     frozen = robot()
     if kind == "curve":
-        gains = jnp.array([2.0, 2.0, 0.2, 0.0, 0.0])
+        gains = jnp.array([2.0, 2.0, 0.2, 0.0, 0.0, 0.15])
         return Pilot(Odometry(frozen, curve=True), Controller(frozen, gains))
     return Pilot(Estimator(frozen), Controller(frozen, jnp.array([2.0, 2.0, 0.2, 1.0, 0.3])))
 

@@ -45,7 +45,7 @@ def searched(robots, cases, method, rollouts=100, seed=0):
 
 
 def test_the_box_holds_the_gains_and_nothing_else():
-    for gains in (HAND, LOWEST, HIGHEST, (0.7, 3.0, 0.2, 0.5, 0.9)):
+    for gains in (HAND, LOWEST, HIGHEST, (0.7, 3.0, 0.2, 0.5, 0.9, 0.3)):
         np.testing.assert_allclose(gains_at(jnp.asarray(box_of(gains))), gains, atol=1e-12)
     beyond = gains_at(jnp.asarray(box_of((9.0, 0.0, -1.0, 2.0, 0.5))))
     np.testing.assert_allclose(beyond, [5.0, 0.2, 0.0, 1.5, 0.5])

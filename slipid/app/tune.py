@@ -26,7 +26,7 @@ from slipid.identify.result import Fit
 from slipid.model.plant import Floor
 
 SCHEMA, CHECKPOINT = "slipid.gains/1", "tuning.npz"
-UNITS = dict(zip(GAINS, ("1/s", "1/s", "1/s^2", "1", "1"), strict=True))
+UNITS = dict(zip(GAINS, ("1/s", "1/s", "1/s^2", "1", "1", "s"), strict=True))
 CORNERS = ((0.0, 0.0), (0.4, 0.0), (0.4, -0.2))
 """Of the path that is rehearsed [m]."""
 SLACK = 1.2

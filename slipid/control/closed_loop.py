@@ -49,7 +49,8 @@ class Pilot(eqx.Module):
         seen, held, time = state[: -cut - 1], state[-cut - 1 : -1], state[-1]
         seen, estimate = self.observer.step(seen, measurement, dt)
         pose = self.controller.estimated.of(estimate).pose
-        time, reference = path.follow(time, jnp.where(jnp.isfinite(pose), pose, 1e3), dt)
+        here, preview = jnp.where(jnp.isfinite(pose), pose, 1e3), self.controller.gains[-1]
+        time, reference = path.follow(time, here, dt, preview)
         held, command = self.controller.step(held, reference, estimate, dt)
         return (
             jnp.concatenate([seen, held, time[None]]),

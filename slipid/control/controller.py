@@ -21,9 +21,10 @@ from slipid.control.packed import Layout
 from slipid.model import contact
 
 Correction = Literal["none", "torque", "paper_print", "paper_code"]
-GAINS = ("place", "yaw", "integral", "ahead", "observer")
+GAINS = ("place", "yaw", "integral", "ahead", "observer", "preview")
 """Pose loop [1/s], heading loop [1/s], integral of the pose error [1/s^2], share of the inverse
-model in the wheel speeds [1], disturbance observer [1]."""
+model in the wheel speeds [1], disturbance observer [1], time by which the path's rates are asked
+for early, because wheels follow late [s]."""
 PAPER_GAIN = {"x": (3000.0, 500.0, 3000.0), "y": (2000.0, 2000.0, 2000.0)}
 """Of the 2021 paper's torque correction, motor rpm per N m at the motor shaft, by leg."""
 OBSERVE_S = 0.4
@@ -154,7 +155,7 @@ class Controller(eqx.Module):
     """
 
     frozen: Frozen
-    gains: Float[Array, "5"]
+    gains: Float[Array, " gain"]
     limits: Limits = eqx.field(static=True, default=Limits())
     correction: Correction = eqx.field(static=True, default="none")
 
@@ -195,7 +196,7 @@ class Controller(eqx.Module):
             dt: since the last step [s].
         """
         f, old, e = self.frozen, self._kept.of(state), self.estimated.of(estimate)
-        place, yaw, integral, ahead, observer = self.gains
+        place, yaw, integral, ahead, observer, _ = self.gains
         safe = jnp.all(jnp.isfinite(estimate)) & jnp.all(jnp.isfinite(reference)) & (e.stale < 0.5)
         pose = jnp.where(safe, e.pose, 0.0)
         ref = jnp.where(safe, reference, 0.0)

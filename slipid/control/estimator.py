@@ -30,7 +30,7 @@ from slipid.model.settle import combine, settle
 
 HISTORY = 48
 """Steps a delayed measurement may reach back."""
-HASTE = 10.0
+HASTE = 30.0
 """Wheel acceleration from which inertia, which the equilibrium lacks, hides floors [rad/s^2]."""
 FLAGS = ("stale", "immobilised", "out_of_range")
 

@@ -44,9 +44,15 @@ class Path(eqx.Module):
         ]
 
     def follow(
-        self, time: Float[Array, ""], pose: Float[Array, "3"], dt: Float[Array, ""] | float
+        self,
+        time: Float[Array, ""],
+        pose: Float[Array, "3"],
+        dt: Float[Array, ""] | float,
+        preview: Float[Array, ""] | float = 0.0,
     ) -> tuple[Float[Array, ""], Float[Array, "6"]]:
         """Time of the path one step later, and the reference there for a robot at a pose.
+
+        The pose is that of this time, the rates are those `preview` later [s].
 
         The path slows down, and its rates with it, while the robot is believed to lag behind or
         beside it; one that is ahead is no reason to wait. Where dt is no positive number, no time
@@ -63,7 +69,8 @@ class Path(eqx.Module):
         )
         pace = jnp.clip((LOST - off) / (LOST - PATIENT), 0.0, 1.0)
         time = jnp.asarray(time) + pace * dt
-        return time, self.at(time) * jnp.ones(6).at[3:].set(pace)
+        rates = self.at(time + preview)[3:] * pace
+        return time, jnp.concatenate([self.at(time)[:3], rates])
 
     def moved(self, start: Sequence[float]) -> "Path":
         """The path as it lies for a robot that starts at a pose (x, y [m], heading [rad])."""

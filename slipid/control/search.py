@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from slipid.control.controller import GAINS
 from slipid.control.frozen import Frozen
 from slipid.control.tuning import (
     BATCH,
@@ -27,8 +28,8 @@ from slipid.control.tuning import (
 )
 
 Method = Literal["gradient", "pso"]
-GRADIENT = 6
-"""Rollouts that a gradient by five gains takes."""
+GRADIENT = len(GAINS) + 1
+"""Rollouts that a gradient by all gains takes."""
 PARTICLES = 30
 INERTIA, OWN, OTHERS = 0.7, 1.5, 1.5
 """Of a particle's speed, its pull to its own best place and to that of all."""
@@ -76,10 +77,16 @@ class Search:
         hand = box_of(HAND)
         count = np.array(0)
         if self.method == "gradient":
-            zero = np.zeros(5)
-            return {"count": count, "x": hand, "m": zero, "v": zero, "way": np.zeros((0, 5))}
+            zero = np.zeros(len(GAINS))
+            return {
+                "count": count,
+                "x": hand,
+                "m": zero,
+                "v": zero,
+                "way": np.zeros((0, len(GAINS))),
+            }
         rng = np.random.default_rng([self.seed, 0])
-        x = np.concatenate([hand[None], rng.uniform(size=(PARTICLES - 1, 5))])
+        x = np.concatenate([hand[None], rng.uniform(size=(PARTICLES - 1, len(GAINS)))])
         return {
             "count": count,
             "x": x,
@@ -96,7 +103,7 @@ class Search:
         """One step on."""
         return self._adam(state) if self.method == "gradient" else self._swarm(state)
 
-    def best(self, state: State) -> Float[np.ndarray, " 5"]:
+    def best(self, state: State) -> Float[np.ndarray, " gain"]:
         """Gains a search has come to, as far on the way there from those by hand as is stable."""
         end, hand = self._places(state).mean(axis=0), box_of(HAND)
         way = hand + np.linspace(1.0, 0.0, _HALTS)[:, None] * (end - hand)
@@ -105,7 +112,7 @@ class Search:
         at = way[stable[0] if len(stable) else int(np.argmin(push))]
         return np.asarray(gains_at(jnp.asarray(at)))
 
-    def spread(self, state: State) -> Float[np.ndarray, " 5"]:
+    def spread(self, state: State) -> Float[np.ndarray, " gain"]:
         """Std of the gains: over Adam's last third, whose cases change, or the best particles."""
         if self.method == "pso":
             order = np.argsort(state["value"])[: PARTICLES // 3]
@@ -142,7 +149,7 @@ class Search:
         k = int(state["count"])
         rng = np.random.default_rng([self.seed, k + 1])
         cases, x = self.cases.at(np.arange(BATCH)), state["x"]
-        parts = x.reshape(-1, 6, 5)  # as many at a time as a gradient's differences
+        parts = x.reshape(-1, 6, len(GAINS))  # few at a time need less memory
         push = [penalties(self.task, jnp.asarray(part), self.stable) for part in parts]
         value = np.array([self._value(row, cases) for row in x]) + np.concatenate(push)
         value = np.where(np.isfinite(value), value, np.inf)

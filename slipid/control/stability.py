@@ -126,7 +126,7 @@ def linearised(loop: Loop) -> Float[Array, "state state"]:
     is no state.
     """
     gains = loop.controller.gains
-    mild = jnp.array([MILD, MILD, 0.0, 0.0, 0.0]).at[3].set(gains[3])
+    mild = jnp.array([MILD, MILD, 0.0, 0.0, 0.0, 0.0]).at[3].set(gains[3])
     calm = eqx.tree_at(lambda x: x.controller.gains, loop, mild)
     state = jax.lax.scan(lambda s, _: (calm.step(s), None), loop.start(), None, length=SETTLING)[0]
     place = loop.kept.place("pose")
@@ -151,7 +151,7 @@ def radii(
         habits: of the wheels; period: [s].
         spare: factor on the pose, heading, integral and observer gains.
     """
-    more = jnp.array([spare, spare, spare, 1.0, spare]) * controller.gains
+    more = jnp.array([spare, spare, spare, 1.0, spare, 1.0]) * controller.gains
     ready = eqx.tree_at(lambda c: c.gains, controller, more)
 
     def one(truth: Frozen, surface: Array, way: Array) -> Array:

@@ -26,9 +26,10 @@ from slipid.control.stability import SPARE, radii
 from slipid.control.twin import Twin, rollout
 from slipid.model.plant import Floor
 
-HAND = (1.5, 1.5, 0.0, 0.0, 0.0)
+HAND = (1.5, 1.5, 0.0, 0.0, 0.0, 0.2)
 """Gains set by hand, in the order of `GAINS`."""
-LOWEST, HIGHEST = np.array([0.2, 0.2, 0.0, 0.0, 0.0]), np.array([5.0, 5.0, 1.5, 1.5, 1.0])
+LOWEST = np.array([0.2, 0.2, 0.0, 0.0, 0.0, 0.0])
+HIGHEST = np.array([5.0, 5.0, 1.5, 1.5, 1.0, 0.4])
 """Of the gains; the first two are searched in their logarithm."""
 BATCH = 16
 """Cases that are rolled out together."""
@@ -96,7 +97,7 @@ class Task(eqx.Module):
     steps: int = eqx.field(static=True, default=120)
     period: float = eqx.field(static=True, default=PERIOD)
 
-    def loss(self, gains: Float[Array, "5"], case: Cases) -> Float[Array, ""]:
+    def loss(self, gains: Float[Array, " gain"], case: Cases) -> Float[Array, ""]:
         """Of one case [mm]."""
         controller = Controller(self.frozen, gains, self.limits)
         pilot = Pilot(Estimator(self.frozen, self.settings), controller)
@@ -116,12 +117,12 @@ class Task(eqx.Module):
         missing = jax.nn.relu(case.path.duration - run.own[-1])
         return 1000.0 * jnp.sqrt(squares + effort + 1e-12) + w.late * missing
 
-    def penalty(self, gains: Float[Array, "5"], truths: Frozen) -> Float[Array, ""]:
+    def penalty(self, gains: Float[Array, " gain"], truths: Frozen) -> Float[Array, ""]:
         """Of a loop that is hardly stable [mm]; continues a little below the bound."""
         rho = radii(self._controller(gains), truths, self.habits, self.period, SPARE)
         return PENALTY * jax.nn.relu(jnp.max(rho) - LARGEST_RADIUS)
 
-    def margins(self, gains: Float[Array, "5"], truths: Frozen) -> Float[np.ndarray, " loop"]:
+    def margins(self, gains: Float[Array, " gain"], truths: Frozen) -> Float[np.ndarray, " loop"]:
         """1 - spectral radius of every draw, floor and direction, gains as they are."""
         rho = radii(self._controller(gains), truths, self.habits, self.period)
         return 1.0 - np.asarray(rho).reshape(-1)
@@ -130,14 +131,14 @@ class Task(eqx.Module):
         return Controller(self.frozen, gains, self.limits)
 
 
-def gains_at(x: Float[Array, "*batch 5"]) -> Float[Array, "*batch 5"]:
+def gains_at(x: Float[Array, "*batch gain"]) -> Float[Array, "*batch gain"]:
     """Gains at places of the unit box."""
     low, high = jnp.asarray(LOWEST), jnp.asarray(HIGHEST)
     ratio = jnp.where(low > 0, high / jnp.where(low > 0, low, 1.0), 1.0)
     return jnp.where(low > 0, low * ratio**x, low + (high - low) * x)
 
 
-def box_of(gains: Any) -> Float[np.ndarray, " 5"]:
+def box_of(gains: Any) -> Float[np.ndarray, " gain"]:
     """Place of gains in the unit box, the nearest one."""
     g = np.clip(np.asarray(gains, float), LOWEST, HIGHEST)
     logs = np.log(np.maximum(g, 1e-9) / np.maximum(LOWEST, 1e-9))
@@ -152,7 +153,7 @@ def combined(losses: Float[Array, " case"]) -> Float[Array, ""]:
 
 
 @eqx.filter_jit
-def losses(task: Task, x: Float[Array, "5"], cases: Cases) -> Float[Array, " case"]:
+def losses(task: Task, x: Float[Array, " gain"], cases: Cases) -> Float[Array, " case"]:
     """Loss of every case at a place of the box [mm]."""
     gains = gains_at(x)
     found: Array = jax.vmap(lambda case: task.loss(gains, case))(cases)
@@ -161,16 +162,16 @@ def losses(task: Task, x: Float[Array, "5"], cases: Cases) -> Float[Array, " cas
 
 @eqx.filter_jit
 def slopes(
-    task: Task, x: Float[Array, "5"], cases: Cases
-) -> tuple[Float[Array, "case 5"], Float[Array, " case"]]:
+    task: Task, x: Float[Array, " gain"], cases: Cases
+) -> tuple[Float[Array, "case gain"], Float[Array, " case"]]:
     """Derivatives of the losses by the place, and the losses.
 
-    By differences with the same noise: through the filter, `jax.jvp` by five gains takes as long as
-    27 rollouts, differences take 6, and over `REACH` the jumps at floors' edges, which a derivative
+    By differences with the same noise: through the filter, `jax.jvp` by five gains took as long as
+    27 rollouts, differences 6, and over `REACH` the jumps at floors' edges, which a derivative
     does not see, count as well.
     """
     step = jnp.where(x + REACH > 1, -REACH, REACH)
-    places = x + jnp.concatenate([jnp.zeros((1, 5)), jnp.diag(step)])
+    places = x + jnp.concatenate([jnp.zeros((1, len(x))), jnp.diag(step)])
 
     def of(place: Array) -> Array:
         return jax.vmap(lambda case: task.loss(gains_at(place), case))(cases)
@@ -180,16 +181,16 @@ def slopes(
 
 
 @eqx.filter_jit
-def penalties(task: Task, x: Float[Array, "place 5"], truths: Frozen) -> Float[Array, " place"]:
+def penalties(task: Task, x: Float[Array, "place gain"], truths: Frozen) -> Float[Array, " place"]:
     """Penalty at places of the box [mm]."""
     found: Array = jax.vmap(lambda place: task.penalty(gains_at(place), truths))(x)
     return found
 
 
-def penalty_slope(task: Task, x: Any, truths: Frozen) -> Float[np.ndarray, "5"]:
+def penalty_slope(task: Task, x: Any, truths: Frozen) -> Float[np.ndarray, " gain"]:
     """Derivative of the penalty by the place, by differences: eigenvalues meet and part [mm]."""
     step = 1e-3
-    places = np.asarray(x) + np.concatenate([np.zeros((1, 5)), step * np.eye(5)])
+    places = np.asarray(x) + np.concatenate([np.zeros((1, len(x))), step * np.eye(len(x))])
     value = np.asarray(penalties(task, jnp.asarray(places), truths))
     slope: np.ndarray = (value[1:] - value[0]) / step
     return slope

@@ -75,7 +75,7 @@ def steps_of(kind):
 
     contact = kind == "contact"
     observer = Estimator(f) if contact else Odometry(f, curve=True)
-    gains = jnp.array([2.0, 2.0, 0.2, 1.0 if contact else 0.0, 0.0])
+    gains = jnp.array([2.0, 2.0, 0.2, 1.0 if contact else 0.0, 0.0, 0.15])
     pilot, path = Pilot(observer, Controller(f, gains)), rectangle()
     rng, sensed = np.random.default_rng(0), observer.sensed
     speed = np.asarray(f.forward @ jnp.array([0.2, 0.05, 0.1]) / f.frame.radius)
