@@ -18,10 +18,9 @@ from scipy.stats import chi2
 
 from slipid.control.estimator import Settings
 from slipid.control.frozen import Frozen, freeze
-from slipid.data.dataset import Dataset, Windows, first_row
+from slipid.data.dataset import Dataset, first_row
 from slipid.data.log import Log
 from slipid.data.terrain import FloorMap
-from slipid.identify import likelihood as lk
 from slipid.model.robot import Robot, compose
 from slipid.parameter import Space
 
@@ -55,7 +54,7 @@ def frozen(
         variance: of every noise component, by name.
         load: set-up it drives with.
         top: highest wheel speed in the fitted runs [rad/s].
-        trend: of the currents in the fitted runs, see `current_trend`.
+        trend: of the currents in the fitted runs, see `slipid.identify.curves.current_trend`.
     """
     rng = np.random.default_rng(0)
     root = np.linalg.cholesky(np.asarray(covariance))
@@ -63,15 +62,6 @@ def frozen(
     draws = jax.vmap(space.tree)(jnp.asarray(several))
     std = {name: float(np.sqrt(v)) for name, v in variance.items()}
     return freeze(space.tree(jnp.asarray(z)), load, std, draws, top, trend)
-
-
-def current_trend(robot: Robot, w: Windows) -> tuple[float, float]:
-    """Least squares a + b v of measured less predicted currents, v the encoders' speed."""
-    b = lk.batch(w, robot)
-    gap = np.asarray(b.current - lk.predicted_current(robot, b, lk.predict(robot, b).felt))
-    speed = np.broadcast_to((lk.travel(w, robot)[0] / w.dt)[..., None], gap.shape).ravel()
-    a, slope = np.linalg.lstsq(np.stack([np.ones_like(speed), speed], 1), gap.ravel())[0]
-    return float(a), float(slope)
 
 
 def heard(estimator: Any, log: Log) -> tuple[np.ndarray, np.ndarray]:

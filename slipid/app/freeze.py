@@ -50,7 +50,7 @@ def frozen_of(fit: Fit, load: str | None = None, draws: int = 64, seed: int = 0)
     """
     name = load_of(fit, load)
     several = _trees(fit, draws, seed) if draws else None
-    return freeze(fit.robot, name, _stds(fit), several, _highest(fit))
+    return freeze(fit.robot, name, _stds(fit), several, _highest(fit), fit.current_trend)
 
 
 def frozen_draws(fit: Fit, load: str | None = None, draws: int = 16, seed: int = 0) -> Frozen:
@@ -68,7 +68,8 @@ def frozen_draws(fit: Fit, load: str | None = None, draws: int = 16, seed: int =
     name, std, top = load_of(fit, load), _stds(fit), _highest(fit)
     trees = _trees(fit, draws, seed)
     one = [
-        freeze(jax.tree.map(lambda x, k=k: x[k], trees), name, std, None, top) for k in range(draws)
+        freeze(jax.tree.map(lambda x, k=k: x[k], trees), name, std, None, top, fit.current_trend)
+        for k in range(draws)
     ]
     stacked: Frozen = jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
     return stacked

@@ -293,11 +293,10 @@ def pilot_of(
     frozen: Frozen, settings: Settings, row: Row, gains: Mapping[str, float]
 ) -> closed_loop.Pilot:
     """Estimator and controller of a row."""
+    own = {**HAND, **(gains if row.tuned else {}), **({"ahead": 1.0} if row.ahead else {})}
     observer: Any = Estimator(frozen, settings)
     if row.observer != "contact":
         observer = Odometry(frozen, settings, curve=row.observer == "curve")
-    own = {**HAND, **(gains if row.tuned else {}), **({"ahead": 1.0} if row.ahead else {})}
-    if row.observer != "contact":
         own["preview"] = 0.0  # the paper's loop has none
     values = jnp.asarray([own[name] for name in GAINS])
     return closed_loop.Pilot(observer, Controller(frozen, values, correction=row.correction))

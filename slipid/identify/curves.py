@@ -131,3 +131,18 @@ def validity(data: Dataset, robot: Robot, b: lk.Batch) -> dict[str, dict[str, An
             "distance": round(float(far[floor == k].sum()) / max(len(runs), 1), 3),
         }
     return out
+
+
+def current_trend(robot: Robot, b: lk.Batch) -> tuple[float, float]:
+    """Least squares a + b v of measured less predicted sizes of currents, v by the encoders.
+
+    Returns:
+        a [A] and b [A s/m], over all floors.
+    """
+    predicted = lk.predicted_current(robot, b, lk.predict(robot, b).felt)
+    gap = np.asarray((b.current - predicted) * jnp.sign(predicted))
+    speed = np.broadcast_to((lk.travel(b, robot)[0] / b.dt)[..., None], gap.shape).ravel()
+    rows = np.stack([np.ones_like(speed), speed], axis=1)
+    known = np.isfinite(gap).ravel()
+    a, slope = np.linalg.lstsq(rows[known], gap.ravel()[known])[0]
+    return float(a), float(slope)

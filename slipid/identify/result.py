@@ -57,6 +57,7 @@ class Fit:
             as the prior.
         has: which of current, voltage were logged.
         curves: slip over torque per floor, as in identified.json.
+        current_trend: a + b v, measured currents over the model's at speed v [A], [A s/m].
         validity: what each floor was seen with.
         converged, reason, rounds, history: how the fit ended.
         remaining: largest step a full Gauss-Newton step would still take, in posterior stds; a
@@ -88,6 +89,7 @@ class Fit:
     history: tuple[float, ...]
     settings: Mapping[str, Any]
     baselines: Mapping[str, Any] = field(default_factory=dict)
+    current_trend: tuple[float, float] = (0.0, 0.0)
 
     @cached_property
     def robot(self) -> Robot:
@@ -191,6 +193,7 @@ class Fit:
             "curves": dict(self.curves),
             "validity": dict(self.validity),
             "settings": dict(self.settings),
+            "current_trend": list(self.current_trend),
             "baselines": dict(self.baselines),
             "data": {"hash": self.data_hash, "runs": [list(r) for r in self.runs]},
         }
@@ -283,6 +286,7 @@ def _from_files(kept: dict[str, Any], arrays: dict[str, np.ndarray]) -> Fit:
         history=tuple(np.inf if x is None else x for x in kept["history"]),
         settings=kept["settings"],
         baselines=kept["baselines"],
+        current_trend=tuple(kept.get("current_trend", (0.0, 0.0))),
     )
 
 
@@ -306,6 +310,7 @@ def summarise(
     settled = left < REMAINING
     stuck = f"the solver stopped {left:.2g} stds of {name} away from where its own step leads"
     windows = problem.windows
+    robot = problem.space.tree(jnp.asarray(z))
     unit = dict(zip(problem.noise.names, problem.noise.unit, strict=True))
     effects = {name: u for name, u in unit.items() if name.startswith("run.")}
     unit |= {f"session.{name.removeprefix('run.')}": u for name, u in effects.items()}
@@ -327,7 +332,7 @@ def summarise(
         curves=curves_of.curves(
             problem.space, z, draws(z, contact.covariance, 400, seed), problem.batch
         ),
-        validity=curves_of.validity(data, problem.space.tree(jnp.asarray(z)), problem.batch),
+        validity=curves_of.validity(data, robot, problem.batch),
         converged=bool(optimum.converged) and settled,
         reason=optimum.reason if settled or not optimum.converged else stuck,
         remaining=left,
@@ -339,6 +344,9 @@ def summarise(
             "current_is_signed": bool(windows.current_is_signed),
             "seed": seed,
         },
+        current_trend=curves_of.current_trend(robot, problem.batch)
+        if windows.has_current
+        else (0.0, 0.0),
     )
 
 

@@ -28,8 +28,10 @@ from slipid.app.config import parsed
 from slipid.app.job import Job, read_job, with_mixed
 from slipid.control.estimator import Estimator
 from slipid.identify.crossing import crossing
+from slipid.identify.curves import current_trend
 from slipid.identify.fit import optimise
 from slipid.identify.folds import sectors
+from slipid.identify.likelihood import batch
 from slipid.identify.mixed import update
 from slipid.identify.predictive import contact_of
 from tests import replayed
@@ -95,7 +97,8 @@ def estimator(job: Job, part: Part, runs: np.ndarray) -> Estimator:
     """Frozen from a part; `runs` on one floor are those it was fitted to."""
     problem = job.problem()
     seen = problem.windows.pieces(np.flatnonzero(np.isin(problem.windows.run, runs)))
-    trend = replayed.current_trend(problem.space.tree(jnp.asarray(part[0])), seen)
+    robot = problem.space.tree(jnp.asarray(part[0]))
+    trend = current_trend(robot, batch(seen, robot))
     return Estimator(replayed.frozen(problem.space, *part, "as_built", TOP, trend), SETTINGS)
 
 
