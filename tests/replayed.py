@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2
 
-from slipid.control.estimator import Settings
 from slipid.control.frozen import Frozen, freeze
 from slipid.data.dataset import Dataset, first_row
 from slipid.data.log import Log
@@ -28,12 +27,6 @@ TOGETHER = 32
 """Runs replayed in one call."""
 ROWS = 128
 """Rows are filled up to a multiple of it, so that few shapes are compiled."""
-SETTINGS = Settings(
-    current_is_signed=False, forget_s=0.4, patch_m=0.1, alike=6.0, ammeter_std_a=0.07
-)
-"""Chosen on fitted runs: what the model misses in a current lasts, so that rows tell little anew;
-rows of these ammeters scatter by 0.1 to 0.2 A about the model, which 50 ms halve.
-"""
 STARTS = 0.001
 """A robot moves from where the rim of a wheel has moved this far [m]."""
 

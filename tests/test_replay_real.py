@@ -47,7 +47,7 @@ def rows(robot: Robot, data: Dataset) -> list[replayed.Judged]:
     kept = json.loads(FIT.read_text())
     std, trend = kept["std"], tuple(kept["current_trend"])
     frozen = freeze(robot, "as_built", std, highest_speed=8.0, current_trend=trend)
-    est = Estimator(frozen, replayed.SETTINGS)
+    est = Estimator(frozen)
     said = replayed.replay(est, data.logs)
     noise = {name: value**2 for name, value in std.items()}
     return replayed.judged(robot, est.frozen.labels, data, said, noise)

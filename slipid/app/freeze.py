@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from slipid.control.estimator import Settings
+from slipid.control.estimator import MIXED, Settings
 from slipid.control.frozen import Frozen, freeze
 from slipid.control.habits import Habits
 from slipid.data.log import DataError
@@ -15,13 +15,16 @@ from slipid.identify.result import Fit
 def sensors_of(fit: Fit, gyro: bool) -> tuple[Settings, Habits]:
     """What the estimator and the twin of a fit's robot count on: the sensors of its logs.
 
+    One that has learnt from runs over several floors expects to drive on several.
+
     Args:
         fit: as `slipid identify` left it.
         gyro: whether the robot has one.
     """
     signed = bool(fit.settings["current_is_signed"])
     habits = Habits(voltage=bool(fit.has["voltage"]), gyro=gyro, signed=signed)
-    return Settings(current_is_signed=signed), habits
+    mixed = {"alike": MIXED} if "mixed" in fit.settings else {}
+    return Settings(current_is_signed=signed, **mixed), habits
 
 
 def load_of(fit: Fit, load: str | None) -> str:

@@ -28,6 +28,8 @@ from slipid.control.packed import Layout
 from slipid.model.robot import GRAVITY, advance, compose
 from slipid.model.settle import combine, settle
 
+MIXED = 1.0
+"""`Settings.alike` of a robot that is known to drive across the edges of floors."""
 HISTORY = 48
 """Steps a delayed measurement may reach back."""
 HASTE = 30.0
@@ -92,12 +94,12 @@ class Settings:
     """
 
     current_is_signed: bool = False
-    forget_s: float = 0.1
+    forget_s: float = 0.4
     filter_s: float = 0.05
-    patch_m: float = 0.15
-    alike: float = 1.0
+    patch_m: float = 0.1
+    alike: float = 3.0
     unknown_std: float = 3.0
-    ammeter_std_a: float = 0.05
+    ammeter_std_a: float = 0.07
     voltmeter_std_v: float = 0.06
     gyro_std: float = 0.004
     gyro_bias_std: float = 0.01

@@ -1,11 +1,13 @@
 """What an estimator and a controller know of an identified robot, as arrays."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.model import contact
@@ -59,6 +61,27 @@ class Frozen(eqx.Module):
     def wheels(self) -> int:
         """Number of wheels."""
         return len(self.rest)
+
+    def on(self, *floors: str) -> "Frozen":
+        """For a place of which it is known that there are only these floors.
+
+        Raises:
+            ValueError: none, or one that is not identified; names those that are.
+        """
+        for name in floors:
+            if name not in self.labels:
+                raise ValueError(f"no floor '{name}'; identified: {', '.join(self.labels)}")
+        if not floors:
+            raise ValueError(f"no floor; expected some of {', '.join(self.labels)}")
+        rows = np.array([self.labels.index(name) for name in floors])
+        return replace(
+            self,
+            floors=jax.tree.map(lambda leaf: leaf[rows], self.floors),
+            process=self.process[rows],
+            effect=self.effect[rows],
+            current_std=self.current_std[rows],
+            labels=floors,
+        )
 
 
 def freeze(
