@@ -53,7 +53,7 @@ def pilot(kind):
     if kind == "curve":
         gains = jnp.array([2.0, 2.0, 0.2, 0.0, 0.0, 0.15])
         return Pilot(Odometry(frozen, curve=True), Controller(frozen, gains))
-    return Pilot(Estimator(frozen), Controller(frozen, jnp.array([2.0, 2.0, 0.2, 1.0, 0.3])))
+    return Pilot(Estimator(frozen), Controller(frozen, jnp.array([2.0, 2.0, 0.2, 1.0, 0.3, 0.15])))
 
 
 @cache
@@ -362,9 +362,18 @@ def test_flags_come_on_and_go_off():
     assert float(said[-1].stale) == 0
     fast = 1.4 * 13.0 * speed / np.abs(speed).max()
     assert float(drive(state, 1, fast)[1][-1].out_of_range) == 1
-    # currents no floor explains
-    _, said = drive(state, 100, speed, current=jnp.full(3, 1.25 * float(robot().highest[1])))
-    assert float(said[-1].out_of_range) == 1
+
+
+def test_currents_that_no_floor_explains_are_out_of_range():
+    sure = eqx.tree_at(lambda f: f.current_std, robot(), jnp.full(3, 0.03))
+    est = Estimator(sure, Settings(ammeter_std_a=0.02))
+    run = jax.jit(lambda state, z: est.step(state, z, DT))
+    state, speed = est.init(), wheels([0.2, 0.0, 0.0])
+    for amps, beyond in ((0.3, 0.0), (1.25 * float(sure.highest[1]), 1.0)):
+        for _ in range(60):
+            z = reading(wheel_speed=speed, current=amps * np.array([1.0, 0.0, 1.0]) + 0.1 * beyond)
+            state, said = run(state, z)
+        assert float(est.estimated.of(said).out_of_range) == beyond
     assert np.asarray(said[-1].surface)[0, -1] > 0.5
 
 

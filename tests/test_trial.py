@@ -10,6 +10,7 @@ from slipid.app import trial as tr
 from slipid.app.plants import floor_of
 from slipid.control import closed_loop, reference
 from slipid.control.controller import GAINS, Controller
+from slipid.control.estimator import Estimator
 from slipid.control.frozen import freeze
 from slipid.control.odometry import Odometry
 from slipid.data.log import DataError
@@ -68,6 +69,15 @@ def test_a_path_waits_for_a_robot_that_lags_and_not_for_one_that_is_ahead():
     assert float(ahead) == pytest.approx(2.05)
 
 
+def test_a_preview_is_of_the_rates_alone():
+    path = reference.waypoints([(0.0, 0.0), (1.0, 0.0)], pause=0.0)
+    now = jnp.asarray(path.duration - 0.35)  # it brakes for 0.4 s
+    _, plain = path.follow(now, path.at(now)[:3], 0.05)
+    _, early = path.follow(now, path.at(now)[:3], 0.05, 0.2)
+    np.testing.assert_array_equal(early[:3], plain[:3])
+    assert float(plain[3] - early[3]) == pytest.approx(0.5 * 0.2)
+
+
 def test_way_points_are_refused_with_the_reason():
     with pytest.raises(ValueError, match="two or more places"):
         reference.waypoints([(0.0, 0.0)])
@@ -84,11 +94,12 @@ def test_smooth_paths_close(turning):
 
 
 class Perfect:
-    """A plant without slip, whose wheels turn as they are told."""
+    """A plant without slip, whose wheels turn as they are told, some periods later."""
 
-    def __init__(self, frozen, start, travelled=1.0):
+    def __init__(self, frozen, start, travelled=1.0, late=0):
         self.frozen, self._pose, self.travelled = frozen, np.array(start, float), travelled
         self.angle = np.zeros(3)
+        self.waiting = [np.zeros(3)] * late
 
     @property
     def pose(self):
@@ -98,6 +109,8 @@ class Perfect:
         return self.step(np.zeros(3))
 
     def step(self, wheel_speed):
+        self.waiting = [*self.waiting, np.asarray(wheel_speed)]
+        wheel_speed = self.waiting.pop(0)
         self.angle = self.angle + np.asarray(wheel_speed) * closed_loop.PERIOD
         v = np.asarray(self.frozen.inverse) @ np.asarray(wheel_speed) * 0.04 * closed_loop.PERIOD
         v = v * [self.travelled, self.travelled, 1.0]
@@ -108,8 +121,8 @@ class Perfect:
         return out
 
 
-def pilot(frozen):
-    gains = jnp.asarray([{**tr.HAND, "ahead": 0.0}[name] for name in GAINS])
+def pilot(frozen, preview=0.0):
+    gains = jnp.asarray([{**tr.HAND, "preview": preview}[name] for name in GAINS])
     return closed_loop.Pilot(Odometry(frozen), Controller(frozen, gains))
 
 
@@ -124,6 +137,16 @@ def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(frozen):
     assert np.abs(found["along_track_mm"]).max() < 10
     assert abs(found["heading_error_deg"]) < 0.5
     assert found["path_length_mm"] == pytest.approx(2600, rel=0.03)
+
+
+def test_rates_are_asked_for_early_of_wheels_that_follow_late(frozen):
+    start, path = (0.0, 0.0, 0.0), reference.waypoints([(0.0, 0.0), (0.9, 0.0)])
+    far = []
+    for preview in (0.0, 0.2):
+        plant = Perfect(frozen, start, late=4)
+        far.append(closed_loop.drive(pilot(frozen, preview), path, plant, start).pose[:, 0].max())
+    assert far[0] > 0.92  # four periods at 0.2 m/s too far
+    assert far[1] < 0.905
 
 
 def test_metrics_see_a_robot_that_travels_only_part_of_its_way(frozen):
@@ -149,6 +172,22 @@ def test_starts_are_spread_and_the_same_for_everyone():
         middles.append((x + 0.45 * c + 0.2 * s, y + 0.45 * s - 0.2 * c))
     assert np.abs(middles).max() <= 1.2 + 1e-9
     assert np.std(middles, axis=0).min() > 0.4
+
+
+def test_a_robot_can_be_told_which_floors_there_are(frozen):
+    a, b = frozen.labels
+    only = frozen.on(b)
+    assert only.labels == (b,)
+    assert float(only.floors.friction[0]) == float(frozen.floors.friction[1])
+    assert frozen.on(b, a).on(a).current_std == frozen.current_std[0]
+    rim = jnp.asarray([3.0, -5.0, 2.0])
+    alone, _ = Estimator(only)._solve(jnp.zeros((1, 3)), rim)
+    every, _ = Estimator(frozen)._solve(jnp.zeros((8, 3)), rim)
+    np.testing.assert_allclose(alone[0], every[-1], atol=1e-6)
+    with pytest.raises(ValueError, match=f"no floor 'ice'; identified: {a}, {b}"):
+        frozen.on("ice")
+    with pytest.raises(ValueError, match="no floor; expected some of"):
+        frozen.on()
 
 
 def test_a_map_is_looked_up_under_the_wheels(frozen):

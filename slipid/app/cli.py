@@ -298,7 +298,7 @@ def tune(
     method: Annotated[str, typer.Option("--method", help="gradient or pso.")] = "gradient",
     rollouts: Annotated[
         int, typer.Option("--rollouts", min=1, help="Rehearsals it may spend.")
-    ] = 3840,
+    ] = 3360,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of draws, floors and search.")] = 0,
     gyro: Annotated[bool, typer.Option("--gyro/--no-gyro", help="The robot has a gyro.")] = False,
     json: Json = None,

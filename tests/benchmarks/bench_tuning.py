@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-SEEDS, ROLLOUTS, JUDGED = 5, 3840, 96
+SEEDS, ROLLOUTS, JUDGED = 5, 3360, 96
 
 
 def test_gradient_against_swarm_and_hand():
