@@ -374,7 +374,7 @@ def test_currents_that_no_floor_explains_are_out_of_range():
             z = reading(wheel_speed=speed, current=amps * np.array([1.0, 0.0, 1.0]) + 0.1 * beyond)
             state, said = run(state, z)
         assert float(est.estimated.of(said).out_of_range) == beyond
-    assert np.asarray(said[-1].surface)[0, -1] > 0.5
+    assert np.asarray(est.estimated.of(said).surface)[0, -1] > 0.5
 
 
 def test_a_robot_that_spins_its_wheels_in_place_is_immobilised():
