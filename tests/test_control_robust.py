@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slipid.control.closed_loop import Pilot
-from slipid.control.controller import Controller, Limits, inverse_contact, limited
+from slipid.control.controller import UNTIMED_S, Controller, Limits, inverse_contact, limited
 from slipid.control.estimator import Estimator, Settings
 from slipid.control.frozen import freeze
 from slipid.control.odometry import Odometry
@@ -87,6 +87,8 @@ def sane(kind, state, said, before, dt):
     command = said[: f.wheels]
     amps = p.controller.estimated.of(said[f.wheels : -1]).current
     passed = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, 0.5), 0.0)
+    stops = jnp.all(jnp.abs(command) <= jnp.abs(last.command))
+    passed = jnp.where(stops, jnp.maximum(passed, UNTIMED_S), passed)
     allowed = LIMITS.acceleration * passed + 1e-9
     slow = jnp.all(jnp.abs(command) <= LIMITS.wheel_speed + 1e-9)
     gentle = jnp.all(jnp.abs(command - last.command) <= allowed) | (last.begun < 0.5)
@@ -108,9 +110,10 @@ def check(kind):
 def adversary(kind, key, count, angle):
     """Readings and time steps of so many robots, most of them broken in some way."""
     sensed = pilot(kind).observer.sensed
-    k = jax.random.split(key, 9)
+    k = jax.random.split(key, 10)
     speed = jax.random.uniform(k[0], (count, 3), minval=-12.0, maxval=12.0)
-    angle = angle + DT * speed
+    stuck = jax.random.bernoulli(k[9], 0.01, (count, 3))
+    angle = jnp.where(stuck, angle, angle + DT * speed)
     # a reset or a jump of one encoder in a hundred, another hundredth stuck
     reset = jax.random.bernoulli(k[1], 0.01, (count, 3))
     angle = jnp.where(reset, jax.random.normal(k[2], (count, 3)) * 1e3, angle)
@@ -304,6 +307,62 @@ def test_a_late_fix_corrects_as_a_prompt_one_does():
     _, late = drive(state, 1, fix=moved(was), fix_age=5 * DT, **one)
     np.testing.assert_allclose(prompt[0].pose, moved(now), atol=0.01)
     np.testing.assert_allclose(late[0].pose, prompt[0].pose, atol=0.01)
+
+
+def test_a_late_fix_does_not_know_what_came_after_it():
+    """Late, it leaves at least the covariance of one in time that was driven on from."""
+    est, run = watch()
+    speed, std = wheels([0.2, 0.05, 0.2]), np.array([0.001, 0.002])
+    state, _ = drive(est.init(std=(0.05, 0.1)), 60, speed)
+    there = np.asarray(est._kept.of(state).pose)
+    prompt, _ = run(state, reading(fix=there, fix_std=std, fix_age=0.0), 1e-4)
+    prompt, _ = drive(prompt, 30, speed)
+    late, _ = drive(state, 30, speed)
+    late, _ = run(late, reading(fix=there, fix_std=std, fix_age=30 * DT), 1e-4)
+    a, b = (np.asarray(est._kept.of(x).covariance)[:3, :3] for x in (late, prompt))
+    assert np.all(np.diag(a) > 0.7 * np.diag(b))
+    assert np.all(np.diag(a) < 2.0 * np.diag(b))
+    assert np.linalg.eigvalsh(a).min() > 0
+    # one more in time, then an old one again: never less than nothing
+    here = np.asarray(est._kept.of(late).pose)
+    state, _ = run(late, reading(fix=here, fix_std=std, fix_age=0.0), DT)
+    state, _ = run(state, reading(fix=there, fix_std=std, fix_age=32 * DT), DT)
+    assert np.linalg.eigvalsh(np.asarray(est._kept.of(state).covariance)[:3, :3]).min() > 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("lost", [(), (20,), (20, 21, 22), tuple(range(3, 60, 4))])
+def test_readings_that_are_lost_do_not_make_the_way_longer(kind, lost):
+    est = pilot(kind).observer
+    run = jax.jit(lambda s, z, dt: est.step(s, z, dt))
+
+    def way(lost, twice=()):
+        state, angle, speed = est.init(jnp.zeros(3)), np.zeros(3), wheels([0.2, 0.0, 0.0])
+        for k in range(60):
+            heard = reading(kind) if k in lost else reading(kind, wheel_angle=angle)
+            state, said = run(state, heard, DT)
+            if k in twice:  # the same time once more
+                state, said = run(state, heard, 0.0)
+            angle = angle + DT * speed
+        return np.asarray(est.estimated.of(said).pose)
+
+    np.testing.assert_allclose(way(lost), way(()), atol=2e-3)
+    np.testing.assert_allclose(way((), lost), way(()), atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("dt", [0.0, np.nan, -1.0])
+def test_it_stops_where_the_clock_fails_for_good(kind, dt):
+    p, run = pilot(kind), step(kind)
+    state, angle = p.init(jnp.zeros(3)), np.zeros(3)
+    moved = 0.0
+    for k in range(100):
+        z = reading(kind, wheel_angle=angle, current=jnp.full(3, 0.3))
+        state, out = run(state, z, DT if k < 40 else dt)
+        command = np.asarray(out[:3])
+        angle, moved = angle + DT * command, max(moved, np.abs(command).max())
+    assert moved > 1.0
+    assert np.abs(command).max() == 0.0
 
 
 def test_the_gyro_bias_is_learnt_at_rest_and_not_while_it_creeps():

@@ -352,3 +352,20 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path):
     drawn = invoke("sample", out)
     assert drawn.exit_code == 2
     assert "runs over several floors, which are not sampled yet" in drawn.stderr
+    deployed(out)
+
+
+def deployed(out):
+    """The fit drives its twin; what is done is not done again."""
+    wish = ("trial", out, "--plant", "twin", "--starts", 2, "--jobs", 1)
+    wish = (*wish, "--controllers", "encoder,contact", "--json", out / "t.json")
+    first = invoke(*wish)
+    assert first.exit_code == 0, first.stderr
+    said = json.loads((out / "t.json").read_text())
+    encoder, contact = (said["summary"][name] for name in ("encoder", "contact"))
+    assert contact["closure_error_median"] < encoder["closure_error_median"]
+    assert encoder["first_side_along_track_mm"] > 20  # it slips
+    assert (out / "trial.png").stat().st_size > 10_000
+    again = invoke(*wish)
+    assert "driving 0 of 4 runs" in again.stderr
+    assert json.loads((out / "t.json").read_text())["runs"] == said["runs"]

@@ -1,6 +1,7 @@
 """Paths, metrics and the trial command."""
 
 import json
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -133,7 +134,8 @@ def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(frozen):
     found = closed_loop.metrics(course)
     assert found["finished"]
     assert found["closure_mm"] < 5
-    assert found["cross_track_rmse_mm"] < 12
+    assert found["cross_track_rmse_mm"] < 10
+    assert found["energy_j"] is None  # this plant does not know
     assert np.abs(found["along_track_mm"]).max() < 10
     assert abs(found["heading_error_deg"]) < 0.5
     assert found["path_length_mm"] == pytest.approx(2600, rel=0.03)
@@ -158,6 +160,30 @@ def test_metrics_see_a_robot_that_travels_only_part_of_its_way(frozen):
     assert found["along_track_mm"][1] == pytest.approx(-80, abs=12)
     assert found["closure_mm"] < 12  # every side is as short as its opposite
     assert found["cross_track_rmse_mm"] > 30
+
+
+def test_a_robot_that_does_not_move_has_its_whole_way_left(frozen):
+    path = reference.rectangle()
+    plant = Perfect(frozen, (0.0, 0.0, 0.0), 0.0)
+    course = closed_loop.drive(pilot(frozen), path, plant, (0.0, 0.0, 0.0))
+    assert closed_loop.metrics(course)["closure_mm"] < 5  # its encoders say that it has arrived
+    course = replace(course, own=np.zeros_like(course.own))
+    found = closed_loop.metrics(course)
+    assert not found["finished"]
+    assert found["closure_mm"] == pytest.approx(2600, abs=1)
+
+
+def test_the_distance_from_a_path_is_from_its_line():
+    line = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    places = np.array([[0.37, 0.2], [1.3, 0.63], [1.3, 1.4], [0.5, 0.0]])
+    np.testing.assert_allclose(
+        closed_loop._from_line(places, line), [0.2, 0.3, 0.5, 0.0], atol=1e-12
+    )
+
+
+def test_gains_of_another_length_are_refused(frozen):
+    with pytest.raises(ValueError, match="expected 6: place, yaw"):
+        Controller(frozen, jnp.ones(5))
 
 
 def test_starts_are_spread_and_the_same_for_everyone():
@@ -208,17 +234,34 @@ def test_what_a_trial_cannot_do_is_said(tmp_path):
     with pytest.raises(DataError, match="no controller 'magic'; expected some of encoder"):
         tr._jobs(tmp_path, tr.Wish(controllers=("magic",)))
     with pytest.raises(DataError, match="has no surface 'gray'; it has firm"):
-        tr._known_grounds(uniform("gray"))
+        tr._known_to_site(uniform("gray"), "as_built", 3)
+    with pytest.raises(DataError, match="no load set-up 'far'; it has as_built"):
+        tr._known_to_site(uniform("firm"), "far", 3)
+    with pytest.raises(DataError, match="has 3 wheels, the fit's 4"):
+        tr._known_to_site(uniform("firm"), "as_built", 4)
+    with pytest.raises(DataError, match="no controller; expected some of encoder"):
+        tr._jobs(tmp_path, tr.Wish(controllers=tr.names_of(",")))
+    assert tr.names_of("contact, encoder,contact") == ("contact", "encoder")
     (tmp_path / "gains.json").write_text(json.dumps({"gains": {"place": {"value": 1}}}))
     with pytest.raises(DataError, match="no gains"):
-        tr.gains_of(tmp_path)
+        tr.gains_of(tmp_path, {"data": "a"}, "as_built")
 
 
 def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path):
-    assert tr.gains_of(tmp_path) == tr.HAND
+    fit = {"data": "a", "numbers": "b"}
+    assert tr.gains_of(tmp_path, fit, "as_built") == tr.HAND
     tuned = {name: {"value": k + 0.5} for k, name in enumerate(GAINS)}
-    (tmp_path / "gains.json").write_text(json.dumps({"gains": tuned}))
-    assert tr.gains_of(tmp_path) == {name: k + 0.5 for k, name in enumerate(GAINS)}
+    content = {"gains": tuned, "fit": fit, "settings": {"load": "as_built"}}
+    (tmp_path / "gains.json").write_text(json.dumps(content))
+    found = tr.gains_of(tmp_path, fit, "as_built")
+    assert found == {name: k + 0.5 for k, name in enumerate(GAINS)}
+    for of, load in (({**fit, "numbers": "c"}, "as_built"), (fit, "far")):
+        with pytest.raises(DataError, match=r"another fit or load set-up \(as_built\); run slipid"):
+            tr.gains_of(tmp_path, of, load)
+    tuned["yaw"]["value"] = float("nan")
+    (tmp_path / "gains.json").write_text(json.dumps(content))
+    with pytest.raises(DataError, match="a gain is no number"):
+        tr.gains_of(tmp_path, fit, "as_built")
 
 
 def test_the_summary_is_of_medians_over_starts_with_intervals():

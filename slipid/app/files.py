@@ -1,5 +1,6 @@
 """What a job keeps beside its results: hashes, versions, the checkpoint of a running fit."""
 
+import hashlib
 import platform
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,13 @@ import numpy as np
 
 from slipid.data.files import read_json, write_arrays, write_json
 from slipid.data.log import DataError
+
+
+def code(*parts: str) -> bytes:
+    """Hash of the sources of some of slipid's packages, by name."""
+    root = Path(__file__).resolve().parents[1]
+    found = sorted(path for part in parts for path in (root / part).rglob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in found)).digest()
 
 
 def versions() -> dict[str, str]:

@@ -1,9 +1,11 @@
 """From a fit to what runs on the robot: frozen at the fitted numbers, or at posterior draws."""
 
+from hashlib import sha256
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from slipid.control.estimator import MIXED, Settings
 from slipid.control.frozen import Frozen, freeze
@@ -25,6 +27,13 @@ def sensors_of(fit: Fit, gyro: bool) -> tuple[Settings, Habits]:
     habits = Habits(voltage=bool(fit.has["voltage"]), gyro=gyro, signed=signed)
     mixed = {"alike": MIXED} if "mixed" in fit.settings else {}
     return Settings(current_is_signed=signed, **mixed), habits
+
+
+def fit_hash(fit: Fit) -> dict[str, str]:
+    """Of the runs a fit was made of, and of its numbers."""
+    numbers = sha256(np.asarray(fit.z, "<f8").tobytes())
+    numbers.update(np.asarray(fit.covariance, "<f8").tobytes())
+    return {"data": fit.data_hash, "numbers": numbers.hexdigest()}
 
 
 def load_of(fit: Fit, load: str | None) -> str:

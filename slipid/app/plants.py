@@ -1,6 +1,7 @@
 """Plants for the closed loop: the virtual test site, and the identified model itself."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +41,8 @@ class SitePlant:
     ):
         site = Site() if site is None else site
         site = replace(site, sensors=replace(site.sensors, gyro=gyro))
-        self._live = Live(site, floor, load, start, seed)
+        self._new = partial(Live, site, floor, load, start, seed)
+        self._live = self._new()
         self._layout = sensed(len(site.machine.wheel_azimuths_deg))
 
     @property
@@ -54,7 +56,8 @@ class SitePlant:
         return self._live.power
 
     def reset(self) -> Float[np.ndarray, " sensed"]:
-        """First readings."""
+        """First readings, of the robot at rest at its start."""
+        self._live = self._new()
         return self._packed(self._live.read())
 
     def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Float[np.ndarray, " sensed"]:

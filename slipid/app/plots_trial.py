@@ -29,7 +29,7 @@ def trial_plot(
     ratio = content["summary"][best].get("to_encoder", {}).get("closure_error_median", {})
     said = f", {100 * ratio['value']:.0f} % of the encoders'" if ratio else ""
     made = figure(
-        13,
+        13.0,
         3.1 * -(-len(names) // 3) + 3.4,
         f"Rectangle trial on the {content['plant']}: {best} closes best{said}",
     )

@@ -32,6 +32,7 @@ def spread(
         yield from ((job, work(job)) for job in todo)
         return
     # forked processes would inherit the threads of whatever the caller has loaded
+    others = set(active_children())
     pool = ProcessPoolExecutor(jobs, get_context("spawn"), _work_for, (os.getpid(),))
     try:
         with _deaf():  # Ctrl-C is for this process, from the start of the others on
@@ -45,7 +46,7 @@ def spread(
         ) from error
     finally:  # what is half done is nothing yet: files come whole
         pool.shutdown(wait=False, cancel_futures=True)
-        for child in active_children():
+        for child in set(active_children()) - others:
             child.terminate()
 
 

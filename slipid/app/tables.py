@@ -380,6 +380,8 @@ def trial(found: dict[str, Any], out: Path) -> None:
     for name, row in found["summary"].items():
         ratio = row.get("to_encoder", {}).get("closure_error_median")
         told = "" if ratio is None else f"{100 * ratio['value']:.0f} % closure"
+        if row["finished_share"] < 1:
+            told += f", {100 * row['finished_share']:.0f} % of runs finished"
         table.add_row(
             name,
             f"{row['closure_error_median']:.0f} mm",

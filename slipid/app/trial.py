@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.app import runtime
-from slipid.app.freeze import frozen_of, load_of, sensors_of
+from slipid.app import files, runtime
+from slipid.app.freeze import fit_hash, frozen_of, load_of, sensors_of
 from slipid.app.progress import Reporter
 from slipid.app.spread import spread
 from slipid.control import closed_loop, reference, tuning
@@ -67,9 +67,9 @@ ROWS: Mapping[str, Row] = {
     "paper_print": Row("curve", "and torque correction as printed", "paper_print"),
     "paper_code": Row("curve", "and torque correction as its authors ran it", "paper_code"),
     "torque": Row("curve", "and torque correction, corrected", "torque"),
-    "lyapunov": Row("contact", "Lyapunov law on the contact estimator, gains set by hand"),
+    "lyapunov": Row("contact", "the common pose loop, a Lyapunov law; gains set by hand"),
     "contact_ahead": Row("contact", "and wheel speeds of the inverse contact model", ahead=True),
-    "contact": Row("contact", "contact estimator, tuned gains where there are any", tuned=True),
+    "contact": Row("contact", "as lyapunov, tuned gains where there are any", tuned=True),
     "contact_gyro": Row("contact", "contact, with a gyro", tuned=True, gyro=True),
 }
 
@@ -195,6 +195,8 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
     for name in wish.controllers:
         if name not in ROWS:
             raise DataError(f"no controller '{name}'; expected some of {', '.join(ROWS)}")
+    if not wish.controllers:
+        raise DataError(f"no controller; expected some of {', '.join(ROWS)}")
     fit = load(out)
     frozen = jax.tree.map(np.asarray, frozen_of(fit, wish.load))
     floor = site(fit) if wish.map is None else read_map(wish.map)
@@ -203,20 +205,22 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         for name in floor.surfaces:
             if name not in labels:
                 raise DataError(f"{wish.map}: no surface '{name}'; identified: {', '.join(labels)}")
-    else:
-        _known_grounds(floor)
-    gains = gains_of(out)
     name = load_of(fit, wish.load)
-    # the test site has the sensors it has, whatever the logs of the fit had
-    settings, habits = (
-        sensors_of(fit, gyro=False) if wish.plant == "twin" else (Settings(), Habits())
-    )
+    if wish.plant != "twin":
+        _known_to_site(floor, name, frozen.wheels)
+    gains = gains_of(out, fit_hash(fit), name)
+    settings, habits = sensors_of(fit, gyro=False)
+    if wish.plant != "twin":  # the test site has the sensors it has, whatever the logs had
+        settings, habits = replace(settings, current_is_signed=False), Habits()
     mark = sha256()
     for leaf in jax.tree.leaves(frozen):
         mark.update(np.ascontiguousarray(leaf).tobytes())
     mark.update(repr((wish.plant, name, floor.surfaces, floor.corner, floor.cell, gains)).encode())
     mark.update(repr((settings, habits)).encode())
-    mark.update(floor.cells.tobytes() + _code())
+    mark.update(floor.cells.tobytes())
+    # runs of other code are not taken for this one's
+    mark.update(files.code("control", "model", "testsite", "data", "app"))
+    mark.update(repr(sorted(files.versions().items())).encode())
     folder = out / FOLDER / mark.hexdigest()[:12]
     return [
         Job(
@@ -238,19 +242,21 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
     ]
 
 
-def _code() -> bytes:
-    """Hash of what drives: runs of other code are not taken for this one's."""
-    root = Path(closed_loop.__file__).parents[1]
-    files = sorted(
-        p for part in ("control", "model", "testsite") for p in (root / part).glob("*.py")
-    )
-    files += [Path(__file__), Path(__file__).with_name("plants.py")]
-    return sha256(b"".join(p.read_bytes() for p in files)).digest()
-
-
-def _known_grounds(floor: FloorMap) -> None:
+def _known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
+    from slipid.testsite.driving import Site
     from slipid.testsite.ground import GROUNDS
 
+    machine = Site().machine
+    if wheels != len(machine.wheel_azimuths_deg):
+        raise DataError(
+            f"the test site's robot has {len(machine.wheel_azimuths_deg)} wheels, the fit's "
+            f"{wheels}. With --plant twin the identified model is driven itself"
+        )
+    if load not in machine.centres_m:
+        raise DataError(
+            f"the test site has no load set-up '{load}'; it has {', '.join(machine.centres_m)}. "
+            "With --plant twin the identified model is driven itself"
+        )
     for name in floor.surfaces:
         if name not in GROUNDS:
             raise DataError(
@@ -259,20 +265,34 @@ def _known_grounds(floor: FloorMap) -> None:
             )
 
 
-def gains_of(out: Path) -> dict[str, float]:
+def gains_of(out: Path, fit: dict[str, str], load: str) -> dict[str, float]:
     """Gains that `slipid tune` found, else those set by hand.
 
+    Args:
+        out: folder of the fit.
+        fit: its hash, see `fit_hash`.
+        load: set-up it is to drive with.
+
     Raises:
-        DataError: gains.json is damaged.
+        DataError: gains.json is damaged, or of another fit or load set-up.
     """
     path = out / "gains.json"
     if not path.is_file():
         return dict(HAND)
     content = read_json(path, "what slipid tune wrote")
     try:
-        return {name: float(content["gains"][name]["value"]) for name in GAINS}
+        found = {name: float(content["gains"][name]["value"]) for name in GAINS}
+        of, with_load = content["fit"], content["settings"]["load"]
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: no gains ({error}); expected what slipid tune writes") from error
+    if of != fit or with_load != load:
+        raise DataError(
+            f"{path}: tuned for another fit or load set-up ({with_load}); run slipid tune again, "
+            "or remove it to drive with gains set by hand"
+        )
+    if not np.all(np.isfinite(list(found.values()))):
+        raise DataError(f"{path}: a gain is no number; run slipid tune again")
+    return found
 
 
 def _file(job: Job) -> Path:
@@ -359,6 +379,7 @@ def summary(runs: Sequence[Mapping[str, Any]], draws: int = 2000) -> dict[str, d
             for k, v in columns.items()
         }
         row["runs"] = len(columns["closure_error_median"])
+        row["finished_share"] = float(np.mean(columns["finished"]))
         if "encoder" in table:
             row["to_encoder"] = _ratios(columns, table["encoder"], again)
         out[name] = row
@@ -374,7 +395,7 @@ def _columns(runs: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
         "closure_error_median": np.array([r["closure_mm"] for r in runs]),
         "cross_track_rmse": np.array([r["cross_track_rmse_mm"] for r in runs]),
         "heading_error_deg": np.abs([r["heading_error_deg"] for r in runs]),
-        **{k: np.array([float(r[k]) for r in runs]) for k in plain},
+        **{k: np.array([np.nan if r[k] is None else float(r[k]) for r in runs]) for k in plain},
     }
 
 
@@ -397,4 +418,6 @@ def processes(jobs: int | None) -> int:
 
 def names_of(text: str | None) -> tuple[str, ...]:
     """Controllers of a list by commas, all of them by default."""
-    return tuple(ROWS) if text is None else tuple(t.strip() for t in text.split(",") if t.strip())
+    if text is None:
+        return tuple(ROWS)
+    return tuple(dict.fromkeys(t.strip() for t in text.split(",") if t.strip()))

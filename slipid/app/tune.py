@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.app import files
-from slipid.app.freeze import frozen_draws, frozen_of, load_of, sensors_of
+from slipid.app.freeze import fit_hash, frozen_draws, frozen_of, load_of, sensors_of
 from slipid.app.progress import Reporter
 from slipid.control import reference
 from slipid.control.closed_loop import PERIOD
@@ -112,7 +112,7 @@ def tune(
     fresh = frozen_draws(fit, name, DRAWS, seed + 1)
     content = _content(search, state, cases(fresh, JUDGED, seed + 1), stable)
     content["settings"] |= {"load": name, "gyro": gyro, "voltage": task.habits.voltage}
-    content |= {"seed": seed, "fit": _fit_hash(fit)}
+    content |= {"seed": seed, "fit": fit_hash(fit)}
     write_json(out / "gains.json", content)
     (out / CHECKPOINT).unlink(missing_ok=True)
     return content
@@ -193,16 +193,17 @@ def _content(search: Search, state: State, judged: Cases, stable: Frozen) -> dic
     }
 
 
-def _fit_hash(fit: Fit) -> dict[str, str]:
-    """Of the runs a fit was made of, and of its numbers."""
-    numbers = hashlib.sha256(np.asarray(fit.z, "<f8").tobytes())
-    numbers.update(np.asarray(fit.covariance, "<f8").tobytes())
-    return {"data": fit.data_hash, "numbers": numbers.hexdigest()}
-
-
 def _key(fit: Fit, load: str, search: Search, gyro: bool) -> str:
-    """Hash of everything a search depends on."""
-    parts = [*_fit_hash(fit).values(), load, search.method, search.steps, search.seed, gyro]
-    parts += [search.task.habits, search.task.weights, search.task.limits, search.task.steps]
+    """Hash of everything a search depends on, the code included."""
+    mark = hashlib.sha256(files.code("control", "model"))
+    for leaf in jax.tree.leaves((search.task, search.cases, search.stable)):
+        values = (
+            jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        )
+        mark.update(np.ascontiguousarray(values).tobytes())
+    parts = [*fit_hash(fit).values(), load, search.method, search.steps, search.seed, gyro]
+    task = search.task
+    parts += [task.settings, task.habits, task.weights, task.limits, task.steps, task.period]
     parts += sorted(files.versions().items())
-    return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()
+    mark.update("\n".join(map(str, parts)).encode())
+    return mark.hexdigest()

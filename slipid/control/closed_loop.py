@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.control.controller import Controller
-from slipid.control.reference import Path
+from slipid.control.reference import STEP, Path
 from slipid.model.plant import Plant
 
 PERIOD = 0.05
@@ -68,7 +68,7 @@ class Course:
         pose, believed: true and estimated [m, m, rad].
         command: wheel speeds [rad/s].
         estimate: as the estimator laid it out.
-        energy: of the motors until then [J]; zeros where the plant does not know.
+        energy: of the motors until then [J]; NaN where the plant does not know.
     """
 
     path: Path
@@ -137,7 +137,7 @@ def drive(pilot: Pilot, path: Path, plant: Plant, start: Any, period: float = PE
         command = said[:wheels]
         rows.append(np.concatenate([[begun, energy], plant.pose, said]))
         reading = plant.step(command)
-        energy += getattr(plant, "power", 0.0) * period
+        energy += getattr(plant, "power", np.nan) * period
         begun += period
     a = np.array(rows)
     heading = np.unwrap(a[:, 4])
@@ -155,12 +155,25 @@ def drive(pilot: Pilot, path: Path, plant: Plant, start: Any, period: float = PE
     )
 
 
+def _from_line(
+    places: Float[np.ndarray, "step 2"], line: Float[np.ndarray, "point 2"]
+) -> Float[np.ndarray, " step"]:
+    """Distance of places from a line through points [m]."""
+    begin, side = line[:-1], np.diff(line, axis=0)
+    square = np.maximum((side**2).sum(-1), 1e-18)
+    since = places[:, None] - begin
+    part = np.clip((since * side).sum(-1) / square, 0.0, 1.0)
+    nearest: np.ndarray = np.sqrt(((since - part[..., None] * side) ** 2).sum(-1)).min(1)
+    return nearest
+
+
 def metrics(course: Course) -> dict[str, Any]:
     """What became of a path, from true poses.
 
     along_track_mm: travelled less wanted at the end of every side; closure_mm: from the end to
-    where it should be; cross_track_rmse_mm: distance from the path as a line; heading_error_deg: at
-    the end; path_length_mm: the 2021 paper's metric; energy_j; effort: rms of the change of wheel
+    where it should be, and what was left of the way where the run was given up;
+    cross_track_rmse_mm: distance from the path as a line, over time; heading_error_deg: at the end;
+    path_length_mm: the 2021 paper's metric; energy_j; effort: rms of the change of wheel
     speed commands [rad/s].
     """
     p, path = course.pose, course.path
@@ -172,17 +185,19 @@ def metrics(course: Course) -> dict[str, Any]:
         size = np.hypot(*side)
         u = side / size if size > 1e-9 else np.zeros(2)
         along.append(1000 * float((p[at, :2] - corners[k + 1]) @ u))
-    line = np.asarray(path.rows[:, :2])[::5]
-    near = np.sqrt(((p[:, None, :2] - line) ** 2).sum(-1)).min(1)
+    rows = np.asarray(path.rows[:, :2])
+    near = _from_line(p[:, :2], rows[::5] if len(rows) > 5 else rows)
+    left = rows[int(course.own[-1] / STEP + 1e-6) :]
+    left_mm = 1000 * float(np.hypot(*np.diff(left, axis=0).T).sum())
     wanted = float(path.rows[-1, 2])
     turned = np.degrees((p[-1, 2] - wanted + np.pi) % (2 * np.pi) - np.pi)
     return {
         "along_track_mm": along,
-        "closure_mm": 1000 * float(np.hypot(*(p[-1, :2] - corners[-1]))),
+        "closure_mm": 1000 * float(np.hypot(*(p[-1, :2] - corners[-1]))) + left_mm,
         "cross_track_rmse_mm": 1000 * float(np.sqrt((near**2).mean())),
         "heading_error_deg": float(turned),
         "path_length_mm": 1000 * float(np.hypot(*np.diff(p[:, :2], axis=0).T).sum()),
-        "energy_j": float(course.energy[-1]),
+        "energy_j": None if np.isnan(course.energy[-1]) else float(course.energy[-1]),
         "effort": float(np.sqrt((np.diff(course.command, axis=0) ** 2).mean())),
         "seconds": float(course.time[-1]),
         "finished": bool(course.own[-1] >= path.duration - 1e-6),

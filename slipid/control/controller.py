@@ -27,6 +27,8 @@ model in the wheel speeds [1], disturbance observer [1], time by which the path'
 for early, because wheels follow late [s]."""
 PAPER_GAIN = {"x": (3000.0, 500.0, 3000.0), "y": (2000.0, 2000.0, 2000.0)}
 """Of the 2021 paper's torque correction, motor rpm per N m at the motor shaft, by leg."""
+UNTIMED_S = 0.01
+"""What a step without a time counts as where the robot must stop [s]."""
 OBSERVE_S = 0.4
 """Time constant of the disturbance observer [s]."""
 LONGEST_I = 0.06
@@ -148,7 +150,7 @@ class Controller(eqx.Module):
 
     Attributes:
         frozen: the identified robot.
-        gains: `GAINS`.
+        gains: of `GAINS`, in their order.
         limits: of the commands.
         correction: torque correction of the 2021 paper, in the form it prints, the form its authors
             ran, or corrected.
@@ -158,6 +160,11 @@ class Controller(eqx.Module):
     gains: Float[Array, " gain"]
     limits: Limits = eqx.field(static=True, default=Limits())
     correction: Correction = eqx.field(static=True, default="none")
+
+    def __check_init__(self) -> None:
+        shape = getattr(self.gains, "shape", (len(GAINS),))  # JAX also puts other things there
+        if shape[-1:] != (len(GAINS),):
+            raise ValueError(f"gains of shape {shape}; expected {len(GAINS)}: {', '.join(GAINS)}")
 
     @property
     def _kept(self) -> Layout:
@@ -218,20 +225,24 @@ class Controller(eqx.Module):
         wheels = wheels + self._torque(wanted, e)
         before = jnp.where(old.begun > 0.5, old.command, jnp.where(safe, e.wheel_speed, 0.0))
         wheels = jnp.where(safe, wheels, 0.0)
-        command = limited(wheels, before, e.current, f, self.limits, dt)
+        since = jnp.where(safe, dt, jnp.maximum(dt, UNTIMED_S))
+        command = limited(wheels, before, e.current, f, self.limits, since)
         free = safe & (jnp.max(jnp.abs(command - wheels)) < 0.05)  # the integral rests at a limit
         summed = jnp.clip(old.integral + integral * gap * dt, -LONGEST_I, LONGEST_I)
         state = self._kept.pack(
             command=command,
             integral=jnp.where(free, summed, jnp.where(safe, old.integral, 0.0)),
-            wanted=jnp.where(safe, wanted, 0.0),
+            wanted=jnp.where(safe, asked, 0.0),
             miss=jnp.where(safe, jnp.clip(miss, -0.2, 0.2), 0.0),
             begun=1.0,
         )
         return state, command
 
     def _wheels(self, asked: Array, e: Any, ahead: Array) -> Array:
-        """Wheel speeds for a twist: a share of the inverse model, the rest kinematics."""
+        """Wheel speeds for a twist: a share of the inverse model, the rest kinematics.
+
+        Mecanum wheels, whose inverse model is another, go by kinematics alone.
+        """
         f = self.frozen
         plain = f.forward @ asked / f.frame.radius
         share = e.surface[:, :-1]
@@ -239,7 +250,9 @@ class Controller(eqx.Module):
         known = jnp.where(total > 1e-3, share / jnp.maximum(total, 1e-3), 0.0)
         known = jnp.where(jnp.isfinite(known), known, 0.0)
         slow = jnp.clip(jnp.max(jnp.abs(plain)) * f.frame.radius / 0.02 - 0.25, 0.0, 1.0)
-        extra = jnp.where(total[:, 0] > 1e-3, inverse_contact(f, asked, known) - plain, 0.0)
+        right = jnp.all(jnp.abs(f.frame.slip_through) < 1e-9)  # rollers at right angles
+        extra = inverse_contact(f, asked, known) - plain
+        extra = jnp.where(right & (total[:, 0] > 1e-3), extra, 0.0)
         return plain + ahead * slow * (1 - e.surface[0, -1]) * extra
 
     def _torque(self, wanted: Array, e: Any) -> Array:

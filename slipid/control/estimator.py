@@ -30,6 +30,8 @@ from slipid.model.settle import combine, settle
 
 MIXED = 1.0
 """`Settings.alike` of a robot that is known to drive across the edges of floors."""
+UNTIMED_S = 0.01
+"""For which a step without a time counts towards staleness [s]."""
 HISTORY = 48
 """Steps a delayed measurement may reach back."""
 HASTE = 30.0
@@ -112,9 +114,10 @@ class Settings:
 def read_wheels(
     frozen: Frozen, settings: Settings, old: Any, z: Any, dt: Array
 ) -> tuple[Array, Array, Array]:
-    """Wheel speeds, the last good angles, and how old each wheel's reading is.
+    """Wheel speeds, angles up to which motion is counted, and how old each wheel's reading is.
 
-    A wheel that is not heard keeps its speed until it is stale, then it counts as standing.
+    A wheel that is not heard keeps its speed until it is stale, then it counts as standing; when it
+    is heard again, what it has turned more than was counted is made up for.
     """
     most = 4.0 * frozen.highest[0]
     turned = (z.wheel_angle - old.angle) / jnp.maximum(dt, 1e-3)
@@ -124,9 +127,12 @@ def read_wheels(
     known = jnp.isfinite(z.wheel_angle) & (jnp.abs(z.wheel_angle) < 1e7)
     first = known & ~jnp.isfinite(old.angle) & ~by_speed  # nothing to compare with: it stands
     good = by_angle | by_speed | first
-    angle = jnp.where(known, z.wheel_angle, old.angle)
-    age = jnp.where(good, 0.0, jnp.minimum(old.age + dt, 1e3))
-    return jnp.where(age > settings.stale_s, 0.0, read), angle, age
+    # a clock that stands, or says nothing, tells nothing of wheels either
+    age = jnp.where(good & (dt > 0), 0.0, jnp.minimum(old.age + jnp.maximum(dt, UNTIMED_S), 1e3))
+    speed = jnp.where(age > settings.stale_s, 0.0, read)
+    heard = known & ((dt > 0) | ~jnp.isfinite(old.angle))
+    angle = jnp.where(heard, z.wheel_angle, old.angle + speed * dt)
+    return speed, angle, age
 
 
 class Estimator(eqx.Module):
@@ -175,7 +181,8 @@ class Estimator(eqx.Module):
                 ("covariance", (n, n)),
                 ("still", ()),
                 ("stuck", ()),
-                ("history", (HISTORY, 5)),
+                ("noise", (3, 3)),
+                ("history", (HISTORY, 14)),
             )
         )
 
@@ -201,7 +208,7 @@ class Estimator(eqx.Module):
             ]
         )
         w = self.frozen.wheels
-        log = jnp.concatenate([jnp.zeros(1), start, jnp.zeros(1)])
+        log = jnp.concatenate([jnp.zeros(1), start, jnp.zeros(10)])
         return self._kept.pack(
             time=0.0,
             angle=jnp.full(w, jnp.nan),
@@ -216,7 +223,8 @@ class Estimator(eqx.Module):
             covariance=jnp.diag(diagonal),
             still=0.0,
             stuck=0.0,
-            history=jnp.broadcast_to(log, (HISTORY, 5)),
+            noise=jnp.zeros((3, 3)),
+            history=jnp.broadcast_to(log, (HISTORY, 14)),
         )
 
     def step(
@@ -397,12 +405,13 @@ class Estimator(eqx.Module):
         apart = apart - late_news
         late_news = late_news.at[2].multiply(jnp.where(has, 0.0, 1.0))
         pose = compose(old.pose, advance(twist, dt) + late_news)
-        cov = self._grow(old, pose, dt, speed, slope, axes, share, scatter, has, moves)
+        cov, noise = self._grow(old, pose, dt, speed, slope, axes, share, scatter, has, moves)
+        noise = old.noise + noise
         still = jnp.where(moves, 0.0, jnp.minimum(old.still + dt, 1e3))
         pose, more, cov = self._rest(still, gyro, pose, old.more, cov)
-        entry = jnp.concatenate([time[None], pose, free[2:]])
+        entry = jnp.concatenate([time[None], pose, free[2:], noise.reshape(-1)])
         history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
-        pose, more, cov, history = self._fix(z, time, pose, more, cov, history)
+        pose, more, cov, history = self._fix(z, time, pose, more, cov, noise, history)
         stuck = self._stuck(old, w, twist, dt, moves)
         state = self._kept.pack(
             time=time,
@@ -418,6 +427,7 @@ class Estimator(eqx.Module):
             covariance=cov,
             still=still,
             stuck=stuck,
+            noise=noise,
             history=history,
         )
         said = self.estimated.pack(
@@ -504,8 +514,8 @@ class Estimator(eqx.Module):
         scatter: Array,
         has: Array,
         moves: Array,
-    ) -> Array:
-        """Covariance of pose, effects and gyro bias after the step."""
+    ) -> tuple[Array, Array]:
+        """Covariance of pose, effects and gyro bias after the step; noise that came in with it."""
         f, s = self.frozen, self.settings
         middle = old.pose[2] + 0.5 * (pose[2] - old.pose[2])
         c, sn = jnp.cos(middle), jnp.sin(middle)
@@ -528,10 +538,17 @@ class Estimator(eqx.Module):
         rows = by @ old.covariance  # what is not the pose stays as it is
         pose_rows = jnp.concatenate([rows @ by.T + noise, rows[:, 3:]], axis=1)
         rest = jnp.concatenate([rows[:, 3:].T, old.covariance[3:, 3:]], axis=1)
-        return jnp.concatenate([pose_rows, rest])
+        return jnp.concatenate([pose_rows, rest]), noise
 
     def _fix(
-        self, z: Any, time: Array, pose: Array, more: Array, cov: Array, history: Array
+        self,
+        z: Any,
+        time: Array,
+        pose: Array,
+        more: Array,
+        cov: Array,
+        noise: Array,
+        history: Array,
     ) -> tuple[Array, Array, Array, Array]:
         """Correct by a pose fix of some time ago, if there is one."""
         age = jnp.where(jnp.isfinite(z.fix_age) & (z.fix_age >= 0), z.fix_age, 0.0)
@@ -546,7 +563,8 @@ class Estimator(eqx.Module):
 
         def corrected() -> tuple[Array, Array, Array, Array]:
             then = _nearest(history, time - age)
-            return _correct(z.fix, jnp.clip(std, 1e-4, 10.0), then, pose, more, cov, history)
+            since = noise - then[5:].reshape(3, 3)
+            return _correct(z.fix, jnp.clip(std, 1e-4, 10.0), then, since, pose, more, cov, history)
 
         kept = (pose, more, cov, history)
         found: tuple[Array, Array, Array, Array] = jax.lax.cond(has, corrected, lambda: kept)
@@ -554,9 +572,21 @@ class Estimator(eqx.Module):
 
 
 def _correct(
-    fix: Array, std: Array, then: Array, pose: Array, more: Array, cov: Array, history: Array
+    fix: Array,
+    std: Array,
+    then: Array,
+    since: Array,
+    pose: Array,
+    more: Array,
+    cov: Array,
+    history: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Pose, further unknowns, covariance and history after a fix of the pose of `then`."""
+    """Pose, further unknowns, covariance and history after a fix of the pose of `then`.
+
+    What came in `since`, a covariance of the pose, the fix has not seen: it is set aside.
+    """
+    aside = jnp.zeros_like(cov).at[:3, :3].set(_within(since, cov[:3, :3]))
+    cov = cov - aside
     gap = fix - then[1:4]
     gap = gap.at[2].set(jnp.arctan2(jnp.sin(gap[2]), jnp.cos(gap[2])))
     gone = pose[:2] - then[1:3]
@@ -570,15 +600,28 @@ def _correct(
     gain = cov @ look.T @ _inverse(total)
     change = gain @ gap
     cov = cov - gain @ look @ cov
-    cov = 0.5 * (cov + cov.T)
+    cov = 0.5 * (cov + cov.T) + aside
     back = history[:, 1:3] - pose[:2]
     moved = change[:2] + change[2] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
     history = history.at[:, 1:3].add(moved).at[:, 3].add(change[2])
     return pose + change[:3], more + change[3:], cov, history
 
 
+def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """As much of a covariance as another one can hold: a fix in between has seen some of it.
+
+    The largest eigenvalue of their quotient is at most the eighth root of the trace of its eighth
+    power, and at least 1 / 1.15 of that.
+    """
+    m = _inverse(whole) @ part
+    for _ in range(3):
+        m = m @ m
+    most = jnp.maximum(jnp.trace(m), 1e-12) ** 0.125
+    return jnp.where(jnp.isfinite(most), part / jnp.maximum(most, 1.0), 0.0)
+
+
 def _nearest(history: Array, time: Array) -> Array:
-    """Entry nearest to a time: time, x, y, heading, yaw rate of the contact model."""
+    """Entry nearest to a time: time, pose, yaw rate of the contact model, noise until then."""
     return history[jnp.argmin(jnp.abs(history[:, 0] - time))]
 
 

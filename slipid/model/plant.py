@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 class Plant(Protocol):
     """A robot that takes wheel speeds and gives back what its sensors read.
 
-    Sensor readings are one flat array as `slipid.control.estimator.Sensed` lays it out.
+    Sensor readings are one flat array as `slipid.control.estimator.sensed` lays it out.
     """
 
     def reset(self) -> Float[np.ndarray, " sensed"]:
