@@ -82,6 +82,8 @@ def test_a_preview_is_of_the_rates_alone():
 def test_way_points_are_refused_with_the_reason():
     with pytest.raises(ValueError, match="two or more places"):
         reference.waypoints([(0.0, 0.0)])
+    with pytest.raises(ValueError, match="expected both positive"):
+        reference.rectangle(speed=-0.2)
     with pytest.raises(ValueError, match="twice in a row"):
         reference.waypoints([(0.0, 0.0), (0.0, 0.0)])
 
@@ -212,8 +214,9 @@ def test_a_robot_can_be_told_which_floors_there_are(frozen):
     np.testing.assert_allclose(alone[0], every[-1], atol=1e-6)
     with pytest.raises(ValueError, match=f"no floor 'ice'; identified: {a}, {b}"):
         frozen.on("ice")
-    with pytest.raises(ValueError, match="no floor; expected some of"):
-        frozen.on()
+    for wrong in ((), (a, a)):
+        with pytest.raises(ValueError, match=f"expected each once of {a}, {b}"):
+            frozen.on(*wrong)
 
 
 def test_a_map_is_looked_up_under_the_wheels(frozen):

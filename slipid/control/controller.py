@@ -249,11 +249,11 @@ class Controller(eqx.Module):
         total = jnp.sum(share, axis=1, keepdims=True)
         known = jnp.where(total > 1e-3, share / jnp.maximum(total, 1e-3), 0.0)
         known = jnp.where(jnp.isfinite(known), known, 0.0)
-        slow = jnp.clip(jnp.max(jnp.abs(plain)) * f.frame.radius / 0.02 - 0.25, 0.0, 1.0)
+        moves = jnp.clip(jnp.max(jnp.abs(plain)) * f.frame.radius / 0.02 - 0.25, 0.0, 1.0)
         right = jnp.all(jnp.abs(f.frame.slip_through) < 1e-9)  # rollers at right angles
         extra = inverse_contact(f, asked, known) - plain
         extra = jnp.where(right & (total[:, 0] > 1e-3), extra, 0.0)
-        return plain + ahead * slow * (1 - e.surface[0, -1]) * extra
+        return plain + ahead * moves * (1 - e.surface[0, -1]) * extra
 
     def _torque(self, wanted: Array, e: Any) -> Array:
         """The 2021 paper's correction by the forces off the commanded direction [rad/s]."""

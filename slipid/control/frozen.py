@@ -36,7 +36,8 @@ class Frozen(eqx.Module):
             numbers included.
         current_std: of a measured current from the model's [A].
         current_trend: a + b v, measured currents over the model's at speed v [A, A s/m].
-        highest: wheel speed [rad/s], current [A] up to which the fit has seen the robot.
+        highest: wheel speed up to which the fit has seen the robot [rad/s], and the model's largest
+            current up to 0.8 of it [A].
         wheel_curve: a + b |I|, the slip ratio of each wheel, of all floors together (wheel, 2).
     """
 
@@ -66,13 +67,15 @@ class Frozen(eqx.Module):
         """For a place of which it is known that there are only these floors.
 
         Raises:
-            ValueError: none, or one that is not identified; names those that are.
+            ValueError: none, one twice, or one that is not identified; names those that are.
         """
         for name in floors:
             if name not in self.labels:
                 raise ValueError(f"no floor '{name}'; identified: {', '.join(self.labels)}")
-        if not floors:
-            raise ValueError(f"no floor; expected some of {', '.join(self.labels)}")
+        if len(set(floors)) < max(len(floors), 1):
+            raise ValueError(
+                f"floors {list(floors)}; expected each once of {', '.join(self.labels)}"
+            )
         rows = np.array([self.labels.index(name) for name in floors])
         return replace(
             self,

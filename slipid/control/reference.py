@@ -108,8 +108,11 @@ def waypoints(
         heading: all the way [rad].
 
     Raises:
-        ValueError: fewer than two places, or neighbours that are the same.
+        ValueError: fewer than two places, neighbours that are the same, or a speed or acceleration
+            that is not positive.
     """
+    if not (speed > 0 and acceleration > 0):
+        raise ValueError(f"speed {speed}, acceleration {acceleration}; expected both positive")
     p = np.asarray(places, float)
     if p.ndim != 2 or len(p) < 2 or p.shape[1] != 2:
         raise ValueError(f"way-points {p.tolist()}; expected two or more places x, y")

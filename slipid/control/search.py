@@ -1,6 +1,6 @@
 """Two searches for gains on one budget of rollouts, each of which can be left and resumed.
 
-Adam on the gradient through the twin (Kingma and Ba 2015), the gains being the mean of the last
+Adam on differences through the twin (Kingma and Ba 2015), the gains being the mean of the last
 third of its steps, and a particle swarm (Goswami and Padhy 2018) on as many cases at a time. Both
 search one box, and a gradient counts as `GRADIENT` rollouts.
 """
