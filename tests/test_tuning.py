@@ -145,4 +145,9 @@ def test_what_is_written_names_every_gain(robots, cases):
     assert tuple(content["gains"]) == GAINS
     assert set(content["gains"]["yaw"]) == {"value", "unit", "spread"}
     assert content["loss"].keys() == {"hand", "tuned"}
-    assert content["stability_margin"]["worst"] <= content["stability_margin"]["median"] < 1
+    low, high = content["loss_interval90"]["tuned"]
+    assert low <= content["loss_mean"]["tuned"] <= high
+    margin = content["stability_margin"]
+    assert margin["worst"] <= margin["median"] < 1
+    assert len(margin["draws"]) == len(robots.mass)
+    assert min(margin["draws"]) == margin["worst"]

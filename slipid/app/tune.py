@@ -170,11 +170,13 @@ def _content(search: Search, state: State, judged: Cases, stable: Frozen) -> dic
         "rollouts": search.rollouts,
         "loss": {k: float(combined(jnp.asarray(v))) for k, v in losses.items()},
         "loss_mean": {k: float(v.mean()) for k, v in losses.items()},
+        "loss_interval90": {k: np.quantile(v, [0.05, 0.95]).tolist() for k, v in losses.items()},
         "better_than_hand": float((losses["tuned"] < losses["hand"]).mean()),
         "stability_margin": {
             "worst": float(margin["tuned"].min()),
             "median": float(np.median(margin["tuned"])),
             "hand_worst": float(margin["hand"].min()),
+            "draws": margin["tuned"].reshape(len(stable.mass), -1).min(axis=1).tolist(),
         },
         "settings": {
             "loss_unit": "mm",
