@@ -364,7 +364,8 @@ def summary(runs: Sequence[Mapping[str, Any]], draws: int = 2000) -> dict[str, d
 
     `first_side_along_track_mm` and `heading_error_deg` are medians of the errors' sizes;
     `first_side_travelled` is the median part of the first side; `to_encoder` are ratios of medians
-    to those of `encoder`, with intervals over the starts they share.
+    to those of `encoder`, with intervals over the starts they share. What a plant does not know
+    (the twin's energy) is left out.
     """
     names = list(dict.fromkeys(r["controller"] for r in runs))
     table = {n: _columns([r for r in runs if r["controller"] == n]) for n in names}
@@ -373,10 +374,11 @@ def summary(runs: Sequence[Mapping[str, Any]], draws: int = 2000) -> dict[str, d
     again = rng.integers(count, size=(draws, count))
     out: dict[str, dict[str, Any]] = {}
     for name, columns in table.items():
-        row: dict[str, Any] = {k: float(np.median(v)) for k, v in columns.items()}
+        known = {k: v for k, v in columns.items() if np.all(np.isfinite(v))}
+        row: dict[str, Any] = {k: float(np.median(v)) for k, v in known.items()}
         row["interval90"] = {
             k: np.quantile(np.median(v[again], axis=1), [0.05, 0.95]).tolist()
-            for k, v in columns.items()
+            for k, v in known.items()
         }
         row["runs"] = len(columns["closure_error_median"])
         row["finished_share"] = float(np.mean(columns["finished"]))
