@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slipid.control.closed_loop import Pilot
-from slipid.control.controller import UNTIMED_S, Controller, Limits, inverse_contact, limited
-from slipid.control.estimator import Estimator, Settings
+from slipid.control.controller import GAINS, Controller, Limits, inverse_contact, limited
+from slipid.control.estimator import UNTIMED_S, Estimator, Settings
 from slipid.control.frozen import freeze
 from slipid.control.odometry import Odometry
 from slipid.control.reference import rectangle
 from slipid.model import contact
-from slipid.model.geometry import omni
+from slipid.model.geometry import mecanum, omni
 from slipid.model.robot import build
 
 PATH = rectangle()
@@ -408,6 +408,33 @@ def test_a_robot_at_rest_turns_as_its_gyro_says_less_the_bias():
     assert abs(float(said[-1].pose[2])) < 0.002
     _, said = drive(state, 20, gyro=0.012 + 0.2)  # by hand
     assert float(said[-1].pose[2]) == pytest.approx(0.2 * 20 * DT, abs=0.01)
+
+
+def test_the_observer_takes_a_constant_disturbance_out():
+    """A body that does what it is asked to but for a constant: what is wanted comes about."""
+    f = robot()
+    for gain, left in ((0.0, 1.0), (1.0, 0.0)):
+        gains = dict.fromkeys(GAINS, 0.0) | {"observer": gain}
+        con = Controller(f, jnp.asarray(list(gains.values())))
+        reference = jnp.array([0.0, 0.0, 0.0, 0.1, 0.05, 0.0])
+        off, state, twist = np.array([-0.04, 0.02, 0.1]), con.init(), np.zeros(3)
+        for _ in range(120):
+            said = con.estimated.pack(
+                **{n: jnp.zeros(s) for n, s in con.estimated.fields} | {"twist": twist}
+            )
+            state, command = con.step(state, reference, said, DT)
+            twist = np.asarray(f.inverse @ (f.frame.radius * command)) + off
+        np.testing.assert_allclose(twist, [0.1, 0.05, 0.0] + left * off, atol=1e-3)
+
+
+def test_mecanum_wheels_go_by_kinematics():
+    f = freeze(build(mecanum(0.2, 0.15, 0.05), ("a",)), "as_built", {}, highest_speed=10.0)
+    con = Controller(f, jnp.asarray([1.0, 1.0, 0.0, 1.0, 0.0, 0.0]))
+    empty = {n: jnp.zeros(s) for n, s in con.estimated.fields}
+    said = con.estimated.pack(**empty | {"surface": jnp.array([[1.0, 0.0]] * 4)})
+    asked = jnp.array([0.1, 0.1, 0.0])
+    wheels_asked = con._wheels(asked, con.estimated.of(said), jnp.asarray(1.0))
+    np.testing.assert_allclose(wheels_asked, f.forward @ asked / f.frame.radius)
 
 
 def test_flags_come_on_and_go_off():

@@ -13,6 +13,7 @@ from scipy.stats import multivariate_t
 
 from slipid.identify import likelihood as lk
 from slipid.identify import problem as problem_module
+from slipid.identify.curves import current_trend
 from slipid.identify.linear import inverse_root
 from slipid.identify.problem import DEGREES, Problem
 from slipid.parameter import Choice
@@ -462,3 +463,14 @@ def test_the_score_of_the_voltage_noise_is_the_slope_of_the_loss(truth):
     # it divides by the expected information, or by more where others explain the residuals
     score = np.asarray(problem.variance_precision(log_v, keep, z) @ step)[-1]
     assert score == pytest.approx(-slope, rel=1e-3)
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_the_trend_of_currents_is_of_their_sizes_over_the_encoders_speed(signed):
+    truth = robot()
+    b = lk.batch(made(truth, signed=signed), truth)
+    predicted = lk.predicted_current(truth, b, lk.predict(truth, b).felt)
+    speed = (lk.travel(b, truth)[0] / b.dt)[..., None]
+    more = jnp.sign(predicted) * (0.05 - 0.3 * speed)
+    told = eqx.tree_at(lambda x: x.current, b, (predicted + more).at[0, 0, 0].set(jnp.nan))
+    np.testing.assert_allclose(current_trend(truth, told), (0.05, -0.3), atol=1e-9)

@@ -17,8 +17,10 @@ from typer.testing import CliRunner
 from slipid.app.cli import app
 from slipid.app.config import read_config
 from slipid.app.demo import packaged_config
+from slipid.app.freeze import frozen_of, sensors_of
 from slipid.app.job import read_job, with_mixed
 from slipid.app.synthetic import Sensors, grid, make_logs, truth, write_logs
+from slipid.control.estimator import MIXED
 from slipid.data.dataset import Windows, collect
 from slipid.data.log import DataError
 from slipid.data.terrain import from_polygons, uniform
@@ -357,11 +359,16 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path):
 
 def deployed(out):
     """The fit drives its twin; what is done is not done again."""
+    fit = load(out)
+    assert sensors_of(fit, gyro=False)[0].alike == MIXED
+    assert fit.current_trend != (0.0, 0.0)
+    np.testing.assert_array_equal(frozen_of(fit, draws=0).current_trend, fit.current_trend)
     wish = ("trial", out, "--plant", "twin", "--starts", 2, "--jobs", 1)
     wish = (*wish, "--controllers", "encoder,contact", "--json", out / "t.json")
     first = invoke(*wish)
     assert first.exit_code == 0, first.stderr
     said = json.loads((out / "t.json").read_text())
+    assert said["closes_best"] == "contact"
     encoder, contact = (said["summary"][name] for name in ("encoder", "contact"))
     assert contact["closure_error_median"] < encoder["closure_error_median"]
     assert encoder["first_side_along_track_mm"] > 20  # it slips

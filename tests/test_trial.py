@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from slipid.app import trial as tr
-from slipid.app.plants import floor_of
+from slipid.app.plants import SitePlant, floor_of
 from slipid.control import closed_loop, reference
 from slipid.control.controller import GAINS, Controller
-from slipid.control.estimator import Estimator
+from slipid.control.estimator import Estimator, Settings
 from slipid.control.frozen import freeze
 from slipid.control.odometry import Odometry
 from slipid.data.log import DataError
@@ -183,6 +183,20 @@ def test_the_distance_from_a_path_is_from_its_line():
     )
 
 
+def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(frozen):
+    tuned = {name: 0.25 + k for k, name in enumerate(GAINS)}
+    for name, row in tr.ROWS.items():
+        found = dict(
+            zip(GAINS, tr.pilot_of(frozen, Settings(), row, tuned).controller.gains, strict=True)
+        )
+        expected = dict(tuned if row.tuned else tr.HAND)
+        if name == "contact_ahead":
+            expected["ahead"] = 1.0
+        if row.observer != "contact":
+            expected["preview"] = 0.0
+        assert found == pytest.approx(expected)
+
+
 def test_gains_of_another_length_are_refused(frozen):
     with pytest.raises(ValueError, match="expected 6: place, yaw"):
         Controller(frozen, jnp.ones(5))
@@ -312,3 +326,14 @@ def test_live_readings_are_as_the_sensors_log_them():
     assert np.isnan(reading.gyro)
     assert live.plant.time == pytest.approx(20 * live.period)
     assert live.pose[0] > 0.1  # a delay and a slew, then 0.2 m/s
+
+
+def test_a_plant_that_is_reset_starts_anew():
+    plant = SitePlant(uniform("firm"), "as_built", (0.2, 0.1, 0.3), 1, gyro=True)
+    first = plant.reset()
+    begin = plant.pose
+    for _ in range(10):
+        plant.step(np.full(3, 3.0))
+    assert plant.pose != begin
+    np.testing.assert_array_equal(plant.reset(), first)
+    assert plant.pose == begin

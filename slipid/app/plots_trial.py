@@ -25,7 +25,7 @@ def trial_plot(
         path: of the PNG.
     """
     names = list(content["summary"])
-    best = min(names, key=lambda n: content["summary"][n]["closure_error_median"])
+    best = content["closes_best"]
     ratio = content["summary"][best].get("to_encoder", {}).get("closure_error_median", {})
     said = f", {100 * ratio['value']:.0f} % of the encoders'" if ratio else ""
     made = figure(

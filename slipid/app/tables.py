@@ -392,7 +392,7 @@ def trial(found: dict[str, Any], out: Path) -> None:
             told,
         )
     console.print(table)
-    best = min(found["summary"].items(), key=lambda item: item[1]["closure_error_median"])[0]
+    best = found["closes_best"]
     console.print(f"closes best: {best} ({found['controllers'][best]})", soft_wrap=True)
     count = min(row["runs"] for row in found["summary"].values())
     console.print(f"medians of {count} starts; 90 % intervals and every run: {out / 'trial.json'}")

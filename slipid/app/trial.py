@@ -171,12 +171,14 @@ def trial(out: Path, wish: Wish, report: Reporter) -> dict[str, Any]:
             left = (time.monotonic() - began) / done * (len(todo) - done)
             report.step(done, len(todo), f"{job.name}, about {left:.0f} s left")
     runs = [_kept(job) for job in jobs]
+    table = summary(runs)
     content = {
         "schema": SCHEMA,
         "plant": wish.plant,
         "map": "patches" if wish.map is None else str(wish.map),
         "gains": dict(jobs[0].gains),
-        "summary": summary(runs),
+        "closes_best": min(table, key=lambda name: table[name]["closure_error_median"]),
+        "summary": table,
         "controllers": {name: ROWS[name].about for name in wish.controllers},
         "runs": runs,
     }
@@ -368,7 +370,8 @@ def summary(runs: Sequence[Mapping[str, Any]], draws: int = 2000) -> dict[str, d
     (the twin's energy) is left out.
     """
     names = list(dict.fromkeys(r["controller"] for r in runs))
-    table = {n: _columns([r for r in runs if r["controller"] == n]) for n in names}
+    of = {n: [r for r in runs if r["controller"] == n] for n in names}
+    table = {n: _columns(of[n]) for n in names}
     rng = np.random.default_rng(0)
     count = min(len(c["closure_error_median"]) for c in table.values())
     again = rng.integers(count, size=(draws, count))
@@ -381,7 +384,7 @@ def summary(runs: Sequence[Mapping[str, Any]], draws: int = 2000) -> dict[str, d
             for k, v in known.items()
         }
         row["runs"] = len(columns["closure_error_median"])
-        row["finished_share"] = float(np.mean(columns["finished"]))
+        row["finished_share"] = float(np.mean([r["finished"] for r in of[name]]))
         if "encoder" in table:
             row["to_encoder"] = _ratios(columns, table["encoder"], again)
         out[name] = row
@@ -390,7 +393,7 @@ def summary(runs: Sequence[Mapping[str, Any]], draws: int = 2000) -> dict[str, d
 
 def _columns(runs: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
     side = np.array([r["along_track_mm"][0] for r in runs])
-    plain = ("path_length_mm", "energy_j", "effort", "seconds", "finished", "believed_error_mm")
+    plain = ("path_length_mm", "energy_j", "effort", "seconds", "believed_error_mm")
     return {
         "first_side_along_track_mm": np.abs(side),
         "first_side_travelled": 1 + side / 900.0,

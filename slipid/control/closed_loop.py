@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.control.controller import Controller
+from slipid.control.controller import GAINS, Controller
 from slipid.control.reference import STEP, Path
 from slipid.model.plant import Plant
 
+PREVIEW = GAINS.index("preview")
 PERIOD = 0.05
 """Between commands [s]."""
 LONGEST = 2.0
@@ -49,7 +50,7 @@ class Pilot(eqx.Module):
         seen, held, time = state[: -cut - 1], state[-cut - 1 : -1], state[-1]
         seen, estimate = self.observer.step(seen, measurement, dt)
         pose = self.controller.estimated.of(estimate).pose
-        here, preview = jnp.where(jnp.isfinite(pose), pose, 1e3), self.controller.gains[-1]
+        here, preview = jnp.where(jnp.isfinite(pose), pose, 1e3), self.controller.gains[PREVIEW]
         time, reference = path.follow(time, here, dt, preview)
         held, command = self.controller.step(held, reference, estimate, dt)
         return (

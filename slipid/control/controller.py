@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.control.estimator import estimated
+from slipid.control.estimator import UNTIMED_S, estimated
 from slipid.control.frozen import Frozen
 from slipid.control.packed import Layout
 from slipid.model import contact
@@ -27,8 +27,6 @@ model in the wheel speeds [1], disturbance observer [1], time by which the path'
 for early, because wheels follow late [s]."""
 PAPER_GAIN = {"x": (3000.0, 500.0, 3000.0), "y": (2000.0, 2000.0, 2000.0)}
 """Of the 2021 paper's torque correction, motor rpm per N m at the motor shaft, by leg."""
-UNTIMED_S = 0.01
-"""What a step without a time counts as where the robot must stop [s]."""
 OBSERVE_S = 0.4
 """Time constant of the disturbance observer [s]."""
 LONGEST_I = 0.06

@@ -31,7 +31,7 @@ from slipid.model.settle import combine, settle
 MIXED = 1.0
 """`Settings.alike` of a robot that is known to drive across the edges of floors."""
 UNTIMED_S = 0.01
-"""For which a step without a time counts towards staleness [s]."""
+"""What a step without a time counts as, until readings are stale and while the robot stops [s]."""
 HISTORY = 48
 """Steps a delayed measurement may reach back."""
 HASTE = 30.0

@@ -143,6 +143,6 @@ def current_trend(robot: Robot, b: lk.Batch) -> tuple[float, float]:
     gap = np.asarray((b.current - predicted) * jnp.sign(predicted))
     speed = np.broadcast_to((lk.travel(b, robot)[0] / b.dt)[..., None], gap.shape).ravel()
     rows = np.stack([np.ones_like(speed), speed], axis=1)
-    known = np.isfinite(gap).ravel()
+    known = np.isfinite(gap).ravel() & np.isfinite(speed)
     a, slope = np.linalg.lstsq(rows[known], gap.ravel()[known])[0]
     return float(a), float(slope)
