@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from slipid.control.closed_loop import Pilot
 from slipid.control.controller import GAINS, Controller, Limits, inverse_contact, limited
-from slipid.control.estimator import UNTIMED_S, Estimator, Settings
+from slipid.control.estimator import UNTIMED_S, Estimator, Settings, _within
 from slipid.control.frozen import freeze
 from slipid.control.odometry import Odometry
 from slipid.control.reference import rectangle
@@ -323,14 +323,47 @@ def test_a_late_fix_does_not_know_what_came_after_it():
     assert np.all(np.diag(a) > 0.7 * np.diag(b))
     assert np.all(np.diag(a) < 2.0 * np.diag(b))
     assert np.linalg.eigvalsh(a).min() > 0
-    # one in time, then an old one that knows less: it cannot make the place less sure
+    # one in time, then an old one: it knows next to nothing of now
     here = np.asarray(est._kept.of(late).pose)
     before, _ = run(late, reading(fix=here, fix_std=std, fix_age=0.0), 1e-4)
-    after, _ = run(before, reading(fix=there, fix_std=std, fix_age=30 * DT), 1e-4)
+    off = np.array([0.003, -0.003, 0.004])
+    after, _ = run(before, reading(fix=there + off, fix_std=std, fix_age=30 * DT), 1e-4)
     without, _ = run(before, reading(), 1e-4)
-    a, b = (np.asarray(est._kept.of(x).covariance)[:3, :3] for x in (after, without))
-    assert np.linalg.eigvalsh(a).min() > 0
-    assert np.linalg.eigvalsh(b - a).min() > -1e-12
+    a, b = (est._kept.of(x) for x in (after, without))
+    assert np.abs(a.pose - b.pose).max() < 0.1 * off[0]
+    assert np.linalg.eigvalsh(b.covariance[:3, :3] - a.covariance[:3, :3]).min() > -1e-12
+
+
+def test_of_a_covariance_only_what_another_can_hold_is_set_aside():
+    rng = np.random.default_rng(0)
+    for scale in (1e-3, 0.1, 1.0, 30.0):
+        for _ in range(20):
+            a, b = rng.normal(size=(2, 3, 3))
+            part, whole = scale * a @ a.T, b @ b.T
+            held = np.asarray(_within(jnp.asarray(part), jnp.asarray(whole)))
+            assert np.linalg.eigvalsh(whole - held).min() > -1e-9
+            most = np.linalg.eigvals(np.linalg.solve(whole, part)).real.max()
+            assert held[0, 0] >= part[0, 0] / max(1.16 * most, 1.0)
+
+
+def test_fixes_that_all_come_late_count_for_what_they_say():
+    est, run = watch()
+    speed, std = wheels([0.2, 0.05, 0.3]), np.array([0.001, 0.002])
+    truth, state = [], est.init(std=(0.05, 0.1))
+    bare = est.init()
+    for k in range(80):
+        bare, said = run(bare, reading(wheel_speed=speed), DT)
+        truth.append(np.asarray(est.estimated.of(said).pose))
+        fix = {"fix": truth[k - 5], "fix_std": std, "fix_age": 5 * DT} if k >= 5 and k % 2 else {}
+        state, said = run(state, reading(wheel_speed=speed, **fix), DT)
+        if k == 30:  # pushed
+            state = state.at[est._kept.place("pose")].add(jnp.array([0.02, -0.02, 0.05]))
+    held = est._kept.of(state)
+    assert np.all(np.abs(np.asarray(held.pose) - truth[-1]) < [0.01, 0.01, 0.02])
+    _, after = drive(est.init(std=(0.001, 0.002)), 6, speed)  # as old as the last fix
+    for part in (slice(0, 2), slice(2, 3)):  # place, turned with the robot, and heading
+        now, fresh = (np.trace(x.covariance[part, part]) for x in (held, after[-1]))
+        assert 0.6 * fresh < now < 1.5 * fresh
 
 
 @pytest.mark.parametrize("kind", KINDS)

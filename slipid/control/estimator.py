@@ -583,16 +583,18 @@ def _correct(
 ) -> tuple[Array, Array, Array, Array]:
     """Pose, further unknowns, covariance and history after a fix of the pose of `then`.
 
-    What came in `since`, a covariance of the pose, the fix has not seen: it is set aside.
+    What came in `since`, a covariance of the pose, the fix has not seen: it is set aside. What the
+    pose no longer holds of it, a later fix having seen it, is so much noise of this one.
     """
-    aside = jnp.zeros_like(cov).at[:3, :3].set(_within(since, cov[:3, :3]))
+    held = _within(since, cov[:3, :3])
+    aside = jnp.zeros_like(cov).at[:3, :3].set(held)
     cov = cov - aside
     gap = fix - then[1:4]
     gap = gap.at[2].set(jnp.arctan2(jnp.sin(gap[2]), jnp.cos(gap[2])))
     gone = pose[:2] - then[1:3]
     look = jnp.zeros((3, cov.shape[0])).at[:, :3].set(jnp.eye(3))
     look = look.at[0, 2].set(gone[1]).at[1, 2].set(-gone[0])
-    noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2)
+    noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2) + since - held
     total = look @ cov @ look.T + noise
     # a fix far from what is believed counts less, yet counts
     far = gap @ _inverse(total) @ gap
@@ -608,7 +610,7 @@ def _correct(
 
 
 def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """As much of a covariance as another one can hold: a fix in between has seen some of it.
+    """As much of a covariance as another one can hold.
 
     The largest eigenvalue of their quotient is at most the eighth root of the trace of its eighth
     power, and at least 1 / 1.15 of that.
