@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from ctypes.util import find_library
-from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+
+from slipid.app.runtime import plain_loops
 
 ROOT = Path(__file__).resolve().parents[1]
 LONG = ("test_cli", "test_calibration", "test_notebooks", "test_compare")
@@ -21,10 +22,7 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# Without its fusion emitters XLA compiles in six tenths of the time what then takes a tenth longer;
-# it ends the process at flags that it does not know.
-if version("jaxlib").startswith("0.10."):
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+plain_loops()
 os.environ["MPLBACKEND"] = "Agg"
 # MuJoCo chooses at its first import what it draws with; without EGL it must not be told to use it.
 if find_library("EGL"):

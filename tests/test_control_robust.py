@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slipid.control.closed_loop import Pilot
+from slipid.control.closed_loop import Pilot, compiled
 from slipid.control.controller import GAINS, Controller, Limits, inverse_contact, limited
 from slipid.control.estimator import UNTIMED_S, Estimator, Settings, _within
 from slipid.control.frozen import freeze
@@ -461,6 +461,23 @@ def test_the_observer_takes_a_constant_disturbance_out():
             state, command = con.step(state, reference, said, DT)
             twist = np.asarray(f.inverse @ (f.frame.radius * command)) + off
         np.testing.assert_allclose(twist, [0.1, 0.05, 0.0] + left * off, atol=1e-3)
+
+
+def test_gains_that_are_known_when_compiled_command_the_same():
+    """Zero ones skip the inverse model; the same gains as arguments do not."""
+    for ahead in (0.0, 0.7):
+        gains = jnp.array([1.5, 1.5, 0.1, ahead, 0.0, 0.2])
+        p = Pilot(Estimator(robot()), Controller(robot(), gains))
+        traced = eqx.filter_jit(lambda p, state, z: p.step(PATH, state, z, DT))
+        known, commands = compiled(p, PATH), []
+        one = two = p.init(jnp.array([0.05, 0.02, 0.1]))
+        for k in range(20):
+            z = reading(wheel_angle=jnp.array([0.3, -0.1, 0.2]) * k, current=jnp.full(3, 0.4))
+            one, out = known(one, z, DT)
+            two, expected = traced(p, two, z)
+            np.testing.assert_allclose(out, expected, atol=1e-9)
+            commands.append(out[:3])
+        assert np.abs(commands).max() > 1.0
 
 
 def test_mecanum_wheels_go_by_kinematics():

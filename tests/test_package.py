@@ -21,3 +21,18 @@ def test_import_is_light_and_silent():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == ""
     assert json.loads(done.stdout) == []
+
+
+def test_xla_is_told_only_what_it_knows_and_nobody_said_otherwise(monkeypatch):
+    from slipid.app import runtime
+
+    for version, before, after in (
+        ("0.10.2", "", runtime.PLAIN_LOOPS),
+        ("0.10.2", "--a=b", f"--a=b {runtime.PLAIN_LOOPS}"),
+        ("0.10.2", "--xla_cpu_use_fusion_emitters=true", "--xla_cpu_use_fusion_emitters=true"),
+        ("0.11.0", "--a=b", "--a=b"),
+    ):
+        monkeypatch.setattr(runtime, "version", lambda _, v=version: v)
+        monkeypatch.setenv("XLA_FLAGS", before)
+        runtime.plain_loops()
+        assert runtime.os.environ["XLA_FLAGS"] == after

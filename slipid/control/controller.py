@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -49,6 +50,13 @@ class Limits:
     acceleration: float = 25.0
     voltage: float = 22.0
     twist: float = 0.5
+
+
+def _known_zero(gains: Any, name: str) -> bool:
+    """Whether a gain is a constant of the compiled code, and zero: what it weighs is left out."""
+    if isinstance(gains, jax.core.Tracer):
+        return False
+    return float(np.asarray(gains)[GAINS.index(name)]) == 0.0
 
 
 def limited(
@@ -243,6 +251,8 @@ class Controller(eqx.Module):
         """
         f = self.frozen
         plain = f.forward @ asked / f.frame.radius
+        if _known_zero(self.gains, "ahead"):
+            return plain
         share = e.surface[:, :-1]
         total = jnp.sum(share, axis=1, keepdims=True)
         known = jnp.where(total > 1e-3, share / jnp.maximum(total, 1e-3), 0.0)
