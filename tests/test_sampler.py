@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from arviz_stats.base import array_stats
 
-from slipid.identify import sampler
+from slipid.identify import sampler, transport
 from slipid.identify.moves import Along, Differential, Hamiltonian, Independence, Target, families
 from slipid.identify.sampler import Plan, diagnose, packed, run, unpacked
 from slipid.identify.transport import Warp, learnt
@@ -343,6 +343,18 @@ def test_a_map_is_undone_and_has_the_slopes_that_it_says(bent):
     np.testing.assert_allclose(log.sum(axis=1), np.linalg.slogdet(jacobian)[1], atol=1e-7)
     numeric = np.stack([(value(u + s) - value(u - s)) / 2e-6 for s in step], axis=1)
     np.testing.assert_allclose(map.pull(u, np.negative), numeric, atol=1e-7)
+
+
+def test_maps_that_have_learnt_different_things_are_compiled_once(bent):
+    map, x = bent
+    other = learnt(np.flip(x, axis=1), 500.0, np.eye(9), np.repeat([-1, 0, 1], 3), np.arange(9) % 3)
+    assert len(other.stairs) != len(map.stairs)
+    u = np.random.default_rng(5).normal(size=(5, 9))
+    np.testing.assert_allclose(other.forward(other.placed(u)[0]), u, atol=1e-9)
+    map.placed(u)
+    before = transport._placed._cache_size()
+    other.placed(u)
+    assert transport._placed._cache_size() == before
 
 
 def test_a_map_is_kept_whole(bent, tmp_path):

@@ -77,19 +77,6 @@ class Bend:
         f = self.monomials(w, told)
         return np.asarray((w - f @ self.shift.T) * np.exp(-f @ self.scale.T))
 
-    def back(self, v: Array, told: Array) -> Array:
-        """From v to w, coordinate after coordinate: monomials of each have earlier ones only."""
-
-        def one(i: Array, w: Array) -> Array:
-            f = self.monomials(w, told)
-            return w.at[:, i].set(f @ self.shift[i] + jnp.exp(f @ self.scale[i]) * v[:, i])
-
-        return jnp.asarray(jax.lax.fori_loop(0, v.shape[1], one, jnp.zeros_like(v)))
-
-    def log_slope(self, w: Any, told: Any) -> Any:
-        """Log dw_i/dv_i."""
-        return self.monomials(w, told) @ self.scale.T
-
     @staticmethod
     def none(size: int, plateaus: int) -> "Bend":
         """Of nothing, with all monomials there can be."""
@@ -304,38 +291,94 @@ class Transport:
 
     def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
         """x, and the part of log |dx/du| of every coordinate (row, size)."""
-        x, log = _placed(self._there, u)
+        x, log = _placed(self._back, u)
         return np.array(x), np.array(log)
 
     def pull(self, u: Matrix, slope: Callable[[Matrix], Matrix]) -> Matrix:
         """Derivative by u of what has the derivative slope(x) by x, plus that of log |dx/du|."""
-        return np.array(_pulled(self._there, u, slope(self.placed(u)[0])))
+        return np.array(_pulled(self._back, u, slope(self.placed(u)[0])))
 
     @cached_property
-    def _there(self) -> "Transport":
-        """The map where it is computed with."""
-        there: Transport = jax.device_put(self)
+    def _back(self) -> "Steps":
+        """The way back, where it is computed with."""
+        there: Steps = jax.device_put(_steps(self))
         return there
 
 
-@jax.jit
-def _placed(map: Transport, u: Array) -> tuple[Array, Array]:
-    v, log = map.last.back(u), map.last.log_slope(u)
-    about = said = jnp.zeros_like(u)
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The way from u to x, a coordinate at a time, in arrays whose shapes nothing learnt changes.
+
+    So that XLA compiles it once: stairs, plateaus and monomials are others after every look at the
+    draws. With columns of all w, of all that is said, zeros until their turn, and of ones:
+
+        w_i = f_i . shift_i + exp(f_i . scale_i) v_i,   x_i - m_i = columns . slope_i
+
+    Attributes:
+        mean, values, last: of the map.
+        order: of the coordinates.
+        slope: of each step by the columns (step, 2 size + 1).
+        root: log dx/dw.
+        factors: columns whose product each monomial f is (step, term, 3).
+        shift, scale: their coefficients (step, term).
+    """
+
+    mean: Leaf
+    values: Values
+    last: Warp
+    order: Leaf
+    slope: Leaf
+    root: Leaf
+    factors: Leaf
+    shift: Leaf
+    scale: Leaf
+
+
+def _steps(map: Transport) -> Steps:
+    size = len(map.mean)
+    slope, root = np.zeros((size, 2 * size + 1)), np.zeros(size)
+    factors = np.full((size, MOST_MONOMIALS + 1, 3), 2 * size)
+    shift, scale = np.zeros((2, size, MOST_MONOMIALS + 1))
+    k = 0
     for s in map.stairs:
-        w = v[:, s.own]
-        if s.bend:
-            told = said[:, s.plateaus]
-            w = s.bend.back(w, told)
-            log = log.at[:, s.own].add(s.bend.log_slope(w, told))
-        about = about.at[:, s.own].set(said[:, s.given] @ s.slope + w @ s.root.T)
-        said = map.values.said(about)
-        log = log.at[:, s.own].add(jnp.log(jnp.diag(s.root)))
-    return map.mean + about, log
+        columns = np.concatenate([s.own, size + np.asarray(s.plateaus, int), [2 * size]])
+        for i in range(len(s.own)):
+            slope[k, s.own], slope[k, size + s.given] = s.root[i], s.slope[:, i]
+            root[k] = np.log(s.root[i, i])
+            if s.bend:
+                own = np.flatnonzero((s.bend.shift[i] != 0) | (s.bend.scale[i] != 0))
+                factors[k, : len(own)] = columns[s.bend.factors[own]]
+                shift[k, : len(own)] = s.bend.shift[i, own]
+                scale[k, : len(own)] = s.bend.scale[i, own]
+            k += 1
+    order = np.concatenate([s.own for s in map.stairs])
+    return Steps(map.mean, map.values, map.last, order, slope, root, factors, shift, scale)
 
 
 @jax.jit
-def _pulled(map: Transport, u: Array, slope: Array) -> Array:
+def _placed(map: Steps, u: Array) -> tuple[Array, Array]:
+    rows, size = u.shape
+    v = map.last.back(u)
+
+    def step(columns: Array, s: Any) -> Any:
+        i, slope, root, factors, shift, scale, values = s
+        f = jnp.clip(columns[:, factors], -FAR, FAR).prod(axis=2)
+        spread = f @ scale
+        columns = columns.at[:, i].set(f @ shift + jnp.exp(spread) * v[:, i])
+        about = columns @ slope
+        return columns.at[:, size + i].set(values.said(about)), (about, spread + root)
+
+    start = jnp.zeros((rows, 2 * size + 1)).at[:, -1].set(1.0)
+    values = jax.tree.map(lambda x: x[map.order], map.values)
+    steps = (map.order, map.slope, map.root, map.factors, map.shift, map.scale, values)
+    _, (about, log) = jax.lax.scan(step, start, steps)
+    there = jnp.zeros_like(u).at[:, map.order].set(about.T)
+    return map.mean + there, map.last.log_slope(u).at[:, map.order].add(log.T)
+
+
+@jax.jit
+def _pulled(map: Steps, u: Array, slope: Array) -> Array:
     (_, log), back = jax.vjp(lambda u: _placed(map, u), u)
     (out,) = back((slope, jnp.ones_like(log)))
     return jnp.asarray(out)

@@ -139,7 +139,7 @@ def nuts(path, seed, out, block=None):
 
     @jax.jit
     def potential(u):
-        x, log = _placed(map, u[None])
+        x, log = _placed(map._back, u[None])
         return -density.logpdf(x[0]) - jnp.sum(log)
 
     kernel = NUTS(potential_fn=potential, dense_mass=False)
