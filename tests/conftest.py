@@ -13,8 +13,6 @@ from slipid.app.runtime import plain_loops
 ROOT = Path(__file__).resolve().parents[1]
 LONG = ("test_cli", "test_calibration", "test_notebooks", "test_compare")
 """Files that take longest."""
-PLAIN = ("test_compare", "test_density", "test_fit", "test_likelihood", "test_result")
-"""Files that compile more than they compute, in one process: plainer code is compiled sooner."""
 
 # Set in the environment, so that commands and notebooks started by a test share them. The cache is
 # what keeps the second run of the suite short: most of the first is compilation.
@@ -47,14 +45,19 @@ def real_data() -> Path:
     return folder
 
 
+def pytest_configure(config):
+    """Tests compile more than they compute, and plainer code is compiled sooner; not what is timed.
+
+    Commands and notebooks that tests start read it from the environment.
+    """
+    if "bench_*.py" not in config.getini("python_files"):
+        plain = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1") == "1"
+        jax.config.update("jax_disable_most_optimizations", plain)
+
+
 def pytest_collection_modifyitems(items):
     """Files that take longest come first, so that two workers end together."""
     items.sort(key=lambda item: item.path.stem not in LONG)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _plain_where_it_pays(request):
-    jax.config.update("jax_disable_most_optimizations", request.path.stem in PLAIN)
 
 
 @pytest.fixture(scope="module", autouse=True)

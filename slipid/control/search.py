@@ -33,7 +33,7 @@ GRADIENT = len(GAINS) + 1
 PARTICLES = 30
 INERTIA, OWN, OTHERS = 0.7, 1.5, 1.5
 """Of a particle's speed, its pull to its own best place and to that of all."""
-RATE = 0.06
+RATE = 0.12
 """First step of Adam, in parts of the box; it falls to a tenth along a cosine."""
 _HALTS = 6
 """Places between the end of a search and the gains by hand where stability is asked for."""
