@@ -32,7 +32,7 @@ from jaxtyping import install_import_hook  # noqa: E402
 jax.config.update("jax_enable_x64", True)
 
 # Shapes and types of every annotated function of slipid are checked while tests run; under jit this
-# costs at tracing only. Must come before the first import of slipid.
+# costs at tracing only. Must come before the first import of what computes.
 install_import_hook("slipid", "beartype.beartype")
 
 
@@ -50,9 +50,9 @@ def pytest_configure(config):
 
     Commands and notebooks that tests start read it from the environment.
     """
-    if "bench_*.py" not in config.getini("python_files"):
-        plain = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1") == "1"
-        jax.config.update("jax_disable_most_optimizations", plain)
+    if not any("bench" in word for word in (*config.getini("python_files"), *config.args)):
+        plain = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+        jax.config.update("jax_disable_most_optimizations", plain.lower() in ("1", "true", "yes"))
 
 
 def pytest_collection_modifyitems(items):

@@ -31,6 +31,7 @@ def test_xla_is_told_only_what_it_knows_and_nobody_said_otherwise(monkeypatch):
         ("0.10.2", "--a=b", f"--a=b {runtime.PLAIN_LOOPS}"),
         ("0.10.2", "--xla_cpu_use_fusion_emitters=true", "--xla_cpu_use_fusion_emitters=true"),
         ("0.11.0", "--a=b", "--a=b"),
+        ("0.10.2", "/flags.txt", "/flags.txt"),  # XLA reads them from there
     ):
         monkeypatch.setattr(runtime, "version", lambda _, v=version: v)
         monkeypatch.setenv("XLA_FLAGS", before)

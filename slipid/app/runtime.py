@@ -13,10 +13,12 @@ def plain_loops() -> None:
 
     A fit is compiled in three quarters of the time and runs as fast; rollouts of the twin take 0.4
     to 0.6 of the time. Must come before JAX first computes. XLA ends the process at flags that it
-    does not know, so other versions than those it was measured with are left alone.
+    does not know, so other versions than those it was measured with are left alone, and so is a
+    file of flags.
     """
-    flags = os.environ.get("XLA_FLAGS", "")
-    if version("jaxlib").startswith("0.10.") and "fusion_emitters" not in flags:
+    flags = os.environ.get("XLA_FLAGS", "").strip()
+    more = "fusion_emitters" not in flags and (not flags or flags.startswith("-"))
+    if more and version("jaxlib").startswith("0.10."):
         os.environ["XLA_FLAGS"] = f"{flags} {PLAIN_LOOPS}".strip()
 
 

@@ -51,7 +51,6 @@ MOST_MONOMIALS = 12
 """Of a coordinate's mean and std."""
 
 
-@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Bend:
     """Polynomials a and b of a group's coordinates.
@@ -66,11 +65,11 @@ class Bend:
     shift: Leaf
     scale: Leaf
 
-    def monomials(self, w: Any, told: Any) -> Any:
+    def monomials(self, w: Matrix, told: Matrix) -> Matrix:
         """Products of columns (row, monomial)."""
-        xp = w.__array_namespace__()
-        columns = xp.clip(xp.concat([w, told], axis=1), -FAR, FAR)
-        return xp.concat([columns, xp.ones((len(w), 1))], axis=1)[:, self.factors].prod(axis=2)
+        columns = np.clip(np.concatenate([w, told], axis=1), -FAR, FAR)
+        columns = np.concatenate([columns, np.ones((len(w), 1))], axis=1)
+        return np.asarray(columns[:, self.factors].prod(axis=2))
 
     def forward(self, w: Matrix, told: Matrix) -> Matrix:
         """From w to v."""
@@ -196,7 +195,6 @@ def _sinh_arcsinh(x: Vector) -> tuple[float, float, float, float]:
     return middle + width * q[0], width * float(np.exp(q[1])), q[2], float(np.exp(q[3]))
 
 
-@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Stair:
     """Some coordinates, after those they follow.
@@ -263,7 +261,6 @@ class Values:
         return Values((skew < SKEW) * 1.0, middle, value.mean(axis=0), value.std(axis=0))
 
 
-@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Transport:
     """The whole map, of vectors x (row, size) to and from u (row, size).
@@ -301,7 +298,8 @@ class Transport:
     @cached_property
     def _back(self) -> "Steps":
         """The way back, where it is computed with."""
-        there: Steps = jax.device_put(_steps(self))
+        with jax.ensure_compile_time_eval():  # kept, so never a tracer's
+            there: Steps = jax.device_put(_steps(self))
         return there
 
 

@@ -137,9 +137,11 @@ def nuts(path, seed, out, block=None):
         with np.load(block) as kept:
             map = sampler.unpacked(dict(kept)).map
 
+    steps = map._back
+
     @jax.jit
     def potential(u):
-        x, log = _placed(map._back, u[None])
+        x, log = _placed(steps, u[None])
         return -density.logpdf(x[0]) - jnp.sum(log)
 
     kernel = NUTS(potential_fn=potential, dense_mass=False)

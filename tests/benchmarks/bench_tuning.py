@@ -2,8 +2,8 @@
 
 Needs a folder `slipid identify` wrote, named by SLIPID_FIT. Every seed is another draw of robots,
 floors, starts, noise and of the search; intervals are over seeds. A case's gain over the hand set
-gains is compared with itself, since floors differ more than controllers do. Measured on the test
-site's fit with four seeds: neither search is better than the other beyond its scatter.
+gains is compared with itself, since floors differ more than controllers do. On the test site's fit
+both better the gains set by hand, and neither the other beyond its scatter: README.
 """
 
 from __future__ import annotations
