@@ -124,7 +124,7 @@ def _bars(axes: Any, table: Mapping[str, Any], key: str, label: str) -> None:
     axes.hlines(at, low, high, color=INK, lw=1.2)
     axes.set_yticks(at, names, fontsize=8)
     axes.set_xlabel(
-        f"{label}, median of {table[names[0]]['runs']} starts, 90 % interval", fontsize=8
+        f"{label}\nmedian of {table[names[0]]['runs']} starts, 90 % interval", fontsize=8
     )
     axes.tick_params(axis="x", labelsize=8, color=SHADE)
     plain(axes)
