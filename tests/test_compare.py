@@ -182,6 +182,7 @@ def width_of_student(m):
     return brentq(slope, 0.5, 3.0)
 
 
+@pytest.mark.slow
 def test_linear_slip_is_told_from_constant_slip():
     told, models, problem, half = judged(
         driven("linear", ([1.0], [3.0]), 3, runs=480), ("encoder", "constant", "linear", "affine")
@@ -201,6 +202,7 @@ def test_linear_slip_is_told_from_constant_slip():
         np.testing.assert_allclose(found, STD[f"run.{axis}"], rtol=0.25)
 
 
+@pytest.mark.slow
 def test_models_that_say_the_same_cannot_be_told_apart():
     told, *_ = judged(driven("constant", ([0.1], [0.3]), 4), ("constant", "affine", "quadratic"))
     for name, floor in ranking(told).items():
@@ -223,6 +225,7 @@ def test_slopes_by_a_rungs_numbers_are_those_of_a_step_in_them(name):
 # leave one out ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_importance_sampling_is_the_exact_leave_one_out():
     w = made(ROBOT, runs=96, count=2, seed=6, voltage=False, std=STD)
     problem = Problem(w, ROBOT, HELD)
@@ -387,6 +390,7 @@ def test_regions_hold_runs_of_other_sessions_as_often_as_they_say():
     assert covered(np.zeros(3), own) < 0.6
 
 
+@pytest.mark.slow
 def test_runs_that_share_nothing_are_left_as_they_are():
     model, w = with_sessions(0.0, 7, np.arange(240) % 8)
     variance, covariance = shared(model, w, np.ones(len(w)))

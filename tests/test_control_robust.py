@@ -463,6 +463,7 @@ def test_the_observer_takes_a_constant_disturbance_out():
         np.testing.assert_allclose(twist, [0.1, 0.05, 0.0] + left * off, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_gains_that_are_known_when_compiled_command_the_same():
     """Zero ones skip the inverse model; the same gains as arguments do not."""
     for ahead in (0.0, 0.7):

@@ -70,6 +70,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("current", "voltage"), CASES)
 def test_is_what_the_likelihood_says_of_the_same_windows(current, voltage):
     """Of one run and of several: information of different runs adds, whatever the channels."""
@@ -88,6 +89,7 @@ def test_is_what_the_likelihood_says_of_the_same_windows(current, voltage):
         )
 
 
+@pytest.mark.slow
 def test_runs_of_a_session_cannot_average_away_what_they_share():
     """Against the covariance of all runs together, written out."""
     plain = planner(False, False)

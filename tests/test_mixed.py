@@ -120,6 +120,7 @@ def learnt():
     )
 
 
+@pytest.mark.slow
 def test_what_one_floor_leaves_open_several_tell(learnt):
     _, space, z, _, covariance, found = learnt
     assert found.settled

@@ -66,6 +66,7 @@ def test_spectral_radius_is_that_of_the_eigenvalues():
     assert float(spectral_radius(chain)) == pytest.approx(0.5, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_loop_is_stable_where_its_radius_says():
     rates, robot = jnp.asarray([0.1, 0.0, 0.0]), frozen()
 
@@ -137,6 +138,7 @@ def test_gains_that_are_handed_over_are_stable(robots, cases):
     assert np.any(found > HAND)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_what_is_written_names_every_gain(robots, cases):
     search = searched(robots, cases, "pso", 40)

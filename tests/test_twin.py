@@ -120,6 +120,7 @@ def test_a_rollout_is_the_run_of_a_plant():
     np.testing.assert_array_equal(np.asarray(plant.reset()), plant.reset())
 
 
+@pytest.mark.slow
 def test_derivative_by_gains_is_that_of_finite_differences():
     robot = frozen(1.0, 1.0)
     path = waypoints([(0.0, 0.0), (0.2, 0.0)], pause=0.2).moved(START)
