@@ -626,6 +626,7 @@ def test_new_writes_a_config_that_reads_and_never_overwrites(tmp_path):
     assert path.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_place_that_cannot_be_written_to_is_said_before_the_work(tmp_path):
     (tmp_path / "file").write_text("")
     path = tmp_path / "file" / "x.toml"

@@ -365,6 +365,7 @@ def test_what_sessions_share_is_found_and_widens_what_was_fitted():
     np.testing.assert_allclose(np.sqrt(np.mean(found, axis=0)), std, rtol=0.3)
 
 
+@pytest.mark.slow
 def test_regions_hold_runs_of_other_sessions_as_often_as_they_say():
     std = np.array([0.03, 0.02, 0.08])
     # of 40 sessions four runs each are fitted; 200 more have a session of their own each

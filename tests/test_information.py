@@ -210,6 +210,7 @@ def test_a_long_run_is_worth_less_than_two_and_a_second_one_its_share():
     )
 
 
+@pytest.mark.slow
 def test_scrub_needs_turning():
     """Along its axes of symmetry an even robot does not turn, and scrub does nothing."""
     even = eqx.tree_at(

@@ -39,6 +39,7 @@ def robotino2022(real_data: Path):
     }
 
 
+@pytest.mark.slow
 def test_every_run_of_2022_reads(robotino2022):
     counts = {name: len(logs) for name, logs in robotino2022.items()}
     assert counts == {"table": 50, "brown": 50, "gray": 150, "green": 150, "moved": 72, "two": 36}

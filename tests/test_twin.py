@@ -137,6 +137,7 @@ def test_derivative_by_gains_is_that_of_finite_differences():
     np.testing.assert_allclose(slope, by_hand, atol=1e-6 + 2e-4 * np.abs(by_hand).max())
 
 
+@pytest.mark.slow
 def test_many_twins_at_once():
     twins = stacked([Twin(frozen(), c, SILENT) for c in (floor([[0]]), floor([[1]]))])
     command = jnp.full(3, 3.0)
