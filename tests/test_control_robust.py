@@ -487,7 +487,7 @@ def test_mecanum_wheels_go_by_kinematics():
     empty = {n: jnp.zeros(s) for n, s in con.estimated.fields}
     said = con.estimated.pack(**empty | {"surface": jnp.array([[1.0, 0.0]] * 4)})
     asked = jnp.array([0.1, 0.1, 0.0])
-    wheels_asked = con._wheels(asked, con.estimated.of(said), jnp.asarray(1.0))
+    wheels_asked = con._wheels(asked, con.estimated.of(said))
     np.testing.assert_allclose(wheels_asked, f.forward @ asked / f.frame.radius)
 
 

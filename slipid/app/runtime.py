@@ -11,7 +11,7 @@ PLAIN_LOOPS = "--xla_cpu_use_fusion_emitters=false"
 def plain_loops() -> None:
     """Have XLA write loops without its fusion emitters, unless XLA_FLAGS says something of them.
 
-    A fit is compiled in three quarters of the time and runs as fast; rollouts of the twin take 0.4
+    A fit is compiled in three quarters of the time and runs as fast; rollouts of the twin take 0.3
     to 0.6 of the time. Must come before JAX first computes. XLA ends the process at flags that it
     does not know, so other versions than those it was measured with are left alone, and so is a
     file of flags.

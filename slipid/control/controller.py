@@ -26,6 +26,7 @@ GAINS = ("place", "yaw", "integral", "ahead", "observer", "preview")
 """Pose loop [1/s], heading loop [1/s], integral of the pose error [1/s^2], share of the inverse
 model in the wheel speeds [1], disturbance observer [1], time by which the path's rates are asked
 for early, because wheels follow late [s]."""
+AHEAD = GAINS.index("ahead")
 PAPER_GAIN = {"x": (3000.0, 500.0, 3000.0), "y": (2000.0, 2000.0, 2000.0)}
 """Of the 2021 paper's torque correction, motor rpm per N m at the motor shaft, by leg."""
 OBSERVE_S = 0.4
@@ -52,11 +53,11 @@ class Limits:
     twist: float = 0.5
 
 
-def _known_zero(gains: Any, name: str) -> bool:
+def _known_zero(gains: Any, place: int) -> bool:
     """Whether a gain is a constant of the compiled code, and zero: what it weighs is left out."""
     if isinstance(gains, jax.core.Tracer):
         return False
-    return float(np.asarray(gains)[GAINS.index(name)]) == 0.0
+    return float(np.asarray(gains)[place]) == 0.0
 
 
 def limited(
@@ -209,7 +210,7 @@ class Controller(eqx.Module):
             dt: since the last step [s].
         """
         f, old, e = self.frozen, self._kept.of(state), self.estimated.of(estimate)
-        place, yaw, integral, ahead, observer, _ = self.gains
+        place, yaw, integral, _, observer, _ = self.gains
         safe = jnp.all(jnp.isfinite(estimate)) & jnp.all(jnp.isfinite(reference)) & (e.stale < 0.5)
         pose = jnp.where(safe, e.pose, 0.0)
         ref = jnp.where(safe, reference, 0.0)
@@ -227,7 +228,7 @@ class Controller(eqx.Module):
         a = 1 - jnp.exp(-dt / OBSERVE_S)
         miss = old.miss + a * (twist - old.wanted - old.miss)
         asked = wanted - observer * miss
-        wheels = self._wheels(asked, e, ahead)
+        wheels = self._wheels(asked, e)
         wheels = wheels + self._torque(wanted, e)
         before = jnp.where(old.begun > 0.5, old.command, jnp.where(safe, e.wheel_speed, 0.0))
         wheels = jnp.where(safe, wheels, 0.0)
@@ -244,14 +245,14 @@ class Controller(eqx.Module):
         )
         return state, command
 
-    def _wheels(self, asked: Array, e: Any, ahead: Array) -> Array:
+    def _wheels(self, asked: Array, e: Any) -> Array:
         """Wheel speeds for a twist: a share of the inverse model, the rest kinematics.
 
         Mecanum wheels, whose inverse model is another, go by kinematics alone.
         """
         f = self.frozen
         plain = f.forward @ asked / f.frame.radius
-        if _known_zero(self.gains, "ahead"):
+        if _known_zero(self.gains, AHEAD):
             return plain
         share = e.surface[:, :-1]
         total = jnp.sum(share, axis=1, keepdims=True)
@@ -261,7 +262,7 @@ class Controller(eqx.Module):
         right = jnp.all(jnp.abs(f.frame.slip_through) < 1e-9)  # rollers at right angles
         extra = inverse_contact(f, asked, known) - plain
         extra = jnp.where(right & (total[:, 0] > 1e-3), extra, 0.0)
-        return plain + ahead * moves * (1 - e.surface[0, -1]) * extra
+        return plain + self.gains[AHEAD] * moves * (1 - e.surface[0, -1]) * extra
 
     def _torque(self, wanted: Array, e: Any) -> Array:
         """The 2021 paper's correction by the forces off the commanded direction [rad/s]."""
