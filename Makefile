@@ -7,7 +7,7 @@ BENCHES := $(wildcard tests/benchmarks/bench_*.py)
 TWO := -n 2 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check bench format clean
+.PHONY: help demo test nightly check bench format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | awk -F '\t' '{printf "make %-8s %s\n", $$1, $$2}'
@@ -18,6 +18,9 @@ demo: $(VENV)/.run-stamp ## the main job on logs of the virtual test site, pictu
 
 test: $(VENV)/.dev-stamp ## the whole test suite, a file at a time on two cores
 	$(BIN)/python -m pytest $(TWO)
+
+nightly: $(VENV)/.dev-stamp ## the whole suite compiled with XLA's optimisations, as users run it
+	JAX_DISABLE_MOST_OPTIMIZATIONS=0 JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.cache/jax-optimised $(BIN)/python -m pytest $(TWO)
 
 check: $(VENV)/.dev-stamp ## format, lint, types, import rules, quick tests: before every push
 	$(BIN)/ruff format --check .

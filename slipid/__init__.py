@@ -1,5 +1,53 @@
-"""Identify a wheeled robot's motors, load shares and wheel-floor contact from its own logs."""
+"""Identify a wheeled robot's motors, load shares and wheel-floor contact from its own logs.
 
-from __future__ import annotations
+Everything below is loaded when it is first asked for: importing slipid loads and changes nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from slipid.api.fit import Fit as Fit
+    from slipid.api.fit import Prior as Prior
+    from slipid.api.fit import fit as fit
+    from slipid.api.posterior import Posterior as Posterior
+    from slipid.api.profile import Profile as Profile
+    from slipid.api.validation import Validation as Validation
+    from slipid.control.controller import Controller as Controller
+    from slipid.control.deployed import DeployedRobot as DeployedRobot
+    from slipid.control.estimator import Estimator as Estimator
+    from slipid.control.interface import Measurement as Measurement
+    from slipid.data.reading.folders import read_runs as read_runs
+    from slipid.model.robot import Robot as Robot
+    from slipid.support.errors import DataError as DataError
+    from slipid.support.jax_setup import setup_jax as setup_jax
 
 __version__ = "0.1.0"
+_ROOMS = {
+    "Controller": "slipid.control.controller",
+    "DataError": "slipid.support.errors",
+    "DeployedRobot": "slipid.control.deployed",
+    "Estimator": "slipid.control.estimator",
+    "Fit": "slipid.api.fit",
+    "Measurement": "slipid.control.interface",
+    "Posterior": "slipid.api.posterior",
+    "Prior": "slipid.api.fit",
+    "Profile": "slipid.api.profile",
+    "Robot": "slipid.model.robot",
+    "Validation": "slipid.api.validation",
+    "fit": "slipid.api.fit",
+    "read_runs": "slipid.data.reading.folders",
+    "setup_jax": "slipid.support.jax_setup",
+}
+__all__ = sorted(_ROOMS)
+
+
+def __getattr__(name: str) -> object:
+    """A public name from the room it lives in (PEP 562)."""
+    if name not in _ROOMS:
+        raise AttributeError(f"module 'slipid' has no attribute '{name}'")
+    return getattr(import_module(_ROOMS[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -12,14 +12,14 @@ import dataclasses
 import fnmatch
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +37,7 @@ class Declaration:
         free: whether it is fitted unless the user says otherwise.
         shares: the numbers of the array are positive and sum to one.
         doc: one line for people.
+        electric: it is read from currents and voltages given the motion, not from the motion.
     """
 
     unit: str
@@ -48,6 +49,7 @@ class Declaration:
     free: bool
     shares: bool
     doc: str
+    electric: bool = False
 
     def to_search(self, value: Any) -> np.ndarray:
         """Search-space vector of an SI value (scalar or array)."""
@@ -103,14 +105,17 @@ def parameter(
     shares: bool = False,
     per: str | None = None,
     doc: str = "",
+    electric: bool = False,
 ) -> Any:
     """Dataclass field that holds a fitted number; arguments as in `Declaration`.
 
     Args:
-        per: name of the attribute of the same object that holds one label per entry of the
-            leading axis; the path then ends in `@label`.
+        per: name of the attribute of the same object, `loads` or `sessions`, that holds one label
+            per entry of the leading axis; the path then ends in `@label`.
     """
-    declaration = Declaration(unit, symbol, lower, upper, start, spread, free, shares, doc)
+    declaration = Declaration(
+        unit, symbol, lower, upper, start, spread, free, shares, doc, electric
+    )
     return eqx.field(
         converter=lambda x: (
             jnp.asarray(x, dtype=float) if not isinstance(x, jax.core.Tracer) else x
@@ -126,17 +131,28 @@ class Entry:
 
     Attributes:
         path: its one name, as in tables, files and errors.
+        quantity: the same without the floor, load set-up or session it is of: `surface.friction`.
         declaration: unit, bounds, prior.
         leaf: attribute names from the root to the array.
         index: place on the array's leading axis, None for the whole array.
         size: how many numbers.
+        surface, load, session: that it is of, None for a number that all of them share.
     """
 
     path: str
+    quantity: str
     declaration: Declaration
     leaf: tuple[str, ...]
     index: int | None
     size: int
+    surface: str | None = None
+    load: str | None = None
+    session: str | None = None
+
+    @property
+    def part(self) -> str:
+        """Attribute of the whole it belongs to: `motor`, `surfaces`, `camera`."""
+        return self.leaf[0]
 
     def get(self, tree: Any) -> Any:
         """Value in a tree [SI], scalar or vector."""
@@ -176,21 +192,27 @@ def entries(tree: Any, prefix: str = "", leaf: tuple[str, ...] = ()) -> Iterator
 
 
 def _of_field(
-    tree: Any, field: Any, declaration: Declaration, prefix: str, leaf: tuple[str, ...]
+    tree: Any,
+    field: dataclasses.Field,
+    declaration: Declaration,
+    prefix: str,
+    leaf: tuple[str, ...],
 ) -> Iterator[Entry]:
     shape = jnp.shape(getattr(tree, field.name))
+    quantity = f"{prefix}{field.name}"
     stack = getattr(tree, "labels", ())
-    if stack:
-        for k, label in enumerate(stack):
-            size = 1 if len(shape) == 1 else shape[1]
-            yield Entry(f"{prefix}{label}.{field.name}", declaration, leaf, k, size)
-    elif field.metadata["per"]:
-        for k, label in enumerate(getattr(tree, field.metadata["per"])):
-            size = 1 if len(shape) == 1 else shape[1]
-            yield Entry(f"{prefix}{field.name}@{label}", declaration, leaf, k, size)
-    else:
-        size = 1 if not shape else shape[0]
-        yield Entry(f"{prefix}{field.name}", declaration, leaf, None, size)
+    if not (stack or field.metadata["per"]):
+        yield Entry(quantity, quantity, declaration, leaf, None, shape[0] if shape else 1)
+        return
+    per = "labels" if stack else field.metadata["per"]
+    for k, label in enumerate(getattr(tree, per)):
+        path = f"{prefix}{label}.{field.name}" if stack else f"{quantity}@{label}"
+        size = 1 if len(shape) == 1 else shape[1]
+        yield Entry(path, quantity, declaration, leaf, k, size, **{_OF[per]: label})
+
+
+_OF = {"labels": "surface", "loads": "load", "sessions": "session"}
+"""What the labels under a name are of."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,18 +237,35 @@ class Choice:
     prior_std: Any = None
 
 
-class Space:
+class Space(eqx.Module):
     """The free numbers of a tree as one vector without bounds, Gaussian prior included.
 
-    Args:
-        tree: module with declared numbers; what is fixed keeps its value here.
-        choices: later ones win.
+    Goes through compiled functions as an argument: spaces of the same parameters share them.
 
-    Raises:
-        ValueError: a pattern matches no path, or a value lies outside its bounds.
+    Attributes:
+        template: the tree; what is fixed keeps its value here.
+        start, prior_mean, prior_std: in the search space.
+        all: every declared number of the tree.
+        free: those that are fitted.
     """
 
+    template: Any
+    start: Float[np.ndarray, " free"]
+    prior_mean: Float[np.ndarray, " free"]
+    prior_std: Float[np.ndarray, " free"]
+    all: tuple[Entry, ...] = eqx.field(static=True)
+    free: tuple[Entry, ...] = eqx.field(static=True)
+
     def __init__(self, tree: Any, choices: Sequence[Choice] = ()):
+        """Space of a module with declared numbers.
+
+        Args:
+            tree: the module.
+            choices: later ones win.
+
+        Raises:
+            ValueError: a pattern matches no path, or a value lies outside its bounds.
+        """
         self.all = tuple(entries(tree))
         unknown = [
             c.pattern
@@ -247,19 +286,31 @@ class Space:
                 means.append(mean)
                 spreads.append(spread)
         self.template = tree
-        self.free: tuple[Entry, ...] = tuple(free)
+        self.free = tuple(free)
         self.start, self.prior_mean, self.prior_std = (
             np.concatenate([np.zeros(0), *parts]) for parts in (starts, means, spreads)
         )
-        ends = np.cumsum([0, *(e.coordinates for e in free)])
-        self.place = {
-            e.path: slice(int(a), int(b)) for e, a, b in zip(free, ends, ends[1:], strict=False)
-        }
+
+    @property
+    def place(self) -> dict[str, slice]:
+        """Where the coordinates of every free number are, by path."""
+        ends = np.cumsum([0, *(e.coordinates for e in self.free)]).tolist()
+        return {e.path: slice(a, b) for e, a, b in zip(self.free, ends, ends[1:], strict=False)}
+
+    def where(self, wanted: Callable[[Entry], bool]) -> Bool[np.ndarray, " free"]:
+        """Coordinates of the free numbers that are wanted."""
+        count = [e.coordinates for e in self.free]
+        return np.repeat(np.array([wanted(e) for e in self.free], bool), count)
+
+    @property
+    def electric(self) -> Bool[np.ndarray, " free"]:
+        """Coordinates that are read from currents and voltages given the motion."""
+        return self.where(lambda e: e.declaration.electric)
 
     @property
     def size(self) -> int:
         """Number of free coordinates."""
-        return len(self.start)
+        return sum(e.coordinates for e in self.free)
 
     @property
     def names(self) -> list[str]:
@@ -274,11 +325,12 @@ class Space:
         """Tree of SI values at a search-space vector; jit-able."""
         z = jnp.asarray(z)
         changed: dict[tuple[str, ...], Any] = {}
+        place = self.place
         for entry in self.free:
             leaf = changed.get(entry.leaf)
             if leaf is None:
                 leaf = _leaf(self.template, entry.leaf)
-            value = entry.declaration.to_si(z[self.place[entry.path]])
+            value = entry.declaration.to_si(z[place[entry.path]])
             if entry.size == 1 and value.shape[0] == 1:
                 value = value[0]
             changed[entry.leaf] = value if entry.index is None else leaf.at[entry.index].set(value)

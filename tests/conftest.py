@@ -6,12 +6,14 @@ import os
 from ctypes.util import find_library
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
-from slipid.app.runtime import plain_loops
+from slipid.support.jax_setup import plain_loops
 
 ROOT = Path(__file__).resolve().parents[1]
-LONG = ("test_cli", "test_calibration", "test_notebooks", "test_compare")
+GOLDENS = Path(__file__).with_name("goldens")
+LONG = ("test_cli", "test_calibration", "test_notebooks", "test_cross_validation", "test_public")
 """Files that take longest."""
 
 # Set in the environment, so that commands and notebooks started by a test share them. The cache is
@@ -34,6 +36,30 @@ jax.config.update("jax_enable_x64", True)
 # Shapes and types of every annotated function of slipid are checked while tests run; under jit this
 # costs at tracing only. Must come before the first import of what computes.
 install_import_hook("slipid", "beartype.beartype")
+
+
+@pytest.fixture
+def original_datadir() -> Path:
+    """Folder of the reviewed numbers that `golden` compares with."""
+    return GOLDENS
+
+
+@pytest.fixture
+def golden(dataframe_regression):
+    """Compare rows of numbers with a reviewed table, `tests/goldens/NAME.csv`.
+
+    Numbers must agree to a relative `rtol` or an absolute `atol`, words to the letter. After a
+    change that is meant to move numbers, `pytest --force-regen` writes the tables anew: commit
+    them apart and say why they moved.
+    """
+
+    def check(name: str, rows: list[dict], rtol: float = 1e-6, atol: float = 1e-12) -> None:
+        table = pd.DataFrame(rows)
+        dataframe_regression.check(
+            table, basename=name, default_tolerance={"rtol": rtol, "atol": atol}
+        )
+
+    return check
 
 
 @pytest.fixture(scope="session")

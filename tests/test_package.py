@@ -24,16 +24,16 @@ def test_import_is_light_and_silent():
 
 
 def test_xla_is_told_only_what_it_knows_and_nobody_said_otherwise(monkeypatch):
-    from slipid.app import runtime
+    from slipid.support import jax_setup
 
     for version, before, after in (
-        ("0.10.2", "", runtime.PLAIN_LOOPS),
-        ("0.10.2", "--a=b", f"--a=b {runtime.PLAIN_LOOPS}"),
+        ("0.10.2", "", jax_setup.PLAIN_LOOPS),
+        ("0.10.2", "--a=b", f"--a=b {jax_setup.PLAIN_LOOPS}"),
         ("0.10.2", "--xla_cpu_use_fusion_emitters=true", "--xla_cpu_use_fusion_emitters=true"),
         ("0.11.0", "--a=b", "--a=b"),
         ("0.10.2", "/flags.txt", "/flags.txt"),  # XLA reads them from there
     ):
-        monkeypatch.setattr(runtime, "version", lambda _, v=version: v)
+        monkeypatch.setattr(jax_setup, "version", lambda _, v=version: v)
         monkeypatch.setenv("XLA_FLAGS", before)
-        runtime.plain_loops()
-        assert runtime.os.environ["XLA_FLAGS"] == after
+        jax_setup.plain_loops()
+        assert jax_setup.os.environ["XLA_FLAGS"] == after

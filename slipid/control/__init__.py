@@ -1,1 +1,1 @@
-"""What runs on the robot: frozen estimator, controllers, closed loop. Needs jax alone."""
+"""What runs on the robot: the deployed robot, estimators, controllers. Needs jax alone."""

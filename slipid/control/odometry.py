@@ -4,88 +4,84 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.control.estimator import Settings, estimated, read_wheels, sensed
-from slipid.control.frozen import Frozen
-from slipid.control.packed import Layout
-from slipid.model.robot import advance, compose
+from slipid.control.deployed import DeployedRobot
+from slipid.control.interface import AbstractEstimator, Estimate, Pose, Readings, Settings
+from slipid.control.wheels import WheelState, read_wheels, time_step
+from slipid.model.se2 import advance, compose
 
 CURRENT_FROM = 0.4
 """Current from which the 2021 paper's deployed estimator counts slip [A]."""
 
 
-class Odometry(eqx.Module):
-    """Wheel-by-wheel odometry, w_eff = w (1 - s), on the interface of `Estimator`.
+class OdometryState(eqx.Module):
+    """What odometry keeps from step to step.
 
     Attributes:
-        frozen: the identified robot.
-        settings: what is not identified.
-        curve: whether slip is taken from `Frozen.wheel_curve`, a + b |I| where the smoothed current
-            exceeds `CURRENT_FROM`, as the 2021 paper's robot did; else the encoders are believed.
+        pose: x, y [m], heading [rad].
+        wheels: how they turn; current: of the motors, smoothed, without a sign [A].
     """
 
-    frozen: Frozen
-    settings: Settings = eqx.field(static=True, default=Settings())
-    curve: bool = eqx.field(static=True, default=False)
+    pose: Float[Array, "3"]
+    wheels: WheelState
+    current: Float[Array, " wheel"]
 
-    @property
-    def sensed(self) -> Layout:
-        """Layout of a measurement."""
-        return sensed(self.frozen.wheels)
 
-    @property
-    def estimated(self) -> Layout:
-        """Layout of an estimate."""
-        return estimated(self.frozen.wheels, len(self.frozen.labels))
+class Odometry(AbstractEstimator[OdometryState]):
+    """Wheel-by-wheel odometry, w_eff = w (1 - s).
 
-    @property
-    def _kept(self) -> Layout:
-        w = (self.frozen.wheels,)
-        return Layout((("pose", (3,)), ("angle", w), ("speed", w), ("age", w), ("amps", w)))
+    Attributes:
+        robot: the identified robot.
+        settings: what is not identified, by default as the robot's logs were.
+        curve: whether slip is taken from `DeployedRobot.wheel_curve`, a + b |I| where the smoothed
+            current exceeds `CURRENT_FROM`, as the 2021 paper's robot did; else the encoders are
+            believed.
+    """
 
-    def init(self, pose: Float[Array, "3"]) -> Float[Array, " state"]:
+    robot: DeployedRobot
+    settings: Settings = eqx.field(static=True)
+    curve: bool = eqx.field(static=True)
+
+    def __init__(self, robot: DeployedRobot, settings: Settings | None = None, curve: bool = False):
+        self.robot, self.curve = robot, curve
+        self.settings = Settings.of(robot) if settings is None else settings
+
+    def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> OdometryState:
         """State of a robot at rest at a pose [m, m, rad]."""
-        w = self.frozen.wheels
-        return self._kept.pack(
+        return OdometryState(
             pose=jnp.asarray(pose, dtype=float),
-            angle=jnp.full(w, jnp.nan),
-            speed=jnp.zeros(w),
-            age=jnp.full(w, 10 * self.settings.stale_s),
-            amps=jnp.zeros(w),
+            wheels=WheelState.init(self.robot, self.settings),
+            current=jnp.zeros(self.robot.wheels),
         )
 
-    def step(
-        self,
-        state: Float[Array, " state"],
-        measurement: Float[Array, " sensed"],
-        dt: Float[Array, ""] | float,
-    ) -> tuple[Float[Array, " state"], Float[Array, " estimated"]]:
-        """One time step; see `Estimator.step`. Neither gyro nor pose fixes are used."""
-        f, s, old = self.frozen, self.settings, self._kept.of(state)
-        z = self.sensed.of(measurement)
-        dt = jnp.asarray(dt, dtype=float)
-        dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.clip(dt, 1e-4, s.longest_s), 0.0)
-        w, angle, age = read_wheels(f, s, old, z, dt)
+    def advance(
+        self, state: OdometryState, z: Readings, dt: Float[Array, ""]
+    ) -> tuple[OdometryState, Estimate]:
+        """One time step; see `AbstractEstimator.step`. Neither gyro nor pose fixes are used."""
+        f, s, old = self.robot, self.settings, state
+        dt = time_step(dt, s)
+        wheels = read_wheels(f, s, old.wheels, z, dt)
+        w = wheels.speed
         known = jnp.isfinite(z.current) & (jnp.abs(z.current) < 10.0 * f.highest[1])
         a = 1 - jnp.exp(-dt / 0.6)  # exponential with 0.97 a row, as on the paper's robot
-        amps = jnp.where(known, old.amps + a * (jnp.abs(z.current) - old.amps), old.amps)
+        smoothed = old.current + a * (jnp.abs(z.current) - old.current)
+        amps = jnp.where(known, smoothed, old.current)
         slip = jnp.zeros_like(w)
         if self.curve:
             line = f.wheel_curve[:, 0] + f.wheel_curve[:, 1] * amps
             slip = jnp.where(amps > CURRENT_FROM, jnp.clip(line, 0.0, 0.95), 0.0)
         twist = f.inverse @ (f.frame.radius * w * (1 - slip))
         pose = compose(old.pose, advance(twist, dt))
-        state = self._kept.pack(pose=pose, angle=angle, speed=w, age=age, amps=amps)
         unknown = jnp.zeros((f.wheels, len(f.labels) + 1)).at[:, -1].set(1.0)
-        said = self.estimated.pack(
+        return OdometryState(pose=pose, wheels=wheels, current=amps), Estimate(
             pose=pose,
             twist=twist,
             slip=slip,
             wheel_speed=w,
             current=amps,
-            surface=unknown,
+            surface_probability=unknown,
             covariance=jnp.zeros((3, 3)),
-            stale=jnp.any(age > s.stale_s),
-            immobilised=0.0,
+            stale=jnp.any(wheels.age > s.stale_s),
+            immobilised=jnp.zeros((), bool),
             out_of_range=jnp.max(jnp.abs(w)) > 1.3 * f.highest[0],
+            labels=f.labels,
         )
-        return state, said

@@ -1,13 +1,13 @@
 """Logs as files: slipid's own columns, and those of the published Robotino logs."""
 
 from collections.abc import Collection
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 
-from slipid.data.formats import preset
-from slipid.data.layout import PER_WHEEL
 from slipid.data.log import Log
+from slipid.data.reading.layout import PER_WHEEL
+from slipid.data.reading.presets import preset
 
 OPTIONAL = {
     "voltage": ("V", "%.2f"),
@@ -15,8 +15,25 @@ OPTIONAL = {
     "bus_voltage": ("V", "%.2f"),
     "gyro": ("rad/s", "%.5f"),
 }
-"""Channels that not every log has, with their unit and how they are written."""
+"""Channels that not every log has, with their unit and the format of their numbers."""
 _IMAGE = (1920, 1080)
+
+
+class ColumnTable(TypedDict, total=False):
+    """Columns of one channel as a config declares them."""
+
+    column: str
+    columns: list[str]
+    unit: str
+
+
+class LayoutTable(TypedDict):
+    """A layout as a config declares it."""
+
+    ticks_per_revolution: int
+    gear_ratio: float
+    current_is_signed: bool
+    columns: dict[str, ColumnTable]
 
 
 def own_layout(
@@ -25,17 +42,17 @@ def own_layout(
     ticks_per_revolution: int,
     current_is_signed: bool = False,
     more: Collection[str] = ("voltage",),
-) -> dict[str, Any]:
+) -> LayoutTable:
     """Layout of `own_csv`, as a config declares one.
 
     Args:
-        wheels: how many.
+        wheels: number of wheels.
         gear_ratio: turns of the motor per turn of the wheel.
-        ticks_per_revolution: of the motor.
+        ticks_per_revolution: ticks in one turn of the motor.
         current_is_signed: False where magnitudes are logged.
         more: channels beside ticks, current and pose: of voltage, duty, bus_voltage, gyro.
     """
-    columns: dict[str, Any] = {
+    columns: dict[str, ColumnTable] = {
         "time": {"column": "time", "unit": "s"},
         "twist_command_x": {"column": "command_x", "unit": "m/s"},
         "twist_command_y": {"column": "command_y", "unit": "m/s"},
@@ -45,8 +62,11 @@ def own_layout(
     }
     for channel, (unit, _) in OPTIONAL.items():
         if channel in more:
-            each = {"columns": _each(channel, wheels)} if channel in PER_WHEEL else {}
-            columns[channel] = {**(each or {"column": channel}), "unit": unit}
+            columns[channel] = (
+                {"columns": _each(channel, wheels), "unit": unit}
+                if channel in PER_WHEEL
+                else {"column": channel, "unit": unit}
+            )
     columns |= {
         "pose_x": {"column": "x", "unit": "mm"},
         "pose_y": {"column": "y", "unit": "mm"},
@@ -66,7 +86,7 @@ def own_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> str:
     Args:
         log: with commands, currents and poses; the `OPTIONAL` channels where it has them.
         gear_ratio: turns of the motor per turn of the wheel.
-        ticks_per_revolution: of the motor.
+        ticks_per_revolution: ticks in one turn of the motor.
     """
     assert log.twist_command is not None
     assert log.current is not None
@@ -110,9 +130,9 @@ def robotino2022_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> 
     The pose's origin is the middle of the image. Projected currents and steps are zeros.
 
     Args:
-        log: of three wheels, with commands, speeds, currents and poses.
+        log: a log of three wheels, with commands, speeds, currents and poses.
         gear_ratio: turns of the motor per turn of the wheel.
-        ticks_per_revolution: of the motor.
+        ticks_per_revolution: ticks in one turn of the motor.
     """
     assert log.twist_command is not None
     assert log.wheel_speed is not None

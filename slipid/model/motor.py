@@ -1,10 +1,14 @@
 """DC motor with brushes: U = R I + C_e wm + L_a dI/dt + brush drop."""
 
+from functools import partial
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from slipid.parameter import parameter
+
+electric = partial(parameter, electric=True)
 
 REST = 2.5
 """Motor speed below which a sign is not trusted, about one speed quantum [rad/s]."""
@@ -17,19 +21,19 @@ class Motor(eqx.Module):
         gear_ratio: n, motor speed over wheel speed.
     """
 
-    resistance: Array = parameter(
+    resistance: Array = electric(
         unit="ohm", symbol="R", start=1.0, lower=0.0, spread=0.5, doc="winding resistance"
     )
-    back_emf: Array = parameter(
+    back_emf: Array = electric(
         unit="V*s/rad", symbol="C_e", start=0.05, lower=0.0, spread=0.5, doc="back-EMF constant"
     )
-    inductance: Array = parameter(
+    inductance: Array = electric(
         unit="H", symbol="L_a", start=0.005, lower=0.0, spread=1.0, free=False, doc="inductance"
     )
-    brush_drop: Array = parameter(
+    brush_drop: Array = electric(
         unit="V", symbol="U_b", start=0.0, spread=0.5, free=False, doc="voltage drop of the brushes"
     )
-    efficiency: Array = parameter(
+    efficiency: Array = electric(
         unit="1",
         symbol="eta",
         start=0.9,
@@ -39,16 +43,16 @@ class Motor(eqx.Module):
         free=False,
         doc="gear",
     )
-    coulomb_friction: Array = parameter(
+    coulomb_friction: Array = electric(
         unit="N*m", symbol="tau_c", start=0.02, lower=0.0, spread=1.5, doc="friction at the wheel"
     )
-    viscous_friction: Array = parameter(
+    viscous_friction: Array = electric(
         unit="N*m*s/rad", symbol="b_w", start=0.005, lower=0.0, spread=1.5, doc="friction per speed"
     )
-    current_offset: Array = parameter(
+    current_offset: Array = electric(
         unit="A", symbol="I_0", start=0.0, spread=0.05, free=False, doc="zero of the ammeter"
     )
-    rotor_inertia: Array = parameter(
+    rotor_inertia: Array = electric(
         unit="kg*m^2", symbol="J_m", start=1e-5, lower=0.0, spread=1.0, free=False, doc="rotor"
     )
     gear_ratio: float = eqx.field(static=True, default=1.0)

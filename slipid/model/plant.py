@@ -1,32 +1,8 @@
-"""What a closed loop needs of the world: a plant to drive, and which floor lies where."""
-
-from typing import Protocol, runtime_checkable
+"""Which floor lies where, as arrays a compiled function can look up."""
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
-
-
-@runtime_checkable
-class Plant(Protocol):
-    """A robot that takes wheel speeds and gives back what its sensors read.
-
-    Sensor readings are one flat array as `slipid.control.estimator.sensed` lays it out.
-    """
-
-    def reset(self) -> Float[np.ndarray, " sensed"]:
-        """First readings, of the robot at rest."""
-        ...
-
-    def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Float[np.ndarray, " sensed"]:
-        """Readings one control period later, with these wheel speeds commanded [rad/s]."""
-        ...
-
-    @property
-    def pose(self) -> tuple[float, float, float]:
-        """True x, y [m] and heading [rad]; for the judge, no controller sees it."""
-        ...
 
 
 class Floor(eqx.Module):

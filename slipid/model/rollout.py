@@ -7,15 +7,15 @@ Both integrate the body by implicit Euler on the twist and exactly on SE(2):
 with M = 0 (quasi-static) unless the body's inertia is asked for. `jax.vmap` lifts both over runs.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from slipid.model import contact
-from slipid.model.robot import GRAVITY, Robot, advance, compose, twist, wheel_torque
+from slipid.model.geometry import Frame
+from slipid.model.robot import GRAVITY, Robot, twist, wheel_torque
+from slipid.model.se2 import advance, compose
 
 _NEWTON = 6
 _DAMPING = (1.0, 0.5, 0.2, 0.05)
@@ -170,14 +170,15 @@ def simulate(
     floors = jnp.broadcast_to(jnp.asarray(surface), command.shape[:1])
     still = jnp.zeros(command.shape[1])
 
-    def step(state: tuple[Array, ...], now: tuple[Array, Array]) -> tuple[Any, Any]:
+    def step(
+        state: tuple[Array, Array, Array, Array, Array], now: tuple[Array, Array]
+    ) -> tuple[tuple[Array, Array, Array, Array, Array], tuple[Array, ...]]:
         xi, w, amps, angle, total = state
         want, floor = now
         volt, total = _control(robot, loop, want, w, total, dt)
         mass = inertia(robot, floor) / dt if body_inertia else jnp.zeros(3)
         henry = robot.motor.inductance if inductance else jnp.zeros(())
-        args = (robot, frame, floor, load, mass, henry, dt, volt, xi, w, amps)
-        w, amps = _wheels(args)
+        w, amps = _Step(robot, frame, floor, load, mass, henry, dt, volt, xi, w, amps).wheels()
         # the twist anew, by the robust root finder: exactly what `replay` makes of these wheels
         rest, rim = robot.body.load_share[load], frame.radius * w
         near = (rim, frame, robot.surfaces.at(floor), rest)
@@ -207,7 +208,7 @@ def simulate(
 
 
 def _control(
-    robot: Robot, loop: SpeedLoop, want: Array, w: Array, total: Array, dt: Any
+    robot: Robot, loop: SpeedLoop, want: Array, w: Array, total: Array, dt: Array | float
 ) -> tuple[Array, Array]:
     """Voltage of this step and the integral after it."""
     gap = want - w
@@ -217,43 +218,60 @@ def _control(
     return volt, jnp.where(volt == asked, total + gap * dt, total)
 
 
-def _wheels(args: tuple[Any, ...]) -> tuple[Array, Array]:
-    """Wheel speeds and currents one implicit Euler step later, solved together with the twist."""
-    *_, xi, w, amps = args
-    count = len(w)
-    y = jnp.concatenate([xi, w, amps])
+class _Step(eqx.Module):
+    """What wheels, motors and body go through in one implicit Euler step.
 
-    def newton(y: Array, _: None) -> tuple[Array, None]:
-        f, jac = _balance(y, args), jax.jacfwd(_balance)(y, args)
-        dy = _eliminate(jac, f)
+    Attributes:
+        robot, frame, floor, load: as of `simulate`.
+        mass: of the body over the time step [mu m g s/m]; henry: inductance of the motors.
+        dt: [s]; volt: of the motors.
+        xi, w, amps: twist, wheel speeds and currents before the step.
+    """
 
-        def merit(alpha: Array) -> Array:
-            g = _balance(y - alpha * dy, args)
-            return jnp.where(jnp.all(jnp.isfinite(g)), g @ g, jnp.inf)
+    robot: Robot
+    frame: Frame
+    floor: Int[Array, ""]
+    load: Int[Array, ""]
+    mass: Float[Array, "3"]
+    henry: Float[Array, ""]
+    dt: Float[Array, ""] | float
+    volt: Float[Array, " wheel"]
+    xi: Float[Array, "3"]
+    w: Float[Array, " wheel"]
+    amps: Float[Array, " wheel"]
 
-        damping = jnp.asarray(_DAMPING)
-        best = damping[jnp.argmin(jax.vmap(merit)(damping))]
-        return y - best * dy, None
+    def balance(self, y: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
+        """Residuals of contact [mu m g], wheels and motors [N m] at twist, speeds and currents."""
+        robot, motor, count = self.robot, self.robot.motor, len(self.w)
+        xi, w, amps = y[:3], y[3 : 3 + count], y[3 + count :]
+        surface, rest = robot.surfaces.at(self.floor), robot.body.load_share[self.load]
+        felt = contact.forces(xi, self.frame.radius * w, self.frame, surface, rest)
+        body = felt.residual - (self.mass * (xi - self.xi)).at[2].divide(self.frame.base)
+        rotor = motor.gear_ratio**2 * motor.rotor_inertia
+        load_torque = wheel_torque(robot, self.frame, xi, w, self.floor, self.load)
+        wheel = motor.torque(amps, w) - load_torque - rotor * (w - self.w) / self.dt
+        stall = motor.gear_ratio * motor.efficiency * motor.back_emf / motor.resistance  # [N m/V]
+        rise = self.henry * (amps - self.amps) / self.dt
+        electric = stall * (self.volt - motor.voltage(amps, w) - rise)
+        return jnp.concatenate([body, wheel, electric])
 
-    y = jax.lax.scan(newton, y, None, length=_NEWTON)[0]
-    return y[3 : 3 + count], y[3 + count :]
+    def wheels(self) -> tuple[Float[Array, " wheel"], Float[Array, " wheel"]]:
+        """Wheel speeds and currents after the step, solved together with the twist."""
 
+        def newton(y: Array, _: None) -> tuple[Array, None]:
+            dy = _eliminate(jax.jacfwd(self.balance)(y), self.balance(y))
 
-def _balance(y: Array, args: tuple[Any, ...]) -> Array:
-    """Residuals of contact [mu m g], wheels and motors [N m] of one step."""
-    robot, frame, floor, load, mass, henry, dt, volt, xi0, w0, amps0 = args
-    count = len(w0)
-    xi, w, amps = y[:3], y[3 : 3 + count], y[3 + count :]
-    motor, surface = robot.motor, robot.surfaces.at(floor)
-    pushed = mass * (xi - xi0)
-    body = contact.residual(xi, frame.radius * w, frame, surface, robot.body.load_share[load])
-    body = body - pushed.at[2].divide(frame.base)
-    rotor = motor.gear_ratio**2 * motor.rotor_inertia
-    load_torque = wheel_torque(robot, frame, xi, w, floor, load)
-    wheel = motor.torque(amps, w) - load_torque - rotor * (w - w0) / dt
-    stall = motor.gear_ratio * motor.efficiency * motor.back_emf / motor.resistance  # [N m/V]
-    electric = stall * (volt - motor.voltage(amps, w) - henry * (amps - amps0) / dt)
-    return jnp.concatenate([body, wheel, electric])
+            def merit(alpha: Array) -> Array:
+                g = self.balance(y - alpha * dy)
+                return jnp.where(jnp.all(jnp.isfinite(g)), g @ g, jnp.inf)
+
+            damping = jnp.asarray(_DAMPING)
+            best = damping[jnp.argmin(jax.vmap(merit)(damping))]
+            return y - best * dy, None
+
+        y = jnp.concatenate([self.xi, self.w, self.amps])
+        y, count = jax.lax.scan(newton, y, None, length=_NEWTON)[0], len(self.w)
+        return y[3 : 3 + count], y[3 + count :]
 
 
 def _eliminate(m: Array, b: Array) -> Array:

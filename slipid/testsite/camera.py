@@ -8,13 +8,13 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.log import DataError
-from slipid.data.terrain import FloorMap
+from slipid.data.floor_map import FloorMap
+from slipid.support.errors import DataError
 from slipid.testsite.ground import Ground
 from slipid.testsite.machine import Machine, mjcf
 from slipid.testsite.refuse import not_negative, positive
@@ -34,9 +34,9 @@ class Camera:
     """A camera that looks down on the floor, its image turned by half a turn from the world's axes.
 
     Attributes:
-        height_m: of the lens above the floor.
+        height_m: height of the lens above the floor.
         focal_px: focal length [pixel].
-        width_px, height_px: of the image.
+        width_px, height_px: size of the image.
         centre_m: where on the floor it hangs above, x and y.
         tilt_deg: about the image's x and y axes.
         distortion: k1, k2, p1, p2 of OpenCV's lens model.
@@ -76,7 +76,7 @@ class Camera:
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """From the world to OpenCV's camera axes: x right, y down, z away."""
+        """Rotation from the world to OpenCV's camera axes: x right, y down, z away."""
         a, b = np.radians(self.tilt_deg)
         down = np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
         about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
@@ -85,11 +85,11 @@ class Camera:
 
     @property
     def place(self) -> Float[np.ndarray, "3"]:
-        """Of the lens in the world [m]."""
+        """Place of the lens in the world [m]."""
         return np.array([*self.centre_m, self.height_m])
 
     def pixels(self, points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 2"]:
-        """Where points of the world are seen."""
+        """Pixels at which points of the world are seen."""
         import cv2
 
         turn, _ = cv2.Rodrigues(self.rotation)
@@ -98,7 +98,7 @@ class Camera:
         seen, _ = cv2.projectPoints(np.asarray(points, float), turn, shift, self.matrix, lens)
         return seen[:, 0]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """What a tracker has to know."""
         return {
             "schema": "slipid.camera/1",
@@ -120,7 +120,7 @@ class Studio:
         floor: which surface lies where.
         grounds: colours of the surfaces.
         camera: that looks.
-        seed: of the floor's pattern, the light and the noise.
+        seed: seed of the floor's pattern, the light and the noise.
 
     Raises:
         DataError: OpenGL or OpenCV is not there.
@@ -222,7 +222,7 @@ class Studio:
         return np.clip(image, 0, 255).astype(np.uint8)
 
     def _lens(self) -> tuple[np.ndarray, np.ndarray]:
-        """From which pixel of the drawing each pixel of the image comes."""
+        """Pixel of the drawing that each pixel of the image comes from."""
         c, cv2 = self.camera, self._cv2
         grid = np.stack(np.meshgrid(np.arange(c.width_px), np.arange(c.height_px)), -1)
         points = grid.reshape(-1, 1, 2).astype(np.float64)
@@ -246,11 +246,11 @@ def film(
 
     Args:
         studio: draws.
-        time: of the truth [s].
-        pose: of the body.
-        wheel_angle: of the wheels.
-        frames: times of its frames [s].
-        path: of the video (.avi, Motion JPEG).
+        time: times of the truth [s].
+        pose: true pose of the body.
+        wheel_angle: true angles of the wheels [rad].
+        frames: times of the video's frames [s].
+        path: where the video goes (.avi, Motion JPEG).
 
     Raises:
         DataError: the video cannot be written.
@@ -285,7 +285,7 @@ def film(
         partial.unlink(missing_ok=True)
 
 
-def _drawing() -> tuple[Any, Any]:
+def _drawing() -> tuple[ModuleType, ModuleType]:
     """The modules mujoco, ready to draw without a screen, and cv2."""
     if os.name == "posix" and "DISPLAY" not in os.environ:
         os.environ.setdefault("MUJOCO_GL", "egl")
@@ -336,11 +336,11 @@ def _carpet(
     return np.clip(picture * (1 + 0.06 * grain[..., None]), 0, 255).astype(np.uint8)[::-1]
 
 
-def _marker(cv2: Any) -> np.ndarray:
+def _marker(cv2: ModuleType) -> np.ndarray:
     """Picture of the marker."""
     book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     return np.repeat(cv2.aruco.generateImageMarker(book, MARKER, 480)[..., None], 3, axis=2)
 
 
-def _png(cv2: Any, picture: np.ndarray) -> bytes:
+def _png(cv2: ModuleType, picture: np.ndarray) -> bytes:
     return bytes(cv2.imencode(".png", picture[..., ::-1])[1])

@@ -23,10 +23,10 @@ class Site:
 
     Attributes:
         machine, motor, loop: the robot.
-        sensors: of its logs.
+        sensors: sensors that make its logs.
         grounds: physics of every surface.
-        command_delay_s: from a command to the wheels.
-        acceleration: of the wheels' rims towards a new command [m/s^2].
+        command_delay_s: delay from a command to the wheels.
+        acceleration: acceleration of the wheels' rims towards a new command [m/s^2].
     """
 
     machine: Machine = field(default_factory=Machine)
@@ -44,8 +44,8 @@ def drive(run: Run, site: Site, seed: int, timestep: float | None = None) -> Tra
     Args:
         run: what to do.
         site: robot and floors.
-        seed: of how the wheels stand and of the floor's unevenness.
-        timestep: of the engine [s], by default `plant.TIMESTEP`.
+        seed: seed of how the wheels stand and of the floor's unevenness.
+        timestep: time step of the engine [s], by default `plant.TIMESTEP`.
 
     Raises:
         DataError: MuJoCo is missing, a surface has no physics, or the simulation became unstable.

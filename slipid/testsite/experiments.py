@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slipid.data.terrain import FloorMap, uniform
+from slipid.data.floor_map import FloorMap, uniform
 
 Twist = tuple[float, float, float]
 """Ahead, left [m/s], turn [rad/s]."""
@@ -34,7 +34,7 @@ class Waypoints:
         places: x, y [m] in the frame of the pose.
         speed: [m/s].
         by: the pose that is believed: `encoders` from the start on, or `camera` (the true one).
-        within_m: from a place it is reached.
+        within_m: distance at which a place counts as reached.
         longest_s: after which it is given up; by default thrice the time without slip and 10 s.
     """
 
@@ -93,7 +93,7 @@ def straight(
     Args:
         surface: everywhere.
         load: name of the load set-up.
-        heading: of the commanded motion in the body frame [rad].
+        heading: direction of the commanded motion in the body frame [rad].
         speed: [m/s]; 0 turns on the spot.
         distance: commanded length [m], arc of the rim where it only turns.
         turn: [rad/s].
@@ -124,7 +124,7 @@ def paper_grid(surface: str, load: str, seconds: float = 3.0) -> list[Run]:
     Args:
         surface: everywhere.
         load: name of the load set-up.
-        seconds: of a run.
+        seconds: length of a run.
     """
     ways = [(1, 0), (0, 1), (1, 1), (1, -1)]
     out = []

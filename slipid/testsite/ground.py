@@ -20,7 +20,7 @@ class Ground:
         shear_n_m: horizontal stiffness of the floor beneath one roller [N/m].
         compaction: resistance of a sunk wheel per sinkage to the power of 1.5 [N/m^1.5].
         body_drag_n: resistance of what touches the body, against its motion, not its turning [N].
-        rib_height_m, rib_distance_m: of ribs along y, none by default [m].
+        rib_height_m, rib_distance_m: size of ribs along y [m]; by default there are none.
         unevenness: std of the logarithm of rolling friction and shear stiffness over the floor [1].
         colour: in pictures.
     """

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.terrain import FloorMap
+from slipid.data.floor_map import FloorMap
 from slipid.testsite.driving import PERIOD, Site
 from slipid.testsite.plant import Plant
 
@@ -33,7 +33,7 @@ class Live:
         floor: which surface lies where.
         load: name of the load set-up.
         start: x, y [m], heading [rad].
-        seed: of the floor's unevenness, the wheels' first angles and the sensors' noise.
+        seed: seed of the floor's unevenness, the wheels' first angles and the sensors' noise.
         period: between commands [s].
 
     Raises:

@@ -14,21 +14,21 @@ class Machine:
     """What the robot is made of; by default like a Robotino 2.
 
     Attributes:
-        mass_kg: of the whole robot.
+        mass_kg: mass of the whole robot.
         centres_m: x, y of the centre of mass of every load set-up.
-        centre_height_m: of the centre of mass, above the wheel axes.
-        wheel_azimuths_deg: of the wheel centres; each drives 90 deg further.
+        centre_height_m: height of the centre of mass above the wheel axes.
+        wheel_azimuths_deg: azimuths of the wheel centres; each drives 90 deg further.
         base_radius_m, wheel_radius_m: [m].
         gear_ratio: turns of the motor per turn of the wheel.
-        rollers: of one wheel, in two staggered rows; even.
-        roller_radius_m, roller_mass_kg: of one.
-        row_offset_m: of each row from the middle of the wheel.
+        rollers: number of rollers of one wheel, in two staggered rows; even.
+        roller_radius_m, roller_mass_kg: radius and mass of one roller.
+        row_offset_m: distance of each row from the middle of the wheel.
         mount_n_m: stiffness of a roller's mount along the wheel's rim [N/m].
-        roller_friction_nm: of a roller's bearing.
+        roller_friction_nm: friction of a roller's bearing.
         wheel_mass_kg: without rollers.
-        body_radius_m: of the chassis, for pictures.
-        marker_height_m, marker_size_m: of the camera's marker above the floor, and its edge.
-        marker_yaw_deg: of the marker, less the body's.
+        body_radius_m: radius of the chassis, for pictures.
+        marker_height_m, marker_size_m: height of the camera's marker above the floor, its edge.
+        marker_yaw_deg: heading of the marker less the body's.
     """
 
     mass_kg: float = 12.0

@@ -12,14 +12,14 @@ class Motor:
     """A brushed DC motor with its gear.
 
     Attributes:
-        resistance_ohm, inductance_h: of the winding.
+        resistance_ohm, inductance_h: resistance and inductance of the winding.
         back_emf_vs: [V s/rad], which is its torque per current as well.
         rotor_inertia_kg_m2: at the motor shaft.
         coulomb_nm, viscous_nms: friction at the wheel [N m], [N m s].
-        efficiency: of the gear, while the motor drives.
-        supply_v, supply_ohm: of the battery that all motors share; it never falls below a
-            twentieth.
-        ticks_per_revolution: of the encoder on the motor shaft.
+        efficiency: efficiency of the gear while the motor drives.
+        supply_v, supply_ohm: voltage and resistance of the battery that all motors share; its
+            voltage never falls below a twentieth.
+        ticks_per_revolution: ticks of the encoder in one turn of the motor shaft.
     """
 
     resistance_ohm: float = 5.5
@@ -52,10 +52,10 @@ class SpeedLoop:
     Attributes:
         kind: `pi`; `feed_forward` (proportional, and the back-EMF of the wanted speed); `cascade`
             (PI to a current, and a current loop below it).
-        gain: of the error in motor speed [V s/rad]; in a cascade [A s/rad].
+        gain: gain of the error in motor speed [V s/rad]; in a cascade [A s/rad].
         integral: per second of it [V/rad]; in a cascade [A/rad].
-        current_gain: of the cascade's inner loop [V/A].
-        current_limit_a: of the cascade.
+        current_gain: gain of the cascade's inner loop [V/A].
+        current_limit_a: limit of the cascade's current.
         filter_s: time constant of the measured speed.
     """
 
@@ -75,8 +75,8 @@ class Drive:
     """Currents and voltages of all wheels, a step at a time.
 
     Args:
-        motor: the same for every wheel.
-        loop: likewise.
+        motor: motor of every wheel.
+        loop: speed loop of every wheel.
         gear_ratio: turns of the motor per turn of the wheel.
         wheels: how many.
         dt: time step [s].
@@ -99,8 +99,8 @@ class Drive:
 
         Args:
             wanted: wheel speeds [rad/s].
-            angle: of the wheels [rad]; the loop sees whole ticks of it.
-            speed: of the wheels [rad/s], for the back-EMF.
+            angle: angles of the wheels [rad]; the loop sees whole ticks of it.
+            speed: speeds of the wheels [rad/s], for the back-EMF.
         """
         m = self.motor
         ticks = [floor(a / self._per_tick) for a in angle]

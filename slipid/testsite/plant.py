@@ -2,21 +2,21 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.log import DataError
-from slipid.data.terrain import FloorMap
+from slipid.data.floor_map import FloorMap
+from slipid.support.errors import DataError
 from slipid.testsite.ground import Ground
 from slipid.testsite.machine import Machine, mjcf
 from slipid.testsite.motors import Drive, Motor, SpeedLoop
 
 TIMESTEP = 1e-3
-"""Of the engine and of the speed loop [s]."""
+"""Time step of the engine and of the speed loop [s]."""
 SETTLING = 0.4
-"""For which a robot stands still before anything is recorded [s]."""
+"""Time for which a robot stands still before anything is recorded [s]."""
 LEVELS = 7
 """Steps of the random unevenness of a floor."""
 LOOK = 5
@@ -26,12 +26,12 @@ ARENA = 1.6
 GRID = 0.005
 """Cells in which the floor is looked up [m], larger on the largest floors."""
 MOST_CELLS = 16_000_000
-"""Of one floor."""
+"""Largest number of cells of one floor."""
 CREEP = 0.02
 """Speed at which an added force has reached 0.7 of its size [m/s]."""
 
 
-def engine() -> Any:
+def engine() -> ModuleType:
     """The mujoco module.
 
     Raises:
@@ -51,13 +51,13 @@ class Trace:
     """What truly happened, a row per time step.
 
     Attributes:
-        time: from the end of the settling [s].
-        pose: of the body: x, y [m], heading [rad].
+        time: time since the end of the settling [s].
+        pose: pose of the body: x, y [m], heading [rad].
         yaw_rate: [rad/s].
         wheel_angle, wheel_speed, wheel_command: [rad], [rad/s], [rad/s].
-        current, voltage: of the motors, signed along the drive direction [A], [V].
+        current, voltage: those of the motors, signed along the drive direction [A], [V].
         bus: voltage of the supply [V].
-        sinkage: of the wheels [m].
+        sinkage: depth to which each wheel has sunk [m].
         twist_command: what was sent to the robot at this time: [m/s, m/s, rad/s].
     """
 
@@ -78,10 +78,10 @@ def _quiet(text: str) -> None:
     """Warnings are counted by the engine; `Plant.check` reads them."""
 
 
-def heading_of(quaternion: Float[np.ndarray, "*batch 4"]) -> Any:
+def heading_of(quaternion: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
     """Angle about the vertical of a quaternion w, x, y, z [rad]."""
     w, x, y, z = np.moveaxis(np.asarray(quaternion), -1, 0)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
 class Plant:
@@ -89,13 +89,13 @@ class Plant:
 
     Args:
         machine: the robot.
-        motor: of every wheel.
+        motor: the motor of every wheel.
         loop: the built-in speed loop.
         floor: which surface lies where.
         grounds: physics of the floor's surfaces.
         load: name of the load set-up.
         start: x, y [m], heading [rad].
-        seed: of how the wheels stand at first, and of the floor's unevenness.
+        seed: seed of how the wheels stand at first, and of the floor's unevenness.
         timestep: [s].
 
     Raises:
@@ -247,7 +247,7 @@ class Plant:
         self._low = np.full(len(self._roller), -1)
 
     def _place(self, start: tuple[float, float, float], rng: np.random.Generator) -> None:
-        """At the start, every wheel turned at random."""
+        """Put the robot at its start, with every wheel turned at random."""
         q = self.data.qpos
         q[:2] = start[:2]
         q[3], q[6] = np.cos(0.5 * start[2]), np.sin(0.5 * start[2])

@@ -1,10 +1,9 @@
-"""Numbers that make no robot are refused where they are given."""
+"""Refusals of numbers that no robot can have, where they are given."""
 
 from math import isfinite
-from typing import Any
 
 
-def positive(thing: Any, *names: str) -> None:
+def positive(thing: object, *names: str) -> None:
     """ValueError unless these attributes are above 0."""
     for name in names:
         value = getattr(thing, name)
@@ -12,7 +11,7 @@ def positive(thing: Any, *names: str) -> None:
             raise ValueError(f"{name} = {value}; expected a number above 0")
 
 
-def at_most(thing: Any, **limits: float) -> None:
+def at_most(thing: object, **limits: float) -> None:
     """ValueError where these attributes are above their limits."""
     for name, limit in limits.items():
         value = getattr(thing, name)
@@ -20,7 +19,7 @@ def at_most(thing: Any, **limits: float) -> None:
             raise ValueError(f"{name} = {value}; expected at most {limit:g}")
 
 
-def not_negative(thing: Any, *names: str) -> None:
+def not_negative(thing: object, *names: str) -> None:
     """ValueError unless these attributes are 0 or above."""
     for name in names:
         value = getattr(thing, name)

@@ -18,7 +18,7 @@ class Sensors:
 
     Attributes:
         row_s, row_jitter: mean time between rows [s], and its spread as part of it.
-        current_step_a, current_noise_a: of the current's converter, and its noise [A].
+        current_step_a, current_noise_a: step of the current's converter, and its noise [A].
         current_is_signed: else magnitudes are logged, as most robots do.
         speed_step, speed_gain: quantum of the reported motor speed [rad/s], and how much it reads
             too high [1].
@@ -28,7 +28,7 @@ class Sensors:
         average_s: over which currents and voltages are averaged before they are sampled [s].
         frame_s, lag_s: between camera frames, and mean age of the pose in a row [s].
         camera_scale: true length over logged length; the camera of the 2022 logs has 1.117.
-        camera_noise_m, camera_noise_rad: of every frame.
+        camera_noise_m, camera_noise_rad: noise of every frame.
         dropout: part of the frames that is lost.
         outlier, outlier_m: part of the frames that is wrong, and by how much [m].
     """
@@ -94,11 +94,11 @@ def observe(
         trace: the truth.
         sensors: how they err.
         rng: their noise.
-        name: of the log.
+        name: name of the log.
         surface: what the log says it drove on.
         load: name of the load set-up.
         gear_ratio: turns of the motor per turn of the wheel.
-        ticks_per_revolution: of the motor.
+        ticks_per_revolution: ticks in one turn of the motor.
         marker_yaw: heading of the marker less the body's [rad].
     """
     s = sensors

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binom, chi2
 
-from tests import calibration
+from tests.helpers import calibration
 
 REPLICATES = 200
 BINS = 10
@@ -63,7 +63,7 @@ def report(rows, folder):
 
 def draw(names, bins, count, path):
     """Rank histograms with the band that 99 % of uniform ones stay in."""
-    from slipid.app import drawing
+    from slipid.plots import drawing
 
     made, axes = drawing.panels(
         len(names),

@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def alone(function, *given):
         return pool.submit(function, *given).result()
 
 
-def frozen():
+def deployed():
     """A robot of three omni wheels on three floors; JAX is started here, one core, float64."""
     import os
 
@@ -45,7 +46,7 @@ def frozen():
     jax.config.update("jax_enable_compilation_cache", False)  # the time to compile is told too
     import jax.numpy as jnp
 
-    from slipid.control.frozen import freeze
+    from slipid.deploy.deploy import deploy_known
     from slipid.model.geometry import omni
     from slipid.model.robot import build
 
@@ -56,7 +57,7 @@ def frozen():
         made,
         [jnp.asarray(v) for v in numbers],
     )
-    return freeze(made, "as_built", {}, highest_speed=13.0)
+    return deploy_known(made, highest_speed=13.0)
 
 
 # one step ------------------------------------------------------------------------------------
@@ -64,30 +65,29 @@ def frozen():
 
 def steps_of(kind):
     """Times of steps and of an empty call in turns [us], and the time to compile [s]."""
-    f = frozen()
+    f = deployed()
     import jax
     import jax.numpy as jnp
 
-    from slipid.control.closed_loop import Pilot, compiled
-    from slipid.control.controller import Controller
+    from slipid.control.controller import Controller, Gains
     from slipid.control.estimator import Estimator
     from slipid.control.odometry import Odometry
-    from slipid.control.reference import rectangle
-    from slipid.control.tuning import HAND
+    from slipid.control.pilot import CompiledPilot, Pilot
+    from slipid.control.trajectory import rectangle
 
     contact = kind == "contact"
     observer = Estimator(f) if contact else Odometry(f, curve=True)
-    gains = HAND if contact else (*HAND[:-1], 0.0)  # as `slipid trial` drives them
-    pilot, path = Pilot(observer, Controller(f, jnp.array(gains))), rectangle()
-    rng, sensed = np.random.default_rng(0), observer.sensed
+    preview = Gains().preview if contact else 0.0  # as `slipid trial` drives them
+    pilot = Pilot(observer, Controller(f, replace(Gains(), preview=preview)))
+    rng, compiled = np.random.default_rng(0), CompiledPilot(pilot, rectangle())
     speed = np.asarray(f.forward @ jnp.array([0.2, 0.05, 0.1]) / f.frame.radius)
+    sensed = compiled.measurements
     readings = np.full((1000, sensed.size), np.nan)
     speeds = speed + rng.normal(size=(1000, 3)) * 0.3
     readings[:, sensed.place("wheel_angle")] = np.cumsum(0.05 * speeds, axis=0)
     readings[:, sensed.place("current")] = np.abs(rng.normal(0.4, 0.1, (1000, 3)))
     readings[:, sensed.place("gyro")] = rng.normal(0.1, 0.004, (1000, 1))
-    state, began = np.asarray(pilot.init(jnp.zeros(3))), time.perf_counter()
-    step = compiled(pilot, path)
+    step, state, began = compiled.call, compiled.init(), time.perf_counter()
     state, _ = step(state, readings[0], 0.05)
     compiling, took, end = time.perf_counter() - began, [], time.perf_counter() + SECONDS
     empty, nothing = jax.jit(lambda x: x + 1.0), []
@@ -127,12 +127,12 @@ def rollouts(folder, robots, steps):
     Robots on all combinations of floors follow wheel speeds of their own: contact settles from the
     step before, motor work is summed, the pose moves on.
     """
-    f = frozen()
+    f = deployed()
     import jax
     import jax.numpy as jnp
 
     from slipid.model import settle as module
-    from slipid.model.robot import advance, compose
+    from slipid.model.se2 import advance, compose
 
     every = np.array(list(itertools.product(range(3), repeat=3)))
     index = every[np.arange(robots) % len(every)]
@@ -168,8 +168,10 @@ def rollouts(folder, robots, steps):
     rollout = ctypes.CDLL(library).rollout
     one = [f.frame.hold, f.frame.roll, f.frame.shift, f.rest, f.inverse, f.frame.base]
     one = np.concatenate([np.asarray(x).ravel() for x in one])
-    rows = [floors.held, floors.creep, floors.drag, floors.roller_creep, floors.resistance]
-    rows += [floors.viscosity, floors.roller_viscosity, floors.scrub[None], floors.lead[None]]
+    under = floors.on.floor
+    rows = [under.friction, under.creep, under.roller_drag, under.roller_creep]
+    rows += [under.rolling_resistance, under.slide_viscosity, under.roller_viscosity]
+    rows += [under.scrub[None], under.lead[None]]
     columns = np.concatenate([np.asarray(x) for x in rows]).T
     table = np.ascontiguousarray(np.hstack([np.tile(one, (robots, 1)), columns]))
     flat = np.ascontiguousarray(np.asarray(rims).transpose(0, 2, 1))

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from tests import designs
+from tests.helpers import designs
 
 SEEDS, WHOLE = 12, 36
 NAMES = ("load share", "end point")

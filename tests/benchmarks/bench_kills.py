@@ -8,7 +8,7 @@ import time
 import numpy as np
 import xarray
 
-from tests import test_cli
+from tests.cli import test_cli
 
 small = test_cli.small  # the fixture: a fit of made logs
 

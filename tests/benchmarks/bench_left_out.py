@@ -9,7 +9,7 @@ Prints mean end-point errors in percent; asserts that every run was judged, and 
 that gray and green agree.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,16 +18,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.app.config import read_config
-from slipid.app.job import Job, read_job
-from slipid.data.dataset import Dataset
-from slipid.identify.fit import Optimum
-from slipid.identify.folds import left_out, only, random_headings, sectors, still_viscosities, train
-from slipid.identify.ladder import rungs
-from slipid.identify.problem import Problem
+from slipid.data.runs import Runs
+from slipid.identify.compare.folds import random_headings, sectors
+from slipid.identify.compare.slip_models import rungs
+from slipid.identify.compare.validation import Judged, Validation, validation
+from slipid.identify.fit.one_speed import still_viscosities
+from slipid.identify.fit.optimise import Optimum
+from slipid.identify.fit.problem import Problem
 from slipid.identify.result import draws
-from slipid.identify.validate import summary, text_table, validation
+from slipid.job.config import read_config
+from slipid.job.problem import Job, read_job
 from slipid.model.robot import build
+from slipid.support.progress import Reporter
+from tests.helpers.left_out import left_out, only, train
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -35,24 +38,24 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture(scope="module")
 def job(real_data: Path) -> Job:
     config = read_config(ROOT / "configs" / "robotino2022.toml")
-    return read_job(config, real_data / "robotino2022", lambda done, count: None, print)
+    return read_job(config, real_data / "robotino2022", Reporter())
 
 
-def show(title: str, rows: list[dict]) -> None:
-    report = {"summary": summary(rows)}
-    print(f"\n{title}\n{text_table(report)}")
-    for floor, by in report["summary"].items():
+def show(title: str, rows: Sequence[Judged]) -> None:
+    report = Validation(tuple(rows))
+    print(f"\n{title}\n{report.table}")
+    for floor, by in report.summary.items():
         mine = by["identified"]
-        share = mine["endpoint_error_mean"] / by["heading_lookup"]["endpoint_error_mean"]
+        share = mine.endpoint_error_mean / by["heading_lookup"].endpoint_error_mean
         print(
-            f"  {floor:12} coverage of 90 % regions {100 * mine['coverage90']:.0f} %, "
-            f"energy score {1000 * mine['energy_score']:.1f} mm, "
-            f"yaw {mine['heading_error_median_deg']:.1f} deg, {100 * share:.0f} % of heading_lookup"
+            f"  {floor:12} coverage of 90 % regions {100 * mine.coverage90:.0f} %, "
+            f"energy score {1000 * mine.energy_score:.1f} mm, "
+            f"yaw {mine.heading_error_median_deg:.1f} deg, {100 * share:.0f} % of heading_lookup"
         )
 
 
-def some(job: Job, runs: np.ndarray) -> tuple[Dataset, Problem]:
-    """Dataset and problem of a part of the runs, viscous terms held where they must be."""
+def some(job: Job, runs: np.ndarray) -> tuple[Runs, Problem]:
+    """Runs and problem of a part of the runs, viscous terms held where they must be."""
     data = job.dataset.subset(runs)
     robot = build(
         job.robot.geometry,
@@ -92,8 +95,8 @@ def test_speeds(job: Job, seen: tuple[float, ...]) -> None:
     fitted = np.flatnonzero(np.isin(speed, seen))
     judged = np.flatnonzero(~np.isin(speed, seen) & several & built)
     part, problem = some(job, fitted)
-    _, frozen = train(problem, part, np.arange(len(part)))
-    rows = validation(frozen, data.subset(judged))["runs"]
+    _, predictor = train(problem, part, np.arange(len(part)))
+    rows = validation(predictor, data.subset(judged)).runs
     show(f"(b) fitted at {seen} m/s, faster runs predicted", rows)
     assert len(rows) == len(judged)
 
@@ -107,17 +110,17 @@ def test_moved_load(job: Job) -> None:
     held = only(problem, optimum.state.z, "robot.load_share@moved")
     refit = Problem(problem.windows, problem.robot, held)
     assert refit.space.names == ["robot.load_share@moved[1]", "robot.load_share@moved[2]"]
-    again, frozen = train(refit, data, third)
+    again, predictor = train(refit, data, third)
     w = problem.windows  # the simpler models see all that the force balance has seen
     seen = w.pieces(np.flatnonzero(np.isin(w.run, np.concatenate([built, third]))))
-    simple = [rung.fit(seen, frozen.robot) for rung in rungs(w.has_current)]
-    rows = validation(replace(frozen, rungs=simple), data.subset(rest))["runs"]
+    simple = [rung.fit(seen, predictor.robot) for rung in rungs(w.has_current)]
+    rows = validation(replace(predictor, rungs=simple), data.subset(rest)).runs
     show("(c) moved load, shares from a third of its headings", rows)
     print_shares("shares of the third", refit, again, ("moved",))
     assert len(rows) == len(rest)
 
 
-def thirds(data: Dataset, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def thirds(data: Runs, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Every third heading of some runs, and the others."""
     heading = np.round(np.degrees(data.heading[runs])) % 360
     chosen = np.isin(heading, np.unique(heading)[::3])

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from tests import recovery
+from tests.helpers import recovery
 
 SEEDS = 40
 

@@ -7,9 +7,9 @@ out/bench_replay/CODE.
 
 One floor: fits of two opposite pairs of 60-degree sectors, the third pair judged, three times over,
 so that no judged heading was fitted on any floor. 64 joint hypotheses; the pose is used once, where
-the wheels have moved 10 mm. Two floors: frozen from runs on one floor each, and after learning from
-half of the runs across the edge (the other half judged), without and with being told that these two
-floors are all there are.
+the wheels have moved 10 mm. Two floors: deployed from runs on one floor each, and after
+learning from half of the runs across the edge (the other half judged), without and with being told
+that these two floors are all there are.
 """
 
 from __future__ import annotations
@@ -25,19 +25,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.app.config import parsed
-from slipid.app.job import Job, read_job, with_mixed
-from slipid.control.estimator import MIXED, Estimator, Settings
-from slipid.control.frozen import Frozen
-from slipid.identify.crossing import crossing
-from slipid.identify.curves import current_trend
-from slipid.identify.fit import optimise
-from slipid.identify.folds import sectors
-from slipid.identify.likelihood import batch
-from slipid.identify.mixed import update
-from slipid.identify.predictive import contact_of
-from tests import replayed
-from tests.replayed import Judged
+from slipid.control.deployed import DeployedRobot
+from slipid.control.estimator import Estimator
+from slipid.control.interface import MIXED, Settings
+from slipid.identify.compare.folds import sectors
+from slipid.identify.compare.predictive import contact_of
+from slipid.identify.fit.crossing import crossing
+from slipid.identify.fit.likelihood import batch
+from slipid.identify.fit.mixed import update
+from slipid.identify.fit.optimise import optimise
+from slipid.identify.slip_curves import current_trend
+from slipid.job.config import parsed
+from slipid.job.problem import Job, read_job, with_mixed
+from slipid.support.progress import Reporter
+from tests.helpers import replayed
+from tests.helpers.replayed import Judged
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "configs" / "robotino2022.toml"
@@ -71,9 +73,8 @@ Part = tuple[np.ndarray, np.ndarray, dict[str, float]]
 def job(real_data: Path) -> Job:
     config = parsed(CONFIG, CONFIG.read_text(encoding="utf-8") + ACROSS)
     root = real_data / "robotino2022"
-    return with_mixed(
-        read_job(config, root, lambda a, b: None, print), root, lambda a, b: None, print
-    )
+    report = Reporter()
+    return with_mixed(read_job(config, root, report), root, report)
 
 
 def kept(name: str, make: Callable[[], Part]) -> Part:
@@ -96,13 +97,13 @@ def fitted(job: Job, runs: np.ndarray) -> Part:
     return np.asarray(contact.z), np.asarray(contact.covariance), dict(contact.variance)
 
 
-def frozen(job: Job, part: Part, runs: np.ndarray) -> Frozen:
+def deployed(job: Job, part: Part, runs: np.ndarray) -> DeployedRobot:
     """From a part; `runs` on one floor are those it was fitted to."""
     problem = job.problem()
     seen = problem.windows.pieces(np.flatnonzero(np.isin(problem.windows.run, runs)))
     robot = problem.space.tree(jnp.asarray(part[0]))
     trend = current_trend(robot, batch(seen, robot))
-    return replayed.frozen(problem.space, *part, "as_built", TOP, trend)
+    return replayed.deployed(problem.space, *part, "as_built", TOP, trend)
 
 
 def show(rows: list[Judged]) -> None:
@@ -138,11 +139,11 @@ def test_one_floor(job: Job) -> None:
     rows: list[Judged] = []
     for k in range(3):
         part = kept(f"fold{k}", lambda k=k: fitted(job, np.flatnonzero(fold != k)))
-        est = Estimator(frozen(job, part, np.flatnonzero(fold != k)))
+        est = Estimator(deployed(job, part, np.flatnonzero(fold != k)))
         some = data.subset(np.flatnonzero(built & (fold == k)))
         robot = job.problem().space.tree(jnp.asarray(part[0]))
         said = replayed.replay(est, some.logs)
-        rows += replayed.judged(robot, est.frozen.labels, some, said, part[2])
+        rows += replayed.judged(robot, est.robot.labels, some, said, part[2])
     print("\nruns on one floor, none of whose headings was fitted")
     show(rows)
     assert len(rows) == built.sum()
@@ -174,10 +175,10 @@ def test_two_floors(job: Job) -> None:
     ):
         found: list[Any] = []
         for part, judged in parts:
-            known = frozen(job, part, everything)
+            known = deployed(job, part, everything)
             est = Estimator(known.on(*(there or known.labels)), settings)
             robot, some = space.tree(jnp.asarray(part[0])), data.subset(np.flatnonzero(judged))
-            said, labels = replayed.replay(est, some.logs), est.frozen.labels
+            said, labels = replayed.replay(est, some.logs), est.robot.labels
             rows = replayed.judged(robot, labels, some, said, part[2])
             found.append((rows, replayed.wheels(robot, labels, floor, some, said)))
         every = [r for rows, _ in found for r in rows]

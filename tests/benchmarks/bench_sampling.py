@@ -30,24 +30,26 @@ pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no real logs: {DATA}
 
 def problem_of(floor):
     """Likelihood of the runs on one floor."""
-    from slipid.app import runtime
-    from slipid.app.config import read_config
-    from slipid.app.job import job_of, read_dataset
+    from slipid.job.config import read_config
+    from slipid.job.logs import read_dataset
+    from slipid.job.problem import job_of
+    from slipid.support.jax_setup import setup_jax
+    from slipid.support.progress import Reporter
 
-    runtime.start()
+    setup_jax(quiet=True)
     config = read_config(ROOT / "configs" / "robotino2022.toml")
     logs = config.content.logs
-    dataset, _ = read_dataset(config, logs, DATA, lambda *_: None)
+    dataset, _ = read_dataset(config, logs, DATA, Reporter(quiet=True))
     mine = [k for k, log in enumerate(dataset.logs) if log.surface == floor]
-    return job_of(config, dataset.subset(mine), [], lambda _: None).problem()
+    return job_of(config, dataset.subset(mine), [], Reporter(quiet=True)).problem()
 
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     """The problem, where its fit ended, and a file of the latter."""
-    from slipid.identify.density import Fitted
-    from slipid.identify.fit import optimise
-    from slipid.identify.predictive import contact_of
+    from slipid.identify.compare.predictive import contact_of
+    from slipid.identify.fit.optimise import optimise
+    from slipid.identify.posterior.coordinates import Fitted
 
     problem = problem_of(FLOOR)
     optimum = optimise(problem)
@@ -61,7 +63,8 @@ def fitted(tmp_path_factory):
 
 
 def density_of(problem, found):
-    from slipid.identify.density import MOTION, Density
+    from slipid.identify.posterior.coordinates import MOTION
+    from slipid.identify.posterior.density import Density
 
     return Density(problem, found, MOTION)
 
@@ -78,12 +81,16 @@ def ess_of(chain):
 
 def by_slipid(density):
     """Chains (chain, draw, coordinate), seconds of sampling and of the warm-up, the last block."""
-    from slipid.identify import sampler
-    from slipid.identify.moves import Target
+    from slipid.identify.posterior import ensemble as sampler
+    from slipid.identify.posterior.blocks import Plan
+    from slipid.identify.posterior.diagnosis import diagnose
+    from slipid.identify.posterior.target import Target
 
     d = density
-    target = Target(d.terms, d.slope, d.coordinates.group, d.kind, d.centre, d.covariance)
-    plan = sampler.Plan()
+    target = Target(
+        d.terms, d.slope, d.coordinates.group, d.coordinates.kind, d.centre, d.covariance
+    )
+    plan = Plan()
     x = np.repeat(d.centre[None], plan.walkers, axis=0)
     d.terms(x), d.slope(x)  # compiles
     blocks, times = [], [time.perf_counter()]
@@ -92,7 +99,7 @@ def by_slipid(density):
         times.append(time.perf_counter())
     warm = plan.warm_up[-1]
     chain = sampler.chain(blocks, plan)
-    found = sampler.diagnose(chain, plan)
+    found = diagnose(chain, plan)
     print(f"slipid: {found.steps} steps, R-hat {found.r_hat.max():.4f}, {found.converged=}")
     walkers = chain.transpose(0, 2, 1, 3).reshape(-1, chain.shape[1], d.size)
     return walkers, times[-1] - times[warm], times[warm] - times[0], blocks[-1]
@@ -104,13 +111,13 @@ def by_nuts(path, block=None):
     Args:
         block: through whose map; None for the Gaussian one of the Laplace approximation.
     """
-    from slipid.identify import sampler
+    from slipid.identify.posterior.blocks import packed
 
     files = [path.with_name(f"nuts{k}.npz") for k in range(CHAINS)]
     words = []
     if block is not None:
         words = [str(path.with_name("block.npz"))]
-        np.savez(words[0], **sampler.packed(block))
+        np.savez(words[0], **packed(block))
     command = [sys.executable, __file__, str(path)]
     runs = [
         subprocess.Popen([*command, str(k), str(file), *words], cwd=ROOT)
@@ -128,14 +135,15 @@ def nuts(path, seed, out, block=None):
     import jax.numpy as jnp
     from numpyro.infer import MCMC, NUTS
 
-    from slipid.identify import sampler
-    from slipid.identify.transport import _placed, gaussian
+    from slipid.identify.posterior.blocks import unpacked
+    from slipid.identify.posterior.transport.learn import gaussian
+    from slipid.identify.posterior.transport.transport_map import _placed
 
     d = density = density_of(problem_of(FLOOR), pickle.loads(Path(path).read_bytes()))
-    map = gaussian(d.centre, d.covariance, d.coordinates.group, d.kind)
+    map = gaussian(d.centre, d.covariance, d.coordinates.group, d.coordinates.kind)
     if block is not None:
         with np.load(block) as kept:
-            map = sampler.unpacked(dict(kept)).map
+            map = unpacked(dict(kept)).map
 
     steps = map._back
 
@@ -170,7 +178,7 @@ def by_stretch(density, draws):
     import emcee
     from threadpoolctl import threadpool_limits
 
-    from tests.numpy_model import Posterior
+    from tests.helpers.numpy_model import Posterior
 
     rival, size = Posterior(density), density.size
     rng = np.random.default_rng(0)

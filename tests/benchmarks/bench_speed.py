@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.identify.problem import Problem
+from slipid.identify.fit.problem import Problem
 from slipid.parameter import Choice
-from tests.made_windows import made, robot
-from tests.numpy_model import Rival, numbers
+from tests.helpers.made_windows import made, robot
+from tests.helpers.numpy_model import Rival, numbers
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("SLIPID_DATA") or ROOT.parent / "shared" / "data") / "robotino2022"
@@ -42,11 +42,12 @@ def problem():
 
 
 def real_job():
-    from slipid.app.config import read_config
-    from slipid.app.job import read_job
+    from slipid.job.config import read_config
+    from slipid.job.problem import read_job
+    from slipid.support.progress import Reporter
 
     config = read_config(ROOT / "configs" / "robotino2022.toml")
-    return read_job(config, DATA, lambda *_: None, lambda _: None)
+    return read_job(config, DATA, Reporter(quiet=True))
 
 
 def best_of(function, repeats):
@@ -132,10 +133,10 @@ def test_whole_2022_fit_cold_and_warm(tmp_path):
 def main():
     """The whole 2022 fit, once, with the time of each stage."""
     began = time.perf_counter()
-    from slipid.app import runtime
-    from slipid.identify.fit import Options, optimise
+    from slipid.identify.fit.optimise import Options, optimise
+    from slipid.support.jax_setup import setup_jax
 
-    runtime.start()
+    setup_jax(quiet=True)
     job = real_job()
     fit = job.config.content.fit
     read = time.perf_counter()

@@ -18,14 +18,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from slipid.app.config import parsed
-from slipid.app.job import read_job
-from slipid.app.progress import Reporter
-from slipid.app.simulate import logged, simulate, truth
-from slipid.app.simulate_config import plan
-from slipid.data.terrain import FloorMap, four_zones, patchwork
-from slipid.identify.folds import left_out, sectors
-from slipid.identify.validate import summary, text_table
+from slipid.data.floor_map import FloorMap, four_zones, patchwork
+from slipid.identify.compare.folds import sectors
+from slipid.identify.compare.validation import Validation
+from slipid.job.config import parsed
+from slipid.job.problem import read_job
+from slipid.support.progress import Reporter
 from slipid.testsite.driving import Site, drive
 from slipid.testsite.experiments import (
     Run,
@@ -39,6 +37,9 @@ from slipid.testsite.experiments import (
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.machine import Machine
 from slipid.testsite.plant import Plant
+from slipid.testsite.simulate.config import plan
+from slipid.testsite.simulate.simulate import logged, simulate, truth
+from tests.helpers.left_out import left_out
 
 ROOT = Path(__file__).resolve().parents[2]
 CODE = sha256(b"".join(p.read_bytes() for p in sorted((ROOT / "slipid").rglob("*.py"))))
@@ -77,7 +78,7 @@ def job_of(out: Path):
     """The identification job that the simulation wrote beside its logs."""
     path = out / "robot.toml"
     config = parsed(path, path.read_text(encoding="utf-8"))
-    return read_job(config, out / "logs", lambda done, count: None, lambda line: None)
+    return read_job(config, out / "logs", Reporter(quiet=True))
 
 
 # speed
@@ -141,16 +142,16 @@ def test_left_out_sectors() -> None:
     driven(text, out)
     job = job_of(out)
     rows = left_out(job.problem(), job.dataset, sectors(job.dataset))
-    report = {"summary": summary(rows)}
-    print(f"\n{text_table(report)}")
-    for floor, by in report["summary"].items():
-        mine, encoder = (by[m]["endpoint_error_mean"] for m in ("identified", "encoder"))
+    report = Validation(tuple(rows))
+    print(f"\n{report.table}")
+    for floor, by in report.summary.items():
+        mine, encoder = (by[m].endpoint_error_mean for m in ("identified", "encoder"))
         print(
             f"{floor}: {encoder / mine:.1f} times better than encoders, 90 % regions hold "
             f"{100 * by['identified']['coverage90']:.0f} %"
         )
-    soft = report["summary"]["soft"]
-    assert soft["encoder"]["endpoint_error_mean"] > 4 * soft["identified"]["endpoint_error_mean"]
+    soft = report.summary["soft"]
+    assert soft["encoder"].endpoint_error_mean > 4 * soft["identified"].endpoint_error_mean
 
 
 def _experiment(seed: int) -> dict:
@@ -191,7 +192,7 @@ def _experiment(seed: int) -> dict:
 
 def _fitted(job):
     """What `identify` finds of a job, without the simpler models."""
-    from slipid.identify.fit import optimise
+    from slipid.identify.fit.optimise import optimise
     from slipid.identify.result import summarise
 
     problem = job.problem()
@@ -325,10 +326,10 @@ def test_figures_beside_the_real_ones(real_data: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from slipid.app.paper_plots import _floor
-    from slipid.baselines.paper2021 import regenerate
-    from slipid.data.formats import preset
-    from slipid.data.reader import find_logs, read_log
+    from slipid.baselines.paper2021.result import regenerate
+    from slipid.data.reading.presets import preset
+    from slipid.data.reading.reader import find_logs, read_log
+    from slipid.plots.paper import _floor
 
     OUT.mkdir(parents=True, exist_ok=True)
     real = regenerate(real_data / "robotino2021", None)
@@ -453,7 +454,8 @@ def _figure_logs(site: Site) -> dict:
 
 def _points(logs: list) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Current, slip and torque variable M of motor 1 over half seconds, cut as the authors did."""
-    from slipid.baselines.paper2021 import FIGURES_3_AND_4, WindowRecipe, wheel_windows
+    from slipid.baselines.paper2021.samples import FIGURES_3_AND_4
+    from slipid.baselines.paper2021.windows import WindowRecipe, wheel_windows
 
     recipe = WindowRecipe(pose_scale=1.117, min_speed=0.01)
     currents, slips, speeds = [], [], []

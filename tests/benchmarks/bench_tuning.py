@@ -24,9 +24,9 @@ def test_gradient_against_swarm_and_hand():
     folder = os.environ.get("SLIPID_FIT")
     if not folder:
         pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
-    from slipid.identify.result import load
+    from slipid.deploy.deploy import read_robot
 
-    rows = compared(load(Path(folder)))
+    rows = compared(read_robot(Path(folder)))
     report(rows)
     # which one wins is what the table says; gains that are handed over must be stable
     for method in ("gradient", "pso"):
@@ -34,19 +34,18 @@ def test_gradient_against_swarm_and_hand():
         assert min(margin for *_, margin in rows[method]) > 0
 
 
-def compared(fit, seeds=SEEDS, rollouts=ROLLOUTS):
+def compared(robot, seeds=SEEDS, rollouts=ROLLOUTS):
     """Losses of every method and seed on cases that no search has seen."""
-    from slipid.app import tune
-    from slipid.app.freeze import frozen_draws
-    from slipid.control.search import Search
-    from slipid.control.tuning import HAND, evaluate
+    from slipid.control.controller import Gains
+    from slipid.control.tuning.objective import HAND, evaluate
+    from slipid.control.tuning.optimisers import Search
+    from slipid.deploy import tune
 
-    name = tune.load_of(fit, None)
-    task = tune.task_of(fit, name, gyro=False)
-    judged = tune.cases(frozen_draws(fit, name, tune.DRAWS, 1000), JUDGED, 1000)
+    task = tune.task_of(robot, gyro=False)
+    judged = tune.cases(tune.robots_of(robot, 1000)[1], JUDGED, 1000)
     rows = {"hand": [(evaluate(task, HAND, judged), np.asarray(HAND), 0.0)]}
     for seed in range(seeds):
-        robots = frozen_draws(fit, name, tune.DRAWS, seed)
+        robots = tune.robots_of(robot, seed)[0]
         stable = jax.tree.map(lambda x: x[: tune.STABLE], robots)
         cases = tune.cases(robots, tune.TRIED, seed)
         for method in ("gradient", "pso"):
@@ -56,7 +55,7 @@ def compared(fit, seeds=SEEDS, rollouts=ROLLOUTS):
                 state = search.step(state)
             best = search.best(state)
             took = time.perf_counter() - began
-            margin = float(task.margins(jnp.asarray(best), stable).min())
+            margin = float(task.margins(Gains.at(best), stable).min())
             rows.setdefault(method, []).append((evaluate(task, best, judged), best, margin))
             print(f"{method} {seed}: {np.round(best, 3)}, {took:.0f} s", flush=True)
     return rows
@@ -64,7 +63,7 @@ def compared(fit, seeds=SEEDS, rollouts=ROLLOUTS):
 
 def report(rows):
     """Print the table."""
-    from slipid.control.tuning import combined
+    from slipid.control.tuning.objective import combined
 
     hand = rows["hand"][0][0]
     print(f"\n{'':10}{'mean [mm]':>20}{'mean + worst tenth':>22}{'better in':>11}{'margin':>9}")

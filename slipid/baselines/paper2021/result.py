@@ -3,13 +3,13 @@
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from slipid.baselines.paper2021.models import DEPLOYED
 from slipid.baselines.paper2021.table import FittedForm, MotorTable, field_table, surface_tables
 from slipid.baselines.paper2021.tracks import Track, read_tracks
 from slipid.baselines.paper2021.transfer import Transfer, leave_one_surface_out
-from slipid.data.log import DataError, Log
+from slipid.data.log import Log
+from slipid.support.errors import DataError
 
 SCHEMA = "slipid.paper2021/1"
 
@@ -30,7 +30,7 @@ class PaperResult:
     tracks: tuple[Track, ...]
     transfer: Transfer | None
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """All numbers by name, ready for JSON."""
         return {
             "schema": SCHEMA,
@@ -88,7 +88,7 @@ def regenerate(folder: Path, logs: Iterable[Log] | None = None) -> PaperResult:
     )
 
 
-def _form_dict(form: FittedForm) -> dict[str, Any]:
+def _form_dict(form: FittedForm) -> dict[str, object]:
     unit = "N m" if form.regressor == "torque" else "A"
     return {
         "regressor": form.regressor,
@@ -99,7 +99,7 @@ def _form_dict(form: FittedForm) -> dict[str, Any]:
     }
 
 
-def _table_dict(table: MotorTable) -> dict[str, Any]:
+def _table_dict(table: MotorTable) -> dict[str, object]:
     return {
         "motor": table.motor,
         "n": len(table.samples),

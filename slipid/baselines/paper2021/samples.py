@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.data.formats import preset
-from slipid.data.log import bad_data
-from slipid.data.table import read_table
+from slipid.data.reading.presets import preset
+from slipid.data.reading.table import read_table
+from slipid.support.errors import bad_data
 
 SURFACES = ("gray", "blue", "red")
 MOTORS = (1, 2, 3)

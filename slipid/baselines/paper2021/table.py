@@ -34,7 +34,7 @@ class FittedForm:
     """One form of slip model with its coefficients, rising in power from `first_power`.
 
     Args:
-        name: as printed in tables.
+        name: what tables call it.
         regressor: "torque" [N m] or "current" [A].
         coefficients: c_k of s = sum c_k x^(first_power + k).
         first_power: 0, or 1 for a line through the origin.

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from slipid.baselines.paper2021.samples import read_columns
-from slipid.data.log import bad_data
+from slipid.support.errors import bad_data
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class TrackFile:
         file: in the folder figure7.
         authors_frames: camera frames of the first side, by the authors' own index.
         side_frames: camera frames of the first side in this file, to where the robot turns off.
-        printed_path_length: of the first side, as the paper prints it [mm].
+        printed_path_length: length of the first side as the paper prints it [mm].
     """
 
     name: str
@@ -63,7 +63,7 @@ class Track:
         file: where it comes from.
         time: [s], shape (frame,).
         position: image x to the right and y down [mm], shape (frame, 2).
-        heading: as logged [deg], unwrapped, shape (frame,).
+        heading: heading as logged [deg], unwrapped, shape (frame,).
     """
 
     file: TrackFile

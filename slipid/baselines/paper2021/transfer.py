@@ -16,8 +16,8 @@ class Transfer:
     Args:
         samples: number of them per surface.
         pooled: root mean square error of a curve fitted to the other surfaces.
-        constant: of the other surfaces' mean slip.
-        own: of a curve fitted to the surface itself.
+        constant: error of the other surfaces' mean slip.
+        own: error of a curve fitted to the surface itself.
     """
 
     samples: dict[str, int]
@@ -52,7 +52,7 @@ def leave_one_surface_out(
     Args:
         logs: runs on one known surface each.
         recipe: how runs are cut into windows; half a second, camera uncorrected, where None.
-        degree: of the polynomial in current, 1 as deployed.
+        degree: degree of the polynomial in current, 1 as deployed.
 
     Raises:
         ValueError: if fewer than two surfaces are there, or one has too few samples for a curve.

@@ -7,6 +7,8 @@ import numpy as np
 
 from slipid.baselines.paper2021.models import DeployedModel, fit_deployed, smooth_current
 from slipid.data.log import Log
+from slipid.data.signals.steps import body_steps
+from slipid.data.signals.wheel_signals import first_moved
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,8 @@ def wheel_windows(log: Log, recipe: WindowRecipe) -> tuple[np.ndarray, np.ndarra
     azimuth = np.radians(recipe.azimuth_deg)
     arm = np.full(len(azimuth), recipe.base_radius)
     rim = np.stack([-np.sin(azimuth), np.cos(azimuth), arm], axis=1)
-    effective = _body_steps(log.pose[edges], recipe.pose_scale) / span @ rim.T
+    steps = body_steps(log.pose[edges]) * [recipe.pose_scale, recipe.pose_scale, 1.0]
+    effective = steps / span @ rim.T
     driven = np.diff(log.wheel_angle[edges], axis=0) / span * recipe.wheel_radius
     # Mean over the rows of each window, not the value at its edge: the current is 10-bit and rough.
     magnitude = smooth_current(np.abs(log.current), recipe.memory)
@@ -92,21 +95,9 @@ def refit_deployed(
 
 
 def _edges(log: Log, recipe: WindowRecipe) -> np.ndarray:
-    travel = np.max(np.abs(log.wheel_angle - log.wheel_angle[0]), axis=1) * recipe.wheel_radius
-    moving = np.flatnonzero(travel >= recipe.moved)
-    if len(moving) == 0:
+    first = first_moved(log.wheel_angle, recipe.wheel_radius, recipe.moved)
+    if first is None:
         return np.empty(0, dtype=int)
-    starts = np.arange(log.time[moving[0]], log.time[-1], recipe.window)
+    starts = np.arange(log.time[first], log.time[-1], recipe.window)
     # unique: where rows are further apart than a window, two windows would begin at the same row
     return np.unique(np.searchsorted(log.time, starts))
-
-
-def _body_steps(pose: np.ndarray, scale: float) -> np.ndarray:
-    """Pose increments in the body frame, turned by the mean heading of each window."""
-    step = np.diff(pose, axis=0)
-    heading = 0.5 * (pose[1:, 2] + pose[:-1, 2])
-    c, s = np.cos(heading), np.sin(heading)
-    step[:, :2] *= scale
-    forward = c * step[:, 0] + s * step[:, 1]
-    left = -s * step[:, 0] + c * step[:, 1]
-    return np.stack([forward, left, step[:, 2]], axis=1)

@@ -1,0 +1,220 @@
+"""Fit a robot to runs, and look at the fit: table, pictures, profiles, predictions, posterior."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slipid.api.profile import Profile
+from slipid.api.validation import Validation
+from slipid.data.runs import Runs
+from slipid.identify import fit_file, result
+from slipid.identify.compare.slip_models import restored
+from slipid.identify.compare.validation import Predictor, validation
+from slipid.identify.fit.one_speed import still_viscosities
+from slipid.identify.fit.optimise import Optimum
+from slipid.identify.fit.problem import Problem
+from slipid.identify.verdicts import profile
+from slipid.identify.verdicts.estimates import Estimate
+from slipid.job.config import FitSection
+from slipid.job.fit import optimised, summarised
+from slipid.job.problem import Task, said_of
+from slipid.model.robot import Robot
+from slipid.parameter import Choice
+from slipid.report.estimates import show_fit
+from slipid.report.page import Page
+from slipid.support.progress import Reporter
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from slipid.api.posterior import Posterior
+    from slipid.control.deployed import DeployedRobot
+
+Numbers = int | float | Sequence[int | float]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Gaussian prior of a number, or of every entry of a short vector, in its own unit.
+
+    Attributes:
+        mean: centre.
+        std: standard deviation.
+    """
+
+    mean: Numbers
+    std: Numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A robot fitted to runs; `print` shows its numbers, and `fit[path]` gives one of them.
+
+    Attributes:
+        result: numbers, covariance, noise, and how the fit ended.
+        task: runs, robot and wishes it was made of.
+        problem: the likelihood of the runs.
+        optimum: where the search ended.
+    """
+
+    result: result.Fit
+    task: Task
+    problem: Problem
+    optimum: Optimum
+
+    def __str__(self) -> str:
+        page = Page(kept=True)
+        show_fit(page, self.result)
+        return page.text
+
+    def __repr__(self) -> str:
+        """The table, so that a notebook shows it."""
+        return str(self)
+
+    def __getitem__(self, path: str) -> Estimate:
+        """One number with its interval and verdict.
+
+        Raises:
+            KeyError: no such number; names those there are.
+        """
+        if path not in self.result.parameters:
+            raise KeyError(f"no parameter '{path}'; there are {', '.join(self.result.parameters)}")
+        return self.result.parameters[path]
+
+    @property
+    def robot(self) -> Robot:
+        """The robot with every number at its fitted value."""
+        return self.result.robot
+
+    @property
+    def converged(self) -> bool:
+        """Whether the fit came to rest."""
+        return self.result.converged
+
+    def plot(self, name: str) -> "Figure":
+        """One of the fit's pictures.
+
+        Args:
+            name: `load_share`, `slip_by_heading`, `slip_by_torque`, `current_by_traction` or
+                `paths`.
+
+        Raises:
+            ValueError: no such picture, or the runs have nothing for it.
+        """
+        from slipid.plots.fit import picture
+
+        return picture(self.result, self.task.dataset, name)
+
+    def profile(self, path: str, quiet: bool = False) -> Profile:
+        """Profile likelihood of one free number: every other one is fitted again at each point.
+
+        Raises:
+            ValueError: no such number, fixed, or a vector; names the choices.
+        """
+        with Reporter(quiet=quiet) as report:
+            report.stage(f"profile of {path}")
+            found = profile.profile(self.problem, self.optimum, path)
+        return Profile(found)
+
+    def validate(self, runs: Runs) -> Validation:
+        """Open-loop prediction of runs, by the fit and by every simpler model that it learnt.
+
+        Raises:
+            DataError: a run on a floor or with a load set-up that was not identified.
+        """
+        fit = self.result
+        rungs = restored(dict(fit.baselines))
+        fitted = Predictor(fit.robot, fit.space, fit.z, fit.covariance, dict(fit.variance), rungs)
+        return Validation(validation(fitted, runs), fit, runs)
+
+    def sample(
+        self, seed: int = 0, draws: int = 400, most: int = 400, quiet: bool = False
+    ) -> "Posterior":
+        """Posterior by emcee, several ensembles; needs `pip install slipid[posterior]`.
+
+        Args:
+            seed: of everything.
+            draws: that are kept of each of the ensembles.
+            most: blocks of steps after which it ends without having converged.
+            quiet: show no progress.
+        """
+        from slipid.api.posterior import sampled
+
+        return sampled(self.result, self.task, self.problem, seed, draws, most, quiet)
+
+    def deploy(self) -> "DeployedRobot":
+        """What runs on the robot, with the intervals of the fit's own curvature.
+
+        Raises:
+            ValueError: the wheels' kinematics have rank below 3.
+        """
+        from slipid.deploy.deploy import deploy
+
+        return deploy(self.result)
+
+    def save(self, folder: Path | str) -> None:
+        """Write fit.json, its arrays and identified.json, each whole or not at all."""
+        fit_file.save(self.result, Path(folder))
+
+
+def fit(
+    runs: Runs,
+    robot: Robot,
+    *,
+    priors: Mapping[str, Prior] | None = None,
+    fixed: Mapping[str, Numbers] | None = None,
+    start: Mapping[str, Numbers] | None = None,
+    free: Sequence[str] = (),
+    image_centre: tuple[float, float] = (0.0, 0.0),
+    windows_per_piece: int = 4,
+    seed: int = 0,
+    quiet: bool = False,
+) -> Fit:
+    """Fit motors, floors, wheel loads and camera to runs, end to end.
+
+    Names of numbers are paths such as `motor.resistance` or `surface.gray.creep`; `*` and `?`
+    stand for any text. What is not named keeps its declared prior or value.
+
+    Args:
+        runs: of `read_runs`, each on one floor.
+        robot: that drove them, such as `Robot.omni(...)`.
+        priors: what is known of a number before; the number is fitted.
+        fixed: numbers that keep a value [SI].
+        start: values the search begins with [SI].
+        free: numbers that are fitted with their declared priors, where they are not by default.
+        image_centre: where the camera's tilt and distortion are zero [m].
+        windows_per_piece: how finely runs are cut.
+        seed: of the draws behind the bands of slip curves.
+        quiet: show no progress.
+
+    Raises:
+        DataError: the runs cannot be cut into windows.
+        ValueError: no such number, or a value outside its bounds.
+
+    Source: the contact law of `slipid.model.contact`, the likelihood of `slipid.identify.fit`.
+    """
+    floors = sorted({log.surface or "unknown" for log in runs.logs})
+    loads = sorted({log.load for log in runs.logs})
+    full = robot.on(floors, loads, sorted(set(runs.session)), image_centre)
+    choices = [*still_viscosities(runs), *said_of(full, float(full.body.mass))]
+    choices += [Choice(path, free=True) for path in free]
+    for path, prior in (priors or {}).items():
+        choices.append(Choice(path, prior_mean=_plain(prior.mean), prior_std=_plain(prior.std)))
+    choices += [Choice(path, fixed=_plain(value)) for path, value in (fixed or {}).items()]
+    choices += [Choice(path, start=_plain(value)) for path, value in (start or {}).items()]
+    settings = FitSection(windows_per_piece=windows_per_piece, seed=seed)  # type: ignore[call-arg]
+    task = Task(runs, full, tuple(choices), settings)
+    with Reporter(quiet=quiet) as report:
+        problem = task.problem()
+        optimum = optimised(task, problem, None, report)
+        found = summarised(task, problem, optimum, report)
+    return Fit(found, task, problem, optimum)
+
+
+def _plain(value: Numbers) -> float | list[float]:
+    """A number, or a list of them, as JSON holds them."""
+    found: float | list[float] = np.asarray(value, float).tolist()
+    return found

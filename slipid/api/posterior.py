@@ -1,0 +1,104 @@
+"""Draws of a posterior with their table, pictures, and the robot that is made of them."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from slipid.control.deployed import DeployedRobot
+from slipid.deploy.deploy import deploy
+from slipid.identify.fit.problem import Problem
+from slipid.identify.posterior import netcdf
+from slipid.identify.posterior import sample as posterior
+from slipid.identify.posterior.blocks import Plan
+from slipid.identify.result import Fit
+from slipid.identify.verdicts.estimates import Estimate
+from slipid.job.drawn_estimates import estimates
+from slipid.job.problem import Task
+from slipid.job.sample import sampled_around
+from slipid.report import estimates as report
+from slipid.report.page import Page
+from slipid.support.progress import Reporter
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from xarray import DataTree
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Posterior of a fit; `print` shows its numbers and whether the chains agree.
+
+    Attributes:
+        result: draws and diagnosis.
+        fit: that was sampled around.
+        task: runs, robot and wishes.
+        problem: the likelihood of the runs.
+    """
+
+    result: posterior.Posterior
+    fit: Fit
+    task: Task
+    problem: Problem
+
+    def __str__(self) -> str:
+        page = Page(kept=True)
+        page.table(report.estimates(self.parameters.values(), f"{self.result.log_prob.size} draws"))
+        state = "converged" if self.converged else "NOT converged, do not trust the intervals"
+        page.line(f"{state}: {self.result.reason}")
+        return page.text
+
+    @property
+    def converged(self) -> bool:
+        """Whether the chains may be believed."""
+        return self.result.converged
+
+    @cached_property
+    def parameters(self) -> dict[str, Estimate]:
+        """Every number by path, with mean, interval and verdict from the draws."""
+        return estimates(self.fit, self.result)
+
+    @cached_property
+    def tree(self) -> "DataTree":
+        """Draws, likelihoods and replicated data as an ArviZ DataTree."""
+        runs = tuple(log.name for log in self.task.dataset.logs)
+        about = {"schema": netcdf.SCHEMA, "data_hash": self.fit.data_hash}
+        made: DataTree = netcdf.tree(self.problem, self.result, runs, about)
+        return made
+
+    def plot(self, name: str = "intervals") -> "Figure":
+        """One of the posterior's pictures.
+
+        Args:
+            name: `intervals` of every number, or `pairs` that are bent the most.
+
+        Raises:
+            ValueError: no such picture.
+        """
+        from slipid.plots.posterior import interval_figure, pair_figure
+
+        figures = {"intervals": interval_figure, "pairs": pair_figure}
+        if name not in figures:
+            raise ValueError(f"no picture '{name}'; there are {', '.join(figures)}")
+        return figures[name](self.fit, self.result.z.reshape(-1, self.fit.space.size))
+
+    def deploy(self) -> DeployedRobot:
+        """What runs on the robot, with the intervals of the draws.
+
+        Raises:
+            ValueError: the wheels' kinematics have rank below 3.
+        """
+        return deploy(self.fit, self.result)
+
+    def save(self, path: Path | str) -> None:
+        """Write posterior.nc, whole or not at all."""
+        netcdf.write(self.tree, Path(path))
+
+
+def sampled(
+    fit: Fit, task: Task, problem: Problem, seed: int, draws: int, most: int, quiet: bool
+) -> Posterior:
+    """Posterior around a fit; arguments as of `Fit.sample`."""
+    with Reporter(quiet=quiet) as progress:
+        found = sampled_around(fit, problem, Plan(seed=seed, most=most), draws, None, progress)
+    return Posterior(found, fit, task, problem)

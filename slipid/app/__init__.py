@@ -1,1 +1,0 @@
-"""Command line, configuration, progress and plots: the only room that imports all others."""

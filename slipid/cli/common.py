@@ -1,0 +1,73 @@
+"""What commands share: types of their options, exit codes, JSON for programs."""
+
+import functools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, ParamSpec
+
+import typer
+
+ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Config, a TOML file.")]
+OutFolder = Annotated[Path, typer.Argument(metavar="OUT", help="Folder identify wrote.")]
+DataFolder = Annotated[
+    Path, typer.Option("--data", metavar="DIR", help="Folder the globs of the config start from.")
+]
+Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write to.")]
+MaybeOut = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Folder to write to, if wanted.")
+]
+Load = Annotated[
+    str | None, typer.Option("--load", metavar="NAME", help="Load set-up; the first by default.")
+]
+Jobs = Annotated[
+    int | None, typer.Option("--jobs", min=1, help="Processes at once; by default all cores.")
+]
+Json = Annotated[
+    str | None, typer.Option("--json", metavar="FILE", help="Also write JSON there; - is stdout.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
+Words = ParamSpec("Words")
+
+
+def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
+    """Bad input is one message and exit code 2, an interrupt 130; neither is a traceback."""
+
+    @functools.wraps(command)
+    def run(*args: Words.args, **options: Words.kwargs) -> None:
+        try:
+            code = command(*args, **options)
+        except KeyboardInterrupt:
+            typer.echo(
+                "interrupted; called again, it goes on from what was kept, if it keeps anything",
+                err=True,
+            )
+            raise typer.Exit(130) from None
+        except ValueError as error:
+            from slipid.support.errors import DataError
+
+            if not isinstance(error, DataError):
+                raise
+            typer.echo(str(error), err=True)
+            raise typer.Exit(2) from None
+        raise typer.Exit(code)
+
+    return run
+
+
+def emit(json: str | None, content: object, show: Callable[[], None]) -> None:
+    """Show a result to people, and write it as JSON where `--json` says so.
+
+    Args:
+        json: a file, written whole or not at all; `-` for stdout, which then has nothing else.
+        content: the result as plain values.
+        show: prints it.
+    """
+    from slipid.support.files import json_text, write_bytes
+
+    if json == "-":
+        sys.stdout.write(json_text(content))
+        return
+    if json is not None:
+        write_bytes(Path(json), json_text(content).encode())
+    show()

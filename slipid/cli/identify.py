@@ -1,0 +1,80 @@
+"""`slipid identify`: the fit, end to end."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, guarded
+
+if TYPE_CHECKING:
+    from slipid.job.identify import Identified
+    from slipid.support.progress import Reporter
+else:
+    # slow to import, so not before a command needs them; run-time checks see Any
+    Identified = Reporter = Any
+
+
+@guarded
+def identify(
+    config: ConfigFile,
+    data: DataFolder,
+    out: Out,
+    profile: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PATH", help="Also profile a number's likelihood; may be repeated."),
+    ] = None,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Fit motors, floors, loads and camera to the logs, end to end.
+
+    Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt.
+    """
+    from slipid.support.files import read_json
+    from slipid.support.progress import Reporter
+
+    with Reporter(quiet=quiet) as report:
+        done = run(config, data, out, report, profile or ())
+    content = read_json(out / "identified.json", "what identify wrote")
+    emit(json, content, lambda: show(done, out))
+    return 0 if done.fit.converged else 1
+
+
+def run(
+    config: Path, data: Path, out: Path, report: Reporter, profiles: Sequence[str] = ()
+) -> Identified:
+    """The fit and its pictures; arguments as of `slipid.job.identify.identify`.
+
+    Raises:
+        DataError: config or logs are wrong; nothing was written then.
+    """
+    from slipid.deploy.deploy import write_robot
+    from slipid.job.identify import identify
+    from slipid.plots.drawing import save
+    from slipid.plots.fit import identify_plots
+    from slipid.plots.profile import profile_figure
+    from slipid.support.errors import DataError
+
+    done = identify(config, data, out, report, profiles)
+    report.stage("drawing")
+    drawn = [out / name for name in write_robot(out, done.fit)]
+    try:
+        drawn += identify_plots(done.fit, done.job.dataset, out)
+    except DataError as error:  # the numbers are written; a run too short to draw spoils none
+        report.line(f"no more pictures: {error}")
+    if done.profiles:
+        drawn.append(save(profile_figure(done.profiles), out / "profile.png"))
+    return replace(done, written=(*done.written, *(path.name for path in drawn)))
+
+
+def show(done: Identified, out: Path) -> None:
+    """Print what was found."""
+    from slipid.report.estimates import show_fit
+    from slipid.report.page import Page
+
+    page = Page()
+    show_fit(page, done.fit, done.profiles)
+    page.files(out, done.written)

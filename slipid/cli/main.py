@@ -1,0 +1,56 @@
+"""The command line. Imports are late: `slipid --help` answers before numpy is loaded."""
+
+import _thread
+import sys
+import threading
+
+import typer
+
+from slipid.cli.check import check
+from slipid.cli.compare import compare
+from slipid.cli.demo import demo
+from slipid.cli.design import design
+from slipid.cli.identify import identify
+from slipid.cli.new import new
+from slipid.cli.paper import paper
+from slipid.cli.sample import sample
+from slipid.cli.selftest import selftest
+from slipid.cli.simulate import simulate
+from slipid.cli.trial import trial
+from slipid.cli.tune import tune
+from slipid.cli.validate import validate
+
+app = typer.Typer(
+    name="slipid",
+    help="Identify motors, floors and wheel loads of a robot from its logs.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+for command in (
+    *(new, check, selftest, identify, sample, validate, compare),
+    *(design, tune, trial, simulate, paper, demo),
+):
+    app.command()(command)
+
+AGAIN_S = 0.05
+"""After which an interrupt is sent again that Python had to ignore."""
+
+
+def main() -> None:
+    """Entry point of the `slipid` command."""
+    sys.unraisablehook = _interrupt_again
+    app()
+
+
+def _interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
+    """Send an interrupt again that Python had to ignore where it arrived.
+
+    In a finaliser or a callback of the garbage collector (jax has one) no exception can be raised.
+    """
+    if lost.exc_type is KeyboardInterrupt:
+        again = threading.Timer(AGAIN_S, _thread.interrupt_main)
+        again.daemon = True  # a command that has ended by then is left in peace
+        again.start()
+    else:
+        sys.__unraisablehook__(lost)

@@ -1,0 +1,23 @@
+"""`slipid paper`: the 2021 paper from its own data."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from slipid.cli.common import Out, guarded
+
+
+@guarded
+def paper(
+    data: Annotated[
+        Path, typer.Option("--data", metavar="DIR", help="Folder that holds robotino2021.")
+    ],
+    out: Out,
+) -> int:
+    """Regenerate the 2021 paper's tables and figures from its own data."""
+    from slipid.plots.paper import run
+
+    for path in run(data, out):
+        typer.echo(str(path))
+    return 0

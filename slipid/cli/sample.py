@@ -1,0 +1,78 @@
+"""`slipid sample`: the posterior of a fit."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from slipid.cli.common import Json, OutFolder, Quiet, emit, guarded
+
+if TYPE_CHECKING:
+    from slipid.job.sample import Sampled
+else:
+    # slow to import, so not before a command needs it; run-time checks see Any
+    Sampled = Any
+
+
+@guarded
+def sample(
+    out: OutFolder,
+    data: Annotated[
+        Path | None, typer.Option("--data", metavar="DIR", help="Where the logs are now.")
+    ] = None,
+    draws: Annotated[
+        int, typer.Option("--draws", min=10, help="Kept of each of four ensembles.")
+    ] = 400,
+    most: Annotated[int, typer.Option("--most", min=24, help="Blocks before it gives up.")] = 400,
+    block: Annotated[
+        int, typer.Option("--block", min=1, hidden=True, help="Steps that are kept together.")
+    ] = 20,
+    seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Posterior of a fit by emcee: honest intervals, posterior.nc; goes on after an interrupt."""
+    from slipid.support.errors import DataError
+    from slipid.support.files import read_json
+    from slipid.support.progress import Reporter
+
+    try:
+        from slipid.deploy.deploy import write_robot
+        from slipid.identify.posterior.blocks import Plan
+        from slipid.job.sample import sample as run
+        from slipid.plots.posterior import posterior_plots
+    except ImportError as error:
+        raise DataError(f"{error}; expected `pip install slipid[posterior]`") from error
+    with Reporter(quiet=quiet) as report:
+        done = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)
+        robot = write_robot(out, done.fit, done.posterior)
+        report.stage("drawing")
+        drawn = posterior_plots(done.fit, done.posterior, out)
+    done = replace(done, written=(*done.written, *robot, *(path.name for path in drawn)))
+    content = read_json(out / "identified.json", "what sample wrote")
+    emit(json, content, lambda: show(done, out))
+    return 0 if done.posterior.converged else 1
+
+
+def show(done: Sampled, out: Path) -> None:
+    """Print what was found."""
+    from slipid.report.estimates import estimates
+    from slipid.report.page import Page
+
+    page, about, worst = Page(), done.about, done.about["worst"]
+    page.table(estimates(done.parameters.values(), f"{about['draws']} draws"))
+    page.notes(done.content["messages"])
+    page.line(
+        f"{about['ensembles']} ensembles of {about['walkers']} walkers, {about['steps']} steps: "
+        f"worst R-hat {worst['r_hat']:.4f}, {worst['steps_per_tau']:.0f} steps per "
+        f"autocorrelation time, {worst['effective_draws']:.0f} effective draws"
+    )
+    if about["converged"]:
+        page.line(f"converged: worst is {about['reason']}")
+    else:
+        page.line(
+            f"NOT converged, do not trust the intervals: worst is {about['reason']}; "
+            "a larger --most goes on from here"
+        )
+    page.files(out, done.written)

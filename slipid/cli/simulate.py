@@ -1,0 +1,53 @@
+"""`slipid simulate`: logs from the virtual test site."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from slipid.cli.common import ConfigFile, Jobs, Json, Out, Quiet, emit, guarded
+from slipid.support.content import Content
+
+if TYPE_CHECKING:
+    from slipid.testsite.simulate.config import Plan
+else:
+    # slow to import, so not before a command needs it; run-time checks see Any
+    Plan = Any
+
+
+@guarded
+def simulate(
+    config: ConfigFile, out: Out, jobs: Jobs = None, json: Json = None, quiet: Quiet = False
+) -> int:
+    """Logs from the virtual test site, whose physics is MuJoCo's; needs slipid[testsite].
+
+    Writes logs, a config that identifies them, floor maps, and the truth in a folder of its own.
+    Runs that are done are kept and not driven again.
+    """
+    from slipid.support.progress import Reporter
+    from slipid.testsite.simulate.config import read_plan
+    from slipid.testsite.simulate.simulate import simulate as run
+
+    plan = read_plan(config)
+    with Reporter(quiet=quiet) as report:
+        found = run(plan, out, jobs or os.cpu_count() or 1, report)
+    emit(json, found, lambda: show(found, plan, out))
+    return 0
+
+
+def show(found: Content, plan: Plan, out: Path) -> None:
+    """Print how much was driven, and what to do with it."""
+    from slipid.report.page import Page
+    from slipid.testsite.simulate.simulate import can_identify
+
+    page = Page()
+    page.line(f"{len(found['runs'])} runs, {found['driven']} of them driven now")
+    if found["pace"] is not None:
+        page.line(f"{found['seconds']:.0f} s at {found['pace']:.1f} times real time")
+    page.line(f"truth, which nothing reads that fits: {out / 'truth'}")
+    jobs = {}
+    if can_identify(plan):
+        jobs[out / "robot.toml"] = (out / "logs", out / "result")
+    if "robotino2022" in plan.content.formats:
+        jobs[Path("configs/robotino2022.toml")] = (out / "robotino2022", out / "result2022")
+    for config, (data, result) in jobs.items():
+        page.line(f"  slipid identify {config} --data {data} --out {result}")

@@ -1,0 +1,69 @@
+"""`slipid tune`: gains rehearsed on the fit's own twin."""
+
+from pathlib import Path
+from typing import Annotated, cast
+
+import typer
+
+from slipid.cli.common import Json, Load, OutFolder, Quiet, emit, guarded
+from slipid.support.content import Content
+
+
+@guarded
+def tune(
+    out: OutFolder,
+    load: Load = None,
+    method: Annotated[str, typer.Option("--method", help="gradient or pso.")] = "gradient",
+    rollouts: Annotated[
+        int, typer.Option("--rollouts", min=1, help="Rehearsals it may spend.")
+    ] = 3360,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of draws, floors and search.")] = 0,
+    gyro: Annotated[bool, typer.Option("--gyro/--no-gyro", help="The robot has a gyro.")] = False,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Tune the controller's gains on the fit's own twin: draws of the robot, floors and noise.
+
+    Writes gains.json, and the gains into robot.json; goes on after an interrupt. Exit code 1 where
+    gains set by hand are better.
+    """
+    from slipid.control.tuning.optimisers import Method
+    from slipid.deploy.tune import Wish
+    from slipid.deploy.tune import tune as run
+    from slipid.support.files import writable
+    from slipid.support.jax_setup import setup_jax
+    from slipid.support.progress import Reporter
+
+    with Reporter(quiet=quiet) as report:
+        report.stage("reading the robot")
+        setup_jax(quiet=True)
+        writable(out)
+        # it says itself which methods there are
+        wish = Wish(load, cast(Method, method), rollouts, seed, gyro)
+        tuned = run(out, wish, report)
+    found = tuned.to_json()
+    emit(json, found, lambda: show(found, out))
+    loss = tuned.record().loss
+    return 0 if loss.tuned <= loss.hand else 1
+
+
+def show(found: Content, out: Path) -> None:
+    """Print the content of gains.json."""
+    from slipid.report.page import Page, table
+
+    page = Page()
+    gains = table(("gain", "value", "spread", "by hand", "unit"), right=("value", "spread"))
+    hand = found["settings"]["hand"]
+    for name, g in found["gains"].items():
+        gains.add_row(name, f"{g['value']:.3f}", f"{g['spread']:.3f}", f"{hand[name]:g}", g["unit"])
+    page.table(gains)
+    loss, margin = found["loss"], found["stability_margin"]
+    page.line(
+        f"loss on {found['settings']['judged_on']} cases not tuned on: by hand {loss['hand']:.1f} "
+        f"mm, tuned {loss['tuned']:.1f} mm; better in {found['better_than_hand']:.0%} of them"
+    )
+    page.line(
+        f"stability margin (1 - spectral radius): worst {margin['worst']:.4f}, "
+        f"median {margin['median']:.4f}"
+    )
+    page.files(out, ("gains.json", "robot.json"))

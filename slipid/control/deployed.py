@@ -1,0 +1,222 @@
+"""What an estimator and a controller know of an identified robot, as arrays."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.control.robot_file.check import check, declared
+from slipid.control.robot_file.file import ANEW, read_robot, write_robot
+from slipid.control.robot_file.record import Numbers, RobotRecord
+from slipid.model.contact_law import ContactSurface
+from slipid.model.geometry import Frame, Geometry
+from slipid.model.motor import Motor
+from slipid.support.errors import DataError
+
+
+class DeployedRobot(eqx.Module):
+    """An identified robot, ready to be deployed: what robot.json holds, for one load set-up.
+
+    Attributes:
+        frame: wheel directions; `places`: wheel centres in the body frame [m].
+        forward: J (wheel, 3); `inverse`: its pseudo-inverse.
+        motor: of every wheel.
+        floors: stacked, a row per floor in the order of `labels`.
+        rest: load shares at rest.
+        mass: [kg]; yaw_inertia: [kg m^2].
+        process: std of what the model misses, growing with the root of the distance, along and
+            across [m/sqrt(m)] and in yaw [rad/sqrt(m)].
+        effect: std of what it misses all the way, [m/m], [m/m], [rad/m]; the spread of the fitted
+            numbers included.
+        current_std: of a measured current from the model's [A].
+        current_trend: a + b v, measured currents over the model's at speed v [A, A s/m].
+        highest: wheel speed up to which the fit has seen the robot [rad/s], and the model's largest
+            current up to 0.8 of it [A].
+        wheel_curve: a + b |I|, the slip ratio of each wheel, of all floors together (wheel, 2).
+        record: every number with its interval, verdict and provenance.
+        load_setup: name of the load set-up.
+    """
+
+    frame: Frame
+    places: Float[Array, "wheel 2"]
+    forward: Float[Array, "wheel 3"]
+    inverse: Float[Array, "3 wheel"]
+    motor: Motor
+    floors: ContactSurface
+    rest: Float[Array, " wheel"]
+    mass: Float[Array, ""]
+    yaw_inertia: Float[Array, ""]
+    process: Float[Array, "floor 3"]
+    effect: Float[Array, "floor 3"]
+    current_std: Float[Array, " floor"]
+    current_trend: Float[Array, "2"]
+    highest: Float[Array, "2"]
+    wheel_curve: Float[Array, "wheel 2"]
+    record: RobotRecord = eqx.field(static=True)
+    load_setup: str = eqx.field(static=True)
+
+    @property
+    def wheels(self) -> int:
+        """Number of wheels."""
+        return len(self.record.wheels.place)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the floors, in the order of every `floor` axis."""
+        return self.record.labels
+
+    @classmethod
+    def of(cls, record: RobotRecord, load: str | None = None) -> "DeployedRobot":
+        """The robot of a record.
+
+        Args:
+            record: every number.
+            load: name of the load set-up it drives with, the first one by default.
+
+        Raises:
+            ValueError: no such load set-up, a number that is missing or out of its bounds, or
+                wheels whose kinematics have rank below 3.
+        """
+        check(record)
+        return _arrays(record, load, {path: n.value for path, n in record.parameters.items()})
+
+    @classmethod
+    def load(cls, path: Path | str, load: str | None = None) -> "DeployedRobot":
+        """The robot of a file that `slipid identify`, `slipid sample` or `save` wrote.
+
+        Args:
+            path: of robot.json.
+            load: name of the load set-up it drives with, the first one by default.
+
+        Raises:
+            DataError: the file is absent, damaged, changed or of a newer version, or has no such
+                load set-up.
+        """
+        path = Path(path)
+        record = read_robot(path)
+        try:
+            record.load_index(load)
+        except ValueError as error:
+            raise DataError(f"{path}: {error}") from error
+        try:
+            return cls.of(record, load)
+        except ValueError as error:
+            raise DataError(f"{path}: {error}; {ANEW}") from error
+
+    def save(self, path: Path | str) -> None:
+        """Write robot.json, with all load set-ups.
+
+        Raises:
+            ValueError: arrays were changed since the robot was made, which no file would tell.
+            DataError: nothing can be written there.
+        """
+        same = DeployedRobot.of(self.record, self.load_setup)
+        pairs = zip(jax.tree.leaves(self), jax.tree.leaves(same), strict=True)
+        if not all(np.array_equal(a, b) for a, b in pairs):
+            raise ValueError(
+                "arrays of this robot are not those of its record; expected both alike"
+            )
+        write_robot(Path(path), self.record)
+
+    def on(self, *floors: str) -> "DeployedRobot":
+        """For a place of which it is known that there are only these floors.
+
+        Raises:
+            ValueError: none, one twice, or one that is not identified; names those that are.
+        """
+        for name in floors:
+            if name not in self.labels:
+                raise ValueError(f"no floor '{name}'; identified: {', '.join(self.labels)}")
+        if len(set(floors)) < max(len(floors), 1):
+            raise ValueError(
+                f"floors {list(floors)}; expected each once of {', '.join(self.labels)}"
+            )
+        rows = np.array([self.labels.index(name) for name in floors])
+        kept = jax.tree.map(lambda leaf: leaf[rows], self.floors)
+        return replace(
+            self,
+            floors=replace(kept, labels=floors),
+            process=self.process[rows],
+            effect=self.effect[rows],
+            current_std=self.current_std[rows],
+            record=self.record.on(tuple(rows.tolist())),
+        )
+
+
+def drawn(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
+    """Robots that the posterior holds possible, stacked along a leading axis.
+
+    What runs differ by stays in `DeployedRobot.effect`; the spread of the numbers is in the draws.
+    What the robot was seen with (`highest`, `wheel_curve`) is that of the robot.
+
+    Args:
+        robot: with draws in its record.
+        picked: numbers of the draws.
+    """
+    record, one = robot.record, []
+    plain = {path: n.value for path, n in record.parameters.items()}
+    for k in picked:
+        values = plain | {path: rows[k] for path, rows in record.draws.items()}
+        one.append(_arrays(record, robot.load_setup, values, spread=False))
+    stacked: DeployedRobot = jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
+    return stacked
+
+
+def _arrays(
+    record: RobotRecord, load: str | None, values: Mapping[str, Numbers], spread: bool = True
+) -> DeployedRobot:
+    """The arrays of a record at some values of its numbers.
+
+    Args:
+        record: all but the numbers.
+        load: name of the load set-up.
+        values: of every number, by path.
+        spread: whether the uncertainty of the numbers counts as an effect.
+    """
+    place = record.load_index(load)
+    chosen, wheels, floors = record.loads[place], record.wheels, record.floors
+
+    def of(prefix: str, kind: type[eqx.Module]) -> dict[str, Array]:
+        return {name: _array(values[f"{prefix}.{name}"]) for name in declared(kind)}
+
+    geometry = Geometry(
+        **of("robot", Geometry),
+        place=wheels.place,
+        drive_angle=wheels.drive_angle,
+        roller_angle=wheels.roller_angle,
+        grips=wheels.grips,
+        gear_ratio=wheels.gear_ratio,
+    )
+    rows = [of(f"surface.{floor.name}", ContactSurface) for floor in floors]
+    effect = _array([floor.effect for floor in floors])
+    return DeployedRobot(
+        frame=geometry.frame(),
+        places=jnp.asarray(geometry.place) * geometry.base_radius,
+        forward=geometry.forward(),
+        inverse=geometry.inverse(),
+        motor=Motor(**of("motor", Motor), gear_ratio=wheels.gear_ratio),
+        floors=ContactSurface(
+            **{name: jnp.stack([row[name] for row in rows]) for name in rows[0]},
+            labels=record.labels,
+        ),
+        rest=_array(values[f"robot.load_share@{chosen.name}"]),
+        mass=_array(values["robot.mass"]),
+        yaw_inertia=_array(values["robot.yaw_inertia"]),
+        process=_array([floor.process for floor in floors]),
+        effect=jnp.sqrt(effect**2 + _array(chosen.spread) ** 2) if spread else effect,
+        current_std=_array([floor.current_std for floor in floors]),
+        current_trend=_array(record.current_trend),
+        highest=_array([record.highest_speed, chosen.highest_current]),
+        wheel_curve=_array(chosen.wheel_curve),
+        record=record,
+        load_setup=chosen.name,
+    )
+
+
+def _array(value: Numbers | Sequence[object]) -> Array:
+    return jnp.asarray(value, dtype=float)

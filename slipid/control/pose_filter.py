@@ -1,0 +1,278 @@
+"""Pose and its covariance, with what the fit says the model misses carried along.
+
+Process noise and effects that stay grow the covariance; the effects and a gyro's bias are further
+unknowns that pose fixes and rest correct.
+"""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from slipid.control.deployed import DeployedRobot
+from slipid.control.floor_filter import Motion, Tick, length
+from slipid.control.interface import Readings, Settings
+from slipid.model.se2 import advance, compose
+
+HISTORY = 48
+"""Steps a delayed measurement may reach back."""
+
+
+class PoseState(eqx.Module):
+    """Pose, what else is unknown, and how sure both are.
+
+    Attributes:
+        pose: x, y [m], heading [rad].
+        nuisance: effects of every floor along, across [m/m] and in yaw [rad/m], then the gyro's
+            bias [rad/s].
+        covariance: of pose and nuisance.
+        time: since the start [s]; still: for which the robot has stood [s].
+        noise: covariance that has come into the pose since the start.
+        history: last steps, the newest first: time, pose, yaw rate of the contact model, noise.
+    """
+
+    pose: Float[Array, "3"]
+    nuisance: Float[Array, " nuisance"]
+    covariance: Float[Array, "unknown unknown"]
+    time: Float[Array, ""]
+    still: Float[Array, ""]
+    noise: Float[Array, "3 3"]
+    history: Float[Array, "entry 14"]
+
+
+class _Way(eqx.Module):
+    """Where the body goes in a step, and what pushes it off.
+
+    Attributes:
+        speed: at which the effects of floors count [m/s].
+        axes: along, across and yaw as columns in the body frame.
+        slope: d twist / d effects.
+        share: of the load on each floor.
+        scatter: of the twist over hypotheses.
+        by_gyro: whether yaw is measured.
+    """
+
+    speed: Float[Array, ""]
+    axes: Float[Array, "3 3"]
+    slope: Float[Array, "3 effect"]
+    share: Float[Array, " floor"]
+    scatter: Float[Array, "3 3"]
+    by_gyro: Bool[Array, ""]
+
+
+class PoseFilter(eqx.Module):
+    """Filter of the pose.
+
+    Attributes:
+        robot: the identified robot.
+        settings: what is not identified.
+    """
+
+    robot: DeployedRobot
+    settings: Settings = eqx.field(static=True, default=Settings())
+
+    def init(self, pose: Float[Array, "3"], std: tuple[float, float] = (0.0, 0.0)) -> PoseState:
+        """At rest at a pose [m, m, rad], known this well [m], [rad]."""
+        place, turn = std
+        parts = [
+            jnp.asarray([place**2, place**2, turn**2]),
+            self.robot.effect.reshape(-1) ** 2,
+            jnp.asarray([self.settings.gyro_bias_std**2]),
+        ]
+        entry = jnp.concatenate([jnp.zeros(1), pose, jnp.zeros(10)])
+        return PoseState(
+            pose=pose,
+            nuisance=jnp.zeros(3 * len(self.robot.labels) + 1),
+            covariance=jnp.diag(jnp.concatenate(parts)),
+            time=jnp.zeros(()),
+            still=jnp.zeros(()),
+            noise=jnp.zeros((3, 3)),
+            history=jnp.broadcast_to(entry, (HISTORY, 14)),
+        )
+
+    def step(
+        self, old: PoseState, motion: Motion, gyro: Array, z: Readings, tick: Tick
+    ) -> tuple[PoseState, Float[Array, "3"]]:
+        """Pose a time step later, and the twist that took it there.
+
+        Args:
+            old: before the step.
+            motion: what the floors say of it.
+            gyro: yaw rate, NaN without one [rad/s].
+            z: for its pose fix.
+            tick: the time step.
+        """
+        dt, moves = tick.dt, tick.moves
+        way = self._way(motion, gyro)
+        free = jnp.where(moves, motion.twist + way.slope @ old.nuisance[:-1], 0.0)
+        time = old.time + dt
+        twist = free.at[2].set(self._turned(old, time, free[2], gyro))
+        jump = motion.jump.at[2].multiply(jnp.where(way.by_gyro, 0.0, 1.0))
+        pose = compose(old.pose, advance(twist, dt) + jump)
+        covariance, noise = self._grow(old, pose, way, tick)
+        noise = old.noise + noise
+        still = jnp.where(moves, 0.0, jnp.minimum(old.still + dt, 1e3))
+        new = replace(old, pose=pose, covariance=covariance, time=time, still=still, noise=noise)
+        new = self._rest(new, gyro)
+        entry = jnp.concatenate([time[None], new.pose, free[2:], noise.reshape(-1)])
+        history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
+        return _fixed(replace(new, history=history), z), twist
+
+    def _way(self, motion: Motion, gyro: Array) -> _Way:
+        """Where the body goes."""
+        mean = motion.twist
+        share = self.robot.rest @ motion.under
+        speed = length(mean[:2]) + self.robot.frame.base * jnp.abs(mean[2])
+        u = jnp.where(speed > 1e-6, mean[:2] / jnp.maximum(length(mean[:2]), 1e-9), 0.0)
+        axes = jnp.array([[u[0], -u[1], 0.0], [u[1], u[0], 0.0], [0.0, 0.0, 1.0]])
+        return _Way(
+            speed=speed,
+            axes=axes,
+            slope=speed * (share[:, None, None] * axes.T).reshape(-1, 3).T,
+            share=share,
+            scatter=motion.scatter,
+            by_gyro=jnp.isfinite(gyro),
+        )
+
+    def _turned(self, old: PoseState, time: Array, free: Array, gyro: Array) -> Array:
+        """Yaw rate: the gyro's less its bias; over its delay, as the contact model goes on from it.
+
+        Args:
+            old: state before the step; time: after it [s].
+            free: yaw rate of the contact model [rad/s].
+            gyro: reading, NaN where there is none [rad/s].
+        """
+        delay = self.settings.gyro_delay_s
+        then = free if delay == 0.0 else _nearest(old.history, time - delay)[4]
+        return jnp.where(jnp.isfinite(gyro), free + gyro - old.nuisance[-1] - then, free)
+
+    def _rest(self, now: PoseState, gyro: Array) -> PoseState:
+        """Learn the gyro's bias while the robot rests.
+
+        A reading that differs from what is known is a robot that creeps on an edge or is turned by
+        hand, no bias.
+        """
+        cov = now.covariance
+        gap = gyro - now.nuisance[-1]
+        var = cov[-1, -1] + self.settings.gyro_std**2
+        rests = jnp.isfinite(gyro) & (now.still > 0.3) & (gap**2 < 9.0 * var)
+        gain = jnp.where(rests, cov[:, -1] / var, 0.0)
+        change = gain * jnp.where(rests, gap, 0.0)
+        return replace(
+            now,
+            pose=now.pose + change[:3],
+            nuisance=now.nuisance + change[3:],
+            covariance=cov - jnp.outer(gain, cov[-1]),
+        )
+
+    def _grow(self, old: PoseState, pose: Array, way: _Way, tick: Tick) -> tuple[Array, Array]:
+        """Covariance of pose and nuisance after the step; noise that came in with it."""
+        f, s, dt = self.robot, self.settings, tick.dt
+        middle = old.pose[2] + 0.5 * (pose[2] - old.pose[2])
+        c, sn = jnp.cos(middle), jnp.sin(middle)
+        world = jnp.array([[c, -sn, 0.0], [sn, c, 0.0], [0.0, 0.0, 1.0]])
+        gone = pose[:2] - old.pose[:2]
+        on = jnp.where(tick.moves, dt, 0.0)
+        by_gyro = jnp.array([1.0, 1.0, 0.0])
+        # yaw comes from the gyro, not from the floor
+        keep = jnp.where(way.by_gyro, by_gyro, jnp.ones(3))
+        push = world @ (keep[:, None] * way.slope) * on
+        drift = jnp.array([[0.0], [0.0], [1.0]]) * jnp.where(way.by_gyro, -dt, 0.0)
+        turned = jnp.array([[1.0, 0.0, -gone[1]], [0.0, 1.0, gone[0]], [0.0, 0.0, 1.0]])
+        by = jnp.concatenate([turned, push, drift], axis=1)  # d pose / d (pose, nuisance)
+        far = way.speed * on
+        grown = (way.share @ f.process**2) * far
+        floor_axes = world @ (keep[:, None] * way.axes)
+        # which floor it is stays in doubt for about a patch
+        doubt = way.scatter * keep[:, None] * keep[None, :] * on * s.patch_m
+        doubt = doubt / jnp.maximum(way.speed, 0.02)
+        noise = (floor_axes * grown) @ floor_axes.T + world @ doubt @ world.T
+        noise = noise.at[2, 2].add(jnp.where(way.by_gyro, (s.gyro_std * dt) ** 2, 0.0))
+        rows = by @ old.covariance  # what is not the pose stays as it is
+        pose_rows = jnp.concatenate([rows @ by.T + noise, rows[:, 3:]], axis=1)
+        rest = jnp.concatenate([rows[:, 3:].T, old.covariance[3:, 3:]], axis=1)
+        return jnp.concatenate([pose_rows, rest]), noise
+
+
+def _fixed(now: PoseState, z: Readings) -> PoseState:
+    """Corrected by a pose fix of some time ago, if there is one."""
+    age = jnp.where(jnp.isfinite(z.fix_age) & (z.fix_age >= 0), z.fix_age, 0.0)
+    has = (
+        jnp.all(jnp.isfinite(z.fix))
+        & jnp.all(jnp.abs(z.fix[:2]) < 1e4)
+        & jnp.all(jnp.isfinite(z.fix_std))
+        & jnp.all(z.fix_std > 0)
+        & (age < now.time - now.history[-1, 0] + 1e-6)
+    )
+
+    def corrected() -> tuple[Array, Array, Array, Array]:
+        found = _correct(now, z.fix, jnp.clip(z.fix_std, 1e-4, 10.0), age)
+        return found.pose, found.nuisance, found.covariance, found.history
+
+    kept = (now.pose, now.nuisance, now.covariance, now.history)
+    pose, nuisance, covariance, history = jax.lax.cond(has, corrected, lambda: kept)
+    return replace(now, pose=pose, nuisance=nuisance, covariance=covariance, history=history)
+
+
+def _correct(now: PoseState, fix: Array, std: Array, age: Array) -> PoseState:
+    """State after a fix of the pose as it was `age` ago [s].
+
+    What came in since then, a covariance of the pose, the fix has not seen: it is set aside. What
+    the pose no longer holds of it, a later fix having seen it, is so much noise of this one.
+    """
+    pose, cov, history = now.pose, now.covariance, now.history
+    then = _nearest(history, now.time - age)
+    since = now.noise - then[5:].reshape(3, 3)
+    held = _within(since, cov[:3, :3])
+    aside = jnp.zeros_like(cov).at[:3, :3].set(held)
+    cov = cov - aside
+    gap = fix - then[1:4]
+    gap = gap.at[2].set(jnp.arctan2(jnp.sin(gap[2]), jnp.cos(gap[2])))
+    gone = pose[:2] - then[1:3]
+    look = jnp.zeros((3, cov.shape[0])).at[:, :3].set(jnp.eye(3))
+    look = look.at[0, 2].set(gone[1]).at[1, 2].set(-gone[0])
+    noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2) + since - held
+    total = look @ cov @ look.T + noise
+    # a fix far from what is believed counts less, yet counts
+    far = gap @ _inverse(total) @ gap
+    total = total + noise * jnp.maximum(far / 9.0 - 1.0, 0.0)
+    gain = cov @ look.T @ _inverse(total)
+    change = gain @ gap
+    cov = cov - gain @ look @ cov
+    cov = 0.5 * (cov + cov.T) + aside
+    back = history[:, 1:3] - pose[:2]
+    moved = change[:2] + change[2] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
+    history = history.at[:, 1:3].add(moved).at[:, 3].add(change[2])
+    return replace(
+        now,
+        pose=pose + change[:3],
+        nuisance=now.nuisance + change[3:],
+        covariance=cov,
+        history=history,
+    )
+
+
+def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """As much of a covariance as another one can hold.
+
+    The largest eigenvalue of their quotient is at most the eighth root of the trace of its eighth
+    power, and at least 1 / 1.15 of that.
+    """
+    m = _inverse(whole) @ part
+    for _ in range(3):
+        m = m @ m
+    most = jnp.maximum(jnp.trace(m), 1e-12) ** 0.125
+    return jnp.where(jnp.isfinite(most), part / jnp.maximum(most, 1.0), 0.0)
+
+
+def _nearest(history: Array, time: Array) -> Array:
+    """Entry nearest to a time: time, pose, yaw rate of the contact model, noise until then."""
+    return history[jnp.argmin(jnp.abs(history[:, 0] - time))]
+
+
+def _inverse(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Inverse of a positive definite matrix by the adjugate."""
+    rows = jnp.stack([jnp.cross(m[1], m[2]), jnp.cross(m[2], m[0]), jnp.cross(m[0], m[1])], axis=1)
+    return rows / jnp.maximum(m[0] @ rows[:, 0], 1e-30)

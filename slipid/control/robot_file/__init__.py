@@ -1,0 +1,1 @@
+"""What robot.json holds, and how it is read, checked and written."""

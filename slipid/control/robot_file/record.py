@@ -1,0 +1,246 @@
+"""An identified robot as plain values, with how sure each is and where it comes from.
+
+Units are those of `UNITS`, numbers of the robot carry their own.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+from slipid.control.robot_file.gains_record import GainsRecord
+
+Numbers = float | tuple[float, ...]
+"""A number, or one per wheel."""
+Pair = tuple[float, float]
+Axes = tuple[float, float, float]
+"""Along, across and in yaw."""
+Source = Literal["laplace", "posterior", "given"]
+Verdict = Literal["identified", "weak", "not_identified", "at_bound", "fixed"]
+Provenance = Literal["measured", "borrowed", "override"]
+UNITS = {
+    "wheels.place": "base radius",
+    "wheels.drive_angle": "rad",
+    "wheels.roller_angle": "rad",
+    "wheels.gear_ratio": "1",
+    "floors.process": "m/sqrt(m), m/sqrt(m), rad/sqrt(m)",
+    "floors.effect": "m/m, m/m, rad/m",
+    "floors.current_std": "A",
+    "floors.seen.wheel_speed": "rad/s",
+    "floors.seen.torque_nm": "N*m",
+    "floors.seen.slip": "1",
+    "floors.seen.yaw_rate": "rad/s",
+    "floors.seen.headings_deg": "deg",
+    "floors.seen.speeds": "m/s",
+    "floors.seen.turn_rates": "rad/s",
+    "floors.seen.distance": "m",
+    "loads.spread": "m/m, m/m, rad/m",
+    "loads.highest_current": "A",
+    "loads.wheel_curve": "1, 1/A",
+    "current_trend": "A, A*s/m",
+    "highest_speed": "rad/s",
+    "gains.loss": "mm",
+}
+
+
+@dataclass(frozen=True)
+class Number:
+    """A fitted or fixed number of the robot.
+
+    Attributes:
+        value, std: [unit]; std is None where the number was fixed.
+        interval90: equal-tailed, or one interval per wheel; None where the number was fixed.
+        verdict: how much the data say of it; provenance: data, a prior or a choice decided.
+        source: what the interval was made of.
+    """
+
+    value: Numbers
+    unit: str
+    std: Numbers | None
+    interval90: Pair | tuple[Pair, ...] | None
+    verdict: Verdict
+    provenance: Provenance
+    source: Source
+
+
+@dataclass(frozen=True)
+class Wheels:
+    """The shape of the robot, as `slipid.model.geometry.Geometry` has it."""
+
+    place: tuple[Pair, ...]
+    drive_angle: tuple[float, ...]
+    roller_angle: tuple[float, ...]
+    grips: tuple[bool, ...]
+    gear_ratio: float
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a floor was seen with; beyond it the numbers extrapolate.
+
+    Attributes:
+        runs: how many; loads: with which load set-ups.
+        wheel_speed, torque_nm, slip, yaw_rate: smallest and largest.
+        headings_deg, speeds, turn_rates: of the body, each that was driven.
+        distance: of a run, on average.
+    """
+
+    runs: int
+    loads: tuple[str, ...]
+    wheel_speed: Pair
+    torque_nm: Pair
+    slip: Pair
+    yaw_rate: Pair
+    headings_deg: tuple[float, ...]
+    speeds: tuple[float, ...]
+    turn_rates: tuple[float, ...]
+    distance: float
+
+
+@dataclass(frozen=True)
+class FloorRecord:
+    """What the model misses on a floor, as stds.
+
+    Attributes:
+        name: of the floor.
+        process: growing with the root of the distance; effect: all the way.
+        current_std: of a measured current from the model's.
+        seen: None where the numbers were given, not fitted.
+    """
+
+    name: str
+    process: Axes
+    effect: Axes
+    current_std: float
+    seen: Seen | None
+
+
+@dataclass(frozen=True)
+class LoadRecord:
+    """What depends on how the robot is loaded.
+
+    Attributes:
+        name: of the load set-up.
+        spread: std of the motion per metre by the uncertainty of the numbers, on every floor.
+        highest_current: of the model up to 0.8 of the highest wheel speed.
+        wheel_curve: a + b |I|, the slip ratio of each wheel, of all floors together.
+    """
+
+    name: str
+    spread: tuple[Axes, ...]
+    highest_current: float
+    wheel_curve: tuple[Pair, ...]
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """What the logs held, and so what the estimator counts on.
+
+    Attributes:
+        current_is_signed: whether ammeters tell the direction.
+        voltage: whether the motors' voltage was measured; gyro: whether a yaw rate was.
+    """
+
+    current_is_signed: bool
+    voltage: bool
+    gyro: bool
+
+
+@dataclass(frozen=True, eq=False)
+class RobotRecord:
+    """All that robot.json holds. Two records with the same content are equal.
+
+    Attributes:
+        source: what the numbers were made of.
+        wheels: shape of the robot.
+        parameters: numbers by path.
+        floors, loads: in the order that arrays have.
+        current_trend: a + b v, measured currents over the model's.
+        highest_speed: wheel speed up to which the robot was seen.
+        sensors: of the logs.
+        alike: how much rarer each further floor under the robot is, in log probability; lower where
+            the fit has learnt from runs over several floors.
+        messages: what a reader of the numbers must know.
+        data: hash of the runs; None where the numbers were given.
+        versions: of what computed.
+        draws: the numbers that were fitted, by path, once per draw of the posterior.
+        gains: None where none were tuned.
+    """
+
+    source: Source
+    wheels: Wheels
+    parameters: Mapping[str, Number]
+    floors: tuple[FloorRecord, ...]
+    loads: tuple[LoadRecord, ...]
+    current_trend: Pair
+    highest_speed: float
+    sensors: Sensors
+    alike: float
+    messages: tuple[str, ...]
+    data: str | None
+    versions: Mapping[str, str]
+    draws: Mapping[str, tuple[Numbers, ...]]
+    gains: GainsRecord | None
+
+    @cached_property
+    def numbers(self) -> str:
+        """Hash of the robot's numbers, whatever gains it has."""
+        content = asdict(replace(self, gains=None, versions={}, messages=()))
+        return checksum(content)
+
+    @cached_property
+    def _mark(self) -> str:
+        return checksum(asdict(self))
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, RobotRecord) and self._mark == other._mark)
+
+    def __hash__(self) -> int:
+        return hash(self._mark)
+
+    @property
+    def drawn(self) -> int:
+        """Number of draws of the posterior."""
+        return len(next(iter(self.draws.values()), ()))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the floors."""
+        return tuple(floor.name for floor in self.floors)
+
+    def load_index(self, name: str | None) -> int:
+        """Place of a load set-up, the first one where none is named.
+
+        Raises:
+            ValueError: no such load set-up; names those there are.
+        """
+        names = [load.name for load in self.loads]
+        if name is None:
+            return 0
+        if name not in names:
+            raise ValueError(f"no load set-up '{name}'; identified: {', '.join(names)}")
+        return names.index(name)
+
+    def on(self, rows: tuple[int, ...]) -> "RobotRecord":
+        """With some of the floors only, by their numbers."""
+        floors = tuple(self.floors[k] for k in rows)
+        kept = {f"surface.{floor.name}." for floor in floors}
+
+        def stays(path: str) -> bool:
+            return not path.startswith("surface.") or any(path.startswith(k) for k in kept)
+
+        return replace(
+            self,
+            floors=floors,
+            loads=tuple(replace(x, spread=tuple(x.spread[k] for k in rows)) for x in self.loads),
+            parameters={path: n for path, n in self.parameters.items() if stays(path)},
+            draws={path: n for path, n in self.draws.items() if stays(path)},
+        )
+
+
+def checksum(content: Mapping[str, object]) -> str:
+    """SHA-256 of JSON with sorted keys and without spaces, as Python writes it."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()

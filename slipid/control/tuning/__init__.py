@@ -1,0 +1,1 @@
+"""Gains by rehearsal on the identified robot; not deployed."""

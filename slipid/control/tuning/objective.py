@@ -1,0 +1,219 @@
+"""Gains from rehearsals on the twin: over draws of the robot, floors and noise.
+
+One case is a draw of the robot, a floor, a start and noise; its loss is the root of the mean over
+the path of squared true errors along, across and in heading, and of the effort, in mm. What is
+minimised is
+
+    mean over cases + mean of their worst tenth + penalty of a loop that is hardly stable
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.control.closed_loop import PERIOD
+from slipid.control.controller import Controller, Gains, Limits
+from slipid.control.deployed import DeployedRobot
+from slipid.control.estimator import Estimator
+from slipid.control.interface import Numbers, Settings
+from slipid.control.pilot import Pilot
+from slipid.control.trajectory import Path
+from slipid.control.tuning.actuation import Habits
+from slipid.control.tuning.stability import SPARE, radii
+from slipid.control.tuning.twin import Twin, rollout
+from slipid.model.plant import Floor
+
+GAINS = tuple(f.name for f in fields(Gains))
+"""Names of the gains, in the order of vectors of them."""
+HAND = tuple(float(f.metadata["parameter"].start) for f in fields(Gains))
+"""Gains set by hand."""
+LOWEST = np.array([0.2, 0.2, 0.0, 0.0, 0.0, 0.0])
+HIGHEST = np.array([5.0, 5.0, 1.5, 1.5, 1.0, 0.4])
+"""Of the gains; the first two are searched in their logarithm."""
+BATCH = 16
+"""Cases that are rolled out together."""
+REACH = 0.02
+"""Over which losses are differenced, in parts of the box."""
+LARGEST_RADIUS, PENALTY = 0.9995, 10_000.0
+"""Spectral radius from which, with gains `SPARE` times as large, a loop costs [mm]."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What counts how much in a case's loss.
+
+    Attributes:
+        along, across: of squared errors; heading: of those times the base radius.
+        effort_s: rim speed a command changes by in a period, times this, counts as error [s].
+        late: each second of the path that is not reached counts so much [mm].
+    """
+
+    along: float = 1.0
+    across: float = 1.0
+    heading: float = 1.0
+    effort_s: float = 0.05
+    late: float = 20.0
+
+
+class Cases(eqx.Module):
+    """What gains are tried on, stacked.
+
+    Attributes:
+        truth: robots; floor: maps of the same size; path: as they lie for the starts.
+        start: poses [m, m, rad]; key: of all that is drawn.
+    """
+
+    truth: DeployedRobot
+    floor: Floor
+    path: Path
+    start: Float[Array, "case 3"]
+    key: Array
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def at(self, index: np.ndarray | slice) -> "Cases":
+        """Those of an index."""
+        picked: Cases = jax.tree.map(lambda x: x[index], self)
+        return picked
+
+
+class Task(eqx.Module):
+    """What is tuned.
+
+    Attributes:
+        robot: as the pilot knows it.
+        settings: of the estimator; habits: of the twin; limits: of the commands.
+        weights: of the loss.
+        steps: of a rollout; period: [s].
+    """
+
+    robot: DeployedRobot
+    settings: Settings = eqx.field(static=True, default=Settings())
+    habits: Habits = eqx.field(static=True, default=Habits())
+    limits: Limits = eqx.field(static=True, default=Limits())
+    weights: Weights = eqx.field(static=True, default=Weights())
+    steps: int = eqx.field(static=True, default=120)
+    period: float = eqx.field(static=True, default=PERIOD)
+
+    def loss(self, gains: Gains, case: Cases) -> Float[Array, ""]:
+        """Of one case [mm]."""
+        controller = Controller(self.robot, gains, self.limits)
+        pilot = Pilot(Estimator(self.robot, self.settings), controller)
+        habits = replace(self.habits, smooth=True)
+        twin = Twin(case.truth, case.floor, habits, self.period)
+        run = rollout(pilot, case.path, twin, case.start, case.key, self.steps)
+        wanted = jax.vmap(case.path.at)(run.own)
+        gap, v = run.pose[:, :2] - wanted[:, :2], wanted[:, 3:5]
+        pace = jnp.sum(v * v, axis=1)
+        along = jnp.sum(gap * v, axis=1) ** 2 / jnp.maximum(pace, 1e-6)
+        across = jnp.sum(gap * gap, axis=1) - along
+        turned = self.robot.frame.base * jnp.sin(run.pose[:, 2] - wanted[:, 2])
+        jump = self.robot.frame.radius * jnp.diff(run.command, axis=0)
+        w = self.weights
+        squares = jnp.mean(w.along * along + w.across * across + w.heading * turned**2)
+        effort = w.effort_s**2 * jnp.mean(jnp.sum(jump**2, axis=1))
+        missing = jax.nn.relu(case.path.duration - run.own[-1])
+        return 1000.0 * jnp.sqrt(squares + effort + 1e-12) + w.late * missing
+
+    def penalty(self, gains: Gains, truths: DeployedRobot) -> Float[Array, ""]:
+        """Of a loop that is hardly stable [mm]; continues a little below the bound."""
+        rho = radii(self._controller(gains), truths, self.habits, self.period, SPARE)
+        return PENALTY * jax.nn.relu(jnp.max(rho) - LARGEST_RADIUS)
+
+    def margins(self, gains: Gains, truths: DeployedRobot) -> Float[np.ndarray, " loop"]:
+        """1 - spectral radius of every draw, floor and direction, gains as they are."""
+        rho = radii(self._controller(gains), truths, self.habits, self.period)
+        return 1.0 - np.asarray(rho).reshape(-1)
+
+    def _controller(self, gains: Gains) -> Controller:
+        return Controller(self.robot, gains, self.limits)
+
+
+def units() -> tuple[str, ...]:
+    """Units of the gains, in the order of vectors of them."""
+    return tuple(f.metadata["parameter"].unit for f in fields(Gains))
+
+
+def gains_at(x: Float[Numbers, "*batch gain"]) -> Float[Array, "*batch gain"]:
+    """Vectors of gains at places of the unit box."""
+    low, high = jnp.asarray(LOWEST), jnp.asarray(HIGHEST)
+    ratio = jnp.where(low > 0, high / jnp.where(low > 0, low, 1.0), 1.0)
+    return jnp.where(low > 0, low * ratio**x, low + (high - low) * x)
+
+
+def box_of(gains: Float[Numbers, " gain"] | Sequence[float]) -> Float[np.ndarray, " gain"]:
+    """Place of a vector of gains in the unit box, the nearest one."""
+    g = np.clip(np.asarray(gains, float), LOWEST, HIGHEST)
+    logs = np.log(np.maximum(g, 1e-9) / np.maximum(LOWEST, 1e-9))
+    logs = logs / np.log(HIGHEST / np.maximum(LOWEST, 1e-9))
+    return np.where(LOWEST > 0, logs, (g - LOWEST) / (HIGHEST - LOWEST))
+
+
+def combined(losses: Float[Array, " case"]) -> Float[Array, ""]:
+    """Mean and mean of the worst tenth together."""
+    worst = max(1, -(-len(losses) // 10))
+    return jnp.mean(losses) + jnp.mean(jax.lax.top_k(losses, worst)[0])
+
+
+@eqx.filter_jit
+def losses(task: Task, x: Float[Array, " gain"], cases: Cases) -> Float[Array, " case"]:
+    """Loss of every case at a place of the box [mm]."""
+    gains = Gains.at(gains_at(x))
+    found: Array = jax.vmap(lambda case: task.loss(gains, case))(cases)
+    return found
+
+
+@eqx.filter_jit
+def slopes(
+    task: Task, x: Float[Array, " gain"], cases: Cases
+) -> tuple[Float[Array, "case gain"], Float[Array, " case"]]:
+    """Derivatives of the losses by the place, and the losses.
+
+    By differences with the same noise: through the filter, `jax.jvp` by five gains took as long as
+    27 rollouts, differences 6, and over `REACH` the jumps at floors' edges, which a derivative
+    does not see, count as well.
+    """
+    step = jnp.where(x + REACH > 1, -REACH, REACH)
+    places = x + jnp.concatenate([jnp.zeros((1, len(x))), jnp.diag(step)])
+
+    def of(place: Array) -> Array:
+        return jax.vmap(lambda case: task.loss(Gains.at(gains_at(place)), case))(cases)
+
+    value = jax.vmap(of)(places)
+    return ((value[1:] - value[0]) / step[:, None]).T, value[0]
+
+
+@eqx.filter_jit
+def penalties(
+    task: Task, x: Float[Array, "place gain"], truths: DeployedRobot
+) -> Float[Array, " place"]:
+    """Penalty at places of the box [mm]."""
+    found: Array = jax.vmap(lambda place: task.penalty(Gains.at(gains_at(place)), truths))(x)
+    return found
+
+
+def penalty_slope(
+    task: Task, x: Float[Numbers, " gain"], truths: DeployedRobot
+) -> Float[np.ndarray, " gain"]:
+    """Derivative of the penalty by the place, by differences: eigenvalues meet and part [mm]."""
+    step = 1e-3
+    places = np.asarray(x) + np.concatenate([np.zeros((1, len(x))), step * np.eye(len(x))])
+    value = np.asarray(penalties(task, jnp.asarray(places), truths))
+    slope: np.ndarray = (value[1:] - value[0]) / step
+    return slope
+
+
+def evaluate(
+    task: Task, gains: Float[Numbers, " gain"] | Sequence[float], cases: Cases
+) -> Float[np.ndarray, " case"]:
+    """Loss of every case at some gains [mm], `BATCH` cases at a time."""
+    x, count = jnp.asarray(box_of(gains)), len(cases)
+    rows = np.arange(-(-count // BATCH) * BATCH) % count
+    parts = [losses(task, x, cases.at(part)) for part in rows.reshape(-1, BATCH)]
+    return np.concatenate([np.asarray(p) for p in parts])[:count]

@@ -1,0 +1,268 @@
+"""The identified robot as a plant: what closed-loop runs are tuned and rehearsed on.
+
+Commands reach the wheels late, a slew and a lag after; wheels on several floors move the body as
+the contact says, and what the fit says the model misses is drawn anew for every run:
+
+    set <- set + clip(command(t - delay) - set, slew h),   w <- w + (1 - exp(-h / lag)) (set - w)
+    xi = equilibrium(r w; floor under each wheel)
+    pose <- pose * exp(xi h + |xi| h effect + sqrt(|xi| h) process)
+
+Everything is differentiable but for which floor a wheel is on; ticks pass derivatives through.
+Differentiate forwards (`jax.jvp`, `jax.jacfwd`): readings that are no numbers would spoil a pass
+backwards.
+"""
+
+from dataclasses import replace
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.control.closed_loop import PERIOD
+from slipid.control.deployed import DeployedRobot
+from slipid.control.interface import Estimate, Measurement, Pose, Readings, State
+from slipid.control.pilot import Pilot, PilotOutput, PilotState
+from slipid.control.trajectory import Path
+from slipid.control.tuning.actuation import RING, Habits, held
+from slipid.model import contact
+from slipid.model.plant import Floor
+from slipid.model.robot import GRAVITY
+from slipid.model.se2 import advance, compose
+
+
+class TwinState(eqx.Module):
+    """What is true of a twin.
+
+    Attributes:
+        pose: x, y [m], heading [rad]; twist: of the body [m/s, m/s, rad/s].
+        wanted: wheel speeds that the motors' control is set to [rad/s].
+        speed: of the wheels [rad/s]; angle: of the wheels [rad].
+        effect: what this run has of its own on every floor [m/m], [m/m], [rad/m].
+        offset, drift: of the currents, all the way and for a moment [A].
+        bias: of the gyro [rad/s].
+        ring: commands on their way, the newest first [rad/s].
+    """
+
+    pose: Float[Array, "3"]
+    twist: Float[Array, "3"]
+    wanted: Float[Array, " wheel"]
+    speed: Float[Array, " wheel"]
+    angle: Float[Array, " wheel"]
+    effect: Float[Array, "floor 3"]
+    offset: Float[Array, " wheel"]
+    drift: Float[Array, " wheel"]
+    bias: Float[Array, ""]
+    ring: Float[Array, "command wheel"]
+
+
+class Twin(eqx.Module):
+    """A robot on a floor.
+
+    Attributes:
+        robot: as it is.
+        floor: which surface lies where, by number in `robot.labels`.
+        habits: what no fit tells.
+        period: between commands [s].
+    """
+
+    robot: DeployedRobot
+    floor: Floor
+    habits: Habits = eqx.field(static=True, default=Habits())
+    period: float = eqx.field(static=True, default=PERIOD)
+
+    def __check_init__(self) -> None:
+        """Refuse a delay that the ring cannot hold."""
+        if not 0 <= self.habits.delay_s <= (RING - 1) * self.period:
+            most = (RING - 1) * self.period
+            raise ValueError(f"delay_s = {self.habits.delay_s}; expected 0 to {most:g}")
+
+    @property
+    def noises(self) -> int:
+        """Standard normal numbers of a step."""
+        return 3 * self.robot.wheels + 1 + 3 * self.habits.substeps
+
+    def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:
+        """Those of a step by its number; 0 is the reading at rest."""
+        drawn: Array = jax.random.normal(jax.random.fold_in(key, number), (self.noises,))
+        return drawn
+
+    def init(self, pose: Pose, key: Array) -> TwinState:
+        """State at rest at a pose [m, m, rad], with what this run has of its own."""
+        f, w = self.robot, (self.robot.wheels,)
+        one, two, three = jax.random.split(jax.random.fold_in(key, 2**31 - 1), 3)
+        off = jax.random.normal(two, w) * jnp.mean(f.current_std) / jnp.sqrt(2.0)
+        zero = jnp.zeros(w)
+        return TwinState(
+            pose=jnp.asarray(pose, dtype=float),
+            twist=jnp.zeros(3),
+            wanted=zero,
+            speed=zero,
+            angle=zero,
+            effect=f.effect * jax.random.normal(one, f.effect.shape),
+            offset=off,
+            drift=zero,
+            bias=self.habits.gyro_bias * jax.random.normal(three),
+            ring=jnp.zeros((RING, *w)),
+        )
+
+    def step(
+        self, state: TwinState, command: Float[Array, " wheel"], noise: Float[Array, " noise"]
+    ) -> tuple[TwinState, Readings]:
+        """State and readings a period after a command [rad/s]."""
+        old, b, h = state, self.habits, self.period / self.habits.substeps
+        ring = jnp.concatenate([command[None], old.ring[:-1]])
+        shares = jnp.asarray(held(b.delay_s, self.period, b.substeps))
+        pushes = noise[: 3 * b.substeps].reshape(-1, 3)
+        follow = 1 - np.exp(-h / max(b.lag_s, 1e-6))
+        pose, xi, wanted, w, angle = old.pose, old.twist, old.wanted, old.speed, old.angle
+        for k in range(b.substeps):
+            jump = b.slew * h
+            wanted = wanted + jnp.clip(shares[k] @ ring - wanted, -jump, jump)
+            w = w + follow * (wanted - w)
+            pose, xi = self._roll(pose, w, old.effect, pushes[k], h)
+            angle = angle + h * w
+        now = replace(old, pose=pose, twist=xi, wanted=wanted, speed=w, angle=angle, ring=ring)
+        amps, drift = self._amps(now, noise[3 * b.substeps :])
+        turned = (pose[2] - old.pose[2]) / self.period
+        return replace(now, drift=drift), self._read(angle, w, amps, turned + old.bias, noise)
+
+    def first(self, state: TwinState, noise: Array) -> Readings:
+        """Readings of a robot at rest."""
+        s = state
+        return self._read(s.angle, s.speed, jnp.zeros_like(s.speed), s.bias, noise)
+
+    def _roll(
+        self, pose: Array, w: Array, effect: Array, push: Array, h: float
+    ) -> tuple[Array, Array]:
+        """Pose and twist a substep later."""
+        f = self.robot
+        under = self.floor.under(pose, f.places)
+        rim = f.frame.radius * w
+        xi = contact.equilibrium(rim, f.frame, f.floors.at(under), f.rest)
+        size = jnp.sqrt(xi[:2] @ xi[:2] + 1e-12)
+        u, far = xi[:2] / size, (size + f.frame.base * jnp.abs(xi[2])) * h
+        share = f.rest[:, None]
+        off = far * jnp.sum(share * effect[under], axis=0)
+        off += jnp.sqrt(far + 1e-12) * push * jnp.sqrt(jnp.sum(share * f.process[under] ** 2, 0))
+        turned = jnp.stack([u[0] * off[0] - u[1] * off[1], u[1] * off[0] + u[0] * off[1], off[2]])
+        return compose(pose, advance(xi + turned / h, h)), xi
+
+    def _amps(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
+        """Signed currents [A], and how far they have drifted from the model's since the last."""
+        f, wheels, xi, w = self.robot, self.robot.wheels, now.twist, now.speed
+        under = self.floor.under(now.pose, f.places)
+        floor = f.floors.at(under)
+        traction = contact.forces(xi, f.frame.radius * w, f.frame, floor, f.rest).traction
+        force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
+        keep = float(np.exp(-self.period / self.habits.drift_s))
+        fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
+        drift = keep * now.drift + fresh
+        moves = jnp.tanh(w / 0.2) ** 2  # a motor that stands draws nothing
+        model = f.motor.current(force * traction, w)
+        free = (f.inverse @ (f.frame.radius * w))[:2]
+        more = f.current_trend @ jnp.stack([1.0, jnp.sqrt(free @ free + 1e-24)])
+        return model + moves * (jnp.sign(model) * more + now.offset + drift), drift
+
+    def _read(self, angle: Array, w: Array, amps: Array, turn: Array, noise: Array) -> Readings:
+        """Readings; what no sensor of this robot measures is NaN."""
+        b, wheels = self.habits, self.robot.wheels
+        _, by_amps, by_volts, by_turn = jnp.split(
+            noise[3 * b.substeps :], [wheels, 2 * wheels, 3 * wheels]
+        )
+        tick = 2 * np.pi / b.ticks
+        whole = jax.lax.stop_gradient(jnp.floor(angle / tick) * tick - angle)
+        read = amps + self.robot.motor.current_offset + b.ammeter_a * by_amps
+        volts = self.robot.motor.voltage(amps, w) + b.voltmeter_v * by_volts
+        return Measurement(
+            wheel_angle=angle if b.smooth else angle + whole,
+            current=read if b.signed else jnp.abs(read),
+            voltage=volts if b.voltage else None,
+            gyro=turn + b.gyro_noise * by_turn[0] if b.gyro else None,
+        ).filled(wheels)
+
+
+class Rolled(eqx.Module):
+    """A rollout, a row per period, as `slipid.control.closed_loop.Course` has it.
+
+    Attributes:
+        pose: true [m, m, rad]; own: time of the path [s].
+        command: [rad/s]; estimate: a leading axis of steps on every array.
+    """
+
+    pose: Float[Array, "step 3"]
+    command: Float[Array, "step wheel"]
+    estimate: Estimate
+    own: Float[Array, " step"]
+
+
+def rollout(
+    pilot: Pilot[State], path: Path, twin: Twin, start: Pose, key: Array, steps: int
+) -> Rolled:
+    """A pilot on a twin for a fixed number of steps; a path that is over is a rest at its end.
+
+    Args:
+        pilot: estimator and controller.
+        path: as it lies for the start.
+        twin: robot and floor.
+        start: where it stands and believes to stand [m, m, rad].
+        key: of all that is drawn.
+        steps: of a period each.
+    """
+    noise = jax.vmap(partial(twin.noise, key))(jnp.arange(steps + 1))
+    state = twin.init(start, key)
+    reading = twin.first(state, noise[0])
+
+    def step(
+        carry: tuple[TwinState, PilotState[State], Readings], drawn: Array
+    ) -> tuple[tuple[TwinState, PilotState[State], Readings], tuple[Array, PilotOutput]]:
+        state, held, reading = carry
+        pose = state.pose
+        held, out = pilot.step(path, held, reading, twin.period)
+        state, reading = twin.step(state, out.command, drawn)
+        return (state, held, reading), (pose, out)
+
+    first = (state, pilot.init(start), reading)
+    pose, out = jax.lax.scan(step, first, noise[1:])[1]
+    return Rolled(pose=pose, command=out.command, estimate=out.estimate, own=out.time)
+
+
+class TwinPlant:
+    """A twin behind `slipid.control.closed_loop.Plant`; a key gives the same run as `rollout`.
+
+    Args:
+        twin: robot and floor.
+        start: pose [m, m, rad].
+        key: of all that is drawn.
+    """
+
+    def __init__(self, twin: Twin, start: Pose, key: Array):
+        self.twin, self.start, self.key = twin, start, key
+        self._state, self._count = twin.init(start, key), 0
+
+    def reset(self) -> Readings:
+        """First readings, of the robot at rest."""
+        self._state, self._count = self.twin.init(self.start, self.key), 0
+        return self.twin.first(self._state, self.twin.noise(self.key, 0))
+
+    def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Readings:
+        """Readings one period later, with these wheel speeds commanded [rad/s]."""
+        self._count += 1
+        command, count = jnp.asarray(wheel_speed), jnp.asarray(self._count)
+        self._state, reading = _stepped(self.twin, self._state, command, self.key, count)
+        return reading
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """True x, y [m] and heading [rad]."""
+        x, y, heading = np.asarray(self._state.pose).tolist()
+        return x, y, heading
+
+
+@eqx.filter_jit
+def _stepped(
+    twin: Twin, state: TwinState, command: Array, key: Array, count: Array
+) -> tuple[TwinState, Readings]:
+    return twin.step(state, command, twin.noise(key, count))

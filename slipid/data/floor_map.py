@@ -1,0 +1,179 @@
+"""Floor maps: which surface lies where, from polygons, from a picture, or drawn at random."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+MOST_CELLS = 16_000_000
+"""Largest number of cells of one map."""
+
+
+@dataclass(frozen=True, eq=False)
+class FloorMap:
+    """A floor in square cells, each with one surface.
+
+    Attributes:
+        surfaces: names; `cells` counts them from 0.
+        cells: surface of each cell, the first row at the lowest y.
+        corner: x, y of the corner with the lowest coordinates [m].
+        cell: edge of a cell [m].
+    """
+
+    surfaces: tuple[str, ...]
+    cells: Int[np.ndarray, "row column"]
+    corner: tuple[float, float]
+    cell: float
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Lowest x, lowest y, highest x, highest y [m]."""
+        rows, columns = self.cells.shape
+        x, y = self.corner
+        return x, y, x + columns * self.cell, y + rows * self.cell
+
+    def at(self, xy: Float[np.ndarray, "*batch 2"]) -> Int[np.ndarray, "*batch"]:
+        """Surface at places [m], by number; beyond the edge that of the nearest cell."""
+        steps = np.floor((np.asarray(xy) - self.corner) / self.cell).astype(np.intp)
+        rows, columns = self.cells.shape
+        row, column = steps[..., 1].clip(0, rows - 1), steps[..., 0].clip(0, columns - 1)
+        return np.asarray(self.cells[row, column])
+
+    def surface_at(self, x: float, y: float) -> str:
+        """Name of the surface at a place [m]."""
+        return self.surfaces[int(self.at(np.array([x, y])))]
+
+
+def uniform(surface: str, half: float = 2.0) -> FloorMap:
+    """One surface everywhere."""
+    return FloorMap((surface,), np.zeros((1, 1), np.intp), (-half, -half), 2 * half)
+
+
+def from_polygons(
+    base: str,
+    patches: Sequence[tuple[str, Sequence[Sequence[float]]]],
+    extent: tuple[float, float, float, float],
+    cell: float = 0.005,
+) -> FloorMap:
+    """Map from patches on a base, later ones on top of earlier ones.
+
+    Args:
+        base: surface where no patch lies.
+        patches: surface and corners (x, y) [m] of each.
+        extent: lowest x, lowest y, highest x, highest y [m].
+        cell: edge of a cell [m].
+
+    Raises:
+        ValueError: more than `MOST_CELLS` cells.
+    """
+    from matplotlib.path import Path as Outline
+
+    surfaces = tuple(dict.fromkeys([base, *(name for name, _ in patches)]))
+    columns, rows = (max(1, round((extent[2 + k] - extent[k]) / cell)) for k in range(2))
+    _few(rows * columns)
+    x = extent[0] + (np.arange(columns) + 0.5) * cell
+    y = extent[1] + (np.arange(rows) + 0.5) * cell
+    centres = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    cells = np.zeros(len(centres), np.intp)
+    for name, corners in patches:
+        cells[Outline(np.asarray(corners, float)).contains_points(centres)] = surfaces.index(name)
+    return FloorMap(surfaces, cells.reshape(rows, columns), (extent[0], extent[1]), cell)
+
+
+def from_picture(
+    picture: Float[np.ndarray, "row column 3"],
+    colours: Mapping[str, str],
+    metres_per_pixel: float,
+    corner: tuple[float, float] = (0.0, 0.0),
+) -> FloorMap:
+    """Map from a picture seen from above, x to the right, y up: each pixel the nearest colour's.
+
+    Args:
+        picture: red, green, blue between 0 and 1, first row at the top.
+        colours: colour of every surface as `#rrggbb`.
+        metres_per_pixel: [m].
+        corner: x, y of the lower left corner [m].
+    """
+    names = tuple(colours)
+    wanted = np.array([rgb(colours[name]) for name in names])
+    far = np.linalg.norm(picture[:, :, None, :] - wanted, axis=-1)
+    return FloorMap(names, np.argmin(far, axis=-1)[::-1].copy(), corner, metres_per_pixel)
+
+
+def patchwork(
+    surfaces: Sequence[str],
+    seed: int,
+    patch: float = 0.25,
+    half: float = 1.2,
+    cell: float = 0.005,
+) -> FloorMap:
+    """Random site of patches, by default smaller than a Robotino: cells of a jittered grid.
+
+    Args:
+        surfaces: names to choose from.
+        seed: seed of the jitter and of the choice.
+        patch: mean distance of neighbouring patches [m].
+        half: half of the site's edge [m].
+        cell: edge of a cell [m].
+
+    Raises:
+        ValueError: too many cells or patches.
+    """
+    _few(round(2 * half / cell) ** 2)
+    count = int(np.ceil(2 * half / patch)) + 2
+    if count > 500:
+        raise ValueError(f"{count} x {count} patches; expected at most 500 x 500")
+    rng = np.random.default_rng(seed)
+    grid = (np.arange(count) - 0.5 * (count - 1)) * patch
+    seeds = np.stack(np.meshgrid(grid, grid), -1).reshape(-1, 2)
+    seeds = seeds + rng.uniform(-0.35, 0.35, seeds.shape) * patch
+    own = rng.integers(len(surfaces), size=len(seeds))
+    x = np.arange(-half + 0.5 * cell, half, cell)
+    centres = np.stack(np.meshgrid(x, x), -1)
+    nearest = np.full(centres.shape[:2], np.inf)
+    cells = np.zeros(centres.shape[:2], np.intp)
+    for place, surface in zip(seeds, own, strict=True):
+        far = np.linalg.norm(centres - place, axis=-1)
+        cells[far < nearest] = surface
+        nearest = np.minimum(nearest, far)
+    return FloorMap(tuple(surfaces), cells, (-half, -half), cell)
+
+
+def four_zones(
+    surfaces: Sequence[str], middle: tuple[float, float] = (0.45, -0.2), reach: float = 1.2
+) -> FloorMap:
+    """Four surfaces that meet in a point, by default the middle of the paper's rectangle.
+
+    Args:
+        surfaces: of the quarters with low x and high y, high x and high y, high x and low y, and
+            of the rest.
+        middle: x, y [m].
+        reach: reach of every zone from there [m].
+    """
+    x, y = middle
+    corners = (
+        [[x - reach, y], [x, y], [x, y + reach], [x - reach, y + reach]],
+        [[x, y], [x + reach, y], [x + reach, y + reach], [x, y + reach]],
+        [[x, y - reach], [x + reach, y - reach], [x + reach, y], [x, y]],
+        [[x - reach, y - reach], [x, y - reach], [x, y], [x - reach, y]],
+    )
+    patches = list(zip(surfaces, corners, strict=True))
+    return from_polygons(surfaces[0], patches, (x - reach, y - reach, x + reach, y + reach))
+
+
+def _few(cells: int) -> None:
+    if cells > MOST_CELLS:
+        raise ValueError(f"{cells} cells; expected at most {MOST_CELLS}: a larger cell, less floor")
+
+
+def rgb(colour: str) -> list[float]:
+    """Red, green and blue between 0 and 1 of a colour `#rrggbb`.
+
+    Raises:
+        ValueError: it is none.
+    """
+    try:
+        return [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+    except ValueError as error:
+        raise ValueError(f"colour {colour!r}; expected '#rrggbb'") from error

@@ -1,0 +1,238 @@
+"""Checks every log passes once, at the door; each failure names file, row and what was expected."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.log import Log
+from slipid.data.reading.layout import Layout
+from slipid.data.reading.table import Table
+from slipid.data.signals.steps import integrated_steps, step_edges
+from slipid.data.signals.wheel_order import best_wheel_order, describe
+from slipid.data.signals.wheel_signals import interpolate
+from slipid.support.errors import bad_data
+
+MIN_ROWS = 2
+"""Rows below which there is no motion to speak of."""
+MAX_FILLED = 3
+"""Missing cells in a row that are filled by interpolation; more is a burst, and refused."""
+MAX_FILLED_SHARE = 0.02
+"""Share of a column's cells that may be missing."""
+
+# What no wheeled robot does, so that the unit or the sensor must be wrong.
+_LIMITS = {
+    "wheel_speed": (1000.0, "rad/s"),
+    "wheel_speed_command": (1000.0, "rad/s"),
+    "current": (1000.0, "A"),
+    "voltage": (1000.0, "V"),
+    "bus_voltage": (1000.0, "V"),
+    "duty": (1.5, "(a share of 1)"),
+    "gyro": (100.0, "rad/s"),
+}
+
+
+def check_time(table: Table, layout: Layout, time: Float[np.ndarray, " row"]) -> None:
+    """Refuse time that is missing, repeats, goes backwards or jumps."""
+    column = str(layout.channels["time"].columns[0]) if "time" in layout.channels else None
+
+    def fail(at: int, found: str, expected: str) -> None:
+        raise bad_data(table.path, found, expected, row=int(table.lines[at]), column=column)
+
+    if len(time) < MIN_ROWS:
+        fail(0, f"{len(time)} row(s) of numbers", f"at least {MIN_ROWS}")
+    bad = np.flatnonzero(~np.isfinite(time))
+    if len(bad):
+        found = "no time" if np.isnan(time[bad[0]]) else "an infinite time"
+        fail(int(bad[0]), found, "a finite number in every row")
+    steps = np.diff(time)
+    if (steps == 0).all():
+        fail(1, f"the time is {time[0]:g} s in every row", "time that increases")
+    bad = np.flatnonzero(steps <= 0)
+    if len(bad):
+        i = int(bad[0])
+        how = "repeats" if steps[i] == 0 else "goes backwards"
+        fail(i + 1, f"time {how}: {time[i + 1]:.6g} s after {time[i]:.6g} s", "time that increases")
+    usual = float(np.median(steps))
+    bad = np.flatnonzero((steps > 20 * usual) & (steps > layout.max_gap))
+    if len(bad):
+        i = int(bad[0])
+        found = f"the clock jumps by {steps[i]:.3g} s from {time[i]:.6g} s"
+        fail(i + 1, found, f"steps of about {usual:.3g} s and none above {layout.max_gap:g} s")
+    if not 1e-5 < usual < 60.0:
+        fail(1, f"rows {usual:.3g} s apart", "10 us to 60 s; is the unit of time right?")
+
+
+def filled(
+    table: Table,
+    columns: Sequence[str | int],
+    cells: Float[np.ndarray, "row column"],
+    time: Float[np.ndarray, " row"],
+    notes: list[str],
+) -> Float[np.ndarray, "row column"]:
+    """Cells with up to three missing in a row filled linearly in time; bursts are refused.
+
+    Raises:
+        DataError: an infinite cell, a burst of missing ones, or too many of them in all.
+    """
+    if np.isfinite(cells).all():
+        return cells
+    cells = cells.copy()
+    for j, column in enumerate(columns):
+        values = cells[:, j]
+        infinite = np.flatnonzero(np.isinf(values))
+        if len(infinite):
+            row = int(table.lines[infinite[0]])
+            raise bad_data(table.path, "an infinite value", "a number", row=row, column=str(column))
+        missing = np.isnan(values)
+        if not missing.any():
+            continue
+        first, last = _longest(missing)
+        rows = (int(table.lines[first]), int(table.lines[last]))
+        if last - first + 1 > MAX_FILLED:
+            found = f"{last - first + 1} missing values in a row"
+            expected = f"numbers (gaps up to {MAX_FILLED} rows are filled in)"
+            raise bad_data(table.path, found, expected, row=rows, column=str(column))
+        if missing.mean() > MAX_FILLED_SHARE:
+            found = f"{missing.sum()} of {len(missing)} values missing"
+            expected = f"at most {MAX_FILLED_SHARE:.0%}"
+            raise bad_data(table.path, found, expected, row=rows, column=str(column))
+        cells[missing, j] = np.interp(time[missing], time[~missing], values[~missing])
+        notes.append(f"column '{column}': {missing.sum()} missing values filled by interpolation")
+    return cells
+
+
+def _longest(mask: np.ndarray) -> tuple[int, int]:
+    """First and last index of the longest stretch of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    starts, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - starts))
+    return int(starts[longest]), int(ends[longest]) - 1
+
+
+def unwrapped_ticks(
+    ticks: Float[np.ndarray, "row wheel"], bits: int, notes: list[str]
+) -> Float[np.ndarray, "row wheel"]:
+    """Ticks without the wrap-around of an integer counter of `bits` bits."""
+    period = 2.0**bits
+    steps = np.diff(ticks, axis=0)
+    if np.abs(steps).max(initial=0.0) <= 0.5 * period:
+        return ticks
+    turns = np.concatenate([np.zeros((1, ticks.shape[1])), np.cumsum(np.round(steps / period), 0)])
+    notes.append(f"tick counter wrapped around at {bits} bits and was continued")
+    return ticks - turns * period
+
+
+def check_log(log: Log, table: Table, layout: Layout) -> None:
+    """Refuse what no robot does: absurd magnitudes, signs, jumps, and channels that stand still."""
+    for name, (limit, unit) in _LIMITS.items():
+        values = getattr(log, name)
+        if values is not None and np.abs(values).max(initial=0.0) > limit:
+            i, j = _first(np.abs(values) > limit)
+            value = values[i, j] if values.ndim == 2 else values[i]
+            found = f"{name} of {value:.4g} {unit}"
+            expected = f"at most {limit:g}; is the unit of the column right?"
+            raise _at(table, layout, name, i, j, found, expected)
+    if log.current is not None and not log.current_is_signed and log.current.min() < 0:
+        i, j = _first(log.current < 0)
+        found = f"a negative current ({log.current[i, j]:.4g} A)"
+        expected = "magnitudes only, as the layout says (current_is_signed = false)"
+        raise _at(table, layout, "current", i, j, found, expected)
+    _check_wheels(log, table, layout)
+    _check_order(log, table, layout)
+    if log.pose is not None:
+        _check_pose(log, table, layout)
+
+
+def _check_wheels(log: Log, table: Table, layout: Layout) -> None:
+    """Refuse angles no wheel can make, and a wheel that stands still when commanded."""
+    if not log.wheels:
+        return
+    rates = np.abs(np.diff(log.wheel_angle, axis=0)) / np.diff(log.time)[:, None]
+    # Telemetry that stalls and catches up makes tenfold rates in sound logs; a counter that starts
+    # anew makes hundredfold ones.
+    limit = max(30.0, 20.0 * float(np.quantile(rates, 0.99)))
+    if rates.max() > limit:
+        i, j = _first(rates > limit)
+        found = f"the wheel turns {rates[i, j]:.4g} rad/s here"
+        expected = (
+            f"at most {limit:.3g}; does the counter restart, or wrap at {layout.tick_bits} bits?"
+        )
+        raise _at(table, layout, "wheel", i + 1, j, found, expected)
+    command = log.wheel_speed_command
+    if command is None:
+        return
+    # Half a second and a radian of commanded motion that the wheel answers with none at all.
+    commanded = np.abs(
+        np.sum(0.5 * (command[1:] + command[:-1]) * np.diff(log.time)[:, None], axis=0)
+    )
+    still = np.ptp(log.wheel_angle, axis=0) == 0
+    dead = np.flatnonzero(still & (commanded > 1.0))
+    if len(dead):
+        j = int(dead[0])
+        found = f"constant, though the wheel was commanded {commanded[j]:.3g} rad"
+        raise _at(table, layout, "wheel", None, j, found, "a wheel that turns when commanded")
+
+
+def _check_order(log: Log, table: Table, layout: Layout) -> None:
+    """Refuse wheel columns in another order than those of the commanded or reported speeds."""
+    for name in ("wheel_speed_command", "wheel_speed"):
+        reference = getattr(log, name)
+        if reference is None:
+            continue
+        edges = step_edges(log.time)
+        measured = np.diff(interpolate(log.time, log.wheel_angle, edges), axis=0)
+        order = best_wheel_order(measured, integrated_steps(log.time, reference, edges))
+        if order.is_swapped:
+            other = np.flatnonzero(np.array(order.order) != np.arange(log.wheels))
+            turned = np.flatnonzero(np.array(order.signs) < 0)
+            j = int(other[0] if len(other) else turned[0])
+            found = f"the wheel does not move as its {name} says"
+            expected = f"wheels in the order {describe(order)} (swapped or reversed columns?)"
+            raise _at(table, layout, "wheel", None, j, found, expected)
+
+
+def _check_pose(log: Log, table: Table, layout: Layout) -> None:
+    pose = log.pose
+    assert pose is not None
+    steps = np.hypot(*np.diff(pose[:, :2], axis=0).T)
+    if steps.max() > layout.max_pose_jump:
+        i = int(np.flatnonzero(steps > layout.max_pose_jump)[0])
+        found = f"the pose jumps by {steps[i]:.3g} m"
+        expected = (
+            f"at most {layout.max_pose_jump:g} m between rows; another marker, or a wrong unit?"
+        )
+        raise _at(table, layout, "pose_x", i + 1, 0, found, expected)
+    turns = np.abs(np.diff(pose[:, 2]))
+    if turns.max() > layout.max_heading_jump:
+        i = int(np.flatnonzero(turns > layout.max_heading_jump)[0])
+        found = f"the heading jumps by {np.degrees(turns[i]):.0f} deg"
+        limit = np.degrees(layout.max_heading_jump)
+        expected = f"at most {limit:.0f} deg between rows; another marker, or a wrong unit?"
+        raise _at(table, layout, "pose_heading", i + 1, 0, found, expected)
+    turned = np.ptp(log.wheel_angle, axis=0).max(initial=0.0)
+    if turned > 2.0 and np.ptp(pose, axis=0).max() == 0:
+        found = f"the pose is constant while a wheel turns {turned:.3g} rad"
+        raise _at(
+            table, layout, "pose_x", None, 0, found, "a pose that changes: was the marker seen?"
+        )
+
+
+def _first(mask: np.ndarray) -> tuple[int, int]:
+    at = np.argwhere(mask)[0]
+    return int(at[0]), int(at[1]) if len(at) > 1 else 0
+
+
+def _at(
+    table: Table, layout: Layout, name: str, i: int | None, j: int, found: str, expected: str
+) -> Exception:
+    """The error at row i of the j-th column of the channel whose name begins with `name`."""
+    order = {
+        "wheel": ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed"),
+        "wheel_speed": ("wheel_speed", "motor_speed"),
+        "wheel_speed_command": ("wheel_speed_command", "motor_speed_command"),
+    }.get(name, (name,))
+    channel = next((layout.channels[n] for n in order if n in layout.channels), None)
+    column = str(channel.columns[j]) if channel else None
+    row = None if i is None else int(table.lines[i])
+    return bad_data(table.path, found, expected, row=row, column=column)

@@ -1,0 +1,134 @@
+"""What a log file's layout is: which column holds which channel, in which unit."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+from slipid.data.reading.units import converts, factor
+
+PER_WHEEL = {
+    "wheel_ticks": "tick",
+    "wheel_angle": "rad",
+    "motor_angle": "rad",
+    "wheel_speed": "rad/s",
+    "motor_speed": "rad/s",
+    "wheel_speed_command": "rad/s",
+    "motor_speed_command": "rad/s",
+    "current": "A",
+    "voltage": "V",
+    "duty": "1",
+}
+SINGLE = {
+    "time": "s",
+    "twist_command_x": "m/s",
+    "twist_command_y": "m/s",
+    "twist_command_yaw": "rad/s",
+    "bus_voltage": "V",
+    "gyro": "rad/s",
+    "pose_x": "m",
+    "pose_y": "m",
+    "pose_heading": "rad",
+}
+CHANNELS: dict[str, str] = {**SINGLE, **PER_WHEEL}
+"""Every channel a layout may name, with the unit it is turned into."""
+
+NEW_RUN = ("never", "time_restarts", "ticks_restart")
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Columns of one channel: value = (scale x cell + offset), in `unit`.
+
+    Attributes:
+        columns: their names, one per wheel where the channel has one; positions counted from 0 in
+            a file without names.
+        unit: the unit in the file; `pixel` is turned into metres by the layout.
+        scale: a sign or a correction, one number for all columns or one for each.
+        offset: added after the scale, in `unit`.
+    """
+
+    columns: tuple[str | int, ...]
+    unit: str
+    scale: float | tuple[float, ...] = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How one kind of log file is laid out.
+
+    Attributes:
+        name: what messages call it.
+        channels: which columns hold which channel.
+        delimiter: character between cells; not used for Parquet.
+        names_row: line that holds the column names, counted from 1; 0 where there is none.
+        units_row: line that holds the units, which are then checked; 0 where there is none.
+        first_data_row: line on which the numbers start.
+        row_period: time between rows of a file without a time column [s].
+        ticks_per_revolution: ticks of the encoder in one turn of the *motor* shaft.
+        gear_ratio: turns of the motor per turn of the wheel.
+        ticks_are_increments: whether the cells hold the ticks since the last row.
+        tick_bits: width of the tick counter, at which it wraps around.
+        current_is_signed: False where the cells are magnitudes.
+        current_step: step of the current's analogue-to-digital converter [A]; None where unknown.
+        metres_per_pixel: scale of the camera along its x and its y [m].
+        new_run: what tells that the next run starts inside the file, one of `NEW_RUN`.
+        drop_repeated_time: whether to keep the last of rows with the same time; else such rows are
+            refused.
+        max_gap: longest time between rows [s]; a longer one is called a clock jump.
+        max_pose_jump: longest way between rows [m]; a longer one is called a marker swap.
+        max_heading_jump: largest turn between rows [rad]; a larger one is called a marker swap.
+    """
+
+    name: str
+    channels: Mapping[str, Channel]
+    delimiter: str = ","
+    names_row: int = 1
+    units_row: int = 0
+    first_data_row: int = 2
+    row_period: float | None = None
+    ticks_per_revolution: float | None = None
+    gear_ratio: float = 1.0
+    ticks_are_increments: bool = False
+    tick_bits: int = 32
+    current_is_signed: bool = True
+    current_step: float | None = None
+    metres_per_pixel: tuple[float, float] | None = None
+    new_run: str = "never"
+    drop_repeated_time: bool = False
+    max_gap: float = 1.0
+    max_pose_jump: float = 0.5
+    max_heading_jump: float = 1.6
+
+    @property
+    def wheels(self) -> int:
+        """Number of wheels, 0 where the file has poses only."""
+        return next((len(c.columns) for n, c in self.channels.items() if n in PER_WHEEL), 0)
+
+    @property
+    def columns(self) -> tuple[str | int, ...]:
+        """Every column the layout uses, each once."""
+        used = (column for channel in self.channels.values() for column in channel.columns)
+        return tuple(dict.fromkeys(used))
+
+    def to_si(self, channel: str) -> float:
+        """Factor from the channel's unit to that of `CHANNELS`, for pixels the camera's scale.
+
+        Raises:
+            ValueError: the unit does not convert, or the scale of the camera is not given.
+        """
+        unit, target = self.channels[channel].unit, CHANNELS[channel]
+        if channel in ("pose_x", "pose_y") and converts(unit, "pixel"):
+            if self.metres_per_pixel is None:
+                raise ValueError(f"{channel} is in '{unit}', but metres_per_pixel is not given")
+            scale = self.metres_per_pixel[0 if channel == "pose_x" else 1]
+            return factor(unit, "pixel") * scale
+        return factor(unit, target)
+
+
+def unknown(what: str, name: object, choices: Iterable[str]) -> str:
+    """Message about a name that is none of the choices: the nearest of them, then all."""
+    names = list(choices)
+    near = get_close_matches(str(name), names, n=2)
+    hint = f", did you mean {' or '.join(near)}?" if near else ""
+    return f"no {what} '{name}'{hint}; expected one of {', '.join(names)}"

@@ -1,0 +1,223 @@
+"""Read logs: from a file and its layout to a `Log` in SI units, checked once, here."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.log import Log
+from slipid.data.reading.checks import MIN_ROWS, check_log, check_time, filled, unwrapped_ticks
+from slipid.data.reading.layout import Layout
+from slipid.data.reading.table import Table, read_table
+from slipid.data.signals.steps import integral
+from slipid.support.errors import DataError, bad_data
+
+
+def read_log(
+    path: Path,
+    layout: Layout,
+    *,
+    root: Path | None = None,
+    surface: str | None = None,
+    load: str = "as_built",
+) -> Log:
+    """The one run in a CSV or Parquet file.
+
+    Args:
+        path: the file.
+        layout: how it is laid out.
+        root: data folder the log's name is relative to; the file's own folder where None.
+        surface: name of the floor.
+        load: name of the load set-up.
+
+    Raises:
+        DataError: the file, row or column that is wrong, what is there and what was expected.
+    """
+    logs = read_logs(path, layout, root=root, surface=surface, load=load)
+    if len(logs) > 1:
+        raise bad_data(path, f"{len(logs)} runs in one file", "one run (read_logs reads several)")
+    return logs[0]
+
+
+def read_logs(
+    path: Path,
+    layout: Layout,
+    *,
+    root: Path | None = None,
+    surface: str | None = None,
+    load: str = "as_built",
+) -> tuple[Log, ...]:
+    """Every run in a file, where `layout.new_run` tells them apart; arguments as of `read_log`.
+
+    Parts of a file of a single row hold no motion and are left out.
+    """
+    table = read_table(path, layout)
+    if layout.drop_repeated_time:
+        last = np.append(np.diff(_time(table, layout)) != 0, True)
+        table = table.rows(last)
+    starts = _run_starts(table, layout)
+    if len(starts) == 1:
+        return (_log(table, layout, _name(path, root), surface, load),)
+    ends = (*starts[1:], len(table.values))
+    pairs = [(a, b) for a, b in zip(starts, ends, strict=True) if b - a >= MIN_ROWS]
+    width = len(str(len(pairs)))
+    return tuple(
+        _log(table.rows(slice(a, b)), layout, f"{_name(path, root)}#{k:0{width}d}", surface, load)
+        for k, (a, b) in enumerate(pairs, start=1)
+    )
+
+
+def find_logs(root: Path, pattern: str) -> list[Path]:
+    """Files under `root` that match a glob, sorted by name.
+
+    Raises:
+        DataError: where none matches; names the folders and files next to it.
+    """
+    if not root.is_dir():
+        raise DataError(f"{root}: no such folder; expected the folder of the logs")
+    found = sorted(p for p in root.glob(pattern) if p.is_file())
+    if found:
+        return found
+    nearest = root
+    for part in Path(pattern).parts[:-1]:
+        if not (nearest / part).is_dir():
+            break
+        nearest = nearest / part
+    inside = sorted(p.name + ("/" if p.is_dir() else "") for p in nearest.iterdir())
+    listed = ", ".join(inside[:8]) + (", ..." if len(inside) > 8 else "")
+    raise DataError(
+        f"{root}: no file matches '{pattern}'; expected at least one "
+        f"({nearest} has {listed or 'nothing in it'})"
+    )
+
+
+def _name(path: Path, root: Path | None) -> str:
+    try:
+        return path.relative_to(root or path.parent).as_posix()
+    except ValueError:
+        return path.name
+
+
+def _run_starts(table: Table, layout: Layout) -> list[int]:
+    if layout.new_run == "time_restarts":
+        time = table.stacked(layout.channels["time"])[:, 0]
+        return [0, *(np.flatnonzero(np.diff(time) <= 0) + 1).tolist()]
+    if layout.new_run == "ticks_restart":
+        # A run that only drives away from its start counts up in magnitude on its fastest wheel.
+        far = np.abs(table.stacked(layout.channels["wheel_ticks"])).max(axis=1)
+        return [0, *(np.flatnonzero(far[1:] < far[:-1]) + 1).tolist()]
+    return [0]
+
+
+def _log(table: Table, layout: Layout, name: str, surface: str | None, load: str) -> Log:
+    """Convert a table that holds one run."""
+    notes: list[str] = []
+    time = _time(table, layout)
+    check_time(table, layout, time)
+    have = {
+        channel: _channel(table, layout, channel, time, notes)
+        for channel in layout.channels
+        if channel != "time"
+    }
+    pose, fresh = _pose(table, layout, have)
+    log = Log(
+        name=name,
+        path=table.path,
+        sha256=table.sha256,
+        time=time,
+        wheel_angle=_wheel_angle(layout, have, time, notes),
+        wheel_speed=_at_wheel(layout, have, "speed"),
+        wheel_speed_command=_at_wheel(layout, have, "speed_command"),
+        twist_command=_twist(have, len(time)),
+        current=have.get("current"),
+        current_is_signed=layout.current_is_signed,
+        voltage=have.get("voltage"),
+        duty=have.get("duty"),
+        bus_voltage=_single(have, "bus_voltage"),
+        gyro=_single(have, "gyro"),
+        pose=pose,
+        pose_fresh=fresh,
+        surface=surface,
+        load=load,
+        notes=tuple(notes),
+    )
+    check_log(log, table, layout)
+    return log
+
+
+def _time(table: Table, layout: Layout) -> Float[np.ndarray, " row"]:
+    if "time" not in layout.channels:
+        return np.arange(len(table.values)) * float(layout.row_period or 1.0)
+    channel = layout.channels["time"]
+    cells = table.stacked(channel)
+    return ((cells * channel.scale + channel.offset) * layout.to_si("time"))[:, 0]
+
+
+def _channel(
+    table: Table, layout: Layout, name: str, time: Float[np.ndarray, " row"], notes: list[str]
+) -> Float[np.ndarray, "row column"]:
+    """A channel in SI units, short gaps filled."""
+    channel = layout.channels[name]
+    cells = filled(table, channel.columns, table.stacked(channel), time, notes)
+    if name == "wheel_ticks" and not layout.ticks_are_increments:
+        cells = unwrapped_ticks(cells, layout.tick_bits, notes)
+    return (cells * channel.scale + channel.offset) * layout.to_si(name)
+
+
+def _wheel_angle(
+    layout: Layout,
+    have: dict[str, np.ndarray],
+    time: Float[np.ndarray, " row"],
+    notes: list[str],
+) -> Float[np.ndarray, "row wheel"]:
+    """Cumulative angle at the wheel: from ticks, else angles, else the integral of the speed."""
+    if "wheel_ticks" in have:
+        ticks = have["wheel_ticks"]
+        ticks = np.cumsum(ticks, axis=0) if layout.ticks_are_increments else ticks
+        per_turn = float(layout.ticks_per_revolution or 1.0) * layout.gear_ratio
+        angle = ticks * (2.0 * np.pi / per_turn)
+    elif "wheel_angle" in have:
+        angle = have["wheel_angle"]
+    elif "motor_angle" in have:
+        angle = have["motor_angle"] / layout.gear_ratio
+    elif (speed := _at_wheel(layout, have, "speed")) is not None:
+        angle = integral(time, speed)
+        notes.append("wheel angle integrated from the reported speed")
+    else:
+        return np.zeros((len(time), 0))
+    return angle - angle[0]
+
+
+def _at_wheel(layout: Layout, have: dict[str, np.ndarray], what: str) -> np.ndarray | None:
+    if f"wheel_{what}" in have:
+        return have[f"wheel_{what}"]
+    if f"motor_{what}" in have:
+        return have[f"motor_{what}"] / layout.gear_ratio
+    return None
+
+
+def _twist(have: dict[str, np.ndarray], rows: int) -> np.ndarray | None:
+    parts = [have.get(f"twist_command_{axis}") for axis in ("x", "y", "yaw")]
+    if all(part is None for part in parts):
+        return None
+    return np.concatenate([np.zeros((rows, 1)) if p is None else p for p in parts], axis=1)
+
+
+def _single(have: dict[str, np.ndarray], name: str) -> np.ndarray | None:
+    return have[name][:, 0] if name in have else None
+
+
+def _pose(
+    table: Table, layout: Layout, have: dict[str, np.ndarray]
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Pose with the heading unwrapped, and which rows bring a new camera frame."""
+    if "pose_x" not in have:
+        return None, None
+    names = [layout.channels[f"pose_{part}"].columns[0] for part in ("x", "y", "heading")]
+    cells = np.column_stack([table[name] for name in names])
+    fresh = np.ones(len(cells), dtype=bool)
+    fresh[1:] = np.any(np.diff(cells, axis=0) != 0, axis=1)
+    fresh &= ~np.isnan(cells).any(axis=1)
+    pose = np.concatenate([have["pose_x"], have["pose_y"], have["pose_heading"]], axis=1)
+    pose[:, 2] = np.unwrap(pose[:, 2])
+    return pose, fresh

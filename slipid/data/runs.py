@@ -1,0 +1,178 @@
+"""Many ragged runs as one set of flat arrays."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from slipid.data.log import Log
+from slipid.data.signals.wheel_signals import MOVED, bridge_stalls, first_moved
+from slipid.support.errors import DataError
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Runs laid end to end: one copy of the samples, each run a view.
+
+    Attributes:
+        logs: the runs; their arrays are views of the flat ones below, except for raw wheel angles
+            where a stall was bridged.
+        offset: sample at which each run starts, and the end of the last.
+        time: time within the run [s] (sample,).
+        wheel_angle: angle of each wheel [rad] (sample, wheel), stalls of the telemetry bridged.
+        pose: x [m], y [m], heading [rad], in the scale of the log.
+        fresh: False where the row repeats the last camera frame.
+        live: False in the rows of a stall, whose currents are stale.
+        current: motor currents [A], or None.
+        voltage: motor voltages [V], or None.
+        current_is_signed: False where some log has magnitudes only.
+        session: name of the time in which the marker stayed as it was, for each run.
+        heading: direction of travel that was commanded, for each run [rad]; nan where it turns.
+        speed: commanded speed of each run [m/s]; nan where no command was logged.
+        turn: commanded yaw rate of each run [rad/s]; nan where no command was logged.
+    """
+
+    logs: tuple[Log, ...]
+    offset: Int[np.ndarray, " runs_and_one"]
+    time: Float[np.ndarray, " sample"]
+    wheel_angle: Float[np.ndarray, "sample wheel"]
+    pose: Float[np.ndarray, "sample 3"]
+    fresh: Bool[np.ndarray, " sample"]
+    live: Bool[np.ndarray, " sample"]
+    current: Float[np.ndarray, "sample wheel"] | None
+    voltage: Float[np.ndarray, "sample wheel"] | None
+    current_is_signed: bool
+    session: tuple[str, ...]
+    heading: Float[np.ndarray, " run"]
+    speed: Float[np.ndarray, " run"]
+    turn: Float[np.ndarray, " run"]
+
+    def __len__(self) -> int:
+        return len(self.logs)
+
+    def rows(self, run: int) -> slice:
+        """Samples of one run in the flat arrays."""
+        return slice(int(self.offset[run]), int(self.offset[run + 1]))
+
+    def subset(self, keep: Iterable[int] | np.ndarray) -> "Runs":
+        """Some of the runs, in the order given."""
+        index, session = [int(k) for k in keep], self._sessions()
+        return collect([self.logs[i] for i in index], session=lambda log: session[log.name])
+
+    def __add__(self, other: "Runs") -> "Runs":
+        """Runs of both.
+
+        Raises:
+            DataError: a run is in both, or they do not go together.
+        """
+        mine, others = self._sessions(), other._sessions()
+        if both := mine.keys() & others.keys():
+            raise DataError(f"{min(both)}: in both sets of runs; expected it once")
+        session = mine | others
+        return collect([*self.logs, *other.logs], session=lambda log: session[log.name])
+
+    def _sessions(self) -> dict[str, str]:
+        return {log.name: name for log, name in zip(self.logs, self.session, strict=True)}
+
+
+def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) -> Runs:
+    """One set of runs that all have wheels and poses.
+
+    Args:
+        logs: as read.
+        session: name of the time in which the marker stayed as it was; by default surface, load and
+            commanded speed, which is how test grids are driven.
+
+    Raises:
+        DataError: no run, different wheel counts, a run without pose.
+    """
+    if not logs:
+        raise DataError("no runs; expected at least one log")
+    for log in logs:
+        if log.wheels != logs[0].wheels:
+            raise DataError(
+                f"{log.name}: {log.wheels} wheels; expected {logs[0].wheels}, as in {logs[0].name}"
+            )
+        if log.pose is None:
+            raise DataError(
+                f"{log.name}: no pose; expected camera columns, there is nothing to fit without"
+            )
+    pick = session or default_session
+    offset = np.concatenate([[0], np.cumsum([log.samples for log in logs])])
+    commands = [_command(log) for log in logs]
+
+    bridged = [bridge_stalls(log.time, log.wheel_angle) for log in logs]
+    flat: dict[str, np.ndarray] = {}
+    for name in ("time", "pose", "current", "voltage"):
+        parts = [getattr(log, name) for log in logs]
+        if not any(p is None for p in parts):
+            flat[name] = np.concatenate(parts)
+    flat["wheel_angle"] = np.concatenate([angle for angle, _ in bridged])
+    flat["pose_fresh"] = np.concatenate(
+        [np.ones(log.samples, bool) if log.pose_fresh is None else log.pose_fresh for log in logs]
+    )
+
+    def view(k: int, log: Log) -> Log:
+        """The run with its arrays in the flat ones; a bridged one keeps its raw wheel angle."""
+        raw = bridged[k][0] is not log.wheel_angle
+        rows = slice(int(offset[k]), int(offset[k + 1]))
+        mine = {n: a[rows] for n, a in flat.items() if not (raw and n == "wheel_angle")}
+        return replace(log, **mine)  # type: ignore[arg-type]
+
+    return Runs(
+        logs=tuple(view(k, log) for k, log in enumerate(logs)),
+        offset=offset,
+        time=flat["time"],
+        wheel_angle=flat["wheel_angle"],
+        pose=flat["pose"],
+        fresh=flat["pose_fresh"],
+        live=np.concatenate([~stalled for _, stalled in bridged]),
+        current=flat.get("current"),
+        voltage=flat.get("voltage"),
+        current_is_signed=all(log.current_is_signed for log in logs),
+        session=tuple(pick(log) for log in logs),
+        heading=np.array([c.heading for c in commands]),
+        speed=np.array([c.speed for c in commands]),
+        turn=np.array([c.turn for c in commands]),
+    )
+
+
+def default_session(log: Log) -> str:
+    """`surface/load/speed`, the speed to 0.01 m/s and left out where nothing was commanded."""
+    speed = _command(log).speed
+    parts = [log.surface or "unknown", log.load] + ([f"{speed:.2f}"] if np.isfinite(speed) else [])
+    return "/".join(parts)
+
+
+class _Command(NamedTuple):
+    """What a run was asked to do: heading [rad], speed [m/s], yaw rate [rad/s]; nan if unknown."""
+
+    heading: float
+    speed: float
+    turn: float
+
+
+def _command(log: Log) -> _Command:
+    """Median command; it has no heading where the robot is to turn on the spot."""
+    if log.twist_command is None:
+        return _Command(np.nan, np.nan, np.nan)
+    x, y, turn = np.median(log.twist_command, axis=0).tolist()
+    speed = float(np.hypot(x, y))
+    return _Command(float(np.arctan2(y, x)) if speed > 1e-4 else np.nan, speed, turn)
+
+
+def first_row(data: Runs, run: int, wheel_radius: float) -> int:
+    """Row of the run in which the fastest wheel's rim has moved `MOVED`.
+
+    Raises:
+        DataError: it never does.
+    """
+    first = first_moved(data.wheel_angle[data.rows(run)], wheel_radius)
+    if first is None:
+        raise DataError(
+            f"{data.logs[run].name}: no wheel moves {MOVED * 1000:.0f} mm; "
+            "expected a run in which the robot drives"
+        )
+    return first

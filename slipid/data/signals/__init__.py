@@ -1,0 +1,1 @@
+"""Speeds, stalls, lags and the order of wheels, from raw channels."""

@@ -1,0 +1,132 @@
+"""Signals of one run: wheel speed from angles, stalls of the telemetry, start, quantisation."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+
+def interpolate(
+    time: Float[np.ndarray, " time"],
+    values: Float[np.ndarray, " time"] | Float[np.ndarray, "time column"],
+    at: Float[np.ndarray, " at"],
+) -> Float[np.ndarray, " at"] | Float[np.ndarray, "at column"]:
+    """Values at other times, linear in between, constant beyond both ends.
+
+    Args:
+        time: [s], increasing.
+        values: one or several columns, one row per time; angles without wrap-around.
+        at: [s].
+    """
+    after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
+    before = after - 1
+    share = np.clip((at - time[before]) / (time[after] - time[before]), 0.0, 1.0)
+    share = share.reshape(-1, *([1] * (values.ndim - 1)))
+    return values[before] + share * (values[after] - values[before])
+
+
+def wheel_speed(
+    time: Float[np.ndarray, " time"],
+    wheel_angle: Float[np.ndarray, "time wheel"],
+    half_window: float = 0.1,
+) -> Float[np.ndarray, "time wheel"]:
+    """Speed of each wheel [rad/s]: slope of the line fitted to its angle around every row.
+
+        w(t) = sum (s - s_mean) angle(s) / sum (s - s_mean)^2     over |s - t| <= half_window
+
+    Firmware updates the counters at its own pace, so that steps from row to row alternate two to
+    one; the fit over a centred window is blind to that. Windows hold at least three rows.
+
+    Args:
+        time: [s].
+        wheel_angle: [rad].
+        half_window: [s]; longer smooths more.
+    """
+    rows = np.arange(len(time))
+    slack = 1e-9 * max(half_window, 1.0)
+    first = np.minimum(np.searchsorted(time, time - half_window - slack), np.maximum(rows - 1, 0))
+    last = np.searchsorted(time, time + half_window + slack, side="right")
+    last = np.maximum(last, np.minimum(rows + 2, len(time)))
+    # Sums over windows as differences of cumulative sums, about the middle to keep the digits.
+    s = time - time.mean()
+    angle = wheel_angle - wheel_angle.mean(axis=0)
+
+    def windowed(values: np.ndarray) -> np.ndarray:
+        total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+        return total[last] - total[first]
+
+    n = (last - first)[:, None].astype(float)
+    s = s[:, None]
+    s_sum, s_square = windowed(s), windowed(s * s)
+    return (windowed(s * angle) - s_sum * windowed(angle) / n) / (s_square - s_sum**2 / n)
+
+
+def bridge_stalls(
+    time: Float[np.ndarray, " time"],
+    wheel_angle: Float[np.ndarray, "time wheel"],
+    min_rows: int = 3,
+) -> tuple[Float[np.ndarray, "time wheel"], Bool[np.ndarray, " time"]]:
+    """Wheel angle with stalls of the telemetry bridged, and the rows in which it was stalled.
+
+    A stall is a stretch in which no wheel's angle changes and that ends in one step as large as the
+    motion missed: the radio froze, not the wheels. The angle is made linear across it; speeds and
+    currents reported in the marked rows are as stale as the angle was.
+
+    Args:
+        time: [s].
+        wheel_angle: [rad].
+        min_rows: steps without change from which a stretch can be a stall.
+    """
+    stalled = np.zeros(len(time), dtype=bool)
+    step = np.abs(np.diff(wheel_angle, axis=0)).max(axis=1, initial=0.0)
+    if not step.any():
+        return wheel_angle, stalled
+    usual = float(np.median(step[step > 0]))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], step == 0, [0]]).astype(np.int8)))
+    bridged = wheel_angle
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        # Rows start..end hold the same angle; row end + 1 is the burst.
+        if end - start < min_rows or end == len(step) or start == 0:
+            continue
+        if step[end] < 0.5 * (end - start + 1) * min(usual, step[start - 1]):
+            continue
+        if bridged is wheel_angle:
+            bridged = wheel_angle.copy()
+        inside = slice(start + 1, end + 1)
+        ends = np.array([start, end + 1])
+        bridged[inside] = interpolate(time[ends], wheel_angle[ends], time[inside])
+        stalled[inside] = True
+    return bridged, stalled
+
+
+MOVED = 0.010
+"""A run counts from where the fastest wheel's rim has moved this far [m]."""
+
+
+def first_moved(
+    wheel_angle: Float[np.ndarray, "time wheel"], radius: float, distance: float = MOVED
+) -> int | None:
+    """First row by which some wheel's rim has moved the distance [m]; None where none ever does."""
+    rim = radius * np.abs(wheel_angle - wheel_angle[:1]).max(axis=1, initial=0.0)
+    moved = np.flatnonzero(rim >= distance)
+    return int(moved[0]) if len(moved) else None
+
+
+def quantum(values: Float[np.ndarray, " time"]) -> float | None:
+    """Step of a quantised column, in its own unit; None where the values are not on a grid.
+
+    All distinct values must be whole multiples of it, to 2 % of a step; digits lost in printing are
+    averaged out by a line through the origin. Levels next to each other need not both occur: the
+    smallest gap may be up to four steps.
+    """
+    levels = np.unique(values)
+    levels = levels - levels[np.argmin(np.abs(levels))] if len(levels) else levels
+    if len(levels) < 3 or len(levels) > 0.5 * len(values):
+        return None
+    gap = float(np.diff(levels).min())
+    for parts in (1, 2, 3, 4):
+        step = gap / parts
+        for _ in range(3):
+            multiples = np.round(levels / step)
+            step = float(levels @ multiples / (multiples @ multiples))
+        if float(np.abs(levels / step - multiples).max()) < 0.02:
+            return step
+    return None

@@ -1,0 +1,196 @@
+"""Pieces of runs as windows, which a likelihood sums over."""
+
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from slipid.data.runs import Runs, first_row
+from slipid.support.errors import DataError
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Pieces of K neighbouring windows; a short run is one piece, a long one is cut.
+
+    Attributes:
+        run: number of the run that each piece is cut from (piece,).
+        surface, load, session: their names for each piece.
+        dt: length of each window [s] (piece, window).
+        turn: rotation of each wheel in the window [rad] (piece, window, wheel), at lag `lag`.
+        faster: wheel speed at its end less that at its start [rad/s]; d turn / d lag = -faster.
+        pose: pose at the edges of the windows (piece, window + 1, 3), as logged.
+        current: mean of the signed current or of its magnitude [A]; zeros where not logged.
+        voltage: mean voltage [V]; zeros where not logged.
+        current_var: variance of the mean current [A^2].
+        has_current, has_voltage: whether they were logged.
+        current_is_signed: False where `current` is a mean of magnitudes.
+        lag: lag of the camera behind the encoders that was assumed [s].
+    """
+
+    run: Int[np.ndarray, " piece"]
+    surface: tuple[str, ...]
+    load: tuple[str, ...]
+    session: tuple[str, ...]
+    dt: Float[np.ndarray, "piece window"]
+    turn: Float[np.ndarray, "piece window wheel"]
+    faster: Float[np.ndarray, "piece window wheel"]
+    pose: Float[np.ndarray, "piece edge 3"]
+    current: Float[np.ndarray, "piece window wheel"]
+    voltage: Float[np.ndarray, "piece window wheel"]
+    current_var: Float[np.ndarray, "piece window wheel"]
+    has_current: bool
+    has_voltage: bool
+    current_is_signed: bool
+    lag: float
+
+    def __len__(self) -> int:
+        return len(self.run)
+
+    def pieces(self, index: Int[np.ndarray, " some"]) -> "Windows":
+        """Some pieces, in the order given."""
+        kept = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                kept[field.name] = value[index]
+            elif isinstance(value, tuple):
+                kept[field.name] = tuple(value[i] for i in index)
+        return replace(self, **kept)
+
+    def at_lag(self, lag: float) -> "Windows":
+        """The same windows at another lag of the camera, to first order [s]."""
+        return replace(self, turn=self.turn - (lag - self.lag) * self.faster, lag=lag)
+
+    def of_runs(self, run: Int[np.ndarray, " piece"]) -> "Windows":
+        """The same pieces under other run numbers: those of the set they are a part of."""
+        return replace(self, run=run)
+
+
+def windows(
+    data: Runs,
+    wheel_radius: float,
+    lag: float = 0.0,
+    per_piece: int = 4,
+    longest: float = 6.0,
+) -> Windows:
+    """Cut every run from where it has moved `MOVED` into pieces of `per_piece` windows.
+
+    Args:
+        data: the runs.
+        wheel_radius: radius of the wheels [m]; it only tells where motion starts.
+        lag: lag of the camera behind the encoders [s].
+        per_piece: number of windows in a piece.
+        longest: longest window [s]; a longer run makes more pieces.
+
+    Raises:
+        DataError: a run whose wheels never move that far, or too short for its windows.
+    """
+    pieces: list[_Piece] = []
+    run: list[int] = []
+    for k in range(len(data)):
+        for edges in _edges(data, k, wheel_radius, per_piece, longest):
+            pieces.append(_cut(data, k, edges, lag))
+            run.append(k)
+    together = _Piece(*(np.stack(part) for part in zip(*pieces, strict=True)))
+    logs = [data.logs[k] for k in run]
+    return Windows(
+        run=np.asarray(run),
+        surface=tuple(log.surface or "unknown" for log in logs),
+        load=tuple(log.load for log in logs),
+        session=tuple(data.session[k] for k in run),
+        **together._asdict(),
+        has_current=data.current is not None,
+        has_voltage=data.voltage is not None,
+        current_is_signed=data.current_is_signed,
+        lag=lag,
+    )
+
+
+def _edges(data: Runs, run: int, radius: float, per_piece: int, longest: float) -> list[np.ndarray]:
+    """Rows at the window edges of each piece of a run; only rows with a new camera frame."""
+    first = first_row(data, run, radius)
+    fresh = np.flatnonzero(data.fresh[data.rows(run)])
+    fresh = fresh[fresh >= first]
+    if len(fresh) < per_piece + 1:
+        raise DataError(
+            f"{data.logs[run].name}: {len(fresh)} camera frames after the robot started; "
+            f"expected at least {per_piece + 1}"
+        )
+    t = data.time[data.rows(run)][fresh]
+    pieces = max(1, int(np.ceil((t[-1] - t[0]) / (per_piece * longest) - 1e-9)))
+    count = min(pieces * per_piece, (len(fresh) - 1) // per_piece * per_piece)
+    at = np.linspace(t[0], t[-1], count + 1)
+    picked = np.searchsorted(t, at - 1e-12).clip(0, len(t) - 1)
+    earlier = (picked - 1).clip(0)
+    picked = np.where(np.abs(t[earlier] - at) < np.abs(t[picked] - at), earlier, picked)
+    if (np.diff(picked) <= 0).any():
+        picked = np.linspace(0, len(fresh) - 1, count + 1).round().astype(int)
+    rows = fresh[picked]
+    return [rows[k : k + per_piece + 1] for k in range(0, count, per_piece)]
+
+
+class _Piece(NamedTuple):
+    """What `Windows` holds of one piece, under the same names; of many, stacked."""
+
+    dt: np.ndarray
+    turn: np.ndarray
+    faster: np.ndarray
+    pose: np.ndarray
+    current: np.ndarray
+    voltage: np.ndarray
+    current_var: np.ndarray
+
+
+def _cut(data: Runs, run: int, edges: Int[np.ndarray, " edge"], lag: float) -> _Piece:
+    """Windows between some rows of a run."""
+    rows = data.rows(run)
+    t, angle = data.time[rows], data.wheel_angle[rows]
+    at = t[edges] - lag
+    half = 0.08  # a speed over 0.16 s: shorter shows the encoder's uneven updates
+    turned, ahead, behind = (_interpolated(t, angle, when) for when in (at, at + half, at - half))
+    span = np.clip(at + half, t[0], t[-1]) - np.clip(at - half, t[0], t[-1])
+    speed = (ahead - behind) / np.maximum(span, 1e-3)[:, None]
+    first = np.searchsorted(t, at[:-1])
+    end = np.maximum(np.searchsorted(t, at[1:]), first + 1)
+    zero = np.zeros((len(edges) - 1, angle.shape[1]))
+    live = data.live[rows].astype(float)[:, None]
+    mean_current = variance = mean_voltage = zero
+    if data.current is not None:
+        amps = data.current[rows]
+        amps = amps if data.current_is_signed else np.abs(amps)
+        mean_current, variance = _mean(amps, live, first, end)
+    if data.voltage is not None:
+        mean_voltage, _ = _mean(data.voltage[rows], live, first, end)
+    return _Piece(
+        dt=np.diff(t[edges]),
+        turn=np.diff(turned, axis=0),
+        faster=np.diff(speed, axis=0),
+        pose=data.pose[rows][edges],
+        current=mean_current,
+        voltage=mean_voltage,
+        current_var=variance,
+    )
+
+
+def _interpolated(time: np.ndarray, angle: np.ndarray, at: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(at, time, column) for column in angle.T], axis=-1)
+
+
+def _mean(
+    x: np.ndarray, live: np.ndarray, lo: np.ndarray, hi: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over the live rows lo..hi of each window, and the variance of that mean."""
+
+    def total(values: np.ndarray) -> np.ndarray:
+        summed = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+        return np.asarray(summed[hi] - summed[lo])
+
+    lo, hi = np.minimum(lo, len(x) - 1), np.minimum(hi, len(x))
+    hi = np.maximum(hi, lo + 1)
+    if (total(live) < 1).any():
+        live = np.ones_like(live)
+    n = total(live)
+    mean = total(x * live) / n
+    return mean, np.maximum(total(x * x * live) / n - mean**2, 0.0) / n

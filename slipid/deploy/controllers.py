@@ -1,0 +1,96 @@
+"""The controllers of a trial, each a row of its table, and the gains they have."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from slipid.control.controller import Controller, Correction, Gains
+from slipid.control.deployed import DeployedRobot
+from slipid.control.estimator import Estimator
+from slipid.control.interface import AbstractEstimator, Settings
+from slipid.control.odometry import Odometry
+from slipid.control.pilot import Pilot
+from slipid.support.errors import DataError
+
+
+@dataclass(frozen=True)
+class Row:
+    """One controller of the trial.
+
+    Attributes:
+        observer: `encoder`, `curve` (slip over current, wheel by wheel) or `contact`.
+        correction: of the 2021 paper.
+        tuned: whether it has the gains of `slipid tune`, where there are any.
+        ahead: whether wheel speeds come from the inverse contact model, whatever the gains say.
+        gyro: whether the robot has one.
+        about: one sentence for people.
+    """
+
+    observer: str
+    about: str
+    correction: Correction = "none"
+    tuned: bool = False
+    ahead: bool = False
+    gyro: bool = False
+
+
+ROWS: Mapping[str, Row] = {
+    "encoder": Row("encoder", "believes its encoders"),
+    "slip_odometry": Row("curve", "odometry less slip over current (figure 5)"),
+    "paper_print": Row("curve", "and torque correction as printed", "paper_print"),
+    "paper_code": Row("curve", "and torque correction as its authors ran it", "paper_code"),
+    "torque": Row("curve", "and torque correction, corrected", "torque"),
+    "lyapunov": Row("contact", "the common pose loop, a Lyapunov law; gains set by hand"),
+    "contact_ahead": Row("contact", "and wheel speeds of the inverse contact model", ahead=True),
+    "contact": Row("contact", "as lyapunov, tuned gains where there are any", tuned=True),
+    "contact_gyro": Row("contact", "contact, with a gyro", tuned=True, gyro=True),
+}
+
+
+def gains_of(out: Path, robot: DeployedRobot) -> Gains:
+    """Gains that `slipid tune` found for a robot, else those set by hand.
+
+    Args:
+        out: folder of the robot.
+        robot: with the load set-up it is to drive with.
+
+    Raises:
+        DataError: there are gains, of other numbers or of another load set-up.
+    """
+    tuned, path = robot.record.gains, out / "gains.json"
+    if tuned is None and path.is_file():
+        raise DataError(
+            f"{path}: tuned for another fit; run slipid tune again, or remove it to drive with "
+            "gains set by hand"
+        )
+    if tuned is not None and tuned.load != robot.load_setup:
+        raise DataError(
+            f"{out / 'robot.json'}: gains were tuned for another load set-up ({tuned.load}); run "
+            f"slipid tune again with --load {robot.load_setup}"
+        )
+    return Gains.of(robot)
+
+
+def pilot_of(
+    robot: DeployedRobot, row: Row, gains: Gains, settings: Settings | None = None
+) -> Pilot[eqx.Module]:
+    """Estimator and controller of a row.
+
+    Args:
+        robot: the identified robot.
+        row: of the trial.
+        gains: tuned ones, which some rows have.
+        settings: of the estimator, by default the robot's.
+    """
+    own = gains if row.tuned else Gains()
+    if row.ahead:
+        own = replace(own, ahead=jnp.asarray(1.0))
+    estimator: AbstractEstimator[Any] = Estimator(robot, settings)
+    if row.observer != "contact":
+        estimator = Odometry(robot, settings, curve=row.observer == "curve")
+        own = replace(own, preview=jnp.asarray(0.0))  # the paper's loop has none
+    return Pilot(estimator, Controller(robot, own, correction=row.correction))

@@ -1,0 +1,179 @@
+"""From a fit, or its posterior, to robot.json, which is all that runs on the robot needs."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import fields, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.control.deployed import DeployedRobot
+from slipid.control.interface import MIXED
+from slipid.control.robot_file.record import Number, Seen, Sensors, Source
+from slipid.control.robot_file.typed import typed
+from slipid.control.tuning.actuation import Habits
+from slipid.deploy.record_of import About, given, record_of
+from slipid.identify.fit_file import number_json
+from slipid.identify.posterior.sample import Posterior
+from slipid.identify.result import Fit
+from slipid.identify.slip_curves import Validity
+from slipid.identify.verdicts.estimates import Estimate
+from slipid.job.drawn_estimates import estimates
+from slipid.model.robot import Robot
+from slipid.parameter import Choice, Space
+from slipid.support.errors import DataError
+from slipid.support.versions import versions
+
+ROBOT = "robot.json"
+DRAWS = 64
+"""Draws of the posterior that are kept."""
+
+
+def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
+    """The robot of a fit, with its first load set-up.
+
+    Its numbers are those of `identified.json`: of the posterior where there is one, else of the
+    fit's Laplace approximation. `DeployedRobot.record.source` says which.
+
+    Args:
+        fit: as `slipid identify` left it.
+        posterior: of `slipid sample`.
+
+    Raises:
+        ValueError: the wheels' kinematics have rank below 3.
+    """
+    source: Source = "laplace"
+    numbers, messages = fit.parameters, fit.messages
+    vectors = fit.draws(DRAWS)
+    if posterior is not None:
+        source, numbers = "posterior", estimates(fit, posterior)
+        flat = posterior.z.reshape(-1, fit.space.size)
+        rows = np.random.default_rng(0).choice(len(flat), DRAWS, replace=len(flat) < DRAWS)
+        vectors = flat[rows]
+        if not posterior.converged:
+            messages += (f"the posterior did not converge: {posterior.reason}",)
+    record = record_of(
+        _at(fit.robot, numbers),
+        {path: _number(e) for path, e in numbers.items()},
+        {name: float(v) ** 0.5 for name, v in fit.variance.items()},
+        jax.vmap(fit.space.tree)(jnp.asarray(vectors)),
+        _highest(fit),
+        fit.current_trend,
+        About(
+            source=source,
+            sensors=Sensors(
+                current_is_signed=bool(fit.settings["current_is_signed"]),
+                voltage=bool(fit.has["voltage"]),
+                gyro=False,
+            ),
+            # one that has learnt from runs over several floors expects to drive on several
+            alike=MIXED if "mixed" in fit.settings else About.alike,
+            messages=messages,
+            data=fit.data_hash,
+            versions=versions(),
+            seen={name: _seen(v) for name, v in fit.validity.items()},
+        ),
+    )
+    return DeployedRobot.of(record)
+
+
+def deploy_known(
+    robot: Robot,
+    load: str | None = None,
+    std: Mapping[str, float] | None = None,
+    draws: Robot | None = None,
+    highest_speed: float | None = None,
+    current_trend: tuple[float, float] = (0.0, 0.0),
+) -> DeployedRobot:
+    """A robot whose numbers are known without a fit; arguments as of `record_of`.
+
+    Raises:
+        ValueError: no such load set-up, or wheels whose kinematics have rank below 3.
+    """
+    numbers, noise = given(robot), {} if std is None else std
+    record = record_of(robot, numbers, noise, draws, highest_speed, current_trend)
+    return DeployedRobot.of(record, load)
+
+
+def write_robot(out: Path, fit: Fit, posterior: Posterior | None = None) -> tuple[str, ...]:
+    """Write robot.json beside a fit where its wheels allow a controller; names of files written.
+
+    Raises:
+        DataError: nothing can be written there.
+    """
+    try:
+        robot = deploy(fit, posterior)
+    except ValueError as error:
+        if isinstance(error, DataError):
+            raise
+        (out / ROBOT).unlink(missing_ok=True)
+        return ()
+    kept = out / ROBOT
+    with suppress(DataError):  # gains outlive a fit that came to the same numbers
+        before = DeployedRobot.load(kept).record if kept.is_file() else robot.record
+        if before.numbers == robot.record.numbers:
+            robot = DeployedRobot.of(replace(robot.record, gains=before.gains))
+    robot.save(kept)
+    return (ROBOT,)
+
+
+def read_robot(out: Path, load: str | None = None) -> DeployedRobot:
+    """The robot of a folder.
+
+    Raises:
+        DataError: there is none, it is damaged, or it has no such load set-up.
+    """
+    path = out / ROBOT
+    if not path.is_file():
+        raise DataError(
+            f"{path}: not there; `slipid identify` writes it (for wheels that determine x, y and "
+            "yaw), so run it again with --out " + str(out)
+        )
+    return DeployedRobot.load(path, load)
+
+
+def habits_of(robot: DeployedRobot, gyro: bool) -> Habits:
+    """What the twin of a robot has: the sensors of its logs.
+
+    Args:
+        robot: of robot.json.
+        gyro: whether the robot has one.
+    """
+    sensors = robot.record.sensors
+    return Habits(voltage=sensors.voltage, gyro=gyro, signed=sensors.current_is_signed)
+
+
+def _at(robot: Robot, numbers: Mapping[str, Estimate]) -> Robot:
+    """The robot with its numbers at their estimates."""
+    fixed = [Choice(_literal(path), fixed=e.value) for path, e in numbers.items()]
+    made: Robot = Space(robot, fixed).template
+    return made
+
+
+def _literal(path: str) -> str:
+    """A path as a pattern that matches it alone."""
+    return "".join(f"[{c}]" if c in "*?[" else c for c in path)
+
+
+def _number(e: Estimate) -> Number:
+    """As identified.json has it."""
+    kept = number_json(e)
+    return typed(Number, {f.name: _lists(kept[f.name]) for f in fields(Number)}, e.path)
+
+
+def _lists(value: object) -> object:
+    """As JSON would give it back."""
+    return [_lists(v) for v in value] if isinstance(value, tuple) else value
+
+
+def _seen(validity: Validity) -> Seen:
+    """What a floor was seen with, as robot.json has it."""
+    return Seen(**vars(validity))
+
+
+def _highest(fit: Fit) -> float | None:
+    """Largest wheel speed of the fitted runs [rad/s]."""
+    seen = [max(v.wheel_speed) for v in fit.validity.values()]
+    return max(seen) if seen else None

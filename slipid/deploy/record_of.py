@@ -1,0 +1,231 @@
+"""The record of a robot: its numbers as they are, and what the model makes of them once for all."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import reduce
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from slipid.control.robot_file.record import (
+    Axes,
+    FloorRecord,
+    LoadRecord,
+    Number,
+    Numbers,
+    Pair,
+    RobotRecord,
+    Seen,
+    Sensors,
+    Source,
+    Wheels,
+)
+from slipid.model import contact
+from slipid.model.contact_law import ContactSurface
+from slipid.model.geometry import Frame
+from slipid.model.robot import GRAVITY, Robot
+from slipid.parameter import entries
+
+AXES = ("along", "across", "yaw")
+FASTEST = 20.0
+"""Wheel speed that counts as seen where nothing is known of it [rad/s]."""
+NO_SENSORS = Sensors(current_is_signed=False, voltage=False, gyro=False)
+
+
+@dataclass(frozen=True)
+class About:
+    """What a record says beside the numbers; attributes as of `RobotRecord`.
+
+    Attributes:
+        seen: by floor.
+    """
+
+    source: Source = "given"
+    sensors: Sensors = NO_SENSORS
+    alike: float = 3.0
+    messages: tuple[str, ...] = ()
+    data: str | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
+    seen: Mapping[str, Seen] = field(default_factory=dict)
+
+
+def record_of(
+    robot: Robot,
+    numbers: Mapping[str, Number],
+    std: Mapping[str, float],
+    draws: Robot | None = None,
+    highest_speed: float | None = None,
+    current_trend: tuple[float, float] = (0.0, 0.0),
+    about: About = About(),
+) -> RobotRecord:
+    """The record of a robot.
+
+    Args:
+        robot: with every number at its value in `numbers`.
+        numbers: by path; those that the deployed robot does not need, the camera's, are left out.
+        std: of every variance component by name, as fit.json has them (`process.gray.along`).
+        draws: the robot's posterior as a batched tree (leading axis), for what the uncertainty of
+            the numbers adds to the effects; None for nothing.
+        highest_speed: of the wheels in the fitted runs [rad/s].
+        current_trend: of currents over the model's in the fitted runs, all floors [A], [A s/m].
+        about: where it all comes from.
+    """
+    shape, top = robot.geometry, FASTEST if highest_speed is None else highest_speed
+    return RobotRecord(
+        source=about.source,
+        wheels=Wheels(
+            place=shape.place,
+            drive_angle=shape.drive_angle,
+            roller_angle=shape.roller_angle,
+            grips=shape.grips,
+            gear_ratio=shape.gear_ratio,
+        ),
+        parameters={p: n for p, n in numbers.items() if not p.startswith("camera.")},
+        floors=tuple(_floor(name, std, about.seen.get(name)) for name in robot.surfaces.labels),
+        loads=tuple(_load(robot, name, top, draws) for name in robot.body.loads),
+        current_trend=current_trend,
+        highest_speed=top,
+        sensors=about.sensors,
+        alike=about.alike,
+        messages=about.messages,
+        data=about.data,
+        versions=about.versions,
+        draws={} if draws is None else dict(_varied(robot, draws)),
+        gains=None,
+    )
+
+
+def given(robot: Robot) -> dict[str, Number]:
+    """The numbers of a robot as they were given, by path."""
+    return {
+        e.path: Number(
+            value=plain(np.asarray(e.get(robot))),
+            unit=e.declaration.unit,
+            std=None,
+            interval90=None,
+            verdict="fixed",
+            provenance="override",
+            source="given",
+        )
+        for e in entries(robot)
+    }
+
+
+def plain(value: np.ndarray) -> Numbers:
+    """A float, or a tuple of floats."""
+    return float(value.reshape(())) if value.size == 1 else tuple(float(v) for v in value)
+
+
+def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[Numbers, ...]]]:
+    """Paths and draws of all numbers that differ between draws, the camera's left out."""
+    for e in entries(robot):
+        leaf = np.asarray(reduce(getattr, e.leaf, draws))
+        rows = leaf if e.index is None else leaf[:, e.index]
+        if not e.path.startswith("camera.") and (rows != rows[0]).any():
+            yield e.path, tuple(plain(np.asarray(row)) for row in rows)
+
+
+def _floor(name: str, std: Mapping[str, float], seen: Seen | None) -> FloorRecord:
+    """What the model misses on a floor."""
+
+    def of(kind: str, default: Axes) -> np.ndarray:
+        return np.array(
+            [std.get(f"{kind}.{name}.{a}", d) for a, d in zip(AXES, default, strict=True)]
+        )
+
+    effect = np.sqrt(of("run", (0.01, 0.01, 0.03)) ** 2 + of("session", (0.0, 0.0, 0.0)) ** 2)
+    kinds = [std.get(f"current.{name}.{kind}", 0.05) for kind in ("window", "run")]
+    return FloorRecord(
+        name=name,
+        process=_axes(of("process", (0.005, 0.002, 0.01))),
+        effect=_axes(effect),
+        current_std=float((kinds[0] ** 2 + kinds[1] ** 2) ** 0.5),
+        seen=seen,
+    )
+
+
+def _axes(row: Sequence[float] | np.ndarray) -> Axes:
+    along, across, yaw = (float(x) for x in row)
+    return along, across, yaw
+
+
+def _load(robot: Robot, name: str, top: float, draws: Robot | None) -> LoadRecord:
+    """What depends on how the robot is loaded."""
+    frame, k = robot.geometry.frame(), jnp.asarray(robot.load_index(name))
+    speed, amps, slip = _circle(robot, frame, k, jnp.asarray(top))
+    curve = np.asarray(_wheel_curve(speed, amps, slip))
+    floors = len(robot.surfaces.labels)
+    spread = np.zeros((floors, 3)) if draws is None else np.asarray(_spread(draws, k))
+    pairs: list[Pair] = [(float(a), float(b)) for a, b in curve]
+    return LoadRecord(
+        name=name,
+        spread=tuple(_axes(row) for row in spread),
+        highest_current=float(jnp.max(jnp.abs(amps))),
+        wheel_curve=tuple(pairs),
+    )
+
+
+@eqx.filter_jit
+def _circle(robot: Robot, frame: Frame, load: Array, top: Array) -> tuple[Array, Array, Array]:
+    """Wheel speeds, currents, slip ratios on every floor in all directions (.., wheel)."""
+    angle = jnp.linspace(0.0, 2 * jnp.pi, 36, endpoint=False)
+    way = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
+    speed = way @ robot.geometry.forward().T / frame.radius
+    speed = jnp.stack([0.4 * top, 0.8 * top])[:, None, None] * speed / jnp.max(jnp.abs(speed))
+    rest = robot.body.load_share[load]
+
+    def one(w: Array, floor: ContactSurface) -> tuple[Array, Array]:
+        rim = frame.radius * w
+        xi = contact.equilibrium(rim, frame, floor, rest)
+        force = floor.friction * robot.body.mass * GRAVITY * frame.radius
+        torque = force * contact.forces(xi, rim, frame, floor, rest).traction
+        return robot.motor.current(torque, w), (rim - robot.geometry.forward() @ xi) / (
+            jnp.where(jnp.abs(rim) < 1e-9, 1e-9, rim)
+        )
+
+    flat = speed.reshape(-1, speed.shape[-1])
+    amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(robot.surfaces)
+    return jnp.broadcast_to(flat, amps.shape), amps, slip
+
+
+@eqx.filter_jit
+def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
+    """Least squares of the slip speed on a + b |I|, wheel by wheel, over all floors.
+
+    The 2021 paper's deployed form, its coefficients refitted; weighted by wheel speed, so that
+    wheels that hardly turn do not decide.
+    """
+    flat = [x.reshape(-1, x.shape[-1]) for x in (speed, jnp.abs(amps), slip)]
+
+    def wheel(w: Array, i: Array, s: Array) -> Array:
+        a = jnp.stack([w, w * i], axis=-1)
+        (p, q), (_, r) = a.T @ a
+        u, v = a.T @ (w * s)
+        det = p * r - q * q
+        return jnp.stack([(r * u - q * v) / det, (p * v - q * u) / det])
+
+    return jax.vmap(wheel, 1)(*flat)
+
+
+@eqx.filter_jit
+def _spread(draws: Robot, load: Array) -> Array:
+    """Std over posterior draws of the motion per metre, a row per floor (along, across, yaw)."""
+
+    def one(robot: Robot) -> Array:
+        frame = robot.geometry.frame()
+        angle = jnp.linspace(0.0, 2 * jnp.pi, 12, endpoint=False)
+        way = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
+        rim = 0.2 * way @ robot.geometry.forward().T
+        rest = robot.body.load_share[load]
+        xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
+            robot.surfaces
+        )
+        along = jnp.einsum("fkc,kc->fk", xi, way)
+        across = xi[..., 1] * way[:, 0] - xi[..., 0] * way[:, 1]
+        return jnp.stack([along, across, xi[..., 2]], axis=-1) / 0.2
+
+    seen = jax.vmap(one)(draws)
+    return jnp.sqrt(jnp.mean(jnp.var(seen, axis=0), axis=1))

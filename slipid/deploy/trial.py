@@ -1,0 +1,237 @@
+"""`slipid trial`: the rectangle of the 2021 paper's figure 7 with every controller, judged."""
+
+import os
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.control import closed_loop, trajectory
+from slipid.control.controller import Gains
+from slipid.control.deployed import DeployedRobot
+from slipid.control.interface import Settings
+from slipid.control.tuning.actuation import Habits
+from slipid.data.floor_map import FloorMap
+from slipid.data.map_file import read_map
+from slipid.deploy.controllers import ROWS, gains_of, pilot_of
+from slipid.deploy.deploy import habits_of, read_robot
+from slipid.deploy.trial_site import known_to_site, site, starts
+from slipid.deploy.trial_summary import Run, summaries
+from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.errors import DataError
+from slipid.support.files import write_json
+from slipid.support.jax_setup import setup_jax
+from slipid.support.progress import Reporter
+from slipid.support.versions import source_hash
+from slipid.support.workers import spread
+
+SCHEMA = "slipid.trial/1"
+FOLDER = "trial"
+"""Finished runs, below OUT."""
+REST_S = 1.0
+"""For which the robot stands before it drives: a gyro learns its zero [s]."""
+PLANTS = ("testsite", "twin")
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """One run of one controller from one start."""
+
+    name: str
+    row: str
+    start: tuple[float, float, float]
+    seed: int
+    plant: str
+    load: str
+    floor: FloorMap
+    robot: DeployedRobot
+    settings: Settings
+    habits: Habits
+    gains: Gains
+    kept: Checkpoint
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is asked of a trial.
+
+    Attributes:
+        plant: `testsite` (MuJoCo) or `twin` (the identified model itself).
+        map: file of a floor map; None for patches of the identified floors.
+        controllers: names of `ROWS`.
+        starts: how many.
+        load: name of the load set-up; None for the first.
+        jobs: processes at once.
+    """
+
+    plant: str = "testsite"
+    map: Path | None = None
+    controllers: tuple[str, ...] = tuple(ROWS)
+    starts: int = 20
+    load: str | None = None
+    jobs: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """End of a trial.
+
+    Attributes:
+        content: of trial.json.
+        paths: true poses of every run, by its name (step, 3).
+        floor: where it was driven.
+    """
+
+    content: dict[str, Any]
+    paths: Mapping[str, np.ndarray]
+    floor: FloorMap
+
+
+def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
+    """Drive every controller from every start, and write trial.json.
+
+    Runs that are done are kept, and not driven again as long as nothing they depend on changes.
+
+    Raises:
+        DataError: no fit, no such plant, controller, load or map, MuJoCo missing, or floors that
+            the plant or the fit does not know.
+    """
+    setup_jax(quiet=True)
+    jobs = _jobs(out, wish)
+    todo = [job for job in jobs if _driven(job) is None]
+    report.stage(f"driving {len(todo)} of {len(jobs)} runs")
+    with closing(spread(drive, todo, min(wish.jobs, max(len(todo), 1)))) as finished:
+        for done, (job, _) in enumerate(finished, 1):
+            report.advance(done, len(todo), f"{done} of {len(todo)}, {job.name}")
+    driven = {job.name: found for job in jobs if (found := _driven(job)) is not None}
+    runs = [run for run, _ in driven.values()]
+    table = summaries(runs)
+    content = {
+        "schema": SCHEMA,
+        "plant": wish.plant,
+        "map": "patches" if wish.map is None else str(wish.map),
+        "gains": _named(jobs[0].gains),
+        "closes_best": min(table, key=lambda name: table[name].median["closure_error_median"]),
+        "summary": {name: row.to_json() for name, row in table.items()},
+        "controllers": {name: ROWS[name].about for name in wish.controllers},
+        "runs": [run.to_json() for run in runs],
+    }
+    write_json(out / "trial.json", content)
+    return Driven(content, {name: path for name, (_, path) in driven.items()}, jobs[0].floor)
+
+
+def _jobs(out: Path, wish: Wish) -> list[Job]:
+    if wish.plant not in PLANTS:
+        raise DataError(f"no plant '{wish.plant}'; expected {' or '.join(PLANTS)}")
+    for name in wish.controllers:
+        if name not in ROWS:
+            raise DataError(f"no controller '{name}'; expected some of {', '.join(ROWS)}")
+    if not wish.controllers:
+        raise DataError(f"no controller; expected some of {', '.join(ROWS)}")
+    robot = jax.tree.map(np.asarray, read_robot(out, wish.load))
+    floor = site(robot) if wish.map is None else read_map(wish.map)
+    labels = robot.labels
+    if wish.plant == "twin":
+        for name in floor.surfaces:
+            if name not in labels:
+                raise DataError(f"{wish.map}: no surface '{name}'; identified: {', '.join(labels)}")
+    name = robot.load_setup
+    if wish.plant == "testsite":
+        known_to_site(floor, name, robot.wheels)
+    gains = jax.tree.map(np.asarray, gains_of(out, robot))
+    settings, habits = Settings.of(robot), habits_of(robot, gyro=False)
+    if wish.plant != "twin":  # the test site has the sensors it has, whatever the logs had
+        settings, habits = replace(settings, current_is_signed=False), Habits()
+    key = key_of(
+        *(wish.plant, name, _named(gains), settings, habits, *jax.tree.leaves(robot)),
+        *(floor.surfaces, floor.corner, floor.cell, floor.cells),
+        # runs of other code are not taken for this one's
+        source_hash("control", "model", "testsite", "data", "deploy"),
+    )
+    # trials of other gains or floors lie beside this one, so that going back to them costs nothing
+    kept = Checkpoint(out / FOLDER / key[:12] / f"of{wish.starts}", key)
+    return [
+        Job(
+            name=f"{row}/start{k:02d}",
+            row=row,
+            start=start,
+            seed=1000 + k,
+            plant=wish.plant,
+            load=name,
+            floor=floor,
+            robot=robot,
+            settings=settings,
+            habits=habits,
+            gains=gains,
+            kept=kept,
+        )
+        for row in wish.controllers
+        for k, start in enumerate(starts(wish.starts, floor))
+    ]
+
+
+def _named(gains: Gains) -> dict[str, float]:
+    return {f.name: float(getattr(gains, f.name)) for f in fields(gains)}
+
+
+def _driven(job: Job) -> tuple[Run, np.ndarray] | None:
+    """A run and its true poses; None where it has not been driven yet."""
+    run, path = job.kept.load_json(job.name), job.kept.load(job.name)
+    return None if run is None or path is None else (Run.of(run), path["pose"])
+
+
+def drive(job: Job) -> float:
+    """Drive one run and write its metrics and its path; how long it took [s]."""
+    _started()
+    row = ROWS[job.row]
+    robot, gains = jax.tree.map(jnp.asarray, (job.robot, job.gains))
+    path = trajectory.rectangle().moved(job.start).waiting(REST_S)
+    plant = _plant(job, row.gyro, robot)
+    pilot = pilot_of(robot, row, gains, job.settings)
+    course = closed_loop.drive(pilot, path, plant, job.start)
+    off = course.pose[-1] - course.believed[-1]
+    run = Run(
+        controller=job.row,
+        start=job.start,
+        seed=job.seed,
+        metrics=closed_loop.metrics(course),
+        believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
+    )
+    # the path first: a run that has metrics is done
+    path_of = {"time": course.time, "pose": course.pose, "believed": course.believed}
+    job.kept.save(job.name, path_of)
+    job.kept.save_json(job.name, run.to_json())
+    return float(course.time[-1])
+
+
+@lru_cache(maxsize=1)
+def _started() -> None:
+    setup_jax(quiet=True)
+
+
+def _plant(job: Job, gyro: bool, robot: DeployedRobot) -> closed_loop.Plant:
+    if job.plant == "twin":
+        from slipid.deploy.plants import twin
+
+        return twin(robot, job.floor, job.start, job.seed, replace(job.habits, gyro=gyro))
+    from slipid.deploy.plants import SitePlant
+
+    return SitePlant(job.floor, job.load, job.start, job.seed, gyro)
+
+
+def processes(jobs: int | None) -> int:
+    """How many at once."""
+    return jobs or os.cpu_count() or 1
+
+
+def names_of(text: str | None) -> tuple[str, ...]:
+    """Controllers of a list by commas, all of them by default."""
+    if text is None:
+        return tuple(ROWS)
+    return tuple(dict.fromkeys(t.strip() for t in text.split(",") if t.strip()))

@@ -1,0 +1,1 @@
+"""Slip models side by side on runs that none of them has seen."""

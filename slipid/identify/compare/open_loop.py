@@ -1,0 +1,199 @@
+"""Open loop: from the first pose on, where does a model say the robot went, and how sure is it?
+
+Everything is in the corrected metres of the fitted camera; the measured pose is used once, at the
+start.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.data.runs import Runs
+from slipid.data.windows import Windows, windows
+from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit.noise import travel
+from slipid.identify.fit.problem import DEGREES
+from slipid.model.robot import Robot
+from slipid.model.se2 import compose
+from slipid.parameter import Space
+
+STEP = 0.5
+"""Longest step of a replay [s]."""
+TOGETHER = 32
+"""Runs replayed in one call."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Paths of runs cut into the same number of steps.
+
+    Attributes:
+        run: number of each run in the dataset.
+        predicted, measured: marker poses in corrected metres (run, step + 1, 3).
+    """
+
+    run: np.ndarray
+    predicted: Float[np.ndarray, "run edge 3"]
+    measured: Float[np.ndarray, "run edge 3"]
+
+    @property
+    def gap(self) -> Float[np.ndarray, "run 3"]:
+        """Predicted less measured end pose."""
+        return self.predicted[:, -1] - self.measured[:, -1]
+
+    @property
+    def chord(self) -> Float[np.ndarray, " run"]:
+        """The camera's straight-line displacement [m]."""
+        return np.linalg.norm((self.measured[:, -1] - self.measured[:, 0])[:, :2], axis=1)
+
+
+def cuts(data: Runs, robot: Robot) -> list[Windows]:
+    """The runs, each as one piece of short steps, `TOGETHER` at a time.
+
+    Numbers of steps are powers of two and the last runs of a group are repeated to fill it up, so
+    that few shapes are compiled.
+    """
+    radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
+    groups: dict[int, list[int]] = {}
+    for k, log in enumerate(data.logs):
+        want = 2 ** int(np.ceil(np.log2(max(log.duration / STEP, 16))))
+        frames = int(data.fresh[data.rows(k)].sum())
+        while want > 1 and want > frames // 3:
+            want //= 2
+        groups.setdefault(want, []).append(k)
+    out = []
+    for steps, runs in sorted(groups.items()):
+        for first in range(0, len(runs), TOGETHER):
+            some = runs[first : first + TOGETHER]
+            w = windows(data.subset(some), radius, lag, per_piece=steps, longest=np.inf)
+            filled = np.minimum(np.arange(TOGETHER), len(w) - 1)
+            out.append(w.of_runs(np.asarray(some)[w.run]).pieces(filled))
+    return out
+
+
+@jax.jit
+def contact_increments(robot: Robot, b: lk.Batch) -> Float[Array, "piece window 3"]:
+    """Marker increments of the contact equilibrium."""
+    return lk.predict(robot, b).increment
+
+
+@jax.jit
+def corrected(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, "piece edge 3"]:
+    """Logged poses in corrected metres."""
+    return jax.vmap(jax.vmap(robot.camera.corrected))(pose)
+
+
+@jax.jit
+def chain(start: Float[Array, "piece 3"], step: Float[Array, "piece window 3"]) -> Array:
+    """Poses from a start pose and body-frame increments (piece, window + 1, 3)."""
+
+    def one(p: Array, steps: Array) -> Array:
+        _, poses = jax.lax.scan(lambda q, d: (compose(q, d),) * 2, p, steps)
+        return jnp.concatenate([p[None], poses])
+
+    return jax.vmap(one)(start, step)
+
+
+def follow(robot: Robot, w: Windows, increment: Float[np.ndarray, "piece window 3"]) -> Tracks:
+    """Tracks of a model that gives marker increments."""
+    pose = np.asarray(corrected(robot, jnp.asarray(w.pose)))
+    path = np.asarray(chain(jnp.asarray(pose[:, 0]), jnp.asarray(increment)))
+    return Tracks(w.run, path, pose)
+
+
+@jax.jit
+def _end(robot: Robot, b: lk.Batch, start: Array) -> Array:
+    return chain(start, lk.predict(robot, b).increment)[:, -1]
+
+
+@eqx.filter_jit
+def twist_end_jacobian(space: Space, z: Array, twist: Array, w: lk.Batch, start: Array) -> Array:
+    """Slope of the ends by the search vector where the body's twists are given (piece, 2, free)."""
+
+    def end(x: Array) -> Array:
+        return chain(start, lk.seen(space.tree(x), twist, w.dt, w.session))[:, -1, :2]
+
+    return jax.jacfwd(end)(z)
+
+
+@eqx.filter_jit
+def end_jacobian(space: Space, z: Array, b: lk.Batch, start: Array) -> Array:
+    """Derivative of the end pose (piece, 3) by the search vector, from given start poses."""
+    return jax.jacfwd(lambda x: _end(space.tree(x), b, start))(z)
+
+
+def end_covariance(
+    robot: Robot,
+    w: Windows,
+    tracks: Tracks,
+    variance: dict[str, float],
+    of_parameters: Float[np.ndarray, "piece 2 2"] | float = 0.0,
+) -> Float[np.ndarray, "piece 2 2"]:
+    """Covariance of the gap between predicted and measured end [m^2], scale matrix of a Student t.
+
+    Process noise, the run's own effect and its session's, camera noise at both ends and in the
+    start heading, and the parameters' uncertainty, each carried to the end along the predicted
+    path.
+    """
+    far, u = travel(w, robot)
+    p = tracks.predicted
+    cov = np.zeros((len(w), 2, 2)) + of_parameters
+    rest = p[:, -1:, :2] - p[:, 1:, :2]  # what a turn at each step moves
+    lever = np.stack([-rest[..., 1], rest[..., 0]], -1)
+    c, s = np.cos(p[:, :-1, 2]), np.sin(p[:, :-1, 2])
+
+    def world(v: np.ndarray) -> np.ndarray:
+        return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], -1)
+
+    across = np.stack([-u[..., 1], u[..., 0]], -1)
+    for name, axis in (("along", world(u)), ("across", world(across)), ("yaw", lever)):
+        v = np.array([variance[f"process.{f}.{name}"] for f in w.surface])
+        cov += np.einsum("n,nk,nki,nkj->nij", v, far, axis, axis)
+        shared = [variance.get(f"session.{f}.{name}", 0.0) for f in w.surface]
+        v = np.array([variance[f"run.{f}.{name}"] for f in w.surface]) + shared
+        whole = np.einsum("nk,nki->ni", far, axis)
+        cov += v[:, None, None] * whole[:, :, None] * whole[:, None, :]
+    all_way = p[:, -1, :2] - p[:, 0, :2]
+    turn = np.stack([-all_way[:, 1], all_way[:, 0]], -1)
+    cov += variance["camera.heading"] * turn[:, :, None] * turn[:, None, :]
+    cov += 2 * variance["camera.place"] * float(robot.camera.scale) ** 2 * np.eye(2)
+    return cov
+
+
+def parameter_covariance(
+    space: Space, z: np.ndarray, covariance: np.ndarray, w: Windows, tracks: Tracks
+) -> Float[np.ndarray, "piece 2 2"]:
+    """Part of the end's covariance that comes from the fitted numbers, linearised."""
+    b = lk.batch(w, space.template)
+    start = jnp.asarray(tracks.predicted[:, 0])
+    jac = np.asarray(end_jacobian(space, jnp.asarray(z), b, start))
+    return np.asarray(np.einsum("nip,pq,njq->nij", jac[:, :2], covariance, jac[:, :2]))
+
+
+def scores(
+    gap: Float[np.ndarray, "run 2"], cov: Float[np.ndarray, "run 2 2"] | None, seed: int = 0
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """Probability of the region whose edge each end lies on, and the energy score of each [m].
+
+    An end lies in the 90 % region where the first is at most 0.9. The predictive distribution is a
+    Student t with `DEGREES` degrees of freedom; without one (None) the energy score is the distance
+    itself, as for a point forecast.
+    Source: Gneiting and Raftery 2007, JASA 102, eq. 22.
+    """
+    if cov is None:
+        return None, np.linalg.norm(gap, axis=1)
+    from scipy.stats import f as fisher
+
+    q = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(cov), gap)
+    level = fisher.cdf(q / 2, 2, DEGREES)
+    rng = np.random.default_rng(seed)
+    count = 500
+    normal = rng.normal(size=(count, 2)) / np.sqrt(rng.chisquare(DEGREES, (count, 1)) / DEGREES)
+    draws = np.einsum("nij,kj->nki", np.linalg.cholesky(cov), normal)
+    near = np.linalg.norm(draws - gap[:, None], axis=2).mean(axis=1)
+    apart = np.linalg.norm(draws[:, : count // 2] - draws[:, count // 2 :], axis=2).mean(axis=1)
+    return level, near - 0.5 * apart

@@ -1,0 +1,191 @@
+"""Which model the left-out runs of a floor prefer, by how much, and whether they can tell."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from slipid.identify.compare.validation import Judged, Score, by_floor
+
+SURE, SMALL = 2.0, 4.0
+"""A difference counts from so many standard errors on, and so many nats over all runs together.
+
+Below four nats models predict alike, and the standard error of their difference is not to be relied
+on: one with an idle number more loses a little in every run.
+Source: Sivula, Magnusson, Matamoros and Vehtari 2020, arXiv:2008.10296.
+"""
+CLUSTER_DEG = 30.0
+"""Neighbouring headings share their errors (they are correlated by a half at 5 degrees, by nothing
+at 30): runs of one such sector are one observation of the clustered standard error."""
+NAMES = {"identified": "contact equilibrium"}
+
+
+def mean_error(
+    value: Float[np.ndarray, " run"], cluster: Int[np.ndarray, " run"]
+) -> tuple[float, float, float]:
+    """Mean, its standard error over runs, and that over clusters of runs.
+
+        se^2 = G / (G - 1) sum_g (sum_{i in g} (x_i - mean))^2 / n^2
+
+    Source: Cameron and Miller 2015, J. Human Resources 50, for a regression on a constant. With one
+    run, or one cluster, an error is not known and is nan.
+    """
+    n = len(value)
+    gap = value - value.mean()
+    sums = np.bincount(np.unique(cluster, return_inverse=True)[1], weights=gap)
+
+    def error(parts: np.ndarray) -> float:
+        g = len(parts)
+        return float(np.sqrt(g / (g - 1) * np.sum(parts**2)) / n) if g > 1 else float("nan")
+
+    return float(value.mean()), error(gap), error(sums)
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A model on a floor.
+
+    Attributes:
+        elpd: its score, see `ranking` [nats per run].
+        difference: to the best, `se` over runs, `se_clustered` over sectors of headings.
+        verdict: `best`, `tied` or `worse`.
+        endpoint_error: mean, with its clustered standard error.
+        energy_score: mean [m].
+        coverage50, coverage90: share of runs that ended in the regions of this probability.
+        heading_error_median_deg: at the end.
+    """
+
+    elpd: float
+    difference: float
+    se: float | None
+    se_clustered: float | None
+    verdict: str
+    endpoint_error: float
+    endpoint_error_se: float | None
+    energy_score: float
+    coverage50: float
+    coverage90: float
+    heading_error_median_deg: float
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The models on a floor.
+
+    Attributes:
+        runs, clusters: number of runs and of sectors of headings.
+        best: name of the best model.
+        sentence: what a reader should take home.
+        band50, band90: shares of runs in regions that honest forecasts have, see `band`.
+        models: every model by name.
+    """
+
+    runs: int
+    clusters: int
+    best: str
+    sentence: str
+    band50: tuple[float, float]
+    band90: tuple[float, float]
+    models: dict[str, Ranked]
+
+
+def clusters(runs: Sequence[Judged]) -> Int[np.ndarray, " run"]:
+    """Sector of heading of each run; a run without heading is by itself."""
+    alone = -1 - np.arange(len(runs))
+    way = [run.heading_deg for run in runs]
+    return np.array(
+        [
+            a if h is None else int((h % 360.0 + 1e-6) // CLUSTER_DEG)
+            for a, h in zip(alone, way, strict=True)
+        ]
+    )
+
+
+def ranking(runs: Sequence[Judged]) -> dict[str, Ranking]:
+    """Every floor: every model's score, its distance to the best, and who cannot be told from it.
+
+    The score is the expected log predictive density of a run's logged poses [nats per run], every
+    run predicted by a fit that has not seen it. A model is tied with the best where the difference
+    is less than `SURE` clustered standard errors or, over all runs, less than `SMALL` nats.
+    """
+    return {floor: _floor(floor, mine) for floor, mine in by_floor(runs).items()}
+
+
+def _floor(floor: str, runs: Sequence[Judged]) -> Ranking:
+    names, cluster = list(runs[0].models), clusters(runs)
+    scores = {m: [run.models[m] for run in runs] for m in names}
+    density = {m: np.array([s.log_density for s in scores[m]], float) for m in names}
+    best = max(names, key=lambda m: float(density[m].mean()))
+    models = {m: _ranked(scores[m], density[m] - density[best], m == best, cluster) for m in names}
+    return Ranking(
+        runs=len(runs),
+        clusters=len(np.unique(cluster)),
+        best=best,
+        sentence=sentence(floor, best, models),
+        band50=band(len(runs), 0.5),
+        band90=band(len(runs), 0.9),
+        models=models,
+    )
+
+
+def _ranked(
+    scores: Sequence[Score], behind: np.ndarray, is_best: bool, cluster: np.ndarray
+) -> Ranked:
+    """A model whose runs have these log densities less the best model's."""
+    difference, se, clustered = mean_error(behind, cluster)
+    far, _, far_se = mean_error(np.array([s.endpoint_error for s in scores]), cluster)
+    level = np.array([s.level for s in scores], float)
+    is_clear = abs(difference) >= SURE * clustered and abs(difference) * len(scores) >= SMALL
+    return Ranked(
+        elpd=float(np.mean([s.log_density for s in scores if s.log_density is not None])),
+        difference=difference,
+        se=_known(se),
+        se_clustered=_known(clustered),
+        verdict="best" if is_best else "worse" if is_clear else "tied",
+        endpoint_error=far,
+        endpoint_error_se=_known(far_se),
+        energy_score=float(np.mean([s.energy_score for s in scores])),
+        coverage50=float(np.mean(level <= 0.5)),
+        coverage90=float(np.mean(level <= 0.9)),
+        heading_error_median_deg=float(np.median([s.heading_error_deg for s in scores])),
+    )
+
+
+def band(runs: int, share: float) -> tuple[float, float]:
+    """Shares of runs in regions of this probability that 99 % of honest forecasts would have."""
+    from scipy.stats import binom
+
+    low, high = (float(binom.ppf(q, runs, share)) / runs for q in (0.005, 0.995))
+    return low, high
+
+
+def sentence(floor: str, best: str, models: Mapping[str, Ranked]) -> str:
+    """What a reader should take home of a floor."""
+    order = sorted((m for m in models if m != best), key=lambda m: -models[m].difference)
+    if not order:
+        return f"{floor}: nothing to compare {name_of(best)} with"
+    tied = [m for m in order if models[m].verdict == "tied"]
+    if tied:
+        said = " or ".join(f"{name_of(m)} ({_apart(models[m])})" for m in tied)
+        worse = [m for m in order if m not in tied]
+        rest = f"; worse: {name_of(worse[0])} ({_apart(models[worse[0]])})" if worse else ""
+        return f"{floor}: the data cannot tell {name_of(best)} from {said}{rest}"
+    return (
+        f"{floor}: {name_of(best)} is best; next {name_of(order[0])}, {_apart(models[order[0]])} "
+        "nats per run worse"
+    )
+
+
+def _apart(model: Ranked) -> str:
+    se = model.se_clustered
+    return f"{-model.difference:.1f} +- {'?' if se is None else format(se, '.1f')}"
+
+
+def name_of(model: str) -> str:
+    """Of a model in a sentence."""
+    return NAMES.get(model, model)
+
+
+def _known(x: float) -> float | None:
+    return x if np.isfinite(x) else None

@@ -1,0 +1,113 @@
+"""Does slip against current carry over to a floor it was not fitted on?
+
+One curve s = b0 + b1 |I| for all wheels, fitted to all floors but one and judged on that one,
+beside a constant fitted to the same floors and a curve fitted to the floor itself.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slipid.data.windows import Windows
+from slipid.identify.compare.slip_models import body_twist
+from slipid.model.robot import Robot
+
+LEAST = 0.2
+"""A wheel counts in a window where it turns at least this part of the fastest one."""
+VARIANTS: dict[str, tuple[float, bool, bool]] = {
+    "all": (LEAST, False, False),
+    "slower wheels too": (0.1, False, False),
+    "fast wheels only": (0.5, False, False),
+    "as built only": (LEAST, True, False),
+    "0 < s <= 1, I > 0.25 A only": (LEAST, False, True),
+}
+"""What may be chosen otherwise: least speed of a wheel, one load set-up, the 2021 paper's filter
+(which cuts the response off and so flatters what it leaves)."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Root mean squares of what a curve leaves of slip.
+
+    Attributes:
+        rows: over all rows.
+        floors: mean of the floors' own.
+        each: of every floor.
+    """
+
+    rows: float
+    floors: float
+    each: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """One choice of rows: how slip is predicted on a floor that was not fitted.
+
+    Attributes:
+        pooled: by the curve of the other floors.
+        constant: by their mean slip.
+        per_surface: by the floor's own curve.
+        count: rows.
+    """
+
+    pooled: Errors
+    constant: Errors
+    per_surface: Errors
+    count: int
+
+
+def transfer(w: Windows, robot: Robot) -> dict[str, Transfer]:
+    """Leave-one-surface-out errors of slip, per variant of what counts as a row.
+
+    A row is one wheel in one window: s = 1 - J xi / (r w), xi the body twist from the camera in
+    corrected metres, I the mean magnitude of the wheel's current.
+
+    Returns:
+        nothing where fewer than two floors were driven.
+    """
+    if len(set(w.surface)) < 2:
+        return {}
+    w = w.at_lag(float(robot.camera.lag))
+    forward = np.asarray(robot.geometry.forward()) / float(robot.geometry.wheel_radius)
+    speed = w.turn / w.dt[..., None]
+    slip = 1 - (body_twist(w, robot) @ forward.T) / np.where(speed == 0.0, np.nan, speed)
+    share = np.abs(speed) / np.abs(speed).max(axis=-1, keepdims=True)
+    amps = np.abs(w.current)
+    floor = np.broadcast_to(np.asarray(w.surface)[:, None, None], slip.shape)
+    load = np.broadcast_to(np.asarray(w.load)[:, None, None], slip.shape)
+    main = max(sorted(set(w.load)), key=w.load.count)
+    main = "as_built" if "as_built" in w.load else main
+    out = {}
+    for name, (least, one_load, cut) in VARIANTS.items():
+        rows = (share >= least) & np.isfinite(slip)
+        if one_load:
+            rows &= load == main
+        if cut:
+            rows &= (slip > 0) & (slip <= 1) & (amps > 0.25)
+        if len(set(floor[rows].tolist())) > 1:
+            out[name] = _errors(slip[rows], amps[rows], floor[rows])
+    return out
+
+
+def _errors(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Transfer:
+    pooled, constant, own = {}, {}, {}
+    line = np.stack([np.ones_like(amps), amps], axis=-1)
+    for name in sorted(set(floor.tolist())):
+        mine = floor == name
+        others = np.linalg.lstsq(line[~mine], slip[~mine], rcond=None)[0]
+        alone = np.linalg.lstsq(line[mine], slip[mine], rcond=None)[0]
+        pooled[name] = slip[mine] - line[mine] @ others
+        constant[name] = slip[mine] - slip[~mine].mean()
+        own[name] = slip[mine] - line[mine] @ alone
+    return Transfer(_left(pooled), _left(constant), _left(own), len(slip))
+
+
+def _left(gaps: dict[str, np.ndarray]) -> Errors:
+    each = {name: _rms(gap) for name, gap in gaps.items()}
+    rows = _rms(np.concatenate(list(gaps.values())))
+    return Errors(rows, float(np.mean(list(each.values()))), each)
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))

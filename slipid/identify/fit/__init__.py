@@ -1,0 +1,1 @@
+"""Likelihood of windows and its maximum."""

@@ -1,0 +1,233 @@
+"""What a robot predicts of every piece of every run, and how far that is from what was measured.
+
+A piece is a few neighbouring windows of one run. How the difference is weighed is in `noise`.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from slipid.data.windows import Windows
+from slipid.model import robot as model
+from slipid.model import se2
+from slipid.model.robot import Robot
+
+SMOOTH = 0.03
+"""Magnitude below which the mean of an unsigned current levels off [A]."""
+FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
+"""Variance added to every residual: rounding of the logs [m^2, A^2, V^2]."""
+
+
+class Batch(eqx.Module):
+    """Windows as arrays for a jitted function; names are indices of the robot's stacks.
+
+    Attributes:
+        surface: under the robot (piece,), or under each of its wheels (piece, wheel).
+    """
+
+    surface: Int[Array, "piece *wheel"]
+    load: Int[Array, " piece"]
+    session: Int[Array, " piece"]
+    dt: Float[Array, "piece window"]
+    turn: Float[Array, "piece window wheel"]
+    faster: Float[Array, "piece window wheel"]
+    pose: Float[Array, "piece edge 3"]
+    current: Float[Array, "piece window wheel"]
+    voltage: Float[Array, "piece window wheel"]
+    current_var: Float[Array, "piece window wheel"]
+    lag: Float[Array, ""]
+    has_current: bool = eqx.field(static=True)
+    has_voltage: bool = eqx.field(static=True)
+    signed: bool = eqx.field(static=True)
+
+
+def batch(
+    windows: Windows, robot: Robot, floor: Int[np.ndarray, "piece wheel"] | None = None
+) -> Batch:
+    """Batch for a robot that knows the floors, loads and sessions of the windows.
+
+    Args:
+        floor: surface under each wheel, where the windows do not know theirs.
+    """
+    if floor is None:
+        floor = np.asarray([robot.surface_index(s) for s in windows.surface])
+    return Batch(
+        surface=jnp.asarray(floor),
+        load=jnp.asarray([robot.load_index(s) for s in windows.load]),
+        session=jnp.asarray([robot.session_index(s) for s in windows.session]),
+        dt=jnp.asarray(windows.dt),
+        turn=jnp.asarray(windows.turn),
+        faster=jnp.asarray(windows.faster),
+        pose=jnp.asarray(windows.pose),
+        current=jnp.asarray(windows.current),
+        voltage=jnp.asarray(windows.voltage),
+        current_var=jnp.asarray(windows.current_var),
+        lag=jnp.asarray(windows.lag),
+        has_current=windows.has_current,
+        has_voltage=windows.has_voltage,
+        signed=windows.current_is_signed,
+    )
+
+
+class Predicted(eqx.Module):
+    """What the robot says of each window.
+
+    Attributes:
+        increment: of the marker (x, y [m], yaw [rad]).
+        twist: of the body.
+        felt: traction of each wheel's motor in units of mu m g.
+    """
+
+    increment: Float[Array, "piece window 3"]
+    twist: Float[Array, "piece window 3"]
+    felt: Float[Array, "piece window wheel"]
+
+
+def wheel_speed(robot: Robot, b: Batch) -> Float[Array, "piece window wheel"]:
+    """Mean wheel speed of every window at the robot's camera lag [rad/s]."""
+    return (b.turn - (robot.camera.lag - b.lag) * b.faster) / b.dt[..., None]
+
+
+def predict(
+    robot: Robot, b: Batch, near: Float[Array, "piece window 3"] | None = None
+) -> Predicted:
+    """Contact equilibrium of every window.
+
+    Args:
+        near: twists close to it, see `slipid.model.robot.twist`.
+    """
+    frame = robot.geometry.frame()
+
+    def window(
+        w: Array, dt: Array, near: Array | None, surface: Array, load: Array, session: Array
+    ) -> tuple[Array, Array, Array]:
+        xi = model.twist(robot, frame, w, surface, load, near)
+        increment = robot.camera.seen(se2.advance(xi, dt), session)
+        return increment, xi, model.felt(robot, frame, xi, w, surface, load)
+
+    piece = jax.vmap(window, (0, 0, None if near is None else 0, None, None, None))
+    lanes = (0, 0, None if near is None else 0, 0, 0, 0)
+    return Predicted(
+        *jax.vmap(piece, lanes)(wheel_speed(robot, b), b.dt, near, b.surface, b.load, b.session)
+    )
+
+
+def seen(
+    robot: Robot,
+    twist: Float[Array, "piece window 3"],
+    dt: Float[Array, "piece window"],
+    session: Int[Array, " piece"],
+) -> Float[Array, "piece window 3"]:
+    """Marker increments of every window for given body twists."""
+
+    def window(xi: Array, dt: Array, session: Array) -> Array:
+        return robot.camera.seen(se2.advance(xi, dt), session)
+
+    return jax.vmap(jax.vmap(window, (0, 0, None)))(twist, dt, session)
+
+
+def predicted_current(
+    robot: Robot, b: Batch, felt: Float[Array, "piece window wheel"]
+) -> Float[Array, "piece window wheel"]:
+    """Motor current of every window [A] given the traction, a magnitude where the log has those."""
+    friction = robot.surfaces.friction[b.surface].reshape(b.dt.shape[0], -1).mean(axis=1)
+    weight = friction * robot.body.mass * model.GRAVITY
+    torque = robot.geometry.wheel_radius * weight[:, None, None] * felt
+    amps = robot.motor.current(torque, wheel_speed(robot, b))
+    if b.signed:
+        return amps + robot.motor.current_offset
+    return jnp.sqrt(amps**2 + SMOOTH**2) + robot.motor.current_offset
+
+
+def measured(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, "piece window 3"]:
+    """Marker increments in the frame of each window's start, in corrected metres."""
+
+    def piece(edges: Float[Array, "edge 3"]) -> Float[Array, "window 3"]:
+        p = jax.vmap(robot.camera.corrected)(edges)
+        c, s = jnp.cos(p[:-1, 2]), jnp.sin(p[:-1, 2])
+        d = p[1:] - p[:-1]
+        return jnp.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], d[:, 2]], axis=-1)
+
+    return jax.vmap(piece)(pose)
+
+
+def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "piece m"]:
+    """Predicted less measured marker increments, a row per piece [m, m, rad]."""
+    return (p.increment - measured(robot, b.pose)).reshape(b.dt.shape[0], -1)
+
+
+def electric_residuals(
+    robot: Robot,
+    b: Batch,
+    felt: Float[Array, "piece window wheel"],
+    voltage_std: Float[Array, ""] | float,
+) -> dict[str, Array]:
+    """Predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
+
+    Args:
+        felt: traction of each wheel's motor in units of mu m g.
+        voltage_std: of the voltage noise [V]; the noise of the measured current is carried into the
+            voltage equation by R, which keeps R from being attenuated.
+    """
+    n = b.dt.shape[0]
+    out = {}
+    if b.has_current:
+        out["current"] = (predicted_current(robot, b, felt) - b.current).reshape(n, -1)
+    if b.has_current and b.has_voltage:
+        w = b.turn / b.dt[..., None]
+        amps = b.current - robot.motor.current_offset
+        if not b.signed:
+            amps = amps * jnp.tanh(w / 0.2)
+        gap = robot.motor.voltage(amps, w) - b.voltage
+        out["voltage"] = (gap / _spread(robot, b, voltage_std)).reshape(n, -1)
+    return out
+
+
+def log_jacobians(
+    robot: Robot, b: Batch, voltage_std: Float[Array, ""] | float
+) -> tuple[Float[Array, " piece"], Float[Array, " piece"]]:
+    """Log |d residuals / d data| of the motion and of the voltage of every piece.
+
+    The camera corrects measured places and the voltage residual is scaled by its own spread:
+    without these terms a smaller scale would fit better only because it shrinks the residuals.
+    """
+    camera = camera_log_jacobian(robot, b.pose)
+    if not (b.has_current and b.has_voltage):
+        return camera, jnp.zeros_like(camera)
+    return camera, -jnp.sum(jnp.log(_spread(robot, b, voltage_std)), axis=(1, 2))
+
+
+def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, " piece"]:
+    """Log |d motion residuals / d logged poses| of every piece; its first pose is given."""
+    return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
+
+
+def _spread(
+    robot: Robot, b: Batch, voltage_std: Float[Array, ""] | float
+) -> Float[Array, "piece window wheel"]:
+    """Std of the voltage residual over that of the voltage noise."""
+    return jnp.sqrt(1.0 + robot.motor.resistance**2 * b.current_var / voltage_std**2)
+
+
+def residuals(robot: Robot, b: Batch, voltage_std: Float[Array, ""] | float) -> dict[str, Array]:
+    """Every block of residuals, `motion` first."""
+    p = predict(robot, b)
+    motion = {"motion": motion_residual(robot, b, p)}
+    return motion | electric_residuals(robot, b, p.felt, voltage_std)
+
+
+def voltage_std(log_variance: Float[Array, ""]) -> Float[Array, ""]:
+    """Std of the voltage noise, rounding included, from the log of its variance [V].
+
+    The voltage residual is in units of it: without the floor it would vanish with the noise.
+    """
+    return jnp.sqrt(jnp.exp(log_variance) + FLOOR["voltage"])
+
+
+def voltage_share(
+    robot: Robot, b: Batch, voltage_std: Float[Array, ""] | float
+) -> Float[Array, "piece m"]:
+    """Part that the voltage's own noise has in the variance of every voltage residual."""
+    return (1 / _spread(robot, b, voltage_std) ** 2).reshape(b.dt.shape[0], -1)

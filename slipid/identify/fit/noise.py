@@ -1,0 +1,185 @@
+"""Variance components of the residuals of a piece, and the covariance they make.
+
+A piece is a few neighbouring windows of one run. Its residuals have the covariance
+
+    V = sum_c v_c B_c,   B from: camera place and heading noise, shared by neighbouring windows;
+                         process noise along, across and in yaw, growing with distance, per floor;
+                         the run's own effect along, across and in yaw, per floor
+
+so the run effects are marginalised.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from slipid.data.windows import Windows
+from slipid.identify.fit.likelihood import FLOOR, Batch
+from slipid.model.robot import Robot
+
+
+class Components(eqx.Module):
+    """Covariance pieces of one block of residuals.
+
+    Attributes:
+        base: B_c (piece, component, m, m).
+        which: number of the variance each belongs to (piece, component).
+        floor: variance that every residual has beside them.
+    """
+
+    base: Float[Array, "piece component m m"]
+    which: Int[Array, "piece component"]
+    floor: float = eqx.field(static=True)
+
+    def covariance(self, log_variance: Float[Array, " variance"]) -> Float[Array, "piece m m"]:
+        """V of every piece."""
+        v, m = jnp.exp(log_variance)[self.which], self.base.shape[-1]
+        return jnp.einsum("nc,ncij->nij", v, self.base) + self.floor * jnp.eye(m)
+
+
+@dataclass(frozen=True)
+class Component:
+    """One source of noise.
+
+    Attributes:
+        kind: `camera`, `process`, `run`, `current` or `voltage`.
+        what: `place`, `along`, `window`, ...
+        floor: it is met on, None where it is of all.
+        unit: of its std.
+        typical: std that the weak log-normal prior is centred on.
+    """
+
+    kind: str
+    what: str
+    floor: str | None
+    unit: str
+    typical: float
+
+    @property
+    def name(self) -> str:
+        """As tables and files have it: `camera.place`, `process.<floor>.along`."""
+        return ".".join(part for part in (self.kind, self.floor, self.what) if part is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Every variance component, and the matrices of each block of residuals."""
+
+    components: tuple[Component, ...]
+    blocks: dict[str, Components]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the components."""
+        return tuple(c.name for c in self.components)
+
+    @property
+    def typical(self) -> Float[np.ndarray, " variance"]:
+        """Typical std of every component."""
+        return np.array([c.typical for c in self.components])
+
+
+_MOTION = (
+    ("along", "m/sqrt(m)", 0.002),
+    ("across", "m/sqrt(m)", 0.002),
+    ("yaw", "rad/sqrt(m)", 0.01),
+)
+_EFFECT = (("along", "m/m", 0.01), ("across", "m/m", 0.01), ("yaw", "rad/m", 0.03))
+
+
+def noise(windows: Windows, robot: Robot) -> Noise:
+    """Variance components for these windows, with distances and directions from the encoders."""
+    floors = robot.surfaces.labels
+    table = [
+        Component("camera", "place", None, "m", 0.0005),
+        Component("camera", "heading", None, "rad", 0.003),
+    ]
+    for floor in floors:
+        table += [Component("process", what, floor, u, v) for what, u, v in _MOTION]
+        table += [Component("run", what, floor, u, v) for what, u, v in _EFFECT]
+    blocks = {"motion": _motion_components(windows, robot)}
+    if windows.has_current:
+        start = len(table)
+        for floor in floors:
+            table += [Component("current", what, floor, "A", 0.05) for what in ("window", "run")]
+        blocks["current"] = _current_components(windows, robot, start)
+    if windows.has_current and windows.has_voltage:
+        n, m = len(windows), windows.turn.shape[1] * windows.turn.shape[2]
+        base = np.broadcast_to(np.eye(m), (n, 1, m, m)).copy()
+        blocks["voltage"] = _components("voltage", base, np.full((n, 1), len(table)))
+        table.append(Component("voltage", "window", None, "V", 0.05))
+    return Noise(tuple(table), blocks)
+
+
+def _components(block: str, base: np.ndarray, which: np.ndarray) -> Components:
+    return Components(jnp.asarray(base), jnp.asarray(which), FLOOR[block])
+
+
+def travel(windows: Windows | Batch, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of each window by the encoders (piece, window) [m], and its unit direction."""
+    j = np.linalg.pinv(np.asarray(robot.geometry.forward()))
+    step = np.asarray(windows.turn) * float(robot.geometry.wheel_radius) @ j.T
+    far = np.linalg.norm(step[..., :2], axis=-1)
+    turned = np.abs(step[..., 2]) * float(robot.geometry.base_radius)
+    u = np.where(
+        far[..., None] > 1e-6, step[..., :2] / np.maximum(far, 1e-9)[..., None], [1.0, 0.0]
+    )
+    return far + turned, u
+
+
+def _motion_components(windows: Windows, robot: Robot) -> Components:
+    far, u = travel(windows, robot)
+    n, k = far.shape
+    scale = float(robot.camera.scale)
+    place, heading = np.zeros((n, 3 * k, 2 * (k + 1))), np.zeros((n, 3 * k, k + 1))
+    for j in range(k):
+        th = windows.pose[:, j, 2]
+        back = (
+            np.stack([np.cos(th), np.sin(th), -np.sin(th), np.cos(th)], -1).reshape(n, 2, 2) * scale
+        )
+        place[:, 3 * j : 3 * j + 2, 2 * j : 2 * j + 2] = -back
+        place[:, 3 * j : 3 * j + 2, 2 * j + 2 : 2 * j + 4] = back
+        move = np.einsum("nij,nj->ni", back, windows.pose[:, j + 1, :2] - windows.pose[:, j, :2])
+        heading[:, 3 * j, j], heading[:, 3 * j + 1, j] = move[:, 1], -move[:, 0]
+        heading[:, 3 * j + 2, j], heading[:, 3 * j + 2, j + 1] = -1.0, 1.0
+    grown = _axes(u) * np.sqrt(far)[None, :, None, :]
+    effect = effects(windows, robot).transpose(2, 0, 1)[..., None]
+    parts = [place, heading, *grown, *effect]
+    base = np.stack([p @ p.transpose(0, 2, 1) for p in parts], axis=1)
+    floor = _floors(windows, robot)
+    which = np.concatenate(
+        [np.zeros((n, 1), int), np.ones((n, 1), int), 2 + 6 * floor[:, None] + np.arange(6)], axis=1
+    )
+    return _components("motion", base, which)
+
+
+def _floors(windows: Windows, robot: Robot) -> Int[np.ndarray, " piece"]:
+    return np.array([robot.surface_index(s) for s in windows.surface])
+
+
+def _axes(u: np.ndarray) -> np.ndarray:
+    """Direction of along, across and yaw in each window (axis, piece, 3 window, window)."""
+    n, k, _ = u.shape
+    axes = np.zeros((3, n, 3 * k, k))
+    for j in range(k):
+        axes[0, :, 3 * j : 3 * j + 2, j] = u[:, j]
+        axes[1, :, 3 * j, j], axes[1, :, 3 * j + 1, j] = -u[:, j, 1], u[:, j, 0]
+        axes[2, :, 3 * j + 2, j] = 1.0
+    return axes
+
+
+def effects(windows: Windows, robot: Robot) -> Float[np.ndarray, "piece m 3"]:
+    """What one unit of an effect along, across and in yaw moves in the residuals of a piece."""
+    far, u = travel(windows, robot)
+    return (_axes(u) * far[None, :, None, :]).sum(-1).transpose(1, 2, 0)
+
+
+def _current_components(windows: Windows, robot: Robot, start: int) -> Components:
+    n, k, w = windows.turn.shape
+    same = np.kron(np.ones((k, k)), np.eye(w))
+    base = np.broadcast_to(np.stack([np.eye(k * w), same]), (n, 2, k * w, k * w)).copy()
+    which = start + 2 * _floors(windows, robot)[:, None] + np.arange(2)
+    return _components("current", base, which)

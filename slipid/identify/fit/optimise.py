@@ -1,0 +1,210 @@
+"""Maximum a posteriori over trajectories: weights, structure, variances in turn until all rest."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from slipid.identify.fit.problem import DEGREES, Problem, State, linear
+from slipid.identify.fit.structure import Held, levenberg
+from slipid.identify.fit.variances import scored
+
+CREEPS = (0.05, 0.4, 1.0)
+"""Starts of the creep of every floor; others end in poor minima."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How long and how precisely to fit.
+
+    Attributes:
+        most_rounds: of weights, structure and variances.
+        tolerance: stop when no number moves more than this many posterior stds in a round.
+    """
+
+    most_rounds: int = 30
+    tolerance: float = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """End of a fit.
+
+    Attributes:
+        state: where it ended.
+        covariance: of the search vector (Laplace).
+        converged: whether the tolerance was met.
+        reason: why it stopped, for people.
+        history: loss after every round.
+    """
+
+    state: State
+    covariance: Float[np.ndarray, "free free"]
+    converged: bool
+    reason: str
+    history: tuple[float, ...]
+
+
+def optimise(
+    problem: Problem,
+    keep: np.ndarray | None = None,
+    start: State | None = None,
+    options: Options | None = None,
+    tell: Callable[[State], None] = lambda state: None,
+    free: np.ndarray | None = None,
+    variances: bool = True,
+) -> Optimum:
+    """Maximum a posteriori from a staged start, or going on from a state.
+
+    Args:
+        problem: windows, robot and priors.
+        keep: weight of each piece, 1 or 0 (piece,); all by default. Folds of a cross-validation
+            differ in this only, so they share one compiled function.
+        start: goes on from here instead of the staged start.
+        options: how long and how precisely.
+        tell: called after every round, for progress and checkpoints.
+        free: 1 for coordinates that may move from the start, 0 for those held there (free,).
+        variances: whether to fit those of the noise, too.
+    """
+    options = options or Options()
+    keep = np.ones(len(problem.windows)) if keep is None else np.asarray(keep, float)
+    state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
+    mask = np.ones(problem.space.size) if free is None else np.asarray(free, float)
+    history: list[float] = []
+    reason = f"{options.most_rounds} rounds without settling"
+    while state.round < options.most_rounds:
+        early = state.round < 3
+        scoring = (2 if early else 4) if variances else 0
+        state = one_round(problem, state, keep, mask, steps=8 if early else 4, scoring=scoring)
+        history.append(state.loss)
+        tell(state)
+        if state.moved < options.tolerance:
+            reason = f"no number moved {options.tolerance:g} of its std in round {state.round}"
+            break
+    _, jacobian = problem.linear(state.z, problem.volt(state.log_variance))
+    info = problem.precision(jacobian, state.log_variance, keep)
+    return Optimum(
+        state=state,
+        covariance=np.linalg.inv(np.asarray(info)),
+        converged=state.moved < options.tolerance,
+        reason=reason,
+        history=tuple(history),
+    )
+
+
+def one_round(
+    problem: Problem,
+    state: State,
+    keep: Float[np.ndarray, " piece"],
+    mask: Float[np.ndarray, " free"],
+    steps: int,
+    scoring: int,
+) -> State:
+    """Weights, structure, variances: one turn of each.
+
+    Args:
+        problem: windows, robot and priors.
+        state: where to start.
+        keep: weight of each piece.
+        mask: 1 for coordinates that may move, 0 for those held.
+        steps: of the structure at most.
+        scoring: steps of the variances.
+    """
+    target, log_v, kept = problem.target, jnp.asarray(state.log_variance), jnp.asarray(keep)
+    volt = problem.volt(log_v)
+    residual, _, felt = linear(target, jnp.asarray(state.z), volt)
+    held = Held(
+        target=target,
+        z=jnp.asarray(state.z),
+        mask=jnp.asarray(mask),
+        root=problem.whitening(residual, log_v, kept).root,
+        volt=volt,
+        felt=felt,
+        slope=problem.log_jacobian(state.z, volt, kept)[1],
+    )
+    z = levenberg(held, steps)
+    residual, jacobian = problem.linear(z, volt)
+    own = problem.own(z, log_v)
+    for _ in range(scoring):
+        log_v = scored(target, residual, jacobian, log_v, kept, own)
+        before, own = own, problem.own(z, log_v)
+        for k, share in own.items():  # these residuals are in units of the noise just found
+            scale = jnp.sqrt(share / before[k])
+            residual = residual | {k: residual[k] * scale}
+            jacobian = jacobian | {k: jacobian[k] * scale[..., None]}
+    if own and scoring:  # the Jacobian by R changes by more than its scale
+        residual, jacobian = problem.linear(z, problem.volt(log_v))
+    std = np.sqrt(np.diag(np.linalg.inv(np.asarray(problem.precision(jacobian, log_v, kept)))))
+    moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
+    moved = max(moved, float(np.max(np.abs(np.asarray(log_v) - state.log_variance)) / 3))
+    return State(
+        z=z,
+        log_variance=np.asarray(log_v),
+        round=state.round + 1,
+        loss=problem.loss(z, log_v, kept, residual),
+        moved=moved,
+        stage=state.stage,
+    )
+
+
+# where a fit begins -----------------------------------------------------------------------------
+
+
+def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], None]) -> State:
+    """Motor by regression, then every floor by itself from several starts, best start per floor.
+
+    Floors share nothing while the shared numbers are held, so one masked fit of all floors is a fit
+    of each by itself.
+    """
+    space, labels = problem.space, problem.robot.surfaces.labels
+    mask = space.where(lambda e: e.surface is not None).astype(float)
+    creep = space.where(lambda e: e.quantity == "surface.creep")
+    # far from the optimum every run is an outlier
+    wide = [1.0 if c.kind == "camera" else 3.0 for c in problem.noise.components]
+    log_v = 2 * np.log(problem.noise.typical) + 2 * np.log(wide)
+    first = _motor_start(problem)
+    best = np.full(len(labels), np.inf)
+    z = first.copy()
+    floors = np.asarray(problem.batch.surface)
+    for attempt, value in enumerate(CREEPS):
+        stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
+        start = np.where(creep, np.log(value), first)
+        state = State(start, log_v, 0, np.inf, np.inf, stage)
+        for steps in (15, 6, 6):  # the damping has to grow from 1 to the size of the problem first
+            state = one_round(problem, state, keep, mask, steps=steps, scoring=0)
+            tell(state)
+        cost = _piece_cost(problem, state)
+        for number, label in enumerate(labels):
+            mine = float(np.sum(cost[(floors == number) & (keep > 0)]))
+            if attempt == 0 or mine < best[number]:
+                best[number] = mine
+                own = space.where(lambda e, label=label: e.surface == label)  # type: ignore[misc]
+                z[own] = state.z[own]
+    return State(z, log_v, 0, np.inf, np.inf, "joint")
+
+
+def _piece_cost(problem: Problem, state: State) -> np.ndarray:
+    residual, _ = problem.linear(state.z, problem.volt(state.log_variance))
+    v = np.asarray(problem.covariance("motion", state.log_variance))
+    r = np.asarray(residual["motion"])
+    q = np.einsum("ni,ni->n", r, np.linalg.solve(v, r[..., None])[..., 0])
+    return 0.5 * (DEGREES + r.shape[1]) * np.log1p(q / DEGREES)
+
+
+def _motor_start(problem: Problem) -> np.ndarray:
+    """Search vector with R and C_e by regression of the voltage where it is logged."""
+    z = problem.space.start.copy()
+    w = problem.windows
+    if not (w.has_voltage and w.has_current):
+        return z
+    speed = (w.turn / w.dt[..., None]).ravel()
+    amps = w.current.ravel() if w.current_is_signed else (w.current.ravel() * np.sign(speed))
+    wm = speed * problem.robot.motor.gear_ratio
+    a, *_ = np.linalg.lstsq(np.stack([amps, wm], -1), w.voltage.ravel(), rcond=None)
+    place = problem.space.place
+    for path, value in (("motor.resistance", a[0]), ("motor.back_emf", a[1])):
+        if path in place and value > 0:
+            z[place[path]] = np.log(value)
+    return z

@@ -1,0 +1,224 @@
+"""Posterior of a robot given windows of its runs, compiled for all windows of the same shapes.
+
+Structural numbers are found by Levenberg-Marquardt steps (`structure`), variances by Fisher scoring
+of the restricted likelihood (`variances`).
+"""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from slipid.data.windows import Windows
+from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit import variances
+from slipid.identify.fit.noise import Components, noise
+from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD, Blocks, Vector, Whitening
+from slipid.model.robot import Robot
+from slipid.parameter import Choice, Space
+
+__all__ = ["DEGREES", "VARIANCE_SPREAD", "Problem", "State", "Target"]
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a fit stands; enough to go on from.
+
+    Attributes:
+        z: structural vector in the search space.
+        log_variance: of every variance component.
+        round: rounds done.
+        loss: minus log posterior up to a constant.
+        moved: largest step of the last round, in posterior stds.
+        stage: what it was doing, for progress.
+    """
+
+    z: Float[np.ndarray, " free"]
+    log_variance: Float[np.ndarray, " variance"]
+    round: int
+    loss: float
+    moved: float
+    stage: str
+
+
+class Target(eqx.Module):
+    """What a fit maximises, as an argument of compiled functions.
+
+    Attributes:
+        space: free numbers and their priors.
+        batch: measured windows.
+        blocks: covariance pieces of every block of residuals.
+        typical: centre of the prior of the log variances.
+        joint: whether currents and voltages move the numbers of the motion, too.
+    """
+
+    space: Space
+    batch: lk.Batch
+    blocks: dict[str, Components]
+    typical: Float[Array, " variance"]
+    joint: bool = eqx.field(static=True)
+
+
+class Problem:
+    """Likelihood of a set of windows as functions of the search vector.
+
+    Args:
+        windows: of the runs, all of them; `keep` below chooses those that count.
+        robot: start values and what is fixed.
+        choices: free, fixed, priors.
+        current_informs_motion: let currents and voltages move the numbers of the motion, too. By
+            default they do not ("cut"): the torque scale is read from currents given the motion,
+            whose errors are carried along. A friction model good to 5 % in current would otherwise
+            outvote forces that motion shows to 1 %.
+
+    Attributes:
+        compiled: what was compiled for windows of these shapes by others, under their own keys.
+    """
+
+    def __init__(
+        self,
+        windows: Windows,
+        robot: Robot,
+        choices: Sequence[Choice],
+        current_informs_motion: bool = False,
+    ):
+        self.space = Space(robot, choices)
+        self.joint = current_informs_motion or not windows.has_current
+        self.robot: Robot = self.space.template
+        self.compiled: dict[Any, Any] = {}
+        self._read(windows)
+
+    def of(self, windows: Windows) -> "Problem":
+        """The same problem for other windows; those of the same shapes share what is compiled."""
+        other = copy.copy(self)
+        other._read(windows)
+        return other
+
+    def _read(self, windows: Windows) -> None:
+        self.windows, self.noise = windows, noise(windows, self.robot)
+        self.target = Target(
+            space=self.space,
+            batch=lk.batch(windows, self.robot),
+            blocks=self.noise.blocks,
+            typical=jnp.asarray(2 * np.log(self.noise.typical)),
+            joint=self.joint,
+        )
+
+    @property
+    def batch(self) -> lk.Batch:
+        """The windows as arrays."""
+        return self.target.batch
+
+    @property
+    def electric(self) -> Bool[np.ndarray, " free"]:
+        """Coordinates that are read from currents and voltages given the motion."""
+        return self.space.electric
+
+    def linear(self, z: Vector, volt: Vector) -> tuple[Blocks, Blocks]:
+        """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
+        return linear(self.target, jnp.asarray(z), jnp.asarray(volt))[:2]
+
+    def log_jacobian(self, z: Vector, volt: Vector, keep: Vector) -> tuple[Array, Array]:
+        """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
+        return log_jacobian(
+            self.target, jnp.asarray(z), jnp.asarray(volt), jnp.asarray(keep, dtype=float)
+        )
+
+    def twists(self, z: Vector) -> tuple[Array, Array]:
+        """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
+        return _twists(self.space, self.batch, jnp.asarray(z))
+
+    def covariance(self, block: str, log_v: Vector) -> Array:
+        """Covariance of the residuals of a block (piece, m, m)."""
+        return self.noise.blocks[block].covariance(jnp.asarray(log_v))
+
+    def whitening(self, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
+        """What residuals are weighed by."""
+        return variances.whitening(
+            self.noise.blocks, residual, jnp.asarray(log_v), jnp.asarray(keep, dtype=float)
+        )
+
+    def precision(self, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
+        """Expected information of the search vector, prior included (free, free)."""
+        return variances.precision(
+            self.target, jacobian, jnp.asarray(log_v), jnp.asarray(keep, dtype=float)
+        )
+
+    def whitened(self, jacobian: Blocks, log_v: Vector) -> Blocks:
+        """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
+        keep = jnp.ones(len(self.windows))
+        return variances.whitened(self.noise.blocks, jacobian, jnp.asarray(log_v), keep)
+
+    def variance_precision(self, log_v: Vector, keep: Vector, z: Vector) -> Array:
+        """Expected information of the log variances at z, prior included (variance, variance)."""
+        log_v, own = jnp.asarray(log_v), self.own(z, log_v)
+        return variances.information(self.noise.blocks, log_v, jnp.asarray(keep, dtype=float), own)
+
+    def loss(self, z: Vector, log_v: Vector, keep: Vector, residual: Blocks) -> float:
+        """Minus log posterior of structure and variances given the residuals, less constants."""
+        nll = float(self.whitening(residual, log_v, keep).loss)
+        nll -= float(self.log_jacobian(z, self.volt(log_v), keep)[0])
+        pull = (np.asarray(z) - self.space.prior_mean) / self.space.prior_std
+        spread = (np.asarray(log_v) - np.asarray(self.target.typical)) / VARIANCE_SPREAD
+        return nll + 0.5 * float(np.sum(pull**2)) + 0.5 * float(np.sum(spread**2))
+
+    def volt(self, log_v: Vector) -> Array:
+        """Std of the voltage noise [V], 1 where none is logged."""
+        if "voltage" not in self.noise.blocks:
+            return jnp.asarray(1.0)
+        return lk.voltage_std(jnp.asarray(log_v)[-1])
+
+    def own(self, z: Vector, log_v: Vector) -> Blocks:
+        """Part that the variance components have in the variance of residuals, where not all.
+
+        The ammeter's noise is known and lies in the voltage residual, too (`electric_residuals`).
+        """
+        if "voltage" not in self.noise.blocks:
+            return {}
+        return {"voltage": _share(self.space, self.batch, jnp.asarray(z), self.volt(log_v))}
+
+
+@eqx.filter_jit
+def linear(target: Target, z: Array, volt: Array) -> tuple[Blocks, Blocks, Array]:
+    """Residual blocks, their Jacobians, and the traction of every wheel's motor."""
+
+    def blocks(x: Array) -> tuple[Blocks, tuple[Blocks, Array]]:
+        robot = target.space.tree(x)
+        p = lk.predict(robot, target.batch)
+        motion = {"motion": lk.motion_residual(robot, target.batch, p)}
+        out = motion | lk.electric_residuals(robot, target.batch, p.felt, volt)
+        return out, (out, p.felt)
+
+    jacobian, (out, felt) = jax.jacfwd(blocks, has_aux=True)(z)
+    return out, jacobian, felt
+
+
+@eqx.filter_jit
+def log_jacobian(target: Target, z: Array, volt: Array, keep: Array) -> tuple[Array, Array]:
+    """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
+
+    def total(x: Array) -> Array:
+        return keep @ sum(lk.log_jacobians(target.space.tree(x), target.batch, volt))
+
+    return jax.value_and_grad(total)(z)
+
+
+@eqx.filter_jit
+def _twists(space: Space, batch: lk.Batch, z: Array) -> tuple[Array, Array]:
+    def twist(x: Array) -> tuple[Array, Array]:
+        xi = lk.predict(space.tree(x), batch).twist
+        return xi, xi
+
+    slope, xi = jax.jacfwd(twist, has_aux=True)(z)
+    return xi, slope
+
+
+@eqx.filter_jit
+def _share(space: Space, batch: lk.Batch, z: Array, volt: Array) -> Array:
+    return lk.voltage_share(space.tree(z), batch, volt)

@@ -1,0 +1,170 @@
+"""Weights of residuals given their variances, and the variances by Fisher scoring.
+
+Residuals of a piece are a multivariate Student t with the scale matrix V of `noise`. The restricted
+likelihood of the variances takes into account what the structural numbers have been fitted to
+(Patterson and Thompson 1971, Biometrika 58(3)).
+"""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from slipid.identify.fit.linear import inverse_root
+from slipid.identify.fit.noise import Components
+
+if TYPE_CHECKING:
+    from slipid.identify.fit.problem import Target
+
+Vector = Array | np.ndarray
+"""One-dimensional, of jax or numpy."""
+Blocks = dict[str, Array]
+"""An array for every block of residuals: `motion`, `current`, `voltage`."""
+Noises = dict[str, Components]
+"""Covariance pieces of every block."""
+DEGREES = 8.0
+"""Degrees of freedom of the Student-t weight of a run."""
+VARIANCE_SPREAD = 3.0
+"""Std of the prior of every log variance."""
+
+
+class Whitening(NamedTuple):
+    """What residuals are weighed by.
+
+    Attributes:
+        root: W with W^T W = w V^-1 of every piece (piece, m, m).
+        weight: w of every piece, small for an outlier.
+        loss: minus log likelihood, less constants.
+    """
+
+    root: Blocks
+    weight: Blocks
+    loss: Array
+
+
+@eqx.filter_jit
+def whitening(noises: Noises, residual: Blocks, log_v: Array, keep: Array) -> Whitening:
+    """Weights of residuals, for pieces that count as `keep` says."""
+    roots, weights, loss = {}, {}, jnp.zeros(())
+    for k, r in residual.items():
+        inverse = inverse_root(noises[k].covariance(log_v))
+        m = inverse.shape[-1]
+        q = jnp.sum(jnp.einsum("nij,nj->ni", inverse, r) ** 2, axis=-1)
+        weights[k] = keep * (DEGREES + m) / (DEGREES + q)
+        roots[k] = jnp.sqrt(weights[k])[:, None, None] * inverse
+        log_det = -jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=-2, axis2=-1)), axis=-1)
+        loss += jnp.sum(keep * (log_det + 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)))
+    return Whitening(roots, weights, loss)
+
+
+@eqx.filter_jit
+def whitened(noises: Noises, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
+    """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
+    out = {}
+    for k, jac in jacobian.items():
+        m = jac.shape[1]
+        factor = keep * (DEGREES + m) / (DEGREES + m + 2)  # Fisher information of a t location
+        root = inverse_root(noises[k].covariance(log_v)) * jnp.sqrt(factor)[:, None, None]
+        out[k] = jnp.einsum("nij,njp->nip", root, jac)
+    return out
+
+
+@eqx.filter_jit
+def precision(target: "Target", jacobian: Blocks, log_v: Array, keep: Array) -> Array:
+    """Expected information of the search vector, prior included (free, free)."""
+    prior = jnp.diag(1 / jnp.asarray(target.space.prior_std) ** 2)
+    total, of_motion = prior, prior
+    for k, half in whitened(target.blocks, jacobian, log_v, keep).items():
+        flat = half.reshape(-1, half.shape[-1])
+        total += flat.T @ flat
+        of_motion += flat.T @ flat if k == "motion" else 0.0
+    return total if target.joint else _cut(total, of_motion, target.space.electric)
+
+
+def _cut(total: Array, of_motion: Array, electric: np.ndarray) -> Array:
+    """Information when p(electric | motion, all data) multiplies p(motion | motion data)."""
+    e = jnp.asarray(electric)
+    own = jnp.where(e[:, None] & e[None, :], total, jnp.where(jnp.eye(len(e)) > 0, 1.0, 0.0))
+    cross = jnp.where(e[:, None] & ~e[None, :], total, 0.0)
+    carried = cross.T @ jnp.linalg.solve(own, cross)
+    motion = ~e[:, None] & ~e[None, :]
+    return jnp.where(motion, of_motion + carried, total)
+
+
+@eqx.filter_jit
+def scored(
+    target: "Target", residual: Blocks, jacobian: Blocks, log_v: Array, keep: Array, own: Blocks
+) -> Array:
+    """One Fisher-scoring step of the restricted likelihood in the log variances.
+
+    Args:
+        target: the posterior.
+        residual, jacobian: of its structural numbers.
+        log_v: where to start.
+        keep: weight of each piece.
+        own: part that the variances have in that of the residuals (piece, m); all where absent.
+    """
+    cov = jnp.linalg.inv(precision(target, jacobian, log_v, keep))
+    spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in jacobian.items()}
+    return scored_given(target, residual, spread, log_v, keep, own)
+
+
+@eqx.filter_jit
+def scored_given(
+    target: "Target", residual: Blocks, spread: Blocks, log_v: Array, keep: Array, own: Blocks
+) -> Array:
+    """The same where it is known what the fitted numbers of a model, this or another, make of V.
+
+    Args:
+        target: the posterior.
+        residual: of the model (piece, m).
+        spread: their covariance from the model's fitted numbers (piece, m, m); the degrees of
+            freedom it stands for are not the variances' to have.
+        log_v, keep, own: as of `scored`.
+    """
+    _, weights, _ = whitening(target.blocks, residual, log_v, keep)
+    score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])
+    for k, r in residual.items():
+        noise, mine = target.blocks[k], own.get(k)
+        root = inverse_root(noise.covariance(log_v))
+        inverse = jnp.einsum("nji,njk->nik", root, root)
+        base, which = _shared(noise.base, mine), noise.which
+        v = jnp.exp(log_v)[which]
+        vr = jnp.einsum("nij,nj->ni", inverse, r)
+        fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
+        trace = jnp.einsum("nij,ncij->nc", inverse, base)
+        spent = jnp.einsum("nij,njk,nkl->nil", inverse, spread[k], inverse)
+        lost = jnp.einsum("nij,ncij->nc", spent, base)
+        slope = 0.5 * v * (fit + keep[:, None] * (lost - trace))
+        score = score.at[which].add(slope)
+        if mine is not None:  # where others explain the residual the loss bends more than expected
+            rest = jnp.clip(1 - 2 * jnp.mean(mine, axis=1), 0.0)
+            steeper = steeper.at[which].add(-rest[:, None] * slope)
+    score -= (log_v - target.typical) / VARIANCE_SPREAD**2
+    info = information(target.blocks, log_v, keep, own)
+    info += jnp.diag(jnp.maximum(steeper, 0.0))
+    return log_v + jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
+
+
+@eqx.filter_jit
+def information(noises: Noises, log_v: Array, keep: Array, own: Blocks) -> Array:
+    """Expected information of the log variances, prior included (variance, variance)."""
+    info = jnp.eye(log_v.shape[0]) / VARIANCE_SPREAD**2
+    for k, noise in noises.items():
+        base, which = _shared(noise.base, own.get(k)), noise.which
+        root = inverse_root(noise.covariance(log_v))
+        vb = jnp.einsum("nji,njk,nckl->ncil", root, root, base)
+        v = jnp.exp(log_v)[which]
+        cross = 0.5 * jnp.einsum("ncij,ndji->ncd", vb, vb) * (v[:, :, None] * v[:, None, :])
+        info = info.at[which[:, :, None], which[:, None, :]].add(keep[:, None, None] * cross)
+    return info
+
+
+def _shared(base: Array, own: Array | None) -> Array:
+    """How the covariance of residuals grows with each variance, of which only a part is in them."""
+    if own is None:
+        return base
+    root = jnp.sqrt(own)
+    return base * root[:, None, :, None] * root[:, None, None, :]

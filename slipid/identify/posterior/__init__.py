@@ -1,0 +1,1 @@
+"""Sampling of the posterior, several emcee ensembles in learnt coordinates."""

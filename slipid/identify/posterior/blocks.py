@@ -1,0 +1,132 @@
+"""Blocks of a chain: what is sampled and when it stops, some steps at a time, and as arrays."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from slipid.identify.posterior.transport.bend import Bend
+from slipid.identify.posterior.transport.plateaus import Values
+from slipid.identify.posterior.transport.transport_map import Stair, Transport
+from slipid.identify.posterior.transport.warp import Warp
+
+FORMAT = 2
+"""Version of the block files; bump it when their content or the way they are made changes."""
+Chain = Float[np.ndarray, "ensemble step walker size"]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to sample and when to stop.
+
+    Attributes:
+        ensembles: number of independent ensembles.
+        walkers: number of walkers of each.
+        block: number of steps in a block.
+        warm_up: numbers of blocks after which proposals are learnt; the last ends the warm-up, and
+            leaves some blocks for the step of Hamiltonian moves to suit the last proposals.
+        most: number of blocks after which sampling ends without having converged.
+        spread: how far from the fit the widest walker starts, in stds; the first starts at a
+            quarter of it. Wide starts find modes that the fit has not seen.
+        r_hat: R-hat over ensembles that every coordinate must be below to have converged.
+        steps_per_tau: steps per autocorrelation time that every coordinate must be above.
+        least_draws: effective draws that every coordinate must be above.
+        seed: seed of everything.
+    """
+
+    ensembles: int = 4
+    walkers: int = 8
+    block: int = 20
+    warm_up: tuple[int, ...] = (3, 6, 10, 16, 20)
+    most: int = 400
+    spread: float = 4.0
+    r_hat: float = 1.01
+    steps_per_tau: float = 50.0
+    least_draws: float = 1000.0
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Some steps of all ensembles, and all that is needed to go on.
+
+    Attributes:
+        number: number of the block; the first is 0.
+        chain: positions of all walkers.
+        log_prob: their log density.
+        random: Mersenne twister keys, and (place, has Gaussian, Gaussian) of each.
+        accepted: part of the moves that moved something, for each ensemble.
+        map: map to the coordinates in which the next block is made.
+        angle: step of the Hamiltonian moves of the next block [rad].
+    """
+
+    number: int
+    chain: Chain
+    log_prob: Float[np.ndarray, "ensemble step walker"]
+    random: tuple[UInt32[np.ndarray, "ensemble 624"], Float[np.ndarray, "ensemble 3"]]
+    accepted: Float[np.ndarray, " ensemble"]
+    map: Transport
+    angle: float
+
+
+@dataclass(frozen=True)
+class Record:
+    """Where blocks of an earlier call are found and where new ones go.
+
+    Attributes:
+        done: gives the blocks of a part that are there already; the name of the second part tells
+            which draws of the first its blocks are of.
+        keep: called with the part and every new block.
+        tell: called with the stage and the number of steps of a block that are done.
+    """
+
+    done: Callable[[str], Sequence[Block]] = lambda part: ()
+    keep: Callable[[str, Block], None] = lambda part, block: None
+    tell: Callable[[str, int], None] = lambda stage, steps: None
+
+
+def packed(block: Block) -> dict[str, np.ndarray]:
+    """Arrays of a block under their names in a file."""
+    out = {
+        "number": np.asarray(block.number),
+        "chain": block.chain,
+        "log_prob": block.log_prob,
+        "random_key": block.random[0],
+        "random_rest": block.random[1],
+        "accepted": block.accepted,
+        "angle": np.asarray(block.angle),
+        "mean": block.map.mean,
+        "values": np.stack(list(vars(block.map.values).values())),
+        "last": np.stack(list(vars(block.map.last).values())),
+    }
+    for k, stair in enumerate(block.map.stairs):
+        out |= {f"{k}/{name}": getattr(stair, name) for name in _OF_STAIR}
+        if stair.bend:
+            out |= {f"{k}/bend/{name}": value for name, value in vars(stair.bend).items()}
+    return out
+
+
+def unpacked(arrays: Mapping[str, np.ndarray]) -> Block:
+    """Block from the arrays that `packed` gave."""
+    stairs = []
+    while f"{len(stairs)}/own" in arrays:
+        k = len(stairs)
+        bend = {n: arrays[f"{k}/bend/{n}"] for n in _OF_BEND if f"{k}/bend/{n}" in arrays}
+        fields = {n: arrays[f"{k}/{n}"] for n in _OF_STAIR}
+        stairs.append(Stair(**fields, bend=Bend(**bend) if bend else None))
+    return Block(
+        number=int(arrays["number"]),
+        chain=arrays["chain"],
+        log_prob=arrays["log_prob"],
+        random=(arrays["random_key"], arrays["random_rest"]),
+        accepted=arrays["accepted"],
+        map=Transport(
+            arrays["mean"], Values(*arrays["values"]), tuple(stairs), Warp(*arrays["last"])
+        ),
+        angle=float(arrays["angle"]),
+    )
+
+
+_OF_STAIR = ("own", "given", "slope", "root", "plateaus")
+_OF_BEND = ("factors", "shift", "scale")

@@ -1,0 +1,110 @@
+"""Which numbers of a problem a density is over, and which of them each floor has to itself."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.sessions import AXES, by_axis, pairs
+
+MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
+"""Parts of a posterior that a density can be of."""
+A = TypeVar("A", Array, np.ndarray)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Where a fit ended.
+
+    Attributes:
+        z: search vector.
+        log_variance: log variances of the noise components.
+        covariance: Laplace covariance of the search vector, as if sessions shared nothing; where
+            currents do not inform motion it is that of p(electric | motion, data)
+            p(motion | motion data).
+        session: variances of what the runs of a session share, `session.<floor>.<axis>`.
+    """
+
+    z: np.ndarray
+    log_variance: np.ndarray
+    covariance: Float[np.ndarray, "free free"]
+    session: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """Which coordinates a density has: structure first, then log variances, then session effects.
+
+    Attributes:
+        names: name of each coordinate.
+        structure: places of the first of them in the search vector.
+        variance: numbers of the variance components that follow.
+        sessions: floor and session of the effects that come last: along, across and yaw of each.
+        group: floor that each coordinate belongs to, -1 where several floors share it.
+    """
+
+    names: tuple[str, ...]
+    structure: Int[np.ndarray, " structure"]
+    variance: Int[np.ndarray, " variance"]
+    sessions: tuple[tuple[str, str], ...]
+    group: Int[np.ndarray, " size"]
+
+    @property
+    def kind(self) -> Int[np.ndarray, " size"]:
+        """0 for structure and effects, 1 for variances."""
+        n, v = len(self.structure), len(self.variance)
+        return np.repeat([0, 1, 0], [n, v, len(self.names) - n - v])
+
+    def parts(self, x: A) -> tuple[A, A, A]:
+        """Structure, log variances and effects of coordinates (..., size)."""
+        n = len(self.structure)
+        end = n + len(self.variance)
+        return x[..., :n], x[..., n:end], x[..., end:]
+
+
+def coordinates_of(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
+    """Coordinates of a part; the floors that each touches are read off the Jacobian at the fit."""
+    volt = problem.volt(jnp.asarray(fitted.log_variance))
+    _, jacobian = problem.linear(jnp.asarray(fitted.z), volt)
+    blocks = {
+        MOTION: ["motion"],
+        ELECTRIC: [k for k in jacobian if k != "motion"],
+        EVERYTHING: list(jacobian),
+    }[part]
+    surface, floors = np.asarray(problem.batch.surface), len(problem.robot.surfaces.labels)
+    touched = np.zeros((problem.space.size, floors), bool)
+    seen = np.zeros((len(problem.noise.names), floors), bool)
+    for k in blocks:
+        moved = np.abs(np.asarray(jacobian[k])).sum(axis=1) > 0
+        for floor in range(floors):
+            touched[:, floor] |= moved[surface == floor].any(axis=0)
+            number = np.asarray(problem.noise.blocks[k].which)[surface == floor]
+            seen[np.unique(number), floor] = True
+    mine = {MOTION: ~problem.electric, ELECTRIC: problem.electric}
+    structure = np.flatnonzero(mine.get(part, np.ones(problem.space.size, bool)))
+    variance = np.flatnonzero(seen.any(axis=1))
+    shared = by_axis(fitted.session, "session", problem.windows)
+    found = {pair for pair, v in zip(pairs(problem.windows), shared, strict=True) if v.any()}
+    sessions = tuple(sorted(found)) if part != ELECTRIC else ()
+    labels = problem.robot.surfaces.labels
+    on = [[label == floor for label in labels] for floor, _ in sessions for _ in AXES]
+    names = [problem.space.names[k] for k in structure]
+    names += [f"noise.{problem.noise.names[k]}" for k in variance]
+    names += [f"session.{floor}.{axis}@{name}" for floor, name in sessions for axis in AXES]
+    return Coordinates(
+        names=tuple(names),
+        structure=structure,
+        variance=variance,
+        sessions=sessions,
+        group=_groups(np.array([*touched[structure], *seen[variance], *on])),
+    )
+
+
+def _groups(touched: Bool[np.ndarray, "size floor"]) -> Int[np.ndarray, " size"]:
+    """The one floor that a coordinate touches, else -1; a single floor is a single group."""
+    group = np.where(touched.sum(axis=1) == 1, touched.argmax(axis=1), -1)
+    return np.zeros_like(group) if touched.shape[1] == 1 else group

@@ -1,0 +1,244 @@
+"""Log posterior of many walkers at a time, for samplers: what the fit maximises, as a density.
+
+A coordinate is a free number of the search space, the log of a variance component, or what the
+runs of a session share along, across or in yaw, in stds that are held. Floors share some of them
+and have the others to themselves, so that the log posterior is a sum
+
+    log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
+
+and numbers of several floors can be moved, and accepted or not, in one evaluation.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit.problem import VARIANCE_SPREAD, Problem
+from slipid.identify.fit.sessions import AXES
+from slipid.identify.posterior.anchor import Anchor, anchor_at, log_student, predict
+from slipid.identify.posterior.coordinates import (
+    ELECTRIC,
+    EVERYTHING,
+    Fitted,
+    coordinates_of,
+)
+from slipid.model.robot import Robot
+
+
+class Held(NamedTuple):
+    """What the electric part holds of the motion of each walker.
+
+    Attributes:
+        z: search vector.
+        felt: traction of each wheel's motor (..., piece, window, wheel).
+    """
+
+    z: Float[Array, "*walker free"]
+    felt: Float[Array, "*walker piece window wheel"]
+
+
+class _Seen(NamedTuple):
+    """Blocks of residuals (piece, m), the robot they are of, and the voltmeter's std [V]."""
+
+    residuals: dict[str, Array]
+    robot: Robot
+    volt: Array
+
+
+class Density:
+    """Log posterior of a part of a problem's numbers, the others held.
+
+    Args:
+        problem: windows, robot and priors.
+        fitted: fit that the chain starts around, and that says how far sessions differ.
+        part: MOTION, ELECTRIC or EVERYTHING; where currents do not inform motion the last is no
+            posterior, but has the likelihoods.
+    """
+
+    def __init__(self, problem: Problem, fitted: Fitted, part: str):
+        self.problem, self.part = problem, part
+        self.floors = problem.robot.surfaces.labels
+        self.coordinates = coordinates_of(problem, fitted, part)
+        self.anchor = anchor_at(problem, fitted, self.coordinates.sessions)
+        # the first of its form compiles for all
+        form = part, self.coordinates.names, self.coordinates.group.tobytes()
+        self._form: Density = problem.compiled.setdefault(form, self)
+        at = self.coordinates
+        effects = np.zeros(len(at.sessions) * len(AXES))
+        z, log_v = np.asarray(fitted.z), np.asarray(fitted.log_variance)
+        self.centre = np.concatenate([z[at.structure], log_v[at.variance], effects])
+        self.covariance = self._laplace(fitted)
+
+    def _laplace(self, fitted: Fitted) -> np.ndarray:
+        """Covariance of all coordinates near the fit; variances are apart from the others."""
+        problem, at = self.problem, self.coordinates
+        n, v = len(at.structure), len(at.variance)
+        out = np.zeros((self.size, self.size))
+        z, log_v = jnp.asarray(fitted.z), jnp.asarray(fitted.log_variance)
+        keep = np.ones(len(problem.windows))
+        of_variance = np.linalg.inv(np.asarray(problem.variance_precision(log_v, keep, z)))
+        out[n : n + v, n : n + v] = of_variance[np.ix_(at.variance, at.variance)]
+        own = np.asarray(fitted.covariance)[np.ix_(at.structure, at.structure)]
+        mean = np.concatenate([np.arange(n), np.arange(n + v, self.size)])
+        precision = np.zeros((len(mean), len(mean)))
+        precision[:n, :n] = np.linalg.inv(own)
+        if at.sessions:
+            _, jacobian = problem.linear(z, problem.volt(log_v))
+            shares = np.asarray(self.anchor.shares)
+            member = np.eye(len(at.sessions))[np.asarray(self.anchor.session)]
+            moved = -shares[:, :, None, :] * member[:, None, :, None]
+            both = [jacobian["motion"][..., at.structure], moved.reshape(*shares.shape[:2], -1)]
+            half = problem.whitened({"motion": jnp.concatenate(both, axis=-1)}, log_v)["motion"]
+            flat = np.asarray(half).reshape(-1, len(mean))
+            told = flat.T @ flat
+            told[:n, :n] = 0.0  # is in the Laplace covariance already
+            precision += told
+            precision[n:, n:] += np.eye(len(mean) - n)
+        out[np.ix_(mean, mean)] = np.linalg.inv(precision)
+        return out
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each coordinate."""
+        return self.coordinates.names
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return len(self.coordinates.names)
+
+    def full(self, x: Array | np.ndarray) -> tuple[Array, Array]:
+        """Search vector and log variances of chain coordinates, the others as at the fit."""
+        return self._full(self.anchor, jnp.asarray(x))
+
+    def _full(self, anchor: Anchor, x: Array) -> tuple[Array, Array]:
+        at = self.coordinates
+        structure, variance, _ = at.parts(x)
+        z = anchor.z.at[at.structure].set(structure)
+        return z, anchor.log_variance.at[at.variance].set(variance)
+
+    def terms(
+        self, x: Float[np.ndarray, "walker size"], held: Held | None = None
+    ) -> Float[np.ndarray, "walker term"]:
+        """Terms of the log posterior of every walker: one per floor, then what floors share.
+
+        Args:
+            x: coordinates.
+            held: what the electric part holds of the motion of each walker, as `hold` gives it.
+        """
+        out = np.array(self._form._terms(self.anchor, jnp.asarray(x), held))
+        out[~np.isfinite(out)] = -np.inf
+        return out
+
+    @partial(jax.jit, static_argnums=0)
+    def _terms(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
+        def one(args: tuple[Array, Held | None]) -> Array:
+            x, held = args
+            return self._sums(anchor, x, held)
+
+        return jax.lax.map(one, (x, held))
+
+    def slope(
+        self, x: Float[np.ndarray, "walker size"], held: Held | None = None
+    ) -> Float[np.ndarray, "walker size"]:
+        """Derivative of the log posterior of every walker; the arguments are those of `terms`."""
+        return np.array(self._form._slope(self.anchor, jnp.asarray(x), held))
+
+    @partial(jax.jit, static_argnums=0)
+    def _slope(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
+        def one(args: tuple[Array, Held | None]) -> Array:
+            x, held = args
+            return jax.grad(lambda x: jnp.sum(self._sums(anchor, x, held)))(x)
+
+        return jax.lax.map(one, (x, held))
+
+    def logpdf(self, x: Float[Array, " size"]) -> Float[Array, ""]:
+        """Log posterior of one vector, differentiable, for samplers that want gradients."""
+        return jnp.sum(self._sums(self.anchor, x, None))
+
+    def _sums(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
+        likelihood = sum(self._pieces(anchor, x, held).values())
+        at = self.coordinates
+        space = self.problem.space
+        n, v = len(at.structure), len(at.variance)
+        unit = np.ones(self.size - n - v)
+        mean = jnp.concatenate(
+            [space.prior_mean[at.structure], anchor.typical[at.variance], 0 * unit]
+        )
+        std = np.concatenate([space.prior_std[at.structure], np.full(v, VARIANCE_SPREAD), unit])
+        prior = -0.5 * ((x - mean) / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi)
+        count = len(self.floors)
+        out = jnp.zeros(count + 1).at[anchor.batch.surface].add(likelihood)
+        return out.at[np.where(at.group < 0, count, at.group)].add(prior)
+
+    def pointwise(
+        self, x: Float[np.ndarray, "draw size"], held: Held | None = None
+    ) -> dict[str, Float[np.ndarray, "draw piece"]]:
+        """Log likelihood of every piece, by block of residuals."""
+        out = self._form._pointwise(self.anchor, jnp.asarray(x), held)
+        return {k: np.asarray(v) for k, v in out.items()}
+
+    @partial(jax.jit, static_argnums=0)
+    def _pointwise(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
+        return jax.lax.map(lambda a: self._pieces(anchor, *a), (x, held))
+
+    def _pieces(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
+        z, log_v = self._full(anchor, x)
+        effects = self.coordinates.parts(x)[2]
+        seen = self._residuals(anchor, z, log_v, effects, held)
+        out = {k: log_student(anchor, k, r, log_v) for k, r in seen.residuals.items()}
+        camera, spread = lk.log_jacobians(seen.robot, anchor.batch, seen.volt)
+        if "motion" in out:
+            out["motion"] += camera
+        if "voltage" in out:
+            out["voltage"] += spread
+        return out
+
+    def residuals(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
+        """Blocks of residuals of many vectors (draw, piece, m)."""
+        return self._form._many_residuals(self.anchor, jnp.asarray(x))
+
+    @partial(jax.jit, static_argnums=0)
+    def _many_residuals(self, anchor: Anchor, x: Array) -> dict[str, Array]:
+        def one(x: Array) -> dict[str, Array]:
+            effects = self.coordinates.parts(x)[2]
+            return self._residuals(anchor, *self._full(anchor, x), effects, None).residuals
+
+        return jax.lax.map(one, x)
+
+    def _residuals(
+        self, anchor: Anchor, z: Array, log_v: Array, effects: Array, held: Held | None
+    ) -> _Seen:
+        b, at = anchor.batch, self.coordinates
+        volt = lk.voltage_std(log_v[-1]) if b.has_current and b.has_voltage else jnp.asarray(1.0)
+        if self.part == ELECTRIC:
+            assert held is not None, "what the electric part holds of the motion"
+            robot = self.problem.space.tree(held.z.at[at.structure].set(z[at.structure]))
+            return _Seen(lk.electric_residuals(robot, b, held.felt, volt), robot, volt)
+        robot = self.problem.space.tree(z)
+        p = predict(robot, anchor, z)
+        out = {"motion": lk.motion_residual(robot, b, p)}
+        if at.sessions:
+            shared = effects.reshape(-1, len(AXES))[anchor.session]
+            out["motion"] -= jnp.sum(anchor.shares * shared[:, None], axis=-1)
+        if self.part == EVERYTHING:
+            out |= lk.electric_residuals(robot, b, p.felt, volt)
+        # or the root finder is computed again for every consumer
+        return _Seen(jax.lax.optimization_barrier(out), robot, volt)
+
+    def hold(self, x: Float[np.ndarray, "walker size"]) -> Held:
+        """What the electric part holds of walkers of the motion part."""
+        return self._form._hold(self.anchor, jnp.asarray(x))
+
+    @partial(jax.jit, static_argnums=0)
+    def _hold(self, anchor: Anchor, x: Array) -> Held:
+        def one(x: Array) -> Held:
+            z, _ = self._full(anchor, x)
+            return Held(z, predict(self.problem.space.tree(z), anchor, z).felt)
+
+        return jax.lax.map(one, x)

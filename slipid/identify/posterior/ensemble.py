@@ -1,0 +1,219 @@
+"""Several independent emcee ensembles, in blocks that can be kept and gone on from.
+
+Walkers of one ensemble know of each other, so that whether the chains agree is asked of ensembles.
+During the warm-up, which is thrown away, proposals are learnt from all of them; after it nothing
+changes any more. What a block holds and when sampling stops depend on blocks before it only, so
+that a chain that was interrupted goes on as if it had not been.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import emcee
+import numpy as np
+from emcee.state import State
+
+from slipid.identify.posterior import diagnosis
+from slipid.identify.posterior.blocks import Block, Chain, Plan, Record
+from slipid.identify.posterior.proposals import WAY, Hamiltonian, moves
+from slipid.identify.posterior.target import Target
+from slipid.identify.posterior.transport.learn import learnt
+from slipid.identify.posterior.transport.transport_map import Transport
+
+RandomState = tuple[str, np.ndarray, int, int, float]
+"""State of a Mersenne twister as numpy gives it."""
+
+ACCEPTED = 0.8
+"""Part of Hamiltonian moves that shall be accepted; their step is adapted in the warm-up."""
+FIRST_ANGLE, LEAST_ANGLE = 0.15, 0.03
+"""First and smallest step of Hamiltonian moves [rad]."""
+DRAWS_PER_EFFECTIVE = 24.0
+"""Draws of the warm-up that tell as much as an independent one, about."""
+
+
+def extended(
+    targets: Sequence[Target],
+    plan: Plan,
+    part: str,
+    record: Record,
+    done: Sequence[Block] | None = None,
+) -> list[Block]:
+    """Blocks of a part up to the plan's end, each kept as soon as it is made.
+
+    Args:
+        targets: one for each ensemble; they differ only where walkers are `apart`.
+        plan: ensembles, bars and seed.
+        part: name of the part in the record.
+        record: blocks of an earlier call, and where new ones go.
+        done: blocks to go on from; those of the record where None.
+    """
+    blocks = list(record.done(part) if done is None else done)
+    stage = part.partition("-")[0]
+    for block in run(targets, plan, blocks, lambda steps: record.tell(stage, steps)):
+        blocks.append(block)
+        record.keep(part, block)
+    return blocks
+
+
+def run(
+    targets: Sequence[Target],
+    plan: Plan,
+    done: Sequence[Block] = (),
+    tell: Callable[[int], None] = lambda steps: None,
+) -> Iterator[Block]:
+    """Blocks after those that are done, until `diagnose` finds them good or the plan's most.
+
+    Args:
+        targets: one for each ensemble; they differ only where walkers are `apart`.
+        plan: ensembles, bars and seed.
+        done: all blocks from the first, to go on from.
+        tell: called with the number of steps of a block that every ensemble has done.
+    """
+    from threadpoolctl import threadpool_limits
+
+    blocks = list(done)
+    while not _ended(blocks, plan):
+        # many small matrices: threads of BLAS cost more than they bring
+        with threadpool_limits(1):
+            block = _block(targets, plan, blocks, tell)
+        blocks.append(block)
+        yield block
+
+
+def _ended(blocks: list[Block], plan: Plan) -> bool:
+    after = len(blocks) - plan.warm_up[-1]
+    if len(blocks) >= plan.most:
+        return True
+    # looked at every fourth block at first, then less often: looking costs, too
+    if after < 4 or after % max(4, 2 ** int(np.log2(after) - 3)):
+        return False
+    return diagnosis.diagnose(chain(blocks, plan), plan).converged
+
+
+def chain(blocks: Sequence[Block], plan: Plan) -> Chain:
+    """Positions after the warm-up."""
+    return np.concatenate([b.chain for b in blocks[plan.warm_up[-1] :]], axis=1)
+
+
+def _block(
+    targets: Sequence[Target], plan: Plan, blocks: list[Block], tell: Callable[[int], None]
+) -> Block:
+    states, map, angle = _begin(targets, plan, blocks)
+    stop, told = threading.Event(), [0] * plan.ensembles
+
+    def ensemble(k: int) -> tuple[np.ndarray, np.ndarray, State, float, list[float]]:
+        inner = targets[k].seen_by(map)
+        made = moves(inner, angle)
+        sampler = emcee.EnsembleSampler(
+            plan.walkers,
+            len(inner.centre),
+            inner.log_prob,
+            moves=made,
+            vectorize=True,
+            blobs_dtype=float,
+        )
+        places, log_probs, moved = [], [], 0.0
+        before = states[k].coords
+        for state in sampler.sample(
+            states[k], iterations=plan.block, store=False, skip_initial_state_check=True
+        ):
+            if stop.is_set():
+                break
+            places.append(state.coords.copy())
+            log_probs.append(state.log_prob.copy())
+            moved += float((state.coords != before).any(axis=1).mean()) / plan.block
+            before = places[-1]
+            told[k] += 1
+            tell(min(told))
+        turns = [a for move, _ in made if isinstance(move, Hamiltonian) for a in move.accepted]
+        return np.stack(places), np.stack(log_probs), state, moved, turns
+
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, plan.ensembles)) as pool:
+        try:
+            found = list(pool.map(ensemble, range(plan.ensembles)))
+        finally:
+            stop.set()  # an interrupt of the caller ends the others at their next step
+    ends = [f[2] for f in found]
+    places = np.stack([f[0] for f in found])
+    x, log = map.placed(places.reshape(-1, places.shape[-1]))
+    block = Block(
+        number=len(blocks),
+        chain=x.reshape(places.shape),
+        log_prob=np.stack([f[1] for f in found]) - log.sum(axis=1).reshape(places.shape[:-1]),
+        random=(
+            np.stack([s.random_state[1] for s in ends]),
+            np.array([s.random_state[2:] for s in ends], float),
+        ),
+        accepted=np.array([f[3] for f in found]),
+        map=map,
+        angle=angle,
+    )
+    turns = [a for f in found for a in f[4]]
+    return _with_learnt(block, targets[0], plan, blocks, turns)
+
+
+def _begin(
+    targets: Sequence[Target], plan: Plan, blocks: list[Block]
+) -> tuple[list[State], Transport, float]:
+    """State of every ensemble in mapped coordinates, the map, and the angle."""
+    if not blocks:
+        map = targets[0].laplace()
+        starts = [_start(t, plan, k) for k, t in enumerate(targets)]
+        return [State(map.forward(x), random_state=r) for x, r in starts], map, FIRST_ANGLE
+    last = blocks[-1]
+    states = [
+        State(
+            last.map.forward(last.chain[k, -1]),
+            random_state=_random_state(last.random[0][k], last.random[1][k]),
+        )
+        for k in range(plan.ensembles)
+    ]
+    return states, last.map, last.angle
+
+
+def _random_state(key: np.ndarray, rest: np.ndarray) -> RandomState:
+    return ("MT19937", key, int(rest[0]), int(rest[1]), float(rest[2]))
+
+
+def _start(target: Target, plan: Plan, ensemble: int) -> tuple[np.ndarray, RandomState]:
+    """Walkers spread wider than the fit's own uncertainty, at places with a density."""
+    root = np.linalg.cholesky(target.covariance)
+    wide = plan.spread * np.geomspace(0.25, 1.0, plan.walkers)[:, None]
+    seeds = np.random.SeedSequence((plan.seed, ensemble))
+    random = np.random.RandomState(np.random.MT19937(seeds))
+    x = np.empty((plan.walkers, len(root)))
+    lost = np.ones(plan.walkers, bool)
+    for shrink in 0.7 ** np.arange(30):
+        # all are drawn, so that what is compiled has one shape
+        tried = target.centre + shrink * wide * random.standard_normal(x.shape) @ root.T
+        found = np.isfinite(target.terms(tried)).all(axis=1)
+        x[lost & found] = tried[lost & found]
+        lost &= ~found
+        if not lost.any():
+            state = random.get_state(legacy=True)
+            assert isinstance(state, tuple)
+            return x, state
+    raise ValueError("the log density is not finite anywhere near the fit")
+
+
+def _with_learnt(
+    block: Block, target: Target, plan: Plan, blocks: list[Block], turns: list[float]
+) -> Block:
+    """The block with what the warm-up has learnt for the next."""
+    count = block.number + 1
+    if count > plan.warm_up[-1]:
+        return block
+    if turns:
+        angle = block.angle * np.exp(np.mean(turns) - ACCEPTED)
+        block = replace(block, angle=float(np.clip(angle, LEAST_ANGLE, WAY)))
+    if count in plan.warm_up[:-1]:
+        recent = [b.chain for b in [*blocks, block][count // 2 :]]
+        draws = np.concatenate(recent, axis=1).reshape(-1, len(target.centre))
+        map = learnt(
+            draws, len(draws) / DRAWS_PER_EFFECTIVE, target.covariance, target.group, target.kind
+        )
+        block = replace(block, map=map)
+    return block

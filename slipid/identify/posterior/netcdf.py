@@ -1,0 +1,158 @@
+"""posterior.nc: draws in the layout of ArviZ, with names for everything."""
+
+import tempfile
+from collections.abc import Iterator
+from functools import reduce
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.identify.fit.problem import Problem
+from slipid.identify.posterior.pointwise import likelihoods, replicates
+from slipid.identify.posterior.sample import Posterior
+from slipid.parameter import Entry, Space
+from slipid.support.files import write_bytes
+
+if TYPE_CHECKING:
+    from xarray import DataTree
+
+SCHEMA = "slipid.posterior/1"
+REPLICATES = 50
+"""Replicated data sets of each ensemble."""
+_AXES = ("x", "y", "yaw")
+
+
+def tree(
+    problem: Problem, found: Posterior, runs: tuple[str, ...], about: dict[str, str]
+) -> "DataTree":
+    """All groups of the file as an xarray DataTree.
+
+    Args:
+        runs: name of every run of the dataset.
+        about: attributes of the whole file.
+    """
+    from arviz_base import from_dict
+
+    w, robot = problem.windows, problem.robot
+    values, dims, units = _numbers(problem.space, found)
+    noise, noise_dims = _noise(problem, found)
+    per_run = likelihoods(problem, found)
+    run = np.unique(w.run)
+    onto = (np.asarray(w.run)[:, None] == run).astype(float)
+    measured, predicted, data_dims = _data(problem, found)
+    unconstrained = {"z": found.z, "log_variance": found.log_variance}
+    if found.effects.shape[-1]:
+        unconstrained["effects"] = found.effects
+    coords = {
+        "surface": list(robot.surfaces.labels),
+        "load": list(robot.body.loads),
+        "session": list(robot.camera.sessions),
+        "wheel": [f"wheel {k + 1}" for k in range(robot.geometry.wheels)],
+        "axis": list(_AXES[:2]),
+        "direction": list(_AXES),
+        "run": [runs[k] for k in run],
+        "coordinate": problem.space.names,
+        "component": list(problem.noise.names),
+        "shared": [n for n in found.names if n.startswith("session.")],
+    }
+    made = from_dict(
+        {
+            "posterior": values | noise,
+            "sample_stats": {"lp": found.log_prob},
+            "log_likelihood": {k: v @ onto for k, v in per_run.items()},
+            "posterior_predictive": predicted,
+            "observed_data": measured,
+            "unconstrained_posterior": unconstrained,
+        },
+        coords=coords,
+        dims=dims
+        | noise_dims
+        | data_dims
+        | {"z": ["coordinate"], "log_variance": ["component"], "effects": ["shared"]}
+        | {k: ["run"] for k in per_run},
+    )
+    for name, unit in units.items():
+        made["posterior"][name].attrs["units"] = unit
+    made["observed_data"].attrs["run_of_piece"] = [runs[k] for k in w.run]
+    made.attrs.update(about)
+    return made
+
+
+def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
+    """Draws of every leaf with a free number, its dimensions and units."""
+    shape = found.z.shape[:2]
+    robots = jax.vmap(space.tree)(jnp.asarray(found.z.reshape(-1, space.size)))
+    values, dims, units = {}, {}, {}
+    for name, entry, of_label in _leaves(space):
+        leaf = np.asarray(reduce(getattr, entry.leaf, robots))
+        values[name] = leaf.reshape(*shape, *leaf.shape[1:])
+        dims[name] = [*of_label, *_of_vector(entry)]
+        units[name] = entry.declaration.unit
+    return values, dims, units
+
+
+def _leaves(space: Space) -> Iterator[tuple[str, Entry, list[str]]]:
+    """Name, an entry and the labelled dimension of every leaf with a free number."""
+    told = set()
+    for e in space.free:
+        if e.leaf in told:
+            continue
+        told.add(e.leaf)
+        of = {"surface": e.surface, "load": e.load, "session": e.session}
+        yield e.quantity, e, [label for label, name in of.items() if name is not None]
+
+
+def _of_vector(entry: Entry) -> list[str]:
+    if entry.size == 1:
+        return []
+    return ["axis"] if entry.size == 2 else ["wheel"]
+
+
+def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
+    """Std of every noise component, floors side by side."""
+    rows = np.moveaxis(np.exp(0.5 * found.log_variance), -1, 0)
+    out: dict[str, np.ndarray] = {}
+    dims: dict[str, list[str]] = {}
+    of_floors: dict[str, list[np.ndarray]] = {}
+    for component, std in zip(problem.noise.components, rows, strict=True):
+        name = f"noise.{component.kind}.{component.what}"
+        if component.floor is None:
+            out[name], dims[name] = std, []
+        else:
+            of_floors.setdefault(name, []).append(std)
+            out[name], dims[name] = np.stack(of_floors[name], axis=-1), ["surface"]
+    return out, dims
+
+
+def _data(problem: Problem, found: Posterior) -> tuple[dict, dict, dict]:
+    """What was measured of every window, and replicates of it.
+
+    Marker increments are in metres corrected by the fitted camera.
+    """
+    from slipid.identify.fit import likelihood as lk
+
+    w, new = problem.windows, replicates(problem, found, REPLICATES)
+    middle = problem.space.tree(jnp.asarray(found.z.mean(axis=(0, 1))))
+    measured = {"increment": np.asarray(jax.jit(lk.measured)(middle, problem.batch.pose))}
+    dims = {"increment": ["piece", "window", "direction"]}
+    gaps = {"increment": new["motion"]}
+    if w.has_current:
+        measured["current"], dims["current"] = np.asarray(w.current), ["piece", "window", "wheel"]
+        gaps["current"] = new["current"]
+    predicted = {k: gaps[k].reshape(*gaps[k].shape[:2], *y.shape) + y for k, y in measured.items()}
+    return measured, predicted, dims
+
+
+def write(made: "DataTree", path: Path) -> None:
+    """Write the file, whole or not at all.
+
+    Raises:
+        DataError: nothing can be written there.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / path.name
+        made.to_netcdf(whole, engine="h5netcdf")
+        write_bytes(path, whole.read_bytes())

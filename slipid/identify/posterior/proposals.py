@@ -1,0 +1,238 @@
+"""Moves of an ensemble of walkers in coordinates in which its target is nearly a Gaussian.
+
+A target's log density is a sum of one term per group of coordinates, given those that groups share,
+and a term of the shared ones. In the coordinates of `transport_map` independence moves and
+differential evolution move all groups in one evaluation, each accepted or not by its own term, or
+the shared ones, which groups then follow. Hamiltonian moves take all coordinates far along the
+gradient where the density still bends, and walks along a single one cross its plateaus.
+"""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from emcee.moves import Move
+from emcee.state import State
+from jaxtyping import Float, Int
+from numpy.random import RandomState
+from scipy.special import gammaln
+
+from slipid.identify.posterior.target import Family, Target, families
+from slipid.identify.posterior.transport.arrays import Matrix
+
+STUDENT = 0.2
+"""Part of independent draws that come from a Student t, so that no tail is left out."""
+DEGREES = 8.0
+"""Degrees of freedom of that Student t."""
+WAY = 0.5 * np.pi
+"""Length of a Hamiltonian move [rad]: a quarter turn leads to an independent draw of a Gaussian."""
+MOST_STEPS = 12
+ALONG, ALONG_APART, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 0.6, 1.2, 0.1, 0.35
+"""How often, relatively, moves of each kind are made; a Hamiltonian one takes ten times longer."""
+ALONE = 0.5
+"""Part of walks along a coordinate that no other one of x follows."""
+STEEPEST = 100.0
+"""Kicks are bounded by this many times the step, so that walkers far out are not thrown away."""
+
+
+@runtime_checkable
+class Model(Protocol):
+    """What emcee gives to moves: the log density, and the ensemble's own randomness."""
+
+    random: RandomState
+
+    def compute_log_prob_fn(self, x: Matrix) -> tuple[Float[np.ndarray, " walker"], Matrix]:
+        """Log density of every walker, and its terms."""
+
+
+class FamilyMove(Move):
+    """Metropolis-Hastings of a family.
+
+    Attributes:
+        halves: 2 where a proposal needs walkers that stand still, else 1.
+    """
+
+    halves = 1
+
+    def __init__(self, family: Family):
+        self.family = family
+
+    def jump(
+        self, old: Matrix, still: Matrix, random: RandomState
+    ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
+        """New coordinates of some places, and log q(old | new) - log q(new | old)."""
+        raise NotImplementedError
+
+    def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
+        """New vectors, and the log factor of each group's part or of the shared one."""
+        new, factor = x.copy(), np.empty((len(x), len(self.family.places)))
+        for k, own in enumerate(self.family.places):
+            new[:, own], factor[:, k] = self.jump(x[:, own], still[:, own], random)
+        return new, factor
+
+    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
+        random, count = model.random, len(state.coords)
+        accepted = np.zeros(count, bool)
+        order = random.permutation(count) if self.halves == 2 else np.arange(count)
+        for mine in np.array_split(order, self.halves):
+            still = state.coords[np.setdiff1d(order, mine)]
+            new, factor = self.proposed(state.coords[mine], still, random)
+            log_prob, terms = model.compute_log_prob_fn(new)
+            if self.family.groups is None:
+                gain = (log_prob - state.log_prob[mine])[:, None] + factor
+            else:
+                own_terms = list(self.family.groups)
+                gain = terms[:, own_terms] - state.blobs[mine][:, own_terms] + factor
+            took = np.log(random.uniform(size=gain.shape)) < np.where(np.isnan(gain), -1e9, gain)
+            self._take(state, mine, new, terms, took)
+            accepted[mine] = took.any(axis=1)
+        return state, accepted
+
+    def _take(
+        self,
+        state: State,
+        mine: Int[np.ndarray, " some"],
+        new: Matrix,
+        terms: Matrix,
+        took: np.ndarray,
+    ) -> None:
+        for k, own in enumerate(self.family.places):
+            rows = mine[took[:, k]]
+            state.coords[np.ix_(rows, own)] = new[took[:, k]][:, own]
+            of = slice(None) if self.family.groups is None else self.family.groups[k]
+            state.blobs[rows, of] = terms[took[:, k], of]
+        state.log_prob[mine] = state.blobs[mine].sum(axis=1)
+
+
+class Independence(FamilyMove):
+    """Draws that do not depend on where a walker is: Gaussian, or Student t of as many degrees."""
+
+    def jump(
+        self, old: Matrix, still: Matrix, random: RandomState
+    ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
+        count = len(old)
+        new = random.standard_normal(old.shape)
+        stretch = np.sqrt(DEGREES / random.chisquare(DEGREES, count))
+        new *= np.where(random.uniform(size=count) < STUDENT, stretch, 1.0)[:, None]
+        return new, _log_density(old) - _log_density(new)
+
+
+def _log_density(u: Matrix) -> Float[np.ndarray, " walker"]:
+    """Log density of the mixture that independence moves draw from, up to a constant."""
+    size, q = u.shape[1], (u**2).sum(axis=1)
+    of_t = gammaln(0.5 * (DEGREES + size)) - gammaln(0.5 * DEGREES)
+    of_t -= 0.5 * size * np.log(DEGREES / 2)  # less the Gaussian's 2 pi
+    of_t -= 0.5 * (DEGREES + size) * np.log1p(q / DEGREES)
+    return np.asarray(np.logaddexp(np.log(1 - STUDENT) - 0.5 * q, np.log(STUDENT) + of_t))
+
+
+class Differential(FamilyMove):
+    """Differential evolution: differences of walkers that stand still, at times whole ones.
+
+    Source: ter Braak 2006, Statistics and Computing 16; whole differences lead from mode to mode.
+    """
+
+    halves = 2
+    whole = 0.1
+
+    def jump(
+        self, old: Matrix, still: Matrix, random: RandomState
+    ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
+        count, size = old.shape
+        first = random.randint(len(still), size=count)
+        second = (first + random.randint(1, len(still), size=count)) % len(still)
+        usual = 2.38 / np.sqrt(2 * size) * np.exp(0.5 * random.standard_normal(count))
+        scale = np.where(random.uniform(size=count) < self.whole, 1.0, usual)
+        jitter = 1e-5 * still.std(axis=0) * random.standard_normal((count, size))
+        return old + scale[:, None] * (still[first] - still[second]) + jitter, np.zeros(count)
+
+
+class Along(FamilyMove):
+    """Random walk of x of one coordinate of each group, or of a shared one.
+
+    Where data say no more than that a number is small, its logarithm may be anything: a plateau
+    that no map of the whole has straight, but along which this walks. The others of u are held, so
+    that those of x follow as the map says, or else the others of x.
+    """
+
+    def __init__(self, target: Target, groups: tuple[int, ...] | None):
+        assert target.map, "a target that is seen by a map"
+        everything = np.arange(len(target.group))
+        of_group = [np.flatnonzero(target.group == g) for g in groups or ()]
+        super().__init__(Family(tuple(of_group or [everything]), groups))
+        self.map = target.map
+        self.mine = tuple(of_group or [np.flatnonzero(target.group < 0)])
+        self.std = np.sqrt(np.diag(target.covariance))
+        # every other walk is along a plateau, where there are any
+        flat = [self.map.values.plateau[mine] > 0 for mine in self.mine]
+        self.often = [np.where(f, 1 / max(f.sum(), 1), 1 / max((~f).sum(), 1)) for f in flat]
+
+    def proposed(self, u: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
+        rows = np.arange(len(u))
+        x, before = self.map.placed(u)
+        moved = np.zeros(u.shape, bool)
+        for mine, often in zip(self.mine, self.often, strict=True):
+            which = random.choice(mine, len(u), p=often / often.sum())
+            reach = 10 ** random.uniform(-0.5, 1.0, len(u)) * self.std[which]
+            x[rows, which] += reach * random.standard_normal(len(u))
+            moved[rows, which] = True
+        moved |= random.uniform(size=(len(u), 1)) < ALONE
+        new = np.where(moved, self.map.forward(x), u)
+        change = np.where(moved, before - self.map.placed(new)[1], 0.0)
+        return new, np.stack([change[:, own].sum(axis=1) for own in self.family.places], axis=1)
+
+
+class Hamiltonian(Move):
+    """Turns of position and momentum that suit a Gaussian, kicked by what it does not know.
+
+    With momentum p and the log density l, steps of
+
+        turn (u, p) by h/2;    p += h (dl/du + u);    turn (u, p) by h/2
+
+    Source: Beskos et al. 2011, Stochastic Processes and their Applications 121, section 4.
+    """
+
+    def __init__(self, target: Target, angle: float):
+        self.target, self.angle = target, angle
+        self.accepted: list[float] = []
+
+    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
+        random, (count, size) = model.random, state.coords.shape
+        # shorter steps, now and then, for walkers where the density is steep
+        h = self.angle * (1 - 0.8 * random.uniform(size=(count, 1)) ** 3)
+        steps = int(np.clip(random.uniform(1.0, 1.4) * WAY / self.angle, 1, MOST_STEPS))
+        u, start = state.coords, random.standard_normal((count, size))
+        u, p = _turn(u, start, h / 2)
+        for step in range(steps):
+            kick = np.nan_to_num(self.target.slope(u)) + u
+            most = np.linalg.norm(kick, axis=1, keepdims=True) / STEEPEST
+            p = p + h * kick / np.maximum(most, 1.0)
+            u, p = _turn(u, p, h if step < steps - 1 else h / 2)
+        log_prob, terms = model.compute_log_prob_fn(u)
+        gain = log_prob - state.log_prob + 0.5 * (start**2 - p**2).sum(axis=1)
+        took = np.log(random.uniform(size=count)) < np.where(np.isnan(gain), -np.inf, gain)
+        state.coords[took], state.blobs[took] = u[took], terms[took]
+        state.log_prob[took] = log_prob[took]
+        self.accepted.append(float(took.mean()))
+        return state, took
+
+
+def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
+    c, s = np.cos(angle), np.sin(angle)
+    return c * u + s * p, c * p - s * u
+
+
+def moves(target: Target, angle: float) -> list[tuple[Move, float]]:
+    """Moves in the target's coordinates, and how often each is made."""
+    of_family = families(target)
+    groups = tuple(int(g) for g in np.unique(target.group) if g >= 0)
+    along = ALONG_APART if target.apart else ALONG
+    found: list[tuple[Move, float]] = [(Along(target, groups), along)] if groups else []
+    if (target.group < 0).any():
+        found.append((Along(target, None), along))
+    kinds: list[tuple[type[FamilyMove], float]] = [(Independence, INDEPENDENT)]
+    if not target.apart:
+        kinds.append((Differential, DIFFERENTIAL))
+    found += [
+        (kind(family), share / len(of_family)) for kind, share in kinds for family in of_family
+    ]
+    return [*found, (Hamiltonian(target, angle), HAMILTONIAN)]

@@ -1,0 +1,130 @@
+"""Second stage: electric numbers given each draw of the motion, a walker for every draw."""
+
+import hashlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.identify.posterior.blocks import Chain, Plan, Record
+from slipid.identify.posterior.coordinates import ELECTRIC
+from slipid.identify.posterior.density import Density, Held
+from slipid.identify.posterior.ensemble import chain, extended
+from slipid.identify.posterior.target import Target
+
+FEWEST, MORE, MOST = 9, 4, 33
+"""Blocks: at first, then so many more until it has settled, at most (or a sixth of the first
+stage's most)."""
+DRIFT, MEMORY = 4.0, 0.5
+"""Standard errors by which means and stds of walkers may still move in the second half of the
+chain, and correlation that they may still have with where they were in its middle."""
+
+
+@dataclass(frozen=True, eq=False)
+class SecondStage:
+    """A draw of the electric numbers for every draw of the motion, and how it was found.
+
+    Attributes:
+        x: draws.
+        accepted: part of the moves that moved something.
+        still: part of the walkers with a group that never moved.
+        unsettled: drift or memory of each coordinate, as `unsettled` says.
+    """
+
+    x: Float[np.ndarray, "ensemble draw size"]
+    accepted: float
+    still: float
+    unsettled: Float[np.ndarray, " size"]
+
+
+def electric_given_motion(
+    first: Density,
+    second: Density,
+    covariance: Float[np.ndarray, "free free"],
+    x: Float[np.ndarray, "ensemble draw size"],
+    plan: Plan,
+    record: Record,
+) -> SecondStage:
+    """A draw of the electric numbers for every draw of the motion.
+
+    Walkers are in coordinates less their regression on the motion, in which they are all alike.
+
+    Args:
+        first, second: densities of the motion and of the electric numbers.
+        covariance: Laplace covariance of the search vector.
+        x: draws of the motion.
+        plan: plan of the first stage.
+        record: blocks of an earlier call, and where new ones go.
+    """
+    motion, electric = first.coordinates.structure, second.coordinates.structure
+    slope = np.linalg.solve(
+        covariance[np.ix_(motion, motion)], covariance[np.ix_(motion, electric)]
+    )
+    n = len(electric)
+    left = second.covariance.copy()
+    left[:n, :n] -= covariance[np.ix_(electric, motion)] @ slope
+    shift = np.zeros((*x.shape[:2], second.size))
+    shift[..., :n] = (x[..., : len(motion)] - first.centre[: len(motion)]) @ slope
+    targets = [
+        _target(second, left, moved, first.hold(of_ensemble))
+        for of_ensemble, moved in zip(x, shift, strict=True)
+    ]
+    later = replace(
+        plan, walkers=x.shape[1], seed=plan.seed + 1, block=8, warm_up=(1, 2, 3, 5), most=FEWEST
+    )
+    part = f"{ELECTRIC}-of-{hashlib.sha256(x.tobytes()).hexdigest()[:12]}"
+    blocks = list(record.done(part))
+    longest = max(MOST, plan.most // 6)
+    while True:
+        # asked after these numbers of blocks only, wherever an earlier call was interrupted
+        while later.most < len(blocks):
+            later = replace(later, most=later.most + MORE)
+        blocks = extended(targets, later, part, record, blocks)
+        steps = chain(blocks, later)
+        left_over = unsettled(steps)
+        if len(blocks) >= longest or left_over.max() < 1:
+            break
+        later = replace(later, most=later.most + MORE)
+    moved = np.diff(steps, axis=1) != 0
+    groups = second.coordinates.group
+    never = np.any([~moved[..., groups == g].any(axis=(1, 3)) for g in np.unique(groups)], axis=0)
+    return SecondStage(
+        x=steps[:, -1] + shift,
+        accepted=float(np.mean([b.accepted for b in blocks])),
+        still=float(never.mean()),
+        unsettled=left_over,
+    )
+
+
+def _target(
+    second: Density,
+    covariance: Float[np.ndarray, "size size"],
+    shift: Float[np.ndarray, "walker size"],
+    held: Held,
+) -> Target:
+    """The electric numbers less their regression on the motion, each walker with its own motion."""
+    return Target(
+        lambda u: second.terms(u + shift, held),
+        lambda u: second.slope(u + shift, held),
+        second.coordinates.group,
+        second.coordinates.kind,
+        second.centre,
+        covariance,
+        apart=True,
+    )
+
+
+def unsettled(steps: Chain) -> Float[np.ndarray, " size"]:
+    """Drift and memory of walkers over the second half of a chain, the worse of the two; 1: enough.
+
+    Walkers of the second stage know nothing of each other and have, less what the motion tells of
+    them, one distribution: they are many independent draws of where a chain is after so many steps.
+    """
+    count = steps.shape[1]
+    middle, end = (steps[:, k].reshape(-1, steps.shape[-1]) for k in (count // 2, count - 1))
+    std, before = end.std(axis=0) + 1e-300, middle.std(axis=0) + 1e-300
+    error = np.sqrt(2 / len(end))  # of a difference of means; of one of log stds it is smaller
+    of_mean = np.abs(end.mean(axis=0) - middle.mean(axis=0)) / std / error
+    drift = np.maximum(of_mean, np.abs(np.log(std / before)) / error)
+    together = ((end - end.mean(axis=0)) * (middle - middle.mean(axis=0))).mean(axis=0)
+    return np.asarray(np.maximum(drift / DRIFT, together / std / before / MEMORY))

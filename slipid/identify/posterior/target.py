@@ -1,0 +1,90 @@
+"""A log density as a sum of terms of groups of coordinates, and which of them move together."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from slipid.identify.posterior.transport.arrays import Matrix
+from slipid.identify.posterior.transport.learn import gaussian
+from slipid.identify.posterior.transport.transport_map import Transport
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A log density, and what is known of it beforehand.
+
+    Attributes:
+        terms: from vectors (walker, size) to terms (walker, group + 1), the shared term last.
+        slope: from vectors to the derivative of the sum of their terms (walker, size).
+        group: group of each coordinate, -1 where groups share it.
+        kind: kind of each coordinate; coordinates of different kinds are moved apart.
+        centre, covariance: mean and covariance of a Gaussian near it (Laplace).
+        apart: whether every walker has a density of its own, so that all are evaluated together and
+            in order, and none can be moved by what others do.
+        map: map it is seen through; None for x itself.
+    """
+
+    terms: Callable[[Matrix], Matrix]
+    slope: Callable[[Matrix], Matrix]
+    group: Int[np.ndarray, " size"]
+    kind: Int[np.ndarray, " size"]
+    centre: Float[np.ndarray, " size"]
+    covariance: Matrix
+    apart: bool = False
+    map: Transport | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of groups."""
+        return int(self.group.max()) + 1
+
+    def log_prob(self, x: Matrix) -> Matrix:
+        """Log density and, as blobs, its terms."""
+        terms = self.terms(x)
+        return np.concatenate([terms.sum(axis=1, keepdims=True), terms], axis=1)
+
+    def laplace(self) -> Transport:
+        """Map of the Gaussian near it."""
+        return gaussian(self.centre, self.covariance, self.group, self.kind)
+
+    def seen_by(self, map: Transport) -> "Target":
+        """The same distribution in other coordinates; centre and covariance are left alone."""
+        onto = np.eye(self.count + 1)[np.where(self.group < 0, self.count, self.group)]
+
+        def terms(u: Matrix) -> Matrix:
+            x, log = map.placed(u)
+            return np.asarray(self.terms(x) + log @ onto)
+
+        def slope(u: Matrix) -> Matrix:
+            return map.pull(u, self.slope)
+
+        return replace(self, terms=terms, slope=slope, map=map)
+
+
+@dataclass(frozen=True)
+class Family:
+    """Coordinates that are moved together.
+
+    Attributes:
+        places: those of each group, or the shared ones alone.
+        groups: number of each group; None for shared ones.
+    """
+
+    places: tuple[Int[np.ndarray, " _"], ...]
+    groups: tuple[int, ...] | None
+
+
+def families(target: Target) -> list[Family]:
+    """Coordinates of every kind, of all groups and shared."""
+    found = []
+    for k in np.unique(target.kind):
+        groups = tuple(int(g) for g in np.unique(target.group[target.kind == k]) if g >= 0)
+        places = [np.flatnonzero((target.kind == k) & (target.group == g)) for g in groups]
+        if groups:
+            found.append(Family(tuple(places), groups))
+        shared = np.flatnonzero((target.kind == k) & (target.group < 0))
+        if len(shared):
+            found.append(Family((shared,), None))
+    return found

@@ -1,0 +1,191 @@
+"""Coordinates in which a posterior is nearly a standard Gaussian, learnt from draws of it.
+
+A triangular map (Knothe-Rosenblatt) from coordinates x to u:
+
+    shared ones       v = L^-1 (x - m - B s)
+    those of a group  w = L^-1 (x - m - B s), widest first
+                      v_i = (w_i - a_i(w_1 .. w_i-1, t)) exp(-b_i(w_1 .. w_i-1, t))
+
+with polynomials a and b, s what coordinates before them say, t the part of it that plateaus of the
+group say, and a sinh-arcsinh map (Jones and Pewsey 2009, Biometrika 96, eq. 2) of every coordinate
+from v to u,
+
+    sinh(tail arcsinh((v - place) / scale) - skew)
+
+A coordinate says x - m; or, on a plateau, where x is the logarithm of a number of which data say no
+more than that it is small, that number: x may then be anything far below, and those that follow
+stay where they are (other plateaus of its stair follow the logarithm). Groups follow the shared
+coordinates and are bent by themselves, so that groups that are independent given the shared ones
+stay so. It is one of the maps of Marzouk et al. 2016 (Sampling via measure transport, section 3).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from slipid.identify.posterior.transport.arrays import Matrix, Vector
+from slipid.identify.posterior.transport.bend import FAR, MOST_MONOMIALS, Bend
+from slipid.identify.posterior.transport.plateaus import Values
+from slipid.identify.posterior.transport.warp import Warp
+
+
+@dataclass(frozen=True, eq=False)
+class Stair:
+    """Some coordinates, after those they follow.
+
+    Attributes:
+        own: their places.
+        given: places of those they follow.
+        slope: derivative of own ones by what given ones say.
+        root: Cholesky factor of the covariance of what is left.
+        bend: bend of what is left; None for shared coordinates.
+        plateaus: places of plateaus of the group among the given; their numbers bend it.
+    """
+
+    own: Int[np.ndarray, " own"]
+    given: Int[np.ndarray, " given"]
+    slope: Float[np.ndarray, "given own"]
+    root: Float[np.ndarray, "own own"]
+    bend: Bend | None
+    plateaus: Int[np.ndarray, " plateau"]
+
+    def left(self, about: Matrix, said: Matrix) -> Matrix:
+        """What others do not say of own coordinates, by the root.
+
+        Args:
+            about: all coordinates less their means.
+            said: what all of them say.
+        """
+        left = about[:, self.own] - said[:, self.given] @ self.slope
+        return np.asarray(np.linalg.solve(self.root, left.T).T)
+
+
+@dataclass(frozen=True, eq=False)
+class Transport:
+    """The whole map, of vectors x (row, size) to and from u (row, size).
+
+    Attributes:
+        mean: mean of x.
+        values: what coordinates say to those that follow.
+        stairs: the way from x to v; every coordinate is in one of them.
+        last: the way from v to u.
+    """
+
+    mean: Vector
+    values: Values
+    stairs: tuple[Stair, ...]
+    last: Warp
+
+    def forward(self, x: Matrix) -> Matrix:
+        """The way from x to u."""
+        about = x - self.mean
+        said, v = self.values.said(about), np.empty_like(about)
+        for s in self.stairs:
+            w = s.left(about, said)
+            v[:, s.own] = s.bend.forward(w, said[:, s.plateaus]) if s.bend else w
+        return self.last.forward(v)
+
+    def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
+        """x, and the part of every coordinate in log |dx/du| (row, size)."""
+        x, log = _placed(self._back, u)
+        return np.array(x), np.array(log)
+
+    def pull(self, u: Matrix, slope: Callable[[Matrix], Matrix]) -> Matrix:
+        """Derivative by u of log |dx/du| plus a function of x that has the derivative slope(x)."""
+        return np.array(_pulled(self._back, u, slope(self.placed(u)[0])))
+
+    @cached_property
+    def _back(self) -> "Steps":
+        """The way back as arrays of jax."""
+        with jax.ensure_compile_time_eval():  # kept, so never a tracer's
+            return _steps(self)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The way from u to x, a coordinate at a time, in arrays whose shapes nothing learnt changes.
+
+    XLA compiles it once so, though stairs, plateaus and monomials are others after every look at
+    the draws. With columns of all w and of all that is said, zeros until their turn, and of ones:
+
+        w_i = f_i . shift_i + exp(f_i . scale_i) v_i,   x_i - m_i = columns . slope_i
+
+    Attributes:
+        mean, values, last: those of the map.
+        order: coordinate of each step.
+        slope: derivative of each step by the columns (step, 2 size + 1).
+        root: log dx/dw of each step.
+        factors: columns whose product each monomial f is (step, term, 3).
+        shift, scale: their coefficients (step, term).
+    """
+
+    mean: Array
+    values: Values
+    last: Warp
+    order: Array
+    slope: Array
+    root: Array
+    factors: Array
+    shift: Array
+    scale: Array
+
+
+def _steps(map: Transport) -> Steps:
+    size = len(map.mean)
+    slope, root = np.zeros((size, 2 * size + 1)), np.zeros(size)
+    factors = np.full((size, MOST_MONOMIALS + 1, 3), 2 * size)
+    shift, scale = np.zeros((2, size, MOST_MONOMIALS + 1))
+    k = 0
+    for s in map.stairs:
+        columns = np.concatenate([s.own, size + np.asarray(s.plateaus, int), [2 * size]])
+        for i in range(len(s.own)):
+            slope[k, s.own], slope[k, size + s.given] = s.root[i], s.slope[:, i]
+            root[k] = np.log(s.root[i, i])
+            if s.bend:
+                own = np.flatnonzero((s.bend.shift[i] != 0) | (s.bend.scale[i] != 0))
+                factors[k, : len(own)] = columns[s.bend.factors[own]]
+                shift[k, : len(own)] = s.bend.shift[i, own]
+                scale[k, : len(own)] = s.bend.scale[i, own]
+            k += 1
+    order = np.concatenate([s.own for s in map.stairs])
+    # on the device once, not in every call
+    arrays = (map.mean, map.values, map.last, order, slope, root, factors, shift, scale)
+    return Steps(*jax.device_put(arrays))
+
+
+_Step = tuple[Array, Array, Array, Array, Array, Array, Values]
+"""A row of `Steps`: place, slope, root, factors, shift, scale, and its values."""
+
+
+@jax.jit
+def _placed(map: Steps, u: Array) -> tuple[Array, Array]:
+    rows, size = u.shape
+    v = map.last.back(u)
+
+    def step(columns: Array, s: _Step) -> tuple[Array, tuple[Array, Array]]:
+        i, slope, root, factors, shift, scale, values = s
+        f = jnp.clip(columns[:, factors], -FAR, FAR).prod(axis=2)
+        spread = f @ scale
+        columns = columns.at[:, i].set(f @ shift + jnp.exp(spread) * v[:, i])
+        about = columns @ slope
+        return columns.at[:, size + i].set(values.said(about)), (about, spread + root)
+
+    start = jnp.zeros((rows, 2 * size + 1)).at[:, -1].set(1.0)
+    values = jax.tree.map(lambda x: x[map.order], map.values)
+    steps = (map.order, map.slope, map.root, map.factors, map.shift, map.scale, values)
+    _, (about, log) = jax.lax.scan(step, start, steps)
+    there = jnp.zeros_like(u).at[:, map.order].set(about.T)
+    return map.mean + there, map.last.log_slope(u).at[:, map.order].add(log.T)
+
+
+@jax.jit
+def _pulled(map: Steps, u: Array, slope: Array) -> Array:
+    (_, log), back = jax.vjp(lambda u: _placed(map, u), u)
+    (out,) = back((slope, jnp.ones_like(log)))
+    return jnp.asarray(out)

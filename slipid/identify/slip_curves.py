@@ -1,0 +1,190 @@
+"""Slip against torque of every floor, with its band, and what range the data saw."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.data.runs import Runs
+from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit.noise import travel
+from slipid.model import contact_law as law
+from slipid.model import robot as model
+from slipid.model.robot import GRAVITY, Robot
+from slipid.parameter import Space
+
+POINTS = 41
+_SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])
+
+
+@dataclass(frozen=True, eq=False)
+class SlipCurve:
+    """Slip of a wheel over its torque on one floor.
+
+    Attributes:
+        torque_nm: from rest to what occurred [N m].
+        slip: at each torque.
+        slip_lo, slip_hi: ends of its 90 % band.
+        wheel_speed, load_share: the speed [rad/s] and the share of the weight it is given for.
+    """
+
+    torque_nm: Float[np.ndarray, " torque"]
+    slip: Float[np.ndarray, " torque"]
+    slip_lo: Float[np.ndarray, " torque"]
+    slip_hi: Float[np.ndarray, " torque"]
+    wheel_speed: float
+    load_share: float
+
+
+@dataclass(frozen=True)
+class Validity:
+    """What a floor was seen with: outside of it the fit extrapolates.
+
+    Attributes:
+        runs: number of them.
+        loads: load set-ups.
+        wheel_speed, torque_nm, slip, yaw_rate: smallest and largest size of each [rad/s], [N m],
+            [1], [rad/s]; the yaw rate by the encoders.
+        headings_deg, speeds, turn_rates: commanded [deg], [m/s], [rad/s].
+        distance: mean length of a run [m].
+    """
+
+    runs: int
+    loads: tuple[str, ...]
+    wheel_speed: tuple[float, float]
+    torque_nm: tuple[float, float]
+    slip: tuple[float, float]
+    yaw_rate: tuple[float, float]
+    headings_deg: tuple[float, ...]
+    speeds: tuple[float, ...]
+    turn_rates: tuple[float, ...]
+    distance: float
+
+
+@jax.jit
+def seen(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
+    """Wheel speeds [rad/s], torques [N m] and slips of every window (piece, window, wheel).
+
+    The slip is the sliding speed over the wheel's activity, rim and roller speed together, so that
+    it stays finite at a wheel that stands.
+    """
+    frame = robot.geometry.frame()
+    speed = lk.wheel_speed(robot, b)
+
+    def one(w: Array, surface: Array, load: Array) -> tuple[Array, Array]:
+        xi = model.twist(robot, frame, w, surface, load)
+        rim = frame.radius * w
+        active = jnp.sqrt(rim**2 + (frame.roll @ xi) ** 2 + 1e-12)
+        torque = model.wheel_torque(robot, frame, xi, w, surface, load)
+        return torque, (rim * frame.pull - frame.hold @ xi) / active
+
+    return speed, *jax.vmap(jax.vmap(one, (0, None, None)))(speed, b.surface, b.load)
+
+
+def torque_of_slip(
+    robot: Robot, wheel_speed: Float[Array, " surface"], share: float
+) -> Float[Array, "surface slip"]:
+    """Torque [N m] of a wheel that slips by `_SLIP` along its drive direction, on every floor.
+
+    Args:
+        wheel_speed: w [rad/s].
+        share: N, of the weight on this wheel.
+
+    Source: `slipid.model.contact_law` without sideways rolling.
+    """
+    floor = jax.tree.map(lambda leaf: leaf[:, None], robot.surfaces)
+    rim = (robot.geometry.wheel_radius * wheel_speed)[:, None]
+    traction = law.wheel_traction(jnp.asarray(_SLIP) * rim, rim, floor).force()
+    weight = robot.body.mass * GRAVITY * law.load_force(jnp.asarray(share), floor)
+    return robot.geometry.wheel_radius * weight * traction
+
+
+def curves(
+    space: Space,
+    z: Float[np.ndarray, " free"],
+    draws: Float[np.ndarray, "draw free"],
+    b: lk.Batch,
+) -> dict[str, SlipCurve]:
+    """Slip over torque per floor with a 90 % band, over the torques that occurred.
+
+    Taken at the median speed of the wheels that turned and an even load.
+    """
+    robot = space.tree(jnp.asarray(z))
+    speed, torque = (np.abs(np.asarray(x)) for x in seen(robot, b)[:2])
+    labels, floor = robot.surfaces.labels, np.asarray(b.surface)
+    share = 1.0 / speed.shape[-1]
+    median = []
+    for k in range(len(labels)):
+        mine = speed[floor == k]
+        turned = mine[mine > 0.05 * max(mine.max(initial=0.0), 1e-9)]
+        median.append(float(np.median(turned)) if turned.size else 1.0)
+    at = jnp.asarray(median)
+    best = np.asarray(torque_of_slip(robot, at, share))
+    band = np.asarray(
+        jax.jit(jax.vmap(lambda x: torque_of_slip(space.tree(x), at, share)))(jnp.asarray(draws))
+    )
+    out = {}
+    for k, label in enumerate(labels):
+        top = min(float(np.quantile(torque[floor == k], 0.98)), 0.999 * float(best[k].max()))
+        grid = np.linspace(0.0, top, POINTS)
+        each = np.stack([np.interp(grid, row, _SLIP) for row in band[:, k]])
+        low, high = np.quantile(each, [0.05, 0.95], axis=0)
+        slip = np.interp(grid, best[k], _SLIP)
+        out[label] = SlipCurve(grid, slip, low, high, median[k], share)
+    return out
+
+
+def slip_on(robot: Robot, floor: str, curve: SlipCurve) -> Float[np.ndarray, " torque"]:
+    """Slip by a robot's own law at the torques, the speed and the load of a curve of `curves`."""
+    at = jnp.full(len(robot.surfaces.labels), curve.wheel_speed)
+    torque = torque_of_slip(robot, at, curve.load_share)[robot.surface_index(floor)]
+    return np.interp(curve.torque_nm, np.asarray(torque), _SLIP)
+
+
+def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
+    """What each floor was seen with."""
+    speed, torque, slip = (np.asarray(x) for x in seen(robot, b))
+    back = np.linalg.pinv(np.asarray(robot.geometry.forward()))[2] * robot.geometry.wheel_radius
+    yaw = np.abs(speed @ np.asarray(back))  # by the encoders: what was driven, not how it slipped
+    speed, torque, slip = np.abs(speed), np.abs(torque), np.abs(slip)
+    floor = np.asarray(b.surface)
+    far = travel(b, robot)[0].sum(axis=1)
+    out: dict[str, Validity] = {}
+    for k, label in enumerate(robot.surfaces.labels):
+        runs = [i for i, log in enumerate(data.logs) if (log.surface or "unknown") == label]
+        mine = floor == k
+        out[label] = Validity(
+            runs=len(runs),
+            loads=tuple(sorted({data.logs[i].load for i in runs})),
+            wheel_speed=(0.0, float(speed[mine].max())),
+            torque_nm=(0.0, float(torque[mine].max())),
+            slip=(0.0, float(slip[mine].max())),
+            yaw_rate=(0.0, float(yaw[mine].max())),
+            headings_deg=_different(np.degrees(data.heading[runs]), 1),
+            speeds=_different(data.speed[runs], 3),
+            turn_rates=_different(data.turn[runs], 2),
+            distance=round(float(far[mine].sum()) / max(len(runs), 1), 3),
+        )
+    return out
+
+
+def _different(x: np.ndarray, digits: int) -> tuple[float, ...]:
+    """The values that occur, rounded and sorted."""
+    return tuple(sorted({round(float(v), digits) for v in x[np.isfinite(x)]}))
+
+
+def current_trend(robot: Robot, b: lk.Batch) -> tuple[float, float]:
+    """Least squares a + b v of measured less predicted sizes of currents, v by the encoders.
+
+    Returns:
+        a [A] and b [A s/m], over all floors.
+    """
+    predicted = lk.predicted_current(robot, b, lk.predict(robot, b).felt)
+    gap = np.asarray((b.current - predicted) * jnp.sign(predicted))
+    speed = np.broadcast_to((travel(b, robot)[0] / b.dt)[..., None], gap.shape).ravel()
+    rows = np.stack([np.ones_like(speed), speed], axis=1)
+    known = np.isfinite(gap).ravel() & np.isfinite(speed)
+    a, slope = np.linalg.lstsq(rows[known], gap.ravel()[known])[0]
+    return float(a), float(slope)

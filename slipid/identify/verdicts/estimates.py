@@ -1,0 +1,311 @@
+"""What may be said of every number and of ratios of them: interval and verdict.
+
+Before a fit from the information expected at the start values, after it from the Laplace posterior.
+Directions in which nothing is said are found by `unidentified`, a number's likelihood beyond
+Laplace by `profile`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from slipid.identify.fit.problem import Problem
+from slipid.parameter import Choice, Declaration, Entry, Space
+
+IDENTIFIED, WEAK = 0.3, 0.8
+"""Largest std(posterior) / std(prior) of the verdicts, in the search space."""
+FROM_ZERO = 3.0
+"""Stds, in its own unit, by which an identified positive number is away from 0: the likelihood of a
+number that is small rises no further towards 0, however narrow the interval of its logarithm is."""
+TAIL, SMALL = 4.0, 0.05
+"""A positive number counts as being at 0 when it is so many prior stds below its prior mean, and
+below this part of it: a tight prior that the data contradict is something else."""
+NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
+"""Without a voltage nothing sets the scale of these; a prior elsewhere must not lend them one."""
+_Z95 = 1.6448536269514722
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A quotient of two positive numbers that may be known where neither of them is.
+
+    Attributes:
+        over: quantity of the numerator, of every floor where floors have their own.
+        under: path of the denominator.
+        unit: of the quotient, as pint reads it.
+        doc: one line for people.
+    """
+
+    over: str
+    under: str
+    unit: str
+    doc: str
+
+
+RATIOS = (
+    Ratio("motor.resistance", "motor.back_emf", "ohm*rad/(V*s)", "needs the voltage, as both do"),
+    Ratio("surface.friction", "motor.back_emf", "rad/(V*s)", "the torque scale currents fix"),
+    Ratio("motor.coulomb_friction", "motor.back_emf", "A", "current at crawling speed"),
+    Ratio("motor.viscous_friction", "motor.back_emf", "A*s/rad", "current per wheel speed"),
+    Ratio("camera.scale", "robot.wheel_radius", "1/m", "all that motion without slip tells"),
+)
+"""Quotients with a verdict of their own, where both numbers are free.
+
+The resistance enters the voltage equation and nothing else: contact forces decide how the body
+moves, and currents follow from them with the torque constant. So without a voltage not even
+R / C_e is known, other than in models that read slip from R I^2 + C_e I wm.
+"""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One fitted or fixed number (or short vector) as people and files get it.
+
+    Attributes:
+        path: its name.
+        value, std: [unit], a float or one per label; std is None where it was fixed.
+        interval90: equal-tailed, (low, high), or one such pair per label.
+        labels: of a vector's entries, () for a scalar.
+        verdict: identified, weak, not_identified, at_bound or fixed; of a vector the verdict of its
+            worst direction.
+        provenance: measured (data decide), borrowed (a prior decides), override (a choice
+            fixed it: the user's, or slipid's where one speed cannot tell).
+        ratio: std(posterior) / std(prior) in the search space, None where it was fixed.
+        pull: (estimate - prior mean) / std(prior), of a vector the largest, None where fixed.
+        prior_mean, prior_std: [unit], None where it was fixed.
+    """
+
+    path: str
+    unit: str
+    doc: str
+    labels: tuple[str, ...]
+    value: Any
+    std: Any
+    interval90: Any
+    verdict: str
+    provenance: str
+    ratio: float | None
+    pull: float | None
+    prior_mean: Any
+    prior_std: Any
+    source: str = "laplace"
+
+
+def estimates(
+    space: Space,
+    choices: Sequence[Choice],
+    z: Float[np.ndarray, " free"],
+    covariance: Float[np.ndarray, "free free"],
+    has_voltage: bool,
+) -> tuple[Estimate, ...]:
+    """Every declared number with its interval and verdict, in order of declaration."""
+    tree = space.tree(jnp.asarray(z))
+    return tuple(
+        _free(space, e, tree, z, covariance, has_voltage)
+        if e.path in space.place
+        else _fixed(e, tree, choices)
+        for e in space.all
+    )
+
+
+def _plain(x: Any) -> Any:
+    """A float, or a tuple of floats."""
+    x = np.asarray(x, float)
+    return float(x.reshape(())) if x.size == 1 else tuple(float(v) for v in x)
+
+
+def _fixed(entry: Entry, tree: Any, choices: Sequence[Choice]) -> Estimate:
+    chosen = any(
+        fnmatchcase(entry.path, c.pattern) and (c.fixed is not None or c.start is not None)
+        for c in choices
+    )
+    return Estimate(
+        path=entry.path,
+        unit=entry.declaration.unit,
+        doc=entry.declaration.doc,
+        labels=entry.labels,
+        value=_plain(entry.get(tree)),
+        std=None,
+        interval90=None,
+        verdict="fixed",
+        provenance="override" if chosen else "borrowed",
+        ratio=None,
+        pull=None,
+        prior_mean=None,
+        prior_std=None,
+    )
+
+
+def _free(
+    space: Space,
+    entry: Entry,
+    tree: Any,
+    z: np.ndarray,
+    covariance: np.ndarray,
+    has_voltage: bool,
+) -> Estimate:
+    at, d = space.place[entry.path], entry.declaration
+    mean, block = np.asarray(z)[at], covariance[at, at]
+    prior_mean, prior_std = space.prior_mean[at], space.prior_std[at]
+    value = np.atleast_1d(np.asarray(entry.get(tree), float))
+    std_z = np.sqrt(np.diag(block))
+    if d.shares:
+        rng = np.random.default_rng(0)
+        spread = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
+        draws = np.stack([np.asarray(d.to_si(s)) for s in jnp.asarray(spread)])
+        low, high = np.quantile(draws, [0.05, 0.95], axis=0)
+        std = draws.std(axis=0)
+        center = np.asarray(d.to_si(jnp.asarray(prior_mean)))
+        wide = np.full(entry.size, prior_std.mean() / entry.size)
+    else:
+        low, high = (np.asarray(d.to_si(jnp.asarray(mean + k * std_z))) for k in (-_Z95, _Z95))
+        std = np.array([d.slope(float(v)) for v in value]) * std_z
+        center = np.asarray(d.to_si(jnp.asarray(prior_mean)))
+        wide = np.array([d.slope(float(v)) for v in center]) * prior_std
+    scaled = block / prior_std[:, None] / prior_std[None, :]
+    ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
+    pull = (mean - prior_mean) / prior_std
+    verdict = _verdict(entry, value, pull, prior_std, std_z, ratio, has_voltage)
+    return Estimate(
+        path=entry.path,
+        unit=d.unit,
+        doc=d.doc,
+        labels=entry.labels,
+        value=_plain(value),
+        std=_plain(std),
+        interval90=_pairs(low, high),
+        verdict=verdict,
+        provenance=provenance(verdict, ratio),
+        ratio=ratio,
+        pull=float(pull[np.argmax(np.abs(pull))]),
+        prior_mean=_plain(center),
+        prior_std=_plain(wide),
+    )
+
+
+def _pairs(low: np.ndarray, high: np.ndarray) -> Any:
+    pairs = tuple((float(a), float(b)) for a, b in zip(low, high, strict=True))
+    return pairs[0] if len(pairs) == 1 else pairs
+
+
+def _verdict(
+    entry: Entry,
+    value: np.ndarray,
+    place: np.ndarray,
+    prior_std: np.ndarray,
+    std_z: np.ndarray,
+    ratio: float,
+    has_voltage: bool,
+) -> str:
+    d = entry.declaration
+    if entry.path in NEEDS_VOLTAGE and not has_voltage:
+        return "not_identified"
+    if np.isfinite(d.upper) and np.isfinite(d.lower) and not d.shares:
+        part = (value - d.lower) / (d.upper - d.lower)
+        if (part < 0.01).any() or (part > 0.99).any():
+            return "at_bound"
+    elif np.isfinite(d.lower) and not d.shares:
+        below = place * prior_std
+        if ((place < -TAIL) & (below < np.log(SMALL))).any():
+            return "at_bound"
+    return by_ratio(ratio, from_zero(d, std_z))
+
+
+def from_zero(declaration: Declaration, std_z: Float[np.ndarray, " coordinate"]) -> float:
+    """Stds by which a positive number is away from 0; infinite for others.
+
+    Args:
+        std_z: in the search space, that of the logarithm.
+    """
+    positive = np.isfinite(declaration.lower) and not np.isfinite(declaration.upper)
+    return float(1 / std_z.max()) if positive and not declaration.shares else np.inf
+
+
+def by_ratio(ratio: float, from_zero: float = np.inf) -> str:
+    """Verdict of std(posterior) / std(prior), and of how many stds a positive number is from 0."""
+    if ratio < IDENTIFIED and from_zero >= FROM_ZERO:
+        return "identified"
+    return "weak" if ratio < WEAK else "not_identified"
+
+
+def provenance(verdict: str, ratio: float) -> str:
+    """Below 1/sqrt(2) the data hold more information than the prior."""
+    held = verdict != "not_identified" and ratio < np.sqrt(0.5)
+    return "measured" if held else "borrowed"
+
+
+def derived(
+    space: Space,
+    z: Float[np.ndarray, " free"],
+    covariance: Float[np.ndarray, "free free"],
+    has_voltage: bool,
+) -> tuple[Estimate, ...]:
+    """`RATIOS` with interval and verdict: the log of each is a difference of coordinates.
+
+    Its std under the posterior, sqrt(c^T C c) with c = (.., 1, .., -1, ..), is compared with that
+    under the prior.
+    """
+    return tuple(
+        _quotient(space, wanted, over.path, z, covariance, has_voltage)
+        for wanted in RATIOS
+        for over in space.free
+        if over.quantity == wanted.over and wanted.under in space.place
+    )
+
+
+def _quotient(
+    space: Space,
+    wanted: Ratio,
+    over: str,
+    z: np.ndarray,
+    covariance: np.ndarray,
+    has_voltage: bool,
+) -> Estimate:
+    c = np.zeros(len(z))
+    c[space.place[over]], c[space.place[wanted.under]] = 1.0, -1.0
+    log_value, log_prior = c @ z, c @ space.prior_mean
+    std = float(np.sqrt(c @ covariance @ c))
+    prior_std = float(np.sqrt(np.sum((c * space.prior_std) ** 2)))
+    value, ratio = float(np.exp(log_value)), std / prior_std
+    unknown = over == NEEDS_VOLTAGE[0] and not has_voltage
+    verdict = "not_identified" if unknown else by_ratio(ratio, 1 / std)
+    low, high = (float(np.exp(log_value + k * std)) for k in (-_Z95, _Z95))
+    return Estimate(
+        path=f"{over}/{wanted.under}",
+        unit=wanted.unit,
+        doc=wanted.doc,
+        labels=(),
+        value=value,
+        std=value * std,
+        interval90=(low, high),
+        verdict=verdict,
+        provenance=provenance(verdict, ratio),
+        ratio=ratio,
+        pull=float((log_value - log_prior) / prior_std),
+        prior_mean=float(np.exp(log_prior)),
+        prior_std=float(np.exp(log_prior)) * prior_std,
+    )
+
+
+def expected_covariance(
+    problem: Problem,
+    z: Float[np.ndarray, " free"] | None = None,
+    log_variance: Float[np.ndarray, " variance"] | None = None,
+) -> Float[np.ndarray, "free free"]:
+    """Posterior covariance to be expected of these windows: inverse information, prior included.
+
+    Args:
+        problem: windows, robot and priors.
+        z: where; the start by default. What the data really hold depends on where the fit ends.
+        log_variance: of every noise component; the typical ones by default.
+    """
+    z = problem.space.start if z is None else z
+    log_v = 2 * np.log(problem.noise.typical) if log_variance is None else log_variance
+    _, jacobian = problem.linear(jnp.asarray(z), problem.volt(log_v))
+    keep = jnp.ones(len(problem.windows))
+    return np.linalg.inv(np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep)))

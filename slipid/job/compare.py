@@ -1,0 +1,154 @@
+"""Slip models judged on left-out runs: what `slipid compare` does, but for its picture."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from slipid.identify.compare.cross_validation import judge
+from slipid.identify.compare.folds import Fold, folds_of
+from slipid.identify.compare.predictive import Contact, contact_of
+from slipid.identify.compare.ranking import ranking
+from slipid.identify.compare.transfer import transfer
+from slipid.identify.compare.validation import Judged
+from slipid.identify.fit.optimise import Options, optimise
+from slipid.identify.fit.problem import Problem, State
+from slipid.job.config import read_config
+from slipid.job.problem import Job, read_job
+from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.content import Content
+from slipid.support.errors import DataError
+from slipid.support.files import writable, write_json
+from slipid.support.jax_setup import setup_jax
+from slipid.support.progress import Reporter
+from slipid.support.versions import versions
+
+SCHEMA = "slipid.comparison/1"
+FOLDS = "folds"
+"""Folder of finished folds inside the result's; a fold there is not done again."""
+
+
+def compare(
+    config_path: Path, data: Path, out: Path, questions: Sequence[str], report: Reporter
+) -> Content:
+    """Judge every rung of the ladder on left-out runs and write comparison.json.
+
+    Args:
+        config_path: of the job.
+        data: folder its globs start from.
+        out: folder to write to; folds that are finished there are not done again.
+        report: progress.
+        questions: what is left out: some of `slipid.identify.compare.folds.QUESTIONS`.
+
+    Raises:
+        DataError: config, logs or questions are wrong; nothing was written then.
+    """
+    setup_jax(quiet=True)
+    config = read_config(config_path)
+    job = read_job(config, data, report)
+    asked = {name: folds_of(job.dataset, name) for name in dict.fromkeys(questions)}
+    try:
+        job.robot.geometry.inverse()
+    except ValueError as error:
+        raise DataError(f"{config.path}: nothing to compare: {error}") from error
+    for name in [name for name, fold in asked.items() if (fold < 0).all()]:
+        report.line(f"skipped: {name}: no floor has runs in two of them")
+        del asked[name]
+    if not asked:
+        raise DataError(
+            f"{config.path}: no run can be left out; expected several headings or speeds"
+        )
+    report.stage("cutting windows")
+    problem = job.problem()
+    writable(out)
+    key = key_of(config.hash, job.data_hash, problem.space.names, problem.noise.names)
+    results, whole = _folds(job, problem, asked, Checkpoint(out / FOLDS, key), report)
+    surfaces = transfer(problem.windows, whole.robot) if problem.windows.has_current else {}
+    found: Content = {
+        "schema": SCHEMA,
+        "questions": {
+            name: {
+                "folds": len(some),
+                "converged": all(fold["converged"] for fold in some),
+                "floors": {floor: asdict(one) for floor, one in ranking(_judged(some)).items()},
+                "cost": _cost(some),
+            }
+            for name, some in results.items()
+        },
+        "surfaces": {k: asdict(v) for k, v in surfaces.items()},
+        "data": {"hash": job.data_hash, "runs": len(job.dataset), "skipped": list(job.skipped)},
+        "config": {"name": config.path.name, "sha256": config.hash},
+        "versions": versions(),
+        "runs": {name: _rows(some) for name, some in results.items()},
+    }
+    report.stage("writing")
+    write_json(out / "comparison.json", found)
+    return found
+
+
+def _rows(folds: Sequence[Content]) -> list[Content]:
+    return [row for fold in folds for row in fold["rows"]]
+
+
+def _judged(folds: Sequence[Content]) -> list[Judged]:
+    return [Judged.of_json(row) for row in _rows(folds)]
+
+
+def _cost(folds: Sequence[Content]) -> Content:
+    """Fitted numbers per floor, and seconds per fold to fit and to predict, of every model."""
+    out = {}
+    for model, numbers in folds[0]["numbers"].items():
+        seconds = [fold["seconds"][model] for fold in folds]
+        out[model] = {
+            "numbers": numbers,
+            "fit_s": float(np.median([s["fit"] for s in seconds])),
+            "predict_s": float(np.median([s["predict"] for s in seconds])),
+        }
+    return out
+
+
+def _folds(
+    job: Job, problem: Problem, asked: Mapping[str, Fold], kept: Checkpoint, report: Reporter
+) -> tuple[dict[str, list[Content]], Contact]:
+    """Every fold of every question, and the force balance fitted to all runs."""
+    wanted = job.settings
+    options = Options(most_rounds=wanted.rounds, tolerance=wanted.tolerance)
+
+    def tell(state: State) -> None:
+        report.note(f"{state.stage}, round {state.round}")
+
+    def whole() -> Content:
+        optimum = optimise(problem, options=options, tell=tell)
+        z, log_variance = optimum.state.z, optimum.state.log_variance
+        return {"z": z, "log_variance": log_variance, "covariance": optimum.covariance}
+
+    def one(judged: np.ndarray) -> Content:
+        return judge(problem, job.choices, job.dataset, judged, options, tell).to_json()
+
+    work: dict[tuple[str, int], Callable[[], Content]] = {
+        (name, k): partial(one, np.flatnonzero(fold == k))
+        for name, fold in asked.items()
+        for k in sorted({int(f) for f in fold if f >= 0})
+    }
+    report.stage("fitting every fold")
+    done: dict[str, list[Content]] = {name: [] for name in asked}
+    for count, ((name, k), make) in enumerate(work.items(), start=1):
+        done[name].append(finished(kept, f"{name}_{k}", make))
+        report.advance(count, len(work), f"{count} of {len(work)} folds, {name}")
+    report.stage("fitting all runs")
+    fit = finished(kept, "all", whole)
+    z, log_v = np.asarray(fit["z"], float), np.asarray(fit["log_variance"], float)
+    state = State(z, log_v, 0, np.inf, np.inf, "joint")
+    return done, contact_of(problem, state, np.asarray(fit["covariance"], float))
+
+
+def finished(kept: Checkpoint, name: str, make: Callable[[], Content]) -> Content:
+    """A piece of work as its file has it; it is made where there is none of this very job."""
+    found: Content | None = kept.load_json(name)
+    if found is None:
+        kept.save_json(name, make())
+        found = kept.load_json(name)
+        assert found is not None
+    return found

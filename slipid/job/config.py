@@ -1,0 +1,244 @@
+"""The config of a job: what the TOML file may say, checked once, every mistake with its key.
+
+Units stand in the names of the keys; everything is optional that has a default here.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from slipid.model import geometry as g
+from slipid.model.geometry import Geometry
+from slipid.support.toml_file import Section, content, text_of
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Numbers = Number | list[Number]
+
+
+class Omni(Section):
+    """Wheels on a circle, each driving 90 deg ahead of its azimuth."""
+
+    drive: Literal["omni"]
+    wheel_radius_m: Positive
+    base_radius_m: Positive
+    wheel_azimuths_deg: list[Number] = Field(min_length=3)
+    roller_angle_deg: Number = 90.0
+    gear_ratio: Positive = 1.0
+    mass_kg: Positive | None = None
+
+
+class Mecanum(Section):
+    """Four mecanum wheels in X: front left, front right, rear left, rear right."""
+
+    drive: Literal["mecanum"]
+    wheel_radius_m: Positive
+    half_length_m: Positive
+    half_width_m: Positive
+    gear_ratio: Positive = 1.0
+    mass_kg: Positive | None = None
+
+
+class Skid(Section):
+    """Four ordinary wheels that point ahead, in the order of `Mecanum`."""
+
+    drive: Literal["skid"]
+    wheel_radius_m: Positive
+    half_length_m: Positive
+    half_width_m: Positive
+    gear_ratio: Positive = 1.0
+    mass_kg: Positive | None = None
+
+
+class General(Section):
+    """Any wheels: centres, drive directions, roller angles ("none": an ordinary wheel)."""
+
+    drive: Literal["general"]
+    wheel_radius_m: Positive
+    wheel_places_m: list[Annotated[list[Number], Field(min_length=2, max_length=2)]] = Field(
+        min_length=2
+    )
+    drive_directions_deg: list[Number]
+    roller_angles_deg: list[Number | Literal["none"]]
+    gear_ratio: Positive = 1.0
+    mass_kg: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_per_wheel(self) -> "General":
+        wheels = len(self.wheel_places_m)
+        for key in ("drive_directions_deg", "roller_angles_deg"):
+            if len(getattr(self, key)) != wheels:
+                raise ValueError(
+                    f"{len(getattr(self, key))} {key}; expected {wheels}, one per wheel_places_m"
+                )
+        return self
+
+
+class Logs(Section):
+    """Log files of one kind, found by a glob below the data folder.
+
+    Runs of a section with a `map` (its file, relative to the config) cross the floors it shows;
+    their poses are in its frame.
+    """
+
+    glob: str
+    format: str
+    surface: str = "folder"
+    map: str | None = None
+    load: str = "as_built"
+    session: Literal["surface/load/speed", "folder", "file"] = "surface/load/speed"
+    min_rows: int = Field(2, ge=2)
+
+    @model_validator(mode="after")
+    def _one_floor_or_many(self) -> "Logs":
+        if self.map is not None and self.surface != "folder":
+            raise ValueError("surface and map at once; expected one of them")
+        return self
+
+
+class Camera(Section):
+    """The camera that saw the pose."""
+
+    image_centre_m: tuple[Number, Number] = (0.0, 0.0)
+
+
+class Prior(Section):
+    """Gaussian prior, in SI around its mean."""
+
+    mean: Numbers
+    std: Positive | list[Positive]
+
+
+class Setting(Section):
+    """What is wanted of the parameters that match a pattern."""
+
+    start: Numbers | None = None
+    fixed: Numbers | None = None
+    free: bool | None = None
+    prior: Prior | None = None
+
+    @model_validator(mode="after")
+    def _not_both(self) -> "Setting":
+        if self.fixed is not None and (self.prior is not None or self.free):
+            raise ValueError("fixed and free or prior at once; expected one of them")
+        return self
+
+
+class FitSection(Section):
+    """How finely runs are cut and how long to fit."""
+
+    windows_per_piece: int = Field(4, ge=1, le=32)
+    longest_window_s: Positive = 6.0
+    rounds: int = Field(30, ge=1)
+    tolerance: Positive = 0.02
+    seed: int = Field(0, ge=0)
+
+
+class ValidateSection(Section):
+    """Runs to predict where they differ from those that were fitted."""
+
+    logs: list[Logs] = Field(default_factory=list)
+
+
+class SelftestSection(Section):
+    """What `selftest` drives where no logs are given, what it takes for true and asks for."""
+
+    surfaces: list[str] = Field(default=["firm", "soft"], min_length=1)
+    headings: int = Field(12, ge=1, le=360)
+    speeds_m_s: list[Positive] = Field(default=[0.1, 0.2], min_length=1)
+    turns: int = Field(2, ge=0)
+    distance_m: Positive = 0.7
+    truth: dict[str, Numbers] = Field(default_factory=dict)
+    wanted: list[str] | None = None
+
+
+class Content(Section):
+    """The whole file."""
+
+    robot: Annotated[Omni | Mecanum | Skid | General, Field(discriminator="drive")]
+    layouts: dict[str, dict[str, object]] = Field(default_factory=dict)
+    logs: list[Logs] = Field(min_length=1)
+    camera: Camera = Camera()
+    parameters: dict[str, Setting] = Field(default_factory=dict)
+    fit: FitSection = FitSection()  # type: ignore[call-arg]
+    selftest: SelftestSection = SelftestSection()  # type: ignore[call-arg]
+    validate_: ValidateSection = Field(default_factory=ValidateSection, alias="validate")
+
+    @model_validator(mode="after")
+    def _floors_one_by_one(self) -> "Content":
+        for name, sections in (("logs", self.logs), ("validate.logs", self.validate_.logs)):
+            if sections and not one_floor(sections):
+                raise ValueError(
+                    f"{name}: every section has a map; expected one without, of runs on one floor"
+                )
+        return self
+
+
+def one_floor(sections: Sequence[Logs]) -> list[Logs]:
+    """Sections whose runs keep to one floor each."""
+    return [section for section in sections if section.map is None]
+
+
+@dataclass(frozen=True)
+class Config:
+    """A config file that was read and found right.
+
+    Attributes:
+        path: the file.
+        text: as it was, to be kept beside the results.
+        content: what it says.
+    """
+
+    path: Path
+    text: str
+    content: Content
+
+    @property
+    def hash(self) -> str:
+        """Hash of the text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+
+def read_config(path: Path) -> Config:
+    """Config from a TOML file.
+
+    Raises:
+        DataError: unreadable, no TOML, unknown or missing keys, wrong values; every one on a line.
+    """
+    return parsed(path, text_of(path))
+
+
+def parsed(path: Path, text: str) -> Config:
+    """Config from TOML text; the path is for messages.
+
+    Raises:
+        DataError: no TOML, unknown or missing keys, wrong values; every one on a line.
+    """
+    return Config(path, text, content(path, text, Content))
+
+
+def geometry(robot: Omni | Mecanum | Skid | General) -> Geometry:
+    """Geometry of a `[robot]` section; ValueError where it cannot drive."""
+    if isinstance(robot, Omni):
+        return g.omni(
+            robot.wheel_azimuths_deg,
+            robot.base_radius_m,
+            robot.wheel_radius_m,
+            robot.gear_ratio,
+            robot.roller_angle_deg,
+        )
+    if isinstance(robot, General):
+        rollers = [None if a == "none" else float(a) for a in robot.roller_angles_deg]
+        return g.general(
+            robot.wheel_places_m,
+            robot.drive_directions_deg,
+            rollers,
+            robot.wheel_radius_m,
+            robot.gear_ratio,
+        )
+    make = g.mecanum if isinstance(robot, Mecanum) else g.skid_steer
+    return make(robot.half_length_m, robot.half_width_m, robot.wheel_radius_m, robot.gear_ratio)

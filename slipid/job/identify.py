@@ -1,0 +1,118 @@
+"""From a config and its logs to a fit: what `slipid identify` does, but for its pictures."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from slipid.identify.fit.optimise import Optimum
+from slipid.identify.fit.problem import Problem
+from slipid.identify.fit_file import save
+from slipid.identify.result import Fit
+from slipid.identify.verdicts.profile import Profile, profile, profiled
+from slipid.job.config import read_config
+from slipid.job.fit import CHECKPOINT, optimised, summarised
+from slipid.job.problem import Job, read_job, with_mixed
+from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.errors import DataError
+from slipid.support.files import writable, write_bytes, write_json
+from slipid.support.jax_setup import setup_jax
+from slipid.support.progress import Reporter
+from slipid.support.versions import versions
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """End of `identify`: the fit, the runs it saw, the profiles asked for, the files written."""
+
+    fit: Fit
+    job: Job
+    profiles: tuple[Profile, ...]
+    written: tuple[str, ...]
+
+
+def identify(
+    config_path: Path, data: Path, out: Path, report: Reporter, profiles: Sequence[str] = ()
+) -> Identified:
+    """Fit the robot of a config to its logs and write everything to `out`.
+
+    Args:
+        config_path: of the job.
+        data: folder its globs start from.
+        out: folder to write to; a fit that was interrupted there goes on.
+        report: progress.
+        profiles: paths of numbers whose profile likelihood is wanted, too.
+
+    Raises:
+        DataError: config or logs are wrong; nothing was written then.
+    """
+    began = time.monotonic()
+    setup_jax(quiet=True)
+    config = read_config(config_path)
+    job = read_job(config, data, report)
+    report.line(f"{len(job.dataset)} runs on {', '.join(job.robot.surfaces.labels)}")
+    job = with_mixed(job, data, report)
+    report.stage("cutting windows")
+    problem = job.problem()
+    for path in profiles:
+        try:
+            profiled(problem.space, path)
+        except ValueError as error:
+            raise DataError(f"--profile: {error}") from error
+    writable(out)
+    key = key_of(config.hash, job.data_hash, problem.space.names, problem.noise.names)
+    kept = Checkpoint(out, key)
+    optimum = optimised(job, problem, kept, report)
+    fit = summarised(job, problem, optimum, report)
+    report.stage("writing")
+    written = list(save(fit, out))
+    _keep_run(job, data, out, time.monotonic() - began)
+    written += ["run.json", "config.toml"]
+    if profiles and job.mixed:
+        report.line("profiles are of the runs on one floor each")
+    found = _profiles(problem, optimum, profiles, report)
+    if found:
+        each = {p.path: p.to_json() for p in found}
+        write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
+        written.append("profile.json")
+    kept.remove(f"{CHECKPOINT}.npz")
+    return Identified(fit, job, found, tuple(written))
+
+
+def _profiles(
+    problem: Problem, optimum: Optimum, paths: Sequence[str], report: Reporter
+) -> tuple[Profile, ...]:
+    """Profile likelihoods of some numbers."""
+
+    def tell(points: int, rise: float) -> None:
+        report.note(f"{points} points, rise {rise:.2f}")
+
+    found = []
+    for path in dict.fromkeys(paths):
+        report.stage(f"profile of {path}")
+        found.append(profile(problem, optimum, path, tell))
+    return tuple(found)
+
+
+def _keep_run(job: Job, data: Path, out: Path, seconds: float) -> None:
+    """What later commands and readers need to know of this run."""
+    config = job.config
+    write_bytes(out / "config.toml", config.text.encode())
+    write_json(
+        out / "run.json",
+        {
+            "schema": "slipid.run/1",
+            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+            "seconds": round(seconds, 1),
+            "config": {"name": config.path.name, "sha256": config.hash},
+            "data": {
+                "folder": str(data),
+                "hash": job.data_hash,
+                "logs": {log.name: log.sha256 for log in job.logs},
+                "skipped": list(job.skipped),
+            },
+            "seed": job.settings.seed,
+            "versions": versions(),
+        },
+    )

@@ -1,0 +1,91 @@
+"""The logs that a config names, read into one data set."""
+
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+from slipid.data.log import Log
+from slipid.data.reading.declared import declared_layout
+from slipid.data.reading.folders import session_of, surface_of, with_voltage
+from slipid.data.reading.layout import Layout
+from slipid.data.reading.presets import PRESETS, preset
+from slipid.data.reading.reader import find_logs, read_logs
+from slipid.data.runs import Runs, collect
+from slipid.job.config import Config, Logs
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
+
+
+def read_dataset(
+    config: Config, sections: Sequence[Logs], root: Path, report: Reporter
+) -> tuple[Runs, list[str]]:
+    """Runs of some log sections, and a line for each section without files.
+
+    Raises:
+        DataError: no file at all, or one that cannot be read.
+    """
+    if not root.is_dir():
+        raise DataError(f"{root}: no such folder; expected the folder of the logs (--data)")
+    found, skipped = files_of(config, sections, root)
+    if not found:
+        raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
+    count = sum(len(paths) for _, paths in found)
+    logs: list[Log] = []
+    session: dict[str, str] = {}
+    done = short = 0
+    for section, paths in found:
+        layout = layout_of(config, section)
+        for path in paths:
+            surface = None if section.map is not None else surface_of(path, section.surface)
+            for log in read_logs(path, layout, root=root, surface=surface, load=section.load):
+                if log.samples < section.min_rows:
+                    short += 1
+                    continue
+                if log.name in session:
+                    raise DataError(
+                        f"{log.name}: found by two globs of {config.path}; expected it once"
+                    )
+                session[log.name] = session_of(log, section.session)
+                logs.append(with_voltage(log))
+            done += 1
+            report.advance(done, count)
+    if short:
+        skipped.append(f"skipped: {short} runs shorter than their min_rows")
+    return collect(logs, session=lambda log: session[log.name]), skipped
+
+
+def files_of(
+    config: Config, sections: Sequence[Logs], root: Path
+) -> tuple[list[tuple[Logs, list[Path]]], list[str]]:
+    """Files of every log section that has some, and a line for each that has none.
+
+    Raises:
+        DataError: a glob that cannot be one.
+    """
+    found: list[tuple[Logs, list[Path]]] = []
+    skipped: list[str] = []
+    for section in sections:
+        try:
+            found.append((section, find_logs(root, section.glob)))
+        except DataError as error:
+            skipped.append(f"skipped: {error}")
+        except (ValueError, NotImplementedError) as error:
+            raise DataError(f"{config.path}: logs.glob '{section.glob}': {error}") from error
+    return found, skipped
+
+
+def layout_of(config: Config, section: Logs) -> Layout:
+    """Layout a log section names: one of the config's own, else a preset."""
+    own = config.content.layouts
+    if section.format in own:
+        where = f"{config.path} layouts.{section.format}"
+        return declared_layout(own[section.format], where)
+    if section.format not in PRESETS:
+        names = [*own, *PRESETS]
+        near = get_close_matches(section.format, names, n=2)
+        hint = f", did you mean {' or '.join(near)}?" if near else ""
+        raise DataError(
+            f"{config.path}: logs.format '{section.format}': no such layout{hint}; "
+            f"expected one of {', '.join(names)}"
+        )
+    return preset(section.format)

@@ -1,0 +1,254 @@
+"""From a config and a data folder to a fitting problem."""
+
+import fnmatch
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from pathlib import Path
+
+from slipid.data.floor_map import FloorMap
+from slipid.data.log import Log
+from slipid.data.map_file import read_map
+from slipid.data.runs import Runs
+from slipid.data.windows import Windows, windows
+from slipid.identify.fit.one_speed import still_viscosities
+from slipid.identify.fit.problem import Problem
+from slipid.identify.result import hash_of
+from slipid.job.config import Config, FitSection, Logs, geometry, one_floor
+from slipid.job.logs import files_of, read_dataset
+from slipid.model.geometry import Geometry
+from slipid.model.robot import Robot, build
+from slipid.parameter import Choice, Space, entries
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Runs, the robot that drove them, and what is wanted of its numbers: all a fit is made of.
+
+    Attributes:
+        dataset: the runs, each on one floor.
+        robot: with its geometry, and every number at its declared start.
+        choices: free, fixed, priors.
+        settings: how finely runs are cut and how long to fit.
+        mixed: runs over several floors, with the map of each set.
+    """
+
+    dataset: Runs
+    robot: Robot
+    choices: tuple[Choice, ...]
+    settings: FitSection
+    mixed: tuple[tuple[Runs, FloorMap], ...] = ()
+
+    @property
+    def logs(self) -> tuple[Log, ...]:
+        """Every run, those over several floors last."""
+        return self.dataset.logs + tuple(log for data, _ in self.mixed for log in data.logs)
+
+    @property
+    def data_hash(self) -> str:
+        """Hash of the runs and their files."""
+        return hash_of((log.name, log.sha256) for log in self.logs)
+
+    def problem(self) -> Problem:
+        """Likelihood of the runs, cut into windows as the settings say."""
+        start = Space(self.robot, self.choices).template
+        return Problem(self.windows(start), self.robot, list(self.choices))
+
+    def windows(self, robot: Robot) -> Windows:
+        """Windows of the runs at the wheel radius and the camera lag of a robot."""
+        return windows(
+            self.dataset,
+            float(robot.geometry.wheel_radius),
+            lag=float(robot.camera.lag),
+            per_piece=self.settings.windows_per_piece,
+            longest=self.settings.longest_window_s,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Job(Task):
+    """What a config says about the logs that are there.
+
+    Attributes:
+        config: as read.
+        skipped: what the config names and the folder does not have, one line each.
+    """
+
+    config: Config
+    skipped: tuple[str, ...]
+
+
+def read_job(config: Config, root: Path, report: Reporter) -> Job:
+    """Read every log of runs on one floor that the config names and set up its robot.
+
+    Args:
+        config: what is wanted.
+        root: data folder the globs are relative to.
+        report: told how many files are read, and what the config names in vain.
+
+    Raises:
+        DataError: what is wrong with config or logs.
+    """
+    report.stage("reading logs")
+    dataset, skipped = read_dataset(config, one_floor(config.content.logs), root, report)
+    return job_of(config, dataset, skipped, report)
+
+
+def with_mixed(job: Job, root: Path, report: Reporter) -> Job:
+    """The job with the runs over several floors that its config names, arguments as of `read_job`.
+
+    Raises:
+        DataError: what is wrong with maps or logs.
+    """
+    wanted = [section for section in job.config.content.logs if section.map is not None]
+    found, absent = files_of(job.config, wanted, root)
+    sets = []
+    for section, _ in found:
+        floor = _map(job, section)
+        data, short = read_dataset(job.config, [section], root, report)
+        absent += short
+        _go_together(job, data)
+        sets.append((data, floor))
+        job = replace(job, mixed=tuple(sets))
+    for sentence in absent:
+        report.line(sentence)
+    return replace(job, skipped=(*job.skipped, *absent))
+
+
+def _map(job: Job, section: Logs) -> FloorMap:
+    """Map of a log section.
+
+    Raises:
+        DataError: unreadable, or of a floor that no run keeps to.
+    """
+    path = job.config.path.parent / str(section.map)
+    floor = read_map(path)
+    known = job.robot.surfaces.labels
+    for name in floor.surfaces:
+        if name not in known:
+            raise DataError(
+                f"{path}: surface '{name}': no run on it alone; expected some of {', '.join(known)}"
+            )
+    return floor
+
+
+def _go_together(job: Job, data: Runs) -> None:
+    """DataError where runs over several floors need what those on one floor do not tell."""
+    seen, first = {log.name for log in job.logs}, job.dataset.logs[0]
+    for log in data.logs:
+        if log.name in seen:
+            raise DataError(
+                f"{log.name}: found by two globs of {job.config.path}; expected it once"
+            )
+        if log.load not in job.robot.body.loads:
+            raise DataError(
+                f"{log.name}: load set-up '{log.load}': no run with it on one floor; "
+                f"expected one of {', '.join(job.robot.body.loads)}"
+            )
+        if log.wheels != first.wheels:
+            raise DataError(f"{log.name}: {log.wheels} wheels; expected {first.wheels}")
+
+
+def job_of(config: Config, dataset: Runs, skipped: Sequence[str], report: Reporter) -> Job:
+    """Job of runs that are there already.
+
+    Raises:
+        DataError: config and runs do not belong together.
+    """
+    shape = shape_of(config)
+    if shape.wheels != dataset.logs[0].wheels:
+        raise DataError(
+            f"{config.path}: robot: {shape.wheels} wheels, but {dataset.logs[0].name} has "
+            f"{dataset.logs[0].wheels}; expected the same"
+        )
+    robot = build(
+        shape,
+        sorted({log.surface or "unknown" for log in dataset.logs}),
+        sorted({log.load for log in dataset.logs}),
+        sorted(set(dataset.session)),
+        centre=config.content.camera.image_centre_m,
+    )
+    choices, left_out = _choices(config, robot)
+    skipped = [*skipped, *left_out]
+    choices = still_viscosities(dataset) + choices  # what the user says comes later and wins
+    for sentence in skipped:
+        report.line(sentence)
+    return Job(
+        dataset=dataset,
+        robot=robot,
+        choices=tuple(choices),
+        settings=config.content.fit,
+        config=config,
+        skipped=tuple(skipped),
+    )
+
+
+def shape_of(config: Config) -> Geometry:
+    """Geometry of the config's robot.
+
+    Raises:
+        DataError: it cannot drive.
+    """
+    try:
+        return geometry(config.content.robot)
+    except ValueError as error:
+        raise DataError(f"{config.path}: robot: {error}") from error
+
+
+_SAID = ("robot.wheel_radius", "robot.base_radius", "robot.mass")
+
+
+def said_of(robot: Robot, mass: float) -> list[Choice]:
+    """Size and mass as they are said: held, and the centre of the prior of what is freed."""
+    choices = []
+    for e in entries(robot):
+        if e.path in _SAID:
+            value = mass if e.path == "robot.mass" else float(e.get(robot))
+            std = e.declaration.spread * value
+            choices.append(Choice(e.path, prior_mean=value, prior_std=std, free=False))
+    return choices
+
+
+def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
+    """The config's parameter settings, checked, less those of floors and loads that are absent."""
+    paths = [e.path for e in entries(robot)]
+    choices: list[Choice] = []
+    skipped: list[str] = []
+    mass = config.content.robot.mass_kg
+    choices += said_of(robot, float(robot.body.mass) if mass is None else mass)
+    for pattern, setting in config.content.parameters.items():
+        if not fnmatch.filter(paths, pattern):
+            if fnmatch.filter(paths, _any_label(pattern)):
+                skipped.append(f"skipped: parameters '{pattern}': no run that has it")
+                continue
+            near = get_close_matches(pattern, paths, n=2)
+            hint = f", did you mean {' or '.join(near)}?" if near else ""
+            raise DataError(
+                f"{config.path}: parameters.'{pattern}': no such parameter{hint}; "
+                f"expected one of {', '.join(paths)}"
+            )
+        choice = Choice(
+            pattern,
+            start=setting.start,
+            fixed=setting.fixed,
+            free=setting.free,
+            prior_mean=None if setting.prior is None else setting.prior.mean,
+            prior_std=None if setting.prior is None else setting.prior.std,
+        )
+        try:
+            Space(robot, [choice])
+        except ValueError as error:
+            raise DataError(f"{config.path}: parameters.'{pattern}': {error}") from error
+        choices.append(choice)
+    return choices, skipped
+
+
+def _any_label(pattern: str) -> str:
+    """The pattern with the name of a floor, load or session replaced by any."""
+    head, at, _ = pattern.partition("@")
+    parts = head.split(".")
+    if parts[0] == "surface" and len(parts) == 3:
+        parts[1] = "*"
+    return ".".join(parts) + (f"{at}*" if at else "")

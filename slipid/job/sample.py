@@ -1,0 +1,243 @@
+"""The posterior of a fit by sampling: what `slipid sample` does, but for its pictures."""
+
+import importlib
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from slipid.identify.fit.problem import Problem
+from slipid.identify.fit_file import load, write_identified
+from slipid.identify.posterior import netcdf
+from slipid.identify.posterior import sample as posterior
+from slipid.identify.posterior.blocks import FORMAT, Block, Plan, Record, packed, unpacked
+from slipid.identify.posterior.coordinates import ELECTRIC, Fitted
+from slipid.identify.posterior.sample import Posterior
+from slipid.identify.result import Fit
+from slipid.identify.verdicts.estimates import Estimate
+from slipid.job.config import read_config
+from slipid.job.drawn_estimates import estimates, identified
+from slipid.job.problem import Job, read_job
+from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.content import Content
+from slipid.support.errors import DataError
+from slipid.support.files import read_json, write_json
+from slipid.support.jax_setup import setup_jax
+from slipid.support.progress import Reporter
+from slipid.support.versions import versions
+
+for _module in ("arviz_base", "arviz_stats", "h5netcdf", "threadpoolctl"):
+    importlib.import_module(_module)  # they are used after hours of work: what is missing shows now
+
+FOLDER = "sampling"
+"""Folder of the blocks of an unfinished chain, inside the result's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """End of `sample`.
+
+    Attributes:
+        fit: that was sampled around.
+        posterior: the draws.
+        parameters: numbers from the draws, by path.
+        content: of identified.json.
+        about: content of sample.json: how the chains did.
+        written: names of the files.
+    """
+
+    fit: Fit
+    posterior: Posterior
+    parameters: dict[str, Estimate]
+    content: Content
+    about: Content
+    written: tuple[str, ...]
+
+
+def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporter) -> Sampled:
+    """Sample around the fit in `out`: posterior.nc, sample.json, intervals in identified.json.
+
+    Args:
+        out: folder `identify` wrote; a chain that was interrupted there goes on.
+        data: folder of the logs; None for where they were fitted.
+        plan: of the chain.
+        draws: that are kept of each ensemble.
+        report: progress.
+
+    Raises:
+        DataError: no fit there, or other logs than it was made of.
+    """
+    began = time.monotonic()
+    setup_jax(quiet=True)
+    fit = load(out)
+    _on_one_floor(fit)
+    folder = _where_the_logs_are(out, data)
+    job = read_job(read_config(out / "config.toml"), folder, report)
+    _same_logs(fit, job)
+    report.stage("compiling")
+    problem = job.problem()
+    kept = Checkpoint(out / FOLDER, key_of(*_everything(fit, plan, draws)))
+    found = sampled_around(fit, problem, plan, draws, kept, report)
+    report.stage("writing")
+    about = _summary(found, plan, time.monotonic() - began)
+    content = identified(fit, found, problem)
+    marks = {k: str(v) for k, v in about.items() if not isinstance(v, dict)}
+    marks |= {"schema": netcdf.SCHEMA, "data_hash": fit.data_hash}
+    runs = tuple(log.name for log in job.dataset.logs)
+    netcdf.write(netcdf.tree(problem, found, runs, marks), out / "posterior.nc")
+    write_identified(out, content)
+    write_json(out / "sample.json", about)
+    if found.converged:
+        kept.remove()
+    written = ("posterior.nc", "sample.json", "identified.json")
+    return Sampled(fit, found, estimates(fit, found), content, about, written)
+
+
+def _everything(fit: Fit, plan: Plan, draws: int) -> tuple[object, ...]:
+    """All that a chain depends on; how long it may become is not of it."""
+    variance = sorted(fit.variance.items())
+    arrays = np.asarray(fit.z), np.asarray(fit.laplace)
+    return FORMAT, fit.data_hash, replace(plan, most=0), draws, variance, *arrays
+
+
+def sampled_around(
+    fit: Fit,
+    problem: Problem,
+    plan: Plan,
+    draws: int,
+    kept: Checkpoint | None,
+    report: Reporter,
+) -> Posterior:
+    """Posterior of a fit.
+
+    Args:
+        fit: that is sampled around.
+        problem: the likelihood it was made of.
+        plan: of the chain.
+        draws: that are kept of each ensemble.
+        kept: goes on from the blocks that an earlier call has left there, and keeps new ones.
+        report: progress.
+    """
+    watch = _Watch(plan, report)
+
+    def done(part: str) -> list[Block]:
+        blocks: list[Block] = []
+        if kept is None:
+            return blocks
+        while (arrays := kept.load(_name(part, len(blocks)))) is not None:
+            blocks.append(unpacked(arrays))
+        if blocks:
+            report.line(f"going on from block {len(blocks)} ({part}) of {kept.folder}")
+        return blocks
+
+    def keep(part: str, block: Block) -> None:
+        if kept is not None:
+            kept.save(_name(part, block.number), packed(block))
+        watch.block(part, block)
+
+    variance = np.array([fit.variance[name] for name in problem.noise.names])
+    shared = {k: v for k, v in fit.variance.items() if k not in problem.noise.names}
+    fitted = Fitted(fit.z, np.log(variance), fit.laplace, shared)
+    return posterior.sample(
+        problem, fitted, plan, draws=draws, record=Record(done, keep, watch.steps)
+    )
+
+
+def _name(part: str, number: int) -> str:
+    return f"{part}-{number:04d}"
+
+
+class _Watch:
+    """Progress of a chain; the time left is what it takes at most."""
+
+    def __init__(self, plan: Plan, report: Reporter):
+        self.plan, self.report = plan, report
+
+    def steps(self, part: str, steps: int) -> None:
+        """Every ensemble has done so many steps of a block."""
+        self.report.stage(f"sampling {part}")
+
+    def block(self, part: str, block: Block) -> None:
+        """A block is done and kept."""
+        count = block.number + 1
+        first = not part.startswith(ELECTRIC)
+        warm = "warm-up, " if first and count <= self.plan.warm_up[-1] else ""
+        what = (
+            f"block {count}: {warm}{count * block.chain.shape[1]} steps, "
+            f"{100 * block.accepted.mean():.0f} % moved, "
+            f"log density {block.log_prob[:, -1].mean():.1f}"
+        )
+        if first:
+            self.report.advance(count, self.plan.most, what)
+        else:  # how many blocks the second stage takes is not known
+            self.report.note(what)
+
+
+def _summary(found: Posterior, plan: Plan, seconds: float) -> Content:
+    """Content of sample.json: what was done and whether to believe it."""
+    d = found.diagnosis
+    return {
+        "schema": "slipid.sample/1",
+        "converged": found.converged,
+        "reason": found.reason,
+        "ensembles": plan.ensembles,
+        "walkers": plan.walkers,
+        "steps": d.steps,
+        "draws": int(np.prod(found.log_prob.shape)),
+        "seconds": round(seconds, 1),
+        "accepted": found.accepted,
+        "electric_unsettled": found.unsettled,
+        "seed": plan.seed,
+        "worst": {
+            "r_hat": float(np.max(d.r_hat)),
+            "steps_per_tau": float(d.steps / np.max(d.tau)),
+            "effective_draws": float(np.min(d.ess)),
+        },
+        "coordinates": {
+            name: {"r_hat": float(r), "tau": float(t), "effective_draws": float(n)}
+            for name, r, t, n in zip(found.names, d.r_hat, d.tau, d.ess, strict=True)
+        },
+        "versions": versions(),
+    }
+
+
+def _where_the_logs_are(out: Path, data: Path | None) -> Path:
+    """The data folder: as given, else where the fit found its logs.
+
+    Raises:
+        DataError: not given and no longer there.
+    """
+    if data is not None:
+        return data
+    run = read_json(out / "run.json", "what `slipid identify` keeps of a run")
+    folder = Path(run["data"]["folder"])
+    if not folder.is_dir():
+        raise DataError(f"{folder}: the logs were fitted from there; expected --data DIR")
+    return folder
+
+
+def _on_one_floor(fit: Fit) -> None:
+    """Refuse a fit that learnt from runs over several floors: their likelihood is not sampled.
+
+    Raises:
+        DataError: it did.
+    """
+    if "mixed" in fit.settings:
+        raise DataError(
+            "the fit learnt from runs over several floors, which are not sampled yet; "
+            "expected a fit without the log sections that have a map (identify again without them)"
+        )
+
+
+def _same_logs(fit: Fit, job: Job) -> None:
+    """Refuse logs other than those that were fitted.
+
+    Raises:
+        DataError: names the first that differs.
+    """
+    then, now = dict(fit.runs), {log.name: log.sha256 for log in job.dataset.logs}
+    for name in [*then, *now]:
+        if then.get(name) != now.get(name):
+            what = "is missing" if name not in now else "is new" if name not in then else "changed"
+            raise DataError(f"{name}: {what} since the fit; expected the very logs it was made of")

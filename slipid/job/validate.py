@@ -1,0 +1,57 @@
+"""Open-loop prediction of runs by a fit: what `slipid validate` does, but for its pictures."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from slipid.data.runs import Runs
+from slipid.identify.compare.slip_models import restored
+from slipid.identify.compare.validation import Predictor, validation
+from slipid.identify.fit_file import load
+from slipid.identify.result import Fit
+from slipid.job.config import one_floor, read_config
+from slipid.job.logs import read_dataset
+from slipid.support.content import Content
+from slipid.support.errors import DataError
+from slipid.support.jax_setup import setup_jax
+from slipid.support.progress import Reporter
+
+
+@dataclass(frozen=True, eq=False)
+class Validated:
+    """End of `validate`: who predicted, which runs, and the content of the validation file."""
+
+    fit: Fit
+    dataset: Runs
+    content: Content
+
+
+def validate(out: Path, data: Path, report: Reporter) -> Validated:
+    """Predict runs with the fit in `out`, and with every simpler model that it learnt.
+
+    Args:
+        out: folder `identify` wrote.
+        data: folder the globs of its config start from.
+        report: progress.
+
+    Raises:
+        DataError: no fit there, or logs that it cannot predict.
+    """
+    setup_jax(quiet=True)
+    fit = load(out)
+    config = read_config(out / "config.toml")
+    sections = one_floor(config.content.validate_.logs or config.content.logs)
+    report.stage("reading logs")
+    dataset, skipped = read_dataset(config, sections, data, report)
+    for sentence in skipped:
+        report.line(sentence)
+    seen = {sha for _, sha in fit.runs}
+    again = sum(log.sha256 in seen for log in dataset.logs)
+    if again:
+        report.line(f"{again} of {len(dataset)} runs were fitted: they say little about new ones")
+    report.stage("predicting")
+    try:
+        rungs = restored(dict(fit.baselines))
+    except ValueError as error:
+        raise DataError(f"{out / 'fit.json'}: {error}") from error
+    fitted = Predictor(fit.robot, fit.space, fit.z, fit.covariance, dict(fit.variance), rungs)
+    return Validated(fit, dataset, validation(fitted, dataset).to_json())

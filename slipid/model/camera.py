@@ -1,0 +1,128 @@
+"""From the body on the floor to the logged pose: scale, tilt, lens, marker."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from slipid.parameter import parameter
+
+
+class Camera(eqx.Module):
+    """From the body on the floor to the logged pose.
+
+    Logged places are corrected by `corrected`: true = scale * Q(q), q from the image centre, with
+    Q(q) = (q (1 + k q.q) + p q.q + 2 q (p.q)) / (1 + tilt.q): perspective of a tilted camera,
+    radial and tangential distortion (Brown 1966, Conrady 1919; first order of each). The marker's
+    heading is the body's plus `marker_yaw`, with an own deviation per session in which it was put
+    on.
+    """
+
+    scale: Array = parameter(
+        unit="1",
+        symbol="s",
+        start=1.0,
+        lower=0.0,
+        spread=0.02,
+        free=False,
+        doc="true over logged length",
+    )
+    lag: Array = parameter(
+        unit="s", symbol="t_c", start=0.0, spread=0.03, free=False, doc="camera behind the encoders"
+    )
+    marker_yaw: Array = parameter(
+        unit="rad",
+        symbol="psi",
+        start=0.0,
+        spread=0.03,
+        free=False,
+        doc="marker heading less body's",
+    )
+    session_yaw: Array = parameter(
+        unit="rad",
+        symbol="dpsi",
+        start=0.0,
+        spread=0.01,
+        free=False,
+        per="sessions",
+        doc="its change",
+    )
+    marker_place: Array = parameter(
+        unit="m",
+        symbol="p_m",
+        start=0.0,
+        spread=0.02,
+        free=False,
+        doc="marker from the body's centre",
+    )
+    tilt: Array = parameter(
+        unit="1/m",
+        symbol="h",
+        start=0.0,
+        spread=0.03,
+        free=False,
+        doc="perspective of a tilted camera",
+    )
+    radial: Array = parameter(
+        unit="1/m^2", symbol="k", start=0.0, spread=0.02, free=False, doc="radial distortion"
+    )
+    tangential: Array = parameter(
+        unit="1/m", symbol="p", start=0.0, spread=0.02, free=False, doc="decentred lens"
+    )
+    centre: tuple[float, float] = eqx.field(static=True, default=(0.0, 0.0))
+    sessions: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def corrected(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Pose in true metres, heading turned as the map turns it; the marker yaw stays in."""
+        u = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
+        place, turned = jax.jvp(self._ground, (pose[:2],), (u,))
+        turn = jnp.arctan2(u[0] * turned[1] - u[1] * turned[0], u @ turned)
+        return jnp.concatenate([place, (pose[2] + turn)[None]])
+
+    def logged(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
+        """What is logged of a true pose: the inverse of `corrected`, by iteration.
+
+        Every step shrinks the error by the bend of the map, some percent across a picture.
+        """
+        step = jnp.stack([self.scale, self.scale, jnp.ones(())])
+        q = (pose / step).at[:2].add(jnp.asarray(self.centre))
+        for _ in range(12):
+            q = q + (pose - self.corrected(q)) / step
+        return q
+
+    def log_jacobian(self, pose: Float[Array, "3"]) -> Float[Array, ""]:
+        """Log |d corrected / d pose|, which a density of logged poses has beside its residuals.
+
+        With m the derivative of the map of places and u the heading's direction the place gives
+        log |m|, the heading log(|m| / |m u|^2).
+        """
+        m = jax.jacfwd(self._ground)(pose[:2])
+        turned = m @ jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
+        area = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
+        return 2 * jnp.log(area) - jnp.log(turned @ turned)
+
+    def _ground(self, place: Float[Array, "2"]) -> Float[Array, "2"]:
+        """True place on the floor of a logged one."""
+        q = place - jnp.asarray(self.centre)
+        p, r2 = self.tangential, q @ q
+        bent = q * (1 + self.radial * r2) + p * r2 + 2 * q * (p @ q)
+        return self.scale * bent / (1 + self.tilt @ q)
+
+    def yaw(self, session: Int[Array, ""] | int) -> Float[Array, ""]:
+        """Marker heading less body heading in a session; an unknown one (-1) has the common yaw."""
+        if not self.sessions:
+            return self.marker_yaw
+        own = jnp.where(session >= 0, self.session_yaw[session], 0.0)
+        return self.marker_yaw + own
+
+    def seen(
+        self, increment: Float[Array, "3"], session: Int[Array, ""] | int
+    ) -> Float[Array, "3"]:
+        """Body-frame increment of the marker from the body's (x, y [m], yaw [rad])."""
+        c, s = jnp.cos(increment[2]), jnp.sin(increment[2])
+        px, py = self.marker_place[0], self.marker_place[1]
+        x = increment[0] + (c - 1) * px - s * py
+        y = increment[1] + s * px + (c - 1) * py
+        psi = self.yaw(session)
+        c, s = jnp.cos(psi), jnp.sin(psi)
+        return jnp.stack([c * x + s * y, c * y - s * x, increment[2]])

@@ -1,0 +1,184 @@
+"""Balance of the contact forces of a robot, of many at once, or of one on many floors.
+
+Wheels are the first axis of every array and the batch the others, if there is one; sums over wheels
+and over x, y, yaw are written out. Nothing is a matrix product then, so that XLA makes few loops
+over contiguous numbers of it; each costs it 0.2 us and more, whatever it does.
+"""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from slipid.model import contact_law as law
+from slipid.model.contact_law import ContactSurface, WheelForces
+from slipid.model.geometry import Frame
+from slipid.model.se2 import Columns, Planar, dot, solve3
+
+_LEAST_LOAD = 1e-3
+
+
+class Stance(eqx.Module):
+    """A robot on its floors.
+
+    Attributes:
+        frame, rest: wheel directions and load shares at rest, with an axis for the batch.
+        hold, roll, shift: those of the frame by the parts of a twist, each (wheel, *one).
+        floor: numbers under each wheel or under all; friction is that over its mean, scrub and lead
+            are means over the loads, and what belongs to rollers is as of `law.sideways`.
+        drag_onset: roller speed below which drag is viscous [m/s].
+        friction: mean over the wheels; forces are in units of it times m g.
+    """
+
+    frame: Frame
+    hold: Planar
+    roll: Planar
+    shift: Float[Array, "2 wheel *one"]
+    rest: Float[Array, "wheel *one"]
+    floor: ContactSurface
+    drag_onset: Float[Array, "wheel *one"]
+    friction: Float[Array, "*batch"]
+
+
+def stand(frame: Frame, surface: ContactSurface, rest: Float[Array, " wheel"]) -> Stance:
+    """A robot on one floor (leaves are numbers) or on one per wheel (wheel, *batch)."""
+    floor, friction = replace(surface, friction=jnp.ones(())), surface.friction
+    if jnp.ndim(friction) > 0:
+        ones = (1,) * (jnp.ndim(friction) - 1)
+        frame, rest = jax.tree.map(lambda a: a.reshape(*a.shape, *ones), (frame, rest))
+        friction = jnp.mean(surface.friction, axis=0)
+        floor = replace(
+            surface,
+            friction=surface.friction / friction,
+            scrub=total(rest * surface.scrub),
+            lead=total(rest * surface.lead),
+        )
+    floor, onset = law.sideways(floor, frame.grip)
+    # parts first: XLA then keeps what belongs to a part, and its derivatives, side by side
+    hold, roll, shift = (jnp.moveaxis(r, 1, 0) for r in (frame.hold, frame.roll, frame.shift))
+    return Stance(frame, Planar(*hold), Planar(*roll), shift, rest, floor, onset, friction)
+
+
+def total(of_wheels: Float[Array, "wheel *batch"]) -> Float[Array, "*batch"]:
+    """Sum over wheels, written out."""
+    return sum(of_wheels[1:], start=of_wheels[0])
+
+
+class Balance(eqx.Module):
+    """The forces on a body by its twist, in units of mean(mu) m g.
+
+    Attributes:
+        rim: r w, rim speeds [m/s].
+        on: how it stands.
+        mass, before: mass and inertia over the time step, and the twist before it; or neither.
+    """
+
+    rim: Float[Array, "wheel *batch"]
+    on: Stance
+    mass: Planar | None = None
+    before: Planar | None = None
+
+    def force(self, xi: Planar) -> Planar:
+        """What does not balance."""
+        w, load = self.wheels(*self._speeds(xi)), self.load(xi)
+        x, y, yaw = self._summed(load * w.push(), -load * w.drag.force())
+        out = Planar(x, y, yaw - law.scrub_moment(xi.yaw, self.on.floor.scrub).force())
+        if self.mass is None:
+            return out
+        return jax.tree.map(lambda f, m, a, b: f - m * (a - b), out, self.mass, xi, self.before)
+
+    def jacobian(self, xi: Planar) -> Columns:
+        """Derivative of the force by the twist: by the speeds of the wheels, and by their loads."""
+        (along, roll), load, rows = self._speeds(xi), self.load(xi), self.on
+        w = self.wheels(along, roll)
+        push, drag = w.push(), -w.drag.force()
+        by_roll = roll / w.active  # of the activity
+        by_along = -w.traction.by_speed() - w.resistance.by_speed()
+        across = (w.traction.by_activity() - w.resistance.by_activity()) * by_roll
+        rolls = -w.drag.by_speed() - w.drag.by_activity() * by_roll
+        by_along, across, rolls = load * by_along, load * across, load * rolls
+        one = jnp.ones_like(xi.x)
+        by_x = jax.jvp(lambda v: self.load(xi._replace(x=v)), (xi.x,), (one,))[1]
+        by_y = jax.jvp(lambda v: self.load(xi._replace(y=v)), (xi.y,), (one,))[1]
+
+        def column(k: int, pushed: Array | float, dragged: Array | float) -> Planar:
+            along = by_along * rows.hold[k] + across * rows.roll[k] + pushed
+            return self._summed(along, rolls * rows.roll[k] + dragged)
+
+        scrub = law.scrub_moment(xi.yaw, self.on.floor.scrub).by_speed()
+        x, y = column(0, push * by_x, drag * by_x), column(1, push * by_y, drag * by_y)
+        return jax.tree.map(jnp.subtract, Columns(x, y, column(2, 0.0, 0.0)), self._diagonal(scrub))
+
+    def newton(self, xi: Planar) -> Planar:
+        """Newton's step, to be taken off the twist."""
+        return solve3(self.jacobian(xi), self.force(xi))
+
+    def chord(self, xi: Planar) -> Planar:
+        """Twist that balances the forces when each is drawn as its chord from zero speed to xi.
+
+        tanh(x) / x falls with |x|, so that no step overshoots where Newton's does; near the root it
+        is slow (Weiszfeld's iteration).
+        """
+        on, f, w = self.on, self.on.frame, self.wheels(*self._speeds(xi))
+        # a lifted wheel would push the chord the wrong way
+        load = law.load_force(jnp.maximum(self.share(xi), _LEAST_LOAD), self.on.floor)
+        pulls, rolls = load * w.traction.chord(), load * w.drag.chord()
+        both = pulls + load * w.resistance.chord()
+
+        def entry(a: int, b: int) -> Array:
+            on_hold, on_roll = on.hold[a] * on.hold[b], on.roll[a] * on.roll[b]
+            return total(on_hold * both + on_roll * rolls)
+
+        xx, xy, yy = entry(0, 0), entry(0, 1), entry(1, 1)
+        x_yaw, y_yaw, turn = entry(0, 2), entry(1, 2), entry(2, 2)
+        m = Columns(Planar(xx, xy, x_yaw), Planar(xy, yy, y_yaw), Planar(x_yaw, y_yaw, turn))
+        scrub = law.scrub_moment(xi.yaw, self.on.floor.scrub).chord()
+        m = jax.tree.map(jnp.add, m, self._diagonal(scrub))
+        drive = self._summed(pulls * self.rim * f.pull, rolls * self.rim * f.slip_through)
+        if self.mass is not None:
+            drive = jax.tree.map(lambda d, k, b: d + k * b, drive, self.mass, self.before)
+        return solve3(m, drive)
+
+    def felt(self, xi: Planar) -> Float[Array, "wheel *batch"]:
+        """Traction that each motor works against."""
+        f = self.on.frame
+        return self.load(xi) * self.wheels(*self._speeds(xi)).felt(f.pull, f.slip_through)
+
+    def dragged(self, xi: Planar) -> Float[Array, "wheel *batch"]:
+        """Force along the rolling direction of the rollers."""
+        return -self.load(xi) * self.wheels(*self._speeds(xi)).drag.force()
+
+    def size(self, force: Planar) -> Float[Array, "*batch"]:
+        """Square of a force, its moment over the base radius."""
+        return force.x**2 + force.y**2 + (force.yaw / self.on.frame.base) ** 2
+
+    def share(self, xi: Planar) -> Float[Array, "wheel *batch"]:
+        """Load shares."""
+        return law.load_shift(xi, self.on.rest, self.on.shift, self.on.floor.lead)
+
+    def load(self, xi: Planar) -> Float[Array, "wheel *batch"]:
+        """Loads as forces count them."""
+        return law.load_force(self.share(xi), self.on.floor)
+
+    def wheels(self, along: Array, roll: Array) -> WheelForces:
+        """The law at speeds of the wheels."""
+        f = self.on.frame
+        return law.wheel_forces(along, roll, self.rim, f.pull, self.on.drag_onset, self.on.floor)
+
+    def _speeds(self, xi: Planar) -> tuple[Array, Array]:
+        """Speeds of the wheels along their drive and along their rollers."""
+        on = self.on
+        return dot(on.hold, xi), dot(on.roll, xi) - self.rim * on.frame.slip_through
+
+    def _summed(self, along: Array, roll: Array) -> Planar:
+        """Force on the body of what wheels exert along their drive and along their rollers."""
+        hold, free = self.on.hold, self.on.roll
+        return Planar(*(total(hold[k] * along + free[k] * roll) for k in range(3)))
+
+    def _diagonal(self, scrub: Array) -> Columns:
+        """What each part of the twist does to its own force alone."""
+        nil = jnp.zeros_like(scrub)
+        x, y, yaw = (nil, nil, nil) if self.mass is None else self.mass
+        return Columns(Planar(x, nil, nil), Planar(nil, y, nil), Planar(nil, nil, yaw + scrub))

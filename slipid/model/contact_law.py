@@ -1,0 +1,233 @@
+"""The contact law: what floors do to rolling wheels, wheel by wheel.
+
+With xi = (v_x, v_y, W) the body twist, r w_i the rim speed, J_i and K_i the rows that give the
+speed of wheel i along its drive and along its rollers' free direction, p_i its place, N_i its load
+share, v^ the direction of motion, and forces in units of mu m g:
+
+    q_i   = K_i xi                                     roller speed
+    c_i   = sqrt((r w_i)^2 + q_i^2)                    wheel activity
+    vs_i  = r w_i - J_i xi                             sliding speed
+    N     = N0 - P b v^                                contact patches lead the wheel centres by b;
+                                                       P: loads that keep sum N and sum N (p + b v^)
+    T_i   =  N_i [tanh(vs_i / (v0 + s0 c_i)) + kv vs_i - crr tanh(J_i xi / (v0 + s1 c_i))]
+    D_i   = -N_i [cr tanh(q_i / (vr + sr c_i)) + kl q_i]
+    0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz tanh(W / W0)) - M (xi - xi_before)
+
+M is mass and inertia over the time step, zero in the quasi-static case. This is for omni wheels;
+where rollers stand at an angle g to the drive, vs_i is r w_i sin g less the speed along the
+direction in which the rollers do not give way, and r w_i cos g is taken off q_i. Ordinary wheels
+grip sideways as they do ahead.
+
+Wheels may stand on different floors. Forces are then in units of mean(mu) m g, each wheel's
+weighted by mu_i / mean(mu), and b and cz are means over the loads. Creep and rolling resistance are
+rate-independent (s0 is a slip *ratio*): with a resistance that sets in at 20 mm/s instead, runs
+faster than the fitted ones are predicted worse.
+
+Every function here is elementwise: it takes arrays of any shapes that broadcast.
+"""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from slipid.model.se2 import Planar
+from slipid.parameter import parameter
+
+V0 = 0.002
+"""Sliding speed below which traction is viscous [m/s]."""
+VR = 0.001
+"""Roller speed below which roller drag is viscous [m/s]."""
+S1 = 0.2
+"""Speed along the drive, over wheel activity, below which rolling resistance is viscous."""
+W0 = 0.05
+"""Yaw rate below which the scrub moment is viscous [rad/s]."""
+
+
+class ContactSurface(eqx.Module):
+    """What a floor does to rolling wheels; leaves may be stacked, one row per label.
+
+    In the force balance leaves are numbers, or one per wheel where wheels stand on several floors.
+
+    Attributes:
+        labels: names of the stacked surfaces.
+    """
+
+    friction: Array = parameter(
+        unit="1",
+        symbol="mu",
+        start=0.4,
+        lower=0.0,
+        spread=0.5,
+        doc="friction coefficient",
+        electric=True,
+    )
+    creep: Array = parameter(
+        unit="1", symbol="s0", start=0.3, lower=0.0, spread=1.5, doc="slip ratio of full traction"
+    )
+    roller_drag: Array = parameter(
+        unit="1", symbol="cr", start=0.3, lower=0.0, spread=1.5, doc="drag of sideways rolling"
+    )
+    roller_creep: Array = parameter(
+        unit="1",
+        symbol="sr",
+        start=0.2,
+        lower=0.0,
+        spread=1.5,
+        doc="roller speed ratio of full drag",
+    )
+    rolling_resistance: Array = parameter(
+        unit="1", symbol="crr", start=0.005, lower=0.0, spread=2.0, doc="resistance along the drive"
+    )
+    slide_viscosity: Array = parameter(
+        unit="s/m", symbol="kv", start=0.02, lower=0.0, spread=2.0, doc="traction per sliding speed"
+    )
+    roller_viscosity: Array = parameter(
+        unit="s/m", symbol="kl", start=0.02, lower=0.0, spread=2.0, doc="drag per roller speed"
+    )
+    scrub: Array = parameter(
+        unit="m", symbol="cz", start=0.002, lower=0.0, spread=2.0, doc="moment against turning"
+    )
+    lead: Array = parameter(
+        unit="m", symbol="b", start=0.002, spread=0.01, doc="contact ahead of the wheel centre"
+    )
+    labels: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def at(self, index: Int[Array | np.ndarray, "..."] | int) -> "ContactSurface":
+        """Surface number `index` of the stack (may be traced), or those under each wheel."""
+        picked: ContactSurface = jax.tree.map(lambda leaf: leaf[index], self)
+        return picked
+
+
+class Friction(eqx.Module):
+    """A force against a speed that saturates: top tanh(speed / onset) + viscosity speed.
+
+    Attributes:
+        speed: [m/s].
+        onset: speed at which it is nearly saturated [m/s], linear in the wheel's activity.
+        ratio: onset per activity; top: where it saturates; viscosity: force per speed.
+    """
+
+    speed: Array
+    onset: Array | float
+    ratio: Array | float
+    top: Array | float
+    viscosity: Array | float = 0.0
+
+    def force(self) -> Array:
+        """The force."""
+        return self.top * jnp.tanh(self.speed / self.onset) + self.viscosity * self.speed
+
+    def chord(self) -> Array:
+        """Force over speed, which is even in the speed and finite at rest."""
+        size = jnp.abs(self.speed) + 1e-12 * self.onset
+        return self.top * (jnp.tanh(size / self.onset) / size) + self.viscosity
+
+    def by_speed(self) -> Array:
+        """Derivative by the speed, at a constant activity."""
+        return self._steep() / self.onset + self.viscosity
+
+    def by_activity(self) -> Array:
+        """Derivative by the wheel's activity, at a constant speed."""
+        return -self._steep() * self.speed * self.ratio / self.onset**2
+
+    def _steep(self) -> Array:
+        return self.top * (1 - jnp.tanh(self.speed / self.onset) ** 2)
+
+
+class WheelForces(eqx.Module):
+    """Forces of a wheel per friction mu N.
+
+    Attributes:
+        active: c, rim and roller speed together [m/s].
+        traction, resistance: ahead and back along the drive.
+        drag: back along the rollers.
+    """
+
+    active: Array
+    traction: Friction
+    resistance: Friction
+    drag: Friction
+
+    def push(self) -> Array:
+        """On the body, along the drive."""
+        return self.traction.force() - self.resistance.force()
+
+    def felt(self, pull: Array, slip_through: Array) -> Array:
+        """On the motor, for the wheel's `Frame.pull` and `Frame.slip_through`.
+
+        Rolling resistance is counted as a force on the body that the motor does not feel; what the
+        motor bears of it is in its own friction. Rollers at an angle (mecanum) pass on a part of
+        what holds the wheel and a part of their drag.
+        """
+        return self.traction.force() * pull - self.drag.force() * slip_through
+
+
+def wheel_traction(slide: Array, active: Array, floor: ContactSurface) -> Friction:
+    """Traction at a sliding speed."""
+    onset = V0 + floor.creep * active
+    return Friction(slide, onset, floor.creep, 1.0, floor.slide_viscosity)
+
+
+def rolling_resistance(along: Array, active: Array, floor: ContactSurface) -> Friction:
+    """Resistance at a speed along the drive."""
+    return Friction(along, V0 + S1 * active, S1, floor.rolling_resistance)
+
+
+def roller_drag(roll: Array, active: Array, floor: ContactSurface, at_rest: Array) -> Friction:
+    """Drag at a roller speed, from its onset of a wheel at rest [m/s] on."""
+    onset = at_rest + floor.roller_creep * active
+    return Friction(roll, onset, floor.roller_creep, floor.roller_drag, floor.roller_viscosity)
+
+
+def scrub_moment(yaw_rate: Array, scrub: Array) -> Friction:
+    """Moment at a yaw rate [m]."""
+    return Friction(yaw_rate, W0, 0.0, scrub)
+
+
+def sideways(floor: ContactSurface, grip: Array) -> tuple[ContactSurface, Array]:
+    """Floor for a wheel without rollers (grip 1) or with (0), and the onset of its drag [m/s].
+
+    An ordinary wheel grips sideways as it does ahead.
+    """
+    free = 1 - grip
+    out = replace(
+        floor,
+        roller_drag=grip + free * floor.roller_drag,
+        roller_creep=grip * floor.creep + free * floor.roller_creep,
+        roller_viscosity=grip * floor.slide_viscosity + free * floor.roller_viscosity,
+    )
+    return out, grip * V0 + free * VR
+
+
+def wheel_forces(
+    along: Array, roll: Array, rim: Array, pull: Array, at_rest: Array, floor: ContactSurface
+) -> WheelForces:
+    """The law at the speeds of a wheel [m/s].
+
+    Args:
+        along, roll, rim: J xi, q and r w of the head of this module.
+        pull: `Frame.pull`.
+        at_rest, floor: from `sideways`.
+    """
+    active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
+    return WheelForces(
+        active=active,
+        traction=wheel_traction(rim * pull - along, active, floor),
+        resistance=rolling_resistance(along, active, floor),
+        drag=roller_drag(roll, active, floor, at_rest),
+    )
+
+
+def load_force(load: Array, floor: ContactSurface) -> Array:
+    """Friction mu N that its load share gives a wheel [m g]: where loads become forces."""
+    return floor.friction * load
+
+
+def load_shift(xi: Planar, rest: Array, shift: Float[Array, "2 wheel *one"], lead: Array) -> Array:
+    """Load shares in motion: those at rest, shifted by contacts that lead along the motion [m]."""
+    inv = jax.lax.rsqrt(xi.x**2 + xi.y**2 + 1e-8)
+    return rest - lead * (shift[0] * (xi.x * inv) + shift[1] * (xi.y * inv))

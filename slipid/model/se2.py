@@ -1,0 +1,59 @@
+"""Motions and forces in the plane: poses, what adds up, and three equations (exact SE(2))."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Planar(NamedTuple):
+    """Three numbers of the plane, each of any batch: a twist, a force, or rows of a matrix."""
+
+    x: Array
+    y: Array
+    yaw: Array
+
+
+class Columns(NamedTuple):
+    """A 3x3 matrix: what a twist's parts do to a force, each of any batch."""
+
+    x: Planar
+    y: Planar
+    yaw: Planar
+
+
+def dot(a: Planar, b: Planar) -> Array:
+    """Sum of the products, written out: a matrix product is a loop of its own to XLA."""
+    return a.x * b.x + a.y * b.y + a.yaw * b.yaw
+
+
+def cross(a: Planar, b: Planar) -> Planar:
+    """Cross product of the triples."""
+    x, y = a.y * b.yaw - a.yaw * b.y, a.yaw * b.x - a.x * b.yaw
+    return Planar(x, y, a.x * b.y - a.y * b.x)
+
+
+def solve3(m: Columns, b: Planar) -> Planar:
+    """m^-1 b by Cramer's rule: no LAPACK call per row of a batch, and it exports to C."""
+    first = cross(m.y, m.yaw)
+    det = dot(m.x, first)
+    scale = 1 / jnp.where(jnp.abs(det) < 1e-30, 1e-30, det)
+    x, y, yaw = dot(first, b), dot(cross(m.yaw, m.x), b), dot(cross(m.x, m.y), b)
+    return Planar(x * scale, y * scale, yaw * scale)
+
+
+def advance(xi: Float[Array, "3"], dt: Float[Array, ""] | float) -> Float[Array, "3"]:
+    """Pose increment in the frame of its start after moving at a constant twist (exact SE(2))."""
+    w = xi[2] * dt
+    small = jnp.abs(w) < 1e-6
+    safe = jnp.where(small, 1.0, w)
+    a = jnp.where(small, 1.0 - w * w / 6, jnp.sin(safe) / safe)
+    b = jnp.where(small, 0.5 * w, (1 - jnp.cos(safe)) / safe)
+    return jnp.stack([(a * xi[0] - b * xi[1]) * dt, (b * xi[0] + a * xi[1]) * dt, w])
+
+
+def compose(pose: Float[Array, "3"], increment: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Pose after a body-frame increment."""
+    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+    x, y = increment[0], increment[1]
+    return jnp.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y, pose[2] + increment[2]])

@@ -1,0 +1,136 @@
+"""Picture of proposed runs: where to drive next, and how fast uncertainty falls."""
+
+import math
+from collections import Counter
+
+import numpy as np
+
+from slipid.identify.design.planned_runs import Drive
+from slipid.identify.design.proposal import Design
+from slipid.plots import drawing
+from slipid.plots.drawing import Axes, Figure
+from slipid.support.content import Content
+
+CURVES = (
+    ("greedy", drawing.BLUE, "-", "chosen one after another"),
+    ("grid", drawing.ORANGE, "-", "the 2021 paper's grid"),
+    ("random_order", drawing.SHADE, "--", "the same grid in random order"),
+)
+
+
+def design_figure(found: Design) -> Figure:
+    """Proposed runs by floor and load on what was driven (left), uncertainty by runs (right)."""
+    setups = list(dict.fromkeys((d.surface, d.load) for d in found.drives))
+    columns = min(len(setups), 2 if len(setups) < 5 else 3)
+    rows = math.ceil(len(setups) / columns)
+    made = drawing.figure(3.6 * columns + 5.6, max(3.7 * rows, 4.4) + 0.8, _title(found))
+    halves = made.subfigures(1, 2, width_ratios=(3.6 * columns, 5.4), squeeze=False)
+    left, right = halves[0]
+    axes = list(left.subplots(rows, columns, squeeze=False).flat)
+    order = {d: k for k, d in reversed(list(enumerate(found.drives, 1)))}
+    for ax, setup in zip(axes, setups, strict=False):
+        mine = Counter(d for d in found.drives if (d.surface, d.load) == setup)
+        _commands(ax, found, setup, mine, order)
+    for spare in axes[len(setups) :]:
+        spare.remove()
+    words = "numbers: in which order (x3: three times)\nbent or round arrows: turning as it drives"
+    left.supxlabel(f"{words}\ngray dots: driven already", fontsize=9, color=drawing.SHADE)
+    _falling(right.subplots(), found.content["runs_saved"]["paper_grid"])
+    return made
+
+
+def _title(found: Design) -> str:
+    goals = [g for g in found.content["goals"] if g["reachable"]]
+    names = [g["name"] for g in goals[:2]] + ["..."] * (len(goals) > 2)
+    last = found.content["runs"][-1]["expected"]
+    kept = math.sqrt(found.content["criterion"][-1])
+    head = f"Drive these {len(found.drives)} runs next to know more of {', '.join(names)}\n"
+    if len(goals) > 1:
+        return head + f"uncertainty falls to {kept:.0%} of what it is now"
+    g = goals[0]
+    scale, unit = (100, " %") if g["unit"] == "m/m" else (1, "" if g["unit"] == "1" else g["unit"])
+    return head + f"std falls from {scale * g['now']:.3g} to {scale * last[g['name']]:.3g}{unit}"
+
+
+def _commands(
+    ax: Axes,
+    found: Design,
+    setup: tuple[str, str],
+    mine: Counter[Drive],
+    order: dict[Drive, int],
+) -> None:
+    """Commanded velocities of one floor and load."""
+    floor, load = setup
+    seen = found.seen[floor]
+    reach = 1.4 * max(d.speed or abs(d.turn) * found.base_radius for d in mine)
+    if load in seen.loads:
+        angle = np.radians(seen.headings_deg)
+        for speed in seen.speeds:
+            ax.plot(
+                speed * np.cos(angle), speed * np.sin(angle), ".", color="#bbbbbb", ms=3.5, mew=0
+            )
+    for d, times in mine.items():
+        text = f"{order[d]}" + f" x{times}" * (times > 1) + "\nspin" * (not d.speed)
+        at = _arrow(ax, d, found.base_radius, 0.1 * reach)
+        ax.text(at[0], at[1], text, ha="center", va="center", fontsize=9, color=_colour(d))
+    drawing.plain(ax)
+    ax.set_aspect("equal")
+    ax.set(xlim=(-reach, reach), ylim=(-reach, reach), title=f"{floor}, load {load}")
+    ax.set(xlabel="ahead [m/s]", ylabel="left [m/s]")
+
+
+def _arrow(ax: Axes, d: Drive, base: float, beyond: float) -> tuple[float, float]:
+    """Arrow to the commanded velocity, bent where it turns, an arc on the spot; its label's place.
+
+    Args:
+        beyond: distance of the label from the tip [m/s].
+    """
+    colour, way = _colour(d), float(np.sign(d.turn))
+    style = {"arrowstyle": "-|>", "color": colour, "lw": 1.5, "shrinkA": 0, "shrinkB": 0}
+    if d.speed:
+        style["connectionstyle"] = f"arc3,rad={0.25 * way}"
+        end, start = (float(d.command[0]), float(d.command[1])), (0.0, 0.0)
+        side = d.heading + 0.12 * way
+        place = (d.speed + beyond) * np.array([np.cos(side), np.sin(side)])
+    else:
+        size = abs(d.turn) * base
+        style["connectionstyle"] = f"arc3,rad={0.9 * way}"
+        low, high = (0.0, -size), (0.0, size)
+        start, end = (low, high) if way > 0 else (high, low)
+        place = np.array([way * (size + 1.3 * beyond), 0.0])
+    ax.annotate("", end, start, arrowprops=style)
+    return float(place[0]), float(place[1])
+
+
+def _colour(d: Drive) -> str:
+    if not d.turn:
+        return drawing.BLUE
+    return drawing.ORANGE if d.turn > 0 else drawing.GREEN
+
+
+def _falling(ax: Axes, saved: Content) -> None:
+    """Uncertainty against runs, from nothing."""
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
+
+    for key, colour, style, label in CURVES:
+        curve = saved["curves"][key]
+        std = np.sqrt(curve["criterion"])
+        ax.plot(curve["runs"], std, style, color=colour, lw=1.8, label=label)
+    end = math.sqrt(saved["criterion"])
+    ax.axhline(end, color=drawing.INK, lw=0.8, ls=":")
+    ax.plot(saved["grid_runs"], end, "o", color=drawing.ORANGE, ms=6)
+    title = f"from no run at all: the grid's {saved['grid_runs']} runs tell"
+    if saved["greedy_runs"]:
+        last = math.sqrt(saved["curves"]["greedy"]["criterion"][-1])
+        ax.plot(saved["greedy_runs"], last, "o", color=drawing.BLUE, ms=6)
+        ax.set_title(f"{title}\nas much as {saved['greedy_runs']} chosen ones", fontsize=11)
+    else:
+        ax.set_title(f"{title}\nmore than as many chosen ones", fontsize=11)
+    ax.set(xscale="log", yscale="log", xlabel="runs")
+    ax.set(ylabel="uncertainty (1: the present fit)")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(FormatStrFormatter("%g"))
+        axis.set_minor_locator(NullLocator())
+    drawing.plain(ax)
+    ax.legend(frameon=False)

@@ -1,0 +1,68 @@
+"""What all pictures share: a figure that needs no display, colours for any eyes, whole files."""
+
+import io
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from slipid.support.files import write_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.collections import PathCollection as PathCollection
+    from matplotlib.figure import Figure as Figure
+else:
+    # matplotlib is slow to import, so not before a figure is drawn; run-time checks see Any
+    Axes = Figure = PathCollection = Any
+
+BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+INK, SHADE = "#222222", "#888888"
+SERIES = (BLUE, ORANGE, GREEN, PURPLE, "#56B4E9", "#E69F00")
+"""Okabe and Ito's colours: told apart with any colour vision."""
+MARKERS = ("o", "^", "s", "D", "v", "P")
+
+
+def figure(width: float, height: float, title: str) -> Figure:
+    """Empty figure [inch] that says at the top what one should see."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    made = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(made)
+    made.suptitle(title, fontsize=13, x=0.01, ha="left", color=INK)
+    return made
+
+
+def panels(count: int, width: float, height: float, title: str) -> tuple[Figure, list[Axes]]:
+    """Figure with `count` panels of one size [inch], in rows of at most four."""
+    columns = min(count, 4 if count != 5 else 3)
+    rows = math.ceil(count / columns)
+    # a single panel still leaves the title room
+    made = figure(max(width * columns, 8.8), height * rows + 0.6, title)
+    axes = list(made.subplots(rows, columns, squeeze=False).flat)
+    for spare in axes[count:]:
+        spare.remove()
+    return made, axes[:count]
+
+
+def styled(count: int) -> Iterator[tuple[str, str]]:
+    """A colour and a marker for each of `count` series."""
+    for k in range(count):
+        yield SERIES[k % len(SERIES)], MARKERS[k % len(MARKERS)]
+
+
+def plain(axes: Axes) -> None:
+    """Light grid, no box."""
+    axes.grid(color="#dddddd", lw=0.6)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def save(made: Figure, path: Path) -> Path:
+    """Write the figure as PNG, whole or not at all."""
+    buffer = io.BytesIO()
+    made.savefig(buffer, format="png", dpi=110)
+    write_bytes(path, buffer.getvalue())
+    return path

@@ -1,0 +1,104 @@
+"""Pictures of a result, as PNG files."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from slipid.data.runs import Runs
+from slipid.identify.result import Fit
+from slipid.plots import drawing
+from slipid.plots.drawing import Figure
+from slipid.plots.load import load_figure
+from slipid.plots.motion import heading_figure, path_figure
+from slipid.plots.seen import Seen, seen
+from slipid.plots.slip_models import ladder_figure
+from slipid.plots.wheels import current_figure, curve_figure
+from slipid.support.content import Content
+
+PATHS = (
+    "Where the encoders say the robot went (dotted), where the fitted robot says (blue),\n"
+    "and where the camera saw it (gray): "
+)
+
+
+PICTURES: dict[str, Callable[[Fit, Runs, Seen], Figure | None]] = {
+    "slip_by_heading": lambda fit, data, pieces: heading_figure(fit.robot, pieces),
+    "paths": lambda fit, data, pieces: path_figure(
+        fit.robot, data, pieces.groups, PATHS + "runs of the fit"
+    ),
+    "slip_by_torque": lambda fit, data, pieces: curve_figure(fit, pieces),
+    "current_by_traction": lambda fit, data, pieces: current_figure(fit.robot, pieces),
+    "load_share": lambda fit, data, pieces: load_figure(fit),
+}
+"""Pictures of a fit by name."""
+
+
+def identify_plots(fit: Fit, data: Runs, out: Path) -> list[Path]:
+    """Draw what a fit found beside the runs it was fitted to.
+
+    Args:
+        fit: of these runs.
+        data: the runs.
+        out: folder to write to.
+
+    Returns:
+        the files; a picture the data have nothing for is left out.
+    """
+    pieces = _pieces(fit, data)
+    figures = {name: draw(fit, data, pieces) for name, draw in PICTURES.items()}
+    return [
+        drawing.save(made, out / f"{name}.png")
+        for name, made in figures.items()
+        if made is not None
+    ]
+
+
+def picture(fit: Fit, data: Runs, name: str) -> Figure:
+    """One picture of a fit, by its name in `PICTURES`.
+
+    Raises:
+        ValueError: no such picture, or the runs have nothing for it.
+    """
+    if name not in PICTURES:
+        raise ValueError(f"no picture '{name}'; there are {', '.join(PICTURES)}")
+    made = PICTURES[name](fit, data, _pieces(fit, data))
+    if made is None:
+        raise ValueError(f"picture '{name}': the runs have nothing for it")
+    return made
+
+
+def _pieces(fit: Fit, data: Runs) -> Seen:
+    return seen(fit.robot, data, int(fit.settings["windows_per_piece"]))
+
+
+def validation_figure(fit: Fit, data: Runs, found: Content) -> Figure:
+    """End-point errors of every model, by floor."""
+    return ladder_figure(found, _new_runs(fit, data))
+
+
+def _new_runs(fit: Fit, data: Runs) -> str:
+    """How many runs the fit has not seen, for people."""
+    seen_before = {sha for _, sha in fit.runs}
+    new = sum(log.sha256 not in seen_before for log in data.logs)
+    return f"{new} of {len(data)} runs are new to the fit"
+
+
+def validate_plots(fit: Fit, data: Runs, found: Content, out: Path) -> list[Path]:
+    """Draw how well runs are predicted, and some of their paths.
+
+    Args:
+        fit: that predicted.
+        data: the runs it predicted.
+        found: the validation file's content.
+        out: folder to write to.
+
+    Returns:
+        the files.
+    """
+    which = _new_runs(fit, data)
+    names = {log.surface or "unknown": None for log in data.logs}
+    order = [(floor, load) for floor in sorted(names) for load in fit.robot.body.loads]
+    figures = {
+        "validation_errors.png": validation_figure(fit, data, found),
+        "validation_paths.png": path_figure(fit.robot, data, order, PATHS + which),
+    }
+    return [drawing.save(made, out / name) for name, made in figures.items()]

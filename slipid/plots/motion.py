@@ -1,0 +1,193 @@
+"""Pictures of the motion: slip and drift against heading, predicted against measured paths."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.data.runs import Runs
+from slipid.identify.compare import open_loop as replay
+from slipid.identify.compare.slip_models import Encoder
+from slipid.identify.fit import likelihood as lk
+from slipid.model.robot import Robot
+from slipid.plots import drawing
+from slipid.plots.drawing import Axes, Figure
+from slipid.plots.seen import Seen, by_heading
+
+ROWS = (
+    ("slip", "slip: way lost [%]"),
+    ("drift", "sideways drift [deg]\n(left positive)"),
+    ("yaw", "yaw drift [deg per m]\n(counter-clockwise positive)"),
+)
+MOST_SPEEDS = 4
+RAYS, LOOPS = 16, 3
+"""Runs drawn per panel of paths: straight ones, others."""
+LEAST_OCTANTS = 5
+"""Eighths of the circle in which a floor must have been driven for a picture by heading."""
+
+
+def heading_figure(robot: Robot, seen: Seen) -> Figure | None:
+    """Slip and drift against the direction of travel, a column per floor and load set-up.
+
+    None where no floor was driven straight in most directions.
+    """
+    octant = (seen.heading // 45.0).astype(int)
+    ways = [octant[seen.straight & (seen.group == g)] for g in range(len(seen.groups))]
+    columns = [g for g, found in enumerate(ways) if len(np.unique(found)) >= LEAST_OCTANTS]
+    if not columns:
+        return None
+    made = drawing.figure(
+        1.4 + 3.1 * max(len(columns), 2),
+        8.2,
+        "Slip depends on the direction of travel, and so does the unwanted turn\n"
+        "dots: camera against encoders; lines: predicted by the force balance",
+    )
+    axes = made.subplots(3, len(columns), sharex=True, sharey="row", squeeze=False)
+    speeds = _speeds(seen)
+    for column, g in enumerate(columns):
+        _headings(robot, seen, g, speeds, list(axes[:, column]))
+    for row, (_, label) in enumerate(ROWS):
+        axes[row, 0].set_ylabel(label)
+    handles = [
+        axes[0, 0].plot([], [], color=c, marker=m, ms=4, label=f"{v:g} m/s")[0]
+        for v, (c, m) in zip(speeds, drawing.styled(len(speeds)), strict=True)
+    ]
+    made.legend(handles=handles, loc="outside right upper", frameon=False, title="speed")
+    return made
+
+
+def _speeds(seen: Seen) -> list[float]:
+    """The speeds driven, at most `MOST_SPEEDS`, each a tenth away from the next."""
+    found: list[float] = []
+    values, counts = np.unique(seen.speed[seen.straight], return_counts=True)
+    for v in values[np.argsort(-counts)]:
+        if v > 0 and all(abs(v - u) > 0.1 * max(u, v) + 0.005 for u in found):
+            found.append(float(v))
+    return sorted(found[:MOST_SPEEDS])
+
+
+def _headings(robot: Robot, seen: Seen, g: int, speeds: list[float], axes: Sequence[Axes]) -> None:
+    surface, load = seen.groups[g]
+    mine = seen.straight & (seen.group == g)
+    nearest = np.argmin(np.abs(seen.speed[:, None] - np.asarray(speeds)), axis=1)
+    heading = np.linspace(0.0, 360.0, 181)
+    for k, (colour, marker) in enumerate(drawing.styled(len(speeds))):
+        picked = mine & (nearest == k)
+        if not picked.any():
+            continue
+        lines = by_heading(robot, surface, load, speeds[k], heading)
+        measured = (100 * seen.slip, seen.drift, seen.yaw)
+        for row, ax in enumerate(axes):
+            ax.plot(
+                seen.heading[picked],
+                measured[row][picked],
+                marker,
+                ms=3.6,
+                color=colour,
+                alpha=0.5,
+                mew=0,
+            )
+            ax.plot(heading, lines[:, row] * (100.0 if row == 0 else 1.0), color=colour, lw=1.6)
+    for ax in axes:
+        drawing.plain(ax)
+        ax.axhline(0.0, color=drawing.INK, lw=0.8)
+    axes[0].set_title(named(surface, load, seen.groups))
+    axes[-1].set(xlabel="direction of travel [deg]\n(0 ahead, 90 left)", xticks=range(0, 361, 90))
+
+
+def named(surface: str, load: str, groups: Sequence[tuple[str, str]]) -> str:
+    """Title of a panel; the load only where set-ups differ."""
+    several = len({other for _, other in groups}) > 1
+    return f"{surface}, load {load}" if several else surface
+
+
+def path_figure(robot: Robot, data: Runs, order: Sequence[tuple[str, str]], title: str) -> Figure:
+    """Some runs per floor and load, started at one point with the robot looking to the right.
+
+    Args:
+        robot: as fitted.
+        data: the runs.
+        order: of the panels, (floor, load set-up).
+        title: says whether the fit has seen these runs.
+    """
+    groups: dict[tuple[str, str], list[int]] = {}
+    for k, log in enumerate(data.logs):
+        groups.setdefault((log.surface or "unknown", log.load), []).append(k)
+    names = [name for name in order if name in groups]
+    paths = _paths(robot, data)
+    made, axes = drawing.panels(len(names), 3.7, 4.3, title)
+    for ax, (surface, load) in zip(axes, names, strict=True):
+        runs = groups[surface, load]
+        shown = [paths[k] for k in _spread(data, runs)]
+        for three in shown:
+            _ray(ax, three)
+        drawing.plain(ax)
+        errors = _errors([paths[k] for k in runs])
+        ax.set_title(f"{named(surface, load, names)}\n{errors}", fontsize=10)
+        reach = 1.08 * max(float(np.abs(p).max()) for three in shown for p in three)
+        ax.set_aspect("equal")
+        ax.set(
+            xlim=(-reach, reach),
+            ylim=(-reach, reach),
+            xlabel="ahead of the start [m]",
+            ylabel="left of the start [m]",
+        )
+    handles = [
+        axes[0].plot([], [], color=drawing.INK, lw=3.2, alpha=0.35, label="camera")[0],
+        axes[0].plot([], [], color=drawing.BLUE, lw=1.4, marker="o", ms=4, label="predicted")[0],
+        axes[0].plot([], [], ":", color=drawing.ORANGE, lw=1.2, label="encoders alone")[0],
+    ]
+    made.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+    return made
+
+
+def _spread(data: Runs, runs: list[int]) -> list[int]:
+    """Some runs, evenly over headings and of the most common speed where there are headings."""
+    heading, speed, most = data.heading[runs], data.speed[runs], LOOPS
+    if np.isfinite(heading).all():
+        values, counts = np.unique(np.round(speed, 3), return_counts=True)
+        runs = [
+            k for k, v in zip(runs, speed, strict=True) if abs(v - values[counts.argmax()]) < 1e-3
+        ]
+        most = RAYS
+        runs.sort(key=lambda k: float(data.heading[k] % (2 * np.pi)))
+    at = np.unique(np.linspace(0, len(runs), min(most, len(runs)), endpoint=False).astype(int))
+    return [runs[k] for k in at]
+
+
+def _paths(robot: Robot, data: Runs) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Measured, predicted and encoder path (edge, 2) of every run, from the origin, x ahead."""
+    out: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = [None] * len(data)
+    for w in replay.cuts(data, robot):
+        b = lk.batch(w, robot)
+        steps = np.asarray(replay.contact_increments(robot, b))
+        tracks = replay.follow(robot, w, steps)
+        encoder = replay.follow(robot, w, Encoder().increments(w, robot))
+        for n, k in enumerate(tracks.run):
+            yaw = float(robot.camera.yaw(jnp.asarray(robot.session_index(w.session[n]))))
+            first = tracks.measured[n, 0]
+            c, s = np.cos(first[2] - yaw), np.sin(first[2] - yaw)
+            back = np.array([[c, s], [-s, c]])
+            out[int(k)] = tuple(
+                (p[n, :, :2] - first[:2]) @ back.T
+                for p in (tracks.measured, tracks.predicted, encoder.predicted)
+            )
+    return [p for p in out if p is not None]
+
+
+def _errors(paths: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> str:
+    """Mean distance of the ends over the camera's displacement, of prediction and encoders."""
+    ends = np.array([[p[-1] for p in three] for three in paths])
+    chord = np.maximum(np.linalg.norm(ends[:, 0], axis=1), 1e-9)
+    gap = np.linalg.norm(ends[:, 1:] - ends[:, :1], axis=2) / chord[:, None]
+    own, encoder = 100 * gap.mean(axis=0)
+    count = f"{len(paths)} runs" if len(paths) > 1 else "1 run"
+    return f"{count}: end off by {own:.1f} % (encoders {encoder:.0f} %)"
+
+
+def _ray(ax: Axes, paths: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+    measured, predicted, encoder = paths
+    ax.plot(*encoder.T, ":", color=drawing.ORANGE, lw=1.0)
+    ax.plot(*measured.T, color=drawing.INK, lw=3.2, alpha=0.35, solid_capstyle="round")
+    ax.plot(*predicted.T, color=drawing.BLUE, lw=1.2)
+    ax.plot(*predicted[-1], "o", color=drawing.BLUE, ms=3.5)

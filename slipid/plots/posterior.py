@@ -1,0 +1,108 @@
+"""Pictures of a posterior: what the draws say beside the curvature at the fit."""
+
+from pathlib import Path
+
+import numpy as np
+
+from slipid.identify.posterior.sample import Posterior
+from slipid.identify.result import Fit
+from slipid.plots import drawing
+from slipid.plots.drawing import Axes, Figure
+
+PANELS = 6
+"""Pairs of numbers drawn."""
+
+
+def posterior_plots(fit: Fit, found: Posterior, out: Path) -> list[Path]:
+    """Draw intervals of every number, and the pairs that are bent the most.
+
+    Returns:
+        the files.
+    """
+    z = found.z.reshape(-1, fit.space.size)
+    figures = {
+        "posterior_intervals.png": interval_figure(fit, z),
+        "posterior_pairs.png": pair_figure(fit, z),
+    }
+    return [drawing.save(made, out / name) for name, made in figures.items()]
+
+
+def interval_figure(fit: Fit, z: np.ndarray) -> Figure:
+    """90 % intervals of draws and of the fit's curvature, in prior standard deviations."""
+    chosen = np.flatnonzero(fit.space.where(lambda e: e.session is None)).tolist()
+    mean, std = fit.space.prior_mean[chosen], fit.space.prior_std[chosen]
+    low, middle, high = (np.quantile(z[:, chosen], (0.05, 0.5, 0.95), axis=0) - mean) / std
+    half = 1.645 * np.sqrt(np.diag(fit.covariance))[chosen] / std
+    fitted = (fit.z[chosen] - mean) / std
+    made = drawing.figure(
+        8.8,
+        1.6 + 0.2 * len(chosen),
+        "What the data say of each number, against what was known before\n"
+        "(0: prior mean; gray band: its 90 %)",
+    )
+    ax = made.subplots()
+    drawing.plain(ax)
+    at = np.arange(len(chosen))
+    ax.axvspan(-1.645, 1.645, color="#eeeeee", zorder=0)
+    ax.errorbar(fitted, at - 0.18, xerr=half, fmt="none", color=drawing.SHADE, lw=1.2)
+    ax.errorbar(
+        middle, at + 0.18, xerr=[middle - low, high - middle], fmt=".", color=drawing.BLUE, lw=1.6
+    )
+    ax.plot([], [], color=drawing.BLUE, lw=1.6, label="draws of the posterior, 90 %")
+    ax.plot([], [], color=drawing.SHADE, lw=1.2, label="curvature at the fit, 90 %")
+    ax.set_yticks(at, [fit.space.names[k] for k in chosen], fontsize=8)
+    ax.set_ylim(len(chosen) - 0.4, -0.6)
+    ax.set_xlabel("prior standard deviations (logarithm for positive numbers)")
+    ax.legend(loc="lower right", fontsize=8)
+    return made
+
+
+def pair_figure(fit: Fit, z: np.ndarray) -> Figure:
+    """The pairs of numbers whose draws are furthest from an ellipse."""
+    pairs = bent(z)[:PANELS]
+    made, axes = drawing.panels(
+        len(pairs),
+        2.9,
+        2.7,
+        "Numbers that trade off along a bent valley: draws (dots)\n"
+        "and the 90 % ellipse of the curvature at the fit",
+    )
+    some = z[:: max(1, len(z) // 1500)]
+    for ax, (i, j) in zip(axes, pairs, strict=True):
+        drawing.plain(ax)
+        ax.plot(some[:, i], some[:, j], ".", ms=2, color=drawing.BLUE, alpha=0.4)
+        _ellipse(ax, fit.z[[i, j]], fit.covariance[np.ix_([i, j], [i, j])])
+        for name, put in ((fit.space.names[i], ax.set_xlabel), (fit.space.names[j], ax.set_ylabel)):
+            put(name.removeprefix("surface."), fontsize=8)
+    return made
+
+
+def bent(z: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs of coordinates, those where a square explains most of the other one first.
+
+    Each coordinate appears once.
+    """
+    t = (z - z.mean(axis=0)) / (z.std(axis=0) + 1e-300)
+    linear = t.T @ t / len(t)
+    square = t**2 - 1
+    cubic = (t**3).mean(axis=0)
+    square = square - t * cubic  # what the square has beyond the line
+    square /= square.std(axis=0) + 1e-300
+    strength = np.abs(square.T @ t / len(t)) * (1 - np.eye(len(linear)))
+    found, used = [], set()
+    for flat in np.argsort(-strength, axis=None):
+        i, j = (int(k) for k in np.unravel_index(flat, strength.shape))
+        if i in used or j in used:
+            continue
+        found.append((i, j))
+        used |= {i, j}
+        if len(found) == PANELS:
+            break
+    return found
+
+
+def _ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray) -> None:
+    turn = np.linspace(0, 2 * np.pi, 100)
+    root = np.linalg.cholesky(covariance) * np.sqrt(4.605)
+    x, y = middle[:, None] + root @ np.stack([np.cos(turn), np.sin(turn)])
+    ax.plot(x, y, color=drawing.ORANGE, lw=1.4)

@@ -1,0 +1,130 @@
+"""Picture of a trial: every controller's paths over the floor, and what they came to."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from slipid.data.floor_map import FloorMap
+from slipid.plots.drawing import INK, SHADE, Axes, figure, plain, save
+from slipid.support.content import Content
+
+TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
+"""Of floors, in the order of the map."""
+
+
+def trial_plot(
+    content: Content, paths: Mapping[str, np.ndarray], floor: FloorMap, path: Path
+) -> Path:
+    """Paths of the start nearest to the medians over the map, all starts from one corner, errors.
+
+    Args:
+        content: of trial.json.
+        paths: true poses (step, 3) by run, `CONTROLLER/startNN`.
+        floor: the site.
+        path: of the PNG.
+    """
+    names = list(content["summary"])
+    best = content["closes_best"]
+    ratio = content["summary"][best].get("to_encoder", {}).get("closure_error_median", {})
+    said = f", {100 * ratio['value']:.0f} % of the encoders'" if ratio else ""
+    made = figure(
+        13.0,
+        3.1 * -(-len(names) // 3) + 3.4,
+        f"Rectangle trial on the {content['plant']}: {best} closes best{said}",
+    )
+    rows = -(-len(names) // 3)
+    grid = made.add_gridspec(rows + 1, 3, height_ratios=[1.0] * rows + [1.1])
+    one = _typical(content)
+    for k, name in enumerate(names):
+        axes = made.add_subplot(grid[k // 3, k % 3])
+        _one(axes, name, content, paths, floor, one)
+    for k, (key, label) in enumerate(
+        (
+            ("closure_error_median", "closure error [mm]"),
+            ("cross_track_rmse", "cross-track rms [mm]"),
+            ("first_side_along_track_mm", "first side, along-track [mm]"),
+        )
+    ):
+        _bars(made.add_subplot(grid[rows, k]), content["summary"], key, label)
+    return save(made, path)
+
+
+def _typical(content: Content) -> int:
+    """Start whose encoder run (else first controller's) is nearest to the median closure."""
+    first = "encoder" if "encoder" in content["summary"] else next(iter(content["summary"]))
+    runs = [r for r in content["runs"] if r["controller"] == first]
+    middle = content["summary"][first]["closure_error_median"]
+    return int(np.argmin([abs(r["closure_mm"] - middle) for r in runs]))
+
+
+def _one(
+    axes: Axes,
+    name: str,
+    content: Content,
+    paths: Mapping[str, np.ndarray],
+    floor: FloorMap,
+    one: int,
+) -> None:
+    """All starts of a controller laid on one another, the typical one over its floor."""
+    from matplotlib.colors import ListedColormap
+
+    runs = [r for r in content["runs"] if r["controller"] == name]
+    own = [_local(paths[f"{name}/start{k:02d}"], r["start"]) for k, r in enumerate(runs)]
+    x, y = np.linspace(-0.35, 1.25, 320), np.linspace(-0.75, 0.35, 220)
+    places = _world(np.stack(np.meshgrid(x, y), -1), runs[one]["start"])
+    tints = ListedColormap(TINTS[: max(len(floor.surfaces), 2)])
+    axes.imshow(
+        floor.at(places),
+        origin="lower",
+        extent=(x[0], x[-1], y[0], y[-1]),
+        cmap=tints,
+        vmin=0,
+        vmax=max(len(floor.surfaces) - 1, 1),
+        interpolation="nearest",
+    )
+    for p in own:
+        axes.plot(*p.T, color="#56B4E9", lw=0.5, alpha=0.6)
+    axes.plot([0, 0.9, 0.9, 0, 0], [0, 0, -0.4, -0.4, 0], "--", color=INK, lw=1.0)
+    axes.plot(*own[one].T, color="#D55E00", lw=1.8)
+    axes.plot(*own[one][-1], "o", color="#D55E00", ms=5)
+    row = content["summary"][name]
+    axes.set_title(
+        f"{name}: closes to {row['closure_error_median']:.0f} mm, heading "
+        f"{row['heading_error_deg']:.0f} deg off",
+        fontsize=9,
+        loc="left",
+    )
+    axes.set_xlim(x[0], x[-1])
+    axes.set_ylim(y[0], y[-1])
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=7)
+
+
+def _local(pose: np.ndarray, start: Sequence[float]) -> np.ndarray:
+    """Places as seen from the start."""
+    c, s = np.cos(start[2]), np.sin(start[2])
+    d = pose[:, :2] - start[:2]
+    return np.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]], -1)
+
+
+def _world(place: np.ndarray, start: Sequence[float]) -> np.ndarray:
+    c, s = np.cos(start[2]), np.sin(start[2])
+    x, y = place[..., 0], place[..., 1]
+    return np.stack([start[0] + c * x - s * y, start[1] + s * x + c * y], -1)
+
+
+def _bars(axes: Axes, table: Content, key: str, label: str) -> None:
+    """Medians with their 90 % intervals."""
+    names = list(table)
+    value = np.array([table[n][key] for n in names])
+    low, high = np.array([table[n]["interval90"][key] for n in names]).T
+    at = np.arange(len(names))[::-1]
+    axes.barh(at, value, color="#9bb8cf", height=0.7)
+    axes.hlines(at, low, high, color=INK, lw=1.2)
+    axes.set_yticks(at, names, fontsize=8)
+    axes.set_xlabel(
+        f"{label}\nmedian of {table[names[0]]['runs']} starts, 90 % interval", fontsize=8
+    )
+    axes.tick_params(axis="x", labelsize=8, color=SHADE)
+    plain(axes)

@@ -1,0 +1,1 @@
+"""Results as text for people: tables, and the sentences around them."""

@@ -1,0 +1,65 @@
+"""A page of text, and what its tables share."""
+
+from collections.abc import Iterable, Sequence
+from io import StringIO
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+COLOUR = {"identified": "green", "weak": "yellow", "not_identified": "red", "at_bound": "magenta"}
+
+
+class Page:
+    """Text for people, on standard output or kept: tables, and sentences that are not wrapped.
+
+    Args:
+        kept: whether the text is kept for `text` instead of printed.
+    """
+
+    def __init__(self, kept: bool = False) -> None:
+        file = StringIO() if kept else None
+        self._console = Console(highlight=False, file=file)
+        if not self._console.is_terminal:  # a file or a pipe has no width: do not wrap
+            self._console = Console(highlight=False, width=140, file=file)
+
+    @property
+    def text(self) -> str:
+        """What was written to a page that keeps it; lines end without blanks."""
+        written = self._console.file
+        lines = written.getvalue().splitlines() if isinstance(written, StringIO) else []
+        return "\n".join(line.rstrip() for line in lines)
+
+    def table(self, table: Table) -> None:
+        self._console.print(table)
+
+    def line(self, text: str = "") -> None:
+        self._console.print(text, markup=False, soft_wrap=True)
+
+    def notes(self, sentences: Iterable[str]) -> None:
+        """Sentences a reader must know."""
+        for sentence in sentences:
+            self.line(f"note: {sentence}")
+
+    def files(self, out: Path, written: Sequence[str]) -> None:
+        """Names of the files that were written to a folder."""
+        self.line(f"in {out}: {', '.join(written)}")
+
+
+def table(columns: Sequence[str], title: str | None = None, right: Sequence[str] = ()) -> Table:
+    """Table without lines; the columns named in `right` are numbers."""
+    made = Table(title=title, title_justify="left", show_edge=False, pad_edge=False, box=None)
+    for name in columns:
+        made.add_column(name, justify="right" if name in right else "left")
+    return made
+
+
+def verdict(word: str, colour: dict[str, str] = COLOUR) -> str:
+    """A verdict in its colour."""
+    shade = colour.get(word, "dim")
+    return f"[{shade}]{word.replace('_', ' ')}[/{shade}]"
+
+
+def percent(x: float | None) -> str:
+    """A share, with two places; nothing where it is not known."""
+    return "" if x is None else f"{100 * x:.2f} %"

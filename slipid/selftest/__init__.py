@@ -1,0 +1,1 @@
+"""Made logs with known truth, and what a fit makes of them."""

@@ -1,0 +1,142 @@
+"""What is driven, by which robot, seen by which sensors: the inputs of made logs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from slipid.identify.design.planned_runs import Drive
+from slipid.model.geometry import omni
+from slipid.model.robot import Robot, build
+from slipid.parameter import Choice, Space, entries
+
+ROBOTINO = (60.0, 180.0, 300.0)
+"""Azimuths of the wheels [deg]."""
+
+
+def grid(
+    setups: Sequence[tuple[str, str]] = (
+        ("firm", "as_built"),
+        ("soft", "as_built"),
+        ("soft", "moved"),
+    ),
+    headings: int = 12,
+    speeds: Sequence[float] = (0.1, 0.2),
+    turns: int = 2,
+) -> tuple[Drive, ...]:
+    """Every heading at every speed on every (floor, load), and `turns` curved runs of each."""
+    drives = []
+    for surface, load in setups:
+        for speed in speeds:
+            ways = 2 * np.pi * np.arange(headings) / headings
+            drives += [Drive(surface, load, float(way), speed) for way in ways]
+            ways = 2 * np.pi * (np.arange(turns) + 0.5) / max(turns, 1)
+            drives += [
+                Drive(surface, load, float(way), speed, turn=(-1) ** k * 4.0 * speed)
+                for k, way in enumerate(ways)
+            ]
+    return tuple(drives)
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """How the logs are disturbed; stds by the names of `slipid.identify.fit.likelihood.noise`.
+
+    Attributes:
+        std: of every variance component; `floor` in a name stands for every floor without its own.
+        ripple: of the current from row to row [A]; voltage_noise: [V].
+        current_step, voltage_step: of the converters [A], [V]; ticks: per turn of the motor.
+        row_period, frame_period: of the log and the camera [s].
+        delay, ramp: from command to motion, and to full speed [s].
+        wobble: of the wheel's angle, as time [s]; a real speed loop is never quite still.
+        free_frames: frames come when the camera pleases, so that the lag differs by up to half a
+            row; otherwise every new frame is exactly `camera.lag` old.
+    """
+
+    std: Mapping[str, float] = field(
+        default_factory=lambda: {
+            "camera.place": 0.0005,
+            "camera.heading": 0.005,
+            "process.floor.along": 0.004,
+            "process.floor.across": 0.004,
+            "process.floor.yaw": 0.008,
+            "run.floor.along": 0.006,
+            "run.floor.across": 0.006,
+            "run.floor.yaw": 0.03,
+            "current.floor.run": 0.03,
+        }
+    )
+    ripple: float = 0.06
+    voltage_noise: float = 0.07
+    current_step: float = 1 / 39
+    voltage_step: float = 0.1
+    ticks: int = 2000
+    row_period: float = 0.031
+    frame_period: float = 1 / 29
+    delay: float = 0.12
+    ramp: float = 0.2
+    wobble: float = 0.002
+    has_voltage: bool = True
+    free_frames: bool = False
+
+    def of(self, name: str) -> float:
+        """Std of a variance component."""
+        head, _, last = name.partition(".")
+        return (
+            self.std[name] if name in self.std else self.std[f"{head}.floor.{last.split('.')[-1]}"]
+        )
+
+
+TRUTH: dict[str, float | tuple[float, ...]] = {
+    "robot.mass": 12.0,
+    "robot.load_share@as_built": (0.29, 0.42, 0.29),
+    "robot.load_share@moved": (0.33, 0.35, 0.32),
+    "motor.resistance": 5.5,
+    "motor.back_emf": 0.0514,
+    "motor.inductance": 8.9e-3,
+    "motor.rotor_inertia": 7.1e-6,
+    "motor.coulomb_friction": 0.07,
+    "motor.viscous_friction": 0.006,
+    "camera.scale": 1.117,
+    "camera.lag": 0.056,
+    "camera.marker_yaw": -0.015,
+    "surface.firm.friction": 0.5,
+    "surface.firm.creep": 0.15,
+    "surface.firm.roller_drag": 0.18,
+    "surface.firm.roller_creep": 0.25,
+    "surface.firm.rolling_resistance": 0.008,
+    "surface.firm.slide_viscosity": 0.03,
+    "surface.firm.roller_viscosity": 0.03,
+    "surface.firm.scrub": 0.001,
+    "surface.firm.lead": 0.0015,
+    "surface.soft.friction": 0.8,
+    "surface.soft.creep": 0.45,
+    "surface.soft.roller_drag": 0.33,
+    "surface.soft.roller_creep": 0.2,
+    "surface.soft.rolling_resistance": 0.02,
+    "surface.soft.slide_viscosity": 0.05,
+    "surface.soft.roller_viscosity": 0.05,
+    "surface.soft.scrub": 0.002,
+    "surface.soft.lead": 0.0045,
+}
+"""Numbers of the default robot [SI], the rest as declared; of the size found on real logs."""
+
+
+def blank(drives: Sequence[Drive]) -> Robot:
+    """Robotino at declared starts that knows the floors, loads and sessions of a plan."""
+    return build(
+        omni(list(ROBOTINO), 0.125, 0.04, 16.0),
+        sorted({d.surface for d in drives}),
+        tuple(dict.fromkeys(d.load for d in drives)),
+        sorted({d.session for d in drives}),
+    )
+
+
+def truth(
+    drives: Sequence[Drive], values: Mapping[str, float | Sequence[float]] | None = None
+) -> Robot:
+    """Robotino with the numbers of `TRUTH`, or others; what the plan does not need is left out."""
+    robot = blank(drives)
+    known = {e.path for e in entries(robot)}
+    values = {**TRUTH, **(values or {})}
+    return Space(robot, [Choice(p, fixed=v) for p, v in values.items() if p in known]).template

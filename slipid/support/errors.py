@@ -1,0 +1,34 @@
+"""The one error that bad input raises, and the one form its messages have."""
+
+from pathlib import Path
+
+
+class DataError(ValueError):
+    """The user's data cannot be read; the message names file, row or column, and the remedy."""
+
+
+def bad_data(
+    path: Path | str,
+    found: str,
+    expected: str,
+    *,
+    row: int | tuple[int, int] | None = None,
+    column: str | None = None,
+) -> DataError:
+    """Data error in the one form all of them have: `file row 12, column 'x': found; expected ...`.
+
+    Args:
+        path: the file.
+        found: what is there.
+        expected: what should have been, or the choices.
+        row: line number in the file, counted from 1 (in Parquet the record), or first and last.
+        column: name of the column, as the file has it.
+    """
+    where = str(path)
+    if isinstance(row, tuple):
+        where += f" rows {row[0]}-{row[1]}" if row[0] != row[1] else f" row {row[0]}"
+    elif row is not None:
+        where += f" row {row}"
+    if column is not None:
+        where += f", column '{column}'"
+    return DataError(f"{where}: {found}; expected {expected}")

@@ -1,0 +1,95 @@
+"""Files that are either whole or not there: atomic writes, strict JSON, arrays without pickle."""
+
+import io
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slipid.support.errors import DataError
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file so that a reader, or a crash, sees the old one or the new one, never a part.
+
+    Raises:
+        DataError: nothing can be written there.
+    """
+    try:
+        _write(path, data)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def writable(folder: Path) -> None:
+    """Make a folder and try to write to it, before hours of work that end there.
+
+    Raises:
+        DataError: nothing can be written there.
+    """
+    write_bytes(folder / ".writable", b"")
+    (folder / ".writable").unlink()
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(name, 0o666 & ~_umask())
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write a JSON file; refuses numbers that are not finite."""
+    write_bytes(path, json_text(value).encode())
+
+
+def json_text(value: object) -> str:
+    """JSON of plain values and numpy numbers; ValueError for NaN and infinity."""
+    return json.dumps(value, indent=1, allow_nan=False, default=_plain) + "\n"
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Path):
+        return value.as_posix()
+    raise TypeError(f"{type(value).__name__} does not go into JSON")
+
+
+def read_json(path: Path, what: str) -> Any:
+    """JSON of a file that this program wrote.
+
+    Raises:
+        DataError: absent or damaged; says what was expected there.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; expected {what}") from error
+    except ValueError as error:
+        raise DataError(f"{path}: no valid JSON ({error}); expected {what}") from error
+
+
+def write_arrays(path: Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:
+    """Write named arrays to an .npz file, no pickle."""
+    buffer = io.BytesIO()
+    save = np.savez_compressed if compress else np.savez
+    save(buffer, allow_pickle=False, **arrays)
+    write_bytes(path, buffer.getvalue())

@@ -1,0 +1,91 @@
+"""Progress of long work on stderr: a bar on a terminal, plain lines elsewhere."""
+
+import time
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+EVERY_S = 2.0
+"""Least time between two plain lines of one stage [s]."""
+MEMORY_S = 3600.0
+"""Time over which speed is averaged: a step of a fit may take minutes [s]."""
+
+
+class Reporter:
+    """Tells a person how far the work is; use as a context.
+
+    Args:
+        quiet: tell nothing.
+    """
+
+    def __init__(self, quiet: bool = False):
+        self._console = Console(stderr=True, highlight=False, quiet=quiet)
+        self._bars = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[what]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=self._console,
+            transient=True,
+            speed_estimate_period=MEMORY_S,
+            # away from a terminal it only does the arithmetic
+            disable=quiet or not self._console.is_terminal,
+        )
+        self._task: TaskID | None = None
+        self._stage, self._told = "", 0.0
+
+    def __enter__(self) -> "Reporter":
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+
+    def line(self, text: str) -> None:
+        """One sentence that stays."""
+        self._print(text)
+
+    def stage(self, name: str) -> None:
+        """A new part of the work begins."""
+        if name == self._stage:
+            return
+        if self._task is not None:
+            self._bars.remove_task(self._task)
+        self._task = self._bars.add_task(name, total=None, what="")
+        self._stage, self._told = name, time.monotonic()
+        if self._bars.disable:
+            self._print(f"{name} ...")
+
+    def note(self, what: str) -> None:
+        """What is going on at this moment; on a bar only."""
+        if self._task is not None:
+            self._bars.update(self._task, what=what)
+
+    def advance(self, done: int | float, total: int | float, what: str | None = None) -> None:
+        """So much of so much is done; away from a terminal a line now and then, and the last one.
+
+        Args:
+            done, total: in any unit; the total is the same throughout a stage.
+            what: the same in words, `done of total` by default.
+        """
+        if self._task is None:
+            return
+        what = f"{done} of {total}" if what is None else what
+        self._bars.update(self._task, completed=done, total=total, what=what)
+        now = time.monotonic()
+        if not self._bars.disable or (now < self._told + EVERY_S and done < total):
+            return
+        self._told = now
+        left = next(task for task in self._bars.tasks if task.id == self._task).time_remaining
+        self._print(f"  {what}" + (f", about {left:.0f} s left" if left else ""))
+
+    def _print(self, text: str) -> None:
+        self._console.print(text, markup=False, soft_wrap=True)

@@ -1,0 +1,1 @@
+"""Logs of the virtual test site: config, runs, files."""

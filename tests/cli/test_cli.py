@@ -1,0 +1,623 @@
+"""The command line: files, exit codes, messages, interrupts; in process and as real processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from slipid.cli.demo import packaged_config
+from slipid.cli.main import app
+from slipid.job.new import Answers, write_new
+from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
+from slipid.support.errors import DataError
+from slipid.support.files import writable, write_bytes, write_json
+from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
+
+ROOT = Path(__file__).resolve().parents[2]
+DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
+UNSEEN = [type(d)(d.surface, d.load, d.heading + 0.4, d.speed) for d in DRIVES[:3]]
+
+
+def invoke(*words: object):
+    return CliRunner().invoke(app, [str(w) for w in words])
+
+
+def process(*words: object, **more):
+    # a suite started in the background hands on a SIGINT that is ignored
+    listen = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{listen}; from slipid.cli.main import main; main()"]
+    return subprocess.Popen(
+        [*command, *map(str, words)],
+        cwd=ROOT,
+        env={**os.environ, "JAX_ENABLE_X64": "0"},  # the command itself must switch it on
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **more,
+    )
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A folder with a config, made logs, unseen logs, and the result of identify on them."""
+    folder = tmp_path_factory.mktemp("small")
+    for name, drives, seed in (("logs", DRIVES, 1), ("unseen", UNSEEN, 2)):
+        robot = truth(drives)
+        write_logs(make_logs(robot, drives, seed, Sensors()), robot, folder / name, folder / "t")
+    (folder / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
+    args = ("identify", folder / "my.toml", "--data", folder / "logs", "--out", folder / "out")
+    return folder, invoke(*args)
+
+
+# help and usage ---------------------------------------------------------------------------------
+
+
+def test_help_names_every_command():
+    result = invoke("--help")
+    assert result.exit_code == 0
+    for command in (
+        *("new", "check", "selftest", "identify", "sample", "validate"),
+        *("compare", "paper", "demo", "simulate"),
+    ):
+        assert command in result.stdout
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys; from slipid.cli.main import app; from typer.testing import CliRunner; "
+        "r = CliRunner().invoke(app, ['--help']); assert r.exit_code == 0; "
+        "print(sorted({'jax', 'numpy', 'pydantic', 'matplotlib', 'scipy'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("identify",),
+        ("identify", "none.toml"),
+        ("nonsense",),
+        ("identify", "none.toml", "--data", ".", "--out", "o", "--unknown"),
+    ],
+)
+def test_wrong_usage_is_2(words):
+    assert invoke(*words).exit_code == 2
+
+
+@pytest.mark.parametrize("command", ["identify", "check"])
+def test_a_bad_config_is_2_and_a_message(tmp_path, command):
+    bad = tmp_path / "bad.toml"
+    bad.write_text('[robot]\ndrive = "omny"\n', encoding="utf-8")
+    out = tmp_path / "out"
+    result = invoke(command, bad, "--data", tmp_path, "--out", out)
+    assert result.exit_code == 2
+    assert f"{bad}: robot.drive: 'omny', did you mean omni?" in result.stderr
+    assert not out.exists()
+
+
+def test_no_data_folder_is_2(tmp_path):
+    config = ROOT / "configs" / "robotino2022.toml"
+    result = invoke("check", config, "--data", tmp_path / "none")
+    assert result.exit_code == 2
+    assert "no such folder; expected the folder of the logs" in result.stderr
+
+
+def test_validate_without_a_fit_is_2(tmp_path):
+    result = invoke("validate", tmp_path, "--data", tmp_path)
+    assert result.exit_code == 2
+    assert "expected the result of `slipid identify`" in result.stderr
+
+
+# broken logs ------------------------------------------------------------------------------------
+
+
+def toml(value: object) -> str:
+    """A value as inline TOML; JSON is TOML for strings, numbers and lists."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{k} = {toml(v)}" for k, v in value.items()) + " }"
+    return json.dumps(value)
+
+
+def config_of(case: Case, folder: Path) -> Path:
+    """A config that reads the case's file with the layout the case declares."""
+    layout = "\n".join(f"{k} = {toml(v)}" for k, v in case.mapping().items())
+    two = (
+        'drive = "general"\nwheel_places_m = [[0, 0.1], [0, -0.1]]\n'
+        'drive_directions_deg = [0, 0]\nroller_angles_deg = ["none", "none"]'
+    )
+    three = 'drive = "omni"\nbase_radius_m = 0.125\nwheel_azimuths_deg = [60, 180, 300]'
+    path = folder / "my.toml"
+    path.write_text(
+        f"[robot]\n{three if case.file == ROBOTINO else two}\nwheel_radius_m = 0.04\n"
+        f"[layouts.mine]\n{layout}\n"
+        f'[[logs]]\nglob = "{case.file}"\nformat = "mine"\nsurface = "gray"\n',
+        encoding="utf-8",
+    )
+    return path
+
+
+def words_of(case: Case) -> list[str]:
+    """What the message must hold; a glob does not see files that are no files."""
+    if case.name in ("folder", "missing file"):
+        return ["no file matches", "exp07.csv"]
+    return [w.replace("layout columns", "layouts.mine columns") for w in case.expected]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_a_broken_log_is_one_message_and_2(tmp_path, case: Case):
+    data = tmp_path / "data"
+    write_good(data)
+    case.breaker(data / case.file)
+    config, out = config_of(case, tmp_path), tmp_path / "out"
+    result = invoke("identify", config, "--data", data, "--out", out, "--quiet")
+    assert result.exit_code == 2
+    assert isinstance(result.exception, SystemExit)
+    assert [w for w in words_of(case) if w not in result.stderr] == [], result.stderr
+    assert result.stderr.count("\n") == 1
+    assert result.stdout == ""
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("name", ["empty file", "binary file", "missing column"])
+def test_a_broken_log_in_a_real_process(tmp_path, name):
+    [case] = [c for c in CASES if c.name == name]
+    data = tmp_path / "data"
+    write_good(data)
+    case.breaker(data / case.file)
+    config, out = config_of(case, tmp_path), tmp_path / "out"
+    run = process("identify", config, "--data", data, "--out", out)
+    stdout, stderr = run.communicate(timeout=120)
+    assert run.returncode == 2
+    assert [w for w in words_of(case) if w not in stderr] == []
+    assert "Traceback" not in stderr + stdout
+    assert not out.exists()
+
+
+def test_a_log_without_motion_is_refused_before_anything_is_written(tmp_path):
+    data = tmp_path / "data"
+    write_good(data)
+    path = data / GENERIC
+    still = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
+    for cells in still[1:]:
+        cells[1:5] = ["0", "0", "0", "0"]
+        cells[9:11] = ["5.0", "1.0"]
+    path.write_text("\n".join(",".join(c) for c in still) + "\n", encoding="utf-8")
+    config = config_of(Case("still", lambda p: None, (), GENERIC), tmp_path)
+    result = invoke("identify", config, "--data", data, "--out", tmp_path / "out", "--quiet")
+    assert result.exit_code == 2
+    assert "no wheel moves 10 mm" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_identify_asks_for_a_place_to_write_before_it_fits(tmp_path):
+    data = tmp_path / "data"
+    write_good(data)
+    config = config_of(Case("good", lambda p: None, (), GENERIC), tmp_path)
+    (tmp_path / "file").write_text("")
+    result = invoke("identify", config, "--data", data, "--out", tmp_path / "file" / "out")
+    assert result.exit_code == 2
+    assert "cannot be written (Not a directory)" in result.stderr
+    assert "compiling" not in result.stderr
+
+
+# the job end to end -----------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_identify_writes_what_the_contract_says(small):
+    folder, result = small
+    assert result.exit_code == 0, result.stderr
+    out = folder / "out"
+    names = {p.name for p in out.iterdir()}
+    assert names >= {"identified.json", "fit.json", "run.json", "config.toml"}
+    assert len([n for n in names if n.startswith("fit-") and n.endswith(".npz")]) == 1
+    assert not [n for n in names if n.startswith(".") or n.endswith(".part")]
+    assert "checkpoint.npz" not in names  # it is done with
+    assert (out / "config.toml").read_text() == (folder / "my.toml").read_text()
+    run = json.loads((out / "run.json").read_text())
+    assert set(run["data"]["logs"]) == {f"as_built/soft/run{k:03d}.csv" for k in range(12)}
+    assert run["seed"] == 0
+    assert {"python", "jax", "numpy", "slipid"} <= set(run["versions"])
+    found = json.loads((out / "identified.json").read_text(), parse_constant=pytest.fail)
+    assert found["data"]["hash"] == run["data"]["hash"]
+    assert json.loads((out / "fit.json").read_text(), parse_constant=pytest.fail)["converged"]
+    assert "motor.resistance" in result.stdout
+    assert "skipped" in result.stderr  # the config also names moved/
+
+
+@pytest.mark.slow
+def test_identify_finds_the_motor(small):
+    folder, _ = small
+    found = json.loads((folder / "out" / "identified.json").read_text())["parameters"]
+    # half and twice the truth to begin with, hardly any data
+    assert found["motor.resistance"]["value"] == pytest.approx(5.5, rel=0.03)
+    assert found["motor.back_emf"]["value"] == pytest.approx(0.0514, rel=0.03)
+    assert found["motor.resistance"]["verdict"] == "identified"
+    ratios = json.loads((folder / "out" / "identified.json").read_text())["derived"]
+    assert ratios["motor.resistance/motor.back_emf"]["verdict"] == "identified"
+    assert ratios["motor.resistance/motor.back_emf"]["unit"] == "ohm*rad/(V*s)"
+
+
+@pytest.mark.slow
+def test_json_to_stdout_and_the_same_numbers_again(small, tmp_path):
+    folder, _ = small
+    config, data = folder / "my.toml", folder / "logs"
+    words = ("--json", "-", "--quiet", "--profile", "motor.resistance")
+    result = invoke("identify", config, "--data", data, "--out", tmp_path, *words)
+    assert result.exit_code == 0
+    assert json.loads(result.stdout) == json.loads((folder / "out/identified.json").read_text())
+    kept = json.loads((tmp_path / "profile.json").read_text(), parse_constant=pytest.fail)
+    [(path, profile)] = kept["profiles"].items()
+    assert (kept["schema"], path) == ("slipid.profile/1", "motor.resistance")
+    low, high = profile["interval90"]
+    assert low < profile["estimate"] < high
+    assert (tmp_path / "profile.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.mark.slow
+def test_a_profile_of_what_is_not_fitted_is_2_before_the_fit(small, tmp_path):
+    folder, _ = small
+    words = ("--data", folder / "logs", "--out", tmp_path / "out", "--profile", "robot.mass")
+    result = invoke("identify", folder / "my.toml", *words)
+    assert result.exit_code == 2
+    assert "--profile: robot.mass is fixed; a profile is of one free number" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_validate_predicts_unseen_runs(small, tmp_path):
+    folder, _ = small
+    target = tmp_path / "v.json"
+    result = invoke("validate", folder / "out", "--data", folder / "unseen", "--json", target)
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(target.read_text(), parse_constant=pytest.fail)
+    assert found["schema"] == "slipid.validation/1"
+    models = found["summary"]["soft"]
+    assert {"encoder", "paper", "heading_lookup", "identified"} <= set(models)
+    assert models["identified"]["runs"] == len(found["runs"]) == 3
+    # encoders are off by a quarter on this floor
+    assert models["identified"]["endpoint_error_mean"] < 0.05
+    assert models["encoder"]["endpoint_error_mean"] > 0.15
+    assert "were fitted" not in result.stderr
+
+
+@pytest.mark.slow
+def test_validate_says_when_runs_were_fitted_and_when_a_floor_is_unknown(small, tmp_path):
+    folder, _ = small
+    result = invoke("validate", folder / "out", "--data", folder / "logs")
+    assert result.exit_code == 0
+    assert "12 of 12 runs were fitted" in result.stderr
+    other = tmp_path / "as_built/ice/run000.csv"
+    other.parent.mkdir(parents=True)
+    other.write_bytes((folder / "logs/as_built/soft/run000.csv").read_bytes())
+    result = invoke("validate", folder / "out", "--data", tmp_path)
+    assert result.exit_code == 2
+    assert "'ice'" in result.stderr
+    assert "identified: soft" in result.stderr
+
+
+@pytest.mark.slow
+def test_check_tells_before_the_fit(small, tmp_path):
+    folder, _ = small
+    out = tmp_path / "check"
+    result = invoke("check", folder / "my.toml", "--data", folder / "logs", "--out", out)
+    assert result.exit_code == 0, result.stderr
+    found = json.loads((out / "check.json").read_text(), parse_constant=pytest.fail)
+    keys = ("surface", "load", "session", "runs", "headings", "speeds")
+    assert [tuple(group[k] for k in keys) for group in found["groups"]] == [
+        ("soft", "as_built", f"soft/as_built/{v:.2f}", 6, 6, [v]) for v in (0.1, 0.3)
+    ]
+    assert "voltage" in found["channels"]
+    assert "current (unsigned)" in found["channels"]
+    assert found["parameters"]["motor.resistance"]["verdict"] == "identified"
+    assert found["parameters"]["robot.mass"]["verdict"] == "fixed"
+    assert found["derived"]["motor.resistance/motor.back_emf"]["verdict"] == "identified"
+    picture = (out / "raw_soft_as_built.png").read_bytes()
+    assert picture[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.mark.slow
+def test_a_fit_that_does_not_settle_is_1_and_says_so(small, tmp_path):
+    folder, _ = small
+    config = tmp_path / "short.toml"
+    text = packaged_config("robotino.toml").replace("rounds = 30 ", "rounds = 1  ")
+    config.write_text(text, encoding="utf-8")
+    result = invoke("identify", config, "--data", folder / "logs", "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "NOT converged: 1 rounds without settling" in result.stdout
+    assert json.loads((tmp_path / "out/fit.json").read_text())["converged"] is False
+
+
+# interrupts -------------------------------------------------------------------------------------
+
+
+def endless(folder: Path, target: Path) -> Path:
+    """The config of the small job with a tolerance that takes many rounds."""
+    text = packaged_config("robotino.toml").replace("tolerance = 0.02", "tolerance = 1e-12")
+    target.write_text(text.replace("rounds = 30 ", "rounds = 60 "), encoding="utf-8")
+    return target
+
+
+def stopped(config: Path, data: Path, out: Path, how: signal.Signals) -> subprocess.Popen:
+    """A fit stopped by a signal some rounds after its first checkpoint."""
+    run = process("identify", config, "--data", data, "--out", out)
+    deadline = time.monotonic() + 300
+    while not (out / "checkpoint.npz").exists():
+        assert run.poll() is None, run.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    run.send_signal(how)
+    return run
+
+
+@pytest.mark.slow
+def test_a_killed_fit_goes_on_and_ends_where_it_would_have(small, tmp_path):
+    folder, _ = small
+    config, data = endless(folder, tmp_path / "long.toml"), folder / "logs"
+    killed = stopped(config, data, tmp_path / "a", signal.SIGKILL)
+    killed.communicate(timeout=60)
+    assert killed.returncode == -signal.SIGKILL
+    assert [p.name for p in (tmp_path / "a").iterdir() if p.suffix == ".json"] == []
+    again = process("identify", config, "--data", data, "--out", tmp_path / "a")
+    _, stderr = again.communicate(timeout=300)
+    whole = process("identify", config, "--data", data, "--out", tmp_path / "b")
+    whole.communicate(timeout=300)
+    assert again.returncode == whole.returncode
+    assert "going on from round" in stderr
+    one, other = (json.loads((tmp_path / k / "fit.json").read_text()) for k in "ab")
+    assert one["z"] == pytest.approx(other["z"], rel=1e-9, abs=1e-12)
+    assert one["history"] == pytest.approx(other["history"], rel=1e-9)
+    assert one["rounds"] == other["rounds"] == len(one["history"]) > 10
+
+
+def test_an_interrupt_that_python_must_ignore_where_it_arrives_stops_the_command():
+    code = """if True:
+        import gc, signal, time
+        from slipid.cli import main as cli
+        from slipid.job import check
+
+        def collecting(phase, info):
+            gc.callbacks.remove(collecting)
+            signal.raise_signal(signal.SIGINT)
+
+        def work(*_):
+            gc.callbacks.append(collecting)
+            gc.collect()
+            print("went on")
+            for _ in range(300):
+                time.sleep(0.1)
+
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        check.check = work
+        cli.AGAIN_S = 3.0  # a busy machine may be slow to print
+        cli.main()
+    """
+    words = [sys.executable, "-c", code, "check", "my.toml", "--data", "."]
+    run = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert run.stdout == "went on\n"
+    assert "interrupted" in run.stderr
+    assert "Traceback" not in run.stderr
+    assert run.returncode == 130
+
+
+@pytest.mark.slow
+def test_an_interrupt_is_130_and_keeps_the_checkpoint(small, tmp_path):
+    folder, _ = small
+    config = endless(folder, tmp_path / "long.toml")
+    run = stopped(config, folder / "logs", tmp_path / "out", signal.SIGINT)
+    _, stderr = run.communicate(timeout=60)
+    assert run.returncode == 130
+    assert "interrupted" in stderr
+    assert "Traceback" not in stderr
+    assert (tmp_path / "out" / "checkpoint.npz").exists()
+    assert not (tmp_path / "out" / "identified.json").exists()
+
+
+# posterior --------------------------------------------------------------------------------------
+
+FEW = ("--draws", "20", "--most", "24", "--block", "2", "--quiet")  # blocks: 20 are to warm up
+
+
+@pytest.fixture(scope="module")
+def sampled(small, tmp_path_factory):
+    """A copy of the fit, and the end of a `sample` that has far too few steps."""
+    out = tmp_path_factory.mktemp("sampled") / "out"
+    shutil.copytree(small[0] / "out", out)
+    return out, invoke("sample", out, *FEW)
+
+
+@pytest.mark.slow
+def test_a_posterior_that_has_not_converged_says_so_everywhere(sampled):
+    out, result = sampled
+    assert result.exit_code == 1, result.output
+    assert "NOT converged" in result.stdout
+    about = json.loads((out / "sample.json").read_text())
+    assert about["converged"] is False
+    found = json.loads((out / "identified.json").read_text())
+    assert any("did not converge" in said for said in found["messages"])
+    import xarray
+
+    with xarray.open_datatree(out / "posterior.nc", engine="h5netcdf") as tree:
+        assert tree.attrs["converged"] == "False"
+
+
+@pytest.mark.slow
+def test_a_posterior_that_has_converged_is_0_and_takes_its_blocks_away(
+    sampled, tmp_path, monkeypatch
+):
+    from slipid.identify.posterior import diagnosis, second_stage
+    from slipid.identify.posterior import sample as posterior
+
+    shutil.copytree(sampled[0], tmp_path / "out")
+    out, found = tmp_path / "out", diagnosis.diagnose
+    assert list(out.glob("sampling/*.npz"))
+    monkeypatch.setattr(
+        diagnosis, "diagnose", lambda chain, plan: replace(found(chain, plan), converged=True)
+    )
+    monkeypatch.setattr(second_stage, "unsettled", lambda chain: np.zeros(chain.shape[-1]))
+    monkeypatch.setattr(posterior, "STILL", 1.0)
+    result = invoke("sample", out, *FEW)
+    assert result.exit_code == 0, result.output
+    assert "converged: worst is" in result.stdout
+    assert not (out / "sampling").exists()
+    said = json.loads((out / "identified.json").read_text())
+    assert not any("did not converge" in sentence for sentence in said["messages"])
+    assert stat.S_IMODE((out / "posterior.nc").stat().st_mode) == stat.S_IMODE(
+        (out / "sample.json").stat().st_mode
+    )
+
+
+@pytest.mark.slow
+def test_quotients_have_the_intervals_of_their_draws(sampled):
+    import xarray
+
+    found = json.loads((sampled[0] / "identified.json").read_text())
+    with xarray.open_datatree(sampled[0] / "posterior.nc", engine="h5netcdf") as tree:
+        draws = tree["posterior"]["motor.resistance"] / tree["posterior"]["motor.back_emf"]
+        expected = np.quantile(draws.values, [0.05, 0.95]).tolist()
+    ratio = found["derived"]["motor.resistance/motor.back_emf"]
+    assert ratio["interval90"] == pytest.approx(expected)
+
+
+@pytest.mark.slow
+def test_posterior_nc_has_the_groups_of_arviz_and_names_for_everything(sampled):
+    import xarray
+
+    out, _ = sampled
+    found = json.loads((out / "identified.json").read_text())
+    with xarray.open_datatree(out / "posterior.nc", engine="h5netcdf") as tree:
+        assert set(tree.children) == {
+            *("posterior", "sample_stats", "log_likelihood", "posterior_predictive"),
+            *("observed_data", "unconstrained_posterior"),
+        }
+        posterior = tree["posterior"]
+        assert posterior["robot.load_share"].dims == ("chain", "draw", "load", "wheel")
+        np.testing.assert_allclose(posterior["robot.load_share"].sum("wheel"), 1.0)
+        creep = posterior["surface.creep"]
+        assert creep.dims == ("chain", "draw", "surface")
+        assert creep.shape[:2] == (4, 20)
+        floor = str(creep.surface[0].values)
+        low, high = found["parameters"][f"surface.{floor}.creep"]["interval90"]
+        draws = creep.sel(surface=floor).values.ravel()
+        assert [low, high] == pytest.approx(np.quantile(draws, [0.05, 0.95]).tolist())
+        runs = tree["log_likelihood"]["motion"]
+        assert runs.dims == ("chain", "draw", "run")
+        assert sorted(runs.run.values) == sorted(found["data"]["runs"])
+        measured, new = (
+            tree[group]["increment"] for group in ("observed_data", "posterior_predictive")
+        )
+        assert new.dims[2:] == measured.dims == ("piece", "window", "direction")
+        inside = (new.quantile(0.05, ("chain", "draw")) < measured) & (
+            measured < new.quantile(0.95, ("chain", "draw"))
+        )
+        assert 0.8 < float(inside.mean()) < 1.0
+    sources = {p["source"] for p in found["parameters"].values() if p["verdict"] != "fixed"}
+    assert sources == {"posterior"}
+
+
+@pytest.mark.slow
+def test_sampling_that_was_killed_ends_as_if_it_had_not_been(sampled, small, tmp_path):
+    whole, _ = sampled
+    out = tmp_path / "out"
+    shutil.copytree(small[0] / "out", out)
+    run = process("sample", out, *FEW)
+    deadline = time.monotonic() + 120
+    while len(list(out.glob("sampling/*.npz"))) < 3:
+        assert run.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    run.kill()
+    run.communicate()
+    kept = len(list(out.glob("sampling/*.npz")))
+    result = invoke("sample", out, *[w for w in FEW if w != "--quiet"])
+    assert f"going on from block {kept} " in result.output
+    import xarray
+
+    with (
+        xarray.open_datatree(whole / "posterior.nc", engine="h5netcdf") as one,
+        xarray.open_datatree(out / "posterior.nc", engine="h5netcdf") as other,
+    ):
+        for group in ("unconstrained_posterior", "sample_stats"):
+            xarray.testing.assert_equal(one[group].to_dataset(), other[group].to_dataset())
+
+
+@pytest.mark.slow
+def test_sample_refuses_logs_that_were_not_fitted(small, tmp_path):
+    folder, _ = small
+    out = tmp_path / "out"
+    shutil.copytree(folder / "out", out)
+    result = invoke("sample", out, "--data", folder / "unseen")
+    assert result.exit_code == 2
+    assert "since the fit" in result.stderr
+    assert not (out / "sampling").exists()
+    result = invoke("sample", tmp_path / "nothing")
+    assert result.exit_code == 2
+    assert "slipid identify" in result.stderr
+
+
+# files ------------------------------------------------------------------------------------------
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "a.json"
+    write_json(path, {"x": 1.5})
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(path, {"x": float("inf")})
+
+    def crash(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", crash)
+    with pytest.raises(DataError, match=r"a\.json: cannot be written"):
+        write_bytes(path, b"new")
+    assert json.loads(path.read_text()) == {"x": 1.5}
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_new_writes_a_config_that_reads_and_never_overwrites(tmp_path):
+    path = tmp_path / "mine.toml"
+    flags = {"wheel-radius-m": 0.05, "base-m": 0.2, "gear-ratio": 12, "mass-kg": 9}
+    words = [w for k, v in flags.items() for w in (f"--{k}", v)]
+    result = invoke("new", "--out", path, *words, "--ticks-per-revolution", 500)
+    assert result.exit_code == 0, result.stderr
+    from slipid.job.config import read_config
+
+    assert read_config(path).content.robot.base_radius_m == 0.2
+    again = invoke("new", "--out", path, *words, "--ticks-per-revolution", 500)
+    assert again.exit_code == 2
+    assert "exists already" in again.stderr
+    for drive in ("mecanum", "skid"):
+        write_new(tmp_path / f"{drive}.toml", Answers(drive, 0.05, 0.2, 12.0, 9.0, 500.0))
+    with pytest.raises(DataError, match="greater than 0"):
+        write_new(tmp_path / "x.toml", Answers("omni", -0.05, 0.2, 12.0, 9.0, 500.0))
+    assert not (tmp_path / "x.toml").exists()
+    before = path.read_bytes()
+    answers = [*words, "--ticks-per-revolution", 500, "--wheel-radius-m", -1]
+    bad = invoke("new", "--out", path, "--force", *answers)
+    assert bad.exit_code == 2
+    assert path.read_bytes() == before
+
+
+@pytest.mark.slow
+def test_a_place_that_cannot_be_written_to_is_said_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    path = tmp_path / "file" / "x.toml"
+    with pytest.raises(DataError, match=r"x\.toml: cannot be written"):
+        write_new(path, Answers("omni", 0.05, 0.2, 12.0, 9.0, 500.0))
+    with pytest.raises(DataError, match="cannot be written"):
+        writable(tmp_path / "file" / "out")
+    writable(tmp_path / "new")
+    assert list((tmp_path / "new").iterdir()) == []

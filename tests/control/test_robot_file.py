@@ -1,0 +1,376 @@
+"""robot.json: every number survives, and whatever is wrong with a file is one clear sentence."""
+
+from __future__ import annotations
+
+import json
+import random
+import subprocess
+import sys
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jsonschema
+import numpy as np
+import pytest
+
+from slipid.control.controller import Gains
+from slipid.control.deployed import DeployedRobot, drawn
+from slipid.control.robot_file.gains_record import GainRecord, GainsRecord, GainValues, Losses
+from slipid.control.robot_file.record import Seen, checksum
+from slipid.deploy.deploy import deploy_known
+from slipid.deploy.record_of import About, given, record_of
+from slipid.model.geometry import omni
+from slipid.model.robot import build
+from slipid.parameter import entries
+from slipid.support.errors import DataError
+
+SCHEMA = json.loads(resources.files("slipid.control").joinpath("robot.schema.json").read_text())
+SEEN = Seen(3, ("as_built",), (0.0, 8.0), (0.0, 0.4), (0.0, 0.3), (0.0, 1.0), (0.0,), (), (), 1.1)
+GAINS = GainsRecord(
+    values=GainValues(*(GainRecord(0.1 * k, "1", 0.01) for k in range(6))),
+    load="moved",
+    gyro=True,
+    method="pso",
+    loss=Losses(2.0, 1.0),
+    better_than_hand=0.7,
+    stability_margin=0.02,
+    verdict="no worse than by hand",
+)
+
+
+@pytest.fixture(scope="module")
+def robot() -> DeployedRobot:
+    """Two floors, two load set-ups, odd numbers, draws and gains."""
+    made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"], ["own", "moved"])
+    share = jnp.asarray([[0.29, 0.44, 0.27], [0.1, 0.2, 0.7]])
+    friction = jnp.asarray([1 / 3, 0.1 + 0.2])
+    made = eqx.tree_at(lambda r: (r.body.load_share, r.surfaces.friction), made, (share, friction))
+    several = jax.tree.map(lambda x: jnp.broadcast_to(x, (5, *x.shape)), made)
+    noise = np.random.default_rng(0).normal(size=(5, 2))
+    shaken = friction * jnp.exp(0.1 * jnp.asarray(noise))
+    several = eqx.tree_at(lambda r: r.surfaces.friction, several, shaken)
+    numbers = given(made)
+    share_path = "robot.load_share@own"
+    pairs = tuple((x - 0.01, x + 0.01) for x in share[0].tolist())
+    known = {"std": (0.01, 0.01, 0.01), "interval90": pairs, "verdict": "identified"}
+    numbers[share_path] = replace(numbers[share_path], **known)
+    about = About(seen={"firm": SEEN}, messages=("say \u00e9 aloud",), versions={"jax": "0.1"})
+    std = {"process.firm.along": 0.003, "session.soft.yaw": 0.02}
+    record = record_of(made, numbers, std, several, 8.1, (0.01, -0.02), about)
+    return DeployedRobot.of(replace(record, gains=GAINS), "moved")
+
+
+@pytest.fixture
+def path(robot, tmp_path) -> Path:
+    robot.save(tmp_path / "robot.json")
+    return tmp_path / "robot.json"
+
+
+def same(a: DeployedRobot, b: DeployedRobot) -> None:
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y, strict=True)
+
+
+def test_every_number_survives_to_the_last_bit(robot, path):
+    again = DeployedRobot.load(path, load="moved")
+    assert again.record == robot.record
+    assert hash(again.record) == hash(robot.record)
+    same(again, robot)
+    first = DeployedRobot.load(path)
+    assert first.load_setup == "own"
+    np.testing.assert_array_equal(first.rest, [0.29, 0.44, 0.27])
+    assert float(again.floors.friction[1]) == 0.1 + 0.2
+    text = path.read_bytes()
+    first.save(path)
+    assert path.read_bytes() == text
+    assert len(text) < 20_000
+
+
+def test_gains_are_those_of_the_load_set_up_they_were_tuned_for(path):
+    tuned, other = DeployedRobot.load(path, "moved"), DeployedRobot.load(path, "own")
+    assert jax.tree.leaves(Gains.of(tuned)) == [0.1 * k for k in range(6)]
+    assert jax.tree.leaves(Gains.of(other)) == jax.tree.leaves(Gains())
+
+
+def test_draws_are_robots_with_other_numbers(robot):
+    several = drawn(robot, (4, 0))
+    rows = robot.record.draws["surface.soft.friction"]
+    np.testing.assert_array_equal(several.floors.friction[:, 1], [rows[4], rows[0]])
+    assert set(robot.record.draws) == {"surface.firm.friction", "surface.soft.friction"}
+    spread = np.asarray(robot.record.loads[1].spread)
+    assert (spread[:, 0] > 0).all()
+    effect = np.asarray([floor.effect for floor in robot.record.floors])
+    np.testing.assert_allclose(robot.effect, np.sqrt(effect**2 + spread**2), rtol=1e-12)
+    np.testing.assert_array_equal(several.effect[0], effect)
+
+
+def test_a_robot_whose_arrays_were_changed_is_not_saved(robot, tmp_path):
+    changed = eqx.tree_at(lambda r: r.mass, robot, robot.mass + 1)
+    with pytest.raises(ValueError, match="arrays of this robot are not those of its record"):
+        changed.save(tmp_path / "robot.json")
+    assert not any(tmp_path.iterdir())
+
+
+def test_what_is_known_of_the_floors_is_saved_with_them(robot, tmp_path):
+    only = robot.on("soft")
+    only.save(tmp_path / "soft.json")
+    same(DeployedRobot.load(tmp_path / "soft.json", "moved"), only)
+
+
+def test_the_schema_tells_what_is_written_and_names_every_gain(path, robot):
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    jsonschema.validate(json.loads(path.read_text()), SCHEMA)
+    deploy_known(build(omni([0.0, 120.0, 240.0], 0.1, 0.03), ["a"])).save(path)
+    jsonschema.validate(json.loads(path.read_text()), SCHEMA)
+    declared = [e.path for e in entries(Gains())]
+    assert declared == list(GainValues.__dataclass_fields__)
+
+
+# what is refused -----------------------------------------------------------------------------
+
+
+def write(path: Path, content: dict) -> None:
+    """Any content, with hashes that are right."""
+    content.pop("checksum", None)
+    if "numbers" in content:
+        fixed = {"gains": None, "versions": {}, "messages": []}
+        numbers = {k: v for k, v in content.items() if k not in ("schema", "units", "numbers")}
+        content["numbers"] = checksum(numbers | fixed)
+    path.write_text(json.dumps(content | {"checksum": checksum(content)}))
+
+
+def rewritten(path: Path, change) -> None:
+    """The file after a change of its content, with hashes that are right."""
+    content = json.loads(path.read_text())
+    change(content)
+    write(path, content)
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(DataError) as caught:
+        DeployedRobot.load(path)
+    said = str(caught.value)
+    assert said.startswith(f"{path}: ")
+    assert "\n" not in said
+    return said
+
+
+def test_what_is_no_robot_is_refused(tmp_path):
+    path = tmp_path / "robot.json"
+    assert "No such file" in refused(path)
+    assert "expected what `slipid identify` writes" in refused(path)
+    assert "irectory" in refused(tmp_path)
+    for text in ("", "{", '{"a": NaN}', '{"a": 1, "a": 2}', "[" * 100_000, '{"a": 1e}'):
+        path.write_text(text)
+        assert "no valid JSON" in refused(path)
+    path.write_bytes(b"\xff\xfe")
+    assert "no valid JSON" in refused(path)
+    for text in (
+        "{}",
+        "3",
+        '{"schema": "slipid.fit/1"}',
+        '{"schema": 7}',
+        '{"schema": "slipid.robot/x"}',
+    ):
+        path.write_text(text)
+        assert "no robot of slipid" in refused(path)
+
+
+def test_a_newer_file_asks_for_an_update(path):
+    rewritten(path, lambda c: c.update(schema="slipid.robot/2", more=3))
+    said = refused(path)
+    assert "written by a newer slipid as slipid.robot/2" in said
+    assert "update slipid" in said
+
+
+def test_a_changed_digit_is_refused(path):
+    text = path.read_text()
+    path.write_text(text.replace("0.003", "0.004", 1))
+    assert "does not match its checksum" in refused(path)
+    assert "write it anew with `slipid identify`" in refused(path)
+    path.write_text(text.replace('"gyro": true', '"gyro": false', 1))
+    assert "does not match its checksum" in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda c: c.pop("loads"), "loads is missing"),
+        (lambda c: c.pop("checksum"), "checksum"),
+        (lambda c: c["parameters"].pop("motor.resistance"), "['motor.resistance'] is missing"),
+        (
+            lambda c: c["parameters"]["robot.mass"].pop("std"),
+            "parameters['robot.mass'].std is miss",
+        ),
+        (lambda c: c["floors"][0].pop("effect"), "floors[0].effect is missing"),
+        (lambda c: c.update(more=1), "more: no such field"),
+        (lambda c: c["sensors"].update(gyro=1), "sensors.gyro: 1; expected true or false"),
+        (lambda c: c.update(alike=True), "alike: True; expected a number"),
+        (lambda c: c.update(alike=10**400), "expected a number"),
+        (lambda c: c.update(source="guess"), "source: 'guess'; expected 'laplace' or 'posterior'"),
+        (
+            lambda c: c["floors"][0].update(process=[1.0]),
+            "floors[0].process: 1 entries; expected 3",
+        ),
+        (lambda c: c["loads"][0].update(spread=[]), "loads, own: spread: 0 entries; expected 2"),
+        (
+            lambda c: c["wheels"].update(drive_angle=[0.0]),
+            "wheels.drive_angle: 1 entries; expected 3",
+        ),
+        (lambda c: c["wheels"].update(roller_angle=[0.0] * 3), "such a wheel cannot drive"),
+        (lambda c: c["wheels"].update(drive_angle=[0.0] * 3), "rank below 3"),
+        (lambda c: c["parameters"]["robot.mass"].update(value=-1), "expected inside (0, inf)"),
+        (lambda c: c["parameters"]["robot.mass"].update(value=[1, 2]), "expected one number"),
+        (lambda c: c["parameters"]["robot.mass"].update(unit="g"), "unit: 'g'; expected 'kg'"),
+        (
+            lambda c: c["parameters"]["robot.load_share@own"].update(value=[1, 1, 1]),
+            "that sum to 1",
+        ),
+        (lambda c: c["parameters"]["robot.load_share@own"].update(std=1), "expected 3 numbers"),
+        (lambda c: c["draws"]["surface.soft.friction"].pop(), "draws: [4, 5] of different numbers"),
+        (
+            lambda c: c["draws"]["surface.soft.friction"].__setitem__(0, 0),
+            "draws['surface.soft.frict",
+        ),
+        (lambda c: c["draws"].update(mass=[1]), "'mass': no such number"),
+        (lambda c: c["units"].update(alike="m"), "other units"),
+        (lambda c: c["gains"]["values"].pop("yaw"), "gains.values.yaw is missing"),
+        (lambda c: c.update(loads=c["loads"][:1] * 2), "expected one or more, each once"),
+        (lambda c: c.update(floors=[]), "floors []; expected one or more"),
+    ],
+)
+def test_what_is_missing_or_wrong_is_named(path, change, said):
+    if "checksum" in said:
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+    else:
+        rewritten(path, change)
+    found = refused(path)
+    assert said in found
+    assert "write it anew with `slipid identify`" in found
+
+
+def test_another_load_set_up_is_refused_with_those_there_are(path):
+    with pytest.raises(DataError, match="no load set-up 'far'; identified: own, moved"):
+        DeployedRobot.load(path, load="far")
+
+
+# anything at all -----------------------------------------------------------------------------
+
+
+def loads(path: Path) -> bool:
+    """Whether a damaged file gives a robot; anything but that and a `DataError` is raised."""
+    try:
+        return isinstance(DeployedRobot.load(path), DeployedRobot)
+    except DataError as error:
+        assert str(error).startswith(f"{path}: ")  # noqa: PT017 (both ends are right)
+        return False
+
+
+def test_damaged_bytes_give_a_robot_or_a_sentence(path):
+    rng, good = random.Random(0), path.read_bytes()
+    survived = 0
+    for _ in range(300):
+        data = bytearray(good)
+        for _ in range(rng.choice([1, 1, 2, 8])):
+            at = rng.randrange(len(data))
+            kind = rng.choice(["flip", "drop", "insert", "cut"])
+            if kind == "flip":
+                data[at] ^= 1 << rng.randrange(8)
+            elif kind == "drop":
+                del data[at : at + rng.choice([1, 1, 40])]
+            elif kind == "insert":
+                data.insert(at, rng.randrange(256))
+            else:
+                data = data[: at + 1]
+        path.write_bytes(data)
+        survived += loads(path)
+    assert survived < 60  # white space may change
+
+
+def places(content, at=()):
+    """Every place below a JSON value."""
+    items = content.items() if isinstance(content, dict) else enumerate(content)
+    for key, value in items:
+        yield (*at, key)
+        if isinstance(value, dict | list):
+            yield from places(value, (*at, key))
+
+
+def test_any_content_gives_a_robot_or_a_sentence_and_the_schema_agrees(path):
+    """With a checksum that is right: what loads is by the schema, what is not by it never loads."""
+    good = json.loads(path.read_text())
+    rng, every = random.Random(1), list(places(good))
+    validator = jsonschema.Draft202012Validator(SCHEMA)
+    junk = (None, True, 0, -1, 1e308, 10**30, "x", [], {}, [1.0], [[1.0]], {"a": 1}, "\ud800")
+    counts = {True: 0, False: 0}
+    for _ in range(400):
+        content = json.loads(json.dumps(good))
+        *way, last = rng.choice(every)
+        parent = content
+        for key in way:
+            parent = parent[key]
+        if rng.random() < 0.3:
+            del parent[last]
+        elif rng.random() < 0.2 and isinstance(parent, dict):
+            parent[rng.choice(["more", "value", "unit"])] = rng.choice(junk)
+        else:
+            parent[last] = rng.choice(junk)
+        write(path, content)
+        fine = loads(path)
+        counts[fine] += 1
+        written = json.loads(path.read_text())
+        assert not fine or validator.is_valid(written), (way, last)
+    assert min(counts.values()) > 10
+
+
+# alone ---------------------------------------------------------------------------------------
+
+ALONE = """
+import sys
+import equinox
+import jax
+import jaxtyping
+jax.config.update("jax_enable_x64", True)
+HERE = {name.split(".")[0] for name in sys.modules} | {"slipid", *sys.stdlib_module_names}
+HERE.add("scipy")  # jaxlib takes it in when it first solves something
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] not in HERE:
+            raise ModuleNotFoundError(name)
+sys.meta_path.insert(0, Absent())
+before = set(sys.modules)
+import importlib, pkgutil
+import slipid.control
+for found in pkgutil.walk_packages(slipid.control.__path__, "slipid.control."):
+    importlib.import_module(found.name)
+new = {name.split(".")[0] for name in set(sys.modules) - before}
+print(sorted(new - {"slipid", *sys.stdlib_module_names}))
+from slipid.control.deployed import DeployedRobot
+from slipid.control.interface import Measurement
+from slipid.control.odometry import Odometry
+from slipid.control.pilot import Pilot
+from slipid.control.controller import Controller
+from slipid.control.trajectory import rectangle
+robot = DeployedRobot.load(sys.argv[1])
+pilot = Pilot(Odometry(robot), Controller(robot))
+z = Measurement(wheel_angle=[0.0, 0.0, 0.0], current=[0.1, 0.1, 0.1])
+state, said = pilot.step(rectangle(), pilot.init(), z, 0.05)
+print(said.estimate.pose, said.estimate.surface, said.command)
+"""
+
+
+def test_it_runs_where_there_is_jax_and_nothing_else(path):
+    """Whatever JAX and equinox do not import themselves is absent."""
+    words = [sys.executable, "-c", ALONE, str(path)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    first, second = done.stdout.splitlines()[:2]
+    assert first == "[]"
+    assert "['unknown' 'unknown' 'unknown']" in second

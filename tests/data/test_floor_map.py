@@ -1,0 +1,153 @@
+"""Floor maps: polygons, pictures, files, and what is wrong with some of them."""
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib.image import imsave
+
+from slipid.data.floor_map import (
+    four_zones,
+    from_picture,
+    from_polygons,
+    patchwork,
+    uniform,
+)
+from slipid.data.map_file import read_map, write_map
+from slipid.support.errors import DataError
+
+UNIT = (0.0, 0.0, 1.0, 1.0)
+SQUARE = [[0.2, 0.2], [0.6, 0.2], [0.6, 0.6], [0.2, 0.6]]
+CORNER = [[0.5, 0.5], [1.0, 0.5], [1.0, 1.0], [0.5, 1.0]]
+GOOD = """
+schema = "slipid.map/1"
+base = "table"
+extent_m = [0.0, 0.0, 1.0, 1.0]
+cell_m = 0.01
+
+[[patch]]
+surface = "gray"
+polygon = [[0.2, 0.2], [0.6, 0.2], [0.6, 0.6], [0.2, 0.6]]
+"""
+
+
+def test_later_patches_lie_on_earlier_ones():
+    floor = from_polygons("table", [("gray", SQUARE), ("green", CORNER)], UNIT, 0.01)
+    assert floor.surfaces == ("table", "gray", "green")
+    places = {(0.1, 0.1): "table", (0.3, 0.3): "gray", (0.55, 0.55): "green", (0.9, 0.3): "table"}
+    for (x, y), name in places.items():
+        assert floor.surface_at(x, y) == name
+    np.testing.assert_array_equal(floor.at(np.array([[0.3, 0.3], [0.9, 0.9]])), [1, 2])
+    assert floor.extent == pytest.approx((0, 0, 1, 1))
+    share = np.mean(floor.cells == 1)
+    assert share == pytest.approx(0.16 - 0.01, abs=0.005)
+
+
+def test_beyond_the_edge_the_floor_goes_on():
+    floor = from_polygons("table", [("green", CORNER)], UNIT, 0.01)
+    assert floor.surface_at(7.0, 8.0) == "green"
+    assert floor.surface_at(-1.0, 8.0) == "table"
+    assert uniform("sand").surface_at(9.0, -9.0) == "sand"
+
+
+def test_a_map_comes_back_from_its_file(tmp_path):
+    floor = patchwork(["a", "b", "c"], seed=3, half=0.5)
+    write_map(tmp_path / "site.toml", floor, {"a": "#102030", "b": "#405060", "c": "#a0b0c0"})
+    again = read_map(tmp_path / "site.toml")
+    np.testing.assert_array_equal(again.cells, floor.cells)
+    assert again.surfaces == floor.surfaces
+    assert again.extent == pytest.approx(floor.extent)
+    with pytest.raises(ValueError, match="same colour"):
+        write_map(tmp_path / "site.toml", floor, dict.fromkeys("abc", "#102030"))
+
+
+def test_a_picture_tells_surfaces_by_the_nearest_colour(tmp_path):
+    picture = np.zeros((4, 6, 3))
+    picture[:2, :, 1] = 0.45  # green above
+    picture[2:, :, 0] = 0.9  # red below
+    picture += np.random.default_rng(0).uniform(-0.05, 0.05, picture.shape)
+    floor = from_picture(picture, {"lawn": "#007000", "brick": "#e00000"}, 0.1, (1.0, 2.0))
+    assert floor.surface_at(1.3, 2.35) == "lawn"
+    assert floor.surface_at(1.3, 2.05) == "brick"
+    imsave(tmp_path / "top.png", np.clip(picture, 0, 1))
+    (tmp_path / "site.toml").write_text(
+        'schema = "slipid.map/1"\npicture = "top.png"\nmetres_per_pixel = 0.1\n'
+        'corner_m = [1.0, 2.0]\n[colours]\nlawn = "#007000"\nbrick = "#e00000"\n'
+    )
+    np.testing.assert_array_equal(read_map(tmp_path / "site.toml").cells, floor.cells)
+
+
+def test_a_picture_may_be_grey(tmp_path):
+    cv2.imwrite(str(tmp_path / "top.png"), np.array([[0, 255]], np.uint8))
+    (tmp_path / "site.toml").write_text(
+        'schema = "slipid.map/1"\npicture = "top.png"\nmetres_per_pixel = 0.1\n'
+        '[colours]\ndark = "#101010"\nlight = "#f0f0f0"\n'
+    )
+    assert read_map(tmp_path / "site.toml").cells.tolist() == [[0, 1]]
+
+
+def test_a_patchwork_has_patches_of_its_size_and_is_the_same_again():
+    floor = patchwork(["a", "b"], seed=1, patch=0.2)
+    np.testing.assert_array_equal(floor.cells, patchwork(["a", "b"], seed=1, patch=0.2).cells)
+    assert (floor.cells != patchwork(["a", "b"], seed=2, patch=0.2).cells).any()
+    assert set(np.unique(floor.cells)) == {0, 1}
+    # neighbouring patches are alike every second time, so an edge comes every 0.4 m or so
+    edges = np.mean(np.diff(floor.cells, axis=1) != 0) / floor.cell
+    assert 1.0 < edges < 5.0
+
+
+def test_the_four_zones_meet_in_the_middle_of_the_rectangle():
+    floor = four_zones(["a", "b", "c", "d"])
+    around = [floor.surface_at(x, y) for x, y in ((0.1, 0.0), (0.8, 0.0), (0.8, -0.4), (0.1, -0.4))]
+    assert around == ["a", "b", "c", "d"]
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (('schema = "slipid.map/1"', 'schema = "map"'), "schema 'map'; expected 'slipid.map/1'"),
+        (('base = "table"', ""), "base None; expected the surface where no patch lies"),
+        (("extent_m = [0.0, 0.0, 1.0, 1.0]", ""), "extent_m None; expected numbers"),
+        (("[0.0, 0.0, 1.0, 1.0]", "[1.0, 0.0, 0.0, 1.0]"), "expected lowest x, y"),
+        (("cell_m = 0.01", "cell_m = 0"), "cell_m 0.0; expected above 0"),
+        (("cell_m = 0.01", "cells_m = 0.01"), "no such key 'cells_m'; expected one of schema"),
+        (('surface = "gray"', ""), "patch 1 has no surface"),
+        ((", [0.6, 0.6], [0.2, 0.6]]", "]"), "patch 1: 2 corners; expected three or more"),
+        (("[0.2, 0.2], [0.6, 0.2]", '["a", 0.2], [0.6, 0.2]'), "polygon of patch 1"),
+        (("schema", "= ="), "no valid TOML"),
+        (("polygon", "polygn"), "patch 1: no such key 'polygn'"),
+        (("cell_m = 0.01", "cell_m = 0.0001"), "100000000 cells; expected at most"),
+    ],
+)
+def test_what_is_wrong_with_a_map_is_said(tmp_path, change, match):
+    path = tmp_path / "map.toml"
+    path.write_text(GOOD)
+    assert read_map(path).surfaces == ("table", "gray")
+    path.write_text(GOOD.replace(*change))
+    with pytest.raises(DataError, match=match) as error:
+        read_map(path)
+    assert str(path) in str(error.value)
+
+
+def test_absent_and_broken_pictures_are_said(tmp_path):
+    path = tmp_path / "map.toml"
+    with pytest.raises(DataError, match="expected a floor map"):
+        read_map(path)
+    text = 'schema = "slipid.map/1"\npicture = "top.png"\nmetres_per_pixel = 0.1\n'
+    path.write_text(text)
+    with pytest.raises(DataError, match=r"no \[colours\]"):
+        read_map(path)
+    path.write_text(text + '[colours]\na = "red"\n')
+    with pytest.raises(DataError, match="colour of a is 'red'"):
+        read_map(path)
+    path.write_text(text.replace("0.1", "-0.1") + '[colours]\na = "#ff0000"\n')
+    with pytest.raises(DataError, match=r"metres_per_pixel -0\.1; expected"):
+        read_map(path)
+    path.write_text('base = "a"\n' + text + '[colours]\na = "#ff0000"\n')
+    with pytest.raises(DataError, match="base beside picture"):
+        read_map(path)
+    path.write_text(text + '[colours]\na = "#ff0000"\n')
+    with pytest.raises(DataError, match=r"picture .*top\.png"):
+        read_map(path)
+    (tmp_path / "top.png").write_bytes(b"no picture")
+    with pytest.raises(DataError, match="expected a PNG or JPEG"):
+        read_map(path)

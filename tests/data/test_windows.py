@@ -1,0 +1,264 @@
+"""Runs laid end to end and cut into windows: nothing is lost, doubled or invented."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slipid.data.log import Log
+from slipid.data.runs import MOVED, collect, first_row
+from slipid.data.windows import windows
+from slipid.support.errors import DataError
+
+RADIUS = 0.04
+
+
+def run(
+    name="one/exp01.csv",
+    seconds=8.0,
+    wheels=3,
+    start=1.0,
+    command=(0.1, 0.0, 0.0),
+    seed=0,
+    **changes,
+):
+    """A run whose wheels swing after `start` and whose camera repeats a tenth of its frames."""
+    rng = np.random.default_rng(seed)
+    time = 5.0 + np.cumsum(rng.normal(0.031, 0.002, int(seconds / 0.031)).clip(0.02))
+    since = np.maximum(time - time[0] - start, 0.0)
+    rate = np.array([3.0, -2.0, 1.5, 2.5])[:wheels]
+    angle = since[:, None] * rate + 0.2 * np.sin(1.3 * since)[:, None]
+    pose = np.stack([0.1 * since, 0.02 * since, 0.05 * since], axis=1)
+    values = {
+        "name": name,
+        "path": Path(name),
+        "sha256": "0" * 64,
+        "time": time,
+        "wheel_angle": angle,
+        "wheel_speed": None,
+        "wheel_speed_command": None,
+        "twist_command": np.tile(command, (len(time), 1)),
+        "current": rng.normal(0.4, 0.1, (len(time), wheels)),
+        "current_is_signed": True,
+        "voltage": rng.normal(6.0, 0.5, (len(time), wheels)),
+        "duty": None,
+        "bus_voltage": None,
+        "gyro": None,
+        "pose": pose,
+        "pose_fresh": rng.random(len(time)) > 0.1,
+        "surface": "gray",
+        "load": "as_built",
+    }
+    return Log(**(values | changes))
+
+
+@pytest.fixture
+def logs():
+    return [run("a.csv"), run("b.csv", seconds=12.0, seed=1), run("c.csv", seconds=6.0, seed=2)]
+
+
+# laid end to end
+
+
+def test_there_is_one_copy_of_the_samples(logs):
+    data = collect(logs)
+    for k, log in enumerate(data.logs):
+        for name in ("time", "wheel_angle", "pose", "current", "voltage"):
+            whole, part = getattr(data, name), getattr(log, name)
+            assert np.shares_memory(part, whole), name
+            np.testing.assert_array_equal(part, whole[data.rows(k)])
+            np.testing.assert_array_equal(part, getattr(logs[k], name))
+        assert np.shares_memory(log.pose_fresh, data.fresh)
+    assert [data.rows(k).stop - data.rows(k).start for k in range(3)] == [x.samples for x in logs]
+    assert len(data.time) == sum(log.samples for log in logs)
+
+
+def test_a_bridged_stall_leaves_the_log_as_it_was():
+    whole = run()
+    angle = whole.wheel_angle.copy()
+    angle[100:120] = angle[100]
+    stalled = run(wheel_angle=angle)
+    data = collect([stalled, whole])
+    np.testing.assert_array_equal(data.logs[0].wheel_angle, angle)
+    assert not data.live[data.rows(0)][101:120].any()
+    assert data.live[data.rows(1)].all()
+    np.testing.assert_allclose(data.wheel_angle[data.rows(0)], whole.wheel_angle, atol=0.05)
+    again = data.subset([0])
+    np.testing.assert_array_equal(again.live, data.live[data.rows(0)])
+    np.testing.assert_array_equal(again.wheel_angle, data.wheel_angle[data.rows(0)])
+
+
+def test_currents_of_a_stall_are_left_out_of_the_mean():
+    whole = run()
+    angle, current = whole.wheel_angle.copy(), np.full_like(whole.current, 0.5)
+    angle[100:120] = angle[100]
+    current[101:120] = 9.0
+    w = windows(collect([run(wheel_angle=angle, current=current)]), RADIUS)
+    np.testing.assert_allclose(w.current, 0.5, atol=1e-12)
+
+
+def test_a_subset_keeps_the_order_and_the_sessions(logs):
+    data = collect(logs, session=lambda log: log.name.upper())
+    part = data.subset([2, 0])
+    assert [log.name for log in part.logs] == ["c.csv", "a.csv"]
+    assert part.session == ("C.CSV", "A.CSV")
+    np.testing.assert_array_equal(part.pose, np.concatenate([logs[2].pose, logs[0].pose]))
+
+
+def test_heading_and_speed_are_those_of_the_command():
+    data = collect(
+        [run(command=(0.0, -0.2, 0.0)), run(command=(0.0, 0.0, 0.5)), run(twist_command=None)]
+    )
+    assert data.heading[0] == pytest.approx(-np.pi / 2)
+    assert data.speed[0] == pytest.approx(0.2)
+    assert np.isnan(data.heading[1:]).all()
+    assert np.isnan(data.speed[2])
+    assert data.session[0] == "gray/as_built/0.20"
+    assert data.session[2] == "gray/as_built"
+
+
+def test_a_channel_that_one_run_lacks_is_missing():
+    data = collect([run(), run(voltage=None)])
+    assert data.voltage is None
+    assert data.current is not None
+    w = windows(data, RADIUS)
+    assert w.has_current
+    assert not w.has_voltage
+    assert (w.voltage == 0).all()
+
+
+# windows
+
+
+@pytest.mark.parametrize("per_piece", [1, 4, 7])
+@pytest.mark.parametrize("longest", [0.4, 1.3, 6.0, np.inf])
+def test_windows_partition_every_run_from_where_it_moves(logs, per_piece, longest):
+    data = collect(logs)
+    w = windows(data, RADIUS, per_piece=per_piece, longest=longest)
+    assert w.dt.shape == (len(w), per_piece)
+    assert (w.dt > 0).all()
+    for k, log in enumerate(data.logs):
+        mine = np.flatnonzero(w.run == k)
+        fresh = np.flatnonzero(log.pose_fresh)
+        first = fresh[fresh >= first_row(data, k, RADIUS)][0]
+        assert w.dt[mine].sum() == pytest.approx(log.time[fresh[-1]] - log.time[first], abs=1e-9)
+        turned = log.wheel_angle[fresh[-1]] - log.wheel_angle[first]
+        np.testing.assert_allclose(w.turn[mine].sum(axis=(0, 1)), turned, atol=1e-9)
+        np.testing.assert_array_equal(w.pose[mine[0], 0], log.pose[first])
+        np.testing.assert_array_equal(w.pose[mine[-1], -1], log.pose[fresh[-1]])
+        np.testing.assert_array_equal(w.pose[mine[:-1], -1], w.pose[mine[1:], 0])
+        assert w.dt[mine].max() <= longest + 0.2  # edges lie on camera frames
+
+
+def test_edges_lie_on_new_camera_frames(logs):
+    data = collect(logs)
+    w = windows(data, RADIUS)
+    for piece, edges in zip(w.run, w.pose, strict=True):
+        log = data.logs[piece]
+        for pose in edges:
+            row = np.flatnonzero((log.pose == pose).all(axis=1))
+            assert log.pose_fresh[row].all()
+
+
+def test_only_long_runs_are_cut_in_pieces():
+    w = windows(collect([run("short", seconds=10.0), run("long", seconds=60.0)]), RADIUS)
+    assert (w.run == 0).sum() == 1
+    assert (w.run == 1).sum() == 3  # 59 s in pieces of at most 4 times 6 s
+    assert w.surface == ("gray",) * 4
+    assert w.session == ("gray/as_built/0.10",) * 4
+
+
+def turn_per_lag(data, lag, small):
+    less, more = (windows(data, RADIUS, lag=lag + d).turn for d in (-small, small))
+    return (more - less) / (2 * small)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.056])
+def test_faster_is_the_derivative_by_the_lag(logs, lag):
+    data = collect(logs)
+    w = windows(data, RADIUS, lag=lag)
+    # a secant over the 0.16 s in which speeds are taken, but for the end of the run
+    secant = turn_per_lag(data, lag, 0.08)[:, :-1]
+    np.testing.assert_allclose(-w.faster[:, :-1], secant, atol=1e-9)
+    assert np.abs(secant).max() > 0.05
+    # the derivative itself where the wheels swing smoothly, away from start and end
+    slope = turn_per_lag(data, lag, 0.02)[:, 1:-1]
+    np.testing.assert_allclose(-w.faster[:, 1:-1], slope, atol=0.02 * np.abs(slope).max())
+    assert np.abs(slope).max() > 0.05
+
+
+def test_lag_shifts_the_wheels_and_not_the_poses(logs):
+    data = collect(logs)
+    w = windows(data, RADIUS, lag=0.1)
+    log = data.logs[0]
+    at = np.array([log.time[(log.pose == p).all(axis=1)][0] for p in w.pose[0]]) - 0.1
+    phi = np.stack([np.interp(at, log.time, log.wheel_angle[:, k]) for k in range(3)], axis=1)
+    np.testing.assert_allclose(w.turn[0], np.diff(phi, axis=0), atol=1e-12)
+
+
+def test_means_and_their_variance_are_those_of_the_rows():
+    data = collect([run(pose_fresh=None)])
+    log = data.logs[0]
+    w = windows(data, RADIUS, per_piece=2)
+    edges = [np.flatnonzero((log.pose == p).all(axis=1))[0] for p in w.pose[0]]
+    for k, (a, b) in enumerate(pairwise(edges)):
+        np.testing.assert_allclose(w.current[0, k], log.current[a:b].mean(axis=0), rtol=1e-9)
+        np.testing.assert_allclose(w.voltage[0, k], log.voltage[a:b].mean(axis=0), rtol=1e-9)
+        expected = log.current[a:b].var(axis=0) / (b - a)
+        np.testing.assert_allclose(w.current_var[0, k], expected, rtol=1e-7)
+
+
+def test_unsigned_currents_are_averaged_as_magnitudes():
+    signed = run()
+    flipped = run(
+        current=signed.current * np.where(np.arange(3) == 1, -1.0, 1.0), current_is_signed=False
+    )
+    w, v = windows(collect([signed]), RADIUS), windows(collect([flipped]), RADIUS)
+    assert w.current_is_signed
+    assert not v.current_is_signed
+    both = windows(collect([run(current=np.abs(signed.current), current_is_signed=False)]), RADIUS)
+    np.testing.assert_allclose(v.current, both.current, rtol=1e-12)
+
+
+def test_motion_starts_where_the_fastest_rim_has_moved():
+    data = collect([run(start=2.0)])
+    row = first_row(data, 0, RADIUS)
+    moved = RADIUS * np.abs(data.wheel_angle - data.wheel_angle[0]).max(axis=1)
+    assert moved[row] >= MOVED > moved[row - 1]
+    assert data.time[row] - data.time[0] > 2.0
+
+
+# refusals
+
+
+def test_no_runs_are_refused():
+    with pytest.raises(DataError, match="no runs; expected at least one log"):
+        collect([])
+
+
+def test_different_robots_are_refused():
+    with pytest.raises(DataError, match=r"b\.csv: 4 wheels; expected 3, as in a\.csv"):
+        collect([run("a.csv"), run("b.csv", wheels=4)])
+
+
+def test_runs_without_poses_are_refused():
+    with pytest.raises(DataError, match=r"b\.csv: no pose; expected camera columns"):
+        collect([run("a.csv"), run("b.csv", pose=None, pose_fresh=None)])
+
+
+def test_a_robot_that_stands_is_refused():
+    data = collect([run("a.csv"), run("still.csv", start=100.0)])
+    with pytest.raises(DataError, match=r"still\.csv: no wheel moves 10 mm; expected a run"):
+        windows(data, RADIUS)
+
+
+def test_a_run_with_too_few_frames_is_refused():
+    few = run("blind.csv")
+    fresh = np.zeros(few.samples, bool)
+    fresh[-4:] = True
+    data = collect([run(pose_fresh=None), run("blind.csv", pose_fresh=fresh)])
+    with pytest.raises(DataError, match=r"blind\.csv: 4 camera frames .*; expected at least 5"):
+        windows(data, RADIUS)

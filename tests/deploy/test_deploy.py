@@ -1,0 +1,121 @@
+"""From a fit and its posterior to robot.json, and from there to the twin: one set of numbers."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from slipid.cli.demo import packaged_config
+from slipid.cli.main import app
+from slipid.control.deployed import DeployedRobot
+from slipid.control.interface import MIXED, Settings
+from slipid.deploy.deploy import DRAWS, deploy, read_robot, write_robot
+from slipid.deploy.tune import robots_of
+from slipid.identify.fit_file import load
+from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
+from slipid.support.errors import DataError
+
+DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
+FEW = ("--draws", "20", "--most", "24", "--block", "2", "--quiet")
+pytestmark = pytest.mark.slow  # a fit
+
+
+def invoke(*words: object):
+    return CliRunner().invoke(app, [str(w) for w in words])
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory) -> Path:
+    """A folder that `slipid identify` wrote."""
+    folder = tmp_path_factory.mktemp("fitted")
+    robot = truth(DRIVES)
+    write_logs(make_logs(robot, DRIVES, 1, Sensors()), robot, folder / "logs", folder / "t")
+    (folder / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
+    args = ("--data", folder / "logs", "--out", folder / "out")
+    done = invoke("identify", folder / "my.toml", *args)
+    assert done.exit_code in (0, 1), done.stderr
+    return folder / "out"
+
+
+def agree(out: Path) -> DeployedRobot:
+    """The robot of a folder, every number of it that of identified.json."""
+    robot = read_robot(out)
+    said = json.loads((out / "identified.json").read_text())["parameters"]
+    kept = json.loads((out / "robot.json").read_text())["parameters"]
+    assert {path for path in said if not path.startswith("camera.")} == set(kept)
+    for path, number in kept.items():
+        assert {key: said[path][key] for key in number} == number
+    numbers = robot.record.parameters
+    assert float(robot.motor.resistance) == numbers["motor.resistance"].value
+    assert tuple(robot.rest.tolist()) == numbers["robot.load_share@as_built"].value
+    assert (out / "robot.json").stat().st_size < 300_000
+    return robot
+
+
+def test_a_fit_writes_its_robot(fitted):
+    robot, fit = agree(fitted), load(fitted)
+    record = robot.record
+    assert record.source == "laplace"
+    assert record.data == fit.data_hash
+    assert record.drawn == DRAWS
+    assert record.messages == fit.messages
+    assert record.floors[0].seen.runs == len(DRIVES)
+    assert record.floors[0].process[0] == pytest.approx(fit.variance["process.soft.along"] ** 0.5)
+    assert Settings.of(robot).current_is_signed == fit.settings["current_is_signed"]
+    assert Settings.of(robot).alike == Settings().alike != MIXED
+    free = {path for path in fit.space.place if not path.startswith("camera.")}
+    assert set(record.draws) == free
+    again = deploy(fit)
+    assert again.record == record
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(robot), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_draws_to_search_with_and_to_judge_on_are_different_ones(fitted):
+    robot = read_robot(fitted)
+    tried, fresh = (x.floors.friction for x in robots_of(robot, 3))
+    assert not set(np.ravel(tried).tolist()) & set(np.ravel(fresh).tolist())
+    np.testing.assert_array_equal(robots_of(robot, 3)[0].floors.friction, tried)
+
+
+def test_after_sampling_no_two_files_disagree(fitted, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(fitted, out)
+    before = read_robot(out).record
+    done = invoke("sample", out, *FEW)
+    assert done.exit_code == 1, done.output  # far too few steps
+    record = agree(out).record
+    assert record.source == "posterior"
+    assert record.parameters["surface.soft.creep"].source == "posterior"
+    assert record.numbers != before.numbers
+    assert any("did not converge" in said for said in record.messages)
+    assert len(set(record.draws["surface.soft.creep"])) > DRAWS // 4
+
+
+def test_gains_outlive_the_same_numbers_and_no_others(fitted, tmp_path):
+    out, fit = tmp_path / "out", load(fitted)
+    shutil.copytree(fitted, out)
+    done = invoke("tune", out, "--method", "pso", "--rollouts", "480", "--quiet")
+    assert done.exit_code in (0, 1), done.output
+    kept, tuned = json.loads((out / "gains.json").read_text()), agree(out).record
+    for name, gain in kept["gains"].items():
+        assert getattr(tuned.gains.values, name).value == gain["value"]
+    assert kept["fit"] == {"data": fit.data_hash, "numbers": tuned.numbers}
+    assert (tuned.gains.verdict == "no worse than by hand") == (done.exit_code == 0)
+    write_robot(out, fit)
+    assert read_robot(out).record == tuned
+    done = invoke("trial", out, "--plant", "twin", "--starts", 1, "--controllers", "encoder")
+    assert done.exit_code == 0, done.output
+    said = json.loads((out / "trial.json").read_text())["gains"]
+    assert said == {name: gain["value"] for name, gain in kept["gains"].items()}
+
+
+def test_a_folder_without_a_robot_says_what_to_run(tmp_path):
+    with pytest.raises(DataError, match=r"robot\.json: not there; `slipid identify` writes it"):
+        read_robot(tmp_path)

@@ -1,0 +1,350 @@
+"""Paths, metrics and the trial command."""
+
+import json
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from slipid.control import closed_loop
+from slipid.control import trajectory as reference
+from slipid.control.controller import Controller, Gains
+from slipid.control.deployed import DeployedRobot
+from slipid.control.estimator import Estimator
+from slipid.control.interface import Measurement
+from slipid.control.odometry import Odometry
+from slipid.control.pilot import Pilot
+from slipid.control.robot_file.gains_record import GainRecord, GainsRecord, GainValues, Losses
+from slipid.data.floor_map import four_zones, uniform
+from slipid.deploy import trial as tr
+from slipid.deploy.controllers import ROWS, gains_of, pilot_of
+from slipid.deploy.deploy import deploy_known
+from slipid.deploy.plants import SitePlant, floor_of
+from slipid.deploy.trial_site import known_to_site, starts
+from slipid.deploy.trial_summary import Run, summaries
+from slipid.model.geometry import omni
+from slipid.model.robot import build
+from slipid.support.errors import DataError
+from slipid.testsite.driving import Site
+from slipid.testsite.live import Live
+
+
+@pytest.fixture(scope="module")
+def deployed():
+    robot = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"])
+    return deploy_known(robot, highest_speed=7.5)
+
+
+def test_the_rectangle_is_that_of_the_paper_and_stops_at_its_corners():
+    path = reference.rectangle()
+    rows = np.asarray(path.rows)
+    length = np.hypot(*np.diff(rows[:, :2], axis=0).T).sum()
+    assert length == pytest.approx(2 * (0.9 + 0.4), abs=1e-3)
+    corners = np.asarray([np.asarray(path.at(t)) for t in np.asarray(path.marks)])
+    np.testing.assert_allclose(
+        corners[:, :2], [[0.9, 0], [0.9, -0.4], [0, -0.4], [0, 0]], atol=1e-9
+    )
+    np.testing.assert_allclose(corners[:, 3:], 0.0, atol=1e-9)
+    # rates are the derivatives of places
+    np.testing.assert_allclose(
+        np.gradient(rows[:, :2], reference.STEP, axis=0)[5:-5], rows[5:-5, 3:5], atol=0.011
+    )
+    assert np.hypot(rows[:, 3], rows[:, 4]).max() <= 0.2 + 1e-9
+
+
+def test_a_path_moved_to_a_start_has_its_shape():
+    start = (0.3, -0.2, 2.0)
+    path = reference.rectangle()
+    moved = path.moved(start)
+    c, s = np.cos(2.0), np.sin(2.0)
+    back = (np.asarray(moved.rows)[:, :2] - start[:2]) @ np.array([[c, -s], [s, c]])
+    np.testing.assert_allclose(back, np.asarray(path.rows)[:, :2], atol=1e-12)
+    assert np.asarray(moved.rows)[0, 2] == pytest.approx(2.0)
+
+
+def test_a_path_waits_for_a_robot_that_lags_and_not_for_one_that_is_ahead():
+    path = reference.waypoints([(0.0, 0.0), (1.0, 0.0)], pause=0.0)
+    now = jnp.asarray(2.0)
+    here = np.asarray(path.at(2.0))
+    on, rates = path.follow(now, jnp.asarray(here[:3]), 0.05)
+    assert float(on) == pytest.approx(2.05)
+    assert float(rates[3]) == pytest.approx(0.2)
+    far_behind = here[:3] - [0.2, 0.0, 0.0]
+    stays, rates = path.follow(now, jnp.asarray(far_behind), 0.05)
+    assert float(stays) == pytest.approx(2.0)
+    np.testing.assert_allclose(rates[3:], 0.0)
+    ahead, _ = path.follow(now, jnp.asarray(here[:3] + np.array([0.2, 0.0, 0.0])), 0.05)
+    assert float(ahead) == pytest.approx(2.05)
+
+
+def test_a_preview_is_of_the_rates_alone():
+    path = reference.waypoints([(0.0, 0.0), (1.0, 0.0)], pause=0.0)
+    now = jnp.asarray(path.duration - 0.35)  # it brakes for 0.4 s
+    _, plain = path.follow(now, path.at(now)[:3], 0.05)
+    _, early = path.follow(now, path.at(now)[:3], 0.05, 0.2)
+    np.testing.assert_array_equal(early[:3], plain[:3])
+    assert float(plain[3] - early[3]) == pytest.approx(0.5 * 0.2)
+
+
+def test_way_points_are_refused_with_the_reason():
+    with pytest.raises(ValueError, match="two or more places"):
+        reference.waypoints([(0.0, 0.0)])
+    with pytest.raises(ValueError, match="expected both positive"):
+        reference.rectangle(speed=-0.2)
+    with pytest.raises(ValueError, match="twice in a row"):
+        reference.waypoints([(0.0, 0.0), (0.0, 0.0)])
+
+
+@pytest.mark.parametrize("turning", [False, True])
+def test_smooth_paths_close(turning):
+    for path in (reference.circle(0.3, turning=turning), reference.figure_eight(turning=turning)):
+        rows = np.asarray(path.rows)
+        np.testing.assert_allclose(rows[-1, :2], rows[0, :2], atol=2e-3)
+        assert np.hypot(rows[:, 3], rows[:, 4]).max() < 0.25
+
+
+class Perfect:
+    """A plant without slip, whose wheels turn as they are told, some periods later."""
+
+    def __init__(self, robot, start, travelled=1.0, late=0):
+        self.robot, self._pose, self.travelled = robot, np.array(start, float), travelled
+        self.angle = np.zeros(3)
+        self.waiting = [np.zeros(3)] * late
+
+    @property
+    def pose(self):
+        return tuple(float(v) for v in self._pose)
+
+    def reset(self):
+        return self.step(np.zeros(3))
+
+    def step(self, wheel_speed):
+        self.waiting = [*self.waiting, np.asarray(wheel_speed)]
+        wheel_speed = self.waiting.pop(0)
+        self.angle = self.angle + np.asarray(wheel_speed) * closed_loop.PERIOD
+        v = np.asarray(self.robot.inverse) @ np.asarray(wheel_speed) * 0.04 * closed_loop.PERIOD
+        v = v * [self.travelled, self.travelled, 1.0]
+        c, s = np.cos(self._pose[2]), np.sin(self._pose[2])
+        self._pose += [c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]]
+        return Measurement(wheel_angle=self.angle, current=np.full(3, 0.5))
+
+
+def pilot(deployed, preview=0.0):
+    gains = replace(Gains(), preview=jnp.asarray(preview))
+    return Pilot(Odometry(deployed), Controller(deployed, gains))
+
+
+def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(deployed):
+    start = (0.2, 0.1, -1.0)
+    path = reference.rectangle().moved(start)
+    course = closed_loop.drive(pilot(deployed), path, Perfect(deployed, start), start)
+    found = closed_loop.metrics(course)
+    assert found.finished
+    assert found.closure_mm < 5
+    assert found.cross_track_rmse_mm < 10
+    assert found.energy_j is None  # this plant does not know
+    assert np.abs(found.along_track_mm).max() < 10
+    assert abs(found.heading_error_deg) < 0.5
+    assert found.path_length_mm == pytest.approx(2600, rel=0.03)
+
+
+def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
+    start, path = (0.0, 0.0, 0.0), reference.waypoints([(0.0, 0.0), (0.9, 0.0)])
+    far = []
+    for preview in (0.0, 0.2):
+        plant = Perfect(deployed, start, late=4)
+        far.append(closed_loop.drive(pilot(deployed, preview), path, plant, start).pose[:, 0].max())
+    assert far[0] > 0.92  # four periods at 0.2 m/s too far
+    assert far[1] < 0.905
+
+
+def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
+    start = (0.0, 0.0, 0.0)
+    path = reference.rectangle()
+    course = closed_loop.drive(pilot(deployed), path, Perfect(deployed, start, 0.8), start)
+    found = closed_loop.metrics(course)
+    assert found.along_track_mm[0] == pytest.approx(-180, abs=12)
+    assert found.along_track_mm[1] == pytest.approx(-80, abs=12)
+    assert found.closure_mm < 12  # every side is as short as its opposite
+    assert found.cross_track_rmse_mm > 30
+
+
+def test_a_robot_that_does_not_move_has_its_whole_way_left(deployed):
+    path = reference.rectangle()
+    plant = Perfect(deployed, (0.0, 0.0, 0.0), 0.0)
+    course = closed_loop.drive(pilot(deployed), path, plant, (0.0, 0.0, 0.0))
+    assert closed_loop.metrics(course).closure_mm < 5  # its encoders say that it has arrived
+    course = replace(course, own=np.zeros_like(course.own))
+    found = closed_loop.metrics(course)
+    assert not found.finished
+    assert found.closure_mm == pytest.approx(2600, abs=1)
+
+
+def test_the_distance_from_a_path_is_from_its_line():
+    line = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    places = np.array([[0.37, 0.2], [1.3, 0.63], [1.3, 1.4], [0.5, 0.0]])
+    np.testing.assert_allclose(
+        closed_loop._from_line(places, line), [0.2, 0.3, 0.5, 0.0], atol=1e-12
+    )
+
+
+def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
+    tuned = Gains.at(np.arange(6) + 0.25)
+    for name, row in ROWS.items():
+        found = pilot_of(deployed, row, tuned).controller.gains
+        expected = tuned if row.tuned else Gains()
+        if name == "contact_ahead":
+            expected = replace(expected, ahead=jnp.asarray(1.0))
+        if row.observer != "contact":
+            expected = replace(expected, preview=jnp.asarray(0.0))
+        assert values(found) == values(expected)
+
+
+def test_starts_are_spread_and_the_same_for_everyone():
+    floor = uniform("firm", 2.0)
+    every = starts(20, floor)
+    assert every == starts(20, floor)
+    headings = np.sort([s[2] for s in every])
+    assert np.diff(headings).max() < 2 * 2 * np.pi / 20
+    middles = []
+    for x, y, h in every:
+        c, s = np.cos(h), np.sin(h)
+        middles.append((x + 0.45 * c + 0.2 * s, y + 0.45 * s - 0.2 * c))
+    assert np.abs(middles).max() <= 1.2 + 1e-9
+    assert np.std(middles, axis=0).min() > 0.4
+
+
+def test_a_robot_can_be_told_which_floors_there_are(deployed):
+    a, b = deployed.labels
+    only = deployed.on(b)
+    assert only.labels == (b,)
+    assert float(only.floors.friction[0]) == float(deployed.floors.friction[1])
+    assert deployed.on(b, a).on(a).current_std == deployed.current_std[0]
+    rim = jnp.asarray([3.0, -5.0, 2.0])
+    assert only.record.labels == (b,)
+    assert not any(path.startswith(f"surface.{a}") for path in only.record.parameters)
+    alone, _ = Estimator(only).floors.solve(jnp.zeros((1, 3)), rim)
+    every, _ = Estimator(deployed).floors.solve(jnp.zeros((8, 3)), rim)
+    np.testing.assert_allclose(alone[0], every[-1], atol=1e-6)
+    with pytest.raises(ValueError, match=f"no floor 'ice'; identified: {a}, {b}"):
+        deployed.on("ice")
+    for wrong in ((), (a, a)):
+        with pytest.raises(ValueError, match=f"expected each once of {a}, {b}"):
+            deployed.on(*wrong)
+
+
+def test_a_map_is_looked_up_under_the_wheels(deployed):
+    floor = four_zones(["firm", "soft", "firm", "soft"], middle=(0.0, 0.0))
+    lookup = floor_of(floor, ("firm", "soft"))
+    pose = jnp.asarray([0.02, -0.01, 0.7])
+    under = np.asarray(lookup.under(pose, deployed.places))
+    c, s = np.cos(0.7), np.sin(0.7)
+    turned = np.asarray(deployed.places) @ np.array([[c, s], [-s, c]]) + [0.02, -0.01]
+    names = [("firm", "soft")[k] for k in under]
+    assert names == [floor.surface_at(float(x), float(y)) for x, y in turned]
+    assert len(set(names)) == 2
+
+
+def test_what_a_trial_cannot_do_is_said(tmp_path):
+    with pytest.raises(DataError, match="expected testsite or twin"):
+        tr._jobs(tmp_path, tr.Wish(plant="moon"))
+    with pytest.raises(DataError, match="no controller 'magic'; expected some of encoder"):
+        tr._jobs(tmp_path, tr.Wish(controllers=("magic",)))
+    with pytest.raises(DataError, match="has no surface 'gray'; it has firm"):
+        known_to_site(uniform("gray"), "as_built", 3)
+    with pytest.raises(DataError, match="no load set-up 'far'; it has as_built"):
+        known_to_site(uniform("firm"), "far", 3)
+    with pytest.raises(DataError, match="has 3 wheels, the fit's 4"):
+        known_to_site(uniform("firm"), "as_built", 4)
+    with pytest.raises(DataError, match="no controller; expected some of encoder"):
+        tr._jobs(tmp_path, tr.Wish(controllers=tr.names_of(",")))
+    assert tr.names_of("contact, encoder,contact") == ("contact", "encoder")
+    with pytest.raises(DataError, match=r"robot\.json: not there; `slipid identify` writes it"):
+        tr._jobs(tmp_path, tr.Wish())
+
+
+def values(gains):
+    return [float(x) for x in jax.tree.leaves(gains)]
+
+
+def tuned_for(load):
+    values = GainValues(*(GainRecord(k + 0.5, "1", 0.1) for k in range(6)))
+    losses = Losses(hand=2.0, tuned=1.0)
+    return GainsRecord(values, load, False, "pso", losses, 0.9, 0.01, "no worse than by hand")
+
+
+def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
+    assert values(gains_of(tmp_path, deployed)) == values(Gains())
+    tuned = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
+    assert values(gains_of(tmp_path, tuned)) == [k + 0.5 for k in range(6)]
+    assert values(Controller(tuned).gains) == [k + 0.5 for k in range(6)]
+    other = DeployedRobot.of(replace(deployed.record, gains=tuned_for("far")))
+    assert values(Controller(other).gains) == values(Gains())
+    with pytest.raises(DataError, match=r"another load set-up \(far\); run slipid tune again with"):
+        gains_of(tmp_path, other)
+    (tmp_path / "gains.json").write_text("{}")
+    with pytest.raises(DataError, match="tuned for another fit; run slipid tune again, or remove"):
+        gains_of(tmp_path, deployed)
+
+
+def test_the_summary_is_of_medians_over_starts_with_intervals():
+    rng = np.random.default_rng(0)
+
+    def run(name, k, closure):
+        metrics = closed_loop.Metrics(
+            along_track_mm=(-90.0 * (1 + 0.1 * k), 0.0, 0.0, 0.0),
+            closure_mm=closure,
+            cross_track_rmse_mm=closure / 2,
+            heading_error_deg=-3.0,
+            path_length_mm=2500.0,
+            energy_j=None if name == "contact" else 10.0,
+            effort=0.1,
+            seconds=19.0,
+            finished=True,
+        )
+        made = Run(name, (0.0, 0.0, 0.1), k, metrics, 1.0)
+        assert Run.of(json.loads(json.dumps(made.to_json()))) == made
+        return made
+
+    base = rng.uniform(100, 200, 20)
+    runs = [run("encoder", k, b) for k, b in enumerate(base)]
+    runs += [run("contact", k, 0.4 * b) for k, b in enumerate(base)]
+    found = {name: row.to_json() for name, row in summaries(runs).items()}
+    assert found["encoder"]["closure_error_median"] == pytest.approx(np.median(base))
+    assert found["encoder"]["heading_error_deg"] == 3.0
+    assert "energy_j" in found["encoder"]
+    assert "energy_j" not in found["contact"]
+    ratio = found["contact"]["to_encoder"]["closure_error_median"]
+    assert ratio["value"] == pytest.approx(0.4)
+    assert ratio["interval90"] == pytest.approx([0.4, 0.4])
+    low, high = found["encoder"]["interval90"]["closure_error_median"]
+    assert low < np.median(base) < high
+
+
+def test_live_readings_are_as_the_sensors_log_them():
+    site = Site()
+    live = Live(site, uniform("firm"), "as_built", (0.0, 0.0, 0.0), seed=1)
+    forward = site.machine.wheel_from_twist @ np.array([0.2, 0.0, 0.0])
+    for _ in range(20):
+        reading = live.step(forward)
+    tick = 2 * np.pi / (2000 * 16)
+    np.testing.assert_allclose(
+        reading.wheel_angle / tick, np.round(reading.wheel_angle / tick), atol=1e-6
+    )
+    assert (reading.current >= 0).all()  # magnitudes
+    assert np.isnan(reading.gyro)
+    assert live.plant.time == pytest.approx(20 * live.period)
+    assert live.pose[0] > 0.1  # a delay and a slew, then 0.2 m/s
+
+
+def test_a_plant_that_is_reset_starts_anew():
+    plant = SitePlant(uniform("firm"), "as_built", (0.2, 0.1, 0.3), 1, gyro=True)
+    first = jax.tree.leaves(plant.reset())
+    begin = plant.pose
+    for _ in range(10):
+        plant.step(np.full(3, 3.0))
+    assert plant.pose != begin
+    np.testing.assert_array_equal(np.hstack(jax.tree.leaves(plant.reset())), np.hstack(first))
+    assert plant.pose == begin

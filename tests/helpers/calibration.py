@@ -1,0 +1,172 @@
+"""Made experiments whose truths come from the fit's own prior: do intervals hold what they say?
+
+The noise is what the likelihood says it is, run effects and heavy tails included, so that draws of
+a right posterior have ranks of the truth that are uniform (Talts et al. 2018, arXiv:1804.06788).
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import binom
+
+from slipid.identify.compare.open_loop import chain, corrected
+from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit.optimise import optimise
+from slipid.identify.fit.problem import DEGREES, VARIANCE_SPREAD, Problem
+from slipid.identify.posterior import sample as posterior
+from slipid.identify.posterior.blocks import Plan
+from slipid.identify.posterior.coordinates import Fitted
+from slipid.parameter import Choice
+from tests.helpers.made_windows import made, robot
+
+PLAN = Plan(ensembles=2, walkers=16, block=10, warm_up=(2, 4, 6, 8), most=14)
+DRAWS = 50
+"""Of each of the plan's ensembles."""
+CENTRE = {
+    "surface.*.creep": 0.2,
+    "surface.*.roller_drag": 0.2,
+    "surface.*.friction": 0.3,
+    "motor.resistance": 5.0,
+    "motor.back_emf": 0.05,
+}
+CHOICES = [
+    Choice("*", free=False),
+    *(Choice(path, prior_mean=x, prior_std=0.4 * x) for path, x in CENTRE.items()),
+    Choice("robot.load_share@*", free=True),
+    Choice("camera.scale", prior_mean=1.1, prior_std=0.01),
+    Choice("camera.marker_yaw", prior_mean=0.0, prior_std=0.05),
+]
+
+
+@dataclass(frozen=True)
+class Replicate:
+    """One made experiment.
+
+    Attributes:
+        names: of the numbers, then of the log variances.
+        truth: of them.
+        draws: of them (ensemble, draw, number).
+        ratio: std of the draws over that of the prior.
+        r_hat: largest of the first stage.
+    """
+
+    names: tuple[str, ...]
+    truth: np.ndarray
+    draws: np.ndarray
+    ratio: np.ndarray
+    r_hat: float
+
+    @property
+    def rank(self) -> np.ndarray:
+        """Part of the draws below the truth."""
+        return (self.draws < self.truth).mean(axis=(0, 1))
+
+    @property
+    def inside(self) -> np.ndarray:
+        """Whether the 90 % interval of the draws holds the truth: 91 of 101 ranks."""
+        return (self.rank >= 0.05) & (self.rank <= 0.95)
+
+
+@functools.cache
+def problem() -> Problem:
+    """What every replicate has in common; its windows say what was driven."""
+    blank = robot()
+    windows = replace(made(blank, runs=48, count=2), current_var=np.full((48, 2, 3), 1e-3))
+    return Problem(windows, blank, CHOICES)
+
+
+def experiment(seed: int) -> tuple[Problem, Fitted, np.ndarray]:
+    """A truth drawn, windows filled and fitted; the truth of numbers and log variances."""
+    rng, common = np.random.default_rng(seed), problem()
+    space, typical = common.space, 2 * np.log(common.noise.typical)
+    z = space.prior_mean + space.prior_std * rng.standard_normal(space.size)
+    log_v = typical + VARIANCE_SPREAD * rng.standard_normal(len(typical))
+    this = common.of(filled(common, z, log_v, rng))
+    optimum = optimise(this)
+    fitted = Fitted(optimum.state.z, np.asarray(optimum.state.log_variance), optimum.covariance)
+    return this, fitted, np.concatenate([z, log_v])
+
+
+def replicate(seed: int, plan: Plan = PLAN) -> Replicate:
+    """An experiment and draws of its posterior."""
+    this, fitted, truth = experiment(seed)
+    space, names = this.space, this.noise.names
+    found = posterior.sample(this, fitted, replace(plan, seed=seed), draws=DRAWS)
+    draws = np.concatenate([found.z, found.log_variance], axis=-1)
+    prior_std = np.concatenate([space.prior_std, np.full(len(names), VARIANCE_SPREAD)])
+    return Replicate(
+        names=(*space.names, *(f"noise.{name}" for name in names)),
+        truth=truth,
+        draws=draws,
+        ratio=draws.std(axis=(0, 1)) / prior_std,
+        r_hat=float(found.diagnosis.r_hat.max()),
+    )
+
+
+def filled(common: Problem, z: np.ndarray, log_v: np.ndarray, rng: np.random.Generator):
+    """The windows as a robot with these numbers gives them, with the likelihood's own noise."""
+    truth, w = common.space.tree(jnp.asarray(z)), common.windows
+    clean, start, amps = (np.asarray(x) for x in _predicted(truth, common.batch))
+    w = replace(w, pose=_logged(truth, start, clean))
+    gap = noise(common.of(w), "motion", log_v, rng).reshape(clean.shape)
+    w = replace(w, pose=_logged(truth, start, clean - gap))
+    this = common.of(w)
+    current = amps - noise(this, "current", log_v, rng).reshape(amps.shape)
+    w = replace(w, current=current, voltage=np.zeros_like(current))
+    volt = common.volt(log_v)
+    batch = lk.batch(w, truth)
+    still = np.asarray(_electric(truth, batch, volt)["voltage"])
+    gap = still - noise(this, "voltage", log_v, rng)
+    spread = np.sqrt(1 + float(truth.motor.resistance) ** 2 * w.current_var / float(volt) ** 2)
+    return replace(w, voltage=gap.reshape(amps.shape) * spread)
+
+
+def noise(this: Problem, block: str, log_v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Residuals of every piece, Student t (piece, m)."""
+    root = np.linalg.cholesky(np.asarray(this.covariance(block, jnp.asarray(log_v))))
+    normal = rng.standard_normal(root.shape[:2])
+    normal *= np.sqrt(DEGREES / rng.chisquare(DEGREES, (len(root), 1)))
+    return np.einsum("nij,nj->ni", root, normal)
+
+
+@jax.jit
+def _predicted(truth, b):
+    p = lk.predict(truth, b)
+    return p.increment, corrected(truth, b.pose)[:, 0], lk.predicted_current(truth, b, p.felt)
+
+
+@jax.jit
+def _electric(truth, b, volt):
+    return lk.electric_residuals(truth, b, lk.predict(truth, b).felt, volt)
+
+
+@jax.jit
+def _logged_of(truth, pose):
+    return jax.vmap(jax.vmap(truth.camera.logged))(pose)
+
+
+def _logged(truth, start, increment):
+    return np.asarray(_logged_of(truth, chain(jnp.asarray(start), jnp.asarray(increment))))
+
+
+def row(found: Replicate) -> dict[str, object]:
+    """What is kept of a replicate, as JSON holds it."""
+    return {
+        "names": list(found.names),
+        "rank": found.rank.tolist(),
+        "inside": found.inside.tolist(),
+        "ratio": found.ratio.tolist(),
+        "r_hat": found.r_hat,
+    }
+
+
+def band(count: int, numbers: int, inside: float = 0.9, sure: float = 0.99) -> tuple[float, float]:
+    """Shares of intervals that hold the truth, in which all of so many numbers are, so surely."""
+    alpha = (1 - sure) / numbers
+    low, high = binom.ppf((alpha / 2, 1 - alpha / 2), count, inside)
+    return float(low) / count, float(high) / count

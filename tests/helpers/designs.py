@@ -1,0 +1,135 @@
+"""Runs chosen from nothing against as many of the 2021 grid, on a robot whose truth is known.
+
+The test fits windows made straight from the model, the benchmark fits whole logs with every trap.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.data.runs import collect
+from slipid.data.windows import windows
+from slipid.identify.compare import open_loop as replay
+from slipid.identify.design import fisher as info
+from slipid.identify.design.planned_runs import (
+    HEADINGS,
+    Drive,
+    candidates,
+    paper_grid,
+    steady_windows,
+)
+from slipid.identify.design.planner import (
+    Channels,
+    Planner,
+    parameter_goal,
+    prediction_goal,
+    weighed,
+)
+from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit import noise as of_noise
+from slipid.identify.fit.optimise import Options, optimise
+from slipid.identify.fit.problem import Problem, State
+from slipid.parameter import Choice
+from slipid.selftest.logs import Sensors, blank, make_logs, truth
+from tests.helpers.made_windows import measure
+
+SETUP = ("soft", "as_built")
+LOAD = "robot.load_share@as_built"
+DISTANCE = 0.7
+SENSORS = Sensors(has_voltage=False)
+ANY = Drive(*SETUP, 0.0, 0.2)
+TRUTH = truth([ANY])
+CHOICES = [
+    Choice("camera.scale", prior_mean=1.117, prior_std=0.002),
+    Choice("camera.lag", prior_mean=0.056, prior_std=0.01),
+    Choice("camera.marker_yaw", free=True),
+    Choice("robot.mass", fixed=12.0),
+    Choice("motor.resistance", fixed=5.5),
+    Choice("motor.back_emf", fixed=0.0514),
+]
+PREDICTED = [
+    Drive(*SETUP, float(np.radians(a)), v, 0.0, DISTANCE) for v in (0.1, 0.2) for a in HEADINGS
+]
+
+
+def std_of(name, rows=40):
+    """True std of a variance component; of the mean of a window of so many rows."""
+    return SENSORS.ripple / np.sqrt(rows) if name.endswith("window") else SENSORS.of(name)
+
+
+@functools.cache
+def planner():
+    names = of_noise.noise(steady_windows([ANY], TRUTH, 4, {}), TRUTH).names
+    return Planner(TRUTH, CHOICES, {n: std_of(n) ** 2 for n in names}, Channels())
+
+
+@dataclass(frozen=True)
+class Plans:
+    """Both plans with what is expected of them: std of load shares and of predictions."""
+
+    drives: dict[str, list[Drive]]
+    expected: dict[str, tuple[float, float]]
+
+
+@functools.cache
+def plans(count):
+    """So many runs chosen from nothing, so many of the grid at random."""
+    this, start = planner(), planner().nothing()
+    offered = candidates([SETUP], {"soft": (0.1, 0.2)}, {"soft": DISTANCE}, 0.125)
+    grid = paper_grid([SETUP], {"soft": DISTANCE})
+    goals = [parameter_goal(this, LOAD), prediction_goal(this, "ends", PREDICTED)]
+    rows, of_grid = this.rows(offered), this.rows(grid)
+    goal = weighed(goals, start.plus(of_grid), [1.0, 1.0])
+    chosen = info.exchanged(start, rows, goal, info.greedy(start, rows, goal, count)[0])
+    dealt = np.random.default_rng(0).permutation(len(grid))[:count]
+    return Plans(
+        {"chosen": [offered[k] for k in chosen], "grid": [grid[k] for k in dealt]},
+        {
+            name: tuple(g.std(start.plus(r)) for g in goals)
+            for name, r in (("chosen", rows.pick(chosen)), ("grid", of_grid.pick(dealt)))
+        },
+    )
+
+
+@functools.cache
+def problem(count):
+    """Compiled for so many runs."""
+    return Problem(steady_windows([ANY] * count, TRUTH, 4, {}), blank([ANY]), CHOICES)
+
+
+def fit_windows(drives, seed):
+    """Fit of windows made from the model, begun at the truth; (z, converged)."""
+    rng = np.random.default_rng(seed)
+    std = {n: std_of(n) for n in problem(len(drives)).noise.names}
+    clean = steady_windows(drives, TRUTH, 4, {})
+    made = measure(TRUTH, clean, rng, {**std, "current": std["current.soft.window"]})
+    this = problem(len(drives)).of(made)
+    log_v = np.log([std[n] ** 2 for n in this.noise.names])
+    begin = State(this.space.vector(TRUTH), log_v, 0, np.inf, np.inf, "joint")
+    end = optimise(this, start=begin, options=Options(most_rounds=15))
+    return end.state.z, end.converged
+
+
+def fit_logs(drives, seed):
+    """Fit of logs with every trap, from the staged start; (z, converged)."""
+    data = collect(make_logs(truth(drives), drives, seed, SENSORS))
+    end = optimise(problem(len(drives)).of(windows(data, 0.04, 0.056)))
+    return end.state.z, end.converged
+
+
+def errors(z):
+    """Real error of the load shares, and of predicted ends over distance, root mean square."""
+    this = planner()
+    found = this.space.tree(jnp.asarray(z))
+    share = np.asarray(found.body.load_share - TRUTH.body.load_share)
+    w = steady_windows(PREDICTED, TRUTH, 4, {})
+    ends = []
+    for robot in (found, this.robot):
+        step = replay.contact_increments(robot, lk.batch(w, robot))
+        ends.append(np.asarray(replay.chain(jnp.zeros((len(w), 3)), step))[:, -1, :2])
+    gap = np.linalg.norm(ends[0] - ends[1], axis=1) / DISTANCE
+    return np.sqrt(np.mean(share**2)), np.sqrt(np.mean(gap**2))

@@ -1,0 +1,20 @@
+"""A reporter that keeps what it is told."""
+
+from __future__ import annotations
+
+from slipid.support.progress import Reporter
+
+
+class Said(Reporter):
+    """Keeps sentences; stages and bars go nowhere.
+
+    Attributes:
+        lines: the sentences.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(quiet=True)
+        self.lines: list[str] = []
+
+    def line(self, text: str) -> None:
+        self.lines.append(text)

@@ -1,0 +1,393 @@
+"""Left-out comparison: densities, errors of differences, verdicts, restarts."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.optimize import brentq
+from scipy.stats import binom, chi2, multivariate_t
+from typer.testing import CliRunner
+
+from slipid.cli.demo import packaged_config
+from slipid.cli.main import app
+from slipid.data.runs import collect
+from slipid.identify.compare import open_loop as replay
+from slipid.identify.compare.folds import folds_of
+from slipid.identify.compare.predictive import contact_of, log_student, slopes, with_noise
+from slipid.identify.compare.ranking import mean_error, ranking
+from slipid.identify.compare.slip_models import rungs
+from slipid.identify.compare.transfer import transfer
+from slipid.identify.compare.validation import Judged, Score
+from slipid.identify.design.planned_runs import Drive
+from slipid.identify.fit.problem import DEGREES, Problem, State
+from slipid.identify.fit.sessions import Linear, shared
+from slipid.job.compare import finished
+from slipid.parameter import Choice
+from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
+from slipid.support.checkpoint import Checkpoint
+from slipid.support.errors import DataError
+from tests.helpers.made_windows import SCALE, made
+from tests.helpers.made_windows import robot as made_robot
+
+ROBOT = made_robot(sessions=("one",))
+ALL = {rung.name: rung for rung in rungs(has_current=True)}
+STD = {
+    "run.along": 0.02,
+    "run.across": 0.02,
+    "run.yaw": 0.05,
+    "process.along": 0.006,
+    "process.across": 0.004,
+    "process.yaw": 0.02,
+    "camera.place": 0.0005,
+    "camera.heading": 0.003,
+}
+HELD = [Choice("camera.scale", fixed=SCALE)]
+
+
+# densities and errors ---------------------------------------------------------------------------
+
+
+def test_the_density_is_that_of_scipy():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(5, 4, 4))
+    scale, gap = root @ root.transpose(0, 2, 1) + np.eye(4), rng.normal(size=(5, 4))
+    oracle = [
+        multivariate_t.logpdf(x, shape=v, df=DEGREES) for x, v in zip(gap, scale, strict=True)
+    ]
+    np.testing.assert_allclose(log_student(gap, scale), oracle, rtol=1e-10)
+
+
+def test_the_error_of_a_paired_difference_is_that_of_a_mean_and_clusters_count_once():
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=40)
+    mean, se, clustered = mean_error(x, np.arange(40))
+    assert (mean, se) == pytest.approx((x.mean(), x.std(ddof=1) / np.sqrt(40)))
+    assert clustered == pytest.approx(se)
+    # the same value three times is one observation
+    again = mean_error(np.repeat(x, 3), np.repeat(np.arange(40), 3))
+    assert again[0] == pytest.approx(mean)
+    assert again[2] == pytest.approx(se)
+    assert again[1] < 0.6 * se
+    assert np.isnan(mean_error(x[:1], np.zeros(1, int))[1])
+
+
+def rows(densities, seed=0):
+    """Rows of 36 headings for models with these log densities per run."""
+    rng = np.random.default_rng(seed)
+    return [
+        Judged(
+            name=f"run{k}",
+            surface="floor",
+            load="as_built",
+            heading_deg=10.0 * k,
+            speed=0.1,
+            chord=0.5,
+            measured_end=(0.5, 0.0, 0.0),
+            models={
+                name: Score(
+                    predicted_end=(0.5, 0.0, 0.0),
+                    endpoint_error=float(rng.uniform(0.01, 0.02)),
+                    length_error=0.01,
+                    heading_error_deg=1.0,
+                    level=float(rng.uniform()),
+                    covered90=True,
+                    energy_score=0.01,
+                    log_density=float(values[k]),
+                )
+                for name, values in densities.items()
+            },
+        )
+        for k in range(36)
+    ]
+
+
+def test_a_judged_run_comes_back_from_its_file():
+    run = rows({"identified": np.arange(36.0)})[3]
+    back = Judged.of_json(json.loads(json.dumps(run.to_json())))
+    assert back.models["identified"].log_density == 3.0
+    assert back.to_json() == json.loads(json.dumps(run.to_json()))
+
+
+def test_a_clear_winner_is_named_and_a_difference_within_its_error_is_not():
+    rng = np.random.default_rng(2)
+    base = rng.normal(30.0, 3.0, 36)
+    told = ranking(
+        rows(
+            {
+                "identified": base,
+                "constant": base - 4.0 + rng.normal(0.0, 1.0, 36),
+                "linear": base + rng.normal(-0.05, 1.0, 36),
+            }
+        )
+    )["floor"]
+    verdicts = {name: one.verdict for name, one in told.models.items()}
+    assert sorted(verdicts.values()) == ["best", "tied", "worse"]
+    assert verdicts["constant"] == "worse"
+    assert "cannot tell contact equilibrium from linear" in told.sentence
+    alone = ranking(rows({"identified": base, "constant": base - 4.0}))["floor"]
+    assert alone.sentence.startswith("floor: contact equilibrium is best; next constant, 4.0")
+
+
+def test_errors_that_neighbouring_headings_share_do_not_make_a_winner():
+    """A difference that is one sector's luck is clear per run and not per sector."""
+    base = np.full(36, 30.0)
+    luck = np.where(np.arange(36) < 9, 1.0, 0.01)
+    one = ranking(rows({"identified": base, "constant": base - luck}))["floor"].models["constant"]
+    assert abs(one.difference) > 2 * one.se
+    assert one.verdict == "tied"
+
+
+# predictive distributions of rungs --------------------------------------------------------------
+
+
+def driven(name, state, seed, runs=96):
+    """Windows whose poses a rung made, with noise of STD, and the same problem's start."""
+    w = made(ROBOT, runs=runs, count=2, seed=seed, voltage=False)
+    amps = np.random.default_rng(seed).uniform(0.1, 2.0, w.current.shape)
+    w = replace(w, current=amps)
+    by_floor = {f: np.asarray(b, float) for f, b in zip(ROBOT.surfaces.labels, state, strict=True)}
+    step = replace(ALL[name], state=by_floor).increments(w, ROBOT)
+    noise = made(ROBOT, runs=runs, count=2, seed=seed, voltage=False, std=STD)
+    still = made(ROBOT, runs=runs, count=2, seed=seed, voltage=False, std={})
+    step = step + increments_of(noise) - increments_of(still)
+    pose = np.array(replay.chain(jnp.asarray(w.pose[:, 0]), jnp.asarray(step)))
+    pose[..., :2] /= SCALE
+    return replace(w, pose=pose)
+
+
+def increments_of(w):
+    from slipid.identify.fit.likelihood import measured
+
+    return np.asarray(measured(ROBOT, jnp.asarray(w.pose)))
+
+
+def judged(w, names):
+    """Rows of the odd runs under rungs fitted to the even ones, at the true camera."""
+    problem = Problem(w, ROBOT, HELD)
+    z = problem.space.vector(ROBOT)
+    start = State(z, 2 * np.log(problem.noise.typical), 0, np.inf, np.inf, "joint")
+    contact = contact_of(problem, start, 1e-12 * np.eye(len(z)))
+    half = w.run // 4 % 2
+    models = [with_noise(ALL[name], contact, (half == 0).astype(float)) for name in names]
+    density = {m.name: m.log_density(problem) for m in models}
+    out = rows({name: values[half == 1] for name, values in density.items()})
+    floors = np.asarray(w.surface)[half == 1]
+    out = [replace(row, surface=str(f)) for row, f in zip(out, floors, strict=False)]
+    return out, dict(zip(names, models, strict=True)), problem, half
+
+
+def width_of_student(m):
+    """Mean of q / m where a Student t's scale was fitted to m Gaussian numbers."""
+
+    def slope(width):
+        def weighed(q):
+            return (DEGREES + m) * width * q / (DEGREES + width * q) * chi2.pdf(q, m)
+
+        return quad(weighed, 0, np.inf)[0] - m
+
+    return brentq(slope, 0.5, 3.0)
+
+
+@pytest.mark.slow
+def test_linear_slip_is_told_from_constant_slip():
+    told, models, problem, half = judged(
+        driven("linear", ([1.0], [3.0]), 3, runs=480), ("encoder", "constant", "linear", "affine")
+    )
+    for floor in ranking(told).values():
+        verdict = {name: one.verdict for name, one in floor.models.items()}
+        assert verdict["encoder"] == verdict["constant"] == "worse"
+        assert "worse" not in (verdict["linear"], verdict["affine"])  # affine contains linear
+    # the distribution of runs it has not seen is as wide as it has to be: as a Student t fitted to
+    # Gaussian gaps is, and 0.13 is three stds of the mean
+    linear = models["linear"]
+    gap, scale = linear.scale(problem)
+    q = np.einsum("ni,ni->n", gap, np.linalg.solve(scale, gap[..., None])[..., 0])[half == 1]
+    assert q.mean() / gap.shape[1] == pytest.approx(width_of_student(gap.shape[1]), abs=0.13)
+    for axis in ("along", "across", "yaw"):
+        found = [np.sqrt(linear.variance[f"run.{f}.{axis}"]) for f in ROBOT.surfaces.labels]
+        np.testing.assert_allclose(found, STD[f"run.{axis}"], rtol=0.25)
+
+
+@pytest.mark.slow
+def test_models_that_say_the_same_cannot_be_told_apart():
+    told, *_ = judged(driven("constant", ([0.1], [0.3]), 4), ("constant", "affine", "quadratic"))
+    for name, floor in ranking(told).items():
+        assert {one.verdict for one in floor.models.values()} <= {"best", "tied"}
+        assert f"{name}: the data cannot tell" in floor.sentence
+
+
+@pytest.mark.parametrize("name", ["affine", "paper", "heading_lookup"])
+def test_slopes_by_a_rungs_numbers_are_those_of_a_step_in_them(name):
+    w = made(ROBOT, runs=24, count=2, seed=5, voltage=False)
+    rung = ALL[name].fit(w, ROBOT)
+    slope = slopes(rung, w, lambda r: r.twist(w, ROBOT))
+    rng = np.random.default_rng(0)
+    step = {key: rng.normal(size=value.shape) for key, value in rung.state.items()}
+    moved = replace(rung, state={key: rung.state[key] + step[key] for key in step})
+    expected = slope @ np.concatenate([v.ravel() for v in step.values()])
+    np.testing.assert_allclose(moved.twist(w, ROBOT) - rung.twist(w, ROBOT), expected, atol=1e-6)
+
+
+# transfer ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("other", [0.1, 0.4])
+def test_a_curve_carries_over_where_floors_share_it_and_nowhere_else(other):
+    w = driven("affine_current", ([0.05, 0.1], [0.05 + other - 0.1, other]), 7)
+    every = transfer(w, ROBOT)["all"]
+    lost = every.pooled.rows / every.per_surface.rows
+    assert lost < 1.05 if other == 0.1 else lost > 1.5
+
+
+# folds, checkpoints, command --------------------------------------------------------------------
+
+PLAN = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
+
+
+@pytest.fixture(scope="module")
+def logs():
+    return make_logs(truth(PLAN), PLAN, 1, Sensors())
+
+
+def test_a_turn_on_the_spot_has_no_speed_to_leave_out(logs):
+    spin = make_logs(truth(PLAN), [Drive("soft", "as_built", 0.0, 0.0, 0.5)], 1, Sensors())
+    fold = folds_of(collect([*logs, *spin]), "speeds")
+    assert sorted(set(fold[:-1])) == [0, 1]
+    assert fold[-1] == -1
+
+
+def test_runs_that_nothing_could_be_fitted_for_are_never_left_out(logs):
+    slow = [log for log in logs if np.hypot(*np.median(log.twist_command, axis=0)[:2]) < 0.2]
+    assert sorted(set(folds_of(collect(logs), "speeds"))) == [0, 1]
+    assert set(folds_of(collect(slow), "speeds")) == {-1}
+    assert set(folds_of(collect([logs[0]]), "sectors")) == {-1}
+    with pytest.raises(DataError, match="expected some of sectors, speeds, random"):
+        folds_of(collect(logs), "luck")
+
+
+def test_a_fold_is_kept_whole_and_only_for_the_job_it_is_of(tmp_path):
+    path = tmp_path / "folds" / "one.json"
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    def again(work, make):
+        return finished(Checkpoint(path.parent, work), path.stem, make)
+
+    with pytest.raises(KeyboardInterrupt):
+        again("a", interrupted)
+    assert not path.exists()
+    value = {"x": np.pi, "rows": [1.0 / 3.0]}
+    assert again("a", lambda: value) == value
+    assert again("a", interrupted) == value
+    assert again("b", lambda: {"x": 1}) == {"x": 1}
+    path.write_text(path.read_text()[:-9])
+    assert again("b", lambda: {"x": 2}) == {"x": 2}
+
+
+@pytest.mark.slow
+def test_compare_goes_on_where_it_was_and_ends_the_same(tmp_path, logs):
+    write_logs(logs, truth(PLAN), tmp_path / "logs", tmp_path / "truth")
+    (tmp_path / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
+    out = tmp_path / "out"
+    words = ("compare", tmp_path / "my.toml", "--data", tmp_path / "logs", "--out", out)
+    words = [str(word) for word in (*words, "--folds", "speeds", "--quiet")]
+    first = CliRunner().invoke(app, words)
+    assert first.exit_code == 0, first.output
+    assert (out / "comparison.png").stat().st_size > 10_000
+    before = json.loads((out / "comparison.json").read_text())
+    floor = before["questions"]["speeds"]["floors"]["soft"]
+    assert floor["runs"] == len(PLAN)
+    assert floor["models"]["identified"]["endpoint_error"] < 0.05
+    assert floor["models"]["encoder"]["verdict"] == "worse"
+    (out / "folds" / "speeds_1.json").unlink()
+    again = CliRunner().invoke(app, [*words, "--json", "-"])
+    after = json.loads(again.stdout)
+    for kept in (before, after):
+        for one in kept["questions"]["speeds"]["cost"].values():
+            del one["fit_s"], one["predict_s"]
+    assert after == before
+
+
+# sessions ---------------------------------------------------------------------------------------
+
+
+def with_sessions(std, seed, session):
+    """A linear model of runs on one floor; what those of one session share has this std."""
+    rng = np.random.default_rng(seed)
+    runs = len(session)
+    effect = np.broadcast_to(np.eye(6, 3), (runs, 6, 3)).copy()
+    effect[:, 3:] = np.eye(3)
+    run, noise = np.array([0.02, 0.02, 0.05]), 0.005
+    slope = rng.normal(size=(runs, 6, 2))
+    each = (
+        rng.normal(size=(runs, 3)) * run + (rng.normal(size=(session.max() + 1, 3)) * std)[session]
+    )
+    gap = np.einsum("nma,na->nm", effect, each) + noise * rng.normal(size=(runs, 6))
+    scale = np.einsum("nma,a,nla->nml", effect, run**2, effect) + noise**2 * np.eye(6)
+    info = np.einsum("nmp,nml,nlq->pq", slope, np.linalg.inv(scale), slope)
+    model = Linear(
+        gap=gap,
+        slope=slope,
+        covariance=np.linalg.inv(info),
+        wide=100.0 * np.eye(2),
+        scale=scale,
+        effect=effect,
+        run=np.broadcast_to(run**2, (runs, 3)).copy(),
+    )
+    w = made(made_robot(floors=("firm",), sessions=("one",)), runs=runs, count=2, voltage=False)
+    return model, replace(w, session=tuple(f"s{k}" for k in session))
+
+
+def test_what_sessions_share_is_found_and_widens_what_was_fitted():
+    std = np.array([0.03, 0.02, 0.08])
+    found = []
+    for seed in range(6):
+        model, w = with_sessions(std, seed, np.arange(80) % 8)
+        variance, covariance = shared(model, w, np.ones(len(w)))
+        found.append(list(variance.values()))
+        assert np.linalg.eigvalsh(covariance - model.covariance).min() > -1e-12
+    # 8 sessions know their std to a quarter, six times as many to a tenth
+    np.testing.assert_allclose(np.sqrt(np.mean(found, axis=0)), std, rtol=0.3)
+
+
+@pytest.mark.slow
+def test_regions_hold_runs_of_other_sessions_as_often_as_they_say():
+    std = np.array([0.03, 0.02, 0.08])
+    # of 40 sessions four runs each are fitted; 200 more have a session of their own each
+    model, w = with_sessions(std, 8, np.append(np.arange(160) % 40, 40 + np.arange(200)))
+    keep, judged = np.arange(360) < 160, np.arange(360) >= 160
+    pull = np.swapaxes(model.slope, 1, 2) @ np.linalg.inv(model.scale)
+    own = np.linalg.inv((pull @ model.slope)[keep].sum(axis=0))
+    z = -own @ (pull @ model.gap[..., None])[keep].sum(axis=0)
+    model = replace(model, covariance=own, gap=model.gap + (model.slope @ z)[..., 0])
+    variance, covariance = shared(model, w, keep.astype(float))
+    e, j = model.effect[judged], model.slope[judged]
+
+    def covered(v, c):
+        """Part of the judged runs in their 90 % regions; all that is drawn is Gaussian."""
+        scale = model.scale[judged] + np.einsum("nma,a,nla->nml", e, v, e)
+        scale += np.einsum("nmp,pq,nlq->nml", j, c, j)
+        gap = model.gap[judged]
+        q = np.einsum("nm,nm->n", gap, np.linalg.solve(scale, gap[..., None])[..., 0])
+        return (chi2.cdf(q, gap.shape[1]) <= 0.9).mean()
+
+    low, high = binom.interval(0.99, 200, 0.9)
+    assert low <= 200 * covered(np.array(list(variance.values())), covariance) <= high
+    assert covered(np.zeros(3), own) < 0.6
+
+
+@pytest.mark.slow
+def test_runs_that_share_nothing_are_left_as_they_are():
+    model, w = with_sessions(0.0, 7, np.arange(240) % 8)
+    variance, covariance = shared(model, w, np.ones(len(w)))
+    assert list(variance) == [f"session.firm.{axis}" for axis in ("along", "across", "yaw")]
+    assert (np.array(list(variance.values())) < 0.1 * model.run[0]).all()
+    np.testing.assert_allclose(covariance, model.covariance, rtol=0.3)
+    alone = replace(w, session=("one",) * len(w))
+    assert shared(model, alone, np.ones(len(w)))[0] == {}

@@ -1,0 +1,41 @@
+"""A short chain of the sampler, both stages, against reviewed numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slipid.identify.posterior import sample as posterior
+from slipid.identify.posterior.blocks import Plan, Record
+from tests.helpers import calibration
+
+PLAN = Plan(ensembles=2, walkers=6, block=4, warm_up=(1, 2), most=3)
+
+
+@pytest.mark.slow
+def test_a_short_chain(golden):
+    """Chains amplify rounding; so few steps do not."""
+    problem, fitted, _ = calibration.experiment(3)
+    blocks = []
+    posterior.sample(
+        problem,
+        fitted,
+        PLAN,
+        draws=10,
+        record=Record(keep=lambda part, block: blocks.append((part, block))),
+    )
+    rows = []
+    for part, block in blocks[:5]:
+        last = np.asarray(block.chain)[:, -1].mean(axis=1)
+        for ensemble, mean in enumerate(last):
+            rows.append(
+                {
+                    "part": part.partition("-")[0],
+                    "block": block.number,
+                    "ensemble": ensemble,
+                    "log_prob": float(block.log_prob[ensemble, -1].mean()),
+                    "accepted": float(block.accepted[ensemble]),
+                }
+                | {f"x{k}": float(v) for k, v in enumerate(mean[:12])}
+            )
+    golden("chain", rows, rtol=1e-4, atol=1e-5)

@@ -1,0 +1,59 @@
+"""Another robot's real logs: geometry found on joystick runs predicts squares and circles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from slipid.identify.compare import open_loop as replay
+from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit.optimise import optimise
+from slipid.identify.result import summarise
+from slipid.job.config import read_config
+from slipid.job.logs import read_dataset
+from slipid.job.problem import read_job
+from slipid.support.progress import Reporter
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "omni3.toml"
+NOMINAL = {"wheel_radius": 0.051, "base_radius": 0.195}
+
+
+def end_errors(robot, data) -> np.ndarray:
+    """Distance between predicted and tracked end, over the length of the tracked path, per run."""
+    out = np.zeros(len(data))
+    for w in replay.cuts(data, robot):
+        step = np.asarray(replay.contact_increments(robot, lk.batch(w, robot)))
+        track = replay.follow(robot, w, step)
+        length = np.linalg.norm(np.diff(track.measured[..., :2], axis=1), axis=-1).sum(axis=1)
+        out[track.run] = np.linalg.norm(track.gap[:, :2], axis=1) / length
+    return out
+
+
+@pytest.mark.slow
+def test_radii_from_joystick_runs_predict_squares_and_circles(real_data):
+    root = real_data / "omni3_optitrack"
+    if not root.is_dir():
+        pytest.skip(f"no logs of the second robot: {root} is no folder")
+    config = read_config(CONFIG)
+    job = read_job(config, root, Reporter(quiet=True))
+    problem = job.problem()
+    fit = summarise(problem, optimise(problem), job.dataset, job.choices)
+    assert fit.converged
+    for name, nominal in NOMINAL.items():
+        found = fit.parameters[f"robot.{name}"]
+        assert found.ratio < 0.35  # two recordings, which do not agree as well as runs of one do
+        assert not found.interval90[0] < nominal < found.interval90[1]
+    unseen, _ = read_dataset(config, config.content.validate_.logs, root, Reporter(quiet=True))
+    nominal = eqx.tree_at(  # as the metadata says, everything else at its start
+        lambda r: (r.geometry.wheel_radius, r.geometry.base_radius),
+        fit.space.template,
+        tuple(jnp.asarray(v) for v in NOMINAL.values()),
+    )
+    before, after = end_errors(nominal, unseen), end_errors(fit.robot, unseen)
+    print("end error over path length, nominal:", before.round(4), "identified:", after.round(4))
+    assert (after < before).all()
+    assert after.mean() < 0.5 * before.mean()

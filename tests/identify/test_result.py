@@ -1,0 +1,470 @@
+"""Verdicts, intervals, flat directions and files of a fit, on made logs with known truth."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import json
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2, lognorm
+from scipy.stats import f as fisher
+
+from slipid.data.runs import collect
+from slipid.data.windows import windows
+from slipid.identify import fit_file
+from slipid.identify.compare.validation import Predictor, validation
+from slipid.identify.fit.optimise import Optimum, one_round
+from slipid.identify.fit.problem import DEGREES, Problem, State
+from slipid.identify.fit_file import identified_json, load, save, to_json
+from slipid.identify.result import Fit, hash_of, summarise
+from slipid.identify.verdicts.estimates import estimates, expected_covariance
+from slipid.identify.verdicts.unidentified import flat_directions
+from slipid.parameter import Choice
+from slipid.selftest.logs import Drive, Sensors, blank, grid, make_logs, truth
+from slipid.support.errors import DataError
+
+pytestmark = pytest.mark.slow  # traces whole fits
+
+DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1,), turns=0)
+TRUTH = truth(DRIVES)
+CHOICES = (
+    Choice("camera.scale", prior_mean=1.117, prior_std=0.002),
+    Choice("camera.lag", prior_mean=0.05, prior_std=0.02),
+    Choice("camera.marker_place", free=True),
+    Choice("robot.mass", fixed=12.0),
+)
+
+
+@functools.cache
+def made(voltage: bool):
+    """A problem, its data, and the Laplace covariance at the truth."""
+    data = collect(make_logs(TRUTH, DRIVES, 1, Sensors(has_voltage=voltage)))
+    problem = Problem(windows(data, 0.04, lag=0.05), blank(DRIVES), list(CHOICES))
+    z = problem.space.vector(TRUTH)
+    state = State(z, 2 * np.log(problem.noise.typical), 7, -1.5, 0.01, "joint")
+    end = Optimum(state, expected_covariance(problem, z), True, "it settled", (3.0, -1.5))
+    return problem, data, end
+
+
+@functools.cache
+def fit_of(voltage: bool) -> Fit:
+    problem, data, end = made(voltage)
+    return summarise(problem, end, data, CHOICES)
+
+
+def test_intervals_are_quantiles_of_the_transformed_gaussian():
+    fit = fit_of(True)
+    e = fit.parameters["surface.soft.creep"]  # positive: log-normal
+    at = fit.space.place[e.path]
+    std = np.sqrt(fit.covariance[at, at][0, 0])
+    exact = lognorm(std, scale=e.value).ppf([0.05, 0.95])
+    assert e.interval90 == pytest.approx(exact, rel=1e-12)
+    assert e.std == pytest.approx(e.value * std)
+    lead = fit.parameters["surface.soft.lead"]  # any sign: normal
+    assert lead.interval90[1] - lead.value == pytest.approx(1.6448536 * lead.std)
+
+
+def test_shares_sum_to_one_and_their_intervals_hold_them():
+    e = fit_of(True).parameters["robot.load_share@as_built"]
+    assert sum(e.value) == pytest.approx(1.0)
+    assert e.labels == ("wheel 1", "wheel 2", "wheel 3")
+    assert all(low < v < high for v, (low, high) in zip(e.value, e.interval90, strict=True))
+    # near a Gaussian the width is 2 x 1.645 stds
+    widths = np.array([high - low for low, high in e.interval90])
+    assert widths == pytest.approx(2 * 1.645 * np.array(e.std), rel=0.1)
+
+
+def verdicts(
+    ratio: float,
+    choices: tuple[Choice, ...] = CHOICES,
+    shift: float = 0.0,
+    prior_std: float | None = None,
+):
+    """Estimates when every posterior is `ratio` times its prior, `shift` prior stds from it.
+
+    `prior_std` in the search space is the declared one, or one for all.
+    """
+    from slipid.parameter import Space
+
+    space = Space(blank(DRIVES), choices)
+    if prior_std:
+        space = eqx.tree_at(lambda s: s.prior_std, space, np.full(space.size, prior_std))
+    cov = np.diag((ratio * space.prior_std) ** 2)
+    z = space.prior_mean + shift * space.prior_std
+    return {e.path: e for e in estimates(space, choices, z, cov, has_voltage=True)}
+
+
+@pytest.mark.parametrize(
+    ("ratio", "verdict"),
+    [(0.29, "identified"), (0.31, "weak"), (0.79, "weak"), (0.81, "not_identified")],
+)
+def test_the_verdict_rule(ratio, verdict):
+    found = verdicts(ratio, prior_std=1.0)
+    free = [e for e in found.values() if e.ratio is not None]
+    assert {e.verdict for e in free} == {verdict}
+    assert {round(e.ratio, 9) for e in free} == {ratio}
+
+
+@pytest.mark.parametrize(("std", "verdict"), [(0.33, "identified"), (0.34, "weak")])
+def test_a_positive_number_within_three_stds_of_zero_is_not_identified(std, verdict):
+    # a wide prior, of which a wide interval is a small part; one that takes any sign is not asked
+    found = verdicts(std / 4, prior_std=4.0)
+    assert found["surface.soft.creep"].verdict == verdict
+    assert found["surface.soft.lead"].verdict == "identified"
+
+
+def test_provenance():
+    found = verdicts(0.2, (*CHOICES, Choice("motor.efficiency", fixed=0.8)))
+    assert found["surface.soft.creep"].provenance == "measured"
+    assert found["motor.efficiency"].provenance == "override"
+    assert found["motor.inductance"].provenance == "borrowed"
+    assert (found["motor.inductance"].verdict, found["motor.inductance"].std) == ("fixed", None)
+    # half of the information from the prior is where measuring ends
+    assert verdicts(0.70)["surface.soft.creep"].provenance == "measured"
+    assert verdicts(0.72)["surface.soft.creep"].provenance == "borrowed"
+
+
+def test_a_number_that_runs_to_zero_is_at_its_bound_and_a_contradicted_prior_is_not():
+    found = verdicts(0.1, shift=-4.5)
+    assert found["surface.soft.creep"].verdict == "at_bound"  # exp(-6.75) of its prior mean
+    assert found["surface.soft.lead"].verdict == "identified"  # has no bound
+    assert found["camera.scale"].verdict == "identified"  # 1 % off, against a tight prior
+    assert found["camera.scale"].pull == pytest.approx(-4.5)
+    assert verdicts(0.1, shift=-3.5)["surface.soft.creep"].verdict == "identified"
+
+
+def test_without_voltage_neither_resistance_nor_back_emf_is_identified():
+    fit = fit_of(False)
+    assert fit.has["voltage"] is False
+    for path in ("motor.resistance", "motor.back_emf"):
+        e = fit.parameters[path]
+        assert (e.verdict, e.provenance) == ("not_identified", "borrowed")
+    text = " | ".join(fit.messages)
+    assert "motor.resistance: log the motor voltage (or duty and bus voltage)" in text
+    [joint] = [f for f in fit.flat if "motor.back_emf" in f.paths]
+    assert "surface.soft.friction" in joint.paths
+    assert joint.powers == pytest.approx([1.0] * len(joint.paths), abs=0.05)
+    assert "surface.soft.friction/motor.back_emf" in joint.text
+    # nothing whose scale hangs on another number's prior is called measured
+    assert {fit.parameters[p].provenance for p in joint.paths} == {"borrowed"}
+
+
+def test_no_prior_however_tight_lends_the_motor_a_verdict_without_voltage():
+    problem, _, end = made(False)
+    tight = end.covariance * 1e-6
+    found = estimates(problem.space, CHOICES, end.state.z, tight, has_voltage=False)
+    by = {e.path: e.verdict for e in found}
+    assert by["motor.resistance"] == by["motor.back_emf"] == "not_identified"
+    assert by["motor.coulomb_friction"] == "identified"
+
+
+def test_with_voltage_both_are_identified_and_no_flat_direction_holds_them():
+    fit = fit_of(True)
+    for path in ("motor.resistance", "motor.back_emf"):
+        assert fit.parameters[path].verdict == "identified"
+        assert fit.parameters[path].provenance == "measured"
+    assert not [f for f in fit.flat if {"motor.resistance", "motor.back_emf"} & set(f.paths)]
+
+
+def test_a_made_up_flat_direction_comes_out_with_its_powers():
+    problem, _, _ = made(True)
+    space = problem.space
+    std, names = space.prior_std, space.names
+    precision = np.diag(1 / std**2)
+    a, b = names.index("motor.back_emf"), names.index("surface.soft.friction")
+    held = np.zeros(len(names))
+    held[a], held[b] = 2.0, 1.0  # only back_emf^2 * friction is measured
+    precision += 1e6 * np.outer(held, held)
+    for k, name in enumerate(names):
+        if k not in (a, b):
+            precision[k, k] += 1e4 / std[k] ** 2
+        assert name
+    [flat] = flat_directions(space, np.linalg.inv(precision), True, True)
+    assert flat.paths == ("motor.back_emf", "surface.soft.friction")
+    assert flat.powers == pytest.approx((-0.5, 1.0), abs=0.02)
+
+
+def test_curves_rise_hold_their_line_and_end_where_the_data_end():
+    fit = fit_of(True)
+    curve = fit.curves["soft"]
+    torque, slip, low, high = (
+        getattr(curve, k) for k in ("torque_nm", "slip", "slip_lo", "slip_hi")
+    )
+    assert (np.diff(torque) > 0).all()
+    assert (np.diff(slip) >= 0).all()
+    assert slip[0] == 0
+    assert (low <= slip + 1e-9).all()
+    assert (high >= slip - 1e-9).all()
+    assert torque[-1] <= fit.validity["soft"].torque_nm[1]
+    # the law itself, at a slip of the curve
+    floor, w, share = TRUTH.surfaces, curve.wheel_speed, curve.load_share
+    rim, k = 0.04 * w, 30
+    grip = np.tanh(slip[k] * rim / (0.002 + float(floor.creep[0]) * rim))
+    grip += float(floor.slide_viscosity[0]) * slip[k] * rim
+    expected = 0.04 * float(floor.friction[0]) * 12.0 * 9.81 * share * grip
+    assert torque[k] == pytest.approx(expected, rel=2e-3)
+
+
+def test_spectrum_is_that_of_the_whitened_jacobian():
+    problem, _, end = made(True)
+    z, log_v = jnp.asarray(end.state.z), end.state.log_variance
+    _, jacobian = problem.linear(z, problem.volt(log_v))
+    rows = []
+    for k, jac in jacobian.items():
+        root = np.linalg.cholesky(np.asarray(problem.covariance(k, jnp.asarray(log_v))))
+        rows.append(np.linalg.solve(root, np.asarray(jac)).reshape(-1, problem.space.size))
+    whole = np.concatenate(rows) * problem.space.prior_std
+    expected = np.linalg.svd(whole, compute_uv=False)
+    found = fit_of(True).spectrum
+    assert found[expected > 1e-3] == pytest.approx(expected[expected > 1e-3], rel=1e-6)
+
+
+def test_whitened_residuals_have_the_scatter_they_are_given():
+    problem, _, _ = made(True)
+    z, log_v = fit_of(True).z, made(True)[2].state.log_variance
+    blocks = problem.linear(jnp.asarray(z), problem.volt(log_v))[0]
+    for k, r in blocks.items():
+        cov = np.asarray(problem.covariance(k, jnp.asarray(log_v)))
+        q = np.einsum("ni,nij,nj->n", r, np.linalg.inv(cov), r)
+        assert (fit_of(True).whitened[k] ** 2).sum(axis=1) == pytest.approx(q, rel=1e-6)
+
+
+def test_a_solver_that_stopped_on_its_way_is_not_called_converged():
+    """At the truth, not at the optimum, of this very noise a step of some stds remains."""
+    problem, data, end = made(True)
+    fit = fit_of(True)
+    assert end.converged  # or so it says
+    assert fit.remaining > 0.3
+    assert not fit.converged
+    assert fit.reason.startswith("the solver stopped")
+    assert any("did not converge" in m for m in fit.messages)
+    # steps with weights kept up to date lead to a point from which none remains
+    state = end.state
+    for _ in range(6):
+        state = one_round(
+            problem,
+            state,
+            np.ones(len(problem.windows)),
+            np.ones(problem.space.size),
+            steps=8,
+            scoring=2,
+        )
+    there = summarise(problem, dataclasses.replace(end, state=state), data, CHOICES)
+    assert there.remaining < 0.1
+    assert there.converged
+
+
+def test_identified_json_is_what_the_contract_says():
+    found = json.loads(json.dumps(identified_json(fit_of(True)), allow_nan=False))
+    assert found["schema"] == "slipid.identified/1"
+    keys = {"value", "unit", "shape", "labels", "std", "interval90", "source", "verdict"}
+    for e in found["parameters"].values():
+        assert set(e) == keys | {"provenance"}
+    shares = found["parameters"]["robot.load_share@as_built"]
+    assert (shares["shape"], len(shares["value"]), len(shares["interval90"])) == ([3], 3, 3)
+    assert found["parameters"]["motor.resistance"]["shape"] == []
+    assert found["surfaces"] == ["soft"]
+    assert set(found["curves"]["soft"]) == {"torque_nm", "slip", "slip_lo", "slip_hi", "at"}
+    assert found["data"]["runs"] == [log.name for log in made(True)[1].logs]
+
+
+def test_the_data_hash_knows_names_and_bytes_but_no_order():
+    runs = [("a", "1"), ("b", "2")]
+    assert hash_of(runs) == hash_of(runs[::-1])
+    assert len({hash_of(runs), hash_of(runs[:1]), hash_of([("a", "2"), ("b", "1")])}) == 3
+
+
+def test_a_saved_fit_comes_back_the_same(tmp_path):
+    fit = fit_of(True).with_baselines({"constant": {"soft": [0.25]}})
+    names = save(fit, tmp_path)
+    back = load(tmp_path)
+    assert identified_json(back) == identified_json(fit)
+    assert to_json(back) == to_json(fit)
+    for name in ("z", "covariance", "spectrum", "piece_run"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(fit, name))
+    for name in ("residual", "whitened", "weight"):
+        mine, other = getattr(fit, name), getattr(back, name)
+        assert set(mine) == set(other) == {"motion", "current", "voltage"}
+        assert all(np.array_equal(mine[k], other[k]) for k in mine)
+    first = (tmp_path / "fit.json").read_bytes()
+    assert save(back, tmp_path) == names
+    assert (tmp_path / "fit.json").read_bytes() == first
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
+
+
+class Killed(BaseException):
+    """The process died."""
+
+
+def dies_after(monkeypatch, writes: int) -> None:
+    """The next writing process dies after so many of its files."""
+    done = iter(range(writes))
+    write = fit_file.write_bytes
+
+    def until(path, data):
+        if next(done, None) is None:
+            raise Killed
+        write(path, data)
+
+    monkeypatch.setattr(fit_file, "write_bytes", until)
+
+
+OLD = 4.0
+"""A number by which two fits are told apart, in what is JSON and in what is an array."""
+
+
+def of_two() -> tuple[Fit, Fit]:
+    old = dataclasses.replace(fit_of(True), remaining=OLD, laplace=OLD * fit_of(True).laplace)
+    return old, fit_of(True)
+
+
+@pytest.mark.parametrize("writes", [0, 1, 2, 3])
+def test_a_refit_that_dies_while_it_is_written_never_leaves_parts_of_two(
+    tmp_path, monkeypatch, writes
+):
+    old, new = of_two()
+    save(old, tmp_path)
+    with monkeypatch.context() as patch:
+        dies_after(patch, writes)
+        if writes < 3:
+            with pytest.raises(Killed):
+                save(new, tmp_path)
+        else:
+            save(new, tmp_path)
+    if writes == 2:  # identified.json is still the old one's
+        with pytest.raises(DataError, match="of another fit than"):
+            load(tmp_path)
+        (tmp_path / "identified.json").unlink()
+    back, left = load(tmp_path), new if writes >= 2 else old
+    assert back.remaining == left.remaining
+    np.testing.assert_array_equal(back.laplace, left.laplace)
+    names = save(new, tmp_path)  # and the next one cleans up
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
+    assert load(tmp_path).remaining == new.remaining
+
+
+def test_a_file_of_another_fit_is_noticed(tmp_path):
+    old, new = of_two()
+    names = save(old, tmp_path / "old"), save(new, tmp_path / "new")
+    for mine, other in zip(*names, strict=True):
+        kept = (tmp_path / "new" / other).read_bytes()
+        (tmp_path / "new" / other).write_bytes((tmp_path / "old" / mine).read_bytes())
+        with pytest.raises(DataError, match=r"another fit|damaged|expected the arrays of"):
+            load(tmp_path / "new")
+        (tmp_path / "new" / other).write_bytes(kept)
+    assert load(tmp_path / "new").remaining == new.remaining
+
+
+def test_damage_of_any_file_is_a_message_and_never_a_traceback(tmp_path):
+    names, rng = save(fit_of(True), tmp_path), np.random.default_rng(0)
+    for name in names:
+        whole = (tmp_path / name).read_bytes()
+        for _ in range(40):
+            data = bytearray(whole)
+            at, most = rng.integers(len(data)), int(rng.integers(1, 40))
+            kind = rng.integers(3)
+            if kind == 0:
+                data[at] ^= 1 << rng.integers(8)
+            elif kind == 1:
+                del data[at : at + most]
+            else:
+                data[at:at] = rng.bytes(most)
+            (tmp_path / name).write_bytes(bytes(data))
+            # identified.json is not read back, and white space means nothing
+            with contextlib.suppress(DataError):
+                assert to_json(load(tmp_path)) == to_json(fit_of(True))
+        (tmp_path / name).unlink()
+        if name != "identified.json":
+            with pytest.raises(DataError, match=name):
+                load(tmp_path)
+        (tmp_path / name).write_bytes(whole)
+    load(tmp_path)
+
+
+# sessions ---------------------------------------------------------------------------------------
+
+SHARED = {"along": 0.02, "across": 0.01}
+"""Stds of what runs of one session share [m/m]: thrice and twice as much as a run has alone."""
+
+
+def in_sessions(session, seed):
+    """Runs in these sessions, whose ends are off by what the runs of each share."""
+    rng = np.random.default_rng(seed)
+    drives = [Drive("soft", "as_built", h, 0.1) for h in rng.uniform(0, 2 * np.pi, len(session))]
+    logs = make_logs(TRUTH, drives, seed, Sensors(has_voltage=False))
+    effect = rng.normal(size=(max(session) + 1, 2)) * [*SHARED.values()]
+    moved = []
+    for log, drive, (along, across) in zip(logs, drives, effect[session], strict=True):
+        back = np.linalg.pinv(np.asarray(TRUTH.geometry.forward()))
+        step = log.wheel_angle * float(TRUTH.geometry.wheel_radius) @ back.T
+        seen_at = log.time - float(TRUTH.camera.lag)
+        far = np.interp(seen_at, log.time, np.hypot(*step.T[:2])) / float(TRUTH.camera.scale)
+        way = log.pose[0, 2] + drive.heading
+        turn = np.array([[np.cos(way), np.sin(way)], [-np.sin(way), np.cos(way)]])
+        pose = log.pose.copy()
+        pose[:, :2] += far[:, None] * (np.array([along, across]) @ turn)
+        moved.append(dataclasses.replace(log, pose=pose))
+    of = {log.name: f"s{k}" for log, k in zip(moved, session, strict=True)}
+    return collect(moved, session=lambda log: of[log.name])
+
+
+def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
+    """At the truth, so that all that is off is noise: 200 runs, each in a session of its own."""
+    data = in_sessions(np.arange(160) % 40, 1)
+    problem = Problem(windows(data, 0.04, lag=0.056), blank(DRIVES), list(CHOICES))
+    z, sensors = problem.space.vector(TRUTH), Sensors()
+    std = problem.noise.typical.copy()
+    for k, name in enumerate(problem.noise.names):
+        if not name.startswith("current."):
+            std[k] = sensors.of(name)
+    log_v = 2 * np.log(std)
+    laplace = expected_covariance(problem, z, log_v)
+    end = Optimum(State(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
+    save(summarise(problem, end, data, CHOICES), tmp_path)
+    fit = load(tmp_path)
+    kept = to_json(fit)["variances"]
+    for axis, true in SHARED.items():
+        found = kept[f"session.soft.{axis}"]
+        assert found["unit"] == kept[f"run.soft.{axis}"]["unit"] == "m/m"
+        assert found["std"] == pytest.approx(true, rel=0.35)  # 40 sessions: three stds of a std
+    assert kept["session.soft.yaw"]["unit"] == "rad/m"
+    assert np.linalg.eigvalsh(fit.covariance - fit.laplace).min() > -1e-12
+    new = in_sessions(np.arange(200), 2)
+    alone = {name: v for name, v in fit.variance.items() if not name.startswith("session.")}
+
+    def covered(covariance, variance):
+        fitted = Predictor(fit.robot, fit.space, fit.z, covariance, variance, ())
+        return validation(fitted, new).summary["soft"]["identified"].coverage90
+
+    # what is drawn is Gaussian: the 90 % region of a Student t holds more of it
+    held = chi2.cdf(2 * fisher.ppf(0.9, 2, DEGREES), 2)
+    low, high = binom.interval(0.99, 200, held)
+    assert low <= 200 * covered(fit.covariance, dict(fit.variance)) <= high
+    assert covered(fit.laplace, alone) < 0.7
+
+
+def test_numbers_that_are_not_finite_never_reach_a_file(tmp_path):
+    bad = dataclasses.replace(fit_of(True), settings={"lag": float("nan")})
+    with pytest.raises(ValueError, match="JSON"):
+        save(bad, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_results_are_refused_with_a_message(tmp_path):
+    with pytest.raises(DataError, match="expected the result of `slipid identify`"):
+        load(tmp_path)
+    *_, arrays = save(fit_of(True), tmp_path)
+    (tmp_path / arrays).write_bytes(b"PK no zip")
+    with pytest.raises(DataError, match="damaged"):
+        load(tmp_path)
+    (tmp_path / "fit.json").write_text('{"schema": "other/1"}')
+    with pytest.raises(DataError, match=r"its schema is other/1; expected slipid\.fit/2"):
+        load(tmp_path)
+    (tmp_path / "fit.json").write_text("{")
+    with pytest.raises(DataError, match="no valid JSON"):
+        load(tmp_path)

@@ -1,0 +1,174 @@
+"""Pictures: what they compare is right, and every one of them shows something."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from slipid.data.runs import collect
+from slipid.data.windows import windows
+from slipid.identify.compare.slip_models import rungs
+from slipid.identify.fit.optimise import Optimum
+from slipid.identify.fit.problem import Problem, State
+from slipid.identify.result import Fit, summarise
+from slipid.parameter import Choice
+from slipid.plots import fit as plots
+from slipid.plots import load as plots_robot
+from slipid.plots.drawing import figure, save
+from slipid.plots.motion import heading_figure
+from slipid.plots.seen import by_heading, seen
+from slipid.plots.slip_models import WORDS, ladder_figure
+from slipid.plots.wheels import current_figure, driving_torque, wheel_curve
+from slipid.selftest.logs import Drive, Sensors, blank, grid, make_logs, truth
+
+pytestmark = pytest.mark.slow  # traces whole fits
+
+DRIVES = grid(setups=(("soft", "as_built"), ("firm", "as_built")), headings=8, turns=0)
+ROBOT = truth(DRIVES)
+QUIET = Sensors(std=dict.fromkeys(Sensors().std, 0.0), ripple=0.0, voltage_noise=0.0, wobble=0.0)
+
+
+@functools.cache
+def data():
+    return collect(make_logs(ROBOT, DRIVES, 0, QUIET))
+
+
+@functools.cache
+def pieces():
+    return seen(ROBOT, data(), 4)
+
+
+@functools.cache
+def fit() -> Fit:
+    """A fit that ended at the truth."""
+    choices = [Choice("camera.scale", prior_mean=1.117, prior_std=0.002)]
+    choices.append(Choice("camera.lag", prior_mean=0.056, prior_std=0.02))
+    choices.append(Choice("robot.mass", fixed=12.0))
+    problem = Problem(windows(data(), 0.04, lag=0.056), blank(DRIVES), choices)
+    z = problem.space.vector(ROBOT)
+    log_v = 2 * np.log(problem.noise.typical)
+    _, jacobian = problem.linear(jnp.asarray(z), problem.volt(log_v))
+    keep = jnp.ones(len(problem.windows))
+    info = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep))
+    state = State(z, log_v, 7, -1.5, 0.01, "joint")
+    return summarise(
+        problem, Optimum(state, np.linalg.inv(info), True, "settled", (0.0,)), data(), choices
+    )
+
+
+def shows_something(path) -> bool:
+    picture = imread(path)
+    return min(picture.shape[:2]) > 200 and bool(picture[..., :3].std() > 0.02)
+
+
+def test_camera_of_undisturbed_logs_lies_on_the_predicted_lines():
+    p = pieces()
+    assert p.straight.all()
+    for g, (floor, load) in enumerate(p.groups):
+        for speed in (0.1, 0.2):
+            mine = (p.group == g) & (p.speed == speed)
+            assert mine.sum() >= 8
+            slip, drift, yaw = by_heading(ROBOT, floor, load, speed, p.heading[mine]).T
+            # wheels ramp up and are rounded to ticks, so a little is left
+            np.testing.assert_allclose(p.slip[mine], slip, atol=0.01)
+            np.testing.assert_allclose(p.drift[mine], drift, atol=0.5)
+            np.testing.assert_allclose(p.yaw[mine], yaw, atol=1.5)
+
+
+def test_floors_are_ordered_by_slip():
+    assert pieces().groups == (("firm", "as_built"), ("soft", "as_built"))
+
+
+def test_torque_from_unsigned_currents_is_that_of_the_contact():
+    p = pieces()
+    turning = np.abs(p.wheel_speed) > 0.5
+    gap = driving_torque(ROBOT, p) - p.torque * np.sign(p.wheel_speed)
+    # half a step of 1/39 A is 0.01 N m
+    assert np.abs(gap[turning]).max() < 0.02
+    assert np.abs(p.torque[turning]).max() > 0.3
+
+
+def test_wheel_slip_and_torque_lie_on_the_curve_of_a_wheel():
+    p = pieces()
+    k = int(np.argmin(np.where(p.group == 1, p.sideways[:, 0], np.inf)))
+    args = float(p.sideways[k, 0]), abs(float(p.wheel_speed[k, 0]))
+    slip = np.linspace(0, 1, 201)
+    # the contact patch shifts loads by a few percent while the robot moves
+    torque = wheel_curve(ROBOT, "soft", slip, *args, float(p.share[k, 0]))
+    expected = np.interp(p.wheel_slip[k, 0], slip, torque)
+    assert abs(p.torque[k, 0]) == pytest.approx(expected, rel=0.06)
+
+
+def test_curve_of_a_straight_wheel_is_the_published_one():
+    for floor, curve in fit().curves.items():
+        torque = wheel_curve(
+            fit().robot,
+            floor,
+            curve.slip,
+            0.0,
+            curve.wheel_speed,
+            curve.load_share,
+        )
+        np.testing.assert_allclose(torque, curve.torque_nm, rtol=0.01, atol=1e-3)
+
+
+def test_sideways_rolling_costs_slip():
+    slip = np.linspace(0.05, 0.5, 10)
+    straight = wheel_curve(ROBOT, "soft", slip, 0.0, 3.0, 1 / 3)
+    assert (wheel_curve(ROBOT, "soft", slip, 1.0, 3.0, 1 / 3) < straight).all()
+
+
+def test_identify_draws_every_picture(tmp_path):
+    files = plots.identify_plots(fit(), data(), tmp_path)
+    assert {f.name for f in files} == {
+        "slip_by_heading.png",
+        "paths.png",
+        "slip_by_torque.png",
+        "current_by_traction.png",
+        "load_share.png",
+    }
+    assert all(shows_something(f) for f in files)
+    assert {f.name for f in tmp_path.iterdir()} == {f.name for f in files}  # no part files
+
+
+def test_an_empty_figure_does_not_pass_for_a_picture(tmp_path):
+    assert not shows_something(save(figure(8.0, 6.0, ""), tmp_path / "empty.png"))
+
+
+def test_without_currents_or_directions_those_pictures_are_left_out():
+    assert current_figure(ROBOT, replace(pieces(), amps=None)) is None
+    one_way = replace(pieces(), heading=np.full(len(pieces().heading), 90.0))
+    assert heading_figure(ROBOT, one_way) is None
+
+
+def test_turning_pieces_have_no_direction():
+    drives = (Drive("soft", "as_built", 0.3, 0.2, turn=0.8),)
+    robot = truth(drives)
+    assert not seen(robot, collect(make_logs(robot, drives, 0, QUIET)), 4).straight.any()
+
+
+def test_loads_are_written_at_their_wheels():
+    made = plots_robot.load_figure(fit())
+    texts = {t.get_text().split("\n")[0]: t for t in made.axes[0].texts}
+    e = fit().parameters["robot.load_share@as_built"]
+    for k, share in enumerate(e.value):
+        assert f"{100 * share:.1f} %" in texts[f"wheel {k + 1}"].get_text()
+    # wheel 2 stands behind, wheel 1 ahead on the left
+    assert texts["wheel 2"].get_position()[1] < 0
+    assert texts["wheel 1"].get_position()[0] < 0 < texts["wheel 1"].get_position()[1]
+
+
+def test_every_rung_has_words_in_the_picture():
+    assert set(WORDS) == {"identified", *(rung.name for rung in rungs(has_current=True))}
+
+
+def test_errors_are_drawn_to_scale():
+    one = {"endpoint_error_mean": 0.02, "runs": 3}
+    other = {"endpoint_error_mean": 0.3, "runs": 3}
+    made = ladder_figure({"summary": {"soft": {"identified": one, "encoder": other}}}, "3 runs")
+    assert [bar.get_width() for bar in made.axes[0].patches] == pytest.approx([2.0, 30.0])

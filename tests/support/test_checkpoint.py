@@ -1,0 +1,129 @@
+"""Checkpoints: what is loaded is whole and of the same work, whatever happened to the files."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from slipid.support.checkpoint import Checkpoint, key_of
+
+ARRAYS = {"z": np.arange(3.0), "stage": "joint", "round": 4}
+PLAIN = {"x": np.pi, "rows": [1.0 / 3.0, None, "a"]}
+
+
+@pytest.fixture
+def kept(tmp_path) -> Checkpoint:
+    kept = Checkpoint(tmp_path / "folder", "mine")
+    kept.save("part", ARRAYS)
+    kept.save_json("part", PLAIN)
+    return kept
+
+
+def test_what_is_kept_comes_back(kept):
+    back = kept.load("part")
+    assert set(back) == set(ARRAYS)
+    np.testing.assert_array_equal(back["z"], ARRAYS["z"])
+    assert (str(back["stage"]), int(back["round"])) == ("joint", 4)
+    assert kept.load_json("part") == PLAIN
+
+
+def test_parts_of_other_work_are_absent(kept):
+    other = Checkpoint(kept.folder, "other")
+    assert other.load("part") is None
+    assert other.load_json("part") is None
+    other.save("part", {"z": np.zeros(1)})
+    assert kept.load("part") is None
+
+
+def test_parts_that_were_never_kept_are_absent(kept, tmp_path):
+    for one in (kept, Checkpoint(tmp_path / "nowhere", "mine")):
+        assert one.load("none") is None
+        assert one.load_json("none") is None
+
+
+@pytest.mark.parametrize("length", [0, 1, 50, 100, -9])
+def test_damaged_files_are_absent(kept, length):
+    for suffix in ("npz", "json"):
+        path = kept.folder / f"part.{suffix}"
+        path.write_bytes(path.read_bytes()[:length])
+    assert kept.load("part") is None
+    assert kept.load_json("part") is None
+
+
+@pytest.mark.parametrize("text", ["[]", "null", '{"key": "mine"}', '{"content": 1}'])
+def test_other_json_is_absent(kept, text):
+    (kept.folder / "part.json").write_text(text)
+    assert kept.load_json("part") is None
+
+
+def test_only_what_matches_is_removed_and_an_empty_folder_goes_too(kept):
+    kept.remove("*.npz")
+    assert kept.load("part") is None
+    assert kept.load_json("part") == PLAIN
+    kept.remove()
+    assert not kept.folder.exists()
+    kept.remove()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        ("a", 1, np.arange(4.0)),
+        ("a", 2, np.arange(3.0)),
+        ("b", 1, np.arange(3.0)),
+        ("a", 1, np.arange(3)),
+        ("a", 1, np.arange(3.0)[None]),
+        ("a", 1),
+        ("a1", np.arange(3.0)),
+        (1, "a", np.arange(3.0)),
+    ],
+    ids=str,
+)
+def test_a_key_tells_any_part_apart(other):
+    mine = ("a", 1, np.arange(3.0))
+    assert key_of(*mine) == key_of(*mine)
+    assert key_of(*mine) != key_of(*other)
+
+
+def test_a_key_knows_the_versions(monkeypatch):
+    before = key_of("a")
+    monkeypatch.setattr("slipid.support.checkpoint.versions", lambda: {"jax": "0.0"})
+    assert key_of("a") != before
+
+
+WRITER = """
+import numpy as np
+from pathlib import Path
+from slipid.support.checkpoint import Checkpoint
+kept = Checkpoint(Path({folder!r}), "mine")
+for k in range(100_000):
+    kept.save("part", {{"value": np.full(20_000, float(k))}})
+    kept.save_json("part", [k] * 2000)
+"""
+
+
+def test_a_kill_leaves_every_part_whole(tmp_path):
+    rng = np.random.default_rng(0)
+    kept, path = Checkpoint(tmp_path, "mine"), tmp_path / "part.json"
+    for _ in range(5):
+        kept.remove()
+        tmp_path.mkdir(exist_ok=True)
+        run = subprocess.Popen([sys.executable, "-c", WRITER.format(folder=str(tmp_path))])
+        deadline = time.monotonic() + 60
+        while not path.exists():
+            assert run.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        time.sleep(rng.uniform(0.0, 0.05))
+        os.kill(run.pid, signal.SIGKILL)
+        run.wait()
+        arrays, plain = kept.load("part"), kept.load_json("part")
+        assert arrays is not None
+        assert plain is not None
+        assert len(set(arrays["value"].tolist())) == len(set(plain)) == 1

@@ -1,0 +1,66 @@
+"""Progress away from a terminal: few lines, whole sentences, nothing where quiet is wanted."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from slipid.support import progress
+from slipid.support.progress import Reporter
+
+
+def test_stages_and_sentences_are_lines_and_progress_is_one_now_and_then(capsys):
+    with Reporter() as report:
+        report.stage("reading logs")
+        report.stage("reading logs")
+        report.note("on a bar only")
+        for k in range(1, 1001):
+            report.advance(k, 1000)
+        report.line("[1000] runs")
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.splitlines() == ["reading logs ...", "  1000 of 1000", "[1000] runs"]
+
+
+def test_the_time_left_is_that_of_the_steps_after_the_first(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "EVERY_S", 0.0)
+    now = [0.0]
+    with Reporter() as report:
+        monkeypatch.setattr(report._bars, "get_time", lambda: now[0])
+        report.stage("driving")
+        for k, at in enumerate((100.0, 110.0, 120.0), start=1):  # the first one compiles
+            now[0] = at
+            report.advance(k, 10, f"run {k}")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [
+        "driving ...",
+        "  run 1",
+        "  run 2, about 80 s left",
+        "  run 3, about 70 s left",
+    ]
+
+
+def test_lines_come_no_closer_than_they_should(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "EVERY_S", 0.05)
+    with Reporter() as report:
+        report.stage("driving")
+        began = time.monotonic()
+        while time.monotonic() < began + 0.3:
+            report.advance(1, 10)
+            time.sleep(0.005)
+    assert 2 <= len(capsys.readouterr().err.splitlines()) <= 8
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_a_quiet_reporter_says_nothing(capsys, inside):
+    report = Reporter(quiet=True)
+    if inside:
+        with report:
+            report.stage("a")
+            report.advance(2, 2)
+    else:
+        report.stage("a")
+        report.advance(2, 2)
+    report.line("b")
+    assert capsys.readouterr() == ("", "")
