@@ -7,9 +7,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from slipid.api.check import check as check
+    from slipid.api.driving import drive as drive
     from slipid.api.fit import Fit as Fit
     from slipid.api.fit import Prior as Prior
     from slipid.api.fit import fit as fit
+    from slipid.api.made import made_runs as made_runs
+    from slipid.api.motion import move as move
     from slipid.api.posterior import Posterior as Posterior
     from slipid.api.profile import Profile as Profile
     from slipid.api.validation import Validation as Validation
@@ -18,7 +22,10 @@ if TYPE_CHECKING:
     from slipid.control.estimator import Estimator as Estimator
     from slipid.control.interface import Measurement as Measurement
     from slipid.data.reading.folders import read_runs as read_runs
+    from slipid.identify.posterior.blocks import Plan as Plan
     from slipid.model.robot import Robot as Robot
+    from slipid.plots.raw import plot_runs as plot_runs
+    from slipid.plots.wheels import wheel_curve as wheel_curve
     from slipid.support.errors import DataError as DataError
     from slipid.support.jax_setup import setup_jax as setup_jax
 
@@ -30,14 +37,21 @@ _ROOMS = {
     "Estimator": "slipid.control.estimator",
     "Fit": "slipid.api.fit",
     "Measurement": "slipid.control.interface",
+    "Plan": "slipid.identify.posterior.blocks",
     "Posterior": "slipid.api.posterior",
     "Prior": "slipid.api.fit",
     "Profile": "slipid.api.profile",
     "Robot": "slipid.model.robot",
     "Validation": "slipid.api.validation",
+    "check": "slipid.api.check",
+    "drive": "slipid.api.driving",
     "fit": "slipid.api.fit",
+    "made_runs": "slipid.api.made",
+    "move": "slipid.api.motion",
+    "plot_runs": "slipid.plots.raw",
     "read_runs": "slipid.data.reading.folders",
     "setup_jax": "slipid.support.jax_setup",
+    "wheel_curve": "slipid.plots.wheels",
 }
 __all__ = sorted(_ROOMS)
 

@@ -7,15 +7,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slipid.api.comparison import Comparison, compared
 from slipid.api.profile import Profile
+from slipid.api.proposal import Proposal
 from slipid.api.validation import Validation
 from slipid.data.runs import Runs
 from slipid.identify import fit_file, result
 from slipid.identify.compare.slip_models import restored
 from slipid.identify.compare.validation import Predictor, validation
+from slipid.identify.design.proposal import Wish, design
 from slipid.identify.fit.one_speed import still_viscosities
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem
+from slipid.identify.posterior.blocks import Plan
 from slipid.identify.verdicts import profile
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.config import FitSection
@@ -131,7 +135,12 @@ class Fit:
         return Validation(validation(fitted, runs), fit, runs)
 
     def sample(
-        self, seed: int = 0, draws: int = 400, most: int = 400, quiet: bool = False
+        self,
+        seed: int = 0,
+        draws: int = 400,
+        most: int = 400,
+        plan: Plan | None = None,
+        quiet: bool = False,
     ) -> "Posterior":
         """Posterior by emcee, several ensembles; needs `pip install slipid[posterior]`.
 
@@ -139,11 +148,36 @@ class Fit:
             seed: of everything.
             draws: that are kept of each of the ensembles.
             most: blocks of steps after which it ends without having converged.
+            plan: of walkers and steps, in place of `seed` and `most`.
             quiet: show no progress.
         """
         from slipid.api.posterior import sampled
 
-        return sampled(self.result, self.task, self.problem, seed, draws, most, quiet)
+        plan = plan or Plan(seed=seed, most=most)
+        return sampled(self.result, self.task, self.problem, plan, draws, quiet)
+
+    def compare(self, question: str = "sectors", parts: int = 6, quiet: bool = False) -> Comparison:
+        """Every slip model fitted anew without some runs, and judged on those.
+
+        Args:
+            question: what is left out together: `sectors` of 60 degrees of headings, `speeds`, or
+                `random` headings.
+            parts: into which runs are dealt, 2 at least: one after another is left out. With 2,
+                every second sector.
+            quiet: show no progress.
+
+        Raises:
+            DataError: no such question.
+        """
+        return compared(self.task, self.problem, question, parts, quiet)
+
+    def design(self, *parameters: str, runs: int = 12) -> Proposal:
+        """Runs to drive next, that shrink some numbers most; without names whatever is weak.
+
+        Raises:
+            DataError: no such number, or fixed.
+        """
+        return Proposal(design(self.result, Wish(parameters=parameters, runs=runs)))
 
     def deploy(self) -> "DeployedRobot":
         """What runs on the robot, with the intervals of the fit's own curvature.
@@ -196,22 +230,38 @@ def fit(
 
     Source: the contact law of `slipid.model.contact`, the likelihood of `slipid.identify.fit`.
     """
-    floors = sorted({log.surface or "unknown" for log in runs.logs})
-    loads = sorted({log.load for log in runs.logs})
-    full = robot.on(floors, loads, sorted(set(runs.session)), image_centre)
-    choices = [*still_viscosities(runs), *said_of(full, float(full.body.mass))]
-    choices += [Choice(path, free=True) for path in free]
-    for path, prior in (priors or {}).items():
-        choices.append(Choice(path, prior_mean=_plain(prior.mean), prior_std=_plain(prior.std)))
-    choices += [Choice(path, fixed=_plain(value)) for path, value in (fixed or {}).items()]
-    choices += [Choice(path, start=_plain(value)) for path, value in (start or {}).items()]
-    settings = FitSection(windows_per_piece=windows_per_piece, seed=seed)  # type: ignore[call-arg]
-    task = Task(runs, full, tuple(choices), settings)
+    wishes = priors or {}, fixed or {}, start or {}, free
+    task = task_of(runs, robot, *wishes, image_centre, windows_per_piece, seed)
     with Reporter(quiet=quiet) as report:
         problem = task.problem()
         optimum = optimised(task, problem, None, report)
         found = summarised(task, problem, optimum, report)
     return Fit(found, task, problem, optimum)
+
+
+def task_of(
+    runs: Runs,
+    robot: Robot,
+    priors: Mapping[str, Prior],
+    fixed: Mapping[str, Numbers],
+    start: Mapping[str, Numbers],
+    free: Sequence[str],
+    image_centre: tuple[float, float] = (0.0, 0.0),
+    windows_per_piece: int = 4,
+    seed: int = 0,
+) -> Task:
+    """What is to be fitted; arguments as of `fit`."""
+    floors = sorted({log.surface or "unknown" for log in runs.logs})
+    loads = sorted({log.load for log in runs.logs})
+    full = robot.on(floors, loads, sorted(set(runs.session)), image_centre)
+    choices = [*still_viscosities(runs), *said_of(full, float(full.body.mass))]
+    choices += [Choice(path, free=True) for path in free]
+    for path, prior in priors.items():
+        choices.append(Choice(path, prior_mean=_plain(prior.mean), prior_std=_plain(prior.std)))
+    choices += [Choice(path, fixed=_plain(value)) for path, value in fixed.items()]
+    choices += [Choice(path, start=_plain(value)) for path, value in start.items()]
+    settings = FitSection(windows_per_piece=windows_per_piece, seed=seed)  # type: ignore[call-arg]
+    return Task(runs, full, tuple(choices), settings)
 
 
 def _plain(value: Numbers) -> float | list[float]:

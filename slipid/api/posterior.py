@@ -5,6 +5,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
 from slipid.control.deployed import DeployedRobot
 from slipid.deploy.deploy import deploy
 from slipid.identify.fit.problem import Problem
@@ -58,6 +63,19 @@ class Posterior:
         """Every number by path, with mean, interval and verdict from the draws."""
         return estimates(self.fit, self.result)
 
+    def draws(self, path: str) -> Float[np.ndarray, "ensemble draw *number"]:
+        """Draws of a free number [SI], a row per ensemble, early steps first.
+
+        Raises:
+            KeyError: no such number, or fixed; names those there are.
+        """
+        space = self.fit.space
+        if path not in space.place:
+            raise KeyError(f"no draws of '{path}'; there are {', '.join(space.place)}")
+        d = next(e.declaration for e in space.free if e.path == path)
+        found = jax.vmap(jax.vmap(d.to_si))(jnp.asarray(self.result.z[..., space.place[path]]))
+        return np.asarray(found if d.shares else found[..., 0])
+
     @cached_property
     def tree(self) -> "DataTree":
         """Draws, likelihoods and replicated data as an ArviZ DataTree."""
@@ -96,9 +114,9 @@ class Posterior:
 
 
 def sampled(
-    fit: Fit, task: Task, problem: Problem, seed: int, draws: int, most: int, quiet: bool
+    fit: Fit, task: Task, problem: Problem, plan: Plan, draws: int, quiet: bool
 ) -> Posterior:
     """Posterior around a fit; arguments as of `Fit.sample`."""
     with Reporter(quiet=quiet) as progress:
-        found = sampled_around(fit, problem, Plan(seed=seed, most=most), draws, None, progress)
+        found = sampled_around(fit, problem, plan, draws, None, progress)
     return Posterior(found, fit, task, problem)

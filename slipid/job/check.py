@@ -1,6 +1,7 @@
 """What a set of logs holds and can tell before anything is fitted: what `slipid check` does."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from slipid.identify.fit.problem import Problem
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates, expected_covariance
 from slipid.identify.verdicts.unidentified import flat_directions, sentences
 from slipid.job.config import read_config
-from slipid.job.problem import Job, read_job
+from slipid.job.problem import Job, Task, read_job
 from slipid.support.content import Content
 from slipid.support.files import write_json
 from slipid.support.jax_setup import setup_jax
@@ -77,14 +78,14 @@ def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> 
     setup_jax(quiet=True)
     job = read_job(read_config(config_path), data, report)
     report.stage("expected information")
-    content = overview(job) | expected(job, job.problem()).to_json()
+    content = overview(job, job.skipped) | expected(job, job.problem()).to_json()
     if out is not None:
         write_json(out / "check.json", content)
     return Checked(job, content)
 
 
-def overview(job: Job) -> Content:
-    """Runs by floor, load and session, channels that every run has, repairs."""
+def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
+    """Runs by floor, load and session, channels that every run has, repairs, what was left out."""
     data = job.dataset
     groups: dict[tuple[str, str, str], list[int]] = {}
     for k, log in enumerate(data.logs):
@@ -108,7 +109,7 @@ def overview(job: Job) -> Content:
         ],
         "channels": [_channel(data.logs, name) for name in _CHANNELS if _has(data.logs, name)],
         "notes": dict(notes.most_common()),
-        "skipped": list(job.skipped),
+        "skipped": list(skipped),
         "data": {"hash": job.data_hash, "logs": {log.name: log.sha256 for log in data.logs}},
     }
 
@@ -128,7 +129,7 @@ def _channel(logs: tuple[Log, ...], name: str) -> str:
     return f"{said} (unsigned)" if unsigned else said
 
 
-def expected(job: Job, problem: Problem) -> Expected:
+def expected(job: Task, problem: Problem) -> Expected:
     """Verdicts from the information expected at the start values with typical noise."""
     space, w = problem.space, problem.windows
     covariance = expected_covariance(problem)

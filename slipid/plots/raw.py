@@ -1,25 +1,34 @@
 """Raw signals of a data set as pictures, one per floor and load: look before you fit."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from slipid.data.runs import Runs
-from slipid.plots.drawing import figure, save
+from slipid.plots.drawing import Figure, figure, save
 
 
 def raw_plots(data: Runs, out: Path) -> list[Path]:
-    """Paths, wheel angles and currents of every run of each floor and load set-up; PNG files."""
+    """`plot_runs` of each floor and load set-up; PNG files."""
     groups: dict[tuple[str, str], list[int]] = {}
     for k, log in enumerate(data.logs):
         groups.setdefault((log.surface or "unknown", log.load), []).append(k)
     return [
-        _group(data, runs, f"{surface}, {load}", out / f"raw_{surface}_{load}.png")
-        for (surface, load), runs in sorted(groups.items())
+        save(plot_runs(data, runs, f"{floor}, {load}"), out / f"raw_{floor}_{load}.png")
+        for (floor, load), runs in sorted(groups.items())
     ]
 
 
-def _group(data: Runs, runs: list[int], title: str, path: Path) -> Path:
+def plot_runs(data: Runs, runs: Sequence[int] | None = None, title: str = "as logged") -> Figure:
+    """Paths, wheel speeds and currents of runs, all on one another.
+
+    Args:
+        data: the runs.
+        runs: numbers of those that are shown; all by default.
+        title: what they are.
+    """
+    runs = range(len(data)) if runs is None else runs
     wheels = data.wheel_angle.shape[1]
     made = figure(12.0, 7.0, f"{title}: {len(runs)} runs")
     axes = made.subplots(2, 1 + wheels, squeeze=False)
@@ -41,4 +50,4 @@ def _group(data: Runs, runs: list[int], title: str, path: Path) -> Path:
     for w in range(wheels):
         axes[0, 1 + w].set(title=f"wheel {w + 1}", ylabel="speed [rad/s]" if w == 0 else "")
         axes[1, 1 + w].set(xlabel="time [s]", ylabel="current [A]" if w == 0 else "")
-    return save(made, path)
+    return made

@@ -19,9 +19,10 @@ class Page:
 
     def __init__(self, kept: bool = False) -> None:
         file = StringIO() if kept else None
-        self._console = Console(highlight=False, file=file)
+        # a notebook is sent text too: rich would show there what is to be kept
+        self._console = Console(highlight=False, file=file, force_jupyter=False)
         if not self._console.is_terminal:  # a file or a pipe has no width: do not wrap
-            self._console = Console(highlight=False, width=140, file=file)
+            self._console = Console(highlight=False, width=140, file=file, force_jupyter=False)
 
     @property
     def text(self) -> str:

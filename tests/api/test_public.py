@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import slipid as sl
-from slipid.api import posterior
 from slipid.data.write import robotino2022_csv
 from slipid.identify.posterior.blocks import Plan
 from slipid.selftest.logs import Sensors, make_logs
@@ -48,7 +47,7 @@ def world(tmp_path_factory) -> dict:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         few = Plan(ensembles=2, walkers=6, block=4, warm_up=(1, 2), most=3)
-        patch.setattr(posterior, "Plan", lambda seed, most: replace(few, seed=seed))
+        patch.setattr("slipid.api.fit.Plan", lambda seed, most: replace(few, seed=seed))
         exec(compile(example(), "README.md", "exec"), names)
     names["folder"] = folder
     return names

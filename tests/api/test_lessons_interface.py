@@ -1,0 +1,84 @@
+"""What a notebook has beside fits: made runs, steady motion, a check, a comparison, a drive."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import slipid as sl
+
+
+def test_made_runs_have_the_channels_and_the_truth_that_were_asked_for():
+    slippery = {"surface.gray.creep": 0.4}
+    made = sl.made_runs(["gray"], headings=3, speeds=[0.2], turns=0, truth=slippery, current=False)
+    log = made.runs.logs[0]
+    assert (len(made.runs), log.surface, log.current) == (3, "gray", None)
+    assert log.voltage is not None
+    assert made.truth["surface.gray.creep"] == 0.4
+    with pytest.raises(ValueError, match=r"no parameter 'surface\.grey\.creep'; there are: robot"):
+        sl.made_runs(["gray"], truth={"surface.grey.creep": 0.4})
+
+
+def test_a_move_has_the_slip_of_its_own_twist():
+    robot = sl.made_runs(["soft"], headings=1, speeds=[0.2], turns=0).robot
+    commands = np.array([[0.2, 0.0, 0.0], [0.1, 0.1, 0.4]])
+    moved = sl.move(robot, "soft", commands)
+    rows = np.asarray(robot.geometry.forward())
+    np.testing.assert_allclose(moved.wheel_speed * 0.04, commands @ rows.T, atol=1e-12)
+    slip = 1 - moved.twist @ rows.T / (0.04 * moved.wheel_speed)
+    np.testing.assert_allclose(moved.slip[1], slip[1], rtol=1e-9)
+    assert np.isnan(moved.slip[0, 1])  # the rear wheel stands when it drives ahead
+    assert (moved.torque[0, [0, 2]] > 0).all()
+    assert (moved.current[0, [0, 2]] > 0).all()
+    with pytest.raises(ValueError, match="no surface 'ice'; identified: soft"):
+        sl.move(robot, "ice", commands)
+
+
+@pytest.fixture(scope="module")
+def fit():
+    made = sl.made_runs(["soft"], headings=12, speeds=[0.2], turns=0, voltage=False)
+    robot = sl.Robot.omni([60, 180, 300], base_radius=0.125, wheel_radius=0.04, gear_ratio=16)
+    return sl.fit(made.runs, robot, fixed={"camera.scale": 1.117}, quiet=True)
+
+
+@pytest.mark.slow
+def test_a_check_counts_runs_and_forecasts_verdicts(fit):
+    robot = sl.Robot.omni([60, 180, 300], base_radius=0.125, wheel_radius=0.04, gear_ratio=16)
+    check = sl.check(fit.task.dataset, robot, fixed={"camera.scale": 1.117})
+    assert check["motor.resistance"].verdict == "not_identified"
+    assert check["camera.scale"].verdict == "fixed"
+    assert "current (unsigned)" in str(check)
+    assert check.content["groups"][0]["runs"] == 12
+    assert sl.plot_runs(fit.task.dataset, [0, 1], "two runs").axes
+
+
+@pytest.mark.slow
+def test_a_comparison_ranks_every_model_on_left_out_runs(fit):
+    found = fit.compare("sectors", parts=2, quiet=True)
+    floor = found.floors["soft"]
+    assert floor.runs == 12
+    assert floor.models[floor.best].verdict == "best"
+    assert str(found) == floor.sentence
+    assert found.plot().axes
+    with pytest.raises(sl.DataError, match="no such question"):
+        fit.compare("moons", quiet=True)
+
+
+@pytest.mark.slow
+def test_a_proposal_has_the_runs_that_were_asked_for(fit):
+    proposal = fit.design("surface.soft.creep", runs=2)
+    assert len(proposal.result.drives) == 2
+    assert str(proposal).startswith("run,floor,load,vx_m_s")
+    assert proposal.plot().axes
+    with pytest.raises(sl.DataError, match="matches no parameter"):
+        fit.design("surface.soft.nonsense")
+
+
+@pytest.mark.slow
+def test_a_drive_says_what_became_of_its_path(fit):
+    robot = fit.deploy()
+    found = sl.drive(robot, "encoder", start=1, seed=2)
+    assert found.course.pose.shape == found.course.believed.shape
+    assert f"{found.metrics.closure_mm:.0f} mm from where it should" in str(found)
+    with pytest.raises(ValueError, match="controller 'magic' from start 0; expected encoder"):
+        sl.drive(robot, "magic")
