@@ -9,6 +9,9 @@ from rich.table import Table
 
 COLOUR = {"identified": "green", "weak": "yellow", "not_identified": "red", "at_bound": "magenta"}
 
+WIDTH = 140
+"""Of text that no terminal shows [characters]."""
+
 
 class Page:
     """Text for people, on standard output or kept: tables, and sentences that are not wrapped.
@@ -18,11 +21,17 @@ class Page:
     """
 
     def __init__(self, kept: bool = False) -> None:
-        file = StringIO() if kept else None
-        # a notebook is sent text too: rich would show there what is to be kept
-        self._console = Console(highlight=False, file=file, force_jupyter=False)
-        if not self._console.is_terminal:  # a file or a pipe has no width: do not wrap
-            self._console = Console(highlight=False, width=140, file=file, force_jupyter=False)
+        self._console = Console(highlight=False)
+        if kept:  # a notebook claims to be a terminal with colours, and shows what is to be kept
+            self._console = Console(
+                highlight=False,
+                width=WIDTH,
+                file=StringIO(),
+                force_terminal=False,
+                force_jupyter=False,
+            )
+        elif not self._console.is_terminal:  # a file or a pipe has no width: do not wrap
+            self._console = Console(highlight=False, width=WIDTH)
 
     @property
     def text(self) -> str:
