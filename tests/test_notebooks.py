@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import ast
 import base64
+import re
 from pathlib import Path
 
 import nbformat
 import pytest
 
+import slipid
+
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 FIGURES = {
-    "01_one_wheel": 5,
-    "02_a_real_log": 8,
-    "03_fit_and_identifiability": 7,
-    "04_posterior": 5,
-    "05_linear_or_nonlinear": 5,
-    "06_compensation": 4,
+    "01_one_wheel": 4,
+    "02_a_real_log": 5,
+    "03_fit_and_identifiability": 6,
+    "04_posterior": 4,
+    "05_linear_or_nonlinear": 4,
+    "06_compensation": 3,
 }
 
 
@@ -41,6 +45,22 @@ def test_outputs_are_stripped(name):
     code = [cell for cell in lesson.cells if cell.cell_type == "code"]
     assert code
     assert all(cell.outputs == [] and cell.execution_count is None for cell in code)
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_lessons_import_the_public_interface_alone(name):
+    lesson = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+    code = "\n".join(cell.source for cell in lesson.cells if cell.cell_type == "code")
+    tree = ast.parse(re.sub("^%.*", "", code, flags=re.M))
+    named = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    of_slipid = [text for node in named if "slipid" in (text := ast.unparse(node))]
+    assert of_slipid == ["import slipid as sl"]
+    used = {
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "sl"
+    }
+    assert used <= set(slipid.__all__)
 
 
 @pytest.mark.slow
