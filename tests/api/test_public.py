@@ -44,11 +44,17 @@ def world(tmp_path_factory) -> dict:
     """Names that the README's example leaves behind, run where its logs are; few steps sampled."""
     folder = tmp_path_factory.mktemp("readme")
     write_runs(folder / "logs")
+    around = posterior.sampled_around
     names: dict = {"angle": [0.0, 0.1, 0.2], "amps": [0.3, 0.1, 0.4]}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         few = Plan(ensembles=2, walkers=6, block=4, warm_up=(1, 2), most=3)
         patch.setattr(posterior, "Plan", lambda seed, most: replace(few, seed=seed))
+        patch.setattr(
+            posterior,
+            "sampled_around",
+            lambda fit, problem, plan, draws, *rest: around(fit, problem, plan, 16, *rest),
+        )
         exec(compile(example(), "README.md", "exec"), names)
     names["folder"] = folder
     return names

@@ -413,6 +413,7 @@ def in_sessions(session, seed):
     return collect(moved, session=lambda log: of[log.name])
 
 
+@pytest.mark.nightly
 def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
     """At the truth, so that all that is off is noise: 200 runs, each in a session of its own."""
     data = in_sessions(np.arange(160) % 40, 1)

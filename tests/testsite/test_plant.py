@@ -108,7 +108,7 @@ def test_the_floor_carries_the_weight_as_statics_say():
     np.testing.assert_allclose(mean / weight, Machine().load_share("as_built"), atol=0.012)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_centred_robot_looks_the_same_from_every_wheel():
     site = Site(machine=CENTRED, grounds=EVEN)
     ends = []
@@ -150,7 +150,7 @@ def test_half_the_time_step_ends_at_the_same_place(surface):
         assert np.hypot(*(ends[0] - ends[1])) < 0.02 * 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_slip_grows_with_softness_and_depends_on_the_direction():
     site = Site()
     found = {}

@@ -154,6 +154,7 @@ def test_without_a_fit_it_is_2(tmp_path):
     assert "expected the result of `slipid identify`" in done.stderr
 
 
+@pytest.mark.nightly
 def test_chosen_runs_are_worth_what_is_expected_of_them():
     """Whole logs, more seeds and the ratio are in bench_design.py."""
     plans, seeds = designs.plans(24), range(6)
