@@ -477,7 +477,7 @@ def test_posterior_nc_has_the_groups_of_arviz_and_names_for_everything(sampled):
         np.testing.assert_allclose(posterior["robot.load_share"].sum("wheel"), 1.0)
         creep = posterior["surface.creep"]
         assert creep.dims == ("chain", "draw", "surface")
-        assert creep.shape[:2] == (4, 8)
+        assert creep.shape[:2] == (4, 10)
         floor = str(creep.surface[0].values)
         low, high = found["parameters"][f"surface.{floor}.creep"]["interval90"]
         draws = creep.sel(surface=floor).values.ravel()
