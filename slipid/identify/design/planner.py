@@ -1,9 +1,6 @@
 """Which runs to drive next: the fitted robot simulates them, Fisher information judges them.
 
-What is assumed: noise as fitted, run effects marginalised (a run driven twice is worth its share, a
-long one does not count as many); all new runs are of one session and share what runs of a session
-share; everything linear around the fitted numbers; steady wheel speeds, so nothing is learnt from
-starting and stopping; the marker is put on once more for the new runs.
+What is assumed of new runs is said by `proposal.ASSUMPTIONS`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -67,7 +64,10 @@ class Planner:
         variance: Mapping[str, float],
         channels: Channels | None = None,
     ):
-        self.robot = _in_new_session(robot)
+        camera = robot.camera
+        if camera.sessions:
+            camera = replace(camera, sessions=(SESSION,), session_yaw=jnp.zeros(1))
+        self.robot = replace(robot, camera=camera)
         self.channels = channels or Channels()
         self.variance = dict(variance)
         paths = [e.path for e in entries(self.robot)]
@@ -98,11 +98,8 @@ class Planner:
         return cls(fit.robot, fit.choices, fit.variance, channels)
 
     def _windows(self, drives: Sequence[Drive], session: str = SESSION) -> Windows:
-        c = self.channels
-        spread = {
-            floor: self.variance.get(f"current.{floor}.window", 0.0)
-            for floor in self.robot.surfaces.labels
-        }
+        c, var, floors = self.channels, self.variance, self.robot.surfaces.labels
+        spread = {floor: var.get(f"current.{floor}.window", 0.0) for floor in floors}
         return steady_windows(
             drives, self.robot, c.windows, spread, session, c.current, c.voltage, c.signed
         )
@@ -127,9 +124,8 @@ class Planner:
 
     def rows(self, drives: Sequence[Drive]) -> Rows:
         """What each run would tell."""
-        first, *others = (
-            self._rows(drives[k : k + _TOGETHER]) for k in range(0, len(drives), _TOGETHER)
-        )
+        starts = range(0, len(drives), _TOGETHER)
+        first, *others = (self._rows(drives[k : k + _TOGETHER]) for k in starts)
         return first.joined(*others)
 
     def _rows(self, drives: Sequence[Drive]) -> Rows:
@@ -142,14 +138,14 @@ class Planner:
         felt = effects(windows, self.robot) * std[:, None]
         on = np.eye(len(self._differ))[np.asarray(this.batch.surface)][:, self._differ]
         moved = (felt[:, :, None, :] * on[:, None, :, None]).reshape(*felt.shape[:2], -1)
-        nothing = {k: np.zeros((*j.shape[:2], self.effects)) for k, j in jacobian.items()}
-        of_session = nothing | {"motion": -moved}
-        jacobian = {k: jnp.concatenate([j, of_session[k]], axis=2) for k, j in jacobian.items()}
-        halves = {
-            k: np.asarray(h)[: len(drives)] for k, h in this.whitened(jacobian, self._log_v).items()
+        # only the motion knows of a session's effects
+        wider = ((0, 0), (0, 0), (0, self.effects))
+        jacobian = {k: jnp.pad(j, wider) for k, j in jacobian.items() if k != "motion"} | {
+            "motion": jnp.concatenate([jacobian["motion"], -moved], axis=2)
         }
-        motion = halves["motion"]
-        others = [h for k, h in halves.items() if k != "motion"]
+        halves = this.whitened(jacobian, self._log_v)
+        motion = np.asarray(halves.pop("motion"))[: len(drives)]
+        others = [np.asarray(h)[: len(drives)] for h in halves.values()]
         if this.joint:
             motion, others = np.concatenate([motion, *others], axis=1), []
         electric = np.concatenate([motion[:, :0], *others], axis=1)
@@ -177,13 +173,6 @@ class Planner:
         out = np.zeros((entry.size, len(self.is_electric)))
         out[:, at] = jax.jacfwd(entry.declaration.to_si)(jnp.asarray(self.z[at]))
         return out
-
-
-def _in_new_session(robot: Robot) -> Robot:
-    camera = robot.camera
-    if camera.sessions:
-        camera = replace(camera, sessions=(SESSION,), session_yaw=jnp.zeros(1))
-    return replace(robot, camera=camera)
 
 
 @dataclass(frozen=True, eq=False)

@@ -153,7 +153,7 @@ def made_up(seed, electric=3, count=25):
 @pytest.mark.parametrize("seed", range(5))
 def test_each_candidate_is_judged_as_if_driven(seed, electric):
     now, rows, goal = made_up(seed, electric)
-    brute = [now.plus(rows.pick([k])).criterion(goal) for k in range(len(rows))]
+    brute = [now.plus(rows.pick([k])).criterion(goal) for k in range(len(rows.motion))]
     np.testing.assert_allclose(now.after_each(rows, goal), brute, rtol=1e-9)
     chosen, found = info.greedy(now, rows, goal, 1)
     assert chosen == [int(np.argmin(brute))]
@@ -166,7 +166,7 @@ def test_a_criterion_of_the_motion_never_rises(seed):
     now, rows, goal = made_up(seed, electric=0)
     chosen, found = info.greedy(now, rows, goal, 8)
     assert (np.diff(found) < 0).all()
-    order = np.random.default_rng(seed).permutation(len(rows))
+    order = np.random.default_rng(seed).permutation(len(rows.motion))
     path = info.path(now, rows, goal, order)
     assert (np.diff(path) < 0).all()
     assert info.path(now, rows, goal, order, [3, 10]) == pytest.approx([path[3], path[10]])
