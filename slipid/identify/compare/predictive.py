@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.slip_models import Rung
+from slipid.identify.compare.rung import Rung
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import effects
 from slipid.identify.fit.problem import DEGREES, Problem, State
@@ -364,7 +364,7 @@ def _moved(rung: Rung, k: int, by: float) -> Rung:
         flat = np.array(value, float).ravel()
         flat[k : k + 1] += by
         state[key] = flat.reshape(value.shape)
-    return rung.with_state(state)
+    return replace(rung, state=state)
 
 
 def _places(rung: Rung) -> dict[str, slice]:

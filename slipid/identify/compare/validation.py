@@ -10,7 +10,7 @@ from jaxtyping import Float
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.slip_models import Rung
+from slipid.identify.compare.rung import Rung
 from slipid.identify.fit import likelihood as lk
 from slipid.model.robot import Robot
 from slipid.parameter import Space
