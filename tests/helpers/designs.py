@@ -23,7 +23,6 @@ from slipid.identify.design.planned_runs import (
     steady_windows,
 )
 from slipid.identify.design.planner import (
-    Channels,
     Planner,
     parameter_goal,
     prediction_goal,
@@ -33,6 +32,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
 from slipid.identify.fit.optimise import Options, optimise
 from slipid.identify.fit.problem import Problem, State
+from slipid.identify.result import Channels
 from slipid.parameter import Choice
 from slipid.selftest.logs import Sensors, blank, make_logs, truth
 from tests.helpers.made_windows import measure

@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 from slipid.data.runs import Runs
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.predictive import Predictive, contact_of, with_noise
+from slipid.identify.compare.noisy_rung import with_noise
+from slipid.identify.compare.predictive import Predictive, contact_of
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.compare.validation import Judged, score
 from slipid.identify.fit.one_speed import still_viscosities

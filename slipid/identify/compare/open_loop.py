@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
+from slipid.identify.compare.body_motion import sideways, turned
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import travel
 from slipid.identify.fit.problem import DEGREES
@@ -105,11 +106,6 @@ def follow(robot: Robot, w: Windows, increment: Float[np.ndarray, "piece window 
     return Tracks(w.run, path, pose)
 
 
-@jax.jit
-def _end(robot: Robot, b: lk.Batch, start: Array) -> Array:
-    return chain(start, lk.predict(robot, b).increment)[:, -1]
-
-
 @eqx.filter_jit
 def twist_end_jacobian(space: Space, z: Array, twist: Array, w: lk.Batch, start: Array) -> Array:
     """Slope of the ends by the search vector where the body's twists are given (piece, 2, free)."""
@@ -123,7 +119,11 @@ def twist_end_jacobian(space: Space, z: Array, twist: Array, w: lk.Batch, start:
 @eqx.filter_jit
 def end_jacobian(space: Space, z: Array, b: lk.Batch, start: Array) -> Array:
     """Derivative of the end pose (piece, 3) by the search vector, from given start poses."""
-    return jax.jacfwd(lambda x: _end(space.tree(x), b, start))(z)
+
+    def end(x: Array) -> Array:
+        return chain(start, contact_increments(space.tree(x), b))[:, -1]
+
+    return jax.jacfwd(end)(z)
 
 
 def end_covariance(
@@ -142,36 +142,37 @@ def end_covariance(
     far, u = travel(w, robot)
     p = tracks.predicted
     cov = np.zeros((len(w), 2, 2)) + of_parameters
-    rest = p[:, -1:, :2] - p[:, 1:, :2]  # what a turn at each step moves
-    lever = np.stack([-rest[..., 1], rest[..., 0]], -1)
-    c, s = np.cos(p[:, :-1, 2]), np.sin(p[:, :-1, 2])
-
-    def world(v: np.ndarray) -> np.ndarray:
-        return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], -1)
-
-    across = np.stack([-u[..., 1], u[..., 0]], -1)
-    for name, axis in (("along", world(u)), ("across", world(across)), ("yaw", lever)):
+    lever = sideways(p[:, -1:, :2] - p[:, 1:, :2])  # what a turn at each step moves
+    way = p[:, :-1, 2]
+    along, across = turned(way, u), turned(way, sideways(u))
+    for name, axis in (("along", along), ("across", across), ("yaw", lever)):
         v = np.array([variance[f"process.{f}.{name}"] for f in w.surface])
         cov += np.einsum("n,nk,nki,nkj->nij", v, far, axis, axis)
         shared = [variance.get(f"session.{f}.{name}", 0.0) for f in w.surface]
         v = np.array([variance[f"run.{f}.{name}"] for f in w.surface]) + shared
         whole = np.einsum("nk,nki->ni", far, axis)
         cov += v[:, None, None] * whole[:, :, None] * whole[:, None, :]
-    all_way = p[:, -1, :2] - p[:, 0, :2]
-    turn = np.stack([-all_way[:, 1], all_way[:, 0]], -1)
+    turn = sideways(p[:, -1, :2] - p[:, 0, :2])
     cov += variance["camera.heading"] * turn[:, :, None] * turn[:, None, :]
     cov += 2 * variance["camera.place"] * float(robot.camera.scale) ** 2 * np.eye(2)
     return cov
 
 
-def parameter_covariance(
-    space: Space, z: np.ndarray, covariance: np.ndarray, w: Windows, tracks: Tracks
-) -> Float[np.ndarray, "piece 2 2"]:
-    """Part of the end's covariance that comes from the fitted numbers, linearised."""
-    b = lk.batch(w, space.template)
+def contact_ends(
+    robot: Robot,
+    space: Space,
+    z: Float[np.ndarray, " free"],
+    covariance: Float[np.ndarray, "free free"],
+    variance: dict[str, float],
+    w: Windows,
+) -> tuple[Tracks, Float[np.ndarray, "piece 2 2"]]:
+    """Tracks of the force balance, and the covariance of their ends, linearised in the numbers."""
+    b = lk.batch(w, robot)
+    tracks = follow(robot, w, np.asarray(contact_increments(robot, b)))
     start = jnp.asarray(tracks.predicted[:, 0])
-    jac = np.asarray(end_jacobian(space, jnp.asarray(z), b, start))
-    return np.asarray(np.einsum("nip,pq,njq->nij", jac[:, :2], covariance, jac[:, :2]))
+    jac = np.asarray(end_jacobian(space, jnp.asarray(z), b, start))[:, :2]
+    own = np.einsum("nip,pq,njq->nij", jac, covariance, jac)
+    return tracks, end_covariance(robot, w, tracks, variance, own)
 
 
 def scores(

@@ -1,19 +1,17 @@
 """Open-loop prediction of runs a fit has not seen, beside every rung it was compared with."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from slipid.data.runs import Runs
-from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.compare.rung import Rung
-from slipid.identify.fit import likelihood as lk
 from slipid.model.robot import Robot
 from slipid.parameter import Space
+from slipid.support.content import Content
 from slipid.support.errors import DataError
 
 SCHEMA = "slipid.validation/1"
@@ -87,21 +85,19 @@ class Judged:
     models: dict[str, Score]
     session: str | None = None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Content:
         """Plain values; what was not asked for is left out."""
-        return {k: v for k, v in asdict(self).items() if v is not None or k != "session"} | {
-            "models": {name: _asked(asdict(score)) for name, score in self.models.items()}
-        }
+        return asdict(self, dict_factory=_told)
 
     @classmethod
-    def of_json(cls, content: Mapping[str, Any]) -> "Judged":
+    def of_json(cls, content: Content) -> "Judged":
         """The run from what `to_json` gave."""
         models = {name: Score(**score) for name, score in content["models"].items()}
         return cls(**{**content, "models": models})
 
 
-def _asked(score: dict[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in score.items() if v is not None or k != "log_density"}
+def _told(values: Iterable[tuple[str, object]]) -> Content:
+    return {k: v for k, v in values if v is not None or k not in ("session", "log_density")}
 
 
 @dataclass(frozen=True)
@@ -131,7 +127,7 @@ class Validation:
             for name, runs in by_floor(self.runs).items()
         }
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Content:
         """Content of the validation file."""
         summary = {
             floor: {model: asdict(one) for model, one in models.items()}
@@ -158,11 +154,7 @@ def validation(fit: Predictor, data: Runs) -> Validation:
 
     As in `cross_validation`, every run is predicted as of a session of its own: what its session
     shares widens its region by the variance found in fitting, whether or not other runs of that
-    session were fitted.
-
-    Args:
-        fit: of other runs.
-        data: runs to predict, each from its first pose after the wheels moved 10 mm.
+    session were fitted. A run begins at its first pose after the wheels moved 10 mm.
 
     Raises:
         DataError: a run on a floor or with a load set-up that was not identified.
@@ -170,35 +162,25 @@ def validation(fit: Predictor, data: Runs) -> Validation:
     _known(fit.robot, data)
     runs: dict[int, Judged] = {}
     for w in replay.cuts(data, fit.robot):
-        tracks = {"identified": _contact(fit.robot, w)}
+        ends = replay.contact_ends(fit.robot, fit.space, fit.z, fit.covariance, fit.variance, w)
+        score(runs, data, "identified", *ends)
         for rung in fit.rungs:
-            tracks[rung.name] = replay.follow(fit.robot, w, rung.increments(w, fit.robot))
-        of_parameters = replay.parameter_covariance(
-            fit.space, fit.z, fit.covariance, w, tracks["identified"]
-        )
-        cov = replay.end_covariance(fit.robot, w, tracks["identified"], fit.variance, of_parameters)
-        for name, track in tracks.items():
-            score(runs, data, name, track, cov if name == "identified" else None)
+            tracks = replay.follow(fit.robot, w, rung.increments(w, fit.robot))
+            score(runs, data, rung.name, tracks, None)
     return Validation(tuple(runs[k] for k in range(len(data))))
-
-
-def _contact(robot: Robot, w: Windows) -> replay.Tracks:
-    b = lk.batch(w, robot)
-    return replay.follow(robot, w, np.asarray(replay.contact_increments(robot, b)))
 
 
 def _known(robot: Robot, data: Runs) -> None:
     for log in data.logs:
-        if log.surface not in robot.surfaces.labels:
-            known = ", ".join(robot.surfaces.labels)
-            raise DataError(
-                f"{log.name}: surface '{log.surface}' was not identified; identified: {known}"
-            )
-        if log.load not in robot.body.loads:
-            known = ", ".join(robot.body.loads)
-            raise DataError(
-                f"{log.name}: load set-up '{log.load}' was not identified; identified: {known}"
-            )
+        for what, name, known in (
+            ("surface", log.surface, robot.surfaces.labels),
+            ("load set-up", log.load, robot.body.loads),
+        ):
+            if name not in known:
+                raise DataError(
+                    f"{log.name}: {what} '{name}' was not identified; "
+                    f"identified: {', '.join(known)}"
+                )
 
 
 def score(
@@ -210,12 +192,8 @@ def score(
 ) -> None:
     """Write what a model's tracks are worth into the scores of their runs.
 
-    Args:
-        runs: by number in `data`; those that are met for the first time are added.
-        data: the runs.
-        model: its name.
-        tracks: of some of the runs.
-        cov: of the ends, None for a model without.
+    `runs` go by their number in `data`; those that are met for the first time are added. `cov` is
+    of the ends, None for a model without.
     """
     gap = tracks.gap
     level, energy = replay.scores(gap[:, :2], cov)
@@ -227,8 +205,8 @@ def score(
                 name=log.name,
                 surface=str(log.surface),
                 load=log.load,
-                heading_deg=_number(np.degrees(data.heading[k])),
-                speed=_number(data.speed[k]),
+                heading_deg=finite(np.degrees(data.heading[k])),
+                speed=finite(data.speed[k]),
                 chord=chord,
                 measured_end=tracks.measured[n, -1].tolist(),
                 models={},
@@ -244,7 +222,8 @@ def score(
         )
 
 
-def _number(x: float) -> float | None:
+def finite(x: float) -> float | None:
+    """A number, None for one that is not."""
     return float(x) if np.isfinite(x) else None
 
 
@@ -263,14 +242,16 @@ def by_floor(runs: Sequence[Judged]) -> dict[str, list[Judged]]:
 
 
 def _mean(scores: Sequence[Score]) -> Summary:
-    error = [s.endpoint_error for s in scores]
-    covered = [s.covered90 for s in scores if s.covered90 is not None]
+    def all_of(name: str) -> list[float]:
+        return [getattr(s, name) for s in scores if getattr(s, name) is not None]
+
+    covered = all_of("covered90")
     return Summary(
-        endpoint_error_mean=float(np.mean(error)),
-        endpoint_error_median=float(np.median(error)),
-        length_error_mean=float(np.mean([s.length_error for s in scores])),
-        heading_error_median_deg=float(np.median([s.heading_error_deg for s in scores])),
+        endpoint_error_mean=float(np.mean(all_of("endpoint_error"))),
+        endpoint_error_median=float(np.median(all_of("endpoint_error"))),
+        length_error_mean=float(np.mean(all_of("length_error"))),
+        heading_error_median_deg=float(np.median(all_of("heading_error_deg"))),
         coverage90=float(np.mean(covered)) if covered else None,
-        energy_score=float(np.mean([s.energy_score for s in scores])),
+        energy_score=float(np.mean(all_of("energy_score"))),
         runs=len(scores),
     )

@@ -21,27 +21,12 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import effects
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES, by_axis
-from slipid.identify.result import Fit
+from slipid.identify.result import Channels, Fit
 from slipid.model.robot import Robot
 from slipid.parameter import Choice, entries
 
 _TOGETHER = 256
 """Runs whose Jacobians are taken in one call."""
-
-
-@dataclass(frozen=True)
-class Channels:
-    """What new runs would log, and how it is cut.
-
-    Attributes:
-        current, voltage: logged or not; signed: the current has a sign.
-        windows: per run.
-    """
-
-    current: bool = True
-    voltage: bool = False
-    signed: bool = False
-    windows: int = 4
 
 
 class Planner:
@@ -89,13 +74,7 @@ class Planner:
     @classmethod
     def of(cls, fit: Fit) -> "Planner":
         """Planner of a fit."""
-        channels = Channels(
-            current=fit.has["current"],
-            voltage=fit.has["voltage"],
-            signed=bool(fit.settings.get("current_is_signed", False)),
-            windows=int(fit.settings["windows_per_piece"]),
-        )
-        return cls(fit.robot, fit.choices, fit.variance, channels)
+        return cls(fit.robot, fit.choices, fit.variance, fit.channels)
 
     def _windows(self, drives: Sequence[Drive], session: str = SESSION) -> Windows:
         c, var, floors = self.channels, self.variance, self.robot.surfaces.labels

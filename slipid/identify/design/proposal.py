@@ -143,7 +143,7 @@ def _out_of_reach(
 ) -> str | None:
     """Why no candidate shrinks a goal, None where one does."""
     # a prior elsewhere must not lend them a scale
-    scaleless = goal.name in NEEDS_VOLTAGE and not fit.has["voltage"]
+    scaleless = goal.name in NEEDS_VOLTAGE and not fit.channels.voltage
     part = goal.std(last) / goal.std(now)
     if part < REACHED and not scaleless:
         return None

@@ -18,7 +18,8 @@ from slipid.cli.main import app
 from slipid.data.runs import collect
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.compare.folds import folds_of
-from slipid.identify.compare.predictive import contact_of, log_student, slopes, with_noise
+from slipid.identify.compare.noisy_rung import slopes, with_noise
+from slipid.identify.compare.predictive import contact_of, log_student
 from slipid.identify.compare.ranking import mean_error, ranking
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.compare.transfer import transfer

@@ -13,9 +13,10 @@ from scipy.linalg import block_diag
 
 from slipid.identify.design import fisher as info
 from slipid.identify.design.planned_runs import Drive, candidates, steady_windows
-from slipid.identify.design.planner import Channels, Planner, parameter_goal
+from slipid.identify.design.planner import Planner, parameter_goal
 from slipid.identify.fit import noise as of_noise
 from slipid.identify.fit.problem import Problem
+from slipid.identify.result import Channels
 from slipid.parameter import Choice
 from tests.helpers import made_windows
 
