@@ -281,7 +281,7 @@ def test_the_data_hash_knows_names_and_bytes_but_no_order():
 
 
 def test_a_saved_fit_comes_back_the_same(tmp_path):
-    fit = replace(fit_of(True), baselines={"constant": {"soft": [0.25]}})
+    fit = dataclasses.replace(fit_of(True), baselines={"constant": {"soft": [0.25]}})
     names = save(fit, tmp_path)
     back = load(tmp_path)
     assert identified_json(back) == identified_json(fit)
