@@ -1,6 +1,6 @@
 """Runs over several floors cut into short windows, each wheel on one floor all the while."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -39,24 +39,15 @@ class Crossing:
 
     def of(self, picked: Bool[np.ndarray, " piece"]) -> "Crossing":
         """Some of the windows, of the same runs."""
-        index = np.flatnonzero(picked)
-        return replace(
-            self,
-            windows=self.windows.pieces(index),
-            floor=self.floor[index],
-            place=self.place[index],
-        )
+        windows = self.windows.pieces(np.flatnonzero(picked))
+        return Crossing(windows, self.floor[picked], self.place[picked], self.runs)
 
 
 def crossing(data: Runs, floor: FloorMap, robot: Robot) -> Crossing:
     """Windows of runs whose poses are in the frame of a map, in which no wheel changes floors.
 
-    Where wheels stand is read through the robot's fitted camera.
-
-    Args:
-        data: the runs.
-        floor: what lies where.
-        robot: fitted; knows every surface of the map and every load of the runs.
+    Where wheels stand is read through the camera of the fitted robot, which knows every surface of
+    the map and every load of the runs.
 
     Raises:
         DataError: no such window.
@@ -88,7 +79,7 @@ def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "piece time whee
     yaw = np.array([float(robot.camera.yaw(robot.session_index(s))) for s in w.session])
     heading = pose[..., 2] - yaw[:, None]
     c, s = np.cos(heading), np.sin(heading)
-    turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    turn = np.stack([c, -s, s, c], -1).reshape(*c.shape, 2, 2)
     place = np.asarray(robot.geometry.place) * float(robot.geometry.base_radius)
     from_marker = place - np.asarray(robot.camera.marker_place)
     return np.asarray(pose[..., None, :2] + np.einsum("ntij,wj->ntwi", turn, from_marker))

@@ -38,6 +38,8 @@ _GAIN, _IDLE = 0.1, 6
 """Or when so many steps on end have gained less than this in log density."""
 _MOST_STEPS, _FACTOR_STEPS, _TRIES = 40, 4, 8
 _TOGETHER = 256
+UNITS = ("m/s", "m/s", "rad/s", "A")
+"""Of the channels of `scatter` and of currents."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +76,11 @@ class _Evidence:
     def __init__(self, space: Space, sets: Sequence[Crossing]):
         self.space, self.sets = space, sets
         first = np.cumsum([0, *(len(s.runs) for s in sets)])
+        has = [np.full(len(s.windows), s.windows.has_current) for s in sets]
         self.pieces = Pieces(
             run=np.concatenate([s.windows.run + k for s, k in zip(sets, first, strict=False)]),
             place=np.concatenate([s.place for s in sets]),
-            has_current=np.concatenate(
-                [np.full(len(s.windows), s.windows.has_current) for s in sets]
-            ),
+            has_current=np.concatenate(has),
         )
         self.chunks = [chunk for s in sets for chunk in _chunks(s, space.template)]
 
@@ -90,9 +91,8 @@ class _Evidence:
 
     def residual(self, z: np.ndarray) -> np.ndarray:
         """Residuals alone."""
-        return self._joined(
-            0, [(_residual(self.space, jnp.asarray(z), b, u),) for b, u, _ in self.chunks]
-        )
+        parts = [(_residual(self.space, jnp.asarray(z), b, u),) for b, u, _ in self.chunks]
+        return self._joined(0, parts)
 
     def _joined(self, k: int, parts: Sequence[Sequence[Array]]) -> np.ndarray:
         kept = [np.asarray(p[k])[:count] for p, (*_, count) in zip(parts, self.chunks, strict=True)]
@@ -103,12 +103,10 @@ def _chunks(s: Crossing, robot: Robot) -> list[tuple[lk.Batch, Array, int]]:
     """Batches of one size, with directions of travel and how many of their windows count."""
     out = []
     for first in range(0, len(s.windows), _TOGETHER):
-        index = np.arange(first, first + _TOGETHER)
-        some = np.minimum(index, len(s.windows) - 1)
-        w = s.windows.pieces(some)
-        u = travel(w, robot)[1][:, 0]
-        count = int((index < len(s.windows)).sum())
-        out.append((lk.batch(w, robot, s.floor[some]), jnp.asarray(u), count))
+        some = np.minimum(np.arange(first, first + _TOGETHER), len(s.windows) - 1)
+        w, count = s.windows.pieces(some), min(_TOGETHER, len(s.windows) - first)
+        u = jnp.asarray(travel(w, robot)[1][:, 0])
+        out.append((lk.batch(w, robot, s.floor[some]), u, count))
     return out
 
 
@@ -174,22 +172,21 @@ def _maximise(e: _Evidence, mean: np.ndarray, covariance: np.ndarray) -> _Found:
             step = np.zeros_like(z)
             damped = hessian + damping * np.diag(np.diag(hessian))
             step[moving] = -np.linalg.solve(damped, gradient)
-            step *= min(
-                1.0, 2.0 / np.abs(step).max()
-            )  # beyond two in a logarithm nothing is linear
+            # beyond two in a logarithm nothing is linear
+            step *= min(1.0, 2.0 / np.abs(step).max())
             expected = -(gradient @ step[moving] + 0.5 * step[moving] @ hessian @ step[moving])
             gained = (now - loss(z + step)) / max(expected, 1e-12)
-            damping = (
-                damping / 4 if gained > 0.7 else max(4 * damping, 0.01) if gained < 0.3 else damping
-            )
+            if gained > 0.7:
+                damping /= 4
+            elif gained < 0.3:
+                damping = max(4 * damping, 0.01)
             if gained > 0:
                 z = z + step
                 idle = idle + 1 if gained * expected < _GAIN else 0
                 break
         else:
             idle += 1
-    information = _gram(slope, found.counted(found.expected))
-    return _Found(z, information, found, settled)
+    return _Found(z, _gram(slope, found.counted(found.expected)), found, settled)
 
 
 def _gram(slope: np.ndarray, count: np.ndarray) -> Float[np.ndarray, "free free"]:
@@ -207,7 +204,7 @@ def informed(
     covariance: Float[np.ndarray, "free free"],
     information: Float[np.ndarray, "free free"],
 ) -> Float[np.ndarray, "free free"]:
-    """Covariance after more information on all numbers but those held, given these.
+    """Covariance after more information on all numbers but the camera's, given these.
 
     With h held and m the others, H = C^-1 + information: C_hh stays, z_m = -H_mm^-1 H_mh z_h + e.
     """
@@ -233,29 +230,20 @@ def update(
     """Posterior of the search vector given windows over several floors.
 
     Errors `before` and `after` are of runs left out: each half of the runs is judged by what the
-    other half made of the fit. A single run has no `after`.
-
-    Args:
-        space: free numbers.
-        mean, covariance: of the fit without these runs.
-        sets: of every map.
+    other half made of the fit. A single run has no `after`. Mean and covariance are of the fit
+    without these runs, sets of every map.
     """
     e = _Evidence(space, sets)
     found = _maximise(e, mean, covariance)
     before, after = _left_out(space, mean, covariance, sets)
-    names = [*CHANNELS, *(["current"] if e.pieces.has_current.any() else [])]
-    column = [*range(len(CHANNELS)), len(CHANNELS)][: len(names)]
-    scatter = found.scatter
-    unit = dict(zip(names, ("m/s", "m/s", "rad/s", "A"), strict=False))
+    names = [*CHANNELS, "current"][: len(CHANNELS) + bool(e.pieces.has_current.any())]
     runs = tuple(run for s in sets for run in s.runs)
     return Update(
         z=found.z,
         covariance=informed(space, covariance, found.information),
         information=found.information,
-        variance={
-            f"mixed.{n}": float(scatter.variance[k]) for n, k in zip(names, column, strict=True)
-        },
-        unit={f"mixed.{n}": unit[n] for n in names},
+        variance={f"mixed.{n}": float(found.scatter.variance[k]) for k, n in enumerate(names)},
+        unit={f"mixed.{n}": unit for n, unit in zip(names, UNITS, strict=False)},
         runs=runs,
         settled=found.settled,
         about={
@@ -263,9 +251,7 @@ def update(
             "windows": len(e.pieces.run),
             "before": before,
             "after": after,
-            "correlation": {
-                n: float(scatter.factor[k]) for n, k in zip(names, column, strict=True)
-            },
+            "correlation": {n: float(found.scatter.factor[k]) for k, n in enumerate(names)},
         },
     )
 

@@ -51,8 +51,6 @@ class Target(eqx.Module):
     """What a fit maximises, as an argument of compiled functions.
 
     Attributes:
-        space: free numbers and their priors.
-        batch: measured windows.
         blocks: covariance pieces of every block of residuals.
         typical: centre of the prior of the log variances.
         joint: whether currents and voltages move the numbers of the motion, too.
@@ -112,23 +110,18 @@ class Problem:
 
     @property
     def batch(self) -> lk.Batch:
-        """The windows as arrays."""
         return self.target.batch
 
     @property
     def electric(self) -> Bool[np.ndarray, " free"]:
-        """Coordinates that are read from currents and voltages given the motion."""
         return self.space.electric
 
     def linear(self, z: Vector, volt: Vector) -> tuple[Blocks, Blocks]:
         """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
-        return linear(self.target, jnp.asarray(z), jnp.asarray(volt))[:2]
+        return linear(self.target, *_arrays(z, volt))[:2]
 
     def log_jacobian(self, z: Vector, volt: Vector, keep: Vector) -> tuple[Array, Array]:
-        """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
-        return log_jacobian(
-            self.target, jnp.asarray(z), jnp.asarray(volt), jnp.asarray(keep, dtype=float)
-        )
+        return log_jacobian(self.target, *_arrays(z, volt, keep))
 
     def twists(self, z: Vector) -> tuple[Array, Array]:
         """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
@@ -139,26 +132,19 @@ class Problem:
         return self.noise.blocks[block].covariance(jnp.asarray(log_v))
 
     def whitening(self, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
-        """What residuals are weighed by."""
-        return variances.whitening(
-            self.noise.blocks, residual, jnp.asarray(log_v), jnp.asarray(keep, dtype=float)
-        )
+        return variances.whitening(self.noise.blocks, residual, *_arrays(log_v, keep))
 
     def precision(self, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
-        """Expected information of the search vector, prior included (free, free)."""
-        return variances.precision(
-            self.target, jacobian, jnp.asarray(log_v), jnp.asarray(keep, dtype=float)
-        )
+        return variances.precision(self.target, jacobian, *_arrays(log_v, keep))
 
     def whitened(self, jacobian: Blocks, log_v: Vector) -> Blocks:
-        """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
-        keep = jnp.ones(len(self.windows))
-        return variances.whitened(self.noise.blocks, jacobian, jnp.asarray(log_v), keep)
+        vectors = _arrays(log_v, np.ones(len(self.windows)))
+        return variances.whitened(self.noise.blocks, jacobian, *vectors)
 
     def variance_precision(self, log_v: Vector, keep: Vector, z: Vector) -> Array:
         """Expected information of the log variances at z, prior included (variance, variance)."""
-        log_v, own = jnp.asarray(log_v), self.own(z, log_v)
-        return variances.information(self.noise.blocks, log_v, jnp.asarray(keep, dtype=float), own)
+        own = self.own(z, log_v)
+        return variances.information(self.noise.blocks, *_arrays(log_v, keep), own=own)
 
     def loss(self, z: Vector, log_v: Vector, keep: Vector, residual: Blocks) -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
@@ -182,6 +168,10 @@ class Problem:
         if "voltage" not in self.noise.blocks:
             return {}
         return {"voltage": _share(self.space, self.batch, jnp.asarray(z), self.volt(log_v))}
+
+
+def _arrays(*vectors: Vector) -> tuple[Array, ...]:
+    return tuple(jnp.asarray(v, float) for v in vectors)
 
 
 @eqx.filter_jit

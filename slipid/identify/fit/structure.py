@@ -21,7 +21,6 @@ class Held(eqx.Module):
     """What is held while the structural numbers move.
 
     Attributes:
-        target: the posterior.
         z: search vector they move from.
         mask: 1 for coordinates that may move, 0 for those held (free,).
         root: what residuals are whitened with.

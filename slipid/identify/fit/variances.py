@@ -80,12 +80,11 @@ def precision(target: "Target", jacobian: Blocks, log_v: Array, keep: Array) -> 
         flat = half.reshape(-1, half.shape[-1])
         total += flat.T @ flat
         of_motion += flat.T @ flat if k == "motion" else 0.0
-    return total if target.joint else _cut(total, of_motion, target.space.electric)
+    return total if target.joint else _cut(total, of_motion, jnp.asarray(target.space.electric))
 
 
-def _cut(total: Array, of_motion: Array, electric: np.ndarray) -> Array:
+def _cut(total: Array, of_motion: Array, e: Array) -> Array:
     """Information when p(electric | motion, all data) multiplies p(motion | motion data)."""
-    e = jnp.asarray(electric)
     own = jnp.where(e[:, None] & e[None, :], total, jnp.where(jnp.eye(len(e)) > 0, 1.0, 0.0))
     cross = jnp.where(e[:, None] & ~e[None, :], total, 0.0)
     carried = cross.T @ jnp.linalg.solve(own, cross)
@@ -99,12 +98,8 @@ def scored(
 ) -> Array:
     """One Fisher-scoring step of the restricted likelihood in the log variances.
 
-    Args:
-        target: the posterior.
-        residual, jacobian: of its structural numbers.
-        log_v: where to start.
-        keep: weight of each piece.
-        own: part that the variances have in that of the residuals (piece, m); all where absent.
+    Residuals and Jacobian are of the structural numbers. `own` is the part that the variances have
+    in that of the residuals (piece, m), all where absent.
     """
     cov = jnp.linalg.inv(precision(target, jacobian, log_v, keep))
     spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in jacobian.items()}
