@@ -143,8 +143,8 @@ class Problem:
 
     def variance_precision(self, log_v: Vector, keep: Vector, z: Vector) -> Array:
         """Expected information of the log variances at z, prior included (variance, variance)."""
-        own = self.own(z, log_v)
-        return variances.information(self.noise.blocks, *_arrays(log_v, keep), own=own)
+        at, counts = _arrays(log_v, keep)
+        return variances.information(self.noise.blocks, at, counts, self.own(z, log_v))
 
     def loss(self, z: Vector, log_v: Vector, keep: Vector, residual: Blocks) -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
