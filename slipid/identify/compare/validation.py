@@ -242,8 +242,8 @@ def by_floor(runs: Sequence[Judged]) -> dict[str, list[Judged]]:
 
 
 def _mean(scores: Sequence[Score]) -> Summary:
-    def all_of(name: str) -> list[float]:
-        return [getattr(s, name) for s in scores if getattr(s, name) is not None]
+    def all_of(name: str) -> np.ndarray:
+        return np.array([getattr(s, name) for s in scores if getattr(s, name) is not None], float)
 
     covered = all_of("covered90")
     return Summary(
@@ -251,7 +251,7 @@ def _mean(scores: Sequence[Score]) -> Summary:
         endpoint_error_median=float(np.median(all_of("endpoint_error"))),
         length_error_mean=float(np.mean(all_of("length_error"))),
         heading_error_median_deg=float(np.median(all_of("heading_error_deg"))),
-        coverage90=float(np.mean(covered)) if covered else None,
+        coverage90=float(np.mean(covered)) if covered.size else None,
         energy_score=float(np.mean(all_of("energy_score"))),
         runs=len(scores),
     )

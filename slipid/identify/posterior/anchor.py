@@ -20,12 +20,9 @@ class Anchor(eqx.Module):
     """Windows and the fit that a density is anchored at; an argument of what is compiled.
 
     Attributes:
-        batch: measured windows.
         base: covariance pieces of every block of residuals, pieces last (component, m, m, piece).
         which: number of the variance that each of them belongs to (component, piece).
-        z, log_variance: search vector and log variances at the fit.
-        twist: twist of every window at the fit.
-        twist_slope: its derivative by the search vector.
+        twist, twist_slope: of every window at the fit, and its derivative by the search vector.
         typical: centre of the prior of the log variances.
         shares: how far session effects of one std move the residuals of a piece.
         session: place of the piece's session among those that have effects.

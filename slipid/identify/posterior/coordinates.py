@@ -21,8 +21,6 @@ class Fitted:
     """Where a fit ended.
 
     Attributes:
-        z: search vector.
-        log_variance: log variances of the noise components.
         covariance: Laplace covariance of the search vector, as if sessions shared nothing; where
             currents do not inform motion it is that of p(electric | motion, data)
             p(motion | motion data).
@@ -40,7 +38,6 @@ class Coordinates:
     """Which coordinates a density has: structure first, then log variances, then session effects.
 
     Attributes:
-        names: name of each coordinate.
         structure: places of the first of them in the search vector.
         variance: numbers of the variance components that follow.
         sessions: floor and session of the effects that come last: along, across and yaw of each.
@@ -75,7 +72,8 @@ def coordinates_of(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
         ELECTRIC: [k for k in jacobian if k != "motion"],
         EVERYTHING: list(jacobian),
     }[part]
-    surface, floors = np.asarray(problem.batch.surface), len(problem.robot.surfaces.labels)
+    labels = problem.robot.surfaces.labels
+    surface, floors = np.asarray(problem.batch.surface), len(labels)
     touched = np.zeros((problem.space.size, floors), bool)
     seen = np.zeros((len(problem.noise.names), floors), bool)
     for k in blocks:
@@ -90,7 +88,6 @@ def coordinates_of(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
     shared = by_axis(fitted.session, "session", problem.windows)
     found = {pair for pair, v in zip(pairs(problem.windows), shared, strict=True) if v.any()}
     sessions = tuple(sorted(found)) if part != ELECTRIC else ()
-    labels = problem.robot.surfaces.labels
     on = [[label == floor for label in labels] for floor, _ in sessions for _ in AXES]
     names = [problem.space.names[k] for k in structure]
     names += [f"noise.{problem.noise.names[k]}" for k in variance]
@@ -106,5 +103,5 @@ def coordinates_of(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
 
 def _groups(touched: Bool[np.ndarray, "size floor"]) -> Int[np.ndarray, " size"]:
     """The one floor that a coordinate touches, else -1; a single floor is a single group."""
-    group = np.where(touched.sum(axis=1) == 1, touched.argmax(axis=1), -1)
-    return np.zeros_like(group) if touched.shape[1] == 1 else group
+    alone = (touched.sum(axis=1) == 1) | (touched.shape[1] == 1)
+    return np.where(alone, touched.argmax(axis=1), -1)

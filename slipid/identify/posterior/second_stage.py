@@ -25,7 +25,6 @@ class SecondStage:
     """A draw of the electric numbers for every draw of the motion, and how it was found.
 
     Attributes:
-        x: draws.
         accepted: part of the moves that moved something.
         still: part of the walkers with a group that never moved.
         unsettled: drift or memory of each coordinate, as `unsettled` says.
@@ -47,20 +46,12 @@ def electric_given_motion(
 ) -> SecondStage:
     """A draw of the electric numbers for every draw of the motion.
 
-    Walkers are in coordinates less their regression on the motion, in which they are all alike.
-
-    Args:
-        first, second: densities of the motion and of the electric numbers.
-        covariance: Laplace covariance of the search vector.
-        x: draws of the motion.
-        plan: plan of the first stage.
-        record: blocks of an earlier call, and where new ones go.
+    Walkers are in coordinates less their regression on the motion, in which they are all alike. The
+    covariance is Laplace's of the search vector, the plan that of the first stage.
     """
     motion, electric = first.coordinates.structure, second.coordinates.structure
-    slope = np.linalg.solve(
-        covariance[np.ix_(motion, motion)], covariance[np.ix_(motion, electric)]
-    )
-    n = len(electric)
+    n, cross = len(electric), covariance[np.ix_(motion, electric)]
+    slope = np.linalg.solve(covariance[np.ix_(motion, motion)], cross)
     left = second.covariance.copy()
     left[:n, :n] -= covariance[np.ix_(electric, motion)] @ slope
     shift = np.zeros((*x.shape[:2], second.size))
@@ -96,18 +87,14 @@ def electric_given_motion(
     )
 
 
-def _target(
-    second: Density,
-    covariance: Float[np.ndarray, "size size"],
-    shift: Float[np.ndarray, "walker size"],
-    held: Held,
-) -> Target:
+def _target(second: Density, covariance: np.ndarray, shift: np.ndarray, held: Held) -> Target:
     """The electric numbers less their regression on the motion, each walker with its own motion."""
+    at = second.coordinates
     return Target(
         lambda u: second.terms(u + shift, held),
         lambda u: second.slope(u + shift, held),
-        second.coordinates.group,
-        second.coordinates.kind,
+        at.group,
+        at.kind,
         second.centre,
         covariance,
         apart=True,

@@ -16,8 +16,8 @@ class Target:
     """A log density, and what is known of it beforehand.
 
     Attributes:
-        terms: from vectors (walker, size) to terms (walker, group + 1), the shared term last.
-        slope: from vectors to the derivative of the sum of their terms (walker, size).
+        terms: of vectors (walker, size): terms (walker, group + 1), the shared one last.
+        slope: derivative of the sum of their terms (walker, size).
         group: group of each coordinate, -1 where groups share it.
         kind: kind of each coordinate; coordinates of different kinds are moved apart.
         centre, covariance: mean and covariance of a Gaussian near it (Laplace).

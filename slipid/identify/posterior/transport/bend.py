@@ -90,12 +90,8 @@ def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]
             step = np.linalg.solve(2 * of.T @ of, of.T @ excess)
             scale[spreads] += step * min(1.0, 1.0 / (np.abs(of @ step).max() + 1e-9))
         root = np.sqrt(weight)
-        gains = np.stack(
-            [
-                0.50 * share * _scores(f * root[:, None], means, root * (w - f @ shift)),
-                0.25 * share * _scores(f, spreads, excess),
-            ]
-        )
+        of_mean = _scores(f * root[:, None], means, root * (w - f @ shift))
+        gains = share * np.stack([0.5 * of_mean, 0.25 * _scores(f, spreads, excess)])
         which, best = np.unravel_index(np.argmax(gains), gains.shape)
         if gains[which, best] < WORTH:
             break

@@ -57,9 +57,7 @@ class Stair:
     def left(self, about: Matrix, said: Matrix) -> Matrix:
         """What others do not say of own coordinates, by the root.
 
-        Args:
-            about: all coordinates less their means.
-            said: what all of them say.
+        From all coordinates less their means, and what all of them say.
         """
         left = about[:, self.own] - said[:, self.given] @ self.slope
         return np.asarray(np.linalg.solve(self.root, left.T).T)
@@ -69,11 +67,7 @@ class Stair:
 class Transport:
     """The whole map, of vectors x (row, size) to and from u (row, size).
 
-    Attributes:
-        mean: mean of x.
-        values: what coordinates say to those that follow.
-        stairs: the way from x to v; every coordinate is in one of them.
-        last: the way from v to u.
+    Stairs lead from x to v, every coordinate is in one of them, and the last warp from v to u.
     """
 
     mean: Vector
@@ -101,7 +95,6 @@ class Transport:
 
     @cached_property
     def _back(self) -> "Steps":
-        """The way back as arrays of jax."""
         with jax.ensure_compile_time_eval():  # kept, so never a tracer's
             return _steps(self)
 
@@ -117,7 +110,6 @@ class Steps:
         w_i = f_i . shift_i + exp(f_i . scale_i) v_i,   x_i - m_i = columns . slope_i
 
     Attributes:
-        mean, values, last: those of the map.
         order: coordinate of each step.
         slope: derivative of each step by the columns (step, 2 size + 1).
         root: log dx/dw of each step.

@@ -28,15 +28,13 @@ class Warp:
 
     def forward(self, v: Matrix) -> Matrix:
         """The way from v to u."""
-        return np.asarray(
-            np.sinh(self.tail * np.arcsinh((v - self.place) / self.scale) - self.skew)
-        )
+        inner = self.tail * np.arcsinh((v - self.place) / self.scale)
+        return np.asarray(np.sinh(inner - self.skew))
 
     def back(self, u: Leaf) -> Array:
         """The way from u to v."""
-        return jnp.asarray(
-            self.place + self.scale * jnp.sinh((jnp.arcsinh(u) + self.skew) / self.tail)
-        )
+        inner = (jnp.arcsinh(u) + self.skew) / self.tail
+        return jnp.asarray(self.place + self.scale * jnp.sinh(inner))
 
     def log_slope(self, u: A) -> A:
         """Log dv/du of every coordinate."""
