@@ -15,12 +15,8 @@ from slipid.identify.fit.variances import Vector
 class Rows:
     """Residuals at a search vector, block by block, with what they are weighed by.
 
-    Attributes:
-        residual, jacobian: predicted less measured, one row per piece, and its slope.
-        roots: of their inverse covariance, weights of outliers included.
-        weight: of each piece, about 1, small for an outlier.
-        whitened: residuals in units of their expected scatter.
-        gram: information of all of them without those weights, in prior stds.
+    Roots are of the inverse covariance, weights of outliers (about 1, small for one) included; gram
+    is the information of all rows without those weights, in prior stds.
     """
 
     residual: dict[str, np.ndarray]

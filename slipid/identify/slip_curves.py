@@ -21,13 +21,9 @@ _SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])
 
 @dataclass(frozen=True, eq=False)
 class SlipCurve:
-    """Slip of a wheel over its torque on one floor.
+    """Slip of a wheel over its torque on one floor, from rest to what occurred, with its 90 % band.
 
-    Attributes:
-        torque_nm: from rest to what occurred [N m].
-        slip: at each torque.
-        slip_lo, slip_hi: ends of its 90 % band.
-        wheel_speed, load_share: the speed [rad/s] and the share of the weight it is given for.
+    It is given for this speed [rad/s] and this share of the weight.
     """
 
     torque_nm: Float[np.ndarray, " torque"]
@@ -42,13 +38,8 @@ class SlipCurve:
 class Validity:
     """What a floor was seen with: outside of it the fit extrapolates.
 
-    Attributes:
-        runs: number of them.
-        loads: load set-ups.
-        wheel_speed, torque_nm, slip, yaw_rate: smallest and largest size of each [rad/s], [N m],
-            [1], [rad/s]; the yaw rate by the encoders.
-        headings_deg, speeds, turn_rates: commanded [deg], [m/s], [rad/s].
-        distance: mean length of a run [m].
+    Smallest and largest wheel speed [rad/s], torque [N m], slip, yaw rate by the encoders [rad/s];
+    commanded headings [deg], speeds [m/s] and turn rates [rad/s]; mean length of a run [m].
     """
 
     runs: int
@@ -88,11 +79,8 @@ def torque_of_slip(
 ) -> Float[Array, "surface slip"]:
     """Torque [N m] of a wheel that slips by `_SLIP` along its drive direction, on every floor.
 
-    Args:
-        wheel_speed: w [rad/s].
-        share: N, of the weight on this wheel.
-
-    Source: `slipid.model.contact_law` without sideways rolling.
+    At this speed [rad/s], with this share of the weight on the wheel. Source:
+    `slipid.model.contact_law` without sideways rolling.
     """
     floor = jax.tree.map(lambda leaf: leaf[:, None], robot.surfaces)
     rim = (robot.geometry.wheel_radius * wheel_speed)[:, None]

@@ -56,12 +56,7 @@ class HeadingLookup(Rung):
 
 
 class _Table(NamedTuple):
-    """What a floor and load set-up has to be fitted to.
-
-    Attributes:
-        phi, gap: features (piece, window, k), and what they have to explain (piece, window, 3).
-        run: of every piece.
-    """
+    """Features (piece, window, k) of a floor and load set-up, and the gap they have to explain."""
 
     key: str
     phi: np.ndarray

@@ -41,12 +41,7 @@ STEP = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Noisy(Predictive):
-    """A rung with noise of its own; its numbers come first, then the camera's.
-
-    Attributes:
-        rung: fitted.
-        contact: whose camera it shares.
-    """
+    """A rung with noise of its own and the camera of a fit, whose numbers follow the rung's."""
 
     rung: Rung
     contact: Contact

@@ -30,12 +30,7 @@ TOGETHER = 32
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Paths of runs cut into the same number of steps.
-
-    Attributes:
-        run: number of each run in the dataset.
-        predicted, measured: marker poses in corrected metres (run, step + 1, 3).
-    """
+    """Paths of runs cut into the same number of steps: marker poses in corrected metres."""
 
     run: np.ndarray
     predicted: Float[np.ndarray, "run edge 3"]

@@ -36,13 +36,10 @@ Slopes = Float[np.ndarray, "piece m number"]
 
 @dataclass(frozen=True, eq=False)
 class Predictive(abc.ABC):
-    """A fitted model with noise of its own.
+    """A fitted model with noise of its own, seen by the camera of its robot.
 
-    Attributes:
-        robot: whose camera sees what the model predicts.
-        log_variance: of every noise component of the problem.
-        variance: the same by name, not as logarithms, and what sessions share.
-        covariance: of the model's numbers and the camera's.
+    The variances are of every noise component of the problem; by name, those of sessions are there,
+    too. The covariance is of the model's numbers and the camera's.
     """
 
     robot: Robot
@@ -104,12 +101,7 @@ _camera_log_jacobian = jax.jit(lk.camera_log_jacobian)
 
 @dataclass(frozen=True, eq=False)
 class Contact(Predictive):
-    """The force balance where a fit has left it.
-
-    Attributes:
-        problem: that was fitted.
-        z: search vector.
-    """
+    """The force balance where a fit of a problem has left it, at the search vector z."""
 
     problem: Problem
     z: Float[np.ndarray, " free"]

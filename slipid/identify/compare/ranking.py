@@ -43,16 +43,11 @@ def mean_error(
 
 @dataclass(frozen=True)
 class Ranked:
-    """A model on a floor.
+    """A model on a floor: its score [nats per run], see `ranking`, and means over the runs.
 
-    Attributes:
-        elpd: its score, see `ranking` [nats per run].
-        difference: to the best, `se` over runs, `se_clustered` over sectors of headings.
-        verdict: `best`, `tied` or `worse`.
-        endpoint_error: mean, with its clustered standard error.
-        energy_score: mean [m].
-        coverage50, coverage90: share of runs that ended in the regions of this probability.
-        heading_error_median_deg: at the end.
+    The difference is to the best, `se` over runs, `se_clustered` over sectors of headings as that
+    of the end-point error; the verdict is `best`, `tied` or `worse`. Coverages are shares of runs
+    that ended in the regions of this probability, the energy score is in m.
     """
 
     elpd: float
@@ -70,14 +65,10 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The models on a floor.
+    """The models on a floor, the best of them, and what a reader should take home.
 
-    Attributes:
-        runs, clusters: number of runs and of sectors of headings.
-        best: name of the best model.
-        sentence: what a reader should take home.
-        band50, band90: shares of runs in regions that honest forecasts have, see `_band`.
-        models: every model by name.
+    Clusters are sectors of headings, bands the shares of runs in regions that honest forecasts
+    have, see `_band`.
     """
 
     runs: int

@@ -27,13 +27,7 @@ VARIANTS: dict[str, tuple[float, bool, bool]] = {
 
 @dataclass(frozen=True)
 class Errors:
-    """Root mean squares of what a curve leaves of slip.
-
-    Attributes:
-        rows: over all rows.
-        floors: mean of the floors' own.
-        each: of every floor.
-    """
+    """Root mean squares of what a curve leaves of slip: over all rows, mean of floors, and each."""
 
     rows: float
     floors: float
@@ -42,13 +36,9 @@ class Errors:
 
 @dataclass(frozen=True)
 class Transfer:
-    """One choice of rows: how slip is predicted on a floor that was not fitted.
+    """How slip is predicted on a floor that was not fitted, for one choice of rows.
 
-    Attributes:
-        pooled: by the curve of the other floors.
-        constant: by their mean slip.
-        per_surface: by the floor's own curve.
-        count: rows.
+    By the curve of the other floors (pooled), by their mean slip, and by the floor's own curve.
     """
 
     pooled: Errors
@@ -58,13 +48,10 @@ class Transfer:
 
 
 def transfer(w: Windows, robot: Robot) -> dict[str, Transfer]:
-    """Leave-one-surface-out errors of slip, per variant of what counts as a row.
+    """Leave-one-surface-out errors of slip, per variant of what counts as a row; none of one floor.
 
     A row is one wheel in one window: s = 1 - J xi / (r w), xi the body twist from the camera in
     corrected metres, I the mean magnitude of the wheel's current.
-
-    Returns:
-        nothing where fewer than two floors were driven.
     """
     if len(set(w.surface)) < 2:
         return {}

@@ -19,15 +19,10 @@ SCHEMA = "slipid.validation/1"
 
 @dataclass(frozen=True, eq=False)
 class Predictor:
-    """What a prediction needs of a fit.
+    """What a prediction needs of a fit: where its free numbers are, how sure it is, and its noise.
 
-    Attributes:
-        robot: fitted numbers.
-        space: of the free ones.
-        z: where they are in it.
-        covariance: of z.
-        variance: of every noise component by name, and of what sessions share; none is none.
-        rungs: fitted on the same runs.
+    The variance is of every noise component by name and of what sessions share, where they do; the
+    rungs were fitted on the same runs.
     """
 
     robot: Robot
@@ -42,15 +37,10 @@ class Predictor:
 class Score:
     """What a model's prediction of a run is worth.
 
-    Attributes:
-        predicted_end: pose at the end (x, y [m], yaw [rad]).
-        endpoint_error: distance to the camera's end, over the chord.
-        length_error: of the predicted chord, relative.
-        heading_error_deg: at the end, absolute.
-        level: probability of the region whose edge the end lies on, None for a model without.
-        covered90: whether that is at most 0.9.
-        energy_score: [m].
-        log_density: of the logged poses [nats]; None where it was not asked for.
+    The pose at the end is x, y [m] and yaw [rad]; the end-point error is over the chord, the length
+    error relative. `level` is the probability of the region whose edge the end lies on, `covered90`
+    whether that is at most 0.9, both None for a model without. The energy score is in m, the log
+    density of the logged poses in nats, None where it was not asked for.
     """
 
     predicted_end: Sequence[float]
@@ -67,12 +57,8 @@ class Score:
 class Judged:
     """A run and the scores of every model on it.
 
-    Attributes:
-        name, surface, load, session: of the run.
-        heading_deg, speed: as commanded [deg], [m/s]; None where that is not known.
-        chord: the camera's straight-line displacement [m].
-        measured_end: pose at the end (x, y [m], yaw [rad]).
-        models: score by model.
+    Heading and speed are as commanded [deg], [m/s], None where not known; the chord is the camera's
+    straight-line displacement [m], the measured end a pose (x, y [m], yaw [rad]).
     """
 
     name: str
@@ -86,8 +72,8 @@ class Judged:
     session: str | None = None
 
     def to_json(self) -> Content:
-        """Plain values; what was not asked for is left out."""
-        return asdict(self, dict_factory=_told)
+        """Plain values."""
+        return asdict(self, dict_factory=told)
 
     @classmethod
     def of_json(cls, content: Content) -> "Judged":
@@ -96,7 +82,8 @@ class Judged:
         return cls(**{**content, "models": models})
 
 
-def _told(values: Iterable[tuple[str, object]]) -> Content:
+def told(values: Iterable[tuple[str, object]]) -> Content:
+    """Plain values without what was not asked for."""
     return {k: v for k, v in values if v is not None or k not in ("session", "log_density")}
 
 
@@ -152,7 +139,7 @@ class Validation:
 def validation(fit: Predictor, data: Runs) -> Validation:
     """Prediction of runs of known floors by a fit, beside every rung.
 
-    As in `cross_validation`, every run is predicted as of a session of its own: what its session
+    As in `folds`, every run is predicted as of a session of its own: what its session
     shares widens its region by the variance found in fitting, whether or not other runs of that
     session were fitted. A run begins at its first pose after the wheels moved 10 mm.
 

@@ -25,12 +25,7 @@ ENDLESS = 1e3
 
 
 class Rows(NamedTuple):
-    """Whitened Jacobians of runs.
-
-    Attributes:
-        motion: J (run, m, motion).
-        electric, carried: E (run, k, electric) and C (run, k, motion), k is 0 without currents.
-    """
+    """Whitened Jacobians of runs: J of the motion, E and C of currents (k is 0 without them)."""
 
     motion: Float[np.ndarray, "run m motion"]
     electric: Float[np.ndarray, "run k electric"]
@@ -47,12 +42,7 @@ class Rows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Knowledge:
-    """Information on all numbers.
-
-    Attributes:
-        is_electric: which of the numbers are (free,).
-        motion, own, cross: M, O and X.
-    """
+    """Information on all numbers, M, O and X, and which of them are electric."""
 
     is_electric: Bool[np.ndarray, " free"]
     motion: Float[np.ndarray, "motion motion"]

@@ -29,9 +29,8 @@ Setup = tuple[str, str]
 class Drive:
     """One run: a constant command on one floor with one load set-up.
 
-    Attributes:
-        heading: of the commanded motion in the body frame [rad]; speed: [m/s]; turn: [rad/s].
-        distance: commanded length [m], arc of the rim where it only turns.
+    The heading of the motion is in the body frame [rad]; speed [m/s], turn [rad/s]; the distance is
+    the commanded length [m], arc of the rim where it only turns.
     """
 
     surface: str

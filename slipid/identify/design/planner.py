@@ -30,16 +30,11 @@ _TOGETHER = 256
 
 
 class Planner:
-    """What runs that were not driven yet would tell of a robot.
+    """What runs that were not driven yet would tell of a robot; choices and variances as fitted.
 
-    Args:
-        robot: as fitted; its sessions are over, new runs have one of their own.
-        choices: free, fixed, priors, as fitted.
-        variance: of every noise component by name, and of what runs of a session share.
-        channels: as fitted.
-
-    Its vectors hold the numbers of the search space and then, in stds of what they share along,
-    across and in yaw, the effects of the new session on floors where sessions are known to differ.
+    The robot's sessions are over, new runs have one of their own. Vectors hold the numbers of the
+    search space and then, in stds of what they share along, across and in yaw, the effects of the
+    new session on floors where sessions are known to differ.
     """
 
     def __init__(
@@ -158,11 +153,7 @@ class Planner:
 class Goal:
     """A number whose uncertainty is to shrink: sqrt(tr(G cov G^T)).
 
-    Attributes:
-        name: for tables and files.
-        unit: of the number.
-        rows: G (k, free).
-        floors, loads: it is about; empty for any.
+    Rows are G; floors and loads those it is about, empty for any.
     """
 
     name: str

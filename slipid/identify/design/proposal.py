@@ -32,14 +32,9 @@ ASSUMPTIONS = (
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Proposed runs.
+    """Proposed runs, the most useful first, with the content of design.json.
 
-    Attributes:
-        content: of design.json.
-        drives: the runs, the most useful first.
-        base_radius: of the robot [m].
-        seen: what each floor was driven with.
-        reached: whether every goal that was asked for can be reached.
+    Seen is what each floor was driven with; reached, whether every goal that was asked for can be.
     """
 
     content: Content

@@ -23,13 +23,10 @@ MOST_ACCELERATION = 0.6
 
 @dataclass(frozen=True, eq=False)
 class Crossing:
-    """Windows of runs over several floors.
+    """Windows of runs over several floors, one per piece; runs are (name, sha256).
 
-    Attributes:
-        windows: one per piece.
-        floor: under each wheel all the while, by number in the robot's stack.
-        place: number of each window in its run, gaps counted.
-        runs: (name, sha256) of the runs.
+    The floor is that under each wheel all the while, by number in the robot's stack, the place a
+    window's number in its run, gaps counted.
     """
 
     windows: Windows

@@ -72,12 +72,9 @@ def batch(
 
 
 class Predicted(eqx.Module):
-    """What the robot says of each window.
+    """What the robot says of each window: marker increments (x, y [m], yaw [rad]), body twists.
 
-    Attributes:
-        increment: of the marker (x, y [m], yaw [rad]).
-        twist: of the body.
-        felt: traction of each wheel's motor in units of mu m g.
+    Felt is the traction of each wheel's motor in units of mu m g.
     """
 
     increment: Float[Array, "piece window 3"]

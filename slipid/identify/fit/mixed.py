@@ -46,14 +46,9 @@ UNITS = ("m/s", "m/s", "rad/s", "A")
 class Update:
     """What runs over several floors make of a fit.
 
-    Attributes:
-        z: search vector.
-        covariance: of it.
-        information: what was added to the inverse covariance.
-        variance, unit: of the residuals by channel, `mixed.yaw` and so on; unit of the std.
-        runs: (name, sha256) of the runs.
-        settled: whether the last step was within `TOLERANCE`.
-        about: runs, windows, root mean square errors before and after, correlation factors.
+    Information is what was added to the inverse covariance; variances are of the residuals by
+    channel, `mixed.yaw` and so on, units of their stds. `about` tells runs, windows, root mean
+    square errors before and after, correlation factors.
     """
 
     z: Float[np.ndarray, " free"]

@@ -22,13 +22,7 @@ from slipid.model.robot import Robot
 
 
 class Components(eqx.Module):
-    """Covariance pieces of one block of residuals.
-
-    Attributes:
-        base: B_c (piece, component, m, m).
-        which: number of the variance each belongs to (piece, component).
-        floor: variance that every residual has beside them.
-    """
+    """Covariance pieces B_c of one block, the variance each belongs to, and one beside them all."""
 
     base: Float[Array, "piece component m m"]
     which: Int[Array, "piece component"]

@@ -17,11 +17,9 @@ CREEPS = (0.05, 0.4, 1.0)
 
 @dataclass(frozen=True)
 class Options:
-    """How long and how precisely to fit.
+    """How many rounds of weights, structure and variances at most.
 
-    Attributes:
-        most_rounds: of weights, structure and variances.
-        tolerance: stop when no number moves more than this many posterior stds in a round.
+    The fit stops when no number moves more than `tolerance` posterior stds in a round.
     """
 
     most_rounds: int = 30
@@ -30,15 +28,7 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """End of a fit.
-
-    Attributes:
-        state: where it ended.
-        covariance: of the search vector (Laplace).
-        converged: whether the tolerance was met.
-        reason: why it stopped, for people.
-        history: loss after every round.
-    """
+    """End of a fit: Laplace covariance, why it stopped, for people, and the loss of every round."""
 
     state: State
     covariance: Float[np.ndarray, "free free"]

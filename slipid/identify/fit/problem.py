@@ -30,13 +30,8 @@ __all__ = ["DEGREES", "VARIANCE_SPREAD", "Problem", "State", "Target"]
 class State:
     """Where a fit stands; enough to go on from.
 
-    Attributes:
-        z: structural vector in the search space.
-        log_variance: of every variance component.
-        round: rounds done.
-        loss: minus log posterior up to a constant.
-        moved: largest step of the last round, in posterior stds.
-        stage: what it was doing, for progress.
+    The loss is minus log posterior up to a constant, `moved` the largest step of the last round in
+    posterior stds, the stage what it was doing, for progress.
     """
 
     z: Float[np.ndarray, " free"]
@@ -50,10 +45,8 @@ class State:
 class Target(eqx.Module):
     """What a fit maximises, as an argument of compiled functions.
 
-    Attributes:
-        blocks: covariance pieces of every block of residuals.
-        typical: centre of the prior of the log variances.
-        joint: whether currents and voltages move the numbers of the motion, too.
+    `typical` is the centre of the prior of the log variances; where it is joint, currents and
+    voltages move the numbers of the motion, too.
     """
 
     space: Space
@@ -66,17 +59,12 @@ class Target(eqx.Module):
 class Problem:
     """Likelihood of a set of windows as functions of the search vector.
 
-    Args:
-        windows: of the runs, all of them; `keep` below chooses those that count.
-        robot: start values and what is fixed.
-        choices: free, fixed, priors.
-        current_informs_motion: let currents and voltages move the numbers of the motion, too. By
-            default they do not ("cut"): the torque scale is read from currents given the motion,
-            whose errors are carried along. A friction model good to 5 % in current would otherwise
-            outvote forces that motion shows to 1 %.
+    By default currents and voltages do not move the numbers of the motion ("cut"): the torque scale
+    is read from currents given the motion, whose errors are carried along. A friction model good to
+    5 % in current would otherwise outvote forces that motion shows to 1 %.
 
-    Attributes:
-        compiled: what was compiled for windows of these shapes by others, under their own keys.
+    `keep`, below, chooses the pieces that count. `compiled` holds what was compiled for windows of
+    these shapes by others, under their own keys.
     """
 
     def __init__(

@@ -18,15 +18,11 @@ _REFUSED = 12
 
 
 class Held(eqx.Module):
-    """What is held while the structural numbers move.
+    """What is held while the structural numbers move from z.
 
-    Attributes:
-        z: search vector they move from.
-        mask: 1 for coordinates that may move, 0 for those held (free,).
-        root: what residuals are whitened with.
-        volt: std of the voltage noise [V].
-        felt: traction at z, which currents and voltages are predicted from.
-        slope: of log |d residuals / d data| by the search vector.
+    The mask is 1 for coordinates that may move; root whitens residuals, volt is the std of the
+    voltage noise [V], felt the traction at z, which currents and voltages are predicted from, and
+    slope that of log |d residuals / d data| by the search vector.
     """
 
     target: Target

@@ -31,12 +31,9 @@ VARIANCE_SPREAD = 3.0
 
 
 class Whitening(NamedTuple):
-    """What residuals are weighed by.
+    """Root W of every piece with W^T W = w V^-1, weight w, small for an outlier, and the loss.
 
-    Attributes:
-        root: W with W^T W = w V^-1 of every piece (piece, m, m).
-        weight: w of every piece, small for an outlier.
-        loss: minus log likelihood, less constants.
+    The loss is minus log likelihood, less constants.
     """
 
     root: Blocks

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from slipid.identify.posterior.transport.bend import Bend
-from slipid.identify.posterior.transport.plateaus import Values
+from slipid.identify.posterior.transport.coordinatewise import Values, Warp
 from slipid.identify.posterior.transport.transport_map import Stair, Transport
-from slipid.identify.posterior.transport.warp import Warp
 
 FORMAT = 2
 """Version of the block files; bump it when their content or the way they are made changes."""

@@ -18,13 +18,10 @@ A = TypeVar("A", Array, np.ndarray)
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Where a fit ended.
+    """Where a fit ended, and the variances of what the runs of a session share.
 
-    Attributes:
-        covariance: Laplace covariance of the search vector, as if sessions shared nothing; where
-            currents do not inform motion it is that of p(electric | motion, data)
-            p(motion | motion data).
-        session: variances of what the runs of a session share, `session.<floor>.<axis>`.
+    The Laplace covariance is as if sessions shared nothing; where currents do not inform motion it
+    is that of p(electric | motion, data) p(motion | motion data).
     """
 
     z: np.ndarray
@@ -37,11 +34,9 @@ class Fitted:
 class Coordinates:
     """Which coordinates a density has: structure first, then log variances, then session effects.
 
-    Attributes:
-        structure: places of the first of them in the search vector.
-        variance: numbers of the variance components that follow.
-        sessions: floor and session of the effects that come last: along, across and yaw of each.
-        group: floor that each coordinate belongs to, -1 where several floors share it.
+    Structure are places in the search vector, variances numbers of components; a session has
+    effects along, across and in yaw. The group is the floor of each coordinate, -1 where several
+    share it.
     """
 
     names: tuple[str, ...]

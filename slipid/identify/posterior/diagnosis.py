@@ -10,15 +10,11 @@ from slipid.identify.posterior.blocks import Chain, Plan
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Whether chains may be believed, per coordinate.
+    """Whether chains may be believed, per coordinate; the worst is furthest from the plan's bars.
 
-    Attributes:
-        r_hat: rank-normalised split R-hat over ensembles (Vehtari et al. 2021).
-        tau: integrated autocorrelation time [steps].
-        ess: effective number of draws, the smaller of bulk and tails.
-        steps: of every walker after the warm-up.
-        converged: whether all coordinates meet the plan's bars.
-        worst, reason: coordinate that is furthest from its bar, and how it stands, in words.
+    R-hat is rank-normalised and split, over ensembles (Vehtari et al. 2021), tau the integrated
+    autocorrelation time [steps], ess the effective draws, the fewer of bulk and tails. Steps are
+    those of every walker after the warm-up.
     """
 
     r_hat: Float[np.ndarray, " size"]

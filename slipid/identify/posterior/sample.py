@@ -26,16 +26,12 @@ STILL = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Draws, and whether they may be believed.
+    """Draws, and whether and why they may be believed.
 
-    Attributes:
-        effects: what runs of a session share, in stds.
-        fitted: fit that was sampled around.
-        log_prob, names, diagnosis: of the first stage, the latter from all its steps.
-        accepted: part of the moves that moved something, by stage.
-        still: part of the second stage's walkers with a group that never moved.
-        unsettled: worst drift or memory of the second stage's walkers, 1 where it is just enough.
-        converged, reason: whether the draws may be believed, and why, or why not.
+    Effects are what runs of a session share, in stds. Log density, names and diagnosis are of the
+    first stage; accepted is the part of the moves that moved something, by stage. Of the second
+    stage's walkers, still is the part with a group that never moved, unsettled the worst drift or
+    memory, 1 where it is just enough.
     """
 
     z: Float[np.ndarray, "ensemble draw free"]

@@ -24,10 +24,8 @@ chain, and correlation that they may still have with where they were in its midd
 class SecondStage:
     """A draw of the electric numbers for every draw of the motion, and how it was found.
 
-    Attributes:
-        accepted: part of the moves that moved something.
-        still: part of the walkers with a group that never moved.
-        unsettled: drift or memory of each coordinate, as `unsettled` says.
+    Accepted is the part of the moves that moved something, still the part of the walkers with a
+    group that never moved; drift or memory of each coordinate is as `unsettled` says.
     """
 
     x: Float[np.ndarray, "ensemble draw size"]

@@ -40,13 +40,9 @@ _PART = 0.3
 class Flat:
     """A direction in which the data do not hold the parameters.
 
-    Attributes:
-        paths: of the parameters that move together.
-        powers: each is multiplied by t to this power, for any t; what has no bounds moves by this
-            times t [unit]. The largest is 1 or -1.
-        others: how many more move a little with them.
-        formula: the same for people.
-        remedy: the channel or the runs that would tell.
+    Each of the paths is multiplied by t to its power, for any t; what has no bounds moves by this
+    times t [unit]. The largest power is 1 or -1; `others` more move a little with them. The formula
+    is the same for people, the remedy the channel or the runs that would tell.
     """
 
     paths: tuple[str, ...]

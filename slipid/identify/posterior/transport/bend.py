@@ -6,7 +6,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from jaxtyping import Float, Int
 
-from slipid.identify.posterior.transport.arrays import Matrix, Vector
+from slipid.identify.posterior.transport.coordinatewise import Matrix, Vector
 
 FAR = 4.0
 """Polynomials stay what they are beyond this many stds."""
@@ -22,13 +22,10 @@ MOST_MONOMIALS = 12
 
 @dataclass(frozen=True, eq=False)
 class Bend:
-    """Polynomials a and b of a group's coordinates.
+    """Polynomials a (shift) and b (scale) of a group's coordinates.
 
-    Attributes:
-        factors: columns whose product each monomial is, from (w, told, 1), where told is what
-            plateaus say.
-        shift: coefficients of a.
-        scale: coefficients of b.
+    Factors are the columns whose product each monomial is, from (w, told, 1), where told is what
+    plateaus say.
     """
 
     factors: Int[np.ndarray, "monomial 3"]

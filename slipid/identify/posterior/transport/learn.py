@@ -4,11 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from slipid.identify.posterior.transport.arrays import Matrix, Vector
 from slipid.identify.posterior.transport.bend import Bend
-from slipid.identify.posterior.transport.plateaus import Values
+from slipid.identify.posterior.transport.coordinatewise import Matrix, Values, Vector, Warp
 from slipid.identify.posterior.transport.transport_map import Stair, Transport
-from slipid.identify.posterior.transport.warp import Warp
 
 MOST_DRAWS = 4000
 """Largest number of draws that a map is learnt from."""

@@ -28,23 +28,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from slipid.identify.posterior.transport.arrays import Matrix, Vector
 from slipid.identify.posterior.transport.bend import FAR, MOST_MONOMIALS, Bend
-from slipid.identify.posterior.transport.plateaus import Values
-from slipid.identify.posterior.transport.warp import Warp
+from slipid.identify.posterior.transport.coordinatewise import Matrix, Values, Vector, Warp
 
 
 @dataclass(frozen=True, eq=False)
 class Stair:
-    """Some coordinates, after those they follow.
+    """Some coordinates, by their places, after those they follow.
 
-    Attributes:
-        own: their places.
-        given: places of those they follow.
-        slope: derivative of own ones by what given ones say.
-        root: Cholesky factor of the covariance of what is left.
-        bend: bend of what is left; None for shared coordinates.
-        plateaus: places of plateaus of the group among the given; their numbers bend it.
+    Slope is the derivative of own ones by what given ones say, root the Cholesky factor of the
+    covariance of what is left, bend the bend of that, None for shared coordinates. Plateaus are
+    those of the group among the given; their numbers bend it.
     """
 
     own: Int[np.ndarray, " own"]
@@ -109,12 +103,8 @@ class Steps:
 
         w_i = f_i . shift_i + exp(f_i . scale_i) v_i,   x_i - m_i = columns . slope_i
 
-    Attributes:
-        order: coordinate of each step.
-        slope: derivative of each step by the columns (step, 2 size + 1).
-        root: log dx/dw of each step.
-        factors: columns whose product each monomial f is (step, term, 3).
-        shift, scale: their coefficients (step, term).
+    Order is the coordinate of each step, root its log dx/dw, factors the columns whose product each
+    monomial f is (step, term, 3).
     """
 
     mean: Array
