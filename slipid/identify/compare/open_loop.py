@@ -4,6 +4,7 @@ Everything is in the corrected metres of the fitted camera; the measured pose is
 start.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.stats import f as fisher
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
@@ -18,6 +20,7 @@ from slipid.identify.compare.body_motion import sideways, turned
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import travel
 from slipid.identify.fit.problem import DEGREES
+from slipid.identify.fit.sessions import by_axis
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
 from slipid.parameter import Space
@@ -125,7 +128,7 @@ def end_covariance(
     robot: Robot,
     w: Windows,
     tracks: Tracks,
-    variance: dict[str, float],
+    variance: Mapping[str, float],
     of_parameters: Float[np.ndarray, "piece 2 2"] | float = 0.0,
 ) -> Float[np.ndarray, "piece 2 2"]:
     """Covariance of the gap between predicted and measured end [m^2], scale matrix of a Student t.
@@ -140,13 +143,11 @@ def end_covariance(
     lever = sideways(p[:, -1:, :2] - p[:, 1:, :2])  # what a turn at each step moves
     way = p[:, :-1, 2]
     along, across = turned(way, u), turned(way, sideways(u))
-    for name, axis in (("along", along), ("across", across), ("yaw", lever)):
-        v = np.array([variance[f"process.{f}.{name}"] for f in w.surface])
-        cov += np.einsum("n,nk,nki,nkj->nij", v, far, axis, axis)
-        shared = [variance.get(f"session.{f}.{name}", 0.0) for f in w.surface]
-        v = np.array([variance[f"run.{f}.{name}"] for f in w.surface]) + shared
+    process, run, session = (by_axis(variance, k, w) for k in ("process", "run", "session"))
+    for k, axis in enumerate((along, across, lever)):
+        cov += np.einsum("n,nk,nki,nkj->nij", process[:, k], far, axis, axis)
         whole = np.einsum("nk,nki->ni", far, axis)
-        cov += v[:, None, None] * whole[:, :, None] * whole[:, None, :]
+        cov += (run + session)[:, k, None, None] * whole[:, :, None] * whole[:, None, :]
     turn = sideways(p[:, -1, :2] - p[:, 0, :2])
     cov += variance["camera.heading"] * turn[:, :, None] * turn[:, None, :]
     cov += 2 * variance["camera.place"] * float(robot.camera.scale) ** 2 * np.eye(2)
@@ -156,9 +157,9 @@ def end_covariance(
 def contact_ends(
     robot: Robot,
     space: Space,
-    z: Float[np.ndarray, " free"],
-    covariance: Float[np.ndarray, "free free"],
-    variance: dict[str, float],
+    z: np.ndarray,
+    covariance: np.ndarray,
+    variance: Mapping[str, float],
     w: Windows,
 ) -> tuple[Tracks, Float[np.ndarray, "piece 2 2"]]:
     """Tracks of the force balance, and the covariance of their ends, linearised in the numbers."""
@@ -182,14 +183,11 @@ def scores(
     """
     if cov is None:
         return None, np.linalg.norm(gap, axis=1)
-    from scipy.stats import f as fisher
-
     q = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(cov), gap)
     level = fisher.cdf(q / 2, 2, DEGREES)
     rng = np.random.default_rng(seed)
-    count = 500
-    normal = rng.normal(size=(count, 2)) / np.sqrt(rng.chisquare(DEGREES, (count, 1)) / DEGREES)
+    normal = rng.normal(size=(500, 2)) / np.sqrt(rng.chisquare(DEGREES, (500, 1)) / DEGREES)
     draws = np.einsum("nij,kj->nki", np.linalg.cholesky(cov), normal)
     near = np.linalg.norm(draws - gap[:, None], axis=2).mean(axis=1)
-    apart = np.linalg.norm(draws[:, : count // 2] - draws[:, count // 2 :], axis=2).mean(axis=1)
+    apart = np.linalg.norm(draws[:, :250] - draws[:, 250:], axis=2).mean(axis=1)
     return level, near - 0.5 * apart

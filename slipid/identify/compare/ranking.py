@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.stats import binom
 
 from slipid.identify.compare.validation import Judged, Score, by_floor, finite
 
@@ -139,8 +140,6 @@ def _ranked(
 
 def _band(runs: int, share: float) -> tuple[float, float]:
     """Shares of runs in regions of this probability that 99 % of honest forecasts would have."""
-    from scipy.stats import binom
-
     low, high = (float(binom.ppf(q, runs, share)) / runs for q in (0.005, 0.995))
     return low, high
 

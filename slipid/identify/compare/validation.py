@@ -1,6 +1,6 @@
 """Open-loop prediction of runs a fit has not seen, beside every rung it was compared with."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -29,7 +29,7 @@ class Predictor:
     space: Space
     z: Float[np.ndarray, " free"]
     covariance: Float[np.ndarray, "free free"]
-    variance: dict[str, float]
+    variance: Mapping[str, float]
     rungs: Sequence[Rung]
 
 

@@ -56,12 +56,9 @@ class Planner:
         self._problem = Problem(self._windows([first] * _TOGETHER), self.robot, choices)
         self.space = self._problem.space
         self.z = self.space.vector(self.robot)
-        joint = self._problem.joint
-        electric = np.zeros(self.space.size, bool) if joint else self._problem.electric
-        labels = self.robot.surfaces.labels
-        self._differ = np.array(
-            [any(self.variance.get(f"session.{x}.{a}") for a in AXES) for x in labels]
-        )
+        electric = self._problem.electric & (not self._problem.joint)
+        of_floor = [[f"session.{x}.{a}" for a in AXES] for x in robot.surfaces.labels]
+        self._differ = np.array([any(map(self.variance.get, names)) for names in of_floor])
         self.effects = len(AXES) * int(self._differ.sum())
         self.is_electric = np.concatenate([electric, np.zeros(self.effects, bool)])
         self._log_v = np.log([self.variance[name] for name in self._problem.noise.names])
@@ -107,16 +104,15 @@ class Planner:
         filled = [*drives, *[drives[-1]] * (_TOGETHER - len(drives))]
         windows = self._windows(filled)
         this = self._problem.of(windows)
-        _, jacobian = this.linear(jnp.asarray(self.z), this.volt(self._log_v))
+        _, jacobian = this.linear(self.z, this.volt(self._log_v))
         std = np.sqrt(by_axis(self.variance, "session", windows))
         felt = effects(windows, self.robot) * std[:, None]
         on = np.eye(len(self._differ))[np.asarray(this.batch.surface)][:, self._differ]
         moved = (felt[:, :, None, :] * on[:, None, :, None]).reshape(*felt.shape[:2], -1)
         # only the motion knows of a session's effects
         wider = ((0, 0), (0, 0), (0, self.effects))
-        jacobian = {k: jnp.pad(j, wider) for k, j in jacobian.items() if k != "motion"} | {
-            "motion": jnp.concatenate([jacobian["motion"], -moved], axis=2)
-        }
+        of_motion = jnp.concatenate([jacobian["motion"], -moved], axis=2)
+        jacobian = {k: jnp.pad(j, wider) for k, j in jacobian.items()} | {"motion": of_motion}
         halves = this.whitened(jacobian, self._log_v)
         motion = np.asarray(halves.pop("motion"))[: len(drives)]
         others = [np.asarray(h)[: len(drives)] for h in halves.values()]
@@ -139,14 +135,6 @@ class Planner:
         jacobian = np.array(end_jacobian(self.space, jnp.asarray(self.z), b, start))[:, :2]
         jacobian /= np.array([d.distance for d in drives])[:, None, None]
         return np.pad(jacobian, ((0, 0), (0, 0), (0, self.effects)))
-
-    def derivative(self, path: str) -> Float[np.ndarray, "entry number"]:
-        """Derivative of a free parameter's entries [SI] by the numbers."""
-        entry = next(e for e in self.space.free if e.path == path)
-        at = self.space.place[path]
-        out = np.zeros((entry.size, len(self.is_electric)))
-        out[:, at] = jax.jacfwd(entry.declaration.to_si)(jnp.asarray(self.z[at]))
-        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +163,9 @@ class Goal:
 def parameter_goal(planner: Planner, path: str) -> Goal:
     """Std of a parameter [its unit], of a short vector the root mean square of its entries."""
     entry = next(e for e in planner.space.free if e.path == path)
-    rows = planner.derivative(path)
+    at = planner.space.place[path]
+    rows = np.zeros((entry.size, len(planner.is_electric)))
+    rows[:, at] = jax.jacfwd(entry.declaration.to_si)(jnp.asarray(planner.z[at]))
     return Goal(
         path,
         entry.declaration.unit,

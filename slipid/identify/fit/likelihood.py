@@ -20,6 +20,9 @@ FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
 """Variance added to every residual: rounding of the logs [m^2, A^2, V^2]."""
 
 
+_AS_THEY_ARE = ("dt", "turn", "faster", "pose", "current", "voltage", "current_var", "lag")
+
+
 class Batch(eqx.Module):
     """Windows as arrays for a jitted function; names are indices of the robot's stacks.
 
@@ -48,8 +51,7 @@ def batch(
 ) -> Batch:
     """Batch for a robot that knows the floors, loads and sessions of the windows.
 
-    Args:
-        floor: surface under each wheel, where the windows do not know theirs.
+    The floor is the surface under each wheel, where the windows do not know theirs.
     """
     if floor is None:
         floor = np.asarray([robot.surface_index(s) for s in windows.surface])
@@ -57,14 +59,7 @@ def batch(
         surface=jnp.asarray(floor),
         load=jnp.asarray([robot.load_index(s) for s in windows.load]),
         session=jnp.asarray([robot.session_index(s) for s in windows.session]),
-        dt=jnp.asarray(windows.dt),
-        turn=jnp.asarray(windows.turn),
-        faster=jnp.asarray(windows.faster),
-        pose=jnp.asarray(windows.pose),
-        current=jnp.asarray(windows.current),
-        voltage=jnp.asarray(windows.voltage),
-        current_var=jnp.asarray(windows.current_var),
-        lag=jnp.asarray(windows.lag),
+        **{name: jnp.asarray(getattr(windows, name)) for name in _AS_THEY_ARE},
         has_current=windows.has_current,
         has_voltage=windows.has_voltage,
         signed=windows.current_is_signed,
@@ -90,11 +85,7 @@ def wheel_speed(robot: Robot, b: Batch) -> Float[Array, "piece window wheel"]:
 def predict(
     robot: Robot, b: Batch, near: Float[Array, "piece window 3"] | None = None
 ) -> Predicted:
-    """Contact equilibrium of every window.
-
-    Args:
-        near: twists close to it, see `slipid.model.robot.twist`.
-    """
+    """Contact equilibrium of every window, looked for near twists as `model.robot.twist` does."""
     frame = robot.geometry.frame()
 
     def window(
@@ -104,11 +95,10 @@ def predict(
         increment = robot.camera.seen(se2.advance(xi, dt), session)
         return increment, xi, model.felt(robot, frame, xi, w, surface, load)
 
-    piece = jax.vmap(window, (0, 0, None if near is None else 0, None, None, None))
-    lanes = (0, 0, None if near is None else 0, 0, 0, 0)
-    return Predicted(
-        *jax.vmap(piece, lanes)(wheel_speed(robot, b), b.dt, near, b.surface, b.load, b.session)
-    )
+    each = None if near is None else 0
+    piece = jax.vmap(window, (0, 0, each, None, None, None))
+    pieces = jax.vmap(piece, (0, 0, each, 0, 0, 0))
+    return Predicted(*pieces(wheel_speed(robot, b), b.dt, near, b.surface, b.load, b.session))
 
 
 def seen(
@@ -163,10 +153,8 @@ def electric_residuals(
 ) -> dict[str, Array]:
     """Predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
 
-    Args:
-        felt: traction of each wheel's motor in units of mu m g.
-        voltage_std: of the voltage noise [V]; the noise of the measured current is carried into the
-            voltage equation by R, which keeps R from being attenuated.
+    The noise of the measured current is carried into the voltage equation by R, which keeps R from
+    being attenuated; `voltage_std` is the voltmeter's own [V].
     """
     n = b.dt.shape[0]
     out = {}

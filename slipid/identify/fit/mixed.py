@@ -17,7 +17,7 @@ contact law lacks would bend a length sooner than a lens does.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -129,8 +129,7 @@ def _linear(space: Space, z: Array, b: lk.Batch, u: Array) -> tuple[Array, Array
     return r, slope
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
+class _Found(NamedTuple):
     """End of the steps: where, what the data added, how residuals scatter there."""
 
     z: np.ndarray
@@ -195,9 +194,7 @@ def held(space: Space) -> Bool[np.ndarray, " free"]:
 
 
 def informed(
-    space: Space,
-    covariance: Float[np.ndarray, "free free"],
-    information: Float[np.ndarray, "free free"],
+    space: Space, covariance: np.ndarray, information: np.ndarray
 ) -> Float[np.ndarray, "free free"]:
     """Covariance after more information on all numbers but the camera's, given these.
 
@@ -207,20 +204,15 @@ def informed(
     total = np.linalg.inv(covariance) + information
     own = np.linalg.inv(total[np.ix_(~h, ~h)])
     carried = -own @ total[np.ix_(~h, h)]
-    kept = covariance[np.ix_(h, h)]
-    out = np.empty_like(covariance)
-    out[np.ix_(h, h)] = kept
-    out[np.ix_(~h, h)] = carried @ kept
-    out[np.ix_(h, ~h)] = (carried @ kept).T
-    out[np.ix_(~h, ~h)] = own + carried @ kept @ carried.T
+    both = carried @ covariance[np.ix_(h, h)]
+    out = covariance.copy()
+    out[np.ix_(~h, h)], out[np.ix_(h, ~h)] = both, both.T
+    out[np.ix_(~h, ~h)] = own + both @ carried.T
     return out
 
 
 def update(
-    space: Space,
-    mean: Float[np.ndarray, " free"],
-    covariance: Float[np.ndarray, "free free"],
-    sets: Sequence[Crossing],
+    space: Space, mean: np.ndarray, covariance: np.ndarray, sets: Sequence[Crossing]
 ) -> Update:
     """Posterior of the search vector given windows over several floors.
 

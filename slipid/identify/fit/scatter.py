@@ -45,11 +45,10 @@ def scatter(r: np.ndarray, of: Pieces, factor: np.ndarray | None) -> Scatter:
     """
     motion = np.arange(r.shape[1]) < len(CHANNELS)
     counts = np.where(motion, 1.0, of.has_current[:, None])
-    blocks = [motion, ~motion]
     weight, expected = counts.copy(), counts.copy()
     for _ in range(5):
         variance = _pooled(weight * r**2, counts)
-        for block in blocks:
+        for block in (motion, ~motion):
             m = int(block.sum())
             q = (r[:, block] ** 2 / variance[block]).sum(axis=1)
             t = (DEGREES + m) / (DEGREES + q)
@@ -68,8 +67,7 @@ def scatter(r: np.ndarray, of: Pieces, factor: np.ndarray | None) -> Scatter:
 def _mean_of_runs(x: np.ndarray, run: np.ndarray) -> Float[np.ndarray, "window channel"]:
     """Mean of every column over the run a window is of; nan counts for nothing."""
     there = np.isfinite(x)
-    total = np.zeros((run.max() + 1, x.shape[1]))
-    count = np.zeros_like(total)
+    total, count = np.zeros((2, run.max() + 1, x.shape[1]))
     np.add.at(total, run, np.where(there, x, 0.0))
     np.add.at(count, run, there.astype(float))
     return np.asarray((total / np.maximum(count, 1.0))[run])

@@ -65,10 +65,9 @@ def shared(
     of_piece = pairs(w)
     for pair in dict.fromkeys(of_piece):
         mine = np.array([other == pair for other in of_piece]) & (keep > 0)
-        if not mine.any():
-            continue
-        u = pulls[mine].sum(axis=0)
-        meat += u.T @ (of_session[mine][0][:, None] * u)
+        if mine.any():
+            u = pulls[mine].sum(axis=0)
+            meat += u.T @ (of_session[mine][0][:, None] * u)
     return variance, model.covariance + model.covariance @ meat @ model.covariance
 
 

@@ -48,13 +48,7 @@ class Steps(optx.LevenbergMarquardt):
         self.most = jnp.asarray(most)
 
     def terminate(
-        self,
-        fn: Any,
-        y: Array,
-        args: Held,
-        options: dict[str, Any],
-        state: Any,
-        tags: frozenset[object],
+        self, fn: Any, y: Array, args: Held, options: Any, state: Any, tags: frozenset[object]
     ) -> tuple[Array, optx.RESULTS]:
         done, result = super().terminate(fn, y, args, options, state, tags)
         taken = state.num_accepted_steps - 1 >= self.most
