@@ -16,6 +16,7 @@ from slipid.identify.compare.predictive import contact_of
 from slipid.identify.fit.mixed import Update, informed
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.variances import Search, Square
 from slipid.identify.rows import remaining, rows_at, spectrum
 from slipid.identify.slip_curves import SlipCurve, Validity
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
@@ -78,9 +79,9 @@ class Fit:
 
     space: Space
     choices: tuple[Choice, ...]
-    z: Float[np.ndarray, " free"]
-    covariance: Float[np.ndarray, "free free"]
-    laplace: Float[np.ndarray, "free free"]
+    z: Search
+    covariance: Square
+    laplace: Square
     variance: Mapping[str, float]
     variance_unit: Mapping[str, str]
     runs: tuple[tuple[str, str], ...]
@@ -88,7 +89,7 @@ class Fit:
     residual: Mapping[str, np.ndarray]
     whitened: Mapping[str, np.ndarray]
     weight: Mapping[str, np.ndarray]
-    spectrum: Float[np.ndarray, " free"]
+    spectrum: Search
     channels: Channels
     curves: Mapping[str, SlipCurve]
     validity: Mapping[str, Validity]
@@ -239,9 +240,7 @@ def updated(fit: Fit, new: Update, problem: Problem, optimum: Optimum, data: Run
     )
 
 
-def draws(
-    z: Float[np.ndarray, " free"], covariance: Float[np.ndarray, "free free"], count: int, seed: int
-) -> Float[np.ndarray, "draw free"]:
+def draws(z: Search, covariance: Square, count: int, seed: int) -> Float[np.ndarray, "draw free"]:
     """Draws of a Gaussian in the search space."""
     rng = np.random.default_rng(seed)
     root = np.linalg.cholesky(covariance)

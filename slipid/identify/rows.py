@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from slipid.identify.fit.problem import Problem
-from slipid.identify.fit.variances import Vector
+from slipid.identify.fit.variances import Search, Square, Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +23,7 @@ class Rows:
     roots: dict[str, np.ndarray]
     weight: dict[str, np.ndarray]
     whitened: dict[str, np.ndarray]
-    gram: Float[np.ndarray, "free free"]
+    gram: Square
 
 
 def rows_at(problem: Problem, z: Vector, log_v: Vector) -> Rows:
@@ -44,14 +43,12 @@ def rows_at(problem: Problem, z: Vector, log_v: Vector) -> Rows:
     return Rows(residual, jacobian, roots, weight, whitened, gram)
 
 
-def spectrum(gram: Float[np.ndarray, "free free"]) -> Float[np.ndarray, " free"]:
+def spectrum(gram: Square) -> Search:
     """Singular values of the Jacobian whose Gram matrix this is, the largest first."""
     return np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0))
 
 
-def remaining(
-    problem: Problem, z: Float[np.ndarray, " free"], volt: Vector, rows: Rows
-) -> tuple[float, str]:
+def remaining(problem: Problem, z: Search, volt: Vector, rows: Rows) -> tuple[float, str]:
     """Largest step of a full Gauss-Newton step in posterior stds, and the number that takes it.
 
     delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), W with the weights of outliers, g

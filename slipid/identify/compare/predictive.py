@@ -27,7 +27,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import effects
 from slipid.identify.fit.problem import DEGREES, Problem, State
 from slipid.identify.fit.sessions import Linear, by_axis, shared
-from slipid.identify.fit.variances import Vector
+from slipid.identify.fit.variances import Search, Square, Vector
 from slipid.model.robot import Robot
 
 Gaps = Float[np.ndarray, "piece m"]
@@ -104,7 +104,7 @@ class Contact(Predictive):
     """The force balance where a fit of a problem has left it, at the search vector z."""
 
     problem: Problem
-    z: Float[np.ndarray, " free"]
+    z: Search
 
     @property
     def name(self) -> str:
@@ -138,7 +138,7 @@ Fitted = TypeVar("Fitted", bound=Predictive)
 def contact_of(
     problem: Problem,
     state: State,
-    covariance: Float[np.ndarray, "free free"],
+    covariance: Square,
     keep: Float[np.ndarray, " piece"] | None = None,
 ) -> Contact:
     """The force balance at the end of a fit.

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from slipid.data.runs import Runs
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.compare.rung import Rung
+from slipid.identify.fit.variances import Search, Square
 from slipid.model.robot import Robot
 from slipid.parameter import Space
 from slipid.support.content import Content
@@ -27,8 +28,8 @@ class Predictor:
 
     robot: Robot
     space: Space
-    z: Float[np.ndarray, " free"]
-    covariance: Float[np.ndarray, "free free"]
+    z: Search
+    covariance: Square
     variance: Mapping[str, float]
     rungs: Sequence[Rung]
 

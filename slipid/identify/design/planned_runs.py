@@ -101,9 +101,7 @@ def paper_grid(setups: Iterable[Setup], distance: Mapping[str, float]) -> tuple[
 
 
 def heading_grid(
-    setups: Iterable[Setup],
-    speeds: Mapping[str, Sequence[float]],
-    distance: Mapping[str, float],
+    setups: Iterable[Setup], speeds: Mapping[str, Sequence[float]], distance: Mapping[str, float]
 ) -> tuple[Drive, ...]:
     """Straight runs in headings every 5 degrees at every speed, as the 2022 logs were driven."""
     headings = np.radians(np.arange(0.0, 360.0, 5.0))

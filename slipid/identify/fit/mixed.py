@@ -29,6 +29,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.crossing import Crossing
 from slipid.identify.fit.noise import travel
 from slipid.identify.fit.scatter import CHANNELS, Pieces, Scatter, scatter
+from slipid.identify.fit.variances import Search, Square
 from slipid.model.robot import Robot
 from slipid.parameter import Space
 
@@ -51,9 +52,9 @@ class Update:
     square errors before and after, correlation factors.
     """
 
-    z: Float[np.ndarray, " free"]
-    covariance: Float[np.ndarray, "free free"]
-    information: Float[np.ndarray, "free free"]
+    z: Search
+    covariance: Square
+    information: Square
     variance: Mapping[str, float]
     unit: Mapping[str, str]
     runs: tuple[tuple[str, str], ...]
@@ -183,7 +184,7 @@ def _maximise(e: _Evidence, mean: np.ndarray, covariance: np.ndarray) -> _Found:
     return _Found(z, _gram(slope, found.counted(found.expected)), found, settled)
 
 
-def _gram(slope: np.ndarray, count: np.ndarray) -> Float[np.ndarray, "free free"]:
+def _gram(slope: np.ndarray, count: np.ndarray) -> Square:
     flat = (np.sqrt(count)[..., None] * slope).reshape(-1, slope.shape[-1])
     return np.asarray(flat.T @ flat)
 
@@ -193,9 +194,7 @@ def held(space: Space) -> Bool[np.ndarray, " free"]:
     return space.where(lambda e: e.part == "camera")
 
 
-def informed(
-    space: Space, covariance: np.ndarray, information: np.ndarray
-) -> Float[np.ndarray, "free free"]:
+def informed(space: Space, covariance: np.ndarray, information: np.ndarray) -> Square:
     """Covariance after more information on all numbers but the camera's, given these.
 
     With h held and m the others, H = C^-1 + information: C_hh stays, z_m = -H_mm^-1 H_mh z_h + e.

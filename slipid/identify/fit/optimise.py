@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from slipid.identify.fit.problem import DEGREES, Problem, State, linear
 from slipid.identify.fit.structure import Held, levenberg
-from slipid.identify.fit.variances import scored
+from slipid.identify.fit.variances import Search, Square, scored
 
 CREEPS = (0.05, 0.4, 1.0)
 """Starts of the creep of every floor; others end in poor minima."""
@@ -31,7 +31,7 @@ class Optimum:
     """End of a fit: Laplace covariance, why it stopped, for people, and the loss of every round."""
 
     state: State
-    covariance: Float[np.ndarray, "free free"]
+    covariance: Square
     converged: bool
     reason: str
     history: tuple[float, ...]
@@ -86,7 +86,7 @@ def one_round(
     problem: Problem,
     state: State,
     keep: Float[np.ndarray, " piece"],
-    mask: Float[np.ndarray, " free"],
+    mask: Search,
     steps: int,
     scoring: int,
 ) -> State:

@@ -19,7 +19,14 @@ from slipid.data.windows import Windows
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import variances
 from slipid.identify.fit.noise import Components, noise
-from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD, Blocks, Vector, Whitening
+from slipid.identify.fit.variances import (
+    DEGREES,
+    VARIANCE_SPREAD,
+    Blocks,
+    Search,
+    Vector,
+    Whitening,
+)
 from slipid.model.robot import Robot
 from slipid.parameter import Choice, Space
 
@@ -34,7 +41,7 @@ class State:
     posterior stds, the stage what it was doing, for progress.
     """
 
-    z: Float[np.ndarray, " free"]
+    z: Search
     log_variance: Float[np.ndarray, " variance"]
     round: int
     loss: float

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Target
-from slipid.identify.fit.variances import Blocks
+from slipid.identify.fit.variances import Blocks, Search
 
 _REFUSED = 12
 """Steps of the solver that may be refused in a round."""
@@ -55,7 +55,7 @@ class Steps(optx.LevenbergMarquardt):
         return done | taken | (state.num_steps >= self.most + _REFUSED), result
 
 
-def levenberg(held: Held, most: int) -> Float[np.ndarray, " free"]:
+def levenberg(held: Held, most: int) -> Search:
     """Search vector after at most so many Levenberg-Marquardt steps with fixed whitening."""
     return np.asarray(_moved(held, Steps(most)))
 

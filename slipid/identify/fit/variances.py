@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from slipid.identify.fit.linear import inverse_root
 from slipid.identify.fit.noise import Components
@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 
 Vector = Array | np.ndarray
 """One-dimensional, of jax or numpy."""
+Search = Float[np.ndarray, " free"]
+"""A search vector, or one number for each of its coordinates."""
+Square = Float[np.ndarray, "free free"]
+"""Covariance or information of the search vector."""
 Blocks = dict[str, Array]
 """An array for every block of residuals: `motion`, `current`, `voltage`."""
 Noises = dict[str, Components]

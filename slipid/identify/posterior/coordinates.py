@@ -6,10 +6,11 @@ from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES, by_axis, pairs
+from slipid.identify.fit.variances import Square
 
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
 """Parts of a posterior that a density can be of."""
@@ -26,7 +27,7 @@ class Fitted:
 
     z: np.ndarray
     log_variance: np.ndarray
-    covariance: Float[np.ndarray, "free free"]
+    covariance: Square
     session: Mapping[str, float] = field(default_factory=dict)
 
 

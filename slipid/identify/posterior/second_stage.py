@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from slipid.identify.fit.variances import Square
 from slipid.identify.posterior.blocks import Chain, Plan, Record
 from slipid.identify.posterior.coordinates import ELECTRIC
 from slipid.identify.posterior.density import Density, Held
@@ -37,7 +38,7 @@ class SecondStage:
 def electric_given_motion(
     first: Density,
     second: Density,
-    covariance: Float[np.ndarray, "free free"],
+    covariance: Square,
     x: Float[np.ndarray, "ensemble draw size"],
     plan: Plan,
     record: Record,

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.variances import Search, Square
 from slipid.parameter import Choice, Declaration, Entry, Space
 
 IDENTIFIED, WEAK = 0.3, 0.8
@@ -92,11 +93,7 @@ class Estimate:
 
 
 def estimates(
-    space: Space,
-    choices: Sequence[Choice],
-    z: Float[np.ndarray, " free"],
-    covariance: Float[np.ndarray, "free free"],
-    has_voltage: bool,
+    space: Space, choices: Sequence[Choice], z: Search, covariance: Square, has_voltage: bool
 ) -> tuple[Estimate, ...]:
     """Every declared number with its interval and verdict, in order of declaration."""
     tree = space.tree(jnp.asarray(z))
@@ -204,12 +201,7 @@ def provenance(verdict: str, ratio: float) -> str:
     return "measured" if held else "borrowed"
 
 
-def derived(
-    space: Space,
-    z: Float[np.ndarray, " free"],
-    covariance: Float[np.ndarray, "free free"],
-    has_voltage: bool,
-) -> tuple[Estimate, ...]:
+def derived(space: Space, z: Search, covariance: Square, has_voltage: bool) -> tuple[Estimate, ...]:
     """`RATIOS` with interval and verdict: the log of each is a difference of coordinates.
 
     Its std under the posterior, sqrt(c^T C c) with c = (.., 1, .., -1, ..), is compared with that
@@ -253,9 +245,9 @@ def _quotient(
 
 def expected_covariance(
     problem: Problem,
-    z: Float[np.ndarray, " free"] | None = None,
+    z: Search | None = None,
     log_variance: Float[np.ndarray, " variance"] | None = None,
-) -> Float[np.ndarray, "free free"]:
+) -> Square:
     """Posterior covariance to be expected of these windows: inverse information, prior included.
 
     By default at the start values and with the typical variances of every noise component. What

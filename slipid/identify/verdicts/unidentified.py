@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from slipid.identify.fit.variances import Search, Square
 from slipid.identify.slip_curves import Validity
 from slipid.identify.verdicts.estimates import WEAK
 from slipid.identify.verdicts.formulas import NOTHING, SMALL, Axis, axes_of, formula
@@ -60,7 +61,7 @@ class Flat:
 class _Told:
     """Information P in prior-scaled coordinates; currents may tell some given the motion."""
 
-    def __init__(self, given: Float[np.ndarray, "free free"], electric: np.ndarray | None = None):
+    def __init__(self, given: Square, electric: np.ndarray | None = None):
         self.given, self.electric = given, electric
         self.motion = np.zeros_like(given)
         if electric is not None:
@@ -84,7 +85,7 @@ class _Told:
 
 def flat_directions(
     space: Space,
-    covariance: Float[np.ndarray, "free free"],
+    covariance: Square,
     has_current: bool,
     has_voltage: bool,
     validity: Mapping[str, Validity] | None = None,
@@ -137,7 +138,7 @@ def sentences(found: Iterable[Flat]) -> tuple[str, ...]:
 
 
 def _sparse(
-    told: _Told, among: list[int], symmetry: list[int], move: Float[np.ndarray, " free"]
+    told: _Told, among: list[int], symmetry: list[int], move: Search
 ) -> list[tuple[list[int], Float[np.ndarray, " some"]]]:
     """Basis of the flat directions, each a unit vector that needs every coordinate it names.
 
