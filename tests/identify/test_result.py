@@ -17,7 +17,8 @@ from scipy.stats import f as fisher
 from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.identify import fit_file
-from slipid.identify.compare.validation import Predictor, validation
+from slipid.identify.compare.predictive import Contact
+from slipid.identify.compare.validation import validation
 from slipid.identify.fit.optimise import Optimum, one_round
 from slipid.identify.fit.problem import DEGREES, Problem, State
 from slipid.identify.fit_file import load, save
@@ -439,8 +440,8 @@ def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
     alone = {name: v for name, v in fit.variance.items() if not name.startswith("session.")}
 
     def covered(covariance, variance):
-        fitted = Predictor(fit.robot, fit.space, fit.z, covariance, variance, ())
-        return validation(fitted, new).summary["soft"]["identified"].coverage90
+        fitted = Contact(fit.robot, variance, covariance, fit.space, fit.z)
+        return validation(fitted, (), new).summary["soft"]["identified"].coverage90
 
     # what is drawn is Gaussian: the 90 % region of a Student t holds more of it
     held = chi2.cdf(2 * fisher.ppf(0.9, 2, DEGREES), 2)

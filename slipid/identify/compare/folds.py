@@ -145,7 +145,7 @@ def judge(
     seconds = {contact.name: {"fit": time.perf_counter() - began}}
     for rung in rungs(problem.windows.has_current):
         began = time.perf_counter()
-        models.append(with_noise(rung, contact, keep))
+        models.append(with_noise(rung, contact, problem, keep))
         seconds[rung.name] = {"fit": time.perf_counter() - began}
     part = data.subset(judged)
     runs: dict[int, Judged] = {}

@@ -68,7 +68,7 @@ class Noisy(Predictive):
 
         tracks = tracks_of(self.rung)
         camera = replay.twist_end_jacobian(
-            contact.problem.space,
+            contact.space,
             jnp.asarray(contact.z),
             jnp.asarray(self.rung.twist(w, robot)),
             lk.batch(w, robot),
@@ -80,20 +80,21 @@ class Noisy(Predictive):
         return tracks, replay.end_covariance(robot, w, tracks, self.variance, spread)
 
 
-def with_noise(rung: Rung, contact: Contact, keep: Float[np.ndarray, " piece"]) -> Noisy:
+def with_noise(
+    rung: Rung, contact: Contact, problem: Problem, keep: Float[np.ndarray, " piece"]
+) -> Noisy:
     """A rung fitted to the kept pieces of a problem, and its noise found from what it leaves there.
 
     Variances by Fisher scoring of the restricted likelihood, as for the force balance; the degrees
     of freedom of the rung's own numbers are taken off.
     """
-    problem, robot = contact.problem, contact.robot
-    lag = float(robot.camera.lag)
-    seen = problem.windows.at_lag(lag).pieces(np.flatnonzero(keep > 0))
+    robot = contact.robot
+    seen = problem.windows.at_lag(float(robot.camera.lag)).pieces(np.flatnonzero(keep > 0))
     rung = rung.fit(seen, robot)
     before = _before(rung, seen, robot)
     gap, slope = _linear(rung, contact, problem)
     common = contact.covariance[np.ix_(contact.camera, contact.camera)]
-    log_v, count = jnp.asarray(contact.log_variance), jnp.asarray(keep, float)
+    log_v, count = jnp.asarray(contact.log_variance(problem)), jnp.asarray(keep, float)
     for _ in range(MOST_TURNS):
         last = log_v
         scale = np.asarray(problem.covariance("motion", log_v))
@@ -104,14 +105,7 @@ def with_noise(rung: Rung, contact: Contact, keep: Float[np.ndarray, " piece"]) 
             log_v = scored_given(problem.target, *blocks, log_v, count, {})
         if float(jnp.abs(log_v - last).max()) < SETTLED:
             break
-    plain = Noisy(
-        robot=robot,
-        log_variance=np.asarray(log_v),
-        variance=by_name(problem, log_v),
-        covariance=covariance,
-        rung=rung,
-        contact=contact,
-    )
+    plain = Noisy(robot, by_name(problem, log_v), covariance, rung, contact)
     own = len(before)
     wide = np.zeros_like(covariance)
     wide[:own, :own], wide[own:, own:] = np.linalg.inv(before), common

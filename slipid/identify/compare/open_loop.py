@@ -154,23 +154,6 @@ def end_covariance(
     return cov
 
 
-def contact_ends(
-    robot: Robot,
-    space: Space,
-    z: np.ndarray,
-    covariance: np.ndarray,
-    variance: Mapping[str, float],
-    w: Windows,
-) -> tuple[Tracks, Float[np.ndarray, "piece 2 2"]]:
-    """Tracks of the force balance, and the covariance of their ends, linearised in the numbers."""
-    b = lk.batch(w, robot)
-    tracks = follow(robot, w, np.asarray(contact_increments(robot, b)))
-    start = jnp.asarray(tracks.predicted[:, 0])
-    jac = np.asarray(end_jacobian(space, jnp.asarray(z), b, start))[:, :2]
-    own = np.einsum("nip,pq,njq->nij", jac, covariance, jac)
-    return tracks, end_covariance(robot, w, tracks, variance, own)
-
-
 def scores(
     gap: Float[np.ndarray, "run 2"], cov: Float[np.ndarray, "run 2 2"] | None, seed: int = 0
 ) -> tuple[np.ndarray | None, np.ndarray]:

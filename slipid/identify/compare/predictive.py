@@ -11,6 +11,7 @@ a rung's numbers follow it.
 """
 
 import abc
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
@@ -29,6 +30,7 @@ from slipid.identify.fit.problem import DEGREES, Problem, State
 from slipid.identify.fit.sessions import Linear, by_axis, shared
 from slipid.identify.fit.variances import Search, Square, Vector
 from slipid.model.robot import Robot
+from slipid.parameter import Space
 
 Gaps = Float[np.ndarray, "piece m"]
 Slopes = Float[np.ndarray, "piece m number"]
@@ -38,13 +40,12 @@ Slopes = Float[np.ndarray, "piece m number"]
 class Predictive(abc.ABC):
     """A fitted model with noise of its own, seen by the camera of its robot.
 
-    The variances are of every noise component of the problem; by name, those of sessions are there,
-    too. The covariance is of the model's numbers and the camera's.
+    Variances are of every noise component by name, and of what sessions share, where they do. The
+    covariance is of the model's numbers and the camera's.
     """
 
     robot: Robot
-    log_variance: Float[np.ndarray, " variance"]
-    variance: dict[str, float]
+    variance: Mapping[str, float]
     covariance: Float[np.ndarray, "number number"]
 
     @property
@@ -57,6 +58,10 @@ class Predictive(abc.ABC):
     def numbers(self) -> dict[str, int]:
         """How many were fitted: of every floor, and `shared` by all, the camera's not counted."""
 
+    def log_variance(self, problem: Problem) -> Float[np.ndarray, " variance"]:
+        """Of every noise component of a problem."""
+        return np.log([self.variance[name] for name in problem.noise.names])
+
     @abc.abstractmethod
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
         """Predicted less measured increments of every piece, and their slope."""
@@ -68,7 +73,7 @@ class Predictive(abc.ABC):
     def scale(self, problem: Problem) -> tuple[Gaps, Float[np.ndarray, "piece m m"]]:
         """Gaps of every piece, and the scale matrix of their distribution."""
         gap, slope = self.linear(problem)
-        noise = np.asarray(problem.covariance("motion", jnp.asarray(self.log_variance)))
+        noise = np.asarray(problem.covariance("motion", self.log_variance(problem)))
         e = effects(problem.windows, problem.robot)
         v = by_axis(self.variance, "session", problem.windows)
         return gap, noise + np.einsum("nma,na,nla->nml", e, v, e) + around(slope, self.covariance)
@@ -101,9 +106,9 @@ _camera_log_jacobian = jax.jit(lk.camera_log_jacobian)
 
 @dataclass(frozen=True, eq=False)
 class Contact(Predictive):
-    """The force balance where a fit of a problem has left it, at the search vector z."""
+    """The force balance where a fit has left it, at the search vector z."""
 
-    problem: Problem
+    space: Space
     z: Search
 
     @property
@@ -113,7 +118,7 @@ class Contact(Predictive):
     @property
     def numbers(self) -> dict[str, int]:
         out = dict.fromkeys([*self.robot.surfaces.labels, "shared"], 0)
-        for e in self.problem.space.free:
+        for e in self.space.free:
             if not e.declaration.electric and e.part != "camera":
                 out[e.surface or "shared"] += e.coordinates
         return out
@@ -121,15 +126,19 @@ class Contact(Predictive):
     @cached_property
     def camera(self) -> np.ndarray:
         """Coordinates of the search vector that belong to the camera."""
-        return np.flatnonzero(self.problem.space.where(lambda e: e.part == "camera"))
+        return np.flatnonzero(self.space.where(lambda e: e.part == "camera"))
 
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
-        blocks, jac = problem.linear(jnp.asarray(self.z), problem.volt(self.log_variance))
+        blocks, jac = problem.linear(self.z, problem.volt(self.log_variance(problem)))
         return np.asarray(blocks["motion"]), np.asarray(jac["motion"])
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
-        space = self.problem.space
-        return replay.contact_ends(self.robot, space, self.z, self.covariance, self.variance, w)
+        b, z = lk.batch(w, self.robot), jnp.asarray(self.z)
+        tracks = replay.follow(self.robot, w, np.asarray(replay.contact_increments(self.robot, b)))
+        start = jnp.asarray(tracks.predicted[:, 0])
+        jac = np.asarray(replay.end_jacobian(self.space, z, b, start))[:, :2]
+        own = np.einsum("nip,pq,njq->nij", jac, self.covariance, jac)
+        return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, own)
 
 
 Fitted = TypeVar("Fitted", bound=Predictive)
@@ -141,19 +150,12 @@ def contact_of(
     covariance: Square,
     keep: Float[np.ndarray, " piece"] | None = None,
 ) -> Contact:
-    """The force balance at the end of a fit.
+    """The force balance at the end of a fit of the kept pieces.
 
-    Args:
-        keep: of the pieces that were fitted; None leaves out what sessions share.
+    Without them it leaves out what sessions share.
     """
-    plain = Contact(
-        robot=problem.space.tree(jnp.asarray(state.z)),
-        log_variance=np.asarray(state.log_variance),
-        variance=by_name(problem, state.log_variance),
-        covariance=np.asarray(covariance),
-        problem=problem,
-        z=np.asarray(state.z),
-    )
+    robot, variance = problem.space.tree(state.z), by_name(problem, state.log_variance)
+    plain = Contact(robot, variance, np.asarray(covariance), problem.space, np.asarray(state.z))
     if keep is None:
         return plain
     of_floor = problem.space.where(lambda e: e.surface is not None)
@@ -170,12 +172,12 @@ def with_sessions(plain: Fitted, problem: Problem, wide: np.ndarray, keep: np.nd
         slope=slope,
         covariance=plain.covariance,
         wide=wide,
-        scale=np.asarray(problem.covariance("motion", jnp.asarray(plain.log_variance))),
+        scale=np.asarray(problem.covariance("motion", plain.log_variance(problem))),
         effect=effects(problem.windows, problem.robot),
         run=by_axis(plain.variance, "run", problem.windows),
     )
     variance, covariance = shared(model, problem.windows, np.asarray(keep, float))
-    return replace(plain, variance=plain.variance | variance, covariance=covariance)
+    return replace(plain, variance={**plain.variance, **variance}, covariance=covariance)
 
 
 def around(jac: Slopes, cov: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Open-loop prediction of runs a fit has not seen, beside every rung it was compared with."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -8,30 +8,13 @@ from jaxtyping import Float
 
 from slipid.data.runs import Runs
 from slipid.identify.compare import open_loop as replay
+from slipid.identify.compare.predictive import Contact
 from slipid.identify.compare.rung import Rung
-from slipid.identify.fit.variances import Search, Square
 from slipid.model.robot import Robot
-from slipid.parameter import Space
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 
 SCHEMA = "slipid.validation/1"
-
-
-@dataclass(frozen=True, eq=False)
-class Predictor:
-    """What a prediction needs of a fit: where its free numbers are, how sure it is, and its noise.
-
-    The variance is of every noise component by name and of what sessions share, where they do; the
-    rungs were fitted on the same runs.
-    """
-
-    robot: Robot
-    space: Space
-    z: Search
-    covariance: Square
-    variance: Mapping[str, float]
-    rungs: Sequence[Rung]
 
 
 @dataclass(frozen=True)
@@ -137,8 +120,8 @@ class Validation:
         return "\n".join(lines)
 
 
-def validation(fit: Predictor, data: Runs) -> Validation:
-    """Prediction of runs of known floors by a fit, beside every rung.
+def validation(fit: Contact, rungs: Sequence[Rung], data: Runs) -> Validation:
+    """Prediction of runs of known floors by a fit, beside every rung fitted on the same runs.
 
     As in `folds`, every run is predicted as of a session of its own: what its session
     shares widens its region by the variance found in fitting, whether or not other runs of that
@@ -150,9 +133,8 @@ def validation(fit: Predictor, data: Runs) -> Validation:
     _known(fit.robot, data)
     runs: dict[int, Judged] = {}
     for w in replay.cuts(data, fit.robot):
-        ends = replay.contact_ends(fit.robot, fit.space, fit.z, fit.covariance, fit.variance, w)
-        score(runs, data, "identified", *ends)
-        for rung in fit.rungs:
+        score(runs, data, fit.name, *fit.ends(w))
+        for rung in rungs:
             tracks = replay.follow(fit.robot, w, rung.increments(w, fit.robot))
             score(runs, data, rung.name, tracks, None)
     return Validation(tuple(runs[k] for k in range(len(data))))
