@@ -52,8 +52,7 @@ def speeds(data: Runs) -> Fold:
     """
     speed = np.round(data.speed, 3)
     speed[speed == 0] = np.nan
-    group = np.array([f"{log.surface}@{log.load}" for log in data.logs])
-    out = np.full(len(data), -1)
+    group, out = _groups(data), np.full(len(data), -1)
     every = np.unique(speed[np.isfinite(speed)])
     for name in np.unique(group):
         mine = (group == name) & np.isfinite(speed)
@@ -83,12 +82,15 @@ def folds_of(data: Runs, question: str) -> Fold:
             f"--folds: '{question}': no such question; expected some of {', '.join(QUESTIONS)}"
         )
     fold = QUESTIONS[question](data)
-    group = np.array([f"{log.surface}@{log.load}" for log in data.logs])
+    group = _groups(data)
     for name in np.unique(group):
-        mine = group == name
-        if len(np.unique(fold[mine])) < 2:
-            fold[mine] = -1
+        if len(np.unique(fold[group == name])) < 2:
+            fold[group == name] = -1
     return fold
+
+
+def _groups(data: Runs) -> np.ndarray:
+    return np.array([f"{log.surface}@{log.load}" for log in data.logs])
 
 
 @dataclass(frozen=True)

@@ -149,12 +149,11 @@ def _sentence(floor: str, best: str, models: Mapping[str, Ranked]) -> str:
     order = sorted((m for m in models if m != best), key=lambda m: -models[m].difference)
     if not order:
         return f"{floor}: nothing to compare {_name(best)} with"
-    tied = [m for m in order if models[m].verdict == "tied"]
+    apart = {m: f"{_name(m)} ({_apart(models[m])})" for m in order}
+    tied = [apart.pop(m) for m in order if models[m].verdict == "tied"]
     if tied:
-        said = " or ".join(f"{_name(m)} ({_apart(models[m])})" for m in tied)
-        worse = [m for m in order if m not in tied]
-        rest = f"; worse: {_name(worse[0])} ({_apart(models[worse[0]])})" if worse else ""
-        return f"{floor}: the data cannot tell {_name(best)} from {said}{rest}"
+        rest = f"; worse: {next(iter(apart.values()))}" if apart else ""
+        return f"{floor}: the data cannot tell {_name(best)} from {' or '.join(tied)}{rest}"
     return (
         f"{floor}: {_name(best)} is best; next {_name(order[0])}, {_apart(models[order[0]])} "
         "nats per run worse"

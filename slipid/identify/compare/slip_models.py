@@ -19,6 +19,8 @@ from slipid.identify.compare.rung import Rung, of_floor
 from slipid.model.motor import signed
 from slipid.model.robot import Robot
 
+KNOTS = (0.0, 0.02, 0.04, 0.06, 0.1, 0.15, 0.25)
+"""Of the monotone spline [N m]."""
 HELD = 1e12
 """Precision of a coefficient that rests on its bound."""
 
@@ -164,10 +166,8 @@ class Saturating(Rung):
 
             top = float(np.log(max(m[mine].max(), 1e-3) * 1.5))
             # the cap makes several minima: with one-sided differences rounding decides between them
-            tries = [
-                least_squares(gap, [np.log(k), top], jac="3-point", max_nfev=200)
-                for k in (0.05, 0.3, 1.0)
-            ]
+            starts = ([np.log(k), top] for k in (0.05, 0.3, 1.0))
+            tries = [least_squares(gap, x, jac="3-point", max_nfev=200) for x in starts]
             shape[name] = min(tries, key=lambda r: r.cost).x
         return replace(self, state=shape)
 
@@ -200,7 +200,7 @@ def _ramps(knots: Sequence[float]) -> Features:
 def rungs(has_current: bool) -> list[Rung]:
     """Every rung the logs allow, unfitted; `paper` is the form the authors ran on the robot.
 
-    Its threshold of 0.4 A and the spline's knots up to 0.25 N m are for motors of that size.
+    Its threshold of 0.4 A and the spline's knots are for motors of that size.
     """
     out: list[Rung] = [Encoder(), Curve("constant", _powers(0))]
     if has_current:
@@ -210,12 +210,7 @@ def rungs(has_current: bool) -> list[Rung]:
             Curve("svr", _powers(0, 1), torque=True, insensitive=True),
             Curve("quadratic", _powers(0, 1, 2), torque=True),
             Saturating(),
-            Curve(
-                "monotone_spline",
-                _ramps((0.0, 0.02, 0.04, 0.06, 0.1, 0.15, 0.25)),
-                torque=True,
-                positive=1,
-            ),
+            Curve("monotone_spline", _ramps(KNOTS), torque=True, positive=1),
             Curve("affine_current", _powers(0, 1)),
             Curve("paper", _above(0.4), per_wheel=True),
         ]

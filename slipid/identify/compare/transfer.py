@@ -10,6 +10,7 @@ import numpy as np
 
 from slipid.data.windows import Windows
 from slipid.identify.compare.body_motion import body_twist
+from slipid.identify.compare.validation import main_load
 from slipid.model.robot import Robot
 
 LEAST = 0.2
@@ -63,13 +64,10 @@ def transfer(w: Windows, robot: Robot) -> dict[str, Transfer]:
     amps = np.abs(w.current)
     floor = np.broadcast_to(np.asarray(w.surface)[:, None, None], slip.shape)
     load = np.broadcast_to(np.asarray(w.load)[:, None, None], slip.shape)
-    main = max(sorted(set(w.load)), key=w.load.count)
-    main = "as_built" if "as_built" in w.load else main
+    main = main_load(w.load)
     out = {}
     for name, (least, one_load, cut) in VARIANTS.items():
-        rows = (share >= least) & np.isfinite(slip)
-        if one_load:
-            rows &= load == main
+        rows = (share >= least) & np.isfinite(slip) & ((load == main) | (not one_load))
         if cut:
             rows &= (slip > 0) & (slip <= 1) & (amps > 0.25)
         if len(set(floor[rows].tolist())) > 1:
@@ -91,10 +89,6 @@ def _errors(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Transfer:
 
 
 def _left(gaps: dict[str, np.ndarray]) -> Errors:
-    each = {name: _rms(gap) for name, gap in gaps.items()}
-    rows = _rms(np.concatenate(list(gaps.values())))
+    each = {name: float(np.sqrt(np.mean(gap**2))) for name, gap in gaps.items()}
+    rows = float(np.sqrt(np.mean(np.concatenate(list(gaps.values())) ** 2)))
     return Errors(rows, float(np.mean(list(each.values()))), each)
-
-
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(x**2)))

@@ -197,13 +197,17 @@ def finite(x: float) -> float | None:
     return float(x) if np.isfinite(x) else None
 
 
+def main_load(loads: Sequence[str]) -> str:
+    """The set-up as built, else the most common."""
+    return "as_built" if "as_built" in loads else max(sorted(set(loads)), key=loads.count)
+
+
 def by_floor(runs: Sequence[Judged]) -> dict[str, list[Judged]]:
     """Runs of every floor, those of other load set-ups by themselves.
 
     A set-up other than the one as built, else the most common, is written `<floor>@<load>`.
     """
-    loads = [run.load for run in runs]
-    main = "as_built" if "as_built" in loads else max(sorted(set(loads)), key=loads.count)
+    main = main_load([run.load for run in runs])
     groups: dict[str, list[Judged]] = {}
     for run in runs:
         name = run.surface if run.load == main else f"{run.surface}@{run.load}"

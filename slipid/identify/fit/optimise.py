@@ -71,15 +71,9 @@ def optimise(
         if state.moved < options.tolerance:
             reason = f"no number moved {options.tolerance:g} of its std in round {state.round}"
             break
-    _, jacobian = problem.linear(state.z, problem.volt(state.log_variance))
-    info = problem.precision(jacobian, state.log_variance, keep)
-    return Optimum(
-        state=state,
-        covariance=np.linalg.inv(np.asarray(info)),
-        converged=state.moved < options.tolerance,
-        reason=reason,
-        history=tuple(history),
-    )
+    covariance = problem.laplace(state.z, state.log_variance, keep)
+    settled = state.moved < options.tolerance
+    return Optimum(state, covariance, settled, reason, tuple(history))
 
 
 def one_round(

@@ -132,6 +132,11 @@ class Problem:
     def precision(self, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
         return variances.precision(self.target, jacobian, *_arrays(log_v, keep))
 
+    def laplace(self, z: Vector, log_v: Vector, keep: Vector) -> np.ndarray:
+        """Covariance of the search vector (free, free): inverse information, prior included."""
+        jacobian = self.linear(z, self.volt(log_v))[1]
+        return np.linalg.inv(np.asarray(self.precision(jacobian, log_v, keep)))
+
     def whitened(self, jacobian: Blocks, log_v: Vector) -> Blocks:
         vectors = _arrays(log_v, np.ones(len(self.windows)))
         return variances.whitened(self.noise.blocks, jacobian, *vectors)
