@@ -19,18 +19,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.crossing import Crossing
-from slipid.identify.fit.noise import travel
-from slipid.identify.fit.scatter import CHANNELS, Pieces, Scatter, scatter
+from slipid.identify.fit.crossing import Crossing, Evidence
+from slipid.identify.fit.scatter import CHANNELS, Scatter, scatter
 from slipid.identify.fit.variances import Search, Square
-from slipid.model.robot import Robot
 from slipid.parameter import Space
 
 TOLERANCE = 0.02
@@ -38,7 +32,6 @@ TOLERANCE = 0.02
 _GAIN, _IDLE = 0.1, 6
 """Or when so many steps on end have gained less than this in log density."""
 _MOST_STEPS, _FACTOR_STEPS, _TRIES = 40, 4, 8
-_TOGETHER = 256
 UNITS = ("m/s", "m/s", "rad/s", "A")
 """Of the channels of `scatter` and of currents."""
 
@@ -62,74 +55,6 @@ class Update:
     about: Mapping[str, Any]
 
 
-class _Evidence:
-    """Residuals of all windows, and how they scatter.
-
-    Rows are windows, columns along, across [m/s], yaw [rad/s] and the current of each wheel [A];
-    a set without currents has none there.
-    """
-
-    def __init__(self, space: Space, sets: Sequence[Crossing]):
-        self.space, self.sets = space, sets
-        first = np.cumsum([0, *(len(s.runs) for s in sets)])
-        has = [np.full(len(s.windows), s.windows.has_current) for s in sets]
-        self.pieces = Pieces(
-            run=np.concatenate([s.windows.run + k for s, k in zip(sets, first, strict=False)]),
-            place=np.concatenate([s.place for s in sets]),
-            has_current=np.concatenate(has),
-        )
-        self.chunks = [chunk for s in sets for chunk in _chunks(s, space.template)]
-
-    def linear(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (window, channel) and their slope by the search vector (.., free)."""
-        parts = [_linear(self.space, jnp.asarray(z), b, u) for b, u, _ in self.chunks]
-        return self._joined(0, parts), self._joined(1, parts)
-
-    def residual(self, z: np.ndarray) -> np.ndarray:
-        """Residuals alone."""
-        parts = [(_residual(self.space, jnp.asarray(z), b, u),) for b, u, _ in self.chunks]
-        return self._joined(0, parts)
-
-    def _joined(self, k: int, parts: Sequence[Sequence[Array]]) -> np.ndarray:
-        kept = [np.asarray(p[k])[:count] for p, (*_, count) in zip(parts, self.chunks, strict=True)]
-        return np.concatenate(kept)
-
-
-def _chunks(s: Crossing, robot: Robot) -> list[tuple[lk.Batch, Array, int]]:
-    """Batches of one size, with directions of travel and how many of their windows count."""
-    out = []
-    for first in range(0, len(s.windows), _TOGETHER):
-        some = np.minimum(np.arange(first, first + _TOGETHER), len(s.windows) - 1)
-        w, count = s.windows.pieces(some), min(_TOGETHER, len(s.windows) - first)
-        u = jnp.asarray(travel(w, robot)[1][:, 0])
-        out.append((lk.batch(w, robot, s.floor[some]), u, count))
-    return out
-
-
-@eqx.filter_jit
-def _residual(space: Space, z: Array, b: lk.Batch, u: Array) -> Float[Array, "piece channel"]:
-    """Predicted less measured speeds along and across the way, yaw rates and currents."""
-    robot = space.tree(z)
-    p = lk.predict(robot, b)
-    rate = lk.motion_residual(robot, b, p) / b.dt
-    along = u[:, 0] * rate[:, 0] + u[:, 1] * rate[:, 1]
-    across = u[:, 0] * rate[:, 1] - u[:, 1] * rate[:, 0]
-    amps = jnp.zeros_like(b.current)
-    if b.has_current:
-        amps = lk.predicted_current(robot, b, p.felt) - b.current
-    return jnp.concatenate([jnp.stack([along, across, rate[:, 2]], axis=1), amps[:, 0]], axis=1)
-
-
-@eqx.filter_jit
-def _linear(space: Space, z: Array, b: lk.Batch, u: Array) -> tuple[Array, Array]:
-    def both(x: Array) -> tuple[Array, Array]:
-        r = _residual(space, x, b, u)
-        return r, r
-
-    slope, r = jax.jacfwd(both, has_aux=True)(z)
-    return r, slope
-
-
 class _Found(NamedTuple):
     """End of the steps: where, what the data added, how residuals scatter there."""
 
@@ -139,7 +64,7 @@ class _Found(NamedTuple):
     settled: bool
 
 
-def _maximise(e: _Evidence, mean: np.ndarray, covariance: np.ndarray) -> _Found:
+def _maximise(e: Evidence, mean: np.ndarray, covariance: np.ndarray) -> _Found:
     """Levenberg-Marquardt steps from the prior mean; scatter anew at each."""
     prior, z, settled = np.linalg.inv(covariance), np.asarray(mean, float), False
     moving = ~held(e.space)
@@ -219,7 +144,7 @@ def update(
     other half made of the fit. A single run has no `after`. Mean and covariance are of the fit
     without these runs, sets of every map.
     """
-    e = _Evidence(space, sets)
+    e = Evidence(space, sets)
     found = _maximise(e, mean, covariance)
     before, after = _left_out(space, mean, covariance, sets)
     names = [*CHANNELS, "current"][: len(CHANNELS) + bool(e.pieces.has_current.any())]
@@ -247,7 +172,7 @@ def _left_out(
 ) -> tuple[dict[str, float], dict[str, float] | None]:
     """Errors before, and after learning from the other half of the runs of each set."""
     halves = [[s.of((s.windows.run + j) % 2 == k) for j, s in enumerate(sets)] for k in range(2)]
-    ends = [_Evidence(space, h) for h in halves if sum(len(s.windows) for s in h)]
+    ends = [Evidence(space, h) for h in halves if sum(len(s.windows) for s in h)]
     has = np.concatenate([e.pieces.has_current for e in ends])
     before = errors(np.concatenate([e.residual(mean) for e in ends]), has)
     if len(ends) < 2:
