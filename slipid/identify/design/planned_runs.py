@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from slipid.data.windows import Windows
 from slipid.identify.compare.open_loop import chain
 from slipid.identify.fit import likelihood as lk
+from slipid.identify.result import Channels
 from slipid.model.robot import Robot
 
 SESSION = "next"
@@ -129,20 +130,17 @@ def drivable(drives: Iterable[Drive], robot: Robot) -> tuple[Drive, ...]:
 def steady_windows(
     drives: Sequence[Drive],
     robot: Robot,
-    per_piece: int,
+    channels: Channels,
     current_var: Mapping[str, float],
     session: str = SESSION,
-    has_current: bool = True,
-    has_voltage: bool = False,
-    signed: bool = False,
 ) -> Windows:
     """Windows that drives at steady wheel speeds would give without noise, each run one piece.
 
     However long a run is, it is one piece: its own effect is met once. Runs are centred on the
-    middle of the image, the marker's heading is zero at their start. `per_piece` counts a run's
-    windows, `current_var` is the variance of a window's mean current on each floor [A^2].
+    middle of the image, the marker's heading is zero at their start. `current_var` is the variance
+    of a window's mean current on each floor [A^2].
     """
-    n, wheels = len(drives), robot.geometry.wheels
+    n, per_piece, wheels = len(drives), channels.windows, robot.geometry.wheels
     base, radius = float(robot.geometry.base_radius), float(robot.geometry.wheel_radius)
     command = np.stack([d.command for d in drives])
     rate = command @ np.asarray(robot.geometry.forward()).T / radius
@@ -161,17 +159,17 @@ def steady_windows(
         current=blank,
         voltage=blank,
         current_var=blank + spread[:, None, None],
-        has_current=has_current,
-        has_voltage=has_voltage,
-        current_is_signed=signed,
+        has_current=channels.current,
+        has_voltage=channels.voltage,
+        current_is_signed=channels.signed,
         lag=float(robot.camera.lag),
     )
     pose, amps, volts = _sensed(robot, lk.batch(w, robot))
     return replace(
         w,
         pose=np.asarray(pose),
-        current=np.asarray(amps) if has_current else blank,
-        voltage=np.asarray(volts) if has_voltage else blank,
+        current=np.asarray(amps) if channels.current else blank,
+        voltage=np.asarray(volts) if channels.voltage else blank,
     )
 
 

@@ -69,11 +69,9 @@ class Planner:
         return cls(fit.robot, fit.choices, fit.variance, fit.channels)
 
     def _windows(self, drives: Sequence[Drive], session: str = SESSION) -> Windows:
-        c, var, floors = self.channels, self.variance, self.robot.surfaces.labels
+        var, floors = self.variance, self.robot.surfaces.labels
         spread = {floor: var.get(f"current.{floor}.window", 0.0) for floor in floors}
-        return steady_windows(
-            drives, self.robot, c.windows, spread, session, c.current, c.voltage, c.signed
-        )
+        return steady_windows(drives, self.robot, self.channels, spread, session)
 
     def nothing(self) -> Knowledge:
         """Before any run: the prior; of a single session the marker's yaw is the common one."""

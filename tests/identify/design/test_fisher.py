@@ -51,7 +51,7 @@ def planner(current, voltage):
 
 def windows(drives, current, voltage):
     spread = dict.fromkeys(("firm", "soft"), 0.05**2) if current else {}
-    return steady_windows(drives, robot(), 4, spread, has_current=current, has_voltage=voltage)
+    return steady_windows(drives, robot(), Channels(current, voltage), spread)
 
 
 @functools.cache
