@@ -30,10 +30,7 @@ _RESULT = "the result of `slipid identify`"
 
 
 def save(fit: Fit, folder: Path) -> tuple[str, ...]:
-    """Write a fit to a folder, in the place of the one that may be there.
-
-    Returns:
-        names of the files.
+    """Write a fit to a folder, in the place of the one that may be there; returns names of files.
 
     Raises:
         ValueError: a number is not finite; nothing is written then.

@@ -95,13 +95,10 @@ def _groups(data: Runs) -> np.ndarray:
 
 @dataclass(frozen=True)
 class FoldResult:
-    """What the models say of the runs of a fold.
+    """What the models say of the runs of a fold, and how the fit of the force balance ended.
 
-    Attributes:
-        rows: runs left out, with the scores of every model.
-        seconds: to `fit` and to `predict`, of every model.
-        numbers: fitted numbers of every model, by floor.
-        converged, reason: how the fit of the force balance ended.
+    Seconds are to `fit` and to `predict`, of every model; numbers are counts of fitted ones, by
+    floor.
     """
 
     rows: tuple[Judged, ...]

@@ -18,12 +18,13 @@ from jaxtyping import Array, Bool, Float
 from slipid.data.windows import Windows
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import variances
-from slipid.identify.fit.noise import Components, noise
+from slipid.identify.fit.noise import noise
 from slipid.identify.fit.variances import (
     DEGREES,
     VARIANCE_SPREAD,
     Blocks,
     Search,
+    Target,
     Vector,
     Whitening,
 )
@@ -47,20 +48,6 @@ class State:
     loss: float
     moved: float
     stage: str
-
-
-class Target(eqx.Module):
-    """What a fit maximises, as an argument of compiled functions.
-
-    `typical` is the centre of the prior of the log variances; where it is joint, currents and
-    voltages move the numbers of the motion, too.
-    """
-
-    space: Space
-    batch: lk.Batch
-    blocks: dict[str, Components]
-    typical: Float[Array, " variance"]
-    joint: bool = eqx.field(static=True)
 
 
 class Problem:

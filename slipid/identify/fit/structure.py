@@ -10,8 +10,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.problem import Target
-from slipid.identify.fit.variances import Blocks, Search
+from slipid.identify.fit.variances import Blocks, Search, Target
 
 _REFUSED = 12
 """Steps of the solver that may be refused in a round."""

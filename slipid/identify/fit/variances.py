@@ -5,18 +5,17 @@ likelihood of the variances takes into account what the structural numbers have 
 (Patterson and Thompson 1971, Biometrika 58(3)).
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.linear import inverse_root
 from slipid.identify.fit.noise import Components
-
-if TYPE_CHECKING:
-    from slipid.identify.fit.problem import Target
+from slipid.parameter import Space
 
 Vector = Array | np.ndarray
 """One-dimensional, of jax or numpy."""
@@ -32,6 +31,20 @@ DEGREES = 8.0
 """Degrees of freedom of the Student-t weight of a run."""
 VARIANCE_SPREAD = 3.0
 """Std of the prior of every log variance."""
+
+
+class Target(eqx.Module):
+    """What a fit maximises, as an argument of compiled functions.
+
+    `typical` is the centre of the prior of the log variances; where it is joint, currents and
+    voltages move the numbers of the motion, too.
+    """
+
+    space: Space
+    batch: lk.Batch
+    blocks: dict[str, Components]
+    typical: Float[Array, " variance"]
+    joint: bool = eqx.field(static=True)
 
 
 class Whitening(NamedTuple):
@@ -73,7 +86,7 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Array, keep: Array) -> Blo
 
 
 @eqx.filter_jit
-def precision(target: "Target", jacobian: Blocks, log_v: Array, keep: Array) -> Array:
+def precision(target: Target, jacobian: Blocks, log_v: Array, keep: Array) -> Array:
     """Expected information of the search vector, prior included (free, free)."""
     prior = jnp.diag(1 / jnp.asarray(target.space.prior_std) ** 2)
     total, of_motion = prior, prior
@@ -95,7 +108,7 @@ def _cut(total: Array, of_motion: Array, e: Array) -> Array:
 
 @eqx.filter_jit
 def scored(
-    target: "Target", residual: Blocks, jacobian: Blocks, log_v: Array, keep: Array, own: Blocks
+    target: Target, residual: Blocks, jacobian: Blocks, log_v: Array, keep: Array, own: Blocks
 ) -> Array:
     """One Fisher-scoring step of the restricted likelihood in the log variances.
 
@@ -109,16 +122,12 @@ def scored(
 
 @eqx.filter_jit
 def scored_given(
-    target: "Target", residual: Blocks, spread: Blocks, log_v: Array, keep: Array, own: Blocks
+    target: Target, residual: Blocks, spread: Blocks, log_v: Array, keep: Array, own: Blocks
 ) -> Array:
     """The same where it is known what the fitted numbers of a model, this or another, make of V.
 
-    Args:
-        target: the posterior.
-        residual: of the model (piece, m).
-        spread: their covariance from the model's fitted numbers (piece, m, m); the degrees of
-            freedom it stands for are not the variances' to have.
-        log_v, keep, own: as of `scored`.
+    `spread` is the covariance of the residuals from the model's fitted numbers (piece, m, m); the
+    degrees of freedom it stands for are not the variances' to have.
     """
     _, weights, _ = whitening(target.blocks, residual, log_v, keep)
     score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])

@@ -70,11 +70,9 @@ class Block:
 class Record:
     """Where blocks of an earlier call are found and where new ones go.
 
-    Attributes:
-        done: gives the blocks of a part that are there already; the name of the second part tells
-            which draws of the first its blocks are of.
-        keep: called with the part and every new block.
-        tell: called with the stage and the number of steps of a block that are done.
+    `done` gives the blocks of a part that are there already; the name of the second part tells
+    which draws of the first its blocks are of. `tell` is called with the stage and the number of
+    steps of a block that are done.
     """
 
     done: Callable[[str], Sequence[Block]] = lambda part: ()

@@ -100,11 +100,8 @@ class Density:
     def size(self) -> int:
         return len(self.coordinates.names)
 
-    def full(self, x: Array | np.ndarray) -> tuple[Array, Array]:
+    def full(self, anchor: Anchor, x: Array) -> tuple[Array, Array]:
         """Search vector and log variances of chain coordinates, the others as at the fit."""
-        return self._full(self.anchor, jnp.asarray(x))
-
-    def _full(self, anchor: Anchor, x: Array) -> tuple[Array, Array]:
         at = self.coordinates
         structure, variance, _ = at.parts(x)
         z = anchor.z.at[at.structure].set(structure)
@@ -167,7 +164,7 @@ class Density:
         return {k: np.asarray(v) for k, v in out.items()}
 
     def _pieces(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
-        seen, log_v = self._residuals(anchor, x, held), self._full(anchor, x)[1]
+        seen, log_v = self._residuals(anchor, x, held), self.full(anchor, x)[1]
         out = {k: log_student(anchor, k, r, log_v) for k, r in seen.residuals.items()}
         camera, spread = lk.log_jacobians(seen.robot, anchor.batch, seen.volt)
         if "motion" in out:
@@ -184,7 +181,7 @@ class Density:
         return self._residuals(anchor, x, held).residuals
 
     def _residuals(self, anchor: Anchor, x: Array, held: Held | None) -> _Seen:
-        z, log_v = self._full(anchor, x)
+        z, log_v = self.full(anchor, x)
         b, at = anchor.batch, self.coordinates
         volt = lk.voltage_std(log_v[-1]) if b.has_current and b.has_voltage else jnp.asarray(1.0)
         if self.part == ELECTRIC:
@@ -207,5 +204,5 @@ class Density:
         return self._of_all(Density._held, x)
 
     def _held(self, anchor: Anchor, x: Array, _: None) -> Held:
-        z, _log_v = self._full(anchor, x)
+        z, _log_v = self.full(anchor, x)
         return Held(z, predict(self.problem.space.tree(z), anchor, z).felt)

@@ -31,11 +31,6 @@ class Target:
     apart: bool = False
     map: Transport | None = None
 
-    @property
-    def count(self) -> int:
-        """Number of groups."""
-        return int(self.group.max()) + 1
-
     def log_prob(self, x: Matrix) -> Matrix:
         """Log density and, as blobs, its terms."""
         terms = self.terms(x)
@@ -47,7 +42,8 @@ class Target:
 
     def seen_by(self, map: Transport) -> "Target":
         """The same distribution in other coordinates; centre and covariance are left alone."""
-        onto = np.eye(self.count + 1)[np.where(self.group < 0, self.count, self.group)]
+        count = int(self.group.max()) + 1
+        onto = np.eye(count + 1)[np.where(self.group < 0, count, self.group)]
 
         def terms(u: Matrix) -> Matrix:
             x, log = map.placed(u)
