@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from slipid.identify.design import fisher as info
-from slipid.identify.design import planned_runs as dr
-from slipid.identify.design.planned_runs import Drive
+from slipid.identify.design.planned_runs import Drive, drivable, heading_grid, paper_grid
 from slipid.identify.design.planner import Goal, Planner
 from slipid.identify.design.wish import Scope
 from slipid.support.content import Content
@@ -32,14 +31,14 @@ def saved(
     """
     setups = [s for s in scope.setups if any(g.is_about(s) for g in goals)]
     setups = [s for s in setups if s in scope.driven] or setups or list(scope.setups)
-    headings = dr.heading_grid(setups, scope.driven_speeds, scope.distance)
+    headings = heading_grid(setups, scope.driven_speeds, scope.distance)
     grids = {
-        "paper_grid": ("the 2021 paper's grid", dr.paper_grid(setups, scope.distance)),
+        "paper_grid": ("the 2021 paper's grid", paper_grid(setups, scope.distance)),
         "heading_grid": ("the 2022 grid of headings every 5 deg", headings),
     }
     return {
         key: {"name": name, "setups": [list(s) for s in setups]}
-        | _against(planner, goal, dr.drivable(grid, scope.fit.robot), offered, rows, scope.base)
+        | _against(planner, goal, drivable(grid, scope.fit.robot), offered, rows, scope.base)
         for key, (name, grid) in grids.items()
     }
 

@@ -6,8 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from slipid.identify.design import planned_runs as dr
-from slipid.identify.design.planned_runs import HEADINGS, Drive, Setup
+from slipid.identify.design.planned_runs import HEADINGS, Drive, Setup, candidates, drivable
 from slipid.identify.result import Fit
 from slipid.support.errors import DataError
 
@@ -115,7 +114,7 @@ class Scope:
         """Runs to choose from."""
         speeds = _numbers("speeds", self.wish.speeds, least=0.0)
         turns = _numbers("turns", self.wish.turns)
-        found = dr.candidates(
+        found = candidates(
             self.setups,
             dict.fromkeys(self.fit.validity, speeds) if speeds else self.driven_speeds,
             self.distance,
@@ -166,7 +165,7 @@ class Scope:
         ]
 
     def _drivable(self, runs: Sequence[Drive], otherwise: str) -> tuple[Drive, ...]:
-        kept = dr.drivable(runs, self.fit.robot)
+        kept = drivable(runs, self.fit.robot)
         if not kept:
             raise DataError(otherwise)
         return kept
