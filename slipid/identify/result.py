@@ -152,11 +152,9 @@ class Fit:
 
     @property
     def data_hash(self) -> str:
-        """Hash of the runs and their files."""
         return hash_of(self.runs)
 
     def draws(self, count: int, seed: int = 0) -> Float[np.ndarray, "draw free"]:
-        """Search vectors drawn from the Gaussian of z and covariance."""
         return draws(self.z, self.covariance, count, seed)
 
 

@@ -154,7 +154,6 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
 
 
 def _different(x: np.ndarray, digits: int) -> tuple[float, ...]:
-    """The values that occur, rounded and sorted."""
     return tuple(sorted({round(float(v), digits) for v in x[np.isfinite(x)]}))
 
 

@@ -108,7 +108,6 @@ class FoldResult:
     reason: str
 
     def to_json(self) -> Content:
-        """Plain values."""
         return asdict(self, dict_factory=told)
 
 

@@ -145,7 +145,6 @@ def _band(runs: int, share: float) -> tuple[float, float]:
 
 
 def _sentence(floor: str, best: str, models: Mapping[str, Ranked]) -> str:
-    """What a reader should take home of a floor."""
     order = sorted((m for m in models if m != best), key=lambda m: -models[m].difference)
     if not order:
         return f"{floor}: nothing to compare {_name(best)} with"

@@ -38,7 +38,6 @@ class Rung(abc.ABC):
         """Body twist of every window (piece, window, 3) [m/s, m/s, rad/s]."""
 
     def increments(self, w: Windows, robot: Robot) -> Increments:
-        """Marker increments of every window [m, m, rad]."""
         return as_increments(self.twist(w, robot), w, robot)
 
     def series(self, surface: str, load: str) -> str:

@@ -56,12 +56,10 @@ class Judged:
     session: str | None = None
 
     def to_json(self) -> Content:
-        """Plain values."""
         return asdict(self, dict_factory=told)
 
     @classmethod
     def of_json(cls, content: Content) -> "Judged":
-        """The run from what `to_json` gave."""
         models = {name: Score(**score) for name, score in content["models"].items()}
         return cls(**{**content, "models": models})
 
@@ -99,7 +97,6 @@ class Validation:
         }
 
     def to_json(self) -> Content:
-        """Content of the validation file."""
         summary = {
             floor: {model: asdict(one) for model, one in models.items()}
             for floor, models in self.summary.items()

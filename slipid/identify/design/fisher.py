@@ -36,7 +36,6 @@ class Rows(NamedTuple):
         return Rows(*(part[np.asarray(index, int)] for part in self))
 
     def joined(self, *others: "Rows") -> "Rows":
-        """These runs and others."""
         return Rows(*map(np.concatenate, zip(self, *others, strict=True)))
 
 
@@ -67,7 +66,6 @@ class Knowledge:
 
     @cached_property
     def covariance(self) -> Float[np.ndarray, "free free"]:
-        """Covariance of all numbers."""
         e, m = np.flatnonzero(self.is_electric), np.flatnonzero(~self.is_electric)
         lean = np.linalg.solve(self.own, self.cross)
         out = np.empty((len(self.is_electric),) * 2)

@@ -65,7 +65,6 @@ class Planner:
 
     @classmethod
     def of(cls, fit: Fit) -> "Planner":
-        """Planner of a fit."""
         return cls(fit.robot, fit.choices, fit.variance, fit.channels)
 
     def _windows(self, drives: Sequence[Drive], session: str = SESSION) -> Windows:
@@ -154,7 +153,6 @@ class Goal:
         return floor in (self.floors or {floor}) and load in (self.loads or {load})
 
     def std(self, knowledge: Knowledge) -> float:
-        """What is uncertain about it."""
         return float(np.sqrt(max(knowledge.criterion(self.rows), 0.0)))
 
 

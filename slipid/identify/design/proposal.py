@@ -102,7 +102,6 @@ def design(fit: Fit, wish: Wish) -> Design:
 
 
 def _goals(fit: Fit, wish: Wish, scope: Scope, planner: Planner) -> dict[Goal, float]:
-    """What is to shrink, and with which weight."""
     found = [parameter_goal(planner, path) for path in _paths(fit, wish.parameters)]
     found += [
         prediction_goal(planner, f"prediction {text}", scope.predicted(text))

@@ -111,7 +111,6 @@ class Scope:
         return {floor: round(seen.distance, 2) for floor, seen in self.fit.validity.items()}
 
     def candidates(self) -> tuple[Drive, ...]:
-        """Runs to choose from."""
         speeds = _numbers("speeds", self.wish.speeds, least=0.0)
         turns = _numbers("turns", self.wish.turns)
         found = candidates(
@@ -150,7 +149,6 @@ class Scope:
         return self._drivable(runs, f"--predict {text}: these wheels cannot drive in that heading")
 
     def all_predicted(self) -> tuple[Drive, ...]:
-        """Every heading at every driven speed on every floor and load that was driven."""
         runs = self._straight(self.driven, [], HEADINGS)
         return self._drivable(runs, "predictions: these wheels cannot drive in that heading")
 

@@ -43,7 +43,6 @@ class Crossing:
     runs: tuple[tuple[str, str], ...]
 
     def of(self, picked: Bool[np.ndarray, " piece"]) -> "Crossing":
-        """Some of the windows, of the same runs."""
         windows = self.windows.pieces(np.flatnonzero(picked))
         return Crossing(windows, self.floor[picked], self.place[picked], self.runs)
 
@@ -122,7 +121,6 @@ class Evidence:
         return self._joined(0, parts), self._joined(1, parts)
 
     def residual(self, z: np.ndarray) -> np.ndarray:
-        """Residuals alone."""
         parts = [(_residual(self.space, jnp.asarray(z), b, u),) for b, u, _ in self.chunks]
         return self._joined(0, parts)
 

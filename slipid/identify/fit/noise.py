@@ -69,7 +69,6 @@ class Noise:
 
     @property
     def typical(self) -> Float[np.ndarray, " variance"]:
-        """Typical std of every component."""
         return np.array([c.typical for c in self.components])
 
 

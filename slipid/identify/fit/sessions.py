@@ -82,7 +82,6 @@ def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.nd
 
 
 def _variances(model: Linear, w: Windows, keep: np.ndarray, weight: np.ndarray) -> dict[str, float]:
-    """Variance per floor and axis, given the weights of the runs."""
     session, floor = np.asarray(w.session), np.asarray(w.surface)
     left, noise, slope = _left(model)
     variance: dict[str, float] = {}

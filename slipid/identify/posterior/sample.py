@@ -108,6 +108,5 @@ def thinned(
 
 
 def _put(density: Density, x: np.ndarray, z: np.ndarray, log_variance: np.ndarray) -> None:
-    """Write draws of a density's coordinates to their places in z and among the variances."""
     at = density.coordinates
     z[..., at.structure], log_variance[..., at.variance], _ = at.parts(x)

@@ -106,7 +106,6 @@ def estimates(
 
 
 def _plain(x: Any) -> Any:
-    """A float, or a tuple of floats."""
     x = np.asarray(x, float)
     return float(x.reshape(())) if x.size == 1 else tuple(float(v) for v in x)
 

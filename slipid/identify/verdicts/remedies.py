@@ -104,7 +104,6 @@ def listed(parts: Sequence[str]) -> str:
 
 
 def _speeds(seen: Validity) -> int:
-    """How many of the speeds differ."""
     count, last = 0, 0.0
     for speed in np.sort(np.asarray(seen.speeds, float)):
         if speed > SPEEDS_DIFFER * max(last, 1e-3):

@@ -54,7 +54,6 @@ class Flat:
 
     @property
     def text(self) -> str:
-        """One sentence."""
         return f"{self.formula}: {self.remedy}"
 
 
@@ -74,7 +73,6 @@ class _Told:
         return (self.motion if of_motion else self.given)[np.ix_(picked, picked)]
 
     def along(self, picked: list[int], u: np.ndarray) -> float:
-        """Information along a unit vector of these coordinates."""
         return float(u @ self.of(picked) @ u)
 
     def flattest(self, picked: list[int]) -> tuple[float, np.ndarray]:
