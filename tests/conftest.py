@@ -14,7 +14,7 @@ from slipid.support.jax_setup import plain_loops
 
 ROOT = Path(__file__).resolve().parents[1]
 GOLDENS = Path(__file__).with_name("goldens")
-LONG = ("test_cli", "test_calibration", "test_notebooks", "test_cross_validation", "test_public")
+LONG = ("test_cli", "test_calibration", "test_notebooks", "test_folds", "test_public")
 """Files that take longest."""
 
 # Set in the environment, so that commands and notebooks started by a test share them. The cache is

@@ -11,8 +11,9 @@ from slipid.api.profile import Profile
 from slipid.api.validation import Validation
 from slipid.data.runs import Runs
 from slipid.identify import fit_file, result
+from slipid.identify.compare.predictive import Contact
 from slipid.identify.compare.slip_models import restored
-from slipid.identify.compare.validation import Predictor, validation
+from slipid.identify.compare.validation import validation
 from slipid.identify.fit.one_speed import still_viscosities
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem
@@ -127,8 +128,8 @@ class Fit:
         """
         fit = self.result
         rungs = restored(dict(fit.baselines))
-        fitted = Predictor(fit.robot, fit.space, fit.z, fit.covariance, dict(fit.variance), rungs)
-        return Validation(validation(fitted, runs), fit, runs)
+        fitted = Contact(fit.robot, fit.variance, fit.covariance, fit.space, fit.z)
+        return Validation(validation(fitted, rungs, runs), fit, runs)
 
     def sample(
         self, seed: int = 0, draws: int = 400, most: int = 400, quiet: bool = False

@@ -63,11 +63,12 @@ def design(
     Writes design.json, design.png and design_commands.csv to OUT.
     """
     from slipid.identify.design import proposal
+    from slipid.identify.design.wish import Wish
     from slipid.identify.fit_file import load as load_fit
     from slipid.support.jax_setup import setup_jax
     from slipid.support.progress import Reporter
 
-    wanted = proposal.wish(
+    wanted = Wish(
         parameter or (),
         predict or (),
         runs,

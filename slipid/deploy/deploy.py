@@ -15,7 +15,7 @@ from slipid.control.robot_file.record import Number, Seen, Sensors, Source
 from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
 from slipid.deploy.record_of import About, given, record_of
-from slipid.identify.fit_file import number_json
+from slipid.identify.fit_json import number_json
 from slipid.identify.posterior.sample import Posterior
 from slipid.identify.result import Fit
 from slipid.identify.slip_curves import Validity
@@ -64,12 +64,12 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
         About(
             source=source,
             sensors=Sensors(
-                current_is_signed=bool(fit.settings["current_is_signed"]),
-                voltage=bool(fit.has["voltage"]),
+                current_is_signed=fit.channels.signed,
+                voltage=fit.channels.voltage,
                 gyro=False,
             ),
             # one that has learnt from runs over several floors expects to drive on several
-            alike=MIXED if "mixed" in fit.settings else About.alike,
+            alike=About.alike if fit.mixed is None else MIXED,
             messages=messages,
             data=fit.data_hash,
             versions=versions(),

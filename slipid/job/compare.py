@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.identify.compare.cross_validation import judge
-from slipid.identify.compare.folds import Fold, folds_of
+from slipid.identify.compare.folds import Fold, folds_of, judge
 from slipid.identify.compare.predictive import Contact, contact_of
 from slipid.identify.compare.ranking import ranking
 from slipid.identify.compare.transfer import transfer

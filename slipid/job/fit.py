@@ -125,7 +125,6 @@ def _with_baselines(fit: Fit, task: Task) -> Fit:
     except ValueError:  # wheels that do not fix the twist: none of them applies
         return fit
     cut = task.windows(fit.robot)
-    learnt = [rung.fit(cut, fit.robot) for rung in rungs(fit.has["current"])]
-    return fit.with_baselines(
-        {r.name: {floor: v.tolist() for floor, v in r.state.items()} for r in learnt}
-    )
+    learnt = [rung.fit(cut, fit.robot) for rung in rungs(fit.channels.current)]
+    plain = {r.name: {floor: v.tolist() for floor, v in r.state.items()} for r in learnt}
+    return replace(fit, baselines=plain)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -73,7 +73,7 @@ def identify(
         report.line("profiles are of the runs on one floor each")
     found = _profiles(problem, optimum, profiles, report)
     if found:
-        each = {p.path: p.to_json() for p in found}
+        each = {p.path: asdict(p) for p in found}
         write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
         written.append("profile.json")
     kept.remove(f"{CHECKPOINT}.npz")

@@ -223,7 +223,7 @@ def _on_one_floor(fit: Fit) -> None:
     Raises:
         DataError: it did.
     """
-    if "mixed" in fit.settings:
+    if fit.mixed is not None:
         raise DataError(
             "the fit learnt from runs over several floors, which are not sampled yet; "
             "expected a fit without the log sections that have a map (identify again without them)"

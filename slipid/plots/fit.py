@@ -67,7 +67,7 @@ def picture(fit: Fit, data: Runs, name: str) -> Figure:
 
 
 def _pieces(fit: Fit, data: Runs) -> Seen:
-    return seen(fit.robot, data, int(fit.settings["windows_per_piece"]))
+    return seen(fit.robot, data, fit.channels.windows)
 
 
 def validation_figure(fit: Fit, data: Runs, found: Content) -> Figure:

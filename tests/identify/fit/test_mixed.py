@@ -343,7 +343,7 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path):
     fit = load(out)
     assert fit.converged
     assert len(fit.runs) == 16
-    assert fit.settings["mixed"]["runs"] == 4
+    assert fit.mixed["runs"] == 4
     assert {"mixed.along", "mixed.across", "mixed.yaw", "mixed.current"} < set(fit.variance)
     run = json.loads((out / "run.json").read_text())
     assert run["data"]["hash"] == fit.data_hash

@@ -18,7 +18,8 @@ from slipid.cli.main import app
 from slipid.data.runs import collect
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.compare.folds import folds_of
-from slipid.identify.compare.predictive import contact_of, log_student, slopes, with_noise
+from slipid.identify.compare.noisy_rung import slopes, with_noise
+from slipid.identify.compare.predictive import contact_of, log_student
 from slipid.identify.compare.ranking import mean_error, ranking
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.compare.transfer import transfer
@@ -173,7 +174,8 @@ def judged(w, names):
     start = State(z, 2 * np.log(problem.noise.typical), 0, np.inf, np.inf, "joint")
     contact = contact_of(problem, start, 1e-12 * np.eye(len(z)))
     half = w.run // 4 % 2
-    models = [with_noise(ALL[name], contact, (half == 0).astype(float)) for name in names]
+    keep = (half == 0).astype(float)
+    models = [with_noise(ALL[name], contact, problem, keep) for name in names]
     density = {m.name: m.log_density(problem) for m in models}
     out = rows({name: values[half == 1] for name, values in density.items()})
     floors = np.asarray(w.surface)[half == 1]
