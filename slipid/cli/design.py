@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,9 +12,6 @@ from slipid.support.content import Content
 
 if TYPE_CHECKING:
     from slipid.identify.design.proposal import Design
-else:
-    # slow to import, so not before a command needs it; run-time checks see Any
-    Design = Any
 
 SHOWN = 3
 """Goals that have a column of their own."""
@@ -89,7 +86,7 @@ def design(
     return 0 if found.reached else 1
 
 
-def write(found: Design, out: Path) -> list[str]:
+def write(found: "Design", out: Path) -> list[str]:
     """Write a design; where it proposes no runs, files of an earlier one do not stay."""
     from slipid.identify.design.proposal import commands
     from slipid.plots.design import design_figure

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,9 +12,6 @@ from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, gu
 if TYPE_CHECKING:
     from slipid.job.identify import Identified
     from slipid.support.progress import Reporter
-else:
-    # slow to import, so not before a command needs them; run-time checks see Any
-    Identified = Reporter = Any
 
 
 @guarded
@@ -44,8 +41,8 @@ def identify(
 
 
 def run(
-    config: Path, data: Path, out: Path, report: Reporter, profiles: Sequence[str] = ()
-) -> Identified:
+    config: Path, data: Path, out: Path, report: "Reporter", profiles: Sequence[str] = ()
+) -> "Identified":
     """The fit and its pictures; arguments as of `slipid.job.identify.identify`.
 
     Raises:
@@ -70,7 +67,7 @@ def run(
     return replace(done, written=(*done.written, *(path.name for path in drawn)))
 
 
-def show(done: Identified, out: Path) -> None:
+def show(done: "Identified", out: Path) -> None:
     """Print what was found."""
     from slipid.report.estimates import show_fit
     from slipid.report.page import Page

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -10,9 +10,6 @@ from slipid.cli.common import Json, OutFolder, Quiet, emit, guarded
 
 if TYPE_CHECKING:
     from slipid.job.sample import Sampled
-else:
-    # slow to import, so not before a command needs it; run-time checks see Any
-    Sampled = Any
 
 
 @guarded
@@ -55,7 +52,7 @@ def sample(
     return 0 if done.posterior.converged else 1
 
 
-def show(done: Sampled, out: Path) -> None:
+def show(done: "Sampled", out: Path) -> None:
     """Print what was found."""
     from slipid.report.estimates import estimates
     from slipid.report.page import Page

@@ -2,16 +2,13 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from slipid.cli.common import ConfigFile, Jobs, Json, Out, Quiet, emit, guarded
 from slipid.support.content import Content
 
 if TYPE_CHECKING:
     from slipid.testsite.simulate.config import Plan
-else:
-    # slow to import, so not before a command needs it; run-time checks see Any
-    Plan = Any
 
 
 @guarded
@@ -34,7 +31,7 @@ def simulate(
     return 0
 
 
-def show(found: Content, plan: Plan, out: Path) -> None:
+def show(found: Content, plan: "Plan", out: Path) -> None:
     """Print how much was driven, and what to do with it."""
     from slipid.report.page import Page
     from slipid.testsite.simulate.simulate import can_identify

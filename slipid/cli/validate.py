@@ -1,7 +1,7 @@
 """`slipid validate`: open-loop prediction of runs."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from slipid.cli.common import DataFolder, Json, OutFolder, Quiet, emit, guarded
 from slipid.support.content import Content
@@ -9,9 +9,6 @@ from slipid.support.content import Content
 if TYPE_CHECKING:
     from slipid.job.validate import Validated
     from slipid.support.progress import Reporter
-else:
-    # slow to import, so not before a command needs them; run-time checks see Any
-    Validated = Reporter = Any
 
 
 @guarded
@@ -25,7 +22,7 @@ def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet =
     return 0
 
 
-def run(out: Path, data: Path, report: Reporter) -> Validated:
+def run(out: Path, data: Path, report: "Reporter") -> "Validated":
     """The prediction and its pictures; arguments as of `slipid.job.validate.validate`.
 
     Raises:

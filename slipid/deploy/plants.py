@@ -13,7 +13,7 @@ from slipid.control.interface import Measurement
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Twin, TwinPlant
 from slipid.data.floor_map import FloorMap
-from slipid.model.plant import Floor
+from slipid.deploy.trial_site import floor_of
 from slipid.testsite.driving import Site
 from slipid.testsite.live import Live, Reading
 
@@ -83,13 +83,3 @@ def twin(
     """The identified model itself as a plant, see `slipid.control.tuning.twin`."""
     made = Twin(robot, floor_of(floor, robot.labels), habits)
     return TwinPlant(made, jnp.asarray(start), jax.random.key(seed))
-
-
-def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Floor:
-    """A map as arrays, its surfaces counted as the fit counts them."""
-    index = np.array([labels.index(name) for name in floor.surfaces])
-    return Floor(
-        cells=jnp.asarray(index[floor.cells]),
-        corner=jnp.asarray(floor.corner),
-        cell=jnp.asarray(floor.cell),
-    )

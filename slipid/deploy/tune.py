@@ -10,13 +10,12 @@ import numpy as np
 from slipid.control import trajectory
 from slipid.control.closed_loop import PERIOD
 from slipid.control.deployed import DeployedRobot, drawn
-from slipid.control.interface import Settings
 from slipid.control.tuning.objective import Cases, Task
 from slipid.control.tuning.optimisers import Method, Search, State
 from slipid.data.floor_map import patchwork
 from slipid.deploy.deploy import ROBOT, habits_of, read_robot
+from slipid.deploy.trial_site import floor_of
 from slipid.deploy.tuned import CORNERS, DRAWS, Tuned, hashes, judged
-from slipid.model.plant import Floor
 from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.errors import DataError
 from slipid.support.files import write_json
@@ -31,20 +30,16 @@ TRIED, JUDGED, STABLE = 64, 48, 4
 
 
 def cases(robots: DeployedRobot, count: int, seed: int) -> Cases:
-    """Starts on patchworks of the robots' floors, of one of the robots each.
-
-    Args:
-        robots: stacked draws.
-        count: of cases.
-        seed: of floors, starts, noise and which robot.
-    """
+    """Starts on patchworks of the robots' floors, of one of the stacked robots each."""
     rng = np.random.default_rng([seed, count])
     start = np.concatenate(
         [rng.uniform(-0.3, 0.3, (count, 2)), rng.uniform(-np.pi, np.pi, (count, 1))], axis=1
     )
     path = trajectory.waypoints(CORNERS)
     picked = rng.integers(len(robots.rest), size=count)
-    floors = [floor(robots.labels, int(s)) for s in rng.integers(2**31, size=count)]
+    seeds = rng.integers(2**31, size=count).tolist()
+    drawn = [patchwork(robots.labels, s, half=1.0, cell=0.02) for s in seeds]
+    floors = [floor_of(floor, robots.labels) for floor in drawn]
     return Cases(
         truth=jax.tree.map(lambda x: x[picked], robots),
         floor=jax.tree.map(lambda *x: jnp.stack(x), *floors),
@@ -54,16 +49,10 @@ def cases(robots: DeployedRobot, count: int, seed: int) -> Cases:
     )
 
 
-def floor(labels: tuple[str, ...], seed: int) -> Floor:
-    """A patchwork as arrays, its surfaces numbered as the robot's."""
-    drawn = patchwork(labels, seed, half=1.0, cell=0.02)
-    return Floor(jnp.asarray(drawn.cells), jnp.asarray(drawn.corner), jnp.asarray(drawn.cell))
-
-
 def task_of(robot: DeployedRobot, gyro: bool) -> Task:
     """What is tuned for a robot: its sensors, its numbers, the rehearsed path."""
     steps = int(np.ceil(SLACK * trajectory.waypoints(CORNERS).duration / PERIOD))
-    return Task(robot, Settings.of(robot), habits_of(robot, gyro), steps=steps)
+    return Task(robot, habits_of(robot, gyro), steps)
 
 
 def robots_of(robot: DeployedRobot, seed: int) -> tuple[DeployedRobot, DeployedRobot]:
@@ -142,6 +131,6 @@ def _everything(search: Search) -> tuple[object, ...]:
         for leaf in jax.tree.leaves((search.task, search.cases, search.stable))
     ]
     task = search.task
-    said = (task.settings, task.habits, task.weights, task.limits, task.steps, task.period)
     own = (hashes(task.robot), task.robot.load_setup, search.method, search.steps, search.seed)
-    return (source_hash("control", "model"), *map(np.asarray, arrays), *own, *said)
+    hashed = source_hash("control", "model")
+    return (hashed, *map(np.asarray, arrays), *own, task.habits, task.steps)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from slipid.control.closed_loop import PERIOD
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.robot_file.gains_record import GainRecord, GainsRecord, GainValues, Losses
@@ -14,11 +15,11 @@ from slipid.control.tuning.objective import (
     BATCH,
     GAINS,
     HAND,
+    UNITS,
     Cases,
     Task,
     combined,
     evaluate,
-    units,
 )
 from slipid.control.tuning.optimisers import GRADIENT, Search, State
 
@@ -57,7 +58,7 @@ class Tuned:
     def record(self) -> GainsRecord:
         """As robot.json has it."""
         loss = Losses(**{k: float(combined(jnp.asarray(v))) for k, v in self.losses.items()})
-        rows = zip(GAINS, self.best, units(), self.spread, strict=True)
+        rows = zip(GAINS, self.best, UNITS, self.spread, strict=True)
         return GainsRecord(
             values=GainValues(**{g: GainRecord(float(v), u, float(s)) for g, v, u, s in rows}),
             load=self.task.robot.load_setup,
@@ -98,7 +99,7 @@ class Tuned:
                 "path_m": [list(c) for c in CORNERS],
                 "delay_s": task.habits.delay_s,
                 "lag_s": task.habits.lag_s,
-                "period_s": task.period,
+                "period_s": PERIOD,
                 "steps": task.steps,
                 "hand": dict(zip(GAINS, HAND, strict=True)),
                 "load": record.load,
