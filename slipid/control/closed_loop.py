@@ -7,10 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from slipid.control.interface import Estimate, Measurement, Pose, Readings, State
-from slipid.control.pilot import Pilot, PilotOutput, PilotState
+from slipid.control.pilot import Pilot, PilotOutput
 from slipid.control.trajectory import STEP, Path
 
 PERIOD = 0.05
@@ -63,12 +63,8 @@ class Course:
         return np.asarray(self.estimate.pose)
 
 
-@eqx.filter_jit
-def _step(
-    pilot: Pilot[State], path: Path, state: PilotState[State], z: Readings, dt: Array
-) -> tuple[PilotState[State], PilotOutput]:
-    """The step with its numbers as arguments: compiled once for all pilots and starts alike."""
-    return pilot.step(path, state, z, dt)
+_step = eqx.filter_jit(Pilot.step)
+"""The step with its numbers as arguments: compiled once for all pilots and starts alike."""
 
 
 def drive(pilot: Pilot[State], path: Path, plant: Plant, start: Pose) -> Course:

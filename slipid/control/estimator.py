@@ -22,8 +22,7 @@ class EstimatorState(eqx.Module):
 
     Attributes:
         wheels: how they turn; current: of the motors, filtered [A].
-        floors: what is believed of the floors under the wheels.
-        place: pose and covariance.
+        floors: what is believed of them; place: pose and covariance.
         stuck: for how long the body has hardly moved while its wheels turn [s].
     """
 

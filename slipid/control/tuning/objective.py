@@ -101,10 +101,10 @@ class Task(eqx.Module):
         rho = radii(Controller(self.robot, gains), truths, self.habits, SPARE)
         return PENALTY * jax.nn.relu(jnp.max(rho) - LARGEST_RADIUS)
 
-    def margins(self, gains: Gains, truths: DeployedRobot) -> Float[np.ndarray, " loop"]:
-        """1 - spectral radius of every draw, floor and direction, gains as they are."""
-        rho = radii(Controller(self.robot, gains), truths, self.habits)
-        return 1.0 - np.asarray(rho).reshape(-1)
+    def margins(self, gains: Gains, truths: DeployedRobot) -> Float[np.ndarray, "draw loop"]:
+        """1 - spectral radius of every draw, for every floor and direction, gains as they are."""
+        rho = np.asarray(radii(Controller(self.robot, gains), truths, self.habits))
+        return 1.0 - rho.reshape(len(rho), -1)
 
 
 def gains_at(x: Float[Numbers, "*batch gain"]) -> Float[Array, "*batch gain"]:

@@ -124,8 +124,8 @@ class Twin(eqx.Module):
 
     def first(self, state: TwinState, noise: Array) -> Readings:
         """Readings of a robot at rest."""
-        s = state
-        return self._read(s.angle, s.speed, jnp.zeros_like(s.speed), s.bias, noise)
+        still = jnp.zeros_like(state.speed)
+        return self._read(state.angle, state.speed, still, state.bias, noise)
 
     def _roll(
         self, pose: Array, w: Array, effect: Array, push: Array, h: float
@@ -210,14 +210,12 @@ def rollout(
     def step(
         carry: tuple[TwinState, PilotState[State], Readings], drawn: Array
     ) -> tuple[tuple[TwinState, PilotState[State], Readings], tuple[Array, PilotOutput]]:
-        state, held, reading = carry
-        pose = state.pose
+        before, held, reading = carry
         held, out = pilot.step(path, held, reading, PERIOD)
-        state, reading = twin.step(state, out.command, drawn)
-        return (state, held, reading), (pose, out)
+        state, reading = twin.step(before, out.command, drawn)
+        return (state, held, reading), (before.pose, out)
 
-    first = (state, pilot.init(start), reading)
-    pose, out = jax.lax.scan(step, first, noise[1:])[1]
+    pose, out = jax.lax.scan(step, (state, pilot.init(start), reading), noise[1:])[1]
     return Rolled(pose=pose, command=out.command, estimate=out.estimate, own=out.time)
 
 
@@ -226,7 +224,7 @@ class TwinPlant:
 
     def __init__(self, twin: Twin, start: Pose, key: Array):
         self.twin, self.start, self.key = twin, start, key
-        self._state, self._count = twin.init(start, key), 0
+        self.reset()
 
     def reset(self) -> Readings:
         self._state, self._count = self.twin.init(self.start, self.key), 0
