@@ -1,11 +1,11 @@
 """`slipid simulate`: logs from the virtual test site."""
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slipid.cli.common import ConfigFile, Jobs, Json, Out, Quiet, emit, guarded
+from slipid.cli.common import ConfigFile, Jobs, Json, Out, Quiet, emit, guarded, processes
 from slipid.support.content import Content
+from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.testsite.simulate.config import Plan
@@ -20,13 +20,12 @@ def simulate(
     Writes logs, a config that identifies them, floor maps, and the truth in a folder of its own.
     Runs that are done are kept and not driven again.
     """
-    from slipid.support.progress import Reporter
     from slipid.testsite.simulate.config import read_plan
     from slipid.testsite.simulate.simulate import simulate as run
 
     plan = read_plan(config)
     with Reporter(quiet=quiet) as report:
-        found = run(plan, out, jobs or os.cpu_count() or 1, report)
+        found = run(plan, out, processes(jobs), report)
     emit(json, found, lambda: show(found, plan, out))
     return 0
 

@@ -1,6 +1,6 @@
 """`slipid tune`: gains rehearsed on the fit's own twin; the search is on disk while it runs."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -61,47 +61,40 @@ def robots_of(robot: DeployedRobot, seed: int) -> tuple[DeployedRobot, DeployedR
     return drawn(robot, tuple(order[:DRAWS])), drawn(robot, tuple(order[DRAWS : 2 * DRAWS]))
 
 
-@dataclass(frozen=True)
-class Wish:
-    """What is asked of tuning.
+def tune(
+    out: Path,
+    load: str | None,
+    method: Method,
+    rollouts: int,
+    seed: int,
+    gyro: bool,
+    report: Reporter,
+) -> Tuned:
+    """Tune the robot of a folder, write gains.json, and the gains into robot.json.
 
-    Attributes:
+    Args:
         load: name of the load set-up, the first one by default.
         method: of the search; rollouts: it may spend.
         seed: of draws, floors, noise and search.
         gyro: whether the robot has one.
-    """
-
-    load: str | None
-    method: Method
-    rollouts: int
-    seed: int
-    gyro: bool
-
-
-def tune(out: Path, wish: Wish, report: Reporter) -> Tuned:
-    """Tune the robot of a folder, write gains.json, and the gains into robot.json.
 
     Raises:
         DataError: no robot, no such load set-up or method, or too few rollouts for one step.
     """
-    if wish.method not in ("gradient", "pso"):
-        raise DataError(f"method '{wish.method}'; expected gradient or pso")
-    robot = read_robot(out, wish.load)
+    if method not in ("gradient", "pso"):
+        raise DataError(f"method '{method}'; expected gradient or pso")
+    robot = read_robot(out, load)
     report.stage("draws of the robot")
-    task = task_of(robot, wish.gyro)
-    robots, fresh = robots_of(robot, wish.seed)
+    robots, fresh = robots_of(robot, seed)
     stable = jax.tree.map(lambda x: x[:STABLE], robots)
-    tried = cases(robots, TRIED, wish.seed)
-    search = Search(task, tried, stable, wish.method, wish.rollouts, wish.seed)
-    if wish.rollouts < search.cost:
-        raise DataError(
-            f"{wish.rollouts} rollouts; expected {search.cost} or more with {wish.method}"
-        )
+    tried = cases(robots, TRIED, seed)
+    search = Search(task_of(robot, gyro), tried, stable, method, rollouts, seed)
+    if rollouts < search.cost:
+        raise DataError(f"{rollouts} rollouts; expected {search.cost} or more with {method}")
     kept = Checkpoint(out, key_of(*_everything(search)))
     state = _searched(search, kept, report)
     report.stage("judging on other cases")
-    found = judged(search, state, cases(fresh, JUDGED, wish.seed + 1), stable)
+    found = judged(search, state, cases(fresh, JUDGED, seed + 1), stable)
     write_json(out / "gains.json", found.to_json())
     record = replace(robot.record, gains=found.record())
     DeployedRobot.of(record, robot.load_setup).save(out / ROBOT)

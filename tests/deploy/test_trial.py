@@ -1,7 +1,7 @@
 """Paths, metrics and the trial command."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from slipid.control.interface import Measurement, Settings
 from slipid.control.odometry import Odometry
 from slipid.control.pilot import Pilot
 from slipid.control.robot_file.gains_record import GainRecord, GainsRecord, GainValues, Losses
+from slipid.control.robot_file.typed import typed
 from slipid.data.floor_map import four_zones, uniform
 from slipid.deploy import trial as tr
 from slipid.deploy.controllers import ROWS, gains_of, pilot_of
@@ -297,7 +298,7 @@ def test_the_summary_is_of_medians_over_starts_with_intervals():
             finished=True,
         )
         made = Run(name, (0.0, 0.0, 0.1), k, metrics, 1.0)
-        assert Run.of(json.loads(json.dumps(made.to_json()))) == made
+        assert typed(Run, json.loads(json.dumps(asdict(made)))) == made
         return made
 
     base = rng.uniform(100, 200, 20)
