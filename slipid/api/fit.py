@@ -11,8 +11,7 @@ from slipid.api.profile import Profile
 from slipid.api.validation import Validation
 from slipid.data.runs import Runs
 from slipid.identify import fit_file, result
-from slipid.identify.compare.slip_models import restored
-from slipid.identify.compare.validation import Predictor, validation
+from slipid.identify.compare.validation import validation
 from slipid.identify.fit.one_speed import still_viscosities
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem
@@ -20,7 +19,8 @@ from slipid.identify.verdicts import profile
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.config import FitSection
 from slipid.job.fit import optimised, summarised
-from slipid.job.problem import Task, said_of
+from slipid.job.problem import Task, on_runs, said_of
+from slipid.job.validate import predictor
 from slipid.model.robot import Robot
 from slipid.parameter import Choice
 from slipid.report.estimates import show_fit
@@ -38,12 +38,7 @@ Numbers = int | float | Sequence[int | float]
 
 @dataclass(frozen=True)
 class Prior:
-    """Gaussian prior of a number, or of every entry of a short vector, in its own unit.
-
-    Attributes:
-        mean: centre.
-        std: standard deviation.
-    """
+    """Gaussian prior of a number, or of every entry of a short vector, in its own unit."""
 
     mean: Numbers
     std: Numbers
@@ -125,10 +120,7 @@ class Fit:
         Raises:
             DataError: a run on a floor or with a load set-up that was not identified.
         """
-        fit = self.result
-        rungs = restored(dict(fit.baselines))
-        fitted = Predictor(fit.robot, fit.space, fit.z, fit.covariance, dict(fit.variance), rungs)
-        return Validation(validation(fitted, runs), fit, runs)
+        return Validation(validation(predictor(self.result), runs), self.result, runs)
 
     def sample(
         self, seed: int = 0, draws: int = 400, most: int = 400, quiet: bool = False
@@ -139,11 +131,16 @@ class Fit:
             seed: of everything.
             draws: that are kept of each of the ensembles.
             most: blocks of steps after which it ends without having converged.
-            quiet: show no progress.
+            quiet: no progress.
         """
-        from slipid.api.posterior import sampled
+        from slipid.api.posterior import Posterior
+        from slipid.identify.posterior.blocks import Plan
+        from slipid.job.sample import sampled_around
 
-        return sampled(self.result, self.task, self.problem, seed, draws, most, quiet)
+        plan = Plan(seed=seed, most=most)
+        with Reporter(quiet=quiet) as report:
+            found = sampled_around(self.result, self.problem, plan, draws, None, report)
+        return Posterior(found, self.result, self.task, self.problem)
 
     def deploy(self) -> "DeployedRobot":
         """What runs on the robot, with the intervals of the fit's own curvature.
@@ -196,16 +193,14 @@ def fit(
 
     Source: the contact law of `slipid.model.contact`, the likelihood of `slipid.identify.fit`.
     """
-    floors = sorted({log.surface or "unknown" for log in runs.logs})
-    loads = sorted({log.load for log in runs.logs})
-    full = robot.on(floors, loads, sorted(set(runs.session)), image_centre)
+    full = on_runs(robot, runs, image_centre)
     choices = [*still_viscosities(runs), *said_of(full, float(full.body.mass))]
     choices += [Choice(path, free=True) for path in free]
     for path, prior in (priors or {}).items():
         choices.append(Choice(path, prior_mean=_plain(prior.mean), prior_std=_plain(prior.std)))
     choices += [Choice(path, fixed=_plain(value)) for path, value in (fixed or {}).items()]
     choices += [Choice(path, start=_plain(value)) for path, value in (start or {}).items()]
-    settings = FitSection(windows_per_piece=windows_per_piece, seed=seed)  # type: ignore[call-arg]
+    settings = FitSection(windows_per_piece=windows_per_piece, seed=seed)
     task = Task(runs, full, tuple(choices), settings)
     with Reporter(quiet=quiet) as report:
         problem = task.problem()

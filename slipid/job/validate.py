@@ -26,12 +26,7 @@ class Validated:
 
 
 def validate(out: Path, data: Path, report: Reporter) -> Validated:
-    """Predict runs with the fit in `out`, and with every simpler model that it learnt.
-
-    Args:
-        out: folder `identify` wrote.
-        data: folder the globs of its config start from.
-        report: progress.
+    """Predict runs of `data` with the fit in `out`, and with every simpler model that it learnt.
 
     Raises:
         DataError: no fit there, or logs that it cannot predict.
@@ -50,8 +45,13 @@ def validate(out: Path, data: Path, report: Reporter) -> Validated:
         report.line(f"{again} of {len(dataset)} runs were fitted: they say little about new ones")
     report.stage("predicting")
     try:
-        rungs = restored(dict(fit.baselines))
+        fitted = predictor(fit)
     except ValueError as error:
         raise DataError(f"{out / 'fit.json'}: {error}") from error
-    fitted = Predictor(fit.robot, fit.space, fit.z, fit.covariance, dict(fit.variance), rungs)
     return Validated(fit, dataset, validation(fitted, dataset).to_json())
+
+
+def predictor(fit: Fit) -> Predictor:
+    """The fit with every simpler model that it learnt; ValueError where it has an unknown one."""
+    rungs = restored(dict(fit.baselines))
+    return Predictor(fit.robot, fit.space, fit.z, fit.covariance, dict(fit.variance), rungs)
