@@ -11,11 +11,12 @@ import typer
 
 from slipid.cli.common import Out, Quiet, guarded
 from slipid.support.content import Content
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.identify.result import Fit
     from slipid.job.identify import Identified
-    from slipid.support.progress import Reporter
 
 PARTS = ("fit", "unseen")
 """What is fitted, and what is predicted: folders, and configs `testsite_<part>.toml`."""
@@ -62,15 +63,13 @@ def demo(
     quiet: Quiet = False,
 ) -> int:
     """The whole job on logs of the virtual test site, small: a folder to look at."""
-    from slipid.support.progress import Reporter
-
     with Reporter(quiet=quiet) as report:
         shown = run(out, plant, seed, os.cpu_count() or 1, report)
     show(shown, out)
     return 0 if shown.done.fit.converged else 1
 
 
-def run(out: Path, plant: str, seed: int | None, jobs: int, report: "Reporter") -> Shown:
+def run(out: Path, plant: str, seed: int | None, jobs: int, report: Reporter) -> Shown:
     """Logs of the test site, identify, predict unseen runs, compare with the truth.
 
     Raises:
@@ -78,7 +77,6 @@ def run(out: Path, plant: str, seed: int | None, jobs: int, report: "Reporter") 
     """
     from slipid.cli.identify import run as identify
     from slipid.cli.validate import run as validate
-    from slipid.support.errors import DataError
     from slipid.support.files import read_json, write_bytes, write_json
 
     if plant not in ("recorded", "mujoco"):
@@ -121,7 +119,6 @@ def unpack(out: Path) -> None:
     """
     from zipfile import ZipFile
 
-    from slipid.support.errors import DataError
     from slipid.support.files import write_bytes
 
     try:
@@ -149,7 +146,7 @@ def pack(folder: Path, archive: Path = RECORDED) -> None:
     write_bytes(archive, content.getvalue())
 
 
-def drive_anew(out: Path, seed: int, jobs: int, report: "Reporter") -> None:
+def drive_anew(out: Path, seed: int, jobs: int, report: Reporter) -> None:
     """Drive the runs that ship recorded, and those to be predicted, on the test site.
 
     Raises:

@@ -9,6 +9,7 @@ import typer
 
 from slipid.cli.common import Json, OutFolder, Quiet, emit, guarded
 from slipid.support.content import Content
+from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.identify.design.proposal import Design
@@ -62,7 +63,6 @@ def design(
     from slipid.identify.design import proposal
     from slipid.identify.fit_file import load as load_fit
     from slipid.support.jax_setup import setup_jax
-    from slipid.support.progress import Reporter
 
     wanted = proposal.wish(
         parameter or (),

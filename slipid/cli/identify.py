@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, guarded
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.job.identify import Identified
-    from slipid.support.progress import Reporter
 
 
 @guarded
@@ -31,7 +32,6 @@ def identify(
     Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt.
     """
     from slipid.support.files import read_json
-    from slipid.support.progress import Reporter
 
     with Reporter(quiet=quiet) as report:
         done = run(config, data, out, report, profile or ())
@@ -41,7 +41,7 @@ def identify(
 
 
 def run(
-    config: Path, data: Path, out: Path, report: "Reporter", profiles: Sequence[str] = ()
+    config: Path, data: Path, out: Path, report: Reporter, profiles: Sequence[str] = ()
 ) -> "Identified":
     """The fit and its pictures; arguments as of `slipid.job.identify.identify`.
 
@@ -53,7 +53,6 @@ def run(
     from slipid.plots.drawing import save
     from slipid.plots.fit import identify_plots
     from slipid.plots.profile import profile_figure
-    from slipid.support.errors import DataError
 
     done = identify(config, data, out, report, profiles)
     report.stage("drawing")

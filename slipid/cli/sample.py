@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import Json, OutFolder, Quiet, emit, guarded
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.job.sample import Sampled
@@ -30,9 +32,7 @@ def sample(
     quiet: Quiet = False,
 ) -> int:
     """Posterior of a fit by emcee: honest intervals, posterior.nc; goes on after an interrupt."""
-    from slipid.support.errors import DataError
     from slipid.support.files import read_json
-    from slipid.support.progress import Reporter
 
     try:
         from slipid.deploy.deploy import write_robot
