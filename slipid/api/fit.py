@@ -133,14 +133,9 @@ class Fit:
             most: blocks of steps after which it ends without having converged.
             quiet: no progress.
         """
-        from slipid.api.posterior import Posterior
-        from slipid.identify.posterior.blocks import Plan
-        from slipid.job.sample import sampled_around
+        from slipid.api.posterior import sampled
 
-        plan = Plan(seed=seed, most=most)
-        with Reporter(quiet=quiet) as report:
-            found = sampled_around(self.result, self.problem, plan, draws, None, report)
-        return Posterior(found, self.result, self.task, self.problem)
+        return sampled(self.result, self.task, self.problem, seed, draws, most, quiet)
 
     def deploy(self) -> "DeployedRobot":
         """What runs on the robot, with the intervals of the fit's own curvature.

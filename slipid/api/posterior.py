@@ -10,12 +10,15 @@ from slipid.deploy.deploy import deploy
 from slipid.identify.fit.problem import Problem
 from slipid.identify.posterior import netcdf
 from slipid.identify.posterior import sample as posterior
+from slipid.identify.posterior.blocks import Plan
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.drawn_estimates import estimates
 from slipid.job.problem import Task
+from slipid.job.sample import sampled_around
 from slipid.report import estimates as report
 from slipid.report.page import Page
+from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,3 +93,12 @@ class Posterior:
     def save(self, path: Path | str) -> None:
         """Write posterior.nc, whole or not at all."""
         netcdf.write(self.tree, Path(path))
+
+
+def sampled(
+    fit: Fit, task: Task, problem: Problem, seed: int, draws: int, most: int, quiet: bool
+) -> Posterior:
+    """Posterior around a fit; arguments as of `Fit.sample`."""
+    with Reporter(quiet=quiet) as progress:
+        found = sampled_around(fit, problem, Plan(seed=seed, most=most), draws, None, progress)
+    return Posterior(found, fit, task, problem)
