@@ -21,7 +21,7 @@ from slipid.identify.verdicts import profile
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.config import FitSection
 from slipid.job.fit import optimised, summarised
-from slipid.job.problem import Task, said_of
+from slipid.job.problem import Task, on_runs, said_of
 from slipid.model.robot import Robot
 from slipid.parameter import Choice
 from slipid.report.estimates import show_fit
@@ -39,12 +39,7 @@ Numbers = int | float | Sequence[int | float]
 
 @dataclass(frozen=True)
 class Prior:
-    """Gaussian prior of a number, or of every entry of a short vector, in its own unit.
-
-    Attributes:
-        mean: centre.
-        std: standard deviation.
-    """
+    """Gaussian prior of a number, or of every entry of a short vector, in its own unit."""
 
     mean: Numbers
     std: Numbers
@@ -140,7 +135,7 @@ class Fit:
             seed: of everything.
             draws: that are kept of each of the ensembles.
             most: blocks of steps after which it ends without having converged.
-            quiet: show no progress.
+            quiet: no progress.
         """
         from slipid.api.posterior import sampled
 
@@ -197,16 +192,14 @@ def fit(
 
     Source: the contact law of `slipid.model.contact`, the likelihood of `slipid.identify.fit`.
     """
-    floors = sorted({log.surface or "unknown" for log in runs.logs})
-    loads = sorted({log.load for log in runs.logs})
-    full = robot.on(floors, loads, sorted(set(runs.session)), image_centre)
+    full = on_runs(robot, runs, image_centre)
     choices = [*still_viscosities(runs), *said_of(full, float(full.body.mass))]
     choices += [Choice(path, free=True) for path in free]
     for path, prior in (priors or {}).items():
         choices.append(Choice(path, prior_mean=_plain(prior.mean), prior_std=_plain(prior.std)))
     choices += [Choice(path, fixed=_plain(value)) for path, value in (fixed or {}).items()]
     choices += [Choice(path, start=_plain(value)) for path, value in (start or {}).items()]
-    settings = FitSection(windows_per_piece=windows_per_piece, seed=seed)  # type: ignore[call-arg]
+    settings = FitSection(windows_per_piece=windows_per_piece, seed=seed)
     task = Task(runs, full, tuple(choices), settings)
     with Reporter(quiet=quiet) as report:
         problem = task.problem()

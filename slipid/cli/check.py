@@ -2,6 +2,7 @@
 
 from slipid.cli.common import ConfigFile, DataFolder, Json, MaybeOut, Quiet, emit, guarded
 from slipid.support.content import Content
+from slipid.support.progress import Reporter
 
 
 @guarded
@@ -15,7 +16,6 @@ def check(
     """Read and validate logs; say what they can tell before anything is fitted."""
     from slipid.job import check as job
     from slipid.plots.raw import raw_plots
-    from slipid.support.progress import Reporter
 
     with Reporter(quiet=quiet) as report:
         done = job.check(config, data, out, report)

@@ -1,5 +1,6 @@
 """Numbers of a robot from draws of its posterior: means, intervals, verdicts."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -57,9 +58,10 @@ def estimates(fit: Fit, found: Posterior) -> dict[str, Estimate]:
     return out
 
 
-def identified(fit: Fit, found: Posterior, problem: Problem) -> Content:
-    """Content of identified.json with what the posterior says."""
-    numbers = estimates(fit, found)
+def identified(
+    fit: Fit, found: Posterior, numbers: Mapping[str, Estimate], problem: Problem
+) -> Content:
+    """Content of identified.json with what the posterior says, `numbers` being its estimates."""
     content = identified_json(fit)
     for path, e in numbers.items():
         content["parameters"][path] = number_json(e)
@@ -67,9 +69,8 @@ def identified(fit: Fit, found: Posterior, problem: Problem) -> Content:
     ratios = derived(fit.space, flat.mean(axis=0), np.cov(flat.T), fit.channels.voltage)
     content["derived"] = {e.path: number_json(_drawn(e, fit, flat)) for e in ratios}
     some = flat[:: max(1, len(flat) // 400)]
-    content["curves"] = curves_json(
-        curves_of.curves(fit.space, flat.mean(axis=0), some, problem.batch)
-    )
+    curves = curves_of.curves(fit.space, flat.mean(axis=0), some, problem.batch)
+    content["curves"] = curves_json(curves)
     if not found.converged:
         content["messages"].append(f"the posterior did not converge: {found.reason}")
     return content

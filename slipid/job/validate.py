@@ -27,12 +27,7 @@ class Validated:
 
 
 def validate(out: Path, data: Path, report: Reporter) -> Validated:
-    """Predict runs with the fit in `out`, and with every simpler model that it learnt.
-
-    Args:
-        out: folder `identify` wrote.
-        data: folder the globs of its config start from.
-        report: progress.
+    """Predict runs of `data` with the fit in `out`, and with every simpler model that it learnt.
 
     Raises:
         DataError: no fit there, or logs that it cannot predict.

@@ -84,7 +84,7 @@ def test_a_loop_is_stable_where_its_radius_says():
 
     @jax.jit
     def both(gains, surface):
-        loop = Loop(Controller(robot, Gains.at(gains)), robot, surface, rates, HABITS, 0.05)
+        loop = Loop(Controller(robot, Gains.at(gains)), robot, surface, rates, HABITS)
         a = linearised(loop)
         off = eqx.tree_at(lambda s: s.pose, loop.start(), jnp.array([0.0, 1e-4, 0.0]))
         calm = jax.lax.scan(lambda s, _: (loop.step(s), s.pose[1]), off, None, length=400)[1]
