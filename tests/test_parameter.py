@@ -13,7 +13,8 @@ from jaxtyping import Array
 
 from slipid.model.geometry import omni
 from slipid.model.robot import build
-from slipid.parameter import Choice, Declaration, Space, entries, parameter, share_basis
+from slipid.parameter import Declaration, entries, parameter, share_basis
+from slipid.search_space import Choice, Space
 
 
 def declaration(lower=-math.inf, upper=math.inf, shares=False):

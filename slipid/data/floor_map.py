@@ -40,10 +40,6 @@ class FloorMap:
         row, column = steps[..., 1].clip(0, rows - 1), steps[..., 0].clip(0, columns - 1)
         return np.asarray(self.cells[row, column])
 
-    def surface_at(self, x: float, y: float) -> str:
-        """Name of the surface at a place [m]."""
-        return self.surfaces[int(self.at(np.array([x, y])))]
-
 
 def uniform(surface: str, half: float = 2.0) -> FloorMap:
     """One surface everywhere."""
@@ -95,10 +91,11 @@ def from_picture(
         metres_per_pixel: [m].
         corner: x, y of the lower left corner [m].
     """
-    names = tuple(colours)
-    wanted = np.array([rgb(colours[name]) for name in names])
+    from matplotlib.colors import to_rgb
+
+    wanted = np.array([to_rgb(colour) for colour in colours.values()])
     far = np.linalg.norm(picture[:, :, None, :] - wanted, axis=-1)
-    return FloorMap(names, np.argmin(far, axis=-1)[::-1].copy(), corner, metres_per_pixel)
+    return FloorMap(tuple(colours), np.argmin(far, axis=-1)[::-1].copy(), corner, metres_per_pixel)
 
 
 def patchwork(
@@ -165,15 +162,3 @@ def four_zones(
 def _few(cells: int) -> None:
     if cells > MOST_CELLS:
         raise ValueError(f"{cells} cells; expected at most {MOST_CELLS}: a larger cell, less floor")
-
-
-def rgb(colour: str) -> list[float]:
-    """Red, green and blue between 0 and 1 of a colour `#rrggbb`.
-
-    Raises:
-        ValueError: it is none.
-    """
-    try:
-        return [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]
-    except ValueError as error:
-        raise ValueError(f"colour {colour!r}; expected '#rrggbb'") from error

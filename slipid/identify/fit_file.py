@@ -23,7 +23,8 @@ from slipid.identify.slip_curves import SlipCurve, Validity
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, build
-from slipid.parameter import Choice, Space, entries
+from slipid.parameter import entries
+from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError
 from slipid.support.files import json_text, read_json, write_bytes
 

@@ -8,7 +8,8 @@ import numpy as np
 from slipid.identify.design.planned_runs import Drive
 from slipid.model.geometry import omni
 from slipid.model.robot import Robot, build
-from slipid.parameter import Choice, Space, entries
+from slipid.parameter import entries
+from slipid.search_space import Choice, Space
 
 ROBOTINO = (60.0, 180.0, 300.0)
 """Azimuths of the wheels [deg]."""

@@ -28,7 +28,7 @@ from slipid.identify.slip_curves import curves, slip_on
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.job.config import Config
 from slipid.model.robot import Robot
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 from slipid.selftest.windows import measure
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError

@@ -34,8 +34,8 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-def text_of(path: Path) -> str:
-    """Text of a file.
+def text_of(path: Path, what: str = "a config") -> str:
+    """Text of a file that should be of some kind.
 
     Raises:
         DataError: unreadable.
@@ -43,9 +43,9 @@ def text_of(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; expected a config (TOML file)") from error
+        raise DataError(f"{path}: {error.strerror}; expected {what} (TOML file)") from error
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: no UTF-8 text; expected a config (TOML file)") from error
+        raise DataError(f"{path}: no UTF-8 text; expected {what} (TOML file)") from error
 
 
 def mapping_of(path: Path, text: str) -> Content:

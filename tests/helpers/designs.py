@@ -33,7 +33,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
 from slipid.identify.fit.optimise import Options, optimise
 from slipid.identify.fit.problem import Problem, State
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 from slipid.selftest.logs import Sensors, blank, make_logs, truth
 from tests.helpers.made_windows import measure
 

@@ -183,7 +183,7 @@ def test_ribs_lie_on_their_surface_only():
     found = ribs(floor, GROUNDS, (0.0, 0.0, 0.0))
     assert len(found) > 20
     for x, low, high, height in found:
-        assert floor.surface_at(x, 0.5 * (low + high)) == "ribbed"
+        assert floor.surfaces[floor.at((x, 0.5 * (low + high)))] == "ribbed"
         assert low < high
         assert height == GROUNDS["ribbed"].rib_height_m
 

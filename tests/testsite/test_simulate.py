@@ -117,7 +117,7 @@ def test_the_same_seed_writes_the_same_bytes_with_any_number_of_processes(config
     assert np.median(np.abs(seen - x)) < 0.003
     floor = read_map(tmp_path / "one/maps/zones.toml")
     assert floor.surfaces == ("firm", "soft", "medium", "short")
-    assert floor.surface_at(0.8, 0.0) == "soft"
+    assert floor.surfaces[floor.at((0.8, 0.0))] == "soft"
 
 
 def children(pid):
@@ -186,7 +186,7 @@ def test_a_map_is_read_from_its_file_beside_the_config(tmp_path):
     text = SMALL.replace('kind = "four_zones", surfaces = ["firm", "soft", "medium", "short"]', "x")
     text = text.replace("{ x }", '{ kind = "file", file = "floor.toml" }')
     found = plan(tmp_path / "site.toml", text)
-    assert found.maps["zones"].surface_at(0.4, 0.1) == "soft"
+    assert found.maps["zones"].surfaces[found.maps["zones"].at((0.4, 0.1))] == "soft"
     other = (tmp_path / "floor.toml").read_text().replace("0.5, 0.5", "0.5, 0.9")
     (tmp_path / "floor.toml").write_text(other)
     assert plan(tmp_path / "site.toml", text).hash != found.hash

@@ -13,7 +13,7 @@ from slipid.identify.compare import open_loop as replay
 from slipid.identify.compare.slip_models import Rung
 from slipid.identify.fit import likelihood as lk
 from slipid.model.robot import Robot
-from slipid.parameter import Space
+from slipid.search_space import Space
 from slipid.support.errors import DataError
 
 SCHEMA = "slipid.validation/1"

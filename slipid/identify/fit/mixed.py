@@ -30,7 +30,7 @@ from slipid.identify.fit.crossing import Crossing
 from slipid.identify.fit.noise import travel
 from slipid.identify.fit.scatter import CHANNELS, Pieces, Scatter, scatter
 from slipid.model.robot import Robot
-from slipid.parameter import Space
+from slipid.search_space import Space
 
 TOLERANCE = 0.02
 """Settled when a step is at most so many posterior stds."""

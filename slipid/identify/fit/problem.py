@@ -21,7 +21,7 @@ from slipid.identify.fit import variances
 from slipid.identify.fit.noise import Components, noise
 from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD, Blocks, Vector, Whitening
 from slipid.model.robot import Robot
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 
 __all__ = ["DEGREES", "VARIANCE_SPREAD", "Problem", "State", "Target"]
 

@@ -13,7 +13,8 @@ import numpy as np
 from slipid.identify.fit.problem import Problem
 from slipid.identify.posterior.pointwise import likelihoods, replicates
 from slipid.identify.posterior.sample import Posterior
-from slipid.parameter import Entry, Space
+from slipid.parameter import Entry
+from slipid.search_space import Space
 from slipid.support.files import write_bytes
 
 if TYPE_CHECKING:

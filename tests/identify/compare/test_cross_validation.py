@@ -27,7 +27,7 @@ from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.problem import DEGREES, Problem, State
 from slipid.identify.fit.sessions import Linear, shared
 from slipid.job.compare import finished
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError

@@ -16,7 +16,7 @@ from slipid.identify.design.planned_runs import Drive, candidates, steady_window
 from slipid.identify.design.planner import Channels, Planner, parameter_goal
 from slipid.identify.fit import noise as of_noise
 from slipid.identify.fit.problem import Problem
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 from tests.helpers import made_windows
 
 SETUP = ("soft", "as_built")

@@ -19,7 +19,7 @@ from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit_file import load, save
 from slipid.identify.result import summarise
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 from slipid.selftest.logs import Sensors, blank, grid, make_logs, truth
 from tests.helpers import designs
 

@@ -28,7 +28,7 @@ from slipid.identify.fit_file import load
 from slipid.job.config import read_config
 from slipid.job.problem import read_job, with_mixed
 from slipid.model import se2
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import ROBOTINO, robotino_text, write_good
