@@ -40,6 +40,10 @@ class FloorMap:
         row, column = steps[..., 1].clip(0, rows - 1), steps[..., 0].clip(0, columns - 1)
         return np.asarray(self.cells[row, column])
 
+    def surface_at(self, x: float, y: float) -> str:
+        """Name of the surface at a place [m]."""
+        return self.surfaces[int(self.at(np.array([x, y])))]
+
 
 def uniform(surface: str, half: float = 2.0) -> FloorMap:
     """One surface everywhere."""

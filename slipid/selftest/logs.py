@@ -20,22 +20,7 @@ from slipid.identify.design.planned_runs import Drive
 from slipid.model.robot import Robot, wheel_torque
 from slipid.model.rollout import path, replay_twist
 from slipid.model.se2 import compose
-from slipid.selftest.files import LAYOUT, numbers, write_logs
-from slipid.selftest.plan import ROBOTINO, TRUTH, Sensors, blank, grid, truth
-
-__all__ = [
-    "LAYOUT",
-    "ROBOTINO",
-    "TRUTH",
-    "Drive",
-    "Sensors",
-    "blank",
-    "grid",
-    "make_logs",
-    "numbers",
-    "truth",
-    "write_logs",
-]
+from slipid.selftest.plan import Sensors
 
 
 def make_logs(

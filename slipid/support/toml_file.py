@@ -17,13 +17,13 @@ from typing import (
     get_type_hints,
 )
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 
-Model = TypeVar("Model", bound=BaseModel)
+Model = TypeVar("Model")
 Step = str | int
 """Key of a table, or place in a list."""
 
@@ -74,24 +74,24 @@ def content(path: Path, text: str, model: type[Model]) -> Model:
     return checked(path, mapping_of(path, text), model)
 
 
-def checked(path: Path, mapping: Mapping[str, object], model: type[Model]) -> Model:
-    """A mapping as a model.
+def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
+    """A mapping as a pydantic model or dataclass.
 
     Raises:
         DataError: unknown or missing keys, wrong values; every one on a line.
     """
     try:
-        return model.model_validate(mapping)
+        return TypeAdapter(model).validate_python(mapping)
     except ValidationError as error:
         lines = dict.fromkeys(_line(path, mapping, model, e) for e in error.errors())
         raise DataError("\n".join(lines)) from None
 
 
-def _line(path: Path, mapping: object, root: type, error: ErrorDetails) -> str:
+def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) -> str:
     """One mistake as one line: file, key, what was found, what was expected."""
     kind, given = error["type"], error["input"]
     steps = _steps(mapping, error["loc"])
-    where = f"{path}: {_spelled(steps)}"
+    where = f"{path}: {_spelled(steps)}" if steps else str(path)
     context = error.get("ctx", {})
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _keys(_kind_at(mapping, root, steps[:-1]))
@@ -142,7 +142,7 @@ def _spelled(steps: Sequence[Step]) -> str:
                 f'"{step}"' if not str(step).replace("_", "").replace("-", "").isalnum() else step
             )
             out += f".{name}" if out else str(name)
-    return out or "the file"
+    return out
 
 
 def _below(here: object, step: Step) -> object:

@@ -1,78 +1,84 @@
 """Driving: a run on a site, as a trace of what truly happened."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from slipid.testsite.experiments import Run, Twist, Waypoints
-from slipid.testsite.ground import GROUNDS, Ground
-from slipid.testsite.machine import Machine
-from slipid.testsite.motors import Motor, SpeedLoop
-from slipid.testsite.plant import Plant, Trace, heading_of
-from slipid.testsite.sensors import Sensors
+from slipid.testsite.plant import TIMESTEP, Plant, heading_of
+from slipid.testsite.site import Site
 
 PERIOD = 0.05
 """Between two commands to the robot [s]."""
 
 
-@dataclass(frozen=True)
-class Site:
-    """Everything that stays the same from run to run.
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """What truly happened, a row per time step.
 
     Attributes:
-        machine, motor, loop: the robot.
-        sensors: sensors that make its logs.
-        grounds: physics of every surface.
-        command_delay_s: delay from a command to the wheels.
-        acceleration: acceleration of the wheels' rims towards a new command [m/s^2].
+        time: time since the end of the settling [s].
+        pose: pose of the body: x, y [m], heading [rad].
+        yaw_rate: [rad/s].
+        wheel_angle, wheel_speed, wheel_command: [rad], [rad/s], [rad/s].
+        current, voltage: those of the motors, signed along the drive direction [A], [V].
+        bus: voltage of the supply [V].
+        sinkage: depth to which each wheel has sunk [m].
+        twist_command: what was sent to the robot at this time: [m/s, m/s, rad/s].
     """
 
-    machine: Machine = field(default_factory=Machine)
-    motor: Motor = field(default_factory=Motor)
-    loop: SpeedLoop = field(default_factory=SpeedLoop)
-    sensors: Sensors = field(default_factory=Sensors)
-    grounds: Mapping[str, Ground] = field(default_factory=lambda: dict(GROUNDS))
-    command_delay_s: float = 0.12
-    acceleration: float = 1.0
+    time: Float[np.ndarray, " step"]
+    pose: Float[np.ndarray, "step 3"]
+    yaw_rate: Float[np.ndarray, " step"]
+    wheel_angle: Float[np.ndarray, "step wheel"]
+    wheel_speed: Float[np.ndarray, "step wheel"]
+    wheel_command: Float[np.ndarray, "step wheel"]
+    current: Float[np.ndarray, "step wheel"]
+    voltage: Float[np.ndarray, "step wheel"]
+    bus: Float[np.ndarray, " step"]
+    sinkage: Float[np.ndarray, "step wheel"]
+    twist_command: Float[np.ndarray, "step 3"]
 
 
-def drive(run: Run, site: Site, seed: int, timestep: float | None = None) -> Trace:
+class Rims:
+    """Wheel speeds that follow commands with the site's delay and acceleration."""
+
+    def __init__(self, site: Site, plant: Plant):
+        self.plant, self.delay = plant, site.command_delay_s
+        self.slew = site.acceleration * plant.dt / site.machine.wheel_radius_m
+        self.speed = self._wanted = np.zeros(len(plant.wheel_dof))
+        self._waiting: list[tuple[float, Float[np.ndarray, " wheel"]]] = []
+
+    def send(self, command: Float[np.ndarray, " wheel"]) -> None:
+        """A command [rad/s] sets out."""
+        self._waiting.append((self.plant.time + self.delay, command))
+
+    def follow(self) -> Float[np.ndarray, " wheel"]:
+        """Speeds [rad/s] to be kept over the next time step."""
+        while self._waiting and self._waiting[0][0] <= self.plant.time + 1e-9:
+            self._wanted = self._waiting.pop(0)[1]
+        self.speed = self.speed + np.clip(self._wanted - self.speed, -self.slew, self.slew)
+        return self.speed
+
+
+def drive(run: Run, site: Site, seed: int, timestep: float = TIMESTEP) -> Trace:
     """Drive one run.
 
     Args:
         run: what to do.
         site: robot and floors.
         seed: seed of how the wheels stand and of the floor's unevenness.
-        timestep: time step of the engine [s], by default `plant.TIMESTEP`.
+        timestep: time step of the engine [s].
 
     Raises:
         DataError: MuJoCo is missing, a surface has no physics, or the simulation became unstable.
     """
-    more = {} if timestep is None else {"timestep": timestep}
-    plant = Plant(
-        site.machine,
-        site.motor,
-        site.loop,
-        run.map,
-        site.grounds,
-        run.load,
-        run.start,
-        seed,
-        **more,
-    )
-    recorder = _Recorder(plant)
-    machine = site.machine
-    back = np.linalg.pinv(machine.wheel_from_twist)
-    believed = np.zeros(3)
+    plant = Plant(site, run.map, run.load, run.start, seed, timestep)
+    recorder, rims = _Recorder(plant), Rims(site, plant)
+    back = np.linalg.pinv(site.machine.wheel_from_twist)
+    believed, sent, goal = np.zeros(3), np.zeros(3), 0
     before = plant.wheel_angle
-    every = round(PERIOD / plant.dt)
-    waiting: list[tuple[float, Float[np.ndarray, " wheel"]]] = []
-    wheels = wanted = np.zeros(len(before))
-    slew = site.acceleration * plant.dt / machine.wheel_radius_m
-    goal = 0
-    sent = np.zeros(3)
     program = run.program
     while True:
         if isinstance(program, Waypoints):
@@ -86,14 +92,11 @@ def drive(run: Run, site: Site, seed: int, timestep: float | None = None) -> Tra
         if twist is None:
             break
         sent = np.array(twist)
-        waiting.append((plant.time + site.command_delay_s, machine.wheel_from_twist @ sent))
-        for _ in range(every):
-            while waiting and waiting[0][0] <= plant.time + 1e-9:
-                wanted = waiting.pop(0)[1]
-            wheels = wheels + np.clip(wanted - wheels, -slew, slew)
-            recorder.record(wheels, sent)
-            plant.step(wheels.tolist())
-    recorder.record(wheels, sent)
+        rims.send(site.machine.wheel_from_twist @ sent)
+        for _ in range(round(PERIOD / plant.dt)):
+            recorder.record(rims.follow(), sent)
+            plant.step(rims.speed.tolist())
+    recorder.record(rims.speed, sent)
     plant.check()
     return recorder.trace()
 

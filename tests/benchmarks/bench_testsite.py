@@ -24,7 +24,7 @@ from slipid.identify.compare.validation import Validation
 from slipid.job.config import parsed
 from slipid.job.problem import read_job
 from slipid.support.progress import Reporter
-from slipid.testsite.driving import Site, drive
+from slipid.testsite.driving import drive
 from slipid.testsite.experiments import (
     Run,
     Timed,
@@ -38,7 +38,9 @@ from slipid.testsite.ground import GROUNDS
 from slipid.testsite.machine import Machine
 from slipid.testsite.plant import Plant
 from slipid.testsite.simulate.config import plan
-from slipid.testsite.simulate.simulate import logged, simulate, truth
+from slipid.testsite.simulate.observe import observe
+from slipid.testsite.simulate.simulate import simulate, truth
+from slipid.testsite.site import Site
 from tests.helpers.left_out import left_out
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -108,7 +110,7 @@ def _profile(surface: str) -> list[float]:
     """Microseconds a step of engine, motors and floor."""
     site = Site()
     run = straight(surface, "as_built", 1.0, 0.2, 0.5)
-    plant = Plant(site.machine, site.motor, site.loop, run.map, site.grounds, "as_built")
+    plant = Plant(site, run.map, "as_built")
     wanted = (site.machine.wheel_from_twist @ np.array([0.1, 0.1, 0.0])).tolist()
     spent = [0.0, 0.0, 0.0]
     engine, motors, look = plant._step, plant.drive.step, plant._look
@@ -447,7 +449,7 @@ def _figure_logs(site: Site) -> dict:
         )
         for (key, k, run), trace in zip(jobs, traces, strict=True):
             out[key].append(
-                trace if key == "rectangle" else logged(trace, site, f"{key}/{k}", run, k)
+                trace if key == "rectangle" else observe(trace, site, run, f"{key}/{k}", k)
             )
     return out
 

@@ -20,10 +20,12 @@ from typer.testing import CliRunner
 from slipid.cli.demo import packaged_config
 from slipid.cli.main import app
 from slipid.job.new import Answers, write_new
-from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
 from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
+from tests.helpers.made_logs import truth, write_logs
 
 ROOT = Path(__file__).resolve().parents[2]
 DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)

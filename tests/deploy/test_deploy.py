@@ -18,8 +18,10 @@ from slipid.control.interface import MIXED, Settings
 from slipid.deploy.deploy import DRAWS, deploy, read_robot, write_robot
 from slipid.deploy.tune import robots_of
 from slipid.identify.fit_file import load
-from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
 from slipid.support.errors import DataError
+from tests.helpers.made_logs import truth, write_logs
 
 DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
 FEW = ("--draws", "20", "--most", "24", "--block", "2", "--quiet")

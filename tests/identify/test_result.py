@@ -18,6 +18,7 @@ from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.identify import fit_file
 from slipid.identify.compare.validation import Predictor, validation
+from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.optimise import Optimum, one_round
 from slipid.identify.fit.problem import DEGREES, Problem, State
 from slipid.identify.fit_file import identified_json, load, save, to_json
@@ -25,8 +26,10 @@ from slipid.identify.result import Fit, hash_of, summarise
 from slipid.identify.verdicts.estimates import estimates, expected_covariance
 from slipid.identify.verdicts.unidentified import flat_directions
 from slipid.search_space import Choice
-from slipid.selftest.logs import Drive, Sensors, blank, grid, make_logs, truth
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
 from slipid.support.errors import DataError
+from tests.helpers.made_logs import blank, truth
 
 pytestmark = pytest.mark.slow  # traces whole fits
 

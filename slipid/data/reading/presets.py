@@ -22,7 +22,7 @@ def preset(name: str) -> Layout:
 
 
 def _one(column: str | int, unit: str, scale: float = 1.0, offset: float = 0.0) -> Channel:
-    return Channel((column,), unit, scale, offset)
+    return Channel((column,), unit, (scale,), offset)
 
 
 def _motors(pattern: str, unit: str) -> Channel:
@@ -154,7 +154,7 @@ _LAYOUTS = (
             "pose_x": _one(1, "m"),
             "pose_y": _one(2, "m"),
             "pose_heading": _one(3, "rad"),
-            "wheel_ticks": Channel((4, 5, 6), "tick", scale=-1.0),
+            "wheel_ticks": Channel((4, 5, 6), "tick", scale=(-1.0,)),
         },
     ),
 )
