@@ -191,7 +191,7 @@ def _draw_track(axes: Axes, track: Track) -> None:
         f"side 1: gained {track.displacement:.0f} of {long:.0f} mm\n"
         f"path {track.path_length:.0f} mm, printed {track.file.printed_path_length:.0f} mm\n"
         f"end {track.closure:.0f} mm from start, "
-        f"heading {track.heading_start:.0f}° to {track.heading_end:.0f}°",
+        f"heading {track.heading[0]:.0f}° to {track.heading[-1]:.0f}°",
         fontsize=9,
     )
 

@@ -9,28 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slipid.baselines.paper2021.models import (
-    CURRENT_SVR,
-    DEPLOYED,
-    TORQUE_SVR,
-    fit_deployed,
-    polynomial,
-    smooth_current,
-)
+from slipid.baselines.paper2021.models import CURRENT_SVR, DEPLOYED, TORQUE_SVR
 from slipid.baselines.paper2021.result import find_folder, regenerate
 from slipid.baselines.paper2021.samples import (
     FIGURES_3_AND_4,
     SURFACES,
     Samples,
     effective_speed,
+    needed,
     read_columns,
-    require_columns,
     slip_samples,
 )
-from slipid.baselines.paper2021.table import fit_form
+from slipid.baselines.paper2021.table import FittedForm, fit_form
 from slipid.baselines.paper2021.tracks import TRACK_FILES, Track, TrackFile, read_track
 from slipid.baselines.paper2021.transfer import curve_points, leave_one_surface_out
-from slipid.baselines.paper2021.windows import WindowRecipe, refit_deployed, wheel_windows
+from slipid.baselines.paper2021.windows import WindowRecipe, wheel_windows
 from slipid.data.log import Log
 from slipid.plots import paper as paper_plots
 from slipid.support.errors import DataError
@@ -182,10 +175,10 @@ def test_broken_file_is_named_with_its_place(tmp_path, text, fragments):
 
 
 def test_absent_column_and_data_set_are_named(tmp_path, rng):
-    table = made_table(*made_rows(rng))
-    del table["Delta Y, mm"]
+    (tmp_path / "x.csv").write_text("time_s,x_mm,y_mm,angle_deg\n0,1,2,3\n1,1,2,3\n")
     with pytest.raises(DataError, match=r"x\.csv, column 'Delta Y, mm': no such"):
-        require_columns(table, FIGURES_3_AND_4, Path("x.csv"))
+        read_columns(tmp_path / "x.csv", "robotino2021_camera", ["x_mm", "Delta Y, mm"])
+    assert "Delta Y, mm" in needed(FIGURES_3_AND_4)
     with pytest.raises(DataError, match="no 2021 data set; expected robotino2021"):
         find_folder(tmp_path)
 
@@ -202,12 +195,10 @@ def test_short_track_is_refused(tmp_path):
 
 
 def test_stored_models():
-    np.testing.assert_allclose(
-        polynomial(CURRENT_SVR, np.array([0.0, 1.0])), [0.120, 0.686], rtol=1e-12
-    )
-    np.testing.assert_allclose(
-        polynomial(TORQUE_SVR, np.array([0.0, 0.1])), [-0.072, 0.36224], rtol=1e-12
-    )
+    line = FittedForm("stored", "current", CURRENT_SVR, 0, 0.0)
+    np.testing.assert_allclose(line.slip(np.array([0.0, 1.0])), [0.120, 0.686], rtol=1e-12)
+    curve = FittedForm("stored", "torque", TORQUE_SVR, 0, 0.0)
+    np.testing.assert_allclose(curve.slip(np.array([0.0, 0.1])), [-0.072, 0.36224], rtol=1e-12)
 
 
 def test_deployed_model_as_printed():
@@ -216,51 +207,6 @@ def test_deployed_model_as_printed():
     np.testing.assert_array_equal(slip[0], 0.0)
     np.testing.assert_allclose(slip[1], [0.651, 0.4881, 0.6381], rtol=1e-12)
     np.testing.assert_array_equal(slip[2], 1.0)
-
-
-def test_smoothing_is_the_recursion(rng):
-    current = rng.uniform(0, 1, (50, 3))
-    expected = [current[0]]
-    for sample in current[1:]:
-        expected.append(0.97 * expected[-1] + 0.03 * sample)
-    np.testing.assert_allclose(smooth_current(current), expected, rtol=1e-12)
-    assert smooth_current(current[:0]).shape == (0, 3)
-    with pytest.raises(ValueError, match=r"memory must lie in \[0, 1\)"):
-        smooth_current(current, 1.0)
-
-
-def test_deployed_model_waits_for_the_smoothed_current():
-    current = np.zeros((200, 3))
-    current[50:] = 1.0
-    slip = DEPLOYED.slip(current)
-    first = int(np.argmax(slip[:, 0] > 0))
-    # 1 - 0.97^n passes 0.4 at n = 17
-    assert first == 50 + 16
-    speed = np.full((200, 3), 5.0)
-    np.testing.assert_allclose(
-        DEPLOYED.effective_speed(speed, current), 5.0 * (1 - slip), rtol=1e-12
-    )
-    np.testing.assert_array_equal(DEPLOYED.slip(-current), slip)
-
-
-def test_fit_deployed_recovers_the_robots_coefficients(rng):
-    current = rng.uniform(0.0, 1.4, (400, 3))
-    slip = 1 - (DEPLOYED.gain * current + DEPLOYED.offset)
-    slip[current <= 0.4] = -3.0  # below the threshold the line is not used, so must not be fitted
-    slip[5] = np.nan
-    model = fit_deployed(current, slip)
-    np.testing.assert_allclose(model.gain, DEPLOYED.gain, rtol=1e-9)
-    np.testing.assert_allclose(model.offset, DEPLOYED.offset, rtol=1e-9)
-
-
-def test_fit_deployed_without_information_keeps_what_can_be_told():
-    current = np.array([[0.1, 0.8, 0.5], [0.2, 0.8, 0.9], [0.9, 0.8, 1.3]])
-    slip = np.array([[0.3, 0.2, 0.10], [0.3, 0.3, 0.18], [0.3, 0.4, 0.26]])
-    model = fit_deployed(current, slip)
-    np.testing.assert_allclose(model.gain, [0.0, 0.0, -0.2], atol=1e-12)
-    np.testing.assert_allclose(model.offset, [1.0, 0.7, 1.0], atol=1e-12)
-    with pytest.raises(ValueError, match="must both be"):
-        fit_deployed(current, slip[:2])
 
 
 # tracks
@@ -274,7 +220,7 @@ def test_track_numbers_of_a_made_square():
     assert track.path_length == pytest.approx(5 + 5 + 12)
     assert track.displacement == pytest.approx(20.0)
     assert track.closure == pytest.approx(50.0)
-    assert (track.heading_start, track.heading_end) == (350.0, 375.0)
+    assert (track.heading[0], track.heading[-1]) == (350.0, 375.0)
 
 
 # transfer between surfaces
@@ -330,13 +276,6 @@ def test_windows_apply_the_pose_scale_and_leave_resting_wheels_out(rng):
     _, slip = wheel_windows(parked, WindowRecipe())
     assert np.isnan(slip[:, 1]).all()
     assert np.isfinite(slip[:, [0, 2]]).all()
-
-
-def test_refitted_deployed_model_is_the_law_put_in(rng):
-    logs = [made_log(rng, "a", 0.1, 0.5) for _ in range(6)]
-    model = refit_deployed(logs, WindowRecipe(), threshold=0.3)
-    np.testing.assert_allclose(model.gain, -0.5, rtol=1e-8)
-    np.testing.assert_allclose(model.offset, 0.9, rtol=1e-8)
 
 
 def test_windows_refuse_a_log_without_pose(rng):
@@ -483,7 +422,7 @@ def test_figure_2_line_comes_back_from_a_support_vector_fit(result):
 def test_figure_7_tracks(result):
     got = {t.file.name: t for t in result.tracks}
     rows = {
-        name: [round(x) for x in (t.displacement, t.closure, t.heading_start, t.heading_end)]
+        name: [round(x) for x in (t.displacement, t.closure, t.heading[0], t.heading[-1])]
         for name, t in got.items()
     }
     assert rows["slip_model"] == [762, 1174, 174, 345]

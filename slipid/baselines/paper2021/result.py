@@ -6,7 +6,7 @@ from pathlib import Path
 
 from slipid.baselines.paper2021.models import DEPLOYED
 from slipid.baselines.paper2021.table import FittedForm, MotorTable, field_table, surface_tables
-from slipid.baselines.paper2021.tracks import Track, read_tracks
+from slipid.baselines.paper2021.tracks import TRACK_FILES, Track, read_track
 from slipid.baselines.paper2021.transfer import Transfer, leave_one_surface_out
 from slipid.data.log import Log
 from slipid.support.errors import DataError
@@ -83,20 +83,15 @@ def regenerate(folder: Path, logs: Iterable[Log] | None = None) -> PaperResult:
     return PaperResult(
         field=field_table(folder),
         motors=surface_tables(folder),
-        tracks=read_tracks(folder),
+        tracks=tuple(read_track(folder, file) for file in TRACK_FILES),
         transfer=None if logs is None else leave_one_surface_out(logs),
     )
 
 
 def _form_dict(form: FittedForm) -> dict[str, object]:
-    unit = "N m" if form.regressor == "torque" else "A"
-    return {
-        "regressor": form.regressor,
-        "unit": unit,
-        "coefficients": list(form.coefficients),
-        "first_power": form.first_power,
-        "rmse": form.rmse,
-    }
+    said = asdict(form)
+    del said["name"]
+    return said | {"unit": "N m" if form.regressor == "torque" else "A"}
 
 
 def _table_dict(table: MotorTable) -> dict[str, object]:
@@ -139,7 +134,7 @@ def _track_lines(tracks: tuple[Track, ...]) -> str:
         ("", "path mm", "printed mm", "along side mm", "closure mm", "heading deg")
     ]
     for t in tracks:
-        heading = f"{t.heading_start:.0f} to {t.heading_end:.0f}"
+        heading = f"{t.heading[0]:.0f} to {t.heading[-1]:.0f}"
         numbers = (t.path_length, t.file.printed_path_length, t.displacement, t.closure)
         rows.append((t.file.label, *(f"{x:.0f}" for x in numbers), heading))
     return "Camera tracks (figure 7), first side 900 mm\n" + _columns(rows)

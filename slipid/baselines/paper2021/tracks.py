@@ -94,16 +94,6 @@ class Track:
         """Distance from the first to the last position of the whole track [mm]."""
         return float(np.hypot(*(self.position[-1] - self.position[0])))
 
-    @property
-    def heading_start(self) -> float:
-        """First heading [deg]."""
-        return float(self.heading[0])
-
-    @property
-    def heading_end(self) -> float:
-        """Last heading of the whole track [deg]."""
-        return float(self.heading[-1])
-
     def as_dict(self) -> dict[str, float | str | int]:
         """The numbers by name, units in the names."""
         return {
@@ -114,41 +104,26 @@ class Track:
             "path_length_printed_mm": self.file.printed_path_length,
             "displacement_mm": self.displacement,
             "closure_mm": self.closure,
-            "heading_start_deg": self.heading_start,
-            "heading_end_deg": self.heading_end,
+            "heading_start_deg": float(self.heading[0]),
+            "heading_end_deg": float(self.heading[-1]),
         }
 
 
 def read_track(folder: Path, file: TrackFile) -> Track:
-    """One track of figure 7.
-
-    Args:
-        folder: the 2021 data set.
-        file: which.
+    """One track of figure 7, below the folder of the 2021 data set.
 
     Raises:
         DataError: if the file or a column is missing or the track ends within its first side.
     """
     path = folder / "figure7" / file.file
     table = read_columns(path, "robotino2021_camera")
-    if len(table["time_s"]) < file.side_frames:
-        raise bad_data(
-            path,
-            f"{len(table['time_s'])} frames",
-            f"at least the {file.side_frames} of the first side",
-        )
+    frames = len(table["time_s"])
+    if frames < file.side_frames:
+        expected = f"at least the {file.side_frames} of the first side"
+        raise bad_data(path, f"{frames} frames", expected)
     return Track(
         file=file,
         time=table["time_s"],
         position=np.stack([table["x_mm"], table["y_mm"]], axis=1),
         heading=np.degrees(np.unwrap(np.radians(table["angle_deg"]))),
     )
-
-
-def read_tracks(folder: Path) -> tuple[Track, ...]:
-    """All tracks of figure 7, in the paper's order.
-
-    Raises:
-        DataError: as `read_track`.
-    """
-    return tuple(read_track(folder, file) for file in TRACK_FILES)

@@ -32,13 +32,7 @@ class Transfer:
 
 
 def curve_points(log: Log, recipe: WindowRecipe, min_current: float = 0.25) -> np.ndarray:
-    """Current [A] and slip [-] of all wheels after the paper's cuts, shape (sample, 2).
-
-    Args:
-        log: one run with pose and current.
-        recipe: how it is cut into windows.
-        min_current: samples at or below it are left out [A].
-    """
+    """Current [A] and slip [-] of all wheels after the paper's cuts, shape (sample, 2)."""
     current, slip = wheel_windows(log, recipe)
     keep = (slip > 0.0) & (slip <= 1.0) & (current > min_current)
     return np.stack([current[keep], slip[keep]], axis=1)

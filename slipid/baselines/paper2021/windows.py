@@ -1,11 +1,9 @@
 """Current and slip of every wheel over short windows of a run, against the overhead camera."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from slipid.baselines.paper2021.models import DeployedModel, fit_deployed, smooth_current
 from slipid.data.log import Log
 from slipid.data.signals.steps import body_steps
 from slipid.data.signals.wheel_signals import first_moved
@@ -23,7 +21,6 @@ class WindowRecipe:
         moved: rim travel after which a run counts as under way [m].
         min_speed: windows in which a wheel's rim is slower have no slip ratio there [m/s].
         pose_scale: metres per logged metre of the camera [-]; 1 leaves it uncorrected.
-        memory: smoothing of the current before it is averaged [-], 0 for none.
     """
 
     wheel_radius: float = 0.040
@@ -33,17 +30,12 @@ class WindowRecipe:
     moved: float = 0.010
     min_speed: float = 0.0
     pose_scale: float = 1.0
-    memory: float = 0.0
 
 
 def wheel_windows(log: Log, recipe: WindowRecipe) -> tuple[np.ndarray, np.ndarray]:
     """Mean current and slip of every wheel over a log's windows, nothing cut away.
 
     s = 1 - J v / (r w), v the camera's body velocity over the window, w the encoders' mean speed.
-
-    Args:
-        log: one run with pose and current.
-        recipe: the choices.
 
     Returns:
         |current| [A] and slip [-], both (window, wheel); slip is not finite where a wheel rests.
@@ -64,34 +56,11 @@ def wheel_windows(log: Log, recipe: WindowRecipe) -> tuple[np.ndarray, np.ndarra
     effective = steps / span @ rim.T
     driven = np.diff(log.wheel_angle[edges], axis=0) / span * recipe.wheel_radius
     # Mean over the rows of each window, not the value at its edge: the current is 10-bit and rough.
-    magnitude = smooth_current(np.abs(log.current), recipe.memory)
-    current = np.add.reduceat(magnitude, edges, axis=0)[:-1] / np.diff(edges)[:, None]
+    current = np.add.reduceat(np.abs(log.current), edges, axis=0)[:-1] / np.diff(edges)[:, None]
     moving = np.abs(driven) > recipe.min_speed
     slip = np.full_like(driven, np.nan)
     np.divide(effective, driven, out=slip, where=moving)
     return current, 1.0 - slip
-
-
-def refit_deployed(
-    logs: Iterable[Log], recipe: WindowRecipe | None = None, threshold: float = 0.4
-) -> DeployedModel:
-    """The paper's deployed model with coefficients of its own for these runs.
-
-    No sample is cut for its slip: to drop slip outside (0, 1], as the authors did, is to select
-    on the very thing fitted.
-
-    Args:
-        logs: runs on one surface.
-        recipe: the choices; where None current is smoothed as on the robot, and wheels below
-            20 mm/s are left out.
-        threshold: current below which a wheel is taken not to slip [A].
-    """
-    recipe = recipe or WindowRecipe(min_speed=0.02, memory=0.97)
-    parts = [wheel_windows(log, recipe) for log in logs]
-    current = np.concatenate([part[0] for part in parts])
-    slip = np.concatenate([part[1] for part in parts])
-    memory = recipe.memory or 0.97
-    return fit_deployed(current, slip, threshold=threshold, memory=memory)
 
 
 def _edges(log: Log, recipe: WindowRecipe) -> np.ndarray:
