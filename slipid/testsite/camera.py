@@ -7,13 +7,13 @@ from jaxtyping import Float
 from pydantic import Field, FiniteFloat
 from pydantic.dataclasses import dataclass
 
-from slipid.support.bounds import NotNegative, Positive
+from slipid.support.bounds import CLOSED, NotNegative, Positive
 
 Tilt = Annotated[float, Field(ge=-10, le=10)]
 """[deg]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=CLOSED)
 class Camera:
     """A camera that looks down on the floor, its image turned by half a turn from the world's axes.
 

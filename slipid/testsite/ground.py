@@ -9,7 +9,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from slipid.data.floor_map import MOST_CELLS, FloorMap
-from slipid.support.bounds import Positive
+from slipid.support.bounds import CLOSED, Positive
 
 GRAVITY = 9.81
 LEVELS = 7
@@ -23,7 +23,7 @@ Pose = tuple[float, float, float]
 """x, y [m], heading [rad]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=CLOSED)
 class Ground:
     """Physics of one surface.
 

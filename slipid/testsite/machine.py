@@ -9,10 +9,10 @@ from jaxtyping import Float
 from pydantic import Field, FiniteFloat
 from pydantic.dataclasses import dataclass
 
-from slipid.support.bounds import NotNegative, Positive
+from slipid.support.bounds import CLOSED, NotNegative, Positive
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=CLOSED)
 class Machine:
     """What the robot is made of; by default like a Robotino 2.
 

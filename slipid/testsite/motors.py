@@ -6,10 +6,10 @@ from typing import Annotated, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from slipid.support.bounds import NotNegative, Positive
+from slipid.support.bounds import CLOSED, NotNegative, Positive
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=CLOSED)
 class Motor:
     """A brushed DC motor with its gear.
 
@@ -36,7 +36,7 @@ class Motor:
     ticks_per_revolution: Annotated[int, Field(ge=10)] = 2000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=CLOSED)
 class SpeedLoop:
     """The built-in controller of wheel speed, at the engine's time step.
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from slipid.support.bounds import NotNegative, Part, Positive
+from slipid.support.bounds import CLOSED, NotNegative, Part, Positive
 from slipid.testsite.ground import GROUNDS, Ground
 from slipid.testsite.machine import Machine
 from slipid.testsite.motors import Motor, SpeedLoop
@@ -18,7 +18,7 @@ Interval = Annotated[float, Field(ge=1e-3, le=1)]
 """[s]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=CLOSED)
 class Sensors:
     """How logs err.
 
@@ -84,7 +84,7 @@ class Sensors:
         return np.round(read / self.voltage_step_v) * self.voltage_step_v
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=CLOSED)
 class Site:
     """Everything that stays the same from run to run.
 

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 from pydantic import (
     AliasChoices,
     BeforeValidator,
-    ConfigDict,
     Field,
     StrictBool,
     StrictFloat,
@@ -17,7 +16,7 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.units import converts, factor
-from slipid.support.bounds import Positive
+from slipid.support.bounds import CLOSED, Positive
 
 PER_WHEEL = {
     "wheel_ticks": "tick",
@@ -45,7 +44,6 @@ SINGLE = {
 CHANNELS: dict[str, str] = {**SINGLE, **PER_WHEEL}
 """Every channel a layout may name, with the unit it is turned into."""
 
-_CLOSED = ConfigDict(extra="forbid")
 Count = Annotated[int, Field(ge=0, strict=True)]
 
 
@@ -54,7 +52,7 @@ def _several(value: object) -> object:
     return tuple(value) if isinstance(value, list | tuple) else (value,)
 
 
-@dataclass(frozen=True, config=_CLOSED)
+@dataclass(frozen=True, config=CLOSED)
 class Channel:
     """Columns of one channel: value = (scale x cell + offset), in `unit`.
 
@@ -87,7 +85,7 @@ def _pair(value: object) -> object:
     return tuple(value) if isinstance(value, list | tuple) else value and (value, value)
 
 
-@dataclass(frozen=True, config=_CLOSED)
+@dataclass(frozen=True, config=CLOSED)
 class Layout:
     """How one kind of log file is laid out.
 
