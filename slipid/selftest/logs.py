@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 from slipid.data.log import Log
 from slipid.identify.design.planned_runs import Drive
 from slipid.model.robot import Robot, wheel_torque
-from slipid.model.rollout import path, replay_twist
-from slipid.model.se2 import compose
+from slipid.model.rollout import replay_twist
+from slipid.model.se2 import compose, path
 from slipid.selftest.plan import Sensors
 
 
