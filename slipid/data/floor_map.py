@@ -112,8 +112,7 @@ def patchwork(
     """Random site of patches, by default smaller than a Robotino: cells of a jittered grid.
 
     Args:
-        surfaces: names to choose from.
-        seed: seed of the jitter and of the choice.
+        seed: seed of the jitter and of the choice of surfaces.
         patch: mean distance of neighbouring patches [m].
         half: half of the site's edge [m].
         cell: edge of a cell [m].

@@ -53,11 +53,7 @@ def _registry() -> "pint.UnitRegistry[Any]":
 
 @lru_cache(maxsize=256)
 def factor(unit: str, target: str) -> float:
-    """Factor between two units: value [target] = factor value [unit].
-
-    Args:
-        unit: a unit as people write it: "ms", "rpm", "mm/s", "%".
-        target: the unit wanted, of the same dimension.
+    """Factor from a unit as people write it ("rpm", "mm/s", "%") to one of the same dimension.
 
     Raises:
         ValueError: where the unit is unknown, or of another dimension.

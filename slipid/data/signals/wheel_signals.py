@@ -9,12 +9,9 @@ def interpolate(
     values: Float[np.ndarray, " time"] | Float[np.ndarray, "time column"],
     at: Float[np.ndarray, " at"],
 ) -> Float[np.ndarray, " at"] | Float[np.ndarray, "at column"]:
-    """Values at other times, linear in between, constant beyond both ends.
+    """Values at other times [s], linear in between, constant beyond both ends.
 
-    Args:
-        time: [s], increasing.
-        values: one or several columns, one row per time; angles without wrap-around.
-        at: [s].
+    Angles have to be without wrap-around.
     """
     after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
     before = after - 1
@@ -36,8 +33,6 @@ def wheel_speed(
     one; the fit over a centred window is blind to that. Windows hold at least three rows.
 
     Args:
-        time: [s].
-        wheel_angle: [rad].
         half_window: [s]; longer smooths more.
     """
     rows = np.arange(len(time))
@@ -71,8 +66,6 @@ def bridge_stalls(
     currents reported in the marked rows are as stale as the angle was.
 
     Args:
-        time: [s].
-        wheel_angle: [rad].
         min_rows: steps without change from which a stretch can be a stall.
     """
     stalled = np.zeros(len(time), dtype=bool)
