@@ -91,8 +91,6 @@ def straight(
     """A constant command that starts so that a robot without slip is in the middle halfway.
 
     Args:
-        surface: everywhere.
-        load: name of the load set-up.
         heading: direction of the commanded motion in the body frame [rad].
         speed: [m/s]; 0 turns on the spot.
         distance: commanded length [m], arc of the rim where it only turns.
@@ -119,13 +117,7 @@ def headings(
 
 
 def paper_grid(surface: str, load: str, seconds: float = 3.0) -> list[Run]:
-    """The 2021 paper's grid: x, y, both, and turns on the spot, forwards and backwards.
-
-    Args:
-        surface: everywhere.
-        load: name of the load set-up.
-        seconds: length of a run.
-    """
+    """The 2021 paper's grid: x, y, both, and turns on the spot, forwards and backwards."""
     ways = [(1, 0), (0, 1), (1, 1), (1, -1)]
     out = []
     for ahead, left in ways:

@@ -45,7 +45,9 @@ class Studio:
     def __init__(self, site: Site, load: str, floor: FloorMap, camera: Camera, seed: int = 0):
         mujoco, cv2 = _drawing()
         self.camera, self._rng, self._cv2 = camera, np.random.default_rng(seed), cv2
-        x0, y0, x1, y1 = _seen(floor, camera)
+        (x, y), half = camera.centre_m, 0.65 * camera.height_m / camera.focal_px
+        wide, high = half * camera.width_px, half * camera.height_px
+        x0, y0, x1, y1 = x - wide, y - high, x + wide, y + high  # what is seen, with a margin
         carpet = _carpet(floor, site, (x0, y0, x1, y1), self._rng)
         assets = {"floor.png": _png(cv2, carpet), "marker.png": _png(cv2, _marker(cv2))}
         fovy = np.degrees(2 * np.arctan(0.5 * WIDE * camera.height_px / camera.focal_px))
@@ -154,9 +156,7 @@ def film(
 
     Args:
         studio: draws.
-        time: times of the truth [s].
-        pose: true pose of the body.
-        wheel_angle: true angles of the wheels [rad].
+        time: times of the truth [s], of true poses and wheel angles.
         frames: times of the video's frames [s].
         path: where the video goes (.avi, Motion JPEG).
 
@@ -216,14 +216,6 @@ def _no_drawing(error: Exception) -> DataError:
         f"nothing can be drawn here ({error}); expected OpenGL without a screen: MUJOCO_GL=egl "
         "and, on Debian and Ubuntu, apt-get install libegl1 libgl1-mesa-dri"
     )
-
-
-def _seen(floor: FloorMap, camera: Camera) -> tuple[float, float, float, float]:
-    """The part of the floor that is drawn: the camera's view, with a margin."""
-    x, y = camera.centre_m
-    half = 0.65 * camera.height_m / camera.focal_px
-    wide, high = half * camera.width_px, half * camera.height_px
-    return x - wide, y - high, x + wide, y + high
 
 
 def _carpet(

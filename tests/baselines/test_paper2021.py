@@ -22,8 +22,7 @@ from slipid.baselines.paper2021.samples import (
 )
 from slipid.baselines.paper2021.table import FittedForm, fit_form
 from slipid.baselines.paper2021.tracks import TRACK_FILES, Track, TrackFile, read_track
-from slipid.baselines.paper2021.transfer import curve_points, leave_one_surface_out
-from slipid.baselines.paper2021.windows import WindowRecipe, wheel_windows
+from slipid.baselines.paper2021.transfer import curve_points, leave_one_surface_out, wheel_windows
 from slipid.data.log import Log
 from slipid.plots import paper as paper_plots
 from slipid.support.errors import DataError
@@ -259,21 +258,18 @@ def made_log(rng, surface, offset, slope, seconds=12.0):
 
 def test_windows_find_the_slip_put_in(rng):
     log = made_log(rng, "a", 0.1, 0.5)
-    current, slip = wheel_windows(log, WindowRecipe())
+    current, slip = wheel_windows(log, FIGURES_3_AND_4)
     assert slip.shape == (23, 3)  # 12 s less 10 mm of start, in whole windows of 0.5 s
     np.testing.assert_allclose(slip, 0.1 + 0.5 * current, rtol=1e-9)
-    points = curve_points(log, WindowRecipe(), min_current=0.0)
+    points = curve_points(log, replace(FIGURES_3_AND_4, min_current=0.0))
     np.testing.assert_allclose(points[:, 1], 0.1 + 0.5 * points[:, 0], rtol=1e-9)
     assert len(points) == 69
 
 
-def test_windows_apply_the_pose_scale_and_leave_resting_wheels_out(rng):
+def test_windows_leave_resting_wheels_out(rng):
     log = made_log(rng, "a", 0.1, 0.5)
-    _, plain = wheel_windows(log, WindowRecipe())
-    _, scaled = wheel_windows(log, WindowRecipe(pose_scale=1.1))
-    np.testing.assert_allclose(1 - scaled, 1.1 * (1 - plain), rtol=1e-9)
     parked = replace(log, wheel_angle=log.wheel_angle * [1.0, 0.0, 1.0])
-    _, slip = wheel_windows(parked, WindowRecipe())
+    _, slip = wheel_windows(parked, FIGURES_3_AND_4)
     assert np.isnan(slip[:, 1]).all()
     assert np.isfinite(slip[:, [0, 2]]).all()
 
@@ -281,7 +277,7 @@ def test_windows_apply_the_pose_scale_and_leave_resting_wheels_out(rng):
 def test_windows_refuse_a_log_without_pose(rng):
     blind = replace(made_log(rng, "a", 0.1, 0.5), pose=None)
     with pytest.raises(ValueError, match=r"a\.csv: slip against current needs both"):
-        wheel_windows(blind, WindowRecipe())
+        wheel_windows(blind, FIGURES_3_AND_4)
 
 
 def test_transfer_tells_a_common_law_from_one_per_surface(rng):

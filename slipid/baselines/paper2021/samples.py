@@ -54,6 +54,13 @@ class Recipe:
     min_current: float = 0.25
     max_torque: float = 0.5
 
+    @property
+    def rim(self) -> np.ndarray:
+        """J: rim speed of each wheel [m/s] from the body twist, (wheel, 3)."""
+        azimuth = np.radians(self.azimuth_deg)
+        arm = np.full(len(azimuth), self.base_radius)
+        return np.stack([-np.sin(azimuth), np.cos(azimuth), arm], axis=1)
+
 
 FIGURES_3_AND_4 = Recipe()
 # The whole-field figure keeps turning rows and idling wheels and uses the re-calibrated deltas.
@@ -123,9 +130,7 @@ def effective_speed(table: dict[str, np.ndarray], recipe: Recipe) -> np.ndarray:
     command = np.stack([table[c] for c in _COMMAND], axis=1)
     delta = np.stack([table[c] for c in recipe.delta_columns], axis=1)
     velocity = delta * _TO_SI / recipe.row_period * (command != 0.0)
-    azimuth = np.radians(recipe.azimuth_deg)
-    rim = np.stack([-np.sin(azimuth), np.cos(azimuth), np.full(3, recipe.base_radius)], axis=1)
-    return velocity @ rim.T * recipe.gear_ratio / recipe.wheel_radius
+    return velocity @ recipe.rim.T * recipe.gear_ratio / recipe.wheel_radius
 
 
 def needed(recipe: Recipe) -> list[str]:

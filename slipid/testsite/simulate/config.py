@@ -30,8 +30,6 @@ class Plan:
 
     Attributes:
         hash: of the config and of the map files it names.
-        content: the config.
-        site: robot and floors.
         maps: floors with several surfaces, by name.
         runs: name and run of each.
         filmed: names of the runs that are filmed.
@@ -46,11 +44,7 @@ class Plan:
 
 
 def read_plan(path: Path) -> Plan:
-    """Plan of a config file.
-
-    Raises:
-        DataError: wrong in the file or in a map it names; every mistake on a line.
-    """
+    """Plan of a config file, see `plan`."""
     return plan(path, text_of(path))
 
 
@@ -98,14 +92,8 @@ def plan(path: Path, text: str) -> Plan:
             raise DataError(
                 f"{path}: video: no run is named '{pattern}'; expected some of {folders}"
             )
-    return Plan(
-        _hash(content, site, maps),
-        content,
-        site,
-        maps,
-        named,
-        tuple(n for n, _ in named if any(fnmatch(n, pattern) for pattern in content.video)),
-    )
+    filmed = tuple(n for n, _ in named if any(fnmatch(n, pattern) for pattern in content.video))
+    return Plan(_hash(content, site, maps), content, site, maps, named, filmed)
 
 
 def _check(path: Path, content: Content, site: Site, maps: Mapping[str, terrain.FloorMap]) -> None:
