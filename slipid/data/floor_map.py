@@ -59,7 +59,6 @@ def from_polygons(
     """Map from patches on a base, later ones on top of earlier ones.
 
     Args:
-        base: surface where no patch lies.
         patches: surface and corners (x, y) [m] of each.
         extent: lowest x, lowest y, highest x, highest y [m].
         cell: edge of a cell [m].
@@ -92,7 +91,6 @@ def from_picture(
     Args:
         picture: red, green, blue between 0 and 1, first row at the top.
         colours: colour of every surface as `#rrggbb`.
-        metres_per_pixel: [m].
         corner: x, y of the lower left corner [m].
     """
     from matplotlib.colors import to_rgb

@@ -71,12 +71,7 @@ def read_map(path: Path) -> FloorMap:
 
 
 def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
-    """Write a map as a picture and a TOML file beside it that `read_map` reads.
-
-    Args:
-        path: where the TOML file goes; the picture has its name.
-        floor: the map.
-        colours: colour of every surface as `#rrggbb`, all different.
+    """Write a map as a TOML file and a picture of its name beside it, in these colours `#rrggbb`.
 
     Raises:
         ValueError: two surfaces have one colour.

@@ -81,7 +81,6 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
     """One set of runs that all have wheels and poses.
 
     Args:
-        logs: as read.
         session: name of the time in which the marker stayed as it was; by default surface, load and
             commanded speed, which is how test grids are driven.
 

@@ -19,11 +19,7 @@ MEMORY_S = 3600.0
 
 
 class Reporter:
-    """Tells a person how far the work is; use as a context.
-
-    Args:
-        quiet: tell nothing.
-    """
+    """Tells a person how far the work is, or nothing where quiet; use as a context."""
 
     def __init__(self, quiet: bool = False):
         self._console = Console(stderr=True, highlight=False, quiet=quiet)
@@ -51,7 +47,7 @@ class Reporter:
 
     def line(self, text: str) -> None:
         """One sentence that stays."""
-        self._print(text)
+        self._console.print(text, markup=False, soft_wrap=True)
 
     def stage(self, name: str) -> None:
         """A new part of the work begins."""
@@ -62,7 +58,7 @@ class Reporter:
         self._task = self._bars.add_task(name, total=None, what="")
         self._stage, self._told = name, time.monotonic()
         if self._bars.disable:
-            self._print(f"{name} ...")
+            self.line(f"{name} ...")
 
     def note(self, what: str) -> None:
         """What is going on at this moment; on a bar only."""
@@ -85,7 +81,4 @@ class Reporter:
             return
         self._told = now
         left = next(task for task in self._bars.tasks if task.id == self._task).time_remaining
-        self._print(f"  {what}" + (f", about {left:.0f} s left" if left else ""))
-
-    def _print(self, text: str) -> None:
-        self._console.print(text, markup=False, soft_wrap=True)
+        self.line(f"  {what}" + (f", about {left:.0f} s left" if left else ""))

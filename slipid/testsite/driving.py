@@ -63,13 +63,7 @@ class Rims:
 
 
 def drive(run: Run, site: Site, seed: int, timestep: float = TIMESTEP) -> Trace:
-    """Drive one run.
-
-    Args:
-        run: what to do.
-        site: robot and floors.
-        seed: seed of how the wheels stand and of the floor's unevenness.
-        timestep: time step of the engine [s].
+    """Drive one run; arguments as of `Plant`.
 
     Raises:
         DataError: MuJoCo is missing, a surface has no physics, or the simulation became unstable.

@@ -31,10 +31,7 @@ class Live:
     """A robot on a floor, driven by wheel speed commands with the site's delay and slew.
 
     Args:
-        site: robot, floors and sensors.
-        floor: which surface lies where.
         load: name of the load set-up.
-        start: x, y [m], heading [rad].
         seed: seed of the floor's unevenness, the wheels' first angles and the sensors' noise.
         period: between commands [s].
 

@@ -117,9 +117,7 @@ def mjcf(
     give each those of the surface beneath it.
 
     Args:
-        machine: the robot.
         load: whose centre of mass it has.
-        timestep: [s].
         ribs: x, lowest y, highest y, height [m] of every rib.
         looks: XML of assets, for pictures.
         floor_looks: XML attributes of the floor's plane.

@@ -47,10 +47,7 @@ class Plant:
     """A robot standing on a floor.
 
     Args:
-        site: robot and floors.
-        floor: which surface lies where.
         load: name of the load set-up.
-        start: x, y [m], heading [rad].
         seed: seed of how the wheels stand at first, and of the floor's unevenness.
         timestep: [s].
 

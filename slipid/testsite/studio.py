@@ -29,14 +29,7 @@ _SHIFT = 97
 
 
 class Studio:
-    """Draws frames of a robot on a floor.
-
-    Args:
-        site: the robot, and the colours of the surfaces.
-        load: name of its load set-up.
-        floor: which surface lies where.
-        camera: that looks.
-        seed: seed of the floor's pattern, the light and the noise.
+    """Draws frames of a robot on a floor; the seed is that of its pattern, the light and the noise.
 
     Raises:
         DataError: OpenGL or OpenCV is not there.
@@ -155,7 +148,6 @@ def film(
     """Write a video of a run, whole or not at all.
 
     Args:
-        studio: draws.
         time: times of the truth [s], of true poses and wheel angles.
         frames: times of the video's frames [s].
         path: where the video goes (.avi, Motion JPEG).

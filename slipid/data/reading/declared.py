@@ -17,9 +17,7 @@ def declared_layout(table: Mapping[str, object], where: str) -> Layout:
     `columns` maps each channel to `{columns = [...] or column = ..., unit, scale, offset}`; `false`
     takes a channel of the preset away.
 
-    Args:
-        table: the layout's section, as TOML gives it.
-        where: what messages call the section, such as `robotino.toml [layout]`.
+    Messages call the section `where`, such as `robotino.toml [layout]`.
 
     Raises:
         DataError: unknown key, channel, unit or format, wrong dimension, wrong type.

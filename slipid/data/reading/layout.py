@@ -1,7 +1,6 @@
 """What a log file's layout is: which column holds which channel, in which unit."""
 
 from collections.abc import Iterable, Mapping
-from difflib import get_close_matches
 from typing import Annotated, Literal
 
 from pydantic import (
@@ -17,6 +16,7 @@ from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.units import converts, factor
 from slipid.support.bounds import CLOSED, Positive
+from slipid.support.errors import near
 
 PER_WHEEL = {
     "wheel_ticks": "tick",
@@ -161,6 +161,4 @@ class Layout:
 def unknown(what: str, name: object, choices: Iterable[str]) -> str:
     """Message about a name that is none of the choices: the nearest of them, then all."""
     names = list(choices)
-    near = get_close_matches(str(name), names, n=2)
-    hint = f", did you mean {' or '.join(near)}?" if near else ""
-    return f"no {what} '{name}'{hint}; expected one of {', '.join(names)}"
+    return f"no {what} '{name}'{near(name, names)}; expected one of {', '.join(names)}"

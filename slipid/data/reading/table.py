@@ -53,7 +53,6 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     """Numbers of a CSV or Parquet file, each cell checked.
 
     Args:
-        path: the file; `.parquet` is read with pyarrow.
         layout: where names and numbers are, and which columns are wanted.
         all_columns: read every column of the file and not only those the layout uses.
 
