@@ -11,6 +11,8 @@ from slipid.testsite.site import Site
 
 PERIOD = 0.05
 """Between two commands to the robot [s]."""
+REACHED_M = 0.02
+"""Distance at which a way-point counts as reached [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,18 +100,18 @@ def drive(run: Run, site: Site, seed: int, timestep: float = TIMESTEP) -> Trace:
 def _towards(
     program: Waypoints, goal: int, pose: Float[np.ndarray, "3"], time: float
 ) -> tuple[int, Twist | None]:
-    """The next way-point, and the twist towards it in the body frame."""
+    """The next way-point, and the twist towards it in the body frame.
+
+    It is given up after thrice the time without slip and 10 s.
+    """
     while goal < len(program.places):
         far = np.array(program.places[goal]) - pose[:2]
         size = float(np.hypot(*far))
-        if size > program.within_m:
+        if size > REACHED_M:
             break
         goal += 1
-    longest = program.longest_s
-    if longest is None:
-        corners = np.array([program.places[-1], *program.places])  # at least as long as the way
-        steps = np.diff(corners, axis=0)
-        longest = 10.0 + 3 * float(np.hypot(*steps.T).sum()) / program.speed
+    corners = np.array([program.places[-1], *program.places])  # at least as long as the way
+    longest = 10.0 + 3 * float(np.hypot(*np.diff(corners, axis=0).T).sum()) / program.speed
     if goal == len(program.places) or time > longest:
         return goal, None
     speed = min(program.speed, max(0.05, 2.0 * size))

@@ -9,21 +9,12 @@ import pytest
 from slipid.data.floor_map import FloorMap, four_zones, uniform
 from slipid.support.errors import DataError
 from slipid.testsite.driving import Trace, drive
-from slipid.testsite.experiments import (
-    Timed,
-    Waypoints,
-    curves,
-    headings,
-    numbered,
-    paper_grid,
-    rectangle,
-    straight,
-    wander,
-)
+from slipid.testsite.experiments import Run, Timed, Waypoints, numbered, straight
 from slipid.testsite.ground import GRAVITY, GROUNDS, LEVELS, Ground, ribs
 from slipid.testsite.machine import Machine
 from slipid.testsite.motors import Drive, Motor, SpeedLoop
 from slipid.testsite.plant import Plant
+from slipid.testsite.simulate.sections import Curves, Headings, PaperGrid, Rectangle, Wander
 from slipid.testsite.site import Site
 
 EVEN = {name: replace(g, unevenness=0.0) for name, g in GROUNDS.items()}
@@ -46,6 +37,12 @@ def loads(plant: Plant) -> np.ndarray:
                 up = contact.frame.reshape(3, 3).T @ force[:3]
                 out[int(name.removeprefix("roller").split("_")[0])] += abs(up[2])
     return out
+
+
+def sixths(surface: str) -> list[Run]:
+    """Straight runs 60 degrees apart."""
+    plan = Headings(surface=surface, step_deg=60.0, speeds_m_s=[0.2], distance_m=0.6)
+    return plan.runs()
 
 
 def body_step(trace: Trace) -> np.ndarray:
@@ -141,7 +138,7 @@ def test_a_centred_robot_looks_the_same_from_every_wheel():
 def test_wheels_roll_where_the_floor_is_firm():
     site = Site()
     back = np.linalg.pinv(site.machine.wheel_from_twist)
-    for run in headings("firm", "as_built", 60.0, (0.2,), 0.6):
+    for run in sixths("firm"):
         trace = drive(run, site, 1)
         steady = (trace.time > 1.0) & (trace.time < 2.8)
         wheels = back @ trace.wheel_speed[steady].mean(axis=0)
@@ -168,16 +165,13 @@ def test_slip_grows_with_softness_and_depends_on_the_direction():
     site = Site()
     found = {}
     for surface in ("firm", "medium", "soft"):
-        runs = headings(surface, "as_built", 60.0, (0.2,), 0.6)
+        runs = sixths(surface)
         found[surface] = [slip(drive(run, site, 3), site.machine) for run in runs]
     assert 0.003 < np.mean(found["firm"]) < 0.03
     assert 0.1 < np.mean(found["medium"]) < 0.3
     assert 0.2 < np.mean(found["soft"]) < 0.55
     assert np.ptp(found["soft"]) > 0.1  # the centre of mass lies off the middle
-    level = [
-        slip(drive(run, Site(machine=CENTRED), 3), CENTRED)
-        for run in headings("soft", "as_built", 60.0, (0.2,), 0.6)
-    ]
+    level = [slip(drive(run, Site(machine=CENTRED), 3), CENTRED) for run in sixths("soft")]
     assert np.ptp(level) < 0.6 * np.ptp(found["soft"])
 
 
@@ -337,16 +331,15 @@ def test_every_speed_loop_drives_the_robot(kind):
 
 
 def test_the_plans_have_the_runs_of_the_published_logs():
-    assert len(headings("soft", "as_built", 5.0, (0.1, 0.2, 0.3), 0.6)) == 216
-    grid = paper_grid("soft", "as_built")
+    plan = Headings(surface="soft", step_deg=5.0, speeds_m_s=[0.1, 0.2, 0.3])
+    assert len(plan.runs()) == 216
+    grid = PaperGrid(surface="soft").runs()
     assert len(grid) == 8 + 8 + 6 + 6 + 6
     assert {round(float(np.hypot(*r.program.legs[0][0][:2])), 2) for r in grid} == {
         0.0, 0.1, 0.14, 0.2, 0.28, 0.3, 0.4, 0.42,
     }  # fmt: skip
-    assert {run.program.legs[0][0][2] > 0 for run in curves("soft", "moved", 4, (0.2,), 0.5)} == {
-        True,
-        False,
-    }
+    arcs = Curves(surface="soft", load="moved", count=4, speeds_m_s=[0.2]).runs()
+    assert {run.program.legs[0][0][2] > 0 for run in arcs} == {True, False}
     names = [name for name, _ in numbered(grid, 0.1, 0)]
     assert len(set(names)) == len(names)
     assert names[0] == "as_built/soft/run000"
@@ -365,7 +358,7 @@ def test_the_rectangle_is_driven_by_encoders_and_better_by_camera():
     floor = four_zones(["firm", "medium", "soft", "short"])
     closure = {}
     for by in ("encoders", "camera"):
-        trace = drive(rectangle(floor, "zones", "as_built", by=by, sides=(0.5, 0.3)), site, 0)
+        trace = drive(Rectangle(map="zones", by=by).runs(floor, 0)[0], site, 0)
         closure[by] = np.hypot(*(trace.pose[-1, :2] - trace.pose[0, :2]))
         if by == "encoders":
             np.testing.assert_allclose(rolled(trace, site.machine)[:2], 0.0, atol=0.05)
@@ -374,7 +367,7 @@ def test_the_rectangle_is_driven_by_encoders_and_better_by_camera():
 
 def test_way_points_by_camera_are_reached():
     floor = uniform("medium")
-    run = wander(floor, "site", "as_built", 1, seed=5, points=1)[0]
+    run = Wander(map="site", count=1, points=1).runs(floor, 5)[0]
     assert run.surface is None
     near = replace(run, program=Waypoints(((run.start[0] + 0.3, run.start[1]),), 0.3, "camera"))
     trace = drive(near, Site(), 0)
