@@ -183,10 +183,11 @@ def test_absent_column_and_data_set_are_named(tmp_path, rng):
 
 
 def test_short_track_is_refused(tmp_path):
-    file = TrackFile("made", "made", "made.csv", 9, 9, 1.0)
+    file = TrackFile("made", "made", "made", 9, 9, 1.0)
     (tmp_path / "figure7").mkdir()
-    (tmp_path / "figure7" / "made.csv").write_text("time_s,x_mm,y_mm,angle_deg\n0,1,2,3\n1,1,2,3\n")
-    with pytest.raises(DataError, match=r"made\.csv: 2 frames; expected at least the 9"):
+    text = "time_s,x_mm,y_mm,angle_deg\n0,1,2,3\n1,1,2,3\n"
+    (tmp_path / "figure7" / "square_made_camera.csv").write_text(text)
+    with pytest.raises(DataError, match=r"made_camera\.csv: 2 frames; expected at least the 9"):
         read_track(tmp_path, file)
 
 
@@ -212,7 +213,7 @@ def test_deployed_model_as_printed():
 
 
 def test_track_numbers_of_a_made_square():
-    file = TrackFile("made", "made", "made.csv", 4, 4, 1.0)
+    file = TrackFile("made", "made", "made", 4, 4, 1.0)
     position = np.array([[10.0, 0], [13, 4], [10, 8], [10, 20], [110, 20], [110, 0], [40, 40]])
     heading = np.array([350.0, 355, 360, 365, 370, 372, 375])
     track = Track(file=file, time=np.arange(7.0), position=position, heading=heading)
@@ -322,7 +323,7 @@ def made_data(tmp_path, rng):
     for file in TRACK_FILES:
         t = np.linspace(0, 1, 400)
         track = {"time_s": 30 * t, "x_mm": 900 * t, "y_mm": 500 * t, "angle_deg": 175 + 10 * t}
-        write_csv(folder / "figure7" / file.file, track, delimiter=",")
+        write_csv(folder / "figure7" / f"square_{file.square}_camera.csv", track, delimiter=",")
     return tmp_path / "data"
 
 
@@ -384,8 +385,6 @@ def test_samples_and_slopes_to_the_digits_given(result, motor, count, slope):
     assert len(table.samples) == count
     assert f"{table.forms['linear in M'].coefficients[0]:.4f}" == slope
     assert sum(len(part) for part in table.by_surface.values()) == count
-    for line in (str(count), slope):
-        assert line in str(result)
 
 
 def test_torque_says_less_than_raw_current(result):

@@ -16,7 +16,7 @@ class TrackFile:
     Args:
         name: key in results.
         label: what steered the robot.
-        file: in the folder figure7.
+        square: how files in the folder figure7 call it: `square_<this>_camera.csv`.
         authors_frames: camera frames of the first side, by the authors' own index.
         side_frames: camera frames of the first side in this file, to where the robot turns off.
         printed_path_length: length of the first side as the paper prints it [mm].
@@ -24,7 +24,7 @@ class TrackFile:
 
     name: str
     label: str
-    file: str
+    square: str
     authors_frames: int
     side_frames: int
     printed_path_length: float
@@ -33,22 +33,10 @@ class TrackFile:
 # Encoders: by the authors' index the first side has 216 frames, but this track turns off at frame
 # 181. Their length script reads a variable of another name, most likely a repeat of the run.
 TRACK_FILES = (
-    TrackFile("encoders", "encoders only", "square_without_controller_camera.csv", 216, 181, 760.0),
+    TrackFile("encoders", "encoders only", "without_controller", 216, 181, 760.0),
+    TrackFile("slip_model", "slip model", "without_controller_with_compensation", 324, 324, 940.0),
     TrackFile(
-        "slip_model",
-        "slip model",
-        "square_without_controller_with_compensation_camera.csv",
-        324,
-        324,
-        940.0,
-    ),
-    TrackFile(
-        "compensation",
-        "slip model and torque correction",
-        "square_with_controller_camera.csv",
-        268,
-        268,
-        1031.0,
+        "compensation", "slip model and torque correction", "with_controller", 268, 268, 1031.0
     ),
 )
 COMMANDED_SIDES = (900.0, 400.0)
@@ -115,7 +103,7 @@ def read_track(folder: Path, file: TrackFile) -> Track:
     Raises:
         DataError: if the file or a column is missing or the track ends within its first side.
     """
-    path = folder / "figure7" / file.file
+    path = folder / "figure7" / f"square_{file.square}_camera.csv"
     table = read_columns(path, "robotino2021_camera")
     frames = len(table["time_s"])
     if frames < file.side_frames:
