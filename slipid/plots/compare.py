@@ -1,12 +1,13 @@
-"""Who wins on which floor, by how much, and where the data cannot tell."""
+"""Slip models side by side: their errors, and who wins on which floor or cannot be told."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from slipid.plots import drawing
-from slipid.plots.slip_models import WORDS, bars, colour_of, titled
 from slipid.support.content import Content
 
 TIED = "#cfe3f1"
@@ -14,6 +15,20 @@ SHOWN = {
     "sectors": "60-degree sectors of headings left out",
     "speeds": "one speed left out",
     "random": "random headings left out",
+}
+WORDS = {
+    "identified": "identified (force balance)",
+    "encoder": "encoders alone",
+    "constant": "one slip for all",
+    "linear": "slip ~ torque",
+    "affine": "slip ~ 1 + torque",
+    "svr": "slip ~ 1 + torque, SVR",
+    "quadratic": "slip ~ 1 + torque + torque²",
+    "saturating": "slip ~ saturating torque",
+    "monotone_spline": "slip ~ any rising curve of torque",
+    "affine_current": "slip ~ 1 + current",
+    "heading_lookup": "lookup by heading",
+    "paper": "form of 2021, refitted",
 }
 
 
@@ -51,9 +66,8 @@ def compare_figure(floors: Content, which: str) -> Figure:
             if one["verdict"] in ("best", "tied"):
                 for ax in (density, error):
                     ax.axhspan(k - 0.5, k + 0.5, color=TIED, zorder=0)
-    words = [WORDS.get(m, m.replace("_", " ")) for m in models]
     for row in (0, 1):
-        axes[row, 0].set_yticks(range(len(models)), words)
+        axes[row, 0].set_yticks(range(len(models)), worded(models))
     axes[0, 0].set_ylim(len(models) - 0.4, -0.6)
     made.supxlabel(
         "error bars: two standard errors, runs of one 30-degree sector of headings counted as one",
@@ -76,3 +90,54 @@ def _density(ax: Axes, models: Content) -> None:
     ax.axvline(0.0, color=drawing.INK, lw=0.8)
     spare = 0.06 * max(max(reach) - min(reach), 1.0)
     ax.set_xlim(min(reach) - spare, max(reach) + spare)
+
+
+def ladder_figure(found: Content, which: str) -> Figure:
+    """Mean end-point error of every model on every floor of a validation file, a bar each.
+
+    Args:
+        which: runs these are, in words.
+    """
+    floors = found["summary"]
+    models = list(next(iter(floors.values())))
+    width = 2.7 * len(floors) + 2.4
+    made = drawing.figure(
+        max(width, 8.8),
+        1.7 + 0.32 * len(models),
+        f"How far from the camera's end each model ends, open loop; {which}",
+    )
+    axes = made.subplots(1, len(floors), sharey=True, squeeze=False)[0]
+    for ax, (floor, by) in zip(axes, floors.items(), strict=True):
+        bars(ax, {model: 100 * by[model]["endpoint_error_mean"] for model in models})
+        titled(ax, floor, by[models[0]]["runs"])
+        ax.set_xlabel("mean end-point error\n[% of the camera's displacement]")
+    axes[0].set_yticks(range(len(models)), worded(models))
+    axes[0].invert_yaxis()
+    return made
+
+
+def worded(models: Sequence[str]) -> list[str]:
+    """Names of models for people."""
+    return [WORDS.get(model, model.replace("_", " ")) for model in models]
+
+
+def titled(ax: Axes, floor: str, runs: int) -> None:
+    """Name a panel by its floor and the number of runs."""
+    ax.set_title(f"{floor.replace('@', ', load ')}\n{runs} runs", fontsize=10)
+
+
+def colour_of(model: str) -> str:
+    """Colour of a model: only the identified one stands out."""
+    return drawing.BLUE if model == "identified" else "#a8a8a8"
+
+
+def bars(ax: Axes, error: Mapping[str, float], half: Sequence[float] | None = None) -> None:
+    """A bar per model with its number, and half the length of its error bar."""
+    drawing.plain(ax)
+    ax.grid(False, axis="y")
+    values, colours = list(error.values()), [colour_of(model) for model in error]
+    drawn = ax.barh(
+        range(len(values)), values, 0.75, color=colours, xerr=half, error_kw={"elinewidth": 0.9}
+    )
+    ax.bar_label(drawn, [f"{v:.1f}" for v in values], padding=3, fontsize=9)
+    ax.set_xlim(0.0, 1.22 * max(np.add(values, 0.0 if half is None else half)))

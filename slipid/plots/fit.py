@@ -7,11 +7,11 @@ from matplotlib.figure import Figure
 
 from slipid.data.runs import Runs
 from slipid.identify.result import Fit
+from slipid.plots.compare import ladder_figure
 from slipid.plots.drawing import save_all
 from slipid.plots.load import load_figure
 from slipid.plots.motion import heading_figure, path_figure
 from slipid.plots.seen import Seen, seen
-from slipid.plots.slip_models import ladder_figure
 from slipid.plots.wheels import current_figure, curve_figure
 from slipid.support.content import Content
 

@@ -132,35 +132,29 @@ class _Recorder:
 
     def __init__(self, plant: Plant):
         self.plant = plant
-        self._position = np.concatenate([np.arange(7), plant.wheel_at])
-        self._velocity = np.concatenate([[5], plant.wheel_dof])
-        self._rows: list[list[float]] = []
+        self._rows: list[tuple[float | list[float] | np.ndarray, ...]] = []
 
     def record(self, wanted: Float[np.ndarray, " wheel"], sent: Float[np.ndarray, "3"]) -> None:
-        p = self.plant
-        row = [p.time, p.drive.bus, *p.drive.current, *p.drive.voltage]
-        row += p.data.qpos[self._position].tolist()
-        row += p.data.qvel[self._velocity].tolist()
-        row += p.data.xpos[p.wheel_body, 2].tolist()
-        self._rows.append(row + wanted.tolist() + sent.tolist())
+        p, d = self.plant, self.plant.data
+        body, turn, height = d.qpos[:7].copy(), d.qvel[5], d.xpos[p.wheel_body, 2]
+        wheels = d.qpos[p.wheel_at], d.qvel[p.wheel_dof], height, wanted
+        electric = list(p.drive.current), list(p.drive.voltage), p.drive.bus
+        self._rows.append((p.time, body, turn, *wheels, *electric, sent))
 
     def trace(self) -> Trace:
-        n = len(self.plant.wheel_at)
-        widths = [1, 1, n, n, 7, n, 1, n, n, n, 3]
-        t, bus, amps, volts, q, angle, turn, speed, height, wanted, sent = np.split(
-            np.array(self._rows), np.cumsum(widths)[:-1], axis=1
-        )
-        heading = np.unwrap(heading_of(q[:, 3:]))[:, None]
+        columns = (np.array(column) for column in zip(*self._rows, strict=True))
+        time, body, turn, angle, speed, height, wanted, amps, volts, bus, sent = columns
+        heading = np.unwrap(heading_of(body[:, 3:]))[:, None]
         return Trace(
-            time=t[:, 0],
-            pose=np.concatenate([q[:, :2], heading], axis=1),
-            yaw_rate=turn[:, 0],
+            time=time,
+            pose=np.concatenate([body[:, :2], heading], axis=1),
+            yaw_rate=turn,
             wheel_angle=angle - self.plant.angle_at_start,
             wheel_speed=speed,
             wheel_command=wanted,
             current=amps,
             voltage=volts,
-            bus=bus[:, 0],
+            bus=bus,
             sinkage=np.maximum(self.plant.machine.wheel_radius_m - height, 0.0),
             twist_command=sent,
         )

@@ -19,10 +19,10 @@ from slipid.identify.fit.problem import Problem, State
 from slipid.identify.result import Fit, summarise
 from slipid.plots import fit as plots
 from slipid.plots import load as plots_robot
+from slipid.plots.compare import WORDS, ladder_figure
 from slipid.plots.drawing import figure, save
 from slipid.plots.motion import heading_figure
 from slipid.plots.seen import by_heading, seen
-from slipid.plots.slip_models import WORDS, ladder_figure
 from slipid.plots.wheels import current_figure, driving_torque, wheel_curve
 from slipid.search_space import Choice
 from slipid.selftest.logs import make_logs

@@ -8,9 +8,8 @@ from jaxtyping import Float
 from slipid.data.log import Log
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.table import Table
-from slipid.data.signals.steps import integrated_steps, step_edges
 from slipid.data.signals.wheel_order import best_wheel_order, describe
-from slipid.data.signals.wheel_signals import interpolate
+from slipid.data.signals.wheel_signals import integrated_steps, interpolate, step_edges
 from slipid.support.errors import bad_data
 
 MIN_ROWS = 2

@@ -10,7 +10,7 @@ from slipid.data.log import Log
 from slipid.data.reading.checks import MIN_ROWS, check_log, check_time, filled, unwrapped_ticks
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.table import Table, read_table
-from slipid.data.signals.steps import integral
+from slipid.data.signals.wheel_signals import integral
 from slipid.support.errors import DataError, bad_data
 
 
