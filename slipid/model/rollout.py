@@ -154,7 +154,6 @@ def simulate(
         n^2 J_m dw/dt = n eta C_e I - friction(w) - traction torque(xi, w)
 
     Args:
-        loop: speed control, sampled once a step.
         command: set speed of each wheel in each step [rad/s].
         dt: step [s]; implicit Euler, so stiff floors are no bar, a millisecond or two is precise.
         surface: index of the floor, one or one per step.

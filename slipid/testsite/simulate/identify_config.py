@@ -48,15 +48,11 @@ def identify_config(plan: Plan) -> str:
     )
     columns = "\n".join(f"{name} = {_inline(c)}" for name, c in layout["columns"].items())
     one = {(run.load, run.surface) for _, run in plan.runs if run.surface is not None}
+    where = [(load, surface, 'surface = "folder"') for load, surface in sorted(one)]
+    where += [(load, name, f'map = "maps/{name}.toml"') for load, name in _mapped(plan)]
     sets = "".join(
-        f'\n[[logs]]\nglob = "{load}/{surface}/*.csv"\nformat = "testsite"\n'
-        f'surface = "folder"\nload = "{load}"\n'
-        for load, surface in sorted(one)
-    )
-    sets += "".join(
-        f'\n[[logs]]\nglob = "{load}/{name}/*.csv"\nformat = "testsite"\n'
-        f'map = "maps/{name}.toml"\nload = "{load}"\n'
-        for load, name in _mapped(plan)
+        f'\n[[logs]]\nglob = "{load}/{name}/*.csv"\nformat = "testsite"\n{floor}\nload = "{load}"\n'
+        for load, name, floor in where
     )
     return _IDENTIFY.format(
         azimuths=list(machine.wheel_azimuths_deg),
