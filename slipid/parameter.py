@@ -20,16 +20,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Declaration:
     """What a number is, wherever it stands.
 
     Attributes:
         unit: as pint spells it, "1" without dimension.
         symbol: as the equations write it.
+        start: value when nothing else is known [unit].
         lower: smallest value; with no `upper` the search space is logarithmic above it.
         upper: largest value; with both the search space is the log-odds of the place between them.
-        start: value when nothing else is known [unit].
         spread: std of the prior in the search space when the user gives none: a log-std where the
             space is logarithmic, in [unit] where there are no bounds.
         free: whether it is fitted unless the user says otherwise.
@@ -40,13 +40,13 @@ class Declaration:
 
     unit: str
     symbol: str
-    lower: float
-    upper: float
     start: float
-    spread: float
-    free: bool
-    shares: bool
-    doc: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    spread: float = 1.0
+    free: bool = True
+    shares: bool = False
+    doc: str = ""
     electric: bool = False
 
     def to_search(self, value: Any) -> np.ndarray:
@@ -91,35 +91,20 @@ def share_basis(n: int) -> np.ndarray:
     return basis
 
 
-def parameter(
-    *,
-    unit: str,
-    symbol: str,
-    start: float,
-    lower: float = -math.inf,
-    upper: float = math.inf,
-    spread: float = 1.0,
-    free: bool = True,
-    shares: bool = False,
-    per: str | None = None,
-    doc: str = "",
-    electric: bool = False,
-) -> Any:
-    """Dataclass field that holds a fitted number; arguments as in `Declaration`.
+def parameter(*, per: str | None = None, **declared: Any) -> Any:
+    """Dataclass field that holds a fitted number, declared by the attributes of `Declaration`.
 
     Args:
         per: name of the attribute of the same object, `loads` or `sessions`, that holds one label
             per entry of the leading axis; the path then ends in `@label`.
     """
-    declaration = Declaration(
-        unit, symbol, lower, upper, start, spread, free, shares, doc, electric
-    )
+    declaration = Declaration(**declared)
     return eqx.field(
         converter=lambda x: (
             jnp.asarray(x, dtype=float) if not isinstance(x, jax.core.Tracer) else x
         ),
         metadata={"parameter": declaration, "per": per},
-        default_factory=lambda: jnp.asarray(start, dtype=float),
+        default_factory=lambda: jnp.asarray(declaration.start, dtype=float),
     )
 
 

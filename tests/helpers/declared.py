@@ -12,7 +12,7 @@ from slipid.parameter import Declaration, parameter
 
 
 def declaration(lower=-math.inf, upper=math.inf, shares=False):
-    return Declaration("1", "x", lower, upper, 1.0, 1.0, True, shares, "")
+    return Declaration(unit="1", symbol="x", start=1.0, lower=lower, upper=upper, shares=shares)
 
 
 class Inner(eqx.Module):
