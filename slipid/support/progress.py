@@ -47,7 +47,7 @@ class Reporter:
 
     def line(self, text: str) -> None:
         """One sentence that stays."""
-        self._console.print(text, markup=False, soft_wrap=True)
+        self._print(text)
 
     def stage(self, name: str) -> None:
         """A new part of the work begins."""
@@ -58,7 +58,7 @@ class Reporter:
         self._task = self._bars.add_task(name, total=None, what="")
         self._stage, self._told = name, time.monotonic()
         if self._bars.disable:
-            self.line(f"{name} ...")
+            self._print(f"{name} ...")
 
     def note(self, what: str) -> None:
         """What is going on at this moment; on a bar only."""
@@ -81,4 +81,7 @@ class Reporter:
             return
         self._told = now
         left = next(task for task in self._bars.tasks if task.id == self._task).time_remaining
-        self.line(f"  {what}" + (f", about {left:.0f} s left" if left else ""))
+        self._print(f"  {what}" + (f", about {left:.0f} s left" if left else ""))
+
+    def _print(self, text: str) -> None:
+        self._console.print(text, markup=False, soft_wrap=True)
