@@ -23,9 +23,9 @@ from slipid.job.config import FitSection
 from slipid.job.fit import optimised, summarised
 from slipid.job.problem import Task, on_runs, said_of
 from slipid.model.robot import Robot
-from slipid.parameter import Choice
 from slipid.report.estimates import show_fit
 from slipid.report.page import Page
+from slipid.search_space import Choice
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:

@@ -33,7 +33,7 @@ def simulate(
 def show(found: Content, plan: "Plan", out: Path) -> None:
     """Print how much was driven, and what to do with it."""
     from slipid.report.page import Page
-    from slipid.testsite.simulate.simulate import can_identify
+    from slipid.testsite.simulate.identify_config import can_identify
 
     page = Page()
     page.line(f"{len(found['runs'])} runs, {found['driven']} of them driven now")

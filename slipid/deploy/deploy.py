@@ -22,7 +22,7 @@ from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.drawn_estimates import estimates
 from slipid.model.robot import Robot
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError
 from slipid.support.versions import versions
 

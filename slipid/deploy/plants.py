@@ -14,8 +14,8 @@ from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Twin, TwinPlant
 from slipid.data.floor_map import FloorMap
 from slipid.deploy.trial_site import floor_of
-from slipid.testsite.driving import Site
 from slipid.testsite.live import Live, Reading
+from slipid.testsite.site import Site
 
 
 class SitePlant:

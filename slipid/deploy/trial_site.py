@@ -56,8 +56,8 @@ def known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
     Raises:
         DataError: another number of wheels, a load set-up or a surface that it does not have.
     """
-    from slipid.testsite.driving import Site
     from slipid.testsite.ground import GROUNDS
+    from slipid.testsite.site import Site
 
     machine, other = Site().machine, "With --plant twin the identified model is driven itself"
     has = len(machine.wheel_azimuths_deg)

@@ -14,7 +14,8 @@ from slipid.identify.slip_curves import SlipCurve, Validity
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, build
-from slipid.parameter import Choice, Space, entries
+from slipid.parameter import entries
+from slipid.search_space import Choice, Space
 from slipid.support.content import Content
 
 SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/2"

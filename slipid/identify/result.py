@@ -22,7 +22,7 @@ from slipid.identify.slip_curves import SlipCurve, Validity
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, sentences
 from slipid.model.robot import Robot
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 
 CONFLICT = 4.0
 """Prior stds from the prior mean beyond which a reader is told."""

@@ -13,7 +13,7 @@ from slipid.identify.fit.noise import travel
 from slipid.model import contact_law as law
 from slipid.model import robot as model
 from slipid.model.robot import GRAVITY, Robot
-from slipid.parameter import Space
+from slipid.search_space import Space
 
 POINTS = 41
 _SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])

@@ -18,7 +18,8 @@ from slipid.job.config import Config, FitSection, Logs, geometry, one_floor
 from slipid.job.logs import files_of, read_dataset
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
-from slipid.parameter import Choice, Space, entries
+from slipid.parameter import entries
+from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 

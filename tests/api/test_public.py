@@ -16,8 +16,9 @@ import slipid as sl
 from slipid.api import posterior
 from slipid.data.write import robotino2022_csv
 from slipid.identify.posterior.blocks import Plan
-from slipid.selftest.logs import Sensors, make_logs
-from slipid.selftest.plan import grid, truth
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
+from tests.helpers.made_logs import truth
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOORS = (("gray", "as_built"),)

@@ -28,8 +28,8 @@ from slipid.deploy.trial_summary import Run, summaries
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.support.errors import DataError
-from slipid.testsite.driving import Site
 from slipid.testsite.live import Live
+from slipid.testsite.site import Site
 
 
 @pytest.fixture(scope="module")

@@ -33,8 +33,10 @@ from slipid.identify.fit import noise as of_noise
 from slipid.identify.fit.optimise import Options, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.result import Channels
-from slipid.parameter import Choice
-from slipid.selftest.logs import Sensors, blank, make_logs, truth
+from slipid.search_space import Choice
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors
+from tests.helpers.made_logs import blank, truth
 from tests.helpers.made_windows import measure
 
 SETUP = ("soft", "as_built")

@@ -16,7 +16,7 @@ from slipid.identify.compare.slip_models import rungs
 from slipid.identify.compare.validation import Judged, validation
 from slipid.identify.fit.optimise import Optimum, Options, optimise
 from slipid.identify.fit.problem import Problem
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 
 
 def left_out(

@@ -14,7 +14,9 @@ from typer.testing import CliRunner
 
 from slipid.cli.demo import packaged_config
 from slipid.cli.main import app
-from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
+from tests.helpers.made_logs import truth, write_logs
 
 DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
 UNSEEN = [type(d)(d.surface, d.load, d.heading + 0.4, d.speed) for d in DRIVES[:3]]

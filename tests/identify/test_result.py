@@ -26,9 +26,11 @@ from slipid.identify.fit_json import identified_json, to_json
 from slipid.identify.result import Fit, hash_of, summarise
 from slipid.identify.verdicts.estimates import estimates, expected_covariance
 from slipid.identify.verdicts.unidentified import flat_directions
-from slipid.parameter import Choice
-from slipid.selftest.logs import Drive, Sensors, blank, grid, make_logs, truth
+from slipid.search_space import Choice
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
 from slipid.support.errors import DataError
+from tests.helpers.made_logs import blank, truth
 
 pytestmark = pytest.mark.slow  # traces whole fits
 
@@ -91,7 +93,7 @@ def verdicts(
 
     `prior_std` in the search space is the declared one, or one for all.
     """
-    from slipid.parameter import Space
+    from slipid.search_space import Space
 
     space = Space(blank(DRIVES), choices)
     if prior_std:

@@ -12,9 +12,12 @@ from slipid.data.reading.reader import find_logs, read_log
 from slipid.data.runs import collect, default_session
 from slipid.data.signals.wheel_signals import quantum
 from slipid.data.windows import windows
+from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.likelihood import batch, residuals
 from slipid.identify.fit.noise import noise
-from slipid.selftest.logs import LAYOUT, TRUTH, Drive, Sensors, grid, make_logs, truth, write_logs
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
+from tests.helpers.made_logs import LAYOUT, TRUTH, truth, write_logs
 
 PLAN = grid(headings=4, turns=2)
 ROBOT = truth(PLAN)

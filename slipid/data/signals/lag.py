@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.data.signals.steps import body_steps, integral
-from slipid.data.signals.wheel_signals import interpolate
+from slipid.data.signals.wheel_signals import body_steps, integral, interpolate
 
 
 class Lag(NamedTuple):

@@ -1,4 +1,4 @@
-"""Signals of one run: wheel speed from angles, stalls of the telemetry, start, quantisation."""
+"""Signals of one run: steps of motion, speeds from angles, stalls of the telemetry, the start."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -9,18 +9,50 @@ def interpolate(
     values: Float[np.ndarray, " time"] | Float[np.ndarray, "time column"],
     at: Float[np.ndarray, " at"],
 ) -> Float[np.ndarray, " at"] | Float[np.ndarray, "at column"]:
-    """Values at other times, linear in between, constant beyond both ends.
+    """Values at other times [s], linear in between, constant beyond both ends.
 
-    Args:
-        time: [s], increasing.
-        values: one or several columns, one row per time; angles without wrap-around.
-        at: [s].
+    Angles have to be without wrap-around.
     """
     after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
     before = after - 1
     share = np.clip((at - time[before]) / (time[after] - time[before]), 0.0, 1.0)
     share = share.reshape(-1, *([1] * (values.ndim - 1)))
     return values[before] + share * (values[after] - values[before])
+
+
+def integral(
+    time: Float[np.ndarray, " time"], rate: Float[np.ndarray, "time column"]
+) -> Float[np.ndarray, "time column"]:
+    """Integral of each column from the first row on, by trapezoids; the first row is 0."""
+    areas = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None]
+    return np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(areas, axis=0)])
+
+
+def step_edges(time: Float[np.ndarray, " time"], step: float = 0.5) -> Float[np.ndarray, " edge"]:
+    """Edges of equal steps [s], long enough that delays and jitter do not matter."""
+    count = max(2, int((time[-1] - time[0]) / step) + 1)
+    return np.linspace(time[0], time[-1], count)
+
+
+def integrated_steps(
+    time: Float[np.ndarray, " time"],
+    rate: Float[np.ndarray, "time column"],
+    edges: Float[np.ndarray, " edge"],
+) -> Float[np.ndarray, "step column"]:
+    """Integral of a rate over each step."""
+    return np.diff(interpolate(time, integral(time, rate), edges), axis=0)
+
+
+def body_steps(pose: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "step 3"]:
+    """Increments ahead [m], to the left [m] and in heading [rad] between rows of a pose.
+
+    They are in the body's axes halfway through each step: turned back by the mean heading.
+    """
+    middle = 0.5 * (pose[1:, 2] + pose[:-1, 2])
+    dx, dy, turn = np.diff(pose, axis=0).T
+    ahead = np.cos(middle) * dx + np.sin(middle) * dy
+    left = np.cos(middle) * dy - np.sin(middle) * dx
+    return np.stack([ahead, left, turn], axis=1)
 
 
 def wheel_speed(
@@ -36,8 +68,6 @@ def wheel_speed(
     one; the fit over a centred window is blind to that. Windows hold at least three rows.
 
     Args:
-        time: [s].
-        wheel_angle: [rad].
         half_window: [s]; longer smooths more.
     """
     rows = np.arange(len(time))
@@ -71,8 +101,6 @@ def bridge_stalls(
     currents reported in the marked rows are as stale as the angle was.
 
     Args:
-        time: [s].
-        wheel_angle: [rad].
         min_rows: steps without change from which a stretch can be a stall.
     """
     stalled = np.zeros(len(time), dtype=bool)

@@ -21,7 +21,7 @@ from slipid.identify.compare.validation import Judged, score, told
 from slipid.identify.fit.one_speed import still_viscosities
 from slipid.identify.fit.optimise import Options, optimise
 from slipid.identify.fit.problem import Problem, State
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 

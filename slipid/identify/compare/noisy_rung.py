@@ -29,7 +29,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import DEGREES, Problem
 from slipid.identify.fit.variances import scored_given
 from slipid.model.robot import Robot
-from slipid.parameter import Space
+from slipid.search_space import Space
 
 MOST_TURNS, SCORING, SETTLED = 15, 4, 0.02
 """Turns of a rung's covariance and so many steps of its log variances, and what counts as rest."""

@@ -23,7 +23,7 @@ from slipid.identify.fit.problem import DEGREES
 from slipid.identify.fit.sessions import by_axis
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
-from slipid.parameter import Space
+from slipid.search_space import Space
 
 STEP = 0.5
 """Longest step of a replay [s]."""

@@ -30,7 +30,7 @@ from slipid.identify.fit.problem import DEGREES, Problem, State
 from slipid.identify.fit.sessions import Linear, by_axis, shared
 from slipid.identify.fit.variances import Search, Square, Vector
 from slipid.model.robot import Robot
-from slipid.parameter import Space
+from slipid.search_space import Space
 
 Gaps = Float[np.ndarray, "piece m"]
 Slopes = Float[np.ndarray, "piece m number"]

@@ -23,7 +23,8 @@ from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES, by_axis
 from slipid.identify.result import Channels, Fit
 from slipid.model.robot import Robot
-from slipid.parameter import Choice, entries
+from slipid.parameter import entries
+from slipid.search_space import Choice
 
 _TOGETHER = 256
 """Runs whose Jacobians are taken in one call."""

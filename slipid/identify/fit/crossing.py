@@ -16,7 +16,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import travel
 from slipid.identify.fit.scatter import Pieces
 from slipid.model.robot import Robot
-from slipid.parameter import Space
+from slipid.search_space import Space
 from slipid.support.errors import DataError
 
 WINDOW = 0.25

@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 from slipid.identify.fit.crossing import Crossing, Evidence
 from slipid.identify.fit.scatter import CHANNELS, Scatter, scatter
 from slipid.identify.fit.variances import Search, Square
-from slipid.parameter import Space
+from slipid.search_space import Space
 
 TOLERANCE = 0.02
 """Settled when a step is at most so many posterior stds."""

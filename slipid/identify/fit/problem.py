@@ -29,7 +29,7 @@ from slipid.identify.fit.variances import (
     Whitening,
 )
 from slipid.model.robot import Robot
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 
 __all__ = ["DEGREES", "VARIANCE_SPREAD", "Problem", "State", "Target"]
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.linear import inverse_root
 from slipid.identify.fit.noise import Components
-from slipid.parameter import Space
+from slipid.search_space import Space
 
 Vector = Array | np.ndarray
 """One-dimensional, of jax or numpy."""

@@ -16,7 +16,8 @@ from jaxtyping import Float
 
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.variances import Search, Square
-from slipid.parameter import Choice, Declaration, Entry, Space
+from slipid.parameter import Declaration, Entry
+from slipid.search_space import Choice, Space
 
 IDENTIFIED, WEAK = 0.3, 0.8
 """Largest std(posterior) / std(prior) of the verdicts, in the search space."""
@@ -143,8 +144,9 @@ def _free(
         wide = np.full(entry.size, prior_std.mean() / entry.size)
     else:
         low, high = (np.asarray(d.to_si(jnp.asarray(mean + k * std_z))) for k in (-_Z95, _Z95))
-        std = np.array([d.slope(float(v)) for v in value]) * std_z
-        wide = np.array([d.slope(float(v)) for v in center]) * prior_std
+        std = d.slope(value) * std_z
+        center = np.asarray(d.to_si(jnp.asarray(prior_mean)))
+        wide = d.slope(center) * prior_std
     scaled = block / prior_std[:, None] / prior_std[None, :]
     ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
     pull = (mean - prior_mean) / prior_std

@@ -23,7 +23,8 @@ from scipy.stats import chi2
 from slipid.identify.fit.optimise import Optimum, Options, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE
-from slipid.parameter import Entry, Space
+from slipid.parameter import Entry
+from slipid.search_space import Space
 
 RISE = float(chi2.ppf(0.9, 1)) / 2
 """Rise of minus log likelihood at the ends of the 90 % interval."""

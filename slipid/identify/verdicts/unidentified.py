@@ -20,7 +20,7 @@ from slipid.identify.slip_curves import Validity
 from slipid.identify.verdicts.estimates import WEAK
 from slipid.identify.verdicts.formulas import NOTHING, SMALL, Axis, axes_of, formula
 from slipid.identify.verdicts.remedies import remedy
-from slipid.parameter import Space
+from slipid.search_space import Space
 
 NOTICED = 1 / WEAK**2
 """Information along a direction, that of the prior being 1, from which it is not flat."""

@@ -12,13 +12,14 @@ from slipid.data.reading.presets import preset
 from slipid.data.reading.reader import find_logs, read_log, read_logs
 from slipid.data.reading.table import read_table
 from slipid.data.signals.lag import camera_lag
-from slipid.data.signals.steps import integrated_steps, step_edges
 from slipid.data.signals.wheel_order import best_wheel_order
 from slipid.data.signals.wheel_signals import (
     bridge_stalls,
     first_moved,
+    integrated_steps,
     interpolate,
     quantum,
+    step_edges,
     wheel_speed,
 )
 

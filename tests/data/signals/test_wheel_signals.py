@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from slipid.data.signals.lag import camera_lag
-from slipid.data.signals.steps import body_steps, integral, integrated_steps
 from slipid.data.signals.wheel_order import best_wheel_order, describe
 from slipid.data.signals.wheel_signals import (
+    body_steps,
     bridge_stalls,
     first_moved,
+    integral,
+    integrated_steps,
     interpolate,
     quantum,
     wheel_speed,

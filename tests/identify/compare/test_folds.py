@@ -28,10 +28,12 @@ from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.problem import DEGREES, Problem, State
 from slipid.identify.fit.sessions import Linear, shared
 from slipid.job.compare import finished
-from slipid.parameter import Choice
-from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
+from slipid.search_space import Choice
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
+from tests.helpers.made_logs import truth, write_logs
 from tests.helpers.made_windows import SCALE, made
 from tests.helpers.made_windows import robot as made_robot
 

@@ -17,7 +17,7 @@ from slipid.identify.design.planner import Planner, parameter_goal
 from slipid.identify.fit import noise as of_noise
 from slipid.identify.fit.problem import Problem
 from slipid.identify.result import Channels
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 from tests.helpers import made_windows
 
 SETUP = ("soft", "as_built")

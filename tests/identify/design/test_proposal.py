@@ -19,9 +19,11 @@ from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit_file import load, save
 from slipid.identify.result import summarise
-from slipid.parameter import Choice
-from slipid.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.search_space import Choice
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
 from tests.helpers import designs
+from tests.helpers.made_logs import blank, truth
 
 pytestmark = pytest.mark.slow  # traces a whole likelihood
 

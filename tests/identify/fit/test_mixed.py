@@ -28,10 +28,12 @@ from slipid.identify.fit_file import load
 from slipid.job.config import read_config
 from slipid.job.problem import read_job, with_mixed
 from slipid.model import se2
-from slipid.parameter import Choice, Space
-from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
+from slipid.search_space import Choice, Space
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import ROBOTINO, robotino_text, write_good
+from tests.helpers.made_logs import truth, write_logs
 from tests.helpers.made_windows import robot
 from tests.helpers.said import Said
 from tests.job.test_config import GOOD, written

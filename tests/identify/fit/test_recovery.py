@@ -10,8 +10,8 @@ from slipid.data.windows import windows
 from slipid.identify.fit.optimise import optimise
 from slipid.identify.fit.problem import State, linear
 from slipid.identify.result import summarise
-from slipid.selftest.logs import blank, truth
 from tests.helpers import recovery
+from tests.helpers.made_logs import blank, truth
 
 SEEDS = (0, 1, 2)
 NO_VOLTAGE = ("motor.resistance", "motor.back_emf")

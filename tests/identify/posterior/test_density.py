@@ -16,7 +16,7 @@ from slipid.identify.fit.problem import DEGREES, VARIANCE_SPREAD, Problem
 from slipid.identify.fit.sessions import AXES
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.identify.posterior.density import Density
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
 pytestmark = pytest.mark.slow  # compiles densities
