@@ -19,8 +19,8 @@ demo: $(VENV)/.run-stamp ## the main job on logs of the virtual test site, pictu
 test: $(VENV)/.dev-stamp ## the whole test suite, a file at a time on two cores
 	$(BIN)/python -m pytest $(TWO)
 
-nightly: $(VENV)/.dev-stamp ## the whole suite compiled with XLA's optimisations, as users run it
-	JAX_DISABLE_MOST_OPTIMIZATIONS=0 JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.cache/jax-optimised $(BIN)/python -m pytest $(TWO)
+nightly: $(VENV)/.dev-stamp ## every test, the long statistical ones too, compiled with XLA's optimisations, as users run it
+	JAX_DISABLE_MOST_OPTIMIZATIONS=0 JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.cache/jax-optimised $(BIN)/python -m pytest $(TWO) -m ""
 
 check: $(VENV)/.dev-stamp ## format, lint, types, import rules, quick tests: before every push
 	$(BIN)/ruff format --check .
@@ -30,7 +30,7 @@ check: $(VENV)/.dev-stamp ## format, lint, types, import rules, quick tests: bef
 ifneq ($(NOTEBOOKS),)
 	$(BIN)/nbstripout --verify $(NOTEBOOKS)
 endif
-	$(BIN)/python -m pytest -q $(TWO) -m "not slow"
+	$(BIN)/python -m pytest -q $(TWO) -m "not slow and not nightly"
 
 bench: $(VENV)/.dev-stamp ## speed, left-out errors, load shares, known truth, posteriors (hours)
 ifneq ($(BENCHES),)

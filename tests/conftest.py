@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from ctypes.util import find_library
 from pathlib import Path
@@ -13,7 +14,7 @@ from slipid.support.jax_setup import plain_loops
 
 ROOT = Path(__file__).resolve().parents[1]
 GOLDENS = Path(__file__).with_name("goldens")
-LONG = ("test_cli", "test_calibration", "test_notebooks", "test_cross_validation", "test_public")
+LONG = ("test_cli", "test_calibration", "test_notebooks", "test_folds", "test_public")
 """Files that take longest."""
 
 # Set in the environment, so that commands and notebooks started by a test share them. The cache is
@@ -71,6 +72,23 @@ def real_data() -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def small(tmp_path_factory):
+    """A folder with a config, made logs, unseen logs, and what identify said; to be read alone."""
+    from tests.helpers.shared import identify, once
+
+    return once(tmp_path_factory, "small", identify)
+
+
+@pytest.fixture(scope="session")
+def sampled(small, tmp_path_factory):
+    """A copy of that fit, and the end of a `sample` of far too few steps; to be read alone."""
+    from tests.helpers.shared import once, sample
+
+    folder, said = once(tmp_path_factory, "sampled", lambda f: sample(small[0] / "out", f / "out"))
+    return folder / "out", said
+
+
 def pytest_configure(config):
     """Tests compile more than they compute, and plainer code is compiled sooner; not what is timed.
 
@@ -88,12 +106,15 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="module", autouse=True)
 def _room_for_compiled_code():
-    """Everything compiled is forgotten before the kernel's limit of memory maps ends the process.
+    """After each file garbage is collected, and compiled code forgotten before it is too much.
 
-    Compiled functions hold maps; at vm.max_map_count (65 530 by default) the next compilation is a
-    segmentation fault.
+    Tracing makes many objects that live long, and looking through them all again and again took a
+    sixth of the suite: garbage is collected between files alone. Compiled functions hold memory
+    maps; at vm.max_map_count (65 530 by default) the next compilation is a segmentation fault.
     """
+    gc.disable()
     yield
+    gc.collect()
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > 15_000:
         jax.clear_caches()

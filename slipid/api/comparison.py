@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slipid.identify.compare.cross_validation import judge
-from slipid.identify.compare.folds import folds_of
+from slipid.identify.compare.folds import folds_of, judge
 from slipid.identify.compare.ranking import Ranking, ranking
 from slipid.identify.compare.validation import Judged
 from slipid.identify.fit.problem import Problem
@@ -49,5 +48,5 @@ def compared(task: Task, problem: Problem, question: str, parts: int, quiet: boo
         for k in sorted(set(fold[fold >= 0].tolist())):
             report.stage(f"{question}: without part {k + 1} of {fold.max() + 1}")
             out = np.flatnonzero(fold == k)
-            rows += judge(problem, task.choices, task.dataset, out).runs
+            rows += judge(problem, task.choices, task.dataset, out).rows
     return Comparison(ranking(rows), question)

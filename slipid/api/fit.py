@@ -13,9 +13,11 @@ from slipid.api.proposal import Proposal
 from slipid.api.validation import Validation
 from slipid.data.runs import Runs
 from slipid.identify import fit_file, result
+from slipid.identify.compare.predictive import Contact
 from slipid.identify.compare.slip_models import restored
-from slipid.identify.compare.validation import Predictor, validation
-from slipid.identify.design.proposal import Wish, design
+from slipid.identify.compare.validation import validation
+from slipid.identify.design.proposal import design
+from slipid.identify.design.wish import Wish
 from slipid.identify.fit.one_speed import still_viscosities
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem
@@ -24,11 +26,11 @@ from slipid.identify.verdicts import profile
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.config import FitSection
 from slipid.job.fit import optimised, summarised
-from slipid.job.problem import Task, said_of
+from slipid.job.problem import Task, on_runs, said_of
 from slipid.model.robot import Robot
-from slipid.parameter import Choice
 from slipid.report.estimates import show_fit
 from slipid.report.page import Page
+from slipid.search_space import Choice
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -42,12 +44,7 @@ Numbers = int | float | Sequence[int | float]
 
 @dataclass(frozen=True)
 class Prior:
-    """Gaussian prior of a number, or of every entry of a short vector, in its own unit.
-
-    Attributes:
-        mean: centre.
-        std: standard deviation.
-    """
+    """Gaussian prior of a number, or of every entry of a short vector, in its own unit."""
 
     mean: Numbers
     std: Numbers
@@ -131,8 +128,8 @@ class Fit:
         """
         fit = self.result
         rungs = restored(dict(fit.baselines))
-        fitted = Predictor(fit.robot, fit.space, fit.z, fit.covariance, dict(fit.variance), rungs)
-        return Validation(validation(fitted, runs), fit, runs)
+        fitted = Contact(fit.robot, fit.variance, fit.covariance, fit.space, fit.z)
+        return Validation(validation(fitted, rungs, runs), fit, runs)
 
     def sample(
         self,
@@ -149,7 +146,7 @@ class Fit:
             draws: that are kept of each of the ensembles.
             most: blocks of steps after which it ends without having converged.
             plan: of walkers and steps, in place of `seed` and `most`.
-            quiet: show no progress.
+            quiet: no progress.
         """
         from slipid.api.posterior import sampled
 
@@ -251,16 +248,14 @@ def task_of(
     seed: int = 0,
 ) -> Task:
     """What is to be fitted; arguments as of `fit`."""
-    floors = sorted({log.surface or "unknown" for log in runs.logs})
-    loads = sorted({log.load for log in runs.logs})
-    full = robot.on(floors, loads, sorted(set(runs.session)), image_centre)
+    full = on_runs(robot, runs, image_centre)
     choices = [*still_viscosities(runs), *said_of(full, float(full.body.mass))]
     choices += [Choice(path, free=True) for path in free]
     for path, prior in priors.items():
         choices.append(Choice(path, prior_mean=_plain(prior.mean), prior_std=_plain(prior.std)))
     choices += [Choice(path, fixed=_plain(value)) for path, value in fixed.items()]
     choices += [Choice(path, start=_plain(value)) for path, value in start.items()]
-    settings = FitSection(windows_per_piece=windows_per_piece, seed=seed)  # type: ignore[call-arg]
+    settings = FitSection(windows_per_piece=windows_per_piece, seed=seed)
     return Task(runs, full, tuple(choices), settings)
 
 

@@ -6,8 +6,7 @@ from functools import cached_property
 
 from slipid.data.runs import Runs, collect
 from slipid.model.robot import Robot
-from slipid.selftest import plan
-from slipid.selftest.files import numbers
+from slipid.selftest import known, plan
 from slipid.selftest.logs import make_logs
 
 
@@ -26,7 +25,7 @@ class Made:
     @cached_property
     def truth(self) -> dict[str, float | list[float]]:
         """Every true number by its path [SI]."""
-        return numbers(self.robot)
+        return known.numbers(self.robot)
 
 
 def made_runs(
@@ -55,8 +54,8 @@ def made_runs(
         ValueError: no such number; names those there are.
     """
     drives = plan.grid([(floor, "as_built") for floor in floors], headings, speeds, turns)
-    robot = plan.truth(drives, truth)
-    if wrong := sorted(set(truth or {}) - set(numbers(robot))):
-        raise ValueError(f"no parameter '{wrong[0]}'; there are: {', '.join(numbers(robot))}")
+    robot = known.truth(drives, truth)
+    if wrong := sorted(set(truth or {}) - set(known.numbers(robot))):
+        raise ValueError(f"no parameter '{wrong[0]}'; there are: {', '.join(known.numbers(robot))}")
     logs = make_logs(robot, drives, seed, plan.Sensors(has_voltage=voltage))
     return Made(collect(logs if current else [replace(log, current=None) for log in logs]), robot)

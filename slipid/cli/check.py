@@ -1,6 +1,7 @@
 """`slipid check`: what logs can tell, before any fit."""
 
 from slipid.cli.common import ConfigFile, DataFolder, Json, MaybeOut, Quiet, emit, guarded
+from slipid.support.progress import Reporter
 
 
 @guarded
@@ -16,7 +17,6 @@ def check(
     from slipid.plots.raw import raw_plots
     from slipid.report.check import show_check
     from slipid.report.page import Page
-    from slipid.support.progress import Reporter
 
     with Reporter(quiet=quiet) as report:
         done = job.check(config, data, out, report)

@@ -1,12 +1,15 @@
 """What commands share: types of their options, exit codes, JSON for programs."""
 
 import functools
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, ParamSpec
 
 import typer
+
+from slipid.support.errors import DataError
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Config, a TOML file.")]
 OutFolder = Annotated[Path, typer.Argument(metavar="OUT", help="Folder identify wrote.")]
@@ -30,6 +33,11 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
 Words = ParamSpec("Words")
 
 
+def processes(jobs: int | None) -> int:
+    """How many at once."""
+    return jobs or os.cpu_count() or 1
+
+
 def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     """Bad input is one message and exit code 2, an interrupt 130; neither is a traceback."""
 
@@ -38,16 +46,9 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
         try:
             code = command(*args, **options)
         except KeyboardInterrupt:
-            typer.echo(
-                "interrupted; called again, it goes on from what was kept, if it keeps anything",
-                err=True,
-            )
+            typer.echo("interrupted; called again, it goes on from what was kept, if any", err=True)
             raise typer.Exit(130) from None
-        except ValueError as error:
-            from slipid.support.errors import DataError
-
-            if not isinstance(error, DataError):
-                raise
+        except DataError as error:
             typer.echo(str(error), err=True)
             raise typer.Exit(2) from None
         raise typer.Exit(code)
@@ -58,10 +59,7 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
 def emit(json: str | None, content: object, show: Callable[[], None]) -> None:
     """Show a result to people, and write it as JSON where `--json` says so.
 
-    Args:
-        json: a file, written whole or not at all; `-` for stdout, which then has nothing else.
-        content: the result as plain values.
-        show: prints it.
+    That is a file, written whole or not at all, or `-`: stdout, which then has nothing else.
     """
     from slipid.support.files import json_text, write_bytes
 

@@ -6,6 +6,7 @@ import typer
 
 from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, guarded
 from slipid.support.content import Content
+from slipid.support.progress import Reporter
 
 
 @guarded
@@ -26,7 +27,6 @@ def compare(
     """
     from slipid.job.compare import compare as run
     from slipid.plots.compare import compare_plot
-    from slipid.support.progress import Reporter
 
     with Reporter(quiet=quiet) as report:
         found = run(config, data, out, folds.replace(" ", "").split(","), report)

@@ -5,20 +5,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from slipid.cli.common import Out, Quiet, guarded
 from slipid.support.content import Content
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.identify.result import Fit
     from slipid.job.identify import Identified
-    from slipid.support.progress import Reporter
-else:
-    # slow to import, so not before a command needs them; run-time checks see Any
-    Fit = Identified = Reporter = Any
 
 PARTS = ("fit", "unseen")
 """What is fitted, and what is predicted: folders, and configs `testsite_<part>.toml`."""
@@ -46,9 +44,9 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """End of the demo: the fit, the content of the validation file, truth against estimates."""
+    """End of the demo."""
 
-    done: Identified
+    done: "Identified"
     validation: Content
     rows: tuple[Row, ...]
 
@@ -65,8 +63,6 @@ def demo(
     quiet: Quiet = False,
 ) -> int:
     """The whole job on logs of the virtual test site, small: a folder to look at."""
-    from slipid.support.progress import Reporter
-
     with Reporter(quiet=quiet) as report:
         shown = run(out, plant, seed, os.cpu_count() or 1, report)
     show(shown, out)
@@ -76,19 +72,11 @@ def demo(
 def run(out: Path, plant: str, seed: int | None, jobs: int, report: Reporter) -> Shown:
     """Logs of the test site, identify, predict unseen runs, compare with the truth.
 
-    Args:
-        out: folder to write to.
-        plant: `recorded` for the logs that ship with slipid, `mujoco` to drive them anew.
-        seed: of the runs that are driven anew, by default that of the recorded ones.
-        jobs: processes that drive at once.
-        report: progress.
-
     Raises:
         DataError: no such plant, a seed for what is recorded, or MuJoCo is missing.
     """
     from slipid.cli.identify import run as identify
     from slipid.cli.validate import run as validate
-    from slipid.support.errors import DataError
     from slipid.support.files import read_json, write_bytes, write_json
 
     if plant not in ("recorded", "mujoco"):
@@ -131,7 +119,6 @@ def unpack(out: Path) -> None:
     """
     from zipfile import ZipFile
 
-    from slipid.support.errors import DataError
     from slipid.support.files import write_bytes
 
     try:
@@ -174,33 +161,20 @@ def drive_anew(out: Path, seed: int, jobs: int, report: Reporter) -> None:
         simulate(plan(Path(name), text), out / part, jobs, report)
 
 
-def compared(fit: Fit, known: Mapping[str, float | list[float]]) -> list[Row]:
-    """Every number that was fitted beside its truth, as far as there is one.
+def compared(fit: "Fit", known: Mapping[str, float | list[float]]) -> list[Row]:
+    """Every number that was fitted beside its truth, as far as there is one."""
+    from slipid.report.estimates import rows_of
 
-    Args:
-        fit: what `identify` found.
-        known: true value of each path, one number or a list.
-    """
     rows = []
     for e in fit.parameters.values():
         if e.verdict == "fixed" or e.path not in known:
             continue
-        values = e.value if e.labels else [e.value]
-        intervals = e.interval90 if e.labels else [e.interval90]
-        labels = e.labels or ("",)
         true = known[e.path]
         truths = true if isinstance(true, list) else [true]
-        for label, truth, value, interval in zip(labels, truths, values, intervals, strict=True):
-            rows.append(Row(e.path, label, e.unit, float(truth), value, tuple(interval), e.verdict))
+        for truth, (label, value, interval) in zip(truths, rows_of(e), strict=True):
+            low, high = interval or (value, value)
+            rows.append(Row(e.path, label, e.unit, float(truth), value, (low, high), e.verdict))
     return rows
-
-
-def real_logs() -> Path | None:
-    """Folder of real logs, where this machine has them: SLIPID_DATA, else ../shared/data."""
-    for folder in (os.environ.get("SLIPID_DATA"), "../shared/data"):
-        if folder and (Path(folder) / "robotino2022").is_dir():
-            return Path(folder)
-    return None
 
 
 def show(shown: Shown, out: Path) -> None:
@@ -235,11 +209,3 @@ def show(shown: Shown, out: Path) -> None:
     pictures += sorted(result.glob("validation_*.png"))
     page.line(f"\nlook at: {', '.join(map(str, pictures))}")
     page.line(f"numbers: {result / 'identified.json'}, {result / 'validation.json'}")
-    real = real_logs()
-    if real is not None:
-        data = real / "robotino2022"
-        page.line("real logs are here; on them:")
-        page.line(
-            f"  slipid identify configs/robotino2022.toml --data {data} --out out/robotino2022"
-        )
-        page.line(f"  slipid validate out/robotino2022 --data {data}")

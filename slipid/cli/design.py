@@ -3,18 +3,16 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from slipid.cli.common import Json, OutFolder, Quiet, emit, guarded
 from slipid.support.content import Content
+from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.identify.design.proposal import Design
-else:
-    # slow to import, so not before a command needs it; run-time checks see Any
-    Design = Any
 
 SHOWN = 3
 """Goals that have a column of their own."""
@@ -63,11 +61,11 @@ def design(
     Writes design.json, design.png and design_commands.csv to OUT.
     """
     from slipid.identify.design import proposal
+    from slipid.identify.design.wish import Wish
     from slipid.identify.fit_file import load as load_fit
     from slipid.support.jax_setup import setup_jax
-    from slipid.support.progress import Reporter
 
-    wanted = proposal.wish(
+    wanted = Wish(
         parameter or (),
         predict or (),
         runs,
@@ -89,7 +87,7 @@ def design(
     return 0 if found.reached else 1
 
 
-def write(found: Design, out: Path) -> list[str]:
+def write(found: "Design", out: Path) -> list[str]:
     """Write a design; where it proposes no runs, files of an earlier one do not stay."""
     from slipid.identify.design.proposal import commands
     from slipid.plots.design import design_figure

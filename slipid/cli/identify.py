@@ -3,18 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, guarded
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.job.identify import Identified
-    from slipid.support.progress import Reporter
-else:
-    # slow to import, so not before a command needs them; run-time checks see Any
-    Identified = Reporter = Any
 
 
 @guarded
@@ -34,7 +32,6 @@ def identify(
     Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt.
     """
     from slipid.support.files import read_json
-    from slipid.support.progress import Reporter
 
     with Reporter(quiet=quiet) as report:
         done = run(config, data, out, report, profile or ())
@@ -45,7 +42,7 @@ def identify(
 
 def run(
     config: Path, data: Path, out: Path, report: Reporter, profiles: Sequence[str] = ()
-) -> Identified:
+) -> "Identified":
     """The fit and its pictures; arguments as of `slipid.job.identify.identify`.
 
     Raises:
@@ -56,7 +53,6 @@ def run(
     from slipid.plots.drawing import save
     from slipid.plots.fit import identify_plots
     from slipid.plots.profile import profile_figure
-    from slipid.support.errors import DataError
 
     done = identify(config, data, out, report, profiles)
     report.stage("drawing")
@@ -70,7 +66,7 @@ def run(
     return replace(done, written=(*done.written, *(path.name for path in drawn)))
 
 
-def show(done: Identified, out: Path) -> None:
+def show(done: "Identified", out: Path) -> None:
     """Print what was found."""
     from slipid.report.estimates import show_fit
     from slipid.report.page import Page

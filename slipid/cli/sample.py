@@ -2,17 +2,16 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from slipid.cli.common import Json, OutFolder, Quiet, emit, guarded
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.job.sample import Sampled
-else:
-    # slow to import, so not before a command needs it; run-time checks see Any
-    Sampled = Any
 
 
 @guarded
@@ -33,9 +32,7 @@ def sample(
     quiet: Quiet = False,
 ) -> int:
     """Posterior of a fit by emcee: honest intervals, posterior.nc; goes on after an interrupt."""
-    from slipid.support.errors import DataError
     from slipid.support.files import read_json
-    from slipid.support.progress import Reporter
 
     try:
         from slipid.deploy.deploy import write_robot
@@ -55,7 +52,7 @@ def sample(
     return 0 if done.posterior.converged else 1
 
 
-def show(done: Sampled, out: Path) -> None:
+def show(done: "Sampled", out: Path) -> None:
     """Print what was found."""
     from slipid.report.estimates import estimates
     from slipid.report.page import Page

@@ -7,6 +7,7 @@ import typer
 
 from slipid.cli.common import ConfigFile, Json, Out, Quiet, emit, guarded
 from slipid.support.content import Content
+from slipid.support.progress import Reporter
 
 COLOUR = {"yes": "green", "roughly": "yellow", "no": "red", "wrong": "magenta"}
 
@@ -30,7 +31,6 @@ def selftest(
     the replicates that are done. Exit code 1 where a number that is wanted is not recovered.
     """
     from slipid.selftest.experiment import selftest as run
-    from slipid.support.progress import Reporter
 
     with Reporter(quiet=quiet) as report:
         found = run(config, data, out, replicates, seed, report)

@@ -1,17 +1,14 @@
 """`slipid simulate`: logs from the virtual test site."""
 
-import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from slipid.cli.common import ConfigFile, Jobs, Json, Out, Quiet, emit, guarded
+from slipid.cli.common import ConfigFile, Jobs, Json, Out, Quiet, emit, guarded, processes
 from slipid.support.content import Content
+from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.testsite.simulate.config import Plan
-else:
-    # slow to import, so not before a command needs it; run-time checks see Any
-    Plan = Any
 
 
 @guarded
@@ -23,21 +20,20 @@ def simulate(
     Writes logs, a config that identifies them, floor maps, and the truth in a folder of its own.
     Runs that are done are kept and not driven again.
     """
-    from slipid.support.progress import Reporter
     from slipid.testsite.simulate.config import read_plan
     from slipid.testsite.simulate.simulate import simulate as run
 
     plan = read_plan(config)
     with Reporter(quiet=quiet) as report:
-        found = run(plan, out, jobs or os.cpu_count() or 1, report)
+        found = run(plan, out, processes(jobs), report)
     emit(json, found, lambda: show(found, plan, out))
     return 0
 
 
-def show(found: Content, plan: Plan, out: Path) -> None:
+def show(found: Content, plan: "Plan", out: Path) -> None:
     """Print how much was driven, and what to do with it."""
     from slipid.report.page import Page
-    from slipid.testsite.simulate.simulate import can_identify
+    from slipid.testsite.simulate.identify_config import can_identify
 
     page = Page()
     page.line(f"{len(found['runs'])} runs, {found['driven']} of them driven now")

@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Jobs, Json, Load, OutFolder, Quiet, emit, guarded
+from slipid.cli.common import Jobs, Json, Load, OutFolder, Quiet, emit, guarded, processes
 from slipid.support.content import Content
+from slipid.support.progress import Reporter
 
 
 @guarded
@@ -32,10 +33,9 @@ def trial(
     Gains are those that `slipid tune` put into robot.json, if any. Writes trial.json and trial.png
     to OUT; runs that are done are kept and not driven again.
     """
-    from slipid.deploy.trial import Wish, names_of, processes
+    from slipid.deploy.trial import Wish, names_of
     from slipid.deploy.trial import trial as run
     from slipid.plots.trial import trial_plot
-    from slipid.support.progress import Reporter
 
     wish = Wish(plant, map, names_of(controllers), starts, load, processes(jobs))
     with Reporter(quiet=quiet) as report:

@@ -7,6 +7,7 @@ import typer
 
 from slipid.cli.common import Json, Load, OutFolder, Quiet, emit, guarded
 from slipid.support.content import Content
+from slipid.support.progress import Reporter
 
 
 @guarded
@@ -28,19 +29,16 @@ def tune(
     gains set by hand are better.
     """
     from slipid.control.tuning.optimisers import Method
-    from slipid.deploy.tune import Wish
     from slipid.deploy.tune import tune as run
     from slipid.support.files import writable
     from slipid.support.jax_setup import setup_jax
-    from slipid.support.progress import Reporter
 
     with Reporter(quiet=quiet) as report:
         report.stage("reading the robot")
         setup_jax(quiet=True)
         writable(out)
         # it says itself which methods there are
-        wish = Wish(load, cast(Method, method), rollouts, seed, gyro)
-        tuned = run(out, wish, report)
+        tuned = run(out, load, cast(Method, method), rollouts, seed, gyro, report)
     found = tuned.to_json()
     emit(json, found, lambda: show(found, out))
     loss = tuned.record().loss

@@ -1,31 +1,26 @@
 """`slipid validate`: open-loop prediction of runs."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from slipid.cli.common import DataFolder, Json, OutFolder, Quiet, emit, guarded
 from slipid.support.content import Content
+from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.job.validate import Validated
-    from slipid.support.progress import Reporter
-else:
-    # slow to import, so not before a command needs them; run-time checks see Any
-    Validated = Reporter = Any
 
 
 @guarded
 def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet = False) -> int:
     """Predict runs open loop and compare with the camera, model by model."""
-    from slipid.support.progress import Reporter
-
     with Reporter(quiet=quiet) as report:
         done = run(out, data, report)
     emit(json, done.content, lambda: show(done.content))
     return 0
 
 
-def run(out: Path, data: Path, report: Reporter) -> Validated:
+def run(out: Path, data: Path, report: Reporter) -> "Validated":
     """The prediction and its pictures; arguments as of `slipid.job.validate.validate`.
 
     Raises:

@@ -7,10 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from slipid.control.interface import Estimate, Measurement, Pose, Readings, State
-from slipid.control.pilot import Pilot, PilotOutput, PilotState
+from slipid.control.pilot import Pilot, PilotOutput
 from slipid.control.trajectory import STEP, Path
 
 PERIOD = 0.05
@@ -44,8 +44,7 @@ class Course:
     Attributes:
         path: what was asked.
         time: [s]; own: time of the path [s].
-        pose, believed: true and estimated [m, m, rad].
-        command: wheel speeds [rad/s].
+        pose: true [m, m, rad]; command: wheel speeds [rad/s].
         estimate: all that was estimated, a leading axis of steps on every array.
         energy: of the motors until then [J]; NaN where the plant does not know.
     """
@@ -54,57 +53,53 @@ class Course:
     time: Float[np.ndarray, " step"]
     own: Float[np.ndarray, " step"]
     pose: Float[np.ndarray, "step 3"]
-    believed: Float[np.ndarray, "step 3"]
     command: Float[np.ndarray, "step wheel"]
     estimate: Estimate
     energy: Float[np.ndarray, " step"]
 
-
-@eqx.filter_jit
-def _step(
-    pilot: Pilot[State], path: Path, state: PilotState[State], z: Readings, dt: Array
-) -> tuple[PilotState[State], PilotOutput]:
-    """The step with its numbers as arguments: compiled once for all pilots and starts alike."""
-    return pilot.step(path, state, z, dt)
+    @property
+    def believed(self) -> Float[np.ndarray, "step 3"]:
+        """Estimated poses [m, m, rad]."""
+        return np.asarray(self.estimate.pose)
 
 
-def drive(
-    pilot: Pilot[State], path: Path, plant: Plant, start: Pose, period: float = PERIOD
-) -> Course:
-    """Run a pilot on a plant until its path is over.
+_step = eqx.filter_jit(Pilot.step)
+"""The step with its numbers as arguments: compiled once for all pilots and starts alike."""
 
-    Args:
-        pilot: estimator and controller.
-        path: as it lies for the start.
-        plant: what is driven, at rest.
-        start: where the pilot believes it stands [m, m, rad].
-        period: of the plant [s].
+
+def drive(pilot: Pilot[State], path: Path, plant: Plant, start: Pose) -> Course:
+    """Run a pilot on a plant at rest until its path is over.
+
+    The path is as it lies for the start, where the pilot believes it stands [m, m, rad].
     """
     wheels = pilot.controller.robot.wheels
-    state, reading, dt = pilot.init(start), plant.reset().filled(wheels), jnp.asarray(period)
-    rows: list[tuple[float, float, tuple[float, float, float]]] = []
+    state, reading, dt = pilot.init(start), plant.reset().filled(wheels), jnp.asarray(PERIOD)
+    time: list[float] = []
+    spent: list[float] = []
+    poses: list[tuple[float, float, float]] = []
     said: list[PilotOutput] = []
     energy, own, begun = 0.0, 0.0, 0.0
     while own < path.duration - 1e-6 and begun < LONGEST * path.duration + 10.0:
         state, out = _step(pilot, path, state, reading, dt)
         own = float(out.time)
         said.append(out)
-        rows.append((begun, energy, plant.pose))
+        time.append(begun)
+        spent.append(energy)
+        poses.append(plant.pose)
         reading = plant.step(np.asarray(out.command)).filled(wheels)
-        energy += getattr(plant, "power", np.nan) * period
-        begun += period
+        energy += getattr(plant, "power", np.nan) * PERIOD
+        begun += PERIOD
     every: PilotOutput = jax.tree.map(lambda *x: np.stack([np.asarray(v) for v in x]), *said)
-    pose = np.array([row[2] for row in rows])
+    pose = np.array(poses)
     pose[:, 2] = np.unwrap(pose[:, 2])
     return Course(
         path=path,
-        time=np.array([row[0] for row in rows]),
+        time=np.array(time),
         own=np.asarray(every.time),
         pose=pose,
-        believed=np.asarray(every.estimate.pose),
         command=np.asarray(every.command),
         estimate=every.estimate,
-        energy=np.array([row[1] for row in rows]),
+        energy=np.array(spent),
     )
 
 
@@ -116,8 +111,7 @@ def _from_line(
     square = np.maximum((side**2).sum(-1), 1e-18)
     since = places[:, None] - begin
     part = np.clip((since * side).sum(-1) / square, 0.0, 1.0)
-    nearest: np.ndarray = np.sqrt(((since - part[..., None] * side) ** 2).sum(-1)).min(1)
-    return nearest
+    return np.asarray(np.sqrt(((since - part[..., None] * side) ** 2).sum(-1)).min(1))
 
 
 @dataclass(frozen=True)

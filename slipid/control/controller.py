@@ -36,18 +36,14 @@ class Gains(eqx.Module):
 
     place: Array = parameter(unit="1/s", symbol="k", start=1.5, doc="pose loop")
     yaw: Array = parameter(unit="1/s", symbol="k_yaw", start=1.5, doc="heading loop")
-    integral: Array = parameter(
-        unit="1/s^2", symbol="k_i", start=0.0, doc="integral of the pose error"
-    )
-    ahead: Array = parameter(
-        unit="1", symbol="k_f", start=0.0, doc="share of the inverse model in the wheel speeds"
-    )
+    integral: Array = parameter(unit="1/s^2", symbol="k_i", start=0.0, doc="pose error's integral")
+    ahead: Array = parameter(unit="1", symbol="k_f", start=0.0, doc="share of the inverse model")
     observer: Array = parameter(unit="1", symbol="k_d", start=0.0, doc="disturbance observer")
     preview: Array = parameter(
         unit="s",
         symbol="t_p",
         start=0.2,
-        doc="time by which the path's rates are asked for early, because wheels follow late",
+        doc="how early rates are asked for, as wheels follow late",
     )
 
     @classmethod
@@ -56,7 +52,7 @@ class Gains(eqx.Module):
         tuned = robot.record.gains
         if tuned is None or tuned.load != robot.load_setup:
             return cls()
-        return cls(**{name: jnp.asarray(g["value"]) for name, g in asdict(tuned.values).items()})
+        return cls.at([g["value"] for g in asdict(tuned.values).values()])
 
     @classmethod
     def at(cls, values: Sequence[Float[Array, ""] | float] | Float[Numbers, " gain"]) -> "Gains":
@@ -70,8 +66,7 @@ class Limits:
 
     Attributes:
         wheel_speed: [rad/s]; acceleration: of a wheel [rad/s^2].
-        voltage: of the supply [V].
-        twist: largest speed asked of the body [m/s].
+        voltage: of the supply [V]; twist: largest speed asked of the body [m/s].
     """
 
     wheel_speed: float = 13.0
@@ -80,21 +75,13 @@ class Limits:
     twist: float = 0.5
 
 
-def _known_zero(gain: Array) -> bool:
-    """Whether a gain is a constant of the compiled code, and zero: what it weighs is left out."""
-    if isinstance(gain, jax.core.Tracer):
-        return False
-    return float(np.asarray(gain)) == 0.0
-
-
 class ControllerState(eqx.Module):
     """What a controller keeps from step to step.
 
     Attributes:
-        command: the last one [rad/s].
-        integral: velocity that the integral asks for [m/s].
-        wanted: twist that was asked for last [m/s, m/s, rad/s]; miss: what the robot was seen to do
-            beyond that, smoothed.
+        command: the last one [rad/s]; integral: velocity it asks for [m/s].
+        wanted: twist asked for last [m/s, m/s, rad/s]; miss: what the robot was seen to do beyond
+            it, smoothed.
         begun: whether anything was commanded.
     """
 
@@ -119,11 +106,9 @@ def limited(
     scales the change from the last command. Never NaN.
 
     Args:
-        wanted: [rad/s].
-        before: last command [rad/s].
+        wanted, before: this command and the last one [rad/s].
         current: of the motors, for what is left of the supply [A].
-        robot: the motor's numbers.
-        limits: what is allowed.
+        robot, limits: the motor's numbers, and what is allowed.
         dt: since the last command [s].
     """
     motor = robot.motor
@@ -146,9 +131,7 @@ class Controller(eqx.Module):
     """Pose loop with whatever a row of the trial adds to it.
 
     Attributes:
-        robot: the identified robot.
         gains: by default those tuned for the robot where there are any, else those set by hand.
-        limits: of the commands.
         correction: torque correction of the 2021 paper, in the form it prints, the form its authors
             ran, or corrected.
     """
@@ -170,13 +153,8 @@ class Controller(eqx.Module):
 
     def init(self) -> ControllerState:
         """State of a controller that has commanded nothing yet."""
-        return ControllerState(
-            command=jnp.zeros(self.robot.wheels),
-            integral=jnp.zeros(2),
-            wanted=jnp.zeros(3),
-            miss=jnp.zeros(3),
-            begun=jnp.zeros((), bool),
-        )
+        none, still = jnp.zeros(self.robot.wheels), jnp.zeros(3)
+        return ControllerState(none, jnp.zeros(2), still, still, jnp.zeros((), bool))
 
     def step(
         self,
@@ -191,9 +169,8 @@ class Controller(eqx.Module):
         starts from the speed the wheels have.
 
         Args:
-            state: from `init` or the last step.
+            state, estimate: from `init` or the last step; of an estimator.
             reference: pose and rates in the world, `slipid.control.trajectory.Path.at`.
-            estimate: of an estimator.
             dt: since the last step [s].
         """
         old, e, k = state, estimate, self.gains
@@ -209,8 +186,7 @@ class Controller(eqx.Module):
         a = 1 - jnp.exp(-dt / OBSERVE_S)
         miss = old.miss + a * (twist - old.wanted - old.miss)
         asked = wanted - k.observer * miss
-        wheels = self._wheels(asked, e)
-        wheels = wheels + self._torque(wanted, e)
+        wheels = self._wheels(asked, e) + self._torque(wanted, e)
         before = jnp.where(old.begun, old.command, jnp.where(safe, e.wheel_speed, 0.0))
         wheels = jnp.where(safe, wheels, 0.0)
         since = jnp.where(safe, dt, jnp.maximum(dt, UNTIMED_S))
@@ -242,8 +218,9 @@ class Controller(eqx.Module):
         """
         f = self.robot
         plain = f.forward @ asked / f.frame.radius
-        if _known_zero(self.gains.ahead):
-            return plain
+        ahead = self.gains.ahead
+        if not isinstance(ahead, jax.core.Tracer) and float(ahead) == 0.0:
+            return plain  # the compiled code goes without the inverse model
         share = e.surface_probability[:, :-1]
         total = jnp.sum(share, axis=1, keepdims=True)
         known = jnp.where(total > 1e-3, share / jnp.maximum(total, 1e-3), 0.0)
@@ -252,7 +229,7 @@ class Controller(eqx.Module):
         right = jnp.all(jnp.abs(f.frame.slip_through) < 1e-9)  # rollers at right angles
         extra = inverse_contact(f.frame, f.floors, f.rest, f.inverse, asked, known) - plain
         extra = jnp.where(right & (total[:, 0] > 1e-3), extra, 0.0)
-        return plain + self.gains.ahead * moves * (1 - e.surface_probability[0, -1]) * extra
+        return plain + ahead * moves * (1 - e.surface_probability[0, -1]) * extra
 
     def _torque(self, wanted: Array, e: Estimate) -> Array:
         """The 2021 paper's correction by the forces off the commanded direction [rad/s]."""
@@ -269,10 +246,8 @@ class Controller(eqx.Module):
             off = jnp.where(along_x, on_x, on_y) * force
         else:
             u = wanted[:2] / jnp.sqrt(wanted[:2] @ wanted[:2] + 1e-8)
-            straight = jnp.abs(wanted[2]) < 0.05
-            off = (
-                force.at[:2].add(-(force[:2] @ u) * u).at[2].multiply(jnp.where(straight, 1.0, 0.0))
-            )
+            straight = jnp.where(jnp.abs(wanted[2]) < 0.05, 1.0, 0.0)
+            off = force.at[:2].add(-(force[:2] @ u) * u).at[2].multiply(straight)
         if self.correction == "torque":
             moment = f.frame.radius * f.inverse.T @ off
         else:  # as printed: the lever is divided by, not multiplied

@@ -1,8 +1,8 @@
 """What an estimator and a controller know of an identified robot, as arrays."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -72,11 +72,7 @@ class DeployedRobot(eqx.Module):
 
     @classmethod
     def of(cls, record: RobotRecord, load: str | None = None) -> "DeployedRobot":
-        """The robot of a record.
-
-        Args:
-            record: every number.
-            load: name of the load set-up it drives with, the first one by default.
+        """The robot of a record, as it drives with a load set-up, the first one by default.
 
         Raises:
             ValueError: no such load set-up, a number that is missing or out of its bounds, or
@@ -89,16 +85,13 @@ class DeployedRobot(eqx.Module):
     def load(cls, path: Path | str, load: str | None = None) -> "DeployedRobot":
         """The robot of a file that `slipid identify`, `slipid sample` or `save` wrote.
 
-        Args:
-            path: of robot.json.
-            load: name of the load set-up it drives with, the first one by default.
+        It drives with a load set-up of this name, the first one by default.
 
         Raises:
             DataError: the file is absent, damaged, changed or of a newer version, or has no such
                 load set-up.
         """
-        path = Path(path)
-        record = read_robot(path)
+        record = read_robot(Path(path))
         try:
             record.load_index(load)
         except ValueError as error:
@@ -129,23 +122,14 @@ class DeployedRobot(eqx.Module):
         Raises:
             ValueError: none, one twice, or one that is not identified; names those that are.
         """
+        known = ", ".join(self.labels)
         for name in floors:
             if name not in self.labels:
-                raise ValueError(f"no floor '{name}'; identified: {', '.join(self.labels)}")
+                raise ValueError(f"no floor '{name}'; identified: {known}")
         if len(set(floors)) < max(len(floors), 1):
-            raise ValueError(
-                f"floors {list(floors)}; expected each once of {', '.join(self.labels)}"
-            )
-        rows = np.array([self.labels.index(name) for name in floors])
-        kept = jax.tree.map(lambda leaf: leaf[rows], self.floors)
-        return replace(
-            self,
-            floors=replace(kept, labels=floors),
-            process=self.process[rows],
-            effect=self.effect[rows],
-            current_std=self.current_std[rows],
-            record=self.record.on(tuple(rows.tolist())),
-        )
+            raise ValueError(f"floors {list(floors)}; expected each once of {known}")
+        rows = tuple(self.labels.index(name) for name in floors)
+        return DeployedRobot.of(self.record.on(rows), self.load_setup)
 
 
 def drawn(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
@@ -153,10 +137,6 @@ def drawn(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
 
     What runs differ by stays in `DeployedRobot.effect`; the spread of the numbers is in the draws.
     What the robot was seen with (`highest`, `wheel_curve`) is that of the robot.
-
-    Args:
-        robot: with draws in its record.
-        picked: numbers of the draws.
     """
     record, one = robot.record, []
     plain = {path: n.value for path, n in record.parameters.items()}
@@ -170,13 +150,9 @@ def drawn(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
 def _arrays(
     record: RobotRecord, load: str | None, values: Mapping[str, Numbers], spread: bool = True
 ) -> DeployedRobot:
-    """The arrays of a record at some values of its numbers.
+    """The arrays of a record at some values of its numbers, by path.
 
-    Args:
-        record: all but the numbers.
-        load: name of the load set-up.
-        values: of every number, by path.
-        spread: whether the uncertainty of the numbers counts as an effect.
+    With `spread` their uncertainty counts as an effect.
     """
     place = record.load_index(load)
     chosen, wheels, floors = record.loads[place], record.wheels, record.floors
@@ -184,14 +160,8 @@ def _arrays(
     def of(prefix: str, kind: type[eqx.Module]) -> dict[str, Array]:
         return {name: _array(values[f"{prefix}.{name}"]) for name in declared(kind)}
 
-    geometry = Geometry(
-        **of("robot", Geometry),
-        place=wheels.place,
-        drive_angle=wheels.drive_angle,
-        roller_angle=wheels.roller_angle,
-        grips=wheels.grips,
-        gear_ratio=wheels.gear_ratio,
-    )
+    shape: dict[str, Any] = of("robot", Geometry) | vars(wheels)
+    geometry = Geometry(**shape)
     rows = [of(f"surface.{floor.name}", ContactSurface) for floor in floors]
     effect = _array([floor.effect for floor in floors])
     return DeployedRobot(

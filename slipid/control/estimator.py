@@ -22,8 +22,7 @@ class EstimatorState(eqx.Module):
 
     Attributes:
         wheels: how they turn; current: of the motors, filtered [A].
-        floors: what is believed of the floors under the wheels.
-        place: pose and covariance.
+        floors: what is believed of them; place: pose and covariance.
         stuck: for how long the body has hardly moved while its wheels turn [s].
     """
 
@@ -40,7 +39,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
     Attributes:
         robot: the identified robot; its `labels` name the floors in the order of
             `Estimate.surface_probability`.
-        settings: what is not identified, by default as the robot's logs were.
+        settings: by default as the robot's logs were.
     """
 
     robot: DeployedRobot
@@ -50,28 +49,16 @@ class Estimator(AbstractEstimator[EstimatorState]):
         self.robot = robot
         self.settings = Settings.of(robot) if settings is None else settings
 
-    @property
-    def floors(self) -> FloorFilter:
-        """The filter over the floors."""
-        return FloorFilter(self.robot, self.settings)
-
     def init(
-        self,
-        pose: Pose = (0.0, 0.0, 0.0),
-        std: tuple[float, float] = (0.0, 0.0),
+        self, pose: Pose = (0.0, 0.0, 0.0), std: tuple[float, float] = (0.0, 0.0)
     ) -> EstimatorState:
-        """State of a robot at rest.
-
-        Args:
-            pose: where it stands [m, m, rad].
-            std: how well that is known [m], [rad].
-        """
-        filter_ = PoseFilter(self.robot, self.settings)
+        """State of a robot at rest at a pose [m, m, rad] that is known so well [m], [rad]."""
+        f, s = self.robot, self.settings
         return EstimatorState(
-            wheels=WheelState.init(self.robot, self.settings),
-            current=jnp.zeros(self.robot.wheels),
-            floors=self.floors.init(),
-            place=filter_.init(jnp.asarray(pose, dtype=float), std),
+            wheels=WheelState.init(f, s),
+            current=jnp.zeros(f.wheels),
+            floors=FloorFilter(f, s).init(),
+            place=PoseFilter(f, s).init(jnp.asarray(pose, dtype=float), std),
             stuck=jnp.zeros(()),
         )
 
@@ -91,20 +78,19 @@ class Estimator(AbstractEstimator[EstimatorState]):
         )
         gyro = jnp.where(jnp.isfinite(z.gyro) & (jnp.abs(z.gyro) < 50.0), z.gyro, jnp.nan)
         turn = gyro - old.place.nuisance[-1]
-        floors, motion = self.floors.step(old.floors, w, currents, turn, tick)
+        floors, motion = FloorFilter(f, s).step(old.floors, w, currents, turn, tick)
         place, twist = PoseFilter(f, s).step(old.place, motion, gyro, z, tick)
         stuck = self._stuck(old.stuck, w, twist, tick)
         new = EstimatorState(wheels, currents.filtered, floors, place, stuck)
         unknown = floors.belief[-1]
+        none = jnp.full((f.wheels, 1), unknown)
         return new, Estimate(
             pose=place.pose,
             twist=twist,
             slip=self._slip(w, twist),
             wheel_speed=w,
             current=currents.filtered,
-            surface_probability=jnp.concatenate(
-                [motion.under * (1 - unknown), jnp.full((f.wheels, 1), unknown)], axis=1
-            ),
+            surface_probability=jnp.concatenate([motion.under * (1 - unknown), none], axis=1),
             covariance=place.covariance[:3, :3],
             stale=jnp.any(wheels.age > s.stale_s),
             immobilised=stuck > 0.4,

@@ -30,10 +30,9 @@ HASTE = 30.0
 
 
 class Tick(eqx.Module):
-    """One time step.
+    """One time step [s], as `slipid.control.wheels.time_step` counts it.
 
     Attributes:
-        dt: [s], from `slipid.control.wheels.time_step`.
         moves: whether a wheel turns.
         acceleration: of the fastest changing wheel [rad/s^2].
     """
@@ -73,15 +72,10 @@ class Motion(eqx.Module):
 
 
 class FloorFilter(eqx.Module):
-    """Filter over the floors under the wheels.
-
-    Attributes:
-        robot: the identified robot.
-        settings: what is not identified.
-    """
+    """Filter over the floors under the wheels."""
 
     robot: DeployedRobot
-    settings: Settings = eqx.field(static=True, default=Settings())
+    settings: Settings = eqx.field(static=True)
 
     @property
     def hypotheses(self) -> np.ndarray:
@@ -114,11 +108,9 @@ class FloorFilter(eqx.Module):
         Bar-Shalom 1988).
 
         Args:
-            old: before the step.
-            w: wheel speeds [rad/s].
-            currents: what is known of them.
+            old, tick: the beliefs before the step, and the step.
+            w: wheel speeds [rad/s]; currents: what is known of them.
             turn: yaw rate by the gyro, its bias taken off, NaN without one [rad/s].
-            tick: the time step.
         """
         xi, predicted = self.solve(old.twist, w)
         told, none = self._evidence(xi, predicted, currents, w, turn)
@@ -138,12 +130,7 @@ class FloorFilter(eqx.Module):
     def solve(
         self, near: Float[Array, "hypothesis 3"], w: Float[Array, " wheel"]
     ) -> tuple[Float[Array, "hypothesis 3"], Float[Array, "hypothesis wheel"]]:
-        """Twist [m/s, m/s, rad/s] and currents [A] of every hypothesis.
-
-        Args:
-            near: twists a moment ago.
-            w: wheel speeds [rad/s].
-        """
+        """Twist [m/s, m/s, rad/s] and currents [A] of every hypothesis, `near` a moment ago."""
         f = self.robot
         floors = combine(f.frame, f.floors, self.hypotheses, f.rest, f.inverse)
         rim = f.frame.radius * w
@@ -192,13 +179,9 @@ class FloorFilter(eqx.Module):
         whole = jax.vmap(self._changed, (1, None), 1)(whole, change)
         moved = whole[:, 0]
         way = whole[:, 1:] / jnp.maximum(moved, 1e-9)[:, None]
-        prior = jnp.concatenate(
-            [
-                moved * (1 - 0.05 * change) + 0.2 * change * unknown * self.prior(),
-                (unknown * (1 - 0.2 * change) + 0.05 * change * jnp.sum(known))[None],
-            ]
-        )
-        return prior, way
+        of_known = moved * (1 - 0.05 * change) + 0.2 * change * unknown * self.prior()
+        of_none = unknown * (1 - 0.2 * change) + 0.05 * change * jnp.sum(known)
+        return jnp.append(of_known, of_none), way
 
     def _changed(self, p: Array, change: Array) -> Array:
         """Every wheel may come to another floor, as likely as the prior says given the others."""

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import equinox as eqx
@@ -124,15 +124,14 @@ class Measurement(eqx.Module):
         Raises:
             ValueError: a field has another shape than a robot of so many wheels gives.
         """
-        nothing, given = Readings.nothing(wheels), {}
-        for field in fields(self):
-            value, none = getattr(self, field.name), getattr(nothing, field.name)
-            given[field.name] = none if value is None else jnp.asarray(value, dtype=float)
-            if given[field.name].shape != none.shape:
-                raise ValueError(
-                    f"{field.name} of shape {given[field.name].shape}; expected {none.shape} of a "
-                    f"robot with {wheels} wheels"
-                )
+        given = vars(Readings.nothing(wheels))
+        for name, value in vars(self).items():
+            if value is not None:
+                found, shape = jnp.asarray(value, dtype=float), given[name].shape
+                if found.shape != shape:
+                    of = f"a robot with {wheels} wheels"
+                    raise ValueError(f"{name} of shape {found.shape}; expected {shape} of {of}")
+                given = given | {name: found}
         return Readings(**given)
 
 
@@ -140,17 +139,14 @@ class Estimate(eqx.Module):
     """What an estimator believes after a step; runs have leading axes in front of every array.
 
     Attributes:
-        pose: x, y [m], heading [rad].
-        twist: of the body [m/s, m/s, rad/s].
-        slip: slip ratio of each wheel.
-        wheel_speed: [rad/s]; current: signed and filtered [A].
+        pose: x, y [m], heading [rad]; twist: of the body [m/s, m/s, rad/s].
+        slip: ratio of each wheel; wheel_speed: [rad/s]; current: signed and filtered [A].
         surface_probability: of each floor in the order of `labels`, and of none of them in the last
             column, under each wheel.
         covariance: of the pose in the world frame.
         stale: wheels are not heard.
         immobilised: the wheels turn and the body does not move.
-        out_of_range: faster, or drawing more, than the fit has seen, or on a floor that it does not
-            know.
+        out_of_range: faster, or drawing more, than the fit has seen, or on an unknown floor.
         labels: names of the floors.
     """
 
@@ -199,11 +195,8 @@ class AbstractEstimator(eqx.Module, Generic[State]):
 
         Compiled at its first call; within a function that JAX transforms, it is part of that.
 
-        Args:
-            state: from `init` or the last step.
-            measurement: NaN, None, infinities and what no sensor of this robot could read count as
-                not measured.
-            dt: since the last step [s]; where it is no positive number, no time has passed.
+        What is None, no number or what no sensor of this robot could read counts as not measured;
+        where `dt` [s] is no positive number, no time has passed.
         """
         z, dt = measurement.filled(self.robot.wheels), jnp.asarray(dt, dtype=float)
         given = jax.tree.leaves((self, state, z, dt))

@@ -14,12 +14,7 @@ CURRENT_FROM = 0.4
 
 
 class OdometryState(eqx.Module):
-    """What odometry keeps from step to step.
-
-    Attributes:
-        pose: x, y [m], heading [rad].
-        wheels: how they turn; current: of the motors, smoothed, without a sign [A].
-    """
+    """Pose [m, m, rad], how the wheels turn, and smoothed currents without a sign [A]."""
 
     pose: Float[Array, "3"]
     wheels: WheelState
@@ -30,8 +25,7 @@ class Odometry(AbstractEstimator[OdometryState]):
     """Wheel-by-wheel odometry, w_eff = w (1 - s).
 
     Attributes:
-        robot: the identified robot.
-        settings: what is not identified, by default as the robot's logs were.
+        settings: by default as the robot's logs were.
         curve: whether slip is taken from `DeployedRobot.wheel_curve`, a + b |I| where the smoothed
             current exceeds `CURRENT_FROM`, as the 2021 paper's robot did; else the encoders are
             believed.

@@ -24,12 +24,7 @@ from slipid.control.trajectory import Path
 
 
 class PilotState(eqx.Module, Generic[State]):
-    """What a pilot keeps from step to step.
-
-    Attributes:
-        seen: state of its estimator; held: of its controller.
-        time: of the path [s].
-    """
+    """What a pilot keeps: state of its estimator, of its controller, time of the path [s]."""
 
     seen: State
     held: ControllerState
@@ -37,12 +32,9 @@ class PilotState(eqx.Module, Generic[State]):
 
 
 class PilotOutput(eqx.Module):
-    """What a pilot says after a step; runs have leading axes in front of every array.
+    """What a pilot says after a step: wheel speeds [rad/s], an estimate, time of the path [s].
 
-    Attributes:
-        command: wheel speeds [rad/s].
-        estimate: of its estimator.
-        time: of the path [s].
+    Runs have leading axes in front of every array.
     """
 
     command: Float[Array, " wheel"]
@@ -51,12 +43,7 @@ class PilotOutput(eqx.Module):
 
 
 class Pilot(eqx.Module, Generic[State]):
-    """An estimator and a controller as one pure function.
-
-    Attributes:
-        estimator: of any kind.
-        controller: a controller.
-    """
+    """An estimator of any kind and a controller as one pure function."""
 
     estimator: AbstractEstimator[State]
     controller: Controller
@@ -99,11 +86,9 @@ class CompiledPilot(Generic[State]):
     def __init__(self, pilot: Pilot[State], path: Path):
         """Prepare a pilot for a path as it lies for the start; the first call compiles."""
         self.pilot = pilot
-        wheels = pilot.controller.robot.wheels
-        begin, nothing = pilot.init(), Readings.nothing(wheels)
+        begin, nothing = pilot.init(), Readings.nothing(pilot.controller.robot.wheels)
         said = eqx.filter_eval_shape(pilot.step, path, begin, nothing, 0.0)[1]
-        self.states, self.measurements = Flat(begin), Flat(nothing)
-        self.outputs = Flat(said)
+        self.states, self.measurements, self.outputs = Flat(begin), Flat(nothing), Flat(said)
         self.call = self._call(path)
 
     def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> Float[np.ndarray, " state"]:

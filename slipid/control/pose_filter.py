@@ -28,7 +28,7 @@ class PoseState(eqx.Module):
         nuisance: effects of every floor along, across [m/m] and in yaw [rad/m], then the gyro's
             bias [rad/s].
         covariance: of pose and nuisance.
-        time: since the start [s]; still: for which the robot has stood [s].
+        time, still: since the start, and for which the robot has stood [s].
         noise: covariance that has come into the pose since the start.
         history: last steps, the newest first: time, pose, yaw rate of the contact model, noise.
     """
@@ -46,11 +46,9 @@ class _Way(eqx.Module):
     """Where the body goes in a step, and what pushes it off.
 
     Attributes:
-        speed: at which the effects of floors count [m/s].
+        speed: at which the effects of floors count [m/s]; slope: d twist / d effects.
         axes: along, across and yaw as columns in the body frame.
-        slope: d twist / d effects.
-        share: of the load on each floor.
-        scatter: of the twist over hypotheses.
+        share: of the load on each floor; scatter: of the twist over hypotheses.
         by_gyro: whether yaw is measured.
     """
 
@@ -63,29 +61,21 @@ class _Way(eqx.Module):
 
 
 class PoseFilter(eqx.Module):
-    """Filter of the pose.
-
-    Attributes:
-        robot: the identified robot.
-        settings: what is not identified.
-    """
+    """Filter of the pose."""
 
     robot: DeployedRobot
-    settings: Settings = eqx.field(static=True, default=Settings())
+    settings: Settings = eqx.field(static=True)
 
     def init(self, pose: Float[Array, "3"], std: tuple[float, float] = (0.0, 0.0)) -> PoseState:
         """At rest at a pose [m, m, rad], known this well [m], [rad]."""
         place, turn = std
-        parts = [
-            jnp.asarray([place**2, place**2, turn**2]),
-            self.robot.effect.reshape(-1) ** 2,
-            jnp.asarray([self.settings.gyro_bias_std**2]),
-        ]
+        begin, bias = jnp.asarray([place, place, turn]), jnp.asarray([self.settings.gyro_bias_std])
+        parts = jnp.concatenate([begin, self.robot.effect.reshape(-1), bias])
         entry = jnp.concatenate([jnp.zeros(1), pose, jnp.zeros(10)])
         return PoseState(
             pose=pose,
             nuisance=jnp.zeros(3 * len(self.robot.labels) + 1),
-            covariance=jnp.diag(jnp.concatenate(parts)),
+            covariance=jnp.diag(parts**2),
             time=jnp.zeros(()),
             still=jnp.zeros(()),
             noise=jnp.zeros((3, 3)),
@@ -98,11 +88,10 @@ class PoseFilter(eqx.Module):
         """Pose a time step later, and the twist that took it there.
 
         Args:
-            old: before the step.
+            old, tick: the state before the step, and the step.
             motion: what the floors say of it.
             gyro: yaw rate, NaN without one [rad/s].
             z: for its pose fix.
-            tick: the time step.
         """
         dt, moves = tick.dt, tick.moves
         way = self._way(motion, gyro)
@@ -121,7 +110,6 @@ class PoseFilter(eqx.Module):
         return _fixed(replace(new, history=history), z), twist
 
     def _way(self, motion: Motion, gyro: Array) -> _Way:
-        """Where the body goes."""
         mean = motion.twist
         share = self.robot.rest @ motion.under
         speed = length(mean[:2]) + self.robot.frame.base * jnp.abs(mean[2])
@@ -139,10 +127,7 @@ class PoseFilter(eqx.Module):
     def _turned(self, old: PoseState, time: Array, free: Array, gyro: Array) -> Array:
         """Yaw rate: the gyro's less its bias; over its delay, as the contact model goes on from it.
 
-        Args:
-            old: state before the step; time: after it [s].
-            free: yaw rate of the contact model [rad/s].
-            gyro: reading, NaN where there is none [rad/s].
+        `free` is the contact model's [rad/s], `time` that after the step.
         """
         delay = self.settings.gyro_delay_s
         then = free if delay == 0.0 else _nearest(old.history, time - delay)[4]
@@ -175,9 +160,8 @@ class PoseFilter(eqx.Module):
         world = jnp.array([[c, -sn, 0.0], [sn, c, 0.0], [0.0, 0.0, 1.0]])
         gone = pose[:2] - old.pose[:2]
         on = jnp.where(tick.moves, dt, 0.0)
-        by_gyro = jnp.array([1.0, 1.0, 0.0])
         # yaw comes from the gyro, not from the floor
-        keep = jnp.where(way.by_gyro, by_gyro, jnp.ones(3))
+        keep = jnp.where(way.by_gyro, jnp.array([1.0, 1.0, 0.0]), jnp.ones(3))
         push = world @ (keep[:, None] * way.slope) * on
         drift = jnp.array([[0.0], [0.0], [1.0]]) * jnp.where(way.by_gyro, -dt, 0.0)
         turned = jnp.array([[1.0, 0.0, -gone[1]], [0.0, 1.0, gone[0]], [0.0, 0.0, 1.0]])
@@ -207,17 +191,19 @@ def _fixed(now: PoseState, z: Readings) -> PoseState:
         & (age < now.time - now.history[-1, 0] + 1e-6)
     )
 
-    def corrected() -> tuple[Array, Array, Array, Array]:
-        found = _correct(now, z.fix, jnp.clip(z.fix_std, 1e-4, 10.0), age)
-        return found.pose, found.nuisance, found.covariance, found.history
-
-    kept = (now.pose, now.nuisance, now.covariance, now.history)
-    pose, nuisance, covariance, history = jax.lax.cond(has, corrected, lambda: kept)
+    std, kept = (
+        jnp.clip(z.fix_std, 1e-4, 10.0),
+        (now.pose, now.nuisance, now.covariance, now.history),
+    )
+    found = jax.lax.cond(has, lambda: _corrected(now, z.fix, std, age), lambda: kept)
+    pose, nuisance, covariance, history = found
     return replace(now, pose=pose, nuisance=nuisance, covariance=covariance, history=history)
 
 
-def _correct(now: PoseState, fix: Array, std: Array, age: Array) -> PoseState:
-    """State after a fix of the pose as it was `age` ago [s].
+def _corrected(
+    now: PoseState, fix: Array, std: Array, age: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Pose, nuisance, covariance and history after a fix of the pose as it was `age` ago [s].
 
     What came in since then, a covariance of the pose, the fix has not seen: it is set aside. What
     the pose no longer holds of it, a later fix having seen it, is so much noise of this one.
@@ -245,13 +231,7 @@ def _correct(now: PoseState, fix: Array, std: Array, age: Array) -> PoseState:
     back = history[:, 1:3] - pose[:2]
     moved = change[:2] + change[2] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
     history = history.at[:, 1:3].add(moved).at[:, 3].add(change[2])
-    return replace(
-        now,
-        pose=pose + change[:3],
-        nuisance=now.nuisance + change[3:],
-        covariance=cov,
-        history=history,
-    )
+    return pose + change[:3], now.nuisance + change[3:], cov, history
 
 
 def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Array, "3 3"]:

@@ -1,7 +1,7 @@
 """Paths in time: where the robot should be and how fast, and when to wait for it."""
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -38,10 +38,8 @@ class Path(eqx.Module):
         """Pose and rates at a time of the path; beyond its ends, at rest there."""
         place = jnp.clip(jnp.asarray(time) / STEP, 0.0, len(self.rows) - 1.000001)
         low = jnp.floor(place).astype(jnp.int32)
-        part = place - low
-        return (1 - part) * self.rows[low] + part * self.rows[
-            jnp.minimum(low + 1, len(self.rows) - 1)
-        ]
+        high, part = jnp.minimum(low + 1, len(self.rows) - 1), place - low
+        return (1 - part) * self.rows[low] + part * self.rows[high]
 
     def follow(
         self,
@@ -102,10 +100,8 @@ def waypoints(
 
     Args:
         places: x, y [m], the first one is where it starts.
-        speed: between stops [m/s].
-        acceleration: [m/s^2].
-        pause: at every place [s].
-        heading: all the way [rad].
+        speed: between stops [m/s]; acceleration: [m/s^2].
+        pause: at every place [s]; heading: all the way [rad].
 
     Raises:
         ValueError: fewer than two places, neighbours that are the same, or a speed or acceleration
@@ -133,24 +129,9 @@ def waypoints(
 
 
 def rectangle(length: float = 0.9, width: float = 0.4, speed: float = 0.2) -> Path:
-    """The 2021 paper's trial (figure 7): ahead, to the right, back, to the left.
-
-    Args:
-        length: of the first side [m]; width: of the second [m].
-        speed: [m/s].
-    """
+    """The 2021 paper's trial (figure 7): ahead, to the right, back, to the left [m], [m/s]."""
     corners = [(0.0, 0.0), (length, 0.0), (length, -width), (0.0, -width), (0.0, 0.0)]
     return waypoints(corners, speed)
-
-
-def circle(radius: float = 0.4, speed: float = 0.2, turning: bool = False) -> Path:
-    """Once around a circle that touches the start, to the left; `turning` along with it."""
-    return _smooth(lambda u: (radius * np.sin(u), radius * (1 - np.cos(u))), speed, turning)
-
-
-def figure_eight(size: float = 0.5, speed: float = 0.2, turning: bool = False) -> Path:
-    """Once through a lying eight (lemniscate of Gerono), `size` to each side."""
-    return _smooth(lambda u: (size * np.sin(u), size * np.sin(u) * np.cos(u)), speed, turning)
 
 
 def _trapezoid(
@@ -166,25 +147,3 @@ def _trapezoid(
     gone = 0.5 * acceleration * up**2 + top * level + top * down - 0.5 * acceleration * down**2
     pace = np.where(t < whole, acceleration * up - acceleration * down, 0.0)
     return np.minimum(gone, far), pace
-
-
-def _smooth(
-    place: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], speed: float, turning: bool
-) -> Path:
-    """A closed curve at constant speed but for its ends, by arc length."""
-    u = np.linspace(0.0, 2 * np.pi, 4001)
-    xy = np.stack(place(u), axis=-1)
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
-    gone, _ = _trapezoid(float(arc[-1]), speed, 0.5, 0.6)
-    gone = np.concatenate([[0.0], gone])
-    x, y = (np.interp(gone, arc, xy[:, k]) for k in range(2))
-    way = np.unwrap(np.arctan2(np.gradient(xy[:, 1], u), np.gradient(xy[:, 0], u)))
-    heading = np.interp(gone, arc, way) if turning else np.zeros_like(x)
-    pose = np.stack([x, y, heading], axis=-1)
-    if turning:  # it starts along the x axis of the robot
-        c, s = np.cos(way[0]), np.sin(way[0])
-        pose[:, :2] = pose[:, :2] @ np.array([[c, -s], [s, c]])
-        pose[:, 2] -= way[0]
-    rates = np.gradient(pose, STEP, axis=0)
-    end = jnp.asarray([(len(pose) - 1) * STEP])
-    return Path(jnp.asarray(np.hstack([pose, rates])), end, jnp.asarray(pose[-1:, :2]))

@@ -12,9 +12,8 @@ class WheelState(eqx.Module):
     """How the wheels turn.
 
     Attributes:
-        speed: [rad/s].
+        speed: [rad/s]; age: of the last reading [s].
         angle: up to which motion is counted [rad]; NaN before the first reading.
-        age: of the last reading [s].
     """
 
     speed: Float[Array, " wheel"]
@@ -60,12 +59,6 @@ def read_wheels(
 
     A wheel that is not heard keeps its speed until it is stale, then it counts as standing; when it
     is heard again, what it has turned more than was counted is made up for.
-
-    Args:
-        robot: the identified robot; settings: what is not identified.
-        old: before the step.
-        z: what is measured.
-        dt: from `time_step` [s].
     """
     most = 4.0 * robot.highest[0]
     turned = (z.wheel_angle - old.angle) / jnp.maximum(dt, 1e-3)
@@ -88,12 +81,7 @@ def read_currents(
 ) -> Currents:
     """Currents from ammeters and, through the motor's equation, from voltmeters.
 
-    Args:
-        robot: the identified robot; settings: what is not identified.
-        old: filtered currents before the step [A].
-        z: what is measured.
-        w: wheel speeds [rad/s].
-        dt: from `time_step` [s].
+    `old` are the filtered ones before the step [A], `w` wheel speeds [rad/s].
     """
     s, motor, most = settings, robot.motor, 10.0 * robot.highest[1]
     known = jnp.isfinite(z.current) & (jnp.abs(z.current) < most)

@@ -59,7 +59,6 @@ def from_polygons(
     """Map from patches on a base, later ones on top of earlier ones.
 
     Args:
-        base: surface where no patch lies.
         patches: surface and corners (x, y) [m] of each.
         extent: lowest x, lowest y, highest x, highest y [m].
         cell: edge of a cell [m].
@@ -92,13 +91,13 @@ def from_picture(
     Args:
         picture: red, green, blue between 0 and 1, first row at the top.
         colours: colour of every surface as `#rrggbb`.
-        metres_per_pixel: [m].
         corner: x, y of the lower left corner [m].
     """
-    names = tuple(colours)
-    wanted = np.array([rgb(colours[name]) for name in names])
+    from matplotlib.colors import to_rgb
+
+    wanted = np.array([to_rgb(colour) for colour in colours.values()])
     far = np.linalg.norm(picture[:, :, None, :] - wanted, axis=-1)
-    return FloorMap(names, np.argmin(far, axis=-1)[::-1].copy(), corner, metres_per_pixel)
+    return FloorMap(tuple(colours), np.argmin(far, axis=-1)[::-1].copy(), corner, metres_per_pixel)
 
 
 def patchwork(
@@ -111,8 +110,7 @@ def patchwork(
     """Random site of patches, by default smaller than a Robotino: cells of a jittered grid.
 
     Args:
-        surfaces: names to choose from.
-        seed: seed of the jitter and of the choice.
+        seed: seed of the jitter and of the choice of surfaces.
         patch: mean distance of neighbouring patches [m].
         half: half of the site's edge [m].
         cell: edge of a cell [m].
@@ -165,15 +163,3 @@ def four_zones(
 def _few(cells: int) -> None:
     if cells > MOST_CELLS:
         raise ValueError(f"{cells} cells; expected at most {MOST_CELLS}: a larger cell, less floor")
-
-
-def rgb(colour: str) -> list[float]:
-    """Red, green and blue between 0 and 1 of a colour `#rrggbb`.
-
-    Raises:
-        ValueError: it is none.
-    """
-    try:
-        return [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]
-    except ValueError as error:
-        raise ValueError(f"colour {colour!r}; expected '#rrggbb'") from error

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Log:
     """One run, every array sampled at `time`.
 
@@ -41,17 +41,17 @@ class Log:
     sha256: str
     time: Float[np.ndarray, " time"]
     wheel_angle: Float[np.ndarray, "time wheel"]
-    wheel_speed: Float[np.ndarray, "time wheel"] | None
-    wheel_speed_command: Float[np.ndarray, "time wheel"] | None
-    twist_command: Float[np.ndarray, "time 3"] | None
-    current: Float[np.ndarray, "time wheel"] | None
+    wheel_speed: Float[np.ndarray, "time wheel"] | None = None
+    wheel_speed_command: Float[np.ndarray, "time wheel"] | None = None
+    twist_command: Float[np.ndarray, "time 3"] | None = None
+    current: Float[np.ndarray, "time wheel"] | None = None
     current_is_signed: bool
-    voltage: Float[np.ndarray, "time wheel"] | None
-    duty: Float[np.ndarray, "time wheel"] | None
-    bus_voltage: Float[np.ndarray, " time"] | None
-    gyro: Float[np.ndarray, " time"] | None
-    pose: Float[np.ndarray, "time 3"] | None
-    pose_fresh: Bool[np.ndarray, " time"] | None
+    voltage: Float[np.ndarray, "time wheel"] | None = None
+    duty: Float[np.ndarray, "time wheel"] | None = None
+    bus_voltage: Float[np.ndarray, " time"] | None = None
+    gyro: Float[np.ndarray, " time"] | None = None
+    pose: Float[np.ndarray, "time 3"] | None = None
+    pose_fresh: Bool[np.ndarray, " time"] | None = None
     surface: str | None
     load: str
     notes: tuple[str, ...] = ()

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -81,7 +81,6 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
     """One set of runs that all have wheels and poses.
 
     Args:
-        logs: as read.
         session: name of the time in which the marker stayed as it was; by default surface, load and
             commanded speed, which is how test grids are driven.
 
@@ -118,8 +117,10 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
         """The run with its arrays in the flat ones; a bridged one keeps its raw wheel angle."""
         raw = bridged[k][0] is not log.wheel_angle
         rows = slice(int(offset[k]), int(offset[k + 1]))
-        mine = {n: a[rows] for n, a in flat.items() if not (raw and n == "wheel_angle")}
-        return replace(log, **mine)  # type: ignore[arg-type]
+        mine: dict[str, Any] = {
+            n: a[rows] for n, a in flat.items() if not (raw and n == "wheel_angle")
+        }
+        return replace(log, **mine)
 
     return Runs(
         logs=tuple(view(k, log) for k, log in enumerate(logs)),

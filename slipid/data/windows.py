@@ -78,21 +78,16 @@ def windows(
     """Cut every run from where it has moved `MOVED` into pieces of `per_piece` windows.
 
     Args:
-        data: the runs.
         wheel_radius: radius of the wheels [m]; it only tells where motion starts.
         lag: lag of the camera behind the encoders [s].
-        per_piece: number of windows in a piece.
         longest: longest window [s]; a longer run makes more pieces.
 
     Raises:
         DataError: a run whose wheels never move that far, or too short for its windows.
     """
-    pieces: list[_Piece] = []
-    run: list[int] = []
-    for k in range(len(data)):
-        for edges in _edges(data, k, wheel_radius, per_piece, longest):
-            pieces.append(_cut(data, k, edges, lag))
-            run.append(k)
+    each = [_edges(data, k, wheel_radius, per_piece, longest) for k in range(len(data))]
+    run = [k for k, pieces in enumerate(each) for _ in pieces]
+    pieces = [_cut(data, k, edges, lag) for k, cuts in enumerate(each) for edges in cuts]
     together = _Piece(*(np.stack(part) for part in zip(*pieces, strict=True)))
     logs = [data.logs[k] for k in run]
     return Windows(
@@ -149,7 +144,10 @@ def _cut(data: Runs, run: int, edges: Int[np.ndarray, " edge"], lag: float) -> _
     t, angle = data.time[rows], data.wheel_angle[rows]
     at = t[edges] - lag
     half = 0.08  # a speed over 0.16 s: shorter shows the encoder's uneven updates
-    turned, ahead, behind = (_interpolated(t, angle, when) for when in (at, at + half, at - half))
+    turned, ahead, behind = (
+        np.stack([np.interp(when, t, column) for column in angle.T], axis=-1)
+        for when in (at, at + half, at - half)
+    )
     span = np.clip(at + half, t[0], t[-1]) - np.clip(at - half, t[0], t[-1])
     speed = (ahead - behind) / np.maximum(span, 1e-3)[:, None]
     first = np.searchsorted(t, at[:-1])
@@ -172,10 +170,6 @@ def _cut(data: Runs, run: int, edges: Int[np.ndarray, " edge"], lag: float) -> _
         voltage=mean_voltage,
         current_var=variance,
     )
-
-
-def _interpolated(time: np.ndarray, angle: np.ndarray, at: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(at, time, column) for column in angle.T], axis=-1)
 
 
 def _mean(

@@ -23,11 +23,11 @@ class Row:
 
     Attributes:
         observer: `encoder`, `curve` (slip over current, wheel by wheel) or `contact`.
+        about: one sentence for people.
         correction: of the 2021 paper.
         tuned: whether it has the gains of `slipid tune`, where there are any.
         ahead: whether wheel speeds come from the inverse contact model, whatever the gains say.
         gyro: whether the robot has one.
-        about: one sentence for people.
     """
 
     observer: str
@@ -52,11 +52,7 @@ ROWS: Mapping[str, Row] = {
 
 
 def gains_of(out: Path, robot: DeployedRobot) -> Gains:
-    """Gains that `slipid tune` found for a robot, else those set by hand.
-
-    Args:
-        out: folder of the robot.
-        robot: with the load set-up it is to drive with.
+    """Gains that `slipid tune` found for a robot and its load set-up, else those set by hand.
 
     Raises:
         DataError: there are gains, of other numbers or of another load set-up.
@@ -78,14 +74,7 @@ def gains_of(out: Path, robot: DeployedRobot) -> Gains:
 def pilot_of(
     robot: DeployedRobot, row: Row, gains: Gains, settings: Settings | None = None
 ) -> Pilot[eqx.Module]:
-    """Estimator and controller of a row.
-
-    Args:
-        robot: the identified robot.
-        row: of the trial.
-        gains: tuned ones, which some rows have.
-        settings: of the estimator, by default the robot's.
-    """
+    """Estimator and controller of a row; the gains are tuned ones, which some rows have."""
     own = gains if row.tuned else Gains()
     if row.ahead:
         own = replace(own, ahead=jnp.asarray(1.0))

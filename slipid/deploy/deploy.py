@@ -1,5 +1,7 @@
 """From a fit, or its posterior, to robot.json, which is all that runs on the robot needs."""
 
+import glob
+import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import fields, replace
@@ -14,15 +16,13 @@ from slipid.control.interface import MIXED
 from slipid.control.robot_file.record import Number, Seen, Sensors, Source
 from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
-from slipid.deploy.record_of import About, given, record_of
-from slipid.identify.fit_file import number_json
+from slipid.deploy.record_of import given, record_of
 from slipid.identify.posterior.sample import Posterior
 from slipid.identify.result import Fit
-from slipid.identify.slip_curves import Validity
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.drawn_estimates import estimates
 from slipid.model.robot import Robot
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError
 from slipid.support.versions import versions
 
@@ -36,10 +36,6 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
 
     Its numbers are those of `identified.json`: of the posterior where there is one, else of the
     fit's Laplace approximation. `DeployedRobot.record.source` says which.
-
-    Args:
-        fit: as `slipid identify` left it.
-        posterior: of `slipid sample`.
 
     Raises:
         ValueError: the wheels' kinematics have rank below 3.
@@ -59,24 +55,22 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
         {path: _number(e) for path, e in numbers.items()},
         {name: float(v) ** 0.5 for name, v in fit.variance.items()},
         jax.vmap(fit.space.tree)(jnp.asarray(vectors)),
-        _highest(fit),
+        max((max(v.wheel_speed) for v in fit.validity.values()), default=None),
         fit.current_trend,
-        About(
-            source=source,
-            sensors=Sensors(
-                current_is_signed=bool(fit.settings["current_is_signed"]),
-                voltage=bool(fit.has["voltage"]),
-                gyro=False,
-            ),
-            # one that has learnt from runs over several floors expects to drive on several
-            alike=MIXED if "mixed" in fit.settings else About.alike,
-            messages=messages,
-            data=fit.data_hash,
-            versions=versions(),
-            seen={name: _seen(v) for name, v in fit.validity.items()},
-        ),
+        {name: Seen(**vars(v)) for name, v in fit.validity.items()},
     )
-    return DeployedRobot.of(record)
+    # one that has learnt from runs over several floors expects to drive on several
+    alike = record.alike if fit.mixed is None else MIXED
+    about = replace(
+        record,
+        source=source,
+        sensors=Sensors(current_is_signed=fit.channels.signed, voltage=fit.channels.voltage),
+        alike=alike,
+        messages=messages,
+        data=fit.data_hash,
+        versions=versions(),
+    )
+    return DeployedRobot.of(about)
 
 
 def deploy_known(
@@ -92,8 +86,7 @@ def deploy_known(
     Raises:
         ValueError: no such load set-up, or wheels whose kinematics have rank below 3.
     """
-    numbers, noise = given(robot), {} if std is None else std
-    record = record_of(robot, numbers, noise, draws, highest_speed, current_trend)
+    record = record_of(robot, given(robot), std or {}, draws, highest_speed, current_trend)
     return DeployedRobot.of(record, load)
 
 
@@ -135,45 +128,19 @@ def read_robot(out: Path, load: str | None = None) -> DeployedRobot:
 
 
 def habits_of(robot: DeployedRobot, gyro: bool) -> Habits:
-    """What the twin of a robot has: the sensors of its logs.
-
-    Args:
-        robot: of robot.json.
-        gyro: whether the robot has one.
-    """
+    """What the twin of a robot has: the sensors of its logs, and a gyro where it has one."""
     sensors = robot.record.sensors
     return Habits(voltage=sensors.voltage, gyro=gyro, signed=sensors.current_is_signed)
 
 
 def _at(robot: Robot, numbers: Mapping[str, Estimate]) -> Robot:
     """The robot with its numbers at their estimates."""
-    fixed = [Choice(_literal(path), fixed=e.value) for path, e in numbers.items()]
+    fixed = [Choice(glob.escape(path), fixed=e.value) for path, e in numbers.items()]
     made: Robot = Space(robot, fixed).template
     return made
 
 
-def _literal(path: str) -> str:
-    """A path as a pattern that matches it alone."""
-    return "".join(f"[{c}]" if c in "*?[" else c for c in path)
-
-
 def _number(e: Estimate) -> Number:
-    """As identified.json has it."""
-    kept = number_json(e)
-    return typed(Number, {f.name: _lists(kept[f.name]) for f in fields(Number)}, e.path)
-
-
-def _lists(value: object) -> object:
-    """As JSON would give it back."""
-    return [_lists(v) for v in value] if isinstance(value, tuple) else value
-
-
-def _seen(validity: Validity) -> Seen:
-    """What a floor was seen with, as robot.json has it."""
-    return Seen(**vars(validity))
-
-
-def _highest(fit: Fit) -> float | None:
-    """Largest wheel speed of the fitted runs [rad/s]."""
-    seen = [max(v.wheel_speed) for v in fit.validity.values()]
-    return max(seen) if seen else None
+    """As robot.json has it."""
+    kept = {f.name: getattr(e, f.name) for f in fields(Number)}
+    return typed(Number, json.loads(json.dumps(kept)), e.path)

@@ -13,33 +13,25 @@ from slipid.control.interface import Measurement
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Twin, TwinPlant
 from slipid.data.floor_map import FloorMap
-from slipid.model.plant import Floor
-from slipid.testsite.driving import Site
+from slipid.deploy.trial_site import floor_of
 from slipid.testsite.live import Live, Reading
+from slipid.testsite.site import Site
 
 
 class SitePlant:
     """The virtual test site as a `slipid.control.closed_loop.Plant`.
 
     Args:
-        floor: which surface lies where.
-        load: name of the load set-up.
+        floor: which surface lies where; load: name of the load set-up.
         start: x, y [m], heading [rad].
         seed: of unevenness and noise.
         gyro: whether the robot has one.
-        site: robot, floors and sensors; by default as they are.
     """
 
     def __init__(
-        self,
-        floor: FloorMap,
-        load: str,
-        start: tuple[float, float, float],
-        seed: int,
-        gyro: bool,
-        site: Site | None = None,
+        self, floor: FloorMap, load: str, start: tuple[float, float, float], seed: int, gyro: bool
     ):
-        site = Site() if site is None else site
+        site = Site()
         site = replace(site, sensors=replace(site.sensors, gyro=gyro))
         self._new = partial(Live, site, floor, load, start, seed)
         self._live = self._new()
@@ -65,12 +57,8 @@ class SitePlant:
 
 
 def _measured(reading: Reading) -> Measurement:
-    return Measurement(
-        wheel_angle=reading.wheel_angle,
-        current=reading.current,
-        voltage=reading.voltage,
-        gyro=reading.gyro,
-    )
+    r = reading
+    return Measurement(wheel_angle=r.wheel_angle, current=r.current, voltage=r.voltage, gyro=r.gyro)
 
 
 def twin(
@@ -83,13 +71,3 @@ def twin(
     """The identified model itself as a plant, see `slipid.control.tuning.twin`."""
     made = Twin(robot, floor_of(floor, robot.labels), habits)
     return TwinPlant(made, jnp.asarray(start), jax.random.key(seed))
-
-
-def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Floor:
-    """A map as arrays, its surfaces counted as the fit counts them."""
-    index = np.array([labels.index(name) for name in floor.surfaces])
-    return Floor(
-        cells=jnp.asarray(index[floor.cells]),
-        corner=jnp.asarray(floor.corner),
-        cell=jnp.asarray(floor.cell),
-    )

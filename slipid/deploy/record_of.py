@@ -1,8 +1,9 @@
 """The record of a robot: its numbers as they are, and what the model makes of them once for all."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import fields
 from functools import reduce
+from types import MappingProxyType
 
 import equinox as eqx
 import jax
@@ -16,11 +17,8 @@ from slipid.control.robot_file.record import (
     LoadRecord,
     Number,
     Numbers,
-    Pair,
     RobotRecord,
     Seen,
-    Sensors,
-    Source,
     Wheels,
 )
 from slipid.model import contact
@@ -32,24 +30,6 @@ from slipid.parameter import entries
 AXES = ("along", "across", "yaw")
 FASTEST = 20.0
 """Wheel speed that counts as seen where nothing is known of it [rad/s]."""
-NO_SENSORS = Sensors(current_is_signed=False, voltage=False, gyro=False)
-
-
-@dataclass(frozen=True)
-class About:
-    """What a record says beside the numbers; attributes as of `RobotRecord`.
-
-    Attributes:
-        seen: by floor.
-    """
-
-    source: Source = "given"
-    sensors: Sensors = NO_SENSORS
-    alike: float = 3.0
-    messages: tuple[str, ...] = ()
-    data: str | None = None
-    versions: Mapping[str, str] = field(default_factory=dict)
-    seen: Mapping[str, Seen] = field(default_factory=dict)
 
 
 def record_of(
@@ -59,42 +39,29 @@ def record_of(
     draws: Robot | None = None,
     highest_speed: float | None = None,
     current_trend: tuple[float, float] = (0.0, 0.0),
-    about: About = About(),
+    seen: Mapping[str, Seen] = MappingProxyType({}),
 ) -> RobotRecord:
-    """The record of a robot.
+    """The record of a robot, but for what is known of where its numbers come from.
 
     Args:
         robot: with every number at its value in `numbers`.
         numbers: by path; those that the deployed robot does not need, the camera's, are left out.
         std: of every variance component by name, as fit.json has them (`process.gray.along`).
-        draws: the robot's posterior as a batched tree (leading axis), for what the uncertainty of
-            the numbers adds to the effects; None for nothing.
+        draws: the robot's posterior, stacked, for what the uncertainty of the numbers adds to the
+            effects; None for nothing.
         highest_speed: of the wheels in the fitted runs [rad/s].
         current_trend: of currents over the model's in the fitted runs, all floors [A], [A s/m].
-        about: where it all comes from.
+        seen: what the floors were seen with, as far as that is known.
     """
     shape, top = robot.geometry, FASTEST if highest_speed is None else highest_speed
     return RobotRecord(
-        source=about.source,
-        wheels=Wheels(
-            place=shape.place,
-            drive_angle=shape.drive_angle,
-            roller_angle=shape.roller_angle,
-            grips=shape.grips,
-            gear_ratio=shape.gear_ratio,
-        ),
+        wheels=Wheels(**{f.name: getattr(shape, f.name) for f in fields(Wheels)}),
         parameters={p: n for p, n in numbers.items() if not p.startswith("camera.")},
-        floors=tuple(_floor(name, std, about.seen.get(name)) for name in robot.surfaces.labels),
+        floors=tuple(_floor(name, std, seen.get(name)) for name in robot.surfaces.labels),
         loads=tuple(_load(robot, name, top, draws) for name in robot.body.loads),
         current_trend=current_trend,
         highest_speed=top,
-        sensors=about.sensors,
-        alike=about.alike,
-        messages=about.messages,
-        data=about.data,
-        versions=about.versions,
         draws={} if draws is None else dict(_varied(robot, draws)),
-        gains=None,
     )
 
 
@@ -159,21 +126,24 @@ def _load(robot: Robot, name: str, top: float, draws: Robot | None) -> LoadRecor
     curve = np.asarray(_wheel_curve(speed, amps, slip))
     floors = len(robot.surfaces.labels)
     spread = np.zeros((floors, 3)) if draws is None else np.asarray(_spread(draws, k))
-    pairs: list[Pair] = [(float(a), float(b)) for a, b in curve]
     return LoadRecord(
         name=name,
         spread=tuple(_axes(row) for row in spread),
         highest_current=float(jnp.max(jnp.abs(amps))),
-        wheel_curve=tuple(pairs),
+        wheel_curve=tuple((float(a), float(b)) for a, b in curve),
     )
+
+
+def _ways(count: int) -> Array:
+    """Twists of 1 m/s in so many directions, without turning."""
+    angle = jnp.linspace(0.0, 2 * jnp.pi, count, endpoint=False)
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
 
 
 @eqx.filter_jit
 def _circle(robot: Robot, frame: Frame, load: Array, top: Array) -> tuple[Array, Array, Array]:
     """Wheel speeds, currents, slip ratios on every floor in all directions (.., wheel)."""
-    angle = jnp.linspace(0.0, 2 * jnp.pi, 36, endpoint=False)
-    way = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
-    speed = way @ robot.geometry.forward().T / frame.radius
+    speed = _ways(36) @ robot.geometry.forward().T / frame.radius
     speed = jnp.stack([0.4 * top, 0.8 * top])[:, None, None] * speed / jnp.max(jnp.abs(speed))
     rest = robot.body.load_share[load]
 
@@ -182,9 +152,8 @@ def _circle(robot: Robot, frame: Frame, load: Array, top: Array) -> tuple[Array,
         xi = contact.equilibrium(rim, frame, floor, rest)
         force = floor.friction * robot.body.mass * GRAVITY * frame.radius
         torque = force * contact.forces(xi, rim, frame, floor, rest).traction
-        return robot.motor.current(torque, w), (rim - robot.geometry.forward() @ xi) / (
-            jnp.where(jnp.abs(rim) < 1e-9, 1e-9, rim)
-        )
+        lost = rim - robot.geometry.forward() @ xi
+        return robot.motor.current(torque, w), lost / jnp.where(jnp.abs(rim) < 1e-9, 1e-9, rim)
 
     flat = speed.reshape(-1, speed.shape[-1])
     amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(robot.surfaces)
@@ -202,10 +171,7 @@ def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
 
     def wheel(w: Array, i: Array, s: Array) -> Array:
         a = jnp.stack([w, w * i], axis=-1)
-        (p, q), (_, r) = a.T @ a
-        u, v = a.T @ (w * s)
-        det = p * r - q * q
-        return jnp.stack([(r * u - q * v) / det, (p * v - q * u) / det])
+        return jnp.linalg.solve(a.T @ a, a.T @ (w * s))
 
     return jax.vmap(wheel, 1)(*flat)
 
@@ -216,8 +182,7 @@ def _spread(draws: Robot, load: Array) -> Array:
 
     def one(robot: Robot) -> Array:
         frame = robot.geometry.frame()
-        angle = jnp.linspace(0.0, 2 * jnp.pi, 12, endpoint=False)
-        way = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
+        way = _ways(12)
         rim = 0.2 * way @ robot.geometry.forward().T
         rest = robot.body.load_share[load]
         xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(

@@ -1,10 +1,9 @@
 """`slipid trial`: the rectangle of the 2021 paper's figure 7 with every controller, judged."""
 
-import os
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from slipid.control import closed_loop, trajectory
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import Settings
+from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
 from slipid.data.floor_map import FloorMap
 from slipid.data.map_file import read_map
@@ -48,7 +48,6 @@ class Job:
     start: tuple[float, float, float]
     seed: int
     plant: str
-    load: str
     floor: FloorMap
     robot: DeployedRobot
     settings: Settings
@@ -65,9 +64,8 @@ class Wish:
         plant: `testsite` (MuJoCo) or `twin` (the identified model itself).
         map: file of a floor map; None for patches of the identified floors.
         controllers: names of `ROWS`.
-        starts: how many.
         load: name of the load set-up; None for the first.
-        jobs: processes at once.
+        starts, jobs: how many, and processes at once.
     """
 
     plant: str = "testsite"
@@ -80,13 +78,7 @@ class Wish:
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """End of a trial.
-
-    Attributes:
-        content: of trial.json.
-        paths: true poses of every run, by its name (step, 3).
-        floor: where it was driven.
-    """
+    """End of a trial: content of trial.json, true poses of every run by its name (step, 3)."""
 
     content: dict[str, Any]
     paths: Mapping[str, np.ndarray]
@@ -129,48 +121,39 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
 def _jobs(out: Path, wish: Wish) -> list[Job]:
     if wish.plant not in PLANTS:
         raise DataError(f"no plant '{wish.plant}'; expected {' or '.join(PLANTS)}")
-    for name in wish.controllers:
-        if name not in ROWS:
-            raise DataError(f"no controller '{name}'; expected some of {', '.join(ROWS)}")
-    if not wish.controllers:
-        raise DataError(f"no controller; expected some of {', '.join(ROWS)}")
+    strange = [f" '{name}'" for name in wish.controllers if name not in ROWS]
+    if strange or not wish.controllers:
+        said = strange[0] if strange else ""
+        raise DataError(f"no controller{said}; expected some of {', '.join(ROWS)}")
     robot = jax.tree.map(np.asarray, read_robot(out, wish.load))
     floor = site(robot) if wish.map is None else read_map(wish.map)
-    labels = robot.labels
-    if wish.plant == "twin":
-        for name in floor.surfaces:
-            if name not in labels:
-                raise DataError(f"{wish.map}: no surface '{name}'; identified: {', '.join(labels)}")
-    name = robot.load_setup
-    if wish.plant == "testsite":
-        known_to_site(floor, name, robot.wheels)
-    gains = jax.tree.map(np.asarray, gains_of(out, robot))
-    settings, habits = Settings.of(robot), habits_of(robot, gyro=False)
-    if wish.plant != "twin":  # the test site has the sensors it has, whatever the logs had
+    settings, habits, known = Settings.of(robot), habits_of(robot, gyro=False), robot.labels
+    if wish.plant == "testsite":  # it has the sensors it has, whatever the logs had
+        known_to_site(floor, robot.load_setup, robot.wheels)
         settings, habits = replace(settings, current_is_signed=False), Habits()
+    elif absent := [name for name in floor.surfaces if name not in known]:
+        raise DataError(f"{wish.map}: no surface '{absent[0]}'; identified: {', '.join(known)}")
+    gains = jax.tree.map(np.asarray, gains_of(out, robot))
     key = key_of(
-        *(wish.plant, name, _named(gains), settings, habits, *jax.tree.leaves(robot)),
+        *(wish.plant, robot.load_setup, _named(gains), settings, habits, *jax.tree.leaves(robot)),
         *(floor.surfaces, floor.corner, floor.cell, floor.cells),
         # runs of other code are not taken for this one's
         source_hash("control", "model", "testsite", "data", "deploy"),
     )
     # trials of other gains or floors lie beside this one, so that going back to them costs nothing
     kept = Checkpoint(out / FOLDER / key[:12] / f"of{wish.starts}", key)
+    made = partial(
+        Job,
+        plant=wish.plant,
+        floor=floor,
+        robot=robot,
+        settings=settings,
+        habits=habits,
+        gains=gains,
+        kept=kept,
+    )
     return [
-        Job(
-            name=f"{row}/start{k:02d}",
-            row=row,
-            start=start,
-            seed=1000 + k,
-            plant=wish.plant,
-            load=name,
-            floor=floor,
-            robot=robot,
-            settings=settings,
-            habits=habits,
-            gains=gains,
-            kept=kept,
-        )
+        made(f"{row}/start{k:02d}", row, start, 1000 + k)
         for row in wish.controllers
         for k, start in enumerate(starts(wish.starts, floor))
     ]
@@ -183,12 +166,12 @@ def _named(gains: Gains) -> dict[str, float]:
 def _driven(job: Job) -> tuple[Run, np.ndarray] | None:
     """A run and its true poses; None where it has not been driven yet."""
     run, path = job.kept.load_json(job.name), job.kept.load(job.name)
-    return None if run is None or path is None else (Run.of(run), path["pose"])
+    return None if run is None or path is None else (typed(Run, run), path["pose"])
 
 
 def drive(job: Job) -> float:
     """Drive one run and write its metrics and its path; how long it took [s]."""
-    _started()
+    setup_jax(quiet=True)
     row = ROWS[job.row]
     robot, gains = jax.tree.map(jnp.asarray, (job.robot, job.gains))
     path = trajectory.rectangle().moved(job.start).waiting(REST_S)
@@ -206,13 +189,8 @@ def drive(job: Job) -> float:
     # the path first: a run that has metrics is done
     path_of = {"time": course.time, "pose": course.pose, "believed": course.believed}
     job.kept.save(job.name, path_of)
-    job.kept.save_json(job.name, run.to_json())
+    job.kept.save_json(job.name, asdict(run))
     return float(course.time[-1])
-
-
-@lru_cache(maxsize=1)
-def _started() -> None:
-    setup_jax(quiet=True)
 
 
 def _plant(job: Job, gyro: bool, robot: DeployedRobot) -> closed_loop.Plant:
@@ -222,12 +200,7 @@ def _plant(job: Job, gyro: bool, robot: DeployedRobot) -> closed_loop.Plant:
         return twin(robot, job.floor, job.start, job.seed, replace(job.habits, gyro=gyro))
     from slipid.deploy.plants import SitePlant
 
-    return SitePlant(job.floor, job.load, job.start, job.seed, gyro)
-
-
-def processes(jobs: int | None) -> int:
-    """How many at once."""
-    return jobs or os.cpu_count() or 1
+    return SitePlant(job.floor, robot.load_setup, job.start, job.seed, gyro)
 
 
 def names_of(text: str | None) -> tuple[str, ...]:

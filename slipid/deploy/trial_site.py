@@ -1,9 +1,11 @@
 """Where a trial is driven: patches of the robot's floors, starts all over them."""
 
+import jax.numpy as jnp
 import numpy as np
 
 from slipid.control.deployed import DeployedRobot
 from slipid.data.floor_map import FloorMap, patchwork
+from slipid.model.plant import Floor
 from slipid.support.errors import DataError
 
 SITE_SEED, STARTS_SEED = 7, 2021
@@ -54,23 +56,28 @@ def known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
     Raises:
         DataError: another number of wheels, a load set-up or a surface that it does not have.
     """
-    from slipid.testsite.driving import Site
     from slipid.testsite.ground import GROUNDS
+    from slipid.testsite.site import Site
 
-    machine = Site().machine
-    if wheels != len(machine.wheel_azimuths_deg):
-        raise DataError(
-            f"the test site's robot has {len(machine.wheel_azimuths_deg)} wheels, the fit's "
-            f"{wheels}. With --plant twin the identified model is driven itself"
-        )
-    if load not in machine.centres_m:
-        raise DataError(
-            f"the test site has no load set-up '{load}'; it has {', '.join(machine.centres_m)}. "
-            "With --plant twin the identified model is driven itself"
-        )
-    for name in floor.surfaces:
-        if name not in GROUNDS:
+    machine, other = Site().machine, "With --plant twin the identified model is driven itself"
+    has = len(machine.wheel_azimuths_deg)
+    if wheels != has:
+        raise DataError(f"the test site's robot has {has} wheels, the fit's {wheels}. {other}")
+    for what, name, there in (
+        ("load set-up", load, machine.centres_m),
+        *(("surface", name, GROUNDS) for name in floor.surfaces),
+    ):
+        if name not in there:
             raise DataError(
-                f"the test site has no surface '{name}'; it has {', '.join(GROUNDS)}. "
-                "With --plant twin the identified model is driven itself"
+                f"the test site has no {what} '{name}'; it has {', '.join(there)}. {other}"
             )
+
+
+def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Floor:
+    """A map as arrays, its surfaces counted as the fit counts them."""
+    index = np.array([labels.index(name) for name in floor.surfaces])
+    return Floor(
+        cells=jnp.asarray(index[floor.cells]),
+        corner=jnp.asarray(floor.corner),
+        cell=jnp.asarray(floor.cell),
+    )

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -34,15 +33,6 @@ class Run:
         about = {"controller": self.controller, "start": list(self.start), "seed": self.seed}
         return {**about, **asdict(self.metrics), "believed_error_mm": self.believed_error_mm}
 
-    @classmethod
-    def of(cls, kept: Mapping[str, Any]) -> "Run":
-        """From what `to_json` gave."""
-        metrics = {name: kept[name] for name in Metrics.__dataclass_fields__}
-        metrics["along_track_mm"] = tuple(metrics["along_track_mm"])
-        x, y, heading = kept["start"]
-        error = kept["believed_error_mm"]
-        return cls(kept["controller"], (x, y, heading), kept["seed"], Metrics(**metrics), error)
-
 
 @dataclass(frozen=True)
 class Ratio:
@@ -58,8 +48,7 @@ class Summary:
 
     Attributes:
         median: by name, see `columns`; what a plant does not know (the twin's energy) is left out.
-        interval90: of the medians.
-        runs: how many; finished_share: part of them that reached the end.
+        finished_share: part of the runs that reached the end.
         to_encoder: ratios of medians; None without the controller `encoder`.
     """
 
@@ -71,15 +60,10 @@ class Summary:
 
     def to_json(self) -> dict[str, object]:
         """As trial.json has it."""
-        row = {
-            **self.median,
-            "interval90": dict(self.interval90),
-            "runs": self.runs,
-            "finished_share": self.finished_share,
-        }
-        if self.to_encoder is not None:
-            row["to_encoder"] = {name: asdict(ratio) for name, ratio in self.to_encoder.items()}
-        return row
+        rest = asdict(self)
+        if self.to_encoder is None:
+            del rest["to_encoder"]
+        return {**rest.pop("median"), **rest}
 
 
 Columns = Mapping[str, Float[np.ndarray, " run"]]

@@ -1,6 +1,6 @@
 """`slipid tune`: gains rehearsed on the fit's own twin; the search is on disk while it runs."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -10,13 +10,12 @@ import numpy as np
 from slipid.control import trajectory
 from slipid.control.closed_loop import PERIOD
 from slipid.control.deployed import DeployedRobot, drawn
-from slipid.control.interface import Settings
 from slipid.control.tuning.objective import Cases, Task
 from slipid.control.tuning.optimisers import Method, Search, State
 from slipid.data.floor_map import patchwork
 from slipid.deploy.deploy import ROBOT, habits_of, read_robot
+from slipid.deploy.trial_site import floor_of
 from slipid.deploy.tuned import CORNERS, DRAWS, Tuned, hashes, judged
-from slipid.model.plant import Floor
 from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.errors import DataError
 from slipid.support.files import write_json
@@ -31,20 +30,16 @@ TRIED, JUDGED, STABLE = 64, 48, 4
 
 
 def cases(robots: DeployedRobot, count: int, seed: int) -> Cases:
-    """Starts on patchworks of the robots' floors, of one of the robots each.
-
-    Args:
-        robots: stacked draws.
-        count: of cases.
-        seed: of floors, starts, noise and which robot.
-    """
+    """Starts on patchworks of the robots' floors, of one of the stacked robots each."""
     rng = np.random.default_rng([seed, count])
     start = np.concatenate(
         [rng.uniform(-0.3, 0.3, (count, 2)), rng.uniform(-np.pi, np.pi, (count, 1))], axis=1
     )
     path = trajectory.waypoints(CORNERS)
     picked = rng.integers(len(robots.rest), size=count)
-    floors = [floor(robots.labels, int(s)) for s in rng.integers(2**31, size=count)]
+    seeds = rng.integers(2**31, size=count).tolist()
+    drawn = [patchwork(robots.labels, s, half=1.0, cell=0.02) for s in seeds]
+    floors = [floor_of(floor, robots.labels) for floor in drawn]
     return Cases(
         truth=jax.tree.map(lambda x: x[picked], robots),
         floor=jax.tree.map(lambda *x: jnp.stack(x), *floors),
@@ -54,16 +49,10 @@ def cases(robots: DeployedRobot, count: int, seed: int) -> Cases:
     )
 
 
-def floor(labels: tuple[str, ...], seed: int) -> Floor:
-    """A patchwork as arrays, its surfaces numbered as the robot's."""
-    drawn = patchwork(labels, seed, half=1.0, cell=0.02)
-    return Floor(jnp.asarray(drawn.cells), jnp.asarray(drawn.corner), jnp.asarray(drawn.cell))
-
-
 def task_of(robot: DeployedRobot, gyro: bool) -> Task:
     """What is tuned for a robot: its sensors, its numbers, the rehearsed path."""
     steps = int(np.ceil(SLACK * trajectory.waypoints(CORNERS).duration / PERIOD))
-    return Task(robot, Settings.of(robot), habits_of(robot, gyro), steps=steps)
+    return Task(robot, habits_of(robot, gyro), steps)
 
 
 def robots_of(robot: DeployedRobot, seed: int) -> tuple[DeployedRobot, DeployedRobot]:
@@ -72,47 +61,40 @@ def robots_of(robot: DeployedRobot, seed: int) -> tuple[DeployedRobot, DeployedR
     return drawn(robot, tuple(order[:DRAWS])), drawn(robot, tuple(order[DRAWS : 2 * DRAWS]))
 
 
-@dataclass(frozen=True)
-class Wish:
-    """What is asked of tuning.
+def tune(
+    out: Path,
+    load: str | None,
+    method: Method,
+    rollouts: int,
+    seed: int,
+    gyro: bool,
+    report: Reporter,
+) -> Tuned:
+    """Tune the robot of a folder, write gains.json, and the gains into robot.json.
 
-    Attributes:
+    Args:
         load: name of the load set-up, the first one by default.
         method: of the search; rollouts: it may spend.
         seed: of draws, floors, noise and search.
         gyro: whether the robot has one.
-    """
-
-    load: str | None
-    method: Method
-    rollouts: int
-    seed: int
-    gyro: bool
-
-
-def tune(out: Path, wish: Wish, report: Reporter) -> Tuned:
-    """Tune the robot of a folder, write gains.json, and the gains into robot.json.
 
     Raises:
         DataError: no robot, no such load set-up or method, or too few rollouts for one step.
     """
-    if wish.method not in ("gradient", "pso"):
-        raise DataError(f"method '{wish.method}'; expected gradient or pso")
-    robot = read_robot(out, wish.load)
+    if method not in ("gradient", "pso"):
+        raise DataError(f"method '{method}'; expected gradient or pso")
+    robot = read_robot(out, load)
     report.stage("draws of the robot")
-    task = task_of(robot, wish.gyro)
-    robots, fresh = robots_of(robot, wish.seed)
+    robots, fresh = robots_of(robot, seed)
     stable = jax.tree.map(lambda x: x[:STABLE], robots)
-    tried = cases(robots, TRIED, wish.seed)
-    search = Search(task, tried, stable, wish.method, wish.rollouts, wish.seed)
-    if wish.rollouts < search.cost:
-        raise DataError(
-            f"{wish.rollouts} rollouts; expected {search.cost} or more with {wish.method}"
-        )
+    tried = cases(robots, TRIED, seed)
+    search = Search(task_of(robot, gyro), tried, stable, method, rollouts, seed)
+    if rollouts < search.cost:
+        raise DataError(f"{rollouts} rollouts; expected {search.cost} or more with {method}")
     kept = Checkpoint(out, key_of(*_everything(search)))
     state = _searched(search, kept, report)
     report.stage("judging on other cases")
-    found = judged(search, state, cases(fresh, JUDGED, wish.seed + 1), stable)
+    found = judged(search, state, cases(fresh, JUDGED, seed + 1), stable)
     write_json(out / "gains.json", found.to_json())
     record = replace(robot.record, gains=found.record())
     DeployedRobot.of(record, robot.load_setup).save(out / ROBOT)
@@ -142,6 +124,6 @@ def _everything(search: Search) -> tuple[object, ...]:
         for leaf in jax.tree.leaves((search.task, search.cases, search.stable))
     ]
     task = search.task
-    said = (task.settings, task.habits, task.weights, task.limits, task.steps, task.period)
     own = (hashes(task.robot), task.robot.load_setup, search.method, search.steps, search.seed)
-    return (source_hash("control", "model"), *map(np.asarray, arrays), *own, *said)
+    hashed = source_hash("control", "model")
+    return (hashed, *map(np.asarray, arrays), *own, task.habits, task.steps)

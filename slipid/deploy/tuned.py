@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from slipid.control.closed_loop import PERIOD
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.robot_file.gains_record import GainRecord, GainsRecord, GainValues, Losses
@@ -14,11 +15,10 @@ from slipid.control.tuning.objective import (
     BATCH,
     GAINS,
     HAND,
+    UNITS,
     Cases,
-    Task,
     combined,
     evaluate,
-    units,
 )
 from slipid.control.tuning.optimisers import GRADIENT, Search, State
 
@@ -34,44 +34,37 @@ class Tuned:
     """What a search has come to.
 
     Attributes:
-        task: what was tuned; search: how.
+        search: what was tuned, and how.
         best, spread: gains and their stds over the end of the search, in the order of `GAINS`.
         losses: of every case not tuned on [mm], by hand and tuned.
-        margins: 1 - spectral radius of every loop, by hand and tuned.
-        draws: the least tuned one of every draw of the robot.
+        margins: 1 - spectral radius of every loop of every draw, by hand and tuned.
     """
 
-    task: Task
     search: Search
     best: Float[np.ndarray, " gain"]
     spread: Float[np.ndarray, " gain"]
     losses: Mapping[str, Float[np.ndarray, " case"]]
-    margins: Mapping[str, Float[np.ndarray, " loop"]]
-    draws: Float[np.ndarray, " draw"]
-
-    @property
-    def better(self) -> float:
-        """Part of the cases in which the tuned gains lose less."""
-        return float((self.losses["tuned"] < self.losses["hand"]).mean())
+    margins: Mapping[str, Float[np.ndarray, "draw loop"]]
 
     def record(self) -> GainsRecord:
         """As robot.json has it."""
         loss = Losses(**{k: float(combined(jnp.asarray(v))) for k, v in self.losses.items()})
-        rows = zip(GAINS, self.best, units(), self.spread, strict=True)
+        task, better = self.search.task, self.losses["tuned"] < self.losses["hand"]
+        rows = zip(GAINS, self.best, UNITS, self.spread, strict=True)
         return GainsRecord(
             values=GainValues(**{g: GainRecord(float(v), u, float(s)) for g, v, u, s in rows}),
-            load=self.task.robot.load_setup,
-            gyro=self.task.habits.gyro,
+            load=task.robot.load_setup,
+            gyro=task.habits.gyro,
             method=self.search.method,
             loss=loss,
-            better_than_hand=self.better,
+            better_than_hand=float(better.mean()),
             stability_margin=float(self.margins["tuned"].min()),
             verdict="no worse than by hand" if loss.tuned <= loss.hand else "worse than by hand",
         )
 
     def to_json(self) -> dict[str, object]:
         """Content of gains.json."""
-        task, kept, record = self.task, self.search, self.record()
+        task, kept, record = self.search.task, self.search, self.record()
         quantiles = {k: np.quantile(v, [0.05, 0.95]).tolist() for k, v in self.losses.items()}
         return {
             "schema": SCHEMA,
@@ -81,12 +74,12 @@ class Tuned:
             "loss": asdict(record.loss),
             "loss_mean": {k: float(v.mean()) for k, v in self.losses.items()},
             "loss_interval90": quantiles,
-            "better_than_hand": self.better,
+            "better_than_hand": record.better_than_hand,
             "stability_margin": {
                 "worst": record.stability_margin,
                 "median": float(np.median(self.margins["tuned"])),
                 "hand_worst": float(self.margins["hand"].min()),
-                "draws": self.draws.tolist(),
+                "draws": self.margins["tuned"].min(axis=1).tolist(),
             },
             "settings": {
                 "loss_unit": "mm",
@@ -98,7 +91,7 @@ class Tuned:
                 "path_m": [list(c) for c in CORNERS],
                 "delay_s": task.habits.delay_s,
                 "lag_s": task.habits.lag_s,
-                "period_s": task.period,
+                "period_s": PERIOD,
                 "steps": task.steps,
                 "hand": dict(zip(GAINS, HAND, strict=True)),
                 "load": record.load,
@@ -119,13 +112,10 @@ def judged(search: Search, state: State, others: Cases, stable: DeployedRobot) -
     """The end of a search, on cases it has not seen."""
     task, best = search.task, search.best(state)
     by = {"hand": np.asarray(HAND), "tuned": best}
-    margins = {name: task.margins(Gains.at(g), stable) for name, g in by.items()}
     return Tuned(
-        task=task,
         search=search,
         best=best,
         spread=search.spread(state),
         losses={name: evaluate(task, g, others) for name, g in by.items()},
-        margins=margins,
-        draws=margins["tuned"].reshape(len(stable.mass), -1).min(axis=1),
+        margins={name: task.margins(Gains.at(g), stable) for name, g in by.items()},
     )

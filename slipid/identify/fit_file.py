@@ -8,39 +8,29 @@ after it the new one.
 import hashlib
 import io
 import json
-from collections.abc import Mapping
-from dataclasses import asdict
-from functools import reduce
 from pathlib import Path
-from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
+from slipid.identify.fit_json import (
+    BLOCKS,
+    MATRICES,
+    SCHEMA_FIT,
+    from_json,
+    identified_json,
+    to_json,
+)
 from slipid.identify.result import Fit
-from slipid.identify.slip_curves import SlipCurve, Validity
-from slipid.identify.verdicts.estimates import Estimate
-from slipid.model.geometry import Geometry
-from slipid.model.robot import Robot, build
-from slipid.parameter import Choice, Space, entries
+from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import json_text, read_json, write_bytes
 
-Json = dict[str, Any]
-"""An object as a JSON file holds it."""
-SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/2"
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
-_MATRICES = ("covariance", "laplace", "piece_run")
-_BLOCKS = ("residual", "whitened", "weight")
 
 
 def save(fit: Fit, folder: Path) -> tuple[str, ...]:
-    """Write a fit to a folder, in the place of the one that may be there.
-
-    Returns:
-        names of the files.
+    """Write a fit to a folder, in the place of the one that may be there; returns names of files.
 
     Raises:
         ValueError: a number is not finite; nothing is written then.
@@ -62,7 +52,7 @@ def save(fit: Fit, folder: Path) -> tuple[str, ...]:
     return IDENTIFIED, FIT, name
 
 
-def write_identified(folder: Path, content: Json) -> None:
+def write_identified(folder: Path, content: Content) -> None:
     """Write identified.json for the fit that is there, under whose checksum it is valid."""
     fit = read_json(folder / FIT, _RESULT)
     write_bytes(folder / IDENTIFIED, json_text(content | {"fit": fit["checksum"]}).encode())
@@ -88,31 +78,25 @@ def load(folder: Path) -> Fit:
         if isinstance(error, DataError):
             raise
         raise DataError(f"{path}: {error}; expected {_RESULT} of this version") from error
-    _of_this_fit(folder / IDENTIFIED, checksum)
+    table = folder / IDENTIFIED
+    other = read_json(table, _RESULT) if table.exists() else {"fit": checksum}
+    if not isinstance(other, dict) or other.get("fit") != checksum:
+        raise DataError(
+            f"{table}: of another fit than {FIT} beside it, its writing was interrupted; "
+            "expected both of one fit (run `slipid identify` again)"
+        )
     return fit
 
 
-def _of_this_fit(path: Path, checksum: str) -> None:
-    """DataError where there is an identified.json of another fit."""
-    if not path.exists():
-        return
-    table = read_json(path, _RESULT)
-    if not isinstance(table, dict) or table.get("fit") != checksum:
-        raise DataError(
-            f"{path}: of another fit than {FIT} beside it, its writing was interrupted; "
-            "expected both of one fit (run `slipid identify` again)"
-        )
-
-
-def _checksum(content: Json) -> str:
+def _checksum(content: Content) -> str:
     """Hash of JSON content that holds the hash of the arrays, so of all that belongs to a fit."""
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _packed(fit: Fit) -> bytes:
-    arrays = {name: getattr(fit, name) for name in _MATRICES}
-    for name in _BLOCKS:
+    arrays = {name: getattr(fit, name) for name in MATRICES}
+    for name in BLOCKS:
         arrays |= {f"{name}/{block}": v for block, v in getattr(fit, name).items()}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
@@ -130,186 +114,3 @@ def _unpacked(folder: Path, file: str, sha256: str) -> dict[str, np.ndarray]:
         raise DataError(f"{path}: damaged, its hash differs from the one in {FIT}")
     with np.load(io.BytesIO(packed), allow_pickle=False) as npz:
         return {name: npz[name] for name in npz.files}
-
-
-# JSON -------------------------------------------------------------------------------------------
-
-
-def identified_json(fit: Fit) -> Json:
-    """Content of identified.json."""
-    return {
-        "schema": SCHEMA,
-        "parameters": {path: number_json(e) for path, e in fit.parameters.items()},
-        "derived": {path: number_json(e) for path, e in fit.derived.items()},
-        "surfaces": list(fit.robot.surfaces.labels),
-        "curves": curves_json(fit.curves),
-        "validity": validity_json(fit.validity),
-        "messages": list(fit.messages),
-        "data": {"hash": fit.data_hash, "runs": [name for name, _ in fit.runs]},
-    }
-
-
-def number_json(e: Estimate) -> Json:
-    """A number as identified.json has it."""
-    return {
-        "value": e.value,
-        "unit": e.unit,
-        "shape": [len(e.labels)] if e.labels else [],
-        "labels": list(e.labels),
-        "std": e.std,
-        "interval90": e.interval90,
-        "source": e.source,
-        "verdict": e.verdict,
-        "provenance": e.provenance,
-    }
-
-
-def curves_json(curves: Mapping[str, SlipCurve]) -> Json:
-    """Slip curves by floor."""
-    return {
-        floor: {
-            "torque_nm": c.torque_nm.tolist(),
-            "slip": c.slip.tolist(),
-            "slip_lo": c.slip_lo.tolist(),
-            "slip_hi": c.slip_hi.tolist(),
-            "at": {"wheel_speed": c.wheel_speed, "load_share": c.load_share},
-        }
-        for floor, c in curves.items()
-    }
-
-
-def validity_json(validity: Mapping[str, Validity]) -> Json:
-    """What each floor was seen with."""
-    return {floor: asdict(v) for floor, v in validity.items()}
-
-
-def to_json(fit: Fit) -> Json:
-    """Content of fit.json: everything but the large arrays, and what people read of it."""
-    return {
-        "schema": SCHEMA_FIT,
-        "converged": fit.converged,
-        "reason": fit.reason,
-        "rounds": fit.rounds,
-        "remaining": fit.remaining,
-        "history": [x if np.isfinite(x) else None for x in fit.history],
-        "parameters": {p: asdict(e) for p, e in fit.parameters.items()},
-        "derived": {p: asdict(e) for p, e in fit.derived.items()},
-        "flat": [asdict(f) | {"text": f.text} for f in fit.flat],
-        "messages": list(fit.messages),
-        "variances": {
-            name: {"variance": v, "std": float(np.sqrt(v)), "unit": fit.variance_unit[name]}
-            for name, v in fit.variance.items()
-        },
-        "spectrum": fit.spectrum.tolist(),
-        "names": fit.space.names,
-        "z": fit.z.tolist(),
-        "robot": _robot_json(fit.space.template),
-        "choices": [asdict(c) for c in fit.choices],
-        "has": dict(fit.has),
-        "curves": curves_json(fit.curves),
-        "validity": validity_json(fit.validity),
-        "settings": dict(fit.settings),
-        "current_trend": list(fit.current_trend),
-        "baselines": dict(fit.baselines),
-        "data": {"hash": fit.data_hash, "runs": [list(r) for r in fit.runs]},
-    }
-
-
-def from_json(content: Json, arrays: Mapping[str, np.ndarray]) -> Fit:
-    """Fit from the content of fit.json and its arrays.
-
-    Raises:
-        KeyError, TypeError, ValueError: it is no such content.
-    """
-    choices = tuple(Choice(**c) for c in content["choices"])
-    space = Space(_robot_of(content["robot"]), choices)
-    if space.names != content["names"]:
-        raise ValueError("it has other parameters than this version declares")
-    variances = content["variances"]
-    blocks: dict[str, dict[str, np.ndarray]] = {name: {} for name in _BLOCKS}
-    for name, array in arrays.items():
-        kind, _, block = name.partition("/")
-        if block:
-            blocks[kind][block] = array
-    return Fit(
-        space=space,
-        choices=choices,
-        z=np.asarray(content["z"], float),
-        variance={name: v["variance"] for name, v in variances.items()},
-        variance_unit={name: v["unit"] for name, v in variances.items()},
-        runs=tuple((str(name), str(sha)) for name, sha in content["data"]["runs"]),
-        spectrum=np.asarray(content["spectrum"], float),
-        has=content["has"],
-        curves={floor: _curve_of(c) for floor, c in content["curves"].items()},
-        validity={floor: _validity_of(v) for floor, v in content["validity"].items()},
-        converged=content["converged"],
-        reason=content["reason"],
-        rounds=content["rounds"],
-        remaining=content["remaining"],
-        history=tuple(np.inf if x is None else x for x in content["history"]),
-        settings=content["settings"],
-        baselines=content["baselines"],
-        current_trend=(content["current_trend"][0], content["current_trend"][1]),
-        covariance=arrays["covariance"],
-        laplace=arrays["laplace"],
-        piece_run=arrays["piece_run"],
-        residual=blocks["residual"],
-        whitened=blocks["whitened"],
-        weight=blocks["weight"],
-    )
-
-
-def _curve_of(content: Json) -> SlipCurve:
-    rows: Json = {k: np.asarray(v, float) for k, v in content.items() if k != "at"}
-    return SlipCurve(**rows, **content["at"])
-
-
-def _validity_of(content: Json) -> Validity:
-    fields: Json = {k: tuple(v) if isinstance(v, list) else v for k, v in content.items()}
-    return Validity(**fields)
-
-
-def _robot_json(robot: Robot) -> Json:
-    """A robot as plain values: its shape, its names, every number."""
-    shape = robot.geometry
-    return {
-        "geometry": {
-            "place": [list(p) for p in shape.place],
-            "drive_angle": list(shape.drive_angle),
-            "roller_angle": list(shape.roller_angle),
-            "grips": list(shape.grips),
-            "gear_ratio": shape.gear_ratio,
-        },
-        "surfaces": list(robot.surfaces.labels),
-        "loads": list(robot.body.loads),
-        "sessions": list(robot.camera.sessions),
-        "centre": list(robot.camera.centre),
-        "values": {e.path: np.asarray(e.get(robot)).tolist() for e in entries(robot)},
-    }
-
-
-def _robot_of(kept: Json) -> Robot:
-    shape = kept["geometry"]
-    geometry = Geometry(
-        drive_offset=jnp.zeros(len(shape["place"])),
-        place=tuple((p[0], p[1]) for p in shape["place"]),
-        drive_angle=tuple(shape["drive_angle"]),
-        roller_angle=tuple(shape["roller_angle"]),
-        grips=tuple(shape["grips"]),
-        gear_ratio=shape["gear_ratio"],
-    )
-    robot = build(
-        geometry, kept["surfaces"], kept["loads"], kept["sessions"], centre=tuple(kept["centre"])
-    )
-    leaves: dict[tuple[str, ...], list[Any]] = {}
-    whole: dict[tuple[str, ...], bool] = {}
-    for e in entries(robot):
-        leaves.setdefault(e.leaf, []).append(kept["values"][e.path])
-        whole[e.leaf] = e.index is None
-    values = [jnp.asarray(v[0] if whole[leaf] else v) for leaf, v in leaves.items()]
-
-    def where(tree: Robot) -> list[Any]:
-        return [reduce(getattr, leaf, tree) for leaf in leaves]
-
-    restored: Robot = eqx.tree_at(where, robot, values)
-    return restored

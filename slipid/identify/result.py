@@ -16,17 +16,33 @@ from slipid.identify.compare.predictive import contact_of
 from slipid.identify.fit.mixed import Update, informed
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem
-from slipid.identify.fit.variances import Vector
+from slipid.identify.fit.variances import Search, Square
+from slipid.identify.rows import remaining, rows_at, spectrum
 from slipid.identify.slip_curves import SlipCurve, Validity
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, sentences
 from slipid.model.robot import Robot
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 
 CONFLICT = 4.0
 """Prior stds from the prior mean beyond which a reader is told."""
 REMAINING = 0.3
 """Largest remaining Gauss-Newton step of a fit that may be called converged [posterior std]."""
+
+
+@dataclass(frozen=True)
+class Channels:
+    """What runs log, and how it is cut.
+
+    Attributes:
+        current, voltage: logged or not; signed: the current has a sign.
+        windows: per piece.
+    """
+
+    current: bool = True
+    voltage: bool = False
+    signed: bool = False
+    windows: int = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,22 +65,23 @@ class Fit:
         weight: of each piece in the last round, by block; about 1, small for an outlier.
         spectrum: singular values of the prior-scaled whitened Jacobian; at 1 the data know as much
             as the prior.
-        has: which of current, voltage were logged.
+        channels: that were logged.
         curves: slip over torque of every floor.
         current_trend: a + b v, measured currents over the model's at speed v [A], [A s/m].
         validity: what each floor was seen with.
         converged, reason, rounds, history: how the fit ended.
         remaining: largest step a full Gauss-Newton step would still take, in posterior stds; a
             solver that finds no way ahead is not at an optimum because of it.
-        settings: of windows and seed, as used; `mixed` says what runs over several floors did.
+        lag, seed: of the windows [s]; of the draws the curves' bands are made of.
         baselines: what simpler models learnt from the same runs, for comparison.
+        mixed: what runs over several floors did, see `slipid.identify.fit.mixed.Update.about`.
     """
 
     space: Space
     choices: tuple[Choice, ...]
-    z: Float[np.ndarray, " free"]
-    covariance: Float[np.ndarray, "free free"]
-    laplace: Float[np.ndarray, "free free"]
+    z: Search
+    covariance: Square
+    laplace: Square
     variance: Mapping[str, float]
     variance_unit: Mapping[str, str]
     runs: tuple[tuple[str, str], ...]
@@ -72,8 +89,8 @@ class Fit:
     residual: Mapping[str, np.ndarray]
     whitened: Mapping[str, np.ndarray]
     weight: Mapping[str, np.ndarray]
-    spectrum: Float[np.ndarray, " free"]
-    has: Mapping[str, bool]
+    spectrum: Search
+    channels: Channels
     curves: Mapping[str, SlipCurve]
     validity: Mapping[str, Validity]
     converged: bool
@@ -81,9 +98,11 @@ class Fit:
     rounds: int
     remaining: float
     history: tuple[float, ...]
-    settings: Mapping[str, Any]
+    lag: float
+    seed: int
     baselines: Mapping[str, Any] = field(default_factory=dict)
     current_trend: tuple[float, float] = (0.0, 0.0)
+    mixed: Mapping[str, Any] | None = None
 
     @cached_property
     def robot(self) -> Robot:
@@ -93,26 +112,23 @@ class Fit:
     @cached_property
     def parameters(self) -> dict[str, Estimate]:
         """Every number by path, with interval and verdict."""
-        found = estimates(self.space, self.choices, self.z, self.covariance, self.has["voltage"])
+        volts = self.channels.voltage
+        found = estimates(self.space, self.choices, self.z, self.covariance, volts)
         # a number whose scale rests on another one's prior was not measured, however narrow
         open_ = {path for f in self.flat for path in f.paths}
-        return {
-            e.path: replace(e, provenance="borrowed")
-            if e.path in open_ and e.provenance == "measured"
-            else e
-            for e in found
-        }
+        rests = {e.path for e in found if e.path in open_ and e.provenance == "measured"}
+        return {e.path: replace(e, provenance="borrowed") if e.path in rests else e for e in found}
 
     @cached_property
     def flat(self) -> tuple[Flat, ...]:
         """Directions the likelihood leaves open; what sessions share blurs numbers, opens none."""
-        has = self.has["current"], self.has["voltage"]
-        return flat_directions(self.space, self.laplace, *has, self.validity)
+        has = self.channels
+        return flat_directions(self.space, self.laplace, has.current, has.voltage, self.validity)
 
     @cached_property
     def derived(self) -> dict[str, Estimate]:
         """Ratios that may be known where the numbers themselves are not."""
-        found = derived(self.space, self.z, self.covariance, self.has["voltage"])
+        found = derived(self.space, self.z, self.covariance, self.channels.voltage)
         return {e.path: e for e in found}
 
     @property
@@ -136,16 +152,10 @@ class Fit:
 
     @property
     def data_hash(self) -> str:
-        """Hash of the runs and their files."""
         return hash_of(self.runs)
 
     def draws(self, count: int, seed: int = 0) -> Float[np.ndarray, "draw free"]:
-        """Search vectors drawn from the Gaussian of z and covariance."""
         return draws(self.z, self.covariance, count, seed)
-
-    def with_baselines(self, baselines: Mapping[str, Any]) -> "Fit":
-        """The fit, with what simpler models learnt (plain numbers, as JSON holds them)."""
-        return replace(self, baselines=dict(baselines))
 
 
 def summarise(
@@ -153,22 +163,17 @@ def summarise(
 ) -> Fit:
     """Fit from the end of an optimisation, and what runs of one session were found to share.
 
-    Args:
-        problem: as it was optimised.
-        optimum: where it ended.
-        data: the runs its windows were cut from.
-        choices: as the problem was given.
-        seed: of the draws the curves' bands are made of.
+    `data` are the runs that the problem's windows were cut from, `choices` what it was given, and
+    `seed` is of the draws the curves' bands are made of.
     """
     z, log_v = optimum.state.z, optimum.state.log_variance
-    volt = problem.volt(log_v)
-    rows = _rows(problem, z, log_v)
+    rows = rows_at(problem, z, log_v)
     contact = contact_of(problem, optimum.state, optimum.covariance, np.ones(len(problem.windows)))
-    left, name = remaining(problem, z, volt, rows)
+    left, name = remaining(problem, z, problem.volt(log_v), rows)
     settled = left < REMAINING
     stuck = f"the solver stopped {left:.2g} stds of {name} away from where its own step leads"
-    windows = problem.windows
-    robot = problem.space.tree(jnp.asarray(z))
+    windows, robot = problem.windows, contact.robot
+    several = draws(z, contact.covariance, 400, seed)
     of_runs = [c for c in problem.noise.components if c.kind == "run"]
     of_sessions = [replace(c, kind="session") for c in of_runs]
     unit = {c.name: c.unit for c in (*problem.noise.components, *of_sessions)}
@@ -185,84 +190,33 @@ def summarise(
         residual=rows.residual,
         whitened=rows.whitened,
         weight=rows.weight,
-        spectrum=_spectrum(rows.gram),
-        has={"current": bool(windows.has_current), "voltage": bool(windows.has_voltage)},
-        curves=curves_of.curves(
-            problem.space, z, draws(z, contact.covariance, 400, seed), problem.batch
+        spectrum=spectrum(rows.gram),
+        channels=Channels(
+            current=bool(windows.has_current),
+            voltage=bool(windows.has_voltage),
+            signed=bool(windows.current_is_signed),
+            windows=int(windows.dt.shape[1]),
         ),
+        curves=curves_of.curves(problem.space, z, several, problem.batch),
         validity=curves_of.validity(data, robot, problem.batch),
         converged=bool(optimum.converged) and settled,
         reason=optimum.reason if settled or not optimum.converged else stuck,
         remaining=left,
         rounds=int(optimum.state.round),
         history=tuple(float(x) for x in optimum.history),
-        settings={
-            "lag": float(windows.lag),
-            "windows_per_piece": int(windows.dt.shape[1]),
-            "current_is_signed": bool(windows.current_is_signed),
-            "seed": seed,
-        },
+        lag=float(windows.lag),
+        seed=seed,
         current_trend=curves_of.current_trend(robot, problem.batch)
         if windows.has_current
         else (0.0, 0.0),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Residuals at a search vector, with what they are weighed by; attributes as of `Fit`.
-
-    Attributes:
-        jacobian: of the residuals.
-        roots: of their inverse covariance, weights of outliers included.
-        gram: information of all of them without those weights, in prior stds.
-    """
-
-    residual: dict[str, np.ndarray]
-    jacobian: dict[str, np.ndarray]
-    roots: dict[str, np.ndarray]
-    weight: dict[str, np.ndarray]
-    whitened: dict[str, np.ndarray]
-    gram: Float[np.ndarray, "free free"]
-
-
-def _rows(problem: Problem, z: Vector, log_v: Vector) -> Rows:
-    blocks, jacobian = problem.linear(jnp.asarray(z), problem.volt(log_v))
-    keep = np.ones(len(problem.windows))
-    roots, weights, _ = problem.whitening(blocks, jnp.asarray(log_v), keep)
-    plain = {  # roots of V^-1 without the weights of outliers
-        k: np.asarray(roots[k]) / np.sqrt(np.asarray(weights[k]))[:, None, None] for k in roots
-    }
-    gram = np.zeros((problem.space.size,) * 2)
-    for k, jac in jacobian.items():
-        half = np.einsum("nij,njp->nip", plain[k], np.asarray(jac)).reshape(-1, len(gram))
-        half = half * problem.space.prior_std
-        gram += half.T @ half
-    return Rows(
-        residual={k: np.asarray(v) for k, v in blocks.items()},
-        jacobian={k: np.asarray(v) for k, v in jacobian.items()},
-        roots={k: np.asarray(v) for k, v in roots.items()},
-        weight={k: np.asarray(v) for k, v in weights.items()},
-        whitened={k: np.einsum("nij,nj->ni", plain[k], np.asarray(r)) for k, r in blocks.items()},
-        gram=gram,
-    )
-
-
-def _spectrum(gram: np.ndarray) -> Float[np.ndarray, " free"]:
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0))
-
-
 def updated(fit: Fit, new: Update, problem: Problem, optimum: Optimum, data: Runs) -> Fit:
-    """The fit after runs over several floors.
-
-    Args:
-        fit: of `summarise`.
-        new: what those runs make of it.
-        problem, optimum, data: as given to `summarise`; residuals are still those of its runs.
-    """
-    rows = _rows(problem, new.z, optimum.state.log_variance)
+    """The fit after runs over several floors; residuals are still those of the runs before."""
+    rows = rows_at(problem, new.z, optimum.state.log_variance)
     outer = problem.space.prior_std[:, None] * problem.space.prior_std
-    several = draws(new.z, new.covariance, 400, fit.settings["seed"])
+    several = draws(new.z, new.covariance, 400, fit.seed)
     unsettled = "the runs over several floors: no rest after all steps"
     return replace(
         fit,
@@ -275,45 +229,16 @@ def updated(fit: Fit, new: Update, problem: Problem, optimum: Optimum, data: Run
         residual=rows.residual,
         whitened=rows.whitened,
         weight=rows.weight,
-        spectrum=_spectrum(rows.gram + outer * new.information),
+        spectrum=spectrum(rows.gram + outer * new.information),
         curves=curves_of.curves(problem.space, new.z, several, problem.batch),
         validity=curves_of.validity(data, problem.space.tree(jnp.asarray(new.z)), problem.batch),
         converged=fit.converged and new.settled,
         reason=fit.reason if new.settled or not fit.converged else unsettled,
-        settings=dict(fit.settings) | {"mixed": dict(new.about)},
+        mixed=dict(new.about),
     )
 
 
-def remaining(
-    problem: Problem, z: Float[np.ndarray, " free"], volt: Vector, rows: Rows
-) -> tuple[float, str]:
-    """Largest step of a full Gauss-Newton step in posterior stds, and the number that takes it.
-
-    delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), W with the weights of outliers, g
-    the slope of log |d residuals / d data|; where currents do not inform motion, their rows move
-    the electric numbers only.
-    """
-    own = np.ones(len(z)) if problem.joint else problem.electric.astype(float)
-    prior = problem.space.prior_std**-2
-    _, slope = problem.log_jacobian(z, volt, np.ones(len(problem.windows)))
-    gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
-    info = np.diag(prior)
-    for k, r in rows.residual.items():
-        root = rows.roots[k]
-        white = np.einsum("nij,nj->ni", root, r).ravel()
-        half = np.einsum("nij,njp->nip", root, rows.jacobian[k]).reshape(-1, len(z))
-        half = half * (1.0 if k == "motion" else own)
-        gradient = gradient + half.T @ white
-        info = info + half.T @ half
-    std = np.sqrt(np.diag(np.linalg.inv(info)))
-    steps = np.abs(np.linalg.solve(info, gradient)) / std
-    worst = int(np.argmax(steps))
-    return float(steps[worst]), problem.space.names[worst]
-
-
-def draws(
-    z: Float[np.ndarray, " free"], covariance: Float[np.ndarray, "free free"], count: int, seed: int
-) -> Float[np.ndarray, "draw free"]:
+def draws(z: Search, covariance: Square, count: int, seed: int) -> Float[np.ndarray, "draw free"]:
     """Draws of a Gaussian in the search space."""
     rng = np.random.default_rng(seed)
     root = np.linalg.cholesky(covariance)

@@ -13,7 +13,7 @@ from slipid.identify.fit.noise import travel
 from slipid.model import contact_law as law
 from slipid.model import robot as model
 from slipid.model.robot import GRAVITY, Robot
-from slipid.parameter import Space
+from slipid.search_space import Space
 
 POINTS = 41
 _SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])
@@ -21,13 +21,9 @@ _SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])
 
 @dataclass(frozen=True, eq=False)
 class SlipCurve:
-    """Slip of a wheel over its torque on one floor.
+    """Slip of a wheel over its torque on one floor, from rest to what occurred, with its 90 % band.
 
-    Attributes:
-        torque_nm: from rest to what occurred [N m].
-        slip: at each torque.
-        slip_lo, slip_hi: ends of its 90 % band.
-        wheel_speed, load_share: the speed [rad/s] and the share of the weight it is given for.
+    It is given for this speed [rad/s] and this share of the weight.
     """
 
     torque_nm: Float[np.ndarray, " torque"]
@@ -42,13 +38,8 @@ class SlipCurve:
 class Validity:
     """What a floor was seen with: outside of it the fit extrapolates.
 
-    Attributes:
-        runs: number of them.
-        loads: load set-ups.
-        wheel_speed, torque_nm, slip, yaw_rate: smallest and largest size of each [rad/s], [N m],
-            [1], [rad/s]; the yaw rate by the encoders.
-        headings_deg, speeds, turn_rates: commanded [deg], [m/s], [rad/s].
-        distance: mean length of a run [m].
+    Smallest and largest wheel speed [rad/s], torque [N m], slip, yaw rate by the encoders [rad/s];
+    commanded headings [deg], speeds [m/s] and turn rates [rad/s]; mean length of a run [m].
     """
 
     runs: int
@@ -88,11 +79,8 @@ def torque_of_slip(
 ) -> Float[Array, "surface slip"]:
     """Torque [N m] of a wheel that slips by `_SLIP` along its drive direction, on every floor.
 
-    Args:
-        wheel_speed: w [rad/s].
-        share: N, of the weight on this wheel.
-
-    Source: `slipid.model.contact_law` without sideways rolling.
+    At this speed [rad/s], with this share of the weight on the wheel. Source:
+    `slipid.model.contact_law` without sideways rolling.
     """
     floor = jax.tree.map(lambda leaf: leaf[:, None], robot.surfaces)
     rim = (robot.geometry.wheel_radius * wheel_speed)[:, None]
@@ -102,10 +90,7 @@ def torque_of_slip(
 
 
 def curves(
-    space: Space,
-    z: Float[np.ndarray, " free"],
-    draws: Float[np.ndarray, "draw free"],
-    b: lk.Batch,
+    space: Space, z: np.ndarray, draws: Float[np.ndarray, "draw free"], b: lk.Batch
 ) -> dict[str, SlipCurve]:
     """Slip over torque per floor with a 90 % band, over the torques that occurred.
 
@@ -122,9 +107,8 @@ def curves(
         median.append(float(np.median(turned)) if turned.size else 1.0)
     at = jnp.asarray(median)
     best = np.asarray(torque_of_slip(robot, at, share))
-    band = np.asarray(
-        jax.jit(jax.vmap(lambda x: torque_of_slip(space.tree(x), at, share)))(jnp.asarray(draws))
-    )
+    drawn = jax.jit(jax.vmap(lambda x: torque_of_slip(space.tree(x), at, share)))
+    band = np.asarray(drawn(jnp.asarray(draws)))
     out = {}
     for k, label in enumerate(labels):
         top = min(float(np.quantile(torque[floor == k], 0.98)), 0.999 * float(best[k].max()))
@@ -147,21 +131,20 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
     """What each floor was seen with."""
     speed, torque, slip = (np.asarray(x) for x in seen(robot, b))
     back = np.linalg.pinv(np.asarray(robot.geometry.forward()))[2] * robot.geometry.wheel_radius
-    yaw = np.abs(speed @ np.asarray(back))  # by the encoders: what was driven, not how it slipped
-    speed, torque, slip = np.abs(speed), np.abs(torque), np.abs(slip)
-    floor = np.asarray(b.surface)
-    far = travel(b, robot)[0].sum(axis=1)
+    yaw = speed @ np.asarray(back)  # by the encoders: what was driven, not how it slipped
+    floor, far = np.asarray(b.surface), travel(b, robot)[0].sum(axis=1)
     out: dict[str, Validity] = {}
     for k, label in enumerate(robot.surfaces.labels):
         runs = [i for i, log in enumerate(data.logs) if (log.surface or "unknown") == label]
         mine = floor == k
+        most = [float(np.abs(x[mine]).max()) for x in (speed, torque, slip, yaw)]
         out[label] = Validity(
             runs=len(runs),
             loads=tuple(sorted({data.logs[i].load for i in runs})),
-            wheel_speed=(0.0, float(speed[mine].max())),
-            torque_nm=(0.0, float(torque[mine].max())),
-            slip=(0.0, float(slip[mine].max())),
-            yaw_rate=(0.0, float(yaw[mine].max())),
+            wheel_speed=(0.0, most[0]),
+            torque_nm=(0.0, most[1]),
+            slip=(0.0, most[2]),
+            yaw_rate=(0.0, most[3]),
             headings_deg=_different(np.degrees(data.heading[runs]), 1),
             speeds=_different(data.speed[runs], 3),
             turn_rates=_different(data.turn[runs], 2),
@@ -171,16 +154,11 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
 
 
 def _different(x: np.ndarray, digits: int) -> tuple[float, ...]:
-    """The values that occur, rounded and sorted."""
     return tuple(sorted({round(float(v), digits) for v in x[np.isfinite(x)]}))
 
 
 def current_trend(robot: Robot, b: lk.Batch) -> tuple[float, float]:
-    """Least squares a + b v of measured less predicted sizes of currents, v by the encoders.
-
-    Returns:
-        a [A] and b [A s/m], over all floors.
-    """
+    """Least squares a [A] + b [A s/m] v of measured less predicted currents' sizes, all floors."""
     predicted = lk.predicted_current(robot, b, lk.predict(robot, b).felt)
     gap = np.asarray((b.current - predicted) * jnp.sign(predicted))
     speed = np.broadcast_to((travel(b, robot)[0] / b.dt)[..., None], gap.shape).ravel()

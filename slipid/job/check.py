@@ -21,25 +21,16 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 _CHANNELS = (
-    "wheel_speed",
-    "wheel_speed_command",
-    "twist_command",
-    "current",
-    "voltage",
-    "duty",
-    "bus_voltage",
-    "gyro",
-    "pose",
+    *("wheel_speed", "wheel_speed_command", "twist_command", "current", "voltage"),
+    *("duty", "bus_voltage", "gyro", "pose"),
 )
 
 
 @dataclass(frozen=True)
 class Expected:
-    """What logs can be expected to tell of every number and ratio, and what stays open.
+    """What logs can be expected to tell of every number and ratio, at the start values by path.
 
-    Attributes:
-        parameters, derived: numbers and ratios at the start values, by path.
-        messages: what stays open and what would close it, one sentence each.
+    `messages` say what stays open and what would close it, one sentence each.
     """
 
     parameters: dict[str, Estimate]
@@ -66,11 +57,7 @@ class Checked:
 def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> Checked:
     """Say what the logs hold, and what they can be expected to tell, before any fit.
 
-    Args:
-        config_path: of the job.
-        data: folder its globs start from.
-        out: folder for check.json, if it is wanted.
-        report: progress.
+    It is written to check.json in `out`, if that is wanted.
 
     Raises:
         DataError: config or logs are wrong.
@@ -102,31 +89,33 @@ def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
                 "session": session,
                 "runs": len(runs),
                 "seconds": round(sum(data.logs[k].duration for k in runs), 1),
-                "headings": len(set(np.round(np.degrees(_known(data.heading[runs])), 1).tolist())),
-                "speeds": sorted(set(np.round(_known(data.speed[runs]), 3).tolist())),
+                "headings": len(_distinct(np.degrees(data.heading[runs]), 1)),
+                "speeds": _distinct(data.speed[runs], 3),
             }
             for (surface, load, session), runs in sorted(groups.items())
         ],
-        "channels": [_channel(data.logs, name) for name in _CHANNELS if _has(data.logs, name)],
+        "channels": _channels(data.logs),
         "notes": dict(notes.most_common()),
         "skipped": list(skipped),
         "data": {"hash": job.data_hash, "logs": {log.name: log.sha256 for log in data.logs}},
     }
 
 
-def _known(x: np.ndarray) -> np.ndarray:
-    return x[np.isfinite(x)]
+def _distinct(x: np.ndarray, places: int) -> list[float]:
+    """Values that are known, rounded, each once."""
+    found: list[float] = np.unique(np.round(x[np.isfinite(x)], places)).tolist()
+    return found
 
 
-def _has(logs: tuple[Log, ...], name: str) -> int:
-    return sum(getattr(log, name) is not None for log in logs)
-
-
-def _channel(logs: tuple[Log, ...], name: str) -> str:
-    count = _has(logs, name)
-    said = name if count == len(logs) else f"{name} ({count} of {len(logs)} runs)"
-    unsigned = name == "current" and not all(log.current_is_signed for log in logs)
-    return f"{said} (unsigned)" if unsigned else said
+def _channels(logs: tuple[Log, ...]) -> list[str]:
+    """Channels that logs have, and what is special of them."""
+    said = []
+    for name in _CHANNELS:
+        if count := sum(getattr(log, name) is not None for log in logs):
+            part = "" if count == len(logs) else f" ({count} of {len(logs)} runs)"
+            unsigned = name == "current" and not all(log.current_is_signed for log in logs)
+            said.append(f"{name}{part}{' (unsigned)' if unsigned else ''}")
+    return said
 
 
 def expected(job: Task, problem: Problem) -> Expected:
@@ -142,10 +131,5 @@ def expected(job: Task, problem: Problem) -> Expected:
 
 
 def _before(e: Estimate) -> Content:
-    return {
-        "unit": e.unit,
-        "start": e.value,
-        "expected_std": e.std,
-        "ratio": e.ratio,
-        "verdict": e.verdict,
-    }
+    kept = {"unit": e.unit, "start": e.value, "expected_std": e.std}
+    return kept | {"ratio": e.ratio, "verdict": e.verdict}

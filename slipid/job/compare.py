@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.identify.compare.cross_validation import judge
-from slipid.identify.compare.folds import Fold, folds_of
+from slipid.identify.compare.folds import Fold, folds_of, judge
 from slipid.identify.compare.predictive import Contact, contact_of
 from slipid.identify.compare.ranking import ranking
 from slipid.identify.compare.transfer import transfer
@@ -33,14 +32,10 @@ FOLDS = "folds"
 def compare(
     config_path: Path, data: Path, out: Path, questions: Sequence[str], report: Reporter
 ) -> Content:
-    """Judge every rung of the ladder on left-out runs and write comparison.json.
+    """Judge every rung of the ladder on left-out runs and write comparison.json to `out`.
 
-    Args:
-        config_path: of the job.
-        data: folder its globs start from.
-        out: folder to write to; folds that are finished there are not done again.
-        report: progress.
-        questions: what is left out: some of `slipid.identify.compare.folds.QUESTIONS`.
+    What is left out say the questions, some of `slipid.identify.compare.folds.QUESTIONS`; folds
+    that are finished in `out` are not done again.
 
     Raises:
         DataError: config, logs or questions are wrong; nothing was written then.

@@ -20,62 +20,51 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 Numbers = Number | list[Number]
 
 
-class Omni(Section):
+class Wheeled(Section):
+    """What every robot has."""
+
+    wheel_radius_m: Positive
+    gear_ratio: Positive = 1.0
+    mass_kg: Positive | None = None
+
+
+class Omni(Wheeled):
     """Wheels on a circle, each driving 90 deg ahead of its azimuth."""
 
     drive: Literal["omni"]
-    wheel_radius_m: Positive
     base_radius_m: Positive
     wheel_azimuths_deg: list[Number] = Field(min_length=3)
     roller_angle_deg: Number = 90.0
-    gear_ratio: Positive = 1.0
-    mass_kg: Positive | None = None
 
 
-class Mecanum(Section):
-    """Four mecanum wheels in X: front left, front right, rear left, rear right."""
+class Box(Wheeled):
+    """Four wheels, front left, front right, rear left, rear right: mecanum in X, or ordinary."""
 
-    drive: Literal["mecanum"]
-    wheel_radius_m: Positive
+    drive: Literal["mecanum", "skid"]
     half_length_m: Positive
     half_width_m: Positive
-    gear_ratio: Positive = 1.0
-    mass_kg: Positive | None = None
 
 
-class Skid(Section):
-    """Four ordinary wheels that point ahead, in the order of `Mecanum`."""
-
-    drive: Literal["skid"]
-    wheel_radius_m: Positive
-    half_length_m: Positive
-    half_width_m: Positive
-    gear_ratio: Positive = 1.0
-    mass_kg: Positive | None = None
-
-
-class General(Section):
+class General(Wheeled):
     """Any wheels: centres, drive directions, roller angles ("none": an ordinary wheel)."""
 
     drive: Literal["general"]
-    wheel_radius_m: Positive
     wheel_places_m: list[Annotated[list[Number], Field(min_length=2, max_length=2)]] = Field(
         min_length=2
     )
     drive_directions_deg: list[Number]
     roller_angles_deg: list[Number | Literal["none"]]
-    gear_ratio: Positive = 1.0
-    mass_kg: Positive | None = None
 
     @model_validator(mode="after")
     def _one_per_wheel(self) -> "General":
         wheels = len(self.wheel_places_m)
         for key in ("drive_directions_deg", "roller_angles_deg"):
-            if len(getattr(self, key)) != wheels:
-                raise ValueError(
-                    f"{len(getattr(self, key))} {key}; expected {wheels}, one per wheel_places_m"
-                )
+            if (count := len(getattr(self, key))) != wheels:
+                raise ValueError(f"{count} {key}; expected {wheels}, one per wheel_places_m")
         return self
+
+
+Wheels = Omni | Box | General
 
 
 class Logs(Section):
@@ -91,7 +80,7 @@ class Logs(Section):
     map: str | None = None
     load: str = "as_built"
     session: Literal["surface/load/speed", "folder", "file"] = "surface/load/speed"
-    min_rows: int = Field(2, ge=2)
+    min_rows: int = Field(default=2, ge=2)
 
     @model_validator(mode="after")
     def _one_floor_or_many(self) -> "Logs":
@@ -131,11 +120,11 @@ class Setting(Section):
 class FitSection(Section):
     """How finely runs are cut and how long to fit."""
 
-    windows_per_piece: int = Field(4, ge=1, le=32)
+    windows_per_piece: int = Field(default=4, ge=1, le=32)
     longest_window_s: Positive = 6.0
-    rounds: int = Field(30, ge=1)
+    rounds: int = Field(default=30, ge=1)
     tolerance: Positive = 0.02
-    seed: int = Field(0, ge=0)
+    seed: int = Field(default=0, ge=0)
 
 
 class ValidateSection(Section):
@@ -148,9 +137,9 @@ class SelftestSection(Section):
     """What `selftest` drives where no logs are given, what it takes for true and asks for."""
 
     surfaces: list[str] = Field(default=["firm", "soft"], min_length=1)
-    headings: int = Field(12, ge=1, le=360)
+    headings: int = Field(default=12, ge=1, le=360)
     speeds_m_s: list[Positive] = Field(default=[0.1, 0.2], min_length=1)
-    turns: int = Field(2, ge=0)
+    turns: int = Field(default=2, ge=0)
     distance_m: Positive = 0.7
     truth: dict[str, Numbers] = Field(default_factory=dict)
     wanted: list[str] | None = None
@@ -159,13 +148,13 @@ class SelftestSection(Section):
 class Content(Section):
     """The whole file."""
 
-    robot: Annotated[Omni | Mecanum | Skid | General, Field(discriminator="drive")]
+    robot: Annotated[Wheels, Field(discriminator="drive")]
     layouts: dict[str, dict[str, object]] = Field(default_factory=dict)
     logs: list[Logs] = Field(min_length=1)
     camera: Camera = Camera()
     parameters: dict[str, Setting] = Field(default_factory=dict)
-    fit: FitSection = FitSection()  # type: ignore[call-arg]
-    selftest: SelftestSection = SelftestSection()  # type: ignore[call-arg]
+    fit: FitSection = FitSection()
+    selftest: SelftestSection = SelftestSection()
     validate_: ValidateSection = Field(default_factory=ValidateSection, alias="validate")
 
     @model_validator(mode="after")
@@ -185,13 +174,7 @@ def one_floor(sections: Sequence[Logs]) -> list[Logs]:
 
 @dataclass(frozen=True)
 class Config:
-    """A config file that was read and found right.
-
-    Attributes:
-        path: the file.
-        text: as it was, to be kept beside the results.
-        content: what it says.
-    """
+    """A config file that was read and found right; its text is kept beside the results."""
 
     path: Path
     text: str
@@ -204,11 +187,7 @@ class Config:
 
 
 def read_config(path: Path) -> Config:
-    """Config from a TOML file.
-
-    Raises:
-        DataError: unreadable, no TOML, unknown or missing keys, wrong values; every one on a line.
-    """
+    """Config from a TOML file; errors as of `parsed`, and where it is unreadable."""
     return parsed(path, text_of(path))
 
 
@@ -221,24 +200,14 @@ def parsed(path: Path, text: str) -> Config:
     return Config(path, text, content(path, text, Content))
 
 
-def geometry(robot: Omni | Mecanum | Skid | General) -> Geometry:
+def geometry(robot: Wheels) -> Geometry:
     """Geometry of a `[robot]` section; ValueError where it cannot drive."""
+    radius, gear = robot.wheel_radius_m, robot.gear_ratio
     if isinstance(robot, Omni):
-        return g.omni(
-            robot.wheel_azimuths_deg,
-            robot.base_radius_m,
-            robot.wheel_radius_m,
-            robot.gear_ratio,
-            robot.roller_angle_deg,
-        )
-    if isinstance(robot, General):
-        rollers = [None if a == "none" else float(a) for a in robot.roller_angles_deg]
-        return g.general(
-            robot.wheel_places_m,
-            robot.drive_directions_deg,
-            rollers,
-            robot.wheel_radius_m,
-            robot.gear_ratio,
-        )
-    make = g.mecanum if isinstance(robot, Mecanum) else g.skid_steer
-    return make(robot.half_length_m, robot.half_width_m, robot.wheel_radius_m, robot.gear_ratio)
+        azimuths, base = robot.wheel_azimuths_deg, robot.base_radius_m
+        return g.omni(azimuths, base, radius, gear, robot.roller_angle_deg)
+    if isinstance(robot, Box):
+        make = g.mecanum if robot.drive == "mecanum" else g.skid_steer
+        return make(robot.half_length_m, robot.half_width_m, radius, gear)
+    rollers = [None if a == "none" else float(a) for a in robot.roller_angles_deg]
+    return g.general(robot.wheel_places_m, robot.drive_directions_deg, rollers, radius, gear)

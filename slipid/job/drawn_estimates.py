@@ -1,5 +1,6 @@
 """Numbers of a robot from draws of its posterior: means, intervals, verdicts."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -7,7 +8,7 @@ import numpy as np
 
 from slipid.identify import slip_curves as curves_of
 from slipid.identify.fit.problem import Problem
-from slipid.identify.fit_file import curves_json, identified_json, number_json
+from slipid.identify.fit_json import curves_json, identified_json, number_json
 from slipid.identify.posterior.sample import Posterior
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import (
@@ -40,7 +41,7 @@ def estimates(fit: Fit, found: Posterior) -> dict[str, Estimate]:
         mean = np.asarray(d.to_si(jnp.asarray(z.mean(axis=0)))).tolist()
         std = values.std(axis=0).tolist()
         single = len(pairs) == 1
-        kept = old.verdict == "at_bound" or (e.path in NEEDS_VOLTAGE and not fit.has["voltage"])
+        kept = old.verdict == "at_bound" or (e.path in NEEDS_VOLTAGE and not fit.channels.voltage)
         verdict = old.verdict if kept else by_ratio(ratio, from_zero(d, z.std(axis=0)))
         pull = (z.mean(axis=0) - fit.space.prior_mean[at]) / fit.space.prior_std[at]
         out[e.path] = replace(
@@ -57,19 +58,19 @@ def estimates(fit: Fit, found: Posterior) -> dict[str, Estimate]:
     return out
 
 
-def identified(fit: Fit, found: Posterior, problem: Problem) -> Content:
-    """Content of identified.json with what the posterior says."""
-    numbers = estimates(fit, found)
+def identified(
+    fit: Fit, found: Posterior, numbers: Mapping[str, Estimate], problem: Problem
+) -> Content:
+    """Content of identified.json with what the posterior says, `numbers` being its estimates."""
     content = identified_json(fit)
     for path, e in numbers.items():
         content["parameters"][path] = number_json(e)
     flat = found.z.reshape(-1, fit.space.size)
-    ratios = derived(fit.space, flat.mean(axis=0), np.cov(flat.T), fit.has["voltage"])
+    ratios = derived(fit.space, flat.mean(axis=0), np.cov(flat.T), fit.channels.voltage)
     content["derived"] = {e.path: number_json(_drawn(e, fit, flat)) for e in ratios}
     some = flat[:: max(1, len(flat) // 400)]
-    content["curves"] = curves_json(
-        curves_of.curves(fit.space, flat.mean(axis=0), some, problem.batch)
-    )
+    curves = curves_of.curves(fit.space, flat.mean(axis=0), some, problem.batch)
+    content["curves"] = curves_json(curves)
     if not found.converged:
         content["messages"].append(f"the posterior did not converge: {found.reason}")
     return content

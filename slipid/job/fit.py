@@ -22,13 +22,9 @@ CHECKPOINT = "checkpoint"
 
 
 def optimised(task: Task, problem: Problem, kept: Checkpoint | None, report: Reporter) -> Optimum:
-    """Optimum of a task.
+    """Optimum of a task, whose problem is `task.problem()`.
 
-    Args:
-        task: runs, robot and wishes.
-        problem: `task.problem()`.
-        kept: goes on from its state of this very task, and keeps every round there.
-        report: progress.
+    It goes on from the state that was kept of this very task, and keeps every round.
     """
     wanted = task.settings
     start, history = _restored(kept)
@@ -61,15 +57,9 @@ def _restored(kept: Checkpoint | None) -> tuple[State | None, list[float]]:
     found = None if kept is None else kept.load(CHECKPOINT)
     if found is None:
         return None, []
-    state = State(
-        z=found["z"],
-        log_variance=found["log_variance"],
-        round=int(found["round"]),
-        loss=float(found["loss"]),
-        moved=float(found["moved"]),
-        stage=str(found["stage"]),
-    )
-    return state, found["history"].tolist()
+    history = found.pop("history").tolist()
+    plain: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in found.items()}
+    return State(**plain), history
 
 
 class _Rounds:
@@ -125,7 +115,6 @@ def _with_baselines(fit: Fit, task: Task) -> Fit:
     except ValueError:  # wheels that do not fix the twist: none of them applies
         return fit
     cut = task.windows(fit.robot)
-    learnt = [rung.fit(cut, fit.robot) for rung in rungs(fit.has["current"])]
-    return fit.with_baselines(
-        {r.name: {floor: v.tolist() for floor, v in r.state.items()} for r in learnt}
-    )
+    learnt = [rung.fit(cut, fit.robot) for rung in rungs(fit.channels.current)]
+    plain = {r.name: {floor: v.tolist() for floor, v in r.state.items()} for r in learnt}
+    return replace(fit, baselines=plain)

@@ -2,12 +2,10 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from slipid.identify.fit.optimise import Optimum
-from slipid.identify.fit.problem import Problem
 from slipid.identify.fit_file import save
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.profile import Profile, profile, profiled
@@ -37,12 +35,7 @@ def identify(
 ) -> Identified:
     """Fit the robot of a config to its logs and write everything to `out`.
 
-    Args:
-        config_path: of the job.
-        data: folder its globs start from.
-        out: folder to write to; a fit that was interrupted there goes on.
-        report: progress.
-        profiles: paths of numbers whose profile likelihood is wanted, too.
+    A fit that was interrupted there goes on. Profile likelihoods are made of the numbers named.
 
     Raises:
         DataError: config or logs are wrong; nothing was written then.
@@ -66,53 +59,38 @@ def identify(
     optimum = optimised(job, problem, kept, report)
     fit = summarised(job, problem, optimum, report)
     report.stage("writing")
-    written = list(save(fit, out))
+    written = (*save(fit, out), "run.json", "config.toml")
     _keep_run(job, data, out, time.monotonic() - began)
-    written += ["run.json", "config.toml"]
     if profiles and job.mixed:
         report.line("profiles are of the runs on one floor each")
-    found = _profiles(problem, optimum, profiles, report)
-    if found:
-        each = {p.path: p.to_json() for p in found}
-        write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
-        written.append("profile.json")
-    kept.remove(f"{CHECKPOINT}.npz")
-    return Identified(fit, job, found, tuple(written))
-
-
-def _profiles(
-    problem: Problem, optimum: Optimum, paths: Sequence[str], report: Reporter
-) -> tuple[Profile, ...]:
-    """Profile likelihoods of some numbers."""
 
     def tell(points: int, rise: float) -> None:
         report.note(f"{points} points, rise {rise:.2f}")
 
     found = []
-    for path in dict.fromkeys(paths):
+    for path in dict.fromkeys(profiles):
         report.stage(f"profile of {path}")
         found.append(profile(problem, optimum, path, tell))
-    return tuple(found)
+    if found:
+        each = {p.path: asdict(p) for p in found}
+        write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
+        written = (*written, "profile.json")
+    kept.remove(f"{CHECKPOINT}.npz")
+    return Identified(fit, job, tuple(found), written)
 
 
 def _keep_run(job: Job, data: Path, out: Path, seconds: float) -> None:
     """What later commands and readers need to know of this run."""
     config = job.config
     write_bytes(out / "config.toml", config.text.encode())
-    write_json(
-        out / "run.json",
-        {
-            "schema": "slipid.run/1",
-            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-            "seconds": round(seconds, 1),
-            "config": {"name": config.path.name, "sha256": config.hash},
-            "data": {
-                "folder": str(data),
-                "hash": job.data_hash,
-                "logs": {log.name: log.sha256 for log in job.logs},
-                "skipped": list(job.skipped),
-            },
-            "seed": job.settings.seed,
-            "versions": versions(),
-        },
-    )
+    logs = {log.name: log.sha256 for log in job.logs}
+    run = {
+        "schema": "slipid.run/1",
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seconds": round(seconds, 1),
+        "config": {"name": config.path.name, "sha256": config.hash},
+        "data": {"folder": str(data), "hash": job.data_hash, "logs": logs, "skipped": job.skipped},
+        "seed": job.settings.seed,
+        "versions": versions(),
+    }
+    write_json(out / "run.json", run)

@@ -59,11 +59,10 @@ load = "as_built"                     # one name per way the robot was loaded
 # from the motor's datasheet; without voltages they stay what is written here
 "motor.resistance" = {{ prior = {{ mean = 1.0, std = 0.5 }} }}     # [ohm]
 "motor.back_emf" = {{ prior = {{ mean = 0.05, std = 0.025 }} }}    # [V s/rad]
-
-[fit]
-windows_per_piece = 4
-longest_window_s = 6.0
 """
+
+
+_AZIMUTHS = "wheel_azimuths_deg = [60, 180, 300]   # of the centres; each drives 90 deg further"
 
 
 @dataclass(frozen=True)
@@ -72,10 +71,8 @@ class Answers:
 
     Attributes:
         drive: omni, mecanum or skid.
-        wheel_radius_m: of the wheels [m].
         base_m: distance of the wheels from the middle [m]; of mecanum and skid along both axes.
         gear_ratio: turns of the motor per turn of the wheel.
-        mass_kg: of the robot [kg].
         ticks_per_revolution: of the encoder, per turn of the motor.
     """
 
@@ -98,12 +95,9 @@ def write_new(out: Path, answers: Answers, force: bool = False) -> None:
         raise DataError(f"{out}: exists already; expected a new file, or --force")
     if drive not in ("omni", "mecanum", "skid"):
         raise DataError(f"drive '{drive}'; expected one of omni, mecanum, skid")
-    wheels = 3 if drive == "omni" else 4
-    circle = (
-        "wheel_azimuths_deg = [60, 180, 300]   # of the wheel centres; each drives 90 deg further\n"
-        f"base_radius_m = {base:g}"
-    )
-    box = f"half_length_m = {base:g}\nhalf_width_m = {base:g}"
+    wheels, shape = 4, f"half_length_m = {base:g}\nhalf_width_m = {base:g}"
+    if drive == "omni":
+        wheels, shape = 3, f"{_AZIMUTHS}\nbase_radius_m = {base:g}"
     columns = {
         f"{what}_columns": ", ".join(f'"{what}_{k + 1}"' for k in range(wheels))
         for what in ("ticks", "current", "voltage")
@@ -111,7 +105,7 @@ def write_new(out: Path, answers: Answers, force: bool = False) -> None:
     text = _TEMPLATE.format(
         name=out.name,
         drive=drive,
-        shape=circle if drive == "omni" else box,
+        shape=shape,
         radius=f"{answers.wheel_radius_m:g}",
         gear=f"{answers.gear_ratio:g}",
         mass=f"{answers.mass_kg:g}",

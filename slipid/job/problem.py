@@ -17,8 +17,9 @@ from slipid.identify.result import hash_of
 from slipid.job.config import Config, FitSection, Logs, geometry, one_floor
 from slipid.job.logs import files_of, read_dataset
 from slipid.model.geometry import Geometry
-from slipid.model.robot import Robot, build
-from slipid.parameter import Choice, Space, entries
+from slipid.model.robot import Robot
+from slipid.parameter import entries
+from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -81,12 +82,7 @@ class Job(Task):
 
 
 def read_job(config: Config, root: Path, report: Reporter) -> Job:
-    """Read every log of runs on one floor that the config names and set up its robot.
-
-    Args:
-        config: what is wanted.
-        root: data folder the globs are relative to.
-        report: told how many files are read, and what the config names in vain.
+    """Read every log of runs on one floor that the config names below a folder, set up its robot.
 
     Raises:
         DataError: what is wrong with config or logs.
@@ -97,32 +93,26 @@ def read_job(config: Config, root: Path, report: Reporter) -> Job:
 
 
 def with_mixed(job: Job, root: Path, report: Reporter) -> Job:
-    """The job with the runs over several floors that its config names, arguments as of `read_job`.
+    """The job with the runs over several floors that its config names.
 
     Raises:
         DataError: what is wrong with maps or logs.
     """
     wanted = [section for section in job.config.content.logs if section.map is not None]
     found, absent = files_of(job.config, wanted, root)
-    sets = []
     for section, _ in found:
         floor = _map(job, section)
         data, short = read_dataset(job.config, [section], root, report)
         absent += short
         _go_together(job, data)
-        sets.append((data, floor))
-        job = replace(job, mixed=tuple(sets))
+        job = replace(job, mixed=(*job.mixed, (data, floor)))
     for sentence in absent:
         report.line(sentence)
     return replace(job, skipped=(*job.skipped, *absent))
 
 
 def _map(job: Job, section: Logs) -> FloorMap:
-    """Map of a log section.
-
-    Raises:
-        DataError: unreadable, or of a floor that no run keeps to.
-    """
+    """Map of a log section; DataError where it is unreadable, or of a floor no run keeps to."""
     path = job.config.path.parent / str(section.map)
     floor = read_map(path)
     known = job.robot.surfaces.labels
@@ -163,34 +153,25 @@ def job_of(config: Config, dataset: Runs, skipped: Sequence[str], report: Report
             f"{config.path}: robot: {shape.wheels} wheels, but {dataset.logs[0].name} has "
             f"{dataset.logs[0].wheels}; expected the same"
         )
-    robot = build(
-        shape,
-        sorted({log.surface or "unknown" for log in dataset.logs}),
-        sorted({log.load for log in dataset.logs}),
-        sorted(set(dataset.session)),
-        centre=config.content.camera.image_centre_m,
-    )
+    robot = on_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
     choices, left_out = _choices(config, robot)
-    skipped = [*skipped, *left_out]
     choices = still_viscosities(dataset) + choices  # what the user says comes later and wins
+    skipped = (*skipped, *left_out)
     for sentence in skipped:
         report.line(sentence)
-    return Job(
-        dataset=dataset,
-        robot=robot,
-        choices=tuple(choices),
-        settings=config.content.fit,
-        config=config,
-        skipped=tuple(skipped),
-    )
+    settings = config.content.fit
+    return Job(dataset, robot, tuple(choices), settings, config=config, skipped=skipped)
+
+
+def on_runs(robot: Robot, runs: Runs, centre: tuple[float, float]) -> Robot:
+    """A robot for the floors, load set-ups and sessions of some runs; image centre [m]."""
+    floors = {log.surface or "unknown" for log in runs.logs}
+    loads = {log.load for log in runs.logs}
+    return robot.on(sorted(floors), sorted(loads), sorted(set(runs.session)), centre)
 
 
 def shape_of(config: Config) -> Geometry:
-    """Geometry of the config's robot.
-
-    Raises:
-        DataError: it cannot drive.
-    """
+    """Geometry of the config's robot; DataError where it cannot drive."""
     try:
         return geometry(config.content.robot)
     except ValueError as error:
@@ -213,11 +194,8 @@ def said_of(robot: Robot, mass: float) -> list[Choice]:
 
 def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
     """The config's parameter settings, checked, less those of floors and loads that are absent."""
-    paths = [e.path for e in entries(robot)]
-    choices: list[Choice] = []
-    skipped: list[str] = []
-    mass = config.content.robot.mass_kg
-    choices += said_of(robot, float(robot.body.mass) if mass is None else mass)
+    paths, skipped = [e.path for e in entries(robot)], []
+    choices = said_of(robot, config.content.robot.mass_kg or float(robot.body.mass))
     for pattern, setting in config.content.parameters.items():
         if not fnmatch.filter(paths, pattern):
             if fnmatch.filter(paths, _any_label(pattern)):
@@ -229,14 +207,8 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
                 f"{config.path}: parameters.'{pattern}': no such parameter{hint}; "
                 f"expected one of {', '.join(paths)}"
             )
-        choice = Choice(
-            pattern,
-            start=setting.start,
-            fixed=setting.fixed,
-            free=setting.free,
-            prior_mean=None if setting.prior is None else setting.prior.mean,
-            prior_std=None if setting.prior is None else setting.prior.std,
-        )
+        prior = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)
+        choice = Choice(pattern, setting.start, setting.fixed, setting.free, *prior)
         try:
             Space(robot, [choice])
         except ValueError as error:

@@ -39,11 +39,8 @@ class Sampled:
     """End of `sample`.
 
     Attributes:
-        fit: that was sampled around.
-        posterior: the draws.
         parameters: numbers from the draws, by path.
-        content: of identified.json.
-        about: content of sample.json: how the chains did.
+        content: of identified.json; about: of sample.json: how the chains did.
         written: names of the files.
     """
 
@@ -58,11 +55,11 @@ class Sampled:
 def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporter) -> Sampled:
     """Sample around the fit in `out`: posterior.nc, sample.json, intervals in identified.json.
 
+    A chain that was interrupted there goes on.
+
     Args:
-        out: folder `identify` wrote; a chain that was interrupted there goes on.
-        data: folder of the logs; None for where they were fitted.
-        plan: of the chain.
-        draws: that are kept of each ensemble.
+        out: folder `identify` wrote; data: of the logs, None for where they were fitted.
+        plan: of the chain; draws: that are kept of each ensemble.
         report: progress.
 
     Raises:
@@ -81,7 +78,8 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     found = sampled_around(fit, problem, plan, draws, kept, report)
     report.stage("writing")
     about = _summary(found, plan, time.monotonic() - began)
-    content = identified(fit, found, problem)
+    numbers = estimates(fit, found)
+    content = identified(fit, found, numbers, problem)
     marks = {k: str(v) for k, v in about.items() if not isinstance(v, dict)}
     marks |= {"schema": netcdf.SCHEMA, "data_hash": fit.data_hash}
     runs = tuple(log.name for log in job.dataset.logs)
@@ -91,7 +89,7 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     if found.converged:
         kept.remove()
     written = ("posterior.nc", "sample.json", "identified.json")
-    return Sampled(fit, found, estimates(fit, found), content, about, written)
+    return Sampled(fit, found, numbers, content, about, written)
 
 
 def _everything(fit: Fit, plan: Plan, draws: int) -> tuple[object, ...]:
@@ -109,17 +107,10 @@ def sampled_around(
     kept: Checkpoint | None,
     report: Reporter,
 ) -> Posterior:
-    """Posterior of a fit.
+    """Posterior of a fit by the likelihood it was made of; arguments as of `sample`.
 
-    Args:
-        fit: that is sampled around.
-        problem: the likelihood it was made of.
-        plan: of the chain.
-        draws: that are kept of each ensemble.
-        kept: goes on from the blocks that an earlier call has left there, and keeps new ones.
-        report: progress.
+    It goes on from the blocks that an earlier call has kept, and keeps new ones.
     """
-    watch = _Watch(plan, report)
 
     def done(part: str) -> list[Block]:
         blocks: list[Block] = []
@@ -134,44 +125,35 @@ def sampled_around(
     def keep(part: str, block: Block) -> None:
         if kept is not None:
             kept.save(_name(part, block.number), packed(block))
-        watch.block(part, block)
+        _tell(part, block, plan, report)
+
+    def steps(part: str, count: int) -> None:
+        report.stage(f"sampling {part}")
 
     variance = np.array([fit.variance[name] for name in problem.noise.names])
     shared = {k: v for k, v in fit.variance.items() if k not in problem.noise.names}
     fitted = Fitted(fit.z, np.log(variance), fit.laplace, shared)
-    return posterior.sample(
-        problem, fitted, plan, draws=draws, record=Record(done, keep, watch.steps)
-    )
+    return posterior.sample(problem, fitted, plan, draws=draws, record=Record(done, keep, steps))
 
 
 def _name(part: str, number: int) -> str:
     return f"{part}-{number:04d}"
 
 
-class _Watch:
+def _tell(part: str, block: Block, plan: Plan, report: Reporter) -> None:
     """Progress of a chain; the time left is what it takes at most."""
-
-    def __init__(self, plan: Plan, report: Reporter):
-        self.plan, self.report = plan, report
-
-    def steps(self, part: str, steps: int) -> None:
-        """Every ensemble has done so many steps of a block."""
-        self.report.stage(f"sampling {part}")
-
-    def block(self, part: str, block: Block) -> None:
-        """A block is done and kept."""
-        count = block.number + 1
-        first = not part.startswith(ELECTRIC)
-        warm = "warm-up, " if first and count <= self.plan.warm_up[-1] else ""
-        what = (
-            f"block {count}: {warm}{count * block.chain.shape[1]} steps, "
-            f"{100 * block.accepted.mean():.0f} % moved, "
-            f"log density {block.log_prob[:, -1].mean():.1f}"
-        )
-        if first:
-            self.report.advance(count, self.plan.most, what)
-        else:  # how many blocks the second stage takes is not known
-            self.report.note(what)
+    count = block.number + 1
+    first = not part.startswith(ELECTRIC)
+    warm = "warm-up, " if first and count <= plan.warm_up[-1] else ""
+    what = (
+        f"block {count}: {warm}{count * block.chain.shape[1]} steps, "
+        f"{100 * block.accepted.mean():.0f} % moved, "
+        f"log density {block.log_prob[:, -1].mean():.1f}"
+    )
+    if first:
+        report.advance(count, plan.most, what)
+    else:  # how many blocks the second stage takes is not known
+        report.note(what)
 
 
 def _summary(found: Posterior, plan: Plan, seconds: float) -> Content:
@@ -203,11 +185,7 @@ def _summary(found: Posterior, plan: Plan, seconds: float) -> Content:
 
 
 def _where_the_logs_are(out: Path, data: Path | None) -> Path:
-    """The data folder: as given, else where the fit found its logs.
-
-    Raises:
-        DataError: not given and no longer there.
-    """
+    """The data folder: as given, else where the fit found its logs, if they are still there."""
     if data is not None:
         return data
     run = read_json(out / "run.json", "what `slipid identify` keeps of a run")
@@ -218,12 +196,8 @@ def _where_the_logs_are(out: Path, data: Path | None) -> Path:
 
 
 def _on_one_floor(fit: Fit) -> None:
-    """Refuse a fit that learnt from runs over several floors: their likelihood is not sampled.
-
-    Raises:
-        DataError: it did.
-    """
-    if "mixed" in fit.settings:
+    """Refuse a fit that learnt from runs over several floors: their likelihood is not sampled."""
+    if fit.mixed is not None:
         raise DataError(
             "the fit learnt from runs over several floors, which are not sampled yet; "
             "expected a fit without the log sections that have a map (identify again without them)"
@@ -231,11 +205,7 @@ def _on_one_floor(fit: Fit) -> None:
 
 
 def _same_logs(fit: Fit, job: Job) -> None:
-    """Refuse logs other than those that were fitted.
-
-    Raises:
-        DataError: names the first that differs.
-    """
+    """Refuse logs other than those that were fitted; names the first that differs."""
     then, now = dict(fit.runs), {log.name: log.sha256 for log in job.dataset.logs}
     for name in [*then, *now]:
         if then.get(name) != now.get(name):

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from slipid.data.runs import Runs
+from slipid.identify.compare.predictive import Contact
 from slipid.identify.compare.slip_models import restored
-from slipid.identify.compare.validation import Predictor, validation
+from slipid.identify.compare.validation import validation
 from slipid.identify.fit_file import load
 from slipid.identify.result import Fit
 from slipid.job.config import one_floor, read_config
@@ -26,12 +27,7 @@ class Validated:
 
 
 def validate(out: Path, data: Path, report: Reporter) -> Validated:
-    """Predict runs with the fit in `out`, and with every simpler model that it learnt.
-
-    Args:
-        out: folder `identify` wrote.
-        data: folder the globs of its config start from.
-        report: progress.
+    """Predict runs of `data` with the fit in `out`, and with every simpler model that it learnt.
 
     Raises:
         DataError: no fit there, or logs that it cannot predict.
@@ -53,5 +49,5 @@ def validate(out: Path, data: Path, report: Reporter) -> Validated:
         rungs = restored(dict(fit.baselines))
     except ValueError as error:
         raise DataError(f"{out / 'fit.json'}: {error}") from error
-    fitted = Predictor(fit.robot, fit.space, fit.z, fit.covariance, dict(fit.variance), rungs)
-    return Validated(fit, dataset, validation(fitted, dataset).to_json())
+    fitted = Contact(fit.robot, fit.variance, fit.covariance, fit.space, fit.z)
+    return Validated(fit, dataset, validation(fitted, rungs, dataset).to_json())

@@ -1,11 +1,16 @@
 """From the body on the floor to the logged pose: scale, tilt, lens, marker."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from slipid.parameter import parameter
+
+known = partial(parameter, free=False)
+"""Held where it is unless the user says otherwise."""
 
 
 class Camera(eqx.Module):
@@ -18,57 +23,26 @@ class Camera(eqx.Module):
     on.
     """
 
-    scale: Array = parameter(
-        unit="1",
-        symbol="s",
-        start=1.0,
-        lower=0.0,
-        spread=0.02,
-        free=False,
-        doc="true over logged length",
+    scale: Array = known(
+        unit="1", symbol="s", start=1.0, lower=0.0, spread=0.02, doc="true over logged length"
     )
-    lag: Array = parameter(
-        unit="s", symbol="t_c", start=0.0, spread=0.03, free=False, doc="camera behind the encoders"
+    lag: Array = known(
+        unit="s", symbol="t_c", start=0.0, spread=0.03, doc="camera behind the encoders"
     )
-    marker_yaw: Array = parameter(
-        unit="rad",
-        symbol="psi",
-        start=0.0,
-        spread=0.03,
-        free=False,
-        doc="marker heading less body's",
+    marker_yaw: Array = known(
+        unit="rad", symbol="psi", start=0.0, spread=0.03, doc="marker heading less body's"
     )
-    session_yaw: Array = parameter(
-        unit="rad",
-        symbol="dpsi",
-        start=0.0,
-        spread=0.01,
-        free=False,
-        per="sessions",
-        doc="its change",
+    session_yaw: Array = known(
+        unit="rad", symbol="dpsi", start=0.0, spread=0.01, per="sessions", doc="its change"
     )
-    marker_place: Array = parameter(
-        unit="m",
-        symbol="p_m",
-        start=0.0,
-        spread=0.02,
-        free=False,
-        doc="marker from the body's centre",
+    marker_place: Array = known(
+        unit="m", symbol="p_m", start=0.0, spread=0.02, doc="marker from the body's centre"
     )
-    tilt: Array = parameter(
-        unit="1/m",
-        symbol="h",
-        start=0.0,
-        spread=0.03,
-        free=False,
-        doc="perspective of a tilted camera",
+    tilt: Array = known(
+        unit="1/m", symbol="h", start=0.0, spread=0.03, doc="perspective of a tilted camera"
     )
-    radial: Array = parameter(
-        unit="1/m^2", symbol="k", start=0.0, spread=0.02, free=False, doc="radial distortion"
-    )
-    tangential: Array = parameter(
-        unit="1/m", symbol="p", start=0.0, spread=0.02, free=False, doc="decentred lens"
-    )
+    radial: Array = known(unit="1/m^2", symbol="k", start=0.0, spread=0.02, doc="radial distortion")
+    tangential: Array = known(unit="1/m", symbol="p", start=0.0, spread=0.02, doc="decentred lens")
     centre: tuple[float, float] = eqx.field(static=True, default=(0.0, 0.0))
     sessions: tuple[str, ...] = eqx.field(static=True, default=())
 

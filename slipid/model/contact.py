@@ -120,17 +120,15 @@ def _root_near(problem: ContactProblem) -> Float[Array, "3"]:
     return jnp.where(jnp.max(jnp.abs(step)) > _NEAR, jnp.nan, xi)
 
 
-Root = Callable[[ContactProblem], Array]
+One = tuple[ContactProblem]
 
 
 def _implicit(
-    root: Root,
-) -> Callable[[tuple[ContactProblem], tuple[ContactProblem]], tuple[Array, Array]]:
+    root: Callable[[ContactProblem], Array],
+) -> Callable[[One, One], tuple[Array, Array]]:
     """Derivative of a root of the balance by what it depends on."""
 
-    def rule(
-        primals: tuple[ContactProblem], tangents: tuple[ContactProblem]
-    ) -> tuple[Array, Array]:
+    def rule(primals: One, tangents: One) -> tuple[Array, Array]:
         xi = root(*primals)
         at = Planar(*xi)
         _, force = jax.jvp(lambda problem: problem.balance().force(at), primals, tangents)

@@ -35,11 +35,9 @@ def inverse_contact(
     goes by the last one's.
 
     Args:
-        frame: wheel directions.
         floors: stacked, leaves (floor,).
         rest: load shares at rest.
         inverse: J^+, twist per rim speed without slip.
-        xi: wanted twist [m/s, m/s, rad/s].
         surface: probability of each floor under each wheel, sums 1.
 
     Source: `slipid.model.contact_law`; rollers at right angles.

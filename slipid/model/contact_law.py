@@ -27,6 +27,7 @@ Every function here is elementwise: it takes arrays of any shapes that broadcast
 """
 
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -47,6 +48,9 @@ W0 = 0.05
 """Yaw rate below which the scrub moment is viscous [rad/s]."""
 
 
+positive = partial(parameter, lower=0.0)
+
+
 class ContactSurface(eqx.Module):
     """What a floor does to rolling wheels; leaves may be stacked, one row per label.
 
@@ -56,40 +60,29 @@ class ContactSurface(eqx.Module):
         labels: names of the stacked surfaces.
     """
 
-    friction: Array = parameter(
-        unit="1",
-        symbol="mu",
-        start=0.4,
-        lower=0.0,
-        spread=0.5,
-        doc="friction coefficient",
-        electric=True,
+    friction: Array = positive(
+        unit="1", symbol="mu", start=0.4, spread=0.5, doc="friction coefficient", electric=True
     )
-    creep: Array = parameter(
-        unit="1", symbol="s0", start=0.3, lower=0.0, spread=1.5, doc="slip ratio of full traction"
+    creep: Array = positive(
+        unit="1", symbol="s0", start=0.3, spread=1.5, doc="slip ratio of full traction"
     )
-    roller_drag: Array = parameter(
-        unit="1", symbol="cr", start=0.3, lower=0.0, spread=1.5, doc="drag of sideways rolling"
+    roller_drag: Array = positive(
+        unit="1", symbol="cr", start=0.3, spread=1.5, doc="drag of sideways rolling"
     )
-    roller_creep: Array = parameter(
-        unit="1",
-        symbol="sr",
-        start=0.2,
-        lower=0.0,
-        spread=1.5,
-        doc="roller speed ratio of full drag",
+    roller_creep: Array = positive(
+        unit="1", symbol="sr", start=0.2, spread=1.5, doc="roller speed ratio of full drag"
     )
-    rolling_resistance: Array = parameter(
-        unit="1", symbol="crr", start=0.005, lower=0.0, spread=2.0, doc="resistance along the drive"
+    rolling_resistance: Array = positive(
+        unit="1", symbol="crr", start=0.005, spread=2.0, doc="resistance along the drive"
     )
-    slide_viscosity: Array = parameter(
-        unit="s/m", symbol="kv", start=0.02, lower=0.0, spread=2.0, doc="traction per sliding speed"
+    slide_viscosity: Array = positive(
+        unit="s/m", symbol="kv", start=0.02, spread=2.0, doc="traction per sliding speed"
     )
-    roller_viscosity: Array = parameter(
-        unit="s/m", symbol="kl", start=0.02, lower=0.0, spread=2.0, doc="drag per roller speed"
+    roller_viscosity: Array = positive(
+        unit="s/m", symbol="kl", start=0.02, spread=2.0, doc="drag per roller speed"
     )
-    scrub: Array = parameter(
-        unit="m", symbol="cz", start=0.002, lower=0.0, spread=2.0, doc="moment against turning"
+    scrub: Array = positive(
+        unit="m", symbol="cz", start=0.002, spread=2.0, doc="moment against turning"
     )
     lead: Array = parameter(
         unit="m", symbol="b", start=0.002, spread=0.01, doc="contact ahead of the wheel centre"

@@ -142,37 +142,28 @@ def omni(
 ) -> Geometry:
     """Omni robot of any number of wheels, each driving 90 deg ahead of its azimuth."""
     d = np.radians(np.asarray(azimuth_deg, float))
-    return general(
-        np.stack([np.cos(d), np.sin(d)], -1) * base_radius,
-        np.degrees(d) + 90.0,
-        [roller_deg] * len(d),
-        wheel_radius,
-        gear_ratio,
-    )
+    place, ways = np.stack([np.cos(d), np.sin(d)], -1) * base_radius, np.degrees(d) + 90.0
+    return general(place, ways, [roller_deg] * len(d), wheel_radius, gear_ratio)
 
 
 def mecanum(
     half_length: float, half_width: float, wheel_radius: float, gear_ratio: float = 1.0
 ) -> Geometry:
     """Four mecanum wheels in X: front left, front right, rear left, rear right."""
-    a, b = half_length, half_width
-    return general(
-        [(a, b), (a, -b), (-a, b), (-a, -b)],
-        [0.0] * 4,
-        [135.0, 45.0, 45.0, 135.0],
-        wheel_radius,
-        gear_ratio,
-    )
+    corners = _corners(half_length, half_width)
+    return general(corners, [0.0] * 4, [135.0, 45.0, 45.0, 135.0], wheel_radius, gear_ratio)
 
 
 def skid_steer(
     half_length: float, half_width: float, wheel_radius: float, gear_ratio: float = 1.0
 ) -> Geometry:
     """Four ordinary wheels that all point ahead: front left, front right, rear left, rear right."""
-    a, b = half_length, half_width
-    return general(
-        [(a, b), (a, -b), (-a, b), (-a, -b)], [0.0] * 4, [None] * 4, wheel_radius, gear_ratio
-    )
+    corners = _corners(half_length, half_width)
+    return general(corners, [0.0] * 4, [None] * 4, wheel_radius, gear_ratio)
+
+
+def _corners(a: float, b: float) -> list[tuple[float, float]]:
+    return [(a, b), (a, -b), (-a, b), (-a, -b)]
 
 
 def general(

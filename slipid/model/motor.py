@@ -14,6 +14,10 @@ REST = 2.5
 """Motor speed below which a sign is not trusted, about one speed quantum [rad/s]."""
 
 
+held = partial(electric, free=False)
+"""Not fitted unless the user says so."""
+
+
 class Motor(eqx.Module):
     """Brushed DC motor behind a gear; all wheels have the same.
 
@@ -27,21 +31,14 @@ class Motor(eqx.Module):
     back_emf: Array = electric(
         unit="V*s/rad", symbol="C_e", start=0.05, lower=0.0, spread=0.5, doc="back-EMF constant"
     )
-    inductance: Array = electric(
-        unit="H", symbol="L_a", start=0.005, lower=0.0, spread=1.0, free=False, doc="inductance"
+    inductance: Array = held(
+        unit="H", symbol="L_a", start=0.005, lower=0.0, spread=1.0, doc="inductance"
     )
-    brush_drop: Array = electric(
-        unit="V", symbol="U_b", start=0.0, spread=0.5, free=False, doc="voltage drop of the brushes"
+    brush_drop: Array = held(
+        unit="V", symbol="U_b", start=0.0, spread=0.5, doc="voltage drop of the brushes"
     )
-    efficiency: Array = electric(
-        unit="1",
-        symbol="eta",
-        start=0.9,
-        lower=0.0,
-        upper=1.001,
-        spread=0.5,
-        free=False,
-        doc="gear",
+    efficiency: Array = held(
+        unit="1", symbol="eta", start=0.9, lower=0.0, upper=1.001, spread=0.5, doc="gear"
     )
     coulomb_friction: Array = electric(
         unit="N*m", symbol="tau_c", start=0.02, lower=0.0, spread=1.5, doc="friction at the wheel"
@@ -49,11 +46,11 @@ class Motor(eqx.Module):
     viscous_friction: Array = electric(
         unit="N*m*s/rad", symbol="b_w", start=0.005, lower=0.0, spread=1.5, doc="friction per speed"
     )
-    current_offset: Array = electric(
-        unit="A", symbol="I_0", start=0.0, spread=0.05, free=False, doc="zero of the ammeter"
+    current_offset: Array = held(
+        unit="A", symbol="I_0", start=0.0, spread=0.05, doc="zero of the ammeter"
     )
-    rotor_inertia: Array = electric(
-        unit="kg*m^2", symbol="J_m", start=1e-5, lower=0.0, spread=1.0, free=False, doc="rotor"
+    rotor_inertia: Array = held(
+        unit="kg*m^2", symbol="J_m", start=1e-5, lower=0.0, spread=1.0, doc="rotor"
     )
     gear_ratio: float = eqx.field(static=True, default=1.0)
 

@@ -22,19 +22,13 @@ class Floor(eqx.Module):
         """Surface at places [m]; beyond the edge that of the nearest cell."""
         steps = jnp.floor((place - self.corner) / self.cell).astype(jnp.int32)
         rows, columns = self.cells.shape
-        return self.cells[
-            jnp.clip(steps[..., 1], 0, rows - 1), jnp.clip(steps[..., 0], 0, columns - 1)
-        ]
+        row, column = steps[..., 1].clip(0, rows - 1), steps[..., 0].clip(0, columns - 1)
+        return self.cells[row, column]
 
     def under(
         self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
     ) -> Int[Array, " wheel"]:
-        """Surface under each wheel of a robot at a pose [m, m, rad].
-
-        Args:
-            pose: of the body.
-            wheels: wheel centres in the body frame [m].
-        """
+        """Surface under wheels at these places in the body frame [m], of a body at a pose."""
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         turned = jnp.stack(
             [c * wheels[:, 0] - s * wheels[:, 1], s * wheels[:, 0] + c * wheels[:, 1]], axis=-1

@@ -66,8 +66,7 @@ class Robot(eqx.Module):
 
         Args:
             azimuth_deg: where the wheels stand, counter-clockwise from ahead [deg].
-            base_radius: from the middle to the wheel centres [m].
-            wheel_radius: [m].
+            base_radius: from the middle to the wheel centres [m]; wheel_radius: [m].
             gear_ratio: motor turns per wheel turn.
             mass: [kg]; torques scale with it.
         """
@@ -89,9 +88,7 @@ class Robot(eqx.Module):
     ) -> "Robot":
         """The same robot for these floors, load set-ups and sessions, their numbers at the start.
 
-        Args:
-            surfaces, loads, sessions: names.
-            image_centre: where the camera's tilt and distortion are zero [m].
+        `image_centre` is where the camera's tilt and distortion are zero [m].
         """
         made = build(self.geometry, surfaces, loads, sessions, image_centre)
         return _with_mass(replace(made, motor=self.motor), self.body.mass)

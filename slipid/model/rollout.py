@@ -7,6 +7,8 @@ Both integrate the body by implicit Euler on the twist and exactly on SE(2):
 with M = 0 (quasi-static) unless the body's inertia is asked for. `jax.vmap` lifts both over runs.
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,11 +16,16 @@ from jaxtyping import Array, Float, Int
 
 from slipid.model import contact
 from slipid.model.geometry import Frame
+from slipid.model.motor import Motor
 from slipid.model.robot import GRAVITY, Robot, twist, wheel_torque
-from slipid.model.se2 import advance, compose
+from slipid.model.se2 import path
 
 _NEWTON = 6
 _DAMPING = (1.0, 0.5, 0.2, 0.05)
+
+
+_Five = tuple[Array, Array, Array, Array, Array]
+_number = partial(eqx.field, converter=jnp.asarray)
 
 
 class SpeedLoop(eqx.Module):
@@ -33,10 +40,20 @@ class SpeedLoop(eqx.Module):
         limit: largest voltage [V]; the integral rests while it is reached.
     """
 
-    proportional: Float[Array, ""] = eqx.field(default=0.8, converter=jnp.asarray)
-    integral: Float[Array, ""] = eqx.field(default=8.0, converter=jnp.asarray)
-    feed_forward: Float[Array, ""] = eqx.field(default=1.0, converter=jnp.asarray)
-    limit: Float[Array, ""] = eqx.field(default=24.0, converter=jnp.asarray)
+    proportional: Float[Array, ""] = _number(default=0.8)
+    integral: Float[Array, ""] = _number(default=8.0)
+    feed_forward: Float[Array, ""] = _number(default=1.0)
+    limit: Float[Array, ""] = _number(default=24.0)
+
+    def control(
+        self, motor: Motor, want: Array, w: Array, total: Array, dt: Array | float
+    ) -> tuple[Array, Array]:
+        """Voltage of this step and the integral after it."""
+        gap = want - w
+        ahead = self.feed_forward * motor.back_emf * motor.gear_ratio * want
+        asked = ahead + self.proportional * gap + self.integral * (total + gap * dt)
+        volt = jnp.clip(asked, -self.limit, self.limit)
+        return volt, jnp.where(volt == asked, total + gap * dt, total)
 
 
 class Simulated(eqx.Module):
@@ -62,19 +79,6 @@ def inertia(robot: Robot, surface: Int[Array, ""] | int) -> Float[Array, "3"]:
     return jnp.stack([robot.body.mass, robot.body.mass, robot.body.yaw_inertia]) / weight
 
 
-def path(
-    xi: Float[Array, "step 3"], dt: Float[Array, " step"], start: Float[Array, "3"]
-) -> Float[Array, "edge 3"]:
-    """Poses before the first and after every step at constant twists (exact SE(2))."""
-
-    def step(pose: Array, increment: Array) -> tuple[Array, Array]:
-        pose = compose(pose, increment)
-        return pose, pose
-
-    poses = jax.lax.scan(step, start, jax.vmap(advance)(xi, dt))[1]
-    return jnp.concatenate([start[None], poses])
-
-
 def replay_twist(
     robot: Robot,
     dt: Float[Array, " step"],
@@ -87,11 +91,9 @@ def replay_twist(
     """Body twists of a robot whose wheels turn at given speeds.
 
     Args:
-        robot: its numbers.
         dt: length of every step [s].
         wheel_speed: mean over every step [rad/s].
         surface: index of the floor, one or one per step.
-        load: index of the load set-up.
         body_inertia: the body starts at rest and has mass; otherwise forces balance at once.
 
     Source: `slipid.model.contact`.
@@ -124,13 +126,9 @@ def replay(
     """Body poses [m, m, rad] of a robot whose wheels turned as measured.
 
     Args:
-        robot: its numbers.
-        time: [s], increasing.
-        wheel_angle: [rad] at every time.
-        surface: index of the floor, one or one per step between times.
-        load: index of the load set-up.
+        wheel_angle: [rad] at every time [s].
+        surface, load, body_inertia: as of `replay_twist`.
         start: first pose, at the origin by default.
-        body_inertia: as of `replay_twist`.
     """
     dt = jnp.diff(time)
     speed = jnp.diff(wheel_angle, axis=0) / dt[:, None]
@@ -156,12 +154,9 @@ def simulate(
         n^2 J_m dw/dt = n eta C_e I - friction(w) - traction torque(xi, w)
 
     Args:
-        robot: its numbers.
-        loop: speed control, sampled once a step.
         command: set speed of each wheel in each step [rad/s].
         dt: step [s]; implicit Euler, so stiff floors are no bar, a millisecond or two is precise.
         surface: index of the floor, one or one per step.
-        load: index of the load set-up.
         start: first pose, at the origin by default.
         inductance: the current takes L_a / R to rise.
         body_inertia: the body has mass; otherwise its forces balance at once.
@@ -170,12 +165,10 @@ def simulate(
     floors = jnp.broadcast_to(jnp.asarray(surface), command.shape[:1])
     still = jnp.zeros(command.shape[1])
 
-    def step(
-        state: tuple[Array, Array, Array, Array, Array], now: tuple[Array, Array]
-    ) -> tuple[tuple[Array, Array, Array, Array, Array], tuple[Array, ...]]:
+    def step(state: _Five, now: tuple[Array, Array]) -> tuple[_Five, _Five]:
         xi, w, amps, angle, total = state
         want, floor = now
-        volt, total = _control(robot, loop, want, w, total, dt)
+        volt, total = loop.control(robot.motor, want, w, total, dt)
         mass = inertia(robot, floor) / dt if body_inertia else jnp.zeros(3)
         henry = robot.motor.inductance if inductance else jnp.zeros(())
         w, amps = _Step(robot, frame, floor, load, mass, henry, dt, volt, xi, w, amps).wheels()
@@ -207,25 +200,12 @@ def simulate(
     )
 
 
-def _control(
-    robot: Robot, loop: SpeedLoop, want: Array, w: Array, total: Array, dt: Array | float
-) -> tuple[Array, Array]:
-    """Voltage of this step and the integral after it."""
-    gap = want - w
-    ahead = loop.feed_forward * robot.motor.back_emf * robot.motor.gear_ratio * want
-    asked = ahead + loop.proportional * gap + loop.integral * (total + gap * dt)
-    volt = jnp.clip(asked, -loop.limit, loop.limit)
-    return volt, jnp.where(volt == asked, total + gap * dt, total)
-
-
 class _Step(eqx.Module):
     """What wheels, motors and body go through in one implicit Euler step.
 
     Attributes:
-        robot, frame, floor, load: as of `simulate`.
-        mass: of the body over the time step [mu m g s/m]; henry: inductance of the motors.
-        dt: [s]; volt: of the motors.
-        xi, w, amps: twist, wheel speeds and currents before the step.
+        mass: of the body over the time step [mu m g s/m]; henry: inductance of the motors [H].
+        volt: of the motors; xi, w, amps: twist, wheel speeds and currents before the step.
     """
 
     robot: Robot

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -57,3 +58,16 @@ def compose(pose: Float[Array, "3"], increment: Float[Array, "3"]) -> Float[Arra
     c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
     x, y = increment[0], increment[1]
     return jnp.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y, pose[2] + increment[2]])
+
+
+def path(
+    xi: Float[Array, "step 3"], dt: Float[Array, " step"], start: Float[Array, "3"]
+) -> Float[Array, "edge 3"]:
+    """Poses before the first and after every step at constant twists (exact SE(2))."""
+
+    def step(pose: Array, increment: Array) -> tuple[Array, Array]:
+        pose = compose(pose, increment)
+        return pose, pose
+
+    poses = jax.lax.scan(step, start, jax.vmap(advance)(xi, dt))[1]
+    return jnp.concatenate([start[None], poses])

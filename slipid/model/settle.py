@@ -43,15 +43,7 @@ def combine(
     rest: Float[Array, " wheel"],
     plain: Float[Array, "3 wheel"],
 ) -> Floors:
-    """A robot on combinations of floors.
-
-    Args:
-        frame: wheel directions.
-        stacked: the floors, leaves (floor,).
-        index: floor under each wheel (combination, wheel).
-        rest: load shares at rest.
-        plain: twist per rim speed without slip.
-    """
+    """A robot on combinations of stacked floors, the index under each wheel given of each."""
     return Floors(stand(frame, stacked.at(index.T), rest), plain)
 
 

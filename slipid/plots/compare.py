@@ -1,10 +1,13 @@
-"""Who wins on which floor, by how much, and where the data cannot tell."""
+"""Slip models side by side: their errors, and who wins on which floor or cannot be told."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
 from slipid.plots import drawing
-from slipid.plots.drawing import Axes, Figure
-from slipid.plots.slip_models import WORDS
 from slipid.support.content import Content
 
 TIED = "#cfe3f1"
@@ -13,15 +16,24 @@ SHOWN = {
     "speeds": "one speed left out",
     "random": "random headings left out",
 }
+WORDS = {
+    "identified": "identified (force balance)",
+    "encoder": "encoders alone",
+    "constant": "one slip for all",
+    "linear": "slip ~ torque",
+    "affine": "slip ~ 1 + torque",
+    "svr": "slip ~ 1 + torque, SVR",
+    "quadratic": "slip ~ 1 + torque + torque²",
+    "saturating": "slip ~ saturating torque",
+    "monotone_spline": "slip ~ any rising curve of torque",
+    "affine_current": "slip ~ 1 + current",
+    "heading_lookup": "lookup by heading",
+    "paper": "form of 2021, refitted",
+}
 
 
 def compare_plot(found: Content, out: Path) -> Path:
-    """Draw the first question's answer.
-
-    Args:
-        found: content of comparison.json.
-        out: folder to write to.
-    """
+    """Draw the answer to the first question of comparison.json."""
     question, answer = next(iter(found["questions"].items()))
     made = compare_figure(answer["floors"], SHOWN.get(question, question))
     return drawing.save(made, out / "comparison.png")
@@ -43,16 +55,19 @@ def compare_figure(floors: Content, which: str) -> Figure:
     )
     axes = made.subplots(2, len(floors), sharey=True, squeeze=False)
     for column, (floor, answer) in enumerate(floors.items()):
-        density, error = axes[0, column], axes[1, column]
-        name = floor.replace("@", ", load ")
-        density.set_title(f"{name}\n{answer['runs']} runs", fontsize=10)
+        density, error = axes[:, column]
+        titled(density, floor, answer["runs"])
         _density(density, answer["models"])
-        _error(error, answer["models"])
-        for ax in (density, error):
-            _mark(ax, answer["models"])
-    words = [WORDS.get(m, m.replace("_", " ")) for m in models]
+        errors = {model: 100 * one["endpoint_error"] for model, one in answer["models"].items()}
+        stds = [200 * (one["endpoint_error_se"] or 0.0) for one in answer["models"].values()]
+        bars(error, errors, stds)
+        error.set_xlabel("mean end-point error\n[% of displacement], less is better")
+        for k, one in enumerate(answer["models"].values()):
+            if one["verdict"] in ("best", "tied"):
+                for ax in (density, error):
+                    ax.axhspan(k - 0.5, k + 0.5, color=TIED, zorder=0)
     for row in (0, 1):
-        axes[row, 0].set_yticks(range(len(models)), words)
+        axes[row, 0].set_yticks(range(len(models)), worded(models))
     axes[0, 0].set_ylim(len(models) - 0.4, -0.6)
     made.supxlabel(
         "error bars: two standard errors, runs of one 30-degree sector of headings counted as one",
@@ -65,48 +80,64 @@ def compare_figure(floors: Content, which: str) -> Figure:
 def _density(ax: Axes, models: Content) -> None:
     drawing.plain(ax)
     ax.set_xlabel("log density less the best's\n[nats per run], more is better")
+    reach: list[float] = []
     for k, (model, one) in enumerate(models.items()):
-        bar = 2 * (one["se_clustered"] or 0.0)
-        ax.errorbar(
-            one["difference"], k, xerr=bar, fmt="none", ecolor=_colour(model), elinewidth=1.6
-        )
+        at, bar, colour = one["difference"], 2 * (one["se_clustered"] or 0.0), colour_of(model)
+        ax.errorbar(at, k, xerr=bar, fmt="none", ecolor=colour, elinewidth=1.6)
         mark, size = ("*", 13.0) if one["verdict"] == "best" else ("o", 5.0)
-        ax.plot(one["difference"], k, mark, ms=size, color=_colour(model), mew=0)
+        ax.plot(at, k, mark, ms=size, color=colour, mew=0)
+        reach += [at - bar, at + bar]
     ax.axvline(0.0, color=drawing.INK, lw=0.8)
-    ends = [
-        one["difference"] + sign * 2 * (one["se_clustered"] or 0.0)
-        for one in models.values()
-        for sign in (-1, 1)
-    ]
-    spare = 0.06 * max(max(ends) - min(ends), 1.0)
-    ax.set_xlim(min(ends) - spare, max(ends) + spare)
+    spare = 0.06 * max(max(reach) - min(reach), 1.0)
+    ax.set_xlim(min(reach) - spare, max(reach) + spare)
 
 
-def _error(ax: Axes, models: Content) -> None:
+def ladder_figure(found: Content, which: str) -> Figure:
+    """Mean end-point error of every model on every floor of a validation file, a bar each.
+
+    Args:
+        which: runs these are, in words.
+    """
+    floors = found["summary"]
+    models = list(next(iter(floors.values())))
+    width = 2.7 * len(floors) + 2.4
+    made = drawing.figure(
+        max(width, 8.8),
+        1.7 + 0.32 * len(models),
+        f"How far from the camera's end each model ends, open loop; {which}",
+    )
+    axes = made.subplots(1, len(floors), sharey=True, squeeze=False)[0]
+    for ax, (floor, by) in zip(axes, floors.items(), strict=True):
+        bars(ax, {model: 100 * by[model]["endpoint_error_mean"] for model in models})
+        titled(ax, floor, by[models[0]]["runs"])
+        ax.set_xlabel("mean end-point error\n[% of the camera's displacement]")
+    axes[0].set_yticks(range(len(models)), worded(models))
+    axes[0].invert_yaxis()
+    return made
+
+
+def worded(models: Sequence[str]) -> list[str]:
+    """Names of models for people."""
+    return [WORDS.get(model, model.replace("_", " ")) for model in models]
+
+
+def titled(ax: Axes, floor: str, runs: int) -> None:
+    """Name a panel by its floor and the number of runs."""
+    ax.set_title(f"{floor.replace('@', ', load ')}\n{runs} runs", fontsize=10)
+
+
+def colour_of(model: str) -> str:
+    """Colour of a model: only the identified one stands out."""
+    return drawing.BLUE if model == "identified" else "#a8a8a8"
+
+
+def bars(ax: Axes, error: Mapping[str, float], half: Sequence[float] | None = None) -> None:
+    """A bar per model with its number, and half the length of its error bar."""
     drawing.plain(ax)
     ax.grid(False, axis="y")
-    ax.set_xlabel("mean end-point error\n[% of displacement], less is better")
-    values = [100 * one["endpoint_error"] for one in models.values()]
-    bars = [200 * (one["endpoint_error_se"] or 0.0) for one in models.values()]
-    ax.barh(
-        range(len(values)),
-        values,
-        height=0.7,
-        color=[_colour(model) for model in models],
-        xerr=bars,
-        error_kw={"ecolor": drawing.INK, "elinewidth": 0.9},
+    values, colours = list(error.values()), [colour_of(model) for model in error]
+    drawn = ax.barh(
+        range(len(values)), values, 0.75, color=colours, xerr=half, error_kw={"elinewidth": 0.9}
     )
-    reach = max(v + b for v, b in zip(values, bars, strict=True))
-    for k, (v, b) in enumerate(zip(values, bars, strict=True)):
-        ax.text(v + b + 0.03 * reach, k, f"{v:.1f}", va="center", fontsize=8)
-    ax.set_xlim(0.0, 1.22 * reach)
-
-
-def _mark(ax: Axes, models: Content) -> None:
-    for k, one in enumerate(models.values()):
-        if one["verdict"] in ("best", "tied"):
-            ax.axhspan(k - 0.5, k + 0.5, color=TIED, zorder=0)
-
-
-def _colour(model: str) -> str:
-    return drawing.BLUE if model == "identified" else "#8c8c8c"
+    ax.bar_label(drawn, [f"{v:.1f}" for v in values], padding=3, fontsize=9)
+    ax.set_xlim(0.0, 1.22 * max(np.add(values, 0.0 if half is None else half)))

@@ -4,11 +4,13 @@ import math
 from collections import Counter
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 
 from slipid.identify.design.planned_runs import Drive
 from slipid.identify.design.proposal import Design
 from slipid.plots import drawing
-from slipid.plots.drawing import Axes, Figure
 from slipid.support.content import Content
 
 CURVES = (
@@ -66,9 +68,8 @@ def _commands(
     if load in seen.loads:
         angle = np.radians(seen.headings_deg)
         for speed in seen.speeds:
-            ax.plot(
-                speed * np.cos(angle), speed * np.sin(angle), ".", color="#bbbbbb", ms=3.5, mew=0
-            )
+            x, y = speed * np.cos(angle), speed * np.sin(angle)
+            ax.plot(x, y, ".", color="#bbbbbb", ms=3.5, mew=0)
     for d, times in mine.items():
         text = f"{order[d]}" + f" x{times}" * (times > 1) + "\nspin" * (not d.speed)
         at = _arrow(ax, d, found.base_radius, 0.1 * reach)
@@ -80,10 +81,10 @@ def _commands(
 
 
 def _arrow(ax: Axes, d: Drive, base: float, beyond: float) -> tuple[float, float]:
-    """Arrow to the commanded velocity, bent where it turns, an arc on the spot; its label's place.
+    """Arrow to the commanded velocity, bent where it turns, an arc on the spot.
 
-    Args:
-        beyond: distance of the label from the tip [m/s].
+    Returns:
+        the place of its label, `beyond` [m/s] the tip.
     """
     colour, way = _colour(d), float(np.sign(d.turn))
     style = {"arrowstyle": "-|>", "color": colour, "lw": 1.5, "shrinkA": 0, "shrinkB": 0}
@@ -110,8 +111,6 @@ def _colour(d: Drive) -> str:
 
 def _falling(ax: Axes, saved: Content) -> None:
     """Uncertainty against runs, from nothing."""
-    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
-
     for key, colour, style, label in CURVES:
         curve = saved["curves"][key]
         std = np.sqrt(curve["criterion"])
@@ -119,13 +118,13 @@ def _falling(ax: Axes, saved: Content) -> None:
     end = math.sqrt(saved["criterion"])
     ax.axhline(end, color=drawing.INK, lw=0.8, ls=":")
     ax.plot(saved["grid_runs"], end, "o", color=drawing.ORANGE, ms=6)
-    title = f"from no run at all: the grid's {saved['grid_runs']} runs tell"
+    told = "more than as many"
     if saved["greedy_runs"]:
         last = math.sqrt(saved["curves"]["greedy"]["criterion"][-1])
         ax.plot(saved["greedy_runs"], last, "o", color=drawing.BLUE, ms=6)
-        ax.set_title(f"{title}\nas much as {saved['greedy_runs']} chosen ones", fontsize=11)
-    else:
-        ax.set_title(f"{title}\nmore than as many chosen ones", fontsize=11)
+        told = f"as much as {saved['greedy_runs']}"
+    title = f"from no run at all: the grid's {saved['grid_runs']} runs tell\n{told} chosen ones"
+    ax.set_title(title, fontsize=11)
     ax.set(xscale="log", yscale="log", xlabel="runs")
     ax.set(ylabel="uncertainty (1: the present fit)")
     for axis in (ax.xaxis, ax.yaxis):

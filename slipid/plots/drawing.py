@@ -2,19 +2,14 @@
 
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from slipid.support.files import write_bytes
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes as Axes
-    from matplotlib.collections import PathCollection as PathCollection
-    from matplotlib.figure import Figure as Figure
-else:
-    # matplotlib is slow to import, so not before a figure is drawn; run-time checks see Any
-    Axes = Figure = PathCollection = Any
 
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 INK, SHADE = "#222222", "#888888"
@@ -25,9 +20,6 @@ MARKERS = ("o", "^", "s", "D", "v", "P")
 
 def figure(width: float, height: float, title: str) -> Figure:
     """Empty figure [inch] that says at the top what one should see."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     made = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(made)
     made.suptitle(title, fontsize=13, x=0.01, ha="left", color=INK)
@@ -35,7 +27,7 @@ def figure(width: float, height: float, title: str) -> Figure:
 
 
 def panels(count: int, width: float, height: float, title: str) -> tuple[Figure, list[Axes]]:
-    """Figure with `count` panels of one size [inch], in rows of at most four."""
+    """Figure with `count` plain panels of one size [inch], in rows of at most four."""
     columns = min(count, 4 if count != 5 else 3)
     rows = math.ceil(count / columns)
     # a single panel still leaves the title room
@@ -43,6 +35,8 @@ def panels(count: int, width: float, height: float, title: str) -> tuple[Figure,
     axes = list(made.subplots(rows, columns, squeeze=False).flat)
     for spare in axes[count:]:
         spare.remove()
+    for ax in axes[:count]:
+        plain(ax)
     return made, axes[:count]
 
 
@@ -66,3 +60,8 @@ def save(made: Figure, path: Path) -> Path:
     made.savefig(buffer, format="png", dpi=110)
     write_bytes(path, buffer.getvalue())
     return path
+
+
+def save_all(figures: Mapping[str, Figure | None], out: Path) -> list[Path]:
+    """Write figures under their names with `.png`; the files of those that there are."""
+    return [save(made, out / f"{name}.png") for name, made in figures.items() if made is not None]

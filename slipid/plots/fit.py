@@ -3,14 +3,15 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 from slipid.data.runs import Runs
 from slipid.identify.result import Fit
-from slipid.plots import drawing
-from slipid.plots.drawing import Figure
+from slipid.plots.compare import ladder_figure
+from slipid.plots.drawing import save_all
 from slipid.plots.load import load_figure
 from slipid.plots.motion import heading_figure, path_figure
 from slipid.plots.seen import Seen, seen
-from slipid.plots.slip_models import ladder_figure
 from slipid.plots.wheels import current_figure, curve_figure
 from slipid.support.content import Content
 
@@ -33,23 +34,9 @@ PICTURES: dict[str, Callable[[Fit, Runs, Seen], Figure | None]] = {
 
 
 def identify_plots(fit: Fit, data: Runs, out: Path) -> list[Path]:
-    """Draw what a fit found beside the runs it was fitted to.
-
-    Args:
-        fit: of these runs.
-        data: the runs.
-        out: folder to write to.
-
-    Returns:
-        the files; a picture the data have nothing for is left out.
-    """
+    """Files of all `PICTURES` that the runs, those of the fit, have something for."""
     pieces = _pieces(fit, data)
-    figures = {name: draw(fit, data, pieces) for name, draw in PICTURES.items()}
-    return [
-        drawing.save(made, out / f"{name}.png")
-        for name, made in figures.items()
-        if made is not None
-    ]
+    return save_all({name: draw(fit, data, pieces) for name, draw in PICTURES.items()}, out)
 
 
 def picture(fit: Fit, data: Runs, name: str) -> Figure:
@@ -67,7 +54,7 @@ def picture(fit: Fit, data: Runs, name: str) -> Figure:
 
 
 def _pieces(fit: Fit, data: Runs) -> Seen:
-    return seen(fit.robot, data, int(fit.settings["windows_per_piece"]))
+    return seen(fit.robot, data, fit.channels.windows)
 
 
 def validation_figure(fit: Fit, data: Runs, found: Content) -> Figure:
@@ -83,22 +70,12 @@ def _new_runs(fit: Fit, data: Runs) -> str:
 
 
 def validate_plots(fit: Fit, data: Runs, found: Content, out: Path) -> list[Path]:
-    """Draw how well runs are predicted, and some of their paths.
-
-    Args:
-        fit: that predicted.
-        data: the runs it predicted.
-        found: the validation file's content.
-        out: folder to write to.
-
-    Returns:
-        the files.
-    """
+    """Files of how well runs are predicted, as the validation found, and some of their paths."""
     which = _new_runs(fit, data)
     names = {log.surface or "unknown": None for log in data.logs}
     order = [(floor, load) for floor in sorted(names) for load in fit.robot.body.loads]
     figures = {
-        "validation_errors.png": validation_figure(fit, data, found),
-        "validation_paths.png": path_figure(fit.robot, data, order, PATHS + which),
+        "validation_errors": ladder_figure(found, which),
+        "validation_paths": path_figure(fit.robot, data, order, PATHS + which),
     }
-    return [drawing.save(made, out / name) for name, made in figures.items()]
+    return save_all(figures, out)

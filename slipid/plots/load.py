@@ -3,11 +3,13 @@
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, FancyArrow, Polygon
 
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.plots import drawing
-from slipid.plots.drawing import Axes, Figure
 
 
 def load_figure(fit: Fit) -> Figure | None:
@@ -27,49 +29,34 @@ def load_figure(fit: Fit) -> Figure | None:
 
 def _robot(ax: Axes, fit: Fit, estimate: Estimate) -> None:
     """One robot; x ahead points up, y to the left."""
-    from matplotlib.patches import Circle, FancyArrow, Polygon
-
     shape = fit.robot.geometry
     base, radius = float(shape.base_radius), float(shape.wheel_radius)
     place = np.asarray(shape.place) * base
     reach = float(np.linalg.norm(place, axis=1).max())
     ax.add_patch(Circle((0, 0), reach * 0.93, fc="#f2f2f2", ec=drawing.SHADE, lw=1.2))
-    ax.add_patch(
-        FancyArrow(
-            0, 0.42 * reach, 0, 0.25 * reach, width=0.02 * reach, fc=drawing.SHADE, ec="none"
-        )
-    )
+    start, length, wide = 0.42 * reach, 0.25 * reach, 0.02 * reach
+    ax.add_patch(FancyArrow(0, start, 0, length, width=wide, fc=drawing.SHADE, ec="none"))
     ax.text(0.06 * reach, 0.5 * reach, "ahead", color=drawing.INK, fontsize=9)
     share = np.asarray(estimate.value, float)
     angles = np.asarray(shape.drive_angle)
     for k, (p, angle) in enumerate(zip(place, angles, strict=True)):
         along = np.array([np.cos(angle), np.sin(angle)])
         side = np.array([-along[1], along[0]]) * 0.35 * radius
-        corners = [
-            p + a * radius * along + b * side for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
-        ]
-        at = _up(p)
-        ax.add_patch(
-            Circle(at, reach * 0.62 * np.sqrt(share[k]), fc=drawing.BLUE, alpha=0.25, ec="none")
-        )
-        ax.add_patch(Polygon([_up(c) for c in corners], fc=drawing.INK, ec="none"))
+        ways = (radius * along + side, radius * along - side)
+        corners = [_up(p + way) for way in (*ways, -ways[0], -ways[1])]
+        size = reach * 0.62 * np.sqrt(share[k])
+        ax.add_patch(Circle(_up(p), size, fc=drawing.BLUE, alpha=0.25, ec="none"))
+        ax.add_patch(Polygon(corners, fc=drawing.INK, ec="none"))
         ax.text(*_up(p * [1.75, 1.95]), _words(k, estimate), ha="center", va="center", fontsize=10)
-    middle = _up(share @ place)
-    ax.plot(*middle, "X", color=drawing.ORANGE, ms=11, mec="white")
+    ax.plot(*_up(share @ place), "X", color=drawing.ORANGE, ms=11, mec="white")
     ahead, left = 1000 * (share @ place)
     where = f"{abs(ahead):.0f} mm {'ahead of' if ahead > 0 else 'behind'} the middle"
     if abs(left) >= 0.5:
         where += f" and {abs(left):.0f} mm to the {'left' if left > 0 else 'right'}"
-    ax.text(
-        0,
-        -2.3 * reach,
-        f"cross: centre of weight, {where}",
-        ha="center",
-        fontsize=9,
-        color=drawing.ORANGE,
-    )
-    ax.set(xlim=(-2.2 * reach, 2.2 * reach), ylim=(-2.4 * reach, 1.6 * reach))
-    ax.set_aspect("equal")
+    said = f"cross: centre of weight, {where}"
+    ax.text(0, -2.3 * reach, said, ha="center", fontsize=9, color=drawing.ORANGE)
+    ax.set(xlim=(-2.2 * reach, 2.2 * reach), ylim=(-2.4 * reach, 1.6 * reach), aspect="equal")
+    ax.grid(False)
     ax.axis("off")
 
 

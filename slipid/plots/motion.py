@@ -4,6 +4,8 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from slipid.data.runs import Runs
 from slipid.identify.compare import open_loop as replay
@@ -11,7 +13,6 @@ from slipid.identify.compare.slip_models import Encoder
 from slipid.identify.fit import likelihood as lk
 from slipid.model.robot import Robot
 from slipid.plots import drawing
-from slipid.plots.drawing import Axes, Figure
 from slipid.plots.seen import Seen, by_heading
 
 ROWS = (
@@ -78,15 +79,8 @@ def _headings(robot: Robot, seen: Seen, g: int, speeds: list[float], axes: Seque
         lines = by_heading(robot, surface, load, speeds[k], heading)
         measured = (100 * seen.slip, seen.drift, seen.yaw)
         for row, ax in enumerate(axes):
-            ax.plot(
-                seen.heading[picked],
-                measured[row][picked],
-                marker,
-                ms=3.6,
-                color=colour,
-                alpha=0.5,
-                mew=0,
-            )
+            x, y = seen.heading[picked], measured[row][picked]
+            ax.plot(x, y, marker, ms=3.6, color=colour, alpha=0.5, mew=0)
             ax.plot(heading, lines[:, row] * (100.0 if row == 0 else 1.0), color=colour, lw=1.6)
     for ax in axes:
         drawing.plain(ax)
@@ -105,8 +99,6 @@ def path_figure(robot: Robot, data: Runs, order: Sequence[tuple[str, str]], titl
     """Some runs per floor and load, started at one point with the robot looking to the right.
 
     Args:
-        robot: as fitted.
-        data: the runs.
         order: of the panels, (floor, load set-up).
         title: says whether the fit has seen these runs.
     """
@@ -121,17 +113,12 @@ def path_figure(robot: Robot, data: Runs, order: Sequence[tuple[str, str]], titl
         shown = [paths[k] for k in _spread(data, runs)]
         for three in shown:
             _ray(ax, three)
-        drawing.plain(ax)
         errors = _errors([paths[k] for k in runs])
         ax.set_title(f"{named(surface, load, names)}\n{errors}", fontsize=10)
         reach = 1.08 * max(float(np.abs(p).max()) for three in shown for p in three)
         ax.set_aspect("equal")
-        ax.set(
-            xlim=(-reach, reach),
-            ylim=(-reach, reach),
-            xlabel="ahead of the start [m]",
-            ylabel="left of the start [m]",
-        )
+        ax.set(xlim=(-reach, reach), xlabel="ahead of the start [m]")
+        ax.set(ylim=(-reach, reach), ylabel="left of the start [m]")
     handles = [
         axes[0].plot([], [], color=drawing.INK, lw=3.2, alpha=0.35, label="camera")[0],
         axes[0].plot([], [], color=drawing.BLUE, lw=1.4, marker="o", ms=4, label="predicted")[0],

@@ -3,16 +3,17 @@
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from slipid.baselines.paper2021.models import DEPLOYED
-from slipid.baselines.paper2021.result import PaperResult, find_folder, regenerate
+from slipid.baselines.paper2021.result import find_folder, regenerate
 from slipid.baselines.paper2021.table import FittedForm, MotorTable
 from slipid.baselines.paper2021.tracks import COMMANDED_SIDES, Track
 from slipid.data.log import Log
 from slipid.data.reading.presets import preset
 from slipid.data.reading.reader import read_log
 from slipid.plots import drawing
-from slipid.plots.drawing import Axes, Figure
 from slipid.support.files import write_json
 
 # the surfaces keep their names
@@ -29,9 +30,6 @@ def run(data_dir: Path, out: Path) -> list[Path]:
         data_dir: folder that holds robotino2021 (and robotino2022), or robotino2021 itself.
         out: folder to write to; made if absent.
 
-    Returns:
-        the files written.
-
     Raises:
         DataError: if the 2021 data set is absent or broken.
     """
@@ -39,7 +37,13 @@ def run(data_dir: Path, out: Path) -> list[Path]:
     result = regenerate(folder, read_runs(folder.parent / "robotino2022"))
     report = out / "paper.json"
     write_json(report, result.as_dict())
-    return [report, *save_all(result, out)]
+    figures = {
+        "figure2_slip_current_whole_field": figure2(result.field),
+        "figure3_slip_current_torque_by_surface": figure3(result.motors),
+        "figure4_slip_torque_models": figure4(result.motors[1]),
+        "figure7_tracks": figure7(result.tracks),
+    }
+    return [report, *drawing.save_all(figures, out)]
 
 
 def read_runs(folder: Path) -> list[Log] | None:
@@ -52,25 +56,6 @@ def read_runs(folder: Path) -> list[Log] | None:
         read_log(path, layout, root=folder, surface=path.parent.name, load="as_built")
         for path in paths
     ]
-
-
-def save_all(result: PaperResult, out_dir: Path) -> list[Path]:
-    """Figures 2, 3, 4 and 7 as PNG.
-
-    Args:
-        result: the paper regenerated.
-        out_dir: folder to write to.
-
-    Returns:
-        the files written.
-    """
-    figures = {
-        "figure2_slip_current_whole_field.png": figure2(result.field),
-        "figure3_slip_current_torque_by_surface.png": figure3(result.motors),
-        "figure4_slip_torque_models.png": figure4(result.motors[1]),
-        "figure7_tracks.png": figure7(result.tracks),
-    }
-    return [drawing.save(made, out_dir / name) for name, made in figures.items()]
 
 
 def figure2(field: MotorTable) -> Figure:
@@ -182,16 +167,14 @@ def _draw_track(axes: Axes, track: Track) -> None:
     axes.plot(*xy[-1], "s", color="black", ms=9, zorder=5, label="end")
     axes.plot([], [], ">", color="black", ms=6, label="robot's heading")
     axes.set_aspect("equal")
-    axes.set_xlim(-250, 1000)
-    axes.set_ylim(-100, 1250)
-    axes.set_xlabel("right of the start / mm")
-    axes.set_ylabel("forward of the start / mm")
+    axes.set(xlim=(-250, 1000), xlabel="right of the start / mm")
+    axes.set(ylim=(-100, 1250), ylabel="forward of the start / mm")
     axes.set_title(
         f"{track.file.label}\n"
         f"side 1: gained {track.displacement:.0f} of {long:.0f} mm\n"
         f"path {track.path_length:.0f} mm, printed {track.file.printed_path_length:.0f} mm\n"
         f"end {track.closure:.0f} mm from start, "
-        f"heading {track.heading_start:.0f}° to {track.heading_end:.0f}°",
+        f"heading {track.heading[0]:.0f}° to {track.heading[-1]:.0f}°",
         fontsize=9,
     )
 
@@ -228,18 +211,12 @@ def _deployed(axes: Axes, motor: int) -> None:
 
 def _formula(form: FittedForm) -> str:
     symbol = "M" if form.regressor == "torque" else "I"
-    text = "s ="
-    for k, c in enumerate(form.coefficients):
-        power = form.first_power + k
-        sign = ("-" if c < 0 else "") if k == 0 else ("- " if c < 0 else "+ ")
-        factor = ["", f" {symbol}", f" {symbol}²"][power]
-        text += f" {sign}{abs(c):.3f}{factor}"
-    return text
+    powers = ("", f" {symbol}", f" {symbol}²")[form.first_power :]
+    terms = [f"{c:+.3f}{power}" for c, power in zip(form.coefficients, powers, strict=False)]
+    said = " ".join(f"{term[0]} {term[1:]}" for term in terms).removeprefix("+ ")
+    return f"s = {said}"
 
 
 def _slip_axes(axes: Axes, what: str, limit: float) -> None:
-    axes.set_xlim(0.0, limit)
-    axes.set_ylim(0.0, 1.0)
-    axes.set_xlabel(_AXIS[what])
-    axes.set_ylabel("slip s")
+    axes.set(xlim=(0.0, limit), ylim=(0.0, 1.0), xlabel=_AXIS[what], ylabel="slip s")
     axes.grid(alpha=0.3)

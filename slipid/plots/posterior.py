@@ -3,28 +3,25 @@
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from slipid.identify.posterior.sample import Posterior
 from slipid.identify.result import Fit
 from slipid.plots import drawing
-from slipid.plots.drawing import Axes, Figure
 
 PANELS = 6
 """Pairs of numbers drawn."""
 
 
 def posterior_plots(fit: Fit, found: Posterior, out: Path) -> list[Path]:
-    """Draw intervals of every number, and the pairs that are bent the most.
-
-    Returns:
-        the files.
-    """
+    """Files of intervals of every number, and of the pairs that are bent the most."""
     z = found.z.reshape(-1, fit.space.size)
     figures = {
-        "posterior_intervals.png": interval_figure(fit, z),
-        "posterior_pairs.png": pair_figure(fit, z),
+        "posterior_intervals": interval_figure(fit, z),
+        "posterior_pairs": pair_figure(fit, z),
     }
-    return [drawing.save(made, out / name) for name, made in figures.items()]
+    return drawing.save_all(figures, out)
 
 
 def interval_figure(fit: Fit, z: np.ndarray) -> Figure:
@@ -59,7 +56,7 @@ def interval_figure(fit: Fit, z: np.ndarray) -> Figure:
 
 def pair_figure(fit: Fit, z: np.ndarray) -> Figure:
     """The pairs of numbers whose draws are furthest from an ellipse."""
-    pairs = bent(z)[:PANELS]
+    pairs = bent(z)
     made, axes = drawing.panels(
         len(pairs),
         2.9,
@@ -69,7 +66,6 @@ def pair_figure(fit: Fit, z: np.ndarray) -> Figure:
     )
     some = z[:: max(1, len(z) // 1500)]
     for ax, (i, j) in zip(axes, pairs, strict=True):
-        drawing.plain(ax)
         ax.plot(some[:, i], some[:, j], ".", ms=2, color=drawing.BLUE, alpha=0.4)
         _ellipse(ax, fit.z[[i, j]], fit.covariance[np.ix_([i, j], [i, j])])
         for name, put in ((fit.space.names[i], ax.set_xlabel), (fit.space.names[j], ax.set_ylabel)):
@@ -89,16 +85,12 @@ def bent(z: np.ndarray) -> list[tuple[int, int]]:
     square = square - t * cubic  # what the square has beyond the line
     square /= square.std(axis=0) + 1e-300
     strength = np.abs(square.T @ t / len(t)) * (1 - np.eye(len(linear)))
-    found, used = [], set()
+    found: list[tuple[int, int]] = []
     for flat in np.argsort(-strength, axis=None):
         i, j = (int(k) for k in np.unravel_index(flat, strength.shape))
-        if i in used or j in used:
-            continue
-        found.append((i, j))
-        used |= {i, j}
-        if len(found) == PANELS:
-            break
-    return found
+        if not {i, j} & {k for pair in found for k in pair}:
+            found.append((i, j))
+    return found[:PANELS]
 
 
 def _ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray) -> None:

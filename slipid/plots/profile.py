@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
 from slipid.identify.verdicts.profile import RISE, Profile
 from slipid.plots import drawing
-from slipid.plots.drawing import Axes, Figure
 
 
 def profile_figure(found: Sequence[Profile]) -> Figure:
@@ -23,20 +25,14 @@ def profile_figure(found: Sequence[Profile]) -> Figure:
 
 
 def _panel(ax: Axes, p: Profile) -> None:
-    drawing.plain(ax)
     ax.plot(p.value, p.likelihood, "o-", color=drawing.BLUE, label="data (own prior taken out)")
     ax.plot(p.value, p.posterior, "s--", color=drawing.GREEN, ms=4, label="data and prior")
     ax.plot(p.value, p.laplace, ":", color=drawing.INK, label="Laplace")
     ax.axhline(RISE, color=drawing.SHADE, lw=1)
     ax.text(1.0, RISE, "90 %", transform=ax.get_yaxis_transform(), ha="right", va="bottom")
     low, high = p.interval90
-    ax.axvspan(
-        p.value[0] if low is None else low,
-        p.value[-1] if high is None else high,
-        color=drawing.BLUE,
-        alpha=0.10,
-        lw=0,
-    )
+    low, high = p.value[0] if low is None else low, p.value[-1] if high is None else high
+    ax.axvspan(low, high, color=drawing.BLUE, alpha=0.10, lw=0)
     ax.plot(p.estimate, 0.0, "X", color=drawing.ORANGE, ms=10, mec="white", label="estimate")
     ax.set_ylim(-0.15, 3.2 * RISE)
     if p.value[-1] > 20 * p.value[0] > 0:

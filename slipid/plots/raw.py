@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from slipid.data.runs import Runs
-from slipid.plots.drawing import Figure, figure, save
+from slipid.plots.drawing import figure, save
 
 
 def raw_plots(data: Runs, out: Path) -> list[Path]:

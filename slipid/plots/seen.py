@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from slipid.data.runs import Runs
 from slipid.data.windows import windows
 from slipid.identify import slip_curves as curves
-from slipid.identify.compare.slip_models import body_twist
+from slipid.identify.compare.body_motion import body_twist
 from slipid.identify.fit import likelihood as lk
 from slipid.model import robot as model
 from slipid.model.robot import Robot
@@ -125,14 +125,8 @@ def by_heading(
     angle = np.radians(heading)
     wanted = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1) * speed
     forward = np.asarray(robot.geometry.forward()) / float(robot.geometry.wheel_radius)
-    xi = np.asarray(
-        _twists(
-            robot,
-            jnp.asarray(wanted @ forward.T),
-            jnp.asarray(robot.surface_index(surface)),
-            jnp.asarray(robot.load_index(load)),
-        )
-    )
+    place = robot.surface_index(surface), robot.load_index(load)
+    xi = np.asarray(_twists(robot, jnp.asarray(wanted @ forward.T), *map(jnp.asarray, place)))
     along = (xi * wanted)[:, :2].sum(axis=1) / speed
     across = (wanted[:, 0] * xi[:, 1] - wanted[:, 1] * xi[:, 0]) / speed
     return np.stack(

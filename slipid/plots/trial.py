@@ -4,13 +4,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 
 from slipid.data.floor_map import FloorMap
-from slipid.plots.drawing import INK, SHADE, Axes, figure, plain, save
+from slipid.plots.drawing import INK, SHADE, figure, plain, save
 from slipid.support.content import Content
 
 TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
 """Of floors, in the order of the map."""
+ERRORS = {
+    "closure_error_median": "closure error [mm]",
+    "cross_track_rmse": "cross-track rms [mm]",
+    "first_side_along_track_mm": "first side, along-track [mm]",
+}
 
 
 def trial_plot(
@@ -28,24 +35,15 @@ def trial_plot(
     best = content["closes_best"]
     ratio = content["summary"][best].get("to_encoder", {}).get("closure_error_median", {})
     said = f", {100 * ratio['value']:.0f} % of the encoders'" if ratio else ""
-    made = figure(
-        13.0,
-        3.1 * -(-len(names) // 3) + 3.4,
-        f"Rectangle trial on the {content['plant']}: {best} closes best{said}",
-    )
     rows = -(-len(names) // 3)
+    title = f"Rectangle trial on the {content['plant']}: {best} closes best{said}"
+    made = figure(13.0, 3.1 * rows + 3.4, title)
     grid = made.add_gridspec(rows + 1, 3, height_ratios=[1.0] * rows + [1.1])
     one = _typical(content)
     for k, name in enumerate(names):
         axes = made.add_subplot(grid[k // 3, k % 3])
         _one(axes, name, content, paths, floor, one)
-    for k, (key, label) in enumerate(
-        (
-            ("closure_error_median", "closure error [mm]"),
-            ("cross_track_rmse", "cross-track rms [mm]"),
-            ("first_side_along_track_mm", "first side, along-track [mm]"),
-        )
-    ):
+    for k, (key, label) in enumerate(ERRORS.items()):
         _bars(made.add_subplot(grid[rows, k]), content["summary"], key, label)
     return save(made, path)
 
@@ -67,37 +65,23 @@ def _one(
     one: int,
 ) -> None:
     """All starts of a controller laid on one another, the typical one over its floor."""
-    from matplotlib.colors import ListedColormap
-
     runs = [r for r in content["runs"] if r["controller"] == name]
     own = [_local(paths[f"{name}/start{k:02d}"], r["start"]) for k, r in enumerate(runs)]
     x, y = np.linspace(-0.35, 1.25, 320), np.linspace(-0.75, 0.35, 220)
     places = _world(np.stack(np.meshgrid(x, y), -1), runs[one]["start"])
-    tints = ListedColormap(TINTS[: max(len(floor.surfaces), 2)])
-    axes.imshow(
-        floor.at(places),
-        origin="lower",
-        extent=(x[0], x[-1], y[0], y[-1]),
-        cmap=tints,
-        vmin=0,
-        vmax=max(len(floor.surfaces) - 1, 1),
-        interpolation="nearest",
-    )
+    kinds = max(len(floor.surfaces), 2)
+    tints = ListedColormap(TINTS[:kinds])
+    axes.pcolormesh(x, y, floor.at(places), cmap=tints, vmin=0, vmax=kinds - 1)
     for p in own:
         axes.plot(*p.T, color="#56B4E9", lw=0.5, alpha=0.6)
     axes.plot([0, 0.9, 0.9, 0, 0], [0, 0, -0.4, -0.4, 0], "--", color=INK, lw=1.0)
     axes.plot(*own[one].T, color="#D55E00", lw=1.8)
     axes.plot(*own[one][-1], "o", color="#D55E00", ms=5)
     row = content["summary"][name]
-    axes.set_title(
-        f"{name}: closes to {row['closure_error_median']:.0f} mm, heading "
-        f"{row['heading_error_deg']:.0f} deg off",
-        fontsize=9,
-        loc="left",
-    )
-    axes.set_xlim(x[0], x[-1])
-    axes.set_ylim(y[0], y[-1])
-    axes.set_aspect("equal")
+    closes, off = row["closure_error_median"], row["heading_error_deg"]
+    title = f"{name}: closes to {closes:.0f} mm, heading {off:.0f} deg off"
+    axes.set_title(title, fontsize=9, loc="left")
+    axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
     axes.tick_params(labelsize=7)
 
 

@@ -3,13 +3,14 @@
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
 
 from slipid.identify.result import Fit
 from slipid.model import contact_law as law
-from slipid.model.motor import Motor
 from slipid.model.robot import GRAVITY, Robot
 from slipid.plots import drawing
-from slipid.plots.drawing import Axes, Figure, PathCollection
 from slipid.plots.motion import named
 from slipid.plots.seen import Seen
 
@@ -38,7 +39,6 @@ def curve_figure(fit: Fit, seen: Seen) -> Figure:
         _curve(ax, fit, floor)
         ax.set(xlim=(min(0.0, left), right), ylim=(min(0.0, bottom), top))
         ax.set_title(floor)
-        drawing.plain(ax)
         torque = "from current" if measured else "predicted"
         ax.set(xlabel=f"wheel torque {torque}, at even load [N m]", ylabel="slip of the wheel [1]")
     made.legend(
@@ -60,17 +60,9 @@ def _cloud(ax: Axes, robot: Robot, seen: Seen, floor: str) -> PathCollection | N
         return None
     torque = driving_torque(robot, seen) / (seen.share * seen.share.shape[1])
     order = np.argsort(-seen.sideways[turns])
-    return ax.scatter(
-        torque[turns][order],
-        seen.wheel_slip[turns][order],
-        c=np.minimum(seen.sideways[turns], 2.0)[order],
-        s=7,
-        lw=0,
-        alpha=0.6,
-        cmap="viridis_r",
-        vmin=0.0,
-        vmax=2.0,
-    )
+    x, y = torque[turns][order], seen.wheel_slip[turns][order]
+    colour = np.minimum(seen.sideways[turns], 2.0)[order]
+    return ax.scatter(x, y, 7, colour, lw=0, alpha=0.6, cmap="viridis_r", vmin=0.0, vmax=2.0)
 
 
 def driving_torque(robot: Robot, seen: Seen) -> np.ndarray:
@@ -84,14 +76,9 @@ def driving_torque(robot: Robot, seen: Seen) -> np.ndarray:
     speed = np.abs(seen.wheel_speed)
     amps = seen.amps * turning
     if seen.unsigned:
-        driven = (seen.torque * turning + friction(robot.motor, speed)) >= 0
+        driven = (seen.torque * turning + np.asarray(robot.motor.friction(speed))) >= 0
         amps = (seen.amps - float(robot.motor.current_offset)) * np.where(driven, 1.0, -1.0)
     return np.asarray(robot.motor.torque(jnp.asarray(amps), jnp.asarray(speed)))
-
-
-def friction(motor: Motor, speed: np.ndarray) -> np.ndarray:
-    """Friction torque of the motor at the wheel [N m]."""
-    return np.asarray(motor.friction(jnp.asarray(speed)))
 
 
 def _curve(ax: Axes, fit: Fit, floor: str) -> None:
@@ -107,14 +94,8 @@ def _curve(ax: Axes, fit: Fit, floor: str) -> None:
         seen = torque <= curve.torque_nm[-1]
         ax.plot(torque, slip, "--", color=colour, lw=1.2)
         ax.plot(torque[seen], slip[seen], color=colour, lw=2, label=label)
-    ax.fill_between(
-        curve.torque_nm,
-        curve.slip_lo,
-        curve.slip_hi,
-        color=drawing.ORANGE,
-        alpha=0.35,
-        lw=0,
-    )
+    low, high = curve.slip_lo, curve.slip_hi
+    ax.fill_between(curve.torque_nm, low, high, color=drawing.ORANGE, alpha=0.35, lw=0)
 
 
 def wheel_curve(
@@ -128,8 +109,6 @@ def wheel_curve(
     """Torque [N m] of a wheel that slips while it also rolls sideways.
 
     Args:
-        robot: its numbers.
-        floor: name.
         slip: of the wheel along its drive direction [1].
         sideways: speed across the wheel over its rim speed [1].
         wheel_speed: [rad/s].
@@ -189,16 +168,8 @@ def _amps(ax: Axes, seen: Seen, mine: np.ndarray, wheel: int, top: float) -> Pat
     mine = mine & (np.abs(speed) > RESTS * fastest)
     speed = speed[mine]
     torque = seen.torque[mine, wheel] * np.sign(speed)
-    made = ax.scatter(
-        torque,
-        seen.amps[mine, wheel],
-        c=np.abs(speed),
-        s=8,
-        lw=0,
-        cmap="viridis_r",
-        vmin=0,
-        vmax=top,
-    )
+    amps = seen.amps[mine, wheel]
+    made = ax.scatter(torque, amps, 8, np.abs(speed), lw=0, cmap="viridis_r", vmin=0, vmax=top)
     order = np.argsort(torque)
     ax.plot(torque[order], seen.amps_model[mine, wheel][order], ".", color=drawing.ORANGE, ms=2)
     return made

@@ -18,9 +18,10 @@ def estimates(items: Iterable[Estimate], title: str) -> Table:
     for e in items:
         if "session_yaw" in e.path or (e.verdict == "fixed" and e.provenance == "borrowed"):
             continue
-        for k, (name, value, interval) in enumerate(_rows(e)):
+        for k, (label, value, interval) in enumerate(rows_of(e)):
+            name = "" if k else e.path
             made.add_row(
-                Text(name),
+                Text(f"{name} [{label}]".strip() if label else name),
                 f"{value:.4g}",
                 e.unit,
                 "" if interval is None else f"{interval[0]:.4g} .. {interval[1]:.4g}",
@@ -30,16 +31,12 @@ def estimates(items: Iterable[Estimate], title: str) -> Table:
     return made
 
 
-def _rows(e: Estimate) -> list[tuple[str, float, tuple[float, float] | None]]:
-    """Name, value and interval of a scalar, or of each entry of a vector."""
+def rows_of(e: Estimate) -> list[tuple[str, float, tuple[float, float] | None]]:
+    """Label, value and interval of a scalar, or of each entry of a vector."""
     if not e.labels:
-        return [(e.path, e.value, e.interval90)]
+        return [("", e.value, e.interval90)]
     intervals = e.interval90 or [None] * len(e.labels)
-    names = [e.path] + [""] * (len(e.labels) - 1)
-    return [
-        (f"{name} [{label}]".strip(), value, interval)
-        for name, label, value, interval in zip(names, e.labels, e.value, intervals, strict=True)
-    ]
+    return list(zip(e.labels, e.value, intervals, strict=True))
 
 
 def show_fit(page: Page, fit: Fit, profiles: Sequence[Profile] = ()) -> None:

@@ -73,28 +73,18 @@ def planned(config: Config, report: Reporter) -> Job:
     wanted, shape = config.content.selftest, shape_of(config)
     sections = one_floor(config.content.logs)
     loads = list(dict.fromkeys(section.load for section in sections))
-    drives = [
-        replace(d, distance=wanted.distance_m)
-        for d in grid(
-            [(floor, load) for floor in wanted.surfaces for load in loads],
-            wanted.headings,
-            wanted.speeds_m_s,
-            wanted.turns,
-        )
-    ]
+    setups = [(floor, load) for floor in wanted.surfaces for load in loads]
+    runs = grid(setups, wanted.headings, wanted.speeds_m_s, wanted.turns)
+    drives = [replace(d, distance=wanted.distance_m) for d in runs]
     robot = build(shape, wanted.surfaces, loads, sorted({d.session for d in drives}))
     layouts = [layout_of(config, section) for section in sections]
-    channels = [set(layout.channels) for layout in layouts]
+    channels = [layout.channels.keys() for layout in layouts]
     has_current = all("current" in c for c in channels)
     has_voltage = all("voltage" in c or {"duty", "bus_voltage"} <= c for c in channels)
     is_signed = all(layout.current_is_signed for layout in layouts)
-    logs = [
-        replace(
-            log,
-            current=log.current if has_current else None,
-            current_is_signed=is_signed,
-        )
-        for log in make_logs(robot, drives, 0, Sensors(has_voltage=has_voltage))
-    ]
+    made = make_logs(robot, drives, 0, Sensors(has_voltage=has_voltage))
+    logs = [replace(log, current_is_signed=is_signed) for log in made]
+    if not has_current:
+        logs = [replace(log, current=None) for log in logs]
     report.line(f"no logs given: {len(logs)} runs of [selftest] on {', '.join(wanted.surfaces)}")
     return job_of(config, collect(logs), [], report)

@@ -1,4 +1,4 @@
-"""What is driven, by which robot, seen by which sensors: the inputs of made logs."""
+"""What is driven, seen by which sensors: the inputs of made logs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -6,12 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slipid.identify.design.planned_runs import Drive
-from slipid.model.geometry import omni
-from slipid.model.robot import Robot, build
-from slipid.parameter import Choice, Space, entries
-
-ROBOTINO = (60.0, 180.0, 300.0)
-"""Azimuths of the wheels [deg]."""
 
 
 def grid(
@@ -85,58 +79,3 @@ class Sensors:
         return (
             self.std[name] if name in self.std else self.std[f"{head}.floor.{last.split('.')[-1]}"]
         )
-
-
-TRUTH: dict[str, float | tuple[float, ...]] = {
-    "robot.mass": 12.0,
-    "robot.load_share@as_built": (0.29, 0.42, 0.29),
-    "robot.load_share@moved": (0.33, 0.35, 0.32),
-    "motor.resistance": 5.5,
-    "motor.back_emf": 0.0514,
-    "motor.inductance": 8.9e-3,
-    "motor.rotor_inertia": 7.1e-6,
-    "motor.coulomb_friction": 0.07,
-    "motor.viscous_friction": 0.006,
-    "camera.scale": 1.117,
-    "camera.lag": 0.056,
-    "camera.marker_yaw": -0.015,
-    "surface.firm.friction": 0.5,
-    "surface.firm.creep": 0.15,
-    "surface.firm.roller_drag": 0.18,
-    "surface.firm.roller_creep": 0.25,
-    "surface.firm.rolling_resistance": 0.008,
-    "surface.firm.slide_viscosity": 0.03,
-    "surface.firm.roller_viscosity": 0.03,
-    "surface.firm.scrub": 0.001,
-    "surface.firm.lead": 0.0015,
-    "surface.soft.friction": 0.8,
-    "surface.soft.creep": 0.45,
-    "surface.soft.roller_drag": 0.33,
-    "surface.soft.roller_creep": 0.2,
-    "surface.soft.rolling_resistance": 0.02,
-    "surface.soft.slide_viscosity": 0.05,
-    "surface.soft.roller_viscosity": 0.05,
-    "surface.soft.scrub": 0.002,
-    "surface.soft.lead": 0.0045,
-}
-"""Numbers of the default robot [SI], the rest as declared; of the size found on real logs."""
-
-
-def blank(drives: Sequence[Drive]) -> Robot:
-    """Robotino at declared starts that knows the floors, loads and sessions of a plan."""
-    return build(
-        omni(list(ROBOTINO), 0.125, 0.04, 16.0),
-        sorted({d.surface for d in drives}),
-        tuple(dict.fromkeys(d.load for d in drives)),
-        sorted({d.session for d in drives}),
-    )
-
-
-def truth(
-    drives: Sequence[Drive], values: Mapping[str, float | Sequence[float]] | None = None
-) -> Robot:
-    """Robotino with the numbers of `TRUTH`, or others; what the plan does not need is left out."""
-    robot = blank(drives)
-    known = {e.path for e in entries(robot)}
-    values = {**TRUTH, **(values or {})}
-    return Space(robot, [Choice(p, fixed=v) for p, v in values.items() if p in known]).template

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 from pydantic import TypeAdapter
 
 from slipid.data.windows import Windows
+from slipid.identify.compare.body_motion import as_increments
 from slipid.identify.compare.open_loop import chain, contact_increments
-from slipid.identify.compare.slip_models import as_increments
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.optimise import Optimum, Options, optimise
 from slipid.identify.fit.problem import Problem, State
@@ -28,7 +28,7 @@ from slipid.identify.slip_curves import curves, slip_on
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.job.config import Config
 from slipid.model.robot import Robot
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 from slipid.selftest.windows import measure
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
@@ -129,16 +129,13 @@ def replicates(
     kept: Checkpoint,
     report: Reporter,
 ) -> list[Replicate]:
-    """Replicates until there are so many; those that are kept are not repeated.
+    """Replicates until there are `count`; those that are kept are not repeated.
 
     Args:
-        config: of the experiment.
         choices: as the problem was given.
         problem: of its windows; what is compiled for it serves every replicate.
-        count: how many there shall be.
         seed: with the replicate's number the seed of truth and noise.
         kept: those that are done; every new one is added.
-        report: progress.
     """
     center, scatter = plausible(config, choices, problem)
     std = dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True))
@@ -215,10 +212,8 @@ def _curves(
     out = {}
     for floor, curve in found.items():
         true = slip_on(truth, floor, curve)
-        low, high = curve.slip_lo, curve.slip_hi
-        inside = (low - 1e-9 <= true) & (true <= high + 1e-9)
-        gap = float(np.abs(true - curve.slip).max())
-        out[floor] = Curve(gap, float(inside[1:].mean()))
+        inside = (curve.slip_lo - 1e-9 <= true) & (true <= curve.slip_hi + 1e-9)
+        out[floor] = Curve(float(np.abs(true - curve.slip).max()), float(inside[1:].mean()))
     return out
 
 
@@ -241,13 +236,9 @@ def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, 
     }
     chord, floor = np.linalg.norm(true, axis=1), np.asarray(w.surface)
     far = chord > 0.1 * np.median(chord)  # those that turn on the spot have none
-    return {
-        str(name): {
-            model: float(
-                np.mean((np.linalg.norm(end - true, axis=1) / chord)[far & (floor == name)])
-            )
-            for model, end in said.items()
-        }
-        for name in dict.fromkeys(w.surface)
-        if (far & (floor == name)).any()
-    }
+    out: dict[str, dict[str, float]] = {}
+    for name in dict.fromkeys(w.surface):
+        if (mine := far & (floor == name)).any():
+            gaps = {model: np.linalg.norm(end - true, axis=1) for model, end in said.items()}
+            out[name] = {m: float(np.mean((gap / chord)[mine])) for m, gap in gaps.items()}
+    return out

@@ -100,21 +100,22 @@ def judged(found: Sequence[Number]) -> Content:
     recovered = {"identified": "yes", "weak": "roughly"}.get(verdict, "no")
     if recovered != "no" and not honest:
         recovered = "wrong"
-    positive = bool((truth > 0).all())
     return {
         "unit": found[0].unit,
         "labels": found[0].labels,
         "truth": truth.tolist(),
         "value": value.tolist(),
         "z": z.tolist(),
-        "error_rms": float(np.sqrt(np.mean((value - truth) ** 2))),
-        "relative_error_rms": float(np.sqrt(np.mean((value / truth - 1) ** 2)))
-        if positive
-        else None,
-        "z_rms": float(np.sqrt(np.mean(z**2))),
+        "error_rms": _rms(value - truth),
+        "relative_error_rms": _rms(value / truth - 1) if (truth > 0).all() else None,
+        "z_rms": _rms(z),
         "coverage90": hits / total,
         "intervals": total,
         "verdicts": dict(count),
         "verdict": verdict,
         "recovered": recovered,
     }
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))

@@ -31,7 +31,6 @@ def measure(
     Args:
         truth: knows the floors, loads and sessions of the windows.
         w: what was driven; what it does not have is not made.
-        rng: random numbers.
         std: of the variance components by name (`fit.noise`); a name without its floor stands for
             every floor, those left out are zero.
     """

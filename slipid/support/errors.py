@@ -1,5 +1,7 @@
 """The one error that bad input raises, and the one form its messages have."""
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 
 
@@ -18,9 +20,6 @@ def bad_data(
     """Data error in the one form all of them have: `file row 12, column 'x': found; expected ...`.
 
     Args:
-        path: the file.
-        found: what is there.
-        expected: what should have been, or the choices.
         row: line number in the file, counted from 1 (in Parquet the record), or first and last.
         column: name of the column, as the file has it.
     """
@@ -32,3 +31,9 @@ def bad_data(
     if column is not None:
         where += f", column '{column}'"
     return DataError(f"{where}: {found}; expected {expected}")
+
+
+def near(name: object, choices: Iterable[str]) -> str:
+    """`, did you mean this or that?` where some of the choices are spelled alike, else nothing."""
+    found = get_close_matches(str(name), list(choices), n=2)
+    return f", did you mean {' or '.join(found)}?" if found else ""

@@ -40,9 +40,6 @@ def setup_jax(quiet: bool = False) -> None:
     """Switch on all of them and say so on stderr; every command that computes calls this first.
 
     A cache named by JAX's own variable stays; one that cannot be written costs time, nothing else.
-
-    Args:
-        quiet: say nothing.
     """
     plain_loops()
     import jax

@@ -19,11 +19,7 @@ MEMORY_S = 3600.0
 
 
 class Reporter:
-    """Tells a person how far the work is; use as a context.
-
-    Args:
-        quiet: tell nothing.
-    """
+    """Tells a person how far the work is, or nothing where quiet; use as a context."""
 
     def __init__(self, quiet: bool = False):
         self._console = Console(stderr=True, highlight=False, quiet=quiet)

@@ -1,78 +1,80 @@
 """Driving: a run on a site, as a trace of what truly happened."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from slipid.testsite.experiments import Run, Twist, Waypoints
-from slipid.testsite.ground import GROUNDS, Ground
-from slipid.testsite.machine import Machine
-from slipid.testsite.motors import Motor, SpeedLoop
-from slipid.testsite.plant import Plant, Trace, heading_of
-from slipid.testsite.sensors import Sensors
+from slipid.testsite.plant import TIMESTEP, Plant, heading_of
+from slipid.testsite.site import Site
 
 PERIOD = 0.05
 """Between two commands to the robot [s]."""
+REACHED_M = 0.02
+"""Distance at which a way-point counts as reached [m]."""
 
 
-@dataclass(frozen=True)
-class Site:
-    """Everything that stays the same from run to run.
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """What truly happened, a row per time step.
 
     Attributes:
-        machine, motor, loop: the robot.
-        sensors: sensors that make its logs.
-        grounds: physics of every surface.
-        command_delay_s: delay from a command to the wheels.
-        acceleration: acceleration of the wheels' rims towards a new command [m/s^2].
+        time: time since the end of the settling [s].
+        pose: pose of the body: x, y [m], heading [rad].
+        yaw_rate: [rad/s].
+        wheel_angle, wheel_speed, wheel_command: [rad], [rad/s], [rad/s].
+        current, voltage: those of the motors, signed along the drive direction [A], [V].
+        bus: voltage of the supply [V].
+        sinkage: depth to which each wheel has sunk [m].
+        twist_command: what was sent to the robot at this time: [m/s, m/s, rad/s].
     """
 
-    machine: Machine = field(default_factory=Machine)
-    motor: Motor = field(default_factory=Motor)
-    loop: SpeedLoop = field(default_factory=SpeedLoop)
-    sensors: Sensors = field(default_factory=Sensors)
-    grounds: Mapping[str, Ground] = field(default_factory=lambda: dict(GROUNDS))
-    command_delay_s: float = 0.12
-    acceleration: float = 1.0
+    time: Float[np.ndarray, " step"]
+    pose: Float[np.ndarray, "step 3"]
+    yaw_rate: Float[np.ndarray, " step"]
+    wheel_angle: Float[np.ndarray, "step wheel"]
+    wheel_speed: Float[np.ndarray, "step wheel"]
+    wheel_command: Float[np.ndarray, "step wheel"]
+    current: Float[np.ndarray, "step wheel"]
+    voltage: Float[np.ndarray, "step wheel"]
+    bus: Float[np.ndarray, " step"]
+    sinkage: Float[np.ndarray, "step wheel"]
+    twist_command: Float[np.ndarray, "step 3"]
 
 
-def drive(run: Run, site: Site, seed: int, timestep: float | None = None) -> Trace:
-    """Drive one run.
+class Rims:
+    """Wheel speeds that follow commands with the site's delay and acceleration."""
 
-    Args:
-        run: what to do.
-        site: robot and floors.
-        seed: seed of how the wheels stand and of the floor's unevenness.
-        timestep: time step of the engine [s], by default `plant.TIMESTEP`.
+    def __init__(self, site: Site, plant: Plant):
+        self.plant, self.delay = plant, site.command_delay_s
+        self.slew = site.acceleration * plant.dt / site.machine.wheel_radius_m
+        self.speed = self._wanted = np.zeros(len(plant.wheel_dof))
+        self._waiting: list[tuple[float, Float[np.ndarray, " wheel"]]] = []
+
+    def send(self, command: Float[np.ndarray, " wheel"]) -> None:
+        """A command [rad/s] sets out."""
+        self._waiting.append((self.plant.time + self.delay, command))
+
+    def follow(self) -> Float[np.ndarray, " wheel"]:
+        """Speeds [rad/s] to be kept over the next time step."""
+        while self._waiting and self._waiting[0][0] <= self.plant.time + 1e-9:
+            self._wanted = self._waiting.pop(0)[1]
+        self.speed = self.speed + np.clip(self._wanted - self.speed, -self.slew, self.slew)
+        return self.speed
+
+
+def drive(run: Run, site: Site, seed: int, timestep: float = TIMESTEP) -> Trace:
+    """Drive one run; arguments as of `Plant`.
 
     Raises:
         DataError: MuJoCo is missing, a surface has no physics, or the simulation became unstable.
     """
-    more = {} if timestep is None else {"timestep": timestep}
-    plant = Plant(
-        site.machine,
-        site.motor,
-        site.loop,
-        run.map,
-        site.grounds,
-        run.load,
-        run.start,
-        seed,
-        **more,
-    )
-    recorder = _Recorder(plant)
-    machine = site.machine
-    back = np.linalg.pinv(machine.wheel_from_twist)
-    believed = np.zeros(3)
+    plant = Plant(site, run.map, run.load, run.start, seed, timestep)
+    recorder, rims = _Recorder(plant), Rims(site, plant)
+    back = np.linalg.pinv(site.machine.wheel_from_twist)
+    believed, sent, goal = np.zeros(3), np.zeros(3), 0
     before = plant.wheel_angle
-    every = round(PERIOD / plant.dt)
-    waiting: list[tuple[float, Float[np.ndarray, " wheel"]]] = []
-    wheels = wanted = np.zeros(len(before))
-    slew = site.acceleration * plant.dt / machine.wheel_radius_m
-    goal = 0
-    sent = np.zeros(3)
     program = run.program
     while True:
         if isinstance(program, Waypoints):
@@ -86,14 +88,11 @@ def drive(run: Run, site: Site, seed: int, timestep: float | None = None) -> Tra
         if twist is None:
             break
         sent = np.array(twist)
-        waiting.append((plant.time + site.command_delay_s, machine.wheel_from_twist @ sent))
-        for _ in range(every):
-            while waiting and waiting[0][0] <= plant.time + 1e-9:
-                wanted = waiting.pop(0)[1]
-            wheels = wheels + np.clip(wanted - wheels, -slew, slew)
-            recorder.record(wheels, sent)
-            plant.step(wheels.tolist())
-    recorder.record(wheels, sent)
+        rims.send(site.machine.wheel_from_twist @ sent)
+        for _ in range(round(PERIOD / plant.dt)):
+            recorder.record(rims.follow(), sent)
+            plant.step(rims.speed.tolist())
+    recorder.record(rims.speed, sent)
     plant.check()
     return recorder.trace()
 
@@ -101,18 +100,18 @@ def drive(run: Run, site: Site, seed: int, timestep: float | None = None) -> Tra
 def _towards(
     program: Waypoints, goal: int, pose: Float[np.ndarray, "3"], time: float
 ) -> tuple[int, Twist | None]:
-    """The next way-point, and the twist towards it in the body frame."""
+    """The next way-point, and the twist towards it in the body frame.
+
+    It is given up after thrice the time without slip and 10 s.
+    """
     while goal < len(program.places):
         far = np.array(program.places[goal]) - pose[:2]
         size = float(np.hypot(*far))
-        if size > program.within_m:
+        if size > REACHED_M:
             break
         goal += 1
-    longest = program.longest_s
-    if longest is None:
-        corners = np.array([program.places[-1], *program.places])  # at least as long as the way
-        steps = np.diff(corners, axis=0)
-        longest = 10.0 + 3 * float(np.hypot(*steps.T).sum()) / program.speed
+    corners = np.array([program.places[-1], *program.places])  # at least as long as the way
+    longest = 10.0 + 3 * float(np.hypot(*np.diff(corners, axis=0).T).sum()) / program.speed
     if goal == len(program.places) or time > longest:
         return goal, None
     speed = min(program.speed, max(0.05, 2.0 * size))
@@ -133,35 +132,29 @@ class _Recorder:
 
     def __init__(self, plant: Plant):
         self.plant = plant
-        self._position = np.concatenate([np.arange(7), plant.wheel_at])
-        self._velocity = np.concatenate([[5], plant.wheel_dof])
-        self._rows: list[list[float]] = []
+        self._rows: list[tuple[float | list[float] | np.ndarray, ...]] = []
 
     def record(self, wanted: Float[np.ndarray, " wheel"], sent: Float[np.ndarray, "3"]) -> None:
-        p = self.plant
-        row = [p.time, p.drive.bus, *p.drive.current, *p.drive.voltage]
-        row += p.data.qpos[self._position].tolist()
-        row += p.data.qvel[self._velocity].tolist()
-        row += p.data.xpos[p.wheel_body, 2].tolist()
-        self._rows.append(row + wanted.tolist() + sent.tolist())
+        p, d = self.plant, self.plant.data
+        body, turn, height = d.qpos[:7].copy(), d.qvel[5], d.xpos[p.wheel_body, 2]
+        wheels = d.qpos[p.wheel_at], d.qvel[p.wheel_dof], height, wanted
+        electric = list(p.drive.current), list(p.drive.voltage), p.drive.bus
+        self._rows.append((p.time, body, turn, *wheels, *electric, sent))
 
     def trace(self) -> Trace:
-        n = len(self.plant.wheel_at)
-        widths = [1, 1, n, n, 7, n, 1, n, n, n, 3]
-        t, bus, amps, volts, q, angle, turn, speed, height, wanted, sent = np.split(
-            np.array(self._rows), np.cumsum(widths)[:-1], axis=1
-        )
-        heading = np.unwrap(heading_of(q[:, 3:]))[:, None]
+        columns = (np.array(column) for column in zip(*self._rows, strict=True))
+        time, body, turn, angle, speed, height, wanted, amps, volts, bus, sent = columns
+        heading = np.unwrap(heading_of(body[:, 3:]))[:, None]
         return Trace(
-            time=t[:, 0],
-            pose=np.concatenate([q[:, :2], heading], axis=1),
-            yaw_rate=turn[:, 0],
+            time=time,
+            pose=np.concatenate([body[:, :2], heading], axis=1),
+            yaw_rate=turn,
             wheel_angle=angle - self.plant.angle_at_start,
             wheel_speed=speed,
             wheel_command=wanted,
             current=amps,
             voltage=volts,
-            bus=bus[:, 0],
+            bus=bus,
             sinkage=np.maximum(self.plant.machine.wheel_radius_m - height, 0.0),
             twist_command=sent,
         )

@@ -1,14 +1,29 @@
-"""What a surface does to a roller."""
+"""What a surface does to a roller, and what lies where on an uneven floor."""
 
-import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import Annotated
 
-from slipid.testsite.refuse import at_most, not_negative, positive
+import numpy as np
+from jaxtyping import Float, Int
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from slipid.data.floor_map import MOST_CELLS, FloorMap
+from slipid.support.bounds import CLOSED, Positive
 
 GRAVITY = 9.81
+LEVELS = 7
+"""Steps of the random unevenness of a floor."""
+ARENA = 1.6
+"""Half of the edge of the square around the start in which one surface is uneven [m]."""
+GRID = 0.005
+"""Cells in which the floor is looked up [m], larger on the largest floors."""
+
+Pose = tuple[float, float, float]
+"""x, y [m], heading [rad]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=CLOSED)
 class Ground:
     """Physics of one surface.
 
@@ -25,26 +40,16 @@ class Ground:
         colour: in pictures.
     """
 
-    friction: float = 0.8
-    rolling_m: float = 0.0003
-    softness_m: float = 0.0003
-    shear_n_m: float = 1e5
-    compaction: float = 0.0
-    body_drag_n: float = 0.0
-    rib_height_m: float = 0.0
-    rib_distance_m: float = 0.03
-    unevenness: float = 0.0
-    colour: str = "#d9d4c7"
-
-    def __post_init__(self) -> None:
-        positive(self, "friction", "softness_m", "shear_n_m", "rib_distance_m")
-        not_negative(self, "rolling_m", "compaction", "body_drag_n", "rib_height_m", "unevenness")
-        at_most(self, friction=10.0, rolling_m=0.05, softness_m=0.03, compaction=1e7)
-        at_most(self, body_drag_n=1000.0, rib_height_m=0.02, unevenness=1.0)
-        if self.shear_n_m < 50:
-            raise ValueError(f"shear_n_m = {self.shear_n_m}; expected 50 or above")
-        if re.fullmatch("#[0-9a-fA-F]{6}", self.colour) is None:
-            raise ValueError(f"colour = {self.colour!r}; expected '#rrggbb'")
+    friction: Annotated[float, Field(gt=0, le=10)] = 0.8
+    rolling_m: Annotated[float, Field(ge=0, le=0.05)] = 0.0003
+    softness_m: Annotated[float, Field(gt=0, le=0.03)] = 0.0003
+    shear_n_m: Annotated[float, Field(ge=50, allow_inf_nan=False)] = 1e5
+    compaction: Annotated[float, Field(ge=0, le=1e7)] = 0.0
+    body_drag_n: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    rib_height_m: Annotated[float, Field(ge=0, le=0.02)] = 0.0
+    rib_distance_m: Positive = 0.03
+    unevenness: Annotated[float, Field(ge=0, le=1)] = 0.0
+    colour: Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")] = "#d9d4c7"
 
     @property
     def settling_s(self) -> float:
@@ -94,3 +99,77 @@ GROUNDS: dict[str, Ground] = {
     ),
 }
 """Surfaces by name: bare, a short carpet, two deeper ones, and a ribbed mat."""
+
+
+class Terrain:
+    """The floor around a start in kinds: a surface at a level of its random unevenness.
+
+    Attributes:
+        kinds: surface of each kind, and the factor of its rolling friction.
+    """
+
+    def __init__(
+        self, floor: FloorMap, grounds: Mapping[str, Ground], start: Pose, rng: np.random.Generator
+    ):
+        own = [grounds[name] for name in floor.surfaces]
+        levels = np.linspace(-1.5, 1.5, LEVELS)
+        self.kinds = [(g, np.exp(g.unevenness * v)) for g in own for v in levels]
+        x0, y0, x1, y1 = arena(floor, start)
+        self._corner = np.array([x0, y0])
+        self._cell = max(GRID, ((x1 - x0) * (y1 - y0) / MOST_CELLS) ** 0.5)
+        x = np.arange(x0, x1, self._cell) + 0.5 * self._cell
+        y = np.arange(y0, y1, self._cell) + 0.5 * self._cell
+        surface = floor.at(np.stack(np.meshgrid(x, y), -1))
+        self._kinds = surface * LEVELS + _uneven(x, y, rng)
+
+    def at(self, xy: Float[np.ndarray, "place 2"]) -> Int[np.ndarray, " place"]:
+        """Kind at places [m], by number."""
+        column, row = ((xy - self._corner) * (1 / self._cell)).astype(np.intp).T
+        rows, columns = self._kinds.shape
+        return self._kinds[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
+
+
+def _uneven(
+    x: Float[np.ndarray, " column"], y: Float[np.ndarray, " row"], rng: np.random.Generator
+) -> np.ndarray:
+    """Levels of a smooth random field (row, column): plane waves of about a hand's width."""
+    waves = 6
+    angle = rng.uniform(0, 2 * np.pi, waves)
+    number = 2 * np.pi / rng.uniform(0.08, 0.3, waves)
+    phase = rng.uniform(0, 2 * np.pi, waves)
+    field = np.zeros((len(y), len(x)))
+    for a, k, p in zip(angle, number, phase, strict=True):  # sin(u + v) from its parts
+        u, v = k * np.cos(a) * x + p, k * np.sin(a) * y
+        field += np.outer(np.cos(v), np.sin(u)) + np.outer(np.sin(v), np.cos(u))
+    field *= (2 / waves) ** 0.5
+    return np.clip(np.rint((field + 1.5) / 3 * (LEVELS - 1)), 0, LEVELS - 1).astype(np.intp)
+
+
+def arena(floor: FloorMap, start: Pose) -> tuple[float, float, float, float]:
+    """Lowest x, y, highest x, y [m] of where a floor is made: all of a map, or around the start."""
+    if len(floor.surfaces) > 1:
+        return floor.extent
+    x, y, _ = start
+    return x - ARENA, y - ARENA, x + ARENA, y + ARENA
+
+
+def ribs(
+    floor: FloorMap, grounds: Mapping[str, Ground], start: Pose
+) -> list[tuple[float, float, float, float]]:
+    """Ribs along y: x, lowest y, highest y, height [m] of each; none beyond `arena`."""
+    out: list[tuple[float, float, float, float]] = []
+    left, low, right, high = arena(floor, start)
+    fine = min(floor.cell, 0.02)
+    y = np.arange(low + 0.5 * fine, high, fine)
+    for number, name in enumerate(floor.surfaces):
+        ground = grounds[name]
+        if ground.rib_height_m <= 0:
+            continue
+        for x in np.arange(left, right, ground.rib_distance_m):
+            on = floor.at(np.stack([np.full_like(y, x), y], 1)) == number
+            ends = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
+            out += [
+                (float(x), low + fine * float(a), low + fine * float(b), ground.rib_height_m)
+                for a, b in ends.reshape(-1, 2)
+            ]
+    return out

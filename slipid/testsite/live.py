@@ -6,8 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.floor_map import FloorMap
-from slipid.testsite.driving import PERIOD, Site
+from slipid.testsite.driving import PERIOD, Rims
+from slipid.testsite.ground import Pose
 from slipid.testsite.plant import Plant
+from slipid.testsite.site import Site
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +31,7 @@ class Live:
     """A robot on a floor, driven by wheel speed commands with the site's delay and slew.
 
     Args:
-        site: robot, floors and sensors.
-        floor: which surface lies where.
         load: name of the load set-up.
-        start: x, y [m], heading [rad].
         seed: seed of the floor's unevenness, the wheels' first angles and the sensors' noise.
         period: between commands [s].
 
@@ -45,23 +44,19 @@ class Live:
         site: Site,
         floor: FloorMap,
         load: str,
-        start: tuple[float, float, float],
+        start: Pose,
         seed: int,
         period: float = PERIOD,
     ):
         self.site, self.period = site, period
-        self.plant = Plant(
-            site.machine, site.motor, site.loop, floor, site.grounds, load, start, seed
-        )
+        self.plant = Plant(site, floor, load, start, seed)
+        self._rims = Rims(site, self.plant)
         self._rng = np.random.default_rng([seed, 1])
         self._bias = site.sensors.gyro_bias * float(self._rng.normal())
-        wheels = len(site.machine.wheel_azimuths_deg)
-        self._wheels = self._wanted = np.zeros(wheels)
-        self._waiting: list[tuple[float, np.ndarray]] = []
-        self._recent = np.zeros((1, 2 * wheels))
+        self._recent = np.zeros((1, 2 * len(site.machine.wheel_azimuths_deg)))
 
     @property
-    def pose(self) -> tuple[float, float, float]:
+    def pose(self) -> Pose:
         """True pose [m, m, rad]."""
         return self.plant.pose
 
@@ -73,34 +68,25 @@ class Live:
 
     def step(self, command: Float[np.ndarray, " wheel"]) -> Reading:
         """Readings one period later."""
-        plant, site = self.plant, self.site
-        self._waiting.append((plant.time + site.command_delay_s, np.asarray(command, float)))
-        slew = site.acceleration * plant.dt / site.machine.wheel_radius_m
-        width = max(1, round(site.sensors.average_s / plant.dt))
+        plant = self.plant
+        self._rims.send(np.asarray(command, float))
+        width = max(1, round(self.site.sensors.average_s / plant.dt))
         rows = []
         for _ in range(round(self.period / plant.dt)):
-            while self._waiting and self._waiting[0][0] <= plant.time + 1e-9:
-                self._wanted = self._waiting.pop(0)[1]
-            self._wheels = self._wheels + np.clip(self._wanted - self._wheels, -slew, slew)
-            plant.step(self._wheels.tolist())
+            plant.step(self._rims.follow().tolist())
             rows.append([*plant.drive.current, *plant.drive.voltage])
         self._recent = np.array(rows[-width:])
         return self.read()
 
     def read(self) -> Reading:
         """Readings at this moment."""
-        s, rng, motor = self.site.sensors, self._rng, self.site.motor
-        tick = 2 * np.pi / (motor.ticks_per_revolution * self.site.machine.gear_ratio)
+        s, rng, tick = self.site.sensors, self._rng, self.site.tick
         amps, volts = np.split(self._recent.mean(axis=0), 2)
-        amps = amps + s.current_noise_a * rng.normal(size=amps.shape)
-        amps = amps if s.current_is_signed else np.abs(amps)
-        volts = volts + s.voltage_noise_v * rng.normal(size=volts.shape)
+        amps, volts = s.amperes(amps, rng), s.volts(volts, rng)
         turn = float(self.plant.data.qvel[5]) + self._bias + s.gyro_noise * float(rng.normal())
         return Reading(
             wheel_angle=np.floor(self.plant.wheel_angle / tick) * tick,
-            current=np.round(amps / s.current_step_a) * s.current_step_a,
-            voltage=np.round(volts / s.voltage_step_v) * s.voltage_step_v
-            if s.voltage
-            else np.full_like(volts, np.nan),
+            current=amps,
+            voltage=volts if s.voltage else np.full_like(volts, np.nan),
             gyro=turn if s.gyro else float("nan"),
         )

@@ -1,15 +1,18 @@
 """The robot as a MuJoCo model: chassis, omni wheels with passive rollers, floor."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import Field, FiniteFloat
+from pydantic.dataclasses import dataclass
 
-from slipid.testsite.refuse import not_negative, positive
+from slipid.support.bounds import CLOSED, NotNegative, Positive
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=CLOSED)
 class Machine:
     """What the robot is made of; by default like a Robotino 2.
 
@@ -31,54 +34,44 @@ class Machine:
         marker_yaw_deg: heading of the marker less the body's.
     """
 
-    mass_kg: float = 12.0
-    centres_m: Mapping[str, tuple[float, float]] = field(
+    mass_kg: Positive = 12.0
+    centres_m: Annotated[Mapping[str, tuple[float, float]], Field(min_length=1)] = field(
         default_factory=lambda: {"as_built": (-0.021, 0.002), "moved": (-0.004, -0.012)}
     )
-    centre_height_m: float = 0.06
-    wheel_azimuths_deg: tuple[float, ...] = (60.0, 180.0, 300.0)
-    base_radius_m: float = 0.125
-    wheel_radius_m: float = 0.04
-    gear_ratio: float = 16.0
-    rollers: int = 12
-    roller_radius_m: float = 0.009
-    roller_mass_kg: float = 0.012
-    row_offset_m: float = 0.006
-    mount_n_m: float = 2e4
-    roller_friction_nm: float = 0.012
-    wheel_mass_kg: float = 0.3
-    body_radius_m: float = 0.18
+    centre_height_m: Annotated[float, Field(ge=0, le=0.5)] = 0.06
+    wheel_azimuths_deg: Annotated[tuple[FiniteFloat, ...], Field(min_length=3)] = (
+        60.0,
+        180.0,
+        300.0,
+    )
+    base_radius_m: Positive = 0.125
+    wheel_radius_m: Positive = 0.04
+    gear_ratio: Positive = 16.0
+    rollers: Annotated[int, Field(ge=6, multiple_of=2)] = 12
+    roller_radius_m: Positive = 0.009
+    roller_mass_kg: Annotated[FiniteFloat, Field(ge=1e-4)] = 0.012
+    row_offset_m: NotNegative = 0.006
+    mount_n_m: Positive = 2e4
+    roller_friction_nm: NotNegative = 0.012
+    wheel_mass_kg: Positive = 0.3
+    body_radius_m: Positive = 0.18
     marker_height_m: float = 0.25
-    marker_size_m: float = 0.131
-    marker_yaw_deg: float = -0.9
+    marker_size_m: Positive = 0.131
+    marker_yaw_deg: FiniteFloat = -0.9
 
     def __post_init__(self) -> None:
-        positive(self, "mass_kg", "base_radius_m", "wheel_radius_m", "gear_ratio", "mount_n_m")
-        positive(self, "roller_radius_m", "roller_mass_kg", "wheel_mass_kg", "marker_size_m")
-        not_negative(self, "centre_height_m", "row_offset_m", "roller_friction_nm")
-        if len(self.wheel_azimuths_deg) < 3:
-            raise ValueError(f"{len(self.wheel_azimuths_deg)} wheels; expected three or more")
-        if self.rollers < 6 or self.rollers % 2:
-            raise ValueError(f"{self.rollers} rollers; expected an even number, 6 or more")
         if self.roller_radius_m >= self.wheel_radius_m:
             raise ValueError("rollers as large as the wheel; expected smaller ones")
-        positive(self, "body_radius_m")
         if self.own_mass_kg <= 0:
             raise ValueError(f"{self.mass_kg} kg is less than the wheels weigh; expected more")
-        if not np.isfinite([*self.wheel_azimuths_deg, self.marker_yaw_deg]).all():
-            raise ValueError("wheel_azimuths_deg and marker_yaw_deg: expected finite numbers")
         if np.linalg.cond(self.wheel_from_twist * self.wheel_radius_m) > 100:
             raise ValueError(
                 f"wheel_azimuths_deg = {self.wheel_azimuths_deg}; expected them spread"
             )
-        if self.roller_mass_kg < 1e-4 or self.centre_height_m > 0.5:
-            raise ValueError("expected roller_mass_kg of 1e-4 or above, centre_height_m up to 0.5")
-        if self.marker_height_m < self.wheel_radius_m + 0.08:
+        if not self.marker_height_m >= self.wheel_radius_m + 0.08:
             raise ValueError(
                 f"marker_height_m = {self.marker_height_m}; expected it 0.08 above the axes"
             )
-        if not self.centres_m:
-            raise ValueError("no centres_m; expected a place for every load set-up")
         for name in self.centres_m:
             if not self.load_share(name).min() > 0.02:
                 raise ValueError(f"load {name}: the centre of mass is not within the wheels")
@@ -124,9 +117,7 @@ def mjcf(
     give each those of the surface beneath it.
 
     Args:
-        machine: the robot.
         load: whose centre of mass it has.
-        timestep: [s].
         ribs: x, lowest y, highest y, height [m] of every rib.
         looks: XML of assets, for pictures.
         floor_looks: XML attributes of the floor's plane.

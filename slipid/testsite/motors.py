@@ -1,13 +1,15 @@
 """DC motors on one supply, and the speed loop that is built into the robot."""
 
-from dataclasses import dataclass
 from math import exp, floor, pi
-from typing import Literal
+from typing import Annotated, Literal
 
-from slipid.testsite.refuse import not_negative, positive
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from slipid.support.bounds import CLOSED, NotNegative, Positive
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=CLOSED)
 class Motor:
     """A brushed DC motor with its gear.
 
@@ -22,30 +24,19 @@ class Motor:
         ticks_per_revolution: ticks of the encoder in one turn of the motor shaft.
     """
 
-    resistance_ohm: float = 5.5
-    inductance_h: float = 8.9e-3
-    back_emf_vs: float = 0.0514
-    rotor_inertia_kg_m2: float = 7.1e-6
-    coulomb_nm: float = 0.07
-    viscous_nms: float = 0.006
-    efficiency: float = 0.9
-    supply_v: float = 24.0
-    supply_ohm: float = 0.15
-    ticks_per_revolution: int = 2000
-
-    def __post_init__(self) -> None:
-        positive(self, "resistance_ohm", "inductance_h", "back_emf_vs", "rotor_inertia_kg_m2")
-        positive(self, "efficiency", "supply_v", "ticks_per_revolution")
-        not_negative(self, "coulomb_nm", "viscous_nms", "supply_ohm")
-        if self.ticks_per_revolution < 10:
-            raise ValueError(
-                f"ticks_per_revolution = {self.ticks_per_revolution}; expected 10 or more"
-            )
-        if self.efficiency > 1:
-            raise ValueError(f"efficiency = {self.efficiency}; expected at most 1")
+    resistance_ohm: Positive = 5.5
+    inductance_h: Positive = 8.9e-3
+    back_emf_vs: Positive = 0.0514
+    rotor_inertia_kg_m2: Positive = 7.1e-6
+    coulomb_nm: NotNegative = 0.07
+    viscous_nms: NotNegative = 0.006
+    efficiency: Annotated[float, Field(gt=0, le=1)] = 0.9
+    supply_v: Positive = 24.0
+    supply_ohm: NotNegative = 0.15
+    ticks_per_revolution: Annotated[int, Field(ge=10)] = 2000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=CLOSED)
 class SpeedLoop:
     """The built-in controller of wheel speed, at the engine's time step.
 
@@ -60,27 +51,15 @@ class SpeedLoop:
     """
 
     kind: Literal["pi", "feed_forward", "cascade"] = "pi"
-    gain: float = 0.08
-    integral: float = 0.8
-    current_gain: float = 4.0
-    current_limit_a: float = 3.0
-    filter_s: float = 0.004
-
-    def __post_init__(self) -> None:
-        not_negative(self, "gain", "integral", "current_gain", "filter_s")
-        positive(self, "current_limit_a")
+    gain: NotNegative = 0.08
+    integral: NotNegative = 0.8
+    current_gain: NotNegative = 4.0
+    current_limit_a: Positive = 3.0
+    filter_s: NotNegative = 0.004
 
 
 class Drive:
-    """Currents and voltages of all wheels, a step at a time.
-
-    Args:
-        motor: motor of every wheel.
-        loop: speed loop of every wheel.
-        gear_ratio: turns of the motor per turn of the wheel.
-        wheels: how many.
-        dt: time step [s].
-    """
+    """Currents [A] and voltages [V] of all wheels, a step of `dt` [s] at a time."""
 
     def __init__(self, motor: Motor, loop: SpeedLoop, gear_ratio: float, wheels: int, dt: float):
         self.motor, self.loop, self.gear, self.dt = motor, loop, gear_ratio, dt

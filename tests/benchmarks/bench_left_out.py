@@ -95,8 +95,8 @@ def test_speeds(job: Job, seen: tuple[float, ...]) -> None:
     fitted = np.flatnonzero(np.isin(speed, seen))
     judged = np.flatnonzero(~np.isin(speed, seen) & several & built)
     part, problem = some(job, fitted)
-    _, predictor = train(problem, part, np.arange(len(part)))
-    rows = validation(predictor, data.subset(judged)).runs
+    _, *fitted = train(problem, part, np.arange(len(part)))
+    rows = validation(*fitted, data.subset(judged)).runs
     show(f"(b) fitted at {seen} m/s, faster runs predicted", rows)
     assert len(rows) == len(judged)
 
@@ -106,15 +106,15 @@ def test_moved_load(job: Job) -> None:
     data, problem = job.dataset, job.problem()
     moved = np.array([log.load == "moved" for log in data.logs])
     built, (third, rest) = np.flatnonzero(~moved), thirds(data, np.flatnonzero(moved))
-    optimum, _ = train(problem, data, built)
+    optimum, *_ = train(problem, data, built)
     held = only(problem, optimum.state.z, "robot.load_share@moved")
     refit = Problem(problem.windows, problem.robot, held)
     assert refit.space.names == ["robot.load_share@moved[1]", "robot.load_share@moved[2]"]
-    again, predictor = train(refit, data, third)
+    again, contact, _ = train(refit, data, third)
     w = problem.windows  # the simpler models see all that the force balance has seen
     seen = w.pieces(np.flatnonzero(np.isin(w.run, np.concatenate([built, third]))))
-    simple = [rung.fit(seen, predictor.robot) for rung in rungs(w.has_current)]
-    rows = validation(replace(predictor, rungs=simple), data.subset(rest)).runs
+    simple = [rung.fit(seen, contact.robot) for rung in rungs(w.has_current)]
+    rows = validation(contact, simple, data.subset(rest)).runs
     show("(c) moved load, shares from a third of its headings", rows)
     print_shares("shares of the third", refit, again, ("moved",))
     assert len(rows) == len(rest)
@@ -135,7 +135,7 @@ def test_load_shares(job: Job) -> None:
     for name in ("gray", "green", None):
         mine = np.arange(len(floor)) if name is None else np.flatnonzero(floor == name)
         data, problem = some(job, mine)
-        optimum, _ = train(problem, data, np.arange(len(data)))
+        optimum, *_ = train(problem, data, np.arange(len(data)))
         loads = sorted({log.load for log in data.logs})
         found[name] = print_shares(name or "all floors", problem, optimum, loads)
     apart = np.abs(found["gray"]["as_built"] - found["green"]["as_built"]).max()

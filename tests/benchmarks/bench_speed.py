@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from slipid.identify.fit.problem import Problem
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 from tests.helpers.numpy_model import Rival, numbers
 

@@ -24,21 +24,16 @@ from slipid.identify.compare.validation import Validation
 from slipid.job.config import parsed
 from slipid.job.problem import read_job
 from slipid.support.progress import Reporter
-from slipid.testsite.driving import Site, drive
-from slipid.testsite.experiments import (
-    Run,
-    Timed,
-    headings,
-    paper_grid,
-    rectangle,
-    straight,
-    wander,
-)
+from slipid.testsite.driving import drive
+from slipid.testsite.experiments import Run, Timed, straight
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.machine import Machine
 from slipid.testsite.plant import Plant
 from slipid.testsite.simulate.config import plan
-from slipid.testsite.simulate.simulate import logged, simulate, truth
+from slipid.testsite.simulate.observe import observe
+from slipid.testsite.simulate.sections import Headings, PaperGrid, Rectangle, Wander
+from slipid.testsite.simulate.simulate import simulate, truth
+from slipid.testsite.site import Site
 from tests.helpers.left_out import left_out
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -108,7 +103,7 @@ def _profile(surface: str) -> list[float]:
     """Microseconds a step of engine, motors and floor."""
     site = Site()
     run = straight(surface, "as_built", 1.0, 0.2, 0.5)
-    plant = Plant(site.machine, site.motor, site.loop, run.map, site.grounds, "as_built")
+    plant = Plant(site, run.map, "as_built")
     wanted = (site.machine.wheel_from_twist @ np.array([0.1, 0.1, 0.0])).tolist()
     spent = [0.0, 0.0, 0.0]
     engine, motors, look = plant._step, plant.drive.step, plant._look
@@ -432,13 +427,14 @@ def _figure_logs(site: Site) -> dict:
     floor = patchwork(["firm", "short", "medium", "soft"], seed=2)
     zones = four_zones(["firm", "medium", "soft", "short"])
     plans = {
-        "site": wander(floor, "site", "as_built", 12, seed=4),
-        "rectangle": [rectangle(zones, "zones", "as_built") for _ in range(6)],
+        "site": Wander(map="site", count=12).runs(floor, 4),
+        "rectangle": Rectangle(map="zones", repeats=6).runs(zones, 0),
     }
     for surface in ("firm", "medium", "soft"):
-        plans[surface] = paper_grid(surface, "as_built")
+        plans[surface] = PaperGrid(surface=surface).runs()
     for surface in ("firm", "short", "medium", "soft"):
-        plans[f"{surface} headings"] = headings(surface, "as_built", 10.0, (0.2,), 0.6)
+        plan = Headings(surface=surface, step_deg=10.0, speeds_m_s=[0.2], distance_m=0.6)
+        plans[f"{surface} headings"] = plan.runs()
     jobs = [(key, k, run) for key, runs in plans.items() for k, run in enumerate(runs)]
     out: dict = {key: [] for key in plans}
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
@@ -447,15 +443,16 @@ def _figure_logs(site: Site) -> dict:
         )
         for (key, k, run), trace in zip(jobs, traces, strict=True):
             out[key].append(
-                trace if key == "rectangle" else logged(trace, site, f"{key}/{k}", run, k)
+                trace if key == "rectangle" else observe(trace, site, run, f"{key}/{k}", k)
             )
     return out
 
 
 def _points(logs: list) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Current, slip and torque variable M of motor 1 over half seconds, cut as the authors did."""
-    from slipid.baselines.paper2021.samples import FIGURES_3_AND_4
     from slipid.baselines.paper2021.windows import WindowRecipe, wheel_windows
+
+    from slipid.baselines.paper2021.samples import FIGURES_3_AND_4
 
     recipe = WindowRecipe(pose_scale=1.117, min_speed=0.01)
     currents, slips, speeds = [], [], []

@@ -15,23 +15,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from slipid.cli.demo import packaged_config
-from slipid.cli.main import app
 from slipid.job.new import Answers, write_new
-from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
 from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
+from tests.helpers.shared import FEW, invoke
 
 ROOT = Path(__file__).resolve().parents[2]
-DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
-UNSEEN = [type(d)(d.surface, d.load, d.heading + 0.4, d.speed) for d in DRIVES[:3]]
-
-
-def invoke(*words: object):
-    return CliRunner().invoke(app, [str(w) for w in words])
 
 
 def process(*words: object, **more):
@@ -47,18 +39,6 @@ def process(*words: object, **more):
         text=True,
         **more,
     )
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """A folder with a config, made logs, unseen logs, and the result of identify on them."""
-    folder = tmp_path_factory.mktemp("small")
-    for name, drives, seed in (("logs", DRIVES, 1), ("unseen", UNSEEN, 2)):
-        robot = truth(drives)
-        write_logs(make_logs(robot, drives, seed, Sensors()), robot, folder / name, folder / "t")
-    (folder / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
-    args = ("identify", folder / "my.toml", "--data", folder / "logs", "--out", folder / "out")
-    return folder, invoke(*args)
 
 
 # help and usage ---------------------------------------------------------------------------------
@@ -344,10 +324,10 @@ def test_a_fit_that_does_not_settle_is_1_and_says_so(small, tmp_path):
 # interrupts -------------------------------------------------------------------------------------
 
 
-def endless(folder: Path, target: Path) -> Path:
+def endless(target: Path) -> Path:
     """The config of the small job with a tolerance that takes many rounds."""
     text = packaged_config("robotino.toml").replace("tolerance = 0.02", "tolerance = 1e-12")
-    target.write_text(text.replace("rounds = 30 ", "rounds = 60 "), encoding="utf-8")
+    target.write_text(text.replace("rounds = 30 ", "rounds = 14 "), encoding="utf-8")
     return target
 
 
@@ -366,17 +346,16 @@ def stopped(config: Path, data: Path, out: Path, how: signal.Signals) -> subproc
 @pytest.mark.slow
 def test_a_killed_fit_goes_on_and_ends_where_it_would_have(small, tmp_path):
     folder, _ = small
-    config, data = endless(folder, tmp_path / "long.toml"), folder / "logs"
+    config, data = endless(tmp_path / "long.toml"), folder / "logs"
     killed = stopped(config, data, tmp_path / "a", signal.SIGKILL)
     killed.communicate(timeout=60)
     assert killed.returncode == -signal.SIGKILL
     assert [p.name for p in (tmp_path / "a").iterdir() if p.suffix == ".json"] == []
-    again = process("identify", config, "--data", data, "--out", tmp_path / "a")
-    _, stderr = again.communicate(timeout=300)
-    whole = process("identify", config, "--data", data, "--out", tmp_path / "b")
-    whole.communicate(timeout=300)
-    assert again.returncode == whole.returncode
-    assert "going on from round" in stderr
+    again, whole = (
+        invoke("identify", config, "--data", data, "--out", tmp_path / name) for name in "ab"
+    )
+    assert again.exit_code == whole.exit_code == 1  # the tolerance is out of reach
+    assert "going on from round" in again.stderr
     one, other = (json.loads((tmp_path / k / "fit.json").read_text()) for k in "ab")
     assert one["z"] == pytest.approx(other["z"], rel=1e-9, abs=1e-12)
     assert one["history"] == pytest.approx(other["history"], rel=1e-9)
@@ -416,7 +395,7 @@ def test_an_interrupt_that_python_must_ignore_where_it_arrives_stops_the_command
 @pytest.mark.slow
 def test_an_interrupt_is_130_and_keeps_the_checkpoint(small, tmp_path):
     folder, _ = small
-    config = endless(folder, tmp_path / "long.toml")
+    config = endless(tmp_path / "long.toml")
     run = stopped(config, folder / "logs", tmp_path / "out", signal.SIGINT)
     _, stderr = run.communicate(timeout=60)
     assert run.returncode == 130
@@ -428,21 +407,11 @@ def test_an_interrupt_is_130_and_keeps_the_checkpoint(small, tmp_path):
 
 # posterior --------------------------------------------------------------------------------------
 
-FEW = ("--draws", "20", "--most", "24", "--block", "2", "--quiet")  # blocks: 20 are to warm up
-
-
-@pytest.fixture(scope="module")
-def sampled(small, tmp_path_factory):
-    """A copy of the fit, and the end of a `sample` that has far too few steps."""
-    out = tmp_path_factory.mktemp("sampled") / "out"
-    shutil.copytree(small[0] / "out", out)
-    return out, invoke("sample", out, *FEW)
-
 
 @pytest.mark.slow
 def test_a_posterior_that_has_not_converged_says_so_everywhere(sampled):
     out, result = sampled
-    assert result.exit_code == 1, result.output
+    assert result.exit_code == 1, result.stderr
     assert "NOT converged" in result.stdout
     about = json.loads((out / "sample.json").read_text())
     assert about["converged"] is False
@@ -508,7 +477,7 @@ def test_posterior_nc_has_the_groups_of_arviz_and_names_for_everything(sampled):
         np.testing.assert_allclose(posterior["robot.load_share"].sum("wheel"), 1.0)
         creep = posterior["surface.creep"]
         assert creep.dims == ("chain", "draw", "surface")
-        assert creep.shape[:2] == (4, 20)
+        assert creep.shape[:2] == (4, 10)
         floor = str(creep.surface[0].values)
         low, high = found["parameters"][f"surface.{floor}.creep"]["interval90"]
         draws = creep.sel(surface=floor).values.ravel()
@@ -523,7 +492,7 @@ def test_posterior_nc_has_the_groups_of_arviz_and_names_for_everything(sampled):
         inside = (new.quantile(0.05, ("chain", "draw")) < measured) & (
             measured < new.quantile(0.95, ("chain", "draw"))
         )
-        assert 0.8 < float(inside.mean()) < 1.0
+        assert 0.7 < float(inside.mean()) < 1.0
     sources = {p["source"] for p in found["parameters"].values() if p["verdict"] != "fixed"}
     assert sources == {"posterior"}
 

@@ -132,8 +132,16 @@ def adversary(key, count, angle):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "steps"), [("contact", 1200), ("curve", 8800)])
-def test_a_million_adversarial_steps_of_both(kind, steps):
+@pytest.mark.parametrize(
+    ("kind", "steps"),
+    [
+        ("contact", 100),
+        ("curve", 700),
+        pytest.param("contact", 1200, marks=pytest.mark.nightly),
+        pytest.param("curve", 8800, marks=pytest.mark.nightly),  # a million of both
+    ],
+)
+def test_adversarial_steps(kind, steps):
     p, robots = pilot(kind), 100
 
     def one(carry, key):

@@ -29,7 +29,7 @@ from slipid.deploy.deploy import deploy_known
 from slipid.model.geometry import omni
 from slipid.model.plant import Floor
 from slipid.model.robot import Robot, build
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 from tests.helpers import replayed
 
 FIT = Path(__file__).parents[1] / "helpers" / "robotino2022_sectors.json"

@@ -22,7 +22,7 @@ from slipid.control.deployed import DeployedRobot, drawn
 from slipid.control.robot_file.gains_record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.control.robot_file.record import Seen, checksum
 from slipid.deploy.deploy import deploy_known
-from slipid.deploy.record_of import About, given, record_of
+from slipid.deploy.record_of import given, record_of
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.parameter import entries
@@ -58,9 +58,9 @@ def robot() -> DeployedRobot:
     pairs = tuple((x - 0.01, x + 0.01) for x in share[0].tolist())
     known = {"std": (0.01, 0.01, 0.01), "interval90": pairs, "verdict": "identified"}
     numbers[share_path] = replace(numbers[share_path], **known)
-    about = About(seen={"firm": SEEN}, messages=("say \u00e9 aloud",), versions={"jax": "0.1"})
     std = {"process.firm.along": 0.003, "session.soft.yaw": 0.02}
-    record = record_of(made, numbers, std, several, 8.1, (0.01, -0.02), about)
+    record = record_of(made, numbers, std, several, 8.1, (0.01, -0.02), {"firm": SEEN})
+    record = replace(record, messages=("say \u00e9 aloud",), versions={"jax": "0.1"})
     return DeployedRobot.of(replace(record, gains=GAINS), "moved")
 
 

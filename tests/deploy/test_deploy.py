@@ -9,38 +9,24 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from slipid.cli.demo import packaged_config
-from slipid.cli.main import app
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import MIXED, Settings
+from slipid.control.tuning import optimisers
+from slipid.deploy import tune
 from slipid.deploy.deploy import DRAWS, deploy, read_robot, write_robot
 from slipid.deploy.tune import robots_of
 from slipid.identify.fit_file import load
-from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
 from slipid.support.errors import DataError
+from tests.helpers.shared import DRIVES, invoke
 
-DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
-FEW = ("--draws", "20", "--most", "24", "--block", "2", "--quiet")
 pytestmark = pytest.mark.slow  # a fit
 
 
-def invoke(*words: object):
-    return CliRunner().invoke(app, [str(w) for w in words])
-
-
-@pytest.fixture(scope="module")
-def fitted(tmp_path_factory) -> Path:
-    """A folder that `slipid identify` wrote."""
-    folder = tmp_path_factory.mktemp("fitted")
-    robot = truth(DRIVES)
-    write_logs(make_logs(robot, DRIVES, 1, Sensors()), robot, folder / "logs", folder / "t")
-    (folder / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
-    args = ("--data", folder / "logs", "--out", folder / "out")
-    done = invoke("identify", folder / "my.toml", *args)
-    assert done.exit_code in (0, 1), done.stderr
-    return folder / "out"
+@pytest.fixture
+def fitted(small) -> Path:
+    """A folder that `slipid identify` wrote; to be read alone."""
+    return small[0] / "out"
 
 
 def agree(out: Path) -> DeployedRobot:
@@ -67,7 +53,7 @@ def test_a_fit_writes_its_robot(fitted):
     assert record.messages == fit.messages
     assert record.floors[0].seen.runs == len(DRIVES)
     assert record.floors[0].process[0] == pytest.approx(fit.variance["process.soft.along"] ** 0.5)
-    assert Settings.of(robot).current_is_signed == fit.settings["current_is_signed"]
+    assert Settings.of(robot).current_is_signed == fit.channels.signed
     assert Settings.of(robot).alike == Settings().alike != MIXED
     free = {path for path in fit.space.place if not path.startswith("camera.")}
     assert set(record.draws) == free
@@ -84,12 +70,8 @@ def test_draws_to_search_with_and_to_judge_on_are_different_ones(fitted):
     np.testing.assert_array_equal(robots_of(robot, 3)[0].floors.friction, tried)
 
 
-def test_after_sampling_no_two_files_disagree(fitted, tmp_path):
-    out = tmp_path / "out"
-    shutil.copytree(fitted, out)
-    before = read_robot(out).record
-    done = invoke("sample", out, *FEW)
-    assert done.exit_code == 1, done.output  # far too few steps
+def test_after_sampling_no_two_files_disagree(fitted, sampled):
+    out, before = sampled[0], read_robot(fitted).record
     record = agree(out).record
     assert record.source == "posterior"
     assert record.parameters["surface.soft.creep"].source == "posterior"
@@ -98,10 +80,12 @@ def test_after_sampling_no_two_files_disagree(fitted, tmp_path):
     assert len(set(record.draws["surface.soft.creep"])) > DRAWS // 4
 
 
-def test_gains_outlive_the_same_numbers_and_no_others(fitted, tmp_path):
+def test_gains_outlive_the_same_numbers_and_no_others(fitted, tmp_path, monkeypatch):
+    monkeypatch.setattr(optimisers, "PARTICLES", 4)
+    monkeypatch.setattr(tune, "JUDGED", 4)
     out, fit = tmp_path / "out", load(fitted)
     shutil.copytree(fitted, out)
-    done = invoke("tune", out, "--method", "pso", "--rollouts", "480", "--quiet")
+    done = invoke("tune", out, "--method", "pso", "--rollouts", "64", "--quiet")
     assert done.exit_code in (0, 1), done.output
     kept, tuned = json.loads((out / "gains.json").read_text()), agree(out).record
     for name, gain in kept["gains"].items():

@@ -21,7 +21,7 @@ from slipid.identify.fit.problem import DEGREES, VARIANCE_SPREAD, Problem
 from slipid.identify.posterior import sample as posterior
 from slipid.identify.posterior.blocks import Plan
 from slipid.identify.posterior.coordinates import Fitted
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
 PLAN = Plan(ensembles=2, walkers=16, block=10, warm_up=(2, 4, 6, 8), most=14)

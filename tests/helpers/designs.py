@@ -23,7 +23,6 @@ from slipid.identify.design.planned_runs import (
     steady_windows,
 )
 from slipid.identify.design.planner import (
-    Channels,
     Planner,
     parameter_goal,
     prediction_goal,
@@ -33,8 +32,11 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
 from slipid.identify.fit.optimise import Options, optimise
 from slipid.identify.fit.problem import Problem, State
-from slipid.parameter import Choice
-from slipid.selftest.logs import Sensors, blank, make_logs, truth
+from slipid.identify.result import Channels
+from slipid.search_space import Choice
+from slipid.selftest.known import blank, truth
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors
 from tests.helpers.made_windows import measure
 
 SETUP = ("soft", "as_built")
@@ -63,7 +65,7 @@ def std_of(name, rows=40):
 
 @functools.cache
 def planner():
-    names = of_noise.noise(steady_windows([ANY], TRUTH, 4, {}), TRUTH).names
+    names = of_noise.noise(steady_windows([ANY], TRUTH, Channels(), {}), TRUTH).names
     return Planner(TRUTH, CHOICES, {n: std_of(n) ** 2 for n in names}, Channels())
 
 
@@ -98,14 +100,14 @@ def plans(count):
 @functools.cache
 def problem(count):
     """Compiled for so many runs."""
-    return Problem(steady_windows([ANY] * count, TRUTH, 4, {}), blank([ANY]), CHOICES)
+    return Problem(steady_windows([ANY] * count, TRUTH, Channels(), {}), blank([ANY]), CHOICES)
 
 
 def fit_windows(drives, seed):
     """Fit of windows made from the model, begun at the truth; (z, converged)."""
     rng = np.random.default_rng(seed)
     std = {n: std_of(n) for n in problem(len(drives)).noise.names}
-    clean = steady_windows(drives, TRUTH, 4, {})
+    clean = steady_windows(drives, TRUTH, Channels(), {})
     made = measure(TRUTH, clean, rng, {**std, "current": std["current.soft.window"]})
     this = problem(len(drives)).of(made)
     log_v = np.log([std[n] ** 2 for n in this.noise.names])
@@ -126,7 +128,7 @@ def errors(z):
     this = planner()
     found = this.space.tree(jnp.asarray(z))
     share = np.asarray(found.body.load_share - TRUTH.body.load_share)
-    w = steady_windows(PREDICTED, TRUTH, 4, {})
+    w = steady_windows(PREDICTED, TRUTH, Channels(), {})
     ends = []
     for robot in (found, this.robot):
         step = replay.contact_increments(robot, lk.batch(w, robot))

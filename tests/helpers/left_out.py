@@ -10,12 +10,13 @@ import numpy as np
 
 from slipid.data.runs import Runs
 from slipid.identify.compare.folds import Fold
-from slipid.identify.compare.predictive import contact_of
+from slipid.identify.compare.predictive import Contact, contact_of
+from slipid.identify.compare.rung import Rung
 from slipid.identify.compare.slip_models import rungs
-from slipid.identify.compare.validation import Judged, Predictor, validation
+from slipid.identify.compare.validation import Judged, validation
 from slipid.identify.fit.optimise import Optimum, Options, optimise
 from slipid.identify.fit.problem import Problem
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 
 
 def left_out(
@@ -35,15 +36,15 @@ def left_out(
     """
     rows: list[Judged] = []
     for k in sorted({int(f) for f in fold if f >= 0}):
-        optimum, fitted = train(problem, data, np.flatnonzero(fold != k), options)
+        optimum, fitted, simple = train(problem, data, np.flatnonzero(fold != k), options)
         tell(k, optimum)
-        rows += validation(fitted, data.subset(np.flatnonzero(fold == k))).runs
+        rows += validation(fitted, simple, data.subset(np.flatnonzero(fold == k))).runs
     return rows
 
 
 def train(
     problem: Problem, data: Runs, runs: np.ndarray, options: Options | None = None
-) -> tuple[Optimum, Predictor]:
+) -> tuple[Optimum, Contact, list[Rung]]:
     """Fit of some runs of a problem, every rung of the ladder included, ready to predict others."""
     keep = np.isin(problem.windows.run, runs).astype(float)
     optimum = optimise(problem, keep=keep, options=options)
@@ -51,15 +52,7 @@ def train(
     robot = contact.robot
     w = problem.windows.at_lag(float(robot.camera.lag))
     seen = w.pieces(np.flatnonzero(keep > 0))
-    fitted = Predictor(
-        robot=robot,
-        space=problem.space,
-        z=contact.z,
-        covariance=contact.covariance,
-        variance=contact.variance,
-        rungs=[rung.fit(seen, robot) for rung in rungs(w.has_current)],
-    )
-    return optimum, fitted
+    return optimum, contact, [rung.fit(seen, robot) for rung in rungs(w.has_current)]
 
 
 def only(problem: Problem, z: np.ndarray, pattern: str) -> list[Choice]:

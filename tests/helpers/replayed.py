@@ -23,7 +23,7 @@ from slipid.data.runs import Runs, first_row
 from slipid.deploy.deploy import deploy_known
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
-from slipid.parameter import Space
+from slipid.search_space import Space
 
 TOGETHER = 32
 """Runs replayed in one call."""

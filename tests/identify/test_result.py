@@ -17,15 +17,19 @@ from scipy.stats import f as fisher
 from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.identify import fit_file
-from slipid.identify.compare.validation import Predictor, validation
+from slipid.identify.compare.predictive import Contact
+from slipid.identify.compare.validation import validation
 from slipid.identify.fit.optimise import Optimum, one_round
 from slipid.identify.fit.problem import DEGREES, Problem, State
-from slipid.identify.fit_file import identified_json, load, save, to_json
+from slipid.identify.fit_file import load, save
+from slipid.identify.fit_json import identified_json, to_json
 from slipid.identify.result import Fit, hash_of, summarise
 from slipid.identify.verdicts.estimates import estimates, expected_covariance
 from slipid.identify.verdicts.unidentified import flat_directions
-from slipid.parameter import Choice
-from slipid.selftest.logs import Drive, Sensors, blank, grid, make_logs, truth
+from slipid.search_space import Choice
+from slipid.selftest.known import blank, truth
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
 from slipid.support.errors import DataError
 
 pytestmark = pytest.mark.slow  # traces whole fits
@@ -89,7 +93,7 @@ def verdicts(
 
     `prior_std` in the search space is the declared one, or one for all.
     """
-    from slipid.parameter import Space
+    from slipid.search_space import Space
 
     space = Space(blank(DRIVES), choices)
     if prior_std:
@@ -140,7 +144,7 @@ def test_a_number_that_runs_to_zero_is_at_its_bound_and_a_contradicted_prior_is_
 
 def test_without_voltage_neither_resistance_nor_back_emf_is_identified():
     fit = fit_of(False)
-    assert fit.has["voltage"] is False
+    assert fit.channels.voltage is False
     for path in ("motor.resistance", "motor.back_emf"):
         e = fit.parameters[path]
         assert (e.verdict, e.provenance) == ("not_identified", "borrowed")
@@ -280,7 +284,7 @@ def test_the_data_hash_knows_names_and_bytes_but_no_order():
 
 
 def test_a_saved_fit_comes_back_the_same(tmp_path):
-    fit = fit_of(True).with_baselines({"constant": {"soft": [0.25]}})
+    fit = dataclasses.replace(fit_of(True), baselines={"constant": {"soft": [0.25]}})
     names = save(fit, tmp_path)
     back = load(tmp_path)
     assert identified_json(back) == identified_json(fit)
@@ -413,6 +417,7 @@ def in_sessions(session, seed):
     return collect(moved, session=lambda log: of[log.name])
 
 
+@pytest.mark.nightly
 def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
     """At the truth, so that all that is off is noise: 200 runs, each in a session of its own."""
     data = in_sessions(np.arange(160) % 40, 1)
@@ -438,8 +443,8 @@ def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
     alone = {name: v for name, v in fit.variance.items() if not name.startswith("session.")}
 
     def covered(covariance, variance):
-        fitted = Predictor(fit.robot, fit.space, fit.z, covariance, variance, ())
-        return validation(fitted, new).summary["soft"]["identified"].coverage90
+        fitted = Contact(fit.robot, variance, covariance, fit.space, fit.z)
+        return validation(fitted, (), new).summary["soft"]["identified"].coverage90
 
     # what is drawn is Gaussian: the 90 % region of a Student t holds more of it
     held = chi2.cdf(2 * fisher.ppf(0.9, 2, DEGREES), 2)
@@ -449,7 +454,7 @@ def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
 
 
 def test_numbers_that_are_not_finite_never_reach_a_file(tmp_path):
-    bad = dataclasses.replace(fit_of(True), settings={"lag": float("nan")})
+    bad = dataclasses.replace(fit_of(True), lag=float("nan"))
     with pytest.raises(ValueError, match="JSON"):
         save(bad, tmp_path)
     assert list(tmp_path.iterdir()) == []

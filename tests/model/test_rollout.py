@@ -12,7 +12,7 @@ from slipid.model import contact
 from slipid.model.geometry import omni, skid_steer
 from slipid.model.robot import build, twist, wheel_torque
 from slipid.model.rollout import SpeedLoop, inertia, replay, replay_twist, simulate
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 
 RADIUS, DT = 0.04, 0.002
 NUMBERS = {

@@ -13,18 +13,21 @@ from matplotlib.image import imread
 from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.identify.compare.slip_models import rungs
+from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.result import Fit, summarise
-from slipid.parameter import Choice
 from slipid.plots import fit as plots
 from slipid.plots import load as plots_robot
+from slipid.plots.compare import WORDS, ladder_figure
 from slipid.plots.drawing import figure, save
 from slipid.plots.motion import heading_figure
 from slipid.plots.seen import by_heading, seen
-from slipid.plots.slip_models import WORDS, ladder_figure
 from slipid.plots.wheels import current_figure, driving_torque, wheel_curve
-from slipid.selftest.logs import Drive, Sensors, blank, grid, make_logs, truth
+from slipid.search_space import Choice
+from slipid.selftest.known import blank, truth
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
 
 pytestmark = pytest.mark.slow  # traces whole fits
 

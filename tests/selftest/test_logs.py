@@ -10,11 +10,14 @@ import pytest
 from slipid.data.reading.declared import declared_layout
 from slipid.data.reading.reader import find_logs, read_log
 from slipid.data.runs import collect, default_session
-from slipid.data.signals.wheel_signals import quantum
 from slipid.data.windows import windows
+from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.likelihood import batch, residuals
 from slipid.identify.fit.noise import noise
-from slipid.selftest.logs import LAYOUT, TRUTH, Drive, Sensors, grid, make_logs, truth, write_logs
+from slipid.selftest.known import TRUTH, truth
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
+from tests.helpers.made_logs import LAYOUT, write_logs
 
 PLAN = grid(headings=4, turns=2)
 ROBOT = truth(PLAN)
@@ -57,8 +60,8 @@ def test_logs_have_the_traps_of_real_ones(logs):
     log = logs[0]
     assert not log.current_is_signed
     assert log.current.min() >= 0
-    assert quantum(log.current.ravel()) == pytest.approx(1 / 39, rel=1e-3)
-    assert quantum(log.voltage.ravel()) == pytest.approx(0.1, rel=1e-3)
+    for steps in (log.current * 39, log.voltage * 10):
+        np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
     turn = 2000 * 16 / (2 * np.pi)
     np.testing.assert_allclose(log.wheel_angle * turn, np.round(log.wheel_angle * turn), atol=1e-6)
     stale = ~log.pose_fresh

@@ -8,22 +8,14 @@ import pytest
 
 from slipid.data.floor_map import FloorMap, four_zones, uniform
 from slipid.support.errors import DataError
-from slipid.testsite.driving import Site, drive
-from slipid.testsite.experiments import (
-    Timed,
-    Waypoints,
-    curves,
-    headings,
-    numbered,
-    paper_grid,
-    rectangle,
-    straight,
-    wander,
-)
-from slipid.testsite.ground import GRAVITY, GROUNDS, Ground
+from slipid.testsite.driving import Trace, drive
+from slipid.testsite.experiments import Run, Timed, Waypoints, numbered, straight
+from slipid.testsite.ground import GRAVITY, GROUNDS, LEVELS, Ground, ribs
 from slipid.testsite.machine import Machine
 from slipid.testsite.motors import Drive, Motor, SpeedLoop
-from slipid.testsite.plant import LEVELS, Plant, Trace, ribs
+from slipid.testsite.plant import Plant
+from slipid.testsite.simulate.sections import Curves, Headings, PaperGrid, Rectangle, Wander
+from slipid.testsite.site import Site
 
 EVEN = {name: replace(g, unevenness=0.0) for name, g in GROUNDS.items()}
 CENTRED = replace(Machine(), centres_m={"as_built": (0.0, 0.0)})
@@ -32,7 +24,25 @@ STILL = [0.0, 0.0, 0.0]
 
 def standing(surface: str, machine: Machine = CENTRED, seed: int = 0, **more: Ground) -> Plant:
     grounds = {**EVEN, **more}
-    return Plant(machine, Motor(), SpeedLoop(), uniform(surface), grounds, "as_built", seed=seed)
+    return Plant(Site(machine, grounds=grounds), uniform(surface), "as_built", seed=seed)
+
+
+def loads(plant: Plant) -> np.ndarray:
+    """Vertical force of the floor on each wheel at this moment [N]."""
+    out, force = np.zeros(len(plant.wheel_dof)), np.zeros(6)
+    for k, contact in enumerate(plant.data.contact):
+        mujoco.mj_contactForce(plant.model, plant.data, k, force)
+        for geom in contact.geom:
+            if (name := plant.model.geom(geom).name).startswith("roller"):
+                up = contact.frame.reshape(3, 3).T @ force[:3]
+                out[int(name.removeprefix("roller").split("_")[0])] += abs(up[2])
+    return out
+
+
+def sixths(surface: str) -> list[Run]:
+    """Straight runs 60 degrees apart."""
+    plan = Headings(surface=surface, step_deg=60.0, speeds_m_s=[0.2], distance_m=0.6)
+    return plan.runs()
 
 
 def body_step(trace: Trace) -> np.ndarray:
@@ -100,7 +110,7 @@ def test_the_floor_carries_the_weight_as_statics_say():
     found = []
     for _ in range(4000):
         plant.step(rim.tolist())
-        found.append(plant.loads())
+        found.append(loads(plant))
     weight = Machine().mass_kg * GRAVITY
     mean = np.mean(found[500:], axis=0)
     assert mean.sum() == pytest.approx(weight, rel=0.01)
@@ -108,7 +118,7 @@ def test_the_floor_carries_the_weight_as_statics_say():
     np.testing.assert_allclose(mean / weight, Machine().load_share("as_built"), atol=0.012)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_centred_robot_looks_the_same_from_every_wheel():
     site = Site(machine=CENTRED, grounds=EVEN)
     ends = []
@@ -128,7 +138,7 @@ def test_a_centred_robot_looks_the_same_from_every_wheel():
 def test_wheels_roll_where_the_floor_is_firm():
     site = Site()
     back = np.linalg.pinv(site.machine.wheel_from_twist)
-    for run in headings("firm", "as_built", 60.0, (0.2,), 0.6):
+    for run in sixths("firm"):
         trace = drive(run, site, 1)
         steady = (trace.time > 1.0) & (trace.time < 2.8)
         wheels = back @ trace.wheel_speed[steady].mean(axis=0)
@@ -150,21 +160,18 @@ def test_half_the_time_step_ends_at_the_same_place(surface):
         assert np.hypot(*(ends[0] - ends[1])) < 0.02 * 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_slip_grows_with_softness_and_depends_on_the_direction():
     site = Site()
     found = {}
     for surface in ("firm", "medium", "soft"):
-        runs = headings(surface, "as_built", 60.0, (0.2,), 0.6)
+        runs = sixths(surface)
         found[surface] = [slip(drive(run, site, 3), site.machine) for run in runs]
     assert 0.003 < np.mean(found["firm"]) < 0.03
     assert 0.1 < np.mean(found["medium"]) < 0.3
     assert 0.2 < np.mean(found["soft"]) < 0.55
     assert np.ptp(found["soft"]) > 0.1  # the centre of mass lies off the middle
-    level = [
-        slip(drive(run, Site(machine=CENTRED), 3), CENTRED)
-        for run in headings("soft", "as_built", 60.0, (0.2,), 0.6)
-    ]
+    level = [slip(drive(run, Site(machine=CENTRED), 3), CENTRED) for run in sixths("soft")]
     assert np.ptp(level) < 0.6 * np.ptp(found["soft"])
 
 
@@ -191,7 +198,7 @@ def test_ribs_lie_on_their_surface_only():
 def test_every_roller_feels_the_floor_beneath_it():
     cells = np.array([[0, 1]])
     floor = FloorMap(("firm", "soft"), cells, (-2.0, -2.0), 2.0)  # soft where x is above 0
-    plant = Plant(CENTRED, Motor(), SpeedLoop(), floor, EVEN, "as_built")
+    plant = Plant(Site(CENTRED, grounds=EVEN), floor, "as_built")
     x = plant.data.geom_xpos[plant.model.geom("roller0_0").id, 0]
     assert x > 0
     rolling = plant.model.geom_friction[:, 2]
@@ -203,10 +210,10 @@ def test_every_roller_feels_the_floor_beneath_it():
 def test_a_map_is_felt_up_to_its_edges():
     cells = np.array([[0, 1]])
     floor = FloorMap(("firm", "soft"), cells, (-3.0, -3.0), 3.0)
-    plant = Plant(CENTRED, Motor(), SpeedLoop(), floor, EVEN, "as_built", (-2.8, 1.0, 0.0))
+    plant = Plant(Site(CENTRED, grounds=EVEN), floor, "as_built", (-2.8, 1.0, 0.0))
     places = np.stack([np.linspace(-3.5, 3.5, 90), np.full(90, 1.2)], axis=1)
     places = places[np.abs(places[:, 0]) > 0.01]  # looked up in cells of some millimetres
-    np.testing.assert_array_equal(plant._kind(places) // LEVELS, floor.at(places))
+    np.testing.assert_array_equal(plant.terrain.at(places) // LEVELS, floor.at(places))
 
 
 def test_the_centre_of_mass_is_where_it_is_put_also_with_uneven_wheels():
@@ -324,16 +331,15 @@ def test_every_speed_loop_drives_the_robot(kind):
 
 
 def test_the_plans_have_the_runs_of_the_published_logs():
-    assert len(headings("soft", "as_built", 5.0, (0.1, 0.2, 0.3), 0.6)) == 216
-    grid = paper_grid("soft", "as_built")
+    plan = Headings(surface="soft", step_deg=5.0, speeds_m_s=[0.1, 0.2, 0.3])
+    assert len(plan.runs()) == 216
+    grid = PaperGrid(surface="soft").runs()
     assert len(grid) == 8 + 8 + 6 + 6 + 6
     assert {round(float(np.hypot(*r.program.legs[0][0][:2])), 2) for r in grid} == {
         0.0, 0.1, 0.14, 0.2, 0.28, 0.3, 0.4, 0.42,
     }  # fmt: skip
-    assert {run.program.legs[0][0][2] > 0 for run in curves("soft", "moved", 4, (0.2,), 0.5)} == {
-        True,
-        False,
-    }
+    arcs = Curves(surface="soft", load="moved", count=4, speeds_m_s=[0.2]).runs()
+    assert {run.program.legs[0][0][2] > 0 for run in arcs} == {True, False}
     names = [name for name, _ in numbered(grid, 0.1, 0)]
     assert len(set(names)) == len(names)
     assert names[0] == "as_built/soft/run000"
@@ -352,7 +358,7 @@ def test_the_rectangle_is_driven_by_encoders_and_better_by_camera():
     floor = four_zones(["firm", "medium", "soft", "short"])
     closure = {}
     for by in ("encoders", "camera"):
-        trace = drive(rectangle(floor, "zones", "as_built", by=by, sides=(0.5, 0.3)), site, 0)
+        trace = drive(Rectangle(map="zones", by=by).runs(floor, 0)[0], site, 0)
         closure[by] = np.hypot(*(trace.pose[-1, :2] - trace.pose[0, :2]))
         if by == "encoders":
             np.testing.assert_allclose(rolled(trace, site.machine)[:2], 0.0, atol=0.05)
@@ -361,7 +367,7 @@ def test_the_rectangle_is_driven_by_encoders_and_better_by_camera():
 
 def test_way_points_by_camera_are_reached():
     floor = uniform("medium")
-    run = wander(floor, "site", "as_built", 1, seed=5, points=1)[0]
+    run = Wander(map="site", count=1, points=1).runs(floor, 5)[0]
     assert run.surface is None
     near = replace(run, program=Waypoints(((run.start[0] + 0.3, run.start[1]),), 0.3, "camera"))
     trace = drive(near, Site(), 0)
@@ -382,16 +388,19 @@ def test_the_same_seed_drives_the_same_run():
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: Machine(rollers=7), "7 rollers; expected an even number"),
+        (lambda: Machine(rollers=7), r"rollers\s+Input should be a multiple of 2"),
         (lambda: Machine(roller_radius_m=0.05), "rollers as large as the wheel"),
         (lambda: Machine(mass_kg=1.0), "less than the wheels weigh"),
         (lambda: Machine(centres_m={"far": (0.2, 0.0)}), "load far: the centre of mass"),
-        (lambda: Machine(wheel_azimuths_deg=(0.0, 90.0)), "2 wheels"),
-        (lambda: Motor(resistance_ohm=0.0), "resistance_ohm = 0.0; expected a number above 0"),
-        (lambda: Motor(efficiency=1.2), "efficiency = 1.2"),
-        (lambda: Ground(friction=float("nan")), "friction = nan"),
-        (lambda: Ground(colour="red"), "expected '#rrggbb'"),
-        (lambda: SpeedLoop(gain=-1.0), "gain = -1.0; expected 0 or above"),
+        (
+            lambda: Machine(wheel_azimuths_deg=(0.0, 90.0)),
+            r"wheel_azimuths_deg\s+Tuple should have at least 3",
+        ),
+        (lambda: Motor(resistance_ohm=0.0), r"resistance_ohm\s+Input should be greater than 0"),
+        (lambda: Motor(efficiency=1.2), r"efficiency\s+Input should be less than or equal to 1"),
+        (lambda: Ground(friction=float("nan")), r"friction\s+Input"),
+        (lambda: Ground(colour="red"), r"colour\s+.*pattern"),
+        (lambda: SpeedLoop(gain=-1.0), r"gain\s+Input should be greater than or equal to 0"),
     ],
 )
 def test_numbers_that_make_no_robot_are_refused(make, match):

@@ -9,8 +9,11 @@ from slipid.data.reading.declared import declared_layout
 from slipid.data.reading.presets import preset
 from slipid.data.reading.reader import read_log
 from slipid.data.write import OPTIONAL, own_csv, own_layout, robotino2022_csv
-from slipid.testsite.plant import Trace
-from slipid.testsite.sensors import Sensors, observe
+from slipid.testsite.driving import Trace
+from slipid.testsite.experiments import straight
+from slipid.testsite.machine import Machine
+from slipid.testsite.simulate.observe import observe
+from slipid.testsite.site import Sensors, Site
 
 EXACT = Sensors(
     current_noise_a=0.0,
@@ -46,17 +49,9 @@ def trace():
 
 
 def seen(trace, sensors, seed=0):
-    return observe(
-        trace,
-        sensors,
-        np.random.default_rng(seed),
-        name="as_built/soft/run000.csv",
-        surface="soft",
-        load="as_built",
-        gear_ratio=16.0,
-        ticks_per_revolution=2000,
-        marker_yaw=-0.02,
-    )
+    site = Site(Machine(marker_yaw_deg=float(np.degrees(-0.02))), sensors=sensors)
+    run = straight("soft", "as_built", 0.0, 0.1, 1.0)
+    return observe(trace, site, run, "as_built/soft/run000", seed)
 
 
 def test_every_channel_is_the_truth_to_its_quantum(trace):

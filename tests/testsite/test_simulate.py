@@ -22,19 +22,14 @@ from slipid.data.reading.reader import read_log
 from slipid.job.config import parsed
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
-from slipid.testsite.camera import MARKER, Camera, Studio, film
-from slipid.testsite.driving import Site
+from slipid.testsite.camera import Camera
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.machine import Machine
 from slipid.testsite.simulate.config import plan, read_plan
-from slipid.testsite.simulate.simulate import (
-    Job,
-    _place,
-    can_identify,
-    identify_config,
-    simulate,
-    truth,
-)
+from slipid.testsite.simulate.identify_config import can_identify, identify_config
+from slipid.testsite.simulate.simulate import Job, _place, simulate, truth
+from slipid.testsite.site import Site
+from slipid.testsite.studio import MARKER, Studio, film
 from tests.conftest import ROOT
 
 SMALL = """
@@ -204,7 +199,7 @@ def test_the_configs_that_ship_are_good(path):
         (('load = "moved"', 'load = "far"'), r"runs\[1\].load: 'far'; expected one of as_built"),
         (('map = "zones"', 'map = "zone"'), r"runs\[2\].map: 'zone'; expected one of zones"),
         (('"medium", "short"', '"medium", "lawn"'), "maps.zones: 'lawn'; expected one of"),
-        (("friction = 0.3", "friction = -1"), "surfaces.snow: friction = -1"),
+        (("friction = 0.3", "friction = -1"), "surfaces.snow.friction: -1; expected"),
         (("rolling_m", "roling_m"), "no such key, did you mean rolling_m"),
         (('kind = "headings"', ""), r"runs\[1\].kind: missing; expected one of headings"),
         (("seed = 3", 'seed = 3\nvideo = ["*/lawn/*"]'), "no run is named '.*lawn/"),
@@ -224,7 +219,7 @@ def test_the_configs_that_ship_are_good(path):
         (("distance_m = 0.1", "distance_m = inf"), "distance_m: inf"),
         (
             ("rolling_m = 0.002", "body_drag_n = 1e9"),
-            "body_drag_n = 1000000000.0; expected at most",
+            r"body_drag_n: 1000000000\.0; expected: input should be less than or equal to 1000",
         ),
         (
             (
@@ -351,7 +346,7 @@ HALF = Camera(width_px=960, height_px=540, focal_px=600.0)
 def studio():
     floor = four_zones(["firm", "medium", "soft", "short"])
     try:
-        made = Studio(Machine(), "as_built", floor, GROUNDS, HALF)
+        made = Studio(Site(), "as_built", floor, HALF)
     except DataError as error:
         pytest.skip(str(error))
     yield made

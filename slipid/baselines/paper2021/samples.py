@@ -54,6 +54,13 @@ class Recipe:
     min_current: float = 0.25
     max_torque: float = 0.5
 
+    @property
+    def rim(self) -> np.ndarray:
+        """J: rim speed of each wheel [m/s] from the body twist, (wheel, 3)."""
+        azimuth = np.radians(self.azimuth_deg)
+        arm = np.full(len(azimuth), self.base_radius)
+        return np.stack([-np.sin(azimuth), np.cos(azimuth), arm], axis=1)
+
 
 FIGURES_3_AND_4 = Recipe()
 # The whole-field figure keeps turning rows and idling wheels and uses the re-calibrated deltas.
@@ -78,6 +85,10 @@ class Samples:
     def __len__(self) -> int:
         return len(self.slip)
 
+    def of(self, regressor: str) -> np.ndarray:
+        """What a form is a function of: `torque` or `current`."""
+        return self.torque if regressor == "torque" else self.current
+
 
 def pool(parts: Sequence[Samples]) -> Samples:
     """All points of several sets of one motor, in order."""
@@ -90,13 +101,7 @@ def pool(parts: Sequence[Samples]) -> Samples:
 
 
 def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Samples:
-    """Points of one motor that survive the recipe.
-
-    Args:
-        table: logged columns by name, in the file's units.
-        motor: 1, 2 or 3.
-        recipe: the choices.
-    """
+    """Points of one motor that survive the recipe; the table is in the file's units."""
     effective = effective_speed(table, recipe)
     rpm = 2.0 * np.pi / 60.0
     keep = np.all(np.abs(effective) < recipe.speed_limit * rpm, axis=1)
@@ -125,42 +130,29 @@ def effective_speed(table: dict[str, np.ndarray], recipe: Recipe) -> np.ndarray:
     command = np.stack([table[c] for c in _COMMAND], axis=1)
     delta = np.stack([table[c] for c in recipe.delta_columns], axis=1)
     velocity = delta * _TO_SI / recipe.row_period * (command != 0.0)
-    azimuth = np.radians(recipe.azimuth_deg)
-    rim = np.stack([-np.sin(azimuth), np.cos(azimuth), np.full(3, recipe.base_radius)], axis=1)
-    return velocity @ rim.T * recipe.gear_ratio / recipe.wheel_radius
+    return velocity @ recipe.rim.T * recipe.gear_ratio / recipe.wheel_radius
 
 
-def read_columns(path: Path, layout: str) -> dict[str, np.ndarray]:
+def needed(recipe: Recipe) -> list[str]:
+    """Names of the columns that a recipe reads."""
+    motors = [f"Motor {m} {what}" for m in MOTORS for what in ("velocity, rpm", "current, A")]
+    return [*_COMMAND, *recipe.delta_columns, *motors]
+
+
+def read_columns(path: Path, layout: str, needed: Sequence[str] = ()) -> dict[str, np.ndarray]:
     """Every column of a file by name, in the file's own units, also those no channel reads.
 
-    Args:
-        path: the file.
-        layout: preset of the data reader.
-
     Raises:
-        DataError: if the file cannot be read or holds a cell that is no finite number.
+        DataError: the file cannot be read, holds a cell that is no finite number, or lacks a column
+            that is needed.
     """
     table = read_table(path, preset(layout), all_columns=True)
     rows, columns = np.nonzero(~np.isfinite(table.values))
     if len(rows):
-        raise bad_data(
-            path,
-            "no finite number",
-            "one in every cell",
-            row=int(table.lines[rows[0]]),
-            column=str(table.names[columns[0]]),
-        )
-    return {str(name): column for name, column in zip(table.names, table.values.T, strict=True)}
-
-
-def require_columns(table: dict[str, np.ndarray], recipe: Recipe, path: Path) -> None:
-    """Refuse a table that lacks a column the recipe reads.
-
-    Raises:
-        DataError: naming the first missing column and those there are.
-    """
-    needed = [*_COMMAND, *recipe.delta_columns]
-    needed += [f"Motor {m} {what}" for m in MOTORS for what in ("velocity, rpm", "current, A")]
+        row, column = int(table.lines[rows[0]]), str(table.names[columns[0]])
+        raise bad_data(path, "no finite number", "one in every cell", row=row, column=column)
     for name in needed:
-        if name not in table:
-            raise bad_data(path, "no such column", f"one of {', '.join(table)}", column=name)
+        if name not in table.names:
+            expected = f"one of {', '.join(map(str, table.names))}"
+            raise bad_data(path, "no such column", expected, column=name)
+    return {str(name): column for name, column in zip(table.names, table.values.T, strict=True)}

@@ -1,11 +1,11 @@
 """The paper's slip models refitted on its own points: coefficients and error of each form."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from slipid.baselines.paper2021.models import CURRENT_SVR, TORQUE_SVR, polynomial
+from slipid.baselines.paper2021.models import CURRENT_SVR, TORQUE_SVR
 from slipid.baselines.paper2021.samples import (
     FIGURE_2,
     FIGURES_3_AND_4,
@@ -13,9 +13,9 @@ from slipid.baselines.paper2021.samples import (
     SURFACES,
     Recipe,
     Samples,
+    needed,
     pool,
     read_columns,
-    require_columns,
     slip_samples,
 )
 
@@ -49,7 +49,7 @@ class FittedForm:
 
     def slip(self, x: np.ndarray) -> np.ndarray:
         """Slip [-] at values of the regressor."""
-        return polynomial((0.0,) * self.first_power + self.coefficients, x)
+        return np.polynomial.polynomial.polyval(x, (0.0,) * self.first_power + self.coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,17 +74,13 @@ class MotorTable:
 
 
 def fit_form(samples: Samples, name: str) -> FittedForm:
-    """Least squares of one form of the table.
-
-    Args:
-        samples: points of one motor.
-        name: one of the table's rows.
+    """Least squares of one row of the table.
 
     Raises:
         ValueError: if there are fewer samples than coefficients.
     """
     regressor, powers = _FORMS[name]
-    x = samples.torque if regressor == "torque" else samples.current
+    x = samples.of(regressor)
     if len(x) < len(powers):
         raise ValueError(f"{name}: {len(x)} samples cannot fix {len(powers)} coefficients")
     design = x[:, None] ** np.array(powers)
@@ -98,25 +94,8 @@ def fit_form(samples: Samples, name: str) -> FittedForm:
     )
 
 
-def fit_motor(by_surface: dict[str, Samples], stored: bool) -> MotorTable:
-    """All forms of one motor, pooled over surfaces.
-
-    Args:
-        by_surface: points of one motor per surface.
-        stored: judge the paper's stored quadratic beside them.
-    """
-    samples = pool(list(by_surface.values()))
-    forms = {name: fit_form(samples, name) for name in _FORMS}
-    kept = _stored("stored quadratic SVR", "torque", TORQUE_SVR, samples) if stored else None
-    return MotorTable(samples=samples, by_surface=by_surface, forms=forms, stored=kept)
-
-
 def surface_tables(folder: Path, recipe: Recipe = FIGURES_3_AND_4) -> dict[int, MotorTable]:
     """The table behind figures 3 and 4, motors 1 to 3, from experimental_data_<surface>.csv.
-
-    Args:
-        folder: the 2021 data set.
-        recipe: the authors' choices.
 
     Raises:
         DataError: if a file or a column is missing.
@@ -124,30 +103,25 @@ def surface_tables(folder: Path, recipe: Recipe = FIGURES_3_AND_4) -> dict[int, 
     tables = {}
     for surface in SURFACES:
         path = folder / f"experimental_data_{surface}.csv"
-        tables[surface] = read_columns(path, "robotino2021")
-        require_columns(tables[surface], recipe, path)
-    return {
-        motor: fit_motor(
-            {surface: slip_samples(table, motor, recipe) for surface, table in tables.items()},
-            stored=motor == 1,
-        )
-        for motor in MOTORS
-    }
+        tables[surface] = read_columns(path, "robotino2021", needed(recipe))
+    found = {}
+    for motor in MOTORS:
+        parts = {name: slip_samples(table, motor, recipe) for name, table in tables.items()}
+        samples = pool(list(parts.values()))
+        forms = {name: fit_form(samples, name) for name in _FORMS}
+        kept = _stored("stored quadratic SVR", "torque", TORQUE_SVR, samples)
+        found[motor] = MotorTable(samples, parts, forms, kept if motor == 1 else None)
+    return found
 
 
 def field_table(folder: Path, recipe: Recipe = FIGURE_2) -> MotorTable:
     """Figure 2: motor 1 over the whole heterogeneous site, our least squares and the paper's SVR.
 
-    Args:
-        folder: the 2021 data set.
-        recipe: the authors' choices.
-
     Raises:
         DataError: if the file or a column is missing.
     """
     path = folder / "experimental_data_on_whole_field.csv"
-    table = read_columns(path, "robotino2021_field")
-    require_columns(table, recipe, path)
+    table = read_columns(path, "robotino2021_field", needed(recipe))
     samples = slip_samples(table, 1, recipe)
     forms = {name: fit_form(samples, name) for name in ("affine in I", "constant")}
     kept = _stored("stored linear SVR", "current", CURRENT_SVR, samples)
@@ -157,9 +131,8 @@ def field_table(folder: Path, recipe: Recipe = FIGURE_2) -> MotorTable:
 def _stored(
     name: str, regressor: str, coefficients: tuple[float, ...], samples: Samples
 ) -> FittedForm:
-    x = samples.torque if regressor == "torque" else samples.current
-    rmse = _rms(samples.slip - polynomial(coefficients, x))
-    return FittedForm(name, regressor, coefficients, first_power=0, rmse=rmse)
+    form = FittedForm(name, regressor, coefficients, first_power=0, rmse=0.0)
+    return replace(form, rmse=_rms(samples.slip - form.slip(samples.of(regressor))))
 
 
 def _rms(error: np.ndarray) -> float:

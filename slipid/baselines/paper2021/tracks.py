@@ -16,7 +16,7 @@ class TrackFile:
     Args:
         name: key in results.
         label: what steered the robot.
-        file: in the folder figure7.
+        square: how files in the folder figure7 call it: `square_<this>_camera.csv`.
         authors_frames: camera frames of the first side, by the authors' own index.
         side_frames: camera frames of the first side in this file, to where the robot turns off.
         printed_path_length: length of the first side as the paper prints it [mm].
@@ -24,7 +24,7 @@ class TrackFile:
 
     name: str
     label: str
-    file: str
+    square: str
     authors_frames: int
     side_frames: int
     printed_path_length: float
@@ -33,22 +33,10 @@ class TrackFile:
 # Encoders: by the authors' index the first side has 216 frames, but this track turns off at frame
 # 181. Their length script reads a variable of another name, most likely a repeat of the run.
 TRACK_FILES = (
-    TrackFile("encoders", "encoders only", "square_without_controller_camera.csv", 216, 181, 760.0),
+    TrackFile("encoders", "encoders only", "without_controller", 216, 181, 760.0),
+    TrackFile("slip_model", "slip model", "without_controller_with_compensation", 324, 324, 940.0),
     TrackFile(
-        "slip_model",
-        "slip model",
-        "square_without_controller_with_compensation_camera.csv",
-        324,
-        324,
-        940.0,
-    ),
-    TrackFile(
-        "compensation",
-        "slip model and torque correction",
-        "square_with_controller_camera.csv",
-        268,
-        268,
-        1031.0,
+        "compensation", "slip model and torque correction", "with_controller", 268, 268, 1031.0
     ),
 )
 COMMANDED_SIDES = (900.0, 400.0)
@@ -94,16 +82,6 @@ class Track:
         """Distance from the first to the last position of the whole track [mm]."""
         return float(np.hypot(*(self.position[-1] - self.position[0])))
 
-    @property
-    def heading_start(self) -> float:
-        """First heading [deg]."""
-        return float(self.heading[0])
-
-    @property
-    def heading_end(self) -> float:
-        """Last heading of the whole track [deg]."""
-        return float(self.heading[-1])
-
     def as_dict(self) -> dict[str, float | str | int]:
         """The numbers by name, units in the names."""
         return {
@@ -114,41 +92,26 @@ class Track:
             "path_length_printed_mm": self.file.printed_path_length,
             "displacement_mm": self.displacement,
             "closure_mm": self.closure,
-            "heading_start_deg": self.heading_start,
-            "heading_end_deg": self.heading_end,
+            "heading_start_deg": float(self.heading[0]),
+            "heading_end_deg": float(self.heading[-1]),
         }
 
 
 def read_track(folder: Path, file: TrackFile) -> Track:
-    """One track of figure 7.
-
-    Args:
-        folder: the 2021 data set.
-        file: which.
+    """One track of figure 7, below the folder of the 2021 data set.
 
     Raises:
         DataError: if the file or a column is missing or the track ends within its first side.
     """
-    path = folder / "figure7" / file.file
+    path = folder / "figure7" / f"square_{file.square}_camera.csv"
     table = read_columns(path, "robotino2021_camera")
-    if len(table["time_s"]) < file.side_frames:
-        raise bad_data(
-            path,
-            f"{len(table['time_s'])} frames",
-            f"at least the {file.side_frames} of the first side",
-        )
+    frames = len(table["time_s"])
+    if frames < file.side_frames:
+        expected = f"at least the {file.side_frames} of the first side"
+        raise bad_data(path, f"{frames} frames", expected)
     return Track(
         file=file,
         time=table["time_s"],
         position=np.stack([table["x_mm"], table["y_mm"]], axis=1),
         heading=np.degrees(np.unwrap(np.radians(table["angle_deg"]))),
     )
-
-
-def read_tracks(folder: Path) -> tuple[Track, ...]:
-    """All tracks of figure 7, in the paper's order.
-
-    Raises:
-        DataError: as `read_track`.
-    """
-    return tuple(read_track(folder, file) for file in TRACK_FILES)

@@ -5,8 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slipid.baselines.paper2021.windows import WindowRecipe, wheel_windows
+from slipid.baselines.paper2021.samples import FIGURES_3_AND_4, Recipe
 from slipid.data.log import Log
+from slipid.data.signals.wheel_signals import body_steps, first_moved
+
+DEGREE = 1
+"""Of the polynomial in current, as deployed."""
 
 
 @dataclass(frozen=True)
@@ -31,50 +35,69 @@ class Transfer:
         return {name: float(np.mean(list(row.values()))) for name, row in rows.items()}
 
 
-def curve_points(log: Log, recipe: WindowRecipe, min_current: float = 0.25) -> np.ndarray:
-    """Current [A] and slip [-] of all wheels after the paper's cuts, shape (sample, 2).
+def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
+    """Mean current and slip of every wheel over a log's windows, nothing cut away.
 
-    Args:
-        log: one run with pose and current.
-        recipe: how it is cut into windows.
-        min_current: samples at or below it are left out [A].
+    A window is as long as a row of the 2021 files. s = 1 - J v / (r w), v the camera's body
+    velocity over the window, w the encoders' mean speed.
+
+    Returns:
+        |current| [A] and slip [-], both (window, wheel); slip is not finite where a wheel rests.
+
+    Raises:
+        ValueError: if the log has no pose or no current.
     """
+    if log.pose is None or log.current is None:
+        raise ValueError(f"{log.name}: slip against current needs both pose and current")
+    first = first_moved(log.wheel_angle, recipe.wheel_radius)
+    start = log.time[-1] if first is None else log.time[first]
+    # unique: where rows are further apart than a window, two windows would begin at the same row
+    starts = np.arange(start, log.time[-1], recipe.row_period)
+    edges = np.unique(np.searchsorted(log.time, starts))
+    if len(edges) < 2:
+        return np.empty((0, log.wheels)), np.empty((0, log.wheels))
+    span = np.diff(log.time[edges])[:, None]
+    effective = body_steps(log.pose[edges]) / span @ recipe.rim.T
+    driven = np.diff(log.wheel_angle[edges], axis=0) / span * recipe.wheel_radius
+    # Mean over the rows of each window, not the value at its edge: the current is 10-bit and rough.
+    current = np.add.reduceat(np.abs(log.current), edges, axis=0)[:-1] / np.diff(edges)[:, None]
+    slip = np.full_like(driven, np.nan)
+    np.divide(effective, driven, out=slip, where=driven != 0)
+    return current, 1.0 - slip
+
+
+def curve_points(log: Log, recipe: Recipe) -> np.ndarray:
+    """Current [A] and slip [-] of all wheels after the paper's cuts, shape (sample, 2)."""
     current, slip = wheel_windows(log, recipe)
-    keep = (slip > 0.0) & (slip <= 1.0) & (current > min_current)
+    keep = (slip > 0.0) & (slip <= 1.0) & (current > recipe.min_current)
     return np.stack([current[keep], slip[keep]], axis=1)
 
 
-def leave_one_surface_out(
-    logs: Iterable[Log], recipe: WindowRecipe | None = None, degree: int = 1
-) -> Transfer:
+def leave_one_surface_out(logs: Iterable[Log]) -> Transfer:
     """Predict the slip of each surface from the others' curve, their mean, and its own curve.
 
-    Args:
-        logs: runs on one known surface each.
-        recipe: how runs are cut into windows; half a second, camera uncorrected, where None.
-        degree: degree of the polynomial in current, 1 as deployed.
+    The camera is uncorrected.
 
     Raises:
         ValueError: if fewer than two surfaces are there, or one has too few samples for a curve.
     """
-    recipe = recipe or WindowRecipe()
     parts: dict[str, list[np.ndarray]] = {}
     for log in logs:
         if log.surface is None:
             raise ValueError(f"{log.name}: no known surface; expected runs on one surface each")
-        parts.setdefault(log.surface, []).append(curve_points(log, recipe))
+        parts.setdefault(log.surface, []).append(curve_points(log, FIGURES_3_AND_4))
     points = {surface: np.concatenate(part) for surface, part in parts.items()}
     if len(points) < 2:
         raise ValueError(f"surfaces {list(points)}: leaving one out needs at least two")
     for surface, point in points.items():
-        if len(point) <= degree:
+        if len(point) <= DEGREE:
             raise ValueError(f"surface {surface!r}: {len(point)} samples, too few for a curve")
     pooled, constant, own = {}, {}, {}
     for surface, here in points.items():
         others = np.concatenate([p for name, p in points.items() if name != surface])
-        pooled[surface] = _curve_error(others, here, degree)
+        pooled[surface] = _curve_error(others, here, DEGREE)
         constant[surface] = _curve_error(others, here, 0)
-        own[surface] = _curve_error(here, here, degree)
+        own[surface] = _curve_error(here, here, DEGREE)
     counts = {surface: len(point) for surface, point in points.items()}
     return Transfer(samples=counts, pooled=pooled, constant=constant, own=own)
 

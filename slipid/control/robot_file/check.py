@@ -1,9 +1,8 @@
 """Whether the parts of a record fit together and its numbers lie within their bounds."""
 
-from collections.abc import Iterator
 from dataclasses import fields
+from typing import Any
 
-import equinox as eqx
 import numpy as np
 
 from slipid.control.robot_file.record import Numbers, RobotRecord
@@ -17,26 +16,21 @@ PER_WHEEL = ("drive_offset", "load_share")
 """Names of numbers of which every wheel has its own."""
 
 
-def declared(kind: type[eqx.Module]) -> dict[str, Declaration]:
+def declared(kind: type[Any]) -> dict[str, Declaration]:
     """Declarations of a module's own numbers, by name."""
     return {f.name: f.metadata["parameter"] for f in fields(kind) if "parameter" in f.metadata}
 
 
-def paths(record: RobotRecord) -> Iterator[tuple[str, str, Declaration]]:
-    """Path, name and declaration of every number that a robot of this shape has."""
-    for name, number in declared(Geometry).items():
-        yield f"robot.{name}", name, number
-    for name, number in declared(Body).items():
-        if name == "load_share":
-            for load in record.loads:
-                yield f"robot.{name}@{load.name}", name, number
-        else:
-            yield f"robot.{name}", name, number
-    for name, number in declared(Motor).items():
-        yield f"motor.{name}", name, number
-    for label in record.labels:
-        for name, number in declared(ContactSurface).items():
-            yield f"surface.{label}.{name}", name, number
+def _known(record: RobotRecord, wheels: int) -> dict[str, tuple[Declaration, int]]:
+    """Declaration and size of every number that a robot of this shape has, by path."""
+    surfaces = [(f"surface.{label}", ContactSurface) for label in record.labels]
+    known = {}
+    for prefix, kind in [("robot", Geometry), ("robot", Body), ("motor", Motor), *surfaces]:
+        for name, number in declared(kind).items():
+            size = wheels if name in PER_WHEEL else 1
+            each = [f"@{load.name}" for load in record.loads] if name == "load_share" else [""]
+            known |= {f"{prefix}.{name}{of}": (number, size) for of in each}
+    return known
 
 
 def check(record: RobotRecord) -> None:
@@ -58,7 +52,7 @@ def check(record: RobotRecord) -> None:
 
 
 def _numbers(record: RobotRecord, wheels: int) -> None:
-    known = {path: (name, declaration) for path, name, declaration in paths(record)}
+    known = _known(record, wheels)
     for path in known:
         if path not in record.parameters:
             raise ValueError(f"parameters['{path}'] is missing")
@@ -66,25 +60,20 @@ def _numbers(record: RobotRecord, wheels: int) -> None:
         if path not in known:
             raise ValueError(f"'{path}': no such number of a robot with these floors and loads")
     for path, number in record.parameters.items():
-        name, declaration = known[path]
-        size = wheels if name in PER_WHEEL else 1
-        where = f"parameters['{path}']"
+        (declaration, size), where = known[path], f"parameters['{path}']"
         _inside(f"{where}.value", number.value, declaration, size)
         if number.unit != declaration.unit:
             raise ValueError(f"{where}.unit: '{number.unit}'; expected '{declaration.unit}'")
         if number.std is not None:
             _sized(f"{where}.std", number.std, size)
-        several = number.interval90 is not None and np.ndim(number.interval90) > 1
-        if several != (size > 1) and number.interval90 is not None:
+        if number.interval90 is not None and (np.ndim(number.interval90) > 1) != (size > 1):
             raise ValueError(f"{where}.interval90: expected {size} intervals")
     counts = {len(rows) for rows in record.draws.values()}
     if len(counts) > 1 or 0 in counts:
         raise ValueError(f"draws: {sorted(counts)} of different numbers; expected as many of each")
     for path, rows in record.draws.items():
-        name, declaration = known[path]
         for k, row in enumerate(rows):
-            size = wheels if name in PER_WHEEL else 1
-            _inside(f"draws['{path}'][{k}]", row, declaration, size)
+            _inside(f"draws['{path}'][{k}]", row, *known[path])
 
 
 def _counted(name: str, values: tuple[object, ...], count: int) -> None:

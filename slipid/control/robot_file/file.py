@@ -68,12 +68,7 @@ def _content(path: Path) -> dict[str, object]:
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: no valid JSON ({error}); {ANEW}") from error
     schema = content.get("schema") if isinstance(content, dict) else None
-    found = (
-        re.fullmatch(r"slipid\.robot/([1-9][0-9]{0,8})", schema, re.ASCII)
-        if isinstance(schema, str)
-        else None
-    )
-    if found is None:
+    if not (isinstance(schema, str) and re.fullmatch(r"slipid\.robot/[1-9][0-9]{0,8}", schema)):
         raise DataError(
             f"{path}: no robot of slipid (its schema is not {SCHEMA}); expected the robot.json "
             "that `slipid identify` writes"
@@ -98,11 +93,10 @@ def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
 
 def _text(value: object, indent: str = "") -> str:
     """JSON with objects over several lines and everything without objects on one."""
+    inner = indent + " "
     if isinstance(value, dict) and value:
-        inner = indent + " "
         rows = [f"{inner}{json.dumps(k)}: {_text(v, inner)}" for k, v in value.items()]
         return "{\n" + ",\n".join(rows) + f"\n{indent}}}"
     if isinstance(value, list | tuple) and any(isinstance(v, dict) for v in value):
-        inner = indent + " "
         return "[\n" + ",\n".join(inner + _text(v, inner) for v in value) + f"\n{indent}]"
     return json.dumps(value, allow_nan=False)

@@ -6,7 +6,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class GainRecord:
-    """One gain: [unit], and its std over the end of the search."""
+    """One gain [unit], and its std over the end of the search."""
 
     value: float
     unit: str
@@ -27,7 +27,7 @@ class GainValues:
 
 @dataclass(frozen=True)
 class Losses:
-    """Loss of gains on cases not tuned on, set by hand and tuned."""
+    """Loss of gains on cases not tuned on, mean and worst tenth together, by hand and tuned."""
 
     hand: float
     tuned: float
@@ -38,11 +38,9 @@ class GainsRecord:
     """Gains that `slipid tune` found.
 
     Attributes:
-        values: every gain.
         load: set-up they were tuned for; gyro: whether with one.
         method: of the search.
-        loss: mean and worst tenth together.
-        better_than_hand: part of these cases in which they are.
+        better_than_hand: part of the cases in which they are.
         stability_margin: 1 - the largest spectral radius of a loop.
         verdict: what the losses say.
     """

@@ -6,7 +6,7 @@ Units are those of `UNITS`, numbers of the robot carry their own.
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -47,13 +47,10 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Number:
-    """A fitted or fixed number of the robot.
+    """A fitted or fixed number of the robot [unit]; attributes as of identified.json.
 
-    Attributes:
-        value, std: [unit]; std is None where the number was fixed.
-        interval90: equal-tailed, or one interval per wheel; None where the number was fixed.
-        verdict: how much the data say of it; provenance: data, a prior or a choice decided.
-        source: what the interval was made of.
+    `std` and `interval90`, equal-tailed, are None where it was fixed; `source` is what they were
+    made of.
     """
 
     value: Numbers
@@ -104,7 +101,6 @@ class FloorRecord:
     """What the model misses on a floor, as stds.
 
     Attributes:
-        name: of the floor.
         process: growing with the root of the distance; effect: all the way.
         current_std: of a measured current from the model's.
         seen: None where the numbers were given, not fitted.
@@ -122,7 +118,6 @@ class LoadRecord:
     """What depends on how the robot is loaded.
 
     Attributes:
-        name: of the load set-up.
         spread: std of the motion per metre by the uncertainty of the numbers, on every floor.
         highest_current: of the model up to 0.8 of the highest wheel speed.
         wheel_curve: a + b |I|, the slip ratio of each wheel, of all floors together.
@@ -136,25 +131,19 @@ class LoadRecord:
 
 @dataclass(frozen=True)
 class Sensors:
-    """What the logs held, and so what the estimator counts on.
+    """What the logs held, and so what the estimator counts on."""
 
-    Attributes:
-        current_is_signed: whether ammeters tell the direction.
-        voltage: whether the motors' voltage was measured; gyro: whether a yaw rate was.
-    """
-
-    current_is_signed: bool
-    voltage: bool
-    gyro: bool
+    current_is_signed: bool = False
+    voltage: bool = False
+    gyro: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RobotRecord:
     """All that robot.json holds. Two records with the same content are equal.
 
     Attributes:
         source: what the numbers were made of.
-        wheels: shape of the robot.
         parameters: numbers by path.
         floors, loads: in the order that arrays have.
         current_trend: a + b v, measured currents over the model's.
@@ -166,29 +155,27 @@ class RobotRecord:
         data: hash of the runs; None where the numbers were given.
         versions: of what computed.
         draws: the numbers that were fitted, by path, once per draw of the posterior.
-        gains: None where none were tuned.
     """
 
-    source: Source
+    source: Source = "given"
     wheels: Wheels
     parameters: Mapping[str, Number]
     floors: tuple[FloorRecord, ...]
     loads: tuple[LoadRecord, ...]
     current_trend: Pair
     highest_speed: float
-    sensors: Sensors
-    alike: float
-    messages: tuple[str, ...]
-    data: str | None
-    versions: Mapping[str, str]
+    sensors: Sensors = Sensors()
+    alike: float = 3.0
+    messages: tuple[str, ...] = ()
+    data: str | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
     draws: Mapping[str, tuple[Numbers, ...]]
-    gains: GainsRecord | None
+    gains: GainsRecord | None = None
 
     @cached_property
     def numbers(self) -> str:
         """Hash of the robot's numbers, whatever gains it has."""
-        content = asdict(replace(self, gains=None, versions={}, messages=()))
-        return checksum(content)
+        return checksum(asdict(replace(self, gains=None, versions={}, messages=())))
 
     @cached_property
     def _mark(self) -> str:
@@ -217,19 +204,17 @@ class RobotRecord:
             ValueError: no such load set-up; names those there are.
         """
         names = [load.name for load in self.loads]
-        if name is None:
-            return 0
-        if name not in names:
+        if name not in (None, *names):
             raise ValueError(f"no load set-up '{name}'; identified: {', '.join(names)}")
-        return names.index(name)
+        return 0 if name is None else names.index(name)
 
     def on(self, rows: tuple[int, ...]) -> "RobotRecord":
         """With some of the floors only, by their numbers."""
         floors = tuple(self.floors[k] for k in rows)
-        kept = {f"surface.{floor.name}." for floor in floors}
+        kept = tuple(f"surface.{floor.name}." for floor in floors)
 
         def stays(path: str) -> bool:
-            return not path.startswith("surface.") or any(path.startswith(k) for k in kept)
+            return not path.startswith("surface.") or path.startswith(kept)
 
         return replace(
             self,

@@ -3,6 +3,7 @@
 import math
 import typing
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
@@ -52,11 +53,9 @@ def _as(kind: Any, value: object, where: str) -> Any:
 
 def _float(value: object, where: str) -> float:
     number = math.nan
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        try:
+    with suppress(OverflowError):
+        if isinstance(value, int | float) and not isinstance(value, bool):
             number = float(value)
-        except OverflowError:
-            number = math.inf
     if not math.isfinite(number):
         raise _wrong(where, value, "a number")
     return number

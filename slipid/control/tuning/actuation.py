@@ -5,13 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from slipid.control.closed_loop import PERIOD
+
 RING = 6
 """Commands that are kept: a delay may be up to `RING` - 1 periods."""
 
 
 @dataclass(frozen=True)
 class Habits:
-    """What no fit tells: how wheels follow and what sensors are like.
+    """How wheels follow their commands and what sensors are like.
 
     Attributes:
         delay_s: from a command to the wheels [s].
@@ -40,15 +42,25 @@ class Habits:
     substeps: int = 2
     smooth: bool = False
 
+    @property
+    def substep(self) -> float:
+        """How long it takes [s]."""
+        return PERIOD / self.substeps
 
-def held(delay: float, period: float, substeps: int) -> Float[np.ndarray, "substep command"]:
-    """Share of each of the last commands, the newest first, in the mean over every substep.
+    @property
+    def follow(self) -> float:
+        """Part of the gap to its set speed that a wheel makes up in a substep."""
+        return 1 - float(np.exp(-self.substep / max(self.lag_s, 1e-6)))
 
-    Commands hold for a period and arrive so late; exact, and linear in the delay.
-    """
-    h = period / substeps
-    begin = np.arange(substeps)[:, None] * h - delay
-    since = -np.arange(RING)[None, :] * period
-    share = np.clip(np.minimum(begin + h, since + period) - np.maximum(begin, since), 0.0, None) / h
-    share[:, -1] += 1.0 - share.sum(axis=1)  # what is older counts as the oldest
-    return share
+    def held(self) -> Float[np.ndarray, "substep command"]:
+        """Share of each of the last commands, the newest first, in the mean over every substep.
+
+        Commands hold for a period and arrive so late; exact, and linear in the delay.
+        """
+        h = self.substep
+        begin = np.arange(self.substeps)[:, None] * h - self.delay_s
+        since = -np.arange(RING)[None, :] * PERIOD
+        both = np.minimum(begin + h, since + PERIOD) - np.maximum(begin, since)
+        share = np.clip(both, 0.0, None) / h
+        share[:, -1] += 1.0 - share.sum(axis=1)  # what is older counts as the oldest
+        return share

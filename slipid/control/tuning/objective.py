@@ -1,14 +1,14 @@
 """Gains from rehearsals on the twin: over draws of the robot, floors and noise.
 
 One case is a draw of the robot, a floor, a start and noise; its loss is the root of the mean over
-the path of squared true errors along, across and in heading, and of the effort, in mm. What is
-minimised is
+the path of squared true errors in place and, times the base radius, in heading, and of the effort,
+in mm. What is minimised is
 
     mean over cases + mean of their worst tenth + penalty of a loop that is hardly stable
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import equinox as eqx
 import jax
@@ -16,11 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.control.closed_loop import PERIOD
-from slipid.control.controller import Controller, Gains, Limits
+from slipid.control.controller import Controller, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
-from slipid.control.interface import Numbers, Settings
+from slipid.control.interface import Numbers
 from slipid.control.pilot import Pilot
 from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import Habits
@@ -32,6 +31,7 @@ GAINS = tuple(f.name for f in fields(Gains))
 """Names of the gains, in the order of vectors of them."""
 HAND = tuple(float(f.metadata["parameter"].start) for f in fields(Gains))
 """Gains set by hand."""
+UNITS = tuple(f.metadata["parameter"].unit for f in fields(Gains))
 LOWEST = np.array([0.2, 0.2, 0.0, 0.0, 0.0, 0.0])
 HIGHEST = np.array([5.0, 5.0, 1.5, 1.5, 1.0, 0.4])
 """Of the gains; the first two are searched in their logarithm."""
@@ -39,25 +39,11 @@ BATCH = 16
 """Cases that are rolled out together."""
 REACH = 0.02
 """Over which losses are differenced, in parts of the box."""
+EFFORT_S, LATE = 0.05, 20.0
+"""Rim speed a command changes by in a period, times this, counts as error [s]; each second of the
+path that is not reached counts so much [mm]."""
 LARGEST_RADIUS, PENALTY = 0.9995, 10_000.0
 """Spectral radius from which, with gains `SPARE` times as large, a loop costs [mm]."""
-
-
-@dataclass(frozen=True)
-class Weights:
-    """What counts how much in a case's loss.
-
-    Attributes:
-        along, across: of squared errors; heading: of those times the base radius.
-        effort_s: rim speed a command changes by in a period, times this, counts as error [s].
-        late: each second of the path that is not reached counts so much [mm].
-    """
-
-    along: float = 1.0
-    across: float = 1.0
-    heading: float = 1.0
-    effort_s: float = 0.05
-    late: float = 20.0
 
 
 class Cases(eqx.Module):
@@ -88,56 +74,37 @@ class Task(eqx.Module):
 
     Attributes:
         robot: as the pilot knows it.
-        settings: of the estimator; habits: of the twin; limits: of the commands.
-        weights: of the loss.
-        steps: of a rollout; period: [s].
+        habits: of the twin.
+        steps: of a rollout.
     """
 
     robot: DeployedRobot
-    settings: Settings = eqx.field(static=True, default=Settings())
     habits: Habits = eqx.field(static=True, default=Habits())
-    limits: Limits = eqx.field(static=True, default=Limits())
-    weights: Weights = eqx.field(static=True, default=Weights())
     steps: int = eqx.field(static=True, default=120)
-    period: float = eqx.field(static=True, default=PERIOD)
 
     def loss(self, gains: Gains, case: Cases) -> Float[Array, ""]:
         """Of one case [mm]."""
-        controller = Controller(self.robot, gains, self.limits)
-        pilot = Pilot(Estimator(self.robot, self.settings), controller)
-        habits = replace(self.habits, smooth=True)
-        twin = Twin(case.truth, case.floor, habits, self.period)
+        pilot = Pilot(Estimator(self.robot), Controller(self.robot, gains))
+        twin = Twin(case.truth, case.floor, replace(self.habits, smooth=True))
         run = rollout(pilot, case.path, twin, case.start, case.key, self.steps)
         wanted = jax.vmap(case.path.at)(run.own)
-        gap, v = run.pose[:, :2] - wanted[:, :2], wanted[:, 3:5]
-        pace = jnp.sum(v * v, axis=1)
-        along = jnp.sum(gap * v, axis=1) ** 2 / jnp.maximum(pace, 1e-6)
-        across = jnp.sum(gap * gap, axis=1) - along
+        gap = run.pose[:, :2] - wanted[:, :2]
         turned = self.robot.frame.base * jnp.sin(run.pose[:, 2] - wanted[:, 2])
-        jump = self.robot.frame.radius * jnp.diff(run.command, axis=0)
-        w = self.weights
-        squares = jnp.mean(w.along * along + w.across * across + w.heading * turned**2)
-        effort = w.effort_s**2 * jnp.mean(jnp.sum(jump**2, axis=1))
+        jump = EFFORT_S * self.robot.frame.radius * jnp.diff(run.command, axis=0)
+        squares = jnp.mean(jnp.sum(gap**2, axis=1) + turned**2)
+        effort = jnp.mean(jnp.sum(jump**2, axis=1))
         missing = jax.nn.relu(case.path.duration - run.own[-1])
-        return 1000.0 * jnp.sqrt(squares + effort + 1e-12) + w.late * missing
+        return 1000.0 * jnp.sqrt(squares + effort + 1e-12) + LATE * missing
 
     def penalty(self, gains: Gains, truths: DeployedRobot) -> Float[Array, ""]:
         """Of a loop that is hardly stable [mm]; continues a little below the bound."""
-        rho = radii(self._controller(gains), truths, self.habits, self.period, SPARE)
+        rho = radii(Controller(self.robot, gains), truths, self.habits, SPARE)
         return PENALTY * jax.nn.relu(jnp.max(rho) - LARGEST_RADIUS)
 
-    def margins(self, gains: Gains, truths: DeployedRobot) -> Float[np.ndarray, " loop"]:
-        """1 - spectral radius of every draw, floor and direction, gains as they are."""
-        rho = radii(self._controller(gains), truths, self.habits, self.period)
-        return 1.0 - np.asarray(rho).reshape(-1)
-
-    def _controller(self, gains: Gains) -> Controller:
-        return Controller(self.robot, gains, self.limits)
-
-
-def units() -> tuple[str, ...]:
-    """Units of the gains, in the order of vectors of them."""
-    return tuple(f.metadata["parameter"].unit for f in fields(Gains))
+    def margins(self, gains: Gains, truths: DeployedRobot) -> Float[np.ndarray, "draw loop"]:
+        """1 - spectral radius of every draw, for every floor and direction, gains as they are."""
+        rho = np.asarray(radii(Controller(self.robot, gains), truths, self.habits))
+        return 1.0 - rho.reshape(len(rho), -1)
 
 
 def gains_at(x: Float[Numbers, "*batch gain"]) -> Float[Array, "*batch gain"]:
@@ -205,8 +172,7 @@ def penalty_slope(
     step = 1e-3
     places = np.asarray(x) + np.concatenate([np.zeros((1, len(x))), step * np.eye(len(x))])
     value = np.asarray(penalties(task, jnp.asarray(places), truths))
-    slope: np.ndarray = (value[1:] - value[0]) / step
-    return slope
+    return np.asarray((value[1:] - value[0]) / step)
 
 
 def evaluate(

@@ -48,8 +48,7 @@ class Search:
         task: what is tuned.
         cases: `BATCH` or more.
         stable: robots whose loops must be stable, stacked.
-        method: gradient or pso.
-        rollouts: that may be spent.
+        method: by which; rollouts: that may be spent.
         seed: of the order of cases and of the swarm.
     """
 
@@ -74,26 +73,13 @@ class Search:
 
     def start(self) -> State:
         """Before the first step, at the gains set by hand."""
-        hand = box_of(HAND)
-        count = np.array(0)
+        x, count, zero = box_of(HAND), np.array(0), np.zeros(len(GAINS))
         if self.method == "gradient":
-            zero = np.zeros(len(GAINS))
-            return {
-                "count": count,
-                "x": hand,
-                "m": zero,
-                "v": zero,
-                "way": np.zeros((0, len(GAINS))),
-            }
+            return {"count": count, "x": x, "m": zero, "v": zero, "way": np.zeros((0, len(GAINS)))}
         rng = np.random.default_rng([self.seed, 0])
-        x = np.concatenate([hand[None], rng.uniform(size=(PARTICLES - 1, len(GAINS)))])
-        return {
-            "count": count,
-            "x": x,
-            "v": np.zeros_like(x),
-            "own": x,
-            "value": np.full(PARTICLES, np.inf),
-        }
+        x = np.concatenate([x[None], rng.uniform(size=(PARTICLES - 1, len(GAINS)))])
+        none = np.full(PARTICLES, np.inf)
+        return {"count": count, "x": x, "v": np.zeros_like(x), "own": x, "value": none}
 
     def done(self, state: State) -> bool:
         """Whether all rollouts are spent."""
@@ -114,10 +100,10 @@ class Search:
 
     def spread(self, state: State) -> Float[np.ndarray, " gain"]:
         """Std of the gains: over Adam's last third, whose cases change, or the best particles."""
+        places = self._places(state)
         if self.method == "pso":
-            order = np.argsort(state["value"])[: PARTICLES // 3]
-            return np.asarray(gains_at(jnp.asarray(state["own"][order]))).std(axis=0)
-        return np.asarray(gains_at(jnp.asarray(self._places(state)))).std(axis=0)
+            places = state["own"][np.argsort(state["value"])[: PARTICLES // 3]]
+        return np.asarray(gains_at(jnp.asarray(places))).std(axis=0)
 
     def _places(self, state: State) -> np.ndarray:
         if self.method == "pso":
@@ -151,7 +137,8 @@ class Search:
         cases, x = self.cases.at(np.arange(BATCH)), state["x"]
         parts = x.reshape(-1, 6, len(GAINS))  # few at a time need less memory
         push = [penalties(self.task, jnp.asarray(part), self.stable) for part in parts]
-        value = np.array([self._value(row, cases) for row in x]) + np.concatenate(push)
+        loss = [float(combined(losses(self.task, jnp.asarray(row), cases))) for row in x]
+        value = np.array(loss) + np.concatenate(push)
         value = np.where(np.isfinite(value), value, np.inf)
         better = value < state["value"]
         own = np.where(better[:, None], x, state["own"])
@@ -162,6 +149,3 @@ class Search:
         v = np.clip(v, -0.5, 0.5)
         new = np.clip(x + v, 0.0, 1.0)
         return {"count": np.array(k + 1), "x": new, "v": v, "own": own, "value": value}
-
-    def _value(self, x: np.ndarray, cases: Cases) -> float:
-        return float(combined(losses(self.task, jnp.asarray(x), cases)))

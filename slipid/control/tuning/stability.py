@@ -18,11 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.control.closed_loop import PERIOD
 from slipid.control.controller import Controller, ControllerState, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.flat import Flat
 from slipid.control.interface import Estimate
-from slipid.control.tuning.actuation import RING, Habits, held
+from slipid.control.tuning.actuation import RING, Habits
 from slipid.model import contact
 from slipid.model.se2 import advance, compose
 
@@ -50,13 +51,7 @@ def spectral_radius(a: Float[Array, "n n"]) -> Float[Array, ""]:
 
 
 class LoopState(eqx.Module):
-    """What a period maps to the next.
-
-    Attributes:
-        pose: error [m, m, rad].
-        speed: of the wheels [rad/s]; ring: commands on their way, the newest first [rad/s].
-        control: of the controller.
-    """
+    """What a period maps to the next: the pose's error [m, m, rad], and as `TwinState` has it."""
 
     pose: Float[Array, "3"]
     speed: Float[Array, " wheel"]
@@ -73,7 +68,6 @@ class Loop(eqx.Module):
         surface: number of the floor.
         rates: of the reference [m/s, m/s, rad/s].
         habits: of the wheels.
-        period: [s].
     """
 
     controller: Controller
@@ -81,7 +75,6 @@ class Loop(eqx.Module):
     surface: Array
     rates: Float[Array, "3"]
     habits: Habits = eqx.field(static=True)
-    period: float = eqx.field(static=True)
 
     def start(self) -> LoopState:
         """Moving without error."""
@@ -91,18 +84,17 @@ class Loop(eqx.Module):
 
     def step(self, state: LoopState) -> LoopState:
         """State one period later."""
-        old, h = state, self.period / self.habits.substeps
+        old = state
         reference = jnp.concatenate([jnp.zeros(3), self.rates])
         seen = self._estimate(old)
-        control, command = self.controller.step(old.control, reference, seen, self.period)
+        control, command = self.controller.step(old.control, reference, seen, PERIOD)
         ring = jnp.concatenate([command[None], old.ring[:-1]])
-        wanted = jnp.asarray(held(self.habits.delay_s, self.period, self.habits.substeps)) @ ring
-        follow = 1 - np.exp(-h / max(self.habits.lag_s, 1e-6))
+        wanted = jnp.asarray(self.habits.held()) @ ring
         pose, w = old.pose, old.speed
         for k in range(self.habits.substeps):
-            w = w + follow * (wanted[k] - w)
-            pose = compose(pose, advance(self._twist(self.truth, w), h))
-        pose = pose - self.rates * self.period
+            w = w + self.habits.follow * (wanted[k] - w)
+            pose = compose(pose, advance(self._twist(self.truth, w), self.habits.substep))
+        pose = pose - self.rates * PERIOD
         return LoopState(pose=pose, speed=w, ring=ring, control=control)
 
     def _twist(self, robot: DeployedRobot, w: Array) -> Array:
@@ -112,15 +104,14 @@ class Loop(eqx.Module):
     def _estimate(self, old: LoopState) -> Estimate:
         """Of an observer that knows pose, wheel speeds and floor."""
         f, no = self.controller.robot, jnp.zeros((), bool)
+        floor = jnp.zeros((f.wheels, len(f.labels) + 1))
         return Estimate(
             pose=old.pose,
             twist=self._twist(f, old.speed),
             slip=jnp.zeros(f.wheels),
             wheel_speed=old.speed,
             current=jnp.zeros(f.wheels),
-            surface_probability=jnp.zeros((f.wheels, len(f.labels) + 1))
-            .at[:, self.surface]
-            .set(1.0),
+            surface_probability=floor.at[:, self.surface].set(1.0),
             covariance=jnp.zeros((3, 3)),
             stale=no,
             immobilised=no,
@@ -153,29 +144,22 @@ def linearised(loop: Loop) -> Float[Array, "state state"]:
 
 @eqx.filter_jit
 def radii(
-    controller: Controller, truths: DeployedRobot, habits: Habits, period: float, spare: float = 1.0
+    controller: Controller, truths: DeployedRobot, habits: Habits, spare: float = 1.0
 ) -> Float[Array, "draw floor way"]:
     """Spectral radius of the loop for every draw of the robot, floor and direction.
 
     Args:
-        controller: with its gains.
+        controller: with its gains; habits: of the wheels.
         truths: robots it may drive, stacked.
-        habits: of the wheels; period: [s].
         spare: factor on the pose, heading, integral and observer gains.
     """
-    gains = controller.gains
-    more = replace(
-        gains,
-        place=spare * gains.place,
-        yaw=spare * gains.yaw,
-        integral=spare * gains.integral,
-        observer=spare * gains.observer,
-    )
+    gains, raised = controller.gains, ("place", "yaw", "integral", "observer")
+    more = replace(gains, **{name: spare * getattr(gains, name) for name in raised})
     ready = eqx.tree_at(lambda c: c.gains, controller, more)
 
     def one(truth: DeployedRobot, surface: Array, way: Array) -> Array:
         rates = SPEED * jnp.stack([jnp.cos(way), jnp.sin(way), jnp.zeros(())])
-        return spectral_radius(linearised(Loop(ready, truth, surface, rates, habits, period)))
+        return spectral_radius(linearised(Loop(ready, truth, surface, rates, habits)))
 
     floors, ways = jnp.arange(len(controller.robot.labels)), jnp.asarray(WAYS)
     over = jax.vmap(jax.vmap(jax.vmap(one, (None, None, 0)), (None, 0, None)), (0, None, None))

@@ -26,7 +26,7 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import Estimate, Measurement, Pose, Readings, State
 from slipid.control.pilot import Pilot, PilotOutput, PilotState
 from slipid.control.trajectory import Path
-from slipid.control.tuning.actuation import RING, Habits, held
+from slipid.control.tuning.actuation import RING, Habits
 from slipid.model import contact
 from slipid.model.plant import Floor
 from slipid.model.robot import GRAVITY
@@ -65,28 +65,22 @@ class Twin(eqx.Module):
         robot: as it is.
         floor: which surface lies where, by number in `robot.labels`.
         habits: what no fit tells.
-        period: between commands [s].
     """
 
     robot: DeployedRobot
     floor: Floor
     habits: Habits = eqx.field(static=True, default=Habits())
-    period: float = eqx.field(static=True, default=PERIOD)
 
     def __check_init__(self) -> None:
         """Refuse a delay that the ring cannot hold."""
-        if not 0 <= self.habits.delay_s <= (RING - 1) * self.period:
-            most = (RING - 1) * self.period
+        most = (RING - 1) * PERIOD
+        if not 0 <= self.habits.delay_s <= most:
             raise ValueError(f"delay_s = {self.habits.delay_s}; expected 0 to {most:g}")
 
-    @property
-    def noises(self) -> int:
-        """Standard normal numbers of a step."""
-        return 3 * self.robot.wheels + 1 + 3 * self.habits.substeps
-
     def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:
-        """Those of a step by its number; 0 is the reading at rest."""
-        drawn: Array = jax.random.normal(jax.random.fold_in(key, number), (self.noises,))
+        """Standard normal numbers of a step by its number; 0 is the reading at rest."""
+        count = 3 * self.robot.wheels + 1 + 3 * self.habits.substeps
+        drawn: Array = jax.random.normal(jax.random.fold_in(key, number), (count,))
         return drawn
 
     def init(self, pose: Pose, key: Array) -> TwinState:
@@ -112,27 +106,26 @@ class Twin(eqx.Module):
         self, state: TwinState, command: Float[Array, " wheel"], noise: Float[Array, " noise"]
     ) -> tuple[TwinState, Readings]:
         """State and readings a period after a command [rad/s]."""
-        old, b, h = state, self.habits, self.period / self.habits.substeps
+        old, b, h = state, self.habits, self.habits.substep
         ring = jnp.concatenate([command[None], old.ring[:-1]])
-        shares = jnp.asarray(held(b.delay_s, self.period, b.substeps))
+        shares = jnp.asarray(b.held())
         pushes = noise[: 3 * b.substeps].reshape(-1, 3)
-        follow = 1 - np.exp(-h / max(b.lag_s, 1e-6))
         pose, xi, wanted, w, angle = old.pose, old.twist, old.wanted, old.speed, old.angle
         for k in range(b.substeps):
             jump = b.slew * h
             wanted = wanted + jnp.clip(shares[k] @ ring - wanted, -jump, jump)
-            w = w + follow * (wanted - w)
+            w = w + b.follow * (wanted - w)
             pose, xi = self._roll(pose, w, old.effect, pushes[k], h)
             angle = angle + h * w
         now = replace(old, pose=pose, twist=xi, wanted=wanted, speed=w, angle=angle, ring=ring)
         amps, drift = self._amps(now, noise[3 * b.substeps :])
-        turned = (pose[2] - old.pose[2]) / self.period
+        turned = (pose[2] - old.pose[2]) / PERIOD
         return replace(now, drift=drift), self._read(angle, w, amps, turned + old.bias, noise)
 
     def first(self, state: TwinState, noise: Array) -> Readings:
         """Readings of a robot at rest."""
-        s = state
-        return self._read(s.angle, s.speed, jnp.zeros_like(s.speed), s.bias, noise)
+        still = jnp.zeros_like(state.speed)
+        return self._read(state.angle, state.speed, still, state.bias, noise)
 
     def _roll(
         self, pose: Array, w: Array, effect: Array, push: Array, h: float
@@ -157,7 +150,7 @@ class Twin(eqx.Module):
         floor = f.floors.at(under)
         traction = contact.forces(xi, f.frame.radius * w, f.frame, floor, f.rest).traction
         force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
-        keep = float(np.exp(-self.period / self.habits.drift_s))
+        keep = float(np.exp(-PERIOD / self.habits.drift_s))
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
         drift = keep * now.drift + fresh
         moves = jnp.tanh(w / 0.2) ** 2  # a motor that stands draws nothing
@@ -204,12 +197,11 @@ def rollout(
     """A pilot on a twin for a fixed number of steps; a path that is over is a rest at its end.
 
     Args:
-        pilot: estimator and controller.
+        pilot, twin: who drives, and what is driven.
         path: as it lies for the start.
-        twin: robot and floor.
         start: where it stands and believes to stand [m, m, rad].
         key: of all that is drawn.
-        steps: of a period each.
+        steps: how many.
     """
     noise = jax.vmap(partial(twin.noise, key))(jnp.arange(steps + 1))
     state = twin.init(start, key)
@@ -218,37 +210,27 @@ def rollout(
     def step(
         carry: tuple[TwinState, PilotState[State], Readings], drawn: Array
     ) -> tuple[tuple[TwinState, PilotState[State], Readings], tuple[Array, PilotOutput]]:
-        state, held, reading = carry
-        pose = state.pose
-        held, out = pilot.step(path, held, reading, twin.period)
-        state, reading = twin.step(state, out.command, drawn)
-        return (state, held, reading), (pose, out)
+        before, held, reading = carry
+        held, out = pilot.step(path, held, reading, PERIOD)
+        state, reading = twin.step(before, out.command, drawn)
+        return (state, held, reading), (before.pose, out)
 
-    first = (state, pilot.init(start), reading)
-    pose, out = jax.lax.scan(step, first, noise[1:])[1]
+    pose, out = jax.lax.scan(step, (state, pilot.init(start), reading), noise[1:])[1]
     return Rolled(pose=pose, command=out.command, estimate=out.estimate, own=out.time)
 
 
 class TwinPlant:
-    """A twin behind `slipid.control.closed_loop.Plant`; a key gives the same run as `rollout`.
-
-    Args:
-        twin: robot and floor.
-        start: pose [m, m, rad].
-        key: of all that is drawn.
-    """
+    """A twin behind `slipid.control.closed_loop.Plant`; a key gives the same run as `rollout`."""
 
     def __init__(self, twin: Twin, start: Pose, key: Array):
         self.twin, self.start, self.key = twin, start, key
-        self._state, self._count = twin.init(start, key), 0
+        self.reset()
 
     def reset(self) -> Readings:
-        """First readings, of the robot at rest."""
         self._state, self._count = self.twin.init(self.start, self.key), 0
         return self.twin.first(self._state, self.twin.noise(self.key, 0))
 
     def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Readings:
-        """Readings one period later, with these wheel speeds commanded [rad/s]."""
         self._count += 1
         command, count = jnp.asarray(wheel_speed), jnp.asarray(self._count)
         self._state, reading = _stepped(self.twin, self._state, command, self.key, count)
@@ -256,7 +238,6 @@ class TwinPlant:
 
     @property
     def pose(self) -> tuple[float, float, float]:
-        """True x, y [m] and heading [rad]."""
         x, y, heading = np.asarray(self._state.pose).tolist()
         return x, y, heading
 

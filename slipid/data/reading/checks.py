@@ -8,9 +8,8 @@ from jaxtyping import Float
 from slipid.data.log import Log
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.table import Table
-from slipid.data.signals.steps import integrated_steps, step_edges
 from slipid.data.signals.wheel_order import best_wheel_order, describe
-from slipid.data.signals.wheel_signals import interpolate
+from slipid.data.signals.wheel_signals import integrated_steps, interpolate, step_edges
 from slipid.support.errors import bad_data
 
 MIN_ROWS = 2
@@ -87,10 +86,11 @@ def filled(
         missing = np.isnan(values)
         if not missing.any():
             continue
-        first, last = _longest(missing)
-        rows = (int(table.lines[first]), int(table.lines[last]))
-        if last - first + 1 > MAX_FILLED:
-            found = f"{last - first + 1} missing values in a row"
+        stretches = np.flatnonzero(np.diff(np.concatenate([[0], missing, [0]]))).reshape(-1, 2)
+        first, end = max(stretches.tolist(), key=lambda ends: ends[1] - ends[0])
+        rows = (int(table.lines[first]), int(table.lines[end - 1]))
+        if end - first > MAX_FILLED:
+            found = f"{end - first} missing values in a row"
             expected = f"numbers (gaps up to {MAX_FILLED} rows are filled in)"
             raise bad_data(table.path, found, expected, row=rows, column=str(column))
         if missing.mean() > MAX_FILLED_SHARE:
@@ -100,14 +100,6 @@ def filled(
         cells[missing, j] = np.interp(time[missing], time[~missing], values[~missing])
         notes.append(f"column '{column}': {missing.sum()} missing values filled by interpolation")
     return cells
-
-
-def _longest(mask: np.ndarray) -> tuple[int, int]:
-    """First and last index of the longest stretch of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    starts, ends = edges[::2], edges[1::2]
-    longest = int(np.argmax(ends - starts))
-    return int(starts[longest]), int(ends[longest]) - 1
 
 
 def unwrapped_ticks(
@@ -196,26 +188,21 @@ def _check_pose(log: Log, table: Table, layout: Layout) -> None:
     pose = log.pose
     assert pose is not None
     steps = np.hypot(*np.diff(pose[:, :2], axis=0).T)
-    if steps.max() > layout.max_pose_jump:
-        i = int(np.flatnonzero(steps > layout.max_pose_jump)[0])
-        found = f"the pose jumps by {steps[i]:.3g} m"
-        expected = (
-            f"at most {layout.max_pose_jump:g} m between rows; another marker, or a wrong unit?"
-        )
-        raise _at(table, layout, "pose_x", i + 1, 0, found, expected)
-    turns = np.abs(np.diff(pose[:, 2]))
-    if turns.max() > layout.max_heading_jump:
-        i = int(np.flatnonzero(turns > layout.max_heading_jump)[0])
-        found = f"the heading jumps by {np.degrees(turns[i]):.0f} deg"
-        limit = np.degrees(layout.max_heading_jump)
-        expected = f"at most {limit:.0f} deg between rows; another marker, or a wrong unit?"
-        raise _at(table, layout, "pose_heading", i + 1, 0, found, expected)
+    turns, most = np.degrees(np.abs(np.diff(pose[:, 2]))), np.degrees(layout.max_heading_jump)
+    for column, what, jumps, limit, unit in (
+        ("pose_x", "pose", steps, layout.max_pose_jump, "m"),
+        ("pose_heading", "heading", turns, most, "deg"),
+    ):
+        if jumps.max() > limit:
+            i = int(np.argmax(jumps > limit))
+            found = f"the {what} jumps by {jumps[i]:.3g} {unit}"
+            expected = f"at most {limit:.3g} {unit} between rows; another marker, or a wrong unit?"
+            raise _at(table, layout, column, i + 1, 0, found, expected)
     turned = np.ptp(log.wheel_angle, axis=0).max(initial=0.0)
     if turned > 2.0 and np.ptp(pose, axis=0).max() == 0:
         found = f"the pose is constant while a wheel turns {turned:.3g} rad"
-        raise _at(
-            table, layout, "pose_x", None, 0, found, "a pose that changes: was the marker seen?"
-        )
+        expected = "a pose that changes: was the marker seen?"
+        raise _at(table, layout, "pose_x", None, 0, found, expected)
 
 
 def _first(mask: np.ndarray) -> tuple[int, int]:

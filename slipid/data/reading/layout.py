@@ -1,10 +1,22 @@
 """What a log file's layout is: which column holds which channel, in which unit."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from difflib import get_close_matches
+from typing import Annotated, Literal
+
+from pydantic import (
+    AliasChoices,
+    BeforeValidator,
+    Field,
+    StrictBool,
+    StrictFloat,
+    StrictInt,
+    StrictStr,
+)
+from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.units import converts, factor
+from slipid.support.bounds import CLOSED, Positive
+from slipid.support.errors import near
 
 PER_WHEEL = {
     "wheel_ticks": "tick",
@@ -32,10 +44,15 @@ SINGLE = {
 CHANNELS: dict[str, str] = {**SINGLE, **PER_WHEEL}
 """Every channel a layout may name, with the unit it is turned into."""
 
-NEW_RUN = ("never", "time_restarts", "ticks_restart")
+Count = Annotated[int, Field(ge=0, strict=True)]
 
 
-@dataclass(frozen=True)
+def _several(value: object) -> object:
+    """One column or one scale, or a list of them."""
+    return tuple(value) if isinstance(value, list | tuple) else (value,)
+
+
+@dataclass(frozen=True, config=CLOSED)
 class Channel:
     """Columns of one channel: value = (scale x cell + offset), in `unit`.
 
@@ -47,13 +64,28 @@ class Channel:
         offset: added after the scale, in `unit`.
     """
 
-    columns: tuple[str | int, ...]
-    unit: str
-    scale: float | tuple[float, ...] = 1.0
-    offset: float = 0.0
+    columns: Annotated[
+        tuple[StrictStr | StrictInt, ...],
+        BeforeValidator(_several),
+        Field(min_length=1, validation_alias=AliasChoices("columns", "column")),
+    ]
+    unit: StrictStr
+    scale: Annotated[tuple[StrictFloat, ...], BeforeValidator(_several)] = (1.0,)
+    offset: StrictFloat = 0.0
+
+    def __post_init__(self) -> None:
+        if len(self.scale) not in (1, len(self.columns)):
+            raise ValueError(
+                f"{len(self.scale)} scales for {len(self.columns)} columns; expected as many"
+            )
 
 
-@dataclass(frozen=True)
+def _pair(value: object) -> object:
+    """Scales along x and y; one number counts for both."""
+    return tuple(value) if isinstance(value, list | tuple) else value and (value, value)
+
+
+@dataclass(frozen=True, config=CLOSED)
 class Layout:
     """How one kind of log file is laid out.
 
@@ -72,7 +104,7 @@ class Layout:
         current_is_signed: False where the cells are magnitudes.
         current_step: step of the current's analogue-to-digital converter [A]; None where unknown.
         metres_per_pixel: scale of the camera along its x and its y [m].
-        new_run: what tells that the next run starts inside the file, one of `NEW_RUN`.
+        new_run: what tells that the next run starts inside the file.
         drop_repeated_time: whether to keep the last of rows with the same time; else such rows are
             refused.
         max_gap: longest time between rows [s]; a longer one is called a clock jump.
@@ -82,23 +114,23 @@ class Layout:
 
     name: str
     channels: Mapping[str, Channel]
-    delimiter: str = ","
-    names_row: int = 1
-    units_row: int = 0
-    first_data_row: int = 2
-    row_period: float | None = None
-    ticks_per_revolution: float | None = None
-    gear_ratio: float = 1.0
-    ticks_are_increments: bool = False
-    tick_bits: int = 32
-    current_is_signed: bool = True
-    current_step: float | None = None
-    metres_per_pixel: tuple[float, float] | None = None
-    new_run: str = "never"
-    drop_repeated_time: bool = False
-    max_gap: float = 1.0
-    max_pose_jump: float = 0.5
-    max_heading_jump: float = 1.6
+    delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","
+    names_row: Count = 1
+    units_row: Count = 0
+    first_data_row: Count = 2
+    row_period: Positive | None = None
+    ticks_per_revolution: Positive | None = None
+    gear_ratio: Positive = 1.0
+    ticks_are_increments: StrictBool = False
+    tick_bits: Count = 32
+    current_is_signed: StrictBool = True
+    current_step: StrictFloat | None = None
+    metres_per_pixel: Annotated[tuple[Positive, Positive] | None, BeforeValidator(_pair)] = None
+    new_run: Literal["never", "time_restarts", "ticks_restart"] = "never"
+    drop_repeated_time: StrictBool = False
+    max_gap: Positive = 1.0
+    max_pose_jump: Positive = 0.5
+    max_heading_jump: Positive = 1.6
 
     @property
     def wheels(self) -> int:
@@ -129,6 +161,4 @@ class Layout:
 def unknown(what: str, name: object, choices: Iterable[str]) -> str:
     """Message about a name that is none of the choices: the nearest of them, then all."""
     names = list(choices)
-    near = get_close_matches(str(name), names, n=2)
-    hint = f", did you mean {' or '.join(near)}?" if near else ""
-    return f"no {what} '{name}'{hint}; expected one of {', '.join(names)}"
+    return f"no {what} '{name}'{near(name, names)}; expected one of {', '.join(names)}"

@@ -22,7 +22,7 @@ def preset(name: str) -> Layout:
 
 
 def _one(column: str | int, unit: str, scale: float = 1.0, offset: float = 0.0) -> Channel:
-    return Channel((column,), unit, scale, offset)
+    return Channel((column,), unit, (scale,), offset)
 
 
 def _motors(pattern: str, unit: str) -> Channel:
@@ -32,11 +32,14 @@ def _motors(pattern: str, unit: str) -> Channel:
 # Overhead camera of the Robotino logs: x right, y DOWN. X = -x, Y = y is right-handed as the robot
 # is seen from above, and the heading is measured from there. The logged steps dx, dy are not used:
 # they are body-frame steps at the same scale, but most steps above 5 pixels are cut short in them.
-_CAMERA_2022 = {
-    "pose_x": _one("xpos", "pixel", scale=-1.0),
-    "pose_y": _one("ypos", "pixel"),
-    "pose_heading": _one("ang", "deg", offset=-90.0),
-}
+def _camera(x: str, y: str, angle: str, unit: str = "pixel") -> dict[str, Channel]:
+    return {
+        "pose_x": _one(x, unit, scale=-1.0),
+        "pose_y": _one(y, unit),
+        "pose_heading": _one(angle, "deg", offset=-90.0),
+    }
+
+
 # As its owners calibrated it, per axis. That motion seen so is too short by about 1.117 is for a
 # fit to find, not for a reader to know.
 _METRES_PER_PIXEL = (1.8404619693756104e-3, 1.8371639251708984e-3)
@@ -69,9 +72,7 @@ _DRIVE_2021 = {
     "wheel_ticks": _motors("Motor {} encoder, ticks", "tick"),
     "motor_speed": _motors("Motor {} velocity, rpm", "rpm"),
     "current": _motors("Motor {} current, A", "A"),
-    "pose_x": _one("X coordinate, pixels", "pixel", scale=-1.0),
-    "pose_y": _one("Y coodinate, pixels", "pixel"),
-    "pose_heading": _one("Angle, deg", "deg", offset=-90.0),
+    **_camera("X coordinate, pixels", "Y coodinate, pixels", "Angle, deg"),
 }
 
 _LAYOUTS = (
@@ -80,7 +81,12 @@ _LAYOUTS = (
         _ROBOTINO_2022,
         name="robotino2022",
         metres_per_pixel=_METRES_PER_PIXEL,
-        channels={**_MOTORS_2022, **_TWIST_2022, **_CAMERA_2022, "wheel_ticks": _TICKS_2022},
+        channels={
+            **_MOTORS_2022,
+            **_TWIST_2022,
+            **_camera("xpos", "ypos", "ang"),
+            "wheel_ticks": _TICKS_2022,
+        },
     ),
     # The same robot out of the camera's sight.
     replace(
@@ -110,11 +116,7 @@ _LAYOUTS = (
         name="robotino2021_field",
         new_run="time_restarts",
         metres_per_pixel=_METRES_PER_PIXEL,
-        channels={
-            **_DRIVE_2021,
-            "time": _one("Time, ms", "ms"),
-            "gyro": _one("Z gyro", "deg/s"),
-        },
+        channels=_DRIVE_2021 | {"time": _one("Time, ms", "ms"), "gyro": _one("Z gyro", "deg/s")},
     ),
     # Speeds at the motor shaft; currents are magnitudes here as well. Where the reference steps,
     # the row is there twice, before and after the step.
@@ -133,12 +135,7 @@ _LAYOUTS = (
     # Camera only: no wheel of these runs was logged. Millimetres already, axes of the image.
     Layout(
         name="robotino2021_camera",
-        channels={
-            "time": _one("time_s", "s"),
-            "pose_x": _one("x_mm", "mm", scale=-1.0),
-            "pose_y": _one("y_mm", "mm"),
-            "pose_heading": _one("angle_deg", "deg", offset=-90.0),
-        },
+        channels={"time": _one("time_s", "s"), **_camera("x_mm", "y_mm", "angle_deg", "mm")},
     ),
     # No names: t, x, y, heading, then the ticks of each wheel since the last row, which count
     # backwards. With the sign turned, the wheels stand at azimuths 300, 60 and 180 deg.
@@ -154,7 +151,7 @@ _LAYOUTS = (
             "pose_x": _one(1, "m"),
             "pose_y": _one(2, "m"),
             "pose_heading": _one(3, "rad"),
-            "wheel_ticks": Channel((4, 5, 6), "tick", scale=-1.0),
+            "wheel_ticks": Channel((4, 5, 6), "tick", scale=(-1.0,)),
         },
     ),
 )

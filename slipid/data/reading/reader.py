@@ -1,5 +1,6 @@
 """Read logs: from a file and its layout to a `Log` in SI units, checked once, here."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from slipid.data.log import Log
 from slipid.data.reading.checks import MIN_ROWS, check_log, check_time, filled, unwrapped_ticks
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.table import Table, read_table
-from slipid.data.signals.steps import integral
+from slipid.data.signals.wheel_signals import integral
 from slipid.support.errors import DataError, bad_data
 
 
@@ -24,11 +25,8 @@ def read_log(
     """The one run in a CSV or Parquet file.
 
     Args:
-        path: the file.
-        layout: how it is laid out.
         root: data folder the log's name is relative to; the file's own folder where None.
-        surface: name of the floor.
-        load: name of the load set-up.
+        surface, load: names of the floor and the load set-up.
 
     Raises:
         DataError: the file, row or column that is wrong, what is there and what was expected.
@@ -53,16 +51,16 @@ def read_logs(
     """
     table = read_table(path, layout)
     if layout.drop_repeated_time:
-        last = np.append(np.diff(_time(table, layout)) != 0, True)
-        table = table.rows(last)
+        table = table.rows(np.append(np.diff(_time(table, layout)) != 0, True))
+    below = root if root is not None and path.is_relative_to(root) else path.parent
+    name = path.relative_to(below).as_posix()
     starts = _run_starts(table, layout)
     if len(starts) == 1:
-        return (_log(table, layout, _name(path, root), surface, load),)
-    ends = (*starts[1:], len(table.values))
-    pairs = [(a, b) for a, b in zip(starts, ends, strict=True) if b - a >= MIN_ROWS]
+        return (_log(table, layout, name, surface, load),)
+    pairs = [(a, b) for a, b in pairwise([*starts, len(table.values)]) if b - a >= MIN_ROWS]
     width = len(str(len(pairs)))
     return tuple(
-        _log(table.rows(slice(a, b)), layout, f"{_name(path, root)}#{k:0{width}d}", surface, load)
+        _log(table.rows(slice(a, b)), layout, f"{name}#{k:0{width}d}", surface, load)
         for k, (a, b) in enumerate(pairs, start=1)
     )
 
@@ -84,18 +82,11 @@ def find_logs(root: Path, pattern: str) -> list[Path]:
             break
         nearest = nearest / part
     inside = sorted(p.name + ("/" if p.is_dir() else "") for p in nearest.iterdir())
-    listed = ", ".join(inside[:8]) + (", ..." if len(inside) > 8 else "")
+    listed = ", ".join(inside[:8] + ["..."] * (len(inside) > 8))
     raise DataError(
         f"{root}: no file matches '{pattern}'; expected at least one "
         f"({nearest} has {listed or 'nothing in it'})"
     )
-
-
-def _name(path: Path, root: Path | None) -> str:
-    try:
-        return path.relative_to(root or path.parent).as_posix()
-    except ValueError:
-        return path.name
 
 
 def _run_starts(table: Table, layout: Layout) -> list[int]:
@@ -133,8 +124,8 @@ def _log(table: Table, layout: Layout, name: str, surface: str | None, load: str
         current_is_signed=layout.current_is_signed,
         voltage=have.get("voltage"),
         duty=have.get("duty"),
-        bus_voltage=_single(have, "bus_voltage"),
-        gyro=_single(have, "gyro"),
+        bus_voltage=have["bus_voltage"][:, 0] if "bus_voltage" in have else None,
+        gyro=have["gyro"][:, 0] if "gyro" in have else None,
         pose=pose,
         pose_fresh=fresh,
         surface=surface,
@@ -197,14 +188,10 @@ def _at_wheel(layout: Layout, have: dict[str, np.ndarray], what: str) -> np.ndar
 
 
 def _twist(have: dict[str, np.ndarray], rows: int) -> np.ndarray | None:
-    parts = [have.get(f"twist_command_{axis}") for axis in ("x", "y", "yaw")]
-    if all(part is None for part in parts):
+    names = [f"twist_command_{axis}" for axis in ("x", "y", "yaw")]
+    if not have.keys() & set(names):
         return None
-    return np.concatenate([np.zeros((rows, 1)) if p is None else p for p in parts], axis=1)
-
-
-def _single(have: dict[str, np.ndarray], name: str) -> np.ndarray | None:
-    return have[name][:, 0] if name in have else None
+    return np.concatenate([have.get(name, np.zeros((rows, 1))) for name in names], axis=1)
 
 
 def _pose(

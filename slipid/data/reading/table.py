@@ -53,7 +53,6 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     """Numbers of a CSV or Parquet file, each cell checked.
 
     Args:
-        path: the file; `.parquet` is read with pyarrow.
         layout: where names and numbers are, and which columns are wanted.
         all_columns: read every column of the file and not only those the layout uses.
 
@@ -84,13 +83,12 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
 
 
 def _bytes(path: Path) -> bytes:
+    if path.is_dir():
+        raise bad_data(path, "a folder", "a CSV or Parquet file")
     try:
         raw = path.read_bytes()
-    except IsADirectoryError as error:
-        raise bad_data(path, "a folder", "a CSV or Parquet file") from error
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise bad_data(path, f"cannot be read ({reason})", "a readable file") from error
+        raise bad_data(path, f"cannot be read ({error.strerror})", "a readable file") from error
     if not raw.strip():
         raise bad_data(path, "the file is empty", "a header and rows of numbers")
     return raw

@@ -1,8 +1,9 @@
 """Units of log columns: from the unit a column is declared in to SI, dimension checked."""
 
-from difflib import get_close_matches
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
+
+from slipid.support.errors import near
 
 if TYPE_CHECKING:
     import pint
@@ -53,11 +54,7 @@ def _registry() -> "pint.UnitRegistry[Any]":
 
 @lru_cache(maxsize=256)
 def factor(unit: str, target: str) -> float:
-    """Factor between two units: value [target] = factor value [unit].
-
-    Args:
-        unit: a unit as people write it: "ms", "rpm", "mm/s", "%".
-        target: the unit wanted, of the same dimension.
+    """Factor from a unit as people write it ("rpm", "mm/s", "%") to one of the same dimension.
 
     Raises:
         ValueError: where the unit is unknown, or of another dimension.
@@ -67,9 +64,8 @@ def factor(unit: str, target: str) -> float:
     try:
         given = registry.parse_units(_ALIASES.get(unit.strip(), unit.strip()))
     except Exception as error:  # pint raises a dozen types, one of them tokenize's
-        near = get_close_matches(unit, _KNOWN, n=3, cutoff=0.5)
-        hint = f", did you mean {' or '.join(near)}?" if near else ""
-        raise ValueError(f"unknown unit '{unit}'{hint} (known: {', '.join(_KNOWN)})") from error
+        known = f"{near(unit, _KNOWN)} (known: {', '.join(_KNOWN)})"
+        raise ValueError(f"unknown unit '{unit}'{known}") from error
     if given.dimensionality != wanted.dimensionality:
         raise ValueError(f"unit '{unit}' cannot be converted to {target}")
     return float(registry.Quantity(1.0, given).to(wanted).magnitude)

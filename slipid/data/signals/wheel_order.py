@@ -41,11 +41,8 @@ def best_wheel_order(
 
         misfit = sum_i |m_order(i) sign_i - ref_i|^2 / sum_i |ref_i|^2
 
-    Only the products of every pair enter, so that all orders of six wheels cost nothing.
-
-    Args:
-        measured: any measure of wheel motion, such as the angle turned in a step.
-        reference: the same for where the wheels should have gone.
+    Only the products of every pair enter, so that all orders of six wheels cost nothing. Steps are
+    in any measure of wheel motion, such as the angle turned.
     """
     products = measured.T @ reference
     norm, reference_norm = float(np.sum(measured**2)), float(np.sum(reference**2))

@@ -1,4 +1,4 @@
-"""Signals of one run: wheel speed from angles, stalls of the telemetry, start, quantisation."""
+"""Signals of one run: steps of motion, speeds from angles, stalls of the telemetry, the start."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -9,12 +9,9 @@ def interpolate(
     values: Float[np.ndarray, " time"] | Float[np.ndarray, "time column"],
     at: Float[np.ndarray, " at"],
 ) -> Float[np.ndarray, " at"] | Float[np.ndarray, "at column"]:
-    """Values at other times, linear in between, constant beyond both ends.
+    """Values at other times [s], linear in between, constant beyond both ends.
 
-    Args:
-        time: [s], increasing.
-        values: one or several columns, one row per time; angles without wrap-around.
-        at: [s].
+    Angles have to be without wrap-around.
     """
     after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
     before = after - 1
@@ -23,40 +20,39 @@ def interpolate(
     return values[before] + share * (values[after] - values[before])
 
 
-def wheel_speed(
+def integral(
+    time: Float[np.ndarray, " time"], rate: Float[np.ndarray, "time column"]
+) -> Float[np.ndarray, "time column"]:
+    """Integral of each column from the first row on, by trapezoids; the first row is 0."""
+    areas = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None]
+    return np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(areas, axis=0)])
+
+
+def step_edges(time: Float[np.ndarray, " time"], step: float = 0.5) -> Float[np.ndarray, " edge"]:
+    """Edges of equal steps [s], long enough that delays and jitter do not matter."""
+    count = max(2, int((time[-1] - time[0]) / step) + 1)
+    return np.linspace(time[0], time[-1], count)
+
+
+def integrated_steps(
     time: Float[np.ndarray, " time"],
-    wheel_angle: Float[np.ndarray, "time wheel"],
-    half_window: float = 0.1,
-) -> Float[np.ndarray, "time wheel"]:
-    """Speed of each wheel [rad/s]: slope of the line fitted to its angle around every row.
+    rate: Float[np.ndarray, "time column"],
+    edges: Float[np.ndarray, " edge"],
+) -> Float[np.ndarray, "step column"]:
+    """Integral of a rate over each step."""
+    return np.diff(interpolate(time, integral(time, rate), edges), axis=0)
 
-        w(t) = sum (s - s_mean) angle(s) / sum (s - s_mean)^2     over |s - t| <= half_window
 
-    Firmware updates the counters at its own pace, so that steps from row to row alternate two to
-    one; the fit over a centred window is blind to that. Windows hold at least three rows.
+def body_steps(pose: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "step 3"]:
+    """Increments ahead [m], to the left [m] and in heading [rad] between rows of a pose.
 
-    Args:
-        time: [s].
-        wheel_angle: [rad].
-        half_window: [s]; longer smooths more.
+    They are in the body's axes halfway through each step: turned back by the mean heading.
     """
-    rows = np.arange(len(time))
-    slack = 1e-9 * max(half_window, 1.0)
-    first = np.minimum(np.searchsorted(time, time - half_window - slack), np.maximum(rows - 1, 0))
-    last = np.searchsorted(time, time + half_window + slack, side="right")
-    last = np.maximum(last, np.minimum(rows + 2, len(time)))
-    # Sums over windows as differences of cumulative sums, about the middle to keep the digits.
-    s = time - time.mean()
-    angle = wheel_angle - wheel_angle.mean(axis=0)
-
-    def windowed(values: np.ndarray) -> np.ndarray:
-        total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-        return total[last] - total[first]
-
-    n = (last - first)[:, None].astype(float)
-    s = s[:, None]
-    s_sum, s_square = windowed(s), windowed(s * s)
-    return (windowed(s * angle) - s_sum * windowed(angle) / n) / (s_square - s_sum**2 / n)
+    middle = 0.5 * (pose[1:, 2] + pose[:-1, 2])
+    dx, dy, turn = np.diff(pose, axis=0).T
+    ahead = np.cos(middle) * dx + np.sin(middle) * dy
+    left = np.cos(middle) * dy - np.sin(middle) * dx
+    return np.stack([ahead, left, turn], axis=1)
 
 
 def bridge_stalls(
@@ -71,8 +67,6 @@ def bridge_stalls(
     currents reported in the marked rows are as stale as the angle was.
 
     Args:
-        time: [s].
-        wheel_angle: [rad].
         min_rows: steps without change from which a stretch can be a stall.
     """
     stalled = np.zeros(len(time), dtype=bool)
@@ -108,25 +102,3 @@ def first_moved(
     rim = radius * np.abs(wheel_angle - wheel_angle[:1]).max(axis=1, initial=0.0)
     moved = np.flatnonzero(rim >= distance)
     return int(moved[0]) if len(moved) else None
-
-
-def quantum(values: Float[np.ndarray, " time"]) -> float | None:
-    """Step of a quantised column, in its own unit; None where the values are not on a grid.
-
-    All distinct values must be whole multiples of it, to 2 % of a step; digits lost in printing are
-    averaged out by a line through the origin. Levels next to each other need not both occur: the
-    smallest gap may be up to four steps.
-    """
-    levels = np.unique(values)
-    levels = levels - levels[np.argmin(np.abs(levels))] if len(levels) else levels
-    if len(levels) < 3 or len(levels) > 0.5 * len(values):
-        return None
-    gap = float(np.diff(levels).min())
-    for parts in (1, 2, 3, 4):
-        step = gap / parts
-        for _ in range(3):
-            multiples = np.round(levels / step)
-            step = float(levels @ multiples / (multiples @ multiples))
-        if float(np.abs(levels / step - multiples).max()) < 0.02:
-            return step
-    return None

@@ -1,16 +1,28 @@
-"""Who is left out together when models are judged on runs that they have not seen.
+"""Every rung of the ladder judged on runs left out: who is left out together, and what they say.
 
 Runs of one heading stay in one fold at every speed and on every floor, so that nothing of a
 left-out heading is seen. Folds differ only in the weight of each piece: one compiled function
 serves all.
 """
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from jaxtyping import Int
 
 from slipid.data.runs import Runs
+from slipid.identify.compare import open_loop as replay
+from slipid.identify.compare.noisy_rung import with_noise
+from slipid.identify.compare.predictive import Predictive, contact_of
+from slipid.identify.compare.slip_models import rungs
+from slipid.identify.compare.validation import Judged, score, told
+from slipid.identify.fit.one_speed import still_viscosities
+from slipid.identify.fit.optimise import Options, optimise
+from slipid.identify.fit.problem import Problem, State
+from slipid.search_space import Choice, Space
+from slipid.support.content import Content
 from slipid.support.errors import DataError
 
 Fold = Int[np.ndarray, " run"]
@@ -40,8 +52,7 @@ def speeds(data: Runs) -> Fold:
     """
     speed = np.round(data.speed, 3)
     speed[speed == 0] = np.nan
-    group = np.array([f"{log.surface}@{log.load}" for log in data.logs])
-    out = np.full(len(data), -1)
+    group, out = _groups(data), np.full(len(data), -1)
     every = np.unique(speed[np.isfinite(speed)])
     for name in np.unique(group):
         mine = (group == name) & np.isfinite(speed)
@@ -61,7 +72,7 @@ QUESTIONS: dict[str, Callable[[Runs], Fold]] = {
 def folds_of(data: Runs, question: str) -> Fold:
     """Fold of every run; -1 for one that cannot be judged and is always fitted.
 
-    A run cannot be judged where leaving out its fold leaves nothing of its floor and load set-up.
+    Leaving out its fold would leave nothing of its floor and load set-up.
 
     Raises:
         DataError: no such question.
@@ -71,9 +82,85 @@ def folds_of(data: Runs, question: str) -> Fold:
             f"--folds: '{question}': no such question; expected some of {', '.join(QUESTIONS)}"
         )
     fold = QUESTIONS[question](data)
-    group = np.array([f"{log.surface}@{log.load}" for log in data.logs])
+    group = _groups(data)
     for name in np.unique(group):
-        mine = group == name
-        if len(np.unique(fold[mine])) < 2:
-            fold[mine] = -1
+        if len(np.unique(fold[group == name])) < 2:
+            fold[group == name] = -1
     return fold
+
+
+def _groups(data: Runs) -> np.ndarray:
+    return np.array([f"{log.surface}@{log.load}" for log in data.logs])
+
+
+@dataclass(frozen=True)
+class FoldResult:
+    """What the models say of the runs of a fold, and how the fit of the force balance ended.
+
+    Seconds are to `fit` and to `predict`, of every model; numbers are counts of fitted ones, by
+    floor.
+    """
+
+    rows: tuple[Judged, ...]
+    seconds: dict[str, dict[str, float]]
+    numbers: dict[str, dict[str, int]]
+    converged: bool
+    reason: str
+
+    def to_json(self) -> Content:
+        return asdict(self, dict_factory=told)
+
+
+def problem_of(
+    problem: Problem, choices: Sequence[Choice], data: Runs, fitted: np.ndarray
+) -> Problem:
+    """The problem for some of its runs; other than itself where they saw a floor at one speed."""
+    held = [*still_viscosities(data, fitted), *choices]
+    if Space(problem.robot, held).names == problem.space.names:
+        return problem
+    return Problem(problem.windows, problem.robot, held, problem.joint)
+
+
+def judge(
+    problem: Problem,
+    choices: Sequence[Choice],
+    data: Runs,
+    judged: np.ndarray,
+    options: Options | None = None,
+    tell: Callable[[State], None] = lambda state: None,
+) -> FoldResult:
+    """One fold: every rung fitted without some runs, and what it says of them.
+
+    The problem is of all the runs of `data`, made with these choices; `judged` are numbers of runs.
+    """
+    fitted = np.setdiff1d(np.arange(len(data)), judged)
+    problem = problem_of(problem, choices, data, fitted)
+    keep = np.isin(problem.windows.run, fitted).astype(float)
+    began = time.perf_counter()
+    optimum = optimise(problem, keep=keep, options=options, tell=tell)
+    contact = contact_of(problem, optimum.state, optimum.covariance, keep)
+    models: list[Predictive] = [contact]
+    seconds = {contact.name: {"fit": time.perf_counter() - began}}
+    for rung in rungs(problem.windows.has_current):
+        began = time.perf_counter()
+        models.append(with_noise(rung, contact, problem, keep))
+        seconds[rung.name] = {"fit": time.perf_counter() - began}
+    part = data.subset(judged)
+    runs: dict[int, Judged] = {}
+    cuts = replay.cuts(part, contact.robot)
+    for model in models:
+        began = time.perf_counter()
+        for w in cuts:
+            score(runs, part, model.name, *model.ends(w))
+        seconds[model.name]["predict"] = time.perf_counter() - began
+        density = model.log_density(problem)
+        for k, number in enumerate(judged):
+            of_run = float(density[problem.windows.run == number].sum())
+            runs[k].models[model.name] = replace(runs[k].models[model.name], log_density=of_run)
+    return FoldResult(
+        rows=tuple(replace(runs[k], session=name) for k, name in enumerate(part.session)),
+        seconds=seconds,
+        numbers={model.name: model.numbers for model in models},
+        converged=bool(optimum.converged),
+        reason=optimum.reason,
+    )

@@ -4,6 +4,7 @@ Everything is in the corrected metres of the fitted camera; the measured pose is
 start.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -11,15 +12,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.stats import f as fisher
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
+from slipid.identify.compare.body_motion import sideways, turned
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import travel
 from slipid.identify.fit.problem import DEGREES
+from slipid.identify.fit.sessions import by_axis
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
-from slipid.parameter import Space
+from slipid.search_space import Space
 
 STEP = 0.5
 """Longest step of a replay [s]."""
@@ -29,12 +33,7 @@ TOGETHER = 32
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Paths of runs cut into the same number of steps.
-
-    Attributes:
-        run: number of each run in the dataset.
-        predicted, measured: marker poses in corrected metres (run, step + 1, 3).
-    """
+    """Paths of runs cut into the same number of steps: marker poses in corrected metres."""
 
     run: np.ndarray
     predicted: Float[np.ndarray, "run edge 3"]
@@ -105,11 +104,6 @@ def follow(robot: Robot, w: Windows, increment: Float[np.ndarray, "piece window 
     return Tracks(w.run, path, pose)
 
 
-@jax.jit
-def _end(robot: Robot, b: lk.Batch, start: Array) -> Array:
-    return chain(start, lk.predict(robot, b).increment)[:, -1]
-
-
 @eqx.filter_jit
 def twist_end_jacobian(space: Space, z: Array, twist: Array, w: lk.Batch, start: Array) -> Array:
     """Slope of the ends by the search vector where the body's twists are given (piece, 2, free)."""
@@ -123,14 +117,18 @@ def twist_end_jacobian(space: Space, z: Array, twist: Array, w: lk.Batch, start:
 @eqx.filter_jit
 def end_jacobian(space: Space, z: Array, b: lk.Batch, start: Array) -> Array:
     """Derivative of the end pose (piece, 3) by the search vector, from given start poses."""
-    return jax.jacfwd(lambda x: _end(space.tree(x), b, start))(z)
+
+    def end(x: Array) -> Array:
+        return chain(start, contact_increments(space.tree(x), b))[:, -1]
+
+    return jax.jacfwd(end)(z)
 
 
 def end_covariance(
     robot: Robot,
     w: Windows,
     tracks: Tracks,
-    variance: dict[str, float],
+    variance: Mapping[str, float],
     of_parameters: Float[np.ndarray, "piece 2 2"] | float = 0.0,
 ) -> Float[np.ndarray, "piece 2 2"]:
     """Covariance of the gap between predicted and measured end [m^2], scale matrix of a Student t.
@@ -142,36 +140,18 @@ def end_covariance(
     far, u = travel(w, robot)
     p = tracks.predicted
     cov = np.zeros((len(w), 2, 2)) + of_parameters
-    rest = p[:, -1:, :2] - p[:, 1:, :2]  # what a turn at each step moves
-    lever = np.stack([-rest[..., 1], rest[..., 0]], -1)
-    c, s = np.cos(p[:, :-1, 2]), np.sin(p[:, :-1, 2])
-
-    def world(v: np.ndarray) -> np.ndarray:
-        return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], -1)
-
-    across = np.stack([-u[..., 1], u[..., 0]], -1)
-    for name, axis in (("along", world(u)), ("across", world(across)), ("yaw", lever)):
-        v = np.array([variance[f"process.{f}.{name}"] for f in w.surface])
-        cov += np.einsum("n,nk,nki,nkj->nij", v, far, axis, axis)
-        shared = [variance.get(f"session.{f}.{name}", 0.0) for f in w.surface]
-        v = np.array([variance[f"run.{f}.{name}"] for f in w.surface]) + shared
+    lever = sideways(p[:, -1:, :2] - p[:, 1:, :2])  # what a turn at each step moves
+    way = p[:, :-1, 2]
+    along, across = turned(way, u), turned(way, sideways(u))
+    process, run, session = (by_axis(variance, k, w) for k in ("process", "run", "session"))
+    for k, axis in enumerate((along, across, lever)):
+        cov += np.einsum("n,nk,nki,nkj->nij", process[:, k], far, axis, axis)
         whole = np.einsum("nk,nki->ni", far, axis)
-        cov += v[:, None, None] * whole[:, :, None] * whole[:, None, :]
-    all_way = p[:, -1, :2] - p[:, 0, :2]
-    turn = np.stack([-all_way[:, 1], all_way[:, 0]], -1)
+        cov += (run + session)[:, k, None, None] * whole[:, :, None] * whole[:, None, :]
+    turn = sideways(p[:, -1, :2] - p[:, 0, :2])
     cov += variance["camera.heading"] * turn[:, :, None] * turn[:, None, :]
     cov += 2 * variance["camera.place"] * float(robot.camera.scale) ** 2 * np.eye(2)
     return cov
-
-
-def parameter_covariance(
-    space: Space, z: np.ndarray, covariance: np.ndarray, w: Windows, tracks: Tracks
-) -> Float[np.ndarray, "piece 2 2"]:
-    """Part of the end's covariance that comes from the fitted numbers, linearised."""
-    b = lk.batch(w, space.template)
-    start = jnp.asarray(tracks.predicted[:, 0])
-    jac = np.asarray(end_jacobian(space, jnp.asarray(z), b, start))
-    return np.asarray(np.einsum("nip,pq,njq->nij", jac[:, :2], covariance, jac[:, :2]))
 
 
 def scores(
@@ -186,14 +166,11 @@ def scores(
     """
     if cov is None:
         return None, np.linalg.norm(gap, axis=1)
-    from scipy.stats import f as fisher
-
     q = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(cov), gap)
     level = fisher.cdf(q / 2, 2, DEGREES)
     rng = np.random.default_rng(seed)
-    count = 500
-    normal = rng.normal(size=(count, 2)) / np.sqrt(rng.chisquare(DEGREES, (count, 1)) / DEGREES)
+    normal = rng.normal(size=(500, 2)) / np.sqrt(rng.chisquare(DEGREES, (500, 1)) / DEGREES)
     draws = np.einsum("nij,kj->nki", np.linalg.cholesky(cov), normal)
     near = np.linalg.norm(draws - gap[:, None], axis=2).mean(axis=1)
-    apart = np.linalg.norm(draws[:, : count // 2] - draws[:, count // 2 :], axis=2).mean(axis=1)
+    apart = np.linalg.norm(draws[:, :250] - draws[:, 250:], axis=2).mean(axis=1)
     return level, near - 0.5 * apart

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.stats import binom
 
-from slipid.identify.compare.validation import Judged, Score, by_floor
+from slipid.identify.compare.validation import Judged, Score, by_floor, finite
 
 SURE, SMALL = 2.0, 4.0
 """A difference counts from so many standard errors on, and so many nats over all runs together.
@@ -18,7 +19,6 @@ Source: Sivula, Magnusson, Matamoros and Vehtari 2020, arXiv:2008.10296.
 CLUSTER_DEG = 30.0
 """Neighbouring headings share their errors (they are correlated by a half at 5 degrees, by nothing
 at 30): runs of one such sector are one observation of the clustered standard error."""
-NAMES = {"identified": "contact equilibrium"}
 
 
 def mean_error(
@@ -44,16 +44,11 @@ def mean_error(
 
 @dataclass(frozen=True)
 class Ranked:
-    """A model on a floor.
+    """A model on a floor: its score [nats per run], see `ranking`, and means over the runs.
 
-    Attributes:
-        elpd: its score, see `ranking` [nats per run].
-        difference: to the best, `se` over runs, `se_clustered` over sectors of headings.
-        verdict: `best`, `tied` or `worse`.
-        endpoint_error: mean, with its clustered standard error.
-        energy_score: mean [m].
-        coverage50, coverage90: share of runs that ended in the regions of this probability.
-        heading_error_median_deg: at the end.
+    The difference is to the best, `se` over runs, `se_clustered` over sectors of headings as that
+    of the end-point error; the verdict is `best`, `tied` or `worse`. Coverages are shares of runs
+    that ended in the regions of this probability, the energy score is in m.
     """
 
     elpd: float
@@ -71,14 +66,10 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The models on a floor.
+    """The models on a floor, the best of them, and what a reader should take home.
 
-    Attributes:
-        runs, clusters: number of runs and of sectors of headings.
-        best: name of the best model.
-        sentence: what a reader should take home.
-        band50, band90: shares of runs in regions that honest forecasts have, see `band`.
-        models: every model by name.
+    Clusters are sectors of headings, bands the shares of runs in regions that honest forecasts
+    have, see `_band`.
     """
 
     runs: int
@@ -92,14 +83,9 @@ class Ranking:
 
 def clusters(runs: Sequence[Judged]) -> Int[np.ndarray, " run"]:
     """Sector of heading of each run; a run without heading is by itself."""
-    alone = -1 - np.arange(len(runs))
-    way = [run.heading_deg for run in runs]
-    return np.array(
-        [
-            a if h is None else int((h % 360.0 + 1e-6) // CLUSTER_DEG)
-            for a, h in zip(alone, way, strict=True)
-        ]
-    )
+    ways = enumerate(run.heading_deg for run in runs)
+    sector = [-1 - k if h is None else int((h % 360.0 + 1e-6) // CLUSTER_DEG) for k, h in ways]
+    return np.array(sector)
 
 
 def ranking(runs: Sequence[Judged]) -> dict[str, Ranking]:
@@ -122,9 +108,9 @@ def _floor(floor: str, runs: Sequence[Judged]) -> Ranking:
         runs=len(runs),
         clusters=len(np.unique(cluster)),
         best=best,
-        sentence=sentence(floor, best, models),
-        band50=band(len(runs), 0.5),
-        band90=band(len(runs), 0.9),
+        sentence=_sentence(floor, best, models),
+        band50=_band(len(runs), 0.5),
+        band90=_band(len(runs), 0.9),
         models=models,
     )
 
@@ -140,11 +126,11 @@ def _ranked(
     return Ranked(
         elpd=float(np.mean([s.log_density for s in scores if s.log_density is not None])),
         difference=difference,
-        se=_known(se),
-        se_clustered=_known(clustered),
+        se=finite(se),
+        se_clustered=finite(clustered),
         verdict="best" if is_best else "worse" if is_clear else "tied",
         endpoint_error=far,
-        endpoint_error_se=_known(far_se),
+        endpoint_error_se=finite(far_se),
         energy_score=float(np.mean([s.energy_score for s in scores])),
         coverage50=float(np.mean(level <= 0.5)),
         coverage90=float(np.mean(level <= 0.9)),
@@ -152,27 +138,23 @@ def _ranked(
     )
 
 
-def band(runs: int, share: float) -> tuple[float, float]:
+def _band(runs: int, share: float) -> tuple[float, float]:
     """Shares of runs in regions of this probability that 99 % of honest forecasts would have."""
-    from scipy.stats import binom
-
     low, high = (float(binom.ppf(q, runs, share)) / runs for q in (0.005, 0.995))
     return low, high
 
 
-def sentence(floor: str, best: str, models: Mapping[str, Ranked]) -> str:
-    """What a reader should take home of a floor."""
+def _sentence(floor: str, best: str, models: Mapping[str, Ranked]) -> str:
     order = sorted((m for m in models if m != best), key=lambda m: -models[m].difference)
     if not order:
-        return f"{floor}: nothing to compare {name_of(best)} with"
-    tied = [m for m in order if models[m].verdict == "tied"]
+        return f"{floor}: nothing to compare {_name(best)} with"
+    apart = {m: f"{_name(m)} ({_apart(models[m])})" for m in order}
+    tied = [apart.pop(m) for m in order if models[m].verdict == "tied"]
     if tied:
-        said = " or ".join(f"{name_of(m)} ({_apart(models[m])})" for m in tied)
-        worse = [m for m in order if m not in tied]
-        rest = f"; worse: {name_of(worse[0])} ({_apart(models[worse[0]])})" if worse else ""
-        return f"{floor}: the data cannot tell {name_of(best)} from {said}{rest}"
+        rest = f"; worse: {next(iter(apart.values()))}" if apart else ""
+        return f"{floor}: the data cannot tell {_name(best)} from {' or '.join(tied)}{rest}"
     return (
-        f"{floor}: {name_of(best)} is best; next {name_of(order[0])}, {_apart(models[order[0]])} "
+        f"{floor}: {_name(best)} is best; next {_name(order[0])}, {_apart(models[order[0]])} "
         "nats per run worse"
     )
 
@@ -182,10 +164,5 @@ def _apart(model: Ranked) -> str:
     return f"{-model.difference:.1f} +- {'?' if se is None else format(se, '.1f')}"
 
 
-def name_of(model: str) -> str:
-    """Of a model in a sentence."""
-    return NAMES.get(model, model)
-
-
-def _known(x: float) -> float | None:
-    return x if np.isfinite(x) else None
+def _name(model: str) -> str:
+    return "contact equilibrium" if model == "identified" else model

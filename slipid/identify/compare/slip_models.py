@@ -1,110 +1,28 @@
-"""Rungs below the force balance: encoders, slip curves wheel by wheel, and a lookup by heading.
+"""Rungs below the force balance: encoders, and slip curves wheel by wheel.
 
-All share one interface, `fit(windows, robot)` then `increments(windows, robot)`, and are judged in
-the same corrected metres as the force balance. Residuals are in displacement,
-so nothing is divided by a wheel speed.
+Residuals are in displacement, so nothing is divided by a wheel speed.
 """
 
-import abc
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from scipy import sparse
 from scipy.optimize import least_squares, linprog, lsq_linear
 
 from slipid.data.windows import Windows
-from slipid.identify.fit.likelihood import measured, seen
+from slipid.identify.compare.body_motion import body_twist, rims
+from slipid.identify.compare.heading_lookup import HeadingLookup
+from slipid.identify.compare.rung import Rung, of_floor
 from slipid.model.motor import signed
 from slipid.model.robot import Robot
 
-Increments = Float[np.ndarray, "piece window 3"]
+KNOTS = (0.0, 0.02, 0.04, 0.06, 0.1, 0.15, 0.25)
+"""Of the monotone spline [N m]."""
 HELD = 1e12
 """Precision of a coefficient that rests on its bound."""
-
-
-class Rung(abc.ABC):
-    """A model that turns wheel motion into marker increments."""
-
-    name: str
-    state: dict[str, np.ndarray]
-    """Fitted numbers of each floor; with the name enough to build the rung again."""
-
-    @abc.abstractmethod
-    def fit(self, w: Windows, robot: Robot) -> "Rung":
-        """The rung fitted to these windows, floor by floor."""
-
-    @abc.abstractmethod
-    def twist(self, w: Windows, robot: Robot) -> np.ndarray:
-        """Body twist of every window (piece, window, 3) [m/s, m/s, rad/s]."""
-
-    def with_state(self, state: dict[str, np.ndarray]) -> "Rung":
-        """The rung with these numbers."""
-        return replace(self, state=state)  # type: ignore[type-var]  # every rung is a dataclass
-
-    def increments(self, w: Windows, robot: Robot) -> Increments:
-        """Marker increments of every window [m, m, rad]."""
-        return as_increments(self.twist(w, robot), w, robot)
-
-    def series(self, surface: str, load: str) -> str:
-        """Key in `state` of the numbers that speak of a floor and load set-up.
-
-        Raises:
-            ValueError: no such floor was fitted.
-        """
-        _need(self.state, surface)
-        return surface
-
-    def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
-        """What holds the fitted numbers besides the data: precision of each key's flat numbers."""
-        return {}
-
-
-_seen, _measured = jax.jit(seen), jax.jit(measured)
-
-
-def as_increments(twist: np.ndarray, w: Windows, robot: Robot) -> Increments:
-    """Marker increments of body twists (piece, window, 3)."""
-    session = jnp.asarray([robot.session_index(s) for s in w.session])
-    return np.asarray(_seen(robot, jnp.asarray(twist), jnp.asarray(w.dt), session))
-
-
-def body_twist(w: Windows, robot: Robot) -> np.ndarray:
-    """Measured body twist of every window: yaw and place of the marker taken out, over dt."""
-    moved = np.asarray(_measured(robot, jnp.asarray(w.pose)))
-    yaw = moved[..., 2]
-    psi = np.array([float(robot.camera.yaw(robot.session_index(s))) for s in w.session])[:, None]
-    chord = _turned(psi, moved[..., :2])
-    place = np.broadcast_to(np.asarray(robot.camera.marker_place), chord.shape)
-    chord -= _turned(yaw, place) - place
-    # a chord is the arc times sinc, and points half the turn away from its start
-    arc = _turned(-0.5 * yaw, chord) / np.sinc(yaw / (2 * np.pi))[..., None]
-    return np.concatenate([arc, yaw[..., None]], -1) / w.dt[..., None]
-
-
-def _turned(angle: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Plane vectors (..., 2), each turned by its angle (...)."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], -1)
-
-
-Number = TypeVar("Number")
-
-
-def _by_floor(w: Windows) -> dict[str, np.ndarray]:
-    floor = np.asarray(w.surface)
-    return {str(name): floor == name for name in dict.fromkeys(w.surface)}
-
-
-def _need(floors: Mapping[str, Number], name: str) -> Number:
-    if name not in floors:
-        raise ValueError(f"no surface '{name}'; identified: {', '.join(floors)}")
-    return floors[name]
 
 
 @dataclass(frozen=True)
@@ -112,14 +30,13 @@ class Encoder(Rung):
     """No slip: xi = J^+ r w."""
 
     name: str = "encoder"
-    state: dict[str, np.ndarray] = field(default_factory=dict)
 
     def fit(self, w: Windows, robot: Robot) -> "Encoder":
         return self
 
     def twist(self, w: Windows, robot: Robot) -> np.ndarray:
-        j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
-        return np.asarray((w.turn / w.dt[..., None]) @ j.T)
+        j, speed = rims(w, robot)
+        return np.asarray(speed @ j.T)
 
     def series(self, surface: str, load: str) -> str:
         return surface
@@ -144,18 +61,15 @@ class Curve(Rung):
             with a linear kernel has it; epsilon is a tenth of a robust std of what slip takes away.
     """
 
-    name: str
     features: Features
     torque: bool = False
     per_wheel: bool = False
     positive: int | None = None
     insensitive: bool = False
-    state: dict[str, np.ndarray] = field(default_factory=dict)
 
     def _design(self, w: Windows, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
         """Twist without slip, and its change per coefficient (piece, window, 3, k)."""
-        j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
-        speed = w.turn / w.dt[..., None]
+        j, speed = rims(w, robot)
         phi = self.features(regressor(w, robot, speed, self.torque))
         moved = np.einsum("aw,npw,npwk->npawk", j, speed, phi)
         lost = moved.reshape(*moved.shape[:3], -1) if self.per_wheel else moved.sum(axis=3)
@@ -167,7 +81,8 @@ class Curve(Rung):
         lost = lost * w.dt[..., None, None]
         scale = np.array([1.0, 1.0, float(robot.geometry.base_radius)])
         beta = {}
-        for name, mine in _by_floor(w).items():
+        for name in dict.fromkeys(w.surface):
+            mine = np.asarray(w.surface) == name
             a = (lost[mine] * scale[:, None]).reshape(-1, lost.shape[-1])
             b = (gap[mine] * scale).ravel()
             lower = np.full(a.shape[1], -np.inf)
@@ -181,7 +96,7 @@ class Curve(Rung):
 
     def twist(self, w: Windows, robot: Robot) -> np.ndarray:
         free, lost = self._design(w, robot)
-        beta = np.stack([_need(self.state, s) for s in w.surface])
+        beta = np.stack([of_floor(self.state, s) for s in w.surface])
         return np.asarray(free - np.einsum("npak,nk->npa", lost, beta))
 
     def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
@@ -231,7 +146,6 @@ class Saturating(Rung):
     """
 
     name: str = "saturating"
-    state: dict[str, np.ndarray] = field(default_factory=dict)
 
     @staticmethod
     def slip(m: np.ndarray, shape: np.ndarray) -> np.ndarray:
@@ -239,12 +153,12 @@ class Saturating(Rung):
         return -kappa * np.log1p(-np.minimum(m / m_max, 0.98))
 
     def fit(self, w: Windows, robot: Robot) -> "Saturating":
-        j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
-        speed = w.turn / w.dt[..., None]
+        j, speed = rims(w, robot)
         m, true = regressor(w, robot, speed, True), body_twist(w, robot)
         scale = np.array([1.0, 1.0, float(robot.geometry.base_radius)])
         shape = {}
-        for name, mine in _by_floor(w).items():
+        for name in dict.fromkeys(w.surface):
+            mine = np.asarray(w.surface) == name
 
             def gap(q: np.ndarray, mine: np.ndarray = mine) -> np.ndarray:
                 xi = (speed[mine] * (1 - self.slip(m[mine], q))) @ j.T
@@ -252,128 +166,16 @@ class Saturating(Rung):
 
             top = float(np.log(max(m[mine].max(), 1e-3) * 1.5))
             # the cap makes several minima: with one-sided differences rounding decides between them
-            tries = [
-                least_squares(gap, [np.log(k), top], jac="3-point", max_nfev=200)
-                for k in (0.05, 0.3, 1.0)
-            ]
+            starts = ([np.log(k), top] for k in (0.05, 0.3, 1.0))
+            tries = [least_squares(gap, x, jac="3-point", max_nfev=200) for x in starts]
             shape[name] = min(tries, key=lambda r: r.cost).x
         return replace(self, state=shape)
 
     def twist(self, w: Windows, robot: Robot) -> np.ndarray:
-        j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
-        speed = w.turn / w.dt[..., None]
-        shape = np.stack([_need(self.state, s) for s in w.surface])[:, None, None, :]
+        j, speed = rims(w, robot)
+        shape = np.stack([of_floor(self.state, s) for s in w.surface])[:, None, None, :]
         slip = self.slip(regressor(w, robot, speed, True), shape)
         return np.asarray((speed * (1 - slip)) @ j.T)
-
-
-@dataclass(frozen=True)
-class HeadingLookup(Rung):
-    """Encoders corrected by a Fourier series in the direction of travel, per floor.
-
-        (along, across, yaw) = (far, 0, turn) + far sum_k c_k phi_k(angle)
-
-    with far, angle and turn the encoders' displacement, its direction and their yaw. Six harmonics,
-    the k-th held down by weight k^4; the weight by cross-validation over random runs within the
-    data it is fitted to, which is how such a table is made, and what makes it good in between.
-    A floor has one series for each load set-up it was driven with.
-    """
-
-    name: str = "heading_lookup"
-    state: dict[str, np.ndarray] = field(default_factory=dict)
-    weights: Sequence[float] = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
-
-    def fit(self, w: Windows, robot: Robot) -> "HeadingLookup":
-        out = {}
-        for key, phi, gap, run in self._each(w, robot):
-            out[key] = _ridge(phi, gap, _best_weight(phi, gap, run, self.weights))
-        return replace(self, state=out)
-
-    def _each(
-        self, w: Windows, robot: Robot
-    ) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-        """Key, features, what they have to explain, and runs of every floor and load set-up."""
-        angle, plain = _encoders(w, robot)
-        true = body_twist(w, robot) * w.dt[..., None]
-        c, s = np.cos(angle), np.sin(angle)
-        along = c * true[..., 0] + s * true[..., 1]
-        across = -s * true[..., 0] + c * true[..., 1]
-        gap = np.stack([along, across, true[..., 2]], -1) - plain
-        phi = _fourier(angle, plain[..., 0])
-        series = np.asarray([f"{a}@{b}" for a, b in zip(w.surface, w.load, strict=True)])
-        for key in dict.fromkeys(series.tolist()):
-            mine = series == key
-            yield key, phi[mine], gap[mine], w.run[mine]
-
-    def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
-        """The ridge as a Gaussian prior: its penalty over the mean square of what is left."""
-        out = {}
-        for key, phi, gap, run in self._each(w, robot):
-            penalty = _penalty(phi, _best_weight(phi, gap, run, self.weights))
-            left = np.mean((gap - phi @ self.state[key]) ** 2, axis=(0, 1))
-            out[key] = np.kron(penalty, np.diag(1 / np.maximum(left, 1e-12)))
-        return out
-
-    def twist(self, w: Windows, robot: Robot) -> np.ndarray:
-        angle, out = _encoders(w, robot)
-        phi = _fourier(angle, out[..., 0])
-        for n, (floor, load) in enumerate(zip(w.surface, w.load, strict=True)):
-            out[n] += phi[n] @ self.state[self.series(floor, load)]
-        c, s = np.cos(angle), np.sin(angle)
-        x, y = c * out[..., 0] - s * out[..., 1], s * out[..., 0] + c * out[..., 1]
-        return np.stack([x, y, out[..., 2]], -1) / w.dt[..., None]
-
-    def series(self, surface: str, load: str) -> str:
-        """Of this floor and load set-up, else of the load the floor was first driven with."""
-        if (exact := f"{surface}@{load}") in self.state:
-            return exact
-        first = {key.rsplit("@", 1)[0]: key for key in reversed(self.state)}
-        return str(_need(first, surface))
-
-
-def _encoders(w: Windows, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Direction of travel by the encoders, and (distance, 0, yaw) of every window."""
-    j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
-    step = w.turn @ j.T
-    far = np.hypot(step[..., 0], step[..., 1])
-    plain = np.stack([far, np.zeros_like(far), step[..., 2]], -1)
-    return np.arctan2(step[..., 1], step[..., 0]), plain
-
-
-HARMONICS = 6
-
-
-def _fourier(angle: np.ndarray, far: np.ndarray) -> np.ndarray:
-    waves = [f(k * angle) for k in range(1, HARMONICS + 1) for f in (np.cos, np.sin)]
-    return np.stack([np.ones_like(angle), *waves], -1) * far[..., None]
-
-
-def _ridge(phi: np.ndarray, target: np.ndarray, weight: float) -> np.ndarray:
-    a = phi.reshape(-1, phi.shape[-1])
-    gram = a.T @ a + _penalty(phi, weight)
-    return np.asarray(np.linalg.solve(gram, a.T @ target.reshape(-1, 3)))
-
-
-def _penalty(phi: np.ndarray, weight: float) -> np.ndarray:
-    rough = np.concatenate([[0.0], np.repeat(np.arange(1.0, HARMONICS + 1) ** 4, 2)])
-    return np.asarray(weight * np.sum(phi[..., 0] ** 2) * np.diag(rough))
-
-
-def _best_weight(
-    phi: np.ndarray, gap: np.ndarray, run: np.ndarray, weights: Sequence[float]
-) -> float:
-    return min(weights, key=lambda weight: _left_out(phi, gap, run, weight))
-
-
-def _left_out(phi: np.ndarray, target: np.ndarray, run: np.ndarray, weight: float) -> float:
-    """Squared error over five random folds of runs."""
-    fold, loss = np.random.default_rng(0).integers(0, 5, run.max() + 1)[run], 0.0
-    for k in range(5):
-        test = fold == k
-        if test.any() and not test.all():
-            gap = target[test] - phi[test] @ _ridge(phi[~test], target[~test], weight)
-            loss += float((gap**2 * np.array([1.0, 1.0, 0.02])).sum())
-    return loss
 
 
 def _powers(*exponents: int) -> Features:
@@ -387,10 +189,9 @@ def _above(threshold: float) -> Features:
 
 def _ramps(knots: Sequence[float]) -> Features:
     """I-spline of degree 1: a constant and rising ramps between knots; monotone if weights >= 0."""
-    edges = np.asarray([*knots])
 
     def phi(x: np.ndarray) -> np.ndarray:
-        ramps = [np.clip((x - a) / (b - a), 0, 1) for a, b in pairwise(edges)]
+        ramps = [np.clip((x - a) / (b - a), 0, 1) for a, b in pairwise(knots)]
         return np.stack([np.ones_like(x), *ramps], -1)
 
     return phi
@@ -399,7 +200,7 @@ def _ramps(knots: Sequence[float]) -> Features:
 def rungs(has_current: bool) -> list[Rung]:
     """Every rung the logs allow, unfitted; `paper` is the form the authors ran on the robot.
 
-    Its threshold of 0.4 A and the spline's knots up to 0.25 N m are for motors of that size.
+    Its threshold of 0.4 A and the spline's knots are for motors of that size.
     """
     out: list[Rung] = [Encoder(), Curve("constant", _powers(0))]
     if has_current:
@@ -409,12 +210,7 @@ def rungs(has_current: bool) -> list[Rung]:
             Curve("svr", _powers(0, 1), torque=True, insensitive=True),
             Curve("quadratic", _powers(0, 1, 2), torque=True),
             Saturating(),
-            Curve(
-                "monotone_spline",
-                _ramps((0.0, 0.02, 0.04, 0.06, 0.1, 0.15, 0.25)),
-                torque=True,
-                positive=1,
-            ),
+            Curve("monotone_spline", _ramps(KNOTS), torque=True, positive=1),
             Curve("affine_current", _powers(0, 1)),
             Curve("paper", _above(0.4), per_wheel=True),
         ]
@@ -427,6 +223,6 @@ def restored(states: Mapping[str, Mapping[str, Sequence]]) -> list[Rung]:
     if strange := sorted(set(states) - set(known)):
         raise ValueError(f"no model '{strange[0]}'; there are: {', '.join(known)}")
     return [
-        known[name].with_state({floor: np.asarray(v, float) for floor, v in state.items()})
+        replace(known[name], state={floor: np.asarray(v, float) for floor, v in state.items()})
         for name, state in states.items()
     ]

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slipid.data.windows import Windows
-from slipid.identify.compare.slip_models import body_twist
+from slipid.identify.compare.body_motion import body_twist
+from slipid.identify.compare.validation import main_load
 from slipid.model.robot import Robot
 
 LEAST = 0.2
@@ -27,13 +28,7 @@ VARIANTS: dict[str, tuple[float, bool, bool]] = {
 
 @dataclass(frozen=True)
 class Errors:
-    """Root mean squares of what a curve leaves of slip.
-
-    Attributes:
-        rows: over all rows.
-        floors: mean of the floors' own.
-        each: of every floor.
-    """
+    """Root mean squares of what a curve leaves of slip: over all rows, mean of floors, and each."""
 
     rows: float
     floors: float
@@ -42,13 +37,9 @@ class Errors:
 
 @dataclass(frozen=True)
 class Transfer:
-    """One choice of rows: how slip is predicted on a floor that was not fitted.
+    """How slip is predicted on a floor that was not fitted, for one choice of rows.
 
-    Attributes:
-        pooled: by the curve of the other floors.
-        constant: by their mean slip.
-        per_surface: by the floor's own curve.
-        count: rows.
+    By the curve of the other floors (pooled), by their mean slip, and by the floor's own curve.
     """
 
     pooled: Errors
@@ -58,13 +49,10 @@ class Transfer:
 
 
 def transfer(w: Windows, robot: Robot) -> dict[str, Transfer]:
-    """Leave-one-surface-out errors of slip, per variant of what counts as a row.
+    """Leave-one-surface-out errors of slip, per variant of what counts as a row; none of one floor.
 
     A row is one wheel in one window: s = 1 - J xi / (r w), xi the body twist from the camera in
     corrected metres, I the mean magnitude of the wheel's current.
-
-    Returns:
-        nothing where fewer than two floors were driven.
     """
     if len(set(w.surface)) < 2:
         return {}
@@ -76,13 +64,10 @@ def transfer(w: Windows, robot: Robot) -> dict[str, Transfer]:
     amps = np.abs(w.current)
     floor = np.broadcast_to(np.asarray(w.surface)[:, None, None], slip.shape)
     load = np.broadcast_to(np.asarray(w.load)[:, None, None], slip.shape)
-    main = max(sorted(set(w.load)), key=w.load.count)
-    main = "as_built" if "as_built" in w.load else main
+    main = main_load(w.load)
     out = {}
     for name, (least, one_load, cut) in VARIANTS.items():
-        rows = (share >= least) & np.isfinite(slip)
-        if one_load:
-            rows &= load == main
+        rows = (share >= least) & np.isfinite(slip) & ((load == main) | (not one_load))
         if cut:
             rows &= (slip > 0) & (slip <= 1) & (amps > 0.25)
         if len(set(floor[rows].tolist())) > 1:
@@ -104,10 +89,6 @@ def _errors(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Transfer:
 
 
 def _left(gaps: dict[str, np.ndarray]) -> Errors:
-    each = {name: _rms(gap) for name, gap in gaps.items()}
-    rows = _rms(np.concatenate(list(gaps.values())))
+    each = {name: float(np.sqrt(np.mean(gap**2))) for name, gap in gaps.items()}
+    rows = float(np.sqrt(np.mean(np.concatenate(list(gaps.values())) ** 2)))
     return Errors(rows, float(np.mean(list(each.values()))), each)
-
-
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(x**2)))

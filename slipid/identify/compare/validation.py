@@ -1,58 +1,30 @@
 """Open-loop prediction of runs a fit has not seen, beside every rung it was compared with."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from slipid.data.runs import Runs
-from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.slip_models import Rung
-from slipid.identify.fit import likelihood as lk
+from slipid.identify.compare.predictive import Contact
+from slipid.identify.compare.rung import Rung
 from slipid.model.robot import Robot
-from slipid.parameter import Space
+from slipid.support.content import Content
 from slipid.support.errors import DataError
 
 SCHEMA = "slipid.validation/1"
-
-
-@dataclass(frozen=True, eq=False)
-class Predictor:
-    """What a prediction needs of a fit.
-
-    Attributes:
-        robot: fitted numbers.
-        space: of the free ones.
-        z: where they are in it.
-        covariance: of z.
-        variance: of every noise component by name, and of what sessions share; none is none.
-        rungs: fitted on the same runs.
-    """
-
-    robot: Robot
-    space: Space
-    z: Float[np.ndarray, " free"]
-    covariance: Float[np.ndarray, "free free"]
-    variance: dict[str, float]
-    rungs: Sequence[Rung]
 
 
 @dataclass(frozen=True)
 class Score:
     """What a model's prediction of a run is worth.
 
-    Attributes:
-        predicted_end: pose at the end (x, y [m], yaw [rad]).
-        endpoint_error: distance to the camera's end, over the chord.
-        length_error: of the predicted chord, relative.
-        heading_error_deg: at the end, absolute.
-        level: probability of the region whose edge the end lies on, None for a model without.
-        covered90: whether that is at most 0.9.
-        energy_score: [m].
-        log_density: of the logged poses [nats]; None where it was not asked for.
+    The pose at the end is x, y [m] and yaw [rad]; the end-point error is over the chord, the length
+    error relative. `level` is the probability of the region whose edge the end lies on, `covered90`
+    whether that is at most 0.9, both None for a model without. The energy score is in m, the log
+    density of the logged poses in nats, None where it was not asked for.
     """
 
     predicted_end: Sequence[float]
@@ -69,12 +41,8 @@ class Score:
 class Judged:
     """A run and the scores of every model on it.
 
-    Attributes:
-        name, surface, load, session: of the run.
-        heading_deg, speed: as commanded [deg], [m/s]; None where that is not known.
-        chord: the camera's straight-line displacement [m].
-        measured_end: pose at the end (x, y [m], yaw [rad]).
-        models: score by model.
+    Heading and speed are as commanded [deg], [m/s], None where not known; the chord is the camera's
+    straight-line displacement [m], the measured end a pose (x, y [m], yaw [rad]).
     """
 
     name: str
@@ -87,21 +55,18 @@ class Judged:
     models: dict[str, Score]
     session: str | None = None
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain values; what was not asked for is left out."""
-        return {k: v for k, v in asdict(self).items() if v is not None or k != "session"} | {
-            "models": {name: _asked(asdict(score)) for name, score in self.models.items()}
-        }
+    def to_json(self) -> Content:
+        return asdict(self, dict_factory=told)
 
     @classmethod
-    def of_json(cls, content: Mapping[str, Any]) -> "Judged":
-        """The run from what `to_json` gave."""
+    def of_json(cls, content: Content) -> "Judged":
         models = {name: Score(**score) for name, score in content["models"].items()}
         return cls(**{**content, "models": models})
 
 
-def _asked(score: dict[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in score.items() if v is not None or k != "log_density"}
+def told(values: Iterable[tuple[str, object]]) -> Content:
+    """Plain values without what was not asked for."""
+    return {k: v for k, v in values if v is not None or k not in ("session", "log_density")}
 
 
 @dataclass(frozen=True)
@@ -131,8 +96,7 @@ class Validation:
             for name, runs in by_floor(self.runs).items()
         }
 
-    def to_json(self) -> dict[str, Any]:
-        """Content of the validation file."""
+    def to_json(self) -> Content:
         summary = {
             floor: {model: asdict(one) for model, one in models.items()}
             for floor, models in self.summary.items()
@@ -153,16 +117,12 @@ class Validation:
         return "\n".join(lines)
 
 
-def validation(fit: Predictor, data: Runs) -> Validation:
-    """Prediction of runs of known floors by a fit, beside every rung.
+def validation(fit: Contact, rungs: Sequence[Rung], data: Runs) -> Validation:
+    """Prediction of runs of known floors by a fit, beside every rung fitted on the same runs.
 
-    As in `cross_validation`, every run is predicted as of a session of its own: what its session
+    As in `folds`, every run is predicted as of a session of its own: what its session
     shares widens its region by the variance found in fitting, whether or not other runs of that
-    session were fitted.
-
-    Args:
-        fit: of other runs.
-        data: runs to predict, each from its first pose after the wheels moved 10 mm.
+    session were fitted. A run begins at its first pose after the wheels moved 10 mm.
 
     Raises:
         DataError: a run on a floor or with a load set-up that was not identified.
@@ -170,35 +130,24 @@ def validation(fit: Predictor, data: Runs) -> Validation:
     _known(fit.robot, data)
     runs: dict[int, Judged] = {}
     for w in replay.cuts(data, fit.robot):
-        tracks = {"identified": _contact(fit.robot, w)}
-        for rung in fit.rungs:
-            tracks[rung.name] = replay.follow(fit.robot, w, rung.increments(w, fit.robot))
-        of_parameters = replay.parameter_covariance(
-            fit.space, fit.z, fit.covariance, w, tracks["identified"]
-        )
-        cov = replay.end_covariance(fit.robot, w, tracks["identified"], fit.variance, of_parameters)
-        for name, track in tracks.items():
-            score(runs, data, name, track, cov if name == "identified" else None)
+        score(runs, data, fit.name, *fit.ends(w))
+        for rung in rungs:
+            tracks = replay.follow(fit.robot, w, rung.increments(w, fit.robot))
+            score(runs, data, rung.name, tracks, None)
     return Validation(tuple(runs[k] for k in range(len(data))))
-
-
-def _contact(robot: Robot, w: Windows) -> replay.Tracks:
-    b = lk.batch(w, robot)
-    return replay.follow(robot, w, np.asarray(replay.contact_increments(robot, b)))
 
 
 def _known(robot: Robot, data: Runs) -> None:
     for log in data.logs:
-        if log.surface not in robot.surfaces.labels:
-            known = ", ".join(robot.surfaces.labels)
-            raise DataError(
-                f"{log.name}: surface '{log.surface}' was not identified; identified: {known}"
-            )
-        if log.load not in robot.body.loads:
-            known = ", ".join(robot.body.loads)
-            raise DataError(
-                f"{log.name}: load set-up '{log.load}' was not identified; identified: {known}"
-            )
+        for what, name, known in (
+            ("surface", log.surface, robot.surfaces.labels),
+            ("load set-up", log.load, robot.body.loads),
+        ):
+            if name not in known:
+                raise DataError(
+                    f"{log.name}: {what} '{name}' was not identified; "
+                    f"identified: {', '.join(known)}"
+                )
 
 
 def score(
@@ -210,12 +159,8 @@ def score(
 ) -> None:
     """Write what a model's tracks are worth into the scores of their runs.
 
-    Args:
-        runs: by number in `data`; those that are met for the first time are added.
-        data: the runs.
-        model: its name.
-        tracks: of some of the runs.
-        cov: of the ends, None for a model without.
+    `runs` go by their number in `data`; those that are met for the first time are added. `cov` is
+    of the ends, None for a model without.
     """
     gap = tracks.gap
     level, energy = replay.scores(gap[:, :2], cov)
@@ -227,8 +172,8 @@ def score(
                 name=log.name,
                 surface=str(log.surface),
                 load=log.load,
-                heading_deg=_number(np.degrees(data.heading[k])),
-                speed=_number(data.speed[k]),
+                heading_deg=finite(np.degrees(data.heading[k])),
+                speed=finite(data.speed[k]),
                 chord=chord,
                 measured_end=tracks.measured[n, -1].tolist(),
                 models={},
@@ -244,8 +189,14 @@ def score(
         )
 
 
-def _number(x: float) -> float | None:
+def finite(x: float) -> float | None:
+    """A number, None for one that is not."""
     return float(x) if np.isfinite(x) else None
+
+
+def main_load(loads: Sequence[str]) -> str:
+    """The set-up as built, else the most common."""
+    return "as_built" if "as_built" in loads else max(sorted(set(loads)), key=loads.count)
 
 
 def by_floor(runs: Sequence[Judged]) -> dict[str, list[Judged]]:
@@ -253,8 +204,7 @@ def by_floor(runs: Sequence[Judged]) -> dict[str, list[Judged]]:
 
     A set-up other than the one as built, else the most common, is written `<floor>@<load>`.
     """
-    loads = [run.load for run in runs]
-    main = "as_built" if "as_built" in loads else max(sorted(set(loads)), key=loads.count)
+    main = main_load([run.load for run in runs])
     groups: dict[str, list[Judged]] = {}
     for run in runs:
         name = run.surface if run.load == main else f"{run.surface}@{run.load}"
@@ -263,14 +213,16 @@ def by_floor(runs: Sequence[Judged]) -> dict[str, list[Judged]]:
 
 
 def _mean(scores: Sequence[Score]) -> Summary:
-    error = [s.endpoint_error for s in scores]
-    covered = [s.covered90 for s in scores if s.covered90 is not None]
+    def all_of(name: str) -> np.ndarray:
+        return np.array([getattr(s, name) for s in scores if getattr(s, name) is not None], float)
+
+    covered = all_of("covered90")
     return Summary(
-        endpoint_error_mean=float(np.mean(error)),
-        endpoint_error_median=float(np.median(error)),
-        length_error_mean=float(np.mean([s.length_error for s in scores])),
-        heading_error_median_deg=float(np.median([s.heading_error_deg for s in scores])),
-        coverage90=float(np.mean(covered)) if covered else None,
-        energy_score=float(np.mean([s.energy_score for s in scores])),
+        endpoint_error_mean=float(np.mean(all_of("endpoint_error"))),
+        endpoint_error_median=float(np.median(all_of("endpoint_error"))),
+        length_error_mean=float(np.mean(all_of("length_error"))),
+        heading_error_median_deg=float(np.median(all_of("heading_error_deg"))),
+        coverage90=float(np.mean(covered)) if covered.size else None,
+        energy_score=float(np.mean(all_of("energy_score"))),
         runs=len(scores),
     )

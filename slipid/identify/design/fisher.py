@@ -15,6 +15,7 @@ Tobias 2007, Optimum Experimental Designs, sections 10 and 12: c- and A-optimali
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,45 +24,24 @@ ENDLESS = 1e3
 """Times that every candidate is driven where "endless" is meant."""
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Whitened Jacobians of runs.
-
-    Attributes:
-        motion: J (run, m, motion).
-        electric, carried: E (run, k, electric) and C (run, k, motion), k is 0 without currents.
-    """
+class Rows(NamedTuple):
+    """Whitened Jacobians of runs: J of the motion, E and C of currents (k is 0 without them)."""
 
     motion: Float[np.ndarray, "run m motion"]
     electric: Float[np.ndarray, "run k electric"]
     carried: Float[np.ndarray, "run k motion"]
 
-    def __len__(self) -> int:
-        return len(self.motion)
-
     def pick(self, index: Sequence[int] | np.ndarray) -> "Rows":
         """Some runs, in the order given; a run may come several times."""
-        at = np.asarray(index, int)
-        return Rows(self.motion[at], self.electric[at], self.carried[at])
+        return Rows(*(part[np.asarray(index, int)] for part in self))
 
     def joined(self, *others: "Rows") -> "Rows":
-        """These runs and others."""
-        every = (self, *others)
-        return Rows(
-            np.concatenate([r.motion for r in every]),
-            np.concatenate([r.electric for r in every]),
-            np.concatenate([r.carried for r in every]),
-        )
+        return Rows(*map(np.concatenate, zip(self, *others, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
 class Knowledge:
-    """Information on all numbers.
-
-    Attributes:
-        is_electric: which of the numbers are (free,).
-        motion, own, cross: M, O and X.
-    """
+    """Information on all numbers, M, O and X, and which of them are electric."""
 
     is_electric: Bool[np.ndarray, " free"]
     motion: Float[np.ndarray, "motion motion"]
@@ -70,7 +50,8 @@ class Knowledge:
 
     def plus(self, rows: Rows, times: float = 1.0) -> "Knowledge":
         """After these runs as well, each so many times; -1 takes them away."""
-        j, e, c = (_flat(x) for x in (rows.motion, rows.electric, rows.carried))
+        # not -1: where a part has no numbers, numpy cannot tell how many rows it has
+        j, e, c = (x.reshape(x.shape[0] * x.shape[1], x.shape[2]) for x in rows)
         return Knowledge(
             self.is_electric,
             self.motion + times * (j.T @ j),
@@ -85,7 +66,6 @@ class Knowledge:
 
     @cached_property
     def covariance(self) -> Float[np.ndarray, "free free"]:
-        """Covariance of all numbers."""
         e, m = np.flatnonzero(self.is_electric), np.flatnonzero(~self.is_electric)
         lean = np.linalg.solve(self.own, self.cross)
         out = np.empty((len(self.is_electric),) * 2)
@@ -155,17 +135,10 @@ def path(
 def greedy(
     start: Knowledge, rows: Rows, goal: np.ndarray, most: int, target: float = 0.0
 ) -> tuple[list[int], list[float]]:
-    """One run after another, each the one that lowers the criterion most; any may come again.
+    """At most so many runs, each the one that lowers the criterion most; any may come again.
 
-    Args:
-        start: before the first.
-        rows: candidates.
-        goal: G (k, free).
-        most: runs at most.
-        target: criterion at which to stop.
-
-    Returns:
-        the runs, and the criterion before and after each.
+    It stops where the criterion has come down to the target. Returns the runs, and the criterion
+    before and after each.
     """
     now, chosen, found = start, [], [start.criterion(goal)]
     while len(chosen) < most and found[-1] > target:
@@ -196,10 +169,6 @@ def exchanged(start: Knowledge, rows: Rows, goal: np.ndarray, chosen: Sequence[i
 def endless(start: Knowledge, rows: Rows) -> Knowledge:
     """After every candidate was driven `ENDLESS` times: what is left then no run can take away."""
     return start.plus(rows, ENDLESS)
-
-
-def _flat(x: np.ndarray) -> np.ndarray:
-    return x.reshape(x.shape[0] * x.shape[1], x.shape[2])
 
 
 def _inverse(a: np.ndarray) -> np.ndarray:

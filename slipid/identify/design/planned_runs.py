@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from slipid.data.windows import Windows
 from slipid.identify.compare.open_loop import chain
 from slipid.identify.fit import likelihood as lk
+from slipid.identify.result import Channels
 from slipid.model.robot import Robot
 
 SESSION = "next"
@@ -29,9 +30,8 @@ Setup = tuple[str, str]
 class Drive:
     """One run: a constant command on one floor with one load set-up.
 
-    Attributes:
-        heading: of the commanded motion in the body frame [rad]; speed: [m/s]; turn: [rad/s].
-        distance: commanded length [m], arc of the rim where it only turns.
+    The heading of the motion is in the body frame [rad]; speed [m/s], turn [rad/s]; the distance is
+    the commanded length [m], arc of the rim where it only turns.
     """
 
     surface: str
@@ -67,14 +67,8 @@ def candidates(
 ) -> tuple[Drive, ...]:
     """Every heading at every speed of a floor, straight and turning, and turns on the spot.
 
-    Args:
-        setups: floors with a load set-up.
-        speeds: of each floor [m/s].
-        distance: of each floor's runs [m].
-        base_radius: [m].
-        headings_deg: of the straight and the curved runs [deg].
-        turns: turning rates [rad/s]; by default none and those at which the rim turns with `BEND`
-            of the speed ahead, and on the spot with all of it.
+    Speeds [m/s] and distances [m] are of each floor. Turning rates [rad/s] are by default none and
+    those at which the rim turns with `BEND` of the speed ahead, and on the spot with all of it.
     """
     out = []
     for surface, load in setups:
@@ -97,34 +91,24 @@ def paper_grid(setups: Iterable[Setup], distance: Mapping[str, float]) -> tuple[
     Along x and y at 100 to 400 mm/s, on the diagonals at 100 to 300 mm/s in x and in y, on the spot
     at 20 to 50 deg/s. Source: Belyaev, Brylev and Ivanov 2021, commands of its logs.
     """
-    settings: list[tuple[float, float, float]] = []
-    for speed in (0.1, 0.2, 0.3, 0.4):
-        settings += [(np.radians(a), speed, 0.0) for a in (0.0, 180.0, 90.0, 270.0)]
-    for rate in (20.0, 30.0, 40.0, 50.0):
-        settings += [(0.0, 0.0, np.radians(rate)), (0.0, 0.0, np.radians(-rate))]
-    for speed in (0.1, 0.2, 0.3):
-        both = float(np.hypot(speed, speed))
-        settings += [(np.radians(a), both, 0.0) for a in (45.0, 225.0, 135.0, 315.0)]
-    every = list(setups)
+    settings = [(a, v, 0.0) for v in (0.1, 0.2, 0.3, 0.4) for a in (0.0, 180.0, 90.0, 270.0)]
+    settings += [(0.0, 0.0, s * rate) for rate in (20.0, 30.0, 40.0, 50.0) for s in (1, -1)]
+    ahead = [float(np.hypot(v, v)) for v in (0.1, 0.2, 0.3)]
+    settings += [(a, v, 0.0) for v in ahead for a in (45.0, 225.0, 135.0, 315.0)]
     return tuple(
-        Drive(f, load, float(a), speed, float(turn), distance[f])
-        for a, speed, turn in settings
-        for f, load in every
+        Drive(f, load, float(np.radians(a)), speed, float(np.radians(turn)), distance[f])
+        for (a, speed, turn), (f, load) in product(settings, setups)
     )
 
 
 def heading_grid(
-    setups: Iterable[Setup],
-    speeds: Mapping[str, Sequence[float]],
-    distance: Mapping[str, float],
-    step_deg: float = 5.0,
+    setups: Iterable[Setup], speeds: Mapping[str, Sequence[float]], distance: Mapping[str, float]
 ) -> tuple[Drive, ...]:
-    """Straight runs in headings every few degrees at every speed, as the 2022 logs were driven."""
-    every = list(setups)
+    """Straight runs in headings every 5 degrees at every speed, as the 2022 logs were driven."""
+    headings = np.radians(np.arange(0.0, 360.0, 5.0))
     return tuple(
-        Drive(f, load, float(a), speed, 0.0, distance[f])
-        for a in np.radians(np.arange(0.0, 360.0, step_deg))
-        for f, load in every
+        Drive(f, load, float(heading), speed, 0.0, distance[f])
+        for heading, (f, load) in product(headings, setups)
         for speed in speeds[f]
         if speed > 0
     )
@@ -135,38 +119,28 @@ def drivable(drives: Iterable[Drive], robot: Robot) -> tuple[Drive, ...]:
     j = np.asarray(robot.geometry.forward())
     reach = np.linalg.pinv(j, rcond=1e-6) @ j
     base = np.array([1.0, 1.0, float(robot.geometry.base_radius)])
-    kept = []
-    for d in drives:
+
+    def fits(d: Drive) -> bool:
         lost = (reach @ d.command - d.command) * base
-        if np.linalg.norm(lost) < 0.05 * np.linalg.norm(d.command * base):
-            kept.append(d)
-    return tuple(kept)
+        return bool(np.linalg.norm(lost) < 0.05 * np.linalg.norm(d.command * base))
+
+    return tuple(filter(fits, drives))
 
 
 def steady_windows(
     drives: Sequence[Drive],
     robot: Robot,
-    per_piece: int,
+    channels: Channels,
     current_var: Mapping[str, float],
     session: str = SESSION,
-    has_current: bool = True,
-    has_voltage: bool = False,
-    signed: bool = False,
 ) -> Windows:
     """Windows that drives at steady wheel speeds would give without noise, each run one piece.
 
     However long a run is, it is one piece: its own effect is met once. Runs are centred on the
-    middle of the image, the marker's heading is zero at their start.
-
-    Args:
-        drives: the runs.
-        robot: that drives them.
-        per_piece: windows per run.
-        current_var: variance of the mean current of a window on each floor [A^2].
-        session: of all of them.
-        has_current, has_voltage, signed: channels that would be logged.
+    middle of the image, the marker's heading is zero at their start. `current_var` is the variance
+    of a window's mean current on each floor [A^2].
     """
-    n, wheels = len(drives), robot.geometry.wheels
+    n, per_piece, wheels = len(drives), channels.windows, robot.geometry.wheels
     base, radius = float(robot.geometry.base_radius), float(robot.geometry.wheel_radius)
     command = np.stack([d.command for d in drives])
     rate = command @ np.asarray(robot.geometry.forward()).T / radius
@@ -185,17 +159,17 @@ def steady_windows(
         current=blank,
         voltage=blank,
         current_var=blank + spread[:, None, None],
-        has_current=has_current,
-        has_voltage=has_voltage,
-        current_is_signed=signed,
+        has_current=channels.current,
+        has_voltage=channels.voltage,
+        current_is_signed=channels.signed,
         lag=float(robot.camera.lag),
     )
     pose, amps, volts = _sensed(robot, lk.batch(w, robot))
     return replace(
         w,
         pose=np.asarray(pose),
-        current=np.asarray(amps) if has_current else blank,
-        voltage=np.asarray(volts) if has_voltage else blank,
+        current=np.asarray(amps) if channels.current else blank,
+        voltage=np.asarray(volts) if channels.voltage else blank,
     )
 
 

@@ -1,9 +1,6 @@
 """Which runs to drive next: the fitted robot simulates them, Fisher information judges them.
 
-What is assumed: noise as fitted, run effects marginalised (a run driven twice is worth its share, a
-long one does not count as many); all new runs are of one session and share what runs of a session
-share; everything linear around the fitted numbers; steady wheel speeds, so nothing is learnt from
-starting and stopping; the marker is put on once more for the new runs.
+What is assumed of new runs is said by `proposal.ASSUMPTIONS`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,40 +21,21 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import effects
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES, by_axis
-from slipid.identify.result import Fit
+from slipid.identify.result import Channels, Fit
 from slipid.model.robot import Robot
-from slipid.parameter import Choice, entries
+from slipid.parameter import entries
+from slipid.search_space import Choice
 
 _TOGETHER = 256
 """Runs whose Jacobians are taken in one call."""
 
 
-@dataclass(frozen=True)
-class Channels:
-    """What new runs would log, and how it is cut.
-
-    Attributes:
-        current, voltage: logged or not; signed: the current has a sign.
-        windows: per run.
-    """
-
-    current: bool = True
-    voltage: bool = False
-    signed: bool = False
-    windows: int = 4
-
-
 class Planner:
-    """What runs that were not driven yet would tell of a robot.
+    """What runs that were not driven yet would tell of a robot; choices and variances as fitted.
 
-    Args:
-        robot: as fitted; its sessions are over, new runs have one of their own.
-        choices: free, fixed, priors, as fitted.
-        variance: of every noise component by name, and of what runs of a session share.
-        channels: as fitted.
-
-    Its vectors hold the numbers of the search space and then, in stds of what they share along,
-    across and in yaw, the effects of the new session on floors where sessions are known to differ.
+    The robot's sessions are over, new runs have one of their own. Vectors hold the numbers of the
+    search space and then, in stds of what they share along, across and in yaw, the effects of the
+    new session on floors where sessions are known to differ.
     """
 
     def __init__(
@@ -67,7 +45,10 @@ class Planner:
         variance: Mapping[str, float],
         channels: Channels | None = None,
     ):
-        self.robot = _in_new_session(robot)
+        camera = robot.camera
+        if camera.sessions:
+            camera = replace(camera, sessions=(SESSION,), session_yaw=jnp.zeros(1))
+        self.robot = replace(robot, camera=camera)
         self.channels = channels or Channels()
         self.variance = dict(variance)
         paths = [e.path for e in entries(self.robot)]
@@ -76,36 +57,21 @@ class Planner:
         self._problem = Problem(self._windows([first] * _TOGETHER), self.robot, choices)
         self.space = self._problem.space
         self.z = self.space.vector(self.robot)
-        joint = self._problem.joint
-        electric = np.zeros(self.space.size, bool) if joint else self._problem.electric
-        labels = self.robot.surfaces.labels
-        self._differ = np.array(
-            [any(self.variance.get(f"session.{x}.{a}") for a in AXES) for x in labels]
-        )
+        electric = self._problem.electric & (not self._problem.joint)
+        of_floor = [[f"session.{x}.{a}" for a in AXES] for x in robot.surfaces.labels]
+        self._differ = np.array([any(map(self.variance.get, names)) for names in of_floor])
         self.effects = len(AXES) * int(self._differ.sum())
         self.is_electric = np.concatenate([electric, np.zeros(self.effects, bool)])
         self._log_v = np.log([self.variance[name] for name in self._problem.noise.names])
 
     @classmethod
     def of(cls, fit: Fit) -> "Planner":
-        """Planner of a fit."""
-        channels = Channels(
-            current=fit.has["current"],
-            voltage=fit.has["voltage"],
-            signed=bool(fit.settings.get("current_is_signed", False)),
-            windows=int(fit.settings["windows_per_piece"]),
-        )
-        return cls(fit.robot, fit.choices, fit.variance, channels)
+        return cls(fit.robot, fit.choices, fit.variance, fit.channels)
 
     def _windows(self, drives: Sequence[Drive], session: str = SESSION) -> Windows:
-        c = self.channels
-        spread = {
-            floor: self.variance.get(f"current.{floor}.window", 0.0)
-            for floor in self.robot.surfaces.labels
-        }
-        return steady_windows(
-            drives, self.robot, c.windows, spread, session, c.current, c.voltage, c.signed
-        )
+        var, floors = self.variance, self.robot.surfaces.labels
+        spread = {floor: var.get(f"current.{floor}.window", 0.0) for floor in floors}
+        return steady_windows(drives, self.robot, self.channels, spread, session)
 
     def nothing(self) -> Knowledge:
         """Before any run: the prior; of a single session the marker's yaw is the common one."""
@@ -127,9 +93,8 @@ class Planner:
 
     def rows(self, drives: Sequence[Drive]) -> Rows:
         """What each run would tell."""
-        first, *others = (
-            self._rows(drives[k : k + _TOGETHER]) for k in range(0, len(drives), _TOGETHER)
-        )
+        starts = range(0, len(drives), _TOGETHER)
+        first, *others = (self._rows(drives[k : k + _TOGETHER]) for k in starts)
         return first.joined(*others)
 
     def _rows(self, drives: Sequence[Drive]) -> Rows:
@@ -137,19 +102,18 @@ class Planner:
         filled = [*drives, *[drives[-1]] * (_TOGETHER - len(drives))]
         windows = self._windows(filled)
         this = self._problem.of(windows)
-        _, jacobian = this.linear(jnp.asarray(self.z), this.volt(self._log_v))
+        _, jacobian = this.linear(self.z, this.volt(self._log_v))
         std = np.sqrt(by_axis(self.variance, "session", windows))
         felt = effects(windows, self.robot) * std[:, None]
         on = np.eye(len(self._differ))[np.asarray(this.batch.surface)][:, self._differ]
         moved = (felt[:, :, None, :] * on[:, None, :, None]).reshape(*felt.shape[:2], -1)
-        nothing = {k: np.zeros((*j.shape[:2], self.effects)) for k, j in jacobian.items()}
-        of_session = nothing | {"motion": -moved}
-        jacobian = {k: jnp.concatenate([j, of_session[k]], axis=2) for k, j in jacobian.items()}
-        halves = {
-            k: np.asarray(h)[: len(drives)] for k, h in this.whitened(jacobian, self._log_v).items()
-        }
-        motion = halves["motion"]
-        others = [h for k, h in halves.items() if k != "motion"]
+        # only the motion knows of a session's effects
+        wider = ((0, 0), (0, 0), (0, self.effects))
+        of_motion = jnp.concatenate([jacobian["motion"], -moved], axis=2)
+        jacobian = {k: jnp.pad(j, wider) for k, j in jacobian.items()} | {"motion": of_motion}
+        halves = this.whitened(jacobian, self._log_v)
+        motion = np.asarray(halves.pop("motion"))[: len(drives)]
+        others = [np.asarray(h)[: len(drives)] for h in halves.values()]
         if this.joint:
             motion, others = np.concatenate([motion, *others], axis=1), []
         electric = np.concatenate([motion[:, :0], *others], axis=1)
@@ -170,31 +134,12 @@ class Planner:
         jacobian /= np.array([d.distance for d in drives])[:, None, None]
         return np.pad(jacobian, ((0, 0), (0, 0), (0, self.effects)))
 
-    def derivative(self, path: str) -> Float[np.ndarray, "entry number"]:
-        """Derivative of a free parameter's entries [SI] by the numbers."""
-        entry = next(e for e in self.space.free if e.path == path)
-        at = self.space.place[path]
-        out = np.zeros((entry.size, len(self.is_electric)))
-        out[:, at] = jax.jacfwd(entry.declaration.to_si)(jnp.asarray(self.z[at]))
-        return out
-
-
-def _in_new_session(robot: Robot) -> Robot:
-    camera = robot.camera
-    if camera.sessions:
-        camera = replace(camera, sessions=(SESSION,), session_yaw=jnp.zeros(1))
-    return replace(robot, camera=camera)
-
 
 @dataclass(frozen=True, eq=False)
 class Goal:
     """A number whose uncertainty is to shrink: sqrt(tr(G cov G^T)).
 
-    Attributes:
-        name: for tables and files.
-        unit: of the number.
-        rows: G (k, free).
-        floors, loads: it is about; empty for any.
+    Rows are G; floors and loads those it is about, empty for any.
     """
 
     name: str
@@ -209,14 +154,15 @@ class Goal:
         return floor in (self.floors or {floor}) and load in (self.loads or {load})
 
     def std(self, knowledge: Knowledge) -> float:
-        """What is uncertain about it."""
         return float(np.sqrt(max(knowledge.criterion(self.rows), 0.0)))
 
 
 def parameter_goal(planner: Planner, path: str) -> Goal:
     """Std of a parameter [its unit], of a short vector the root mean square of its entries."""
     entry = next(e for e in planner.space.free if e.path == path)
-    rows = planner.derivative(path)
+    at = planner.space.place[path]
+    rows = np.zeros((entry.size, len(planner.is_electric)))
+    rows[:, at] = jax.jacfwd(entry.declaration.to_si)(jnp.asarray(planner.z[at]))
     return Goal(
         path,
         entry.declaration.unit,

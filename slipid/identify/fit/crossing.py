@@ -1,16 +1,22 @@
-"""Runs over several floors cut into short windows, each wheel on one floor all the while."""
+"""Runs over several floors in short windows, each wheel on one floor all the while; residuals."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
+from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit.noise import travel
+from slipid.identify.fit.scatter import Pieces
 from slipid.model.robot import Robot
+from slipid.search_space import Space
 from slipid.support.errors import DataError
 
 WINDOW = 0.25
@@ -19,17 +25,16 @@ LEAST_SPEED = 0.04
 """Speed of the fastest rim below which a window says nothing [m/s]."""
 MOST_ACCELERATION = 0.6
 """Of a rim: beyond it the balance of forces is not that of rest [m/s^2]."""
+TOGETHER = 256
+"""Windows whose residuals are found in one call."""
 
 
 @dataclass(frozen=True, eq=False)
 class Crossing:
-    """Windows of runs over several floors.
+    """Windows of runs over several floors, one per piece; runs are (name, sha256).
 
-    Attributes:
-        windows: one per piece.
-        floor: under each wheel all the while, by number in the robot's stack.
-        place: number of each window in its run, gaps counted.
-        runs: (name, sha256) of the runs.
+    The floor is that under each wheel all the while, by number in the robot's stack, the place a
+    window's number in its run, gaps counted.
     """
 
     windows: Windows
@@ -38,25 +43,15 @@ class Crossing:
     runs: tuple[tuple[str, str], ...]
 
     def of(self, picked: Bool[np.ndarray, " piece"]) -> "Crossing":
-        """Some of the windows, of the same runs."""
-        index = np.flatnonzero(picked)
-        return replace(
-            self,
-            windows=self.windows.pieces(index),
-            floor=self.floor[index],
-            place=self.place[index],
-        )
+        windows = self.windows.pieces(np.flatnonzero(picked))
+        return Crossing(windows, self.floor[picked], self.place[picked], self.runs)
 
 
 def crossing(data: Runs, floor: FloorMap, robot: Robot) -> Crossing:
     """Windows of runs whose poses are in the frame of a map, in which no wheel changes floors.
 
-    Where wheels stand is read through the robot's fitted camera.
-
-    Args:
-        data: the runs.
-        floor: what lies where.
-        robot: fitted; knows every surface of the map and every load of the runs.
+    Where wheels stand is read through the camera of the fitted robot, which knows every surface of
+    the map and every load of the runs.
 
     Raises:
         DataError: no such window.
@@ -88,7 +83,7 @@ def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "piece time whee
     yaw = np.array([float(robot.camera.yaw(robot.session_index(s))) for s in w.session])
     heading = pose[..., 2] - yaw[:, None]
     c, s = np.cos(heading), np.sin(heading)
-    turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    turn = np.stack([c, -s, s, c], -1).reshape(*c.shape, 2, 2)
     place = np.asarray(robot.geometry.place) * float(robot.geometry.base_radius)
     from_marker = place - np.asarray(robot.camera.marker_place)
     return np.asarray(pose[..., None, :2] + np.einsum("ntij,wj->ntwi", turn, from_marker))
@@ -100,3 +95,70 @@ def _steady(w: Windows, radius: float) -> Bool[np.ndarray, " piece"]:
     moves = np.abs(rim).max(axis=1) >= LEAST_SPEED
     even = np.abs(jump).max(axis=1) <= MOST_ACCELERATION
     return np.asarray(moves & even & (w.dt[:, 0] < 2 * WINDOW))
+
+
+class Evidence:
+    """Residuals of all windows, and how they scatter.
+
+    Rows are windows, columns along, across [m/s], yaw [rad/s] and the current of each wheel [A];
+    a set without currents has none there.
+    """
+
+    def __init__(self, space: Space, sets: Sequence[Crossing]):
+        self.space, self.sets = space, sets
+        first = np.cumsum([0, *(len(s.runs) for s in sets)])
+        has = [np.full(len(s.windows), s.windows.has_current) for s in sets]
+        self.pieces = Pieces(
+            run=np.concatenate([s.windows.run + k for s, k in zip(sets, first, strict=False)]),
+            place=np.concatenate([s.place for s in sets]),
+            has_current=np.concatenate(has),
+        )
+        self.chunks = [chunk for s in sets for chunk in _chunks(s, space.template)]
+
+    def linear(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (window, channel) and their slope by the search vector (.., free)."""
+        parts = [_linear(self.space, jnp.asarray(z), b, u) for b, u, _ in self.chunks]
+        return self._joined(0, parts), self._joined(1, parts)
+
+    def residual(self, z: np.ndarray) -> np.ndarray:
+        parts = [(_residual(self.space, jnp.asarray(z), b, u),) for b, u, _ in self.chunks]
+        return self._joined(0, parts)
+
+    def _joined(self, k: int, parts: Sequence[Sequence[Array]]) -> np.ndarray:
+        kept = [np.asarray(p[k])[:count] for p, (*_, count) in zip(parts, self.chunks, strict=True)]
+        return np.concatenate(kept)
+
+
+def _chunks(s: Crossing, robot: Robot) -> list[tuple[lk.Batch, Array, int]]:
+    """Batches of one size, with directions of travel and how many of their windows count."""
+    out = []
+    for first in range(0, len(s.windows), TOGETHER):
+        some = np.minimum(np.arange(first, first + TOGETHER), len(s.windows) - 1)
+        w, count = s.windows.pieces(some), min(TOGETHER, len(s.windows) - first)
+        u = jnp.asarray(travel(w, robot)[1][:, 0])
+        out.append((lk.batch(w, robot, s.floor[some]), u, count))
+    return out
+
+
+@eqx.filter_jit
+def _residual(space: Space, z: Array, b: lk.Batch, u: Array) -> Float[Array, "piece channel"]:
+    """Predicted less measured speeds along and across the way, yaw rates and currents."""
+    robot = space.tree(z)
+    p = lk.predict(robot, b)
+    rate = lk.motion_residual(robot, b, p) / b.dt
+    along = u[:, 0] * rate[:, 0] + u[:, 1] * rate[:, 1]
+    across = u[:, 0] * rate[:, 1] - u[:, 1] * rate[:, 0]
+    amps = jnp.zeros_like(b.current)
+    if b.has_current:
+        amps = lk.predicted_current(robot, b, p.felt) - b.current
+    return jnp.concatenate([jnp.stack([along, across, rate[:, 2]], axis=1), amps[:, 0]], axis=1)
+
+
+@eqx.filter_jit
+def _linear(space: Space, z: Array, b: lk.Batch, u: Array) -> tuple[Array, Array]:
+    def both(x: Array) -> tuple[Array, Array]:
+        r = _residual(space, x, b, u)
+        return r, r
+
+    slope, r = jax.jacfwd(both, has_aux=True)(z)
+    return r, slope

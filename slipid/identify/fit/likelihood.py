@@ -14,10 +14,17 @@ from slipid.model import robot as model
 from slipid.model import se2
 from slipid.model.robot import Robot
 
+Marker = Float[Array, "piece window 3"]
+"""Increments of the marker [m, m, rad], or body twists [m/s, m/s, rad/s], of every window."""
+PerWheel = Float[Array, "piece window wheel"]
+Std = Float[Array, ""] | float
 SMOOTH = 0.03
 """Magnitude below which the mean of an unsigned current levels off [A]."""
 FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
 """Variance added to every residual: rounding of the logs [m^2, A^2, V^2]."""
+
+
+_AS_THEY_ARE = ("dt", "turn", "faster", "pose", "current", "voltage", "current_var", "lag")
 
 
 class Batch(eqx.Module):
@@ -31,12 +38,12 @@ class Batch(eqx.Module):
     load: Int[Array, " piece"]
     session: Int[Array, " piece"]
     dt: Float[Array, "piece window"]
-    turn: Float[Array, "piece window wheel"]
-    faster: Float[Array, "piece window wheel"]
+    turn: PerWheel
+    faster: PerWheel
     pose: Float[Array, "piece edge 3"]
-    current: Float[Array, "piece window wheel"]
-    voltage: Float[Array, "piece window wheel"]
-    current_var: Float[Array, "piece window wheel"]
+    current: PerWheel
+    voltage: PerWheel
+    current_var: PerWheel
     lag: Float[Array, ""]
     has_current: bool = eqx.field(static=True)
     has_voltage: bool = eqx.field(static=True)
@@ -48,8 +55,7 @@ def batch(
 ) -> Batch:
     """Batch for a robot that knows the floors, loads and sessions of the windows.
 
-    Args:
-        floor: surface under each wheel, where the windows do not know theirs.
+    The floor is the surface under each wheel, where the windows do not know theirs.
     """
     if floor is None:
         floor = np.asarray([robot.surface_index(s) for s in windows.surface])
@@ -57,14 +63,7 @@ def batch(
         surface=jnp.asarray(floor),
         load=jnp.asarray([robot.load_index(s) for s in windows.load]),
         session=jnp.asarray([robot.session_index(s) for s in windows.session]),
-        dt=jnp.asarray(windows.dt),
-        turn=jnp.asarray(windows.turn),
-        faster=jnp.asarray(windows.faster),
-        pose=jnp.asarray(windows.pose),
-        current=jnp.asarray(windows.current),
-        voltage=jnp.asarray(windows.voltage),
-        current_var=jnp.asarray(windows.current_var),
-        lag=jnp.asarray(windows.lag),
+        **{name: jnp.asarray(getattr(windows, name)) for name in _AS_THEY_ARE},
         has_current=windows.has_current,
         has_voltage=windows.has_voltage,
         signed=windows.current_is_signed,
@@ -72,32 +71,23 @@ def batch(
 
 
 class Predicted(eqx.Module):
-    """What the robot says of each window.
+    """What the robot says of each window: marker increments (x, y [m], yaw [rad]), body twists.
 
-    Attributes:
-        increment: of the marker (x, y [m], yaw [rad]).
-        twist: of the body.
-        felt: traction of each wheel's motor in units of mu m g.
+    Felt is the traction of each wheel's motor in units of mu m g.
     """
 
-    increment: Float[Array, "piece window 3"]
-    twist: Float[Array, "piece window 3"]
-    felt: Float[Array, "piece window wheel"]
+    increment: Marker
+    twist: Marker
+    felt: PerWheel
 
 
-def wheel_speed(robot: Robot, b: Batch) -> Float[Array, "piece window wheel"]:
+def wheel_speed(robot: Robot, b: Batch) -> PerWheel:
     """Mean wheel speed of every window at the robot's camera lag [rad/s]."""
     return (b.turn - (robot.camera.lag - b.lag) * b.faster) / b.dt[..., None]
 
 
-def predict(
-    robot: Robot, b: Batch, near: Float[Array, "piece window 3"] | None = None
-) -> Predicted:
-    """Contact equilibrium of every window.
-
-    Args:
-        near: twists close to it, see `slipid.model.robot.twist`.
-    """
+def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
+    """Contact equilibrium of every window, looked for near twists as `model.robot.twist` does."""
     frame = robot.geometry.frame()
 
     def window(
@@ -107,19 +97,15 @@ def predict(
         increment = robot.camera.seen(se2.advance(xi, dt), session)
         return increment, xi, model.felt(robot, frame, xi, w, surface, load)
 
-    piece = jax.vmap(window, (0, 0, None if near is None else 0, None, None, None))
-    lanes = (0, 0, None if near is None else 0, 0, 0, 0)
-    return Predicted(
-        *jax.vmap(piece, lanes)(wheel_speed(robot, b), b.dt, near, b.surface, b.load, b.session)
-    )
+    each = None if near is None else 0
+    piece = jax.vmap(window, (0, 0, each, None, None, None))
+    pieces = jax.vmap(piece, (0, 0, each, 0, 0, 0))
+    return Predicted(*pieces(wheel_speed(robot, b), b.dt, near, b.surface, b.load, b.session))
 
 
 def seen(
-    robot: Robot,
-    twist: Float[Array, "piece window 3"],
-    dt: Float[Array, "piece window"],
-    session: Int[Array, " piece"],
-) -> Float[Array, "piece window 3"]:
+    robot: Robot, twist: Marker, dt: Float[Array, "piece window"], session: Int[Array, " piece"]
+) -> Marker:
     """Marker increments of every window for given body twists."""
 
     def window(xi: Array, dt: Array, session: Array) -> Array:
@@ -128,9 +114,7 @@ def seen(
     return jax.vmap(jax.vmap(window, (0, 0, None)))(twist, dt, session)
 
 
-def predicted_current(
-    robot: Robot, b: Batch, felt: Float[Array, "piece window wheel"]
-) -> Float[Array, "piece window wheel"]:
+def predicted_current(robot: Robot, b: Batch, felt: PerWheel) -> PerWheel:
     """Motor current of every window [A] given the traction, a magnitude where the log has those."""
     friction = robot.surfaces.friction[b.surface].reshape(b.dt.shape[0], -1).mean(axis=1)
     weight = friction * robot.body.mass * model.GRAVITY
@@ -141,7 +125,7 @@ def predicted_current(
     return jnp.sqrt(amps**2 + SMOOTH**2) + robot.motor.current_offset
 
 
-def measured(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, "piece window 3"]:
+def measured(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Marker:
     """Marker increments in the frame of each window's start, in corrected metres."""
 
     def piece(edges: Float[Array, "edge 3"]) -> Float[Array, "window 3"]:
@@ -159,17 +143,12 @@ def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "piece
 
 
 def electric_residuals(
-    robot: Robot,
-    b: Batch,
-    felt: Float[Array, "piece window wheel"],
-    voltage_std: Float[Array, ""] | float,
+    robot: Robot, b: Batch, felt: PerWheel, voltage_std: Std
 ) -> dict[str, Array]:
     """Predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
 
-    Args:
-        felt: traction of each wheel's motor in units of mu m g.
-        voltage_std: of the voltage noise [V]; the noise of the measured current is carried into the
-            voltage equation by R, which keeps R from being attenuated.
+    The noise of the measured current is carried into the voltage equation by R, which keeps R from
+    being attenuated; `voltage_std` is the voltmeter's own [V].
     """
     n = b.dt.shape[0]
     out = {}
@@ -185,9 +164,7 @@ def electric_residuals(
     return out
 
 
-def log_jacobians(
-    robot: Robot, b: Batch, voltage_std: Float[Array, ""] | float
-) -> tuple[Float[Array, " piece"], Float[Array, " piece"]]:
+def log_jacobians(robot: Robot, b: Batch, voltage_std: Std) -> tuple[Array, Array]:
     """Log |d residuals / d data| of the motion and of the voltage of every piece.
 
     The camera corrects measured places and the voltage residual is scaled by its own spread:
@@ -204,14 +181,12 @@ def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Flo
     return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
 
 
-def _spread(
-    robot: Robot, b: Batch, voltage_std: Float[Array, ""] | float
-) -> Float[Array, "piece window wheel"]:
+def _spread(robot: Robot, b: Batch, voltage_std: Std) -> PerWheel:
     """Std of the voltage residual over that of the voltage noise."""
     return jnp.sqrt(1.0 + robot.motor.resistance**2 * b.current_var / voltage_std**2)
 
 
-def residuals(robot: Robot, b: Batch, voltage_std: Float[Array, ""] | float) -> dict[str, Array]:
+def residuals(robot: Robot, b: Batch, voltage_std: Std) -> dict[str, Array]:
     """Every block of residuals, `motion` first."""
     p = predict(robot, b)
     motion = {"motion": motion_residual(robot, b, p)}
@@ -226,8 +201,6 @@ def voltage_std(log_variance: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.sqrt(jnp.exp(log_variance) + FLOOR["voltage"])
 
 
-def voltage_share(
-    robot: Robot, b: Batch, voltage_std: Float[Array, ""] | float
-) -> Float[Array, "piece m"]:
+def voltage_share(robot: Robot, b: Batch, voltage_std: Std) -> Float[Array, "piece m"]:
     """Part that the voltage's own noise has in the variance of every voltage residual."""
     return (1 / _spread(robot, b, voltage_std) ** 2).reshape(b.dt.shape[0], -1)

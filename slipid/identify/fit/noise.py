@@ -22,13 +22,7 @@ from slipid.model.robot import Robot
 
 
 class Components(eqx.Module):
-    """Covariance pieces of one block of residuals.
-
-    Attributes:
-        base: B_c (piece, component, m, m).
-        which: number of the variance each belongs to (piece, component).
-        floor: variance that every residual has beside them.
-    """
+    """Covariance pieces B_c of one block, the variance each belongs to, and one beside them all."""
 
     base: Float[Array, "piece component m m"]
     which: Int[Array, "piece component"]
@@ -42,11 +36,9 @@ class Components(eqx.Module):
 
 @dataclass(frozen=True)
 class Component:
-    """One source of noise.
+    """One source of noise: `process` `along`, `camera` `place`, `current` `window` and so on.
 
     Attributes:
-        kind: `camera`, `process`, `run`, `current` or `voltage`.
-        what: `place`, `along`, `window`, ...
         floor: it is met on, None where it is of all.
         unit: of its std.
         typical: std that the weak log-normal prior is centred on.
@@ -73,12 +65,10 @@ class Noise:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the components."""
         return tuple(c.name for c in self.components)
 
     @property
     def typical(self) -> Float[np.ndarray, " variance"]:
-        """Typical std of every component."""
         return np.array([c.typical for c in self.components])
 
 
@@ -124,10 +114,8 @@ def travel(windows: Windows | Batch, robot: Robot) -> tuple[np.ndarray, np.ndarr
     step = np.asarray(windows.turn) * float(robot.geometry.wheel_radius) @ j.T
     far = np.linalg.norm(step[..., :2], axis=-1)
     turned = np.abs(step[..., 2]) * float(robot.geometry.base_radius)
-    u = np.where(
-        far[..., None] > 1e-6, step[..., :2] / np.maximum(far, 1e-9)[..., None], [1.0, 0.0]
-    )
-    return far + turned, u
+    way = step[..., :2] / np.maximum(far, 1e-9)[..., None]
+    return far + turned, np.where(far[..., None] > 1e-6, way, [1.0, 0.0])
 
 
 def _motion_components(windows: Windows, robot: Robot) -> Components:
@@ -137,9 +125,8 @@ def _motion_components(windows: Windows, robot: Robot) -> Components:
     place, heading = np.zeros((n, 3 * k, 2 * (k + 1))), np.zeros((n, 3 * k, k + 1))
     for j in range(k):
         th = windows.pose[:, j, 2]
-        back = (
-            np.stack([np.cos(th), np.sin(th), -np.sin(th), np.cos(th)], -1).reshape(n, 2, 2) * scale
-        )
+        c, s = scale * np.cos(th), scale * np.sin(th)
+        back = np.stack([c, s, -s, c], -1).reshape(n, 2, 2)
         place[:, 3 * j : 3 * j + 2, 2 * j : 2 * j + 2] = -back
         place[:, 3 * j : 3 * j + 2, 2 * j + 2 : 2 * j + 4] = back
         move = np.einsum("nij,nj->ni", back, windows.pose[:, j + 1, :2] - windows.pose[:, j, :2])
@@ -149,15 +136,12 @@ def _motion_components(windows: Windows, robot: Robot) -> Components:
     effect = effects(windows, robot).transpose(2, 0, 1)[..., None]
     parts = [place, heading, *grown, *effect]
     base = np.stack([p @ p.transpose(0, 2, 1) for p in parts], axis=1)
-    floor = _floors(windows, robot)
-    which = np.concatenate(
-        [np.zeros((n, 1), int), np.ones((n, 1), int), 2 + 6 * floor[:, None] + np.arange(6)], axis=1
-    )
-    return _components("motion", base, which)
+    of_floor = 2 + 6 * _floors(windows, robot) + np.arange(6)
+    return _components("motion", base, np.insert(of_floor, 0, [[0], [1]], axis=1))
 
 
-def _floors(windows: Windows, robot: Robot) -> Int[np.ndarray, " piece"]:
-    return np.array([robot.surface_index(s) for s in windows.surface])
+def _floors(windows: Windows, robot: Robot) -> Int[np.ndarray, "piece 1"]:
+    return np.array([[robot.surface_index(s)] for s in windows.surface])
 
 
 def _axes(u: np.ndarray) -> np.ndarray:
@@ -181,5 +165,5 @@ def _current_components(windows: Windows, robot: Robot, start: int) -> Component
     n, k, w = windows.turn.shape
     same = np.kron(np.ones((k, k)), np.eye(w))
     base = np.broadcast_to(np.stack([np.eye(k * w), same]), (n, 2, k * w, k * w)).copy()
-    which = start + 2 * _floors(windows, robot)[:, None] + np.arange(2)
+    which = start + 2 * _floors(windows, robot) + np.arange(2)
     return _components("current", base, which)

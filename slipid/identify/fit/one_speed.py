@@ -6,7 +6,7 @@ from glob import escape
 import numpy as np
 
 from slipid.data.runs import Runs
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 
 
 def still_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from slipid.identify.fit.problem import DEGREES, Problem, State, linear
 from slipid.identify.fit.structure import Held, levenberg
-from slipid.identify.fit.variances import scored
+from slipid.identify.fit.variances import Search, Square, scored
 
 CREEPS = (0.05, 0.4, 1.0)
 """Starts of the creep of every floor; others end in poor minima."""
@@ -17,11 +17,9 @@ CREEPS = (0.05, 0.4, 1.0)
 
 @dataclass(frozen=True)
 class Options:
-    """How long and how precisely to fit.
+    """How many rounds of weights, structure and variances at most.
 
-    Attributes:
-        most_rounds: of weights, structure and variances.
-        tolerance: stop when no number moves more than this many posterior stds in a round.
+    The fit stops when no number moves more than `tolerance` posterior stds in a round.
     """
 
     most_rounds: int = 30
@@ -30,18 +28,10 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """End of a fit.
-
-    Attributes:
-        state: where it ended.
-        covariance: of the search vector (Laplace).
-        converged: whether the tolerance was met.
-        reason: why it stopped, for people.
-        history: loss after every round.
-    """
+    """End of a fit: Laplace covariance, why it stopped, for people, and the loss of every round."""
 
     state: State
-    covariance: Float[np.ndarray, "free free"]
+    covariance: Square
     converged: bool
     reason: str
     history: tuple[float, ...]
@@ -59,11 +49,9 @@ def optimise(
     """Maximum a posteriori from a staged start, or going on from a state.
 
     Args:
-        problem: windows, robot and priors.
         keep: weight of each piece, 1 or 0 (piece,); all by default. Folds of a cross-validation
             differ in this only, so they share one compiled function.
         start: goes on from here instead of the staged start.
-        options: how long and how precisely.
         tell: called after every round, for progress and checkpoints.
         free: 1 for coordinates that may move from the start, 0 for those held there (free,).
         variances: whether to fit those of the noise, too.
@@ -83,52 +71,41 @@ def optimise(
         if state.moved < options.tolerance:
             reason = f"no number moved {options.tolerance:g} of its std in round {state.round}"
             break
-    _, jacobian = problem.linear(state.z, problem.volt(state.log_variance))
-    info = problem.precision(jacobian, state.log_variance, keep)
-    return Optimum(
-        state=state,
-        covariance=np.linalg.inv(np.asarray(info)),
-        converged=state.moved < options.tolerance,
-        reason=reason,
-        history=tuple(history),
-    )
+    covariance = problem.laplace(state.z, state.log_variance, keep)
+    settled = state.moved < options.tolerance
+    return Optimum(state, covariance, settled, reason, tuple(history))
 
 
 def one_round(
     problem: Problem,
     state: State,
     keep: Float[np.ndarray, " piece"],
-    mask: Float[np.ndarray, " free"],
+    mask: Search,
     steps: int,
     scoring: int,
 ) -> State:
     """Weights, structure, variances: one turn of each.
 
-    Args:
-        problem: windows, robot and priors.
-        state: where to start.
-        keep: weight of each piece.
-        mask: 1 for coordinates that may move, 0 for those held.
-        steps: of the structure at most.
-        scoring: steps of the variances.
+    At most so many steps of the structure, and so many scoring steps of the variances; the mask is
+    1 for coordinates that may move, 0 for those held.
     """
-    target, log_v, kept = problem.target, jnp.asarray(state.log_variance), jnp.asarray(keep)
+    target, log_v = problem.target, jnp.asarray(state.log_variance)
     volt = problem.volt(log_v)
     residual, _, felt = linear(target, jnp.asarray(state.z), volt)
     held = Held(
         target=target,
         z=jnp.asarray(state.z),
         mask=jnp.asarray(mask),
-        root=problem.whitening(residual, log_v, kept).root,
+        root=problem.whitening(residual, log_v, keep).root,
         volt=volt,
         felt=felt,
-        slope=problem.log_jacobian(state.z, volt, kept)[1],
+        slope=problem.log_jacobian(state.z, volt, keep)[1],
     )
     z = levenberg(held, steps)
     residual, jacobian = problem.linear(z, volt)
     own = problem.own(z, log_v)
     for _ in range(scoring):
-        log_v = scored(target, residual, jacobian, log_v, kept, own)
+        log_v = scored(target, residual, jacobian, log_v, jnp.asarray(keep), own)
         before, own = own, problem.own(z, log_v)
         for k, share in own.items():  # these residuals are in units of the noise just found
             scale = jnp.sqrt(share / before[k])
@@ -136,20 +113,17 @@ def one_round(
             jacobian = jacobian | {k: jacobian[k] * scale[..., None]}
     if own and scoring:  # the Jacobian by R changes by more than its scale
         residual, jacobian = problem.linear(z, problem.volt(log_v))
-    std = np.sqrt(np.diag(np.linalg.inv(np.asarray(problem.precision(jacobian, log_v, kept)))))
+    std = np.sqrt(np.diag(np.linalg.inv(np.asarray(problem.precision(jacobian, log_v, keep)))))
     moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
     moved = max(moved, float(np.max(np.abs(np.asarray(log_v) - state.log_variance)) / 3))
     return State(
         z=z,
         log_variance=np.asarray(log_v),
         round=state.round + 1,
-        loss=problem.loss(z, log_v, kept, residual),
+        loss=problem.loss(z, log_v, keep, residual),
         moved=moved,
         stage=state.stage,
     )
-
-
-# where a fit begins -----------------------------------------------------------------------------
 
 
 def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], None]) -> State:
@@ -165,8 +139,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
     wide = [1.0 if c.kind == "camera" else 3.0 for c in problem.noise.components]
     log_v = 2 * np.log(problem.noise.typical) + 2 * np.log(wide)
     first = _motor_start(problem)
-    best = np.full(len(labels), np.inf)
-    z = first.copy()
+    best, z = np.full(len(labels), np.inf), first.copy()
     floors = np.asarray(problem.batch.surface)
     for attempt, value in enumerate(CREEPS):
         stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
@@ -178,7 +151,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
         cost = _piece_cost(problem, state)
         for number, label in enumerate(labels):
             mine = float(np.sum(cost[(floors == number) & (keep > 0)]))
-            if attempt == 0 or mine < best[number]:
+            if mine < best[number]:
                 best[number] = mine
                 own = space.where(lambda e, label=label: e.surface == label)  # type: ignore[misc]
                 z[own] = state.z[own]

@@ -18,10 +18,18 @@ from jaxtyping import Array, Bool, Float
 from slipid.data.windows import Windows
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import variances
-from slipid.identify.fit.noise import Components, noise
-from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD, Blocks, Vector, Whitening
+from slipid.identify.fit.noise import noise
+from slipid.identify.fit.variances import (
+    DEGREES,
+    VARIANCE_SPREAD,
+    Blocks,
+    Search,
+    Target,
+    Vector,
+    Whitening,
+)
 from slipid.model.robot import Robot
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 
 __all__ = ["DEGREES", "VARIANCE_SPREAD", "Problem", "State", "Target"]
 
@@ -30,16 +38,11 @@ __all__ = ["DEGREES", "VARIANCE_SPREAD", "Problem", "State", "Target"]
 class State:
     """Where a fit stands; enough to go on from.
 
-    Attributes:
-        z: structural vector in the search space.
-        log_variance: of every variance component.
-        round: rounds done.
-        loss: minus log posterior up to a constant.
-        moved: largest step of the last round, in posterior stds.
-        stage: what it was doing, for progress.
+    The loss is minus log posterior up to a constant, `moved` the largest step of the last round in
+    posterior stds, the stage what it was doing, for progress.
     """
 
-    z: Float[np.ndarray, " free"]
+    z: Search
     log_variance: Float[np.ndarray, " variance"]
     round: int
     loss: float
@@ -47,38 +50,15 @@ class State:
     stage: str
 
 
-class Target(eqx.Module):
-    """What a fit maximises, as an argument of compiled functions.
-
-    Attributes:
-        space: free numbers and their priors.
-        batch: measured windows.
-        blocks: covariance pieces of every block of residuals.
-        typical: centre of the prior of the log variances.
-        joint: whether currents and voltages move the numbers of the motion, too.
-    """
-
-    space: Space
-    batch: lk.Batch
-    blocks: dict[str, Components]
-    typical: Float[Array, " variance"]
-    joint: bool = eqx.field(static=True)
-
-
 class Problem:
     """Likelihood of a set of windows as functions of the search vector.
 
-    Args:
-        windows: of the runs, all of them; `keep` below chooses those that count.
-        robot: start values and what is fixed.
-        choices: free, fixed, priors.
-        current_informs_motion: let currents and voltages move the numbers of the motion, too. By
-            default they do not ("cut"): the torque scale is read from currents given the motion,
-            whose errors are carried along. A friction model good to 5 % in current would otherwise
-            outvote forces that motion shows to 1 %.
+    By default currents and voltages do not move the numbers of the motion ("cut"): the torque scale
+    is read from currents given the motion, whose errors are carried along. A friction model good to
+    5 % in current would otherwise outvote forces that motion shows to 1 %.
 
-    Attributes:
-        compiled: what was compiled for windows of these shapes by others, under their own keys.
+    `keep`, below, chooses the pieces that count. `compiled` holds what was compiled for windows of
+    these shapes by others, under their own keys.
     """
 
     def __init__(
@@ -112,23 +92,18 @@ class Problem:
 
     @property
     def batch(self) -> lk.Batch:
-        """The windows as arrays."""
         return self.target.batch
 
     @property
     def electric(self) -> Bool[np.ndarray, " free"]:
-        """Coordinates that are read from currents and voltages given the motion."""
         return self.space.electric
 
     def linear(self, z: Vector, volt: Vector) -> tuple[Blocks, Blocks]:
         """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
-        return linear(self.target, jnp.asarray(z), jnp.asarray(volt))[:2]
+        return linear(self.target, *_arrays(z, volt))[:2]
 
     def log_jacobian(self, z: Vector, volt: Vector, keep: Vector) -> tuple[Array, Array]:
-        """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
-        return log_jacobian(
-            self.target, jnp.asarray(z), jnp.asarray(volt), jnp.asarray(keep, dtype=float)
-        )
+        return log_jacobian(self.target, *_arrays(z, volt, keep))
 
     def twists(self, z: Vector) -> tuple[Array, Array]:
         """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
@@ -139,26 +114,24 @@ class Problem:
         return self.noise.blocks[block].covariance(jnp.asarray(log_v))
 
     def whitening(self, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
-        """What residuals are weighed by."""
-        return variances.whitening(
-            self.noise.blocks, residual, jnp.asarray(log_v), jnp.asarray(keep, dtype=float)
-        )
+        return variances.whitening(self.noise.blocks, residual, *_arrays(log_v, keep))
 
     def precision(self, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
-        """Expected information of the search vector, prior included (free, free)."""
-        return variances.precision(
-            self.target, jacobian, jnp.asarray(log_v), jnp.asarray(keep, dtype=float)
-        )
+        return variances.precision(self.target, jacobian, *_arrays(log_v, keep))
+
+    def laplace(self, z: Vector, log_v: Vector, keep: Vector) -> np.ndarray:
+        """Covariance of the search vector (free, free): inverse information, prior included."""
+        jacobian = self.linear(z, self.volt(log_v))[1]
+        return np.linalg.inv(np.asarray(self.precision(jacobian, log_v, keep)))
 
     def whitened(self, jacobian: Blocks, log_v: Vector) -> Blocks:
-        """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
-        keep = jnp.ones(len(self.windows))
-        return variances.whitened(self.noise.blocks, jacobian, jnp.asarray(log_v), keep)
+        vectors = _arrays(log_v, np.ones(len(self.windows)))
+        return variances.whitened(self.noise.blocks, jacobian, *vectors)
 
     def variance_precision(self, log_v: Vector, keep: Vector, z: Vector) -> Array:
         """Expected information of the log variances at z, prior included (variance, variance)."""
-        log_v, own = jnp.asarray(log_v), self.own(z, log_v)
-        return variances.information(self.noise.blocks, log_v, jnp.asarray(keep, dtype=float), own)
+        at, counts = _arrays(log_v, keep)
+        return variances.information(self.noise.blocks, at, counts, self.own(z, log_v))
 
     def loss(self, z: Vector, log_v: Vector, keep: Vector, residual: Blocks) -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
@@ -182,6 +155,10 @@ class Problem:
         if "voltage" not in self.noise.blocks:
             return {}
         return {"voltage": _share(self.space, self.batch, jnp.asarray(z), self.volt(log_v))}
+
+
+def _arrays(*vectors: Vector) -> tuple[Array, ...]:
+    return tuple(jnp.asarray(v, float) for v in vectors)
 
 
 @eqx.filter_jit

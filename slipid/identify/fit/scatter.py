@@ -13,12 +13,7 @@ CHANNELS = ("along", "across", "yaw")
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Where windows come from.
-
-    Attributes:
-        run, place: which run each is of, and where in it.
-        has_current: whether its currents were logged.
-    """
+    """Where windows come from: run, place in it, and whether its currents were logged."""
 
     run: Int[np.ndarray, " window"]
     place: Int[np.ndarray, " window"]
@@ -29,11 +24,9 @@ class Pieces:
 class Scatter:
     """How residuals scatter: what each counts for.
 
-    Attributes:
-        weight: of every residual, the t weight of its block; 0 where nothing was measured.
-        expected: mean of it where the scatter is as found.
-        variance: of every column, wheels alike.
-        factor: windows over the number they are worth, per column.
+    The weight is the t weight of a residual's block, 0 where nothing was measured, `expected` its
+    mean where the scatter is as found. Variances are of columns, wheels alike; the factor is
+    windows over the number they are worth.
     """
 
     weight: Float[np.ndarray, "window channel"]
@@ -52,11 +45,10 @@ def scatter(r: np.ndarray, of: Pieces, factor: np.ndarray | None) -> Scatter:
     """
     motion = np.arange(r.shape[1]) < len(CHANNELS)
     counts = np.where(motion, 1.0, of.has_current[:, None])
-    blocks = [motion, ~motion]
     weight, expected = counts.copy(), counts.copy()
     for _ in range(5):
         variance = _pooled(weight * r**2, counts)
-        for block in blocks:
+        for block in (motion, ~motion):
             m = int(block.sum())
             q = (r[:, block] ** 2 / variance[block]).sum(axis=1)
             t = (DEGREES + m) / (DEGREES + q)
@@ -75,8 +67,7 @@ def scatter(r: np.ndarray, of: Pieces, factor: np.ndarray | None) -> Scatter:
 def _mean_of_runs(x: np.ndarray, run: np.ndarray) -> Float[np.ndarray, "window channel"]:
     """Mean of every column over the run a window is of; nan counts for nothing."""
     there = np.isfinite(x)
-    total = np.zeros((run.max() + 1, x.shape[1]))
-    count = np.zeros_like(total)
+    total, count = np.zeros((2, run.max() + 1, x.shape[1]))
     np.add.at(total, run, np.where(there, x, 0.0))
     np.add.at(count, run, there.astype(float))
     return np.asarray((total / np.maximum(count, 1.0))[run])
@@ -94,12 +85,8 @@ def _dilution(x: np.ndarray, run: np.ndarray, place: np.ndarray) -> float:
     """Windows over the number of independent ones that tell as much; at least 1.
 
     1 + 2 sum of the correlations over lags within runs, in pairs of lags while these are positive
-    (Geyer 1992, Stat. Sci. 7, section 3.3). Residuals are taken about zero: of motion, what a whole
-    run has in common counts as correlation.
-
-    Args:
-        x: one residual per window, nan where nothing was measured.
-        run, place: which run each is of, and where in it.
+    (Geyer 1992, Stat. Sci. 7, section 3.3). Residuals x, nan where nothing was measured, are taken
+    about zero: of motion, what a whole run has in common counts as correlation.
     """
     grid = np.full((run.max() + 1, place.max() + 2), np.nan)
     grid[run, place] = x

@@ -34,14 +34,9 @@ TURNS = 4
 class Linear:
     """A fitted model made linear at its fit, on all pieces of a problem.
 
-    Attributes:
-        gap: predicted less measured (piece, m).
-        slope: by the fitted numbers (piece, m, number).
-        covariance: of the numbers.
-        wide: of the numbers as they were before a floor's own runs were seen.
-        scale: noise covariance of each piece, the run's own effect included (piece, m, m).
-        effect: what one unit of an effect along, across and in yaw moves (piece, m, 3).
-        run: variance of these effects (piece, 3).
+    Gap is predicted less measured; `wide` the covariance of the numbers as they were before a
+    floor's own runs were seen; scale the noise covariance, the run's own effect included; effect
+    what one unit along, across and in yaw moves; run the variance of these effects.
     """
 
     gap: Float[np.ndarray, "piece m"]
@@ -70,10 +65,9 @@ def shared(
     of_piece = pairs(w)
     for pair in dict.fromkeys(of_piece):
         mine = np.array([other == pair for other in of_piece]) & (keep > 0)
-        if not mine.any():
-            continue
-        u = pulls[mine].sum(axis=0)
-        meat += u.T @ (of_session[mine][0][:, None] * u)
+        if mine.any():
+            u = pulls[mine].sum(axis=0)
+            meat += u.T @ (of_session[mine][0][:, None] * u)
     return variance, model.covariance + model.covariance @ meat @ model.covariance
 
 
@@ -88,7 +82,6 @@ def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.nd
 
 
 def _variances(model: Linear, w: Windows, keep: np.ndarray, weight: np.ndarray) -> dict[str, float]:
-    """Variance per floor and axis, given the weights of the runs."""
     session, floor = np.asarray(w.session), np.asarray(w.surface)
     left, noise, slope = _left(model)
     variance: dict[str, float] = {}
@@ -127,13 +120,10 @@ def _left(model: Linear) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _variance(left: np.ndarray, own: np.ndarray, member: np.ndarray, centre: float) -> float:
-    """Most likely variance of what the members of each session share.
+    """Most likely variance of what the members of each session share (run, session), each 1 or 0.
 
-    Args:
-        left: effects of runs.
-        own: their covariance without it.
-        member: 1 where a run is of a session, else 0 (run, session).
-        centre: of the prior of the log variance.
+    `own` is the covariance of the effects left without it, `centre` that of the log variance's
+    prior.
     """
     root = np.linalg.cholesky(own)
     white = np.linalg.solve(root, np.concatenate([left[:, None], member], axis=1))

@@ -10,24 +10,18 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.problem import Target
-from slipid.identify.fit.variances import Blocks
+from slipid.identify.fit.variances import Blocks, Search, Target
 
 _REFUSED = 12
 """Steps of the solver that may be refused in a round."""
 
 
 class Held(eqx.Module):
-    """What is held while the structural numbers move.
+    """What is held while the structural numbers move from z.
 
-    Attributes:
-        target: the posterior.
-        z: search vector they move from.
-        mask: 1 for coordinates that may move, 0 for those held (free,).
-        root: what residuals are whitened with.
-        volt: std of the voltage noise [V].
-        felt: traction at z, which currents and voltages are predicted from.
-        slope: of log |d residuals / d data| by the search vector.
+    The mask is 1 for coordinates that may move; root whitens residuals, volt is the std of the
+    voltage noise [V], felt the traction at z, which currents and voltages are predicted from, and
+    slope that of log |d residuals / d data| by the search vector.
     """
 
     target: Target
@@ -53,20 +47,14 @@ class Steps(optx.LevenbergMarquardt):
         self.most = jnp.asarray(most)
 
     def terminate(
-        self,
-        fn: Any,
-        y: Array,
-        args: Held,
-        options: dict[str, Any],
-        state: Any,
-        tags: frozenset[object],
+        self, fn: Any, y: Array, args: Held, options: Any, state: Any, tags: frozenset[object]
     ) -> tuple[Array, optx.RESULTS]:
         done, result = super().terminate(fn, y, args, options, state, tags)
         taken = state.num_accepted_steps - 1 >= self.most
         return done | taken | (state.num_steps >= self.most + _REFUSED), result
 
 
-def levenberg(held: Held, most: int) -> Float[np.ndarray, " free"]:
+def levenberg(held: Held, most: int) -> Search:
     """Search vector after at most so many Levenberg-Marquardt steps with fixed whitening."""
     return np.asarray(_moved(held, Steps(most)))
 

@@ -5,21 +5,24 @@ likelihood of the variances takes into account what the structural numbers have 
 (Patterson and Thompson 1971, Biometrika 58(3)).
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
+from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.linear import inverse_root
 from slipid.identify.fit.noise import Components
-
-if TYPE_CHECKING:
-    from slipid.identify.fit.problem import Target
+from slipid.search_space import Space
 
 Vector = Array | np.ndarray
 """One-dimensional, of jax or numpy."""
+Search = Float[np.ndarray, " free"]
+"""A search vector, or one number for each of its coordinates."""
+Square = Float[np.ndarray, "free free"]
+"""Covariance or information of the search vector."""
 Blocks = dict[str, Array]
 """An array for every block of residuals: `motion`, `current`, `voltage`."""
 Noises = dict[str, Components]
@@ -30,13 +33,24 @@ VARIANCE_SPREAD = 3.0
 """Std of the prior of every log variance."""
 
 
-class Whitening(NamedTuple):
-    """What residuals are weighed by.
+class Target(eqx.Module):
+    """What a fit maximises, as an argument of compiled functions.
 
-    Attributes:
-        root: W with W^T W = w V^-1 of every piece (piece, m, m).
-        weight: w of every piece, small for an outlier.
-        loss: minus log likelihood, less constants.
+    `typical` is the centre of the prior of the log variances; where it is joint, currents and
+    voltages move the numbers of the motion, too.
+    """
+
+    space: Space
+    batch: lk.Batch
+    blocks: dict[str, Components]
+    typical: Float[Array, " variance"]
+    joint: bool = eqx.field(static=True)
+
+
+class Whitening(NamedTuple):
+    """Root W of every piece with W^T W = w V^-1, weight w, small for an outlier, and the loss.
+
+    The loss is minus log likelihood, less constants.
     """
 
     root: Blocks
@@ -72,7 +86,7 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Array, keep: Array) -> Blo
 
 
 @eqx.filter_jit
-def precision(target: "Target", jacobian: Blocks, log_v: Array, keep: Array) -> Array:
+def precision(target: Target, jacobian: Blocks, log_v: Array, keep: Array) -> Array:
     """Expected information of the search vector, prior included (free, free)."""
     prior = jnp.diag(1 / jnp.asarray(target.space.prior_std) ** 2)
     total, of_motion = prior, prior
@@ -80,12 +94,11 @@ def precision(target: "Target", jacobian: Blocks, log_v: Array, keep: Array) -> 
         flat = half.reshape(-1, half.shape[-1])
         total += flat.T @ flat
         of_motion += flat.T @ flat if k == "motion" else 0.0
-    return total if target.joint else _cut(total, of_motion, target.space.electric)
+    return total if target.joint else _cut(total, of_motion, jnp.asarray(target.space.electric))
 
 
-def _cut(total: Array, of_motion: Array, electric: np.ndarray) -> Array:
+def _cut(total: Array, of_motion: Array, e: Array) -> Array:
     """Information when p(electric | motion, all data) multiplies p(motion | motion data)."""
-    e = jnp.asarray(electric)
     own = jnp.where(e[:, None] & e[None, :], total, jnp.where(jnp.eye(len(e)) > 0, 1.0, 0.0))
     cross = jnp.where(e[:, None] & ~e[None, :], total, 0.0)
     carried = cross.T @ jnp.linalg.solve(own, cross)
@@ -95,16 +108,12 @@ def _cut(total: Array, of_motion: Array, electric: np.ndarray) -> Array:
 
 @eqx.filter_jit
 def scored(
-    target: "Target", residual: Blocks, jacobian: Blocks, log_v: Array, keep: Array, own: Blocks
+    target: Target, residual: Blocks, jacobian: Blocks, log_v: Array, keep: Array, own: Blocks
 ) -> Array:
     """One Fisher-scoring step of the restricted likelihood in the log variances.
 
-    Args:
-        target: the posterior.
-        residual, jacobian: of its structural numbers.
-        log_v: where to start.
-        keep: weight of each piece.
-        own: part that the variances have in that of the residuals (piece, m); all where absent.
+    Residuals and Jacobian are of the structural numbers. `own` is the part that the variances have
+    in that of the residuals (piece, m), all where absent.
     """
     cov = jnp.linalg.inv(precision(target, jacobian, log_v, keep))
     spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in jacobian.items()}
@@ -113,16 +122,12 @@ def scored(
 
 @eqx.filter_jit
 def scored_given(
-    target: "Target", residual: Blocks, spread: Blocks, log_v: Array, keep: Array, own: Blocks
+    target: Target, residual: Blocks, spread: Blocks, log_v: Array, keep: Array, own: Blocks
 ) -> Array:
     """The same where it is known what the fitted numbers of a model, this or another, make of V.
 
-    Args:
-        target: the posterior.
-        residual: of the model (piece, m).
-        spread: their covariance from the model's fitted numbers (piece, m, m); the degrees of
-            freedom it stands for are not the variances' to have.
-        log_v, keep, own: as of `scored`.
+    `spread` is the covariance of the residuals from the model's fitted numbers (piece, m, m); the
+    degrees of freedom it stands for are not the variances' to have.
     """
     _, weights, _ = whitening(target.blocks, residual, log_v, keep)
     score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from slipid.identify.posterior.transport.bend import Bend
-from slipid.identify.posterior.transport.plateaus import Values
+from slipid.identify.posterior.transport.coordinatewise import Values, Warp
 from slipid.identify.posterior.transport.transport_map import Stair, Transport
-from slipid.identify.posterior.transport.warp import Warp
 
 FORMAT = 2
 """Version of the block files; bump it when their content or the way they are made changes."""
@@ -21,18 +20,16 @@ class Plan:
     """How to sample and when to stop.
 
     Attributes:
-        ensembles: number of independent ensembles.
-        walkers: number of walkers of each.
-        block: number of steps in a block.
+        ensembles, walkers: independent ensembles, and walkers of each.
+        block: steps in a block.
         warm_up: numbers of blocks after which proposals are learnt; the last ends the warm-up, and
             leaves some blocks for the step of Hamiltonian moves to suit the last proposals.
-        most: number of blocks after which sampling ends without having converged.
+        most: blocks after which sampling ends without having converged.
         spread: how far from the fit the widest walker starts, in stds; the first starts at a
             quarter of it. Wide starts find modes that the fit has not seen.
         r_hat: R-hat over ensembles that every coordinate must be below to have converged.
         steps_per_tau: steps per autocorrelation time that every coordinate must be above.
         least_draws: effective draws that every coordinate must be above.
-        seed: seed of everything.
     """
 
     ensembles: int = 4
@@ -52,9 +49,8 @@ class Block:
     """Some steps of all ensembles, and all that is needed to go on.
 
     Attributes:
-        number: number of the block; the first is 0.
-        chain: positions of all walkers.
-        log_prob: their log density.
+        number: of the block; the first is 0.
+        chain, log_prob: positions of all walkers, and their log density.
         random: Mersenne twister keys, and (place, has Gaussian, Gaussian) of each.
         accepted: part of the moves that moved something, for each ensemble.
         map: map to the coordinates in which the next block is made.
@@ -74,11 +70,9 @@ class Block:
 class Record:
     """Where blocks of an earlier call are found and where new ones go.
 
-    Attributes:
-        done: gives the blocks of a part that are there already; the name of the second part tells
-            which draws of the first its blocks are of.
-        keep: called with the part and every new block.
-        tell: called with the stage and the number of steps of a block that are done.
+    `done` gives the blocks of a part that are there already; the name of the second part tells
+    which draws of the first its blocks are of. `tell` is called with the stage and the number of
+    steps of a block that are done.
     """
 
     done: Callable[[str], Sequence[Block]] = lambda part: ()
@@ -115,15 +109,14 @@ def unpacked(arrays: Mapping[str, np.ndarray]) -> Block:
         bend = {n: arrays[f"{k}/bend/{n}"] for n in _OF_BEND if f"{k}/bend/{n}" in arrays}
         fields = {n: arrays[f"{k}/{n}"] for n in _OF_STAIR}
         stairs.append(Stair(**fields, bend=Bend(**bend) if bend else None))
+    values = Values(*arrays["values"])
     return Block(
         number=int(arrays["number"]),
         chain=arrays["chain"],
         log_prob=arrays["log_prob"],
         random=(arrays["random_key"], arrays["random_rest"]),
         accepted=arrays["accepted"],
-        map=Transport(
-            arrays["mean"], Values(*arrays["values"]), tuple(stairs), Warp(*arrays["last"])
-        ),
+        map=Transport(arrays["mean"], values, tuple(stairs), Warp(*arrays["last"])),
         angle=float(arrays["angle"]),
     )
 

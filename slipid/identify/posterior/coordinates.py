@@ -6,10 +6,11 @@ from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES, by_axis, pairs
+from slipid.identify.fit.variances import Square
 
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
 """Parts of a posterior that a density can be of."""
@@ -18,20 +19,15 @@ A = TypeVar("A", Array, np.ndarray)
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Where a fit ended.
+    """Where a fit ended, and the variances of what the runs of a session share.
 
-    Attributes:
-        z: search vector.
-        log_variance: log variances of the noise components.
-        covariance: Laplace covariance of the search vector, as if sessions shared nothing; where
-            currents do not inform motion it is that of p(electric | motion, data)
-            p(motion | motion data).
-        session: variances of what the runs of a session share, `session.<floor>.<axis>`.
+    The Laplace covariance is as if sessions shared nothing; where currents do not inform motion it
+    is that of p(electric | motion, data) p(motion | motion data).
     """
 
     z: np.ndarray
     log_variance: np.ndarray
-    covariance: Float[np.ndarray, "free free"]
+    covariance: Square
     session: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -39,12 +35,9 @@ class Fitted:
 class Coordinates:
     """Which coordinates a density has: structure first, then log variances, then session effects.
 
-    Attributes:
-        names: name of each coordinate.
-        structure: places of the first of them in the search vector.
-        variance: numbers of the variance components that follow.
-        sessions: floor and session of the effects that come last: along, across and yaw of each.
-        group: floor that each coordinate belongs to, -1 where several floors share it.
+    Structure are places in the search vector, variances numbers of components; a session has
+    effects along, across and in yaw. The group is the floor of each coordinate, -1 where several
+    share it.
     """
 
     names: tuple[str, ...]
@@ -75,7 +68,8 @@ def coordinates_of(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
         ELECTRIC: [k for k in jacobian if k != "motion"],
         EVERYTHING: list(jacobian),
     }[part]
-    surface, floors = np.asarray(problem.batch.surface), len(problem.robot.surfaces.labels)
+    labels = problem.robot.surfaces.labels
+    surface, floors = np.asarray(problem.batch.surface), len(labels)
     touched = np.zeros((problem.space.size, floors), bool)
     seen = np.zeros((len(problem.noise.names), floors), bool)
     for k in blocks:
@@ -90,7 +84,6 @@ def coordinates_of(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
     shared = by_axis(fitted.session, "session", problem.windows)
     found = {pair for pair, v in zip(pairs(problem.windows), shared, strict=True) if v.any()}
     sessions = tuple(sorted(found)) if part != ELECTRIC else ()
-    labels = problem.robot.surfaces.labels
     on = [[label == floor for label in labels] for floor, _ in sessions for _ in AXES]
     names = [problem.space.names[k] for k in structure]
     names += [f"noise.{problem.noise.names[k]}" for k in variance]
@@ -106,5 +99,5 @@ def coordinates_of(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
 
 def _groups(touched: Bool[np.ndarray, "size floor"]) -> Int[np.ndarray, " size"]:
     """The one floor that a coordinate touches, else -1; a single floor is a single group."""
-    group = np.where(touched.sum(axis=1) == 1, touched.argmax(axis=1), -1)
-    return np.zeros_like(group) if touched.shape[1] == 1 else group
+    alone = (touched.sum(axis=1) == 1) | (touched.shape[1] == 1)
+    return np.where(alone, touched.argmax(axis=1), -1)

@@ -9,8 +9,9 @@ and have the others to themselves, so that the log posterior is a sum
 and numbers of several floors can be moved, and accepted or not, in one evaluation.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,22 +22,14 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import VARIANCE_SPREAD, Problem
 from slipid.identify.fit.sessions import AXES
 from slipid.identify.posterior.anchor import Anchor, anchor_at, log_student, predict
-from slipid.identify.posterior.coordinates import (
-    ELECTRIC,
-    EVERYTHING,
-    Fitted,
-    coordinates_of,
-)
+from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, Fitted, coordinates_of
 from slipid.model.robot import Robot
+
+Result = TypeVar("Result")
 
 
 class Held(NamedTuple):
-    """What the electric part holds of the motion of each walker.
-
-    Attributes:
-        z: search vector.
-        felt: traction of each wheel's motor (..., piece, window, wheel).
-    """
+    """What the electric part holds of the motion of each walker: search vector and traction."""
 
     z: Float[Array, "*walker free"]
     felt: Float[Array, "*walker piece window wheel"]
@@ -53,11 +46,8 @@ class _Seen(NamedTuple):
 class Density:
     """Log posterior of a part of a problem's numbers, the others held.
 
-    Args:
-        problem: windows, robot and priors.
-        fitted: fit that the chain starts around, and that says how far sessions differ.
-        part: MOTION, ELECTRIC or EVERYTHING; where currents do not inform motion the last is no
-            posterior, but has the likelihoods.
+    The fit is what a chain starts around, and says how far sessions differ. Where currents do not
+    inform motion, the part EVERYTHING is no posterior, but has the likelihoods.
     """
 
     def __init__(self, problem: Problem, fitted: Fitted, part: str):
@@ -104,58 +94,50 @@ class Density:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Name of each coordinate."""
         return self.coordinates.names
 
     @property
     def size(self) -> int:
-        """Number of coordinates."""
         return len(self.coordinates.names)
 
-    def full(self, x: Array | np.ndarray) -> tuple[Array, Array]:
+    def full(self, anchor: Anchor, x: Array) -> tuple[Array, Array]:
         """Search vector and log variances of chain coordinates, the others as at the fit."""
-        return self._full(self.anchor, jnp.asarray(x))
-
-    def _full(self, anchor: Anchor, x: Array) -> tuple[Array, Array]:
         at = self.coordinates
         structure, variance, _ = at.parts(x)
         z = anchor.z.at[at.structure].set(structure)
         return z, anchor.log_variance.at[at.variance].set(variance)
+
+    @partial(jax.jit, static_argnums=(0, 1))
+    def _each(
+        self, of: Callable[..., Result], anchor: Anchor, x: Array, held: Held | None
+    ) -> Result:
+        return jax.lax.map(lambda one: of(self, anchor, *one), (x, held))
+
+    def _of_all(
+        self, of: Callable[..., Result], x: np.ndarray | Array, held: Held | None = None
+    ) -> Result:
+        """A method of one vector for many, by the density of this form that compiles for all."""
+        return self._form._each(of, self.anchor, jnp.asarray(x), held)
 
     def terms(
         self, x: Float[np.ndarray, "walker size"], held: Held | None = None
     ) -> Float[np.ndarray, "walker term"]:
         """Terms of the log posterior of every walker: one per floor, then what floors share.
 
-        Args:
-            x: coordinates.
-            held: what the electric part holds of the motion of each walker, as `hold` gives it.
+        The electric part needs what it holds of the motion of each walker, as `hold` gives it.
         """
-        out = np.array(self._form._terms(self.anchor, jnp.asarray(x), held))
+        out = np.array(self._of_all(Density._sums, x, held))
         out[~np.isfinite(out)] = -np.inf
         return out
-
-    @partial(jax.jit, static_argnums=0)
-    def _terms(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
-        def one(args: tuple[Array, Held | None]) -> Array:
-            x, held = args
-            return self._sums(anchor, x, held)
-
-        return jax.lax.map(one, (x, held))
 
     def slope(
         self, x: Float[np.ndarray, "walker size"], held: Held | None = None
     ) -> Float[np.ndarray, "walker size"]:
         """Derivative of the log posterior of every walker; the arguments are those of `terms`."""
-        return np.array(self._form._slope(self.anchor, jnp.asarray(x), held))
+        return np.array(self._of_all(Density._gradient, x, held))
 
-    @partial(jax.jit, static_argnums=0)
-    def _slope(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
-        def one(args: tuple[Array, Held | None]) -> Array:
-            x, held = args
-            return jax.grad(lambda x: jnp.sum(self._sums(anchor, x, held)))(x)
-
-        return jax.lax.map(one, (x, held))
+    def _gradient(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
+        return jax.grad(lambda x: jnp.sum(self._sums(anchor, x, held)))(x)
 
     def logpdf(self, x: Float[Array, " size"]) -> Float[Array, ""]:
         """Log posterior of one vector, differentiable, for samplers that want gradients."""
@@ -163,15 +145,13 @@ class Density:
 
     def _sums(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
         likelihood = sum(self._pieces(anchor, x, held).values())
-        at = self.coordinates
-        space = self.problem.space
+        at, space = self.coordinates, self.problem.space
         n, v = len(at.structure), len(at.variance)
         unit = np.ones(self.size - n - v)
-        mean = jnp.concatenate(
-            [space.prior_mean[at.structure], anchor.typical[at.variance], 0 * unit]
-        )
+        centre = [space.prior_mean[at.structure], anchor.typical[at.variance], 0 * unit]
         std = np.concatenate([space.prior_std[at.structure], np.full(v, VARIANCE_SPREAD), unit])
-        prior = -0.5 * ((x - mean) / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi)
+        pull = (x - jnp.concatenate(centre)) / std
+        prior = -0.5 * pull**2 - np.log(std) - 0.5 * np.log(2 * np.pi)
         count = len(self.floors)
         out = jnp.zeros(count + 1).at[anchor.batch.surface].add(likelihood)
         return out.at[np.where(at.group < 0, count, at.group)].add(prior)
@@ -180,17 +160,11 @@ class Density:
         self, x: Float[np.ndarray, "draw size"], held: Held | None = None
     ) -> dict[str, Float[np.ndarray, "draw piece"]]:
         """Log likelihood of every piece, by block of residuals."""
-        out = self._form._pointwise(self.anchor, jnp.asarray(x), held)
+        out = self._of_all(Density._pieces, x, held)
         return {k: np.asarray(v) for k, v in out.items()}
 
-    @partial(jax.jit, static_argnums=0)
-    def _pointwise(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
-        return jax.lax.map(lambda a: self._pieces(anchor, *a), (x, held))
-
     def _pieces(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
-        z, log_v = self._full(anchor, x)
-        effects = self.coordinates.parts(x)[2]
-        seen = self._residuals(anchor, z, log_v, effects, held)
+        seen, log_v = self._residuals(anchor, x, held), self.full(anchor, x)[1]
         out = {k: log_student(anchor, k, r, log_v) for k, r in seen.residuals.items()}
         camera, spread = lk.log_jacobians(seen.robot, anchor.batch, seen.volt)
         if "motion" in out:
@@ -201,19 +175,13 @@ class Density:
 
     def residuals(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
         """Blocks of residuals of many vectors (draw, piece, m)."""
-        return self._form._many_residuals(self.anchor, jnp.asarray(x))
+        return self._of_all(Density._gaps, x)
 
-    @partial(jax.jit, static_argnums=0)
-    def _many_residuals(self, anchor: Anchor, x: Array) -> dict[str, Array]:
-        def one(x: Array) -> dict[str, Array]:
-            effects = self.coordinates.parts(x)[2]
-            return self._residuals(anchor, *self._full(anchor, x), effects, None).residuals
+    def _gaps(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
+        return self._residuals(anchor, x, held).residuals
 
-        return jax.lax.map(one, x)
-
-    def _residuals(
-        self, anchor: Anchor, z: Array, log_v: Array, effects: Array, held: Held | None
-    ) -> _Seen:
+    def _residuals(self, anchor: Anchor, x: Array, held: Held | None) -> _Seen:
+        z, log_v = self.full(anchor, x)
         b, at = anchor.batch, self.coordinates
         volt = lk.voltage_std(log_v[-1]) if b.has_current and b.has_voltage else jnp.asarray(1.0)
         if self.part == ELECTRIC:
@@ -224,7 +192,7 @@ class Density:
         p = predict(robot, anchor, z)
         out = {"motion": lk.motion_residual(robot, b, p)}
         if at.sessions:
-            shared = effects.reshape(-1, len(AXES))[anchor.session]
+            shared = at.parts(x)[2].reshape(-1, len(AXES))[anchor.session]
             out["motion"] -= jnp.sum(anchor.shares * shared[:, None], axis=-1)
         if self.part == EVERYTHING:
             out |= lk.electric_residuals(robot, b, p.felt, volt)
@@ -233,12 +201,8 @@ class Density:
 
     def hold(self, x: Float[np.ndarray, "walker size"]) -> Held:
         """What the electric part holds of walkers of the motion part."""
-        return self._form._hold(self.anchor, jnp.asarray(x))
+        return self._of_all(Density._held, x)
 
-    @partial(jax.jit, static_argnums=0)
-    def _hold(self, anchor: Anchor, x: Array) -> Held:
-        def one(x: Array) -> Held:
-            z, _ = self._full(anchor, x)
-            return Held(z, predict(self.problem.space.tree(z), anchor, z).felt)
-
-        return jax.lax.map(one, x)
+    def _held(self, anchor: Anchor, x: Array, _: None) -> Held:
+        z, _log_v = self.full(anchor, x)
+        return Held(z, predict(self.problem.space.tree(z), anchor, z).felt)

@@ -10,16 +10,11 @@ from slipid.identify.posterior.blocks import Chain, Plan
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Whether chains may be believed, per coordinate.
+    """Whether chains may be believed, per coordinate; the worst is furthest from the plan's bars.
 
-    Attributes:
-        r_hat: rank-normalised split R-hat over ensembles (Vehtari et al. 2021).
-        tau: integrated autocorrelation time [steps].
-        ess: effective number of draws, the smaller of bulk and tails.
-        steps: number of steps of every walker after the warm-up.
-        converged: whether all coordinates meet the plan's bars.
-        worst: coordinate that is furthest from its bar.
-        reason: how the worst coordinate stands, in words.
+    R-hat is rank-normalised and split, over ensembles (Vehtari et al. 2021), tau the integrated
+    autocorrelation time [steps], ess the effective draws, the fewer of bulk and tails. Steps are
+    those of every walker after the warm-up.
     """
 
     r_hat: Float[np.ndarray, " size"]
@@ -56,15 +51,8 @@ def diagnose(chain: Chain, plan: Plan) -> Diagnosis:
     short, values, said = max(bars, key=lambda bar: float(np.max(bar[0])))
     worst = int(np.argmax(short))
     converged = bool(short[worst] < 1)
-    return Diagnosis(
-        r_hat=np.asarray(r_hat),
-        tau=tau,
-        ess=np.asarray(ess),
-        steps=steps,
-        converged=converged,
-        worst=worst,
-        reason=said.format(values[worst]),
-    )
+    reason = said.format(values[worst])
+    return Diagnosis(np.asarray(r_hat), tau, np.asarray(ess), steps, converged, worst, reason)
 
 
 def autocorrelation_time(chain: Chain) -> Float[np.ndarray, " size"]:

@@ -41,14 +41,10 @@ def extended(
     record: Record,
     done: Sequence[Block] | None = None,
 ) -> list[Block]:
-    """Blocks of a part up to the plan's end, each kept as soon as it is made.
+    """Blocks of a part up to the plan's end, each kept in the record as soon as it is made.
 
-    Args:
-        targets: one for each ensemble; they differ only where walkers are `apart`.
-        plan: ensembles, bars and seed.
-        part: name of the part in the record.
-        record: blocks of an earlier call, and where new ones go.
-        done: blocks to go on from; those of the record where None.
+    Targets, one for each ensemble, differ only where walkers are `apart`. Goes on from the blocks
+    that are done, by default those of the record.
     """
     blocks = list(record.done(part) if done is None else done)
     stage = part.partition("-")[0]
@@ -66,11 +62,7 @@ def run(
 ) -> Iterator[Block]:
     """Blocks after those that are done, until `diagnose` finds them good or the plan's most.
 
-    Args:
-        targets: one for each ensemble; they differ only where walkers are `apart`.
-        plan: ensembles, bars and seed.
-        done: all blocks from the first, to go on from.
-        tell: called with the number of steps of a block that every ensemble has done.
+    `tell` is called with the number of steps of a block that every ensemble has done.
     """
     from threadpoolctl import threadpool_limits
 
@@ -163,19 +155,11 @@ def _begin(
         map = targets[0].laplace()
         starts = [_start(t, plan, k) for k, t in enumerate(targets)]
         return [State(map.forward(x), random_state=r) for x, r in starts], map, FIRST_ANGLE
-    last = blocks[-1]
-    states = [
-        State(
-            last.map.forward(last.chain[k, -1]),
-            random_state=_random_state(last.random[0][k], last.random[1][k]),
-        )
-        for k in range(plan.ensembles)
-    ]
+    last, states = blocks[-1], []
+    for x, key, (place, has_gauss, gauss) in zip(last.chain[:, -1], *last.random, strict=True):
+        random: RandomState = ("MT19937", key, int(place), int(has_gauss), float(gauss))
+        states.append(State(last.map.forward(x), random_state=random))
     return states, last.map, last.angle
-
-
-def _random_state(key: np.ndarray, rest: np.ndarray) -> RandomState:
-    return ("MT19937", key, int(rest[0]), int(rest[1]), float(rest[2]))
 
 
 def _start(target: Target, plan: Plan, ensemble: int) -> tuple[np.ndarray, RandomState]:
@@ -212,8 +196,7 @@ def _with_learnt(
     if count in plan.warm_up[:-1]:
         recent = [b.chain for b in [*blocks, block][count // 2 :]]
         draws = np.concatenate(recent, axis=1).reshape(-1, len(target.centre))
-        map = learnt(
-            draws, len(draws) / DRAWS_PER_EFFECTIVE, target.covariance, target.group, target.kind
-        )
+        effective = len(draws) / DRAWS_PER_EFFECTIVE
+        map = learnt(draws, effective, target.covariance, target.group, target.kind)
         block = replace(block, map=map)
     return block

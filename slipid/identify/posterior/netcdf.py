@@ -2,22 +2,25 @@
 
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import reduce
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from arviz_base import from_dict
+from jaxtyping import Float
+from xarray import DataTree
 
-from slipid.identify.fit.problem import Problem
-from slipid.identify.posterior.pointwise import likelihoods, replicates
+from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit.problem import DEGREES, Problem
+from slipid.identify.posterior.coordinates import EVERYTHING
+from slipid.identify.posterior.density import Density
 from slipid.identify.posterior.sample import Posterior
-from slipid.parameter import Entry, Space
+from slipid.parameter import Entry
+from slipid.search_space import Space
 from slipid.support.files import write_bytes
-
-if TYPE_CHECKING:
-    from xarray import DataTree
 
 SCHEMA = "slipid.posterior/1"
 REPLICATES = 50
@@ -27,15 +30,8 @@ _AXES = ("x", "y", "yaw")
 
 def tree(
     problem: Problem, found: Posterior, runs: tuple[str, ...], about: dict[str, str]
-) -> "DataTree":
-    """All groups of the file as an xarray DataTree.
-
-    Args:
-        runs: name of every run of the dataset.
-        about: attributes of the whole file.
-    """
-    from arviz_base import from_dict
-
+) -> DataTree:
+    """All groups of the file, for runs of these names, with these attributes of the whole."""
     w, robot = problem.windows, problem.robot
     values, dims, units = _numbers(problem.space, found)
     noise, noise_dims = _noise(problem, found)
@@ -89,7 +85,8 @@ def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
     for name, entry, of_label in _leaves(space):
         leaf = np.asarray(reduce(getattr, entry.leaf, robots))
         values[name] = leaf.reshape(*shape, *leaf.shape[1:])
-        dims[name] = [*of_label, *_of_vector(entry)]
+        of_vector = [] if entry.size == 1 else ["axis"] if entry.size == 2 else ["wheel"]
+        dims[name] = [*of_label, *of_vector]
         units[name] = entry.declaration.unit
     return values, dims, units
 
@@ -98,33 +95,22 @@ def _leaves(space: Space) -> Iterator[tuple[str, Entry, list[str]]]:
     """Name, an entry and the labelled dimension of every leaf with a free number."""
     told = set()
     for e in space.free:
-        if e.leaf in told:
-            continue
-        told.add(e.leaf)
-        of = {"surface": e.surface, "load": e.load, "session": e.session}
-        yield e.quantity, e, [label for label, name in of.items() if name is not None]
-
-
-def _of_vector(entry: Entry) -> list[str]:
-    if entry.size == 1:
-        return []
-    return ["axis"] if entry.size == 2 else ["wheel"]
+        if e.leaf not in told:
+            told.add(e.leaf)
+            of = {"surface": e.surface, "load": e.load, "session": e.session}
+            yield e.quantity, e, [label for label, name in of.items() if name is not None]
 
 
 def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
     """Std of every noise component, floors side by side."""
     rows = np.moveaxis(np.exp(0.5 * found.log_variance), -1, 0)
-    out: dict[str, np.ndarray] = {}
+    stds: dict[str, list[np.ndarray]] = {}
     dims: dict[str, list[str]] = {}
-    of_floors: dict[str, list[np.ndarray]] = {}
     for component, std in zip(problem.noise.components, rows, strict=True):
         name = f"noise.{component.kind}.{component.what}"
-        if component.floor is None:
-            out[name], dims[name] = std, []
-        else:
-            of_floors.setdefault(name, []).append(std)
-            out[name], dims[name] = np.stack(of_floors[name], axis=-1), ["surface"]
-    return out, dims
+        stds.setdefault(name, []).append(std)
+        dims[name] = [] if component.floor is None else ["surface"]
+    return {k: np.stack(v, axis=-1) if dims[k] else v[0] for k, v in stds.items()}, dims
 
 
 def _data(problem: Problem, found: Posterior) -> tuple[dict, dict, dict]:
@@ -132,8 +118,6 @@ def _data(problem: Problem, found: Posterior) -> tuple[dict, dict, dict]:
 
     Marker increments are in metres corrected by the fitted camera.
     """
-    from slipid.identify.fit import likelihood as lk
-
     w, new = problem.windows, replicates(problem, found, REPLICATES)
     middle = problem.space.tree(jnp.asarray(found.z.mean(axis=(0, 1))))
     measured = {"increment": np.asarray(jax.jit(lk.measured)(middle, problem.batch.pose))}
@@ -146,7 +130,7 @@ def _data(problem: Problem, found: Posterior) -> tuple[dict, dict, dict]:
     return measured, predicted, dims
 
 
-def write(made: "DataTree", path: Path) -> None:
+def write(made: DataTree, path: Path) -> None:
     """Write the file, whole or not at all.
 
     Raises:
@@ -156,3 +140,45 @@ def write(made: "DataTree", path: Path) -> None:
         whole = Path(folder) / path.name
         made.to_netcdf(whole, engine="h5netcdf")
         write_bytes(path, whole.read_bytes())
+
+
+def likelihoods(
+    problem: Problem, found: Posterior
+) -> dict[str, Float[np.ndarray, "ensemble draw piece"]]:
+    """Log likelihood of every piece under every draw, by block of residuals."""
+    density, x = _everything(problem, found)
+    shape = x.shape[:2]
+    out = density.pointwise(x.reshape(-1, x.shape[-1]))
+    return {k: v.reshape(*shape, -1) for k, v in out.items()}
+
+
+def replicates(
+    problem: Problem, found: Posterior, draws: int, seed: int = 0
+) -> dict[str, Float[np.ndarray, "ensemble draw piece m"]]:
+    """Replicated less measured data of every piece, from some draws of each ensemble.
+
+    What the model says, less what was measured, plus noise of the draw's own variances.
+    """
+    density, x = _everything(problem, found)
+    some = x[:, np.linspace(0, x.shape[1] - 1, draws).astype(int)]
+    rng = np.random.default_rng(seed)
+    flat = some.reshape(-1, x.shape[-1])
+    out = {k: np.array(v) for k, v in density.residuals(flat).items()}
+    for k, r in out.items():
+        for one, log_v in zip(r, density.coordinates.parts(flat)[1], strict=True):
+            root = np.linalg.cholesky(np.asarray(problem.covariance(k, log_v)))
+            normal = rng.standard_normal(one.shape)
+            normal *= np.sqrt(DEGREES / rng.chisquare(DEGREES, (len(normal), 1)))
+            one += np.einsum("nij,nj->ni", root, normal)
+    return {k: v.reshape(*some.shape[:2], *v.shape[1:]) for k, v in out.items()}
+
+
+def _everything(problem: Problem, found: Posterior) -> tuple[Density, np.ndarray]:
+    """A density of all numbers together, and the draws as its coordinates."""
+    middle = replace(
+        found.fitted,
+        z=found.z.mean(axis=(0, 1)),
+        log_variance=found.log_variance.mean(axis=(0, 1)),
+    )
+    density = Density(problem, middle, EVERYTHING)
+    return density, np.concatenate([found.z, found.log_variance, found.effects], axis=-1)

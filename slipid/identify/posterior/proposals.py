@@ -12,12 +12,12 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from emcee.moves import Move
 from emcee.state import State
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.random import RandomState
 from scipy.special import gammaln
 
 from slipid.identify.posterior.target import Family, Target, families
-from slipid.identify.posterior.transport.arrays import Matrix
+from slipid.identify.posterior.transport.coordinatewise import Matrix
 
 STUDENT = 0.2
 """Part of independent draws that come from a Student t, so that no tail is left out."""
@@ -34,6 +34,10 @@ STEEPEST = 100.0
 """Kicks are bounded by this many times the step, so that walkers far out are not thrown away."""
 
 
+Jump = tuple[Matrix, Float[np.ndarray, " walker"]]
+"""New coordinates of some places, and log q(old | new) - log q(new | old)."""
+
+
 @runtime_checkable
 class Model(Protocol):
     """What emcee gives to moves: the log density, and the ensemble's own randomness."""
@@ -45,21 +49,15 @@ class Model(Protocol):
 
 
 class FamilyMove(Move):
-    """Metropolis-Hastings of a family.
-
-    Attributes:
-        halves: 2 where a proposal needs walkers that stand still, else 1.
-    """
+    """Metropolis-Hastings of a family."""
 
     halves = 1
+    """2 where a proposal needs walkers that stand still."""
 
     def __init__(self, family: Family):
         self.family = family
 
-    def jump(
-        self, old: Matrix, still: Matrix, random: RandomState
-    ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
-        """New coordinates of some places, and log q(old | new) - log q(new | old)."""
+    def jump(self, old: Matrix, still: Matrix, random: RandomState) -> Jump:
         raise NotImplementedError
 
     def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
@@ -83,32 +81,20 @@ class FamilyMove(Move):
                 own_terms = list(self.family.groups)
                 gain = terms[:, own_terms] - state.blobs[mine][:, own_terms] + factor
             took = np.log(random.uniform(size=gain.shape)) < np.where(np.isnan(gain), -1e9, gain)
-            self._take(state, mine, new, terms, took)
+            for k, own in enumerate(self.family.places):
+                rows = mine[took[:, k]]
+                state.coords[np.ix_(rows, own)] = new[took[:, k]][:, own]
+                of = slice(None) if self.family.groups is None else self.family.groups[k]
+                state.blobs[rows, of] = terms[took[:, k], of]
+            state.log_prob[mine] = state.blobs[mine].sum(axis=1)
             accepted[mine] = took.any(axis=1)
         return state, accepted
-
-    def _take(
-        self,
-        state: State,
-        mine: Int[np.ndarray, " some"],
-        new: Matrix,
-        terms: Matrix,
-        took: np.ndarray,
-    ) -> None:
-        for k, own in enumerate(self.family.places):
-            rows = mine[took[:, k]]
-            state.coords[np.ix_(rows, own)] = new[took[:, k]][:, own]
-            of = slice(None) if self.family.groups is None else self.family.groups[k]
-            state.blobs[rows, of] = terms[took[:, k], of]
-        state.log_prob[mine] = state.blobs[mine].sum(axis=1)
 
 
 class Independence(FamilyMove):
     """Draws that do not depend on where a walker is: Gaussian, or Student t of as many degrees."""
 
-    def jump(
-        self, old: Matrix, still: Matrix, random: RandomState
-    ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
+    def jump(self, old: Matrix, still: Matrix, random: RandomState) -> Jump:
         count = len(old)
         new = random.standard_normal(old.shape)
         stretch = np.sqrt(DEGREES / random.chisquare(DEGREES, count))
@@ -134,9 +120,7 @@ class Differential(FamilyMove):
     halves = 2
     whole = 0.1
 
-    def jump(
-        self, old: Matrix, still: Matrix, random: RandomState
-    ) -> tuple[Matrix, Float[np.ndarray, " walker"]]:
+    def jump(self, old: Matrix, still: Matrix, random: RandomState) -> Jump:
         count, size = old.shape
         first = random.randint(len(still), size=count)
         second = (first + random.randint(1, len(still), size=count)) % len(still)
@@ -229,10 +213,7 @@ def moves(target: Target, angle: float) -> list[tuple[Move, float]]:
     found: list[tuple[Move, float]] = [(Along(target, groups), along)] if groups else []
     if (target.group < 0).any():
         found.append((Along(target, None), along))
-    kinds: list[tuple[type[FamilyMove], float]] = [(Independence, INDEPENDENT)]
+    found += [(Independence(family), INDEPENDENT / len(of_family)) for family in of_family]
     if not target.apart:
-        kinds.append((Differential, DIFFERENTIAL))
-    found += [
-        (kind(family), share / len(of_family)) for kind, share in kinds for family in of_family
-    ]
+        found += [(Differential(family), DIFFERENTIAL / len(of_family)) for family in of_family]
     return [*found, (Hamiltonian(target, angle), HAMILTONIAN)]

@@ -26,21 +26,12 @@ STILL = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Draws, and whether they may be believed.
+    """Draws, and whether and why they may be believed.
 
-    Attributes:
-        z: search vectors.
-        log_variance: log variances of the noise components.
-        effects: what runs of a session share, in stds.
-        fitted: fit that was sampled around.
-        log_prob: log density of the first stage.
-        names: coordinates of the first stage, in the order of `diagnosis`.
-        diagnosis: diagnosis of the first stage, from all its steps.
-        accepted: part of the moves that moved something, by stage.
-        still: part of the second stage's walkers with a group that never moved.
-        unsettled: worst drift or memory of the second stage's walkers, 1 where it is just enough.
-        converged: whether the draws may be believed.
-        reason: why, or why not.
+    Effects are what runs of a session share, in stds. Log density, names and diagnosis are of the
+    first stage; accepted is the part of the moves that moved something, by stage. Of the second
+    stage's walkers, still is the part with a group that never moved, unsettled the worst drift or
+    memory, 1 where it is just enough.
     """
 
     z: Float[np.ndarray, "ensemble draw free"]
@@ -58,21 +49,9 @@ class Posterior:
 
 
 def sample(
-    problem: Problem,
-    fitted: Fitted,
-    plan: Plan,
-    draws: int = 400,
-    record: Record | None = None,
+    problem: Problem, fitted: Fitted, plan: Plan, draws: int = 400, record: Record | None = None
 ) -> Posterior:
-    """Posterior around a fit.
-
-    Args:
-        problem: windows, robot and priors.
-        fitted: where the fit ended.
-        plan: ensembles, bars and seed.
-        draws: number of draws that are kept of each ensemble.
-        record: blocks of an earlier call, and where new ones go.
-    """
+    """Posterior around a fit, so many draws of each ensemble."""
     record = record or Record()
     parts = (EVERYTHING,) if problem.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
@@ -129,6 +108,5 @@ def thinned(
 
 
 def _put(density: Density, x: np.ndarray, z: np.ndarray, log_variance: np.ndarray) -> None:
-    """Write draws of a density's coordinates to their places in z and among the variances."""
     at = density.coordinates
     z[..., at.structure], log_variance[..., at.variance], _ = at.parts(x)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from slipid.identify.fit.variances import Square
 from slipid.identify.posterior.blocks import Chain, Plan, Record
 from slipid.identify.posterior.coordinates import ELECTRIC
 from slipid.identify.posterior.density import Density, Held
@@ -24,11 +25,8 @@ chain, and correlation that they may still have with where they were in its midd
 class SecondStage:
     """A draw of the electric numbers for every draw of the motion, and how it was found.
 
-    Attributes:
-        x: draws.
-        accepted: part of the moves that moved something.
-        still: part of the walkers with a group that never moved.
-        unsettled: drift or memory of each coordinate, as `unsettled` says.
+    Accepted is the part of the moves that moved something, still the part of the walkers with a
+    group that never moved; drift or memory of each coordinate is as `unsettled` says.
     """
 
     x: Float[np.ndarray, "ensemble draw size"]
@@ -40,27 +38,19 @@ class SecondStage:
 def electric_given_motion(
     first: Density,
     second: Density,
-    covariance: Float[np.ndarray, "free free"],
+    covariance: Square,
     x: Float[np.ndarray, "ensemble draw size"],
     plan: Plan,
     record: Record,
 ) -> SecondStage:
     """A draw of the electric numbers for every draw of the motion.
 
-    Walkers are in coordinates less their regression on the motion, in which they are all alike.
-
-    Args:
-        first, second: densities of the motion and of the electric numbers.
-        covariance: Laplace covariance of the search vector.
-        x: draws of the motion.
-        plan: plan of the first stage.
-        record: blocks of an earlier call, and where new ones go.
+    Walkers are in coordinates less their regression on the motion, in which they are all alike. The
+    covariance is Laplace's of the search vector, the plan that of the first stage.
     """
     motion, electric = first.coordinates.structure, second.coordinates.structure
-    slope = np.linalg.solve(
-        covariance[np.ix_(motion, motion)], covariance[np.ix_(motion, electric)]
-    )
-    n = len(electric)
+    n, cross = len(electric), covariance[np.ix_(motion, electric)]
+    slope = np.linalg.solve(covariance[np.ix_(motion, motion)], cross)
     left = second.covariance.copy()
     left[:n, :n] -= covariance[np.ix_(electric, motion)] @ slope
     shift = np.zeros((*x.shape[:2], second.size))
@@ -96,18 +86,14 @@ def electric_given_motion(
     )
 
 
-def _target(
-    second: Density,
-    covariance: Float[np.ndarray, "size size"],
-    shift: Float[np.ndarray, "walker size"],
-    held: Held,
-) -> Target:
+def _target(second: Density, covariance: np.ndarray, shift: np.ndarray, held: Held) -> Target:
     """The electric numbers less their regression on the motion, each walker with its own motion."""
+    at = second.coordinates
     return Target(
         lambda u: second.terms(u + shift, held),
         lambda u: second.slope(u + shift, held),
-        second.coordinates.group,
-        second.coordinates.kind,
+        at.group,
+        at.kind,
         second.centre,
         covariance,
         apart=True,

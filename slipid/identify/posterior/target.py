@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from slipid.identify.posterior.transport.arrays import Matrix
+from slipid.identify.posterior.transport.coordinatewise import Matrix
 from slipid.identify.posterior.transport.learn import gaussian
 from slipid.identify.posterior.transport.transport_map import Transport
 
@@ -15,15 +15,11 @@ from slipid.identify.posterior.transport.transport_map import Transport
 class Target:
     """A log density, and what is known of it beforehand.
 
-    Attributes:
-        terms: from vectors (walker, size) to terms (walker, group + 1), the shared term last.
-        slope: from vectors to the derivative of the sum of their terms (walker, size).
-        group: group of each coordinate, -1 where groups share it.
-        kind: kind of each coordinate; coordinates of different kinds are moved apart.
-        centre, covariance: mean and covariance of a Gaussian near it (Laplace).
-        apart: whether every walker has a density of its own, so that all are evaluated together and
-            in order, and none can be moved by what others do.
-        map: map it is seen through; None for x itself.
+    Terms of vectors (walker, size) are (walker, group + 1), the shared one last; the slope is that
+    of their sum. Coordinates have a group, -1 where groups share them, and a kind, which is moved
+    apart; centre and covariance are of a Gaussian near it (Laplace). Where walkers are `apart`,
+    each has a density of its own, so that all are evaluated together and in order, and none can be
+    moved by what others do. The map is what it is seen through; None for x itself.
     """
 
     terms: Callable[[Matrix], Matrix]
@@ -34,11 +30,6 @@ class Target:
     covariance: Matrix
     apart: bool = False
     map: Transport | None = None
-
-    @property
-    def count(self) -> int:
-        """Number of groups."""
-        return int(self.group.max()) + 1
 
     def log_prob(self, x: Matrix) -> Matrix:
         """Log density and, as blobs, its terms."""
@@ -51,7 +42,8 @@ class Target:
 
     def seen_by(self, map: Transport) -> "Target":
         """The same distribution in other coordinates; centre and covariance are left alone."""
-        onto = np.eye(self.count + 1)[np.where(self.group < 0, self.count, self.group)]
+        count = int(self.group.max()) + 1
+        onto = np.eye(count + 1)[np.where(self.group < 0, count, self.group)]
 
         def terms(u: Matrix) -> Matrix:
             x, log = map.placed(u)
@@ -65,12 +57,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Family:
-    """Coordinates that are moved together.
-
-    Attributes:
-        places: those of each group, or the shared ones alone.
-        groups: number of each group; None for shared ones.
-    """
+    """Coordinates that are moved together: those of each group, or the shared ones alone (None)."""
 
     places: tuple[Int[np.ndarray, " _"], ...]
     groups: tuple[int, ...] | None

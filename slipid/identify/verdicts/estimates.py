@@ -8,14 +8,16 @@ Laplace by `profile`.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from slipid.identify.fit.problem import Problem
-from slipid.parameter import Choice, Declaration, Entry, Space
+from slipid.identify.fit.variances import Search, Square
+from slipid.parameter import Declaration, Entry
+from slipid.search_space import Choice, Space
 
 IDENTIFIED, WEAK = 0.3, 0.8
 """Largest std(posterior) / std(prior) of the verdicts, in the search space."""
@@ -30,15 +32,10 @@ NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
 _Z95 = 1.6448536269514722
 
 
-@dataclass(frozen=True)
-class Ratio:
+class Ratio(NamedTuple):
     """A quotient of two positive numbers that may be known where neither of them is.
 
-    Attributes:
-        over: quantity of the numerator, of every floor where floors have their own.
-        under: path of the denominator.
-        unit: of the quotient, as pint reads it.
-        doc: one line for people.
+    The numerator is a quantity, of every floor where floors have their own, the denominator a path.
     """
 
     over: str
@@ -62,7 +59,7 @@ R / C_e is known, other than in models that read slip from R I^2 + C_e I wm.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Estimate:
     """One fitted or fixed number (or short vector) as people and files get it.
 
@@ -83,25 +80,21 @@ class Estimate:
     path: str
     unit: str
     doc: str
-    labels: tuple[str, ...]
+    labels: tuple[str, ...] = ()
     value: Any
-    std: Any
-    interval90: Any
+    std: Any = None
+    interval90: Any = None
     verdict: str
     provenance: str
-    ratio: float | None
-    pull: float | None
-    prior_mean: Any
-    prior_std: Any
+    ratio: float | None = None
+    pull: float | None = None
+    prior_mean: Any = None
+    prior_std: Any = None
     source: str = "laplace"
 
 
 def estimates(
-    space: Space,
-    choices: Sequence[Choice],
-    z: Float[np.ndarray, " free"],
-    covariance: Float[np.ndarray, "free free"],
-    has_voltage: bool,
+    space: Space, choices: Sequence[Choice], z: Search, covariance: Square, has_voltage: bool
 ) -> tuple[Estimate, ...]:
     """Every declared number with its interval and verdict, in order of declaration."""
     tree = space.tree(jnp.asarray(z))
@@ -114,7 +107,6 @@ def estimates(
 
 
 def _plain(x: Any) -> Any:
-    """A float, or a tuple of floats."""
     x = np.asarray(x, float)
     return float(x.reshape(())) if x.size == 1 else tuple(float(v) for v in x)
 
@@ -130,47 +122,41 @@ def _fixed(entry: Entry, tree: Any, choices: Sequence[Choice]) -> Estimate:
         doc=entry.declaration.doc,
         labels=entry.labels,
         value=_plain(entry.get(tree)),
-        std=None,
-        interval90=None,
         verdict="fixed",
         provenance="override" if chosen else "borrowed",
-        ratio=None,
-        pull=None,
-        prior_mean=None,
-        prior_std=None,
     )
 
 
 def _free(
-    space: Space,
-    entry: Entry,
-    tree: Any,
-    z: np.ndarray,
-    covariance: np.ndarray,
-    has_voltage: bool,
+    space: Space, entry: Entry, tree: Any, z: np.ndarray, covariance: np.ndarray, has_voltage: bool
 ) -> Estimate:
     at, d = space.place[entry.path], entry.declaration
     mean, block = np.asarray(z)[at], covariance[at, at]
     prior_mean, prior_std = space.prior_mean[at], space.prior_std[at]
     value = np.atleast_1d(np.asarray(entry.get(tree), float))
-    std_z = np.sqrt(np.diag(block))
+    std_z, center = np.sqrt(np.diag(block)), np.asarray(d.to_si(jnp.asarray(prior_mean)))
     if d.shares:
         rng = np.random.default_rng(0)
         spread = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
         draws = np.stack([np.asarray(d.to_si(s)) for s in jnp.asarray(spread)])
         low, high = np.quantile(draws, [0.05, 0.95], axis=0)
         std = draws.std(axis=0)
-        center = np.asarray(d.to_si(jnp.asarray(prior_mean)))
         wide = np.full(entry.size, prior_std.mean() / entry.size)
     else:
         low, high = (np.asarray(d.to_si(jnp.asarray(mean + k * std_z))) for k in (-_Z95, _Z95))
-        std = np.array([d.slope(float(v)) for v in value]) * std_z
+        std = d.slope(value) * std_z
         center = np.asarray(d.to_si(jnp.asarray(prior_mean)))
-        wide = np.array([d.slope(float(v)) for v in center]) * prior_std
+        wide = d.slope(center) * prior_std
     scaled = block / prior_std[:, None] / prior_std[None, :]
     ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
     pull = (mean - prior_mean) / prior_std
-    verdict = _verdict(entry, value, pull, prior_std, std_z, ratio, has_voltage)
+    pairs = tuple(zip(low.tolist(), high.tolist(), strict=True))
+    if entry.path in NEEDS_VOLTAGE and not has_voltage:
+        verdict = "not_identified"
+    elif _at_bound(d, value, pull, prior_std):
+        verdict = "at_bound"
+    else:
+        verdict = by_ratio(ratio, from_zero(d, std_z))
     return Estimate(
         path=entry.path,
         unit=d.unit,
@@ -178,7 +164,7 @@ def _free(
         labels=entry.labels,
         value=_plain(value),
         std=_plain(std),
-        interval90=_pairs(low, high),
+        interval90=pairs[0] if len(pairs) == 1 else pairs,
         verdict=verdict,
         provenance=provenance(verdict, ratio),
         ratio=ratio,
@@ -188,40 +174,17 @@ def _free(
     )
 
 
-def _pairs(low: np.ndarray, high: np.ndarray) -> Any:
-    pairs = tuple((float(a), float(b)) for a, b in zip(low, high, strict=True))
-    return pairs[0] if len(pairs) == 1 else pairs
-
-
-def _verdict(
-    entry: Entry,
-    value: np.ndarray,
-    place: np.ndarray,
-    prior_std: np.ndarray,
-    std_z: np.ndarray,
-    ratio: float,
-    has_voltage: bool,
-) -> str:
-    d = entry.declaration
-    if entry.path in NEEDS_VOLTAGE and not has_voltage:
-        return "not_identified"
-    if np.isfinite(d.upper) and np.isfinite(d.lower) and not d.shares:
+def _at_bound(d: Declaration, value: np.ndarray, pull: np.ndarray, prior_std: np.ndarray) -> bool:
+    if d.shares or not np.isfinite(d.lower):
+        return False
+    if np.isfinite(d.upper):
         part = (value - d.lower) / (d.upper - d.lower)
-        if (part < 0.01).any() or (part > 0.99).any():
-            return "at_bound"
-    elif np.isfinite(d.lower) and not d.shares:
-        below = place * prior_std
-        if ((place < -TAIL) & (below < np.log(SMALL))).any():
-            return "at_bound"
-    return by_ratio(ratio, from_zero(d, std_z))
+        return bool(((part < 0.01) | (part > 0.99)).any())
+    return bool(((pull < -TAIL) & (pull * prior_std < np.log(SMALL))).any())
 
 
 def from_zero(declaration: Declaration, std_z: Float[np.ndarray, " coordinate"]) -> float:
-    """Stds by which a positive number is away from 0; infinite for others.
-
-    Args:
-        std_z: in the search space, that of the logarithm.
-    """
+    """Stds by which a positive number is away from 0, from that of its logarithm; else infinite."""
     positive = np.isfinite(declaration.lower) and not np.isfinite(declaration.upper)
     return float(1 / std_z.max()) if positive and not declaration.shares else np.inf
 
@@ -239,12 +202,7 @@ def provenance(verdict: str, ratio: float) -> str:
     return "measured" if held else "borrowed"
 
 
-def derived(
-    space: Space,
-    z: Float[np.ndarray, " free"],
-    covariance: Float[np.ndarray, "free free"],
-    has_voltage: bool,
-) -> tuple[Estimate, ...]:
+def derived(space: Space, z: Search, covariance: Square, has_voltage: bool) -> tuple[Estimate, ...]:
     """`RATIOS` with interval and verdict: the log of each is a difference of coordinates.
 
     Its std under the posterior, sqrt(c^T C c) with c = (.., 1, .., -1, ..), is compared with that
@@ -259,12 +217,7 @@ def derived(
 
 
 def _quotient(
-    space: Space,
-    wanted: Ratio,
-    over: str,
-    z: np.ndarray,
-    covariance: np.ndarray,
-    has_voltage: bool,
+    space: Space, wanted: Ratio, over: str, z: np.ndarray, covariance: np.ndarray, has_voltage: bool
 ) -> Estimate:
     c = np.zeros(len(z))
     c[space.place[over]], c[space.place[wanted.under]] = 1.0, -1.0
@@ -279,7 +232,6 @@ def _quotient(
         path=f"{over}/{wanted.under}",
         unit=wanted.unit,
         doc=wanted.doc,
-        labels=(),
         value=value,
         std=value * std,
         interval90=(low, high),
@@ -294,18 +246,14 @@ def _quotient(
 
 def expected_covariance(
     problem: Problem,
-    z: Float[np.ndarray, " free"] | None = None,
+    z: Search | None = None,
     log_variance: Float[np.ndarray, " variance"] | None = None,
-) -> Float[np.ndarray, "free free"]:
+) -> Square:
     """Posterior covariance to be expected of these windows: inverse information, prior included.
 
-    Args:
-        problem: windows, robot and priors.
-        z: where; the start by default. What the data really hold depends on where the fit ends.
-        log_variance: of every noise component; the typical ones by default.
+    By default at the start values and with the typical variances of every noise component. What
+    the data really hold depends on where the fit ends.
     """
     z = problem.space.start if z is None else z
     log_v = 2 * np.log(problem.noise.typical) if log_variance is None else log_variance
-    _, jacobian = problem.linear(jnp.asarray(z), problem.volt(log_v))
-    keep = jnp.ones(len(problem.windows))
-    return np.linalg.inv(np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep)))
+    return problem.laplace(z, log_v, np.ones(len(problem.windows)))

@@ -1,13 +1,12 @@
 """Directions of the parameter space in words."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.identify.verdicts.remedies import listed
-from slipid.parameter import Declaration, Entry
+from slipid.parameter import Entry
 
 _LARGE = 10.0
 """Powers that differ more are no formula for people."""
@@ -18,15 +17,10 @@ NOTHING = "the data say next to nothing of "
 SMALL = ", while others move a little"
 
 
-@dataclass(frozen=True)
-class Axis:
-    """One coordinate of the search space.
+class Axis(NamedTuple):
+    """One coordinate of the search space, the number it is of, and what people call it.
 
-    Attributes:
-        entry: the number it is of.
-        label: as people call it.
-        unit: of a step along it.
-        is_log: whether a step multiplies the number.
+    The unit is of a step along it; a step of a logarithm multiplies the number.
     """
 
     entry: Entry
@@ -39,23 +33,15 @@ def axes_of(entry: Entry) -> list[Axis]:
     """The coordinates of a free number, of shares the log ratios that their basis is made of."""
     d = entry.declaration
     unit = "log-odds" if np.isfinite(d.upper) else d.unit
+    is_log = bool(np.isfinite(d.lower) and not np.isfinite(d.upper))
     if entry.size == 1:
-        return [Axis(entry, entry.path, unit, _is_log(d))]
+        return [Axis(entry, entry.path, unit, is_log)]
     if d.shares:
-        each = [
-            f"{'wheel' if k == 1 else 'wheels'} {_list(range(1, k + 1))} : wheel {k + 1}"
-            for k in range(1, entry.size)
-        ]
-        return [Axis(entry, f"{entry.path} ({what})", d.unit, True) for what in each]
-    return [Axis(entry, f"{entry.path} [{label}]", unit, _is_log(d)) for label in entry.labels]
-
-
-def _list(numbers: Iterable[int]) -> str:
-    return ", ".join(map(str, numbers))
-
-
-def _is_log(d: Declaration) -> bool:
-    return bool(np.isfinite(d.lower) and not np.isfinite(d.upper))
+        wheels = [", ".join(map(str, range(1, k))) for k in range(2, entry.size + 1)]
+        before = ["wheel 1", *(f"wheels {several}" for several in wheels[1:])]
+        each = [f"{entry.path} ({first} : wheel {k})" for k, first in enumerate(before, start=2)]
+        return [Axis(entry, label, d.unit, True) for label in each]
+    return [Axis(entry, f"{entry.path} [{label}]", unit, is_log) for label in entry.labels]
 
 
 def formula(axes: list[Axis], power: np.ndarray, step: np.ndarray) -> str:

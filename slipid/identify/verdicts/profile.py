@@ -12,8 +12,7 @@ Source: Venzon and Moolgavkar 1988 (Applied Statistics 37(1)); Raue et al. 2009 
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,20 +23,17 @@ from scipy.stats import chi2
 from slipid.identify.fit.optimise import Optimum, Options, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE
-from slipid.parameter import Entry, Space
+from slipid.parameter import Entry
+from slipid.search_space import Space
 
 RISE = float(chi2.ppf(0.9, 1)) / 2
 """Rise of minus log likelihood at the ends of the 90 % interval."""
-_ENOUGH = 1.5 * RISE
-"""Rise at which a side is done."""
-_TOO_FAR = 3 * RISE
-"""Rise after a point inside the interval that tells that its end was stepped over."""
+_ENOUGH, _TOO_FAR = 1.5 * RISE, 3 * RISE
+"""Rise at which a side is done, and the one that tells that an interval's end was stepped over."""
 _FAR = 3.0
 """A side ends so many prior stds from the prior mean: beyond it, nobody expects the number."""
-_LEAST = 0.1
-"""Laplace stds: no step is halved below that."""
-_MOST = 24
-"""Points on a side."""
+_LEAST, _MOST = 0.1, 24
+"""Laplace stds below which no step is halved, and points on a side."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +70,6 @@ class Profile:
     settled: bool
     said: str
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
-
 
 def profiled(space: Space, path: str) -> Entry:
     """The free scalar of a path.
@@ -87,15 +79,10 @@ def profiled(space: Space, path: str) -> Entry:
     """
     can = {e.path: e for e in space.free if e.size == 1}
     if path not in can:
-        known = {e.path: e for e in space.all}
-        why = (
-            f"no parameter '{path}'"
-            if path not in known
-            else f"{path} is fixed"
-            if path not in space.place
-            else f"{path} has {known[path].size} numbers"
-        )
-        raise ValueError(f"{why}; a profile is of one free number: {', '.join(can)}")
+        why = {e.path: f"{path} is fixed" for e in space.all}
+        why |= {e.path: f"{path} has {e.size} numbers" for e in space.free}
+        said = why.get(path, f"no parameter '{path}'")
+        raise ValueError(f"{said}; a profile is of one free number: {', '.join(can)}")
     return can[path]
 
 
@@ -109,13 +96,8 @@ def profile(
 
     The noise keeps the variances of the fit. Where currents do not inform motion, a number that
     currents tell is profiled given the motion, and one of the motion by the motion's likelihood:
-    Laplace's parabola beside it is then the one of the same question.
-
-    Args:
-        problem: as it was optimised; what is compiled for it serves every point.
-        optimum: where it ended.
-        path: of a free scalar.
-        tell: called after every point with their number and the rise there.
+    Laplace's parabola beside it is then the one of the same question. `tell` is called after every
+    point with their number and the rise there.
 
     Raises:
         ValueError: as `profiled`.
@@ -210,11 +192,9 @@ def _told(
     def si(x: float) -> float:
         return float(np.asarray(d.to_si(jnp.atleast_1d(jnp.asarray(float(x))))).reshape(()))
 
-    lowest = int(np.argmin(likelihood))
-    cross = [
-        _crossing(z[: lowest + 1][::-1], likelihood[: lowest + 1][::-1]),
-        _crossing(z[lowest:], likelihood[lowest:]),
-    ]
+    low = int(np.argmin(likelihood))
+    sides = (slice(low, None, -1), slice(low, None))
+    cross = [_crossing(z[side], likelihood[side]) for side in sides]
     ends = ["open" if x is None else "closed" for x in cross]
     interval = [None if x is None else si(x) for x in cross]
     for k, bound in enumerate((d.lower, d.upper)):

@@ -44,18 +44,9 @@ SPEEDS_DIFFER = 1.3
 
 
 def remedy(
-    found: Sequence[Entry],
-    has_current: bool,
-    has_voltage: bool,
-    validity: Mapping[str, Validity],
+    found: Sequence[Entry], has_current: bool, has_voltage: bool, validity: Mapping[str, Validity]
 ) -> str:
-    """What to log or to drive.
-
-    Args:
-        found: the numbers that are open.
-        has_current, has_voltage: what was logged.
-        validity: per floor what it was driven with; may be empty.
-    """
+    """What to log or to drive for numbers that are open, by what each floor was driven with."""
     quantities = {e.quantity for e in found}
     electric = all(e.declaration.electric or e.quantity == "robot.mass" for e in found)
     if electric or quantities & {*_SCALE}:
@@ -69,10 +60,7 @@ def remedy(
 
 
 def _electric(
-    quantities: Set[str],
-    has_current: bool,
-    has_voltage: bool,
-    validity: Mapping[str, Validity],
+    quantities: Set[str], has_current: bool, has_voltage: bool, validity: Mapping[str, Validity]
 ) -> str:
     if not has_current:
         return f"log the motor currents, and {VOLTAGE.removeprefix('log ')}"
@@ -94,9 +82,10 @@ def _runs(found: Sequence[Entry], validity: Mapping[str, Validity]) -> str:
     ]
     where = " there" if floors else " with that load" if loads else ""
     said = []
-    headings = {h for v in mine for h in v.headings_deg}
+    headings = sorted({h for v in mine for h in v.headings_deg})
     if len(headings) < FEW_HEADINGS:
-        said.append("in other directions" + (f" than {_degrees(headings)}" if headings else ""))
+        seen = f" than {', '.join(f'{h:g}' for h in headings)} deg" if headings else ""
+        said.append(f"in other directions{seen}")
     if any(_speeds(v) < 2 for v in mine) or not mine:
         said.append("at other speeds")
     if max((v.yaw_rate[1] for v in mine), default=0.0) < TURNING:
@@ -114,12 +103,7 @@ def listed(parts: Sequence[str]) -> str:
     return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]
 
 
-def _degrees(headings: set[float]) -> str:
-    return f"{', '.join(f'{h:g}' for h in sorted(headings))} deg"
-
-
 def _speeds(seen: Validity) -> int:
-    """How many of the speeds differ."""
     count, last = 0, 0.0
     for speed in np.sort(np.asarray(seen.speeds, float)):
         if speed > SPEEDS_DIFFER * max(last, 1e-3):

@@ -15,11 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from slipid.identify.fit.variances import Search, Square
 from slipid.identify.slip_curves import Validity
 from slipid.identify.verdicts.estimates import WEAK
 from slipid.identify.verdicts.formulas import NOTHING, SMALL, Axis, axes_of, formula
 from slipid.identify.verdicts.remedies import remedy
-from slipid.parameter import Space
+from slipid.search_space import Space
 
 NOTICED = 1 / WEAK**2
 """Information along a direction, that of the prior being 1, from which it is not flat."""
@@ -40,13 +41,9 @@ _PART = 0.3
 class Flat:
     """A direction in which the data do not hold the parameters.
 
-    Attributes:
-        paths: of the parameters that move together.
-        powers: each is multiplied by t to this power, for any t; what has no bounds moves by this
-            times t [unit]. The largest is 1 or -1.
-        others: how many more move a little with them.
-        formula: the same for people.
-        remedy: the channel or the runs that would tell.
+    Each of the paths is multiplied by t to its power, for any t; what has no bounds moves by this
+    times t [unit]. The largest power is 1 or -1; `others` more move a little with them. The formula
+    is the same for people, the remedy the channel or the runs that would tell.
     """
 
     paths: tuple[str, ...]
@@ -57,19 +54,13 @@ class Flat:
 
     @property
     def text(self) -> str:
-        """One sentence."""
         return f"{self.formula}: {self.remedy}"
 
 
 class _Told:
-    """Information in prior-scaled coordinates.
+    """Information P in prior-scaled coordinates; currents may tell some given the motion."""
 
-    Args:
-        given: of all coordinates, P.
-        electric: those that currents tell given the motion, where that is so.
-    """
-
-    def __init__(self, given: Float[np.ndarray, "free free"], electric: np.ndarray | None = None):
+    def __init__(self, given: Square, electric: np.ndarray | None = None):
         self.given, self.electric = given, electric
         self.motion = np.zeros_like(given)
         if electric is not None:
@@ -81,10 +72,18 @@ class _Told:
         of_motion = self.electric is not None and not self.electric[picked].any()
         return (self.motion if of_motion else self.given)[np.ix_(picked, picked)]
 
+    def along(self, picked: list[int], u: np.ndarray) -> float:
+        return float(u @ self.of(picked) @ u)
+
+    def flattest(self, picked: list[int]) -> tuple[float, np.ndarray]:
+        """The least information along any unit vector of these coordinates, and that vector."""
+        values, vectors = np.linalg.eigh(self.of(picked))
+        return float(values[0]), vectors[:, 0]
+
 
 def flat_directions(
     space: Space,
-    covariance: Float[np.ndarray, "free free"],
+    covariance: Square,
     has_current: bool,
     has_voltage: bool,
     validity: Mapping[str, Validity] | None = None,
@@ -96,30 +95,22 @@ def flat_directions(
     directions of others. The yaws of single sessions are deviations by declaration and are taken as
     known.
 
-    Args:
-        space: free numbers and their priors.
-        covariance: of the posterior.
-        has_current, has_voltage: what was logged.
-        validity: what every floor was driven with; makes the remedies definite.
-        current_informs_motion: as the `Problem` was told.
+    `validity`, what every floor was driven with, makes the remedies definite.
     """
     axes = [axis for e in space.free for axis in axes_of(e)]
     kept = [k for k, axis in enumerate(axes) if axis.entry.session is None]
     scale = [k for k in kept if axes[k].entry.quantity in TORQUE_SCALE]
     std = space.prior_std
-    outer = std[:, None] * std
-    told = _Told(np.linalg.inv(covariance) * outer)
-    if has_current and not current_informs_motion:
-        told = _Told(told.given, space.electric)
+    given = np.linalg.inv(covariance) * (std[:, None] * std)
+    apart = has_current and not current_informs_motion
+    told = _Told(given, space.electric if apart else None)
     out = []
     for picked, u in _sparse(told, kept, scale, 1 / std):
-        mine = [axes[k] for k in picked]
-        main = _named(told, mine, picked, u, std[picked])
-        mine = [axis for axis, is_main in zip(mine, main, strict=True) if is_main]
+        main = _named(told, [axes[k] for k in picked], picked, u, std[picked])
+        mine = [axes[k] for k, is_main in zip(picked, main, strict=True) if is_main]
         step = _rounded(told, picked, u, std[picked], main)[main]
         power = step / step[np.argmax(np.abs(step))]
-        moving = [axis.entry for axis in mine]
-        rest = len(picked) - len(mine)
+        moving, rest = [axis.entry for axis in mine], len(picked) - len(mine)
         out.append(
             Flat(
                 paths=tuple(e.path for e in moving),
@@ -145,31 +136,26 @@ def sentences(found: Iterable[Flat]) -> tuple[str, ...]:
 
 
 def _sparse(
-    told: _Told, among: list[int], symmetry: list[int], move: Float[np.ndarray, " free"]
+    told: _Told, among: list[int], symmetry: list[int], move: Search
 ) -> list[tuple[list[int], Float[np.ndarray, " some"]]]:
     """Basis of the flat directions, each a unit vector that needs every coordinate it names.
 
     When one is found, its largest coordinate (the first, if several are as large) counts as known
     from there on, as in Gaussian elimination; so the next one is another. The symmetry, if it is
-    one in these data, comes first and whole: search would find parts of it.
-
-    Args:
-        told: information.
-        among: coordinates to look at.
-        symmetry: those that may move together.
-        move: prior-scaled step of each coordinate in it.
+    one in these data, comes first and whole: search would find parts of it. `move` is each
+    coordinate's prior-scaled step in it.
     """
     alone = [k for k in among if told.of([k])[0, 0] < NOTICED]
     found = [([k], np.ones(1)) for k in alone]
     known = set(alone)
     whole = [k for k in symmetry if k not in known]
     along = move[whole] / np.linalg.norm(move[whole])
-    if len(whole) > 1 and _along(told, whole, along) < NOTICED:
+    if len(whole) > 1 and told.along(whole, along) < NOTICED:
         found.append((whole, along))
         known.add(whole[0])
     for limit in (_UNSEEN, NOTICED):
         while left := [k for k in among if k not in known]:
-            value, u = _flattest(told, left)
+            value, u = told.flattest(left)
             if value >= limit:
                 break
             picked = left
@@ -188,7 +174,7 @@ def _without_one(
     for drop in np.argsort(np.abs(u)):
         fewer = [k for j, k in enumerate(picked) if j != drop]
         if fewer:
-            value, other = _flattest(told, fewer)
+            value, other = told.flattest(fewer)
             if value < limit:
                 return fewer, other
     return None
@@ -203,7 +189,7 @@ def _named(
     power: a wide prior makes the part of a number small whose scale is as open as the others'.
     """
     main = np.abs(u) >= _PART * np.abs(u).max()
-    if _along(told, picked, u) < _UNSEEN and len({axis.is_log for axis in axes}) == 1:
+    if told.along(picked, u) < _UNSEEN and len({axis.is_log for axis in axes}) == 1:
         power = np.abs(u * std)
         main |= power >= _PART * power.max()
     return np.asarray(main)
@@ -217,15 +203,6 @@ def _rounded(
     top = float(np.abs(step[main]).max())
     halves = np.where(main, np.round(2 * step / top) / 2 * top, step)
     size = float(np.linalg.norm(halves / std))
-    if (halves[main] != 0).all() and _along(told, picked, halves / std / size) < NOTICED:
+    if (halves[main] != 0).all() and told.along(picked, halves / std / size) < NOTICED:
         return halves / size
     return step
-
-
-def _along(told: _Told, picked: list[int], u: np.ndarray) -> float:
-    return float(u @ told.of(picked) @ u)
-
-
-def _flattest(told: _Told, picked: list[int]) -> tuple[float, np.ndarray]:
-    values, vectors = np.linalg.eigh(told.of(picked))
-    return float(values[0]), vectors[:, 0]

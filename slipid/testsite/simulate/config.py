@@ -2,139 +2,26 @@
 
 import json
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatch
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
 
 from slipid.data import floor_map as terrain
-from slipid.data.map_file import read_map
 from slipid.support.errors import DataError
-from slipid.support.toml_file import Section, checked, mapping_of, text_of
+from slipid.support.toml_file import checked, mapping_of, text_of
 from slipid.testsite import experiments as ex
-from slipid.testsite.camera import Camera
-from slipid.testsite.driving import Site
-from slipid.testsite.ground import GROUNDS, Ground
-from slipid.testsite.machine import Machine
-from slipid.testsite.motors import Motor, SpeedLoop
-from slipid.testsite.sensors import Sensors
+from slipid.testsite.ground import GROUNDS
+from slipid.testsite.simulate.sections import Content, OnMap
+from slipid.testsite.site import Site
 
-Speed = Annotated[float, Field(gt=0, le=3)]
-Speeds = Annotated[list[Speed], Field(min_length=1)]
-Distance = Annotated[float, Field(gt=0, le=100)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
-"""Of surfaces, loads and maps: they name files and folders."""
 RESERVED = ("one_surface", "two_surfaces", "wheel_load")
 """Folders of the 2022 layout."""
-
-
-class FileMap(Section):
-    """A floor map's file, beside the config."""
-
-    kind: Literal["file"]
-    file: str
-
-
-class Patchwork(Section):
-    """Random patches, by default smaller than the robot."""
-
-    kind: Literal["patchwork"]
-    surfaces: list[str] = Field(min_length=1)
-    seed: int = Field(0, ge=0)
-    patch_m: float = Field(0.25, ge=0.01, le=10)
-    half_m: float = Field(1.2, ge=0.4, le=20)
-
-
-class FourZones(Section):
-    """Four surfaces around the middle of the rectangle, as in the 2021 paper's trial."""
-
-    kind: Literal["four_zones"]
-    surfaces: list[str] = Field(min_length=4, max_length=4)
-
-
-Map = Annotated[FileMap | Patchwork | FourZones, Field(discriminator="kind")]
-
-
-class Headings(Section):
-    """Straight runs in evenly spread directions."""
-
-    kind: Literal["headings"]
-    surface: str
-    load: str = "as_built"
-    step_deg: float = Field(15.0, ge=0.1, le=360)
-    first_deg: float = Field(0.0, allow_inf_nan=False)
-    speeds_m_s: Speeds = Field(default=[0.1, 0.2])
-    distance_m: Distance = 0.7
-
-
-class Curves(Section):
-    """Arcs, to the left and to the right in turn."""
-
-    kind: Literal["curves"]
-    surface: str
-    load: str = "as_built"
-    count: int = Field(4, ge=1, le=10_000)
-    speeds_m_s: Speeds = Field(default=[0.1, 0.2])
-    distance_m: Distance = 0.7
-
-
-class PaperGrid(Section):
-    """The 2021 paper's grid of commands."""
-
-    kind: Literal["paper_grid"]
-    surface: str
-    load: str = "as_built"
-    seconds: float = Field(3.0, gt=0, le=3600)
-
-
-class Wander(Section):
-    """Random way-points on a map."""
-
-    kind: Literal["wander"]
-    map: str
-    load: str = "as_built"
-    count: int = Field(8, ge=1, le=10_000)
-    points: int = Field(4, ge=1, le=1000)
-    by: Literal["camera", "encoders"] = "camera"
-
-
-class Rectangle(Section):
-    """The 2021 paper's 900 x 400 mm rectangle on a map."""
-
-    kind: Literal["rectangle"]
-    map: str
-    load: str = "as_built"
-    by: Literal["camera", "encoders"] = "encoders"
-    repeats: int = Field(1, ge=1, le=10_000)
-    speed_m_s: Speed = 0.2
-
-
-Runs = Annotated[Headings | Curves | PaperGrid | Wander | Rectangle, Field(discriminator="kind")]
-
-
-class Content(Section):
-    """The whole file."""
-
-    seed: int = Field(0, ge=0)
-    formats: list[Literal["slipid", "robotino2022"]] = Field(default=["slipid"], min_length=1)
-    heading_jitter_deg: float = Field(5.0, ge=0, le=180)
-    command_delay_s: float = Field(0.12, ge=0, le=10)
-    acceleration_m_s2: float = Field(1.0, ge=0.01, le=1000)
-    robot: Machine = Field(default_factory=Machine)
-    motor: Motor = Motor()
-    speed_loop: SpeedLoop = SpeedLoop()
-    sensors: Sensors = Sensors()
-    video: list[str] = Field(default_factory=list)
-    camera: Camera = Camera()
-    surfaces: dict[Name, Ground] = Field(default_factory=dict)
-    maps: dict[Name, Map] = Field(default_factory=dict)
-    runs: list[Runs] = Field(min_length=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +30,6 @@ class Plan:
 
     Attributes:
         hash: of the config and of the map files it names.
-        content: the config.
-        site: robot and floors.
         maps: floors with several surfaces, by name.
         runs: name and run of each.
         filmed: names of the runs that are filmed.
@@ -159,11 +44,7 @@ class Plan:
 
 
 def read_plan(path: Path) -> Plan:
-    """Plan of a config file.
-
-    Raises:
-        DataError: wrong in the file or in a map it names; every mistake on a line.
-    """
+    """Plan of a config file, see `plan`."""
     return plan(path, text_of(path))
 
 
@@ -192,14 +73,17 @@ def plan(path: Path, text: str) -> Plan:
         content.command_delay_s,
         content.acceleration_m_s2,
     )
-    maps = {name: _floor(path, name, m) for name, m in content.maps.items()}
+    maps, everything = {}, list[ex.Run]()
+    for name, given in content.maps.items():
+        with _said_of(f"{path}: maps.{name}"):
+            maps[name] = given.floor(path.parent)
     _check(path, content, site, maps)
-    everything: list[ex.Run] = []
-    for k, one in enumerate(content.runs, 1):
-        try:
-            everything += _runs(one, maps, content, k)
-        except ValueError as error:
-            raise DataError(f"{path}: runs[{k}]: {error}") from error
+    for k, runs in enumerate(content.runs, 1):
+        with _said_of(f"{path}: runs[{k}]"):
+            if isinstance(runs, OnMap):
+                everything += runs.runs(maps[runs.map], 1000 * content.seed + k)
+            else:
+                everything += runs.runs()
     jitter = float(np.radians(content.heading_jitter_deg))
     named = tuple(ex.numbered(everything, jitter, content.seed))
     for pattern in content.video:
@@ -208,14 +92,8 @@ def plan(path: Path, text: str) -> Plan:
             raise DataError(
                 f"{path}: video: no run is named '{pattern}'; expected some of {folders}"
             )
-    return Plan(
-        _hash(content, site, maps),
-        content,
-        site,
-        maps,
-        named,
-        tuple(n for n, _ in named if any(fnmatch(n, pattern) for pattern in content.video)),
-    )
+    filmed = tuple(n for n, _ in named if any(fnmatch(n, pattern) for pattern in content.video))
+    return Plan(_hash(content, site, maps), content, site, maps, named, filmed)
 
 
 def _check(path: Path, content: Content, site: Site, maps: Mapping[str, terrain.FloorMap]) -> None:
@@ -228,7 +106,7 @@ def _check(path: Path, content: Content, site: Site, maps: Mapping[str, terrain.
             )
     for k, runs in enumerate(content.runs, 1):
         _known(path, f"runs[{k}].load", runs.load, site.machine.centres_m)
-        if isinstance(runs, Wander | Rectangle):
+        if isinstance(runs, OnMap):
             _known(path, f"runs[{k}].map", runs.map, maps)
         else:
             _known(path, f"runs[{k}].surface", runs.surface, site.grounds)
@@ -269,44 +147,12 @@ def _known(path: Path, where: str, name: str, choices: Collection[str]) -> None:
         )
 
 
-def _floor(path: Path, name: str, given: Map) -> terrain.FloorMap:
-    if isinstance(given, FileMap):
-        return read_map(path.parent / given.file)
-    if isinstance(given, FourZones):
-        return terrain.four_zones(given.surfaces)
+@contextmanager
+def _said_of(what: str) -> Iterator[None]:
+    """Says of which part of the config an error is that does not know."""
     try:
-        return terrain.patchwork(given.surfaces, given.seed, given.patch_m, given.half_m)
+        yield
+    except DataError:
+        raise
     except ValueError as error:
-        raise DataError(f"{path}: maps.{name}: {error}") from error
-
-
-def _runs(
-    given: Runs, maps: dict[str, terrain.FloorMap], content: Content, place: int
-) -> list[ex.Run]:
-    if isinstance(given, Headings):
-        return ex.headings(
-            given.surface,
-            given.load,
-            given.step_deg,
-            given.speeds_m_s,
-            given.distance_m,
-            given.first_deg,
-        )
-    if isinstance(given, Curves):
-        return ex.curves(given.surface, given.load, given.count, given.speeds_m_s, given.distance_m)
-    if isinstance(given, PaperGrid):
-        return ex.paper_grid(given.surface, given.load, given.seconds)
-    floor = maps[given.map]
-    x0, y0, x1, y1 = floor.extent
-    if isinstance(given, Rectangle) and not (x0 <= 0 <= x1 and y0 <= 0 <= y1):
-        raise ValueError(
-            f"it starts at 0, 0, but map {given.map} reaches from {x0:g}, {y0:g} to "
-            f"{x1:g}, {y1:g}; expected a map around the start"
-        )
-    if isinstance(given, Wander):
-        seed = 1000 * content.seed + place
-        return ex.wander(floor, given.map, given.load, given.count, seed, given.points, given.by)
-    return [
-        ex.rectangle(floor, given.map, given.load, by=given.by, speed=given.speed_m_s)
-        for _ in range(given.repeats)
-    ]
+        raise DataError(f"{what}: {error}") from error

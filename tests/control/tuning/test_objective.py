@@ -84,7 +84,7 @@ def test_a_loop_is_stable_where_its_radius_says():
 
     @jax.jit
     def both(gains, surface):
-        loop = Loop(Controller(robot, Gains.at(gains)), robot, surface, rates, HABITS, 0.05)
+        loop = Loop(Controller(robot, Gains.at(gains)), robot, surface, rates, HABITS)
         a = linearised(loop)
         off = eqx.tree_at(lambda s: s.pose, loop.start(), jnp.array([0.0, 1e-4, 0.0]))
         calm = jax.lax.scan(lambda s, _: (loop.step(s), s.pose[1]), off, None, length=400)[1]
@@ -104,7 +104,7 @@ def test_the_same_budget_is_the_same_number_of_rollouts(robots, cases):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("method", ["gradient", "pso"])
+@pytest.mark.parametrize("method", [pytest.param("gradient", marks=pytest.mark.nightly), "pso"])
 def test_a_search_betters_gains_by_hand_and_can_be_left(
     robots, cases, method, tmp_path, monkeypatch
 ):

@@ -10,7 +10,7 @@ from slipid.control.controller import Controller, Gains
 from slipid.control.odometry import Odometry
 from slipid.control.pilot import Pilot
 from slipid.control.trajectory import waypoints
-from slipid.control.tuning.actuation import RING, Habits, held
+from slipid.control.tuning.actuation import RING, Habits
 from slipid.control.tuning.twin import Twin, TwinPlant, rollout
 from slipid.model import contact
 from tests.helpers.small_twin import deployed, floor, stacked
@@ -38,7 +38,7 @@ def driven(twin, commands, key=KEY):
 
 def test_commands_arrive_late_as_a_fine_grid_says():
     for delay in (0.0, 0.03, 0.12, 0.25):
-        share = held(delay, 0.05, 2)
+        share = Habits(delay_s=delay).held()
         grid = (np.arange(100_000) + 0.5) / 100_000 * 0.05
         index = -np.floor((grid - delay) / 0.05).astype(int)
         brute = [[np.mean(part == k) for k in range(RING)] for part in np.split(index, 2)]

@@ -11,15 +11,13 @@ import pytest
 from slipid.data.reading.presets import preset
 from slipid.data.reading.reader import find_logs, read_log, read_logs
 from slipid.data.reading.table import read_table
-from slipid.data.signals.lag import camera_lag
-from slipid.data.signals.steps import integrated_steps, step_edges
 from slipid.data.signals.wheel_order import best_wheel_order
 from slipid.data.signals.wheel_signals import (
     bridge_stalls,
     first_moved,
+    integrated_steps,
     interpolate,
-    quantum,
-    wheel_speed,
+    step_edges,
 )
 
 RADIUS = 0.04
@@ -98,10 +96,9 @@ def test_logged_steps_have_the_nominal_scale_and_lose_large_ones(robotino2022):
     assert (step[large] / pixel[large]).max() < 1.5
 
 
-def test_current_and_speed_are_quantised_as_documented(robotino2022):
+def test_currents_are_magnitudes_in_steps_of_the_converter(robotino2022):
     log = robotino2022["gray"][0]
-    assert quantum(log.current[:, 0]) == pytest.approx(1 / 39, rel=1e-4)
-    assert quantum(log.wheel_speed[:, 0] * 16) == pytest.approx(2.827, abs=0.001)
+    np.testing.assert_allclose(log.current * 39, np.round(log.current * 39), atol=0.02)
     assert log.current.min() >= 0
 
 
@@ -133,21 +130,11 @@ def test_stalls_of_the_telemetry_are_found_and_bridged(robotino2022):
     log = next(log for log in robotino2022["brown"] if log.name.endswith("exp05.csv"))
     bridged, stalled = bridge_stalls(log.time, log.wheel_angle)
     assert set(range(61, 67)) <= set(np.flatnonzero(stalled) + 4)  # lines of the file
-    speed = wheel_speed(log.time, bridged)
-    raw = wheel_speed(log.time, log.wheel_angle)
-    row = int(np.argmax(np.abs(np.diff(log.wheel_angle[:, 2]))))
-    usual = np.median(np.abs(speed[row - 30 : row + 30, 2]))
-    assert np.abs(raw[row - 2 : row + 3, 2]).max() > 2.0 * usual
-    assert np.abs(speed[row - 2 : row + 3, 2]).max() < 1.4 * usual
-
-
-@pytest.mark.slow
-def test_the_camera_is_late_not_early(robotino2022):
-    lags = []
-    for log in robotino2022["gray"][::3]:
-        angle, _ = bridge_stalls(log.time, log.wheel_angle)
-        lags.append(camera_lag(log.time, angle, log.pose, log.pose_fresh, TO_TWIST).value)
-    assert np.median(lags) == pytest.approx(0.056, abs=0.02)
+    step, raw = (np.abs(np.diff(angle[:, 2])) for angle in (bridged, log.wheel_angle))
+    row = int(np.argmax(raw))
+    usual = np.median(step[row - 30 : row + 30])
+    assert raw[row] > 2.0 * usual
+    assert step[row - 2 : row + 3].max() < 2.0 * usual
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,11 @@ from scipy.linalg import block_diag
 
 from slipid.identify.design import fisher as info
 from slipid.identify.design.planned_runs import Drive, candidates, steady_windows
-from slipid.identify.design.planner import Channels, Planner, parameter_goal
+from slipid.identify.design.planner import Planner, parameter_goal
 from slipid.identify.fit import noise as of_noise
 from slipid.identify.fit.problem import Problem
-from slipid.parameter import Choice
+from slipid.identify.result import Channels
+from slipid.search_space import Choice
 from tests.helpers import made_windows
 
 SETUP = ("soft", "as_built")
@@ -50,7 +51,7 @@ def planner(current, voltage):
 
 def windows(drives, current, voltage):
     spread = dict.fromkeys(("firm", "soft"), 0.05**2) if current else {}
-    return steady_windows(drives, robot(), 4, spread, has_current=current, has_voltage=voltage)
+    return steady_windows(drives, robot(), Channels(current, voltage), spread)
 
 
 @functools.cache
@@ -153,7 +154,7 @@ def made_up(seed, electric=3, count=25):
 @pytest.mark.parametrize("seed", range(5))
 def test_each_candidate_is_judged_as_if_driven(seed, electric):
     now, rows, goal = made_up(seed, electric)
-    brute = [now.plus(rows.pick([k])).criterion(goal) for k in range(len(rows))]
+    brute = [now.plus(rows.pick([k])).criterion(goal) for k in range(len(rows.motion))]
     np.testing.assert_allclose(now.after_each(rows, goal), brute, rtol=1e-9)
     chosen, found = info.greedy(now, rows, goal, 1)
     assert chosen == [int(np.argmin(brute))]
@@ -166,7 +167,7 @@ def test_a_criterion_of_the_motion_never_rises(seed):
     now, rows, goal = made_up(seed, electric=0)
     chosen, found = info.greedy(now, rows, goal, 8)
     assert (np.diff(found) < 0).all()
-    order = np.random.default_rng(seed).permutation(len(rows))
+    order = np.random.default_rng(seed).permutation(len(rows.motion))
     path = info.path(now, rows, goal, order)
     assert (np.diff(path) < 0).all()
     assert info.path(now, rows, goal, order, [3, 10]) == pytest.approx([path[3], path[10]])

@@ -19,8 +19,10 @@ from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit_file import load, save
 from slipid.identify.result import summarise
-from slipid.parameter import Choice
-from slipid.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.search_space import Choice
+from slipid.selftest.known import blank, truth
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
 from tests.helpers import designs
 
 pytestmark = pytest.mark.slow  # traces a whole likelihood
@@ -154,6 +156,7 @@ def test_without_a_fit_it_is_2(tmp_path):
     assert "expected the result of `slipid identify`" in done.stderr
 
 
+@pytest.mark.nightly
 def test_chosen_runs_are_worth_what_is_expected_of_them():
     """Whole logs, more seeds and the ratio are in bench_design.py."""
     plans, seeds = designs.plans(24), range(6)

@@ -17,7 +17,7 @@ from slipid.identify.fit.linear import inverse_root
 from slipid.identify.fit.problem import DEGREES, Problem
 from slipid.identify.fit.variances import scored
 from slipid.identify.slip_curves import current_trend
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
 EVERYTHING = [Choice("*", free=True)]

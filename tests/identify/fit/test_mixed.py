@@ -28,10 +28,13 @@ from slipid.identify.fit_file import load
 from slipid.job.config import read_config
 from slipid.job.problem import read_job, with_mixed
 from slipid.model import se2
-from slipid.parameter import Choice, Space
-from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
+from slipid.search_space import Choice, Space
+from slipid.selftest.known import truth
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import ROBOTINO, robotino_text, write_good
+from tests.helpers.made_logs import write_logs
 from tests.helpers.made_windows import robot
 from tests.helpers.said import Said
 from tests.job.test_config import GOOD, written
@@ -343,7 +346,7 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path):
     fit = load(out)
     assert fit.converged
     assert len(fit.runs) == 16
-    assert fit.settings["mixed"]["runs"] == 4
+    assert fit.mixed["runs"] == 4
     assert {"mixed.along", "mixed.across", "mixed.yaw", "mixed.current"} < set(fit.variance)
     run = json.loads((out / "run.json").read_text())
     assert run["data"]["hash"] == fit.data_hash

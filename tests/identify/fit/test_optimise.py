@@ -14,7 +14,7 @@ from slipid.identify.fit import problem as of_problem
 from slipid.identify.fit import structure, variances
 from slipid.identify.fit.optimise import Options, optimise
 from slipid.identify.fit.problem import DEGREES, Problem, State
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
 pytestmark = pytest.mark.slow  # compiles three fits

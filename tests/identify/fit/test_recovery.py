@@ -10,7 +10,7 @@ from slipid.data.windows import windows
 from slipid.identify.fit.optimise import optimise
 from slipid.identify.fit.problem import State, linear
 from slipid.identify.result import summarise
-from slipid.selftest.logs import blank, truth
+from slipid.selftest.known import blank, truth
 from tests.helpers import recovery
 
 SEEDS = (0, 1, 2)

@@ -22,7 +22,7 @@ def replicates():
     return {seed: calibration.replicate(seed) for seed in SEEDS}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_intervals_hold_the_truth_as_often_as_they_say(replicates):
     inside = np.concatenate([r.inside for r in replicates.values()])
     rank = np.concatenate([r.rank for r in replicates.values()])
@@ -32,7 +32,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(replicates):
     assert rank.mean() == pytest.approx(0.5, abs=4 / np.sqrt(12 * len(rank)))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_variance_that_may_be_anything_small_is_not_held_near_the_fit(replicates):
     """In experiments 1 and 4 the ammeter hides the voltmeter's noise, whose truth is tiny."""
     place = replicates[1].names.index("noise.voltage.window")

@@ -16,7 +16,7 @@ from slipid.identify.fit.problem import DEGREES, VARIANCE_SPREAD, Problem
 from slipid.identify.fit.sessions import AXES
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.identify.posterior.density import Density
-from slipid.parameter import Choice
+from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
 pytestmark = pytest.mark.slow  # compiles densities
@@ -93,7 +93,7 @@ def test_it_is_the_posterior_by_definition(problem, part):
     terms = d.terms(x)
     blocks = ["motion"] if part == MOTION else ["motion", "current", "voltage"]
     for one, found in zip(x, terms, strict=True):
-        z, log_v = d.full(one)
+        z, log_v = d.full(d.anchor, jnp.asarray(one))
         pieces = expected(problem, np.asarray(z), np.asarray(log_v), blocks)
         of_prior = prior(problem, d, one)
         group, floor = d.coordinates.group, np.asarray(problem.batch.surface)
@@ -102,7 +102,7 @@ def test_it_is_the_posterior_by_definition(problem, part):
             assert found[g] == pytest.approx(total, rel=1e-9)
         assert found[-1] == pytest.approx(of_prior[group < 0].sum(), rel=1e-9)
     for k, each in d.pointwise(x).items():
-        z, log_v = d.full(x[0])
+        z, log_v = d.full(d.anchor, jnp.asarray(x[0]))
         np.testing.assert_allclose(
             each[0], expected(problem, np.asarray(z), np.asarray(log_v), [k]), rtol=1e-8
         )
@@ -133,7 +133,7 @@ def test_runs_of_a_session_share_effects_with_the_priors_that_were_found(problem
     assert d.size == plain.size + 6
     assert (d.coordinates.group[plain.size :] == d.floors.index("soft")).all()
     x = near(d, 2, width=0.7)
-    z, log_v = d.full(x[0])
+    z, log_v = d.full(d.anchor, jnp.asarray(x[0]))
     tree = problem.space.tree(jnp.asarray(z))
     residual = np.array(jax.jit(lk.residuals)(tree, problem.batch, 1.0)["motion"])
     effect, w = of_noise.effects(problem.windows, problem.robot), problem.windows
@@ -201,7 +201,7 @@ def test_far_from_the_fit_the_root_is_found_from_scratch(problem):
     d = density(problem, MOTION)
     far = near(d, 3, width=2.0)
     for one, found in zip(far, d.terms(far).sum(axis=1), strict=True):
-        z, log_v = d.full(one)
+        z, log_v = d.full(d.anchor, jnp.asarray(one))
         total = expected(problem, np.asarray(z), np.asarray(log_v), ["motion"]).sum()
         assert found == pytest.approx(total + prior(problem, d, one).sum(), rel=1e-7)
 

@@ -19,7 +19,7 @@ from slipid.identify.verdicts.estimates import RATIOS, derived, expected_covaria
 from slipid.identify.verdicts.profile import RISE, _Walk, profile, profiled
 from slipid.identify.verdicts.remedies import VOLTAGE, remedy
 from slipid.identify.verdicts.unidentified import NOTICED, flat_directions, sentences
-from slipid.parameter import Choice, Space
+from slipid.search_space import Choice, Space
 from tests.helpers.made_windows import made, robot
 from tests.identify.fit.test_optimise import NOISE, begin
 

@@ -6,7 +6,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from jaxtyping import Float, Int
 
-from slipid.identify.posterior.transport.arrays import Matrix, Vector
+from slipid.identify.posterior.transport.coordinatewise import Matrix, Vector
 
 FAR = 4.0
 """Polynomials stay what they are beyond this many stds."""
@@ -22,13 +22,10 @@ MOST_MONOMIALS = 12
 
 @dataclass(frozen=True, eq=False)
 class Bend:
-    """Polynomials a and b of a group's coordinates.
+    """Polynomials a (shift) and b (scale) of a group's coordinates.
 
-    Attributes:
-        factors: columns whose product each monomial is, from (w, told, 1), where told is what
-            plateaus say.
-        shift: coefficients of a.
-        scale: coefficients of b.
+    Factors are the columns whose product each monomial is, from (w, told, 1), where told is what
+    plateaus say.
     """
 
     factors: Int[np.ndarray, "monomial 3"]
@@ -90,12 +87,8 @@ def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]
             step = np.linalg.solve(2 * of.T @ of, of.T @ excess)
             scale[spreads] += step * min(1.0, 1.0 / (np.abs(of @ step).max() + 1e-9))
         root = np.sqrt(weight)
-        gains = np.stack(
-            [
-                0.50 * share * _scores(f * root[:, None], means, root * (w - f @ shift)),
-                0.25 * share * _scores(f, spreads, excess),
-            ]
-        )
+        of_mean = _scores(f * root[:, None], means, root * (w - f @ shift))
+        gains = share * np.stack([0.5 * of_mean, 0.25 * _scores(f, spreads, excess)])
         which, best = np.unravel_index(np.argmax(gains), gains.shape)
         if gains[which, best] < WORTH:
             break

@@ -4,11 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from slipid.identify.posterior.transport.arrays import Matrix, Vector
 from slipid.identify.posterior.transport.bend import Bend
-from slipid.identify.posterior.transport.plateaus import Values
+from slipid.identify.posterior.transport.coordinatewise import Matrix, Values, Vector, Warp
 from slipid.identify.posterior.transport.transport_map import Stair, Transport
-from slipid.identify.posterior.transport.warp import Warp
 
 MOST_DRAWS = 4000
 """Largest number of draws that a map is learnt from."""
@@ -17,10 +15,8 @@ MOST_DRAWS = 4000
 def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray, kind: np.ndarray) -> Transport:
     """Map of a Gaussian.
 
-    Args:
-        mean, covariance: mean and covariance of the Gaussian.
-        group: group of each coordinate, -1 where groups share it.
-        kind: kind of each coordinate; within a group a higher kind follows the lower ones.
+    Groups are those of each coordinate, -1 where groups share it; within a group a higher kind
+    follows the lower ones.
     """
     values = Values.none(len(mean))
     stairs = _stairs(np.tile(covariance, (2, 2)), group, kind, values, covariance)
@@ -48,11 +44,8 @@ def _stairs(
 ) -> tuple[Stair, ...]:
     """Stairs of a Gaussian; the coordinates that are widest at the mode come first in a stair.
 
-    A valley has its direction at the mode, where draws are as wide across as they are bent.
-
-    Args:
-        covariance: covariance of all coordinates, followed by what they say.
-        at_mode: covariance at the mode, where the order within a stair is read off.
+    A valley has its direction at the mode, where draws are as wide across as they are bent. The
+    covariance is of all coordinates, followed by what they say.
     """
     stairs = []
     for own, given in _order(group, kind, values):
@@ -74,13 +67,9 @@ def _given(covariance: Matrix, own: np.ndarray, given: np.ndarray) -> tuple[Matr
 def learnt(
     draws: Matrix, effective: float, covariance: Matrix, group: np.ndarray, kind: np.ndarray
 ) -> Transport:
-    """Map learnt from draws.
+    """Map learnt from draws (draw, size) that are worth so many independent ones, about.
 
-    Args:
-        draws: positions (draw, size).
-        effective: number of independent draws that they are worth, about.
-        covariance: Laplace covariance; it counts as many draws as there are coordinates.
-        group, kind: group and kind of each coordinate, as of `gaussian`.
+    The Laplace covariance counts as many draws as there are coordinates.
     """
     some = draws[:: max(1, len(draws) // MOST_DRAWS)]
     size, mean = some.shape[1], some.mean(axis=0)
@@ -90,11 +79,10 @@ def learnt(
     steps = np.concatenate([np.ones(size), values.slope()])
     at_mode = np.tile(covariance, (2, 2)) * np.outer(steps, steps)
     both = effective * np.cov(np.concatenate([about, said], axis=1).T) + size * at_mode
-    stairs = tuple(
-        replace(s, bend=Bend.learnt(s.left(about, said), said[:, s.plateaus], effective))
-        if s.bend
-        else s
-        for s in _stairs(both / (effective + size), group, kind, values, covariance)
-    )
-    found = Transport(mean, values, stairs, Warp.none(size))
+    stairs = []
+    for s in _stairs(both / (effective + size), group, kind, values, covariance):
+        left, of_plateaus = s.left(about, said), said[:, s.plateaus]
+        bend = Bend.learnt(left, of_plateaus, effective) if s.bend else None
+        stairs.append(replace(s, bend=bend))
+    found = Transport(mean, values, tuple(stairs), Warp.none(size))
     return replace(found, last=Warp.learnt(found.forward(some)))

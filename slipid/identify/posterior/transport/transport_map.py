@@ -28,23 +28,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from slipid.identify.posterior.transport.arrays import Matrix, Vector
 from slipid.identify.posterior.transport.bend import FAR, MOST_MONOMIALS, Bend
-from slipid.identify.posterior.transport.plateaus import Values
-from slipid.identify.posterior.transport.warp import Warp
+from slipid.identify.posterior.transport.coordinatewise import Matrix, Values, Vector, Warp
 
 
 @dataclass(frozen=True, eq=False)
 class Stair:
-    """Some coordinates, after those they follow.
+    """Some coordinates, by their places, after those they follow.
 
-    Attributes:
-        own: their places.
-        given: places of those they follow.
-        slope: derivative of own ones by what given ones say.
-        root: Cholesky factor of the covariance of what is left.
-        bend: bend of what is left; None for shared coordinates.
-        plateaus: places of plateaus of the group among the given; their numbers bend it.
+    Slope is the derivative of own ones by what given ones say, root the Cholesky factor of the
+    covariance of what is left, bend the bend of that, None for shared coordinates. Plateaus are
+    those of the group among the given; their numbers bend it.
     """
 
     own: Int[np.ndarray, " own"]
@@ -57,9 +51,7 @@ class Stair:
     def left(self, about: Matrix, said: Matrix) -> Matrix:
         """What others do not say of own coordinates, by the root.
 
-        Args:
-            about: all coordinates less their means.
-            said: what all of them say.
+        From all coordinates less their means, and what all of them say.
         """
         left = about[:, self.own] - said[:, self.given] @ self.slope
         return np.asarray(np.linalg.solve(self.root, left.T).T)
@@ -69,11 +61,7 @@ class Stair:
 class Transport:
     """The whole map, of vectors x (row, size) to and from u (row, size).
 
-    Attributes:
-        mean: mean of x.
-        values: what coordinates say to those that follow.
-        stairs: the way from x to v; every coordinate is in one of them.
-        last: the way from v to u.
+    Stairs lead from x to v, every coordinate is in one of them, and the last warp from v to u.
     """
 
     mean: Vector
@@ -101,7 +89,6 @@ class Transport:
 
     @cached_property
     def _back(self) -> "Steps":
-        """The way back as arrays of jax."""
         with jax.ensure_compile_time_eval():  # kept, so never a tracer's
             return _steps(self)
 
@@ -116,13 +103,8 @@ class Steps:
 
         w_i = f_i . shift_i + exp(f_i . scale_i) v_i,   x_i - m_i = columns . slope_i
 
-    Attributes:
-        mean, values, last: those of the map.
-        order: coordinate of each step.
-        slope: derivative of each step by the columns (step, 2 size + 1).
-        root: log dx/dw of each step.
-        factors: columns whose product each monomial f is (step, term, 3).
-        shift, scale: their coefficients (step, term).
+    Order is the coordinate of each step, root its log dx/dw, factors the columns whose product each
+    monomial f is (step, term, 3).
     """
 
     mean: Array

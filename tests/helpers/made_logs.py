@@ -1,14 +1,13 @@
-"""Made logs as CSV files, with the truth in a folder of its own."""
+"""Made logs as files, the truth in a folder of its own."""
 
 from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
 
 from slipid.data.log import Log
 from slipid.data.write import own_csv, own_layout
 from slipid.model.robot import Robot
 from slipid.parameter import entries
+from slipid.selftest.known import numbers
 from slipid.support.files import write_bytes, write_json
 
 TICKS = 2000
@@ -36,8 +35,3 @@ def write_logs(logs: Sequence[Log], robot: Robot, out: Path, truth_dir: Path) ->
     values = {path: {"value": v, "unit": units[path]} for path, v in numbers(robot).items()}
     write_json(truth_dir / "truth.json", {"schema": "slipid.truth/1", "parameters": values})
     return paths
-
-
-def numbers(robot: Robot) -> dict[str, float | list[float]]:
-    """Every number of a robot by its path, as plain values."""
-    return {e.path: np.asarray(e.get(robot)).tolist() for e in entries(robot)}

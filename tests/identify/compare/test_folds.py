@@ -18,7 +18,8 @@ from slipid.cli.main import app
 from slipid.data.runs import collect
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.compare.folds import folds_of
-from slipid.identify.compare.predictive import contact_of, log_student, slopes, with_noise
+from slipid.identify.compare.noisy_rung import slopes, with_noise
+from slipid.identify.compare.predictive import contact_of, log_student
 from slipid.identify.compare.ranking import mean_error, ranking
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.compare.transfer import transfer
@@ -27,10 +28,13 @@ from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.problem import DEGREES, Problem, State
 from slipid.identify.fit.sessions import Linear, shared
 from slipid.job.compare import finished
-from slipid.parameter import Choice
-from slipid.selftest.logs import Sensors, grid, make_logs, truth, write_logs
+from slipid.search_space import Choice
+from slipid.selftest.known import truth
+from slipid.selftest.logs import make_logs
+from slipid.selftest.plan import Sensors, grid
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
+from tests.helpers.made_logs import write_logs
 from tests.helpers.made_windows import SCALE, made
 from tests.helpers.made_windows import robot as made_robot
 
@@ -173,7 +177,8 @@ def judged(w, names):
     start = State(z, 2 * np.log(problem.noise.typical), 0, np.inf, np.inf, "joint")
     contact = contact_of(problem, start, 1e-12 * np.eye(len(z)))
     half = w.run // 4 % 2
-    models = [with_noise(ALL[name], contact, (half == 0).astype(float)) for name in names]
+    keep = (half == 0).astype(float)
+    models = [with_noise(ALL[name], contact, problem, keep) for name in names]
     density = {m.name: m.log_density(problem) for m in models}
     out = rows({name: values[half == 1] for name, values in density.items()})
     floors = np.asarray(w.surface)[half == 1]

@@ -1,0 +1,181 @@
+"""A rung of the ladder with noise of its own, so that it forecasts as the force balance does.
+
+Its numbers follow the camera's, which it shares with the force balance.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.linalg import block_diag
+
+from slipid.data.windows import Windows
+from slipid.identify.compare import open_loop as replay
+from slipid.identify.compare.predictive import (
+    Contact,
+    Gaps,
+    Predictive,
+    Slopes,
+    around,
+    by_name,
+    with_sessions,
+)
+from slipid.identify.compare.rung import Rung
+from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit.problem import DEGREES, Problem
+from slipid.identify.fit.variances import scored_given
+from slipid.model.robot import Robot
+from slipid.search_space import Space
+
+MOST_TURNS, SCORING, SETTLED = 15, 4, 0.02
+"""Turns of a rung's covariance and so many steps of its log variances, and what counts as rest."""
+VAGUE = 1e-2
+"""Precision of a rung's number before any data: of slips below one, a std of 10 says nothing."""
+STEP = 1e-4
+"""Of the difference quotients by a rung's numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Noisy(Predictive):
+    """A rung with noise of its own and the camera of a fit, whose numbers follow the rung's."""
+
+    rung: Rung
+    contact: Contact
+
+    @property
+    def name(self) -> str:
+        return self.rung.name
+
+    @property
+    def numbers(self) -> dict[str, int]:
+        sizes = dict.fromkeys(self.robot.surfaces.labels, 0)
+        for key, value in self.rung.state.items():
+            sizes[next(f for f in sizes if key == f or key.startswith(f"{f}@"))] += value.size
+        return sizes | {"shared": 0}
+
+    def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
+        return _linear(self.rung, self.contact, problem)
+
+    def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
+        robot, contact = self.robot, self.contact
+
+        def tracks_of(rung: Rung) -> replay.Tracks:
+            return replay.follow(robot, w, rung.increments(w, robot))
+
+        tracks = tracks_of(self.rung)
+        camera = replay.twist_end_jacobian(
+            contact.space,
+            jnp.asarray(contact.z),
+            jnp.asarray(self.rung.twist(w, robot)),
+            lk.batch(w, robot),
+            jnp.asarray(tracks.predicted[:, 0]),
+        )
+        own = slopes(self.rung, w, lambda rung: tracks_of(rung).predicted[:, -1, :2])
+        jac = np.concatenate([own, np.asarray(camera)[..., contact.camera]], axis=-1)
+        spread = around(jac, self.covariance)
+        return tracks, replay.end_covariance(robot, w, tracks, self.variance, spread)
+
+
+def with_noise(
+    rung: Rung, contact: Contact, problem: Problem, keep: Float[np.ndarray, " piece"]
+) -> Noisy:
+    """A rung fitted to the kept pieces of a problem, and its noise found from what it leaves there.
+
+    Variances by Fisher scoring of the restricted likelihood, as for the force balance; the degrees
+    of freedom of the rung's own numbers are taken off.
+    """
+    robot = contact.robot
+    seen = problem.windows.at_lag(float(robot.camera.lag)).pieces(np.flatnonzero(keep > 0))
+    rung = rung.fit(seen, robot)
+    before = _before(rung, seen, robot)
+    gap, slope = _linear(rung, contact, problem)
+    common = contact.covariance[np.ix_(contact.camera, contact.camera)]
+    log_v, count = jnp.asarray(contact.log_variance(problem)), jnp.asarray(keep, float)
+    for _ in range(MOST_TURNS):
+        last = log_v
+        scale = np.asarray(problem.covariance("motion", log_v))
+        covariance = _numbers(before, common, scale, slope, keep)
+        spread = jnp.asarray(around(slope, covariance))
+        blocks = {"motion": jnp.asarray(gap)}, {"motion": spread}
+        for _ in range(SCORING):
+            log_v = scored_given(problem.target, *blocks, log_v, count, {})
+        if float(jnp.abs(log_v - last).max()) < SETTLED:
+            break
+    plain = Noisy(robot, by_name(problem, log_v), covariance, rung, contact)
+    own = len(before)
+    wide = np.zeros_like(covariance)
+    wide[:own, :own], wide[own:, own:] = np.linalg.inv(before), common
+    return with_sessions(plain, problem, wide, keep)
+
+
+def _before(rung: Rung, w: Windows, robot: Robot) -> np.ndarray:
+    """Precision of a rung's numbers without the data."""
+    held = rung.stiffness(w, robot)
+    parts = [VAGUE * np.eye(v.size) + held.get(key, 0.0) for key, v in rung.state.items()]
+    return np.asarray(block_diag(np.zeros((0, 0)), *parts))
+
+
+def _numbers(
+    before: np.ndarray, common: np.ndarray, scale: np.ndarray, slope: Slopes, keep: np.ndarray
+) -> np.ndarray:
+    """Covariance of a rung's numbers and the camera's; the former follow the latter."""
+    own, m = len(before), slope.shape[1]
+    factor = keep * (DEGREES + m) / (DEGREES + m + 2)
+    weighted = np.linalg.solve(scale, slope[..., :own]) * factor[:, None, None]
+    rows = len(slope) * m
+    to_own = weighted.reshape(rows, own).T @ slope.reshape(rows, -1)
+    alone = np.linalg.inv(before + to_own[:, :own])
+    follows = -alone @ to_own[:, own:]
+    both = np.concatenate([follows, np.eye(len(common))])
+    out = both @ common @ both.T
+    out[:own, :own] += alone
+    return np.asarray(0.5 * (out + out.T))
+
+
+def _linear(rung: Rung, contact: Contact, problem: Problem) -> tuple[Gaps, Slopes]:
+    """Gaps of all pieces of a problem, and their slope by the rung's numbers and the camera's."""
+    robot, b, z = contact.robot, problem.batch, jnp.asarray(contact.z)
+    w = problem.windows.at_lag(float(robot.camera.lag))
+
+    def gap(some: Rung) -> np.ndarray:
+        return np.asarray(_gap(problem.space, z, jnp.asarray(some.twist(w, robot)), b))
+
+    camera = _gap_jacobian(problem.space, z, jnp.asarray(rung.twist(w, robot)), b)
+    by_camera = np.asarray(camera)[..., contact.camera]
+    return gap(rung), np.concatenate([slopes(rung, w, gap), by_camera], axis=-1)
+
+
+@eqx.filter_jit
+def _gap(space: Space, z: Array, twist: Array, b: lk.Batch) -> Array:
+    robot = space.tree(z)
+    gap = lk.seen(robot, twist, b.dt, b.session) - lk.measured(robot, b.pose)
+    return gap.reshape(gap.shape[0], -1)
+
+
+@eqx.filter_jit
+def _gap_jacobian(space: Space, z: Array, twist: Array, b: lk.Batch) -> Array:
+    return jax.jacfwd(lambda x: _gap(space, x, twist, b))(z)
+
+
+def slopes(rung: Rung, w: Windows, of: Callable[[Rung], np.ndarray]) -> np.ndarray:
+    """Slope of a function of a rung by its numbers, key after key (piece, ..., number).
+
+    Keys share no piece, so one number of each is moved at once.
+    """
+    ends = np.cumsum([0, *(v.size for v in rung.state.values())]).tolist()
+    now = of(rung)
+    out = np.zeros((*now.shape, ends[-1]))
+    keys = np.array([rung.series(s, load) for s, load in zip(w.surface, w.load, strict=True)])
+    for k in range(max((v.size for v in rung.state.values()), default=0)):
+        moved = {key: np.array(value, float) for key, value in rung.state.items()}
+        for value in moved.values():
+            value.flat[k : k + 1] += STEP
+        quotient = (of(replace(rung, state=moved)) - now) / STEP
+        for key, first, last in zip(rung.state, ends[:-1], ends[1:], strict=True):
+            if first + k < last:
+                out[keys == key, ..., first + k] = quotient[keys == key]
+    return out

@@ -1,0 +1,195 @@
+"""What the user wants of declared numbers, and the free ones as a vector without bounds."""
+
+import fnmatch
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from slipid.parameter import Entry, entries, share_basis
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What the user wants of the paths that match a pattern.
+
+    Attributes:
+        pattern: path, `*` and `?` allowed: `surface.*.creep`.
+        start: value to begin with [SI]; a number that is fixed stays so, at this value.
+        fixed: value it keeps [SI]; None leaves it free.
+        free: True or False to say it without a value.
+        prior_mean: centre of the prior [SI].
+        prior_std: std of the prior, in SI around its centre, which without `prior_mean` is the
+            declared start.
+    """
+
+    pattern: str
+    start: Any = None
+    fixed: Any = None
+    free: bool | None = None
+    prior_mean: Any = None
+    prior_std: Any = None
+
+
+class Space(eqx.Module):
+    """The free numbers of a tree as one vector without bounds, Gaussian prior included.
+
+    Goes through compiled functions as an argument: spaces of the same parameters share them.
+
+    Attributes:
+        template: the tree; what is fixed keeps its value here.
+        start, prior_mean, prior_std: in the search space.
+        all: every declared number of the tree.
+        free: those that are fitted.
+    """
+
+    template: Any
+    start: Float[np.ndarray, " free"]
+    prior_mean: Float[np.ndarray, " free"]
+    prior_std: Float[np.ndarray, " free"]
+    all: tuple[Entry, ...] = eqx.field(static=True)
+    free: tuple[Entry, ...] = eqx.field(static=True)
+
+    def __init__(self, tree: Any, choices: Sequence[Choice] = ()):
+        """Space of a module with declared numbers; later choices win.
+
+        Raises:
+            ValueError: a pattern matches no path, or a value lies outside its bounds.
+        """
+        self.all = tuple(entries(tree))
+        for c in choices:
+            if not any(fnmatch.fnmatchcase(e.path, c.pattern) for e in self.all):
+                paths = ", ".join(e.path for e in self.all)
+                raise ValueError(f"no parameter '{c.pattern}'; there are: {paths}")
+        values: dict[Entry, Any] = {}
+        free, starts, means, spreads = [], [], [], []
+        for entry in self.all:
+            picked = [c for c in choices if fnmatch.fnmatchcase(entry.path, c.pattern)]
+            value, mean, spread, is_free = _settle(entry, entry.get(tree), picked)
+            values[entry] = value
+            if is_free:
+                free.append(entry)
+                starts.append(entry.declaration.to_search(value))
+                means.append(mean)
+                spreads.append(spread)
+        self.template = _put(tree, values)
+        self.free = tuple(free)
+        self.start, self.prior_mean, self.prior_std = (
+            np.concatenate([np.zeros(0), *parts]) for parts in (starts, means, spreads)
+        )
+
+    @property
+    def place(self) -> dict[str, slice]:
+        """Where the coordinates of every free number are, by path."""
+        ends = np.cumsum([0, *(e.coordinates for e in self.free)]).tolist()
+        return {e.path: slice(a, b) for e, a, b in zip(self.free, ends, ends[1:], strict=False)}
+
+    def where(self, wanted: Callable[[Entry], bool]) -> Bool[np.ndarray, " free"]:
+        """Coordinates of the free numbers that are wanted."""
+        count = [e.coordinates for e in self.free]
+        return np.repeat(np.array([wanted(e) for e in self.free], bool), count)
+
+    @property
+    def electric(self) -> Bool[np.ndarray, " free"]:
+        """Coordinates that are read from currents and voltages given the motion."""
+        return self.where(lambda e: e.declaration.electric)
+
+    @property
+    def size(self) -> int:
+        """Number of free coordinates."""
+        return sum(e.coordinates for e in self.free)
+
+    @property
+    def names(self) -> list[str]:
+        """One name per coordinate: the path, numbered where it takes several."""
+        return [
+            e.path if e.coordinates == 1 else f"{e.path}[{k + 1}]"
+            for e in self.free
+            for k in range(e.coordinates)
+        ]
+
+    def tree(self, z: Float[Array, " free"] | Float[np.ndarray, " free"]) -> Any:
+        """Tree of SI values at a search-space vector; jit-able."""
+        z, place = jnp.asarray(z), self.place
+        return _put(self.template, {e: e.declaration.to_si(z[place[e.path]]) for e in self.free})
+
+    def vector(self, tree: Any) -> np.ndarray:
+        """Search-space vector of a tree's free numbers."""
+        parts = [e.declaration.to_search(np.asarray(e.get(tree))) for e in self.free]
+        return np.concatenate([np.zeros(0), *parts])
+
+
+def _put(tree: Any, values: Mapping[Entry, Any]) -> Any:
+    """The tree with these values [SI] at their places."""
+    changed: dict[tuple[str, ...], tuple[Entry, Any]] = {}
+    for entry, value in values.items():
+        whole = changed[entry.leaf][1] if entry.leaf in changed else entry.whole(tree)
+        shape = whole.shape if entry.index is None else whole.shape[1:]
+        new = jnp.asarray(value, dtype=whole.dtype).reshape(shape)
+        changed[entry.leaf] = entry, new if entry.index is None else whole.at[entry.index].set(new)
+    if not changed:
+        return tree
+    places, arrays = zip(*changed.values(), strict=True)
+    return eqx.tree_at(lambda t: [e.whole(t) for e in places], tree, arrays)
+
+
+def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, Any, bool]:
+    """Value, prior mean and std in the search space, and whether it is free."""
+    d = entry.declaration
+    usual = np.full(entry.size, 1 / entry.size if d.shares else d.start)
+    is_free, mean_si, std_si = d.free, None, None
+    for c in picked:
+        if c.fixed is not None:
+            value, is_free = _inside(entry, c.fixed), False
+        if c.start is not None:
+            value = _inside(entry, c.start)
+        if c.prior_mean is not None or c.prior_std is not None:
+            mean_si = _inside(entry, usual if c.prior_mean is None else c.prior_mean)
+            std_si = _spread(entry, c.prior_std)
+            value = value if c.prior_mean is None or c.start is not None else mean_si
+            is_free = True
+        if c.free is not None:
+            is_free = c.free
+    value = _inside(entry, value)
+    mean = d.to_search(usual if mean_si is None else mean_si)
+    if std_si is None:
+        spread = np.full(entry.coordinates, d.spread)
+    elif d.shares:
+        share = np.asarray(mean_si, float)
+        slopes = (np.diag(share) - np.outer(share, share)) @ share_basis(entry.size)
+        spread = np.full(
+            entry.coordinates, np.mean(std_si) / np.sqrt((slopes**2).sum(axis=1).mean())
+        )
+    else:
+        spread = std_si / d.slope(np.atleast_1d(np.asarray(mean_si, float)))
+    return value, mean, spread, is_free
+
+
+def _spread(entry: Entry, std: Any) -> np.ndarray | None:
+    """Std of a prior, checked; None where only its centre was given."""
+    if std is None:
+        return None
+    x = np.asarray(std, float).ravel()
+    if x.size not in (1, entry.size) or not (np.isfinite(x) & (x > 0)).all():
+        raise ValueError(f"{entry.path}: prior std {std}; expected 1 or {entry.size} above zero")
+    return x
+
+
+def _inside(entry: Entry, value: Any) -> np.ndarray:
+    """Value as an array, checked; one number stands for all of a vector."""
+    x, d = np.asarray(value, float), entry.declaration
+    if x.size not in (1, entry.size):
+        raise ValueError(f"{entry.path} takes {entry.size} numbers, got {x.size}")
+    x = np.broadcast_to(x.ravel(), (entry.size,))
+    if d.shares:
+        inside, rule = (x > 0) & (abs(x.sum() - 1) < 1e-6), "positive shares that sum to 1"
+    else:
+        inside = (x > d.lower) & (x < d.upper)
+        rule = f"inside ({d.lower:g}, {d.upper:g}) {d.unit}"
+    if not inside.all():
+        raise ValueError(f"{entry.path} = {value}: expected {rule}")
+    return x.reshape(()) if entry.size == 1 else x

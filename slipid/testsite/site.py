@@ -1,0 +1,110 @@
+"""What stays the same from run to run: the robot, its sensors, and the physics of the floors."""
+
+from collections.abc import Mapping
+from dataclasses import field
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from slipid.support.bounds import CLOSED, NotNegative, Part, Positive
+from slipid.testsite.ground import GROUNDS, Ground
+from slipid.testsite.machine import Machine
+from slipid.testsite.motors import Motor, SpeedLoop
+
+Interval = Annotated[float, Field(ge=1e-3, le=1)]
+"""[s]."""
+
+
+@dataclass(frozen=True, config=CLOSED)
+class Sensors:
+    """How logs err.
+
+    Attributes:
+        row_s, row_jitter: mean time between rows [s], and its spread as part of it.
+        current_step_a, current_noise_a: step of the current's converter, and its noise [A].
+        current_is_signed: else magnitudes are logged, as most robots do.
+        speed_step, speed_gain: quantum of the reported motor speed [rad/s], and how much it reads
+            too high [1].
+        voltage, duty, bus_voltage, gyro: whether these are logged.
+        voltage_step_v, voltage_noise_v: [V].
+        gyro_noise, gyro_bias: [rad/s]; the bias is drawn anew for every run.
+        average_s: over which currents and voltages are averaged before they are sampled [s].
+        frame_s, lag_s: between camera frames, and mean age of the pose in a row [s].
+        camera_scale: true length over logged length; the camera of the 2022 logs has 1.117.
+        camera_noise_m, camera_noise_rad: noise of every frame.
+        dropout: part of the frames that is lost.
+        outlier, outlier_m: part of the frames that is wrong, and by how much [m].
+    """
+
+    row_s: Interval = 0.031
+    row_jitter: Part = 0.1
+    current_step_a: Positive = 1 / 39
+    current_noise_a: NotNegative = 0.05
+    current_is_signed: bool = False
+    speed_step: Positive = 2.83
+    speed_gain: Positive = 1.013
+    voltage: bool = True
+    duty: bool = False
+    bus_voltage: bool = False
+    gyro: bool = False
+    voltage_step_v: Annotated[float, Field(ge=0.01, allow_inf_nan=False)] = 0.1
+    voltage_noise_v: NotNegative = 0.05
+    gyro_noise: NotNegative = 0.004
+    gyro_bias: NotNegative = 0.005
+    average_s: Annotated[float, Field(ge=0, le=1)] = 0.008
+    frame_s: Interval = 1 / 29
+    lag_s: float = 0.056
+    camera_scale: Annotated[float, Field(ge=1e-3, le=100)] = 1.117
+    camera_noise_m: NotNegative = 0.0005
+    camera_noise_rad: NotNegative = 0.004
+    dropout: Part = 0.01
+    outlier: Part = 0.0005
+    outlier_m: NotNegative = 0.03
+
+    def __post_init__(self) -> None:
+        if not 0.5 * self.frame_s <= self.lag_s <= 0.4:
+            raise ValueError(f"lag_s = {self.lag_s}; expected half of frame_s or above, up to 0.4")
+
+    def amperes(
+        self, true: Float[np.ndarray, "*batch"], rng: np.random.Generator
+    ) -> Float[np.ndarray, "*batch"]:
+        """What ammeters give for true currents [A]."""
+        read = true + self.current_noise_a * rng.normal(size=true.shape)
+        read = read if self.current_is_signed else np.abs(read)
+        return np.round(read / self.current_step_a) * self.current_step_a
+
+    def volts(
+        self, true: Float[np.ndarray, "*batch"], rng: np.random.Generator
+    ) -> Float[np.ndarray, "*batch"]:
+        """What voltmeters give for true voltages [V]."""
+        read = true + self.voltage_noise_v * rng.normal(size=true.shape)
+        return np.round(read / self.voltage_step_v) * self.voltage_step_v
+
+
+@dataclass(frozen=True, config=CLOSED)
+class Site:
+    """Everything that stays the same from run to run.
+
+    Attributes:
+        machine, motor, loop: the robot.
+        sensors: sensors that make its logs.
+        grounds: physics of every surface.
+        command_delay_s: delay from a command to the wheels.
+        acceleration: acceleration of the wheels' rims towards a new command [m/s^2].
+    """
+
+    machine: Machine = field(default_factory=Machine)
+    motor: Motor = field(default_factory=Motor)
+    loop: SpeedLoop = field(default_factory=SpeedLoop)
+    sensors: Sensors = field(default_factory=Sensors)
+    grounds: Mapping[str, Ground] = field(default_factory=lambda: dict(GROUNDS))
+    command_delay_s: float = 0.12
+    acceleration: float = 1.0
+
+    @property
+    def tick(self) -> float:
+        """Turn of a wheel from one tick of its encoder to the next [rad]."""
+        return 2 * np.pi / (self.motor.ticks_per_revolution * self.machine.gear_ratio)
