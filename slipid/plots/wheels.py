@@ -76,7 +76,7 @@ def driving_torque(robot: Robot, seen: Seen) -> np.ndarray:
     speed = np.abs(seen.wheel_speed)
     amps = seen.amps * turning
     if seen.unsigned:
-        driven = (seen.torque * turning + np.asarray(robot.motor.friction(speed))) >= 0
+        driven = (seen.torque * turning + np.asarray(robot.motor.friction(jnp.asarray(speed)))) >= 0
         amps = (seen.amps - float(robot.motor.current_offset)) * np.where(driven, 1.0, -1.0)
     return np.asarray(robot.motor.torque(jnp.asarray(amps), jnp.asarray(speed)))
 
