@@ -16,7 +16,7 @@ help: ## this list
 demo: $(VENV)/.run-stamp ## the main job on logs of the virtual test site, pictures in demo_out
 	$(BIN)/slipid demo --out demo_out
 
-test: $(VENV)/.dev-stamp ## the whole test suite, a file at a time on two cores
+test: $(VENV)/.dev-stamp ## the test suite but for what is nightly, a file at a time on two cores
 	$(BIN)/python -m pytest $(TWO)
 
 nightly: $(VENV)/.dev-stamp ## every test, the long statistical ones too, compiled with XLA's optimisations, as users run it

@@ -10,6 +10,7 @@ from slipid.identify.compare.ranking import Ranking, ranking
 from slipid.identify.compare.validation import Judged
 from slipid.identify.fit.problem import Problem
 from slipid.job.problem import Task
+from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -41,8 +42,10 @@ class Comparison:
 
 def compared(task: Task, problem: Problem, question: str, parts: int, quiet: bool) -> Comparison:
     """Every rung of the ladder judged fold by fold; arguments as of `Fit.compare`."""
-    fold = folds_of(task.dataset, question)
-    fold = np.where(fold < 0, fold, fold % parts)
+    task.robot.geometry.inverse()  # nothing to compare where motion does not tell the wheels' turns
+    fold = folds_of(task.dataset, question, parts)
+    if (fold < 0).all():
+        raise DataError("no run can be left out; expected several headings or speeds")
     rows: list[Judged] = []
     with Reporter(quiet=quiet) as report:
         for k in sorted(set(fold[fold >= 0].tolist())):

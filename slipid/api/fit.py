@@ -225,7 +225,7 @@ def fit(
         DataError: the runs cannot be cut into windows.
         ValueError: no such number, or a value outside its bounds.
 
-    Source: the contact law of `slipid.model.contact`, the likelihood of `slipid.identify.fit`.
+    Source: the contact law of `slipid.model.contact_law`, the likelihood of `slipid.identify.fit`.
     """
     wishes = priors or {}, fixed or {}, start or {}, free
     task = task_of(runs, robot, *wishes, image_centre, windows_per_piece, seed)

@@ -1,1 +1,1 @@
-"""Published methods to compare with, one file per system."""
+"""Published methods to compare with, a folder per system."""

@@ -1,7 +1,6 @@
 """The logs that a config names, read into one data set."""
 
 from collections.abc import Sequence
-from difflib import get_close_matches
 from pathlib import Path
 
 from slipid.data.log import Log
@@ -12,7 +11,7 @@ from slipid.data.reading.presets import PRESETS, preset
 from slipid.data.reading.reader import find_logs, read_logs
 from slipid.data.runs import Runs, collect
 from slipid.job.config import Config, Logs
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, near
 from slipid.support.progress import Reporter
 
 
@@ -82,8 +81,7 @@ def layout_of(config: Config, section: Logs) -> Layout:
         return declared_layout(own[section.format], where)
     if section.format not in PRESETS:
         names = [*own, *PRESETS]
-        near = get_close_matches(section.format, names, n=2)
-        hint = f", did you mean {' or '.join(near)}?" if near else ""
+        hint = near(section.format, names)
         raise DataError(
             f"{config.path}: logs.format '{section.format}': no such layout{hint}; "
             f"expected one of {', '.join(names)}"

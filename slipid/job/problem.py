@@ -3,7 +3,6 @@
 import fnmatch
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 
 from slipid.data.floor_map import FloorMap
@@ -20,7 +19,7 @@ from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, near
 from slipid.support.progress import Reporter
 
 
@@ -201,10 +200,8 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
             if fnmatch.filter(paths, _any_label(pattern)):
                 skipped.append(f"skipped: parameters '{pattern}': no run that has it")
                 continue
-            near = get_close_matches(pattern, paths, n=2)
-            hint = f", did you mean {' or '.join(near)}?" if near else ""
             raise DataError(
-                f"{config.path}: parameters.'{pattern}': no such parameter{hint}; "
+                f"{config.path}: parameters.'{pattern}': no such parameter{near(pattern, paths)}; "
                 f"expected one of {', '.join(paths)}"
             )
         prior = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)

@@ -34,7 +34,7 @@ def grid(
 
 @dataclass(frozen=True)
 class Sensors:
-    """How the logs are disturbed; stds by the names of `slipid.identify.fit.likelihood.noise`.
+    """How the logs are disturbed; stds by the names of `slipid.identify.fit.noise.noise`.
 
     Attributes:
         std: of every variance component; `floor` in a name stands for every floor without its own.

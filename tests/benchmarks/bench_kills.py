@@ -10,8 +10,6 @@ import xarray
 
 from tests.cli import test_cli
 
-small = test_cli.small  # the fixture: a fit of made logs
-
 KILLS = 20
 JOB = ("--draws", "40", "--most", "80", "--block", "4", "--quiet")
 

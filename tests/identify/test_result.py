@@ -417,6 +417,19 @@ def in_sessions(session, seed):
     return collect(moved, session=lambda log: of[log.name])
 
 
+def test_what_sessions_share_is_stored_with_its_unit():
+    data = in_sessions(np.arange(24) % 6, 1)
+    problem = Problem(windows(data, 0.04, lag=0.056), blank(DRIVES), list(CHOICES))
+    z, log_v = problem.space.vector(TRUTH), 2 * np.log(problem.noise.typical)
+    laplace = expected_covariance(problem, z, log_v)
+    end = Optimum(State(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
+    fit = summarise(problem, end, data, CHOICES)
+    kept = to_json(fit)["variances"]
+    for axis, unit in {**dict.fromkeys(SHARED, "m/m"), "yaw": "rad/m"}.items():
+        assert kept[f"session.soft.{axis}"]["unit"] == kept[f"run.soft.{axis}"]["unit"] == unit
+    assert np.linalg.eigvalsh(fit.covariance - fit.laplace).min() > -1e-12
+
+
 @pytest.mark.nightly
 def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
     """At the truth, so that all that is off is noise: 200 runs, each in a session of its own."""

@@ -82,7 +82,9 @@ class Channel:
 
 def _pair(value: object) -> object:
     """Scales along x and y; one number counts for both."""
-    return tuple(value) if isinstance(value, list | tuple) else value and (value, value)
+    if isinstance(value, list | tuple):
+        return tuple(value)
+    return None if value is None else (value, value)
 
 
 @dataclass(frozen=True, config=CLOSED)

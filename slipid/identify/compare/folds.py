@@ -69,19 +69,25 @@ QUESTIONS: dict[str, Callable[[Runs], Fold]] = {
 """What is left out together: 60-degree sectors of headings, one speed, headings dealt at random."""
 
 
-def folds_of(data: Runs, question: str) -> Fold:
+def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
     """Fold of every run; -1 for one that cannot be judged and is always fitted.
 
-    Leaving out its fold would leave nothing of its floor and load set-up.
+    Leaving out its fold would leave nothing of its floor and load set-up. With `parts`, every
+    parts-th fold is left out together.
 
     Raises:
         DataError: no such question.
+        ValueError: fewer than two parts.
     """
     if question not in QUESTIONS:
         raise DataError(
-            f"--folds: '{question}': no such question; expected some of {', '.join(QUESTIONS)}"
+            f"folds '{question}': no such question; expected some of {', '.join(QUESTIONS)}"
         )
+    if parts is not None and parts < 2:
+        raise ValueError(f"{parts} parts; expected 2 or more")
     fold = QUESTIONS[question](data)
+    if parts is not None:
+        fold = np.where(fold < 0, fold, fold % parts)
     group = _groups(data)
     for name in np.unique(group):
         if len(np.unique(fold[group == name])) < 2:

@@ -104,7 +104,7 @@ def test_the_same_budget_is_the_same_number_of_rollouts(robots, cases):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("method", [pytest.param("gradient", marks=pytest.mark.nightly), "pso"])
+@pytest.mark.parametrize("method", ["gradient", "pso"])
 def test_a_search_betters_gains_by_hand_and_can_be_left(
     robots, cases, method, tmp_path, monkeypatch
 ):

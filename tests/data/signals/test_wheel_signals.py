@@ -18,7 +18,6 @@ from slipid.data.signals.wheel_signals import (
 AZIMUTH = np.radians([60.0, 180.0, 300.0])
 RIM = np.stack([-np.sin(AZIMUTH), np.cos(AZIMUTH), np.full(3, 0.125)], axis=1)
 RADIUS = 0.04
-RIM_TO_TWIST = RADIUS * np.linalg.pinv(RIM)
 
 
 @pytest.fixture

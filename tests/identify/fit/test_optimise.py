@@ -101,7 +101,6 @@ def test_a_fit_ends_where_the_loss_is_level(truth, path):
     assert abs(rise[0] - rise[1]) < 0.1  # a slope would show here twice
 
 
-@pytest.mark.slow
 def test_a_voltage_without_noise_of_its_own_leaves_the_motor_alone(truth):
     """The ammeter claims a variance that explains every gap of the voltage."""
     w = made(truth, runs=48, std={**NOISE, "voltage.window": 0.002})
