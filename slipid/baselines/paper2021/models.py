@@ -17,8 +17,8 @@ class DeployedModel:
 
     1 - s_i = a_i I~_i + b_i where the smoothed current I~_i > threshold, else s_i = 0. The robot
     smoothed currents from sample to sample, I~_k = memory I~_(k-1) + (1 - memory) I_k; the method
-    takes smoothed ones. The authors' lines leave [0, 1] beyond 1.55 A, so 1 - s is held inside it: a
-    wheel is never turned backwards.
+    takes smoothed ones. The authors' lines leave [0, 1] beyond 1.55 A, so 1 - s is held inside it:
+    a wheel is never turned backwards.
 
     Attributes:
         gain: a [1/A], shape (wheel,).
