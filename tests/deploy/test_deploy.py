@@ -81,11 +81,11 @@ def test_after_sampling_no_two_files_disagree(fitted, sampled):
 
 
 def test_gains_outlive_the_same_numbers_and_no_others(fitted, tmp_path, monkeypatch):
-    monkeypatch.setattr(optimisers, "PARTICLES", 4)
+    monkeypatch.setattr(optimisers, "PARTICLES", 6)
     monkeypatch.setattr(tune, "JUDGED", 4)
     out, fit = tmp_path / "out", load(fitted)
     shutil.copytree(fitted, out)
-    done = invoke("tune", out, "--method", "pso", "--rollouts", "64", "--quiet")
+    done = invoke("tune", out, "--method", "pso", "--rollouts", "96", "--quiet")
     assert done.exit_code in (0, 1), done.output
     kept, tuned = json.loads((out / "gains.json").read_text()), agree(out).record
     for name, gain in kept["gains"].items():
