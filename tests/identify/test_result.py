@@ -19,6 +19,7 @@ from slipid.data.windows import windows
 from slipid.identify import fit_file
 from slipid.identify.compare.predictive import Contact
 from slipid.identify.compare.validation import validation
+from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.optimise import Optimum, one_round
 from slipid.identify.fit.problem import DEGREES, Problem, State
 from slipid.identify.fit_file import load, save
