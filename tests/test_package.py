@@ -23,6 +23,22 @@ def test_import_is_light_and_silent():
     assert json.loads(done.stdout) == []
 
 
+def test_all_but_extras_runs_without_their_libraries():
+    """What `pip install slipid` brings is enough to identify, deploy, tune and run the demo."""
+    rooms = (
+        *("cli.demo", "job.identify", "job.validate", "job.compare", "job.drawn_estimates"),
+        *("deploy.deploy", "deploy.tune", "deploy.trial", "api.fit", "api.driving", "plots.fit"),
+    )
+    code = (
+        "import sys\nfrom importlib import import_module\n"
+        "for extra in ('emcee', 'arviz_stats', 'xarray', 'h5netcdf', 'mujoco', 'cv2', 'pyarrow'):\n"
+        "    sys.modules[extra] = None\n"
+        f"for room in {rooms!r}: import_module('slipid.' + room)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_xla_is_told_only_what_it_knows_and_nobody_said_otherwise(monkeypatch):
     from slipid.support import jax_setup
 

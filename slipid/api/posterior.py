@@ -14,7 +14,7 @@ from slipid.control.deployed import DeployedRobot
 from slipid.deploy.deploy import deploy
 from slipid.identify.fit.problem import Problem
 from slipid.identify.posterior import netcdf
-from slipid.identify.posterior import sample as posterior
+from slipid.identify.posterior import draws
 from slipid.identify.posterior.blocks import Plan
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
@@ -41,7 +41,7 @@ class Posterior:
         problem: the likelihood of the runs.
     """
 
-    result: posterior.Posterior
+    result: draws.Posterior
     fit: Fit
     task: Task
     problem: Problem

@@ -17,7 +17,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import DEGREES, Problem
 from slipid.identify.posterior.coordinates import EVERYTHING
 from slipid.identify.posterior.density import Density
-from slipid.identify.posterior.sample import Posterior
+from slipid.identify.posterior.draws import Posterior
 from slipid.parameter import Entry
 from slipid.search_space import Space
 from slipid.support.files import write_bytes

@@ -6,7 +6,6 @@ two stages; in the second every walker keeps its own draw of the motion.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -16,36 +15,12 @@ from slipid.identify.posterior import diagnosis, ensemble
 from slipid.identify.posterior.blocks import Block, Chain, Plan, Record
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.identify.posterior.density import Density
-from slipid.identify.posterior.diagnosis import Diagnosis
+from slipid.identify.posterior.draws import Posterior
 from slipid.identify.posterior.second_stage import electric_given_motion
 from slipid.identify.posterior.target import Target
 
 STILL = 0.01
 """Part of the walkers of the second stage that may never have moved."""
-
-
-@dataclass(frozen=True, eq=False)
-class Posterior:
-    """Draws, and whether and why they may be believed.
-
-    Effects are what runs of a session share, in stds. Log density, names and diagnosis are of the
-    first stage; accepted is the part of the moves that moved something, by stage. Of the second
-    stage's walkers, still is the part with a group that never moved, unsettled the worst drift or
-    memory, 1 where it is just enough.
-    """
-
-    z: Float[np.ndarray, "ensemble draw free"]
-    log_variance: Float[np.ndarray, "ensemble draw variance"]
-    effects: Float[np.ndarray, "ensemble draw effect"]
-    fitted: Fitted
-    log_prob: Float[np.ndarray, "ensemble draw"]
-    names: tuple[str, ...]
-    diagnosis: Diagnosis
-    accepted: dict[str, float]
-    still: float
-    unsettled: float
-    converged: bool
-    reason: str
 
 
 def sample(
