@@ -275,6 +275,16 @@ def test_runs_that_nothing_could_be_fitted_for_are_never_left_out(logs):
         folds_of(collect(logs), "luck")
 
 
+def test_folds_that_are_left_out_together_leave_some_of_every_floor(logs):
+    data = collect(logs)
+    every = folds_of(data, "sectors")
+    np.testing.assert_array_equal(folds_of(data, "sectors", 2), every % 2)
+    even = collect([log for log, k in zip(logs, every, strict=True) if k % 2 == 0])
+    assert set(folds_of(even, "sectors", 2)) == {-1}
+    with pytest.raises(ValueError, match="1 parts; expected 2 or more"):
+        folds_of(data, "sectors", 1)
+
+
 def test_a_fold_is_kept_whole_and_only_for_the_job_it_is_of(tmp_path):
     path = tmp_path / "folds" / "one.json"
 
