@@ -4,8 +4,8 @@ Everything below is loaded when it is first asked for: importing slipid loads an
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
 
+TYPE_CHECKING = False  # known to type checkers by its name, without loading `typing`
 if TYPE_CHECKING:
     from slipid.api.check import check as check
     from slipid.api.driving import drive as drive

@@ -89,6 +89,7 @@ def _damped(balance: Balance, xi: Planar) -> Planar:
 
 
 @jax.custom_jvp
+@jax.jit
 def _root(problem: ContactProblem) -> Float[Array, "3"]:
     balance = problem.balance()
 
@@ -103,6 +104,7 @@ def _root(problem: ContactProblem) -> Float[Array, "3"]:
 
 
 @jax.custom_jvp
+@jax.jit
 def _root_near(problem: ContactProblem) -> Float[Array, "3"]:
     balance = problem.balance()
 
@@ -130,9 +132,13 @@ def _implicit(
 
     def rule(primals: One, tangents: One) -> tuple[Array, Array]:
         xi = root(*primals)
+        return xi, moved(xi, primals, tangents)
+
+    @jax.jit
+    def moved(xi: Array, primals: One, tangents: One) -> Array:
         at = Planar(*xi)
         _, force = jax.jvp(lambda problem: problem.balance().force(at), primals, tangents)
-        return xi, -jnp.stack(solve3(primals[0].balance().jacobian(at), force))
+        return -jnp.stack(solve3(primals[0].balance().jacobian(at), force))
 
     return rule
 

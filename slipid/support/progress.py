@@ -1,16 +1,10 @@
 """Progress of long work on stderr: a bar on a terminal, plain lines elsewhere."""
 
 import time
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+if TYPE_CHECKING:
+    from rich.progress import TaskID
 
 EVERY_S = 2.0
 """Least time between two plain lines of one stage [s]."""
@@ -22,6 +16,16 @@ class Reporter:
     """Tells a person how far the work is, or nothing where quiet; use as a context."""
 
     def __init__(self, quiet: bool = False):
+        # late: every command names a reporter, and `--help` needs none
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
         self._console = Console(stderr=True, highlight=False, quiet=quiet)
         self._bars = Progress(
             TextColumn("{task.description}"),
@@ -35,7 +39,7 @@ class Reporter:
             # away from a terminal it only does the arithmetic
             disable=quiet or not self._console.is_terminal,
         )
-        self._task: TaskID | None = None
+        self._task: "TaskID | None" = None
         self._stage, self._told = "", 0.0
 
     def __enter__(self) -> "Reporter":
