@@ -118,6 +118,8 @@ def patchwork(
     Raises:
         ValueError: too many cells or patches.
     """
+    from scipy.spatial import KDTree
+
     _few(round(2 * half / cell) ** 2)
     count = int(np.ceil(2 * half / patch)) + 2
     if count > 500:
@@ -129,12 +131,7 @@ def patchwork(
     own = rng.integers(len(surfaces), size=len(seeds))
     x = np.arange(-half + 0.5 * cell, half, cell)
     centres = np.stack(np.meshgrid(x, x), -1)
-    nearest = np.full(centres.shape[:2], np.inf)
-    cells = np.zeros(centres.shape[:2], np.intp)
-    for place, surface in zip(seeds, own, strict=True):
-        far = np.linalg.norm(centres - place, axis=-1)
-        cells[far < nearest] = surface
-        nearest = np.minimum(nearest, far)
+    cells = own[KDTree(seeds).query(centres)[1]]
     return FloorMap(tuple(surfaces), cells, (-half, -half), cell)
 
 

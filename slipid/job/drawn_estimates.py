@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -33,7 +34,7 @@ def estimates(fit: Fit, found: Posterior) -> dict[str, Estimate]:
     for e in fit.space.free:
         at, d, old = fit.space.place[e.path], e.declaration, fit.parameters[e.path]
         z = flat[:, at]
-        values = np.stack([np.asarray(d.to_si(jnp.asarray(row))) for row in z])
+        values = np.asarray(jax.vmap(d.to_si)(jnp.asarray(z)))
         low, high = np.quantile(values, [0.05, 0.95], axis=0)
         scaled = np.cov((z / fit.space.prior_std[at]).T).reshape(e.coordinates, e.coordinates)
         ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))

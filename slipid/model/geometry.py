@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -60,28 +61,7 @@ class Geometry(eqx.Module):
 
     def frame(self) -> "Frame":
         """The wheels as rows of matrices, at the current radius, base and offsets."""
-        drive = jnp.asarray(self.drive_angle) + self.drive_offset
-        roller = jnp.asarray(self.roller_angle)
-        free = drive - roller
-        hold = free + 0.5 * math.pi
-        p = jnp.asarray(self.place) * self.base_radius
-
-        def row(angle: Float[Array, " wheel"]) -> Float[Array, "wheel 3"]:
-            c, s = jnp.cos(angle), jnp.sin(angle)
-            return jnp.stack([c, s, p[:, 0] * s - p[:, 1] * c], axis=-1)
-
-        # loads move when the contact patches do: N = N0 - shift @ (displacement), minimum change
-        lever = jnp.concatenate([jnp.ones((1, self.wheels)), p.T], axis=0)
-        return Frame(
-            hold=row(hold),
-            roll=row(free),
-            pull=jnp.sin(roller),
-            slip_through=jnp.cos(roller),
-            grip=jnp.asarray(self.grips, dtype=float),
-            shift=jnp.linalg.pinv(lever)[:, 1:],
-            radius=self.wheel_radius,
-            base=self.base_radius,
-        )
+        return _frame(self)
 
     def forward(self) -> Float[Array, "wheel 3"]:
         """J: rim speed of each wheel without slip [m/s] from the body twist."""
@@ -101,7 +81,7 @@ class Geometry(eqx.Module):
                 "the kinematics have rank below 3. Wheel-by-wheel inversion needs rank 3; "
                 "use model.slip = 'contact', which needs no inversion"
             )
-        return jnp.linalg.pinv(self.forward())
+        return jnp.asarray(np.linalg.pinv(j))
 
     def torques(self, force: Float[Array, " 3"]) -> Float[Array, " wheel"]:
         """Wheel torques [N m] that give a body force [N] and moment [N m], tau = r (J^+)^T F."""
@@ -131,6 +111,32 @@ class Frame(eqx.Module):
     shift: Float[Array, "wheel 2"]
     radius: Float[Array, ""]
     base: Float[Array, ""]
+
+
+@jax.jit
+def _frame(of: Geometry) -> Frame:
+    drive = jnp.asarray(of.drive_angle) + of.drive_offset
+    roller = jnp.asarray(of.roller_angle)
+    free = drive - roller
+    hold = free + 0.5 * math.pi
+    p = jnp.asarray(of.place) * of.base_radius
+
+    def row(angle: Float[Array, " wheel"]) -> Float[Array, "wheel 3"]:
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        return jnp.stack([c, s, p[:, 0] * s - p[:, 1] * c], axis=-1)
+
+    # loads move when the contact patches do: N = N0 - shift @ (displacement), minimum change
+    lever = jnp.concatenate([jnp.ones((1, of.wheels)), p.T], axis=0)
+    return Frame(
+        hold=row(hold),
+        roll=row(free),
+        pull=jnp.sin(roller),
+        slip_through=jnp.cos(roller),
+        grip=jnp.asarray(of.grips, dtype=float),
+        shift=jnp.linalg.pinv(lever)[:, 1:],
+        radius=of.wheel_radius,
+        base=of.base_radius,
+    )
 
 
 def omni(

@@ -10,8 +10,7 @@ and numbers of several floors can be moved, and accepted or not, in one evaluati
 """
 
 from collections.abc import Callable
-from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -57,6 +56,7 @@ class Density:
         self.anchor = anchor_at(problem, fitted, self.coordinates.sessions)
         # the first of its form compiles for all
         form = part, self.coordinates.names, self.coordinates.group.tobytes()
+        self._each: dict[Callable[..., object], Callable[..., Any]] = {}
         self._form: Density = problem.compiled.setdefault(form, self)
         at = self.coordinates
         effects = np.zeros(len(at.sessions) * len(AXES))
@@ -107,17 +107,18 @@ class Density:
         z = anchor.z.at[at.structure].set(structure)
         return z, anchor.log_variance.at[at.variance].set(variance)
 
-    @partial(jax.jit, static_argnums=(0, 1))
-    def _each(
-        self, of: Callable[..., Result], anchor: Anchor, x: Array, held: Held | None
-    ) -> Result:
-        return jax.lax.map(lambda one: of(self, anchor, *one), (x, held))
-
     def _of_all(
         self, of: Callable[..., Result], x: np.ndarray | Array, held: Held | None = None
     ) -> Result:
         """A method of one vector for many, by the density of this form that compiles for all."""
-        return self._form._each(of, self.anchor, jnp.asarray(x), held)
+        form = self._form
+
+        def each(anchor: Anchor, x: Array, held: Held | None) -> Result:
+            return jax.lax.map(lambda one: of(form, anchor, *one), (x, held))
+
+        # belongs to the density: one that JAX held by its arguments would never be forgotten
+        compiled = form._each.setdefault(of, jax.jit(each))
+        return compiled(self.anchor, jnp.asarray(x), held)
 
     def terms(
         self, x: Float[np.ndarray, "walker size"], held: Held | None = None

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -134,18 +135,18 @@ def _free(
     mean, block = np.asarray(z)[at], covariance[at, at]
     prior_mean, prior_std = space.prior_mean[at], space.prior_std[at]
     value = np.atleast_1d(np.asarray(entry.get(tree), float))
-    std_z, center = np.sqrt(np.diag(block)), np.asarray(d.to_si(jnp.asarray(prior_mean)))
+    std_z = np.sqrt(np.diag(block))
+    center = np.asarray(d.to_si(jnp.asarray(prior_mean)))
     if d.shares:
         rng = np.random.default_rng(0)
         spread = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
-        draws = np.stack([np.asarray(d.to_si(s)) for s in jnp.asarray(spread)])
+        draws = np.asarray(jax.vmap(d.to_si)(jnp.asarray(spread)))
         low, high = np.quantile(draws, [0.05, 0.95], axis=0)
         std = draws.std(axis=0)
         wide = np.full(entry.size, prior_std.mean() / entry.size)
     else:
         low, high = (np.asarray(d.to_si(jnp.asarray(mean + k * std_z))) for k in (-_Z95, _Z95))
         std = d.slope(value) * std_z
-        center = np.asarray(d.to_si(jnp.asarray(prior_mean)))
         wide = d.slope(center) * prior_std
     scaled = block / prior_std[:, None] / prior_std[None, :]
     ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from dataclasses import replace
 
 import jax
@@ -44,12 +46,16 @@ FREE = [
 ]
 
 
-@pytest.fixture(scope="module")
-def problem():
+def stated():
     truth = robot()
     w = made(truth, std=NOISE)
     w = replace(w, current_var=np.full_like(w.current_var, 1e-3))
     return Problem(w, truth, FREE)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return stated()
 
 
 def density(problem, part, session=None):
@@ -221,3 +227,14 @@ def test_a_single_floor_is_a_single_group():
     d = density(Problem(w, truth, [FREE[0], Choice("surface.*.creep", free=True)]), EVERYTHING)
     assert (d.coordinates.group == 0).all()
     assert d.terms(near(d)).shape == (4, 2)
+
+
+def test_a_density_is_forgotten_after_use():
+    """Chains around fit after fit must not keep the data of all of them."""
+    problem = stated()
+    d = density(problem, MOTION)
+    d.terms(near(d))
+    kept = weakref.ref(problem), weakref.ref(d)
+    del problem, d
+    gc.collect()
+    assert [ref() for ref in kept] == [None] * 2
