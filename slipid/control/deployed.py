@@ -28,7 +28,7 @@ class DeployedRobot(eqx.Module):
         motor: of every wheel.
         floors: stacked, a row per floor in the order of `labels`.
         rest: load shares at rest.
-        mass: [kg]; yaw_inertia: [kg m^2].
+        mass: [kg].
         process: std of what the model misses, growing with the root of the distance, along and
             across [m/sqrt(m)] and in yaw [rad/sqrt(m)].
         effect: std of what it misses all the way, [m/m], [m/m], [rad/m]; the spread of the fitted
@@ -50,7 +50,6 @@ class DeployedRobot(eqx.Module):
     floors: ContactSurface
     rest: Float[Array, " wheel"]
     mass: Float[Array, ""]
-    yaw_inertia: Float[Array, ""]
     process: Float[Array, "floor 3"]
     effect: Float[Array, "floor 3"]
     current_std: Float[Array, " floor"]
@@ -176,7 +175,6 @@ def _arrays(
         ),
         rest=_array(values[f"robot.load_share@{chosen.name}"]),
         mass=_array(values["robot.mass"]),
-        yaw_inertia=_array(values["robot.yaw_inertia"]),
         process=_array([floor.process for floor in floors]),
         effect=jnp.sqrt(effect**2 + _array(chosen.spread) ** 2) if spread else effect,
         current_std=_array([floor.current_std for floor in floors]),

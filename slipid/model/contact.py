@@ -26,22 +26,6 @@ _NEAR = 1e-6
 _MOST_NEAR = 12
 
 
-class Contact(eqx.Module):
-    """Forces on the body, in units of mean(mu) m g.
-
-    Attributes:
-        traction: along the drive direction of each wheel, what its motor works against.
-        drag: along the rolling direction of the rollers.
-        load: share of the weight.
-        residual: what does not balance, the moment over the base radius; zero at equilibrium.
-    """
-
-    traction: Float[Array, " wheel"]
-    drag: Float[Array, " wheel"]
-    load: Float[Array, " wheel"]
-    residual: Float[Array, "3"]
-
-
 class ContactProblem(eqx.Module):
     """What the twist of a robot depends on.
 
@@ -50,8 +34,7 @@ class ContactProblem(eqx.Module):
         frame: wheel directions.
         surface: one floor, or one under each wheel.
         rest: load shares at rest, sum 1.
-        start: where the twist is looked for; with inertia that before the step.
-        mass: mass and inertia over the time step, None in the quasi-static case.
+        start: where the twist is looked for.
     """
 
     rim: Float[Array, " wheel"]
@@ -59,14 +42,10 @@ class ContactProblem(eqx.Module):
     surface: ContactSurface
     rest: Float[Array, " wheel"]
     start: Float[Array, "3"]
-    mass: Float[Array, "3"] | None = None
 
     def balance(self) -> Balance:
         """The forces as a function of the twist."""
-        on = stand(self.frame, self.surface, self.rest)
-        if self.mass is None:
-            return Balance(self.rim, on)
-        return Balance(self.rim, on, Planar(*self.mass), Planar(*self.start))
+        return Balance(self.rim, stand(self.frame, self.surface, self.rest))
 
 
 def _damped(balance: Balance, xi: Planar) -> Planar:
@@ -159,6 +138,7 @@ def equilibrium(
     frame: Frame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
+    near: Float[Array, "3"] | None = None,
 ) -> Float[Array, "3"]:
     """Body twist (vx [m/s], vy [m/s], yaw rate [rad/s]) at which the contact forces balance.
 
@@ -167,60 +147,22 @@ def equilibrium(
         frame: wheel directions.
         surface: one floor, or one under each wheel.
         rest: load shares at rest, sum 1.
+        near: a twist so close that plain Newton steps arrive, about ten times cheaper; NaN comes
+            back where they do not. The last step is below 1e-6, which Newton's squares.
 
-    Source: the balance at the head of `slipid.model.contact_law` with M = 0.
+    Source: the balance at the head of `slipid.model.contact_law`.
     """
-    start = jax.lax.stop_gradient(guess(rim, frame))
-    return _root(ContactProblem(rim, frame, surface, rest, start))
+    start = jax.lax.stop_gradient(guess(rim, frame) if near is None else near)
+    problem = ContactProblem(rim, frame, surface, rest, start)
+    return _root(problem) if near is None else _root_near(problem)
 
 
-def equilibrium_near(
-    start: Float[Array, "3"],
-    rim: Float[Array, " wheel"],
-    frame: Frame,
-    surface: ContactSurface,
-    rest: Float[Array, " wheel"],
-) -> Float[Array, "3"]:
-    """`equilibrium` by plain Newton steps from a twist nearby, NaN where they do not arrive.
-
-    About ten times cheaper; the last step is below 1e-6, which Newton's squares.
-    """
-    start = jax.lax.stop_gradient(start)
-    return _root_near(ContactProblem(rim, frame, surface, rest, start))
-
-
-def step_with_inertia(
-    rim: Float[Array, " wheel"],
-    frame: Frame,
-    surface: ContactSurface,
-    rest: Float[Array, " wheel"],
-    before: Float[Array, "3"],
-    inertia: Float[Array, "3"],
-    dt: Float[Array, ""] | float,
-) -> Float[Array, "3"]:
-    """Twist one implicit Euler step later, with body inertia.
-
-    Args:
-        before: twist at the start of the step.
-        inertia: (m, m, I_z) / (mu m g) [s^2/m, s^2/m, s^2 m].
-        dt: step [s].
-    """
-    return _root(ContactProblem(rim, frame, surface, rest, before, inertia / dt))
-
-
-def forces(
+def traction(
     xi: Float[Array, "3"],
     rim: Float[Array, " wheel"],
     frame: Frame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
-) -> Contact:
-    """Forces and loads at a twist, and whether they balance."""
-    at, balance = Planar(*xi), Balance(rim, stand(frame, surface, rest))
-    x, y, moment = balance.force(at)
-    return Contact(
-        traction=balance.felt(at),
-        drag=balance.dragged(at),
-        load=balance.share(at),
-        residual=jnp.stack([x, y, moment / frame.base]),
-    )
+) -> Float[Array, " wheel"]:
+    """Traction along the drive of each wheel that its motor works against at a twist [mu m g]."""
+    return Balance(rim, stand(frame, surface, rest)).felt(Planar(*xi))

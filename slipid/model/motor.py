@@ -62,15 +62,6 @@ class Motor(eqx.Module):
         drop = self.brush_drop * jnp.tanh(current / 0.05)
         return self.resistance * current + self.back_emf * wm + drop
 
-    def current_rate(
-        self,
-        voltage: Float[Array, " *w"],
-        current: Float[Array, " *w"],
-        wheel_speed: Float[Array, " *w"],
-    ) -> Float[Array, " *w"]:
-        """dI/dt [A/s] with inductance."""
-        return (voltage - self.voltage(current, wheel_speed)) / self.inductance
-
     def friction(self, wheel_speed: Float[Array, " *w"]) -> Float[Array, " *w"]:
         """Friction torque at the wheel [N m], against the motion."""
         return (

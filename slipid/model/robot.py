@@ -155,18 +155,12 @@ def twist(
     load: Array,
     near: Float[Array, "3"] | None = None,
 ) -> Float[Array, "3"]:
-    """Quasi-static body twist on floor `surface` (index) with load set-up `load` (index).
+    """Body twist on floor `surface` (index) with load set-up `load` (index).
 
-    `surface` may have one index per wheel, here and below.
-
-    Args:
-        near: a twist so close that plain Newton steps arrive; NaN comes back where they do not.
+    `surface` may have one index per wheel, here and below; `near` is as of `contact.equilibrium`.
     """
     floor, rest = robot.surfaces.at(surface), robot.body.load_share[load]
-    rim = frame.radius * wheel_speed
-    if near is None:
-        return contact.equilibrium(rim, frame, floor, rest)
-    return contact.equilibrium_near(near, rim, frame, floor, rest)
+    return contact.equilibrium(frame.radius * wheel_speed, frame, floor, rest, near)
 
 
 def felt(
@@ -180,7 +174,7 @@ def felt(
     """Traction each motor works against at a twist, in units of mean(mu) m g."""
     rim = frame.radius * wheel_speed
     floor = robot.surfaces.at(surface)
-    return contact.forces(xi, rim, frame, floor, robot.body.load_share[load]).traction
+    return contact.traction(xi, rim, frame, floor, robot.body.load_share[load])
 
 
 def wheel_torque(

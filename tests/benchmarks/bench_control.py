@@ -46,9 +46,9 @@ def deployed():
     jax.config.update("jax_enable_compilation_cache", False)  # the time to compile is told too
     import jax.numpy as jnp
 
-    from slipid.deploy.deploy import deploy_known
     from slipid.model.geometry import omni
     from slipid.model.robot import build
+    from tests.helpers.known_robot import deploy_known
 
     made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ("a", "b", "c"))
     numbers = ([0.3, 0.45, 0.6], [0.2, 0.4, 0.9], [0.12, 0.25, 0.4])
@@ -72,8 +72,9 @@ def steps_of(kind):
     from slipid.control.controller import Controller, Gains
     from slipid.control.estimator import Estimator
     from slipid.control.odometry import Odometry
-    from slipid.control.pilot import CompiledPilot, Pilot
+    from slipid.control.pilot import Pilot
     from slipid.control.trajectory import rectangle
+    from tests.helpers.compiled_pilot import CompiledPilot
 
     contact = kind == "contact"
     observer = Estimator(f) if contact else Odometry(f, curve=True)

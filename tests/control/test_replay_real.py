@@ -25,12 +25,12 @@ from slipid.data.reading.presets import preset
 from slipid.data.reading.reader import read_log
 from slipid.data.runs import Runs, collect
 from slipid.deploy.controllers import ROWS, pilot_of
-from slipid.deploy.deploy import deploy_known
 from slipid.model.geometry import omni
 from slipid.model.plant import Floor
 from slipid.model.robot import Robot, build
 from slipid.search_space import Choice, Space
 from tests.helpers import replayed
+from tests.helpers.known_robot import deploy_known
 
 FIT = Path(__file__).parents[1] / "helpers" / "robotino2022_sectors.json"
 """Numbers of a fit that has seen no heading of 0 to 60 deg."""

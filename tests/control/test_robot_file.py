@@ -21,8 +21,7 @@ from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot, drawn
 from slipid.control.robot_file.gains_record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.control.robot_file.record import Seen, checksum
-from slipid.deploy.deploy import deploy_known
-from slipid.deploy.record_of import given, record_of
+from slipid.deploy.record_of import record_of
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.parameter import entries
@@ -358,6 +357,7 @@ from slipid.control.odometry import Odometry
 from slipid.control.pilot import Pilot
 from slipid.control.controller import Controller
 from slipid.control.trajectory import rectangle
+from tests.helpers.known_robot import deploy_known, given
 robot = DeployedRobot.load(sys.argv[1])
 pilot = Pilot(Odometry(robot), Controller(robot))
 z = Measurement(wheel_angle=[0.0, 0.0, 0.0], current=[0.1, 0.1, 0.1])

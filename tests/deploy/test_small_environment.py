@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from slipid.deploy.deploy import deploy_known
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 
@@ -24,6 +23,7 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.interface import Measurement
 from slipid.control.trajectory import rectangle
+from tests.helpers.known_robot import deploy_known
 
 robot = DeployedRobot.load(sys.argv[1])
 estimator, controller, path = Estimator(robot), Controller(robot), rectangle()

@@ -21,7 +21,6 @@ from slipid.control.robot_file.typed import typed
 from slipid.data.floor_map import four_zones, uniform
 from slipid.deploy import trial as tr
 from slipid.deploy.controllers import ROWS, gains_of, pilot_of
-from slipid.deploy.deploy import deploy_known
 from slipid.deploy.plants import SitePlant
 from slipid.deploy.trial_site import floor_of, known_to_site, starts
 from slipid.deploy.trial_summary import Run, summaries
@@ -30,6 +29,7 @@ from slipid.model.robot import build
 from slipid.support.errors import DataError
 from slipid.testsite.live import Live
 from slipid.testsite.site import Site
+from tests.helpers.known_robot import deploy_known
 
 
 @pytest.fixture(scope="module")

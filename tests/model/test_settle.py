@@ -49,7 +49,7 @@ def one_by_one(kind, rim):
 
     def of(floor):
         xi = contact.equilibrium(rim, frame, floor, rest)
-        return xi, contact.forces(xi, rim, frame, floor, rest).traction
+        return xi, contact.traction(xi, rim, frame, floor, rest)
 
     xi, pull = jax.vmap(of)(FLOORS.at(index))
     return xi.T, pull.T

@@ -148,7 +148,7 @@ class Twin(eqx.Module):
         f, wheels, xi, w = self.robot, self.robot.wheels, now.twist, now.speed
         under = self.floor.under(now.pose, f.places)
         floor = f.floors.at(under)
-        traction = contact.forces(xi, f.frame.radius * w, f.frame, floor, f.rest).traction
+        traction = contact.traction(xi, f.frame.radius * w, f.frame, floor, f.rest)
         force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
         keep = float(np.exp(-PERIOD / self.habits.drift_s))
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
