@@ -14,15 +14,12 @@ from slipid.control.deployed import DeployedRobot
 from slipid.deploy.deploy import deploy
 from slipid.identify.fit.problem import Problem
 from slipid.identify.posterior import draws, netcdf
-from slipid.identify.posterior.blocks import Plan
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.drawn_estimates import estimates
 from slipid.job.problem import Task
-from slipid.job.sample import sampled_around
 from slipid.report import estimates as report
 from slipid.report.page import Page
-from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -110,12 +107,3 @@ class Posterior:
     def save(self, path: Path | str) -> None:
         """Write posterior.nc, whole or not at all."""
         netcdf.write(self.tree, Path(path))
-
-
-def sampled(
-    fit: Fit, task: Task, problem: Problem, plan: Plan, draws: int, quiet: bool
-) -> Posterior:
-    """Posterior around a fit; arguments as of `Fit.sample`."""
-    with Reporter(quiet=quiet) as progress:
-        found = sampled_around(fit, problem, plan, draws, None, progress)
-    return Posterior(found, fit, task, problem)
