@@ -1,6 +1,7 @@
 """What an estimator and a controller know of an identified robot, as arrays."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.control.robot_file.check import check, declared
-from slipid.control.robot_file.file import ANEW, read_robot, write_robot
+from slipid.control.robot_file.file import ANEW, check, read_robot, write_robot
 from slipid.control.robot_file.record import Numbers, RobotRecord
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame, Geometry
@@ -157,7 +157,8 @@ def _arrays(
     chosen, wheels, floors = record.loads[place], record.wheels, record.floors
 
     def of(prefix: str, kind: type[eqx.Module]) -> dict[str, Array]:
-        return {name: _array(values[f"{prefix}.{name}"]) for name in declared(kind)}
+        names = [f.name for f in fields(kind) if "parameter" in f.metadata]
+        return {name: _array(values[f"{prefix}.{name}"]) for name in names}
 
     shape: dict[str, Any] = of("robot", Geometry) | vars(wheels)
     geometry = Geometry(**shape)

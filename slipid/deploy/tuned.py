@@ -10,7 +10,7 @@ from jaxtyping import Float
 from slipid.control.closed_loop import PERIOD
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot
-from slipid.control.robot_file.gains_record import GainRecord, GainsRecord, GainValues, Losses
+from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.control.tuning.objective import (
     BATCH,
     GAINS,

@@ -19,8 +19,7 @@ import pytest
 
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot, drawn
-from slipid.control.robot_file.gains_record import GainRecord, GainsRecord, GainValues, Losses
-from slipid.control.robot_file.record import Seen, checksum
+from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses, Seen
 from slipid.deploy.record_of import record_of
 from slipid.model.geometry import omni
 from slipid.model.robot import build
@@ -357,6 +356,7 @@ from slipid.control.odometry import Odometry
 from slipid.control.pilot import Pilot
 from slipid.control.controller import Controller
 from slipid.control.trajectory import rectangle
+from slipid.support.files import checksum
 from tests.helpers.known_robot import deploy_known, given
 robot = DeployedRobot.load(sys.argv[1])
 pilot = Pilot(Odometry(robot), Controller(robot))

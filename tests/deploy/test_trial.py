@@ -16,7 +16,7 @@ from slipid.control.floor_filter import FloorFilter
 from slipid.control.interface import Measurement, Settings
 from slipid.control.odometry import Odometry
 from slipid.control.pilot import Pilot
-from slipid.control.robot_file.gains_record import GainRecord, GainsRecord, GainValues, Losses
+from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.control.robot_file.typed import typed
 from slipid.data.floor_map import four_zones, uniform
 from slipid.deploy import trial as tr
