@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.control.deployed import DeployedRobot
+from slipid.control.tuning.twin import Floor
 from slipid.data.floor_map import FloorMap, patchwork
-from slipid.model.plant import Floor
 from slipid.support.errors import DataError
 
 SITE_SEED, STARTS_SEED = 7, 2021

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.model.contact_balance import Balance, stand
+from slipid.model.contact_balance import Balance, Stance, stand, total
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame
 from slipid.model.se2 import Columns, Planar, solve3
@@ -24,6 +24,12 @@ _DAMPING = (1.0, 0.3, 0.05)
 _ROUNDING = 1e-20
 _NEAR = 1e-6
 _MOST_NEAR = 12
+CHORD, NEWTON = 4, 2
+"""Steps of each kind that `settle` takes from the twist of a moment ago.
+
+Wheel speeds that change by up to 1.25 rad/s a step, three floors: 99 % of all twists are then
+within 3 mm/s (20 mm/s with 2 and 3 steps), half of them within rounding.
+"""
 
 
 class ContactProblem(eqx.Module):
@@ -166,3 +172,38 @@ def traction(
 ) -> Float[Array, " wheel"]:
     """Traction along the drive of each wheel that its motor works against at a twist [mu m g]."""
     return Balance(rim, stand(frame, surface, rest)).felt(Planar(*xi))
+
+
+def settle(
+    start: Float[Array, "3 floors"], rim: Array, on: Stance, plain: Float[Array, "3 wheel"]
+) -> tuple[Float[Array, "3 floors"], Float[Array, "wheel floors"]]:
+    """Equilibrium of many floors at once from the twist of a moment ago, and the traction felt.
+
+    A few chord steps, then Newton's where these come nearer: for a robot's computer. Where a number
+    is lost it is the twist without slip. What a jump of the wheel speeds leaves over, the next call
+    settles.
+
+    Args:
+        start: twists [m/s, m/s, rad/s].
+        rim: rim speeds of one robot (wheel,), or of one for every column (wheel, floors) [m/s].
+        on: how the robot stands on each combination of floors, arrays (wheel, floors).
+        plain: twist per rim speed without slip, J^+.
+
+    Returns:
+        Twists, and tractions [m g mean(mu)].
+    """
+    rim = rim.reshape(plain.shape[1], -1)
+    balance, near = Balance(rim, on), Planar(*start)
+    for _ in range(CHORD):
+        near = balance.chord(near)
+    xi = near
+    for _ in range(NEWTON):
+        xi = jax.tree.map(jnp.subtract, xi, balance.newton(xi))
+    # NaN is not nearer
+    nearer = balance.size(balance.force(xi)) <= balance.size(balance.force(near))
+    found = jax.tree.map(lambda x, n: jnp.where(nearer, x, n), xi, near)
+    sound = jnp.isfinite(found.x + found.y + found.yaw)
+    free = Planar(*(total(row[:, None] * rim) for row in plain))
+    twist = jnp.stack(jax.tree.map(lambda x, p: jnp.where(sound, x, p), found, free))
+    felt = jnp.where(nearer, balance.felt(xi), balance.felt(near))
+    return twist, jnp.where(jnp.isfinite(felt), felt, 0.0)

@@ -1,4 +1,4 @@
-"""robot.json: written whole or not at all, read and checked with one sentence for all that is wrong.
+"""robot.json: written whole or not at all, and read with one clear sentence for all that is wrong.
 
 `robot.schema.json` beside this package describes the file for other programs.
 """

@@ -24,8 +24,7 @@ from slipid.control.pilot import Pilot
 from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.stability import SPARE, radii
-from slipid.control.tuning.twin import Twin, rollout
-from slipid.model.plant import Floor
+from slipid.control.tuning.twin import Floor, Twin, rollout
 
 GAINS = tuple(f.name for f in fields(Gains))
 """Names of the gains, in the order of vectors of them."""
@@ -86,14 +85,14 @@ class Task(eqx.Module):
         """Of one case [mm]."""
         pilot = Pilot(Estimator(self.robot), Controller(self.robot, gains))
         twin = Twin(case.truth, case.floor, replace(self.habits, smooth=True))
-        run = rollout(pilot, case.path, twin, case.start, case.key, self.steps)
-        wanted = jax.vmap(case.path.at)(run.own)
-        gap = run.pose[:, :2] - wanted[:, :2]
-        turned = self.robot.frame.base * jnp.sin(run.pose[:, 2] - wanted[:, 2])
-        jump = EFFORT_S * self.robot.frame.radius * jnp.diff(run.command, axis=0)
+        pose, said = rollout(pilot, case.path, twin, case.start, case.key, self.steps)
+        wanted = jax.vmap(case.path.at)(said.time)
+        gap = pose[:, :2] - wanted[:, :2]
+        turned = self.robot.frame.base * jnp.sin(pose[:, 2] - wanted[:, 2])
+        jump = EFFORT_S * self.robot.frame.radius * jnp.diff(said.command, axis=0)
         squares = jnp.mean(jnp.sum(gap**2, axis=1) + turned**2)
         effort = jnp.mean(jnp.sum(jump**2, axis=1))
-        missing = jax.nn.relu(case.path.duration - run.own[-1])
+        missing = jax.nn.relu(case.path.duration - said.time[-1])
         return 1000.0 * jnp.sqrt(squares + effort + 1e-12) + LATE * missing
 
     def penalty(self, gains: Gains, truths: DeployedRobot) -> Float[Array, ""]:
