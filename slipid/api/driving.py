@@ -8,9 +8,8 @@ from slipid.control.deployed import DeployedRobot
 from slipid.data.floor_map import FloorMap
 from slipid.deploy.controllers import ROWS, pilot_of
 from slipid.deploy.deploy import habits_of
-from slipid.deploy.plants import twin
 from slipid.deploy.trial import REST_S
-from slipid.deploy.trial_site import site, starts
+from slipid.deploy.trial_site import site, starts, twin
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from slipid.data.floor_map import FloorMap
 from slipid.data.map_file import read_map
 from slipid.deploy.controllers import ROWS, gains_of, pilot_of
 from slipid.deploy.deploy import habits_of, read_robot
-from slipid.deploy.trial_site import known_to_site, site, starts
+from slipid.deploy.trial_site import SitePlant, known_to_site, site, starts, twin
 from slipid.deploy.trial_summary import Run, summaries
 from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.errors import DataError
@@ -195,11 +195,7 @@ def drive(job: Job) -> float:
 
 def _plant(job: Job, gyro: bool, robot: DeployedRobot) -> closed_loop.Plant:
     if job.plant == "twin":
-        from slipid.deploy.plants import twin
-
         return twin(robot, job.floor, job.start, job.seed, replace(job.habits, gyro=gyro))
-    from slipid.deploy.plants import SitePlant
-
     return SitePlant(job.floor, robot.load_setup, job.start, job.seed, gyro)
 
 

@@ -69,10 +69,10 @@ def steps_of(kind):
     import jax
     import jax.numpy as jnp
 
+    from slipid.control.closed_loop import Pilot
     from slipid.control.controller import Controller, Gains
     from slipid.control.estimator import Estimator
     from slipid.control.odometry import Odometry
-    from slipid.control.pilot import Pilot
     from slipid.control.trajectory import rectangle
     from tests.helpers.compiled_pilot import CompiledPilot
 

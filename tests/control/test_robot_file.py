@@ -25,6 +25,8 @@ from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.parameter import entries
 from slipid.support.errors import DataError
+from slipid.support.files import checksum
+from tests.helpers.known_robot import deploy_known, given
 
 SCHEMA = json.loads(resources.files("slipid.control").joinpath("robot.schema.json").read_text())
 SEEN = Seen(3, ("as_built",), (0.0, 8.0), (0.0, 0.4), (0.0, 0.3), (0.0, 1.0), (0.0,), (), (), 1.1)
@@ -353,11 +355,9 @@ print(sorted(new - {"slipid", *sys.stdlib_module_names}))
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import Measurement
 from slipid.control.odometry import Odometry
-from slipid.control.pilot import Pilot
+from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller
 from slipid.control.trajectory import rectangle
-from slipid.support.files import checksum
-from tests.helpers.known_robot import deploy_known, given
 robot = DeployedRobot.load(sys.argv[1])
 pilot = Pilot(Odometry(robot), Controller(robot))
 z = Measurement(wheel_angle=[0.0, 0.0, 0.0], current=[0.1, 0.1, 0.1])

@@ -12,6 +12,7 @@ import pytest
 
 from slipid.model.geometry import omni
 from slipid.model.robot import build
+from tests.helpers.known_robot import deploy_known
 
 ROOT = Path(__file__).resolve().parents[2]
 ON_THE_ROBOT = """
@@ -23,7 +24,6 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.interface import Measurement
 from slipid.control.trajectory import rectangle
-from tests.helpers.known_robot import deploy_known
 
 robot = DeployedRobot.load(sys.argv[1])
 estimator, controller, path = Estimator(robot), Controller(robot), rectangle()

@@ -10,19 +10,18 @@ import pytest
 
 from slipid.control import closed_loop
 from slipid.control import trajectory as reference
+from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.floor_filter import FloorFilter
 from slipid.control.interface import Measurement, Settings
 from slipid.control.odometry import Odometry
-from slipid.control.pilot import Pilot
 from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.control.robot_file.typed import typed
 from slipid.data.floor_map import four_zones, uniform
 from slipid.deploy import trial as tr
 from slipid.deploy.controllers import ROWS, gains_of, pilot_of
-from slipid.deploy.plants import SitePlant
-from slipid.deploy.trial_site import floor_of, known_to_site, starts
+from slipid.deploy.trial_site import SitePlant, floor_of, known_to_site, starts
 from slipid.deploy.trial_summary import Run, summaries
 from slipid.model.geometry import omni
 from slipid.model.robot import build

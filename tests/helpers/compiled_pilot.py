@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.control.closed_loop import Pilot
 from slipid.control.interface import Pose, Readings, State
-from slipid.control.pilot import Pilot
 from slipid.control.trajectory import Path
 
 Tree = TypeVar("Tree")

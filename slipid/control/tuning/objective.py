@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.interface import Numbers
-from slipid.control.pilot import Pilot
 from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.stability import SPARE, radii

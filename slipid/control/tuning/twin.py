@@ -21,10 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from slipid.control.closed_loop import PERIOD
+from slipid.control.closed_loop import PERIOD, Pilot, PilotOutput, PilotState
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import Measurement, Pose, Readings, State
-from slipid.control.pilot import Pilot, PilotOutput, PilotState
 from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import RING, Habits
 from slipid.model import contact

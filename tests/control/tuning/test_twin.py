@@ -5,10 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.control.closed_loop import Plant, drive
+from slipid.control.closed_loop import Pilot, Plant, drive
 from slipid.control.controller import Controller, Gains
 from slipid.control.odometry import Odometry
-from slipid.control.pilot import Pilot
 from slipid.control.trajectory import waypoints
 from slipid.control.tuning.actuation import RING, Habits
 from slipid.control.tuning.twin import Twin, TwinPlant, rollout
