@@ -13,7 +13,7 @@ import numpy as np
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import MIXED
-from slipid.control.robot_file.record import Number, Seen, Sensors, Source
+from slipid.control.robot_file.record import Number, Sensors, Source
 from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
 from slipid.deploy.record_of import record_of
@@ -57,7 +57,7 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
         jax.vmap(fit.space.tree)(jnp.asarray(vectors)),
         max(max(v.wheel_speed) for v in fit.validity.values()),
         fit.current_trend,
-        {name: Seen(**vars(v)) for name, v in fit.validity.items()},
+        fit.validity,
     )
     # one that has learnt from runs over several floors expects to drive on several
     alike = record.alike if fit.mixed is None else MIXED

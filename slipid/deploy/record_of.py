@@ -18,13 +18,12 @@ from slipid.control.robot_file.record import (
     Numbers,
     Pair,
     RobotRecord,
-    Seen,
     Wheels,
 )
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame
-from slipid.model.robot import GRAVITY, Robot
+from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.parameter import entries
 
 AXES = ("along", "across", "yaw")
@@ -37,7 +36,7 @@ def record_of(
     draws: Robot,
     highest_speed: float,
     current_trend: Pair,
-    seen: Mapping[str, Seen],
+    seen: Mapping[str, Validity],
 ) -> RobotRecord:
     """The record of a robot, but for what is known of where its numbers come from.
 
@@ -76,7 +75,7 @@ def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[Numbers, ..
             yield e.path, tuple(plain(np.asarray(row)) for row in rows)
 
 
-def _floor(name: str, std: Mapping[str, float], seen: Seen | None) -> FloorRecord:
+def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> FloorRecord:
     """What the model misses on a floor."""
 
     def of(kind: str, default: Axes) -> np.ndarray:

@@ -1,7 +1,7 @@
 """The whole robot as one tree of declared numbers: wheels, motors, floors, loads, camera."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -113,6 +113,30 @@ class Robot(eqx.Module):
     def session_index(self, name: str) -> int:
         """Place of a session, -1 for one that was not fitted."""
         return self.camera.sessions.index(name) if name in self.camera.sessions else -1
+
+
+@dataclass(frozen=True)
+class Validity:
+    """What a floor was seen with; beyond it numbers extrapolate.
+
+    Attributes:
+        runs: how many; loads: with which load set-ups.
+        wheel_speed, torque_nm, slip, yaw_rate: smallest and largest [rad/s], [N m], 1, [rad/s];
+            the yaw rate by the encoders.
+        headings_deg, speeds, turn_rates: of the body, each that was driven [deg], [m/s], [rad/s].
+        distance: of a run, on average [m].
+    """
+
+    runs: int
+    loads: tuple[str, ...]
+    wheel_speed: tuple[float, float]
+    torque_nm: tuple[float, float]
+    slip: tuple[float, float]
+    yaw_rate: tuple[float, float]
+    headings_deg: tuple[float, ...]
+    speeds: tuple[float, ...]
+    turn_rates: tuple[float, ...]
+    distance: float
 
 
 def _with_mass(robot: Robot, mass: Array) -> Robot:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
+from slipid.model.robot import Validity
 from slipid.support.files import checksum
 
 Numbers = float | tuple[float, ...]
@@ -72,29 +73,6 @@ class Wheels:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What a floor was seen with; beyond it the numbers extrapolate.
-
-    Attributes:
-        runs: how many; loads: with which load set-ups.
-        wheel_speed, torque_nm, slip, yaw_rate: smallest and largest.
-        headings_deg, speeds, turn_rates: of the body, each that was driven.
-        distance: of a run, on average.
-    """
-
-    runs: int
-    loads: tuple[str, ...]
-    wheel_speed: Pair
-    torque_nm: Pair
-    slip: Pair
-    yaw_rate: Pair
-    headings_deg: tuple[float, ...]
-    speeds: tuple[float, ...]
-    turn_rates: tuple[float, ...]
-    distance: float
-
-
-@dataclass(frozen=True)
 class FloorRecord:
     """What the model misses on a floor, as stds.
 
@@ -108,7 +86,7 @@ class FloorRecord:
     process: Axes
     effect: Axes
     current_std: float
-    seen: Seen | None
+    seen: Validity | None
 
 
 @dataclass(frozen=True)
