@@ -167,8 +167,7 @@ class FloorFilter(eqx.Module):
     def _stiction(self, w: Array) -> Array:
         """Variance of the current that holds a standing wheel, between friction's bounds [A^2]."""
         motor = self.robot.motor
-        gain = motor.gear_ratio * motor.efficiency * motor.back_emf
-        return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / gain) ** 2 / 3
+        return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / motor.gain) ** 2 / 3
 
     def _mixed(self, old: FloorState, xi: Array, tick: Tick) -> tuple[Array, Array]:
         """Probabilities and ways once wheels may have come to other floors."""

@@ -19,7 +19,7 @@ from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
 from slipid.data.floor_map import FloorMap
 from slipid.data.map_file import read_map
-from slipid.deploy.controllers import ROWS, gains_of, pilot_of
+from slipid.deploy.controllers import ROWS, check_gains, pilot_of
 from slipid.deploy.deploy import habits_of, read_robot
 from slipid.deploy.trial_site import SitePlant, known_to_site, site, starts, twin
 from slipid.deploy.trial_summary import Run, summaries
@@ -52,7 +52,6 @@ class Job:
     robot: DeployedRobot
     settings: Settings
     habits: Habits
-    gains: Gains
     kept: Checkpoint
 
 
@@ -108,7 +107,7 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
         "schema": SCHEMA,
         "plant": wish.plant,
         "map": "patches" if wish.map is None else str(wish.map),
-        "gains": _named(jobs[0].gains),
+        "gains": _named(jobs[0].robot),
         "closes_best": min(table, key=lambda name: table[name].median["closure_error_median"]),
         "summary": {name: row.to_json() for name, row in table.items()},
         "controllers": {name: ROWS[name].about for name in wish.controllers},
@@ -133,9 +132,9 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         settings, habits = replace(settings, current_is_signed=False), Habits()
     elif absent := [name for name in floor.surfaces if name not in known]:
         raise DataError(f"{wish.map}: no surface '{absent[0]}'; identified: {', '.join(known)}")
-    gains = jax.tree.map(np.asarray, gains_of(out, robot))
+    check_gains(out, robot)
     key = key_of(
-        *(wish.plant, robot.load_setup, _named(gains), settings, habits, *jax.tree.leaves(robot)),
+        *(wish.plant, robot.load_setup, _named(robot), settings, habits, *jax.tree.leaves(robot)),
         *(floor.surfaces, floor.corner, floor.cell, floor.cells),
         # runs of other code are not taken for this one's
         source_hash("control", "model", "testsite", "data", "deploy"),
@@ -149,7 +148,6 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         robot=robot,
         settings=settings,
         habits=habits,
-        gains=gains,
         kept=kept,
     )
     return [
@@ -159,7 +157,8 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
     ]
 
 
-def _named(gains: Gains) -> dict[str, float]:
+def _named(robot: DeployedRobot) -> dict[str, float]:
+    gains = Gains.of(robot)
     return {f.name: float(getattr(gains, f.name)) for f in fields(gains)}
 
 
@@ -173,10 +172,10 @@ def drive(job: Job) -> float:
     """Drive one run and write its metrics and its path; how long it took [s]."""
     setup_jax(quiet=True)
     row = ROWS[job.row]
-    robot, gains = jax.tree.map(jnp.asarray, (job.robot, job.gains))
+    robot = jax.tree.map(jnp.asarray, job.robot)
     path = trajectory.rectangle().moved(job.start).waiting(REST_S)
     plant = _plant(job, row.gyro, robot)
-    pilot = pilot_of(robot, row, gains, job.settings)
+    pilot = pilot_of(robot, row, job.settings)
     course = closed_loop.drive(pilot, path, plant, job.start)
     off = course.pose[-1] - course.believed[-1]
     run = Run(

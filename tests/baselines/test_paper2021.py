@@ -133,7 +133,7 @@ def test_forms_recover_their_coefficients(rng):
     }
     expected = [(3.2,), (0.1, 2.0), (0.05, 4.0, -5.0), (0.08, 0.5), (0.4,)]
     for (name, slip), coefficients in zip(truth.items(), expected, strict=True):
-        form = fit_form(Samples(1, I, M, slip), name)
+        form = fit_form(Samples(I, M, slip), name)
         np.testing.assert_allclose(form.coefficients, coefficients, rtol=1e-9)
         assert form.rmse < 1e-12
         np.testing.assert_allclose(form.slip(M if "M" in name else I), slip, rtol=1e-9)
@@ -142,7 +142,7 @@ def test_forms_recover_their_coefficients(rng):
 def test_line_through_the_origin_does_not_bend_to_an_offset(rng):
     M = rng.uniform(0.02, 0.4, 400)
     slip = 0.3 + 0.0 * M
-    form = fit_form(Samples(1, M, M, slip), "linear in M")
+    form = fit_form(Samples(M, M, slip), "linear in M")
     slope = (M @ slip) / (M @ M)
     assert form.coefficients == pytest.approx((slope,), rel=1e-12)
     assert form.rmse == pytest.approx(np.sqrt(np.mean((slip - slope * M) ** 2)), rel=1e-12)
@@ -150,7 +150,7 @@ def test_line_through_the_origin_does_not_bend_to_an_offset(rng):
 
 
 def test_too_few_samples_are_refused():
-    empty = Samples(1, np.zeros(1), np.zeros(1), np.zeros(1))
+    empty = Samples(np.zeros(1), np.zeros(1), np.zeros(1))
     with pytest.raises(ValueError, match="1 samples cannot fix 2 coefficients"):
         fit_form(empty, "affine in M")
 

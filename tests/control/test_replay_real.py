@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from slipid.control import trajectory as reference
-from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.interface import Settings
@@ -107,7 +106,7 @@ def test_twin_and_controllers_do_what_was_reviewed(deployed: DeployedRobot, gold
         for row in ("encoder", "paper_code", "contact", "contact_ahead", "contact_gyro"):
             kind = ROWS[row]
             habits = Habits(voltage=False, gyro=kind.gyro)
-            pilot = pilot_of(deployed, kind, Gains(), Settings())
+            pilot = pilot_of(deployed, kind, Settings())
             path = reference.rectangle().moved(start).waiting(1.0)
             twin = Twin(deployed, floor, habits)
             key = jax.random.key(1000 + k)

@@ -34,8 +34,8 @@ class PaperResult:
         """All numbers by name, ready for JSON."""
         return {
             "schema": SCHEMA,
-            "figure2": _table_dict(self.field),
-            "figures3and4": {f"motor{m}": _table_dict(table) for m, table in self.motors.items()},
+            "figure2": _table_dict(1, self.field),
+            "figures3and4": {f"motor{m}": _table_dict(m, t) for m, t in self.motors.items()},
             "figure7": {track.file.name: track.as_dict() for track in self.tracks},
             "deployed": {
                 "gain_per_A": tables.DEPLOYED_GAIN,
@@ -83,9 +83,9 @@ def _form_dict(form: FittedForm) -> dict[str, object]:
     return asdict(form) | {"unit": "N m" if form.regressor == "torque" else "A"}
 
 
-def _table_dict(table: MotorTable) -> dict[str, object]:
+def _table_dict(motor: int, table: MotorTable) -> dict[str, object]:
     return {
-        "motor": table.motor,
+        "motor": motor,
         "n": len(table.samples),
         "n_by_surface": {name: len(part) for name, part in table.by_surface.items()},
         "models": {name: _form_dict(form) for name, form in table.forms.items()},

@@ -90,10 +90,6 @@ class MotorTable:
     forms: dict[str, FittedForm]
     stored: FittedForm | None
 
-    @property
-    def motor(self) -> int:
-        return self.samples.motor
-
 
 def fit_form(samples: Samples, name: str) -> FittedForm:
     """Least squares of one row of the table.

@@ -95,11 +95,6 @@ class Task(eqx.Module):
         missing = jax.nn.relu(case.path.duration - said.time[-1])
         return 1000.0 * jnp.sqrt(squares + effort + 1e-12) + LATE * missing
 
-    def penalty(self, gains: Gains, truths: DeployedRobot) -> Float[Array, ""]:
-        """Of a loop that is hardly stable [mm]; continues a little below the bound."""
-        rho = radii(Controller(self.robot, gains), truths, self.habits, SPARE)
-        return PENALTY * jax.nn.relu(jnp.max(rho) - LARGEST_RADIUS)
-
     def margins(self, gains: Gains, truths: DeployedRobot) -> Float[np.ndarray, "draw loop"]:
         """1 - spectral radius of every draw, for every floor and direction, gains as they are."""
         rho = np.asarray(radii(Controller(self.robot, gains), truths, self.habits))
@@ -147,11 +142,7 @@ def slopes(
     """
     step = jnp.where(x + REACH > 1, -REACH, REACH)
     places = x + jnp.concatenate([jnp.zeros((1, len(x))), jnp.diag(step)])
-
-    def of(place: Array) -> Array:
-        return jax.vmap(lambda case: task.loss(Gains.at(gains_at(place)), case))(cases)
-
-    value = jax.vmap(of)(places)
+    value = jax.vmap(lambda place: losses(task, place, cases))(places)
     return ((value[1:] - value[0]) / step[:, None]).T, value[0]
 
 
@@ -159,9 +150,14 @@ def slopes(
 def penalties(
     task: Task, x: Float[Array, "place gain"], truths: DeployedRobot
 ) -> Float[Array, " place"]:
-    """Penalty at places of the box [mm]."""
-    found: Array = jax.vmap(lambda place: task.penalty(Gains.at(gains_at(place)), truths))(x)
-    return found
+    """Of loops that are hardly stable, at places of the box [mm]; goes on below the bound."""
+
+    def of(place: Array) -> Array:
+        controller = Controller(task.robot, Gains.at(gains_at(place)))
+        rho = radii(controller, truths, task.habits, SPARE)
+        return PENALTY * jax.nn.relu(jnp.max(rho) - LARGEST_RADIUS)
+
+    return jax.vmap(of)(x)
 
 
 def penalty_slope(
