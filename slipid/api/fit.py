@@ -261,5 +261,4 @@ def task_of(
 
 def _plain(value: Numbers) -> float | list[float]:
     """A number, or a list of them, as JSON holds them."""
-    found: float | list[float] = np.asarray(value, float).tolist()
-    return found
+    return np.asarray(value, float).tolist()

@@ -77,8 +77,7 @@ class Posterior:
         """Draws, likelihoods and replicated data as an ArviZ DataTree."""
         runs = tuple(log.name for log in self.task.dataset.logs)
         about = {"schema": netcdf.SCHEMA, "data_hash": self.fit.data_hash}
-        made: DataTree = netcdf.tree(self.problem, self.result, runs, about)
-        return made
+        return netcdf.tree(self.problem, self.result, runs, about)
 
     def plot(self, name: str = "intervals") -> "Figure":
         """One of the posterior's pictures.

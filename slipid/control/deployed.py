@@ -142,8 +142,7 @@ def drawn(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
     for k in picked:
         values = plain | {path: rows[k] for path, rows in record.draws.items()}
         one.append(_arrays(record, robot.load_setup, values, spread=False))
-    stacked: DeployedRobot = jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
-    return stacked
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
 
 
 def _arrays(

@@ -119,8 +119,7 @@ def habits_of(robot: DeployedRobot, gyro: bool) -> Habits:
 def _at(robot: Robot, numbers: Mapping[str, Estimate]) -> Robot:
     """The robot with its numbers at their estimates."""
     fixed = [Choice(glob.escape(path), fixed=e.value) for path, e in numbers.items()]
-    made: Robot = Space(robot, fixed).template
-    return made
+    return Space(robot, fixed).template
 
 
 def _number(e: Estimate) -> Number:

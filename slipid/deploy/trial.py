@@ -174,7 +174,11 @@ def drive(job: Job) -> float:
     row = ROWS[job.row]
     robot = jax.tree.map(jnp.asarray, job.robot)
     path = trajectory.rectangle().moved(job.start).waiting(REST_S)
-    plant = _plant(job, row.gyro, robot)
+    plant: closed_loop.Plant
+    if job.plant == "twin":
+        plant = twin(robot, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro))
+    else:
+        plant = SitePlant(job.floor, robot.load_setup, job.start, job.seed, row.gyro)
     pilot = pilot_of(robot, row, job.settings)
     course = closed_loop.drive(pilot, path, plant, job.start)
     off = course.pose[-1] - course.believed[-1]
@@ -190,12 +194,6 @@ def drive(job: Job) -> float:
     job.kept.save(job.name, path_of)
     job.kept.save_json(job.name, asdict(run))
     return float(course.time[-1])
-
-
-def _plant(job: Job, gyro: bool, robot: DeployedRobot) -> closed_loop.Plant:
-    if job.plant == "twin":
-        return twin(robot, job.floor, job.start, job.seed, replace(job.habits, gyro=gyro))
-    return SitePlant(job.floor, robot.load_setup, job.start, job.seed, gyro)
 
 
 def names_of(text: str | None) -> tuple[str, ...]:

@@ -90,8 +90,7 @@ class ContactSurface(eqx.Module):
 
     def at(self, index: Int[Array | np.ndarray, "..."] | int) -> "ContactSurface":
         """Surface number `index` of the stack (may be traced), or those under each wheel."""
-        picked: ContactSurface = jax.tree.map(lambda leaf: leaf[index], self)
-        return picked
+        return jax.tree.map(lambda leaf: leaf[index], self)
 
 
 class Friction(eqx.Module):

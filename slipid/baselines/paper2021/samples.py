@@ -91,11 +91,8 @@ class Samples:
 
 def pool(parts: Sequence[Samples]) -> Samples:
     """All points of several sets of one motor, in order."""
-    return Samples(
-        current=np.concatenate([p.current for p in parts]),
-        torque=np.concatenate([p.torque for p in parts]),
-        slip=np.concatenate([p.slip for p in parts]),
-    )
+    columns = zip(*((p.current, p.torque, p.slip) for p in parts), strict=True)
+    return Samples(*map(np.concatenate, columns))
 
 
 def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Samples:

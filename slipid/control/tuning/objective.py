@@ -64,8 +64,7 @@ class Cases(eqx.Module):
 
     def at(self, index: np.ndarray | slice) -> "Cases":
         """Those of an index."""
-        picked: Cases = jax.tree.map(lambda x: x[index], self)
-        return picked
+        return jax.tree.map(lambda x: x[index], self)
 
 
 class Task(eqx.Module):
@@ -126,8 +125,7 @@ def combined(losses: Float[Array, " case"]) -> Float[Array, ""]:
 def losses(task: Task, x: Float[Array, " gain"], cases: Cases) -> Float[Array, " case"]:
     """Loss of every case at a place of the box [mm]."""
     gains = Gains.at(gains_at(x))
-    found: Array = jax.vmap(lambda case: task.loss(gains, case))(cases)
-    return found
+    return jax.vmap(lambda case: task.loss(gains, case))(cases)
 
 
 @eqx.filter_jit

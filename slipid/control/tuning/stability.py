@@ -160,5 +160,4 @@ def radii(
 
     floors, ways = jnp.arange(len(controller.robot.labels)), jnp.asarray(WAYS)
     over = jax.vmap(jax.vmap(jax.vmap(one, (None, None, 0)), (None, 0, None)), (0, None, None))
-    found: Array = over(truths, floors, ways)
-    return found
+    return over(truths, floors, ways)

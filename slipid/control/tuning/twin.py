@@ -107,8 +107,7 @@ class Twin(eqx.Module):
     def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:
         """Standard normal numbers of a step by its number; 0 is the reading at rest."""
         count = 3 * self.robot.wheels + 1 + 3 * self.habits.substeps
-        drawn: Array = jax.random.normal(jax.random.fold_in(key, number), (count,))
-        return drawn
+        return jax.random.normal(jax.random.fold_in(key, number), (count,))
 
     def init(self, pose: Pose, key: Array) -> TwinState:
         """State at rest at a pose [m, m, rad], with what this run has of its own."""
@@ -230,9 +229,7 @@ def rollout(
         state, reading = twin.step(before, out.command, drawn)
         return (state, held, reading), (before.pose, out)
 
-    run: tuple[Array, PilotOutput]
-    run = jax.lax.scan(step, (state, pilot.init(start), reading), noise[1:])[1]
-    return run
+    return jax.lax.scan(step, (state, pilot.init(start), reading), noise[1:])[1]
 
 
 class TwinPlant:
