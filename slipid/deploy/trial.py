@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -141,17 +140,9 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
     )
     # trials of other gains or floors lie beside this one, so that going back to them costs nothing
     kept = Checkpoint(out / FOLDER / key[:12] / f"of{wish.starts}", key)
-    made = partial(
-        Job,
-        plant=wish.plant,
-        floor=floor,
-        robot=robot,
-        settings=settings,
-        habits=habits,
-        kept=kept,
-    )
+    shared = wish.plant, floor, robot, settings, habits, kept
     return [
-        made(f"{row}/start{k:02d}", row, start, 1000 + k)
+        Job(f"{row}/start{k:02d}", row, start, 1000 + k, *shared)
         for row in wish.controllers
         for k, start in enumerate(starts(wish.starts, floor))
     ]
