@@ -353,7 +353,7 @@ import slipid.control
 for found in pkgutil.walk_packages(slipid.control.__path__, "slipid.control."):
     importlib.import_module(found.name)
 new = {name.split(".")[0] for name in set(sys.modules) - before}
-print(sorted(new - {"slipid", *sys.stdlib_module_names}))
+print(sorted(new - {"slipid", "jax", *sys.stdlib_module_names}))
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import Measurement
 from slipid.control.odometry import Odometry
