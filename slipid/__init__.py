@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from slipid.api.made import made_runs as made_runs
     from slipid.api.motion import move as move
     from slipid.api.posterior import Posterior as Posterior
-    from slipid.api.profile import Profile as Profile
-    from slipid.api.validation import Validation as Validation
+    from slipid.api.results import Profile as Profile
+    from slipid.api.results import Validation as Validation
     from slipid.control.controller import Controller as Controller
     from slipid.control.deployed import DeployedRobot as DeployedRobot
     from slipid.control.estimator import Estimator as Estimator
@@ -40,9 +40,9 @@ _ROOMS = {
     "Plan": "slipid.identify.posterior.blocks",
     "Posterior": "slipid.api.posterior",
     "Prior": "slipid.api.fit",
-    "Profile": "slipid.api.profile",
+    "Profile": "slipid.api.results",
     "Robot": "slipid.model.robot",
-    "Validation": "slipid.api.validation",
+    "Validation": "slipid.api.results",
     "check": "slipid.api.check",
     "drive": "slipid.api.driving",
     "fit": "slipid.api.fit",

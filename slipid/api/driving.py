@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 
 from slipid.control import closed_loop, trajectory
-from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.data.floor_map import FloorMap
 from slipid.deploy.controllers import ROWS, pilot_of
 from slipid.deploy.deploy import habits_of
-from slipid.deploy.plants import twin
 from slipid.deploy.trial import REST_S
-from slipid.deploy.trial_site import site, starts
+from slipid.deploy.trial_site import site, starts, twin
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,5 +55,5 @@ def drive(
     row, begin = ROWS[controller], places[start]
     plant = twin(robot, floor, begin, seed, habits_of(robot, gyro=row.gyro))
     path = trajectory.rectangle().moved(begin).waiting(REST_S)
-    course = closed_loop.drive(pilot_of(robot, row, Gains.of(robot)), path, plant, begin)
+    course = closed_loop.drive(pilot_of(robot, row), path, plant, begin)
     return Drive(course, floor, closed_loop.metrics(course))

@@ -7,10 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slipid.api.comparison import Comparison, compared
-from slipid.api.profile import Profile
-from slipid.api.proposal import Proposal
-from slipid.api.validation import Validation
+from slipid.api.results import Comparison, Profile, Proposal, Validation, compared
 from slipid.data.runs import Runs
 from slipid.identify import fit_file, result
 from slipid.identify.compare.predictive import Contact
@@ -148,10 +145,13 @@ class Fit:
             plan: of walkers and steps, in place of `seed` and `most`.
             quiet: no progress.
         """
-        from slipid.api.posterior import sampled
+        from slipid.api.posterior import Posterior
+        from slipid.job.sample import sampled_around
 
         plan = plan or Plan(seed=seed, most=most)
-        return sampled(self.result, self.task, self.problem, plan, draws, quiet)
+        with Reporter(quiet=quiet) as report:
+            found = sampled_around(self.result, self.problem, plan, draws, None, report)
+        return Posterior(found, self.result, self.task, self.problem)
 
     def compare(self, question: str = "sectors", parts: int = 6, quiet: bool = False) -> Comparison:
         """Every slip model fitted anew without some runs, and judged on those.
@@ -261,5 +261,4 @@ def task_of(
 
 def _plain(value: Numbers) -> float | list[float]:
     """A number, or a list of them, as JSON holds them."""
-    found: float | list[float] = np.asarray(value, float).tolist()
-    return found
+    return np.asarray(value, float).tolist()

@@ -67,5 +67,4 @@ def _moved(
         current = robot.motor.current(torque, speed)
         return xi, speed, 1 - frame.hold @ xi / rim, torque * way, current * way
 
-    moved: tuple[Array, ...] = jax.vmap(one)(command)
-    return moved
+    return jax.vmap(one)(command)

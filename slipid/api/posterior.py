@@ -14,15 +14,12 @@ from slipid.control.deployed import DeployedRobot
 from slipid.deploy.deploy import deploy
 from slipid.identify.fit.problem import Problem
 from slipid.identify.posterior import draws, netcdf
-from slipid.identify.posterior.blocks import Plan
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.drawn_estimates import estimates
 from slipid.job.problem import Task
-from slipid.job.sample import sampled_around
 from slipid.report import estimates as report
 from slipid.report.page import Page
-from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,8 +77,7 @@ class Posterior:
         """Draws, likelihoods and replicated data as an ArviZ DataTree."""
         runs = tuple(log.name for log in self.task.dataset.logs)
         about = {"schema": netcdf.SCHEMA, "data_hash": self.fit.data_hash}
-        made: DataTree = netcdf.tree(self.problem, self.result, runs, about)
-        return made
+        return netcdf.tree(self.problem, self.result, runs, about)
 
     def plot(self, name: str = "intervals") -> "Figure":
         """One of the posterior's pictures.
@@ -110,12 +106,3 @@ class Posterior:
     def save(self, path: Path | str) -> None:
         """Write posterior.nc, whole or not at all."""
         netcdf.write(self.tree, Path(path))
-
-
-def sampled(
-    fit: Fit, task: Task, problem: Problem, plan: Plan, draws: int, quiet: bool
-) -> Posterior:
-    """Posterior around a fit; arguments as of `Fit.sample`."""
-    with Reporter(quiet=quiet) as progress:
-        found = sampled_around(fit, problem, plan, draws, None, progress)
-    return Posterior(found, fit, task, problem)

@@ -1,6 +1,7 @@
 """What an estimator and a controller know of an identified robot, as arrays."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.control.robot_file.check import check, declared
-from slipid.control.robot_file.file import ANEW, read_robot, write_robot
+from slipid.control.robot_file.file import ANEW, check, read_robot, write_robot
 from slipid.control.robot_file.record import Numbers, RobotRecord
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame, Geometry
@@ -28,7 +28,7 @@ class DeployedRobot(eqx.Module):
         motor: of every wheel.
         floors: stacked, a row per floor in the order of `labels`.
         rest: load shares at rest.
-        mass: [kg]; yaw_inertia: [kg m^2].
+        mass: [kg].
         process: std of what the model misses, growing with the root of the distance, along and
             across [m/sqrt(m)] and in yaw [rad/sqrt(m)].
         effect: std of what it misses all the way, [m/m], [m/m], [rad/m]; the spread of the fitted
@@ -50,7 +50,6 @@ class DeployedRobot(eqx.Module):
     floors: ContactSurface
     rest: Float[Array, " wheel"]
     mass: Float[Array, ""]
-    yaw_inertia: Float[Array, ""]
     process: Float[Array, "floor 3"]
     effect: Float[Array, "floor 3"]
     current_std: Float[Array, " floor"]
@@ -143,8 +142,7 @@ def drawn(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
     for k in picked:
         values = plain | {path: rows[k] for path, rows in record.draws.items()}
         one.append(_arrays(record, robot.load_setup, values, spread=False))
-    stacked: DeployedRobot = jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
-    return stacked
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
 
 
 def _arrays(
@@ -158,7 +156,8 @@ def _arrays(
     chosen, wheels, floors = record.loads[place], record.wheels, record.floors
 
     def of(prefix: str, kind: type[eqx.Module]) -> dict[str, Array]:
-        return {name: _array(values[f"{prefix}.{name}"]) for name in declared(kind)}
+        names = [f.name for f in fields(kind) if "parameter" in f.metadata]
+        return {name: _array(values[f"{prefix}.{name}"]) for name in names}
 
     shape: dict[str, Any] = of("robot", Geometry) | vars(wheels)
     geometry = Geometry(**shape)
@@ -176,7 +175,6 @@ def _arrays(
         ),
         rest=_array(values[f"robot.load_share@{chosen.name}"]),
         mass=_array(values["robot.mass"]),
-        yaw_inertia=_array(values["robot.yaw_inertia"]),
         process=_array([floor.process for floor in floors]),
         effect=jnp.sqrt(effect**2 + _array(chosen.spread) ** 2) if spread else effect,
         current_std=_array([floor.current_std for floor in floors]),

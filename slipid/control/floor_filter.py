@@ -22,8 +22,9 @@ from jaxtyping import Array, Bool, Float
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import Settings
 from slipid.control.wheels import Currents
+from slipid.model.contact import settle
+from slipid.model.contact_balance import stand
 from slipid.model.robot import GRAVITY
-from slipid.model.settle import combine, settle
 
 HASTE = 30.0
 """Wheel acceleration from which inertia, which the equilibrium lacks, hides floors [rad/s^2]."""
@@ -132,10 +133,10 @@ class FloorFilter(eqx.Module):
     ) -> tuple[Float[Array, "hypothesis 3"], Float[Array, "hypothesis wheel"]]:
         """Twist [m/s, m/s, rad/s] and currents [A] of every hypothesis, `near` a moment ago."""
         f = self.robot
-        floors = combine(f.frame, f.floors, self.hypotheses, f.rest, f.inverse)
+        on = stand(f.frame, f.floors.at(self.hypotheses.T), f.rest)
         rim = f.frame.radius * w
-        twist, pull = settle(near.T, rim, floors)
-        torque = floors.friction * f.mass * GRAVITY * f.frame.radius * pull
+        twist, pull = settle(near.T, rim, on, f.inverse)
+        torque = on.friction * f.mass * GRAVITY * f.frame.radius * pull
         amps = f.motor.current(torque.T, jnp.broadcast_to(w, torque.T.shape))
         more = f.current_trend @ jnp.stack([1.0, length((f.inverse @ rim)[:2])])
         return twist.T, amps + jnp.sign(amps) * more
@@ -166,8 +167,7 @@ class FloorFilter(eqx.Module):
     def _stiction(self, w: Array) -> Array:
         """Variance of the current that holds a standing wheel, between friction's bounds [A^2]."""
         motor = self.robot.motor
-        gain = motor.gear_ratio * motor.efficiency * motor.back_emf
-        return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / gain) ** 2 / 3
+        return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / motor.gain) ** 2 / 3
 
     def _mixed(self, old: FloorState, xi: Array, tick: Tick) -> tuple[Array, Array]:
         """Probabilities and ways once wheels may have come to other floors."""

@@ -202,8 +202,7 @@ class AbstractEstimator(eqx.Module, Generic[State]):
         given = jax.tree.leaves((self, state, z, dt))
         if any(isinstance(x, jax.core.Tracer) for x in given):
             return self.advance(state, z, dt)
-        found: tuple[State, Estimate] = _advanced(self, state, z, dt)
-        return found
+        return _advanced(self, state, z, dt)
 
 
 @eqx.filter_jit

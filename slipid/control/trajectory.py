@@ -94,14 +94,13 @@ def waypoints(
     speed: float = 0.2,
     acceleration: float = 0.5,
     pause: float = 0.6,
-    heading: float = 0.0,
 ) -> Path:
     """Straight from place to place with a stop at each, without turning.
 
     Args:
         places: x, y [m], the first one is where it starts.
         speed: between stops [m/s]; acceleration: [m/s^2].
-        pause: at every place [s]; heading: all the way [rad].
+        pause: at every place [s].
 
     Raises:
         ValueError: fewer than two places, neighbours that are the same, or a speed or acceleration
@@ -112,16 +111,15 @@ def waypoints(
     p = np.asarray(places, float)
     if p.ndim != 2 or len(p) < 2 or p.shape[1] != 2:
         raise ValueError(f"way-points {p.tolist()}; expected two or more places x, y")
-    parts, marks, time = [np.array([[*p[0], heading, 0.0, 0.0, 0.0]])], [], 0.0
+    parts, marks, time = [np.array([[*p[0], 0.0, 0.0, 0.0, 0.0]])], [], 0.0
     for a, b in itertools.pairwise(p):
         far = float(np.hypot(*(b - a)))
         if far < 1e-9:
             raise ValueError(f"way-point {b.tolist()} twice in a row; expected another place")
         gone, pace = _trapezoid(far, speed, acceleration, pause)
         u = (b - a) / far
-        turned = np.full((len(gone), 1), heading)
         still = np.zeros((len(gone), 1))
-        parts.append(np.hstack([a + gone[:, None] * u, turned, pace[:, None] * u, still]))
+        parts.append(np.hstack([a + gone[:, None] * u, still, pace[:, None] * u, still]))
         time += len(gone) * STEP
         marks.append(time)
     rows = np.concatenate(parts)

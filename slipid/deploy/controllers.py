@@ -8,12 +8,12 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
+from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Correction, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.interface import AbstractEstimator, Settings
 from slipid.control.odometry import Odometry
-from slipid.control.pilot import Pilot
 from slipid.support.errors import DataError
 
 
@@ -51,11 +51,11 @@ ROWS: Mapping[str, Row] = {
 }
 
 
-def gains_of(out: Path, robot: DeployedRobot) -> Gains:
-    """Gains that `slipid tune` found for a robot and its load set-up, else those set by hand.
+def check_gains(out: Path, robot: DeployedRobot) -> None:
+    """Refuse gains that `slipid tune` found for other numbers or another load set-up.
 
     Raises:
-        DataError: there are gains, of other numbers or of another load set-up.
+        DataError: there are such gains in the folder.
     """
     tuned, path = robot.record.gains, out / "gains.json"
     if tuned is None and path.is_file():
@@ -68,14 +68,11 @@ def gains_of(out: Path, robot: DeployedRobot) -> Gains:
             f"{out / 'robot.json'}: gains were tuned for another load set-up ({tuned.load}); run "
             f"slipid tune again with --load {robot.load_setup}"
         )
-    return Gains.of(robot)
 
 
-def pilot_of(
-    robot: DeployedRobot, row: Row, gains: Gains, settings: Settings | None = None
-) -> Pilot[eqx.Module]:
-    """Estimator and controller of a row; the gains are tuned ones, which some rows have."""
-    own = gains if row.tuned else Gains()
+def pilot_of(robot: DeployedRobot, row: Row, settings: Settings | None = None) -> Pilot[eqx.Module]:
+    """Estimator and controller of a row; some rows have the gains tuned for the robot."""
+    own = Gains.of(robot) if row.tuned else Gains()
     if row.ahead:
         own = replace(own, ahead=jnp.asarray(1.0))
     estimator: AbstractEstimator[Any] = Estimator(robot, settings)

@@ -13,10 +13,10 @@ import numpy as np
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import MIXED
-from slipid.control.robot_file.record import Number, Seen, Sensors, Source
+from slipid.control.robot_file.record import Number, Sensors, Source
 from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
-from slipid.deploy.record_of import given, record_of
+from slipid.deploy.record_of import record_of
 from slipid.identify.posterior.draws import Posterior
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
@@ -55,9 +55,9 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
         {path: _number(e) for path, e in numbers.items()},
         {name: float(v) ** 0.5 for name, v in fit.variance.items()},
         jax.vmap(fit.space.tree)(jnp.asarray(vectors)),
-        max((max(v.wheel_speed) for v in fit.validity.values()), default=None),
+        max(max(v.wheel_speed) for v in fit.validity.values()),
         fit.current_trend,
-        {name: Seen(**vars(v)) for name, v in fit.validity.items()},
+        fit.validity,
     )
     # one that has learnt from runs over several floors expects to drive on several
     alike = record.alike if fit.mixed is None else MIXED
@@ -71,23 +71,6 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
         versions=versions(),
     )
     return DeployedRobot.of(about)
-
-
-def deploy_known(
-    robot: Robot,
-    load: str | None = None,
-    std: Mapping[str, float] | None = None,
-    draws: Robot | None = None,
-    highest_speed: float | None = None,
-    current_trend: tuple[float, float] = (0.0, 0.0),
-) -> DeployedRobot:
-    """A robot whose numbers are known without a fit; arguments as of `record_of`.
-
-    Raises:
-        ValueError: no such load set-up, or wheels whose kinematics have rank below 3.
-    """
-    record = record_of(robot, given(robot), std or {}, draws, highest_speed, current_trend)
-    return DeployedRobot.of(record, load)
 
 
 def write_robot(out: Path, fit: Fit, posterior: Posterior | None = None) -> tuple[str, ...]:
@@ -136,8 +119,7 @@ def habits_of(robot: DeployedRobot, gyro: bool) -> Habits:
 def _at(robot: Robot, numbers: Mapping[str, Estimate]) -> Robot:
     """The robot with its numbers at their estimates."""
     fixed = [Choice(glob.escape(path), fixed=e.value) for path, e in numbers.items()]
-    made: Robot = Space(robot, fixed).template
-    return made
+    return Space(robot, fixed).template
 
 
 def _number(e: Estimate) -> Number:

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import reduce
-from types import MappingProxyType
 
 import equinox as eqx
 import jax
@@ -17,29 +16,27 @@ from slipid.control.robot_file.record import (
     LoadRecord,
     Number,
     Numbers,
+    Pair,
     RobotRecord,
-    Seen,
     Wheels,
 )
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame
-from slipid.model.robot import GRAVITY, Robot
+from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.parameter import entries
 
 AXES = ("along", "across", "yaw")
-FASTEST = 20.0
-"""Wheel speed that counts as seen where nothing is known of it [rad/s]."""
 
 
 def record_of(
     robot: Robot,
     numbers: Mapping[str, Number],
     std: Mapping[str, float],
-    draws: Robot | None = None,
-    highest_speed: float | None = None,
-    current_trend: tuple[float, float] = (0.0, 0.0),
-    seen: Mapping[str, Seen] = MappingProxyType({}),
+    draws: Robot,
+    highest_speed: float,
+    current_trend: Pair,
+    seen: Mapping[str, Validity],
 ) -> RobotRecord:
     """The record of a robot, but for what is known of where its numbers come from.
 
@@ -48,37 +45,20 @@ def record_of(
         numbers: by path; those that the deployed robot does not need, the camera's, are left out.
         std: of every variance component by name, as fit.json has them (`process.gray.along`).
         draws: the robot's posterior, stacked, for what the uncertainty of the numbers adds to the
-            effects; None for nothing.
+            effects.
         highest_speed: of the wheels in the fitted runs [rad/s].
         current_trend: of currents over the model's in the fitted runs, all floors [A], [A s/m].
         seen: what the floors were seen with, as far as that is known.
     """
-    shape, top = robot.geometry, FASTEST if highest_speed is None else highest_speed
     return RobotRecord(
-        wheels=Wheels(**{f.name: getattr(shape, f.name) for f in fields(Wheels)}),
+        wheels=Wheels(**{f.name: getattr(robot.geometry, f.name) for f in fields(Wheels)}),
         parameters={p: n for p, n in numbers.items() if not p.startswith("camera.")},
         floors=tuple(_floor(name, std, seen.get(name)) for name in robot.surfaces.labels),
-        loads=tuple(_load(robot, name, top, draws) for name in robot.body.loads),
+        loads=tuple(_load(robot, name, highest_speed, draws) for name in robot.body.loads),
         current_trend=current_trend,
-        highest_speed=top,
-        draws={} if draws is None else dict(_varied(robot, draws)),
+        highest_speed=highest_speed,
+        draws=dict(_varied(robot, draws)),
     )
-
-
-def given(robot: Robot) -> dict[str, Number]:
-    """The numbers of a robot as they were given, by path."""
-    return {
-        e.path: Number(
-            value=plain(np.asarray(e.get(robot))),
-            unit=e.declaration.unit,
-            std=None,
-            interval90=None,
-            verdict="fixed",
-            provenance="override",
-            source="given",
-        )
-        for e in entries(robot)
-    }
 
 
 def plain(value: np.ndarray) -> Numbers:
@@ -95,7 +75,7 @@ def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[Numbers, ..
             yield e.path, tuple(plain(np.asarray(row)) for row in rows)
 
 
-def _floor(name: str, std: Mapping[str, float], seen: Seen | None) -> FloorRecord:
+def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> FloorRecord:
     """What the model misses on a floor."""
 
     def of(kind: str, default: Axes) -> np.ndarray:
@@ -119,16 +99,14 @@ def _axes(row: Sequence[float] | np.ndarray) -> Axes:
     return along, across, yaw
 
 
-def _load(robot: Robot, name: str, top: float, draws: Robot | None) -> LoadRecord:
+def _load(robot: Robot, name: str, top: float, draws: Robot) -> LoadRecord:
     """What depends on how the robot is loaded."""
     frame, k = robot.geometry.frame(), jnp.asarray(robot.load_index(name))
     speed, amps, slip = _circle(robot, frame, k, jnp.asarray(top))
     curve = np.asarray(_wheel_curve(speed, amps, slip))
-    floors = len(robot.surfaces.labels)
-    spread = np.zeros((floors, 3)) if draws is None else np.asarray(_spread(draws, k))
     return LoadRecord(
         name=name,
-        spread=tuple(_axes(row) for row in spread),
+        spread=tuple(_axes(row) for row in np.asarray(_spread(draws, k))),
         highest_current=float(jnp.max(jnp.abs(amps))),
         wheel_curve=tuple((float(a), float(b)) for a, b in curve),
     )
@@ -151,7 +129,7 @@ def _circle(robot: Robot, frame: Frame, load: Array, top: Array) -> tuple[Array,
         rim = frame.radius * w
         xi = contact.equilibrium(rim, frame, floor, rest)
         force = floor.friction * robot.body.mass * GRAVITY * frame.radius
-        torque = force * contact.forces(xi, rim, frame, floor, rest).traction
+        torque = force * contact.traction(xi, rim, frame, floor, rest)
         lost = rim - robot.geometry.forward() @ xi
         return robot.motor.current(torque, w), lost / jnp.where(jnp.abs(rim) < 1e-9, 1e-9, rim)
 

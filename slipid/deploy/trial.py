@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,9 @@ from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
 from slipid.data.floor_map import FloorMap
 from slipid.data.map_file import read_map
-from slipid.deploy.controllers import ROWS, gains_of, pilot_of
+from slipid.deploy.controllers import ROWS, check_gains, pilot_of
 from slipid.deploy.deploy import habits_of, read_robot
-from slipid.deploy.trial_site import known_to_site, site, starts
+from slipid.deploy.trial_site import SitePlant, known_to_site, site, starts, twin
 from slipid.deploy.trial_summary import Run, summaries
 from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.errors import DataError
@@ -52,7 +51,6 @@ class Job:
     robot: DeployedRobot
     settings: Settings
     habits: Habits
-    gains: Gains
     kept: Checkpoint
 
 
@@ -108,7 +106,7 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
         "schema": SCHEMA,
         "plant": wish.plant,
         "map": "patches" if wish.map is None else str(wish.map),
-        "gains": _named(jobs[0].gains),
+        "gains": _named(jobs[0].robot),
         "closes_best": min(table, key=lambda name: table[name].median["closure_error_median"]),
         "summary": {name: row.to_json() for name, row in table.items()},
         "controllers": {name: ROWS[name].about for name in wish.controllers},
@@ -133,33 +131,25 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         settings, habits = replace(settings, current_is_signed=False), Habits()
     elif absent := [name for name in floor.surfaces if name not in known]:
         raise DataError(f"{wish.map}: no surface '{absent[0]}'; identified: {', '.join(known)}")
-    gains = jax.tree.map(np.asarray, gains_of(out, robot))
+    check_gains(out, robot)
     key = key_of(
-        *(wish.plant, robot.load_setup, _named(gains), settings, habits, *jax.tree.leaves(robot)),
+        *(wish.plant, robot.load_setup, _named(robot), settings, habits, *jax.tree.leaves(robot)),
         *(floor.surfaces, floor.corner, floor.cell, floor.cells),
         # runs of other code are not taken for this one's
         source_hash("control", "model", "testsite", "data", "deploy"),
     )
     # trials of other gains or floors lie beside this one, so that going back to them costs nothing
     kept = Checkpoint(out / FOLDER / key[:12] / f"of{wish.starts}", key)
-    made = partial(
-        Job,
-        plant=wish.plant,
-        floor=floor,
-        robot=robot,
-        settings=settings,
-        habits=habits,
-        gains=gains,
-        kept=kept,
-    )
+    shared = wish.plant, floor, robot, settings, habits, kept
     return [
-        made(f"{row}/start{k:02d}", row, start, 1000 + k)
+        Job(f"{row}/start{k:02d}", row, start, 1000 + k, *shared)
         for row in wish.controllers
         for k, start in enumerate(starts(wish.starts, floor))
     ]
 
 
-def _named(gains: Gains) -> dict[str, float]:
+def _named(robot: DeployedRobot) -> dict[str, float]:
+    gains = Gains.of(robot)
     return {f.name: float(getattr(gains, f.name)) for f in fields(gains)}
 
 
@@ -173,10 +163,14 @@ def drive(job: Job) -> float:
     """Drive one run and write its metrics and its path; how long it took [s]."""
     setup_jax(quiet=True)
     row = ROWS[job.row]
-    robot, gains = jax.tree.map(jnp.asarray, (job.robot, job.gains))
+    robot = jax.tree.map(jnp.asarray, job.robot)
     path = trajectory.rectangle().moved(job.start).waiting(REST_S)
-    plant = _plant(job, row.gyro, robot)
-    pilot = pilot_of(robot, row, gains, job.settings)
+    plant: closed_loop.Plant
+    if job.plant == "twin":
+        plant = twin(robot, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro))
+    else:
+        plant = SitePlant(job.floor, robot.load_setup, job.start, job.seed, row.gyro)
+    pilot = pilot_of(robot, row, job.settings)
     course = closed_loop.drive(pilot, path, plant, job.start)
     off = course.pose[-1] - course.believed[-1]
     run = Run(
@@ -191,16 +185,6 @@ def drive(job: Job) -> float:
     job.kept.save(job.name, path_of)
     job.kept.save_json(job.name, asdict(run))
     return float(course.time[-1])
-
-
-def _plant(job: Job, gyro: bool, robot: DeployedRobot) -> closed_loop.Plant:
-    if job.plant == "twin":
-        from slipid.deploy.plants import twin
-
-        return twin(robot, job.floor, job.start, job.seed, replace(job.habits, gyro=gyro))
-    from slipid.deploy.plants import SitePlant
-
-    return SitePlant(job.floor, robot.load_setup, job.start, job.seed, gyro)
 
 
 def names_of(text: str | None) -> tuple[str, ...]:

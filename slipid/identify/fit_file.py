@@ -23,7 +23,7 @@ from slipid.identify.fit_json import (
 from slipid.identify.result import Fit
 from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import json_text, read_json, write_bytes
+from slipid.support.files import checksum, json_text, read_json, write_bytes
 
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
@@ -41,7 +41,7 @@ def save(fit: Fit, folder: Path) -> tuple[str, ...]:
     name = f"fit-{sha256[:12]}.npz"
     content = to_json(fit) | {"arrays": {"file": name, "sha256": sha256}}
     content = json.loads(json_text(content))
-    content |= {"checksum": _checksum(content)}
+    content |= {"checksum": checksum(content)}
     table = json_text(identified_json(fit))
     write_bytes(folder / name, arrays)
     write_bytes(folder / FIT, json_text(content).encode())  # from here on it is the new fit
@@ -70,7 +70,7 @@ def load(folder: Path) -> Fit:
     if found != SCHEMA_FIT:
         what = f"its schema is {found}" if isinstance(found, str) else "it has no schema"
         raise DataError(f"{path}: {what}; expected {SCHEMA_FIT}, {_RESULT} of this version")
-    if content.pop("checksum", None) != (checksum := _checksum(content)):
+    if content.pop("checksum", None) != (mark := checksum(content)):
         raise DataError(f"{path}: damaged or edited, its checksum differs; expected {_RESULT}")
     try:
         fit = from_json(content, _unpacked(folder, **content["arrays"]))
@@ -79,19 +79,13 @@ def load(folder: Path) -> Fit:
             raise
         raise DataError(f"{path}: {error}; expected {_RESULT} of this version") from error
     table = folder / IDENTIFIED
-    other = read_json(table, _RESULT) if table.exists() else {"fit": checksum}
-    if not isinstance(other, dict) or other.get("fit") != checksum:
+    other = read_json(table, _RESULT) if table.exists() else {"fit": mark}
+    if not isinstance(other, dict) or other.get("fit") != mark:
         raise DataError(
             f"{table}: of another fit than {FIT} beside it, its writing was interrupted; "
             "expected both of one fit (run `slipid identify` again)"
         )
     return fit
-
-
-def _checksum(content: Content) -> str:
-    """Hash of JSON content that holds the hash of the arrays, so of all that belongs to a fit."""
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _packed(fit: Fit) -> bytes:

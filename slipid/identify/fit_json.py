@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.identify.result import Channels, Fit
-from slipid.identify.slip_curves import SlipCurve, Validity
+from slipid.identify.slip_curves import SlipCurve
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.model.geometry import Geometry
-from slipid.model.robot import Robot, build
+from slipid.model.robot import Robot, Validity, build
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
 from slipid.support.content import Content

@@ -18,10 +18,10 @@ from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.variances import Search, Square
 from slipid.identify.rows import remaining, rows_at, spectrum
-from slipid.identify.slip_curves import SlipCurve, Validity
+from slipid.identify.slip_curves import SlipCurve
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, sentences
-from slipid.model.robot import Robot
+from slipid.model.robot import Robot, Validity
 from slipid.search_space import Choice, Space
 
 CONFLICT = 4.0

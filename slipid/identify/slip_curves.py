@@ -12,7 +12,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import travel
 from slipid.model import contact_law as law
 from slipid.model import robot as model
-from slipid.model.robot import GRAVITY, Robot
+from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.search_space import Space
 
 POINTS = 41
@@ -32,26 +32,6 @@ class SlipCurve:
     slip_hi: Float[np.ndarray, " torque"]
     wheel_speed: float
     load_share: float
-
-
-@dataclass(frozen=True)
-class Validity:
-    """What a floor was seen with: outside of it the fit extrapolates.
-
-    Smallest and largest wheel speed [rad/s], torque [N m], slip, yaw rate by the encoders [rad/s];
-    commanded headings [deg], speeds [m/s] and turn rates [rad/s]; mean length of a run [m].
-    """
-
-    runs: int
-    loads: tuple[str, ...]
-    wheel_speed: tuple[float, float]
-    torque_nm: tuple[float, float]
-    slip: tuple[float, float]
-    yaw_rate: tuple[float, float]
-    headings_deg: tuple[float, ...]
-    speeds: tuple[float, ...]
-    turn_rates: tuple[float, ...]
-    distance: float
 
 
 @jax.jit

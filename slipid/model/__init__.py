@@ -1,1 +1,1 @@
-"""Physics of one instant (geometry, motor, slip, contact) and its rollout over time."""
+"""Physics of one instant: geometry, motor, slip, contact."""

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.model.contact_balance import Balance, stand
+from slipid.model.contact_balance import Balance, Stance, stand, total
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame
 from slipid.model.se2 import Columns, Planar, solve3
@@ -24,22 +24,12 @@ _DAMPING = (1.0, 0.3, 0.05)
 _ROUNDING = 1e-20
 _NEAR = 1e-6
 _MOST_NEAR = 12
+CHORD, NEWTON = 4, 2
+"""Steps of each kind that `settle` takes from the twist of a moment ago.
 
-
-class Contact(eqx.Module):
-    """Forces on the body, in units of mean(mu) m g.
-
-    Attributes:
-        traction: along the drive direction of each wheel, what its motor works against.
-        drag: along the rolling direction of the rollers.
-        load: share of the weight.
-        residual: what does not balance, the moment over the base radius; zero at equilibrium.
-    """
-
-    traction: Float[Array, " wheel"]
-    drag: Float[Array, " wheel"]
-    load: Float[Array, " wheel"]
-    residual: Float[Array, "3"]
+Wheel speeds that change by up to 1.25 rad/s a step, three floors: 99 % of all twists are then
+within 3 mm/s (20 mm/s with 2 and 3 steps), half of them within rounding.
+"""
 
 
 class ContactProblem(eqx.Module):
@@ -50,8 +40,7 @@ class ContactProblem(eqx.Module):
         frame: wheel directions.
         surface: one floor, or one under each wheel.
         rest: load shares at rest, sum 1.
-        start: where the twist is looked for; with inertia that before the step.
-        mass: mass and inertia over the time step, None in the quasi-static case.
+        start: where the twist is looked for.
     """
 
     rim: Float[Array, " wheel"]
@@ -59,14 +48,10 @@ class ContactProblem(eqx.Module):
     surface: ContactSurface
     rest: Float[Array, " wheel"]
     start: Float[Array, "3"]
-    mass: Float[Array, "3"] | None = None
 
     def balance(self) -> Balance:
         """The forces as a function of the twist."""
-        on = stand(self.frame, self.surface, self.rest)
-        if self.mass is None:
-            return Balance(self.rim, on)
-        return Balance(self.rim, on, Planar(*self.mass), Planar(*self.start))
+        return Balance(self.rim, stand(self.frame, self.surface, self.rest))
 
 
 def _damped(balance: Balance, xi: Planar) -> Planar:
@@ -159,6 +144,7 @@ def equilibrium(
     frame: Frame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
+    near: Float[Array, "3"] | None = None,
 ) -> Float[Array, "3"]:
     """Body twist (vx [m/s], vy [m/s], yaw rate [rad/s]) at which the contact forces balance.
 
@@ -167,60 +153,57 @@ def equilibrium(
         frame: wheel directions.
         surface: one floor, or one under each wheel.
         rest: load shares at rest, sum 1.
+        near: a twist so close that plain Newton steps arrive, about ten times cheaper; NaN comes
+            back where they do not. The last step is below 1e-6, which Newton's squares.
 
-    Source: the balance at the head of `slipid.model.contact_law` with M = 0.
+    Source: the balance at the head of `slipid.model.contact_law`.
     """
-    start = jax.lax.stop_gradient(guess(rim, frame))
-    return _root(ContactProblem(rim, frame, surface, rest, start))
+    start = jax.lax.stop_gradient(guess(rim, frame) if near is None else near)
+    problem = ContactProblem(rim, frame, surface, rest, start)
+    return _root(problem) if near is None else _root_near(problem)
 
 
-def equilibrium_near(
-    start: Float[Array, "3"],
-    rim: Float[Array, " wheel"],
-    frame: Frame,
-    surface: ContactSurface,
-    rest: Float[Array, " wheel"],
-) -> Float[Array, "3"]:
-    """`equilibrium` by plain Newton steps from a twist nearby, NaN where they do not arrive.
-
-    About ten times cheaper; the last step is below 1e-6, which Newton's squares.
-    """
-    start = jax.lax.stop_gradient(start)
-    return _root_near(ContactProblem(rim, frame, surface, rest, start))
-
-
-def step_with_inertia(
-    rim: Float[Array, " wheel"],
-    frame: Frame,
-    surface: ContactSurface,
-    rest: Float[Array, " wheel"],
-    before: Float[Array, "3"],
-    inertia: Float[Array, "3"],
-    dt: Float[Array, ""] | float,
-) -> Float[Array, "3"]:
-    """Twist one implicit Euler step later, with body inertia.
-
-    Args:
-        before: twist at the start of the step.
-        inertia: (m, m, I_z) / (mu m g) [s^2/m, s^2/m, s^2 m].
-        dt: step [s].
-    """
-    return _root(ContactProblem(rim, frame, surface, rest, before, inertia / dt))
-
-
-def forces(
+def traction(
     xi: Float[Array, "3"],
     rim: Float[Array, " wheel"],
     frame: Frame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
-) -> Contact:
-    """Forces and loads at a twist, and whether they balance."""
-    at, balance = Planar(*xi), Balance(rim, stand(frame, surface, rest))
-    x, y, moment = balance.force(at)
-    return Contact(
-        traction=balance.felt(at),
-        drag=balance.dragged(at),
-        load=balance.share(at),
-        residual=jnp.stack([x, y, moment / frame.base]),
-    )
+) -> Float[Array, " wheel"]:
+    """Traction along the drive of each wheel that its motor works against at a twist [mu m g]."""
+    return Balance(rim, stand(frame, surface, rest)).felt(Planar(*xi))
+
+
+def settle(
+    start: Float[Array, "3 floors"], rim: Array, on: Stance, plain: Float[Array, "3 wheel"]
+) -> tuple[Float[Array, "3 floors"], Float[Array, "wheel floors"]]:
+    """Equilibrium of many floors at once from the twist of a moment ago, and the traction felt.
+
+    A few chord steps, then Newton's where these come nearer: for a robot's computer. Where a number
+    is lost it is the twist without slip. What a jump of the wheel speeds leaves over, the next call
+    settles.
+
+    Args:
+        start: twists [m/s, m/s, rad/s].
+        rim: rim speeds of one robot (wheel,), or of one for every column (wheel, floors) [m/s].
+        on: how the robot stands on each combination of floors, arrays (wheel, floors).
+        plain: twist per rim speed without slip, J^+.
+
+    Returns:
+        Twists, and tractions [m g mean(mu)].
+    """
+    rim = rim.reshape(plain.shape[1], -1)
+    balance, near = Balance(rim, on), Planar(*start)
+    for _ in range(CHORD):
+        near = balance.chord(near)
+    xi = near
+    for _ in range(NEWTON):
+        xi = jax.tree.map(jnp.subtract, xi, balance.newton(xi))
+    # NaN is not nearer
+    nearer = balance.size(balance.force(xi)) <= balance.size(balance.force(near))
+    found = jax.tree.map(lambda x, n: jnp.where(nearer, x, n), xi, near)
+    sound = jnp.isfinite(found.x + found.y + found.yaw)
+    free = Planar(*(total(row[:, None] * rim) for row in plain))
+    twist = jnp.stack(jax.tree.map(lambda x, p: jnp.where(sound, x, p), found, free))
+    felt = jnp.where(nearer, balance.felt(xi), balance.felt(near))
+    return twist, jnp.where(jnp.isfinite(felt), felt, 0.0)

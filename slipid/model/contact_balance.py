@@ -72,22 +72,16 @@ class Balance(eqx.Module):
     Attributes:
         rim: r w, rim speeds [m/s].
         on: how it stands.
-        mass, before: mass and inertia over the time step, and the twist before it; or neither.
     """
 
     rim: Float[Array, "wheel *batch"]
     on: Stance
-    mass: Planar | None = None
-    before: Planar | None = None
 
     def force(self, xi: Planar) -> Planar:
         """What does not balance."""
         w, load = self.wheels(*self._speeds(xi)), self.load(xi)
         x, y, yaw = self._summed(load * w.push(), -load * w.drag.force())
-        out = Planar(x, y, yaw - law.scrub_moment(xi.yaw, self.on.floor.scrub).force())
-        if self.mass is None:
-            return out
-        return jax.tree.map(lambda f, m, a, b: f - m * (a - b), out, self.mass, xi, self.before)
+        return Planar(x, y, yaw - law.scrub_moment(xi.yaw, self.on.floor.scrub).force())
 
     def jacobian(self, xi: Planar) -> Columns:
         """Derivative of the force by the twist: by the speeds of the wheels, and by their loads."""
@@ -109,7 +103,8 @@ class Balance(eqx.Module):
 
         scrub = law.scrub_moment(xi.yaw, self.on.floor.scrub).by_speed()
         x, y = column(0, push * by_x, drag * by_x), column(1, push * by_y, drag * by_y)
-        return jax.tree.map(jnp.subtract, Columns(x, y, column(2, 0.0, 0.0)), self._diagonal(scrub))
+        yaw = column(2, 0.0, 0.0)
+        return Columns(x, y, yaw._replace(yaw=yaw.yaw - scrub))
 
     def newton(self, xi: Planar) -> Planar:
         """Newton's step, to be taken off the twist."""
@@ -123,7 +118,7 @@ class Balance(eqx.Module):
         """
         on, f, w = self.on, self.on.frame, self.wheels(*self._speeds(xi))
         # a lifted wheel would push the chord the wrong way
-        load = law.load_force(jnp.maximum(self.share(xi), _LEAST_LOAD), self.on.floor)
+        load = law.load_force(jnp.maximum(self.share(xi), _LEAST_LOAD), on.floor)
         pulls, rolls = load * w.traction.chord(), load * w.drag.chord()
         both = pulls + load * w.resistance.chord()
 
@@ -133,22 +128,15 @@ class Balance(eqx.Module):
 
         xx, xy, yy = entry(0, 0), entry(0, 1), entry(1, 1)
         x_yaw, y_yaw, turn = entry(0, 2), entry(1, 2), entry(2, 2)
+        turn += law.scrub_moment(xi.yaw, on.floor.scrub).chord()
         m = Columns(Planar(xx, xy, x_yaw), Planar(xy, yy, y_yaw), Planar(x_yaw, y_yaw, turn))
-        scrub = law.scrub_moment(xi.yaw, self.on.floor.scrub).chord()
-        m = jax.tree.map(jnp.add, m, self._diagonal(scrub))
         drive = self._summed(pulls * self.rim * f.pull, rolls * self.rim * f.slip_through)
-        if self.mass is not None:
-            drive = jax.tree.map(lambda d, k, b: d + k * b, drive, self.mass, self.before)
         return solve3(m, drive)
 
     def felt(self, xi: Planar) -> Float[Array, "wheel *batch"]:
         """Traction that each motor works against."""
         f = self.on.frame
         return self.load(xi) * self.wheels(*self._speeds(xi)).felt(f.pull, f.slip_through)
-
-    def dragged(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Force along the rolling direction of the rollers."""
-        return -self.load(xi) * self.wheels(*self._speeds(xi)).drag.force()
 
     def size(self, force: Planar) -> Float[Array, "*batch"]:
         """Square of a force, its moment over the base radius."""
@@ -176,9 +164,3 @@ class Balance(eqx.Module):
         """Force on the body of what wheels exert along their drive and along their rollers."""
         hold, free = self.on.hold, self.on.roll
         return Planar(*(total(hold[k] * along + free[k] * roll) for k in range(3)))
-
-    def _diagonal(self, scrub: Array) -> Columns:
-        """What each part of the twist does to its own force alone."""
-        nil = jnp.zeros_like(scrub)
-        x, y, yaw = (nil, nil, nil) if self.mass is None else self.mass
-        return Columns(Planar(x, nil, nil), Planar(nil, y, nil), Planar(nil, nil, yaw + scrub))

@@ -11,12 +11,11 @@ share, v^ the direction of motion, and forces in units of mu m g:
                                                        P: loads that keep sum N and sum N (p + b v^)
     T_i   =  N_i [tanh(vs_i / (v0 + s0 c_i)) + kv vs_i - crr tanh(J_i xi / (v0 + s1 c_i))]
     D_i   = -N_i [cr tanh(q_i / (vr + sr c_i)) + kl q_i]
-    0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz tanh(W / W0)) - M (xi - xi_before)
+    0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz tanh(W / W0))
 
-M is mass and inertia over the time step, zero in the quasi-static case. This is for omni wheels;
-where rollers stand at an angle g to the drive, vs_i is r w_i sin g less the speed along the
-direction in which the rollers do not give way, and r w_i cos g is taken off q_i. Ordinary wheels
-grip sideways as they do ahead.
+This is for omni wheels; where rollers stand at an angle g to the drive, vs_i is r w_i sin g less
+the speed along the direction in which the rollers do not give way, and r w_i cos g is taken off
+q_i. Ordinary wheels grip sideways as they do ahead.
 
 Wheels may stand on different floors. Forces are then in units of mean(mu) m g, each wheel's
 weighted by mu_i / mean(mu), and b and cz are means over the loads. Creep and rolling resistance are
@@ -91,8 +90,7 @@ class ContactSurface(eqx.Module):
 
     def at(self, index: Int[Array | np.ndarray, "..."] | int) -> "ContactSurface":
         """Surface number `index` of the stack (may be traced), or those under each wheel."""
-        picked: ContactSurface = jax.tree.map(lambda leaf: leaf[index], self)
-        return picked
+        return jax.tree.map(lambda leaf: leaf[index], self)
 
 
 class Friction(eqx.Module):
@@ -165,17 +163,6 @@ def wheel_traction(slide: Array, active: Array, floor: ContactSurface) -> Fricti
     return Friction(slide, onset, floor.creep, 1.0, floor.slide_viscosity)
 
 
-def rolling_resistance(along: Array, active: Array, floor: ContactSurface) -> Friction:
-    """Resistance at a speed along the drive."""
-    return Friction(along, V0 + S1 * active, S1, floor.rolling_resistance)
-
-
-def roller_drag(roll: Array, active: Array, floor: ContactSurface, at_rest: Array) -> Friction:
-    """Drag at a roller speed, from its onset of a wheel at rest [m/s] on."""
-    onset = at_rest + floor.roller_creep * active
-    return Friction(roll, onset, floor.roller_creep, floor.roller_drag, floor.roller_viscosity)
-
-
 def scrub_moment(yaw_rate: Array, scrub: Array) -> Friction:
     """Moment at a yaw rate [m]."""
     return Friction(yaw_rate, W0, 0.0, scrub)
@@ -207,11 +194,12 @@ def wheel_forces(
         at_rest, floor: from `sideways`.
     """
     active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
+    onset = at_rest + floor.roller_creep * active
     return WheelForces(
         active=active,
         traction=wheel_traction(rim * pull - along, active, floor),
-        resistance=rolling_resistance(along, active, floor),
-        drag=roller_drag(roll, active, floor, at_rest),
+        resistance=Friction(along, V0 + S1 * active, S1, floor.rolling_resistance),
+        drag=Friction(roll, onset, floor.roller_creep, floor.roller_drag, floor.roller_viscosity),
     )
 
 

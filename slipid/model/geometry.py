@@ -83,10 +83,6 @@ class Geometry(eqx.Module):
             )
         return jnp.asarray(np.linalg.pinv(j))
 
-    def torques(self, force: Float[Array, " 3"]) -> Float[Array, " wheel"]:
-        """Wheel torques [N m] that give a body force [N] and moment [N m], tau = r (J^+)^T F."""
-        return self.wheel_radius * jnp.linalg.pinv(self.forward()).T @ force
-
 
 class Frame(eqx.Module):
     """Wheel directions and levers as the force balance uses them.

@@ -62,15 +62,6 @@ class Motor(eqx.Module):
         drop = self.brush_drop * jnp.tanh(current / 0.05)
         return self.resistance * current + self.back_emf * wm + drop
 
-    def current_rate(
-        self,
-        voltage: Float[Array, " *w"],
-        current: Float[Array, " *w"],
-        wheel_speed: Float[Array, " *w"],
-    ) -> Float[Array, " *w"]:
-        """dI/dt [A/s] with inductance."""
-        return (voltage - self.voltage(current, wheel_speed)) / self.inductance
-
     def friction(self, wheel_speed: Float[Array, " *w"]) -> Float[Array, " *w"]:
         """Friction torque at the wheel [N m], against the motion."""
         return (
@@ -78,19 +69,22 @@ class Motor(eqx.Module):
             + self.viscous_friction * wheel_speed
         )
 
+    @property
+    def gain(self) -> Array:
+        """Torque at the wheel per current, n eta C_e [N m/A]."""
+        return self.gear_ratio * self.efficiency * self.back_emf
+
     def torque(
         self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
     ) -> Float[Array, " *w"]:
         """Torque at the wheel [N m] of a signed current: n eta C_e I - friction."""
-        gain = self.gear_ratio * self.efficiency * self.back_emf
-        return gain * current - self.friction(wheel_speed)
+        return self.gain * current - self.friction(wheel_speed)
 
     def current(
         self, torque: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
     ) -> Float[Array, " *w"]:
         """Signed current [A] that gives a wheel torque [N m], the inverse of `torque`."""
-        gain = self.gear_ratio * self.efficiency * self.back_emf
-        return (torque + self.friction(wheel_speed)) / gain
+        return (torque + self.friction(wheel_speed)) / self.gain
 
     def characteristic(
         self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]

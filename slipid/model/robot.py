@@ -1,7 +1,7 @@
 """The whole robot as one tree of declared numbers: wheels, motors, floors, loads, camera."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -115,6 +115,30 @@ class Robot(eqx.Module):
         return self.camera.sessions.index(name) if name in self.camera.sessions else -1
 
 
+@dataclass(frozen=True)
+class Validity:
+    """What a floor was seen with; beyond it numbers extrapolate.
+
+    Attributes:
+        runs: how many; loads: with which load set-ups.
+        wheel_speed, torque_nm, slip, yaw_rate: smallest and largest [rad/s], [N m], 1, [rad/s];
+            the yaw rate by the encoders.
+        headings_deg, speeds, turn_rates: of the body, each that was driven [deg], [m/s], [rad/s].
+        distance: of a run, on average [m].
+    """
+
+    runs: int
+    loads: tuple[str, ...]
+    wheel_speed: tuple[float, float]
+    torque_nm: tuple[float, float]
+    slip: tuple[float, float]
+    yaw_rate: tuple[float, float]
+    headings_deg: tuple[float, ...]
+    speeds: tuple[float, ...]
+    turn_rates: tuple[float, ...]
+    distance: float
+
+
 def _with_mass(robot: Robot, mass: Array) -> Robot:
     return replace(robot, body=replace(robot.body, mass=mass))
 
@@ -155,18 +179,12 @@ def twist(
     load: Array,
     near: Float[Array, "3"] | None = None,
 ) -> Float[Array, "3"]:
-    """Quasi-static body twist on floor `surface` (index) with load set-up `load` (index).
+    """Body twist on floor `surface` (index) with load set-up `load` (index).
 
-    `surface` may have one index per wheel, here and below.
-
-    Args:
-        near: a twist so close that plain Newton steps arrive; NaN comes back where they do not.
+    `surface` may have one index per wheel, here and below; `near` is as of `contact.equilibrium`.
     """
     floor, rest = robot.surfaces.at(surface), robot.body.load_share[load]
-    rim = frame.radius * wheel_speed
-    if near is None:
-        return contact.equilibrium(rim, frame, floor, rest)
-    return contact.equilibrium_near(near, rim, frame, floor, rest)
+    return contact.equilibrium(frame.radius * wheel_speed, frame, floor, rest, near)
 
 
 def felt(
@@ -180,7 +198,7 @@ def felt(
     """Traction each motor works against at a twist, in units of mean(mu) m g."""
     rim = frame.radius * wheel_speed
     floor = robot.surfaces.at(surface)
-    return contact.forces(xi, rim, frame, floor, robot.body.load_share[load]).traction
+    return contact.traction(xi, rim, frame, floor, robot.body.load_share[load])
 
 
 def wheel_torque(

@@ -6,9 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from slipid.baselines.paper2021.models import DEPLOYED
 from slipid.baselines.paper2021.result import find_folder, regenerate
-from slipid.baselines.paper2021.table import FittedForm, MotorTable
+from slipid.baselines.paper2021.table import FittedForm, MotorTable, deployed_slip
 from slipid.baselines.paper2021.tracks import COMMANDED_SIDES, Track
 from slipid.data.log import Log
 from slipid.data.reading.presets import preset
@@ -204,8 +203,7 @@ def _medians(
 
 def _deployed(axes: Axes, motor: int) -> None:
     current = np.linspace(0.0, 2.1, 421)
-    both = np.tile(current[:, None], (1, len(DEPLOYED.gain)))
-    slip = DEPLOYED.slip_of_smoothed(both)[:, motor - 1]
+    slip = deployed_slip(np.tile(current[:, None], (1, 3)))[:, motor - 1]
     axes.plot(current, slip, color=_PAPER, lw=2, label="deployed on the robot", zorder=4)
 
 

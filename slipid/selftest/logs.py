@@ -18,8 +18,7 @@ from jaxtyping import Array, Float
 
 from slipid.data.log import Log
 from slipid.identify.design.planned_runs import Drive
-from slipid.model.robot import Robot, wheel_torque
-from slipid.model.rollout import replay_twist
+from slipid.model.robot import Robot, twist, wheel_torque
 from slipid.model.se2 import compose, path
 from slipid.selftest.plan import Sensors
 
@@ -49,7 +48,7 @@ class _Maker:
         load = jnp.asarray([robot.load_index(d.load) for d in drives])
         dt = np.diff(time, axis=1)
         speed = np.diff(angle, axis=1) / dt[..., None]
-        xi, amps = (np.asarray(x) for x in _twists(robot, dt, speed, floor, load))
+        xi, amps = (np.asarray(x) for x in _twists(robot, speed, floor, load))
         pose, fresh = self.camera(time, self.poses(dt, speed, xi))
         channels = self.electric(speed, amps)
         tick = 2 * np.pi / (s.ticks * robot.geometry.gear_ratio)
@@ -164,18 +163,15 @@ class _Maker:
 
 
 @jax.jit
-def _twists(
-    robot: Robot, dt: Array, speed: Array, floor: Array, load: Array
-) -> tuple[Array, Array]:
+def _twists(robot: Robot, speed: Array, floor: Array, load: Array) -> tuple[Array, Array]:
     """Body twists and signed motor currents of every step of every run."""
     frame = robot.geometry.frame()
 
-    def one(h: Array, w: Array, f: Array, s: Array) -> tuple[Array, Array]:
-        xi = replay_twist(robot, h, w, f, s)
-        torque = jax.vmap(lambda x, v: wheel_torque(robot, frame, x, v, f, s))(xi, w)
-        return xi, jax.vmap(robot.motor.current)(torque, w)
+    def one(w: Array, f: Array, s: Array) -> tuple[Array, Array]:
+        xi = twist(robot, frame, w, f, s)
+        return xi, robot.motor.current(wheel_torque(robot, frame, xi, w, f, s), w)
 
-    return jax.vmap(one)(dt, speed, floor, load)
+    return jax.vmap(jax.vmap(one, (0, None, None)))(speed, floor, load)
 
 
 @jax.jit

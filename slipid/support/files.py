@@ -1,9 +1,11 @@
 """Files that are either whole or not there: atomic writes, strict JSON, arrays without pickle."""
 
+import hashlib
 import io
 import json
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +65,12 @@ def write_json(path: Path, value: object) -> None:
 def json_text(value: object) -> str:
     """JSON of plain values and numpy numbers; ValueError for NaN and infinity."""
     return json.dumps(value, indent=1, allow_nan=False, default=_plain) + "\n"
+
+
+def checksum(content: Mapping[str, object]) -> str:
+    """SHA-256 of JSON with sorted keys and without spaces, as Python writes it."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _plain(value: object) -> object:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slipid.baselines.paper2021.models import CURRENT_SVR, DEPLOYED, TORQUE_SVR
 from slipid.baselines.paper2021.result import find_folder, regenerate
 from slipid.baselines.paper2021.samples import (
     FIGURES_3_AND_4,
@@ -20,7 +19,13 @@ from slipid.baselines.paper2021.samples import (
     read_columns,
     slip_samples,
 )
-from slipid.baselines.paper2021.table import FittedForm, fit_form
+from slipid.baselines.paper2021.table import (
+    CURRENT_SVR,
+    TORQUE_SVR,
+    FittedForm,
+    deployed_slip,
+    fit_form,
+)
 from slipid.baselines.paper2021.tracks import TRACK_FILES, Track, TrackFile, read_track
 from slipid.baselines.paper2021.transfer import curve_points, leave_one_surface_out, wheel_windows
 from slipid.data.log import Log
@@ -128,7 +133,7 @@ def test_forms_recover_their_coefficients(rng):
     }
     expected = [(3.2,), (0.1, 2.0), (0.05, 4.0, -5.0), (0.08, 0.5), (0.4,)]
     for (name, slip), coefficients in zip(truth.items(), expected, strict=True):
-        form = fit_form(Samples(1, I, M, slip), name)
+        form = fit_form(Samples(I, M, slip), name)
         np.testing.assert_allclose(form.coefficients, coefficients, rtol=1e-9)
         assert form.rmse < 1e-12
         np.testing.assert_allclose(form.slip(M if "M" in name else I), slip, rtol=1e-9)
@@ -137,7 +142,7 @@ def test_forms_recover_their_coefficients(rng):
 def test_line_through_the_origin_does_not_bend_to_an_offset(rng):
     M = rng.uniform(0.02, 0.4, 400)
     slip = 0.3 + 0.0 * M
-    form = fit_form(Samples(1, M, M, slip), "linear in M")
+    form = fit_form(Samples(M, M, slip), "linear in M")
     slope = (M @ slip) / (M @ M)
     assert form.coefficients == pytest.approx((slope,), rel=1e-12)
     assert form.rmse == pytest.approx(np.sqrt(np.mean((slip - slope * M) ** 2)), rel=1e-12)
@@ -145,7 +150,7 @@ def test_line_through_the_origin_does_not_bend_to_an_offset(rng):
 
 
 def test_too_few_samples_are_refused():
-    empty = Samples(1, np.zeros(1), np.zeros(1), np.zeros(1))
+    empty = Samples(np.zeros(1), np.zeros(1), np.zeros(1))
     with pytest.raises(ValueError, match="1 samples cannot fix 2 coefficients"):
         fit_form(empty, "affine in M")
 
@@ -195,15 +200,15 @@ def test_short_track_is_refused(tmp_path):
 
 
 def test_stored_models():
-    line = FittedForm("stored", "current", CURRENT_SVR, 0, 0.0)
+    line = FittedForm("current", CURRENT_SVR, 0, 0.0)
     np.testing.assert_allclose(line.slip(np.array([0.0, 1.0])), [0.120, 0.686], rtol=1e-12)
-    curve = FittedForm("stored", "torque", TORQUE_SVR, 0, 0.0)
+    curve = FittedForm("torque", TORQUE_SVR, 0, 0.0)
     np.testing.assert_allclose(curve.slip(np.array([0.0, 0.1])), [-0.072, 0.36224], rtol=1e-12)
 
 
 def test_deployed_model_as_printed():
     steady = np.array([[0.39] * 3, [1.0] * 3, [2.5] * 3])
-    slip = DEPLOYED.slip_of_smoothed(steady)
+    slip = deployed_slip(steady)
     np.testing.assert_array_equal(slip[0], 0.0)
     np.testing.assert_allclose(slip[1], [0.651, 0.4881, 0.6381], rtol=1e-12)
     np.testing.assert_array_equal(slip[2], 1.0)

@@ -46,9 +46,9 @@ def deployed():
     jax.config.update("jax_enable_compilation_cache", False)  # the time to compile is told too
     import jax.numpy as jnp
 
-    from slipid.deploy.deploy import deploy_known
     from slipid.model.geometry import omni
     from slipid.model.robot import build
+    from tests.helpers.known_robot import deploy_known
 
     made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ("a", "b", "c"))
     numbers = ([0.3, 0.45, 0.6], [0.2, 0.4, 0.9], [0.12, 0.25, 0.4])
@@ -69,11 +69,12 @@ def steps_of(kind):
     import jax
     import jax.numpy as jnp
 
+    from slipid.control.closed_loop import Pilot
     from slipid.control.controller import Controller, Gains
     from slipid.control.estimator import Estimator
     from slipid.control.odometry import Odometry
-    from slipid.control.pilot import CompiledPilot, Pilot
     from slipid.control.trajectory import rectangle
+    from tests.helpers.compiled_pilot import CompiledPilot
 
     contact = kind == "contact"
     observer = Estimator(f) if contact else Odometry(f, curve=True)
@@ -131,12 +132,13 @@ def rollouts(folder, robots, steps):
     import jax
     import jax.numpy as jnp
 
-    from slipid.model import settle as module
+    from slipid.model import contact
+    from slipid.model.contact_balance import stand
     from slipid.model.se2 import advance, compose
 
     every = np.array(list(itertools.product(range(3), repeat=3)))
     index = every[np.arange(robots) % len(every)]
-    floors = module.combine(f.frame, f.floors, index, f.rest, f.inverse)
+    on = stand(f.frame, f.floors.at(index.T), f.rest)
     rng = np.random.default_rng(0)
     speed = 3 * rng.normal(size=(1, 3, robots)) + 0.2 * rng.normal(size=(steps, 3, robots)).cumsum(
         0
@@ -147,7 +149,7 @@ def rollouts(folder, robots, steps):
     def ours(rims):
         def one(carry, rim):
             twist, pose, sum_ = carry
-            twist, felt = module.settle(twist, rim, floors)
+            twist, felt = contact.settle(twist, rim, on, f.inverse)
             return (twist, move(pose, twist), sum_ + jnp.sum(felt**2, axis=0)), None
 
         start = (jnp.zeros((3, robots)), jnp.zeros((3, robots)), jnp.zeros(robots))
@@ -168,7 +170,7 @@ def rollouts(folder, robots, steps):
     rollout = ctypes.CDLL(library).rollout
     one = [f.frame.hold, f.frame.roll, f.frame.shift, f.rest, f.inverse, f.frame.base]
     one = np.concatenate([np.asarray(x).ravel() for x in one])
-    under = floors.on.floor
+    under = on.floor
     rows = [under.friction, under.creep, under.roller_drag, under.roller_creep]
     rows += [under.rolling_resistance, under.slide_viscosity, under.roller_viscosity]
     rows += [under.scrub[None], under.lead[None]]
@@ -179,7 +181,7 @@ def rollouts(folder, robots, steps):
     def theirs():
         twist, pose, total = np.zeros((robots, 3)), np.zeros((robots, 3)), np.zeros(robots)
         at = [x.ctypes.data_as(ctypes.c_void_p) for x in (flat, table, pose, twist, total)]
-        counts = (steps, robots, module.CHORD, module.NEWTON)
+        counts = (steps, robots, contact.CHORD, contact.NEWTON)
         rollout(*counts, ctypes.c_double(dt), *at)
         return twist.T, pose.T, total
 

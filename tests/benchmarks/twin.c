@@ -1,5 +1,5 @@
-/* Twin of slipid.model.settle: chord and Newton steps of the contact balance for one robot after the
-   other, the same arithmetic in the same order of steps. Doubles in, doubles out; see bench_control.py. */
+/* Twin of slipid.model.contact.settle: chord and Newton steps of the contact balance for one robot
+   after the other, the same arithmetic in the same order of steps. Doubles in, doubles out; see bench_control.py. */
 #include <math.h>
 #define W 3
 static const double V0 = 0.002, VR = 0.001, S1 = 0.2, W0 = 0.05;

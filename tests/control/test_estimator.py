@@ -13,17 +13,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains, Limits, limited
 from slipid.control.estimator import Estimator
-from slipid.control.flat import Flat
 from slipid.control.interface import UNTIMED_S, Measurement, Readings, Settings
 from slipid.control.odometry import Odometry
-from slipid.control.pilot import CompiledPilot, Pilot
 from slipid.control.pose_filter import _within
 from slipid.control.trajectory import rectangle
-from slipid.deploy.deploy import deploy_known
 from slipid.model.geometry import mecanum, omni
 from slipid.model.robot import build
+from tests.helpers.compiled_pilot import CompiledPilot, Flat
+from tests.helpers.known_robot import deploy_known
 
 PATH = rectangle()
 LIMITS = Limits()

@@ -14,23 +14,21 @@ import numpy as np
 import pytest
 
 from slipid.control import trajectory as reference
-from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.interface import Settings
 from slipid.control.tuning.actuation import Habits
-from slipid.control.tuning.twin import Twin, rollout
+from slipid.control.tuning.twin import Floor, Twin, rollout
 from slipid.data.floor_map import patchwork
 from slipid.data.reading.presets import preset
 from slipid.data.reading.reader import read_log
 from slipid.data.runs import Runs, collect
 from slipid.deploy.controllers import ROWS, pilot_of
-from slipid.deploy.deploy import deploy_known
 from slipid.model.geometry import omni
-from slipid.model.plant import Floor
 from slipid.model.robot import Robot, build
 from slipid.search_space import Choice, Space
 from tests.helpers import replayed
+from tests.helpers.known_robot import deploy_known
 
 FIT = Path(__file__).parents[1] / "helpers" / "robotino2022_sectors.json"
 """Numbers of a fit that has seen no heading of 0 to 60 deg."""
@@ -108,25 +106,25 @@ def test_twin_and_controllers_do_what_was_reviewed(deployed: DeployedRobot, gold
         for row in ("encoder", "paper_code", "contact", "contact_ahead", "contact_gyro"):
             kind = ROWS[row]
             habits = Habits(voltage=False, gyro=kind.gyro)
-            pilot = pilot_of(deployed, kind, Gains(), Settings())
+            pilot = pilot_of(deployed, kind, Settings())
             path = reference.rectangle().moved(start).waiting(1.0)
             twin = Twin(deployed, floor, habits)
             key = jax.random.key(1000 + k)
-            run = _rollout(pilot, path, twin, jnp.asarray(start), key, 400)
-            estimates = run.estimate
+            pose, said = _rollout(pilot, path, twin, jnp.asarray(start), key, 400)
+            estimates = said.estimate
             for at in (100, 399):
                 numbers = {
-                    "x": run.pose[at, 0],
-                    "y": run.pose[at, 1],
-                    "yaw": run.pose[at, 2],
+                    "x": pose[at, 0],
+                    "y": pose[at, 1],
+                    "yaw": pose[at, 2],
                     "believed_x": estimates.pose[at, 0],
                     "believed_y": estimates.pose[at, 1],
                     "believed_yaw": estimates.pose[at, 2],
-                    "wheel_1": run.command[at, 0],
-                    "wheel_2": run.command[at, 1],
-                    "wheel_3": run.command[at, 2],
+                    "wheel_1": said.command[at, 0],
+                    "wheel_2": said.command[at, 1],
+                    "wheel_3": said.command[at, 2],
                     "current_1": estimates.current[at, 0],
-                    "path_time": run.own[at],
+                    "path_time": said.time[at],
                 }
                 plain = {name: float(value) for name, value in numbers.items()}
                 lines.append({"start": k, "controller": row, "step": at} | plain)

@@ -19,17 +19,19 @@ import pytest
 
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot, drawn
-from slipid.control.robot_file.gains_record import GainRecord, GainsRecord, GainValues, Losses
-from slipid.control.robot_file.record import Seen, checksum
-from slipid.deploy.deploy import deploy_known
-from slipid.deploy.record_of import given, record_of
+from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
+from slipid.deploy.record_of import record_of
 from slipid.model.geometry import omni
-from slipid.model.robot import build
+from slipid.model.robot import Validity, build
 from slipid.parameter import entries
 from slipid.support.errors import DataError
+from slipid.support.files import checksum
+from tests.helpers.known_robot import deploy_known, given
 
 SCHEMA = json.loads(resources.files("slipid.control").joinpath("robot.schema.json").read_text())
-SEEN = Seen(3, ("as_built",), (0.0, 8.0), (0.0, 0.4), (0.0, 0.3), (0.0, 1.0), (0.0,), (), (), 1.1)
+SEEN = Validity(
+    3, ("as_built",), (0.0, 8.0), (0.0, 0.4), (0.0, 0.3), (0.0, 1.0), (0.0,), (), (), 1.1
+)
 GAINS = GainsRecord(
     values=GainValues(*(GainRecord(0.1 * k, "1", 0.01) for k in range(6))),
     load="moved",
@@ -351,11 +353,11 @@ import slipid.control
 for found in pkgutil.walk_packages(slipid.control.__path__, "slipid.control."):
     importlib.import_module(found.name)
 new = {name.split(".")[0] for name in set(sys.modules) - before}
-print(sorted(new - {"slipid", *sys.stdlib_module_names}))
+print(sorted(new - {"slipid", "jax", *sys.stdlib_module_names}))
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import Measurement
 from slipid.control.odometry import Odometry
-from slipid.control.pilot import Pilot
+from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller
 from slipid.control.trajectory import rectangle
 robot = DeployedRobot.load(sys.argv[1])

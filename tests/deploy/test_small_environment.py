@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from slipid.deploy.deploy import deploy_known
 from slipid.model.geometry import omni
 from slipid.model.robot import build
+from tests.helpers.known_robot import deploy_known
 
 ROOT = Path(__file__).resolve().parents[2]
 ON_THE_ROBOT = """

@@ -10,26 +10,25 @@ import pytest
 
 from slipid.control import closed_loop
 from slipid.control import trajectory as reference
+from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.floor_filter import FloorFilter
 from slipid.control.interface import Measurement, Settings
 from slipid.control.odometry import Odometry
-from slipid.control.pilot import Pilot
-from slipid.control.robot_file.gains_record import GainRecord, GainsRecord, GainValues, Losses
+from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.control.robot_file.typed import typed
 from slipid.data.floor_map import four_zones, uniform
 from slipid.deploy import trial as tr
-from slipid.deploy.controllers import ROWS, gains_of, pilot_of
-from slipid.deploy.deploy import deploy_known
-from slipid.deploy.plants import SitePlant
-from slipid.deploy.trial_site import floor_of, known_to_site, starts
+from slipid.deploy.controllers import ROWS, check_gains, pilot_of
+from slipid.deploy.trial_site import SitePlant, floor_of, known_to_site, starts
 from slipid.deploy.trial_summary import Run, summaries
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.support.errors import DataError
 from slipid.testsite.live import Live
 from slipid.testsite.site import Site
+from tests.helpers.known_robot import deploy_known
 
 
 @pytest.fixture(scope="module")
@@ -184,9 +183,10 @@ def test_the_distance_from_a_path_is_from_its_line():
 
 
 def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
-    tuned = Gains.at(np.arange(6) + 0.25)
+    tuned = Gains.at(np.arange(6) + 0.5)
+    robot = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
     for name, row in ROWS.items():
-        found = pilot_of(deployed, row, tuned).controller.gains
+        found = pilot_of(robot, row).controller.gains
         expected = tuned if row.tuned else Gains()
         if name == "contact_ahead":
             expected = replace(expected, ahead=jnp.asarray(1.0))
@@ -269,17 +269,18 @@ def tuned_for(load):
 
 
 def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
-    assert values(gains_of(tmp_path, deployed)) == values(Gains())
+    check_gains(tmp_path, deployed)
+    assert values(Controller(deployed).gains) == values(Gains())
     tuned = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
-    assert values(gains_of(tmp_path, tuned)) == [k + 0.5 for k in range(6)]
+    check_gains(tmp_path, tuned)
     assert values(Controller(tuned).gains) == [k + 0.5 for k in range(6)]
     other = DeployedRobot.of(replace(deployed.record, gains=tuned_for("far")))
     assert values(Controller(other).gains) == values(Gains())
     with pytest.raises(DataError, match=r"another load set-up \(far\); run slipid tune again with"):
-        gains_of(tmp_path, other)
+        check_gains(tmp_path, other)
     (tmp_path / "gains.json").write_text("{}")
     with pytest.raises(DataError, match="tuned for another fit; run slipid tune again, or remove"):
-        gains_of(tmp_path, deployed)
+        check_gains(tmp_path, deployed)
 
 
 def test_the_summary_is_of_medians_over_starts_with_intervals():

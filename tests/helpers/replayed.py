@@ -21,10 +21,10 @@ from slipid.control.interface import AbstractEstimator, Estimate, Readings
 from slipid.data.floor_map import FloorMap
 from slipid.data.log import Log
 from slipid.data.runs import Runs, first_row
-from slipid.deploy.deploy import deploy_known
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
 from slipid.search_space import Space
+from tests.helpers.known_robot import deploy_known
 
 TOGETHER = 32
 """Runs replayed in one call."""

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from slipid.control.deployed import DeployedRobot
-from slipid.deploy.deploy import deploy_known
+from slipid.control.tuning.twin import Floor
 from slipid.model.geometry import omni
-from slipid.model.plant import Floor
 from slipid.model.robot import build
+from tests.helpers.known_robot import deploy_known
 
 AXES = ("along", "across", "yaw")
 

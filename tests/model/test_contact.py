@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -87,7 +88,6 @@ def cases(kind, count, geometry=ROBOTINO, seed=0):
 
 # jitted once: by itself every call would be traced anew
 equilibrium = eqx.filter_jit(contact.equilibrium)
-step_with_inertia = eqx.filter_jit(contact.step_with_inertia)
 
 
 @eqx.filter_jit
@@ -95,9 +95,27 @@ def solve(rim, frame, floors, rest):
     return jax.vmap(contact.equilibrium, (0, None, 0, 0))(rim, frame, floors, rest)
 
 
+class Forces(NamedTuple):
+    """Along the drive of each wheel as its motor feels it, along its rollers; loads; no balance."""
+
+    traction: jax.Array
+    drag: jax.Array
+    load: jax.Array
+    residual: jax.Array
+
+
+def forces_of(xi, rim, frame, floor, rest):
+    at, balance = Planar(*xi), Balance(rim, stand(frame, floor, rest))
+    roll = frame.roll @ xi - rim * frame.slip_through
+    drag = balance.wheels(frame.hold @ xi, roll).drag.force()
+    x, y, moment = balance.force(at)
+    residual = jnp.stack([x, y, moment / frame.base])
+    return Forces(balance.felt(at), -balance.load(at) * drag, balance.share(at), residual)
+
+
 @eqx.filter_jit
 def forces(xi, rim, frame, floors, rest):
-    return jax.vmap(contact.forces, (0, 0, None, 0, 0))(xi, rim, frame, floors, rest)
+    return jax.vmap(forces_of, (0, 0, None, 0, 0))(xi, rim, frame, floors, rest)
 
 
 @eqx.filter_jit
@@ -161,7 +179,7 @@ def test_another_root_finder_finds_the_same_twist():
     @jax.vmap
     def oracle(start, rim, floor, rest):
         def balance(y, _):
-            return contact.forces(scale * y, rim, frame, floor, rest).residual
+            return forces_of(scale * y, rim, frame, floor, rest).residual
 
         solver = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
         found = optx.least_squares(balance, solver, start / scale, max_steps=2000, throw=False)
@@ -181,10 +199,9 @@ def test_the_jacobian_is_the_derivative_of_the_balance(name):
     frame = g.frame()
     rng = np.random.default_rng(2)
     xi = jnp.asarray(rng.normal(size=(200, 3)) * [0.2, 0.2, 1.0])
-    mass, before = Planar(0.3, 0.3, 0.02), Planar(0.1, 0.0, 0.2)
 
     def both(x, rim, floor, rest):
-        balance = Balance(rim, stand(frame, floor, rest), mass, before)
+        balance = Balance(rim, stand(frame, floor, rest))
 
         def force(x):
             return jnp.stack(balance.force(Planar(*x)))
@@ -362,9 +379,7 @@ def test_loads_carry_the_weight_at_the_centre_of_pressure():
     places = np.asarray(ROBOTINO.place) * 0.125
     for xi in np.random.default_rng(4).normal(size=(10, 3)):
         frame = ROBOTINO.frame()
-        got = np.asarray(
-            contact.forces(jnp.asarray(xi), jnp.zeros(3), frame, FLOORS["gray"], rest).load
-        )
+        got = np.asarray(forces_of(jnp.asarray(xi), jnp.zeros(3), frame, FLOORS["gray"], rest).load)
         ahead = 0.004 * xi[:2] / np.linalg.norm(xi[:2])
         assert got.sum() == pytest.approx(1.0, abs=1e-12)
         np.testing.assert_allclose(got @ (places + ahead), np.asarray(rest) @ places, atol=1e-9)
@@ -464,46 +479,3 @@ def test_mecanum_goes_sideways():
     xi = np.asarray(equilibrium(rim, MECANUM.frame(), floor, jnp.full(4, 0.25)))
     np.testing.assert_allclose(xi, [0.0, 0.3, 0.0], atol=0.01)
     assert xi[1] < 0.3
-
-
-# inertia
-
-
-@pytest.mark.slow
-def test_inertia_is_newton_s_law_for_the_step():
-    frame, gray = ROBOTINO.frame(), FLOORS["gray"]
-    rim, rest = jnp.array([0.2, -0.05, -0.15]), jnp.array([0.3, 0.3, 0.4])
-    before, inertia, dt = jnp.array([0.02, -0.1, 0.3]), jnp.array([0.25, 0.25, 0.004]), 0.01
-    after = step_with_inertia(rim, frame, gray, rest, before, inertia, dt)
-    force = contact.forces(after, rim, frame, gray, rest).residual * jnp.array(
-        [1.0, 1.0, frame.base]
-    )
-    np.testing.assert_allclose(inertia * (after - before) / dt, force, atol=1e-10)
-
-
-@pytest.mark.slow
-def test_much_inertia_keeps_the_twist_and_none_forgets_it():
-    frame, gray = ROBOTINO.frame(), FLOORS["gray"]
-    rim, rest = jnp.array([0.2, -0.05, -0.15]), EVEN
-    before = jnp.array([0.02, -0.1, 0.3])
-    inertia = jnp.array([0.25, 0.25, 0.004])
-    kept = step_with_inertia(rim, frame, gray, rest, before, inertia, 1e-9)
-    np.testing.assert_allclose(kept, before, atol=1e-6)
-    steady = equilibrium(rim, frame, gray, rest)
-    forgot = step_with_inertia(rim, frame, gray, rest, before, inertia, 1e9)
-    np.testing.assert_allclose(forgot, steady, atol=1e-8)
-
-
-def test_steps_with_inertia_settle_at_the_equilibrium_without_overshoot():
-    frame, gray = ROBOTINO.frame(), FLOORS["gray"]
-    rim, inertia = headings(0.2)[0], jnp.array([0.25, 0.25, 0.004])
-    steady = equilibrium(rim, frame, gray, EVEN)
-
-    def step(xi, _):
-        xi = step_with_inertia(rim, frame, gray, EVEN, xi, inertia, 0.01)
-        return xi, xi
-
-    path = np.asarray(jax.lax.scan(step, jnp.zeros(3), None, length=200)[1])
-    np.testing.assert_allclose(path[-1], steady, atol=1e-8)
-    assert (np.diff(path[:, 0]) >= -1e-12).all()
-    assert path[0, 0] < 0.5 * float(steady[0])

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from slipid.model import contact
+from slipid.model.contact_balance import Balance, stand
 from slipid.model.contact_inverse import inverse_contact
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import omni
+from slipid.model.se2 import Planar
 
 GEOMETRY = omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0)
 FLOORS = ContactSurface(
@@ -34,14 +36,15 @@ def test_the_inverse_model_inverts_the_contact(mixed):
     plain = GEOMETRY.inverse()
     there = jax.jit(lambda xi, p: inverse_contact(frame, FLOORS, REST, plain, xi, p))
     back = jax.jit(lambda rim, s: contact.equilibrium(rim, frame, s, REST))
-    pull = jax.jit(lambda xi, rim, s: contact.forces(xi, rim, frame, s, REST))
+    pull = jax.jit(lambda xi, rim, s: contact.traction(xi, rim, frame, s, REST))
+    load = jax.jit(lambda xi, s: Balance(REST, stand(frame, s, REST)).share(Planar(*xi)))
     for _ in range(20):
         index = rng.integers(0, 3, 3) if mixed else np.full(3, rng.integers(0, 3))
         floor = FLOORS.at(jnp.asarray(index))
         xi = jnp.asarray(rng.uniform(-1, 1, 3) * [0.3, 0.3, 0.8])
         rim = frame.radius * there(xi, jnp.eye(3)[index])
-        force = pull(xi, rim, floor)
-        held = force.traction / (force.load * floor.friction / jnp.mean(floor.friction))
+        grip = load(xi, floor) * floor.friction / jnp.mean(floor.friction)
+        held = pull(xi, rim, floor) / grip
         if jnp.max(floor.creep * jnp.arctanh(jnp.clip(jnp.abs(held), 0.0, 0.99))) > 0.85:
             continue  # a wheel about to spin on the spot
         checked += 1

@@ -40,27 +40,6 @@ def test_wheels_to_body_is_least_squares(name):
     np.testing.assert_allclose(rim @ np.asarray(g.inverse()).T, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", GEOMETRIES)
-def test_torques_keep_the_power(name):
-    g = GEOMETRIES[name]
-    force = np.random.default_rng(2).normal(size=3)
-    tau = np.asarray(g.torques(jnp.asarray(force)))
-    for xi in twists(10):
-        wheel_speed = np.asarray(g.forward()) @ xi / float(g.wheel_radius)
-        assert tau @ wheel_speed == pytest.approx(force @ xi, abs=1e-12)
-
-
-@pytest.mark.parametrize("name", GEOMETRIES)
-def test_torques_are_the_smallest_that_give_the_force(name):
-    g = GEOMETRIES[name]
-    force = np.array([1.0, -2.0, 0.3])
-    tau = np.asarray(g.torques(jnp.asarray(force)))
-    to_force = np.asarray(g.forward()).T / float(g.wheel_radius)
-    np.testing.assert_allclose(to_force @ tau, force, atol=1e-12)
-    smallest = np.linalg.lstsq(to_force, force, rcond=None)[0]
-    np.testing.assert_allclose(tau, smallest, atol=1e-12)
-
-
 def test_the_paper_s_two_kinematic_matrices_are_exact_inverses():
     d = np.radians([60.0, 180.0, 300.0])
     base = 0.125

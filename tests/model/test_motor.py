@@ -26,34 +26,6 @@ def test_steady_voltage_is_the_drop_and_the_back_emf():
     np.testing.assert_allclose(MOTOR.voltage(current, wheel_speed), expected, rtol=1e-12)
 
 
-def test_current_rests_exactly_at_the_steady_voltage():
-    current = jnp.linspace(-2.0, 2.0, 41)
-    rate = MOTOR.current_rate(MOTOR.voltage(current, SPEEDS), current, SPEEDS)
-    np.testing.assert_allclose(rate, 0.0, atol=1e-9)
-    more = MOTOR.current_rate(MOTOR.voltage(current, SPEEDS) + 1.0, current, SPEEDS)
-    np.testing.assert_allclose(more, 1 / 8.9e-3, rtol=1e-9)
-
-
-def test_a_voltage_step_rises_with_the_time_constant_of_the_winding():
-    """I(t) = U / R (1 - exp(-t R / L_a)) at standstill, by Runge-Kutta on `current_rate`."""
-    volt, still, dt = jnp.asarray([3.0]), jnp.zeros(1), 1e-5
-    rate = lambda i: MOTOR.current_rate(volt, i, still)  # noqa: E731
-
-    def step(i, _):
-        k1 = rate(i)
-        k2 = rate(i + dt / 2 * k1)
-        k3 = rate(i + dt / 2 * k2)
-        k4 = rate(i + dt * k3)
-        i = i + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return i, i[0]
-
-    current = jax.lax.scan(step, jnp.zeros(1), None, length=1000)[1]
-    time = dt * np.arange(1, 1001)
-    expected = 3.0 / 5.95 * (1 - np.exp(-time * 5.95 / 8.9e-3))
-    np.testing.assert_allclose(current, expected, rtol=1e-9)
-    assert 1.4e-3 < 8.9e-3 / 5.95 < 1.6e-3  # the 1.5 ms below which L_a cannot be seen
-
-
 def test_torque_and_current_are_inverses():
     current = jnp.linspace(-2.0, 2.0, 41)
     back = MOTOR.current(MOTOR.torque(current, SPEEDS), SPEEDS)

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from slipid.baselines.paper2021.models import DEPLOYED
+from slipid.baselines.paper2021 import table as tables
 from slipid.baselines.paper2021.table import FittedForm, MotorTable, field_table, surface_tables
 from slipid.baselines.paper2021.tracks import TRACK_FILES, Track, read_track
 from slipid.baselines.paper2021.transfer import Transfer, leave_one_surface_out
@@ -34,14 +34,14 @@ class PaperResult:
         """All numbers by name, ready for JSON."""
         return {
             "schema": SCHEMA,
-            "figure2": _table_dict(self.field),
-            "figures3and4": {f"motor{m}": _table_dict(table) for m, table in self.motors.items()},
+            "figure2": _table_dict(1, self.field),
+            "figures3and4": {f"motor{m}": _table_dict(m, t) for m, t in self.motors.items()},
             "figure7": {track.file.name: track.as_dict() for track in self.tracks},
             "deployed": {
-                "gain_per_A": DEPLOYED.gain.tolist(),
-                "offset": DEPLOYED.offset.tolist(),
-                "threshold_A": DEPLOYED.threshold,
-                "memory": DEPLOYED.memory,
+                "gain_per_A": tables.DEPLOYED_GAIN,
+                "offset": tables.DEPLOYED_OFFSET,
+                "threshold_A": tables.DEPLOYED_THRESHOLD,
+                "memory": tables.DEPLOYED_MEMORY,
             },
             "transfer": self.transfer and {**asdict(self.transfer), "mean": self.transfer.mean()},
         }
@@ -80,14 +80,12 @@ def regenerate(folder: Path, logs: Iterable[Log] | None = None) -> PaperResult:
 
 
 def _form_dict(form: FittedForm) -> dict[str, object]:
-    said = asdict(form)
-    del said["name"]
-    return said | {"unit": "N m" if form.regressor == "torque" else "A"}
+    return asdict(form) | {"unit": "N m" if form.regressor == "torque" else "A"}
 
 
-def _table_dict(table: MotorTable) -> dict[str, object]:
+def _table_dict(motor: int, table: MotorTable) -> dict[str, object]:
     return {
-        "motor": table.motor,
+        "motor": motor,
         "n": len(table.samples),
         "n_by_surface": {name: len(part) for name, part in table.by_surface.items()},
         "models": {name: _form_dict(form) for name, form in table.forms.items()},

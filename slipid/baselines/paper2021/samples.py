@@ -77,7 +77,6 @@ FIGURE_2 = Recipe(
 class Samples:
     """Points of one motor: current [A], torque M [N m, motor] and slip [-], all (sample,)."""
 
-    motor: int
     current: np.ndarray
     torque: np.ndarray
     slip: np.ndarray
@@ -92,12 +91,8 @@ class Samples:
 
 def pool(parts: Sequence[Samples]) -> Samples:
     """All points of several sets of one motor, in order."""
-    return Samples(
-        motor=parts[0].motor,
-        current=np.concatenate([p.current for p in parts]),
-        torque=np.concatenate([p.torque for p in parts]),
-        slip=np.concatenate([p.slip for p in parts]),
-    )
+    columns = zip(*((p.current, p.torque, p.slip) for p in parts), strict=True)
+    return Samples(*map(np.concatenate, columns))
 
 
 def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Samples:
@@ -116,7 +111,7 @@ def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Sa
         torque = voltage * current / speed
         keep &= (current > recipe.min_current) & (slip > 0.0) & (slip <= 1.0)
         keep &= torque <= recipe.max_torque
-    return Samples(motor=motor, current=current[keep], torque=torque[keep], slip=slip[keep])
+    return Samples(current=current[keep], torque=torque[keep], slip=slip[keep])
 
 
 def effective_speed(table: dict[str, np.ndarray], recipe: Recipe) -> np.ndarray:

@@ -8,11 +8,16 @@ import re
 from dataclasses import asdict
 from pathlib import Path
 
-from slipid.control.robot_file.check import check
-from slipid.control.robot_file.record import UNITS, RobotRecord, checksum
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.control.robot_file.record import UNITS, Numbers, RobotRecord
 from slipid.control.robot_file.typed import typed
+from slipid.model.geometry import Geometry
+from slipid.model.robot import build
+from slipid.parameter import Declaration, entries
 from slipid.support.errors import DataError
-from slipid.support.files import write_bytes
+from slipid.support.files import checksum, write_bytes
 
 SCHEMA = "slipid.robot/1"
 ANEW = "copy it again, or write it anew with `slipid identify`"
@@ -100,3 +105,77 @@ def _text(value: object, indent: str = "") -> str:
     if isinstance(value, list | tuple) and any(isinstance(v, dict) for v in value):
         return "[\n" + ",\n".join(inner + _text(v, inner) for v in value) + f"\n{indent}]"
     return json.dumps(value, allow_nan=False)
+
+
+def check(record: RobotRecord) -> None:
+    """Refuse a record whose parts do not fit together.
+
+    Raises:
+        ValueError: says which and how.
+    """
+    wheels = len(record.wheels.place)
+    if not wheels:
+        raise ValueError("wheels.place: no entries; expected one for every wheel")
+    for name in ("drive_angle", "roller_angle", "grips"):
+        _counted(f"wheels.{name}", getattr(record.wheels, name), wheels)
+    for kind, names in (("floors", record.labels), ("loads", [x.name for x in record.loads])):
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"{kind} {list(names)}; expected one or more, each once")
+    for load in record.loads:
+        _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
+        _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, wheels)
+    _numbers(record, wheels)
+
+
+def _known(record: RobotRecord, wheels: int) -> dict[str, tuple[Declaration, int]]:
+    """Declaration and size of every number that a robot of this shape has, by path."""
+    shape = Geometry(**vars(record.wheels), drive_offset=jnp.zeros(wheels))
+    robot = build(shape, record.labels, [load.name for load in record.loads])
+    return {e.path: (e.declaration, e.size) for e in entries(robot) if e.part != "camera"}
+
+
+def _numbers(record: RobotRecord, wheels: int) -> None:
+    known = _known(record, wheels)
+    for path in known:
+        if path not in record.parameters:
+            raise ValueError(f"parameters['{path}'] is missing")
+    for path in (*record.parameters, *record.draws):
+        if path not in known:
+            raise ValueError(f"'{path}': no such number of a robot with these floors and loads")
+    for path, number in record.parameters.items():
+        (declaration, size), where = known[path], f"parameters['{path}']"
+        _inside(f"{where}.value", number.value, declaration, size)
+        if number.unit != declaration.unit:
+            raise ValueError(f"{where}.unit: '{number.unit}'; expected '{declaration.unit}'")
+        if number.std is not None:
+            _sized(f"{where}.std", number.std, size)
+        if number.interval90 is not None and (np.ndim(number.interval90) > 1) != (size > 1):
+            raise ValueError(f"{where}.interval90: expected {size} intervals")
+    counts = {len(rows) for rows in record.draws.values()}
+    if len(counts) > 1 or 0 in counts:
+        raise ValueError(f"draws: {sorted(counts)} of different numbers; expected as many of each")
+    for path, rows in record.draws.items():
+        for k, row in enumerate(rows):
+            _inside(f"draws['{path}'][{k}]", row, *known[path])
+
+
+def _counted(name: str, values: tuple[object, ...], count: int) -> None:
+    if len(values) != count:
+        raise ValueError(f"{name}: {len(values)} entries; expected {count}")
+
+
+def _sized(where: str, value: Numbers, size: int) -> None:
+    if np.shape(value) != (() if size == 1 else (size,)):
+        raise ValueError(f"{where}: expected {'one number' if size == 1 else f'{size} numbers'}")
+
+
+def _inside(where: str, value: Numbers, declaration: Declaration, size: int) -> None:
+    """Refuse a value of another size, or one out of its declared bounds."""
+    _sized(where, value, size)
+    x = np.asarray(value)
+    if declaration.shares:
+        if not ((x > 0).all() and abs(x.sum() - 1) < 1e-6):
+            raise ValueError(f"{where} = {value}: expected positive shares that sum to 1")
+    elif not ((x > declaration.lower) & (x < declaration.upper)).all():
+        low, high = declaration.lower, declaration.upper
+        raise ValueError(f"{where} = {value}: expected inside ({low:g}, {high:g})")

@@ -3,14 +3,13 @@
 Units are those of `UNITS`, numbers of the robot carry their own.
 """
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
-from slipid.control.robot_file.gains_record import GainsRecord
+from slipid.model.robot import Validity
+from slipid.support.files import checksum
 
 Numbers = float | tuple[float, ...]
 """A number, or one per wheel."""
@@ -74,29 +73,6 @@ class Wheels:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What a floor was seen with; beyond it the numbers extrapolate.
-
-    Attributes:
-        runs: how many; loads: with which load set-ups.
-        wheel_speed, torque_nm, slip, yaw_rate: smallest and largest.
-        headings_deg, speeds, turn_rates: of the body, each that was driven.
-        distance: of a run, on average.
-    """
-
-    runs: int
-    loads: tuple[str, ...]
-    wheel_speed: Pair
-    torque_nm: Pair
-    slip: Pair
-    yaw_rate: Pair
-    headings_deg: tuple[float, ...]
-    speeds: tuple[float, ...]
-    turn_rates: tuple[float, ...]
-    distance: float
-
-
-@dataclass(frozen=True)
 class FloorRecord:
     """What the model misses on a floor, as stds.
 
@@ -110,7 +86,7 @@ class FloorRecord:
     process: Axes
     effect: Axes
     current_std: float
-    seen: Seen | None
+    seen: Validity | None
 
 
 @dataclass(frozen=True)
@@ -136,6 +112,57 @@ class Sensors:
     current_is_signed: bool = False
     voltage: bool = False
     gyro: bool = False
+
+
+@dataclass(frozen=True)
+class GainRecord:
+    """One gain [unit], and its std over the end of the search."""
+
+    value: float
+    unit: str
+    spread: float
+
+
+@dataclass(frozen=True)
+class GainValues:
+    """Every gain, as `slipid.control.controller.Gains` has them."""
+
+    place: GainRecord
+    yaw: GainRecord
+    integral: GainRecord
+    ahead: GainRecord
+    observer: GainRecord
+    preview: GainRecord
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Loss of gains on cases not tuned on, mean and worst tenth together, by hand and tuned."""
+
+    hand: float
+    tuned: float
+
+
+@dataclass(frozen=True)
+class GainsRecord:
+    """Gains that `slipid tune` found.
+
+    Attributes:
+        load: set-up they were tuned for; gyro: whether with one.
+        method: of the search.
+        better_than_hand: part of the cases in which they are.
+        stability_margin: 1 - the largest spectral radius of a loop.
+        verdict: what the losses say.
+    """
+
+    values: GainValues
+    load: str
+    gyro: bool
+    method: str
+    loss: Losses
+    better_than_hand: float
+    stability_margin: float
+    verdict: Literal["no worse than by hand", "worse than by hand"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -223,9 +250,3 @@ class RobotRecord:
             parameters={path: n for path, n in self.parameters.items() if stays(path)},
             draws={path: n for path, n in self.draws.items() if stays(path)},
         )
-
-
-def checksum(content: Mapping[str, object]) -> str:
-    """SHA-256 of JSON with sorted keys and without spaces, as Python writes it."""
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()

@@ -24,8 +24,7 @@ def typed(kind: type[Kind], value: object, where: str = "") -> Kind:
     Raises:
         ValueError: something is missing, too much, or of another type; says where.
     """
-    made: Kind = _as(kind, value, where)
-    return made
+    return _as(kind, value, where)
 
 
 def _as(kind: Any, value: object, where: str) -> Any:

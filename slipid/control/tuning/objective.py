@@ -16,16 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.interface import Numbers
-from slipid.control.pilot import Pilot
 from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.stability import SPARE, radii
-from slipid.control.tuning.twin import Twin, rollout
-from slipid.model.plant import Floor
+from slipid.control.tuning.twin import Floor, Twin, rollout
 
 GAINS = tuple(f.name for f in fields(Gains))
 """Names of the gains, in the order of vectors of them."""
@@ -65,8 +64,7 @@ class Cases(eqx.Module):
 
     def at(self, index: np.ndarray | slice) -> "Cases":
         """Those of an index."""
-        picked: Cases = jax.tree.map(lambda x: x[index], self)
-        return picked
+        return jax.tree.map(lambda x: x[index], self)
 
 
 class Task(eqx.Module):
@@ -86,20 +84,15 @@ class Task(eqx.Module):
         """Of one case [mm]."""
         pilot = Pilot(Estimator(self.robot), Controller(self.robot, gains))
         twin = Twin(case.truth, case.floor, replace(self.habits, smooth=True))
-        run = rollout(pilot, case.path, twin, case.start, case.key, self.steps)
-        wanted = jax.vmap(case.path.at)(run.own)
-        gap = run.pose[:, :2] - wanted[:, :2]
-        turned = self.robot.frame.base * jnp.sin(run.pose[:, 2] - wanted[:, 2])
-        jump = EFFORT_S * self.robot.frame.radius * jnp.diff(run.command, axis=0)
+        pose, said = rollout(pilot, case.path, twin, case.start, case.key, self.steps)
+        wanted = jax.vmap(case.path.at)(said.time)
+        gap = pose[:, :2] - wanted[:, :2]
+        turned = self.robot.frame.base * jnp.sin(pose[:, 2] - wanted[:, 2])
+        jump = EFFORT_S * self.robot.frame.radius * jnp.diff(said.command, axis=0)
         squares = jnp.mean(jnp.sum(gap**2, axis=1) + turned**2)
         effort = jnp.mean(jnp.sum(jump**2, axis=1))
-        missing = jax.nn.relu(case.path.duration - run.own[-1])
+        missing = jax.nn.relu(case.path.duration - said.time[-1])
         return 1000.0 * jnp.sqrt(squares + effort + 1e-12) + LATE * missing
-
-    def penalty(self, gains: Gains, truths: DeployedRobot) -> Float[Array, ""]:
-        """Of a loop that is hardly stable [mm]; continues a little below the bound."""
-        rho = radii(Controller(self.robot, gains), truths, self.habits, SPARE)
-        return PENALTY * jax.nn.relu(jnp.max(rho) - LARGEST_RADIUS)
 
     def margins(self, gains: Gains, truths: DeployedRobot) -> Float[np.ndarray, "draw loop"]:
         """1 - spectral radius of every draw, for every floor and direction, gains as they are."""
@@ -132,8 +125,7 @@ def combined(losses: Float[Array, " case"]) -> Float[Array, ""]:
 def losses(task: Task, x: Float[Array, " gain"], cases: Cases) -> Float[Array, " case"]:
     """Loss of every case at a place of the box [mm]."""
     gains = Gains.at(gains_at(x))
-    found: Array = jax.vmap(lambda case: task.loss(gains, case))(cases)
-    return found
+    return jax.vmap(lambda case: task.loss(gains, case))(cases)
 
 
 @eqx.filter_jit
@@ -148,11 +140,7 @@ def slopes(
     """
     step = jnp.where(x + REACH > 1, -REACH, REACH)
     places = x + jnp.concatenate([jnp.zeros((1, len(x))), jnp.diag(step)])
-
-    def of(place: Array) -> Array:
-        return jax.vmap(lambda case: task.loss(Gains.at(gains_at(place)), case))(cases)
-
-    value = jax.vmap(of)(places)
+    value = jax.vmap(lambda place: losses(task, place, cases))(places)
     return ((value[1:] - value[0]) / step[:, None]).T, value[0]
 
 
@@ -160,9 +148,14 @@ def slopes(
 def penalties(
     task: Task, x: Float[Array, "place gain"], truths: DeployedRobot
 ) -> Float[Array, " place"]:
-    """Penalty at places of the box [mm]."""
-    found: Array = jax.vmap(lambda place: task.penalty(Gains.at(gains_at(place)), truths))(x)
-    return found
+    """Of loops that are hardly stable, at places of the box [mm]; goes on below the bound."""
+
+    def of(place: Array) -> Array:
+        controller = Controller(task.robot, Gains.at(gains_at(place)))
+        rho = radii(controller, truths, task.habits, SPARE)
+        return PENALTY * jax.nn.relu(jnp.max(rho) - LARGEST_RADIUS)
+
+    return jax.vmap(of)(x)
 
 
 def penalty_slope(

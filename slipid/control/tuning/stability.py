@@ -15,13 +15,12 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from slipid.control.closed_loop import PERIOD
 from slipid.control.controller import Controller, ControllerState, Gains
 from slipid.control.deployed import DeployedRobot
-from slipid.control.flat import Flat
 from slipid.control.interface import Estimate
 from slipid.control.tuning.actuation import RING, Habits
 from slipid.model import contact
@@ -132,13 +131,11 @@ def linearised(loop: Loop) -> Float[Array, "state state"]:
     state = jax.lax.scan(lambda s, _: (calm.step(s), None), loop.start(), None, length=SETTLING)[0]
     loops = jnp.stack([gains.place, gains.place, gains.yaw])
     state = replace(state, pose=state.pose * (MILD / jnp.maximum(loops, 0.1)))
-    flat = Flat(state)
-    a = jax.jacfwd(lambda x: flat.ravel(loop.step(flat.unravel(x))))(
-        jax.lax.stop_gradient(flat.ravel(state))
-    )
-    integral = np.zeros(len(a), bool)
-    integral[flat.place("control.integral")] = True
-    idle = integral & (gains.integral < 1e-6)
+    flat, tree = ravel_pytree(state)
+    a = jax.jacfwd(lambda x: ravel_pytree(loop.step(tree(x)))[0])(jax.lax.stop_gradient(flat))
+    none = jax.tree.map(jnp.zeros_like, state)
+    own = replace(none, control=replace(none.control, integral=jnp.ones(2)))
+    idle = (ravel_pytree(own)[0] > 0) & (gains.integral < 1e-6)
     return jnp.where(idle[:, None] | idle[None, :], 0.0, a)
 
 
@@ -163,5 +160,4 @@ def radii(
 
     floors, ways = jnp.arange(len(controller.robot.labels)), jnp.asarray(WAYS)
     over = jax.vmap(jax.vmap(jax.vmap(one, (None, None, 0)), (None, 0, None)), (0, None, None))
-    found: Array = over(truths, floors, ways)
-    return found
+    return over(truths, floors, ways)

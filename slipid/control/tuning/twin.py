@@ -19,18 +19,45 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from slipid.control.closed_loop import PERIOD
+from slipid.control.closed_loop import PERIOD, Pilot, PilotOutput, PilotState
 from slipid.control.deployed import DeployedRobot
-from slipid.control.interface import Estimate, Measurement, Pose, Readings, State
-from slipid.control.pilot import Pilot, PilotOutput, PilotState
+from slipid.control.interface import Measurement, Pose, Readings, State
 from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import RING, Habits
 from slipid.model import contact
-from slipid.model.plant import Floor
 from slipid.model.robot import GRAVITY
 from slipid.model.se2 import advance, compose
+
+
+class Floor(eqx.Module):
+    """Which surface lies where, as arrays a jitted function can look up.
+
+    Attributes:
+        cells: index of the surface in every square cell (row, column), row 0 at the lowest y.
+        corner: x, y of the corner with the lowest coordinates [m].
+        cell: edge of a cell [m].
+    """
+
+    cells: Int[Array, "row column"]
+    corner: Float[Array, "2"]
+    cell: Float[Array, ""]
+
+    def under(
+        self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
+    ) -> Int[Array, " wheel"]:
+        """Surface under wheels at these places in the body frame [m], of a body at a pose.
+
+        Beyond the edge it is that of the nearest cell.
+        """
+        c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+        turned = jnp.stack(
+            [c * wheels[:, 0] - s * wheels[:, 1], s * wheels[:, 0] + c * wheels[:, 1]], axis=-1
+        )
+        steps = jnp.floor((pose[:2] + turned - self.corner) / self.cell).astype(jnp.int32)
+        rows, columns = self.cells.shape
+        return self.cells[steps[:, 1].clip(0, rows - 1), steps[:, 0].clip(0, columns - 1)]
 
 
 class TwinState(eqx.Module):
@@ -80,8 +107,7 @@ class Twin(eqx.Module):
     def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:
         """Standard normal numbers of a step by its number; 0 is the reading at rest."""
         count = 3 * self.robot.wheels + 1 + 3 * self.habits.substeps
-        drawn: Array = jax.random.normal(jax.random.fold_in(key, number), (count,))
-        return drawn
+        return jax.random.normal(jax.random.fold_in(key, number), (count,))
 
     def init(self, pose: Pose, key: Array) -> TwinState:
         """State at rest at a pose [m, m, rad], with what this run has of its own."""
@@ -148,7 +174,7 @@ class Twin(eqx.Module):
         f, wheels, xi, w = self.robot, self.robot.wheels, now.twist, now.speed
         under = self.floor.under(now.pose, f.places)
         floor = f.floors.at(under)
-        traction = contact.forces(xi, f.frame.radius * w, f.frame, floor, f.rest).traction
+        traction = contact.traction(xi, f.frame.radius * w, f.frame, floor, f.rest)
         force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
         keep = float(np.exp(-PERIOD / self.habits.drift_s))
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
@@ -177,24 +203,12 @@ class Twin(eqx.Module):
         ).filled(wheels)
 
 
-class Rolled(eqx.Module):
-    """A rollout, a row per period, as `slipid.control.closed_loop.Course` has it.
-
-    Attributes:
-        pose: true [m, m, rad]; own: time of the path [s].
-        command: [rad/s]; estimate: a leading axis of steps on every array.
-    """
-
-    pose: Float[Array, "step 3"]
-    command: Float[Array, "step wheel"]
-    estimate: Estimate
-    own: Float[Array, " step"]
-
-
 def rollout(
     pilot: Pilot[State], path: Path, twin: Twin, start: Pose, key: Array, steps: int
-) -> Rolled:
-    """A pilot on a twin for a fixed number of steps; a path that is over is a rest at its end.
+) -> tuple[Float[Array, "step 3"], PilotOutput]:
+    """True poses [m, m, rad] and what the pilot says over a fixed number of steps.
+
+    A path that is over is a rest at its end.
 
     Args:
         pilot, twin: who drives, and what is driven.
@@ -215,8 +229,7 @@ def rollout(
         state, reading = twin.step(before, out.command, drawn)
         return (state, held, reading), (before.pose, out)
 
-    pose, out = jax.lax.scan(step, (state, pilot.init(start), reading), noise[1:])[1]
-    return Rolled(pose=pose, command=out.command, estimate=out.estimate, own=out.time)
+    return jax.lax.scan(step, (state, pilot.init(start), reading), noise[1:])[1]
 
 
 class TwinPlant:

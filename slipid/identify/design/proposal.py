@@ -12,8 +12,8 @@ from slipid.identify.design.planner import Goal, Planner, parameter_goal, predic
 from slipid.identify.design.savings import saved
 from slipid.identify.design.wish import Scope, Wish
 from slipid.identify.result import Fit
-from slipid.identify.slip_curves import Validity
 from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE
+from slipid.model.robot import Validity
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 

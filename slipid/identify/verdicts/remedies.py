@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence, Set
 
 import numpy as np
 
-from slipid.identify.slip_curves import Validity
+from slipid.model.robot import Validity
 from slipid.parameter import Entry
 
 VOLTAGE = "log the motor voltage (or duty and bus voltage)"

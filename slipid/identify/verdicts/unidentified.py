@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.identify.fit.variances import Search, Square
-from slipid.identify.slip_curves import Validity
 from slipid.identify.verdicts.estimates import WEAK
 from slipid.identify.verdicts.formulas import NOTHING, SMALL, Axis, axes_of, formula
 from slipid.identify.verdicts.remedies import remedy
+from slipid.model.robot import Validity
 from slipid.search_space import Space
 
 NOTICED = 1 / WEAK**2

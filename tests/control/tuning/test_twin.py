@@ -5,10 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.control.closed_loop import Plant, drive
+from slipid.control.closed_loop import Pilot, Plant, drive
 from slipid.control.controller import Controller, Gains
 from slipid.control.odometry import Odometry
-from slipid.control.pilot import Pilot
 from slipid.control.trajectory import waypoints
 from slipid.control.tuning.actuation import RING, Habits
 from slipid.control.tuning.twin import Twin, TwinPlant, rollout
@@ -112,10 +111,10 @@ def test_a_rollout_is_the_run_of_a_plant():
     plant = TwinPlant(twin, START, KEY)
     assert isinstance(plant, Plant)
     course = drive(own, path, plant, START)
-    run = jax.jit(lambda k: rollout(own, path, twin, START, k, len(course.pose)))(KEY)
-    np.testing.assert_allclose(run.pose[:, :2], course.pose[:, :2], atol=1e-12)
-    np.testing.assert_allclose(run.command, course.command, atol=1e-12)
-    np.testing.assert_allclose(run.own, course.own, atol=1e-12)
+    pose, said = jax.jit(lambda k: rollout(own, path, twin, START, k, len(course.pose)))(KEY)
+    np.testing.assert_allclose(pose[:, :2], course.pose[:, :2], atol=1e-12)
+    np.testing.assert_allclose(said.command, course.command, atol=1e-12)
+    np.testing.assert_allclose(said.time, course.own, atol=1e-12)
     other = drive(own, path, TwinPlant(twin, START, jax.random.PRNGKey(4)), START)
     assert np.abs(other.pose[-1] - course.pose[-1]).max() > 1e-5
     for one, again in zip(*(jax.tree.leaves(plant.reset()) for _ in range(2)), strict=True):
@@ -129,7 +128,7 @@ def test_derivative_by_gains_is_that_of_finite_differences():
     twin = Twin(robot, FIRM, Habits(smooth=True))
 
     def end(gains):
-        return rollout(pilot(robot, gains), path, twin, START, KEY, 50).pose[-1]
+        return rollout(pilot(robot, gains), path, twin, START, KEY, 50)[0][-1]
 
     gains = jnp.asarray([1.5, 1.2, 0.3, 0.2, 0.4, 0.113])  # between rows of the path
     slope = jax.jit(jax.jacfwd(end))(gains)

@@ -12,13 +12,13 @@ from scipy.stats import chi2
 
 from slipid.identify.fit.optimise import Options, optimise
 from slipid.identify.fit.problem import Problem
-from slipid.identify.slip_curves import Validity
 from slipid.identify.verdicts import formulas
 from slipid.identify.verdicts import unidentified as flat_module
 from slipid.identify.verdicts.estimates import RATIOS, derived, expected_covariance
 from slipid.identify.verdicts.profile import RISE, _Walk, profile, profiled
 from slipid.identify.verdicts.remedies import VOLTAGE, remedy
 from slipid.identify.verdicts.unidentified import NOTICED, flat_directions, sentences
+from slipid.model.robot import Validity
 from slipid.search_space import Choice, Space
 from tests.helpers.made_windows import made, robot
 from tests.identify.fit.test_optimise import NOISE, begin

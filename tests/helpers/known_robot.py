@@ -1,0 +1,47 @@
+"""A deployed robot whose numbers are known, without a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax
+import numpy as np
+
+from slipid.control.deployed import DeployedRobot
+from slipid.control.robot_file.record import Number
+from slipid.deploy.record_of import plain, record_of
+from slipid.model.robot import Robot
+from slipid.parameter import entries
+
+
+def deploy_known(
+    robot: Robot,
+    load: str | None = None,
+    std: Mapping[str, float] | None = None,
+    draws: Robot | None = None,
+    highest_speed: float = 20.0,
+    current_trend: tuple[float, float] = (0.0, 0.0),
+) -> DeployedRobot:
+    """The robot as it drives with a load set-up; arguments as of `record_of`.
+
+    Without draws of its posterior its numbers have no spread.
+    """
+    several = jax.tree.map(lambda x: x[None], robot) if draws is None else draws
+    record = record_of(robot, given(robot), std or {}, several, highest_speed, current_trend, {})
+    return DeployedRobot.of(record, load)
+
+
+def given(robot: Robot) -> dict[str, Number]:
+    """The numbers of a robot as they were given, by path."""
+    return {
+        e.path: Number(
+            value=plain(np.asarray(e.get(robot))),
+            unit=e.declaration.unit,
+            std=None,
+            interval90=None,
+            verdict="fixed",
+            provenance="override",
+            source="given",
+        )
+        for e in entries(robot)
+    }
