@@ -16,12 +16,11 @@ def check(
     from slipid.job import check as job
     from slipid.plots.raw import raw_plots
     from slipid.report.check import show_check
-    from slipid.report.page import Page
 
     with Reporter(quiet=quiet) as report:
         done = job.check(config, data, out, report)
         if out is not None:
             report.stage("drawing")
             raw_plots(done.job.dataset, out)
-    emit(json, done.content, lambda: show_check(Page(), done.content))
+    emit(json, done.content, lambda page: show_check(page, done.content))
     return 0

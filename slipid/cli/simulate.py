@@ -8,6 +8,7 @@ from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
+    from slipid.report.page import Page
     from slipid.testsite.simulate.config import Plan
 
 
@@ -26,16 +27,14 @@ def simulate(
     plan = read_plan(config)
     with Reporter(quiet=quiet) as report:
         found = run(plan, out, processes(jobs), report)
-    emit(json, found, lambda: show(found, plan, out))
+    emit(json, found, lambda page: show(page, found, plan, out))
     return 0
 
 
-def show(found: Content, plan: "Plan", out: Path) -> None:
+def show(page: "Page", found: Content, plan: "Plan", out: Path) -> None:
     """Print how much was driven, and what to do with it."""
-    from slipid.report.page import Page
     from slipid.testsite.simulate.identify_config import can_identify
 
-    page = Page()
     page.line(f"{len(found['runs'])} runs, {found['driven']} of them driven now")
     if found["pace"] is not None:
         page.line(f"{found['seconds']:.0f} s at {found['pace']:.1f} times real time")

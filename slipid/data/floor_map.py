@@ -40,10 +40,6 @@ class FloorMap:
         row, column = steps[..., 1].clip(0, rows - 1), steps[..., 0].clip(0, columns - 1)
         return np.asarray(self.cells[row, column])
 
-    def surface_at(self, x: float, y: float) -> str:
-        """Name of the surface at a place [m]."""
-        return self.surfaces[int(self.at(np.array([x, y])))]
-
 
 def uniform(surface: str, half: float = 2.0) -> FloorMap:
     """One surface everywhere."""
@@ -138,26 +134,20 @@ def patchwork(
     return FloorMap(tuple(surfaces), cells, (-half, -half), cell)
 
 
-def four_zones(
-    surfaces: Sequence[str], middle: tuple[float, float] = (0.45, -0.2), reach: float = 1.2
-) -> FloorMap:
+def four_zones(surfaces: Sequence[str], middle: tuple[float, float] = (0.45, -0.2)) -> FloorMap:
     """Four surfaces that meet in a point, by default the middle of the paper's rectangle.
 
     Args:
         surfaces: of the quarters with low x and high y, high x and high y, high x and low y, and
             of the rest.
-        middle: x, y [m].
-        reach: reach of every zone from there [m].
+        middle: x, y [m]; every zone reaches 1.2 m from there.
     """
-    x, y = middle
-    corners = (
-        [[x - reach, y], [x, y], [x, y + reach], [x - reach, y + reach]],
-        [[x, y], [x + reach, y], [x + reach, y + reach], [x, y + reach]],
-        [[x, y - reach], [x + reach, y - reach], [x + reach, y], [x, y]],
-        [[x - reach, y - reach], [x, y - reach], [x, y], [x - reach, y]],
-    )
-    patches = list(zip(surfaces, corners, strict=True))
-    return from_polygons(surfaces[0], patches, (x - reach, y - reach, x + reach, y + reach))
+    reach, cell = 1.2, 0.005
+    names = tuple(dict.fromkeys(surfaces))
+    a, b, c, d = (names.index(surface) for surface in surfaces)
+    zone = np.ones((round(reach / cell), round(reach / cell)), np.intp)
+    cells = np.kron([[d, c], [a, b]], zone)
+    return FloorMap(names, cells, (middle[0] - reach, middle[1] - reach), cell)
 
 
 def _few(cells: int) -> None:

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from slipid.data.log import Log
-from slipid.data.signals.wheel_signals import MOVED, bridge_stalls, first_moved
+from slipid.data.wheel_signals import MOVED, bridge_stalls, first_moved
 from slipid.support.errors import DataError
 
 
@@ -100,8 +100,7 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
             )
     pick = session or default_session
     offset = np.concatenate([[0], np.cumsum([log.samples for log in logs])])
-    commands = [_command(log) for log in logs]
-
+    heading, speed, turn = np.array([_command(log) for log in logs]).T
     bridged = [bridge_stalls(log.time, log.wheel_angle) for log in logs]
     flat: dict[str, np.ndarray] = {}
     for name in ("time", "pose", "current", "voltage"):
@@ -134,34 +133,29 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
         voltage=flat.get("voltage"),
         current_is_signed=all(log.current_is_signed for log in logs),
         session=tuple(pick(log) for log in logs),
-        heading=np.array([c.heading for c in commands]),
-        speed=np.array([c.speed for c in commands]),
-        turn=np.array([c.turn for c in commands]),
+        heading=heading,
+        speed=speed,
+        turn=turn,
     )
 
 
 def default_session(log: Log) -> str:
     """`surface/load/speed`, the speed to 0.01 m/s and left out where nothing was commanded."""
-    speed = _command(log).speed
+    _, speed, _ = _command(log)
     parts = [log.surface or "unknown", log.load] + ([f"{speed:.2f}"] if np.isfinite(speed) else [])
     return "/".join(parts)
 
 
-class _Command(NamedTuple):
-    """What a run was asked to do: heading [rad], speed [m/s], yaw rate [rad/s]; nan if unknown."""
+def _command(log: Log) -> tuple[float, float, float]:
+    """Heading [rad], speed [m/s] and yaw rate [rad/s] of the median command; nan if unknown.
 
-    heading: float
-    speed: float
-    turn: float
-
-
-def _command(log: Log) -> _Command:
-    """Median command; it has no heading where the robot is to turn on the spot."""
+    It has no heading where the robot is to turn on the spot.
+    """
     if log.twist_command is None:
-        return _Command(np.nan, np.nan, np.nan)
+        return np.nan, np.nan, np.nan
     x, y, turn = np.median(log.twist_command, axis=0).tolist()
     speed = float(np.hypot(x, y))
-    return _Command(float(np.arctan2(y, x)) if speed > 1e-4 else np.nan, speed, turn)
+    return float(np.arctan2(y, x)) if speed > 1e-4 else np.nan, speed, turn
 
 
 def first_row(data: Runs, run: int, wheel_radius: float) -> int:

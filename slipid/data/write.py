@@ -1,6 +1,6 @@
 """Logs as files: slipid's own columns, and those of the published Robotino logs."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from io import StringIO
 
 import numpy as np
@@ -20,22 +20,8 @@ OPTIONAL = {
 _IMAGE = (1920, 1080)
 
 
-def own_layout(
-    wheels: int,
-    gear_ratio: float,
-    ticks_per_revolution: int,
-    current_is_signed: bool = False,
-    more: Collection[str] = ("voltage",),
-) -> Content:
-    """Layout of `own_csv`, as a config declares one.
-
-    Args:
-        wheels: number of wheels.
-        gear_ratio: turns of the motor per turn of the wheel.
-        ticks_per_revolution: ticks in one turn of the motor.
-        current_is_signed: False where magnitudes are logged.
-        more: those of the `OPTIONAL` channels that there are.
-    """
+def own_columns(wheels: int, more: Sequence[str]) -> Content:
+    """`own_csv`'s columns as a config declares them, of the `OPTIONAL` channels those in `more`."""
     columns: Content = {
         "time": {"column": "time", "unit": "s"},
         "twist_command_x": {"column": "command_x", "unit": "m/s"},
@@ -49,21 +35,15 @@ def own_layout(
             columns[channel] = {"columns": _each(channel, wheels), "unit": unit}
         elif channel in more:
             columns[channel] = {"column": channel, "unit": unit}
-    columns |= {
+    return columns | {
         "pose_x": {"column": "x", "unit": "mm"},
         "pose_y": {"column": "y", "unit": "mm"},
         "pose_heading": {"column": "heading", "unit": "deg"},
     }
-    return {
-        "ticks_per_revolution": ticks_per_revolution,
-        "gear_ratio": gear_ratio,
-        "current_is_signed": current_is_signed,
-        "columns": columns,
-    }
 
 
 def own_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> str:
-    """Text of a log with commands, currents and poses in slipid's own columns, see `own_layout`."""
+    """Text of a log with commands, currents and poses in slipid's own columns."""
     assert log.twist_command is not None
     assert log.current is not None
     assert log.pose is not None

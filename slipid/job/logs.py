@@ -5,7 +5,7 @@ from pathlib import Path
 
 from slipid.data.log import Log
 from slipid.data.reading.declared import declared_layout
-from slipid.data.reading.folders import session_of, surface_of, with_voltage
+from slipid.data.reading.folders import session_of, surface_of
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import PRESETS, preset
 from slipid.data.reading.reader import find_logs, read_logs
@@ -36,7 +36,7 @@ def read_dataset(
         layout = layout_of(config, section)
         for path in paths:
             surface = None if section.map is not None else surface_of(path, section.surface)
-            for log in read_logs(path, layout, root=root, surface=surface, load=section.load):
+            for log in read_logs(path, layout, root, surface, section.load):
                 if log.samples < section.min_rows:
                     short += 1
                     continue
@@ -45,7 +45,7 @@ def read_dataset(
                         f"{log.name}: found by two globs of {config.path}; expected it once"
                     )
                 session[log.name] = session_of(log, section.session)
-                logs.append(with_voltage(log))
+                logs.append(log)
             done += 1
             report.advance(done, count)
     if short:

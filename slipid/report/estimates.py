@@ -9,6 +9,7 @@ from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.identify.verdicts.profile import Profile
 from slipid.report.page import Page, table, verdict
+from slipid.support.content import Content
 
 
 def estimates(items: Iterable[Estimate], title: str) -> Table:
@@ -37,6 +38,27 @@ def rows_of(e: Estimate) -> list[tuple[str, float, tuple[float, float] | None]]:
         return [("", e.value, e.interval90)]
     intervals = e.interval90 or [None] * len(e.labels)
     return list(zip(e.labels, e.value, intervals, strict=True))
+
+
+def show_sample(
+    page: Page, numbers: Iterable[Estimate], about: Content, messages: Iterable[str]
+) -> None:
+    """Write what the draws of a posterior say, and what sample.json says of how they were made."""
+    worst = about["worst"]
+    page.table(estimates(numbers, f"{about['draws']} draws"))
+    page.notes(messages)
+    page.line(
+        f"{about['ensembles']} ensembles of {about['walkers']} walkers, {about['steps']} steps: "
+        f"worst R-hat {worst['r_hat']:.4f}, {worst['steps_per_tau']:.0f} steps per "
+        f"autocorrelation time, {worst['effective_draws']:.0f} effective draws"
+    )
+    if about["converged"]:
+        page.line(f"converged: worst is {about['reason']}")
+    else:
+        page.line(
+            f"NOT converged, do not trust the intervals: worst is {about['reason']}; "
+            "a larger --most goes on from here"
+        )
 
 
 def show_fit(page: Page, fit: Fit, profiles: Sequence[Profile] = ()) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.data.log import Log
+from slipid.data.wheel_signals import interpolate
 from slipid.identify.design.planned_runs import Drive
 from slipid.model.robot import Robot, wheel_torque
 from slipid.model.rollout import replay_twist
@@ -136,7 +137,7 @@ class _Maker:
             fresh[k, 1:] = np.diff(newest) > 0
             age = t - frames[newest] - 0.5 * s.row_period if s.free_frames else 0.0
             at = t - float(robot.camera.lag) - age
-            marker[k] = np.stack([np.interp(at, t, column) for column in pose[k].T], axis=-1)
+            marker[k] = interpolate(t, pose[k], at)
         session = [robot.session_index(d.session) for d in self.drives]
         yaw = np.array([float(robot.camera.yaw(k)) for k in session])
         logged = np.asarray(_as_logged(robot, jnp.asarray(marker), jnp.asarray(yaw)))

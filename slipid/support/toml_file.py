@@ -58,15 +58,6 @@ def mapping_of(path: Path, text: str) -> Content:
         raise DataError(f"{path}: no valid TOML: {error}") from error
 
 
-def content(path: Path, text: str, model: type[Model]) -> Model:
-    """TOML text as a model; the path is for messages.
-
-    Raises:
-        DataError: no TOML, unknown or missing keys, wrong values; every one on a line.
-    """
-    return checked(path, mapping_of(path, text), model)
-
-
 def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
     """A mapping as a pydantic model or dataclass.
 

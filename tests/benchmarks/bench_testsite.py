@@ -323,8 +323,9 @@ def test_figures_beside_the_real_ones(real_data: Path) -> None:
 
     from slipid.baselines.paper2021.result import regenerate
     from slipid.data.reading.presets import preset
-    from slipid.data.reading.reader import find_logs, read_log
+    from slipid.data.reading.reader import find_logs
     from slipid.plots.paper import _floor
+    from tests.helpers.one_log import read_log
 
     OUT.mkdir(parents=True, exist_ok=True)
     real = regenerate(real_data / "robotino2021", None)

@@ -22,7 +22,6 @@ from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Twin, rollout
 from slipid.data.floor_map import patchwork
 from slipid.data.reading.presets import preset
-from slipid.data.reading.reader import read_log
 from slipid.data.runs import Runs, collect
 from slipid.deploy.controllers import ROWS, pilot_of
 from slipid.deploy.deploy import deploy_known
@@ -31,6 +30,7 @@ from slipid.model.plant import Floor
 from slipid.model.robot import Robot, build
 from slipid.search_space import Choice, Space
 from tests.helpers import replayed
+from tests.helpers.one_log import read_log
 
 FIT = Path(__file__).parents[1] / "helpers" / "robotino2022_sectors.json"
 """Numbers of a fit that has seen no heading of 0 to 60 deg."""

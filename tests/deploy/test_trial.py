@@ -30,6 +30,7 @@ from slipid.model.robot import build
 from slipid.support.errors import DataError
 from slipid.testsite.live import Live
 from slipid.testsite.site import Site
+from tests.helpers.floors import surface_at
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +237,7 @@ def test_a_map_is_looked_up_under_the_wheels(deployed):
     c, s = np.cos(0.7), np.sin(0.7)
     turned = np.asarray(deployed.places) @ np.array([[c, s], [-s, c]]) + [0.02, -0.01]
     names = [("firm", "soft")[k] for k in under]
-    assert names == [floor.surface_at(float(x), float(y)) for x, y in turned]
+    assert names == [surface_at(floor, float(x), float(y)) for x, y in turned]
     assert len(set(names)) == 2
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slipid.data.reading.declared import declared_layout
-from slipid.data.reading.reader import find_logs, read_log
+from slipid.data.reading.reader import find_logs
 from slipid.data.runs import collect, default_session
 from slipid.data.windows import windows
 from slipid.identify.design.planned_runs import Drive
@@ -18,6 +18,7 @@ from slipid.selftest.known import TRUTH, truth
 from slipid.selftest.logs import make_logs
 from slipid.selftest.plan import Sensors, grid
 from tests.helpers.made_logs import LAYOUT, write_logs
+from tests.helpers.one_log import read_log
 
 PLAN = grid(headings=4, turns=2)
 ROBOT = truth(PLAN)

@@ -16,6 +16,7 @@ from slipid.testsite.motors import Drive, Motor, SpeedLoop
 from slipid.testsite.plant import Plant
 from slipid.testsite.simulate.sections import Curves, Headings, PaperGrid, Rectangle, Wander
 from slipid.testsite.site import Site
+from tests.helpers.floors import surface_at
 
 EVEN = {name: replace(g, unevenness=0.0) for name, g in GROUNDS.items()}
 CENTRED = replace(Machine(), centres_m={"as_built": (0.0, 0.0)})
@@ -190,7 +191,7 @@ def test_ribs_lie_on_their_surface_only():
     found = ribs(floor, GROUNDS, (0.0, 0.0, 0.0))
     assert len(found) > 20
     for x, low, high, height in found:
-        assert floor.surface_at(x, 0.5 * (low + high)) == "ribbed"
+        assert surface_at(floor, x, 0.5 * (low + high)) == "ribbed"
         assert low < high
         assert height == GROUNDS["ribbed"].rib_height_m
 

@@ -18,7 +18,6 @@ from slipid.cli.main import app
 from slipid.data.floor_map import four_zones
 from slipid.data.map_file import read_map
 from slipid.data.reading.presets import preset
-from slipid.data.reading.reader import read_log
 from slipid.job.config import parsed
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -31,6 +30,8 @@ from slipid.testsite.simulate.simulate import Job, _place, simulate, truth
 from slipid.testsite.site import Site
 from slipid.testsite.studio import MARKER, Studio, film
 from tests.conftest import ROOT
+from tests.helpers.floors import surface_at
+from tests.helpers.one_log import read_log
 
 SMALL = """
 seed = 3
@@ -112,7 +113,7 @@ def test_the_same_seed_writes_the_same_bytes_with_any_number_of_processes(config
     assert np.median(np.abs(seen - x)) < 0.003
     floor = read_map(tmp_path / "one/maps/zones.toml")
     assert floor.surfaces == ("firm", "soft", "medium", "short")
-    assert floor.surface_at(0.8, 0.0) == "soft"
+    assert surface_at(floor, 0.8, 0.0) == "soft"
 
 
 def children(pid):
@@ -181,7 +182,7 @@ def test_a_map_is_read_from_its_file_beside_the_config(tmp_path):
     text = SMALL.replace('kind = "four_zones", surfaces = ["firm", "soft", "medium", "short"]', "x")
     text = text.replace("{ x }", '{ kind = "file", file = "floor.toml" }')
     found = plan(tmp_path / "site.toml", text)
-    assert found.maps["zones"].surface_at(0.4, 0.1) == "soft"
+    assert surface_at(found.maps["zones"], 0.4, 0.1) == "soft"
     other = (tmp_path / "floor.toml").read_text().replace("0.5, 0.5", "0.5, 0.9")
     (tmp_path / "floor.toml").write_text(other)
     assert plan(tmp_path / "site.toml", text).hash != found.hash

@@ -8,8 +8,7 @@ from jaxtyping import Float
 from slipid.data.log import Log
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.table import Table
-from slipid.data.signals.wheel_order import best_wheel_order, describe
-from slipid.data.signals.wheel_signals import integrated_steps, interpolate, step_edges
+from slipid.data.wheel_signals import best_wheel_order, describe, integral, interpolate
 from slipid.support.errors import bad_data
 
 MIN_ROWS = 2
@@ -168,13 +167,17 @@ def _check_wheels(log: Log, table: Table, layout: Layout) -> None:
 
 def _check_order(log: Log, table: Table, layout: Layout) -> None:
     """Refuse wheel columns in another order than those of the commanded or reported speeds."""
+    # steps of half a second: delays and jitter do not matter
+    edges = np.linspace(log.time[0], log.time[-1], max(2, int(log.duration / 0.5) + 1))
     for name in ("wheel_speed_command", "wheel_speed"):
         reference = getattr(log, name)
         if reference is None:
             continue
-        edges = step_edges(log.time)
-        measured = np.diff(interpolate(log.time, log.wheel_angle, edges), axis=0)
-        order = best_wheel_order(measured, integrated_steps(log.time, reference, edges))
+        measured, said = (
+            np.diff(interpolate(log.time, angle, edges), axis=0)
+            for angle in (log.wheel_angle, integral(log.time, reference))
+        )
+        order = best_wheel_order(measured, said)
         if order.is_swapped:
             other = np.flatnonzero(np.array(order.order) != np.arange(log.wheels))
             turned = np.flatnonzero(np.array(order.signs) < 0)

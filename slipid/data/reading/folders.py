@@ -1,6 +1,5 @@
 """Runs of a folder: the surface from the folder's name, a session for each run, then one `Runs`."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -42,9 +41,9 @@ def read_runs(
     root = Path(folder)
     chosen = preset(layout) if isinstance(layout, str) else layout
     logs = [
-        with_voltage(log)
+        log
         for path in find_logs(root, pattern)
-        for log in read_logs(path, chosen, root=root, surface=surface_of(path, surface), load=load)
+        for log in read_logs(path, chosen, root, surface_of(path, surface), load)
     ]
     return collect(logs, session=lambda log: session_of(log, session))
 
@@ -61,10 +60,3 @@ def session_of(log: Log, session: Session) -> str:
     if session == "folder":
         return log.name.rpartition("/")[0] or log.name
     return default_session(log)
-
-
-def with_voltage(log: Log) -> Log:
-    """The log with voltage = duty x bus voltage where only those two were logged."""
-    if log.voltage is None and log.duty is not None and log.bus_voltage is not None:
-        return replace(log, voltage=log.duty * log.bus_voltage[:, None])
-    return log

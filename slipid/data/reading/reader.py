@@ -10,50 +10,28 @@ from slipid.data.log import Log
 from slipid.data.reading.checks import MIN_ROWS, check_log, check_time, filled, unwrapped_ticks
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.table import Table, read_table
-from slipid.data.signals.wheel_signals import integral
-from slipid.support.errors import DataError, bad_data
+from slipid.data.wheel_signals import integral
+from slipid.support.errors import DataError
 
 
-def read_log(
-    path: Path,
-    layout: Layout,
-    *,
-    root: Path | None = None,
-    surface: str | None = None,
-    load: str = "as_built",
-) -> Log:
-    """The one run in a CSV or Parquet file.
+def read_logs(
+    path: Path, layout: Layout, root: Path, surface: str | None, load: str
+) -> tuple[Log, ...]:
+    """Every run in a CSV or Parquet file, where `layout.new_run` tells them apart.
+
+    Parts of a file of a single row hold no motion and are left out.
 
     Args:
-        root: data folder the log's name is relative to; the file's own folder where None.
+        root: data folder above the file, which the names of the runs are relative to.
         surface, load: names of the floor and the load set-up.
 
     Raises:
         DataError: the file, row or column that is wrong, what is there and what was expected.
     """
-    logs = read_logs(path, layout, root=root, surface=surface, load=load)
-    if len(logs) > 1:
-        raise bad_data(path, f"{len(logs)} runs in one file", "one run (read_logs reads several)")
-    return logs[0]
-
-
-def read_logs(
-    path: Path,
-    layout: Layout,
-    *,
-    root: Path | None = None,
-    surface: str | None = None,
-    load: str = "as_built",
-) -> tuple[Log, ...]:
-    """Every run in a file, where `layout.new_run` tells them apart; arguments as of `read_log`.
-
-    Parts of a file of a single row hold no motion and are left out.
-    """
     table = read_table(path, layout)
     if layout.drop_repeated_time:
         table = table.rows(np.append(np.diff(_time(table, layout)) != 0, True))
-    below = root if root is not None and path.is_relative_to(root) else path.parent
-    name = path.relative_to(below).as_posix()
+    name = path.relative_to(root).as_posix()
     starts = _run_starts(table, layout)
     if len(starts) == 1:
         return (_log(table, layout, name, surface, load),)
@@ -122,7 +100,7 @@ def _log(table: Table, layout: Layout, name: str, surface: str | None, load: str
         twist_command=_twist(have, len(time)),
         current=have.get("current"),
         current_is_signed=layout.current_is_signed,
-        voltage=have.get("voltage"),
+        voltage=_voltage(have),
         duty=have.get("duty"),
         bus_voltage=have["bus_voltage"][:, 0] if "bus_voltage" in have else None,
         gyro=have["gyro"][:, 0] if "gyro" in have else None,
@@ -185,6 +163,13 @@ def _at_wheel(layout: Layout, have: dict[str, np.ndarray], what: str) -> np.ndar
     if f"motor_{what}" in have:
         return have[f"motor_{what}"] / layout.gear_ratio
     return None
+
+
+def _voltage(have: dict[str, np.ndarray]) -> np.ndarray | None:
+    """As logged, else the duty cycle of the bus voltage where both were."""
+    if "voltage" not in have and {"duty", "bus_voltage"} <= have.keys():
+        return have["duty"] * have["bus_voltage"]
+    return have.get("voltage")
 
 
 def _twist(have: dict[str, np.ndarray], rows: int) -> np.ndarray | None:

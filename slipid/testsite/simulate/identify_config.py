@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slipid.data.write import OPTIONAL, own_layout
+from slipid.data.write import OPTIONAL, own_columns
 from slipid.testsite.simulate.config import Plan
 
 _IDENTIFY = """\
@@ -39,14 +39,8 @@ def identify_config(plan: Plan) -> str:
     """Text of a config for `slipid identify` that fits the logs in slipid's own columns."""
     machine, sensors = plan.site.machine, plan.site.sensors
     measured = 0.0015 * float(np.random.default_rng([plan.content.seed, 2]).normal())
-    layout = own_layout(
-        len(machine.wheel_azimuths_deg),
-        machine.gear_ratio,
-        plan.site.motor.ticks_per_revolution,
-        sensors.current_is_signed,
-        [channel for channel in OPTIONAL if getattr(sensors, channel)],
-    )
-    columns = "\n".join(f"{name} = {_inline(c)}" for name, c in layout["columns"].items())
+    more = [channel for channel in OPTIONAL if getattr(sensors, channel)]
+    columns = own_columns(len(machine.wheel_azimuths_deg), more)
     one = {(run.load, run.surface) for _, run in plan.runs if run.surface is not None}
     where = [(load, surface, 'surface = "folder"') for load, surface in sorted(one)]
     where += [(load, name, f'map = "maps/{name}.toml"') for load, name in _mapped(plan)]
@@ -60,9 +54,9 @@ def identify_config(plan: Plan) -> str:
         radius=machine.wheel_radius_m,
         gear=machine.gear_ratio,
         mass=machine.mass_kg,
-        ticks=layout["ticks_per_revolution"],
-        signed="true" if layout["current_is_signed"] else "false",
-        columns=columns,
+        ticks=plan.site.motor.ticks_per_revolution,
+        signed=str(sensors.current_is_signed).lower(),
+        columns="\n".join(f"{name} = {_inline(c)}" for name, c in columns.items()),
         sets=sets,
         scale=round(sensors.camera_scale * (1 + measured), 4),
     )

@@ -9,11 +9,12 @@ import pytest
 
 from slipid.data.reading.declared import declared_layout
 from slipid.data.reading.presets import PRESETS, preset
-from slipid.data.reading.reader import find_logs, read_log
+from slipid.data.reading.reader import find_logs
 from slipid.data.reading.table import read_table
 from slipid.data.reading.units import factor, same_unit
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import GENERIC, GENERIC_LAYOUT, ROBOTINO, generic_text, write_good
+from tests.helpers.one_log import read_log
 
 TURN = 2 * math.pi
 POSE = ("pose_x", "pose_y", "pose_heading")
