@@ -1,6 +1,5 @@
 """`slipid sample`: the posterior of a fit."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -44,14 +43,8 @@ def sample(
         robot = write_robot(out, done.fit, done.posterior)
         report.stage("drawing")
         drawn = posterior_plots(done.fit, done.posterior, out)
-    done = replace(done, written=(*done.written, *robot, *(path.name for path in drawn)))
     content = read_json(out / "identified.json", "what sample wrote")
-    messages = done.content["messages"]
-    emit(
-        json,
-        content,
-        lambda page: show_sample(page, done.parameters.values(), done.about, messages),
-        out,
-        done.written,
-    )
+    told = done.parameters.values(), done.about, content["messages"]
+    written = (*done.written, *robot, *(path.name for path in drawn))
+    emit(json, content, lambda page: show_sample(page, *told), out, written)
     return 0 if done.posterior.converged else 1

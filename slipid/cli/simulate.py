@@ -21,10 +21,11 @@ def simulate(
     Writes logs, a config that identifies them, floor maps, and the truth in a folder of its own.
     Runs that are done are kept and not driven again.
     """
-    from slipid.testsite.simulate.config import read_plan
+    from slipid.support.toml_file import text_of
+    from slipid.testsite.simulate.config import plan as read
     from slipid.testsite.simulate.simulate import simulate as run
 
-    plan = read_plan(config)
+    plan = read(config, text_of(config))
     with Reporter(quiet=quiet) as report:
         found = run(plan, out, processes(jobs), report)
     emit(json, found, lambda page: show(page, found, plan, out))

@@ -16,11 +16,10 @@ from slipid.data.floor_map import patchwork
 from slipid.deploy.deploy import ROBOT, habits_of, read_robot
 from slipid.deploy.trial_site import floor_of
 from slipid.deploy.tuned import CORNERS, DRAWS, Tuned, hashes, judged
-from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.errors import DataError
 from slipid.support.files import write_json
 from slipid.support.progress import Reporter
-from slipid.support.versions import source_hash
 
 CHECKPOINT = "tuning"
 SLACK = 1.2

@@ -12,12 +12,11 @@ from slipid.identify.verdicts.profile import Profile, profile, profiled
 from slipid.job.config import read_config
 from slipid.job.fit import CHECKPOINT, optimised, summarised
 from slipid.job.problem import Job, read_job, with_mixed
-from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
-from slipid.support.versions import versions
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,8 @@ from slipid.job.logs import layout_of
 from slipid.job.problem import Job, job_of, read_job, shape_of
 from slipid.model.robot import build
 from slipid.selftest import replicates as test
+from slipid.selftest.known import Sensors, grid
 from slipid.selftest.logs import make_logs
-from slipid.selftest.plan import Sensors, grid
 from slipid.selftest.summary import SCHEMA, summary, wanted_of
 from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.content import Content

@@ -22,7 +22,7 @@ from slipid.identify.design.planned_runs import Drive
 from slipid.model.robot import Robot, wheel_torque
 from slipid.model.rollout import replay_twist
 from slipid.model.se2 import compose, path
-from slipid.selftest.plan import Sensors
+from slipid.selftest.known import Sensors
 
 
 def make_logs(

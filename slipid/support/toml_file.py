@@ -15,12 +15,18 @@ from typing import (
     get_type_hints,
 )
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from slipid.support.content import Content
 from slipid.support.errors import DataError, near
 
+CLOSED = ConfigDict(extra="forbid")
+"""Of a dataclass that a config declares: other keys are refused."""
+Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
+Part = Annotated[float, Field(ge=0, lt=1)]
+"""Of a whole."""
 Model = TypeVar("Model")
 Step = str | int
 """Key of a table, or place in a list."""

@@ -9,7 +9,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from slipid.data.floor_map import MOST_CELLS, FloorMap
-from slipid.support.bounds import CLOSED, Positive
+from slipid.support.toml_file import CLOSED, Positive
 
 GRAVITY = 9.81
 LEVELS = 7

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from slipid.support.bounds import CLOSED, NotNegative, Part, Positive
+from slipid.support.toml_file import CLOSED, NotNegative, Part, Positive
 from slipid.testsite.ground import GROUNDS, Ground
 from slipid.testsite.machine import Machine
 from slipid.testsite.motors import Motor, SpeedLoop

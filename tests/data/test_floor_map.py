@@ -10,9 +10,10 @@ from slipid.data.floor_map import (
     from_picture,
     from_polygons,
     patchwork,
+    read_map,
     uniform,
+    write_map,
 )
-from slipid.data.map_file import read_map, write_map
 from slipid.support.errors import DataError
 from tests.helpers.floors import surface_at
 

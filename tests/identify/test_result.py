@@ -28,9 +28,8 @@ from slipid.identify.result import Fit, hash_of, summarise
 from slipid.identify.verdicts.estimates import estimates, expected_covariance
 from slipid.identify.verdicts.unidentified import flat_directions
 from slipid.search_space import Choice
-from slipid.selftest.known import blank, truth
+from slipid.selftest.known import Sensors, blank, grid, truth
 from slipid.selftest.logs import make_logs
-from slipid.selftest.plan import Sensors, grid
 from slipid.support.errors import DataError
 
 pytestmark = pytest.mark.slow  # traces whole fits

@@ -14,9 +14,8 @@ from slipid.data.windows import windows
 from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.likelihood import batch, residuals
 from slipid.identify.fit.noise import noise
-from slipid.selftest.known import TRUTH, truth
+from slipid.selftest.known import TRUTH, Sensors, grid, truth
 from slipid.selftest.logs import make_logs
-from slipid.selftest.plan import Sensors, grid
 from tests.helpers.made_logs import LAYOUT, write_logs
 from tests.helpers.one_log import read_log
 

@@ -15,8 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from slipid.cli.main import app
-from slipid.data.floor_map import four_zones
-from slipid.data.map_file import read_map
+from slipid.data.floor_map import four_zones, read_map
 from slipid.data.reading.presets import preset
 from slipid.job.config import parsed
 from slipid.support.errors import DataError
@@ -24,7 +23,7 @@ from slipid.support.progress import Reporter
 from slipid.testsite.camera import Camera
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.machine import Machine
-from slipid.testsite.simulate.config import plan, read_plan
+from slipid.testsite.simulate.config import plan
 from slipid.testsite.simulate.identify_config import can_identify, identify_config
 from slipid.testsite.simulate.simulate import Job, _place, simulate, truth
 from slipid.testsite.site import Site
@@ -69,7 +68,7 @@ def config(tmp_path):
 
 def quietly(config, out, jobs=1):
     with Reporter(quiet=True) as report:
-        return simulate(read_plan(config), out, jobs, report)
+        return simulate(plan(config, config.read_text()), out, jobs, report)
 
 
 def sums(folder):
@@ -162,7 +161,7 @@ def test_another_config_does_not_mix_with_what_is_there(config, tmp_path):
 
 
 def test_known_surfaces_are_changed_and_others_made_anew(config):
-    found = read_plan(config)
+    found = plan(config, config.read_text())
     assert found.site.grounds["soft"].friction == 0.7
     assert found.site.grounds["soft"].rolling_m == GROUNDS["soft"].rolling_m
     assert found.site.grounds["snow"].friction == 0.3
@@ -190,7 +189,7 @@ def test_a_map_is_read_from_its_file_beside_the_config(tmp_path):
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("testsite*.toml")))
 def test_the_configs_that_ship_are_good(path):
-    assert read_plan(path).runs
+    assert plan(path, path.read_text()).runs
 
 
 @pytest.mark.parametrize(
@@ -290,7 +289,7 @@ def test_only_runs_that_a_fit_can_use_get_a_config_for_it(tmp_path):
     config = tmp_path / "x.toml"
     start = SMALL.index("[[runs]]")
     config.write_text(SMALL[:start] + SMALL[SMALL.index("[[runs]]", start + 1) :])
-    assert not can_identify(read_plan(config))
+    assert not can_identify(plan(config, config.read_text()))
     assert can_identify(plan(config, SMALL))
 
 

@@ -15,8 +15,8 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.units import converts, factor
-from slipid.support.bounds import CLOSED, Positive
 from slipid.support.errors import near
+from slipid.support.toml_file import CLOSED, Positive
 
 PER_WHEEL = {
     "wheel_ticks": "tick",

@@ -14,7 +14,7 @@ import numpy as np
 
 from slipid.data import floor_map as terrain
 from slipid.support.errors import DataError
-from slipid.support.toml_file import checked, mapping_of, text_of
+from slipid.support.toml_file import checked, mapping_of
 from slipid.testsite import experiments as ex
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.simulate.sections import Content, OnMap
@@ -41,11 +41,6 @@ class Plan:
     maps: dict[str, terrain.FloorMap]
     runs: tuple[tuple[str, ex.Run], ...]
     filmed: tuple[str, ...]
-
-
-def read_plan(path: Path) -> Plan:
-    """Plan of a config file, see `plan`."""
-    return plan(path, text_of(path))
 
 
 def plan(path: Path, text: str) -> Plan:

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from slipid.data import floor_map as terrain
-from slipid.data.map_file import read_map
+from slipid.data.floor_map import read_map
 from slipid.support.toml_file import Section
 from slipid.testsite.camera import Camera
 from slipid.testsite.experiments import Run, Waypoints, straight

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.data.map_file import write_map
+from slipid.data.floor_map import write_map
 from slipid.data.write import own_csv, robotino2022_csv
 from slipid.support.content import Content
 from slipid.support.errors import DataError
