@@ -106,11 +106,6 @@ class Plant:
         """Since the end of the settling [rad]."""
         return self.data.qpos[self.wheel_at] - self.angle_at_start
 
-    @property
-    def sinkage(self) -> Float[np.ndarray, " wheel"]:
-        """How deep each wheel's rim is in the floor [m]."""
-        return np.maximum(self.machine.wheel_radius_m - self.data.xpos[self.wheel_body, 2], 0.0)
-
     def step(self, wanted: list[float]) -> None:
         """One time step with these wheel speeds wanted [rad/s]."""
         d = self.data
