@@ -4,7 +4,7 @@ from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 MOVED = 0.010
 """A run counts from where the fastest wheel's rim has moved this far [m]."""
@@ -48,6 +48,11 @@ def body_steps(pose: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "step 3"]:
     return np.stack([ahead, left, turn], axis=1)
 
 
+def stretches(mask: Bool[np.ndarray, " row"]) -> Int[np.ndarray, "stretch 2"]:
+    """First row of every stretch that is true, and the row behind its last."""
+    return np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]]))).reshape(-1, 2)
+
+
 def bridge_stalls(
     time: Float[np.ndarray, " time"], wheel_angle: Float[np.ndarray, "time wheel"]
 ) -> tuple[Float[np.ndarray, "time wheel"], Bool[np.ndarray, " time"]]:
@@ -62,9 +67,8 @@ def bridge_stalls(
     if not step.any():
         return wheel_angle, stalled
     usual = float(np.median(step[step > 0]))
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], step == 0, [0]]).astype(np.int8)))
     bridged = wheel_angle
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
+    for start, end in stretches(step == 0):
         # Rows start..end hold the same angle; row end + 1 is the burst.
         if end - start < STALLED or end == len(step) or start == 0:
             continue

@@ -21,13 +21,13 @@ from slipid.control.robot_file.record import (
     Seen,
     Wheels,
 )
+from slipid.identify.fit.sessions import AXES
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame
 from slipid.model.robot import GRAVITY, Robot
 from slipid.parameter import entries
 
-AXES = ("along", "across", "yaw")
 FASTEST = 20.0
 """Wheel speed that counts as seen where nothing is known of it [rad/s]."""
 

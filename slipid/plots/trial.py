@@ -1,6 +1,6 @@
 """Picture of a trial: every controller's paths over the floor, and what they came to."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -66,9 +66,13 @@ def _one(
 ) -> None:
     """All starts of a controller laid on one another, the typical one over its floor."""
     runs = [r for r in content["runs"] if r["controller"] == name]
-    own = [_local(paths[f"{name}/start{k:02d}"], r["start"]) for k, r in enumerate(runs)]
+    own = [
+        (paths[f"{name}/start{k:02d}"][:, :2] - r["start"][:2]) @ _turned(r["start"][2])
+        for k, r in enumerate(runs)
+    ]
     x, y = np.linspace(-0.35, 1.25, 320), np.linspace(-0.75, 0.35, 220)
-    places = _world(np.stack(np.meshgrid(x, y), -1), runs[one]["start"])
+    start = runs[one]["start"]
+    places = start[:2] + np.stack(np.meshgrid(x, y), -1) @ _turned(start[2]).T
     kinds = max(len(floor.surfaces), 2)
     tints = ListedColormap(TINTS[:kinds])
     axes.pcolormesh(x, y, floor.at(places), cmap=tints, vmin=0, vmax=kinds - 1)
@@ -85,17 +89,10 @@ def _one(
     axes.tick_params(labelsize=7)
 
 
-def _local(pose: np.ndarray, start: Sequence[float]) -> np.ndarray:
-    """Places as seen from the start."""
-    c, s = np.cos(start[2]), np.sin(start[2])
-    d = pose[:, :2] - start[:2]
-    return np.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]], -1)
-
-
-def _world(place: np.ndarray, start: Sequence[float]) -> np.ndarray:
-    c, s = np.cos(start[2]), np.sin(start[2])
-    x, y = place[..., 0], place[..., 1]
-    return np.stack([start[0] + c * x - s * y, start[1] + s * x + c * y], -1)
+def _turned(heading: float) -> np.ndarray:
+    """Rotation from the axes of a pose to the site's."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.array([[c, -s], [s, c]])
 
 
 def _bars(axes: Axes, table: Content, key: str, label: str) -> None:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from slipid.data.log import Log
 from slipid.data.wheel_signals import interpolate
 from slipid.identify.design.planned_runs import Drive
+from slipid.identify.fit.sessions import AXES
 from slipid.model.robot import Robot, wheel_torque
 from slipid.model.rollout import replay_twist
 from slipid.model.se2 import compose, path
@@ -108,7 +109,7 @@ class _Maker:
         u = np.where(far > 0, step[..., :2] / np.maximum(far, 1e-12), [1.0, 0.0])
         far = far[..., 0] + np.abs(step[..., 2]) * float(shape.base_radius)
         drawn = []
-        for part in ("along", "across", "yaw"):
+        for part in AXES:
             grown, level = (
                 np.array([s.of(f"{kind}.{d.surface}.{part}") for d in self.drives])[:, None]
                 for kind in ("process", "run")

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from slipid.data.log import Log
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.table import Table
-from slipid.data.wheel_signals import best_wheel_order, describe, integral, interpolate
+from slipid.data.wheel_signals import best_wheel_order, describe, integral, interpolate, stretches
 from slipid.support.errors import bad_data
 
 MIN_ROWS = 2
@@ -85,8 +85,7 @@ def filled(
         missing = np.isnan(values)
         if not missing.any():
             continue
-        stretches = np.flatnonzero(np.diff(np.concatenate([[0], missing, [0]]))).reshape(-1, 2)
-        first, end = max(stretches.tolist(), key=lambda ends: ends[1] - ends[0])
+        first, end = max(stretches(missing).tolist(), key=lambda ends: ends[1] - ends[0])
         rows = (int(table.lines[first]), int(table.lines[end - 1]))
         if end - first > MAX_FILLED:
             found = f"{end - first} missing values in a row"

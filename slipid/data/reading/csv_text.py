@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.units import same_unit
-from slipid.support.errors import DataError, bad_data
+from slipid.support.errors import bad_data
 
 _MISSING = {"", "nan", "na", "n/a", "null", "none"}
 
@@ -144,16 +144,13 @@ def cell_by_cell(
                 # Python would read 1_000 as a thousand; no logger writes that on purpose.
                 values[i, j] = float(cell.replace("_", "?"))
             except ValueError:
+                comma = re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell)
+                more = " with a decimal point, not a decimal comma" if comma else ""
                 row, column = layout.first_data_row + i, str(names[j])
-                raise _bad_cell(path, cell, row, column) from None
+                raise bad_data(
+                    path, f"'{cell[:40]}'", f"a number{more}", row=row, column=column
+                ) from None
     return values
-
-
-def _bad_cell(path: Path, cell: str, row: int, column: str) -> DataError:
-    expected = "a number"
-    if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell):
-        expected = "a number with a decimal point, not a decimal comma"
-    return bad_data(path, f"'{cell[:40]}'", expected, row=row, column=column)
 
 
 def _is_number(cell: str) -> bool:
