@@ -28,7 +28,7 @@ class SitePlant:
         gyro: whether the robot has one.
 
     Raises:
-        DataError: MuJoCo is missing, or a surface has no physics.
+        DataError: MuJoCo is missing.
     """
 
     def __init__(

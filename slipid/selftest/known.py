@@ -110,8 +110,6 @@ class Sensors:
         row_period, frame_period: of the log and the camera [s].
         delay, ramp: from command to motion, and to full speed [s].
         wobble: of the wheel's angle, as time [s]; a real speed loop is never quite still.
-        free_frames: frames come when the camera pleases, so that the lag differs by up to half a
-            row; otherwise every new frame is exactly `camera.lag` old.
     """
 
     std: Mapping[str, float] = field(
@@ -138,11 +136,9 @@ class Sensors:
     ramp: float = 0.2
     wobble: float = 0.002
     has_voltage: bool = True
-    free_frames: bool = False
 
     def of(self, name: str) -> float:
         """Std of a variance component."""
         head, _, last = name.partition(".")
-        return (
-            self.std[name] if name in self.std else self.std[f"{head}.floor.{last.split('.')[-1]}"]
-        )
+        of_any_floor = f"{head}.floor.{last.split('.')[-1]}"
+        return self.std[name if name in self.std else of_any_floor]

@@ -136,8 +136,7 @@ class _Maker:
             frames += rng.uniform(0, s.frame_period)
             newest = np.searchsorted(frames, t) - 1
             fresh[k, 1:] = np.diff(newest) > 0
-            age = t - frames[newest] - 0.5 * s.row_period if s.free_frames else 0.0
-            at = t - float(robot.camera.lag) - age
+            at = t - float(robot.camera.lag)  # every new frame is that old
             marker[k] = interpolate(t, pose[k], at)
         session = [robot.session_index(d.session) for d in self.drives]
         yaw = np.array([float(robot.camera.yaw(k)) for k in session])

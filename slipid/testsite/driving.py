@@ -68,7 +68,7 @@ def drive(run: Run, site: Site, seed: int, timestep: float = TIMESTEP) -> Trace:
     """Drive one run; arguments as of `Plant`.
 
     Raises:
-        DataError: MuJoCo is missing, a surface has no physics, or the simulation became unstable.
+        DataError: MuJoCo is missing, or the simulation became unstable.
     """
     plant = Plant(site, run.map, run.load, run.start, seed, timestep)
     recorder, rims = _Recorder(plant), Rims(site, plant)

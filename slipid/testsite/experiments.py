@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -38,11 +39,7 @@ class Waypoints:
 
     places: tuple[tuple[float, float], ...]
     speed: float = 0.2
-    by: str = "encoders"
-
-    def __post_init__(self) -> None:
-        if self.by not in ("encoders", "camera"):
-            raise ValueError(f"way-points by {self.by!r}; expected encoders or camera")
+    by: Literal["encoders", "camera"] = "encoders"
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,6 @@ def test_a_map_comes_back_from_its_file(tmp_path):
     np.testing.assert_array_equal(again.cells, floor.cells)
     assert again.surfaces == floor.surfaces
     assert again.extent == pytest.approx(floor.extent)
-    with pytest.raises(ValueError, match="same colour"):
-        write_map(tmp_path / "site.toml", floor, dict.fromkeys("abc", "#102030"))
 
 
 def test_a_picture_tells_surfaces_by_the_nearest_colour(tmp_path):

@@ -410,7 +410,8 @@ def test_a_video_has_all_its_frames(studio, tmp_path):
     time_s = np.arange(0.0, 0.3, 0.01)
     pose = np.stack([0.3 + 0.2 * time_s, 0 * time_s, 0 * time_s], axis=1)
     frames = np.arange(0.0, 0.25, 0.05)
-    film(studio, time_s, pose, np.zeros((len(time_s), 3)), frames, tmp_path / "run.avi")
+    true = {"time": time_s, "pose": pose, "wheel_angle": np.zeros((len(time_s), 3))}
+    film(studio, true, frames, tmp_path / "run.avi")
     video = cv2.VideoCapture(str(tmp_path / "run.avi"))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == len(frames)
     assert video.read()[1].shape == (540, 960, 3)

@@ -110,7 +110,7 @@ def film_and_write(what: tuple[Job, Camera]) -> None:
         rows = "".join(f"{k},{t:.4f}\n" for k, t in enumerate(frames))
         write_bytes(path.with_suffix(".csv"), f"frame,time\n{rows}".encode())
         with closing(studio):
-            film(studio, true["time"], true["pose"], true["wheel_angle"], frames, path)
+            film(studio, dict(true), frames, path)
 
 
 def _video(job: Job) -> Path:
