@@ -24,6 +24,6 @@ class Profile:
 
     def plot(self) -> "Figure":
         """How fast the fit gets worse when the number is held elsewhere."""
-        from slipid.plots.profile import profile_figure
+        from slipid.plots.posterior import profile_figure
 
         return profile_figure([self.result])

@@ -53,7 +53,7 @@ def run(
     from slipid.job.identify import identify
     from slipid.plots.drawing import save
     from slipid.plots.fit import identify_plots
-    from slipid.plots.profile import profile_figure
+    from slipid.plots.posterior import profile_figure
 
     done = identify(config, data, out, report, profiles)
     report.stage("drawing")

@@ -4,11 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from slipid.data.log import Log
-from slipid.data.reading.declared import declared_layout
-from slipid.data.reading.folders import session_of, surface_of
 from slipid.data.reading.layout import Layout
-from slipid.data.reading.presets import PRESETS, preset
-from slipid.data.reading.reader import find_logs, read_logs
+from slipid.data.reading.presets import PRESETS, declared_layout, preset
+from slipid.data.reading.reader import find_logs, read_logs, session_of, surface_of
 from slipid.data.runs import Runs, collect
 from slipid.job.config import Config, Logs
 from slipid.support.errors import DataError, near

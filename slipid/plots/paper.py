@@ -11,7 +11,7 @@ from slipid.baselines.paper2021.result import find_folder, regenerate
 from slipid.baselines.paper2021.table import FittedForm, MotorTable
 from slipid.baselines.paper2021.tracks import COMMANDED_SIDES, Track
 from slipid.data.log import Log
-from slipid.data.reading.folders import read_runs
+from slipid.data.reading.reader import read_runs
 from slipid.plots import drawing
 from slipid.support.files import write_json
 

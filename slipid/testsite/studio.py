@@ -15,9 +15,8 @@ from jaxtyping import Float
 from slipid.data.floor_map import FloorMap
 from slipid.data.wheel_signals import interpolate
 from slipid.support.errors import DataError
-from slipid.testsite.camera import Camera
 from slipid.testsite.machine import mjcf
-from slipid.testsite.site import Site
+from slipid.testsite.site import Camera, Site
 
 MARKER = 0
 """Number of the marker in ArUco's dictionary 4X4_50, as on the Robotino of the published frames."""

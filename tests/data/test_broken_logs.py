@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from slipid.data.reading.declared import declared_layout
+from slipid.data.reading.presets import declared_layout
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import CASES, GENERIC, GENERIC_LAYOUT, ROBOTINO, Case, write_good
 from tests.helpers.one_log import read_log

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slipid.data.log import Log
-from slipid.data.reading.declared import declared_layout
+from slipid.data.reading.presets import declared_layout
 from slipid.data.reading.reader import read_logs
 from slipid.support.errors import DataError, bad_data
 from tests.helpers.broken_logs import GENERIC, GENERIC_LAYOUT, ROBOTINO, ROWS, write_good

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.data.reading.declared import declared_layout
+from slipid.data.reading.presets import declared_layout
 from slipid.data.reading.reader import find_logs
 from slipid.data.runs import collect, default_session
 from slipid.data.windows import windows

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.data.reading.declared import declared_layout
-from slipid.data.reading.presets import preset
+from slipid.data.reading.presets import declared_layout, preset
 from slipid.data.write import OPTIONAL, own_columns, own_csv, robotino2022_csv
 from slipid.testsite.driving import Trace
 from slipid.testsite.experiments import straight

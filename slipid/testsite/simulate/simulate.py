@@ -15,14 +15,13 @@ from slipid.support.errors import DataError
 from slipid.support.files import read_json, write_arrays, write_bytes, write_json
 from slipid.support.progress import Reporter
 from slipid.support.workers import spread
-from slipid.testsite.camera import Camera
 from slipid.testsite.driving import Trace, drive
 from slipid.testsite.experiments import Run
 from slipid.testsite.plant import engine
 from slipid.testsite.simulate.config import Plan
 from slipid.testsite.simulate.identify_config import can_identify, identify_config
 from slipid.testsite.simulate.observe import observe
-from slipid.testsite.site import Site
+from slipid.testsite.site import Camera, Site
 from slipid.testsite.studio import Studio, film
 
 MANIFEST = "simulate.json"

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.data.reading.declared import declared_layout
-from slipid.data.reading.folders import read_runs, session_of, surface_of
+from slipid.data.reading.presets import declared_layout
+from slipid.data.reading.reader import read_runs, session_of, surface_of
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import GENERIC, GENERIC_LAYOUT, ROBOTINO, write_good
 

@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from slipid.data.reading.declared import declared_layout
-from slipid.data.reading.presets import PRESETS, preset
+from slipid.data.reading.presets import PRESETS, declared_layout, preset
 from slipid.data.reading.reader import find_logs
 from slipid.data.reading.table import read_table
 from slipid.data.reading.units import factor, same_unit
