@@ -6,7 +6,7 @@ from pathlib import Path
 from slipid.data.log import Log
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import PRESETS, declared_layout, preset
-from slipid.data.reading.reader import find_logs, read_logs, session_of, surface_of
+from slipid.data.reading.reader import find_logs, read_logs, session_of
 from slipid.data.runs import Runs, collect
 from slipid.job.config import Config, Logs
 from slipid.support.errors import DataError, near
@@ -32,8 +32,8 @@ def read_dataset(
     done = short = 0
     for section, paths in found:
         layout = layout_of(config, section)
+        surface = None if section.map is not None else section.surface
         for path in paths:
-            surface = None if section.map is not None else surface_of(path, section.surface)
             for log in read_logs(path, layout, root, surface, section.load):
                 if log.samples < section.min_rows:
                     short += 1

@@ -50,14 +50,9 @@ def read_runs(
     logs = [
         log
         for path in find_logs(root, pattern)
-        for log in read_logs(path, chosen, root, surface_of(path, surface), load)
+        for log in read_logs(path, chosen, root, surface, load)
     ]
     return collect(logs, session=lambda log: session_of(log, session))
-
-
-def surface_of(path: Path, surface: str | None) -> str | None:
-    """Surface a file was driven on; `folder` stands for the name of its folder, less `_surface`."""
-    return path.parent.name.removesuffix("_surface") if surface == "folder" else surface
 
 
 def session_of(log: Log, session: Session) -> str:
@@ -78,11 +73,13 @@ def read_logs(
 
     Args:
         root: data folder above the file, which the names of the runs are relative to.
-        surface, load: names of the floor and the load set-up.
+        surface: name of the floor; `folder` stands for that of the file's folder less `_surface`.
+        load: name of the load set-up.
 
     Raises:
         DataError: the file, row or column that is wrong, what is there and what was expected.
     """
+    surface = path.parent.name.removesuffix("_surface") if surface == "folder" else surface
     table = read_table(path, layout)
     if layout.drop_repeated_time:
         table = table.rows(np.append(np.diff(_time(table, layout)) != 0, True))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slipid.data.reading.presets import declared_layout
-from slipid.data.reading.reader import read_runs, session_of, surface_of
+from slipid.data.reading.reader import read_runs, session_of
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import GENERIC, GENERIC_LAYOUT, ROBOTINO, write_good
 
@@ -37,7 +37,7 @@ def test_the_folder_names_the_surface(root):
 def test_a_surface_may_be_named_or_unknown(root):
     assert read(root, surface="oak").logs[0].surface == "oak"
     assert read(root, surface=None).logs[0].surface is None
-    assert surface_of(root / "gray_surface" / "a.csv", "gray_surface") == "gray_surface"
+    assert read(root, surface="gray_surface").logs[0].surface == "gray_surface"
 
 
 def test_sessions(root):
