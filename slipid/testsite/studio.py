@@ -6,6 +6,7 @@ does not.
 
 import os
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -158,24 +159,24 @@ def film(
         return interpolate(true["time"], true[name], np.array([t]))[0]
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial.avi")
+    unfinished = path.with_name(f".{path.name}.partial.avi")
     code = cv2.VideoWriter.fourcc(*"MJPG")
-    video = cv2.VideoWriter(str(partial), code, 1 / c.frame_s, (c.width_px, c.height_px))
+    video = cv2.VideoWriter(str(unfinished), code, 1 / c.frame_s, (c.width_px, c.height_px))
     if not video.isOpened():
         raise DataError(f"{path}: OpenCV cannot write a video there")
     try:
         for t in frames:
             video.write(studio.exposed(float(t), partial(at, "pose"), partial(at, "wheel_angle")))
         video.release()
-        written = cv2.VideoCapture(str(partial)).get(cv2.CAP_PROP_FRAME_COUNT)
+        written = cv2.VideoCapture(str(unfinished)).get(cv2.CAP_PROP_FRAME_COUNT)
         if written != len(frames):
             raise DataError(
                 f"{path}: {written:.0f} of {len(frames)} frames written; is there room?"
             )
-        os.replace(partial, path)
+        os.replace(unfinished, path)
     finally:
         video.release()
-        partial.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
 
 
 def _drawing() -> tuple[ModuleType, ModuleType]:
