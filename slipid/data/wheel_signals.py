@@ -1,7 +1,6 @@
 """Signals of one run: steps of motion, stalls of the telemetry, the start, swapped wheels."""
 
 from itertools import permutations
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -90,32 +89,13 @@ def first_moved(wheel_angle: Float[np.ndarray, "time wheel"], radius: float) -> 
     return int(moved[0]) if len(moved) else None
 
 
-class WheelOrder(NamedTuple):
-    """The order and signs of wheels that fit best, beside the declared ones.
+def swapped_order(
+    measured: Float[np.ndarray, "time wheel"], reference: Float[np.ndarray, "time wheel"]
+) -> tuple[int, ...] | None:
+    """Where each wheel's motion is found, as (3, -1, 2); None where the declared order is right.
 
-    Attributes:
-        order: position at which the motion of each wheel is found, from 0.
-        signs: +1, or -1 where it counts backwards.
-        misfit: sum of squares that this order leaves over, relative to the reference's.
-        misfit_as_declared: the same for the order in the log.
-    """
-
-    order: tuple[int, ...]
-    signs: tuple[int, ...]
-    misfit: float
-    misfit_as_declared: float
-
-    @property
-    def is_swapped(self) -> bool:
-        """Whether the declared order is wrong beyond doubt."""
-        return self.misfit_as_declared > DOUBT and self.misfit < BETTER * self.misfit_as_declared
-
-
-def best_wheel_order(
-    measured: Float[np.ndarray, "time wheel"],
-    reference: Float[np.ndarray, "time wheel"],
-) -> WheelOrder:
-    """Order and signs of the wheels in which the measured steps come closest to the reference.
+    Wheels are counted from 1, and negative where they count backwards. It is the order in which the
+    measured steps come closest to the reference:
 
         misfit = sum_i |m_order(i) sign_i - ref_i|^2 / sum_i |ref_i|^2
 
@@ -124,24 +104,15 @@ def best_wheel_order(
     """
     products = measured.T @ reference
     norm, reference_norm = float(np.sum(measured**2)), float(np.sum(reference**2))
-    wheels = range(products.shape[0])
     if not norm > 0 or not reference_norm > 0:
-        return WheelOrder(tuple(wheels), (1,) * len(wheels), 0.0, 0.0)
-
-    def misfit(along: float) -> float:
-        return norm / reference_norm - 2.0 * along / reference_norm + 1.0
-
+        return None
+    wheels = range(len(products))
     best = max(permutations(wheels), key=lambda p: float(np.abs(products[p, wheels]).sum()))
     along = products[best, wheels]
-    return WheelOrder(
-        order=best,
-        signs=tuple(-1 if value < 0 else 1 for value in along),
-        misfit=misfit(float(np.abs(along).sum())),
-        misfit_as_declared=misfit(float(np.trace(products))),
+    declared, found = (
+        (norm - 2.0 * float(total)) / reference_norm + 1.0
+        for total in (np.trace(products), np.abs(along).sum())
     )
-
-
-def describe(found: WheelOrder) -> str:
-    """Order and signs as people write them, wheels counted from 1: `3, -1, 2`."""
-    pairs = zip(found.order, found.signs, strict=True)
-    return ", ".join(f"{'-' if sign < 0 else ''}{wheel + 1}" for wheel, sign in pairs)
+    if declared <= DOUBT or found >= BETTER * declared:
+        return None
+    return tuple(-(k + 1) if value < 0 else k + 1 for k, value in zip(best, along, strict=True))

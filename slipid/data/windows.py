@@ -63,10 +63,6 @@ class Windows:
         """The same windows at another lag of the camera, to first order [s]."""
         return replace(self, turn=self.turn - (lag - self.lag) * self.faster, lag=lag)
 
-    def of_runs(self, run: Int[np.ndarray, " piece"]) -> "Windows":
-        """The same pieces under other run numbers: those of the set they are a part of."""
-        return replace(self, run=run)
-
 
 def windows(
     data: Runs,

@@ -179,9 +179,7 @@ def _twists(
     return jax.vmap(one)(dt, speed, floor, load)
 
 
-@jax.jit
-def _paths(xi: Array, dt: Array, start: Array) -> Array:
-    return jax.vmap(path)(xi, dt, start)
+_paths = jax.jit(jax.vmap(path))
 
 
 @jax.jit

@@ -168,16 +168,6 @@ class Camera:
         """Place of the lens in the world [m]."""
         return np.array([*self.centre_m, self.height_m])
 
-    def pixels(self, points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 2"]:
-        """Pixels at which points of the world are seen."""
-        import cv2
-
-        turn, _ = cv2.Rodrigues(self.rotation)
-        shift = -self.rotation @ self.place
-        lens = np.array(self.distortion)
-        seen, _ = cv2.projectPoints(np.asarray(points, float), turn, shift, self.matrix, lens)
-        return seen[:, 0]
-
     def as_dict(self) -> dict[str, object]:
         """What a tracker has to know."""
         return {

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from slipid.data.log import Log
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.table import Table
-from slipid.data.wheel_signals import best_wheel_order, describe, integral, interpolate, stretches
+from slipid.data.wheel_signals import integral, interpolate, stretches, swapped_order
 from slipid.support.errors import bad_data
 
 MIN_ROWS = 2
@@ -176,13 +176,12 @@ def _check_order(log: Log, table: Table, layout: Layout) -> None:
             np.diff(interpolate(log.time, angle, edges), axis=0)
             for angle in (log.wheel_angle, integral(log.time, reference))
         )
-        order = best_wheel_order(measured, said)
-        if order.is_swapped:
-            other = np.flatnonzero(np.array(order.order) != np.arange(log.wheels))
-            turned = np.flatnonzero(np.array(order.signs) < 0)
-            j = int(other[0] if len(other) else turned[0])
+        if order := swapped_order(measured, said):
+            elsewhere = [j for j, wheel in enumerate(order) if abs(wheel) != j + 1]
+            j, *_ = elsewhere or [j for j, wheel in enumerate(order) if wheel < 0]
             found = f"the wheel does not move as its {name} says"
-            expected = f"wheels in the order {describe(order)} (swapped or reversed columns?)"
+            listed = ", ".join(map(str, order))
+            expected = f"wheels in the order {listed} (swapped or reversed columns?)"
             raise _at(table, layout, "wheel", None, j, found, expected)
 
 

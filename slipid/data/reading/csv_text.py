@@ -54,9 +54,11 @@ def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
         raise bad_data(path, found, f"cells separated by {layout.delimiter!r}", row=row)
     if not layout.names_row:
         return [""] * len(cells)
-    if all(_is_number(cell) for cell in cells if cell):
-        raise bad_data(path, "numbers", f"the column names ({_some(layout.columns)})", row=row)
-    return cells
+    try:
+        [float(cell) for cell in cells if cell]
+    except ValueError:
+        return cells
+    raise bad_data(path, "numbers", f"the column names ({_some(layout.columns)})", row=row)
 
 
 def wanted_names(
@@ -151,14 +153,6 @@ def cell_by_cell(
                     path, f"'{cell[:40]}'", f"a number{more}", row=row, column=column
                 ) from None
     return values
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def _some(names: tuple[str | int, ...]) -> str:

@@ -135,11 +135,6 @@ class Layout:
     max_heading_jump: Positive = 1.6
 
     @property
-    def wheels(self) -> int:
-        """Number of wheels, 0 where the file has poses only."""
-        return next((len(c.columns) for n, c in self.channels.items() if n in PER_WHEEL), 0)
-
-    @property
     def columns(self) -> tuple[str | int, ...]:
         """Every column the layout uses, each once."""
         used = (column for channel in self.channels.values() for column in channel.columns)
