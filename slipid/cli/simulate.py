@@ -34,7 +34,7 @@ def simulate(
 
 def show(page: "Page", found: Content, plan: "Plan", out: Path) -> None:
     """Print how much was driven, and what to do with it."""
-    from slipid.testsite.simulate.identify_config import can_identify
+    from slipid.testsite.simulate.config import can_identify
 
     page.line(f"{len(found['runs'])} runs, {found['driven']} of them driven now")
     if found["pace"] is not None:

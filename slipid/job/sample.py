@@ -53,12 +53,8 @@ class Sampled:
 def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporter) -> Sampled:
     """Sample around the fit in `out`: posterior.nc, sample.json, intervals in identified.json.
 
-    A chain that was interrupted there goes on.
-
-    Args:
-        out: folder `identify` wrote; data: of the logs, None for where they were fitted.
-        plan: of the chain; draws: that are kept of each ensemble.
-        report: progress.
+    A chain that was interrupted there goes on. The logs lie in `data`, by default where they were
+    fitted; `draws` are kept of each ensemble.
 
     Raises:
         DataError: no fit there, or other logs than it was made of.
@@ -97,12 +93,7 @@ def _everything(fit: Fit, plan: Plan, draws: int) -> tuple[object, ...]:
 
 
 def sampled_around(
-    fit: Fit,
-    problem: Problem,
-    plan: Plan,
-    draws: int,
-    kept: Checkpoint | None,
-    report: Reporter,
+    fit: Fit, problem: Problem, plan: Plan, draws: int, kept: Checkpoint | None, report: Reporter
 ) -> Posterior:
     """Posterior of a fit by the likelihood it was made of; arguments as of `sample`.
 

@@ -11,6 +11,7 @@ from slipid.data.floor_map import FloorMap
 from slipid.plots.drawing import INK, SHADE, figure, plain, save
 from slipid.support.content import Content
 
+Paths = Mapping[str, np.ndarray]
 TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
 """Of floors, in the order of the map."""
 ERRORS = {
@@ -20,16 +21,10 @@ ERRORS = {
 }
 
 
-def trial_plot(
-    content: Content, paths: Mapping[str, np.ndarray], floor: FloorMap, path: Path
-) -> Path:
+def trial_plot(content: Content, paths: Paths, floor: FloorMap, path: Path) -> Path:
     """Paths of the start nearest to the medians over the map, all starts from one corner, errors.
 
-    Args:
-        content: of trial.json.
-        paths: true poses (step, 3) by run, `CONTROLLER/startNN`.
-        floor: the site.
-        path: of the PNG.
+    `content` is that of trial.json, `paths` are true poses (step, 3) by run, `CONTROLLER/startNN`.
     """
     names = list(content["summary"])
     best = content["closes_best"]
@@ -56,14 +51,7 @@ def _typical(content: Content) -> int:
     return int(np.argmin([abs(r["closure_mm"] - middle) for r in runs]))
 
 
-def _one(
-    axes: Axes,
-    name: str,
-    content: Content,
-    paths: Mapping[str, np.ndarray],
-    floor: FloorMap,
-    one: int,
-) -> None:
+def _one(axes: Axes, name: str, content: Content, paths: Paths, floor: FloorMap, one: int) -> None:
     """All starts of a controller laid on one another, the typical one over its floor."""
     runs = [r for r in content["runs"] if r["controller"] == name]
     own = [

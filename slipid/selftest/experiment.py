@@ -45,12 +45,10 @@ def selftest(
     """What an experiment can recover, by making it with known truth and fitting that.
 
     Args:
-        config_path: of the experiment.
-        data: its logs, whose wheel motion is taken; without them a plan is made.
+        data: logs of the experiment, whose wheel motion is taken; without them a plan is made.
         out: folder for selftest.json and the replicates, which a later call goes on from.
         count: replicates.
         seed: of truths and noise.
-        report: progress.
 
     Raises:
         DataError: config or logs are wrong.

@@ -22,8 +22,7 @@ from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.machine import Machine
-from slipid.testsite.simulate.config import plan
-from slipid.testsite.simulate.identify_config import can_identify, identify_config
+from slipid.testsite.simulate.config import can_identify, identify_config, plan
 from slipid.testsite.simulate.simulate import Job, _place, simulate, truth
 from slipid.testsite.site import Camera, Site
 from slipid.testsite.studio import MARKER, Studio, film

@@ -18,8 +18,7 @@ from slipid.support.workers import spread
 from slipid.testsite.driving import Trace, drive
 from slipid.testsite.experiments import Run
 from slipid.testsite.plant import engine
-from slipid.testsite.simulate.config import Plan
-from slipid.testsite.simulate.identify_config import can_identify, identify_config
+from slipid.testsite.simulate.config import Plan, can_identify, identify_config
 from slipid.testsite.simulate.observe import observe
 from slipid.testsite.site import Camera, Site
 from slipid.testsite.studio import Studio, film
