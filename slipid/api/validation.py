@@ -30,6 +30,6 @@ class Validation:
 
     def plot(self) -> "Figure":
         """End-point errors of every model."""
-        from slipid.plots.fit import validation_figure
+        from slipid.plots.fit import ladder_figure, new_runs
 
-        return validation_figure(self.fit, self.runs, self.result.to_json())
+        return ladder_figure(self.result.to_json(), new_runs(self.fit, self.runs))

@@ -76,11 +76,7 @@ def truth(
 
 
 def grid(
-    setups: Sequence[tuple[str, str]] = (
-        ("firm", "as_built"),
-        ("soft", "as_built"),
-        ("soft", "moved"),
-    ),
+    setups: Sequence[tuple[str, str]],
     headings: int = 12,
     speeds: Sequence[float] = (0.1, 0.2),
     turns: int = 2,

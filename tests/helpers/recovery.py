@@ -17,7 +17,8 @@ from slipid.search_space import Choice, Space
 from slipid.selftest.known import Sensors, blank, grid, truth
 from slipid.selftest.logs import make_logs
 
-PLAN = grid(headings=8, turns=1)
+SETUPS = (("firm", "as_built"), ("soft", "as_built"), ("soft", "moved"))
+PLAN = grid(SETUPS, headings=8, turns=1)
 TRUTH = truth(PLAN)
 LAG = 0.05
 

@@ -19,7 +19,8 @@ from slipid.selftest.logs import make_logs
 from tests.helpers.made_logs import LAYOUT, write_logs
 from tests.helpers.one_log import read_log
 
-PLAN = grid(headings=4, turns=2)
+SETUPS = (("firm", "as_built"), ("soft", "as_built"), ("soft", "moved"))
+PLAN = grid(SETUPS, headings=4, turns=2)
 ROBOT = truth(PLAN)
 STILL = dict.fromkeys(Sensors().std, 0.0)
 
