@@ -30,6 +30,7 @@ class Validation:
 
     def plot(self) -> "Figure":
         """End-point errors of every model."""
-        from slipid.plots.fit import ladder_figure, new_runs
+        from slipid.plots.compare import ladder_figure
+        from slipid.plots.fit import new_runs
 
         return ladder_figure(self.result.to_json(), new_runs(self.fit, self.runs))
