@@ -26,7 +26,7 @@ def compare(
     """
     from slipid.job.compare import compare as run
     from slipid.plots.compare import compare_plot
-    from slipid.report.compare import show_comparison
+    from slipid.report.answers import show_comparison
 
     with Reporter(quiet=quiet) as report:
         found = run(config, data, out, folds.replace(" ", "").split(","), report)

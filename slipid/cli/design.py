@@ -57,7 +57,7 @@ def design(
     from slipid.identify.design import proposal
     from slipid.identify.design.wish import Wish
     from slipid.identify.fit_file import load as load_fit
-    from slipid.report.design import show_design
+    from slipid.report.answers import show_design
     from slipid.support.jax_setup import setup_jax
 
     wanted = Wish(

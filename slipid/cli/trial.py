@@ -35,7 +35,7 @@ def trial(
     from slipid.deploy.trial import Wish, names_of
     from slipid.deploy.trial import trial as run
     from slipid.plots.trial import trial_plot
-    from slipid.report.driving import show_trial
+    from slipid.report.answers import show_trial
 
     wish = Wish(plant, map, names_of(controllers), starts, load, processes(jobs))
     with Reporter(quiet=quiet) as report:

@@ -28,7 +28,7 @@ def tune(
     """
     from slipid.control.tuning.optimisers import Method
     from slipid.deploy.tune import tune as run
-    from slipid.report.driving import show_gains
+    from slipid.report.answers import show_gains
     from slipid.support.files import writable
     from slipid.support.jax_setup import setup_jax
 

@@ -14,7 +14,7 @@ import pytest
 
 from slipid.identify.compare.folds import QUESTIONS
 from slipid.job.compare import compare
-from slipid.report.compare import show_comparison
+from slipid.report.answers import show_comparison
 from slipid.report.page import Page
 from slipid.support.progress import Reporter
 

@@ -24,8 +24,7 @@ from slipid.identify.compare.validation import Validation
 from slipid.job.config import parsed
 from slipid.job.problem import read_job
 from slipid.support.progress import Reporter
-from slipid.testsite.driving import drive
-from slipid.testsite.experiments import Run, Timed, straight
+from slipid.testsite.driving import Run, Timed, drive, straight
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.machine import Machine
 from slipid.testsite.plant import Plant

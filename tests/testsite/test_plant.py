@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from slipid.data.floor_map import FloorMap, four_zones, uniform
-from slipid.testsite.driving import Trace, drive
-from slipid.testsite.experiments import Run, Timed, Waypoints, numbered, straight
+from slipid.testsite.driving import Run, Timed, Trace, Waypoints, drive, numbered, straight
 from slipid.testsite.ground import GRAVITY, GROUNDS, LEVELS, Ground, ribs
 from slipid.testsite.machine import Machine
 from slipid.testsite.motors import Drive, Motor, SpeedLoop

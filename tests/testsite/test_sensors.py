@@ -7,8 +7,7 @@ import pytest
 
 from slipid.data.reading.presets import declared_layout, preset
 from slipid.data.write import OPTIONAL, own_columns, own_csv, robotino2022_csv
-from slipid.testsite.driving import Trace
-from slipid.testsite.experiments import straight
+from slipid.testsite.driving import Trace, straight
 from slipid.testsite.machine import Machine
 from slipid.testsite.simulate.observe import observe
 from slipid.testsite.site import Sensors, Site

@@ -16,7 +16,7 @@ from slipid.data import floor_map as terrain
 from slipid.data.write import OPTIONAL, own_columns
 from slipid.support.errors import DataError
 from slipid.support.toml_file import checked, mapping_of
-from slipid.testsite import experiments as ex
+from slipid.testsite import driving as ex
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.simulate.sections import Content, OnMap
 from slipid.testsite.site import Site

@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float
 
 from slipid.data.log import Log
 from slipid.data.wheel_signals import interpolate
-from slipid.testsite.driving import Trace
-from slipid.testsite.experiments import Run
+from slipid.testsite.driving import Run, Trace
 from slipid.testsite.site import Site
 
 

@@ -9,7 +9,7 @@ from pydantic import Field
 from slipid.data import floor_map as terrain
 from slipid.data.floor_map import read_map
 from slipid.support.toml_file import Section
-from slipid.testsite.experiments import Run, Waypoints, straight
+from slipid.testsite.driving import Run, Waypoints, straight
 from slipid.testsite.ground import Ground
 from slipid.testsite.machine import Machine
 from slipid.testsite.motors import Motor, SpeedLoop

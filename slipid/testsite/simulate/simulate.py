@@ -15,8 +15,7 @@ from slipid.support.errors import DataError
 from slipid.support.files import read_json, write_arrays, write_bytes, write_json
 from slipid.support.progress import Reporter
 from slipid.support.workers import spread
-from slipid.testsite.driving import Trace, drive
-from slipid.testsite.experiments import Run
+from slipid.testsite.driving import Run, Trace, drive
 from slipid.testsite.plant import engine
 from slipid.testsite.simulate.config import Plan, can_identify, identify_config
 from slipid.testsite.simulate.observe import observe
