@@ -1,6 +1,6 @@
 """Many ragged runs as one set of flat arrays."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -58,8 +58,8 @@ class Runs:
 
     def subset(self, keep: Iterable[int] | np.ndarray) -> "Runs":
         """Some of the runs, in the order given."""
-        index, session = [int(k) for k in keep], self._sessions()
-        return collect([self.logs[i] for i in index], session=lambda log: session[log.name])
+        index = [int(k) for k in keep]
+        return collect([self.logs[i] for i in index], [self.session[i] for i in index])
 
     def __add__(self, other: "Runs") -> "Runs":
         """Runs of both.
@@ -67,22 +67,17 @@ class Runs:
         Raises:
             DataError: a run is in both, or they do not go together.
         """
-        mine, others = self._sessions(), other._sessions()
-        if both := mine.keys() & others.keys():
+        if both := {log.name for log in self.logs} & {log.name for log in other.logs}:
             raise DataError(f"{min(both)}: in both sets of runs; expected it once")
-        session = mine | others
-        return collect([*self.logs, *other.logs], session=lambda log: session[log.name])
-
-    def _sessions(self) -> dict[str, str]:
-        return {log.name: name for log, name in zip(self.logs, self.session, strict=True)}
+        return collect([*self.logs, *other.logs], [*self.session, *other.session])
 
 
-def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) -> Runs:
+def collect(logs: Sequence[Log], session: Sequence[str] | None = None) -> Runs:
     """One set of runs that all have wheels and poses.
 
     Args:
-        session: name of the time in which the marker stayed as it was; by default surface, load and
-            commanded speed, which is how test grids are driven.
+        session: of each run, the time in which the marker stayed as it was; by default surface,
+            load and commanded speed, which is how test grids are driven.
 
     Raises:
         DataError: no run, different wheel counts, a run without pose.
@@ -98,7 +93,6 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
             raise DataError(
                 f"{log.name}: no pose; expected camera columns, there is nothing to fit without"
             )
-    pick = session or default_session
     offset = np.concatenate([[0], np.cumsum([log.samples for log in logs])])
     heading, speed, turn = np.array([_command(log) for log in logs]).T
     bridged = [bridge_stalls(log.time, log.wheel_angle) for log in logs]
@@ -132,7 +126,7 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
         current=flat.get("current"),
         voltage=flat.get("voltage"),
         current_is_signed=all(log.current_is_signed for log in logs),
-        session=tuple(pick(log) for log in logs),
+        session=tuple(session or (default_session(log) for log in logs)),
         heading=heading,
         speed=speed,
         turn=turn,

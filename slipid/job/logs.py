@@ -28,7 +28,7 @@ def read_dataset(
         raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
     count = sum(len(paths) for _, paths in found)
     logs: list[Log] = []
-    session: dict[str, str] = {}
+    sessions: dict[str, str] = {}
     done = short = 0
     for section, paths in found:
         layout = layout_of(config, section)
@@ -38,17 +38,17 @@ def read_dataset(
                 if log.samples < section.min_rows:
                     short += 1
                     continue
-                if log.name in session:
+                if log.name in sessions:
                     raise DataError(
                         f"{log.name}: found by two globs of {config.path}; expected it once"
                     )
-                session[log.name] = session_of(log, section.session)
+                sessions[log.name] = session_of(log, section.session)
                 logs.append(log)
             done += 1
             report.advance(done, count)
     if short:
         skipped.append(f"skipped: {short} runs shorter than their min_rows")
-    return collect(logs, session=lambda log: session[log.name]), skipped
+    return collect(logs, list(sessions.values())), skipped
 
 
 def files_of(

@@ -413,8 +413,7 @@ def in_sessions(session, seed):
         pose = log.pose.copy()
         pose[:, :2] += far[:, None] * (np.array([along, across]) @ turn)
         moved.append(dataclasses.replace(log, pose=pose))
-    of = {log.name: f"s{k}" for log, k in zip(moved, session, strict=True)}
-    return collect(moved, session=lambda log: of[log.name])
+    return collect(moved, [f"s{k}" for k in session])
 
 
 def test_what_sessions_share_is_stored_with_its_unit():

@@ -52,7 +52,7 @@ def read_runs(
         for path in find_logs(root, pattern)
         for log in read_logs(path, chosen, root, surface, load)
     ]
-    return collect(logs, session=lambda log: session_of(log, session))
+    return collect(logs, [session_of(log, session) for log in logs])
 
 
 def session_of(log: Log, session: Session) -> str:
