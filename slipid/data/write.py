@@ -30,11 +30,10 @@ def own_columns(wheels: int, more: Sequence[str]) -> Content:
         "wheel_ticks": {"columns": _each("ticks", wheels), "unit": "tick"},
         "current": {"columns": _each("current", wheels), "unit": "A"},
     }
-    for channel, (unit, _) in OPTIONAL.items():
-        if channel in more and channel in PER_WHEEL:
-            columns[channel] = {"columns": _each(channel, wheels), "unit": unit}
-        elif channel in more:
-            columns[channel] = {"column": channel, "unit": unit}
+    for channel in more:
+        per_wheel = {"columns": _each(channel, wheels)}
+        named: Content = per_wheel if channel in PER_WHEEL else {"column": channel}
+        columns[channel] = named | {"unit": OPTIONAL[channel][0]}
     return columns | {
         "pose_x": {"column": "x", "unit": "mm"},
         "pose_y": {"column": "y", "unit": "mm"},
@@ -47,22 +46,19 @@ def own_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> str:
     assert log.twist_command is not None
     assert log.current is not None
     assert log.pose is not None
-    wheels = log.wheels
-    columns = [
-        (["time"], log.time[:, None], "%.4f"),
-        (["command_x", "command_y", "command_yaw"], log.twist_command, "%.4f"),
-        (_each("ticks", wheels), _ticks(log, gear_ratio, ticks_per_revolution), "%d"),
-        (_each("current", wheels), log.current, "%.4f"),
+    more = [channel for channel in OPTIONAL if getattr(log, channel) is not None]
+    values = [
+        (log.time[:, None], "%.4f"),
+        (log.twist_command, "%.4f"),
+        (_ticks(log, gear_ratio, ticks_per_revolution), "%d"),
+        (log.current, "%.4f"),
+        *((getattr(log, c).reshape(log.samples, -1), OPTIONAL[c][1]) for c in more),
+        (1000 * log.pose[:, :2], "%.3f"),
+        (np.degrees(log.pose[:, 2:]), "%.4f"),
     ]
-    for channel, (_, form) in OPTIONAL.items():
-        values = getattr(log, channel)
-        if values is not None:
-            names = _each(channel, wheels) if channel in PER_WHEEL else [channel]
-            columns.append((names, values.reshape(log.samples, -1), form))
-    columns.append((["x", "y"], 1000 * log.pose[:, :2], "%.3f"))
-    columns.append((["heading"], np.degrees(log.pose[:, 2:]), "%.4f"))
-    header = ",".join(name for names, *_ in columns for name in names)
-    return _csv(header, [(values, form) for _, values, form in columns], ",", "\n")
+    columns = own_columns(log.wheels, more).values()
+    names = [name for c in columns for name in c.get("columns", [c.get("column")])]
+    return _csv(",".join(names), values, ",", "\n")
 
 
 _WORDS_2022 = (

@@ -1,12 +1,10 @@
 """Checks every log passes once, at the door; each failure names file, row and what was expected."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.layout import Layout
+from slipid.data.reading.layout import Channel, Layout
 from slipid.data.reading.table import Table
 from slipid.data.wheel_signals import integral, interpolate, stretches, swapped_order
 from slipid.support.errors import bad_data
@@ -62,21 +60,15 @@ def check_time(table: Table, layout: Layout, time: Float[np.ndarray, " row"]) ->
 
 
 def filled(
-    table: Table,
-    columns: Sequence[str | int],
-    cells: Float[np.ndarray, "row column"],
-    time: Float[np.ndarray, " row"],
-    notes: list[str],
+    table: Table, channel: Channel, time: Float[np.ndarray, " row"], notes: list[str]
 ) -> Float[np.ndarray, "row column"]:
-    """Cells with up to three missing in a row filled linearly in time; bursts are refused.
+    """Cells of a channel, up to three missing in a row filled linearly in time; bursts are refused.
 
     Raises:
         DataError: an infinite cell, a burst of missing ones, or too many of them in all.
     """
-    if np.isfinite(cells).all():
-        return cells
-    cells = cells.copy()
-    for j, column in enumerate(columns):
+    cells = table.stacked(channel)
+    for j, column in enumerate(channel.columns):
         values = cells[:, j]
         infinite = np.flatnonzero(np.isinf(values))
         if len(infinite):

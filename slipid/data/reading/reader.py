@@ -179,7 +179,7 @@ def _channel(
 ) -> Float[np.ndarray, "row column"]:
     """A channel in SI units, short gaps filled."""
     channel = layout.channels[name]
-    cells = filled(table, channel.columns, table.stacked(channel), time, notes)
+    cells = filled(table, channel, time, notes)
     if name == "wheel_ticks" and not layout.ticks_are_increments:
         cells = unwrapped_ticks(cells, layout.tick_bits, notes)
     return (cells * channel.scale + channel.offset) * layout.to_si(name)
@@ -237,11 +237,11 @@ def _pose(
     """Pose with the heading unwrapped, and which rows bring a new camera frame."""
     if "pose_x" not in have:
         return None, None
-    names = [layout.channels[f"pose_{part}"].columns[0] for part in ("x", "y", "heading")]
-    cells = np.column_stack([table[name] for name in names])
+    names = ("pose_x", "pose_y", "pose_heading")
+    cells = np.concatenate([table.stacked(layout.channels[name]) for name in names], axis=1)
     fresh = np.ones(len(cells), dtype=bool)
     fresh[1:] = np.any(np.diff(cells, axis=0) != 0, axis=1)
     fresh &= ~np.isnan(cells).any(axis=1)
-    pose = np.concatenate([have["pose_x"], have["pose_y"], have["pose_heading"]], axis=1)
+    pose = np.concatenate([have[name] for name in names], axis=1)
     pose[:, 2] = np.unwrap(pose[:, 2])
     return pose, fresh
