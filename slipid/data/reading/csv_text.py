@@ -58,7 +58,8 @@ def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
         [float(cell) for cell in cells if cell]
     except ValueError:
         return cells
-    raise bad_data(path, "numbers", f"the column names ({_some(layout.columns)})", row=row)
+    names = ", ".join(map(str, layout.columns[:6])) + ", ..." * (len(layout.columns) > 6)
+    raise bad_data(path, "numbers", f"the column names ({names})", row=row)
 
 
 def wanted_names(
@@ -153,7 +154,3 @@ def cell_by_cell(
                     path, f"'{cell[:40]}'", f"a number{more}", row=row, column=column
                 ) from None
     return values
-
-
-def _some(names: tuple[str | int, ...]) -> str:
-    return ", ".join(map(str, names[:6])) + (", ..." if len(names) > 6 else "")
