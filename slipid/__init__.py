@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from slipid.control.deployed import DeployedRobot as DeployedRobot
     from slipid.control.estimator import Estimator as Estimator
     from slipid.control.interface import Measurement as Measurement
-    from slipid.data.reading.folders import read_runs as read_runs
+    from slipid.data.reading.reader import read_runs as read_runs
     from slipid.identify.posterior.blocks import Plan as Plan
     from slipid.model.robot import Robot as Robot
     from slipid.plots.raw import plot_runs as plot_runs
@@ -49,7 +49,7 @@ _ROOMS = {
     "made_runs": "slipid.api.made",
     "move": "slipid.api.motion",
     "plot_runs": "slipid.plots.raw",
-    "read_runs": "slipid.data.reading.folders",
+    "read_runs": "slipid.data.reading.reader",
     "setup_jax": "slipid.support.jax_setup",
     "wheel_curve": "slipid.plots.wheels",
 }

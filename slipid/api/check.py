@@ -8,7 +8,7 @@ from slipid.data.runs import Runs
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.check import Expected, expected, overview
 from slipid.model.robot import Robot
-from slipid.report.check import show_check
+from slipid.report.estimates import show_check
 from slipid.report.page import Page
 from slipid.support.content import Content
 

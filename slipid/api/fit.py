@@ -22,7 +22,7 @@ from slipid.identify.posterior.blocks import Plan
 from slipid.identify.verdicts import profile
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.config import FitSection
-from slipid.job.fit import optimised, summarised
+from slipid.job.identify import optimised, summarised
 from slipid.job.problem import Task, on_runs, said_of
 from slipid.model.robot import Robot
 from slipid.report.estimates import show_fit

@@ -6,7 +6,7 @@ from functools import cached_property
 
 from slipid.data.runs import Runs, collect
 from slipid.model.robot import Robot
-from slipid.selftest import known, plan
+from slipid.selftest import known
 from slipid.selftest.logs import make_logs
 
 
@@ -53,9 +53,9 @@ def made_runs(
     Raises:
         ValueError: no such number; names those there are.
     """
-    drives = plan.grid([(floor, "as_built") for floor in floors], headings, speeds, turns)
+    drives = known.grid([(floor, "as_built") for floor in floors], headings, speeds, turns)
     robot = known.truth(drives, truth)
     if wrong := sorted(set(truth or {}) - set(known.numbers(robot))):
         raise ValueError(f"no parameter '{wrong[0]}'; there are: {', '.join(known.numbers(robot))}")
-    logs = make_logs(robot, drives, seed, plan.Sensors(has_voltage=voltage))
+    logs = make_logs(robot, drives, seed, known.Sensors(has_voltage=voltage))
     return Made(collect(logs if current else [replace(log, current=None) for log in logs]), robot)

@@ -36,7 +36,7 @@ class Profile:
 
     def plot(self) -> "Figure":
         """How fast the fit gets worse when the number is held elsewhere."""
-        from slipid.plots.profile import profile_figure
+        from slipid.plots.posterior import profile_figure
 
         return profile_figure([self.result])
 
@@ -60,9 +60,10 @@ class Validation:
 
     def plot(self) -> "Figure":
         """End-point errors of every model."""
-        from slipid.plots.fit import validation_figure
+        from slipid.plots.compare import ladder_figure
+        from slipid.plots.fit import new_runs
 
-        return validation_figure(self.fit, self.runs, self.result.to_json())
+        return ladder_figure(self.result.to_json(), new_runs(self.fit, self.runs))
 
 
 @dataclass(frozen=True, eq=False)

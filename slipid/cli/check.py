@@ -15,13 +15,12 @@ def check(
     """Read and validate logs; say what they can tell before anything is fitted."""
     from slipid.job import check as job
     from slipid.plots.raw import raw_plots
-    from slipid.report.check import show_check
-    from slipid.report.page import Page
+    from slipid.report.estimates import show_check
 
     with Reporter(quiet=quiet) as report:
-        done = job.check(config, data, out, report)
+        logs, found = job.check(config, data, out, report)
         if out is not None:
             report.stage("drawing")
-            raw_plots(done.job.dataset, out)
-    emit(json, done.content, lambda: show_check(Page(), done.content))
+            raw_plots(logs, out)
+    emit(json, found, lambda page: show_check(page, found))
     return 0

@@ -3,13 +3,16 @@
 import functools
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, ParamSpec
+from typing import TYPE_CHECKING, Annotated, ParamSpec
 
 import typer
 
 from slipid.support.errors import DataError
+
+if TYPE_CHECKING:
+    from slipid.report.page import Page
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Config, a TOML file.")]
 OutFolder = Annotated[Path, typer.Argument(metavar="OUT", help="Folder identify wrote.")]
@@ -56,16 +59,26 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     return run
 
 
-def emit(json: str | None, content: object, show: Callable[[], None]) -> None:
-    """Show a result to people, and write it as JSON where `--json` says so.
+def emit(
+    json: str | None,
+    content: object,
+    show: Callable[["Page"], None],
+    out: Path | None = None,
+    written: Sequence[str] = (),
+) -> None:
+    """Show a result to people, with the files written to `out`; as JSON where `--json` says so.
 
     That is a file, written whole or not at all, or `-`: stdout, which then has nothing else.
     """
-    from slipid.support.files import json_text, write_bytes
+    from slipid.report.page import Page
+    from slipid.support.files import json_text, write_json
 
     if json == "-":
         sys.stdout.write(json_text(content))
         return
     if json is not None:
-        write_bytes(Path(json), json_text(content).encode())
-    show()
+        write_json(Path(json), content)
+    page = Page()
+    show(page)
+    if out is not None:
+        page.line(f"in {out}: {', '.join(written)}")

@@ -31,12 +31,13 @@ def identify(
 
     Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt.
     """
+    from slipid.report.estimates import show_fit
     from slipid.support.files import read_json
 
     with Reporter(quiet=quiet) as report:
         done = run(config, data, out, report, profile or ())
     content = read_json(out / "identified.json", "what identify wrote")
-    emit(json, content, lambda: show(done, out))
+    emit(json, content, lambda page: show_fit(page, done.fit, done.profiles), out, done.written)
     return 0 if done.fit.converged else 1
 
 
@@ -52,7 +53,7 @@ def run(
     from slipid.job.identify import identify
     from slipid.plots.drawing import save
     from slipid.plots.fit import identify_plots
-    from slipid.plots.profile import profile_figure
+    from slipid.plots.posterior import profile_figure
 
     done = identify(config, data, out, report, profiles)
     report.stage("drawing")
@@ -64,13 +65,3 @@ def run(
     if done.profiles:
         drawn.append(save(profile_figure(done.profiles), out / "profile.png"))
     return replace(done, written=(*done.written, *(path.name for path in drawn)))
-
-
-def show(done: "Identified", out: Path) -> None:
-    """Print what was found."""
-    from slipid.report.estimates import show_fit
-    from slipid.report.page import Page
-
-    page = Page()
-    show_fit(page, done.fit, done.profiles)
-    page.files(out, done.written)

@@ -26,10 +26,10 @@ def new(
     force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False,
 ) -> int:
     """Write a commented config for your robot; asks what it needs to know."""
-    from slipid.job.new import Answers, write_new
+    from slipid.job.new import write_new
 
-    answers = Answers(drive, wheel_radius_m, base_m, gear_ratio, mass_kg, ticks_per_revolution)
-    write_new(out, answers, force)
+    robot = drive, wheel_radius_m, base_m, gear_ratio, mass_kg, ticks_per_revolution
+    write_new(out, *robot, force)
     typer.echo(f"{out}: name your columns below [layouts.mine.columns], then run")
     typer.echo(f"  slipid check {out} --data DIR")
     typer.echo("or, before anything is driven, see what a plan of runs would tell:")

@@ -1,17 +1,13 @@
 """`slipid sample`: the posterior of a fit."""
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from slipid.cli.common import Json, OutFolder, Quiet, emit, guarded
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
-
-if TYPE_CHECKING:
-    from slipid.job.sample import Sampled
 
 
 @guarded
@@ -32,6 +28,7 @@ def sample(
     quiet: Quiet = False,
 ) -> int:
     """Posterior of a fit by emcee: honest intervals, posterior.nc; goes on after an interrupt."""
+    from slipid.report.estimates import show_sample
     from slipid.support.files import read_json
 
     try:
@@ -46,30 +43,8 @@ def sample(
         robot = write_robot(out, done.fit, done.posterior)
         report.stage("drawing")
         drawn = posterior_plots(done.fit, done.posterior, out)
-    done = replace(done, written=(*done.written, *robot, *(path.name for path in drawn)))
     content = read_json(out / "identified.json", "what sample wrote")
-    emit(json, content, lambda: show(done, out))
+    told = done.parameters.values(), done.about, content["messages"]
+    written = (*done.written, *robot, *(path.name for path in drawn))
+    emit(json, content, lambda page: show_sample(page, *told), out, written)
     return 0 if done.posterior.converged else 1
-
-
-def show(done: "Sampled", out: Path) -> None:
-    """Print what was found."""
-    from slipid.report.estimates import estimates
-    from slipid.report.page import Page
-
-    page, about, worst = Page(), done.about, done.about["worst"]
-    page.table(estimates(done.parameters.values(), f"{about['draws']} draws"))
-    page.notes(done.content["messages"])
-    page.line(
-        f"{about['ensembles']} ensembles of {about['walkers']} walkers, {about['steps']} steps: "
-        f"worst R-hat {worst['r_hat']:.4f}, {worst['steps_per_tau']:.0f} steps per "
-        f"autocorrelation time, {worst['effective_draws']:.0f} effective draws"
-    )
-    if about["converged"]:
-        page.line(f"converged: worst is {about['reason']}")
-    else:
-        page.line(
-            f"NOT converged, do not trust the intervals: worst is {about['reason']}; "
-            "a larger --most goes on from here"
-        )
-    page.files(out, done.written)

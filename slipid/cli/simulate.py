@@ -8,6 +8,7 @@ from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
+    from slipid.report.page import Page
     from slipid.testsite.simulate.config import Plan
 
 
@@ -20,22 +21,21 @@ def simulate(
     Writes logs, a config that identifies them, floor maps, and the truth in a folder of its own.
     Runs that are done are kept and not driven again.
     """
-    from slipid.testsite.simulate.config import read_plan
+    from slipid.support.toml_file import text_of
+    from slipid.testsite.simulate.config import plan as read
     from slipid.testsite.simulate.simulate import simulate as run
 
-    plan = read_plan(config)
+    plan = read(config, text_of(config))
     with Reporter(quiet=quiet) as report:
         found = run(plan, out, processes(jobs), report)
-    emit(json, found, lambda: show(found, plan, out))
+    emit(json, found, lambda page: show(page, found, plan, out))
     return 0
 
 
-def show(found: Content, plan: "Plan", out: Path) -> None:
+def show(page: "Page", found: Content, plan: "Plan", out: Path) -> None:
     """Print how much was driven, and what to do with it."""
-    from slipid.report.page import Page
-    from slipid.testsite.simulate.identify_config import can_identify
+    from slipid.testsite.simulate.config import can_identify
 
-    page = Page()
     page.line(f"{len(found['runs'])} runs, {found['driven']} of them driven now")
     if found["pace"] is not None:
         page.line(f"{found['seconds']:.0f} s at {found['pace']:.1f} times real time")

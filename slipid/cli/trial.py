@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from slipid.cli.common import Jobs, Json, Load, OutFolder, Quiet, emit, guarded, processes
-from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
 
@@ -36,40 +35,12 @@ def trial(
     from slipid.deploy.trial import Wish, names_of
     from slipid.deploy.trial import trial as run
     from slipid.plots.trial import trial_plot
+    from slipid.report.answers import show_trial
 
     wish = Wish(plant, map, names_of(controllers), starts, load, processes(jobs))
     with Reporter(quiet=quiet) as report:
         done = run(out, wish, report)
         report.stage("drawing")
         trial_plot(done.content, done.paths, done.floor, out / "trial.png")
-    emit(json, done.content, lambda: show(done.content, out))
+    emit(json, done.content, lambda page: show_trial(page, done.content, out))
     return 0
-
-
-def show(found: Content, out: Path) -> None:
-    """Print what every controller came to, medians over the starts."""
-    from slipid.report.page import Page, table
-
-    page = Page()
-    numbers = ("closure", "cross-track", "first side", "heading", "path", "of encoders'")
-    made = table(("controller", *numbers), right=numbers)
-    for name, row in found["summary"].items():
-        ratio = row.get("to_encoder", {}).get("closure_error_median")
-        told = "" if ratio is None else f"{100 * ratio['value']:.0f} % closure"
-        if row["finished_share"] < 1:
-            told += f", {100 * row['finished_share']:.0f} % of runs finished"
-        made.add_row(
-            name,
-            f"{row['closure_error_median']:.0f} mm",
-            f"{row['cross_track_rmse']:.0f} mm",
-            f"{row['first_side_along_track_mm']:.0f} mm",
-            f"{row['heading_error_deg']:.1f} deg",
-            f"{row['path_length_mm']:.0f} mm",
-            told,
-        )
-    page.table(made)
-    best = found["closes_best"]
-    page.line(f"closes best: {best} ({found['controllers'][best]})")
-    count = min(row["runs"] for row in found["summary"].values())
-    page.line(f"medians of {count} starts; 90 % intervals and every run: {out / 'trial.json'}")
-    page.line(f"look at: {out / 'trial.png'}")

@@ -1,12 +1,10 @@
 """`slipid tune`: gains rehearsed on the fit's own twin."""
 
-from pathlib import Path
 from typing import Annotated, cast
 
 import typer
 
 from slipid.cli.common import Json, Load, OutFolder, Quiet, emit, guarded
-from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
 
@@ -30,6 +28,7 @@ def tune(
     """
     from slipid.control.tuning.optimisers import Method
     from slipid.deploy.tune import tune as run
+    from slipid.report.answers import show_gains
     from slipid.support.files import writable
     from slipid.support.jax_setup import setup_jax
 
@@ -40,28 +39,6 @@ def tune(
         # it says itself which methods there are
         tuned = run(out, load, cast(Method, method), rollouts, seed, gyro, report)
     found = tuned.to_json()
-    emit(json, found, lambda: show(found, out))
+    emit(json, found, lambda page: show_gains(page, found), out, ("gains.json", "robot.json"))
     loss = tuned.record().loss
     return 0 if loss.tuned <= loss.hand else 1
-
-
-def show(found: Content, out: Path) -> None:
-    """Print the content of gains.json."""
-    from slipid.report.page import Page, table
-
-    page = Page()
-    gains = table(("gain", "value", "spread", "by hand", "unit"), right=("value", "spread"))
-    hand = found["settings"]["hand"]
-    for name, g in found["gains"].items():
-        gains.add_row(name, f"{g['value']:.3f}", f"{g['spread']:.3f}", f"{hand[name]:g}", g["unit"])
-    page.table(gains)
-    loss, margin = found["loss"], found["stability_margin"]
-    page.line(
-        f"loss on {found['settings']['judged_on']} cases not tuned on: by hand {loss['hand']:.1f} "
-        f"mm, tuned {loss['tuned']:.1f} mm; better in {found['better_than_hand']:.0%} of them"
-    )
-    page.line(
-        f"stability margin (1 - spectral radius): worst {margin['worst']:.4f}, "
-        f"median {margin['median']:.4f}"
-    )
-    page.files(out, ("gains.json", "robot.json"))

@@ -71,11 +71,6 @@ class Log:
         """Time from the first to the last row [s]."""
         return float(self.time[-1] - self.time[0])
 
-    @property
-    def period(self) -> float:
-        """Median time between rows [s]."""
-        return float(np.median(np.diff(self.time)))
-
     def __repr__(self) -> str:
         """Name, size and what was measured, on one line."""
         names = ("wheel_speed", "current", "voltage", "duty", "bus_voltage", "gyro", "pose")

@@ -1,14 +1,14 @@
 """Many ragged runs as one set of flat arrays."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from slipid.data.log import Log
-from slipid.data.signals.wheel_signals import MOVED, bridge_stalls, first_moved
+from slipid.data.wheel_signals import MOVED, bridge_stalls, first_moved
 from slipid.support.errors import DataError
 
 
@@ -58,8 +58,8 @@ class Runs:
 
     def subset(self, keep: Iterable[int] | np.ndarray) -> "Runs":
         """Some of the runs, in the order given."""
-        index, session = [int(k) for k in keep], self._sessions()
-        return collect([self.logs[i] for i in index], session=lambda log: session[log.name])
+        index = [int(k) for k in keep]
+        return collect([self.logs[i] for i in index], [self.session[i] for i in index])
 
     def __add__(self, other: "Runs") -> "Runs":
         """Runs of both.
@@ -67,22 +67,17 @@ class Runs:
         Raises:
             DataError: a run is in both, or they do not go together.
         """
-        mine, others = self._sessions(), other._sessions()
-        if both := mine.keys() & others.keys():
+        if both := {log.name for log in self.logs} & {log.name for log in other.logs}:
             raise DataError(f"{min(both)}: in both sets of runs; expected it once")
-        session = mine | others
-        return collect([*self.logs, *other.logs], session=lambda log: session[log.name])
-
-    def _sessions(self) -> dict[str, str]:
-        return {log.name: name for log, name in zip(self.logs, self.session, strict=True)}
+        return collect([*self.logs, *other.logs], [*self.session, *other.session])
 
 
-def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) -> Runs:
+def collect(logs: Sequence[Log], session: Sequence[str] | None = None) -> Runs:
     """One set of runs that all have wheels and poses.
 
     Args:
-        session: name of the time in which the marker stayed as it was; by default surface, load and
-            commanded speed, which is how test grids are driven.
+        session: of each run, the time in which the marker stayed as it was; by default surface,
+            load and commanded speed, which is how test grids are driven.
 
     Raises:
         DataError: no run, different wheel counts, a run without pose.
@@ -98,10 +93,8 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
             raise DataError(
                 f"{log.name}: no pose; expected camera columns, there is nothing to fit without"
             )
-    pick = session or default_session
     offset = np.concatenate([[0], np.cumsum([log.samples for log in logs])])
-    commands = [_command(log) for log in logs]
-
+    heading, speed, turn = np.array([_command(log) for log in logs]).T
     bridged = [bridge_stalls(log.time, log.wheel_angle) for log in logs]
     flat: dict[str, np.ndarray] = {}
     for name in ("time", "pose", "current", "voltage"):
@@ -133,35 +126,30 @@ def collect(logs: Sequence[Log], session: Callable[[Log], str] | None = None) ->
         current=flat.get("current"),
         voltage=flat.get("voltage"),
         current_is_signed=all(log.current_is_signed for log in logs),
-        session=tuple(pick(log) for log in logs),
-        heading=np.array([c.heading for c in commands]),
-        speed=np.array([c.speed for c in commands]),
-        turn=np.array([c.turn for c in commands]),
+        session=tuple(session or (default_session(log) for log in logs)),
+        heading=heading,
+        speed=speed,
+        turn=turn,
     )
 
 
 def default_session(log: Log) -> str:
     """`surface/load/speed`, the speed to 0.01 m/s and left out where nothing was commanded."""
-    speed = _command(log).speed
+    _, speed, _ = _command(log)
     parts = [log.surface or "unknown", log.load] + ([f"{speed:.2f}"] if np.isfinite(speed) else [])
     return "/".join(parts)
 
 
-class _Command(NamedTuple):
-    """What a run was asked to do: heading [rad], speed [m/s], yaw rate [rad/s]; nan if unknown."""
+def _command(log: Log) -> tuple[float, float, float]:
+    """Heading [rad], speed [m/s] and yaw rate [rad/s] of the median command; nan if unknown.
 
-    heading: float
-    speed: float
-    turn: float
-
-
-def _command(log: Log) -> _Command:
-    """Median command; it has no heading where the robot is to turn on the spot."""
+    It has no heading where the robot is to turn on the spot.
+    """
     if log.twist_command is None:
-        return _Command(np.nan, np.nan, np.nan)
+        return np.nan, np.nan, np.nan
     x, y, turn = np.median(log.twist_command, axis=0).tolist()
     speed = float(np.hypot(x, y))
-    return _Command(float(np.arctan2(y, x)) if speed > 1e-4 else np.nan, speed, turn)
+    return float(np.arctan2(y, x)) if speed > 1e-4 else np.nan, speed, turn
 
 
 def first_row(data: Runs, run: int, wheel_radius: float) -> int:

@@ -1,12 +1,12 @@
 """Pieces of runs as windows, which a likelihood sums over."""
 
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.data.runs import Runs, first_row
+from slipid.data.wheel_signals import interpolate
 from slipid.support.errors import DataError
 
 
@@ -63,10 +63,6 @@ class Windows:
         """The same windows at another lag of the camera, to first order [s]."""
         return replace(self, turn=self.turn - (lag - self.lag) * self.faster, lag=lag)
 
-    def of_runs(self, run: Int[np.ndarray, " piece"]) -> "Windows":
-        """The same pieces under other run numbers: those of the set they are a part of."""
-        return replace(self, run=run)
-
 
 def windows(
     data: Runs,
@@ -88,14 +84,14 @@ def windows(
     each = [_edges(data, k, wheel_radius, per_piece, longest) for k in range(len(data))]
     run = [k for k, pieces in enumerate(each) for _ in pieces]
     pieces = [_cut(data, k, edges, lag) for k, cuts in enumerate(each) for edges in cuts]
-    together = _Piece(*(np.stack(part) for part in zip(*pieces, strict=True)))
+    together = {name: np.stack([piece[name] for piece in pieces]) for name in pieces[0]}
     logs = [data.logs[k] for k in run]
     return Windows(
         run=np.asarray(run),
         surface=tuple(log.surface or "unknown" for log in logs),
         load=tuple(log.load for log in logs),
         session=tuple(data.session[k] for k in run),
-        **together._asdict(),
+        **together,
         has_current=data.current is not None,
         has_voltage=data.voltage is not None,
         current_is_signed=data.current_is_signed,
@@ -126,28 +122,13 @@ def _edges(data: Runs, run: int, radius: float, per_piece: int, longest: float) 
     return [rows[k : k + per_piece + 1] for k in range(0, count, per_piece)]
 
 
-class _Piece(NamedTuple):
-    """What `Windows` holds of one piece, under the same names; of many, stacked."""
-
-    dt: np.ndarray
-    turn: np.ndarray
-    faster: np.ndarray
-    pose: np.ndarray
-    current: np.ndarray
-    voltage: np.ndarray
-    current_var: np.ndarray
-
-
-def _cut(data: Runs, run: int, edges: Int[np.ndarray, " edge"], lag: float) -> _Piece:
-    """Windows between some rows of a run."""
+def _cut(data: Runs, run: int, edges: np.ndarray, lag: float) -> dict[str, np.ndarray]:
+    """Windows between some rows of a run: the arrays of `Windows` for this piece, by name."""
     rows = data.rows(run)
     t, angle = data.time[rows], data.wheel_angle[rows]
     at = t[edges] - lag
     half = 0.08  # a speed over 0.16 s: shorter shows the encoder's uneven updates
-    turned, ahead, behind = (
-        np.stack([np.interp(when, t, column) for column in angle.T], axis=-1)
-        for when in (at, at + half, at - half)
-    )
+    turned, ahead, behind = (interpolate(t, angle, when) for when in (at, at + half, at - half))
     span = np.clip(at + half, t[0], t[-1]) - np.clip(at - half, t[0], t[-1])
     speed = (ahead - behind) / np.maximum(span, 1e-3)[:, None]
     first = np.searchsorted(t, at[:-1])
@@ -161,15 +142,15 @@ def _cut(data: Runs, run: int, edges: Int[np.ndarray, " edge"], lag: float) -> _
         mean_current, variance = _mean(amps, live, first, end)
     if data.voltage is not None:
         mean_voltage, _ = _mean(data.voltage[rows], live, first, end)
-    return _Piece(
-        dt=np.diff(t[edges]),
-        turn=np.diff(turned, axis=0),
-        faster=np.diff(speed, axis=0),
-        pose=data.pose[rows][edges],
-        current=mean_current,
-        voltage=mean_voltage,
-        current_var=variance,
-    )
+    return {
+        "dt": np.diff(t[edges]),
+        "turn": np.diff(turned, axis=0),
+        "faster": np.diff(speed, axis=0),
+        "pose": data.pose[rows][edges],
+        "current": mean_current,
+        "voltage": mean_voltage,
+        "current_var": variance,
+    }
 
 
 def _mean(

@@ -1,6 +1,6 @@
 """Logs as files: slipid's own columns, and those of the published Robotino logs."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from io import StringIO
 
 import numpy as np
@@ -20,22 +20,8 @@ OPTIONAL = {
 _IMAGE = (1920, 1080)
 
 
-def own_layout(
-    wheels: int,
-    gear_ratio: float,
-    ticks_per_revolution: int,
-    current_is_signed: bool = False,
-    more: Collection[str] = ("voltage",),
-) -> Content:
-    """Layout of `own_csv`, as a config declares one.
-
-    Args:
-        wheels: number of wheels.
-        gear_ratio: turns of the motor per turn of the wheel.
-        ticks_per_revolution: ticks in one turn of the motor.
-        current_is_signed: False where magnitudes are logged.
-        more: those of the `OPTIONAL` channels that there are.
-    """
+def own_columns(wheels: int, more: Sequence[str]) -> Content:
+    """`own_csv`'s columns as a config declares them, of the `OPTIONAL` channels those in `more`."""
     columns: Content = {
         "time": {"column": "time", "unit": "s"},
         "twist_command_x": {"column": "command_x", "unit": "m/s"},
@@ -44,45 +30,35 @@ def own_layout(
         "wheel_ticks": {"columns": _each("ticks", wheels), "unit": "tick"},
         "current": {"columns": _each("current", wheels), "unit": "A"},
     }
-    for channel, (unit, _) in OPTIONAL.items():
-        if channel in more and channel in PER_WHEEL:
-            columns[channel] = {"columns": _each(channel, wheels), "unit": unit}
-        elif channel in more:
-            columns[channel] = {"column": channel, "unit": unit}
-    columns |= {
+    for channel in more:
+        per_wheel = {"columns": _each(channel, wheels)}
+        named: Content = per_wheel if channel in PER_WHEEL else {"column": channel}
+        columns[channel] = named | {"unit": OPTIONAL[channel][0]}
+    return columns | {
         "pose_x": {"column": "x", "unit": "mm"},
         "pose_y": {"column": "y", "unit": "mm"},
         "pose_heading": {"column": "heading", "unit": "deg"},
     }
-    return {
-        "ticks_per_revolution": ticks_per_revolution,
-        "gear_ratio": gear_ratio,
-        "current_is_signed": current_is_signed,
-        "columns": columns,
-    }
 
 
 def own_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> str:
-    """Text of a log with commands, currents and poses in slipid's own columns, see `own_layout`."""
+    """Text of a log with commands, currents and poses in slipid's own columns."""
     assert log.twist_command is not None
     assert log.current is not None
     assert log.pose is not None
-    wheels = log.wheels
-    columns = [
-        (["time"], log.time[:, None], "%.4f"),
-        (["command_x", "command_y", "command_yaw"], log.twist_command, "%.4f"),
-        (_each("ticks", wheels), _ticks(log, gear_ratio, ticks_per_revolution), "%d"),
-        (_each("current", wheels), log.current, "%.4f"),
+    more = [channel for channel in OPTIONAL if getattr(log, channel) is not None]
+    values = [
+        (log.time[:, None], "%.4f"),
+        (log.twist_command, "%.4f"),
+        (_ticks(log, gear_ratio, ticks_per_revolution), "%d"),
+        (log.current, "%.4f"),
+        *((getattr(log, c).reshape(log.samples, -1), OPTIONAL[c][1]) for c in more),
+        (1000 * log.pose[:, :2], "%.3f"),
+        (np.degrees(log.pose[:, 2:]), "%.4f"),
     ]
-    for channel, (_, form) in OPTIONAL.items():
-        values = getattr(log, channel)
-        if values is not None:
-            names = _each(channel, wheels) if channel in PER_WHEEL else [channel]
-            columns.append((names, values.reshape(log.samples, -1), form))
-    columns.append((["x", "y"], 1000 * log.pose[:, :2], "%.3f"))
-    columns.append((["heading"], np.degrees(log.pose[:, 2:]), "%.4f"))
-    header = ",".join(name for names, *_ in columns for name in names)
-    return _csv(header, [(values, form) for _, values, form in columns], ",", "\n")
+    columns = own_columns(log.wheels, more).values()
+    names = [name for c in columns for name in c.get("columns", [c.get("column")])]
+    return _csv(",".join(names), values, ",", "\n")
 
 
 _WORDS_2022 = (

@@ -23,8 +23,8 @@ from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.drawn_estimates import estimates
 from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
+from slipid.support.checkpoint import versions
 from slipid.support.errors import DataError
-from slipid.support.versions import versions
 
 ROBOT = "robot.json"
 DRAWS = 64

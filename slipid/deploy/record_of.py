@@ -20,13 +20,12 @@ from slipid.control.robot_file.record import (
     RobotRecord,
     Wheels,
 )
+from slipid.identify.fit.sessions import AXES
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame
 from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.parameter import entries
-
-AXES = ("along", "across", "yaw")
 
 
 def record_of(

@@ -16,18 +16,16 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import Settings
 from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
-from slipid.data.floor_map import FloorMap
-from slipid.data.map_file import read_map
+from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import ROWS, check_gains, pilot_of
 from slipid.deploy.deploy import habits_of, read_robot
 from slipid.deploy.trial_site import SitePlant, known_to_site, site, starts, twin
 from slipid.deploy.trial_summary import Run, summaries
-from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.errors import DataError
 from slipid.support.files import write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
-from slipid.support.versions import source_hash
 from slipid.support.workers import spread
 
 SCHEMA = "slipid.trial/1"

@@ -28,11 +28,10 @@ from slipid.control.tuning.optimisers import GRADIENT, Method, Search, State
 from slipid.data.floor_map import patchwork
 from slipid.deploy.deploy import ROBOT, habits_of, read_robot
 from slipid.deploy.trial_site import floor_of
-from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.errors import DataError
 from slipid.support.files import write_json
 from slipid.support.progress import Reporter
-from slipid.support.versions import source_hash
 
 SCHEMA = "slipid.gains/1"
 CORNERS = ((0.0, 0.0), (0.4, 0.0), (0.4, -0.2))

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.data.log import Log
+from slipid.data.runs import Runs
 from slipid.identify import slip_curves as curves_of
 from slipid.identify.fit.problem import Problem
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates, expected_covariance
 from slipid.identify.verdicts.unidentified import flat_directions, sentences
 from slipid.job.config import read_config
-from slipid.job.problem import Job, Task, read_job
+from slipid.job.problem import Task, read_job
 from slipid.support.content import Content
 from slipid.support.files import write_json
 from slipid.support.jax_setup import setup_jax
@@ -46,18 +47,12 @@ class Expected:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Checked:
-    """End of `check`: the logs, and the content of check.json."""
-
-    job: Job
-    content: Content
-
-
-def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> Checked:
+def check(
+    config_path: Path, data: Path, out: Path | None, report: Reporter
+) -> tuple[Runs, Content]:
     """Say what the logs hold, and what they can be expected to tell, before any fit.
 
-    It is written to check.json in `out`, if that is wanted.
+    That is the content of check.json, which is written to `out`, if that is wanted.
 
     Raises:
         DataError: config or logs are wrong.
@@ -68,7 +63,7 @@ def check(config_path: Path, data: Path, out: Path | None, report: Reporter) -> 
     content = overview(job, job.skipped) | expected(job, job.problem()).to_json()
     if out is not None:
         write_json(out / "check.json", content)
-    return Checked(job, content)
+    return job.dataset, content
 
 
 def overview(job: Task, skipped: Sequence[str] = ()) -> Content:

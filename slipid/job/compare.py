@@ -16,13 +16,12 @@ from slipid.identify.fit.optimise import Options, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.job.config import read_config
 from slipid.job.problem import Job, read_job
-from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
-from slipid.support.versions import versions
 
 SCHEMA = "slipid.comparison/1"
 FOLDS = "folds"
@@ -67,7 +66,10 @@ def compare(
             name: {
                 "folds": len(some),
                 "converged": all(fold["converged"] for fold in some),
-                "floors": {floor: asdict(one) for floor, one in ranking(_judged(some)).items()},
+                "floors": {
+                    floor: asdict(one)
+                    for floor, one in ranking([Judged.of_json(r) for r in _rows(some)]).items()
+                },
                 "cost": _cost(some),
             }
             for name, some in results.items()
@@ -85,10 +87,6 @@ def compare(
 
 def _rows(folds: Sequence[Content]) -> list[Content]:
     return [row for fold in folds for row in fold["rows"]]
-
-
-def _judged(folds: Sequence[Content]) -> list[Judged]:
-    return [Judged.of_json(row) for row in _rows(folds)]
 
 
 def _cost(folds: Sequence[Content]) -> Content:

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from slipid.model import geometry as g
 from slipid.model.geometry import Geometry
-from slipid.support.toml_file import Section, content, text_of
+from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -197,7 +197,7 @@ def parsed(path: Path, text: str) -> Config:
     Raises:
         DataError: no TOML, unknown or missing keys, wrong values; every one on a line.
     """
-    return Config(path, text, content(path, text, Content))
+    return Config(path, text, checked(path, mapping_of(path, text), Content))
 
 
 def geometry(robot: Wheels) -> Geometry:

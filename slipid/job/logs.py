@@ -4,11 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from slipid.data.log import Log
-from slipid.data.reading.declared import declared_layout
-from slipid.data.reading.folders import session_of, surface_of, with_voltage
 from slipid.data.reading.layout import Layout
-from slipid.data.reading.presets import PRESETS, preset
-from slipid.data.reading.reader import find_logs, read_logs
+from slipid.data.reading.presets import PRESETS, declared_layout, preset
+from slipid.data.reading.reader import find_logs, read_logs, session_of
 from slipid.data.runs import Runs, collect
 from slipid.job.config import Config, Logs
 from slipid.support.errors import DataError, near
@@ -30,27 +28,27 @@ def read_dataset(
         raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
     count = sum(len(paths) for _, paths in found)
     logs: list[Log] = []
-    session: dict[str, str] = {}
+    sessions: dict[str, str] = {}
     done = short = 0
     for section, paths in found:
         layout = layout_of(config, section)
+        surface = None if section.map is not None else section.surface
         for path in paths:
-            surface = None if section.map is not None else surface_of(path, section.surface)
-            for log in read_logs(path, layout, root=root, surface=surface, load=section.load):
+            for log in read_logs(path, layout, root, surface, section.load):
                 if log.samples < section.min_rows:
                     short += 1
                     continue
-                if log.name in session:
+                if log.name in sessions:
                     raise DataError(
                         f"{log.name}: found by two globs of {config.path}; expected it once"
                     )
-                session[log.name] = session_of(log, section.session)
-                logs.append(with_voltage(log))
+                sessions[log.name] = session_of(log, section.session)
+                logs.append(log)
             done += 1
             report.advance(done, count)
     if short:
         skipped.append(f"skipped: {short} runs shorter than their min_rows")
-    return collect(logs, session=lambda log: session[log.name]), skipped
+    return collect(logs, list(sessions.values())), skipped
 
 
 def files_of(

@@ -1,6 +1,5 @@
 """A config for a robot that nobody has described yet, with every key explained in place."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from slipid.job.config import parsed
@@ -65,39 +64,35 @@ load = "as_built"                     # one name per way the robot was loaded
 _AZIMUTHS = "wheel_azimuths_deg = [60, 180, 300]   # of the centres; each drives 90 deg further"
 
 
-@dataclass(frozen=True)
-class Answers:
-    """What has to be known of a robot to begin with.
+def write_new(
+    out: Path,
+    drive: str,
+    wheel_radius_m: float,
+    base_m: float,
+    gear_ratio: float,
+    mass_kg: float,
+    ticks_per_revolution: float,
+    force: bool = False,
+) -> None:
+    """Write a config that reads.
 
-    Attributes:
+    Args:
         drive: omni, mecanum or skid.
         base_m: distance of the wheels from the middle [m]; of mecanum and skid along both axes.
         gear_ratio: turns of the motor per turn of the wheel.
         ticks_per_revolution: of the encoder, per turn of the motor.
-    """
-
-    drive: str
-    wheel_radius_m: float
-    base_m: float
-    gear_ratio: float
-    mass_kg: float
-    ticks_per_revolution: float
-
-
-def write_new(out: Path, answers: Answers, force: bool = False) -> None:
-    """Write a config that reads.
+        force: replace the file if there is one.
 
     Raises:
         DataError: the file exists and shall not be replaced, or the answers make no robot.
     """
-    drive, base = answers.drive, answers.base_m
     if out.exists() and not force:
         raise DataError(f"{out}: exists already; expected a new file, or --force")
     if drive not in ("omni", "mecanum", "skid"):
         raise DataError(f"drive '{drive}'; expected one of omni, mecanum, skid")
-    wheels, shape = 4, f"half_length_m = {base:g}\nhalf_width_m = {base:g}"
+    wheels, shape = 4, f"half_length_m = {base_m:g}\nhalf_width_m = {base_m:g}"
     if drive == "omni":
-        wheels, shape = 3, f"{_AZIMUTHS}\nbase_radius_m = {base:g}"
+        wheels, shape = 3, f"{_AZIMUTHS}\nbase_radius_m = {base_m:g}"
     columns = {
         f"{what}_columns": ", ".join(f'"{what}_{k + 1}"' for k in range(wheels))
         for what in ("ticks", "current", "voltage")
@@ -106,10 +101,10 @@ def write_new(out: Path, answers: Answers, force: bool = False) -> None:
         name=out.name,
         drive=drive,
         shape=shape,
-        radius=f"{answers.wheel_radius_m:g}",
-        gear=f"{answers.gear_ratio:g}",
-        mass=f"{answers.mass_kg:g}",
-        ticks=f"{answers.ticks_per_revolution:g}",
+        radius=f"{wheel_radius_m:g}",
+        gear=f"{gear_ratio:g}",
+        mass=f"{mass_kg:g}",
+        ticks=f"{ticks_per_revolution:g}",
         **columns,
     )
     parsed(out, text)  # answers that make no robot overwrite nothing

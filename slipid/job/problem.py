@@ -5,9 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from slipid.data.floor_map import FloorMap
+from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
-from slipid.data.map_file import read_map
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
 from slipid.identify.fit.one_speed import still_viscosities

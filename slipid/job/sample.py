@@ -19,13 +19,12 @@ from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.config import read_config
 from slipid.job.drawn_estimates import estimates, identified
 from slipid.job.problem import Job, read_job
-from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
-from slipid.support.versions import versions
 
 for _module in ("arviz_base", "arviz_stats", "h5netcdf", "threadpoolctl"):
     importlib.import_module(_module)  # they are used after hours of work: what is missing shows now
@@ -40,14 +39,13 @@ class Sampled:
 
     Attributes:
         parameters: numbers from the draws, by path.
-        content: of identified.json; about: of sample.json: how the chains did.
+        about: content of sample.json: how the chains did.
         written: names of the files.
     """
 
     fit: Fit
     posterior: Posterior
     parameters: dict[str, Estimate]
-    content: Content
     about: Content
     written: tuple[str, ...]
 
@@ -55,12 +53,8 @@ class Sampled:
 def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporter) -> Sampled:
     """Sample around the fit in `out`: posterior.nc, sample.json, intervals in identified.json.
 
-    A chain that was interrupted there goes on.
-
-    Args:
-        out: folder `identify` wrote; data: of the logs, None for where they were fitted.
-        plan: of the chain; draws: that are kept of each ensemble.
-        report: progress.
+    A chain that was interrupted there goes on. The logs lie in `data`, by default where they were
+    fitted; `draws` are kept of each ensemble.
 
     Raises:
         DataError: no fit there, or other logs than it was made of.
@@ -79,17 +73,16 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     report.stage("writing")
     about = _summary(found, plan, time.monotonic() - began)
     numbers = estimates(fit, found)
-    content = identified(fit, found, numbers, problem)
     marks = {k: str(v) for k, v in about.items() if not isinstance(v, dict)}
     marks |= {"schema": netcdf.SCHEMA, "data_hash": fit.data_hash}
     runs = tuple(log.name for log in job.dataset.logs)
     netcdf.write(netcdf.tree(problem, found, runs, marks), out / "posterior.nc")
-    write_identified(out, content)
+    write_identified(out, identified(fit, found, numbers, problem))
     write_json(out / "sample.json", about)
     if found.converged:
         kept.remove()
     written = ("posterior.nc", "sample.json", "identified.json")
-    return Sampled(fit, found, numbers, content, about, written)
+    return Sampled(fit, found, numbers, about, written)
 
 
 def _everything(fit: Fit, plan: Plan, draws: int) -> tuple[object, ...]:
@@ -100,12 +93,7 @@ def _everything(fit: Fit, plan: Plan, draws: int) -> tuple[object, ...]:
 
 
 def sampled_around(
-    fit: Fit,
-    problem: Problem,
-    plan: Plan,
-    draws: int,
-    kept: Checkpoint | None,
-    report: Reporter,
+    fit: Fit, problem: Problem, plan: Plan, draws: int, kept: Checkpoint | None, report: Reporter
 ) -> Posterior:
     """Posterior of a fit by the likelihood it was made of; arguments as of `sample`.
 

@@ -35,7 +35,7 @@ PICTURES: dict[str, Callable[[Fit, Runs, Seen], Figure | None]] = {
 
 def identify_plots(fit: Fit, data: Runs, out: Path) -> list[Path]:
     """Files of all `PICTURES` that the runs, those of the fit, have something for."""
-    pieces = _pieces(fit, data)
+    pieces = seen(fit.robot, data, fit.channels.windows)
     return save_all({name: draw(fit, data, pieces) for name, draw in PICTURES.items()}, out)
 
 
@@ -47,22 +47,13 @@ def picture(fit: Fit, data: Runs, name: str) -> Figure:
     """
     if name not in PICTURES:
         raise ValueError(f"no picture '{name}'; there are {', '.join(PICTURES)}")
-    made = PICTURES[name](fit, data, _pieces(fit, data))
+    made = PICTURES[name](fit, data, seen(fit.robot, data, fit.channels.windows))
     if made is None:
         raise ValueError(f"picture '{name}': the runs have nothing for it")
     return made
 
 
-def _pieces(fit: Fit, data: Runs) -> Seen:
-    return seen(fit.robot, data, fit.channels.windows)
-
-
-def validation_figure(fit: Fit, data: Runs, found: Content) -> Figure:
-    """End-point errors of every model, by floor."""
-    return ladder_figure(found, _new_runs(fit, data))
-
-
-def _new_runs(fit: Fit, data: Runs) -> str:
+def new_runs(fit: Fit, data: Runs) -> str:
     """How many runs the fit has not seen, for people."""
     seen_before = {sha for _, sha in fit.runs}
     new = sum(log.sha256 not in seen_before for log in data.logs)
@@ -71,7 +62,7 @@ def _new_runs(fit: Fit, data: Runs) -> str:
 
 def validate_plots(fit: Fit, data: Runs, found: Content, out: Path) -> list[Path]:
     """Files of how well runs are predicted, as the validation found, and some of their paths."""
-    which = _new_runs(fit, data)
+    which = new_runs(fit, data)
     names = {log.surface or "unknown": None for log in data.logs}
     order = [(floor, load) for floor in sorted(names) for load in fit.robot.body.loads]
     figures = {

@@ -10,8 +10,7 @@ from slipid.baselines.paper2021.result import find_folder, regenerate
 from slipid.baselines.paper2021.table import FittedForm, MotorTable, deployed_slip
 from slipid.baselines.paper2021.tracks import COMMANDED_SIDES, Track
 from slipid.data.log import Log
-from slipid.data.reading.presets import preset
-from slipid.data.reading.reader import read_log
+from slipid.data.reading.reader import read_runs
 from slipid.plots import drawing
 from slipid.support.files import write_json
 
@@ -33,7 +32,7 @@ def run(data_dir: Path, out: Path) -> list[Path]:
         DataError: if the 2021 data set is absent or broken.
     """
     folder = find_folder(data_dir)
-    result = regenerate(folder, read_runs(folder.parent / "robotino2022"))
+    result = regenerate(folder, runs_2022(folder.parent / "robotino2022"))
     report = out / "paper.json"
     write_json(report, result.as_dict())
     figures = {
@@ -45,16 +44,10 @@ def run(data_dir: Path, out: Path) -> list[Path]:
     return [report, *drawing.save_all(figures, out)]
 
 
-def read_runs(folder: Path) -> list[Log] | None:
+def runs_2022(folder: Path) -> tuple[Log, ...] | None:
     """The 2022 runs on one surface each, None where there are none."""
-    paths = sorted(folder.glob("one_surface/*/*.csv"))
-    if not paths:
-        return None
-    layout = preset("robotino2022")
-    return [
-        read_log(path, layout, root=folder, surface=path.parent.name, load="as_built")
-        for path in paths
-    ]
+    pattern = "one_surface/*/*.csv"
+    return read_runs(folder, pattern, "robotino2022").logs if any(folder.glob(pattern)) else None
 
 
 def figure2(field: MotorTable) -> Figure:

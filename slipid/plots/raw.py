@@ -25,9 +25,7 @@ def plot_runs(data: Runs, runs: Sequence[int] | None = None, title: str = "as lo
     """Paths, wheel speeds and currents of runs, all on one another.
 
     Args:
-        data: the runs.
         runs: numbers of those that are shown; all by default.
-        title: what they are.
     """
     runs = range(len(data)) if runs is None else runs
     wheels = data.wheel_angle.shape[1]

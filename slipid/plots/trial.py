@@ -1,6 +1,6 @@
 """Picture of a trial: every controller's paths over the floor, and what they came to."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from slipid.data.floor_map import FloorMap
 from slipid.plots.drawing import INK, SHADE, figure, plain, save
 from slipid.support.content import Content
 
+Paths = Mapping[str, np.ndarray]
 TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
 """Of floors, in the order of the map."""
 ERRORS = {
@@ -20,16 +21,10 @@ ERRORS = {
 }
 
 
-def trial_plot(
-    content: Content, paths: Mapping[str, np.ndarray], floor: FloorMap, path: Path
-) -> Path:
+def trial_plot(content: Content, paths: Paths, floor: FloorMap, path: Path) -> Path:
     """Paths of the start nearest to the medians over the map, all starts from one corner, errors.
 
-    Args:
-        content: of trial.json.
-        paths: true poses (step, 3) by run, `CONTROLLER/startNN`.
-        floor: the site.
-        path: of the PNG.
+    `content` is that of trial.json, `paths` are true poses (step, 3) by run, `CONTROLLER/startNN`.
     """
     names = list(content["summary"])
     best = content["closes_best"]
@@ -56,19 +51,16 @@ def _typical(content: Content) -> int:
     return int(np.argmin([abs(r["closure_mm"] - middle) for r in runs]))
 
 
-def _one(
-    axes: Axes,
-    name: str,
-    content: Content,
-    paths: Mapping[str, np.ndarray],
-    floor: FloorMap,
-    one: int,
-) -> None:
+def _one(axes: Axes, name: str, content: Content, paths: Paths, floor: FloorMap, one: int) -> None:
     """All starts of a controller laid on one another, the typical one over its floor."""
     runs = [r for r in content["runs"] if r["controller"] == name]
-    own = [_local(paths[f"{name}/start{k:02d}"], r["start"]) for k, r in enumerate(runs)]
+    own = [
+        (paths[f"{name}/start{k:02d}"][:, :2] - r["start"][:2]) @ _turned(r["start"][2])
+        for k, r in enumerate(runs)
+    ]
     x, y = np.linspace(-0.35, 1.25, 320), np.linspace(-0.75, 0.35, 220)
-    places = _world(np.stack(np.meshgrid(x, y), -1), runs[one]["start"])
+    start = runs[one]["start"]
+    places = start[:2] + np.stack(np.meshgrid(x, y), -1) @ _turned(start[2]).T
     kinds = max(len(floor.surfaces), 2)
     tints = ListedColormap(TINTS[:kinds])
     axes.pcolormesh(x, y, floor.at(places), cmap=tints, vmin=0, vmax=kinds - 1)
@@ -85,17 +77,10 @@ def _one(
     axes.tick_params(labelsize=7)
 
 
-def _local(pose: np.ndarray, start: Sequence[float]) -> np.ndarray:
-    """Places as seen from the start."""
-    c, s = np.cos(start[2]), np.sin(start[2])
-    d = pose[:, :2] - start[:2]
-    return np.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]], -1)
-
-
-def _world(place: np.ndarray, start: Sequence[float]) -> np.ndarray:
-    c, s = np.cos(start[2]), np.sin(start[2])
-    x, y = place[..., 0], place[..., 1]
-    return np.stack([start[0] + c * x - s * y, start[1] + s * x + c * y], -1)
+def _turned(heading: float) -> np.ndarray:
+    """Rotation from the axes of a pose to the site's."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.array([[c, -s], [s, c]])
 
 
 def _bars(axes: Axes, table: Content, key: str, label: str) -> None:

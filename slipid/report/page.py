@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from io import StringIO
-from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -50,10 +49,6 @@ class Page:
         """Sentences a reader must know."""
         for sentence in sentences:
             self.line(f"note: {sentence}")
-
-    def files(self, out: Path, written: Sequence[str]) -> None:
-        """Names of the files that were written to a folder."""
-        self.line(f"in {out}: {', '.join(written)}")
 
 
 def table(columns: Sequence[str], title: str | None = None, right: Sequence[str] = ()) -> Table:

@@ -17,10 +17,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.data.log import Log
+from slipid.data.wheel_signals import interpolate
 from slipid.identify.design.planned_runs import Drive
+from slipid.identify.fit.sessions import AXES
 from slipid.model.robot import Robot, twist, wheel_torque
 from slipid.model.se2 import compose, path
-from slipid.selftest.plan import Sensors
+from slipid.selftest.known import Sensors
 
 
 def make_logs(
@@ -106,7 +108,7 @@ class _Maker:
         u = np.where(far > 0, step[..., :2] / np.maximum(far, 1e-12), [1.0, 0.0])
         far = far[..., 0] + np.abs(step[..., 2]) * float(shape.base_radius)
         drawn = []
-        for part in ("along", "across", "yaw"):
+        for part in AXES:
             grown, level = (
                 np.array([s.of(f"{kind}.{d.surface}.{part}") for d in self.drives])[:, None]
                 for kind in ("process", "run")
@@ -133,9 +135,8 @@ class _Maker:
             frames += rng.uniform(0, s.frame_period)
             newest = np.searchsorted(frames, t) - 1
             fresh[k, 1:] = np.diff(newest) > 0
-            age = t - frames[newest] - 0.5 * s.row_period if s.free_frames else 0.0
-            at = t - float(robot.camera.lag) - age
-            marker[k] = np.stack([np.interp(at, t, column) for column in pose[k].T], axis=-1)
+            at = t - float(robot.camera.lag)  # every new frame is that old
+            marker[k] = interpolate(t, pose[k], at)
         session = [robot.session_index(d.session) for d in self.drives]
         yaw = np.array([float(robot.camera.yaw(k)) for k in session])
         logged = np.asarray(_as_logged(robot, jnp.asarray(marker), jnp.asarray(yaw)))
@@ -174,9 +175,7 @@ def _twists(robot: Robot, speed: Array, floor: Array, load: Array) -> tuple[Arra
     return jax.vmap(jax.vmap(one, (0, None, None)))(speed, floor, load)
 
 
-@jax.jit
-def _paths(xi: Array, dt: Array, start: Array) -> Array:
-    return jax.vmap(path)(xi, dt, start)
+_paths = jax.jit(jax.vmap(path))
 
 
 @jax.jit

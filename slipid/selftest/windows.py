@@ -17,6 +17,7 @@ from slipid.data.windows import Windows
 from slipid.identify.compare.open_loop import chain, corrected
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import travel
+from slipid.identify.fit.sessions import AXES
 from slipid.model.robot import Robot
 
 
@@ -87,7 +88,7 @@ def _process(
     axes[1, ..., 0], axes[1, ..., 1] = -u[..., 1], u[..., 0]
     axes[2, ..., 2] = 1.0
     total = np.zeros((*far.shape, 3))
-    for axis, name in zip(axes, ("along", "across", "yaw"), strict=True):
+    for axis, name in zip(axes, AXES, strict=True):
         grown = _of(std, w, "process", name)[:, None] * np.sqrt(far)
         own = _of(std, w, "run", name) * rng.normal(size=len(w))
         total += axis * (grown * rng.normal(size=far.shape) + own[:, None] * far)[..., None]

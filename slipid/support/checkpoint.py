@@ -1,8 +1,10 @@
 """Finished parts of a long piece of work, kept on disk for the same work to go on from."""
 
 import hashlib
+import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -11,9 +13,27 @@ import numpy as np
 
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, write_arrays, write_json
-from slipid.support.versions import versions
 
 SCHEMA = "slipid.checkpoint/1"
+LIBRARIES = ("slipid", "jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy", "emcee")
+
+
+def versions() -> dict[str, str]:
+    """Version of Python and of every library that numbers depend on, by name."""
+    found = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def source_hash(*rooms: str) -> bytes:
+    """Hash of the sources of some of slipid's packages, by name."""
+    root = Path(__file__).resolve().parents[1]
+    found = sorted(path for room in rooms for path in (root / room).rglob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in found)).digest()
 
 
 def key_of(*parts: object) -> str:

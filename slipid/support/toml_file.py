@@ -15,12 +15,18 @@ from typing import (
     get_type_hints,
 )
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from slipid.support.content import Content
 from slipid.support.errors import DataError, near
 
+CLOSED = ConfigDict(extra="forbid")
+"""Of a dataclass that a config declares: other keys are refused."""
+Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
+Part = Annotated[float, Field(ge=0, lt=1)]
+"""Of a whole."""
 Model = TypeVar("Model")
 Step = str | int
 """Key of a table, or place in a list."""
@@ -58,15 +64,6 @@ def mapping_of(path: Path, text: str) -> Content:
         raise DataError(f"{path}: no valid TOML: {error}") from error
 
 
-def content(path: Path, text: str, model: type[Model]) -> Model:
-    """TOML text as a model; the path is for messages.
-
-    Raises:
-        DataError: no TOML, unknown or missing keys, wrong values; every one on a line.
-    """
-    return checked(path, mapping_of(path, text), model)
-
-
 def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
     """A mapping as a pydantic model or dataclass.
 
@@ -76,23 +73,24 @@ def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
     try:
         return TypeAdapter(model).validate_python(mapping)
     except ValidationError as error:
-        lines = dict.fromkeys(_line(path, mapping, model, e) for e in error.errors())
+        lines = dict.fromkeys(_line(path, model, e) for e in error.errors())
         raise DataError("\n".join(lines)) from None
 
 
-def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) -> str:
+def _line(path: Path | str, root: type, error: ErrorDetails) -> str:
     """One mistake as one line: file, key, what was found, what was expected."""
     kind, given, context = error["type"], error["input"], error.get("ctx", {})
-    steps = _steps(mapping, error["loc"])
+    steps, there = _place(root, error["loc"])
     where = f"{path}: {_spelled(steps)}" if steps else str(path)
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = list(_annotations(_kinds_at(mapping, root, steps[:-1])[0]))
+        _, (model, *_) = _place(root, error["loc"][:-1])
+        known = list(_annotations(model))
         return f"{where}: no such key{near(steps[-1], known)}; expected one of {', '.join(known)}"
     if kind in ("missing", "missing_argument"):
         return f"{where}: missing; expected a value for it"
     if kind == "union_tag_not_found":
         key = context["discriminator"].strip("'")
-        tags = [get_args(_annotations(m)[key]) for m in _kinds_at(mapping, root, steps)]
+        tags = [get_args(_annotations(model)[key]) for model in there]
         return f"{where}.{key}: missing; expected one of {', '.join(v for t in tags for v in t)}"
     if kind == "union_tag_invalid":
         key, tag = context["discriminator"].strip("'"), context["tag"]
@@ -105,19 +103,24 @@ def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) ->
     return f"{where}: {given!r}; expected: {error['msg'][0].lower()}{error['msg'][1:]}"
 
 
-def _steps(mapping: object, loc: Sequence[Step]) -> list[Step]:
-    """The part of pydantic's location that is in the file: without names of union members."""
+def _place(root: object, loc: Sequence[Step]) -> tuple[list[Step], list[object]]:
+    """The part of pydantic's location that is in the file, and the types that may be there.
+
+    Tags and names of union members are not in the file.
+    """
     steps: list[Step] = []
-    here = mapping
+    kinds = [root]
     for k, part in enumerate(loc):
-        if (isinstance(here, dict) and part in here) or (
-            isinstance(here, list) and isinstance(part, int) and part < len(here)
-        ):
-            here = _below(here, part)
-        elif k < len(loc) - 1 or not isinstance(here, dict):
+        tagged = [kind for kind in kinds if _has_tag(kind, part)]
+        if len(kinds) > 1 and tagged:
+            kinds = tagged
             continue
-        steps.append(part)
-    return steps
+        inner = [t for kind in kinds for t in _inner(kind, part)]
+        is_unknown_key = k == len(loc) - 1 and any(_annotations(kind) for kind in kinds)
+        if inner or isinstance(part, int) or is_unknown_key:
+            steps.append(part)
+            kinds = inner
+    return steps, kinds
 
 
 def _spelled(steps: Sequence[Step]) -> str:
@@ -131,28 +134,11 @@ def _spelled(steps: Sequence[Step]) -> str:
     return out.removeprefix(".")
 
 
-def _below(here: object, step: Step) -> object:
-    """What lies one step below; None where nothing does."""
-    if isinstance(here, list) and isinstance(step, int):
-        return here[step]
-    return here.get(step) if isinstance(here, dict) else None
-
-
-def _kinds_at(mapping: object, root: object, steps: Sequence[Step]) -> list[object]:
-    """Models and dataclasses that may describe a place of the file, by literals in it."""
-    found, here = [root], mapping
-    for step in steps:
-        inner = [t for kind in found for t in _inner(kind, step)]
-        here = _below(here, step)
-        found = [kind for kind in inner if _fits(kind, here)] or inner
-    return [kind for kind in found if _annotations(kind)]
-
-
 def _inner(kind: object, step: Step) -> list[object]:
     """Types of what lies one step below."""
-    if get_origin(kind) in (list, dict):
+    if get_origin(kind) is dict or (get_origin(kind) is list and isinstance(step, int)):
         return _members(get_args(kind)[-1])
-    return _members(_annotations(kind).get(str(step)))
+    return _members(annotation) if (annotation := _annotations(kind).get(str(step))) else []
 
 
 def _members(annotation: object) -> list[object]:
@@ -174,10 +160,9 @@ def _annotations(kind: object) -> dict[str, object]:
     return {}
 
 
-def _fits(kind: object, here: object) -> bool:
-    """Whether its literals are those of the file."""
-    return all(
-        here[key] in get_args(annotation)
-        for key, annotation in _annotations(kind).items()
-        if get_origin(annotation) is Literal and isinstance(here, dict) and key in here
+def _has_tag(kind: object, tag: Step) -> bool:
+    """Whether a literal of the model is this tag."""
+    return any(
+        get_origin(annotation) is Literal and tag in get_args(annotation)
+        for annotation in _annotations(kind).values()
     )

@@ -9,7 +9,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from slipid.data.floor_map import MOST_CELLS, FloorMap
-from slipid.support.bounds import CLOSED, Positive
+from slipid.data.wheel_signals import stretches
+from slipid.support.toml_file import CLOSED, Positive
 
 GRAVITY = 9.81
 LEVELS = 7
@@ -167,9 +168,8 @@ def ribs(
             continue
         for x in np.arange(left, right, ground.rib_distance_m):
             on = floor.at(np.stack([np.full_like(y, x), y], 1)) == number
-            ends = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
             out += [
                 (float(x), low + fine * float(a), low + fine * float(b), ground.rib_height_m)
-                for a, b in ends.reshape(-1, 2)
+                for a, b in stretches(on)
             ]
     return out

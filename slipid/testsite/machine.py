@@ -9,7 +9,7 @@ from jaxtyping import Float
 from pydantic import Field, FiniteFloat
 from pydantic.dataclasses import dataclass
 
-from slipid.support.bounds import CLOSED, NotNegative, Positive
+from slipid.support.toml_file import CLOSED, NotNegative, Positive
 
 
 @dataclass(frozen=True, config=CLOSED)

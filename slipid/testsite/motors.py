@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from slipid.support.bounds import CLOSED, NotNegative, Positive
+from slipid.support.toml_file import CLOSED, NotNegative, Positive
 
 
 @dataclass(frozen=True, config=CLOSED)

@@ -5,7 +5,8 @@ does not.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -13,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.floor_map import FloorMap
+from slipid.data.wheel_signals import interpolate
 from slipid.support.errors import DataError
-from slipid.testsite.camera import Camera
 from slipid.testsite.machine import mjcf
-from slipid.testsite.site import Site
+from slipid.testsite.site import Camera, Site
 
 MARKER = 0
 """Number of the marker in ArUco's dictionary 4X4_50, as on the Robotino of the published frames."""
@@ -138,17 +139,12 @@ class Studio:
 
 
 def film(
-    studio: Studio,
-    time: Float[np.ndarray, " step"],
-    pose: Float[np.ndarray, "step 3"],
-    wheel_angle: Float[np.ndarray, "step wheel"],
-    frames: Float[np.ndarray, " frame"],
-    path: Path,
+    studio: Studio, true: Mapping[str, np.ndarray], frames: Float[np.ndarray, " frame"], path: Path
 ) -> None:
     """Write a video of a run, whole or not at all.
 
     Args:
-        time: times of the truth [s], of true poses and wheel angles.
+        true: time [s] (step,), pose (step, 3) and wheel_angle (step, wheel) of the run.
         frames: times of the video's frames [s].
         path: where the video goes (.avi, Motion JPEG).
 
@@ -159,30 +155,28 @@ def film(
 
     c = studio.camera
 
-    def at(values: np.ndarray, t: float) -> np.ndarray:
-        return np.array([np.interp(t, time, column) for column in values.T])
+    def at(name: str, t: float) -> np.ndarray:
+        return interpolate(true["time"], true[name], np.array([t]))[0]
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial.avi")
+    unfinished = path.with_name(f".{path.name}.partial.avi")
     code = cv2.VideoWriter.fourcc(*"MJPG")
-    video = cv2.VideoWriter(str(partial), code, 1 / c.frame_s, (c.width_px, c.height_px))
+    video = cv2.VideoWriter(str(unfinished), code, 1 / c.frame_s, (c.width_px, c.height_px))
     if not video.isOpened():
         raise DataError(f"{path}: OpenCV cannot write a video there")
     try:
         for t in frames:
-            video.write(
-                studio.exposed(float(t), lambda s: at(pose, s), lambda s: at(wheel_angle, s))
-            )
+            video.write(studio.exposed(float(t), partial(at, "pose"), partial(at, "wheel_angle")))
         video.release()
-        written = cv2.VideoCapture(str(partial)).get(cv2.CAP_PROP_FRAME_COUNT)
+        written = cv2.VideoCapture(str(unfinished)).get(cv2.CAP_PROP_FRAME_COUNT)
         if written != len(frames):
             raise DataError(
                 f"{path}: {written:.0f} of {len(frames)} frames written; is there room?"
             )
-        os.replace(partial, path)
+        os.replace(unfinished, path)
     finally:
         video.release()
-        partial.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
 
 
 def _drawing() -> tuple[ModuleType, ModuleType]:

@@ -16,9 +16,8 @@ import slipid as sl
 from slipid.data.write import robotino2022_csv
 from slipid.identify.posterior.blocks import Plan
 from slipid.job import sample
-from slipid.selftest.known import truth
+from slipid.selftest.known import Sensors, grid, truth
 from slipid.selftest.logs import make_logs
-from slipid.selftest.plan import Sensors, grid
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOORS = (("gray", "as_built"),)

@@ -438,7 +438,7 @@ def test_figure_7_tracks(result):
 
 @pytest.mark.slow
 def test_no_curve_in_current_carries_over_to_an_unseen_surface(real_data):
-    logs = paper_plots.read_runs(real_data / "robotino2022")
+    logs = paper_plots.runs_2022(real_data / "robotino2022")
     if logs is None:
         pytest.skip(f"no 2022 runs below {real_data}")
     transfer = leave_one_surface_out(logs)

@@ -12,9 +12,10 @@ from typing import Any
 
 import pytest
 
-from slipid.cli.compare import show
 from slipid.identify.compare.folds import QUESTIONS
 from slipid.job.compare import compare
+from slipid.report.answers import show_comparison
+from slipid.report.page import Page
 from slipid.support.progress import Reporter
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -25,7 +26,7 @@ def found(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
     config, out = ROOT / "configs" / "robotino2022.toml", tmp_path_factory.mktemp("compare")
     with Reporter() as report:
         result = compare(config, real_data / "robotino2022", out, list(QUESTIONS), report)
-    show(result)
+    show_comparison(Page(), result)
     return result
 
 

@@ -24,8 +24,7 @@ from slipid.identify.compare.validation import Validation
 from slipid.job.config import parsed
 from slipid.job.problem import read_job
 from slipid.support.progress import Reporter
-from slipid.testsite.driving import drive
-from slipid.testsite.experiments import Run, Timed, straight
+from slipid.testsite.driving import Run, Timed, drive, straight
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.machine import Machine
 from slipid.testsite.plant import Plant
@@ -323,8 +322,9 @@ def test_figures_beside_the_real_ones(real_data: Path) -> None:
 
     from slipid.baselines.paper2021.result import regenerate
     from slipid.data.reading.presets import preset
-    from slipid.data.reading.reader import find_logs, read_log
+    from slipid.data.reading.reader import find_logs
     from slipid.plots.paper import _floor
+    from tests.helpers.one_log import read_log
 
     OUT.mkdir(parents=True, exist_ok=True)
     real = regenerate(real_data / "robotino2021", None)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from slipid.cli.demo import packaged_config
-from slipid.job.new import Answers, write_new
+from slipid.job.new import write_new
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
 from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
@@ -569,9 +569,9 @@ def test_new_writes_a_config_that_reads_and_never_overwrites(tmp_path):
     assert again.exit_code == 2
     assert "exists already" in again.stderr
     for drive in ("mecanum", "skid"):
-        write_new(tmp_path / f"{drive}.toml", Answers(drive, 0.05, 0.2, 12.0, 9.0, 500.0))
+        write_new(tmp_path / f"{drive}.toml", drive, 0.05, 0.2, 12.0, 9.0, 500.0)
     with pytest.raises(DataError, match="greater than 0"):
-        write_new(tmp_path / "x.toml", Answers("omni", -0.05, 0.2, 12.0, 9.0, 500.0))
+        write_new(tmp_path / "x.toml", "omni", -0.05, 0.2, 12.0, 9.0, 500.0)
     assert not (tmp_path / "x.toml").exists()
     before = path.read_bytes()
     answers = [*words, "--ticks-per-revolution", 500, "--wheel-radius-m", -1]
@@ -585,7 +585,7 @@ def test_a_place_that_cannot_be_written_to_is_said_before_the_work(tmp_path):
     (tmp_path / "file").write_text("")
     path = tmp_path / "file" / "x.toml"
     with pytest.raises(DataError, match=r"x\.toml: cannot be written"):
-        write_new(path, Answers("omni", 0.05, 0.2, 12.0, 9.0, 500.0))
+        write_new(path, "omni", 0.05, 0.2, 12.0, 9.0, 500.0)
     with pytest.raises(DataError, match="cannot be written"):
         writable(tmp_path / "file" / "out")
     writable(tmp_path / "new")

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from slipid.cli import demo
-from slipid.cli.demo import PARTS, RECORDED, drive_anew, pack, packaged_config, unpack
+from slipid.cli.demo import PARTS, RECORDED, drive_anew, packaged_config, unpack
+from slipid.report.near import compared
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from slipid.testsite.driving import drive
 from slipid.testsite.simulate.config import plan
 from tests.helpers.golden_rows import of_identified, of_validation
+from tests.helpers.recording import pack
 
 
 def test_the_recording_holds_logs_and_truth(tmp_path):
@@ -112,9 +114,9 @@ def test_driving_anew_drives_what_ships(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_demo_finds_the_motor_weighs_the_robot_and_beats_the_encoders(tmp_path, golden):
     """Bars for logs whose physics slipid's model does not share; left-out headings."""
-    shown = demo.run(tmp_path, "recorded", None, 1, Reporter(quiet=True))
-    found, rows = shown.validation, shown.rows
-    assert shown.done.fit.converged
+    done, found, truth = demo.run(tmp_path, "recorded", None, 1, Reporter(quiet=True))
+    rows = compared(done.fit, truth)
+    assert done.fit.converged
     errors = {(r.path, r.label): r.value - r.truth for r in rows}
     for path in ("motor.resistance", "motor.back_emf"):
         row = next(r for r in rows if r.path == path)

@@ -21,7 +21,6 @@ from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Floor, Twin, rollout
 from slipid.data.floor_map import patchwork
 from slipid.data.reading.presets import preset
-from slipid.data.reading.reader import read_log
 from slipid.data.runs import Runs, collect
 from slipid.deploy.controllers import ROWS, pilot_of
 from slipid.model.geometry import omni
@@ -29,6 +28,7 @@ from slipid.model.robot import Robot, build
 from slipid.search_space import Choice, Space
 from tests.helpers import replayed
 from tests.helpers.known_robot import deploy_known
+from tests.helpers.one_log import read_log
 
 FIT = Path(__file__).parents[1] / "helpers" / "robotino2022_sectors.json"
 """Numbers of a fit that has seen no heading of 0 to 60 deg."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from slipid.data.reading.declared import declared_layout
-from slipid.data.reading.reader import read_log
+from slipid.data.reading.presets import declared_layout
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import CASES, GENERIC, GENERIC_LAYOUT, ROBOTINO, Case, write_good
+from tests.helpers.one_log import read_log
 
 
 @pytest.fixture

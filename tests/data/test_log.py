@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from slipid.data.log import Log
-from slipid.data.reading.declared import declared_layout
-from slipid.data.reading.reader import read_log, read_logs
+from slipid.data.reading.presets import declared_layout
+from slipid.data.reading.reader import read_logs
 from slipid.support.errors import DataError, bad_data
 from tests.helpers.broken_logs import GENERIC, GENERIC_LAYOUT, ROBOTINO, ROWS, write_good
+from tests.helpers.one_log import read_log
 
 
 @pytest.fixture
@@ -30,7 +31,6 @@ def log(root):
 def test_a_run_in_si_units(log: Log):
     assert (log.name, log.surface, log.load) == (ROBOTINO, "gray", "moved")
     assert (log.samples, log.wheels) == (ROWS, 3)
-    assert log.period == pytest.approx(0.031, rel=1e-6)
     assert log.duration == pytest.approx(0.031 * (ROWS - 1), rel=1e-6)
     # 0.1 m/s along 20 deg: rim speed of the wheel at 60 deg is 0.1 sin(20 - 60) m/s, r = 0.04 m
     wheel = 0.1 * np.sin(np.radians(20.0 - 60.0)) / 0.04
@@ -80,20 +80,18 @@ def test_several_runs_in_one_file(root):
     lines = (root / GENERIC).read_text().splitlines()
     (root / GENERIC).write_text("\n".join([*lines, *lines[1:51]]) + "\n")
     layout = declared_layout({**GENERIC_LAYOUT, "new_run": "time_restarts"}, "layout")
-    logs = read_logs(root / GENERIC, layout, root=root, surface="oak")
+    logs = read_logs(root / GENERIC, layout, root, "oak", "as_built")
     assert [(log.name, log.samples) for log in logs] == [
         ("generic/run.csv#1", 200),
         ("generic/run.csv#2", 50),
     ]
     assert {log.surface for log in logs} == {"oak"}
-    with pytest.raises(DataError, match=r"run.csv: 2 runs in one file; expected one run"):
-        read_log(root / GENERIC, layout, root=root)
     broken = lines[1:51]
     broken[10] = broken[10].replace(",6,", ",nan,")
     (root / GENERIC).write_text("\n".join([*lines, *broken, broken[-1]]) + "\n")
     # the row named is that of the file, not of the run inside it
     with pytest.raises(DataError, match=r"row 252, column 'time'"):
-        read_logs(root / GENERIC, dataclasses.replace(layout, new_run="ticks_restart"), root=root)
+        read_log(root / GENERIC, dataclasses.replace(layout, new_run="ticks_restart"), root=root)
 
 
 def test_errors_have_one_form():

@@ -101,7 +101,7 @@ def test_currents_of_a_stall_are_left_out_of_the_mean():
 
 
 def test_a_subset_keeps_the_order_and_the_sessions(logs):
-    data = collect(logs, session=lambda log: log.name.upper())
+    data = collect(logs, [log.name.upper() for log in logs])
     part = data.subset([2, 0])
     assert [log.name for log in part.logs] == ["c.csv", "a.csv"]
     assert part.session == ("C.CSV", "A.CSV")

@@ -26,8 +26,8 @@ from slipid.deploy.trial_summary import Run, summaries
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.support.errors import DataError
-from slipid.testsite.live import Live
-from slipid.testsite.site import Site
+from slipid.testsite.driving import PERIOD
+from tests.helpers.floors import surface_at
 from tests.helpers.known_robot import deploy_known
 
 
@@ -236,7 +236,7 @@ def test_a_map_is_looked_up_under_the_wheels(deployed):
     c, s = np.cos(0.7), np.sin(0.7)
     turned = np.asarray(deployed.places) @ np.array([[c, s], [-s, c]]) + [0.02, -0.01]
     names = [("firm", "soft")[k] for k in under]
-    assert names == [floor.surface_at(float(x), float(y)) for x, y in turned]
+    assert names == [surface_at(floor, float(x), float(y)) for x, y in turned]
     assert len(set(names)) == 2
 
 
@@ -318,9 +318,8 @@ def test_the_summary_is_of_medians_over_starts_with_intervals():
 
 
 def test_live_readings_are_as_the_sensors_log_them():
-    site = Site()
-    live = Live(site, uniform("firm"), "as_built", (0.0, 0.0, 0.0), seed=1)
-    forward = site.machine.wheel_from_twist @ np.array([0.2, 0.0, 0.0])
+    live = SitePlant(uniform("firm"), "as_built", (0.0, 0.0, 0.0), 1, gyro=False)
+    forward = live.plant.machine.wheel_from_twist @ np.array([0.2, 0.0, 0.0])
     for _ in range(20):
         reading = live.step(forward)
     tick = 2 * np.pi / (2000 * 16)
@@ -329,7 +328,7 @@ def test_live_readings_are_as_the_sensors_log_them():
     )
     assert (reading.current >= 0).all()  # magnitudes
     assert np.isnan(reading.gyro)
-    assert live.plant.time == pytest.approx(20 * live.period)
+    assert live.plant.time == pytest.approx(20 * PERIOD)
     assert live.pose[0] > 0.1  # a delay and a slew, then 0.2 m/s
 
 

@@ -34,9 +34,8 @@ from slipid.identify.fit.optimise import Options, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.result import Channels
 from slipid.search_space import Choice
-from slipid.selftest.known import blank, truth
+from slipid.selftest.known import Sensors, blank, truth
 from slipid.selftest.logs import make_logs
-from slipid.selftest.plan import Sensors
 from tests.helpers.made_windows import measure
 
 SETUP = ("soft", "as_built")

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from slipid.data.log import Log
-from slipid.data.write import own_csv, own_layout
+from slipid.data.write import own_columns, own_csv
 from slipid.model.robot import Robot
 from slipid.parameter import entries
 from slipid.selftest.known import numbers
@@ -12,7 +12,12 @@ from slipid.support.files import write_bytes, write_json
 
 TICKS = 2000
 """Per turn of the motor."""
-LAYOUT = own_layout(3, 16.0, TICKS)
+LAYOUT = {
+    "ticks_per_revolution": TICKS,
+    "gear_ratio": 16.0,
+    "current_is_signed": False,
+    "columns": own_columns(3, ["voltage"]),
+}
 """Layout of the files `write_logs` writes, as a config declares it; `voltage = false` without."""
 
 

@@ -14,11 +14,11 @@ from slipid.identify.fit.problem import Problem
 from slipid.identify.slip_curves import curves, slip_on
 from slipid.identify.verdicts.estimates import by_ratio, expected_covariance, from_zero
 from slipid.search_space import Choice, Space
-from slipid.selftest.known import blank, truth
+from slipid.selftest.known import Sensors, blank, grid, truth
 from slipid.selftest.logs import make_logs
-from slipid.selftest.plan import Sensors, grid
 
-PLAN = grid(headings=8, turns=1)
+SETUPS = (("firm", "as_built"), ("soft", "as_built"), ("soft", "moved"))
+PLAN = grid(SETUPS, headings=8, turns=1)
 TRUTH = truth(PLAN)
 LAG = 0.05
 

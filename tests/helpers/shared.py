@@ -14,9 +14,8 @@ from typer.testing import CliRunner
 
 from slipid.cli.demo import packaged_config
 from slipid.cli.main import app
-from slipid.selftest.known import truth
+from slipid.selftest.known import Sensors, grid, truth
 from slipid.selftest.logs import make_logs
-from slipid.selftest.plan import Sensors, grid
 from tests.helpers.made_logs import write_logs
 
 DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)

@@ -28,9 +28,8 @@ from slipid.identify.result import Fit, hash_of, summarise
 from slipid.identify.verdicts.estimates import estimates, expected_covariance
 from slipid.identify.verdicts.unidentified import flat_directions
 from slipid.search_space import Choice
-from slipid.selftest.known import blank, truth
+from slipid.selftest.known import Sensors, blank, grid, truth
 from slipid.selftest.logs import make_logs
-from slipid.selftest.plan import Sensors, grid
 from slipid.support.errors import DataError
 
 pytestmark = pytest.mark.slow  # traces whole fits
@@ -414,8 +413,7 @@ def in_sessions(session, seed):
         pose = log.pose.copy()
         pose[:, :2] += far[:, None] * (np.array([along, across]) @ turn)
         moved.append(dataclasses.replace(log, pose=pose))
-    of = {log.name: f"s{k}" for log, k in zip(moved, session, strict=True)}
-    return collect(moved, session=lambda log: of[log.name])
+    return collect(moved, [f"s{k}" for k in session])
 
 
 def test_what_sessions_share_is_stored_with_its_unit():

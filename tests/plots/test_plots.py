@@ -25,9 +25,8 @@ from slipid.plots.motion import heading_figure
 from slipid.plots.seen import by_heading, seen
 from slipid.plots.wheels import current_figure, driving_torque, wheel_curve
 from slipid.search_space import Choice
-from slipid.selftest.known import blank, truth
+from slipid.selftest.known import Sensors, blank, grid, truth
 from slipid.selftest.logs import make_logs
-from slipid.selftest.plan import Sensors, grid
 
 pytestmark = pytest.mark.slow  # traces whole fits
 

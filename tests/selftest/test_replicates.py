@@ -23,8 +23,8 @@ from slipid.identify.fit.problem import Problem
 from slipid.job.config import parsed
 from slipid.job.problem import Job
 from slipid.selftest import replicates as selftest
+from slipid.selftest.experiment import judged, summary
 from slipid.selftest.replicates import Curve, Number, Replicate
-from slipid.selftest.summary import judged, summary
 from slipid.selftest.windows import measure
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.progress import Reporter

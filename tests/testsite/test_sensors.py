@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.data.reading.declared import declared_layout
-from slipid.data.reading.presets import preset
-from slipid.data.reading.reader import read_log
-from slipid.data.write import OPTIONAL, own_csv, own_layout, robotino2022_csv
-from slipid.testsite.driving import Trace
-from slipid.testsite.experiments import straight
+from slipid.data.reading.presets import declared_layout, preset
+from slipid.data.write import OPTIONAL, own_columns, own_csv, robotino2022_csv
+from slipid.testsite.driving import Trace, straight
 from slipid.testsite.machine import Machine
 from slipid.testsite.simulate.observe import observe
 from slipid.testsite.site import Sensors, Site
+from tests.helpers.made_logs import LAYOUT
+from tests.helpers.one_log import read_log
 
 EXACT = Sensors(
     current_noise_a=0.0,
@@ -128,7 +127,7 @@ def test_own_columns_come_back(trace, sensors, tmp_path):
     path.parent.mkdir(parents=True)
     path.write_text(own_csv(log, 16.0, 2000))
     more = [channel for channel in OPTIONAL if getattr(log, channel) is not None]
-    layout = declared_layout(own_layout(3, 16.0, 2000, False, more), "made")
+    layout = declared_layout(LAYOUT | {"columns": own_columns(3, more)}, "made")
     again = read_log(path, layout, root=tmp_path, surface="soft")
     np.testing.assert_allclose(again.time - again.time[0], log.time - log.time[0], atol=1e-4)
     np.testing.assert_allclose(again.wheel_angle, log.wheel_angle, atol=1e-9)

@@ -15,22 +15,20 @@ import pytest
 from typer.testing import CliRunner
 
 from slipid.cli.main import app
-from slipid.data.floor_map import four_zones
-from slipid.data.map_file import read_map
+from slipid.data.floor_map import four_zones, read_map
 from slipid.data.reading.presets import preset
-from slipid.data.reading.reader import read_log
 from slipid.job.config import parsed
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
-from slipid.testsite.camera import Camera
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.machine import Machine
-from slipid.testsite.simulate.config import plan, read_plan
-from slipid.testsite.simulate.identify_config import can_identify, identify_config
+from slipid.testsite.simulate.config import can_identify, identify_config, plan
 from slipid.testsite.simulate.simulate import Job, _place, simulate, truth
-from slipid.testsite.site import Site
+from slipid.testsite.site import Camera, Site
 from slipid.testsite.studio import MARKER, Studio, film
 from tests.conftest import ROOT
+from tests.helpers.floors import surface_at
+from tests.helpers.one_log import read_log
 
 SMALL = """
 seed = 3
@@ -68,7 +66,7 @@ def config(tmp_path):
 
 def quietly(config, out, jobs=1):
     with Reporter(quiet=True) as report:
-        return simulate(read_plan(config), out, jobs, report)
+        return simulate(plan(config, config.read_text()), out, jobs, report)
 
 
 def sums(folder):
@@ -112,7 +110,7 @@ def test_the_same_seed_writes_the_same_bytes_with_any_number_of_processes(config
     assert np.median(np.abs(seen - x)) < 0.003
     floor = read_map(tmp_path / "one/maps/zones.toml")
     assert floor.surfaces == ("firm", "soft", "medium", "short")
-    assert floor.surface_at(0.8, 0.0) == "soft"
+    assert surface_at(floor, 0.8, 0.0) == "soft"
 
 
 def children(pid):
@@ -161,7 +159,7 @@ def test_another_config_does_not_mix_with_what_is_there(config, tmp_path):
 
 
 def test_known_surfaces_are_changed_and_others_made_anew(config):
-    found = read_plan(config)
+    found = plan(config, config.read_text())
     assert found.site.grounds["soft"].friction == 0.7
     assert found.site.grounds["soft"].rolling_m == GROUNDS["soft"].rolling_m
     assert found.site.grounds["snow"].friction == 0.3
@@ -181,7 +179,7 @@ def test_a_map_is_read_from_its_file_beside_the_config(tmp_path):
     text = SMALL.replace('kind = "four_zones", surfaces = ["firm", "soft", "medium", "short"]', "x")
     text = text.replace("{ x }", '{ kind = "file", file = "floor.toml" }')
     found = plan(tmp_path / "site.toml", text)
-    assert found.maps["zones"].surface_at(0.4, 0.1) == "soft"
+    assert surface_at(found.maps["zones"], 0.4, 0.1) == "soft"
     other = (tmp_path / "floor.toml").read_text().replace("0.5, 0.5", "0.5, 0.9")
     (tmp_path / "floor.toml").write_text(other)
     assert plan(tmp_path / "site.toml", text).hash != found.hash
@@ -189,7 +187,7 @@ def test_a_map_is_read_from_its_file_beside_the_config(tmp_path):
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("testsite*.toml")))
 def test_the_configs_that_ship_are_good(path):
-    assert read_plan(path).runs
+    assert plan(path, path.read_text()).runs
 
 
 @pytest.mark.parametrize(
@@ -289,7 +287,7 @@ def test_only_runs_that_a_fit_can_use_get_a_config_for_it(tmp_path):
     config = tmp_path / "x.toml"
     start = SMALL.index("[[runs]]")
     config.write_text(SMALL[:start] + SMALL[SMALL.index("[[runs]]", start + 1) :])
-    assert not can_identify(read_plan(config))
+    assert not can_identify(plan(config, config.read_text()))
     assert can_identify(plan(config, SMALL))
 
 
@@ -353,12 +351,20 @@ def studio():
     made.close()
 
 
+def pixels(camera, points):
+    """Pixels at which points of the world are seen."""
+    turn, _ = cv2.Rodrigues(camera.rotation)
+    shift = -camera.rotation @ camera.place
+    seen, _ = cv2.projectPoints(points, turn, shift, camera.matrix, np.array(camera.distortion))
+    return seen[:, 0]
+
+
 def corners(pose, machine, camera):
     """Where the marker's corners should be seen, in ArUco's order."""
     yaw, half = pose[2] + np.radians(machine.marker_yaw_deg), 0.5 * machine.marker_size_m
     c, s = np.cos(yaw), np.sin(yaw)
     flat = half * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) @ np.array([[c, s], [-s, c]])
-    return camera.pixels(np.c_[flat + pose[:2], np.full(4, machine.marker_height_m)])
+    return pixels(camera, np.c_[flat + pose[:2], np.full(4, machine.marker_height_m)])
 
 
 def test_the_marker_is_seen_where_the_camera_says(studio):
@@ -377,7 +383,7 @@ def test_the_marker_is_seen_where_the_camera_says(studio):
 def test_the_floor_has_its_colours_where_its_patches_are(studio):
     image = studio.frame(np.array([0.45, -0.2, 0.0]), np.zeros(3)).astype(float)
     for place, name in (((-0.3, 0.3), "firm"), ((0.9, 0.3), "medium"), ((0.0, -0.6), "short")):
-        x, y = HALF.pixels(np.array([[*place, 0.0]]))[0].round().astype(int)
+        x, y = pixels(HALF, np.array([[*place, 0.0]]))[0].round().astype(int)
         seen = image[y - 8 : y + 8, x - 8 : x + 8].mean(axis=(0, 1))[::-1]
         colour = GROUNDS[name].colour
         wanted = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], float)
@@ -410,7 +416,8 @@ def test_a_video_has_all_its_frames(studio, tmp_path):
     time_s = np.arange(0.0, 0.3, 0.01)
     pose = np.stack([0.3 + 0.2 * time_s, 0 * time_s, 0 * time_s], axis=1)
     frames = np.arange(0.0, 0.25, 0.05)
-    film(studio, time_s, pose, np.zeros((len(time_s), 3)), frames, tmp_path / "run.avi")
+    true = {"time": time_s, "pose": pose, "wheel_angle": np.zeros((len(time_s), 3))}
+    film(studio, true, frames, tmp_path / "run.avi")
     video = cv2.VideoCapture(str(tmp_path / "run.avi"))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == len(frames)
     assert video.read()[1].shape == (540, 960, 3)

@@ -7,7 +7,7 @@ import numpy as np
 
 from slipid.baselines.paper2021.samples import FIGURES_3_AND_4, Recipe
 from slipid.data.log import Log
-from slipid.data.signals.wheel_signals import body_steps, first_moved
+from slipid.data.wheel_signals import body_steps, first_moved
 
 DEGREE = 1
 """Of the polynomial in current, as deployed."""

@@ -1,15 +1,12 @@
 """Checks every log passes once, at the door; each failure names file, row and what was expected."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.layout import Layout
+from slipid.data.reading.layout import Channel, Layout
 from slipid.data.reading.table import Table
-from slipid.data.signals.wheel_order import best_wheel_order, describe
-from slipid.data.signals.wheel_signals import integrated_steps, interpolate, step_edges
+from slipid.data.wheel_signals import integral, interpolate, stretches, swapped_order
 from slipid.support.errors import bad_data
 
 MIN_ROWS = 2
@@ -63,21 +60,15 @@ def check_time(table: Table, layout: Layout, time: Float[np.ndarray, " row"]) ->
 
 
 def filled(
-    table: Table,
-    columns: Sequence[str | int],
-    cells: Float[np.ndarray, "row column"],
-    time: Float[np.ndarray, " row"],
-    notes: list[str],
+    table: Table, channel: Channel, time: Float[np.ndarray, " row"], notes: list[str]
 ) -> Float[np.ndarray, "row column"]:
-    """Cells with up to three missing in a row filled linearly in time; bursts are refused.
+    """Cells of a channel, up to three missing in a row filled linearly in time; bursts are refused.
 
     Raises:
         DataError: an infinite cell, a burst of missing ones, or too many of them in all.
     """
-    if np.isfinite(cells).all():
-        return cells
-    cells = cells.copy()
-    for j, column in enumerate(columns):
+    cells = table.stacked(channel)
+    for j, column in enumerate(channel.columns):
         values = cells[:, j]
         infinite = np.flatnonzero(np.isinf(values))
         if len(infinite):
@@ -86,8 +77,7 @@ def filled(
         missing = np.isnan(values)
         if not missing.any():
             continue
-        stretches = np.flatnonzero(np.diff(np.concatenate([[0], missing, [0]]))).reshape(-1, 2)
-        first, end = max(stretches.tolist(), key=lambda ends: ends[1] - ends[0])
+        first, end = max(stretches(missing).tolist(), key=lambda ends: ends[1] - ends[0])
         rows = (int(table.lines[first]), int(table.lines[end - 1]))
         if end - first > MAX_FILLED:
             found = f"{end - first} missing values in a row"
@@ -168,19 +158,22 @@ def _check_wheels(log: Log, table: Table, layout: Layout) -> None:
 
 def _check_order(log: Log, table: Table, layout: Layout) -> None:
     """Refuse wheel columns in another order than those of the commanded or reported speeds."""
+    # steps of half a second: delays and jitter do not matter
+    edges = np.linspace(log.time[0], log.time[-1], max(2, int(log.duration / 0.5) + 1))
     for name in ("wheel_speed_command", "wheel_speed"):
         reference = getattr(log, name)
         if reference is None:
             continue
-        edges = step_edges(log.time)
-        measured = np.diff(interpolate(log.time, log.wheel_angle, edges), axis=0)
-        order = best_wheel_order(measured, integrated_steps(log.time, reference, edges))
-        if order.is_swapped:
-            other = np.flatnonzero(np.array(order.order) != np.arange(log.wheels))
-            turned = np.flatnonzero(np.array(order.signs) < 0)
-            j = int(other[0] if len(other) else turned[0])
+        measured, said = (
+            np.diff(interpolate(log.time, angle, edges), axis=0)
+            for angle in (log.wheel_angle, integral(log.time, reference))
+        )
+        if order := swapped_order(measured, said):
+            elsewhere = [j for j, wheel in enumerate(order) if abs(wheel) != j + 1]
+            j, *_ = elsewhere or [j for j, wheel in enumerate(order) if wheel < 0]
             found = f"the wheel does not move as its {name} says"
-            expected = f"wheels in the order {describe(order)} (swapped or reversed columns?)"
+            listed = ", ".join(map(str, order))
+            expected = f"wheels in the order {listed} (swapped or reversed columns?)"
             raise _at(table, layout, "wheel", None, j, found, expected)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.units import same_unit
-from slipid.support.errors import DataError, bad_data
+from slipid.support.errors import bad_data
 
 _MISSING = {"", "nan", "na", "n/a", "null", "none"}
 
@@ -54,9 +54,12 @@ def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
         raise bad_data(path, found, f"cells separated by {layout.delimiter!r}", row=row)
     if not layout.names_row:
         return [""] * len(cells)
-    if all(_is_number(cell) for cell in cells if cell):
-        raise bad_data(path, "numbers", f"the column names ({_some(layout.columns)})", row=row)
-    return cells
+    try:
+        [float(cell) for cell in cells if cell]
+    except ValueError:
+        return cells
+    names = ", ".join(map(str, layout.columns[:6])) + ", ..." * (len(layout.columns) > 6)
+    raise bad_data(path, "numbers", f"the column names ({names})", row=row)
 
 
 def wanted_names(
@@ -144,25 +147,10 @@ def cell_by_cell(
                 # Python would read 1_000 as a thousand; no logger writes that on purpose.
                 values[i, j] = float(cell.replace("_", "?"))
             except ValueError:
+                comma = re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell)
+                more = " with a decimal point, not a decimal comma" if comma else ""
                 row, column = layout.first_data_row + i, str(names[j])
-                raise _bad_cell(path, cell, row, column) from None
+                raise bad_data(
+                    path, f"'{cell[:40]}'", f"a number{more}", row=row, column=column
+                ) from None
     return values
-
-
-def _bad_cell(path: Path, cell: str, row: int, column: str) -> DataError:
-    expected = "a number"
-    if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell):
-        expected = "a number with a decimal point, not a decimal comma"
-    return bad_data(path, f"'{cell[:40]}'", expected, row=row, column=column)
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _some(names: tuple[str | int, ...]) -> str:
-    return ", ".join(map(str, names[:6])) + (", ..." if len(names) > 6 else "")

@@ -15,8 +15,8 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.units import converts, factor
-from slipid.support.bounds import CLOSED, Positive
 from slipid.support.errors import near
+from slipid.support.toml_file import CLOSED, Positive
 
 PER_WHEEL = {
     "wheel_ticks": "tick",
@@ -133,11 +133,6 @@ class Layout:
     max_gap: Positive = 1.0
     max_pose_jump: Positive = 0.5
     max_heading_jump: Positive = 1.6
-
-    @property
-    def wheels(self) -> int:
-        """Number of wheels, 0 where the file has poses only."""
-        return next((len(c.columns) for n, c in self.channels.items() if n in PER_WHEEL), 0)
 
     @property
     def columns(self) -> tuple[str | int, ...]:

@@ -1,7 +1,8 @@
-"""Read logs: from a file and its layout to a `Log` in SI units, checked once, here."""
+"""Read logs: from files and their layout to runs in SI units, checked once, here."""
 
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -9,51 +10,80 @@ from jaxtyping import Float
 from slipid.data.log import Log
 from slipid.data.reading.checks import MIN_ROWS, check_log, check_time, filled, unwrapped_ticks
 from slipid.data.reading.layout import Layout
+from slipid.data.reading.presets import preset
 from slipid.data.reading.table import Table, read_table
-from slipid.data.signals.wheel_signals import integral
-from slipid.support.errors import DataError, bad_data
+from slipid.data.runs import Runs, collect, default_session
+from slipid.data.wheel_signals import integral
+from slipid.support.errors import DataError
+
+Session = Literal["surface/load/speed", "folder", "file"]
+"""What runs have in common between which the camera's marker stayed as it was."""
 
 
-def read_log(
-    path: Path,
-    layout: Layout,
+def read_runs(
+    folder: Path | str,
+    pattern: str,
+    layout: Layout | str,
     *,
-    root: Path | None = None,
-    surface: str | None = None,
+    surface: str | None = "folder",
     load: str = "as_built",
-) -> Log:
-    """The one run in a CSV or Parquet file.
+    session: Session = "surface/load/speed",
+) -> Runs:
+    """Every run of the files that match a glob.
+
+    Runs of another load set-up are read by another call and added: `as_built + moved`.
 
     Args:
-        root: data folder the log's name is relative to; the file's own folder where None.
-        surface, load: names of the floor and the load set-up.
+        folder: data folder, which the names of the runs are relative to.
+        pattern: glob below the folder, such as `one_surface/*/*.csv`.
+        layout: how the files are laid out, or the name of a preset.
+        surface: name of the floor, `folder` for that of the folder each file lies in, or None where
+            it is unknown.
+        load: name of the load set-up.
+        session: what runs have in common between which the camera's marker stayed as it was.
+
+    Raises:
+        DataError: no file matches, or one is wrong; the message names the file and the row.
+    """
+    root = Path(folder)
+    chosen = preset(layout) if isinstance(layout, str) else layout
+    logs = [
+        log
+        for path in find_logs(root, pattern)
+        for log in read_logs(path, chosen, root, surface, load)
+    ]
+    return collect(logs, [session_of(log, session) for log in logs])
+
+
+def session_of(log: Log, session: Session) -> str:
+    """Name of the session of a run: its file, the folder of its file, or how it was driven."""
+    if session == "file":
+        return log.name
+    if session == "folder":
+        return log.name.rpartition("/")[0] or log.name
+    return default_session(log)
+
+
+def read_logs(
+    path: Path, layout: Layout, root: Path, surface: str | None, load: str
+) -> tuple[Log, ...]:
+    """Every run in a CSV or Parquet file, where `layout.new_run` tells them apart.
+
+    Parts of a file of a single row hold no motion and are left out.
+
+    Args:
+        root: data folder above the file, which the names of the runs are relative to.
+        surface: name of the floor; `folder` stands for that of the file's folder less `_surface`.
+        load: name of the load set-up.
 
     Raises:
         DataError: the file, row or column that is wrong, what is there and what was expected.
     """
-    logs = read_logs(path, layout, root=root, surface=surface, load=load)
-    if len(logs) > 1:
-        raise bad_data(path, f"{len(logs)} runs in one file", "one run (read_logs reads several)")
-    return logs[0]
-
-
-def read_logs(
-    path: Path,
-    layout: Layout,
-    *,
-    root: Path | None = None,
-    surface: str | None = None,
-    load: str = "as_built",
-) -> tuple[Log, ...]:
-    """Every run in a file, where `layout.new_run` tells them apart; arguments as of `read_log`.
-
-    Parts of a file of a single row hold no motion and are left out.
-    """
+    surface = path.parent.name.removesuffix("_surface") if surface == "folder" else surface
     table = read_table(path, layout)
     if layout.drop_repeated_time:
         table = table.rows(np.append(np.diff(_time(table, layout)) != 0, True))
-    below = root if root is not None and path.is_relative_to(root) else path.parent
-    name = path.relative_to(below).as_posix()
+    name = path.relative_to(root).as_posix()
     starts = _run_starts(table, layout)
     if len(starts) == 1:
         return (_log(table, layout, name, surface, load),)
@@ -122,7 +152,7 @@ def _log(table: Table, layout: Layout, name: str, surface: str | None, load: str
         twist_command=_twist(have, len(time)),
         current=have.get("current"),
         current_is_signed=layout.current_is_signed,
-        voltage=have.get("voltage"),
+        voltage=_voltage(have),
         duty=have.get("duty"),
         bus_voltage=have["bus_voltage"][:, 0] if "bus_voltage" in have else None,
         gyro=have["gyro"][:, 0] if "gyro" in have else None,
@@ -149,7 +179,7 @@ def _channel(
 ) -> Float[np.ndarray, "row column"]:
     """A channel in SI units, short gaps filled."""
     channel = layout.channels[name]
-    cells = filled(table, channel.columns, table.stacked(channel), time, notes)
+    cells = filled(table, channel, time, notes)
     if name == "wheel_ticks" and not layout.ticks_are_increments:
         cells = unwrapped_ticks(cells, layout.tick_bits, notes)
     return (cells * channel.scale + channel.offset) * layout.to_si(name)
@@ -187,6 +217,13 @@ def _at_wheel(layout: Layout, have: dict[str, np.ndarray], what: str) -> np.ndar
     return None
 
 
+def _voltage(have: dict[str, np.ndarray]) -> np.ndarray | None:
+    """As logged, else the duty cycle of the bus voltage where both were."""
+    if "voltage" not in have and {"duty", "bus_voltage"} <= have.keys():
+        return have["duty"] * have["bus_voltage"]
+    return have.get("voltage")
+
+
 def _twist(have: dict[str, np.ndarray], rows: int) -> np.ndarray | None:
     names = [f"twist_command_{axis}" for axis in ("x", "y", "yaw")]
     if not have.keys() & set(names):
@@ -200,11 +237,11 @@ def _pose(
     """Pose with the heading unwrapped, and which rows bring a new camera frame."""
     if "pose_x" not in have:
         return None, None
-    names = [layout.channels[f"pose_{part}"].columns[0] for part in ("x", "y", "heading")]
-    cells = np.column_stack([table[name] for name in names])
+    names = ("pose_x", "pose_y", "pose_heading")
+    cells = np.concatenate([table.stacked(layout.channels[name]) for name in names], axis=1)
     fresh = np.ones(len(cells), dtype=bool)
     fresh[1:] = np.any(np.diff(cells, axis=0) != 0, axis=1)
     fresh &= ~np.isnan(cells).any(axis=1)
-    pose = np.concatenate([have["pose_x"], have["pose_y"], have["pose_heading"]], axis=1)
+    pose = np.concatenate([have[name] for name in names], axis=1)
     pose[:, 2] = np.unwrap(pose[:, 2])
     return pose, fresh

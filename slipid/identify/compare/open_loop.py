@@ -5,7 +5,7 @@ start.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -70,7 +70,7 @@ def cuts(data: Runs, robot: Robot) -> list[Windows]:
             some = runs[first : first + TOGETHER]
             w = windows(data.subset(some), radius, lag, per_piece=steps, longest=np.inf)
             filled = np.minimum(np.arange(TOGETHER), len(w) - 1)
-            out.append(w.of_runs(np.asarray(some)[w.run]).pieces(filled))
+            out.append(replace(w, run=np.asarray(some)[w.run]).pieces(filled))
     return out
 
 

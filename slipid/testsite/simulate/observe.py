@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from slipid.data.log import Log
-from slipid.testsite.driving import Trace
-from slipid.testsite.experiments import Run
+from slipid.data.wheel_signals import interpolate
+from slipid.testsite.driving import Run, Trace
 from slipid.testsite.site import Site
 
 
@@ -75,7 +75,7 @@ def _camera(
     first = -(s.lag_s + 3 * s.frame_s)  # so that there is one to be logged when it starts
     taken = np.arange(first, trace.time[-1] + s.frame_s, s.frame_s) + rng.uniform(0, s.frame_s)
     taken = taken[(rng.uniform(size=len(taken)) >= s.dropout) | (taken + delay <= 0.0)]
-    seen = np.stack([np.interp(taken, trace.time, trace.pose[:, k]) for k in range(3)], axis=1)
+    seen = interpolate(trace.time, trace.pose, taken)
     seen[:, 2] += float(np.radians(site.machine.marker_yaw_deg))
     seen[:, :2] += s.camera_noise_m * rng.normal(size=(len(taken), 2))
     seen[:, 2] += s.camera_noise_rad * rng.normal(size=len(taken))

@@ -7,14 +7,13 @@ import numpy as np
 from pydantic import Field
 
 from slipid.data import floor_map as terrain
-from slipid.data.map_file import read_map
+from slipid.data.floor_map import read_map
 from slipid.support.toml_file import Section
-from slipid.testsite.camera import Camera
-from slipid.testsite.experiments import Run, Waypoints, straight
+from slipid.testsite.driving import Run, Waypoints, straight
 from slipid.testsite.ground import Ground
 from slipid.testsite.machine import Machine
 from slipid.testsite.motors import Motor, SpeedLoop
-from slipid.testsite.site import Sensors
+from slipid.testsite.site import Camera, Sensors
 
 Speed = Annotated[float, Field(gt=0, le=3)]
 Speeds = Annotated[list[Speed], Field(min_length=1)]

@@ -8,21 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.data.map_file import write_map
+from slipid.data.floor_map import write_map
 from slipid.data.write import own_csv, robotino2022_csv
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, write_arrays, write_bytes, write_json
 from slipid.support.progress import Reporter
 from slipid.support.workers import spread
-from slipid.testsite.camera import Camera
-from slipid.testsite.driving import Trace, drive
-from slipid.testsite.experiments import Run
+from slipid.testsite.driving import Run, Trace, drive
 from slipid.testsite.plant import engine
-from slipid.testsite.simulate.config import Plan
-from slipid.testsite.simulate.identify_config import can_identify, identify_config
+from slipid.testsite.simulate.config import Plan, can_identify, identify_config
 from slipid.testsite.simulate.observe import observe
-from slipid.testsite.site import Site
+from slipid.testsite.site import Camera, Site
 from slipid.testsite.studio import Studio, film
 
 MANIFEST = "simulate.json"
@@ -110,7 +107,7 @@ def film_and_write(what: tuple[Job, Camera]) -> None:
         rows = "".join(f"{k},{t:.4f}\n" for k, t in enumerate(frames))
         write_bytes(path.with_suffix(".csv"), f"frame,time\n{rows}".encode())
         with closing(studio):
-            film(studio, true["time"], true["pose"], true["wheel_angle"], frames, path)
+            film(studio, dict(true), frames, path)
 
 
 def _video(job: Job) -> Path:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.data.reading.declared import declared_layout
-from slipid.data.reading.folders import read_runs, session_of, surface_of, with_voltage
+from slipid.data.reading.presets import declared_layout
+from slipid.data.reading.reader import read_runs, session_of
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import GENERIC, GENERIC_LAYOUT, ROBOTINO, write_good
 
@@ -37,7 +37,7 @@ def test_the_folder_names_the_surface(root):
 def test_a_surface_may_be_named_or_unknown(root):
     assert read(root, surface="oak").logs[0].surface == "oak"
     assert read(root, surface=None).logs[0].surface is None
-    assert surface_of(root / "gray_surface" / "a.csv", "gray_surface") == "gray_surface"
+    assert read(root, surface="gray_surface").logs[0].surface == "gray_surface"
 
 
 def test_sessions(root):
@@ -73,10 +73,16 @@ def test_what_is_not_there_is_said(root):
 
 
 def test_voltage_from_duty_only_where_it_was_not_logged(root):
-    (log,) = read(root).logs
-    assert with_voltage(log) is log
-    duty = np.full_like(log.wheel_angle, 0.5)
-    driven = replace(log, duty=duty, bus_voltage=np.full(log.samples, 12.0))
-    np.testing.assert_array_equal(with_voltage(driven).voltage, 12.0 * duty)
-    logged = replace(driven, voltage=7.0 * duty)
-    assert with_voltage(logged) is logged
+    columns = dict(GENERIC_LAYOUT["columns"])
+    columns["duty"] = {"columns": ["left_a", "right_a"], "unit": "1"}
+    columns["bus_voltage"] = {"column": "y", "unit": "V"}
+
+    def voltage(columns):
+        layout = declared_layout(GENERIC_LAYOUT | {"columns": columns}, "layout")
+        return read_runs(root, GENERIC, layout, surface=None).logs[0].voltage
+
+    np.testing.assert_array_equal(voltage(columns)[0], [6.0, 6.1])
+    del columns["voltage"]
+    np.testing.assert_array_equal(voltage(columns)[0], [0.5, 0.6])
+    del columns["duty"]
+    assert voltage(columns) is None

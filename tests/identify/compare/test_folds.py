@@ -29,9 +29,8 @@ from slipid.identify.fit.problem import DEGREES, Problem, State
 from slipid.identify.fit.sessions import Linear, shared
 from slipid.job.compare import finished
 from slipid.search_space import Choice
-from slipid.selftest.known import truth
+from slipid.selftest.known import Sensors, grid, truth
 from slipid.selftest.logs import make_logs
-from slipid.selftest.plan import Sensors, grid
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
 from tests.helpers.made_logs import write_logs

@@ -20,9 +20,8 @@ from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit_file import load, save
 from slipid.identify.result import summarise
 from slipid.search_space import Choice
-from slipid.selftest.known import blank, truth
+from slipid.selftest.known import Sensors, blank, grid, truth
 from slipid.selftest.logs import make_logs
-from slipid.selftest.plan import Sensors, grid
 from tests.helpers import designs
 
 pytestmark = pytest.mark.slow  # traces a whole likelihood

@@ -29,9 +29,8 @@ from slipid.job.config import read_config
 from slipid.job.problem import read_job, with_mixed
 from slipid.model import se2
 from slipid.search_space import Choice, Space
-from slipid.selftest.known import truth
+from slipid.selftest.known import Sensors, grid, truth
 from slipid.selftest.logs import make_logs
-from slipid.selftest.plan import Sensors, grid
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import ROBOTINO, robotino_text, write_good
 from tests.helpers.made_logs import write_logs

@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slipid.data.signals.wheel_order import best_wheel_order, describe
-from slipid.data.signals.wheel_signals import (
+from slipid.data.wheel_signals import (
     body_steps,
     bridge_stalls,
     first_moved,
     integral,
-    integrated_steps,
-    interpolate,
+    swapped_order,
 )
 
 AZIMUTH = np.radians([60.0, 180.0, 300.0])
@@ -25,19 +23,7 @@ def rng():
     return np.random.default_rng(7)
 
 
-def uneven(rng, seconds=10.0, period=0.031):
-    return np.cumsum(rng.normal(period, 0.002, int(seconds / period)).clip(0.02))
-
-
-# interpolation and speed
-
-
-def test_interpolation_is_numpys(rng):
-    time, at = uneven(rng), np.linspace(-1.0, 12.0, 500)
-    values = rng.normal(size=(len(time), 3))
-    expected = np.stack([np.interp(at, time, column) for column in values.T], axis=1)
-    np.testing.assert_allclose(interpolate(time, values, at), expected, atol=1e-12)
-    np.testing.assert_allclose(interpolate(time, values[:, 0], at), expected[:, 0], atol=1e-12)
+# stalls
 
 
 def stalled_run(rng, at=100, rows=7):
@@ -72,8 +58,8 @@ def test_wheels_that_stop_are_no_stall(rng):
 def test_first_moved():
     angle = np.array([[1.0, 0.0], [1.1, 0.0], [1.2, -0.3], [1.3, -0.6]])
     assert first_moved(angle, radius=0.04) == 2
-    assert first_moved(angle, radius=0.04, distance=0.004) == 1
-    assert first_moved(angle, radius=0.04, distance=1.0) is None
+    assert first_moved(angle, radius=0.11) == 1
+    assert first_moved(angle, radius=0.001) is None
 
 
 def test_wheel_order_is_found(rng):
@@ -82,18 +68,15 @@ def test_wheel_order_is_found(rng):
     measured = np.empty_like(reference)
     for wheel, (position, sign) in enumerate(zip(order, signs, strict=True)):
         measured[:, position] = sign * reference[:, wheel]
-    found = best_wheel_order(measured + 0.01 * rng.normal(size=(200, 4)), reference)
-    assert (found.order, found.signs) == (order, signs)
-    assert found.is_swapped
-    assert found.misfit < 1e-3
-    assert describe(found) == "3, -1, 4, -2"
+    found = swapped_order(measured + 0.01 * rng.normal(size=(200, 4)), reference)
+    assert found == (3, -1, 4, -2)
 
 
 def test_sound_wheels_pass_and_slip_is_no_swap(rng):
     reference = rng.normal(size=(200, 3))
-    assert not best_wheel_order(0.6 * reference, reference).is_swapped
-    assert not best_wheel_order(rng.normal(size=(200, 3)), reference).is_swapped
-    assert not best_wheel_order(0 * reference, reference).is_swapped
+    assert swapped_order(0.6 * reference, reference) is None
+    assert swapped_order(rng.normal(size=(200, 3)), reference) is None
+    assert swapped_order(0 * reference, reference) is None
 
 
 # steps
@@ -105,8 +88,6 @@ def test_integrals_of_rates_are_those_of_scipy(rng):
     time, rate = np.cumsum(rng.uniform(0.02, 0.04, 50)), rng.normal(size=(50, 3))
     whole = integral(time, rate)
     np.testing.assert_allclose(whole, cumulative_trapezoid(rate, time, axis=0, initial=0.0))
-    steps = integrated_steps(time, rate, time[[0, 20, 49]])
-    np.testing.assert_allclose(steps, np.diff(whole[[0, 20, 49]], axis=0), atol=1e-12)
 
 
 def test_steps_of_a_body_that_drives_ahead_on_a_circle():

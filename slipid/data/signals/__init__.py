@@ -1,1 +1,0 @@
-"""Speeds, stalls, lags and the order of wheels, from raw channels."""

@@ -1,0 +1,171 @@
+"""Which model is right, what to drive next, and how the robot is best driven, as tables."""
+
+import math
+from pathlib import Path
+
+from rich.table import Table
+from rich.text import Text
+
+from slipid.report.page import Page, table
+from slipid.support.content import Content
+
+SHOWN = 3
+"""Goals of a design that have a column of their own."""
+
+
+def show_comparison(page: Page, found: Content) -> None:
+    """Write the content of comparison.json: a line per model, a column per floor, sentences."""
+    for question, answer in found["questions"].items():
+        page.line(
+            f"{question} left out: log density less the best's ± clustered standard error (nats "
+            "per run), mean end-point error (%), ends in the 90 % region (%)"
+        )
+        page.table(_ladder(answer))
+        for one in answer["floors"].values():
+            page.line(one["sentence"])
+            low, high = one["band90"]
+            missed = [
+                f"{model} {100 * m['coverage90']:.0f}"
+                for model, m in one["models"].items()
+                if not low <= m["coverage90"] <= high
+            ]
+            if missed:
+                page.line(
+                    f"  not in {100 * low:.0f} to {100 * high:.0f} %, where honest 90 % regions "
+                    f"hold ends: {', '.join(missed)}"
+                )
+        page.line()
+    if found["surfaces"]:
+        one = found["surfaces"]["all"]
+        page.line(
+            "slip of a floor that was not fitted, root mean square over floors: one curve of "
+            f"current {one['pooled']['floors']:.3f}, a constant {one['constant']['floors']:.3f}, "
+            f"the floor's own curve {one['per_surface']['floors']:.3f}"
+        )
+
+
+def _ladder(answer: Content) -> Table:
+    """Table of one question."""
+    floors = answer["floors"]
+    made = table(())
+    made.add_column("model", no_wrap=True)
+    for name in (*(f"{floor} ({one['runs']})" for floor, one in floors.items()), "numbers"):
+        made.add_column(Text(name), justify="right", no_wrap=True)
+    made.add_column("fit [s]", justify="right", no_wrap=True)
+    for model, spent in answer["cost"].items():
+        cells = [_judged(one["models"][model]) for one in floors.values()]
+        made.add_row(model, *cells, _numbers(spent["numbers"]), f"{spent['fit_s']:.1f}")
+    return made
+
+
+def _judged(m: Content) -> str:
+    colour = {"best": "bold green", "tied": "green"}.get(m["verdict"], "default")
+    se = m["se_clustered"]
+    if m["verdict"] == "best":
+        apart = "best"
+    else:
+        apart = f"{m['difference']:.1f} ± {'?' if se is None else format(se, '.1f')}"
+    far, inside = 100 * m["endpoint_error"], 100 * m["coverage90"]
+    return f"[{colour}]{apart}[/{colour}] {far:5.1f} {inside:3.0f}"
+
+
+def _numbers(count: dict[str, int]) -> str:
+    """Fitted numbers of a floor, and of all floors together."""
+    floors = sorted({n for floor, n in count.items() if floor != "shared"})
+    own = f"{floors[0]}" if len(floors) == 1 else f"{floors[0]}-{floors[-1]}"
+    return f"{own} + {count['shared']}" if count["shared"] else own
+
+
+def show_design(page: Page, found: Content) -> None:
+    """Write the content of design.json: runs to drive next, what they shrink, what they save."""
+    if found["runs"]:
+        page.table(_runs(found))
+        rest = len([g for g in found["goals"] if g["reachable"]]) - SHOWN
+        more = f"; {rest} more goals are in design.json" if rest > 0 else ""
+        page.line(f"std after each run{more}")
+    for s in found["runs_saved"].values():
+        page.line(_saving(s))
+    page.notes(found["messages"])
+
+
+def _runs(found: Content) -> Table:
+    """Table of proposed runs."""
+    goals = [g for g in found["goals"] if g["reachable"]][:SHOWN]
+    names = ("run", "floor", "load", "heading", "m/s", "turn", "m", "seconds")
+    made = table(names, right=[n for n in names if n not in ("floor", "load")])
+    for g in goals:
+        made.add_column(Text(f"{g['name']} [{g['unit']}]"), justify="right")
+    made.add_row("", "now", *[""] * 6, *(_uncertain(g["now"], g["unit"]) for g in goals))
+    for k, run in enumerate(found["runs"], 1):
+        made.add_row(
+            str(k),
+            Text(run["floor"]),
+            Text(run["load"]),
+            f"{run['heading_deg']:.0f} deg" if run["speed"] else "",
+            f"{run['speed']:g}" if run["speed"] else "",
+            f"{math.degrees(run['turn_rate']):.0f} deg/s" if run["turn_rate"] else "",
+            f"{run['distance']:.2g}",
+            f"{run['seconds']:.1f}",
+            *(_uncertain(run["expected"][g["name"]], g["unit"]) for g in goals),
+        )
+    return made
+
+
+def _uncertain(std: float, unit: str) -> str:
+    return f"{100 * std:.3g} %" if unit == "m/m" else f"{std:.3g}"
+
+
+def _saving(s: Content) -> str:
+    """One sentence on runs saved."""
+    whole = f"{s['name']} ({s['grid_runs']} runs)"
+    if s["greedy_runs"] is None:
+        return f"from nothing: no fewer chosen runs tell as much as {whole}"
+    worse = s["criterion_random_order"] / s["criterion"]
+    return (
+        f"from nothing: {s['greedy_runs']} chosen runs tell as much as {whole}: {s['ratio']:.0%}; "
+        f"the first {s['greedy_runs']} of it in random order leave {worse:.2g} times the variance"
+    )
+
+
+def show_gains(page: Page, found: Content) -> None:
+    """Write the content of gains.json."""
+    gains = table(("gain", "value", "spread", "by hand", "unit"), right=("value", "spread"))
+    hand = found["settings"]["hand"]
+    for name, g in found["gains"].items():
+        gains.add_row(name, f"{g['value']:.3f}", f"{g['spread']:.3f}", f"{hand[name]:g}", g["unit"])
+    page.table(gains)
+    loss, margin = found["loss"], found["stability_margin"]
+    page.line(
+        f"loss on {found['settings']['judged_on']} cases not tuned on: by hand {loss['hand']:.1f} "
+        f"mm, tuned {loss['tuned']:.1f} mm; better in {found['better_than_hand']:.0%} of them"
+    )
+    page.line(
+        f"stability margin (1 - spectral radius): worst {margin['worst']:.4f}, "
+        f"median {margin['median']:.4f}"
+    )
+
+
+def show_trial(page: Page, found: Content, out: Path) -> None:
+    """Write what every controller came to, medians over the starts."""
+    numbers = ("closure", "cross-track", "first side", "heading", "path", "of encoders'")
+    made = table(("controller", *numbers), right=numbers)
+    for name, row in found["summary"].items():
+        ratio = row.get("to_encoder", {}).get("closure_error_median")
+        told = "" if ratio is None else f"{100 * ratio['value']:.0f} % closure"
+        if row["finished_share"] < 1:
+            told += f", {100 * row['finished_share']:.0f} % of runs finished"
+        made.add_row(
+            name,
+            f"{row['closure_error_median']:.0f} mm",
+            f"{row['cross_track_rmse']:.0f} mm",
+            f"{row['first_side_along_track_mm']:.0f} mm",
+            f"{row['heading_error_deg']:.1f} deg",
+            f"{row['path_length_mm']:.0f} mm",
+            told,
+        )
+    page.table(made)
+    best = found["closes_best"]
+    page.line(f"closes best: {best} ({found['controllers'][best]})")
+    count = min(row["runs"] for row in found["summary"].values())
+    page.line(f"medians of {count} starts; 90 % intervals and every run: {out / 'trial.json'}")
+    page.line(f"look at: {out / 'trial.png'}")
