@@ -55,7 +55,7 @@ def remaining(problem: Problem, z: Search, volt: Vector, rows: Rows) -> tuple[fl
     the slope of log |d residuals / d data|; where currents do not inform motion, their rows move
     the electric numbers only.
     """
-    own = np.ones(len(z)) if problem.joint else problem.electric.astype(float)
+    own = np.ones(len(z)) if problem.joint else problem.space.electric.astype(float)
     prior = problem.space.prior_std**-2
     _, slope = problem.log_jacobian(z, volt, np.ones(len(problem.windows)))
     gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)

@@ -45,11 +45,7 @@ def optimised(task: Task, problem: Problem, kept: Checkpoint | None, report: Rep
         rounds = start.round  # it had settled: only the last steps are missing
     options = Options(most_rounds=rounds, tolerance=wanted.tolerance)
     optimum = optimise(problem, start=start, options=options, tell=tell)
-    reason = optimum.reason
-    if optimum.converged:
-        round_ = optimum.state.round
-        reason = f"no number moved {wanted.tolerance:g} of its std in round {round_}"
-    return replace(optimum, history=tuple(history), reason=reason)
+    return replace(optimum, history=tuple(history))
 
 
 def _restored(kept: Checkpoint | None) -> tuple[State | None, list[float]]:

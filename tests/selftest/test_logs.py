@@ -12,12 +12,13 @@ from slipid.data.reading.reader import find_logs, read_log
 from slipid.data.runs import collect, default_session
 from slipid.data.windows import windows
 from slipid.identify.design.planned_runs import Drive
-from slipid.identify.fit.likelihood import batch, residuals
+from slipid.identify.fit.likelihood import batch
 from slipid.identify.fit.noise import noise
 from slipid.selftest.known import TRUTH, truth
 from slipid.selftest.logs import make_logs
 from slipid.selftest.plan import Sensors, grid
 from tests.helpers.made_logs import LAYOUT, write_logs
+from tests.helpers.made_windows import residuals
 
 PLAN = grid(headings=4, turns=2)
 ROBOT = truth(PLAN)

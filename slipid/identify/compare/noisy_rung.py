@@ -26,8 +26,8 @@ from slipid.identify.compare.predictive import (
 )
 from slipid.identify.compare.rung import Rung
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.problem import DEGREES, Problem
-from slipid.identify.fit.variances import scored_given
+from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.variances import DEGREES, scored_given
 from slipid.model.robot import Robot
 from slipid.search_space import Space
 

@@ -19,8 +19,8 @@ from slipid.data.windows import Windows, windows
 from slipid.identify.compare.body_motion import sideways, turned
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import travel
-from slipid.identify.fit.problem import DEGREES
 from slipid.identify.fit.sessions import by_axis
+from slipid.identify.fit.variances import DEGREES
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
 from slipid.search_space import Space

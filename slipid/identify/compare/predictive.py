@@ -26,9 +26,9 @@ from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import effects
-from slipid.identify.fit.problem import DEGREES, Problem, State
+from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit.sessions import Linear, by_axis, shared
-from slipid.identify.fit.variances import Search, Square, Vector
+from slipid.identify.fit.variances import DEGREES, Search, Square, Vector
 from slipid.model.robot import Robot
 from slipid.search_space import Space
 

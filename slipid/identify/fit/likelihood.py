@@ -186,13 +186,6 @@ def _spread(robot: Robot, b: Batch, voltage_std: Std) -> PerWheel:
     return jnp.sqrt(1.0 + robot.motor.resistance**2 * b.current_var / voltage_std**2)
 
 
-def residuals(robot: Robot, b: Batch, voltage_std: Std) -> dict[str, Array]:
-    """Every block of residuals, `motion` first."""
-    p = predict(robot, b)
-    motion = {"motion": motion_residual(robot, b, p)}
-    return motion | electric_residuals(robot, b, p.felt, voltage_std)
-
-
 def voltage_std(log_variance: Float[Array, ""]) -> Float[Array, ""]:
     """Std of the voltage noise, rounding included, from the log of its variance [V].
 

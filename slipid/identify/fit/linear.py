@@ -56,10 +56,6 @@ def _columns(rows: Float[Array, "row m piece"]) -> list[Array]:
     return columns
 
 
-def _squares_forward(v: Array, r: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    return squares(v, r), (v, r)
-
-
 def _squares_backward(kept: tuple[Array, Array], slope: tuple[Array, Array]) -> tuple[Array, Array]:
     v, r = kept
     low, inverse = _columns(v), []
@@ -74,4 +70,4 @@ def _squares_backward(kept: tuple[Array, Array], slope: tuple[Array, Array]) -> 
     return slope[0] * precision - slope[1] * w[:, None] * w, 2 * slope[1] * w
 
 
-squares.defvjp(_squares_forward, _squares_backward)
+squares.defvjp(lambda v, r: (squares(v, r), (v, r)), _squares_backward)

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from slipid.identify.fit.problem import DEGREES, Problem, State, linear
-from slipid.identify.fit.structure import Held, levenberg
-from slipid.identify.fit.variances import Search, Square, scored
-from slipid.search_space import Space
+from slipid.identify.fit.problem import Problem, State, linear
+from slipid.identify.fit.structure import Held, Steps, levenberg
+from slipid.identify.fit.variances import DEGREES, Search, Square, scored
 
 CREEPS = (0.05, 0.4, 1.0)
 """Starts of the creep of every floor; others end in poor minima."""
@@ -62,7 +61,6 @@ def optimise(
     state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
     mask = np.ones(problem.space.size) if free is None else np.asarray(free, float)
     history: list[float] = []
-    reason = f"{options.most_rounds} rounds without settling"
     while state.round < options.most_rounds:
         early = state.round < 3
         scoring = (2 if early else 4) if variances else 0
@@ -70,10 +68,11 @@ def optimise(
         history.append(state.loss)
         tell(state)
         if state.moved < options.tolerance:
-            reason = f"no number moved {options.tolerance:g} of its std in round {state.round}"
             break
     covariance = problem.laplace(state.z, state.log_variance, keep)
-    settled = state.moved < options.tolerance
+    reason = f"{options.most_rounds} rounds without settling"
+    if settled := state.moved < options.tolerance:
+        reason = f"no number moved {options.tolerance:g} of its std in round {state.round}"
     return Optimum(state, covariance, settled, reason, tuple(history))
 
 
@@ -102,7 +101,7 @@ def one_round(
         felt=felt,
         slope=problem.log_jacobian(state.z, volt, keep)[1],
     )
-    z = levenberg(held, steps)
+    z = np.asarray(levenberg(held, Steps(steps)))
     residual, jacobian = problem.linear(z, volt)
     own = problem.own(z, log_v)
     for _ in range(scoring):
@@ -154,13 +153,9 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
             mine = float(np.sum(cost[(floors == number) & (keep > 0)]))
             if mine < best[number]:
                 best[number] = mine
-                own = _of_floor(space, label)
+                own = space.where(lambda e, label=label: e.surface == label)
                 z[own] = state.z[own]
     return State(z, log_v, 0, np.inf, np.inf, "joint")
-
-
-def _of_floor(space: Space, label: str) -> np.ndarray:
-    return space.where(lambda e: e.surface == label)
 
 
 def _piece_cost(problem: Problem, state: State) -> np.ndarray:

@@ -13,25 +13,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from slipid.data.windows import Windows
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import variances
 from slipid.identify.fit.noise import noise
-from slipid.identify.fit.variances import (
-    DEGREES,
-    VARIANCE_SPREAD,
-    Blocks,
-    Search,
-    Target,
-    Vector,
-    Whitening,
-)
+from slipid.identify.fit.variances import VARIANCE_SPREAD, Blocks, Search, Target, Vector, Whitening
 from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
-
-__all__ = ["DEGREES", "VARIANCE_SPREAD", "Problem", "State", "Target"]
 
 
 @dataclass(frozen=True)
@@ -94,30 +84,26 @@ class Problem:
     def batch(self) -> lk.Batch:
         return self.target.batch
 
-    @property
-    def electric(self) -> Bool[np.ndarray, " free"]:
-        return self.space.electric
-
     def linear(self, z: Vector, volt: Vector) -> tuple[Blocks, Blocks]:
         """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
-        return linear(self.target, *_arrays(z, volt))[:2]
+        return linear(self.target, z, volt)[:2]
 
     def log_jacobian(self, z: Vector, volt: Vector, keep: Vector) -> tuple[Array, Array]:
-        return log_jacobian(self.target, *_arrays(z, volt, keep))
+        return log_jacobian(self.target, z, volt, keep)
 
     def twists(self, z: Vector) -> tuple[Array, Array]:
         """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
-        return _twists(self.space, self.batch, jnp.asarray(z))
+        return _twists(self.space, self.batch, z)
 
     def covariance(self, block: str, log_v: Vector) -> Array:
         """Covariance of the residuals of a block (piece, m, m)."""
         return self.noise.blocks[block].covariance(jnp.asarray(log_v))
 
     def whitening(self, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
-        return variances.whitening(self.noise.blocks, residual, *_arrays(log_v, keep))
+        return variances.whitening(self.noise.blocks, residual, log_v, keep)
 
     def precision(self, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
-        return variances.precision(self.target, jacobian, *_arrays(log_v, keep))
+        return variances.precision(self.target, jacobian, log_v, keep)
 
     def laplace(self, z: Vector, log_v: Vector, keep: Vector) -> np.ndarray:
         """Covariance of the search vector (free, free): inverse information, prior included."""
@@ -125,13 +111,12 @@ class Problem:
         return np.linalg.inv(np.asarray(self.precision(jacobian, log_v, keep)))
 
     def whitened(self, jacobian: Blocks, log_v: Vector) -> Blocks:
-        vectors = _arrays(log_v, np.ones(len(self.windows)))
-        return variances.whitened(self.noise.blocks, jacobian, *vectors)
+        every = np.ones(len(self.windows))
+        return variances.whitened(self.noise.blocks, jacobian, log_v, every)
 
     def variance_precision(self, log_v: Vector, keep: Vector, z: Vector) -> Array:
         """Expected information of the log variances at z, prior included (variance, variance)."""
-        at, counts = _arrays(log_v, keep)
-        return variances.information(self.noise.blocks, at, counts, self.own(z, log_v))
+        return variances.information(self.noise.blocks, log_v, keep, self.own(z, log_v))
 
     def loss(self, z: Vector, log_v: Vector, keep: Vector, residual: Blocks) -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
@@ -144,7 +129,7 @@ class Problem:
     def volt(self, log_v: Vector) -> Array:
         """Std of the voltage noise [V], 1 where none is logged."""
         if "voltage" not in self.noise.blocks:
-            return jnp.asarray(1.0)
+            return jnp.ones(())
         return lk.voltage_std(jnp.asarray(log_v)[-1])
 
     def own(self, z: Vector, log_v: Vector) -> Blocks:
@@ -154,11 +139,7 @@ class Problem:
         """
         if "voltage" not in self.noise.blocks:
             return {}
-        return {"voltage": _share(self.space, self.batch, jnp.asarray(z), self.volt(log_v))}
-
-
-def _arrays(*vectors: Vector) -> tuple[Array, ...]:
-    return tuple(jnp.asarray(v, float) for v in vectors)
+        return {"voltage": _share(self.space, self.batch, z, self.volt(log_v))}
 
 
 @eqx.filter_jit

@@ -5,12 +5,11 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import lineax as lx
-import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.variances import Blocks, Search, Target
+from slipid.identify.fit.variances import Blocks, Target
 
 _REFUSED = 12
 """Steps of the solver that may be refused in a round."""
@@ -54,13 +53,9 @@ class Steps(optx.LevenbergMarquardt):
         return done | taken | (state.num_steps >= self.most + _REFUSED), result
 
 
-def levenberg(held: Held, most: int) -> Search:
-    """Search vector after at most so many Levenberg-Marquardt steps with fixed whitening."""
-    return np.asarray(_moved(held, Steps(most)))
-
-
 @eqx.filter_jit
-def _moved(held: Held, solver: Steps) -> Array:
+def levenberg(held: Held, solver: Steps) -> Float[Array, " free"]:
+    """Search vector after the solver's steps with fixed whitening."""
     start = jnp.zeros_like(held.z)
     found = optx.least_squares(_stacked, solver, start, held, max_steps=None, throw=False)
     return _at(held, found.value)
@@ -75,14 +70,13 @@ def _stacked(y: Array, held: Held) -> Array:
     """Whitened residuals of all blocks and of the prior."""
     target, space = held.target, held.target.space
     z = _at(held, y)
-    robot = space.tree(z)
-    if target.joint:
-        blocks = lk.residuals(robot, target.batch, held.volt)
-    else:  # motion by itself; currents and voltages given the motion of the round's start
-        given = space.tree(jnp.where(space.electric, z, held.z))
-        still = lk.motion_residual(robot, target.batch, lk.predict(robot, target.batch))
-        electric = lk.electric_residuals(given, target.batch, held.felt, held.volt)
-        blocks = {"motion": still} | electric
+    robot = given = space.tree(z)
+    p = lk.predict(robot, target.batch)
+    felt = p.felt
+    if not target.joint:  # currents and voltages given the motion of the round's start
+        given, felt = space.tree(jnp.where(space.electric, z, held.z)), held.felt
+    blocks = {"motion": lk.motion_residual(robot, target.batch, p)}
+    blocks |= lk.electric_residuals(given, target.batch, felt, held.volt)
     parts = [jnp.einsum("nij,nj->ni", held.root[k], r).ravel() for k, r in blocks.items()]
     # the slope of the log Jacobian adds slope . z to the log posterior
     mean = space.prior_mean + space.prior_std**2 * held.slope

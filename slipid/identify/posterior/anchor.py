@@ -10,8 +10,9 @@ from jaxtyping import Array, Float, Int
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.linear import squares
 from slipid.identify.fit.noise import effects
-from slipid.identify.fit.problem import DEGREES, Problem
+from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import by_axis, pairs
+from slipid.identify.fit.variances import DEGREES
 from slipid.identify.posterior.coordinates import Fitted
 from slipid.model.robot import Robot
 
@@ -39,7 +40,7 @@ class Anchor(eqx.Module):
 
 def anchor_at(problem: Problem, fitted: Fitted, sessions: tuple[tuple[str, str], ...]) -> Anchor:
     """Anchor at a fit, for sessions that have effects of their own."""
-    twist, slope = problem.twists(jnp.asarray(fitted.z))
+    twist, slope = problem.twists(fitted.z)
     w = problem.windows
     shares = effects(w, problem.robot) * np.sqrt(by_axis(fitted.session, "session", w))[:, None]
     place = {pair: k for k, pair in enumerate(sessions)}
@@ -51,7 +52,7 @@ def anchor_at(problem: Problem, fitted: Fitted, sessions: tuple[tuple[str, str],
         log_variance=jnp.asarray(fitted.log_variance),
         twist=twist,
         twist_slope=slope,
-        typical=jnp.asarray(2 * np.log(problem.noise.typical)),
+        typical=problem.target.typical,
         shares=jnp.asarray(shares),
         session=jnp.asarray([place.get(pair, 0) for pair in pairs(w)]),
     )

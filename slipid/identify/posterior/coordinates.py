@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
@@ -61,8 +60,7 @@ class Coordinates:
 
 def coordinates_of(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
     """Coordinates of a part; the floors that each touches are read off the Jacobian at the fit."""
-    volt = problem.volt(jnp.asarray(fitted.log_variance))
-    _, jacobian = problem.linear(jnp.asarray(fitted.z), volt)
+    _, jacobian = problem.linear(fitted.z, problem.volt(fitted.log_variance))
     blocks = {
         MOTION: ["motion"],
         ELECTRIC: [k for k in jacobian if k != "motion"],
@@ -78,7 +76,8 @@ def coordinates_of(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
             touched[:, floor] |= moved[surface == floor].any(axis=0)
             number = np.asarray(problem.noise.blocks[k].which)[surface == floor]
             seen[np.unique(number), floor] = True
-    mine = {MOTION: ~problem.electric, ELECTRIC: problem.electric}
+    electric = problem.space.electric
+    mine = {MOTION: ~electric, ELECTRIC: electric}
     structure = np.flatnonzero(mine.get(part, np.ones(problem.space.size, bool)))
     variance = np.flatnonzero(seen.any(axis=1))
     shared = by_axis(fitted.session, "session", problem.windows)

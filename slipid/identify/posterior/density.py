@@ -19,8 +19,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.problem import VARIANCE_SPREAD, Problem
+from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES
+from slipid.identify.fit.variances import VARIANCE_SPREAD
 from slipid.identify.posterior.anchor import Anchor, anchor_at, log_student, predict
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, Fitted, coordinates_of
 from slipid.model.robot import Robot
@@ -60,8 +61,8 @@ class Density:
         self._form: Density = problem.compiled.setdefault(form, self)
         at = self.coordinates
         effects = np.zeros(len(at.sessions) * len(AXES))
-        z, log_v = np.asarray(fitted.z), np.asarray(fitted.log_variance)
-        self.centre = np.concatenate([z[at.structure], log_v[at.variance], effects])
+        structure, variance = fitted.z[at.structure], fitted.log_variance[at.variance]
+        self.centre = np.concatenate([structure, variance, effects])
         self.covariance = self._laplace(fitted)
 
     def _laplace(self, fitted: Fitted) -> np.ndarray:
@@ -69,11 +70,10 @@ class Density:
         problem, at = self.problem, self.coordinates
         n, v = len(at.structure), len(at.variance)
         out = np.zeros((self.size, self.size))
-        z, log_v = jnp.asarray(fitted.z), jnp.asarray(fitted.log_variance)
-        keep = np.ones(len(problem.windows))
+        z, log_v, keep = fitted.z, fitted.log_variance, np.ones(len(problem.windows))
         of_variance = np.linalg.inv(np.asarray(problem.variance_precision(log_v, keep, z)))
         out[n : n + v, n : n + v] = of_variance[np.ix_(at.variance, at.variance)]
-        own = np.asarray(fitted.covariance)[np.ix_(at.structure, at.structure)]
+        own = fitted.covariance[np.ix_(at.structure, at.structure)]
         mean = np.concatenate([np.arange(n), np.arange(n + v, self.size)])
         precision = np.zeros((len(mean), len(mean)))
         precision[:n, :n] = np.linalg.inv(own)
@@ -98,7 +98,7 @@ class Density:
 
     @property
     def size(self) -> int:
-        return len(self.coordinates.names)
+        return len(self.names)
 
     def full(self, anchor: Anchor, x: Array) -> tuple[Array, Array]:
         """Search vector and log variances of chain coordinates, the others as at the fit."""
@@ -139,10 +139,6 @@ class Density:
     def _gradient(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
         return jax.grad(lambda x: jnp.sum(self._sums(anchor, x, held)))(x)
 
-    def logpdf(self, x: Float[Array, " size"]) -> Float[Array, ""]:
-        """Log posterior of one vector, differentiable, for samplers that want gradients."""
-        return jnp.sum(self._sums(self.anchor, x, None))
-
     def _sums(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
         likelihood = sum(self._pieces(anchor, x, held).values())
         at, space = self.coordinates, self.problem.space
@@ -156,12 +152,9 @@ class Density:
         out = jnp.zeros(count + 1).at[anchor.batch.surface].add(likelihood)
         return out.at[np.where(at.group < 0, count, at.group)].add(prior)
 
-    def pointwise(
-        self, x: Float[np.ndarray, "draw size"], held: Held | None = None
-    ) -> dict[str, Float[np.ndarray, "draw piece"]]:
-        """Log likelihood of every piece, by block of residuals."""
-        out = self._of_all(Density._pieces, x, held)
-        return {k: np.asarray(v) for k, v in out.items()}
+    def pointwise(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
+        """Log likelihood of every piece, by block of residuals (draw, piece)."""
+        return self._of_all(Density._pieces, x)
 
     def _pieces(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
         seen, log_v = self._residuals(anchor, x, held), self.full(anchor, x)[1]
@@ -175,10 +168,7 @@ class Density:
 
     def residuals(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
         """Blocks of residuals of many vectors (draw, piece, m)."""
-        return self._of_all(Density._gaps, x)
-
-    def _gaps(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
-        return self._residuals(anchor, x, held).residuals
+        return self._of_all(Density._residuals, x).residuals
 
     def _residuals(self, anchor: Anchor, x: Array, held: Held | None) -> _Seen:
         z, log_v = self.full(anchor, x)

@@ -14,10 +14,11 @@ from jaxtyping import Float
 from xarray import DataTree
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.problem import DEGREES, Problem
+from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.variances import DEGREES
 from slipid.identify.posterior.coordinates import EVERYTHING
 from slipid.identify.posterior.density import Density
-from slipid.identify.posterior.draws import Posterior
+from slipid.identify.posterior.diagnosis import Posterior
 from slipid.parameter import Entry
 from slipid.search_space import Space
 from slipid.support.files import write_bytes

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.identify.posterior.transport.coordinatewise import Matrix
-from slipid.identify.posterior.transport.learn import gaussian
-from slipid.identify.posterior.transport.transport_map import Transport
+from slipid.identify.posterior.transport.transport_map import Transport, gaussian
 
 
 @dataclass(frozen=True, eq=False)

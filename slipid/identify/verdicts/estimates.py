@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.variances import Search, Square
 from slipid.parameter import Declaration, Entry
 from slipid.search_space import Choice, Space
@@ -145,7 +144,6 @@ def _free(
     else:
         low, high = (np.asarray(d.to_si(jnp.asarray(mean + k * std_z))) for k in (-_Z95, _Z95))
         std = d.slope(value) * std_z
-        center = np.asarray(d.to_si(jnp.asarray(prior_mean)))
         wide = d.slope(center) * prior_std
     scaled = block / prior_std[:, None] / prior_std[None, :]
     ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
@@ -242,18 +240,3 @@ def _quotient(
         prior_mean=float(np.exp(log_prior)),
         prior_std=float(np.exp(log_prior)) * prior_std,
     )
-
-
-def expected_covariance(
-    problem: Problem,
-    z: Search | None = None,
-    log_variance: Float[np.ndarray, " variance"] | None = None,
-) -> Square:
-    """Posterior covariance to be expected of these windows: inverse information, prior included.
-
-    By default at the start values and with the typical variances of every noise component. What
-    the data really hold depends on where the fit ends.
-    """
-    z = problem.space.start if z is None else z
-    log_v = 2 * np.log(problem.noise.typical) if log_variance is None else log_variance
-    return problem.laplace(z, log_v, np.ones(len(problem.windows)))

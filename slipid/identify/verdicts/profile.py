@@ -124,8 +124,9 @@ class _Walk:
         self.free, self.of_motion = np.ones(problem.space.size), False
         covariance = optimum.covariance
         if not problem.joint:
-            self.of_motion = not problem.electric[at]
-            mine = problem.electric == problem.electric[at]
+            electric = problem.space.electric
+            self.of_motion = not electric[at]
+            mine = electric == electric[at]
             self.free = mine.astype(float)
             if not self.of_motion:  # given the motion: a block of the information
                 held = np.where(mine[:, None] & mine, np.linalg.inv(covariance), np.eye(len(mine)))

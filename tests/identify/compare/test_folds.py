@@ -25,8 +25,9 @@ from slipid.identify.compare.slip_models import rungs
 from slipid.identify.compare.transfer import transfer
 from slipid.identify.compare.validation import Judged, Score
 from slipid.identify.design.planned_runs import Drive
-from slipid.identify.fit.problem import DEGREES, Problem, State
+from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit.sessions import Linear, shared
+from slipid.identify.fit.variances import DEGREES
 from slipid.job.compare import finished
 from slipid.search_space import Choice
 from slipid.selftest.known import truth

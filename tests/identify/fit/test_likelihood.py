@@ -14,11 +14,11 @@ from scipy.stats import multivariate_t
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
 from slipid.identify.fit.linear import inverse_root
-from slipid.identify.fit.problem import DEGREES, Problem
-from slipid.identify.fit.variances import scored
+from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.variances import DEGREES, scored
 from slipid.identify.slip_curves import current_trend
 from slipid.search_space import Choice
-from tests.helpers.made_windows import made, robot
+from tests.helpers.made_windows import made, residuals, robot
 
 EVERYTHING = [Choice("*", free=True)]
 NOTHING = Choice("*", free=False)
@@ -54,7 +54,7 @@ def everything(request, truth):
 @pytest.mark.slow
 def test_without_noise_the_truth_leaves_no_residual(truth, signed):
     b = lk.batch(made(truth, signed=signed), truth)
-    blocks = jax.jit(lk.residuals)(truth, b, 1.0)
+    blocks = jax.jit(residuals)(truth, b, 1.0)
     assert sorted(blocks) == ["current", "motion", "voltage"]
     for name, r in blocks.items():
         assert r.shape == (24, 6)
@@ -64,9 +64,9 @@ def test_without_noise_the_truth_leaves_no_residual(truth, signed):
 @pytest.mark.slow
 def test_channels_that_were_not_logged_have_no_block(truth):
     w = made(truth, voltage=False)
-    assert sorted(lk.residuals(truth, lk.batch(w, truth), 1.0)) == ["current", "motion"]
+    assert sorted(residuals(truth, lk.batch(w, truth), 1.0)) == ["current", "motion"]
     w = replace(w, has_current=False)
-    assert sorted(lk.residuals(truth, lk.batch(w, truth), 1.0)) == ["motion"]
+    assert sorted(residuals(truth, lk.batch(w, truth), 1.0)) == ["motion"]
     assert list(of_noise.noise(w, truth).blocks) == ["motion"]
 
 
@@ -300,7 +300,7 @@ def test_a_cut_keeps_what_motion_alone_says_of_the_motion():
     _, jacobian = problem.linear(problem.space.start, jnp.asarray(0.05))
     cut = np.linalg.inv(np.asarray(problem.precision(jacobian, log_v, np.ones(24))))
     alone = np.linalg.inv(information(problem, jacobian, log_v, ["motion"]))
-    m, e = ~problem.electric, problem.electric
+    m, e = ~problem.space.electric, problem.space.electric
     assert e.any()
     np.testing.assert_allclose(cut[np.ix_(m, m)], alone[np.ix_(m, m)], rtol=1e-6, atol=1e-12)
     # electric numbers: what is left at fixed motion plus what the motion's uncertainty adds

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from arviz_stats.base import array_stats
 
-from slipid.identify.posterior.blocks import Plan, packed, unpacked
+from slipid.identify.posterior.blocks import Plan, Record, packed, unpacked
 from slipid.identify.posterior.diagnosis import autocorrelation_time, diagnose
 from slipid.identify.posterior.ensemble import chain as positions
-from slipid.identify.posterior.ensemble import run
+from slipid.identify.posterior.ensemble import extended
 from slipid.identify.posterior.proposals import (
     Along,
     Differential,
@@ -126,8 +126,13 @@ def plateau():
     return known(terms, group, kind, np.array([0.0, -2.0]), covariance), mean, np.sqrt(var)
 
 
+def run(target, plan, done=()):
+    """Blocks up to the plan's end, of ensembles that share a target."""
+    return extended([target] * plan.ensembles, plan, "part", Record(), done)
+
+
 def sampled(target, plan=PLAN):
-    blocks = list(run([target] * plan.ensembles, plan))
+    blocks = run(target, plan)
     chain = positions(blocks, plan)
     return blocks, chain, diagnose(chain, plan)
 
@@ -180,10 +185,10 @@ def test_ensembles_in_different_modes_are_not_reported():
 def test_an_interrupted_chain_goes_on_as_if_it_had_not_been():
     target, _, _ = gaussian()
     plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=6)
-    whole = list(run([target] * 2, plan))
+    whole = run(target, plan)
     for stop in range(1, 6):
         kept = [unpacked(dict(packed(b))) for b in whole[:stop]]
-        rest = list(run([target] * 2, plan, kept))
+        rest = run(target, plan, kept)[stop:]
         assert len(rest) == 6 - stop
         for one, other in zip([*kept, *rest], whole, strict=True):
             np.testing.assert_array_equal(one.chain, other.chain)
@@ -193,8 +198,8 @@ def test_an_interrupted_chain_goes_on_as_if_it_had_not_been():
 def test_the_seed_decides():
     target, _, _ = banana()
     plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1,), most=3)
-    one, same = (np.concatenate([b.chain for b in run([target] * 2, plan)]) for _ in range(2))
-    other = np.concatenate([b.chain for b in run([target] * 2, Plan(**{**vars(plan), "seed": 1}))])
+    one, same = (np.concatenate([b.chain for b in run(target, plan)]) for _ in range(2))
+    other = np.concatenate([b.chain for b in run(target, replace(plan, seed=1))])
     np.testing.assert_array_equal(one, same)
     assert not np.array_equal(one, other)
     assert not np.array_equal(one[0], one[1])  # ensembles differ

@@ -15,7 +15,7 @@ from slipid.identify.fit.problem import Problem
 from slipid.identify.slip_curves import Validity
 from slipid.identify.verdicts import formulas
 from slipid.identify.verdicts import unidentified as flat_module
-from slipid.identify.verdicts.estimates import RATIOS, derived, expected_covariance
+from slipid.identify.verdicts.estimates import RATIOS, derived
 from slipid.identify.verdicts.profile import RISE, _Walk, profile, profiled
 from slipid.identify.verdicts.remedies import VOLTAGE, remedy
 from slipid.identify.verdicts.unidentified import NOTICED, flat_directions, sentences
@@ -165,14 +165,15 @@ def precision(voltage: bool, one_heading: bool = False) -> np.ndarray:
         w = this.windows
         rate = np.abs(w.turn).max(axis=-1, keepdims=True)
         this = this.of(replace(w, turn=rate * np.array([-1.0, 0.0, 1.0])))
-    return np.linalg.inv(expected_covariance(this))
+    typical, keep = 2 * np.log(this.noise.typical), np.ones(len(this.windows))
+    return np.linalg.inv(this.laplace(this.space.start, typical, keep))
 
 
 def seen(*patterns: str, voltage: bool = True, one_heading: bool = False):
     """Space in which only these are free, and the covariance to be expected in it."""
     space, names = space_of(*patterns), problem(voltage).space.names
     at = np.array([names.index(n) for n in space.names])
-    whole, electric = precision(voltage, one_heading), problem(voltage).electric
+    whole, electric = precision(voltage, one_heading), problem(voltage).space.electric
     motion = np.zeros_like(whole)  # currents do not inform it
     still = np.ix_(~electric, ~electric)
     motion[still] = np.linalg.inv(np.linalg.inv(whole)[still])
