@@ -2,10 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from functools import reduce
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,7 +13,7 @@ from slipid.identify.verdicts.estimates import Estimate
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, build
 from slipid.parameter import entries
-from slipid.search_space import Choice, Space
+from slipid.search_space import Choice, Space, put
 from slipid.support.content import Content
 
 SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/2"
@@ -163,18 +161,7 @@ def _robot_json(robot: Robot) -> Content:
 def _robot_of(kept: Content) -> Robot:
     shape = _tuples(kept["geometry"])
     geometry = Geometry(drive_offset=jnp.zeros(len(shape["place"])), **shape)
-    robot = build(
-        geometry, kept["surfaces"], kept["loads"], kept["sessions"], centre=tuple(kept["centre"])
-    )
-    leaves: dict[tuple[str, ...], list[Any]] = {}
-    whole: dict[tuple[str, ...], bool] = {}
-    for e in entries(robot):
-        leaves.setdefault(e.leaf, []).append(kept["values"][e.path])
-        whole[e.leaf] = e.index is None
-    values = [jnp.asarray(v[0] if whole[leaf] else v) for leaf, v in leaves.items()]
-
-    def where(tree: Robot) -> list[Any]:
-        return [reduce(getattr, leaf, tree) for leaf in leaves]
-
-    restored: Robot = eqx.tree_at(where, robot, values)
+    names = kept["surfaces"], kept["loads"], kept["sessions"]
+    robot = build(geometry, *names, centre=tuple(kept["centre"]))
+    restored: Robot = put(robot, {e: kept["values"][e.path] for e in entries(robot)})
     return restored

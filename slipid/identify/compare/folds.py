@@ -18,9 +18,8 @@ from slipid.identify.compare.noisy_rung import with_noise
 from slipid.identify.compare.predictive import Predictive, contact_of
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.compare.validation import Judged, score, told
-from slipid.identify.fit.one_speed import still_viscosities
 from slipid.identify.fit.optimise import Options, optimise
-from slipid.identify.fit.problem import Problem, State
+from slipid.identify.fit.problem import Problem, State, still_viscosities
 from slipid.search_space import Choice, Space
 from slipid.support.content import Content
 from slipid.support.errors import DataError
@@ -28,21 +27,19 @@ from slipid.support.errors import DataError
 Fold = Int[np.ndarray, " run"]
 
 
-def sectors(data: Runs, width_deg: float = 60.0) -> Fold:
-    """Fold of every run by the sector its commanded heading lies in, -1 where it has none."""
+def sectors(data: Runs) -> Fold:
+    """Fold of every run by the 60 deg its commanded heading lies in, -1 where it has none."""
     known = np.isfinite(data.heading)
     turn = np.degrees(np.where(known, data.heading, 0.0)) % 360.0
-    sector = (np.floor((turn + 1e-6) / width_deg) % round(360 / width_deg)).astype(int)
-    return np.where(known, sector, -1)
+    return np.where(known, (np.floor((turn + 1e-6) / 60.0) % 6).astype(int), -1)
 
 
-def random_headings(data: Runs, folds: int = 6, step_deg: float = 5.0, seed: int = 0) -> Fold:
-    """Fold of every run by its heading, headings dealt at random, -1 where it has none."""
-    count = round(360 / step_deg)
-    dealt = np.random.default_rng(seed).permutation(count) % folds
+def random_headings(data: Runs) -> Fold:
+    """One of six folds of every run by its heading, dealt every 5 deg, -1 where it has none."""
+    dealt = np.random.default_rng(0).permutation(72) % 6
     known = np.isfinite(data.heading)
     way = np.degrees(np.where(known, data.heading, 0.0))
-    return np.where(known, dealt[np.round(way / step_deg).astype(int) % count], -1)
+    return np.where(known, dealt[np.round(way / 5.0).astype(int) % 72], -1)
 
 
 def speeds(data: Runs) -> Fold:

@@ -58,7 +58,16 @@ class Noisy(Predictive):
         return sizes | {"shared": 0}
 
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
-        return _linear(self.rung, self.contact, problem)
+        rung, robot, contact = self.rung, self.robot, self.contact
+        b, z = problem.batch, jnp.asarray(contact.z)
+        w = problem.windows.at_lag(float(robot.camera.lag))
+
+        def gap(some: Rung) -> np.ndarray:
+            return np.asarray(_gap(problem.space, z, jnp.asarray(some.twist(w, robot)), b))
+
+        camera = _gap_jacobian(problem.space, z, jnp.asarray(rung.twist(w, robot)), b)
+        by_camera = np.asarray(camera)[..., contact.camera]
+        return gap(rung), np.concatenate([slopes(rung, w, gap), by_camera], axis=-1)
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
         robot, contact = self.robot, self.contact
@@ -92,8 +101,9 @@ def with_noise(
     seen = problem.windows.at_lag(float(robot.camera.lag)).pieces(np.flatnonzero(keep > 0))
     rung = rung.fit(seen, robot)
     before = _before(rung, seen, robot)
-    gap, slope = _linear(rung, contact, problem)
     common = contact.covariance[np.ix_(contact.camera, contact.camera)]
+    plain = Noisy(robot, contact.variance, common, rung, contact)
+    gap, slope = plain.linear(problem)
     log_v, count = jnp.asarray(contact.log_variance(problem)), jnp.asarray(keep, float)
     for _ in range(MOST_TURNS):
         last = log_v
@@ -105,7 +115,7 @@ def with_noise(
             log_v = scored_given(problem.target, *blocks, log_v, count, {})
         if float(jnp.abs(log_v - last).max()) < SETTLED:
             break
-    plain = Noisy(robot, by_name(problem, log_v), covariance, rung, contact)
+    plain = replace(plain, variance=by_name(problem, log_v), covariance=covariance)
     own = len(before)
     wide = np.zeros_like(covariance)
     wide[:own, :own], wide[own:, own:] = np.linalg.inv(before), common
@@ -134,19 +144,6 @@ def _numbers(
     out = both @ common @ both.T
     out[:own, :own] += alone
     return np.asarray(0.5 * (out + out.T))
-
-
-def _linear(rung: Rung, contact: Contact, problem: Problem) -> tuple[Gaps, Slopes]:
-    """Gaps of all pieces of a problem, and their slope by the rung's numbers and the camera's."""
-    robot, b, z = contact.robot, problem.batch, jnp.asarray(contact.z)
-    w = problem.windows.at_lag(float(robot.camera.lag))
-
-    def gap(some: Rung) -> np.ndarray:
-        return np.asarray(_gap(problem.space, z, jnp.asarray(some.twist(w, robot)), b))
-
-    camera = _gap_jacobian(problem.space, z, jnp.asarray(rung.twist(w, robot)), b)
-    by_camera = np.asarray(camera)[..., contact.camera]
-    return gap(rung), np.concatenate([slopes(rung, w, gap), by_camera], axis=-1)
 
 
 @eqx.filter_jit

@@ -129,7 +129,7 @@ def end_covariance(
     w: Windows,
     tracks: Tracks,
     variance: Mapping[str, float],
-    of_parameters: Float[np.ndarray, "piece 2 2"] | float = 0.0,
+    of_parameters: Float[np.ndarray, "piece 2 2"],
 ) -> Float[np.ndarray, "piece 2 2"]:
     """Covariance of the gap between predicted and measured end [m^2], scale matrix of a Student t.
 
@@ -139,7 +139,7 @@ def end_covariance(
     """
     far, u = travel(w, robot)
     p = tracks.predicted
-    cov = np.zeros((len(w), 2, 2)) + of_parameters
+    cov = of_parameters.copy()
     lever = sideways(p[:, -1:, :2] - p[:, 1:, :2])  # what a turn at each step moves
     way = p[:, :-1, 2]
     along, across = turned(way, u), turned(way, sideways(u))
@@ -155,7 +155,7 @@ def end_covariance(
 
 
 def scores(
-    gap: Float[np.ndarray, "run 2"], cov: Float[np.ndarray, "run 2 2"] | None, seed: int = 0
+    gap: Float[np.ndarray, "run 2"], cov: Float[np.ndarray, "run 2 2"] | None
 ) -> tuple[np.ndarray | None, np.ndarray]:
     """Probability of the region whose edge each end lies on, and the energy score of each [m].
 
@@ -168,7 +168,7 @@ def scores(
         return None, np.linalg.norm(gap, axis=1)
     q = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(cov), gap)
     level = fisher.cdf(q / 2, 2, DEGREES)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     normal = rng.normal(size=(500, 2)) / np.sqrt(rng.chisquare(DEGREES, (500, 1)) / DEGREES)
     draws = np.einsum("nij,kj->nki", np.linalg.cholesky(cov), normal)
     near = np.linalg.norm(draws - gap[:, None], axis=2).mean(axis=1)

@@ -43,13 +43,13 @@ class Planner:
         robot: Robot,
         choices: Sequence[Choice],
         variance: Mapping[str, float],
-        channels: Channels | None = None,
+        channels: Channels,
     ):
         camera = robot.camera
         if camera.sessions:
             camera = replace(camera, sessions=(SESSION,), session_yaw=jnp.zeros(1))
         self.robot = replace(robot, camera=camera)
-        self.channels = channels or Channels()
+        self.channels = channels
         self.variance = dict(variance)
         paths = [e.path for e in entries(self.robot)]
         choices = [c for c in choices if any(fnmatchcase(p, c.pattern) for p in paths)]

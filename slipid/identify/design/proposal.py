@@ -53,7 +53,7 @@ def design(fit: Fit, wish: Wish) -> Design:
     scope, planner = Scope(fit, wish), Planner.of(fit)
     offered = scope.candidates()
     rows, now = planner.rows(offered), planner.after(fit)
-    last = info.endless(now, rows)
+    last = now.plus(rows, info.ENDLESS)
     weights = _goals(fit, wish, scope, planner)
     lost = {g.name: s for g in weights if (s := _out_of_reach(fit, g, now, last, len(offered)))}
     goals = [g for g in weights if g.name not in lost]

@@ -5,8 +5,9 @@ of the restricted likelihood (`variances`).
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from glob import escape
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.data.runs import Runs
 from slipid.data.windows import Windows
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import variances
@@ -180,3 +182,21 @@ def _twists(space: Space, batch: lk.Batch, z: Array) -> tuple[Array, Array]:
 @eqx.filter_jit
 def _share(space: Space, batch: lk.Batch, z: Array, volt: Array) -> Array:
     return lk.voltage_share(space.tree(z), batch, volt)
+
+
+def still_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:
+    """Viscous terms held near zero on every floor that was driven at one speed only.
+
+    With one speed they cannot be told from creep, and what they take from it is wrong at every
+    other speed.
+    """
+    seen: dict[str, list[float]] = {}
+    for k in range(len(data)) if runs is None else runs:
+        seen.setdefault(data.logs[k].surface or "unknown", []).append(float(data.speed[k]))
+    out = []
+    for floor, speeds in seen.items():
+        known = np.asarray(speeds)[np.isfinite(speeds)]
+        if len(known) == len(speeds) and known.max() < 1.3 * max(known.min(), 1e-3):
+            names = (f"surface.{floor}.{name}" for name in ("slide_viscosity", "roller_viscosity"))
+            out += [Choice(escape(path), fixed=1e-4) for path in names]
+    return out

@@ -18,8 +18,7 @@ from jaxtyping import Float
 from slipid.identify.fit.variances import Search, Square
 from slipid.identify.slip_curves import Validity
 from slipid.identify.verdicts.estimates import WEAK
-from slipid.identify.verdicts.formulas import NOTHING, SMALL, Axis, axes_of, formula
-from slipid.identify.verdicts.remedies import remedy
+from slipid.identify.verdicts.wording import NOTHING, SMALL, Axis, axes_of, formula, remedy
 from slipid.search_space import Space
 
 NOTICED = 1 / WEAK**2

@@ -13,12 +13,12 @@ from scipy.stats import chi2
 from slipid.identify.fit.optimise import Options, optimise
 from slipid.identify.fit.problem import Problem
 from slipid.identify.slip_curves import Validity
-from slipid.identify.verdicts import formulas
 from slipid.identify.verdicts import unidentified as flat_module
+from slipid.identify.verdicts import wording
 from slipid.identify.verdicts.estimates import RATIOS, derived
 from slipid.identify.verdicts.profile import RISE, _Walk, profile, profiled
-from slipid.identify.verdicts.remedies import VOLTAGE, remedy
 from slipid.identify.verdicts.unidentified import NOTICED, flat_directions, sentences
+from slipid.identify.verdicts.wording import VOLTAGE, remedy
 from slipid.search_space import Choice, Space
 from tests.helpers.made_windows import made, robot
 from tests.identify.fit.test_optimise import NOISE, begin
@@ -93,13 +93,13 @@ def test_nothing_is_flat_where_the_data_tell_every_direction(seed):
 
 def test_powers_differ_by_formula():
     a, b = "camera.scale", "robot.wheel_radius"
-    both = [axis for e in numbers(a, b) for axis in formulas.axes_of(e)]
-    assert formulas._product(both, np.array([1.0, 1.0])) == f"{a}, {b} only as {b}/{a}"
-    assert formulas._product(both, np.array([1.0, -1.0])) == f"{a} and {b} only as {a} * {b}"
-    assert formulas._product(both, np.array([-0.5, 1.0])) == f"{a} and {b} only as {a}^2 * {b}"
-    assert formulas._product(both, np.array([1.0, 0.5])) == f"{a} and {b} only as {a} / {b}^2"
-    assert formulas._sum([a, b], np.array([1.0, -1.0])) == f"{a} and {b} only as {b} + {a}"
-    assert formulas._sum([a, b], np.array([1.0, 0.5])) == f"{a} and {b} only as {a} - 2 {b}"
+    both = [axis for e in numbers(a, b) for axis in wording.axes_of(e)]
+    assert wording._product(both, np.array([1.0, 1.0])) == f"{a}, {b} only as {b}/{a}"
+    assert wording._product(both, np.array([1.0, -1.0])) == f"{a} and {b} only as {a} * {b}"
+    assert wording._product(both, np.array([-0.5, 1.0])) == f"{a} and {b} only as {a}^2 * {b}"
+    assert wording._product(both, np.array([1.0, 0.5])) == f"{a} and {b} only as {a} / {b}^2"
+    assert wording._sum([a, b], np.array([1.0, -1.0])) == f"{a} and {b} only as {b} + {a}"
+    assert wording._sum([a, b], np.array([1.0, 0.5])) == f"{a} and {b} only as {a} - 2 {b}"
 
 
 # remedies ----------------------------------------------------------------------------------------
