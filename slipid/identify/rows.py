@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.problem import Problem, log_jacobian
 from slipid.identify.fit.variances import Search, Square, Vector
 
 
@@ -28,9 +27,8 @@ class Rows:
 
 def rows_at(problem: Problem, z: Vector, log_v: Vector) -> Rows:
     """Residuals of a problem at a search vector and these log variances."""
-    linear = problem.linear(jnp.asarray(z), problem.volt(log_v))
-    keep = np.ones(len(problem.windows))
-    weighed = problem.whitening(linear[0], jnp.asarray(log_v), keep)[:2]
+    linear = problem.linear(z, problem.volt(log_v))
+    weighed = problem.whitening(linear[0], log_v, np.ones(len(problem.windows)))[:2]
     residual, jacobian, roots, weight = jax.device_get((*linear, *weighed))
     # roots of V^-1 without the weights of outliers
     plain = {k: root / np.sqrt(weight[k])[:, None, None] for k, root in roots.items()}
@@ -57,7 +55,7 @@ def remaining(problem: Problem, z: Search, volt: Vector, rows: Rows) -> tuple[fl
     """
     own = np.ones(len(z)) if problem.joint else problem.space.electric.astype(float)
     prior = problem.space.prior_std**-2
-    _, slope = problem.log_jacobian(z, volt, np.ones(len(problem.windows)))
+    _, slope = log_jacobian(problem.target, z, volt, np.ones(len(problem.windows)))
     gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
     info = np.diag(prior)
     for k, r in rows.residual.items():

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from slipid.identify.compare.folds import Fold, folds_of, judge
-from slipid.identify.compare.predictive import Contact, contact_of
 from slipid.identify.compare.ranking import ranking
 from slipid.identify.compare.transfer import transfer
 from slipid.identify.compare.validation import Judged
@@ -16,6 +15,7 @@ from slipid.identify.fit.optimise import Options, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.job.config import read_config
 from slipid.job.problem import Job, read_job
+from slipid.model.robot import Robot
 from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.content import Content
 from slipid.support.errors import DataError
@@ -59,8 +59,8 @@ def compare(
     problem = job.problem()
     writable(out)
     key = key_of(config.hash, job.data_hash, problem.space.names, problem.noise.names)
-    results, whole = _folds(job, problem, asked, Checkpoint(out / FOLDS, key), report)
-    surfaces = transfer(problem.windows, whole.robot) if problem.windows.has_current else {}
+    results, robot = _folds(job, problem, asked, Checkpoint(out / FOLDS, key), report)
+    surfaces = transfer(problem.windows, robot) if problem.windows.has_current else {}
     found: Content = {
         "schema": SCHEMA,
         "questions": {
@@ -106,8 +106,8 @@ def _cost(folds: Sequence[Content]) -> Content:
 
 def _folds(
     job: Job, problem: Problem, asked: Mapping[str, Fold], kept: Checkpoint, report: Reporter
-) -> tuple[dict[str, list[Content]], Contact]:
-    """Every fold of every question, and the force balance fitted to all runs."""
+) -> tuple[dict[str, list[Content]], Robot]:
+    """Every fold of every question, and the robot fitted to all runs."""
     wanted = job.settings
     options = Options(most_rounds=wanted.rounds, tolerance=wanted.tolerance)
 
@@ -134,9 +134,7 @@ def _folds(
         report.advance(count, len(work), f"{count} of {len(work)} folds, {name}")
     report.stage("fitting all runs")
     fit = finished(kept, "all", whole)
-    z, log_v = np.asarray(fit["z"], float), np.asarray(fit["log_variance"], float)
-    state = State(z, log_v, 0, np.inf, np.inf, "joint")
-    return done, contact_of(problem, state, np.asarray(fit["covariance"], float))
+    return done, problem.space.tree(np.asarray(fit["z"], float))
 
 
 def finished(kept: Checkpoint, name: str, make: Callable[[], Content]) -> Content:

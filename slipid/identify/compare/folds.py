@@ -114,16 +114,6 @@ class FoldResult:
         return asdict(self, dict_factory=told)
 
 
-def problem_of(
-    problem: Problem, choices: Sequence[Choice], data: Runs, fitted: np.ndarray
-) -> Problem:
-    """The problem for some of its runs; other than itself where they saw a floor at one speed."""
-    held = [*still_viscosities(data, fitted), *choices]
-    if Space(problem.robot, held).names == problem.space.names:
-        return problem
-    return Problem(problem.windows, problem.robot, held, problem.joint)
-
-
 def judge(
     problem: Problem,
     choices: Sequence[Choice],
@@ -137,7 +127,9 @@ def judge(
     The problem is of all the runs of `data`, made with these choices; `judged` are numbers of runs.
     """
     fitted = np.setdiff1d(np.arange(len(data)), judged)
-    problem = problem_of(problem, choices, data, fitted)
+    held = [*still_viscosities(data, fitted), *choices]
+    if Space(problem.robot, held).names != problem.space.names:  # they saw a floor at one speed
+        problem = Problem(problem.windows, problem.robot, held, problem.joint)
     keep = np.isin(problem.windows.run, fitted).astype(float)
     began = time.perf_counter()
     optimum = optimise(problem, keep=keep, options=options, tell=tell)

@@ -145,19 +145,11 @@ Fitted = TypeVar("Fitted", bound=Predictive)
 
 
 def contact_of(
-    problem: Problem,
-    state: State,
-    covariance: Square,
-    keep: Float[np.ndarray, " piece"] | None = None,
+    problem: Problem, state: State, covariance: Square, keep: Float[np.ndarray, " piece"]
 ) -> Contact:
-    """The force balance at the end of a fit of the kept pieces.
-
-    Without them it leaves out what sessions share.
-    """
+    """The force balance at the end of a fit of the kept pieces, with what sessions share."""
     robot, variance = problem.space.tree(state.z), by_name(problem, state.log_variance)
     plain = Contact(robot, variance, np.asarray(covariance), problem.space, np.asarray(state.z))
-    if keep is None:
-        return plain
     of_floor = problem.space.where(lambda e: e.surface is not None)
     wide = np.where(of_floor[:, None] | of_floor, 0.0, plain.covariance)
     wide[of_floor, of_floor] = problem.space.prior_std[of_floor] ** 2

@@ -162,11 +162,14 @@ def score(
     `runs` go by their number in `data`; those that are met for the first time are added. `cov` is
     of the ends, None for a model without.
     """
-    gap = tracks.gap
+    gap = tracks.predicted[:, -1] - tracks.measured[:, -1]
     level, energy = replay.scores(gap[:, :2], cov)
-    ahead = np.linalg.norm((tracks.predicted[:, -1] - tracks.predicted[:, 0])[:, :2], axis=1)
+    ahead, chords = (
+        np.linalg.norm((path[:, -1] - path[:, 0])[:, :2], axis=1)
+        for path in (tracks.predicted, tracks.measured)
+    )
     for n, k in enumerate(tracks.run.tolist()):
-        log, chord = data.logs[k], float(tracks.chord[n])
+        log, chord = data.logs[k], float(chords[n])
         if k not in runs:
             runs[k] = Judged(
                 name=log.name,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from slipid.identify.fit.problem import Problem, State, linear
+from slipid.identify.fit.problem import Problem, State, linear, log_jacobian
 from slipid.identify.fit.structure import Held, Steps, levenberg
 from slipid.identify.fit.variances import DEGREES, Search, Square, scored
 
@@ -99,7 +99,7 @@ def one_round(
         root=problem.whitening(residual, log_v, keep).root,
         volt=volt,
         felt=felt,
-        slope=problem.log_jacobian(state.z, volt, keep)[1],
+        slope=log_jacobian(target, state.z, volt, keep)[1],
     )
     z = np.asarray(levenberg(held, Steps(steps)))
     residual, jacobian = problem.linear(z, volt)

@@ -90,13 +90,6 @@ class Problem:
         """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
         return linear(self.target, z, volt)[:2]
 
-    def log_jacobian(self, z: Vector, volt: Vector, keep: Vector) -> tuple[Array, Array]:
-        return log_jacobian(self.target, z, volt, keep)
-
-    def twists(self, z: Vector) -> tuple[Array, Array]:
-        """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
-        return _twists(self.space, self.batch, z)
-
     def covariance(self, block: str, log_v: Vector) -> Array:
         """Covariance of the residuals of a block (piece, m, m)."""
         return self.noise.blocks[block].covariance(jnp.asarray(log_v))
@@ -116,14 +109,10 @@ class Problem:
         every = np.ones(len(self.windows))
         return variances.whitened(self.noise.blocks, jacobian, log_v, every)
 
-    def variance_precision(self, log_v: Vector, keep: Vector, z: Vector) -> Array:
-        """Expected information of the log variances at z, prior included (variance, variance)."""
-        return variances.information(self.noise.blocks, log_v, keep, self.own(z, log_v))
-
     def loss(self, z: Vector, log_v: Vector, keep: Vector, residual: Blocks) -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
         nll = float(self.whitening(residual, log_v, keep).loss)
-        nll -= float(self.log_jacobian(z, self.volt(log_v), keep)[0])
+        nll -= float(log_jacobian(self.target, z, self.volt(log_v), keep)[0])
         pull = (np.asarray(z) - self.space.prior_mean) / self.space.prior_std
         spread = (np.asarray(log_v) - np.asarray(self.target.typical)) / VARIANCE_SPREAD
         return nll + 0.5 * float(np.sum(pull**2)) + 0.5 * float(np.sum(spread**2))
@@ -170,7 +159,9 @@ def log_jacobian(target: Target, z: Array, volt: Array, keep: Array) -> tuple[Ar
 
 
 @eqx.filter_jit
-def _twists(space: Space, batch: lk.Batch, z: Array) -> tuple[Array, Array]:
+def twists(space: Space, batch: lk.Batch, z: Array) -> tuple[Array, Array]:
+    """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
+
     def twist(x: Array) -> tuple[Array, Array]:
         xi = lk.predict(space.tree(x), batch).twist
         return xi, xi

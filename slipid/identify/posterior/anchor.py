@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.linear import squares
 from slipid.identify.fit.noise import effects
-from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.problem import Problem, twists
 from slipid.identify.fit.sessions import by_axis, pairs
 from slipid.identify.fit.variances import DEGREES
 from slipid.identify.posterior.coordinates import Fitted
@@ -40,7 +40,7 @@ class Anchor(eqx.Module):
 
 def anchor_at(problem: Problem, fitted: Fitted, sessions: tuple[tuple[str, str], ...]) -> Anchor:
     """Anchor at a fit, for sessions that have effects of their own."""
-    twist, slope = problem.twists(fitted.z)
+    twist, slope = twists(problem.space, problem.batch, fitted.z)
     w = problem.windows
     shares = effects(w, problem.robot) * np.sqrt(by_axis(fitted.session, "session", w))[:, None]
     place = {pair: k for k, pair in enumerate(sessions)}

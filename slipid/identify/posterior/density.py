@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES
-from slipid.identify.fit.variances import VARIANCE_SPREAD
+from slipid.identify.fit.variances import VARIANCE_SPREAD, information
 from slipid.identify.posterior.anchor import Anchor, anchor_at, log_student, predict
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, Fitted, coordinates_of
 from slipid.model.robot import Robot
@@ -71,7 +71,8 @@ class Density:
         n, v = len(at.structure), len(at.variance)
         out = np.zeros((self.size, self.size))
         z, log_v, keep = fitted.z, fitted.log_variance, np.ones(len(problem.windows))
-        of_variance = np.linalg.inv(np.asarray(problem.variance_precision(log_v, keep, z)))
+        told = information(problem.noise.blocks, log_v, keep, problem.own(z, log_v))
+        of_variance = np.linalg.inv(np.asarray(told))
         out[n : n + v, n : n + v] = of_variance[np.ix_(at.variance, at.variance)]
         own = fitted.covariance[np.ix_(at.structure, at.structure)]
         mean = np.concatenate([np.arange(n), np.arange(n + v, self.size)])
@@ -85,9 +86,9 @@ class Density:
             both = [jacobian["motion"][..., at.structure], moved.reshape(*shares.shape[:2], -1)]
             half = problem.whitened({"motion": jnp.concatenate(both, axis=-1)}, log_v)["motion"]
             flat = np.asarray(half).reshape(-1, len(mean))
-            told = flat.T @ flat
-            told[:n, :n] = 0.0  # is in the Laplace covariance already
-            precision += told
+            of_data = flat.T @ flat
+            of_data[:n, :n] = 0.0  # is in the Laplace covariance already
+            precision += of_data
             precision[n:, n:] += np.eye(len(mean) - n)
         out[np.ix_(mean, mean)] = np.linalg.inv(precision)
         return out

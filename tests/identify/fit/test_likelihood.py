@@ -13,6 +13,7 @@ from scipy.stats import multivariate_t
 
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
+from slipid.identify.fit import variances
 from slipid.identify.fit.linear import inverse_root
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.variances import DEGREES, scored
@@ -463,7 +464,7 @@ def test_the_score_of_the_voltage_noise_is_the_slope_of_the_loss(truth):
     step = scored(problem.target, blocks, known, typical, jnp.asarray(keep), own) - log_v
     assert abs(step[-1]) < 1.5  # else it was cut short
     # it divides by the expected information, or by more where others explain the residuals
-    score = np.asarray(problem.variance_precision(log_v, keep, z) @ step)[-1]
+    score = np.asarray(variances.information(problem.noise.blocks, log_v, keep, own) @ step)[-1]
     assert score == pytest.approx(-slope, rel=1e-3)
 
 
