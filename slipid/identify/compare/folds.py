@@ -1,8 +1,7 @@
 """Every rung of the ladder judged on runs left out: who is left out together, and what they say.
 
 Runs of one heading stay in one fold at every speed and on every floor, so that nothing of a
-left-out heading is seen. Folds differ only in the weight of each piece: one compiled function
-serves all.
+left-out heading is seen.
 """
 
 import time

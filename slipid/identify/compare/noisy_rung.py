@@ -1,7 +1,4 @@
-"""A rung of the ladder with noise of its own, so that it forecasts as the force balance does.
-
-Its numbers follow the camera's, which it shares with the force balance.
-"""
+"""A rung of the ladder with noise of its own, so that it forecasts as the force balance does."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

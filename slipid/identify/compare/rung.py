@@ -1,8 +1,4 @@
-"""The interface of every slip model below the force balance.
-
-A rung is fitted by `fit(windows, robot)` and predicts by `increments(windows, robot)`, judged in
-the same corrected metres as the force balance.
-"""
+"""The interface of every slip model below the force balance."""
 
 import abc
 from collections.abc import Mapping
@@ -20,7 +16,7 @@ Number = TypeVar("Number")
 
 @dataclass(frozen=True)
 class Rung(abc.ABC):
-    """A model that turns wheel motion into marker increments.
+    """A model that turns wheel motion into marker increments, in corrected metres.
 
     Attributes:
         state: fitted numbers of each floor; with the name enough to build the rung again.

@@ -1,7 +1,4 @@
-"""Which runs to drive next: the fitted robot simulates them, Fisher information judges them.
-
-What is assumed of new runs is said by `proposal.ASSUMPTIONS`.
-"""
+"""Which runs to drive next: the fitted robot simulates them, Fisher information judges them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

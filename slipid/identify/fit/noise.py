@@ -1,6 +1,6 @@
 """Variance components of the residuals of a piece, and the covariance they make.
 
-A piece is a few neighbouring windows of one run. Its residuals have the covariance
+The residuals of a piece have the covariance
 
     V = sum_c v_c B_c,   B from: camera place and heading noise, shared by neighbouring windows;
                          process noise along, across and in yaw, growing with distance, per floor;

@@ -1,8 +1,4 @@
-"""Posterior of a robot given windows of its runs, compiled for all windows of the same shapes.
-
-Structural numbers are found by Levenberg-Marquardt steps (`structure`), variances by Fisher scoring
-of the restricted likelihood (`variances`).
-"""
+"""Posterior of a robot given windows of its runs, compiled for all windows of the same shapes."""
 
 import copy
 from collections.abc import Iterable, Sequence

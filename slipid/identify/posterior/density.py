@@ -22,8 +22,16 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES
 from slipid.identify.fit.variances import VARIANCE_SPREAD, information
-from slipid.identify.posterior.anchor import Anchor, anchor_at, log_student, predict
-from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, Fitted, coordinates_of
+from slipid.identify.posterior.coordinates import (
+    ELECTRIC,
+    EVERYTHING,
+    Anchor,
+    Fitted,
+    anchor_at,
+    coordinates_of,
+    log_student,
+    predict,
+)
 from slipid.model.robot import Robot
 
 Result = TypeVar("Result")

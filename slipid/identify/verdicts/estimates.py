@@ -1,8 +1,6 @@
 """What may be said of every number and of ratios of them: interval and verdict.
 
 Before a fit from the information expected at the start values, after it from the Laplace posterior.
-Directions in which nothing is said are found by `unidentified`, a number's likelihood beyond
-Laplace by `profile`.
 """
 
 from collections.abc import Sequence
