@@ -18,6 +18,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import effects
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES, by_axis
+from slipid.identify.fit.variances import whitened
 from slipid.identify.result import Channels, Fit
 from slipid.model.robot import Robot
 from slipid.parameter import entries
@@ -108,7 +109,7 @@ class Planner:
         wider = ((0, 0), (0, 0), (0, self.effects))
         of_motion = jnp.concatenate([jacobian["motion"], -moved], axis=2)
         jacobian = {k: jnp.pad(j, wider) for k, j in jacobian.items()} | {"motion": of_motion}
-        halves = this.whitened(jacobian, self._log_v)
+        halves = whitened(this.noise.blocks, jacobian, self._log_v, np.ones(_TOGETHER))
         motion = np.asarray(halves.pop("motion"))[: len(drives)]
         others = [np.asarray(h)[: len(drives)] for h in halves.values()]
         if this.joint:

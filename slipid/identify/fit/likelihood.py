@@ -23,7 +23,6 @@ SMOOTH = 0.03
 FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
 """Variance added to every residual: rounding of the logs [m^2, A^2, V^2]."""
 
-
 _AS_THEY_ARE = ("dt", "turn", "faster", "pose", "current", "voltage", "current_var", "lag")
 
 
@@ -90,17 +89,14 @@ def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
     """Contact equilibrium of every window, looked for near twists as `model.robot.twist` does."""
     frame = robot.geometry.frame()
 
-    def window(
-        w: Array, dt: Array, near: Array | None, surface: Array, load: Array, session: Array
-    ) -> tuple[Array, Array, Array]:
+    def window(w: Array, near: Array | None, surface: Array, load: Array) -> tuple[Array, Array]:
         xi = model.twist(robot, frame, w, surface, load, near)
-        increment = robot.camera.seen(se2.advance(xi, dt), session)
-        return increment, xi, model.felt(robot, frame, xi, w, surface, load)
+        return xi, model.felt(robot, frame, xi, w, surface, load)
 
     each = None if near is None else 0
-    piece = jax.vmap(window, (0, 0, each, None, None, None))
-    pieces = jax.vmap(piece, (0, 0, each, 0, 0, 0))
-    return Predicted(*pieces(wheel_speed(robot, b), b.dt, near, b.surface, b.load, b.session))
+    pieces = jax.vmap(jax.vmap(window, (0, each, None, None)), (0, each, 0, 0))
+    twist, felt = pieces(wheel_speed(robot, b), near, b.surface, b.load)
+    return Predicted(seen(robot, twist, b.dt, b.session), twist, felt)
 
 
 def seen(

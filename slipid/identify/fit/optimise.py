@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from slipid.identify.fit.problem import Problem, State, linear, log_jacobian
 from slipid.identify.fit.structure import Held, Steps, levenberg
-from slipid.identify.fit.variances import DEGREES, Search, Square, scored
+from slipid.identify.fit.variances import Search, Square, scored
 
 CREEPS = (0.05, 0.4, 1.0)
 """Starts of the creep of every floor; others end in poor minima."""
@@ -148,7 +148,10 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
         for steps in (15, 6, 6):  # the damping has to grow from 1 to the size of the problem first
             state = one_round(problem, state, keep, mask, steps=steps, scoring=0)
             tell(state)
-        cost = _piece_cost(problem, state)
+        residual, _ = problem.linear(state.z, problem.volt(state.log_variance))
+        every = np.ones(len(floors))
+        weight = problem.whitening(residual, state.log_variance, every).weight["motion"]
+        cost = -np.log(np.asarray(weight))  # as good as the loss, but for factor and constant
         for number, label in enumerate(labels):
             mine = float(np.sum(cost[(floors == number) & (keep > 0)]))
             if mine < best[number]:
@@ -156,14 +159,6 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
                 own = space.where(lambda e, label=label: e.surface == label)
                 z[own] = state.z[own]
     return State(z, log_v, 0, np.inf, np.inf, "joint")
-
-
-def _piece_cost(problem: Problem, state: State) -> np.ndarray:
-    residual, _ = problem.linear(state.z, problem.volt(state.log_variance))
-    v = np.asarray(problem.covariance("motion", state.log_variance))
-    r = np.asarray(residual["motion"])
-    q = np.einsum("ni,ni->n", r, np.linalg.solve(v, r[..., None])[..., 0])
-    return 0.5 * (DEGREES + r.shape[1]) * np.log1p(q / DEGREES)
 
 
 def _motor_start(problem: Problem) -> np.ndarray:

@@ -101,10 +101,6 @@ class Problem:
         jacobian = self.linear(z, self.volt(log_v))[1]
         return np.linalg.inv(np.asarray(self.precision(jacobian, log_v, keep)))
 
-    def whitened(self, jacobian: Blocks, log_v: Vector) -> Blocks:
-        every = np.ones(len(self.windows))
-        return variances.whitened(self.noise.blocks, jacobian, log_v, every)
-
     def loss(self, z: Vector, log_v: Vector, keep: Vector, residual: Blocks) -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
         nll = float(self.whitening(residual, log_v, keep).loss)

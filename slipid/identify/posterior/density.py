@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES
-from slipid.identify.fit.variances import VARIANCE_SPREAD, information
+from slipid.identify.fit.variances import VARIANCE_SPREAD, information, whitened
 from slipid.identify.posterior.coordinates import (
     ELECTRIC,
     EVERYTHING,
@@ -92,7 +92,8 @@ class Density:
             member = np.eye(len(at.sessions))[np.asarray(self.anchor.session)]
             moved = -shares[:, :, None, :] * member[:, None, :, None]
             both = [jacobian["motion"][..., at.structure], moved.reshape(*shares.shape[:2], -1)]
-            half = problem.whitened({"motion": jnp.concatenate(both, axis=-1)}, log_v)["motion"]
+            wider = {"motion": jnp.concatenate(both, axis=-1)}
+            half = whitened(problem.noise.blocks, wider, log_v, keep)["motion"]
             flat = np.asarray(half).reshape(-1, len(mean))
             of_data = flat.T @ flat
             of_data[:n, :n] = 0.0  # is in the Laplace covariance already

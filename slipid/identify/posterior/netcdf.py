@@ -1,9 +1,7 @@
 """posterior.nc: draws in the layout of ArviZ, with names for everything."""
 
 import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
-from functools import reduce
 from pathlib import Path
 
 import jax
@@ -19,7 +17,6 @@ from slipid.identify.fit.variances import DEGREES
 from slipid.identify.posterior.coordinates import EVERYTHING
 from slipid.identify.posterior.density import Density
 from slipid.identify.posterior.diagnosis import Posterior
-from slipid.parameter import Entry
 from slipid.search_space import Space
 from slipid.support.files import write_bytes
 
@@ -88,23 +85,14 @@ def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
     shape = found.z.shape[:2]
     robots = jax.vmap(space.tree)(jnp.asarray(found.z.reshape(-1, space.size)))
     values, dims, units = {}, {}, {}
-    for name, entry, of_label in _leaves(space):
-        leaf = np.asarray(reduce(getattr, entry.leaf, robots))
-        values[name] = leaf.reshape(*shape, *leaf.shape[1:])
-        of_vector = [] if entry.size == 1 else ["axis"] if entry.size == 2 else ["wheel"]
-        dims[name] = [*of_label, *of_vector]
-        units[name] = entry.declaration.unit
-    return values, dims, units
-
-
-def _leaves(space: Space) -> Iterator[tuple[str, Entry, list[str]]]:
-    """Name, an entry and the labelled dimension of every leaf with a free number."""
-    told = set()
     for e in space.free:
-        if e.leaf not in told:
-            told.add(e.leaf)
-            of = {"surface": e.surface, "load": e.load, "session": e.session}
-            yield e.quantity, e, [label for label, name in of.items() if name is not None]
+        leaf = np.asarray(e.whole(robots))
+        values[e.quantity] = leaf.reshape(*shape, *leaf.shape[1:])
+        of = {"surface": e.surface, "load": e.load, "session": e.session}
+        of_vector = [] if e.size == 1 else ["axis"] if e.size == 2 else ["wheel"]
+        dims[e.quantity] = [label for label, name in of.items() if name is not None] + of_vector
+        units[e.quantity] = e.declaration.unit
+    return values, dims, units
 
 
 def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
