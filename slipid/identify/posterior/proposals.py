@@ -17,7 +17,7 @@ from numpy.random import RandomState
 from scipy.special import gammaln
 
 from slipid.identify.posterior.target import Family, Target, families
-from slipid.identify.posterior.transport.coordinatewise import Matrix
+from slipid.identify.posterior.transport.pieces import Matrix
 
 STUDENT = 0.2
 """Part of independent draws that come from a Student t, so that no tail is left out."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from slipid.identify.posterior.blocks import Block, packed, unpacked
-from slipid.identify.posterior.transport.coordinatewise import Warp
+from slipid.identify.posterior.transport.pieces import Warp
 from slipid.identify.posterior.transport.transport_map import _placed, learnt
 
 

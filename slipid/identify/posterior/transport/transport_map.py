@@ -28,8 +28,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from slipid.identify.posterior.transport.bend import FAR, MOST_MONOMIALS, Bend
-from slipid.identify.posterior.transport.coordinatewise import Matrix, Values, Vector, Warp
+from slipid.identify.posterior.transport.pieces import (
+    FAR,
+    MOST_MONOMIALS,
+    Bend,
+    Matrix,
+    Values,
+    Vector,
+    Warp,
+)
 
 MOST_DRAWS = 4000
 """Largest number of draws that a map is learnt from."""
