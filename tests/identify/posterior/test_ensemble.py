@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
+from emcee.model import Model
 
 from slipid.identify.posterior.blocks import Plan, Record, packed, unpacked
 from slipid.identify.posterior.diagnosis import autocorrelation_time, diagnose
@@ -239,23 +240,21 @@ def made_gaussian(map, group, kind):
     return Target(terms, np.negative, group, kind, centre, covariance, map=map)
 
 
-class Model:
+def model_of(target):
     """What emcee gives to moves."""
 
-    def __init__(self, target):
-        self.random = np.random.RandomState(0)
-        self.target = target
-
-    def compute_log_prob_fn(self, u):
-        out = self.target.log_prob(u)
+    def compute(u):
+        out = target.log_prob(u)
         return out[:, 0], out[:, 1:]
+
+    return Model(target.log_prob, compute, map, np.random.RandomState(0))
 
 
 def test_a_hamiltonian_move_is_exact_and_independent_for_a_gaussian(exact):
     from emcee.state import State
 
     target, u = exact
-    model = Model(target)
+    model = model_of(target)
     log_prob, terms = model.compute_log_prob_fn(u)
     state = State(u, log_prob=log_prob, blobs=terms, copy=True)
     state, took = Hamiltonian(target, 0.5).propose(model, state)
@@ -271,7 +270,7 @@ def test_walking_along_a_coordinate_keeps_the_distribution(bent, groups):
     map, _ = bent
     group, kind = np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1]), np.array([0, 1, 0, 0, 0, 1, 0, 0, 1])
     target = made_gaussian(map, group, kind)
-    model, u = Model(target), np.random.RandomState(1).standard_normal((4000, 9))
+    model, u = model_of(target), np.random.RandomState(1).standard_normal((4000, 9))
     log_prob, terms = model.compute_log_prob_fn(u)
     from emcee.state import State
 
