@@ -55,15 +55,14 @@ class Noisy(Predictive):
         return sizes | {"shared": 0}
 
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
-        rung, robot, contact = self.rung, self.robot, self.contact
-        b, z = problem.batch, jnp.asarray(contact.z)
-        w = problem.windows.at_lag(float(robot.camera.lag))
+        rung, z, b = self.rung, self.contact.z, problem.batch
+        w = problem.windows.at_lag(float(self.robot.camera.lag))
 
         def gap(some: Rung) -> np.ndarray:
-            return np.asarray(_gap(problem.space, z, jnp.asarray(some.twist(w, robot)), b))
+            return np.asarray(_gap(problem.space, z, some.twist(w, self.robot), b))
 
-        camera = _gap_jacobian(problem.space, z, jnp.asarray(rung.twist(w, robot)), b)
-        by_camera = np.asarray(camera)[..., contact.camera]
+        by_z = np.asarray(_gap_jacobian(problem.space, z, rung.twist(w, self.robot), b))
+        by_camera = by_z[..., self.contact.camera]
         return gap(rung), np.concatenate([slopes(rung, w, gap), by_camera], axis=-1)
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
@@ -73,13 +72,8 @@ class Noisy(Predictive):
             return replay.follow(robot, w, rung.increments(w, robot))
 
         tracks = tracks_of(self.rung)
-        camera = replay.twist_end_jacobian(
-            contact.space,
-            jnp.asarray(contact.z),
-            jnp.asarray(self.rung.twist(w, robot)),
-            lk.batch(w, robot),
-            jnp.asarray(tracks.predicted[:, 0]),
-        )
+        twist, start = self.rung.twist(w, robot), tracks.predicted[:, 0]
+        camera = replay.end_jacobian(contact.space, contact.z, lk.batch(w, robot), start, twist)
         own = slopes(self.rung, w, lambda rung: tracks_of(rung).predicted[:, -1, :2])
         jac = np.concatenate([own, np.asarray(camera)[..., contact.camera]], axis=-1)
         spread = around(jac, self.covariance)
@@ -150,9 +144,7 @@ def _gap(space: Space, z: Array, twist: Array, b: lk.Batch) -> Array:
     return gap.reshape(gap.shape[0], -1)
 
 
-@eqx.filter_jit
-def _gap_jacobian(space: Space, z: Array, twist: Array, b: lk.Batch) -> Array:
-    return jax.jacfwd(lambda x: _gap(space, x, twist, b))(z)
+_gap_jacobian = eqx.filter_jit(jax.jacfwd(_gap, argnums=1))
 
 
 def slopes(rung: Rung, w: Windows, of: Callable[[Rung], np.ndarray]) -> np.ndarray:

@@ -95,21 +95,19 @@ def follow(robot: Robot, w: Windows, increment: Float[np.ndarray, "piece window 
 
 
 @eqx.filter_jit
-def twist_end_jacobian(space: Space, z: Array, twist: Array, w: lk.Batch, start: Array) -> Array:
-    """Slope of the ends by the search vector where the body's twists are given (piece, 2, free)."""
+def end_jacobian(
+    space: Space, z: Array, b: lk.Batch, start: Array, twist: Array | None = None
+) -> Float[Array, "piece 2 free"]:
+    """Slope of the ends by the search vector, from given start poses.
+
+    Of the contact equilibrium, or where the body's twists are given (piece, window, 3).
+    """
 
     def end(x: Array) -> Array:
-        return chain(start, lk.seen(space.tree(x), twist, w.dt, w.session))[:, -1, :2]
-
-    return jax.jacfwd(end)(z)
-
-
-@eqx.filter_jit
-def end_jacobian(space: Space, z: Array, b: lk.Batch, start: Array) -> Array:
-    """Derivative of the end pose (piece, 3) by the search vector, from given start poses."""
-
-    def end(x: Array) -> Array:
-        return chain(start, contact_increments(space.tree(x), b))[:, -1]
+        robot = space.tree(x)
+        if twist is None:
+            return chain(start, contact_increments(robot, b))[:, -1, :2]
+        return chain(start, lk.seen(robot, twist, b.dt, b.session))[:, -1, :2]
 
     return jax.jacfwd(end)(z)
 

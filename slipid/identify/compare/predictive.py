@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.special import gammaln
@@ -133,10 +132,9 @@ class Contact(Predictive):
         return np.asarray(blocks["motion"]), np.asarray(jac["motion"])
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
-        b, z = lk.batch(w, self.robot), jnp.asarray(self.z)
+        b = lk.batch(w, self.robot)
         tracks = replay.follow(self.robot, w, np.asarray(replay.contact_increments(self.robot, b)))
-        start = jnp.asarray(tracks.predicted[:, 0])
-        jac = np.asarray(replay.end_jacobian(self.space, z, b, start))[:, :2]
+        jac = np.asarray(replay.end_jacobian(self.space, self.z, b, tracks.predicted[:, 0]))
         own = np.einsum("nip,pq,njq->nij", jac, self.covariance, jac)
         return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, own)
 

@@ -97,7 +97,18 @@ def design(fit: Fit, wish: Wish) -> Design:
     for k, drive in zip(chosen, drives, strict=True):
         after = after.plus(rows.pick([k]))
         expected = {g.name: g.std(after) for g in goals}
-        content["runs"].append(_run(drive, scope.base) | {"expected": expected})
+        content["runs"].append(
+            {
+                "floor": drive.surface,
+                "load": drive.load,
+                "heading_deg": float(np.degrees(drive.heading)),
+                "speed": drive.speed,
+                "turn_rate": drive.turn,
+                "distance": drive.distance,
+                "seconds": drive.seconds(scope.base),
+                "expected": expected,
+            }
+        )
     content["messages"] = [*lost.values(), *_extrapolated(fit, drives)]
     content["data"] = {"hash": fit.data_hash, "runs": len(fit.runs)}
     asked = bool(wish.parameters or wish.predictions)
@@ -147,18 +158,6 @@ def _out_of_reach(
     most = f"driving all {count} {info.ENDLESS:.0f} times would leave {part:.0%} of its std"
     why = next((f.text for f in fit.flat if goal.name in f.paths), most)
     return f"no candidate run shrinks {goal.name}: {why}"
-
-
-def _run(drive: Drive, base: float) -> Content:
-    return {
-        "floor": drive.surface,
-        "load": drive.load,
-        "heading_deg": float(np.degrees(drive.heading)),
-        "speed": drive.speed,
-        "turn_rate": drive.turn,
-        "distance": drive.distance,
-        "seconds": drive.seconds(base),
-    }
 
 
 def _extrapolated(fit: Fit, drives: Sequence[Drive]) -> list[str]:

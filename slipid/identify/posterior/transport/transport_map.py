@@ -19,7 +19,7 @@ coordinates and are bent by themselves, so that groups that are independent give
 stay so. It is one of the maps of Marzouk et al. 2016 (Sampling via measure transport, section 3).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -196,18 +196,17 @@ def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray, kind: np.ndarr
 
 def _order(
     group: np.ndarray, kind: np.ndarray, values: Values
-) -> list[tuple[np.ndarray, np.ndarray]]:
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Coordinates of every stair, and those before it that they are given."""
-    plateau, found = values.plateau > 0, []
+    plateau = values.plateau > 0
     for g in range(-1, int(group.max()) + 1):
         before = np.flatnonzero(group < 0) if g >= 0 else np.zeros(0, int)
         for k in np.unique(kind):
             for first in (True, False):
                 own = np.flatnonzero((group == g) & (kind == k) & (plateau == first))
                 if len(own):
-                    found.append((own, before))
+                    yield own, before
                     before = np.concatenate([before, own])
-    return found
 
 
 def _stairs(
