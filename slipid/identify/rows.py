@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from slipid.identify.fit.problem import Problem, log_jacobian
 from slipid.identify.fit.variances import Search, Square, Vector
@@ -46,7 +47,7 @@ def spectrum(gram: Square) -> Search:
     return np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0))
 
 
-def remaining(problem: Problem, z: Search, volt: Vector, rows: Rows) -> tuple[float, str]:
+def remaining(problem: Problem, z: Search, volt: Array, rows: Rows) -> tuple[float, str]:
     """Largest step of a full Gauss-Newton step in posterior stds, and the number that takes it.
 
     delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), W with the weights of outliers, g

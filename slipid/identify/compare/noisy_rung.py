@@ -138,9 +138,9 @@ def _numbers(
 
 
 @eqx.filter_jit
-def _gap(space: Space, z: Array, twist: Array, b: lk.Batch) -> Array:
+def _gap(space: Space, z: replay.Numbers, twist: replay.Numbers, b: lk.Batch) -> Array:
     robot = space.tree(z)
-    gap = lk.seen(robot, twist, b.dt, b.session) - lk.measured(robot, b.pose)
+    gap = lk.seen(robot, jnp.asarray(twist), b.dt, b.session) - lk.measured(robot, b.pose)
     return gap.reshape(gap.shape[0], -1)
 
 

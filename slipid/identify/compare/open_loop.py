@@ -27,6 +27,7 @@ from slipid.search_space import Space
 
 STEP = 0.5
 """Longest step of a replay [s]."""
+Numbers = Array | np.ndarray
 TOGETHER = 32
 """Runs replayed in one call."""
 
@@ -96,7 +97,7 @@ def follow(robot: Robot, w: Windows, increment: Float[np.ndarray, "piece window 
 
 @eqx.filter_jit
 def end_jacobian(
-    space: Space, z: Array, b: lk.Batch, start: Array, twist: Array | None = None
+    space: Space, z: Numbers, b: lk.Batch, start: Numbers, twist: Numbers | None = None
 ) -> Float[Array, "piece 2 free"]:
     """Slope of the ends by the search vector, from given start poses.
 
@@ -107,7 +108,7 @@ def end_jacobian(
         robot = space.tree(x)
         if twist is None:
             return chain(start, contact_increments(robot, b))[:, -1, :2]
-        return chain(start, lk.seen(robot, twist, b.dt, b.session))[:, -1, :2]
+        return chain(start, lk.seen(robot, jnp.asarray(twist), b.dt, b.session))[:, -1, :2]
 
     return jax.jacfwd(end)(z)
 

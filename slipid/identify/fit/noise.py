@@ -28,7 +28,9 @@ class Components(eqx.Module):
     which: Int[Array, "piece component"]
     floor: float = eqx.field(static=True)
 
-    def covariance(self, log_variance: Float[Array, " variance"]) -> Float[Array, "piece m m"]:
+    def covariance(
+        self, log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"]
+    ) -> Float[Array, "piece m m"]:
         """V of every piece."""
         v, m = jnp.exp(log_variance)[self.which], self.base.shape[-1]
         return jnp.einsum("nc,ncij->nij", v, self.base) + self.floor * jnp.eye(m)

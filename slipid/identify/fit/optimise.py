@@ -10,6 +10,7 @@ from jaxtyping import Float
 from slipid.identify.fit.problem import Problem, State, linear, log_jacobian
 from slipid.identify.fit.structure import Held, Steps, levenberg
 from slipid.identify.fit.variances import Search, Square, scored
+from slipid.search_space import Space
 
 CREEPS = (0.05, 0.4, 1.0)
 """Starts of the creep of every floor; others end in poor minima."""
@@ -156,9 +157,13 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
             mine = float(np.sum(cost[(floors == number) & (keep > 0)]))
             if mine < best[number]:
                 best[number] = mine
-                own = space.where(lambda e, label=label: e.surface == label)
+                own = _of_floor(space, label)
                 z[own] = state.z[own]
     return State(z, log_v, 0, np.inf, np.inf, "joint")
+
+
+def _of_floor(space: Space, label: str) -> np.ndarray:
+    return space.where(lambda e: e.surface == label)
 
 
 def _motor_start(problem: Problem) -> np.ndarray:

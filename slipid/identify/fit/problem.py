@@ -82,13 +82,13 @@ class Problem:
     def batch(self) -> lk.Batch:
         return self.target.batch
 
-    def linear(self, z: Vector, volt: Vector) -> tuple[Blocks, Blocks]:
+    def linear(self, z: Vector, volt: Array) -> tuple[Blocks, Blocks]:
         """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
         return linear(self.target, z, volt)[:2]
 
     def covariance(self, block: str, log_v: Vector) -> Array:
         """Covariance of the residuals of a block (piece, m, m)."""
-        return self.noise.blocks[block].covariance(jnp.asarray(log_v))
+        return self.noise.blocks[block].covariance(log_v)
 
     def whitening(self, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
         return variances.whitening(self.noise.blocks, residual, log_v, keep)
@@ -126,7 +126,7 @@ class Problem:
 
 
 @eqx.filter_jit
-def linear(target: Target, z: Array, volt: Array) -> tuple[Blocks, Blocks, Array]:
+def linear(target: Target, z: Vector, volt: Array) -> tuple[Blocks, Blocks, Array]:
     """Residual blocks, their Jacobians, and the traction of every wheel's motor."""
 
     def blocks(x: Array) -> tuple[Blocks, tuple[Blocks, Array]]:
@@ -141,17 +141,17 @@ def linear(target: Target, z: Array, volt: Array) -> tuple[Blocks, Blocks, Array
 
 
 @eqx.filter_jit
-def log_jacobian(target: Target, z: Array, volt: Array, keep: Array) -> tuple[Array, Array]:
+def log_jacobian(target: Target, z: Vector, volt: Array, keep: Vector) -> tuple[Array, Array]:
     """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
 
     def total(x: Array) -> Array:
-        return keep @ sum(lk.log_jacobians(target.space.tree(x), target.batch, volt))
+        return jnp.asarray(keep) @ sum(lk.log_jacobians(target.space.tree(x), target.batch, volt))
 
     return jax.value_and_grad(total)(z)
 
 
 @eqx.filter_jit
-def twists(space: Space, batch: lk.Batch, z: Array) -> tuple[Array, Array]:
+def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
     """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
 
     def twist(x: Array) -> tuple[Array, Array]:
@@ -163,7 +163,7 @@ def twists(space: Space, batch: lk.Batch, z: Array) -> tuple[Array, Array]:
 
 
 @eqx.filter_jit
-def _share(space: Space, batch: lk.Batch, z: Array, volt: Array) -> Array:
+def _share(space: Space, batch: lk.Batch, z: Vector, volt: Array) -> Array:
     return lk.voltage_share(space.tree(z), batch, volt)
 
 

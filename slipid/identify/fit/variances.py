@@ -59,14 +59,14 @@ class Whitening(NamedTuple):
 
 
 @eqx.filter_jit
-def whitening(noises: Noises, residual: Blocks, log_v: Array, keep: Array) -> Whitening:
+def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
     """Weights of residuals, for pieces that count as `keep` says."""
     roots, weights, loss = {}, {}, jnp.zeros(())
     for k, r in residual.items():
         inverse = inverse_root(noises[k].covariance(log_v))
         m = inverse.shape[-1]
         q = jnp.sum(jnp.einsum("nij,nj->ni", inverse, r) ** 2, axis=-1)
-        weights[k] = keep * (DEGREES + m) / (DEGREES + q)
+        weights[k] = (DEGREES + m) / (DEGREES + q) * keep
         roots[k] = jnp.sqrt(weights[k])[:, None, None] * inverse
         log_det = -jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=-2, axis2=-1)), axis=-1)
         loss += jnp.sum(keep * (log_det + 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)))
@@ -74,7 +74,7 @@ def whitening(noises: Noises, residual: Blocks, log_v: Array, keep: Array) -> Wh
 
 
 @eqx.filter_jit
-def whitened(noises: Noises, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
+def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> Blocks:
     """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
     out = {}
     for k, jac in jacobian.items():
@@ -86,7 +86,7 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Array, keep: Array) -> Blo
 
 
 @eqx.filter_jit
-def precision(target: Target, jacobian: Blocks, log_v: Array, keep: Array) -> Array:
+def precision(target: Target, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
     """Expected information of the search vector, prior included (free, free)."""
     prior = jnp.diag(1 / jnp.asarray(target.space.prior_std) ** 2)
     total, of_motion = prior, prior
@@ -154,7 +154,7 @@ def scored_given(
 
 
 @eqx.filter_jit
-def information(noises: Noises, log_v: Array, keep: Array, own: Blocks) -> Array:
+def information(noises: Noises, log_v: Vector, keep: Vector, own: Blocks) -> Array:
     """Expected information of the log variances, prior included (variance, variance)."""
     info = jnp.eye(log_v.shape[0]) / VARIANCE_SPREAD**2
     for k, noise in noises.items():
