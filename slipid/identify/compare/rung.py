@@ -18,8 +18,7 @@ Number = TypeVar("Number")
 class Rung(abc.ABC):
     """A model that turns wheel motion into marker increments, in corrected metres.
 
-    Attributes:
-        state: fitted numbers of each floor; with the name enough to build the rung again.
+    The state is the fitted numbers of each floor, with the name enough to build the rung again.
     """
 
     name: str

@@ -29,8 +29,7 @@ _AS_THEY_ARE = ("dt", "turn", "faster", "pose", "current", "voltage", "current_v
 class Batch(eqx.Module):
     """Windows as arrays for a jitted function; names are indices of the robot's stacks.
 
-    Attributes:
-        surface: under the robot (piece,), or under each of its wheels (piece, wheel).
+    The surface is the one under the robot (piece,), or under each of its wheels (piece, wheel).
     """
 
     surface: Int[Array, "piece *wheel"]

@@ -40,10 +40,8 @@ class Components(eqx.Module):
 class Component:
     """One source of noise: `process` `along`, `camera` `place`, `current` `window` and so on.
 
-    Attributes:
-        floor: it is met on, None where it is of all.
-        unit: of its std.
-        typical: std that the weak log-normal prior is centred on.
+    It is met on a floor, None for all; unit and typical value, which the weak log-normal prior is
+    centred on, are of its std.
     """
 
     kind: str

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from slipid.identify.fit import problem as of_problem
-from slipid.identify.fit import structure, variances
-from slipid.identify.fit.optimise import Options, optimise
+from slipid.identify.fit import variances
+from slipid.identify.fit.optimise import Options, levenberg, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit.variances import DEGREES
 from slipid.search_space import Choice
@@ -296,7 +296,7 @@ def test_a_problem_is_forgotten_after_use_and_those_like_it_compile_nothing(trut
     del first
     gc.collect()
     assert [ref() for ref in kept] == [None] * 3
-    jitted = (of_problem.linear, of_problem.log_jacobian, structure.levenberg)
+    jitted = (of_problem.linear, of_problem.log_jacobian, levenberg)
     jitted += (variances.whitening, variances.scored, variances.precision)
     before = [f._cached._cache_size() for f in jitted]
     assert min(before) > 0
