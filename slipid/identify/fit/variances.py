@@ -8,12 +8,12 @@ likelihood of the variances takes into account what the structural numbers have 
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.linear import inverse_root
 from slipid.identify.fit.noise import Components
 from slipid.search_space import Space
 
@@ -173,3 +173,27 @@ def _shared(base: Array, own: Array | None) -> Array:
         return base
     root = jnp.sqrt(own)
     return base * root[:, None, :, None] * root[:, None, None, :]
+
+
+def inverse_root(v: Float[Array, "piece m m"]) -> Float[Array, "piece m m"]:
+    """L^-1 of V = L L^T for many small matrices, all at once, column by column.
+
+    Written out because batched LAPACK calls that run beside each other inside one compiled function
+    can wait for each other for ever on a machine with two cores (seen with jax 0.10).
+    """
+    a = jnp.moveaxis(v, 0, -1)
+    m = a.shape[0]
+    rows = jnp.arange(m)[:, None]
+
+    def column(j: Array, low: Array) -> Array:
+        rest = a[:, j] - jnp.sum(low * low[j], axis=1)
+        return low.at[:, j].set(jnp.where(rows >= j, rest / jnp.sqrt(rest[j]), 0.0))
+
+    low = jax.lax.fori_loop(0, m, column, jnp.zeros_like(a))
+
+    def row(i: Array, inverse: Array) -> Array:
+        known = jnp.sum(low[i][:, None] * inverse, axis=0)
+        return inverse.at[i].set(((rows == i) - known) / low[i, i])
+
+    inverse = jax.lax.fori_loop(0, m, row, jnp.zeros_like(a))
+    return jnp.moveaxis(inverse, -1, 0)

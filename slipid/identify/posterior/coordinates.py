@@ -12,7 +12,6 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float, Int
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.linear import squares
 from slipid.identify.fit.noise import effects
 from slipid.identify.fit.problem import Problem, twists
 from slipid.identify.fit.sessions import AXES, by_axis, pairs
@@ -173,3 +172,47 @@ def log_student(
     constant = gammaln(0.5 * (DEGREES + m)) - gammaln(0.5 * DEGREES)
     constant -= 0.5 * m * np.log(DEGREES * np.pi)
     return constant - 0.5 * log_det - 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)
+
+
+@jax.custom_vjp
+def squares(
+    v: Float[Array, "m m piece"], r: Float[Array, "m piece"]
+) -> tuple[Float[Array, " piece"], Float[Array, " piece"]]:
+    """Log |V| and r^T V^-1 r of many small matrices, pieces last.
+
+    Columns of L and of L^-1 r, one after the other; the columns are few enough to be written out.
+    The derivative backwards is V^-1 and -V^-1 r r^T V^-1 (reverse mode only): going back through
+    the columns takes longer.
+    """
+    columns = _columns(jnp.concatenate([v, r[None]]))
+    log_det = jnp.sum(jnp.stack([2 * jnp.log(c[0]) for c in columns]), axis=0)
+    return log_det, jnp.sum(jnp.stack([c[-1] ** 2 for c in columns]), axis=0)
+
+
+def _columns(rows: Float[Array, "row m piece"]) -> list[Array]:
+    """Columns of L from the diagonal on; rows after the m-th are L^-1 times what they were."""
+    columns: list[Array] = []
+    for j in range(rows.shape[1]):
+        c = rows[j:, j]
+        if columns:
+            known = jnp.stack([old[j - k :] for k, old in enumerate(columns)], axis=1)
+            c = c - jnp.sum(known * known[:1], axis=1)
+        columns.append(jax.lax.optimization_barrier(c * jax.lax.rsqrt(c[0])))
+    return columns
+
+
+def _squares_backward(kept: tuple[Array, Array], slope: tuple[Array, Array]) -> tuple[Array, Array]:
+    v, r = kept
+    low, inverse = _columns(v), []
+    for i in range(len(low)):  # rows of L^-1
+        row = jnp.zeros_like(v[0]).at[i].set(1.0)
+        for k in range(i):
+            row = row.at[: k + 1].add(-low[k][i - k] * inverse[k][: k + 1])
+        inverse.append(jax.lax.optimization_barrier(row / low[i][0]))
+    root = jnp.stack(inverse)
+    precision = jnp.einsum("iap,ibp->abp", root, root)
+    w = jnp.sum(precision * r, axis=1)
+    return slope[0] * precision - slope[1] * w[:, None] * w, 2 * slope[1] * w
+
+
+squares.defvjp(lambda v, r: (squares(v, r), (v, r)), _squares_backward)

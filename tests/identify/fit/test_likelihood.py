@@ -14,9 +14,8 @@ from scipy.stats import multivariate_t
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
 from slipid.identify.fit import variances
-from slipid.identify.fit.linear import inverse_root
 from slipid.identify.fit.problem import Problem
-from slipid.identify.fit.variances import DEGREES, scored
+from slipid.identify.fit.variances import DEGREES, inverse_root, scored
 from slipid.identify.slip_curves import current_trend
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, residuals, robot
