@@ -23,8 +23,7 @@ from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.optimise import Optimum, one_round
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit.variances import DEGREES
-from slipid.identify.fit_file import load, save
-from slipid.identify.fit_json import identified_json, to_json
+from slipid.identify.fit_file import identified_json, load, save, to_json
 from slipid.identify.result import Fit, hash_of, summarise
 from slipid.identify.verdicts.estimates import estimates
 from slipid.identify.verdicts.unidentified import flat_directions
