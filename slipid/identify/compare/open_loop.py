@@ -16,7 +16,7 @@ from scipy.stats import f as fisher
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
-from slipid.identify.compare.body_motion import sideways, turned
+from slipid.identify.compare.rung import sideways, turned
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import travel
 from slipid.identify.fit.sessions import by_axis
