@@ -110,7 +110,7 @@ def with_noise(
     own = len(before)
     wide = np.zeros_like(covariance)
     wide[:own, :own], wide[own:, own:] = np.linalg.inv(before), common
-    return with_sessions(plain, problem, wide, keep)
+    return with_sessions(plain, problem, (gap, slope), wide, keep)
 
 
 def _before(rung: Rung, w: Windows, robot: Robot) -> np.ndarray:

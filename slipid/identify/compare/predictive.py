@@ -151,15 +151,15 @@ def contact_of(
     of_floor = problem.space.where(lambda e: e.surface is not None)
     wide = np.where(of_floor[:, None] | of_floor, 0.0, plain.covariance)
     wide[of_floor, of_floor] = problem.space.prior_std[of_floor] ** 2
-    return with_sessions(plain, problem, wide, keep)
+    return with_sessions(plain, problem, plain.linear(problem), wide, keep)
 
 
-def with_sessions(plain: Fitted, problem: Problem, wide: np.ndarray, keep: np.ndarray) -> Fitted:
+def with_sessions(
+    plain: Fitted, problem: Problem, linear: tuple[Gaps, Slopes], wide: np.ndarray, keep: np.ndarray
+) -> Fitted:
     """The model with what runs of a session share in its variances and in its covariance."""
-    gap, slope = plain.linear(problem)
     model = Linear(
-        gap=gap,
-        slope=slope,
+        *linear,
         covariance=plain.covariance,
         wide=wide,
         scale=np.asarray(problem.covariance("motion", plain.log_variance(problem))),
