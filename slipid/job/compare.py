@@ -11,7 +11,7 @@ from slipid.identify.compare.folds import Fold, folds_of, judge
 from slipid.identify.compare.ranking import ranking
 from slipid.identify.compare.transfer import transfer
 from slipid.identify.compare.validation import Judged
-from slipid.identify.fit.optimise import Options, optimise
+from slipid.identify.fit.optimise import optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.job.config import read_config
 from slipid.job.problem import Job, read_job
@@ -109,18 +109,19 @@ def _folds(
 ) -> tuple[dict[str, list[Content]], Robot]:
     """Every fold of every question, and the robot fitted to all runs."""
     wanted = job.settings
-    options = Options(most_rounds=wanted.rounds, tolerance=wanted.tolerance)
 
     def tell(state: State) -> None:
         report.note(f"{state.stage}, round {state.round}")
 
+    fit = partial(optimise, most_rounds=wanted.rounds, tolerance=wanted.tolerance, tell=tell)
+
     def whole() -> Content:
-        optimum = optimise(problem, options=options, tell=tell)
+        optimum = fit(problem)
         z, log_variance = optimum.state.z, optimum.state.log_variance
         return {"z": z, "log_variance": log_variance, "covariance": optimum.covariance}
 
     def one(judged: np.ndarray) -> Content:
-        return judge(problem, job.choices, job.dataset, judged, options, tell).to_json()
+        return judge(problem, job.choices, job.dataset, judged, fit).to_json()
 
     work: dict[tuple[str, int], Callable[[], Content]] = {
         (name, k): partial(one, np.flatnonzero(fold == k))
@@ -133,8 +134,8 @@ def _folds(
         done[name].append(finished(kept, f"{name}_{k}", make))
         report.advance(count, len(work), f"{count} of {len(work)} folds, {name}")
     report.stage("fitting all runs")
-    fit = finished(kept, "all", whole)
-    return done, problem.space.tree(np.asarray(fit["z"], float))
+    found = finished(kept, "all", whole)
+    return done, problem.space.tree(np.asarray(found["z"], float))
 
 
 def finished(kept: Checkpoint, name: str, make: Callable[[], Content]) -> Content:

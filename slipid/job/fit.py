@@ -10,7 +10,7 @@ import numpy as np
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.fit.crossing import crossing
 from slipid.identify.fit.mixed import update
-from slipid.identify.fit.optimise import Optimum, Options, optimise
+from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.result import Fit, summarise, updated
 from slipid.job.problem import Task
@@ -43,8 +43,9 @@ def optimised(task: Task, problem: Problem, kept: Checkpoint | None, report: Rep
     rounds = wanted.rounds
     if start is not None and start.moved < wanted.tolerance:
         rounds = start.round  # it had settled: only the last steps are missing
-    options = Options(most_rounds=rounds, tolerance=wanted.tolerance)
-    optimum = optimise(problem, start=start, options=options, tell=tell)
+    optimum = optimise(
+        problem, start=start, most_rounds=rounds, tolerance=wanted.tolerance, tell=tell
+    )
     return replace(optimum, history=tuple(history))
 
 

@@ -17,8 +17,8 @@ from slipid.identify.compare.noisy_rung import with_noise
 from slipid.identify.compare.predictive import Predictive, contact_of
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.compare.validation import Judged, score, told
-from slipid.identify.fit.optimise import Options, optimise
-from slipid.identify.fit.problem import Problem, State, still_viscosities
+from slipid.identify.fit.optimise import Optimum, optimise
+from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.search_space import Choice, Space
 from slipid.support.content import Content
 from slipid.support.errors import DataError
@@ -118,12 +118,12 @@ def judge(
     choices: Sequence[Choice],
     data: Runs,
     judged: np.ndarray,
-    options: Options | None = None,
-    tell: Callable[[State], None] = lambda state: None,
+    fit: Callable[..., Optimum] = optimise,
 ) -> FoldResult:
     """One fold: every rung fitted without some runs, and what it says of them.
 
-    The problem is of all the runs of `data`, made with these choices; `judged` are numbers of runs.
+    The problem is of all the runs of `data`, made with these choices; `judged` are numbers of runs,
+    `fit` is how it is fitted.
     """
     fitted = np.setdiff1d(np.arange(len(data)), judged)
     held = [*still_viscosities(data, fitted), *choices]
@@ -131,7 +131,7 @@ def judge(
         problem = Problem(problem.windows, problem.robot, held, problem.joint)
     keep = np.isin(problem.windows.run, fitted).astype(float)
     began = time.perf_counter()
-    optimum = optimise(problem, keep=keep, options=options, tell=tell)
+    optimum = fit(problem, keep=keep)
     contact = contact_of(problem, optimum.state, optimum.covariance, keep)
     models: list[Predictive] = [contact]
     seconds = {contact.name: {"fit": time.perf_counter() - began}}

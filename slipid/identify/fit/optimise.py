@@ -22,17 +22,6 @@ _REFUSED = 12
 """Steps of the solver that may be refused in a round."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """How many rounds of weights, structure and variances at most.
-
-    The fit stops when no number moves more than `tolerance` posterior stds in a round.
-    """
-
-    most_rounds: int = 30
-    tolerance: float = 0.02
-
-
 @dataclass(frozen=True, eq=False)
 class Optimum:
     """End of a fit: Laplace covariance, why it stopped, for people, and the loss of every round."""
@@ -48,7 +37,8 @@ def optimise(
     problem: Problem,
     keep: np.ndarray | None = None,
     start: State | None = None,
-    options: Options | None = None,
+    most_rounds: int = 30,
+    tolerance: float = 0.02,
     tell: Callable[[State], None] = lambda state: None,
     free: np.ndarray | None = None,
     variances: bool = True,
@@ -59,27 +49,28 @@ def optimise(
         keep: weight of each piece, 1 or 0 (piece,); all by default. Folds of a cross-validation
             differ in this only, so they share one compiled function.
         start: goes on from here instead of the staged start.
+        most_rounds: of weights, structure and variances.
+        tolerance: it stops when no number moves more posterior stds than this in a round.
         tell: called after every round, for progress and checkpoints.
         free: 1 for coordinates that may move from the start, 0 for those held there (free,).
         variances: whether to fit those of the noise, too.
     """
-    options = options or Options()
     keep = np.ones(len(problem.windows)) if keep is None else np.asarray(keep, float)
     state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
     mask = np.ones(problem.space.size) if free is None else np.asarray(free, float)
     history: list[float] = []
-    while state.round < options.most_rounds:
+    while state.round < most_rounds:
         early = state.round < 3
         scoring = (2 if early else 4) if variances else 0
         state = one_round(problem, state, keep, mask, steps=8 if early else 4, scoring=scoring)
         history.append(state.loss)
         tell(state)
-        if state.moved < options.tolerance:
+        if state.moved < tolerance:
             break
     covariance = problem.laplace(state.z, state.log_variance, keep)
-    reason = f"{options.most_rounds} rounds without settling"
-    if settled := state.moved < options.tolerance:
-        reason = f"no number moved {options.tolerance:g} of its std in round {state.round}"
+    reason = f"{most_rounds} rounds without settling"
+    if settled := state.moved < tolerance:
+        reason = f"no number moved {tolerance:g} of its std in round {state.round}"
     return Optimum(state, covariance, settled, reason, tuple(history))
 
 

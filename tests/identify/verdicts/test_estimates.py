@@ -10,7 +10,7 @@ import pint
 import pytest
 from scipy.stats import chi2
 
-from slipid.identify.fit.optimise import Options, optimise
+from slipid.identify.fit.optimise import optimise
 from slipid.identify.fit.problem import Problem
 from slipid.identify.slip_curves import Validity
 from slipid.identify.verdicts import unidentified as flat_module
@@ -296,7 +296,7 @@ FITTED = (
 def fitted():
     w = made(TRUTH, runs=24, std=NOISE)
     this = Problem(w, TRUTH, [NOTHING, *FITTED])
-    return this, optimise(this, start=begin(this), options=Options(tolerance=1e-3))
+    return this, optimise(this, start=begin(this), tolerance=1e-3)
 
 
 @pytest.mark.slow
