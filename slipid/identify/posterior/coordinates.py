@@ -64,43 +64,43 @@ class Coordinates:
         end = n + len(self.variance)
         return x[..., :n], x[..., n:end], x[..., end:]
 
-
-def coordinates_of(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
-    """Coordinates of a part; the floors that each touches are read off the Jacobian at the fit."""
-    _, jacobian = problem.linear(fitted.z, problem.volt(fitted.log_variance))
-    blocks = {
-        MOTION: ["motion"],
-        ELECTRIC: [k for k in jacobian if k != "motion"],
-        EVERYTHING: list(jacobian),
-    }[part]
-    labels = problem.robot.surfaces.labels
-    surface, floors = np.asarray(problem.batch.surface), len(labels)
-    touched = np.zeros((problem.space.size, floors), bool)
-    seen = np.zeros((len(problem.noise.names), floors), bool)
-    for k in blocks:
-        moved = np.abs(np.asarray(jacobian[k])).sum(axis=1) > 0
-        for floor in range(floors):
-            touched[:, floor] |= moved[surface == floor].any(axis=0)
-            number = np.asarray(problem.noise.blocks[k].which)[surface == floor]
-            seen[np.unique(number), floor] = True
-    electric = problem.space.electric
-    mine = {MOTION: ~electric, ELECTRIC: electric}
-    structure = np.flatnonzero(mine.get(part, np.ones(problem.space.size, bool)))
-    variance = np.flatnonzero(seen.any(axis=1))
-    shared = by_axis(fitted.session, "session", problem.windows)
-    found = {pair for pair, v in zip(pairs(problem.windows), shared, strict=True) if v.any()}
-    sessions = tuple(sorted(found)) if part != ELECTRIC else ()
-    on = [[label == floor for label in labels] for floor, _ in sessions for _ in AXES]
-    names = [problem.space.names[k] for k in structure]
-    names += [f"noise.{problem.noise.names[k]}" for k in variance]
-    names += [f"session.{floor}.{axis}@{name}" for floor, name in sessions for axis in AXES]
-    return Coordinates(
-        names=tuple(names),
-        structure=structure,
-        variance=variance,
-        sessions=sessions,
-        group=_groups(np.array([*touched[structure], *seen[variance], *on])),
-    )
+    @staticmethod
+    def of(problem: Problem, fitted: Fitted, part: str) -> "Coordinates":
+        """Coordinates of a part; the floors that each touches are those of the fit's Jacobian."""
+        _, jacobian = problem.linear(fitted.z, problem.volt(fitted.log_variance))
+        blocks = {
+            MOTION: ["motion"],
+            ELECTRIC: [k for k in jacobian if k != "motion"],
+            EVERYTHING: list(jacobian),
+        }[part]
+        labels = problem.robot.surfaces.labels
+        surface, floors = np.asarray(problem.batch.surface), len(labels)
+        touched = np.zeros((problem.space.size, floors), bool)
+        seen = np.zeros((len(problem.noise.names), floors), bool)
+        for k in blocks:
+            moved = np.abs(np.asarray(jacobian[k])).sum(axis=1) > 0
+            for floor in range(floors):
+                touched[:, floor] |= moved[surface == floor].any(axis=0)
+                number = np.asarray(problem.noise.blocks[k].which)[surface == floor]
+                seen[np.unique(number), floor] = True
+        electric = problem.space.electric
+        mine = {MOTION: ~electric, ELECTRIC: electric}
+        structure = np.flatnonzero(mine.get(part, np.ones(problem.space.size, bool)))
+        variance = np.flatnonzero(seen.any(axis=1))
+        shared = by_axis(fitted.session, "session", problem.windows)
+        found = {pair for pair, v in zip(pairs(problem.windows), shared, strict=True) if v.any()}
+        sessions = tuple(sorted(found)) if part != ELECTRIC else ()
+        on = [[label == floor for label in labels] for floor, _ in sessions for _ in AXES]
+        names = [problem.space.names[k] for k in structure]
+        names += [f"noise.{problem.noise.names[k]}" for k in variance]
+        names += [f"session.{floor}.{axis}@{name}" for floor, name in sessions for axis in AXES]
+        return Coordinates(
+            names=tuple(names),
+            structure=structure,
+            variance=variance,
+            sessions=sessions,
+            group=_groups(np.array([*touched[structure], *seen[variance], *on])),
+        )
 
 
 def _groups(touched: Bool[np.ndarray, "size floor"]) -> Int[np.ndarray, " size"]:
@@ -129,49 +129,47 @@ class Anchor(eqx.Module):
     shares: Float[Array, "piece m 3"]
     session: Int[Array, " piece"]
 
+    @staticmethod
+    def at(problem: Problem, fitted: Fitted, sessions: tuple[tuple[str, str], ...]) -> "Anchor":
+        """Anchor at a fit, for sessions that have effects of their own."""
+        twist, slope = twists(problem.space, problem.batch, fitted.z)
+        w = problem.windows
+        shares = effects(w, problem.robot) * np.sqrt(by_axis(fitted.session, "session", w))[:, None]
+        place = {pair: k for k, pair in enumerate(sessions)}
+        return Anchor(
+            batch=problem.batch,
+            base={k: jnp.moveaxis(c.base, 0, -1) for k, c in problem.noise.blocks.items()},
+            which={k: c.which.T for k, c in problem.noise.blocks.items()},
+            z=jnp.asarray(fitted.z),
+            log_variance=jnp.asarray(fitted.log_variance),
+            twist=twist,
+            twist_slope=slope,
+            typical=problem.target.typical,
+            shares=jnp.asarray(shares),
+            session=jnp.asarray([place.get(pair, 0) for pair in pairs(w)]),
+        )
 
-def anchor_at(problem: Problem, fitted: Fitted, sessions: tuple[tuple[str, str], ...]) -> Anchor:
-    """Anchor at a fit, for sessions that have effects of their own."""
-    twist, slope = twists(problem.space, problem.batch, fitted.z)
-    w = problem.windows
-    shares = effects(w, problem.robot) * np.sqrt(by_axis(fitted.session, "session", w))[:, None]
-    place = {pair: k for k, pair in enumerate(sessions)}
-    return Anchor(
-        batch=problem.batch,
-        base={k: jnp.moveaxis(c.base, 0, -1) for k, c in problem.noise.blocks.items()},
-        which={k: c.which.T for k, c in problem.noise.blocks.items()},
-        z=jnp.asarray(fitted.z),
-        log_variance=jnp.asarray(fitted.log_variance),
-        twist=twist,
-        twist_slope=slope,
-        typical=problem.target.typical,
-        shares=jnp.asarray(shares),
-        session=jnp.asarray([place.get(pair, 0) for pair in pairs(w)]),
-    )
+    def predict(self, robot: Robot, z: Array) -> lk.Predicted:
+        """What the robot predicts, searched from twists at the fit and, if that fails, afresh."""
+        b = self.batch
+        start = self.twist + self.twist_slope @ (z - self.z)
+        p = lk.predict(robot, b, jax.lax.stop_gradient(start))
+        arrived = jnp.all(jnp.isfinite(p.twist))
+        return jax.lax.cond(arrived, lambda: p, lambda: lk.predict(robot, b))
 
-
-def predict(robot: Robot, anchor: Anchor, z: Array) -> lk.Predicted:
-    """What the robot predicts, searched from the twists at the fit and, if that fails, afresh."""
-    b = anchor.batch
-    start = anchor.twist + anchor.twist_slope @ (z - anchor.z)
-    p = lk.predict(robot, b, jax.lax.stop_gradient(start))
-    arrived = jnp.all(jnp.isfinite(p.twist))
-    return jax.lax.cond(arrived, lambda: p, lambda: lk.predict(robot, b))
-
-
-def log_student(
-    anchor: Anchor, k: str, r: Float[Array, "piece m"], log_v: Float[Array, " variance"]
-) -> Float[Array, " piece"]:
-    """Log density of residuals of block `k` by a Student t with scale matrix V, for every piece."""
-    base, which = anchor.base[k], anchor.which[k]
-    m = base.shape[1]
-    v = jnp.exp(log_v)[which]
-    floor = lk.FLOOR[k] * jnp.eye(m)[:, :, None]
-    cov = sum((v[c] * base[c] for c in range(len(base))), floor)
-    log_det, q = squares(jax.lax.optimization_barrier(cov), r.T)
-    constant = gammaln(0.5 * (DEGREES + m)) - gammaln(0.5 * DEGREES)
-    constant -= 0.5 * m * np.log(DEGREES * np.pi)
-    return constant - 0.5 * log_det - 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)
+    def log_student(
+        self, k: str, r: Float[Array, "piece m"], log_v: Float[Array, " variance"]
+    ) -> Float[Array, " piece"]:
+        """Log density of residuals of block `k` of every piece, a Student t with scale matrix V."""
+        base, which = self.base[k], self.which[k]
+        m = base.shape[1]
+        v = jnp.exp(log_v)[which]
+        floor = lk.FLOOR[k] * jnp.eye(m)[:, :, None]
+        cov = sum((v[c] * base[c] for c in range(len(base))), floor)
+        log_det, q = squares(jax.lax.optimization_barrier(cov), r.T)
+        constant = gammaln(0.5 * (DEGREES + m)) - gammaln(0.5 * DEGREES)
+        constant -= 0.5 * m * np.log(DEGREES * np.pi)
+        return constant - 0.5 * log_det - 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)
 
 
 @jax.custom_vjp

@@ -22,16 +22,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES
 from slipid.identify.fit.variances import VARIANCE_SPREAD, information, whitened
-from slipid.identify.posterior.coordinates import (
-    ELECTRIC,
-    EVERYTHING,
-    Anchor,
-    Fitted,
-    anchor_at,
-    coordinates_of,
-    log_student,
-    predict,
-)
+from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Coordinates, Fitted
 from slipid.model.robot import Robot
 
 Result = TypeVar("Result")
@@ -62,8 +53,8 @@ class Density:
     def __init__(self, problem: Problem, fitted: Fitted, part: str):
         self.problem, self.part = problem, part
         self.floors = problem.robot.surfaces.labels
-        self.coordinates = coordinates_of(problem, fitted, part)
-        self.anchor = anchor_at(problem, fitted, self.coordinates.sessions)
+        self.coordinates = Coordinates.of(problem, fitted, part)
+        self.anchor = Anchor.at(problem, fitted, self.coordinates.sessions)
         # the first of its form compiles for all
         form = part, self.coordinates.names, self.coordinates.group.tobytes()
         self._form: Density = problem.compiled.setdefault(form, self)
@@ -168,7 +159,7 @@ class Density:
 
     def _pieces(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
         seen, log_v = self._residuals(anchor, x, held), self.full(anchor, x)[1]
-        out = {k: log_student(anchor, k, r, log_v) for k, r in seen.residuals.items()}
+        out = {k: anchor.log_student(k, r, log_v) for k, r in seen.residuals.items()}
         camera, spread = lk.log_jacobians(seen.robot, anchor.batch, seen.volt)
         if "motion" in out:
             out["motion"] += camera
@@ -189,7 +180,7 @@ class Density:
             robot = self.problem.space.tree(held.z.at[at.structure].set(z[at.structure]))
             return _Seen(lk.electric_residuals(robot, b, held.felt, volt), robot, volt)
         robot = self.problem.space.tree(z)
-        p = predict(robot, anchor, z)
+        p = anchor.predict(robot, z)
         out = {"motion": lk.motion_residual(robot, b, p)}
         if at.sessions:
             shared = at.parts(x)[2].reshape(-1, len(AXES))[anchor.session]
@@ -205,4 +196,4 @@ class Density:
 
     def _held(self, anchor: Anchor, x: Array, _: None) -> Held:
         z, _log_v = self.full(anchor, x)
-        return Held(z, predict(self.problem.space.tree(z), anchor, z).felt)
+        return Held(z, anchor.predict(self.problem.space.tree(z), z).felt)
