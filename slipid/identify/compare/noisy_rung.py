@@ -12,15 +12,7 @@ from scipy.linalg import block_diag
 
 from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.predictive import (
-    Contact,
-    Gaps,
-    Predictive,
-    Slopes,
-    around,
-    by_name,
-    with_sessions,
-)
+from slipid.identify.compare.predictive import Contact, Gaps, Predictive, Slopes, around, by_name
 from slipid.identify.compare.rung import Rung
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem
@@ -110,7 +102,7 @@ def with_noise(
     own = len(before)
     wide = np.zeros_like(covariance)
     wide[:own, :own], wide[own:, own:] = np.linalg.inv(before), common
-    return with_sessions(plain, problem, (gap, slope), wide, keep)
+    return plain.with_sessions(problem, (gap, slope), wide, keep)
 
 
 def _before(rung: Rung, w: Windows, robot: Robot) -> np.ndarray:

@@ -33,6 +33,7 @@ from slipid.search_space import Space
 
 Gaps = Float[np.ndarray, "piece m"]
 Slopes = Float[np.ndarray, "piece m number"]
+Fitted = TypeVar("Fitted", bound="Predictive")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +83,25 @@ class Predictive(abc.ABC):
         return log_student(*self.scale(problem)) + np.asarray(
             _camera_log_jacobian(self.robot, problem.batch.pose)
         )
+
+    def with_sessions(
+        self: Fitted,
+        problem: Problem,
+        linear: tuple[Gaps, Slopes],
+        wide: np.ndarray,
+        keep: np.ndarray,
+    ) -> Fitted:
+        """The model with what runs of a session share in its variances and in its covariance."""
+        model = Linear(
+            *linear,
+            covariance=self.covariance,
+            wide=wide,
+            scale=np.asarray(problem.covariance("motion", self.log_variance(problem))),
+            effect=effects(problem.windows, problem.robot),
+            run=by_axis(self.variance, "run", problem.windows),
+        )
+        variance, covariance = shared(model, problem.windows, np.asarray(keep, float))
+        return replace(self, variance={**self.variance, **variance}, covariance=covariance)
 
 
 def log_student(
@@ -139,9 +159,6 @@ class Contact(Predictive):
         return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, own)
 
 
-Fitted = TypeVar("Fitted", bound=Predictive)
-
-
 def contact_of(
     problem: Problem, state: State, covariance: Square, keep: Float[np.ndarray, " piece"]
 ) -> Contact:
@@ -151,23 +168,7 @@ def contact_of(
     of_floor = problem.space.where(lambda e: e.surface is not None)
     wide = np.where(of_floor[:, None] | of_floor, 0.0, plain.covariance)
     wide[of_floor, of_floor] = problem.space.prior_std[of_floor] ** 2
-    return with_sessions(plain, problem, plain.linear(problem), wide, keep)
-
-
-def with_sessions(
-    plain: Fitted, problem: Problem, linear: tuple[Gaps, Slopes], wide: np.ndarray, keep: np.ndarray
-) -> Fitted:
-    """The model with what runs of a session share in its variances and in its covariance."""
-    model = Linear(
-        *linear,
-        covariance=plain.covariance,
-        wide=wide,
-        scale=np.asarray(problem.covariance("motion", plain.log_variance(problem))),
-        effect=effects(problem.windows, problem.robot),
-        run=by_axis(plain.variance, "run", problem.windows),
-    )
-    variance, covariance = shared(model, problem.windows, np.asarray(keep, float))
-    return replace(plain, variance={**plain.variance, **variance}, covariance=covariance)
+    return plain.with_sessions(problem, plain.linear(problem), wide, keep)
 
 
 def around(jac: Slopes, cov: np.ndarray) -> np.ndarray:
