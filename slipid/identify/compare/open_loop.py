@@ -40,6 +40,16 @@ class Tracks:
     predicted: Float[np.ndarray, "run edge 3"]
     measured: Float[np.ndarray, "run edge 3"]
 
+    @property
+    def gap(self) -> Float[np.ndarray, "run 3"]:
+        """Predicted less measured end pose."""
+        return self.predicted[:, -1] - self.measured[:, -1]
+
+    @property
+    def chord(self) -> Float[np.ndarray, " run"]:
+        """The camera's straight-line displacement [m]."""
+        return np.linalg.norm((self.measured[:, -1] - self.measured[:, 0])[:, :2], axis=1)
+
 
 def cuts(data: Runs, robot: Robot) -> list[Windows]:
     """The runs, each as one piece of short steps, `TOGETHER` at a time.

@@ -162,14 +162,11 @@ def score(
     `runs` go by their number in `data`; those that are met for the first time are added. `cov` is
     of the ends, None for a model without.
     """
-    gap = tracks.predicted[:, -1] - tracks.measured[:, -1]
+    gap = tracks.gap
     level, energy = replay.scores(gap[:, :2], cov)
-    ahead, chords = (
-        np.linalg.norm((path[:, -1] - path[:, 0])[:, :2], axis=1)
-        for path in (tracks.predicted, tracks.measured)
-    )
+    ahead = np.linalg.norm((tracks.predicted[:, -1] - tracks.predicted[:, 0])[:, :2], axis=1)
     for n, k in enumerate(tracks.run.tolist()):
-        log, chord = data.logs[k], float(chords[n])
+        log, chord = data.logs[k], float(tracks.chord[n])
         if k not in runs:
             runs[k] = Judged(
                 name=log.name,

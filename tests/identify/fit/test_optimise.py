@@ -215,7 +215,7 @@ def test_every_round_is_told_and_ends_in_the_result(surface_fit):
     assert [s.round for s in told] == list(range(1, len(told) + 1))
     assert told[-1] is best.state
     assert tuple(s.loss for s in told) == best.history
-    assert best.state.moved < PRECISE.tolerance
+    assert best.state.moved < PRECISE["tolerance"]
     assert "no number moved" in best.reason
 
 
