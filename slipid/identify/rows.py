@@ -54,7 +54,7 @@ def remaining(problem: Problem, z: Search, volt: Array, rows: Rows) -> tuple[flo
     the slope of log |d residuals / d data|; where currents do not inform motion, their rows move
     the electric numbers only.
     """
-    own = np.ones(len(z)) if problem.joint else problem.space.electric.astype(float)
+    own = problem.space.electric.astype(float)
     prior = problem.space.prior_std**-2
     _, slope = log_jacobian(problem.target, z, volt, np.ones(len(problem.windows)))
     gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)

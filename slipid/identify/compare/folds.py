@@ -128,7 +128,7 @@ def judge(
     fitted = np.setdiff1d(np.arange(len(data)), judged)
     held = [*still_viscosities(data, fitted), *choices]
     if Space(problem.robot, held).names != problem.space.names:  # they saw a floor at one speed
-        problem = Problem(problem.windows, problem.robot, held, problem.joint)
+        problem = Problem(problem.windows, problem.robot, held)
     keep = np.isin(problem.windows.run, fitted).astype(float)
     began = time.perf_counter()
     optimum = fit(problem, keep=keep)

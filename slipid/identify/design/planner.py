@@ -112,8 +112,6 @@ class Planner:
         halves = whitened(this.noise.blocks, jacobian, self._log_v, np.ones(_TOGETHER))
         motion = np.asarray(halves.pop("motion"))[: len(drives)]
         others = [np.asarray(h)[: len(drives)] for h in halves.values()]
-        if this.joint:
-            motion, others = np.concatenate([motion, *others], axis=1), []
         electric = np.concatenate([motion[:, :0], *others], axis=1)
         return Rows(
             motion[..., ~self.is_electric],

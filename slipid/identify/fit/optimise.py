@@ -235,13 +235,11 @@ def _stacked(y: Array, held: Held) -> Array:
     """Whitened residuals of all blocks and of the prior."""
     target, space = held.target, held.target.space
     z = _at(held, y)
-    robot = given = space.tree(z)
-    p = lk.predict(robot, target.batch)
-    felt = p.felt
-    if not target.joint:  # currents and voltages given the motion of the round's start
-        given, felt = space.tree(jnp.where(space.electric, z, held.z)), held.felt
-    blocks = {"motion": lk.motion_residual(robot, target.batch, p)}
-    blocks |= lk.electric_residuals(given, target.batch, felt, held.volt)
+    robot, given = space.tree(z), space.tree(jnp.where(space.electric, z, held.z))
+    motion = lk.motion_residual(robot, target.batch, lk.predict(robot, target.batch))
+    # currents and voltages given the motion of the round's start
+    electric = lk.electric_residuals(given, target.batch, held.felt, held.volt)
+    blocks = {"motion": motion} | electric
     parts = [jnp.einsum("nij,nj->ni", held.root[k], r).ravel() for k, r in blocks.items()]
     # the slope of the log Jacobian adds slope . z to the log posterior
     mean = space.prior_mean + space.prior_std**2 * held.slope

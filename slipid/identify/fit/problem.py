@@ -41,7 +41,7 @@ class State:
 class Problem:
     """Likelihood of a set of windows as functions of the search vector.
 
-    By default currents and voltages do not move the numbers of the motion ("cut"): the torque scale
+    Currents and voltages do not move the numbers of the motion ("cut"): the torque scale
     is read from currents given the motion, whose errors are carried along. A friction model good to
     5 % in current would otherwise outvote forces that motion shows to 1 %.
 
@@ -54,10 +54,9 @@ class Problem:
         windows: Windows,
         robot: Robot,
         choices: Sequence[Choice],
-        current_informs_motion: bool = False,
     ):
         self.space = Space(robot, choices)
-        self.joint = current_informs_motion or not windows.has_current
+        self.joint = not windows.has_current
         self.robot: Robot = self.space.template
         self.compiled: dict[Any, Any] = {}
         self._read(windows)
@@ -75,7 +74,6 @@ class Problem:
             batch=lk.batch(windows, self.robot),
             blocks=self.noise.blocks,
             typical=jnp.asarray(2 * np.log(self.noise.typical)),
-            joint=self.joint,
         )
 
     @property

@@ -282,8 +282,9 @@ def information(problem, jacobian, log_v, blocks):
 
 
 @pytest.mark.slow
-def test_the_information_of_a_joint_fit_is_the_sum_over_blocks(truth):
-    problem = Problem(made(truth, std=NOISE), truth, EVERYTHING, current_informs_motion=True)
+def test_the_information_without_currents_is_that_of_the_motion_and_the_prior(truth):
+    w = replace(made(truth, std=NOISE), has_current=False, has_voltage=False)
+    problem = Problem(w, truth, EVERYTHING)
     log_v = 2 * np.log(problem.noise.typical)
     _, jacobian = problem.linear(problem.space.start, jnp.asarray(0.05))
     ours = problem.precision(jacobian, log_v, np.ones(24))
