@@ -74,6 +74,7 @@ class Problem:
             batch=lk.batch(windows, self.robot),
             blocks=self.noise.blocks,
             typical=jnp.asarray(2 * np.log(self.noise.typical)),
+            joint=self.joint,
         )
 
     @property

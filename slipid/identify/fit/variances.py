@@ -36,13 +36,15 @@ VARIANCE_SPREAD = 3.0
 class Target(eqx.Module):
     """What a fit maximises, as an argument of compiled functions.
 
-    `typical` is the centre of the prior of the log variances.
+    `typical` is the centre of the prior of the log variances; where it is joint, there are no
+    currents, and all numbers are the motion's.
     """
 
     space: Space
     batch: lk.Batch
     blocks: dict[str, Components]
     typical: Float[Array, " variance"]
+    joint: bool = eqx.field(static=True)
 
 
 class Whitening(NamedTuple):
@@ -92,7 +94,7 @@ def precision(target: Target, jacobian: Blocks, log_v: Vector, keep: Vector) -> 
         flat = half.reshape(-1, half.shape[-1])
         total += flat.T @ flat
         of_motion += flat.T @ flat if k == "motion" else 0.0
-    return _cut(total, of_motion, jnp.asarray(target.space.electric))
+    return total if target.joint else _cut(total, of_motion, jnp.asarray(target.space.electric))
 
 
 def _cut(total: Array, of_motion: Array, e: Array) -> Array:
