@@ -76,7 +76,7 @@ class Space(eqx.Module):
                 starts.append(entry.declaration.to_search(value))
                 means.append(mean)
                 spreads.append(spread)
-        self.template = _put(tree, values)
+        self.template = put(tree, values)
         self.free = tuple(free)
         self.start, self.prior_mean, self.prior_std = (
             np.concatenate([np.zeros(0), *parts]) for parts in (starts, means, spreads)
@@ -115,7 +115,7 @@ class Space(eqx.Module):
     def tree(self, z: Float[Array, " free"] | Float[np.ndarray, " free"]) -> Any:
         """Tree of SI values at a search-space vector; jit-able."""
         z, place = jnp.asarray(z), self.place
-        return _put(self.template, {e: e.declaration.to_si(z[place[e.path]]) for e in self.free})
+        return put(self.template, {e: e.declaration.to_si(z[place[e.path]]) for e in self.free})
 
     def vector(self, tree: Any) -> np.ndarray:
         """Search-space vector of a tree's free numbers."""
@@ -123,7 +123,7 @@ class Space(eqx.Module):
         return np.concatenate([np.zeros(0), *parts])
 
 
-def _put(tree: Any, values: Mapping[Entry, Any]) -> Any:
+def put(tree: Any, values: Mapping[Entry, Any]) -> Any:
     """The tree with these values [SI] at their places."""
     changed: dict[tuple[str, ...], tuple[Entry, Any]] = {}
     for entry, value in values.items():

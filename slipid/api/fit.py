@@ -15,9 +15,8 @@ from slipid.identify.compare.slip_models import restored
 from slipid.identify.compare.validation import validation
 from slipid.identify.design.proposal import design
 from slipid.identify.design.wish import Wish
-from slipid.identify.fit.one_speed import still_viscosities
 from slipid.identify.fit.optimise import Optimum
-from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.identify.posterior.blocks import Plan
 from slipid.identify.verdicts import profile
 from slipid.identify.verdicts.estimates import Estimate

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from slipid.control.deployed import DeployedRobot
 from slipid.deploy.deploy import deploy
 from slipid.identify.fit.problem import Problem
-from slipid.identify.posterior import draws, netcdf
+from slipid.identify.posterior import diagnosis, netcdf
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.drawn_estimates import estimates
@@ -37,7 +37,7 @@ class Posterior:
         problem: the likelihood of the runs.
     """
 
-    result: draws.Posterior
+    result: diagnosis.Posterior
     fit: Fit
     task: Task
     problem: Problem

@@ -8,25 +8,33 @@ after it the new one.
 import hashlib
 import io
 import json
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
-from slipid.identify.fit_json import (
-    BLOCKS,
-    MATRICES,
-    SCHEMA_FIT,
-    from_json,
-    identified_json,
-    to_json,
-)
-from slipid.identify.result import Fit
+from slipid.identify.result import Channels, Fit
+from slipid.identify.slip_curves import SlipCurve
+from slipid.identify.verdicts.estimates import Estimate
+from slipid.model.geometry import Geometry
+from slipid.model.robot import Robot, Validity, build
+from slipid.parameter import entries
+from slipid.search_space import Choice, Space, put
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, json_text, read_json, write_bytes
 
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
+SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/2"
+MATRICES = ("covariance", "laplace", "piece_run")
+BLOCKS = ("residual", "whitened", "weight")
+_PLAIN = ("converged", "reason", "rounds", "remaining")
+_CURVE = ("torque_nm", "slip", "slip_lo", "slip_hi")
+_SHAPE = ("place", "drive_angle", "roller_angle", "grips", "gear_ratio")
 
 
 def save(fit: Fit, folder: Path) -> tuple[str, ...]:
@@ -108,3 +116,146 @@ def _unpacked(folder: Path, file: str, sha256: str) -> dict[str, np.ndarray]:
         raise DataError(f"{path}: damaged, its hash differs from the one in {FIT}")
     with np.load(io.BytesIO(packed), allow_pickle=False) as npz:
         return {name: npz[name] for name in npz.files}
+
+
+def identified_json(fit: Fit) -> Content:
+    """Content of identified.json."""
+    return {
+        "schema": SCHEMA,
+        "parameters": {path: number_json(e) for path, e in fit.parameters.items()},
+        "derived": {path: number_json(e) for path, e in fit.derived.items()},
+        "surfaces": list(fit.robot.surfaces.labels),
+        "curves": curves_json(fit.curves),
+        "validity": {floor: asdict(v) for floor, v in fit.validity.items()},
+        "messages": list(fit.messages),
+        "data": {"hash": fit.data_hash, "runs": [name for name, _ in fit.runs]},
+    }
+
+
+def number_json(e: Estimate) -> Content:
+    """A number as identified.json has it."""
+    shape = [len(e.labels)] if e.labels else []
+    known = {k: getattr(e, k) for k in ("std", "interval90", "source", "verdict", "provenance")}
+    return {"value": e.value, "unit": e.unit, "shape": shape, "labels": list(e.labels)} | known
+
+
+def curves_json(curves: Mapping[str, SlipCurve]) -> Content:
+    """Slip curves by floor."""
+    return {
+        floor: {name: getattr(c, name).tolist() for name in _CURVE}
+        | {"at": {"wheel_speed": c.wheel_speed, "load_share": c.load_share}}
+        for floor, c in curves.items()
+    }
+
+
+def to_json(fit: Fit) -> Content:
+    """Content of fit.json: everything but the large arrays, and what people read of it."""
+    return {
+        "schema": SCHEMA_FIT,
+        **{name: getattr(fit, name) for name in _PLAIN},
+        "history": [x if np.isfinite(x) else None for x in fit.history],
+        "parameters": {p: asdict(e) for p, e in fit.parameters.items()},
+        "derived": {p: asdict(e) for p, e in fit.derived.items()},
+        "flat": [asdict(f) | {"text": f.text} for f in fit.flat],
+        "messages": list(fit.messages),
+        "variances": {
+            name: {"variance": v, "std": float(np.sqrt(v)), "unit": fit.variance_unit[name]}
+            for name, v in fit.variance.items()
+        },
+        "spectrum": fit.spectrum.tolist(),
+        "names": fit.space.names,
+        "z": fit.z.tolist(),
+        "robot": _robot_json(fit.space.template),
+        "choices": [asdict(c) for c in fit.choices],
+        "has": {"current": fit.channels.current, "voltage": fit.channels.voltage},
+        "curves": curves_json(fit.curves),
+        "validity": {floor: asdict(v) for floor, v in fit.validity.items()},
+        "settings": {
+            "lag": fit.lag,
+            "windows_per_piece": fit.channels.windows,
+            "current_is_signed": fit.channels.signed,
+            "seed": fit.seed,
+        }
+        | ({} if fit.mixed is None else {"mixed": dict(fit.mixed)}),
+        "current_trend": list(fit.current_trend),
+        "baselines": dict(fit.baselines),
+        "data": {"hash": fit.data_hash, "runs": [list(r) for r in fit.runs]},
+    }
+
+
+def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
+    """Fit from the content of fit.json and its arrays.
+
+    Raises:
+        KeyError, TypeError, ValueError: it is no such content.
+    """
+    choices = tuple(Choice(**c) for c in content["choices"])
+    space = Space(_robot_of(content["robot"]), choices)
+    if space.names != content["names"]:
+        raise ValueError("it has other parameters than this version declares")
+    variances, settings = content["variances"], content["settings"]
+    parts: Content = {name: content[name] for name in _PLAIN} | {name: {} for name in BLOCKS}
+    for name, array in arrays.items():
+        kind, _, block = name.partition("/")
+        if block:
+            parts[kind][block] = array
+        else:
+            parts[kind] = array
+    return Fit(
+        space=space,
+        choices=choices,
+        z=np.asarray(content["z"], float),
+        variance={name: v["variance"] for name, v in variances.items()},
+        variance_unit={name: v["unit"] for name, v in variances.items()},
+        runs=tuple((str(name), str(sha)) for name, sha in content["data"]["runs"]),
+        spectrum=np.asarray(content["spectrum"], float),
+        channels=Channels(
+            **content["has"],
+            signed=settings["current_is_signed"],
+            windows=settings["windows_per_piece"],
+        ),
+        curves={floor: _curve_of(c) for floor, c in content["curves"].items()},
+        validity={floor: Validity(**_tuples(v)) for floor, v in content["validity"].items()},
+        history=tuple(np.inf if x is None else x for x in content["history"]),
+        lag=settings["lag"],
+        seed=settings["seed"],
+        mixed=settings.get("mixed"),
+        baselines=content["baselines"],
+        current_trend=(content["current_trend"][0], content["current_trend"][1]),
+        **parts,
+    )
+
+
+def _curve_of(content: Content) -> SlipCurve:
+    rows: Content = {name: np.asarray(content[name], float) for name in _CURVE}
+    return SlipCurve(**rows, **content["at"])
+
+
+def _tuples(plain: Content) -> Content:
+    """With tuples, and tuples in them, where JSON has lists."""
+
+    def deep(x: Any) -> Any:
+        return tuple(map(deep, x)) if isinstance(x, list) else x
+
+    return {name: deep(x) for name, x in plain.items()}
+
+
+def _robot_json(robot: Robot) -> Content:
+    """A robot as plain values: its shape, its names, every number."""
+    return {
+        "geometry": {name: getattr(robot.geometry, name) for name in _SHAPE},
+        "surfaces": list(robot.surfaces.labels),
+        "loads": list(robot.body.loads),
+        "sessions": list(robot.camera.sessions),
+        "centre": list(robot.camera.centre),
+        "values": {e.path: np.asarray(e.get(robot)).tolist() for e in entries(robot)},
+    }
+
+
+def _robot_of(kept: Content) -> Robot:
+    shape = _tuples(kept["geometry"])
+    geometry = Geometry(drive_offset=jnp.zeros(len(shape["place"])), **shape)
+    names = kept["surfaces"], kept["loads"], kept["sessions"]
+    robot = build(geometry, *names, centre=tuple(kept["centre"]))
+    restored: Robot = put(robot, {e: kept["values"][e.path] for e in entries(robot)})
+    return restored

@@ -32,12 +32,7 @@ REMAINING = 0.3
 
 @dataclass(frozen=True)
 class Channels:
-    """What runs log, and how it is cut.
-
-    Attributes:
-        current, voltage: logged or not; signed: the current has a sign.
-        windows: per piece.
-    """
+    """What runs log, whether the current has a sign, and how many windows make a piece."""
 
     current: bool = True
     voltage: bool = False

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
-from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.problem import Problem, log_jacobian
 from slipid.identify.fit.variances import Search, Square, Vector
 
 
@@ -28,9 +28,8 @@ class Rows:
 
 def rows_at(problem: Problem, z: Vector, log_v: Vector) -> Rows:
     """Residuals of a problem at a search vector and these log variances."""
-    linear = problem.linear(jnp.asarray(z), problem.volt(log_v))
-    keep = np.ones(len(problem.windows))
-    weighed = problem.whitening(linear[0], jnp.asarray(log_v), keep)[:2]
+    linear = problem.linear(z, problem.volt(log_v))
+    weighed = problem.whitening(linear[0], log_v, np.ones(len(problem.windows)))[:2]
     residual, jacobian, roots, weight = jax.device_get((*linear, *weighed))
     # roots of V^-1 without the weights of outliers
     plain = {k: root / np.sqrt(weight[k])[:, None, None] for k, root in roots.items()}
@@ -48,16 +47,16 @@ def spectrum(gram: Square) -> Search:
     return np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0))
 
 
-def remaining(problem: Problem, z: Search, volt: Vector, rows: Rows) -> tuple[float, str]:
+def remaining(problem: Problem, z: Search, volt: Array, rows: Rows) -> tuple[float, str]:
     """Largest step of a full Gauss-Newton step in posterior stds, and the number that takes it.
 
     delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), W with the weights of outliers, g
     the slope of log |d residuals / d data|; where currents do not inform motion, their rows move
     the electric numbers only.
     """
-    own = np.ones(len(z)) if problem.joint else problem.electric.astype(float)
+    own = problem.space.electric.astype(float)
     prior = problem.space.prior_std**-2
-    _, slope = problem.log_jacobian(z, volt, np.ones(len(problem.windows)))
+    _, slope = log_jacobian(problem.target, z, volt, np.ones(len(problem.windows)))
     gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
     info = np.diag(prior)
     for k, r in rows.residual.items():

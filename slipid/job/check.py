@@ -12,7 +12,7 @@ from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.identify import slip_curves as curves_of
 from slipid.identify.fit.problem import Problem
-from slipid.identify.verdicts.estimates import Estimate, derived, estimates, expected_covariance
+from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import flat_directions, sentences
 from slipid.job.config import read_config
 from slipid.job.problem import Task, read_job
@@ -116,7 +116,8 @@ def _channels(logs: tuple[Log, ...]) -> list[str]:
 def expected(job: Task, problem: Problem) -> Expected:
     """Verdicts from the information expected at the start values with typical noise."""
     space, w = problem.space, problem.windows
-    covariance = expected_covariance(problem)
+    log_v, keep = 2 * np.log(problem.noise.typical), np.ones(len(w))
+    covariance = problem.laplace(space.start, log_v, keep)
     robot = space.tree(jnp.asarray(space.start))
     validity = curves_of.validity(job.dataset, robot, problem.batch)
     flat = flat_directions(space, covariance, w.has_current, w.has_voltage, validity)

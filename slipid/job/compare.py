@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from slipid.identify.compare.folds import Fold, folds_of, judge
-from slipid.identify.compare.predictive import Contact, contact_of
 from slipid.identify.compare.ranking import ranking
 from slipid.identify.compare.transfer import transfer
 from slipid.identify.compare.validation import Judged
-from slipid.identify.fit.optimise import Options, optimise
+from slipid.identify.fit.optimise import optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.job.config import read_config
 from slipid.job.problem import Job, read_job
+from slipid.model.robot import Robot
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError
@@ -58,8 +58,8 @@ def compare(
     problem = job.problem()
     writable(out)
     key = key_of(config.hash, job.data_hash, problem.space.names, problem.noise.names)
-    results, whole = _folds(job, problem, asked, Checkpoint(out / FOLDS, key), report)
-    surfaces = transfer(problem.windows, whole.robot) if problem.windows.has_current else {}
+    results, robot = _folds(job, problem, asked, Checkpoint(out / FOLDS, key), report)
+    surfaces = transfer(problem.windows, robot) if problem.windows.has_current else {}
     found: Content = {
         "schema": SCHEMA,
         "questions": {
@@ -104,21 +104,22 @@ def _cost(folds: Sequence[Content]) -> Content:
 
 def _folds(
     job: Job, problem: Problem, asked: Mapping[str, Fold], kept: Checkpoint, report: Reporter
-) -> tuple[dict[str, list[Content]], Contact]:
-    """Every fold of every question, and the force balance fitted to all runs."""
+) -> tuple[dict[str, list[Content]], Robot]:
+    """Every fold of every question, and the robot fitted to all runs."""
     wanted = job.settings
-    options = Options(most_rounds=wanted.rounds, tolerance=wanted.tolerance)
 
     def tell(state: State) -> None:
         report.note(f"{state.stage}, round {state.round}")
 
+    fit = partial(optimise, most_rounds=wanted.rounds, tolerance=wanted.tolerance, tell=tell)
+
     def whole() -> Content:
-        optimum = optimise(problem, options=options, tell=tell)
+        optimum = fit(problem)
         z, log_variance = optimum.state.z, optimum.state.log_variance
         return {"z": z, "log_variance": log_variance, "covariance": optimum.covariance}
 
     def one(judged: np.ndarray) -> Content:
-        return judge(problem, job.choices, job.dataset, judged, options, tell).to_json()
+        return judge(problem, job.choices, job.dataset, judged, fit).to_json()
 
     work: dict[tuple[str, int], Callable[[], Content]] = {
         (name, k): partial(one, np.flatnonzero(fold == k))
@@ -131,10 +132,8 @@ def _folds(
         done[name].append(finished(kept, f"{name}_{k}", make))
         report.advance(count, len(work), f"{count} of {len(work)} folds, {name}")
     report.stage("fitting all runs")
-    fit = finished(kept, "all", whole)
-    z, log_v = np.asarray(fit["z"], float), np.asarray(fit["log_variance"], float)
-    state = State(z, log_v, 0, np.inf, np.inf, "joint")
-    return done, contact_of(problem, state, np.asarray(fit["covariance"], float))
+    found = finished(kept, "all", whole)
+    return done, problem.space.tree(np.asarray(found["z"], float))
 
 
 def finished(kept: Checkpoint, name: str, make: Callable[[], Content]) -> Content:

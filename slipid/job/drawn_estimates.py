@@ -9,8 +9,8 @@ import numpy as np
 
 from slipid.identify import slip_curves as curves_of
 from slipid.identify.fit.problem import Problem
-from slipid.identify.fit_json import curves_json, identified_json, number_json
-from slipid.identify.posterior.draws import Posterior
+from slipid.identify.fit_file import curves_json, identified_json, number_json
+from slipid.identify.posterior.diagnosis import Posterior
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import (
     NEEDS_VOLTAGE,

@@ -13,7 +13,7 @@ import numpy as np
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.fit.crossing import crossing
 from slipid.identify.fit.mixed import update
-from slipid.identify.fit.optimise import Optimum, Options, optimise
+from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit_file import save
 from slipid.identify.result import Fit, summarise, updated
@@ -128,13 +128,10 @@ def optimised(task: Task, problem: Problem, kept: Checkpoint | None, report: Rep
     rounds = wanted.rounds
     if start is not None and start.moved < wanted.tolerance:
         rounds = start.round  # it had settled: only the last steps are missing
-    options = Options(most_rounds=rounds, tolerance=wanted.tolerance)
-    optimum = optimise(problem, start=start, options=options, tell=tell)
-    reason = optimum.reason
-    if optimum.converged:
-        round_ = optimum.state.round
-        reason = f"no number moved {wanted.tolerance:g} of its std in round {round_}"
-    return replace(optimum, history=tuple(history), reason=reason)
+    optimum = optimise(
+        problem, start=start, most_rounds=rounds, tolerance=wanted.tolerance, tell=tell
+    )
+    return replace(optimum, history=tuple(history))
 
 
 def _restored(kept: Checkpoint | None) -> tuple[State | None, list[float]]:

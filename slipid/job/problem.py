@@ -9,8 +9,7 @@ from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
-from slipid.identify.fit.one_speed import still_viscosities
-from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.identify.result import hash_of
 from slipid.job.config import Config, FitSection, Logs, geometry, one_floor
 from slipid.job.logs import files_of, read_dataset

@@ -13,7 +13,7 @@ from slipid.identify.posterior import netcdf
 from slipid.identify.posterior import sample as posterior
 from slipid.identify.posterior.blocks import FORMAT, Block, Plan, Record, packed, unpacked
 from slipid.identify.posterior.coordinates import ELECTRIC, Fitted
-from slipid.identify.posterior.draws import Posterior
+from slipid.identify.posterior.diagnosis import Posterior
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.config import read_config

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from slipid.identify.posterior.draws import Posterior
+from slipid.identify.posterior.diagnosis import Posterior
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.profile import RISE, Profile
 from slipid.plots import drawing

@@ -18,10 +18,10 @@ from jaxtyping import Array, Float
 from pydantic import TypeAdapter
 
 from slipid.data.windows import Windows
-from slipid.identify.compare.body_motion import as_increments
 from slipid.identify.compare.open_loop import chain, contact_increments
+from slipid.identify.compare.rung import as_increments
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.optimise import Optimum, Options, optimise
+from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.result import draws
 from slipid.identify.slip_curves import curves, slip_on
@@ -140,7 +140,6 @@ def replicates(
     center, scatter = plausible(config, choices, problem)
     std = dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True))
     fit = config.content.fit
-    options = Options(most_rounds=fit.rounds, tolerance=fit.tolerance)
     found = _FILE.validate_python(kept.load_json(KEPT) or [])[:count]
     if found:
         report.line(f"{len(found)} of {count} replicates are in {kept.folder / KEPT}.json already")
@@ -154,7 +153,7 @@ def replicates(
         z = center + scatter * rng.standard_normal(len(center))
         made = measure(problem.space.tree(jnp.asarray(z)), problem.windows, rng, std)
         this = problem.of(made)
-        end = optimise(this, options=options, tell=tell)
+        end = optimise(this, most_rounds=fit.rounds, tolerance=fit.tolerance, tell=tell)
         found.append(compared(this, choices, z, end))
         kept.save_json(KEPT, [asdict(one) for one in found])
         report.advance(len(found), count)

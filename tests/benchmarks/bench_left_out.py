@@ -22,9 +22,8 @@ from slipid.data.runs import Runs
 from slipid.identify.compare.folds import random_headings, sectors
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.compare.validation import Judged, Validation, validation
-from slipid.identify.fit.one_speed import still_viscosities
 from slipid.identify.fit.optimise import Optimum
-from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.identify.result import draws
 from slipid.job.config import read_config
 from slipid.job.problem import Job, read_job

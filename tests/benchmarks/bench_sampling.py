@@ -136,8 +136,7 @@ def nuts(path, seed, out, block=None):
     from numpyro.infer import MCMC, NUTS
 
     from slipid.identify.posterior.blocks import unpacked
-    from slipid.identify.posterior.transport.learn import gaussian
-    from slipid.identify.posterior.transport.transport_map import _placed
+    from slipid.identify.posterior.transport.transport_map import _placed, gaussian
 
     d = density = density_of(problem_of(FLOOR), pickle.loads(Path(path).read_bytes()))
     map = gaussian(d.centre, d.covariance, d.coordinates.group, d.coordinates.kind)
@@ -150,7 +149,7 @@ def nuts(path, seed, out, block=None):
     @jax.jit
     def potential(u):
         x, log = _placed(steps, u[None])
-        return -density.logpdf(x[0]) - jnp.sum(log)
+        return -jnp.sum(density._sums(density.anchor, x[0], None)) - jnp.sum(log)
 
     kernel = NUTS(potential_fn=potential, dense_mass=False)
     chain = MCMC(kernel, num_warmup=NUTS_WARM_UP, num_samples=NUTS_DRAWS, progress_bar=False)

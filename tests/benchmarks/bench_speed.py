@@ -133,7 +133,7 @@ def test_whole_2022_fit_cold_and_warm(tmp_path):
 def main():
     """The whole 2022 fit, once, with the time of each stage."""
     began = time.perf_counter()
-    from slipid.identify.fit.optimise import Options, optimise
+    from slipid.identify.fit.optimise import optimise
     from slipid.support.jax_setup import setup_jax
 
     setup_jax(quiet=True)
@@ -141,7 +141,7 @@ def main():
     fit = job.config.content.fit
     read = time.perf_counter()
     problem = job.problem()
-    optimum = optimise(problem, options=Options(fit.rounds, fit.tolerance))
+    optimum = optimise(problem, most_rounds=fit.rounds, tolerance=fit.tolerance)
     done = time.perf_counter()
     took = {
         "runs": len(job.dataset),

@@ -17,7 +17,8 @@ from scipy.stats import binom
 from slipid.identify.compare.open_loop import chain, corrected
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.optimise import optimise
-from slipid.identify.fit.problem import DEGREES, VARIANCE_SPREAD, Problem
+from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD
 from slipid.identify.posterior import sample as posterior
 from slipid.identify.posterior.blocks import Plan
 from slipid.identify.posterior.coordinates import Fitted

@@ -30,7 +30,7 @@ from slipid.identify.design.planner import (
 )
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
-from slipid.identify.fit.optimise import Options, optimise
+from slipid.identify.fit.optimise import optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.result import Channels
 from slipid.search_space import Choice
@@ -111,7 +111,7 @@ def fit_windows(drives, seed):
     this = problem(len(drives)).of(made)
     log_v = np.log([std[n] ** 2 for n in this.noise.names])
     begin = State(this.space.vector(TRUTH), log_v, 0, np.inf, np.inf, "joint")
-    end = optimise(this, start=begin, options=Options(most_rounds=15))
+    end = optimise(this, start=begin, most_rounds=15)
     return end.state.z, end.converged
 
 

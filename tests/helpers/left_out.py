@@ -14,7 +14,7 @@ from slipid.identify.compare.predictive import Contact, contact_of
 from slipid.identify.compare.rung import Rung
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.compare.validation import Judged, validation
-from slipid.identify.fit.optimise import Optimum, Options, optimise
+from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem
 from slipid.search_space import Choice
 
@@ -23,7 +23,6 @@ def left_out(
     problem: Problem,
     data: Runs,
     fold: Fold,
-    options: Options | None = None,
     tell: Callable[[int, Optimum], None] = lambda fold, optimum: None,
 ) -> list[Judged]:
     """Scores of every run, each predicted by a fit that has not seen its fold.
@@ -36,18 +35,16 @@ def left_out(
     """
     rows: list[Judged] = []
     for k in sorted({int(f) for f in fold if f >= 0}):
-        optimum, fitted, simple = train(problem, data, np.flatnonzero(fold != k), options)
+        optimum, fitted, simple = train(problem, data, np.flatnonzero(fold != k))
         tell(k, optimum)
         rows += validation(fitted, simple, data.subset(np.flatnonzero(fold == k))).runs
     return rows
 
 
-def train(
-    problem: Problem, data: Runs, runs: np.ndarray, options: Options | None = None
-) -> tuple[Optimum, Contact, list[Rung]]:
+def train(problem: Problem, data: Runs, runs: np.ndarray) -> tuple[Optimum, Contact, list[Rung]]:
     """Fit of some runs of a problem, every rung of the ladder included, ready to predict others."""
     keep = np.isin(problem.windows.run, runs).astype(float)
-    optimum = optimise(problem, keep=keep, options=options)
+    optimum = optimise(problem, keep=keep)
     contact = contact_of(problem, optimum.state, optimum.covariance, keep)
     robot = contact.robot
     w = problem.windows.at_lag(float(robot.camera.lag))

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.data.windows import Windows
+from slipid.identify.fit import likelihood as lk
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.selftest.windows import measure
@@ -77,3 +78,10 @@ def made(truth, runs=24, count=2, seed=0, std=None, signed=True, voltage=True):
         lag=float(truth.camera.lag),
     )
     return measure(truth, w, rng, std)
+
+
+def residuals(robot, b, voltage_std):
+    """Every block of residuals, `motion` first."""
+    p = lk.predict(robot, b)
+    motion = {"motion": lk.motion_residual(robot, b, p)}
+    return motion | lk.electric_residuals(robot, b, p.felt, voltage_std)

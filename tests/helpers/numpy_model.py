@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from slipid.identify.fit.likelihood import FLOOR, SMOOTH
-from slipid.identify.fit.problem import DEGREES, VARIANCE_SPREAD
+from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD
 from slipid.model import contact, contact_law
 from slipid.parameter import entries, share_basis
 

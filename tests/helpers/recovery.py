@@ -12,7 +12,7 @@ from slipid.data.windows import windows
 from slipid.identify.fit.optimise import optimise
 from slipid.identify.fit.problem import Problem
 from slipid.identify.slip_curves import curves, slip_on
-from slipid.identify.verdicts.estimates import by_ratio, expected_covariance, from_zero
+from slipid.identify.verdicts.estimates import by_ratio, from_zero
 from slipid.search_space import Choice, Space
 from slipid.selftest.known import Sensors, blank, grid, truth
 from slipid.selftest.logs import make_logs
@@ -64,7 +64,8 @@ def design():
         white.get(name, white["window"]) if name.endswith("window") else sensors.of(name)
         for name in this.noise.names
     ]
-    covariance = expected_covariance(this, this.space.vector(TRUTH), 2 * np.log(std))
+    keep = np.ones(len(this.windows))
+    covariance = this.laplace(this.space.vector(TRUTH), 2 * np.log(std), keep)
     return said_identified(this.space, np.sqrt(np.diag(covariance)))
 
 

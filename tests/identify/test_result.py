@@ -21,11 +21,11 @@ from slipid.identify.compare.predictive import Contact
 from slipid.identify.compare.validation import validation
 from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.optimise import Optimum, one_round
-from slipid.identify.fit.problem import DEGREES, Problem, State
-from slipid.identify.fit_file import load, save
-from slipid.identify.fit_json import identified_json, to_json
+from slipid.identify.fit.problem import Problem, State
+from slipid.identify.fit.variances import DEGREES
+from slipid.identify.fit_file import identified_json, load, save, to_json
 from slipid.identify.result import Fit, hash_of, summarise
-from slipid.identify.verdicts.estimates import estimates, expected_covariance
+from slipid.identify.verdicts.estimates import estimates
 from slipid.identify.verdicts.unidentified import flat_directions
 from slipid.search_space import Choice
 from slipid.selftest.known import Sensors, blank, grid, truth
@@ -51,7 +51,8 @@ def made(voltage: bool):
     problem = Problem(windows(data, 0.04, lag=0.05), blank(DRIVES), list(CHOICES))
     z = problem.space.vector(TRUTH)
     state = State(z, 2 * np.log(problem.noise.typical), 7, -1.5, 0.01, "joint")
-    end = Optimum(state, expected_covariance(problem, z), True, "it settled", (3.0, -1.5))
+    laplace = problem.laplace(z, state.log_variance, np.ones(len(problem.windows)))
+    end = Optimum(state, laplace, True, "it settled", (3.0, -1.5))
     return problem, data, end
 
 
@@ -420,7 +421,7 @@ def test_what_sessions_share_is_stored_with_its_unit():
     data = in_sessions(np.arange(24) % 6, 1)
     problem = Problem(windows(data, 0.04, lag=0.056), blank(DRIVES), list(CHOICES))
     z, log_v = problem.space.vector(TRUTH), 2 * np.log(problem.noise.typical)
-    laplace = expected_covariance(problem, z, log_v)
+    laplace = problem.laplace(z, log_v, np.ones(len(problem.windows)))
     end = Optimum(State(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
     fit = summarise(problem, end, data, CHOICES)
     kept = to_json(fit)["variances"]
@@ -440,7 +441,7 @@ def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
         if not name.startswith("current."):
             std[k] = sensors.of(name)
     log_v = 2 * np.log(std)
-    laplace = expected_covariance(problem, z, log_v)
+    laplace = problem.laplace(z, log_v, np.ones(len(problem.windows)))
     end = Optimum(State(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
     save(summarise(problem, end, data, CHOICES), tmp_path)
     fit = load(tmp_path)

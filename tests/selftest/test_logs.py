@@ -12,11 +12,12 @@ from slipid.data.reading.reader import find_logs
 from slipid.data.runs import collect, default_session
 from slipid.data.windows import windows
 from slipid.identify.design.planned_runs import Drive
-from slipid.identify.fit.likelihood import batch, residuals
+from slipid.identify.fit.likelihood import batch
 from slipid.identify.fit.noise import noise
 from slipid.selftest.known import TRUTH, Sensors, grid, truth
 from slipid.selftest.logs import make_logs
 from tests.helpers.made_logs import LAYOUT, write_logs
+from tests.helpers.made_windows import residuals
 from tests.helpers.one_log import read_log
 
 SETUPS = (("firm", "as_built"), ("soft", "as_built"), ("soft", "moved"))

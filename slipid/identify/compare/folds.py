@@ -1,8 +1,7 @@
 """Every rung of the ladder judged on runs left out: who is left out together, and what they say.
 
 Runs of one heading stay in one fold at every speed and on every floor, so that nothing of a
-left-out heading is seen. Folds differ only in the weight of each piece: one compiled function
-serves all.
+left-out heading is seen.
 """
 
 import time
@@ -18,9 +17,8 @@ from slipid.identify.compare.noisy_rung import with_noise
 from slipid.identify.compare.predictive import Predictive, contact_of
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.compare.validation import Judged, score, told
-from slipid.identify.fit.one_speed import still_viscosities
-from slipid.identify.fit.optimise import Options, optimise
-from slipid.identify.fit.problem import Problem, State
+from slipid.identify.fit.optimise import Optimum, optimise
+from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.search_space import Choice, Space
 from slipid.support.content import Content
 from slipid.support.errors import DataError
@@ -28,21 +26,19 @@ from slipid.support.errors import DataError
 Fold = Int[np.ndarray, " run"]
 
 
-def sectors(data: Runs, width_deg: float = 60.0) -> Fold:
-    """Fold of every run by the sector its commanded heading lies in, -1 where it has none."""
+def sectors(data: Runs) -> Fold:
+    """Fold of every run by the 60 deg its commanded heading lies in, -1 where it has none."""
     known = np.isfinite(data.heading)
     turn = np.degrees(np.where(known, data.heading, 0.0)) % 360.0
-    sector = (np.floor((turn + 1e-6) / width_deg) % round(360 / width_deg)).astype(int)
-    return np.where(known, sector, -1)
+    return np.where(known, (np.floor((turn + 1e-6) / 60.0) % 6).astype(int), -1)
 
 
-def random_headings(data: Runs, folds: int = 6, step_deg: float = 5.0, seed: int = 0) -> Fold:
-    """Fold of every run by its heading, headings dealt at random, -1 where it has none."""
-    count = round(360 / step_deg)
-    dealt = np.random.default_rng(seed).permutation(count) % folds
+def random_headings(data: Runs) -> Fold:
+    """One of six folds of every run by its heading, dealt every 5 deg, -1 where it has none."""
+    dealt = np.random.default_rng(0).permutation(72) % 6
     known = np.isfinite(data.heading)
     way = np.degrees(np.where(known, data.heading, 0.0))
-    return np.where(known, dealt[np.round(way / step_deg).astype(int) % count], -1)
+    return np.where(known, dealt[np.round(way / 5.0).astype(int) % 72], -1)
 
 
 def speeds(data: Runs) -> Fold:
@@ -117,33 +113,25 @@ class FoldResult:
         return asdict(self, dict_factory=told)
 
 
-def problem_of(
-    problem: Problem, choices: Sequence[Choice], data: Runs, fitted: np.ndarray
-) -> Problem:
-    """The problem for some of its runs; other than itself where they saw a floor at one speed."""
-    held = [*still_viscosities(data, fitted), *choices]
-    if Space(problem.robot, held).names == problem.space.names:
-        return problem
-    return Problem(problem.windows, problem.robot, held, problem.joint)
-
-
 def judge(
     problem: Problem,
     choices: Sequence[Choice],
     data: Runs,
     judged: np.ndarray,
-    options: Options | None = None,
-    tell: Callable[[State], None] = lambda state: None,
+    fit: Callable[..., Optimum] = optimise,
 ) -> FoldResult:
     """One fold: every rung fitted without some runs, and what it says of them.
 
-    The problem is of all the runs of `data`, made with these choices; `judged` are numbers of runs.
+    The problem is of all the runs of `data`, made with these choices; `judged` are numbers of runs,
+    `fit` is how it is fitted.
     """
     fitted = np.setdiff1d(np.arange(len(data)), judged)
-    problem = problem_of(problem, choices, data, fitted)
+    held = [*still_viscosities(data, fitted), *choices]
+    if Space(problem.robot, held).names != problem.space.names:  # they saw a floor at one speed
+        problem = Problem(problem.windows, problem.robot, held)
     keep = np.isin(problem.windows.run, fitted).astype(float)
     began = time.perf_counter()
-    optimum = optimise(problem, keep=keep, options=options, tell=tell)
+    optimum = fit(problem, keep=keep)
     contact = contact_of(problem, optimum.state, optimum.covariance, keep)
     models: list[Predictive] = [contact]
     seconds = {contact.name: {"fit": time.perf_counter() - began}}

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slipid.data.windows import Windows
-from slipid.identify.compare.body_motion import body_twist, rims, turned
-from slipid.identify.compare.rung import Rung, of_floor
+from slipid.identify.compare.rung import Rung, body_twist, of_floor, rims, turned
 from slipid.model.robot import Robot
 
 HARMONICS = 6

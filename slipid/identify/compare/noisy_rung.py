@@ -1,7 +1,4 @@
-"""A rung of the ladder with noise of its own, so that it forecasts as the force balance does.
-
-Its numbers follow the camera's, which it shares with the force balance.
-"""
+"""A rung of the ladder with noise of its own, so that it forecasts as the force balance does."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,19 +12,11 @@ from scipy.linalg import block_diag
 
 from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.predictive import (
-    Contact,
-    Gaps,
-    Predictive,
-    Slopes,
-    around,
-    by_name,
-    with_sessions,
-)
+from slipid.identify.compare.predictive import Contact, Gaps, Predictive, Slopes, around, by_name
 from slipid.identify.compare.rung import Rung
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.problem import DEGREES, Problem
-from slipid.identify.fit.variances import scored_given
+from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.variances import DEGREES, scored_given
 from slipid.model.robot import Robot
 from slipid.search_space import Space
 
@@ -58,7 +47,15 @@ class Noisy(Predictive):
         return sizes | {"shared": 0}
 
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
-        return _linear(self.rung, self.contact, problem)
+        rung, z, b = self.rung, self.contact.z, problem.batch
+        w = problem.windows.at_lag(float(self.robot.camera.lag))
+
+        def gap(some: Rung) -> np.ndarray:
+            return np.asarray(_gap(problem.space, z, some.twist(w, self.robot), b))
+
+        by_z = np.asarray(_gap_jacobian(problem.space, z, rung.twist(w, self.robot), b))
+        by_camera = by_z[..., self.contact.camera]
+        return gap(rung), np.concatenate([slopes(rung, w, gap), by_camera], axis=-1)
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
         robot, contact = self.robot, self.contact
@@ -67,13 +64,8 @@ class Noisy(Predictive):
             return replay.follow(robot, w, rung.increments(w, robot))
 
         tracks = tracks_of(self.rung)
-        camera = replay.twist_end_jacobian(
-            contact.space,
-            jnp.asarray(contact.z),
-            jnp.asarray(self.rung.twist(w, robot)),
-            lk.batch(w, robot),
-            jnp.asarray(tracks.predicted[:, 0]),
-        )
+        twist, start = self.rung.twist(w, robot), tracks.predicted[:, 0]
+        camera = replay.end_jacobian(contact.space, contact.z, lk.batch(w, robot), start, twist)
         own = slopes(self.rung, w, lambda rung: tracks_of(rung).predicted[:, -1, :2])
         jac = np.concatenate([own, np.asarray(camera)[..., contact.camera]], axis=-1)
         spread = around(jac, self.covariance)
@@ -92,8 +84,9 @@ def with_noise(
     seen = problem.windows.at_lag(float(robot.camera.lag)).pieces(np.flatnonzero(keep > 0))
     rung = rung.fit(seen, robot)
     before = _before(rung, seen, robot)
-    gap, slope = _linear(rung, contact, problem)
     common = contact.covariance[np.ix_(contact.camera, contact.camera)]
+    plain = Noisy(robot, contact.variance, common, rung, contact)
+    gap, slope = plain.linear(problem)
     log_v, count = jnp.asarray(contact.log_variance(problem)), jnp.asarray(keep, float)
     for _ in range(MOST_TURNS):
         last = log_v
@@ -105,11 +98,11 @@ def with_noise(
             log_v = scored_given(problem.target, *blocks, log_v, count, {})
         if float(jnp.abs(log_v - last).max()) < SETTLED:
             break
-    plain = Noisy(robot, by_name(problem, log_v), covariance, rung, contact)
+    plain = replace(plain, variance=by_name(problem, log_v), covariance=covariance)
     own = len(before)
     wide = np.zeros_like(covariance)
     wide[:own, :own], wide[own:, own:] = np.linalg.inv(before), common
-    return with_sessions(plain, problem, wide, keep)
+    return plain.with_sessions(problem, (gap, slope), wide, keep)
 
 
 def _before(rung: Rung, w: Windows, robot: Robot) -> np.ndarray:
@@ -136,29 +129,14 @@ def _numbers(
     return np.asarray(0.5 * (out + out.T))
 
 
-def _linear(rung: Rung, contact: Contact, problem: Problem) -> tuple[Gaps, Slopes]:
-    """Gaps of all pieces of a problem, and their slope by the rung's numbers and the camera's."""
-    robot, b, z = contact.robot, problem.batch, jnp.asarray(contact.z)
-    w = problem.windows.at_lag(float(robot.camera.lag))
-
-    def gap(some: Rung) -> np.ndarray:
-        return np.asarray(_gap(problem.space, z, jnp.asarray(some.twist(w, robot)), b))
-
-    camera = _gap_jacobian(problem.space, z, jnp.asarray(rung.twist(w, robot)), b)
-    by_camera = np.asarray(camera)[..., contact.camera]
-    return gap(rung), np.concatenate([slopes(rung, w, gap), by_camera], axis=-1)
-
-
 @eqx.filter_jit
-def _gap(space: Space, z: Array, twist: Array, b: lk.Batch) -> Array:
+def _gap(space: Space, z: replay.Numbers, twist: replay.Numbers, b: lk.Batch) -> Array:
     robot = space.tree(z)
-    gap = lk.seen(robot, twist, b.dt, b.session) - lk.measured(robot, b.pose)
+    gap = lk.seen(robot, jnp.asarray(twist), b.dt, b.session) - lk.measured(robot, b.pose)
     return gap.reshape(gap.shape[0], -1)
 
 
-@eqx.filter_jit
-def _gap_jacobian(space: Space, z: Array, twist: Array, b: lk.Batch) -> Array:
-    return jax.jacfwd(lambda x: _gap(space, x, twist, b))(z)
+_gap_jacobian = eqx.filter_jit(jax.jacfwd(_gap, argnums=1))
 
 
 def slopes(rung: Rung, w: Windows, of: Callable[[Rung], np.ndarray]) -> np.ndarray:

@@ -16,17 +16,18 @@ from scipy.stats import f as fisher
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
-from slipid.identify.compare.body_motion import sideways, turned
+from slipid.identify.compare.rung import sideways, turned
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import travel
-from slipid.identify.fit.problem import DEGREES
 from slipid.identify.fit.sessions import by_axis
+from slipid.identify.fit.variances import DEGREES
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
 from slipid.search_space import Space
 
 STEP = 0.5
 """Longest step of a replay [s]."""
+Numbers = Array | np.ndarray
 TOGETHER = 32
 """Runs replayed in one call."""
 
@@ -105,21 +106,19 @@ def follow(robot: Robot, w: Windows, increment: Float[np.ndarray, "piece window 
 
 
 @eqx.filter_jit
-def twist_end_jacobian(space: Space, z: Array, twist: Array, w: lk.Batch, start: Array) -> Array:
-    """Slope of the ends by the search vector where the body's twists are given (piece, 2, free)."""
+def end_jacobian(
+    space: Space, z: Numbers, b: lk.Batch, start: Numbers, twist: Numbers | None = None
+) -> Float[Array, "piece 2 free"]:
+    """Slope of the ends by the search vector, from given start poses.
+
+    Of the contact equilibrium, or where the body's twists are given (piece, window, 3).
+    """
 
     def end(x: Array) -> Array:
-        return chain(start, lk.seen(space.tree(x), twist, w.dt, w.session))[:, -1, :2]
-
-    return jax.jacfwd(end)(z)
-
-
-@eqx.filter_jit
-def end_jacobian(space: Space, z: Array, b: lk.Batch, start: Array) -> Array:
-    """Derivative of the end pose (piece, 3) by the search vector, from given start poses."""
-
-    def end(x: Array) -> Array:
-        return chain(start, contact_increments(space.tree(x), b))[:, -1]
+        robot = space.tree(x)
+        if twist is None:
+            return chain(start, contact_increments(robot, b))[:, -1, :2]
+        return chain(start, lk.seen(robot, jnp.asarray(twist), b.dt, b.session))[:, -1, :2]
 
     return jax.jacfwd(end)(z)
 
@@ -129,7 +128,7 @@ def end_covariance(
     w: Windows,
     tracks: Tracks,
     variance: Mapping[str, float],
-    of_parameters: Float[np.ndarray, "piece 2 2"] | float = 0.0,
+    of_parameters: Float[np.ndarray, "piece 2 2"],
 ) -> Float[np.ndarray, "piece 2 2"]:
     """Covariance of the gap between predicted and measured end [m^2], scale matrix of a Student t.
 
@@ -139,7 +138,7 @@ def end_covariance(
     """
     far, u = travel(w, robot)
     p = tracks.predicted
-    cov = np.zeros((len(w), 2, 2)) + of_parameters
+    cov = of_parameters.copy()
     lever = sideways(p[:, -1:, :2] - p[:, 1:, :2])  # what a turn at each step moves
     way = p[:, :-1, 2]
     along, across = turned(way, u), turned(way, sideways(u))
@@ -155,7 +154,7 @@ def end_covariance(
 
 
 def scores(
-    gap: Float[np.ndarray, "run 2"], cov: Float[np.ndarray, "run 2 2"] | None, seed: int = 0
+    gap: Float[np.ndarray, "run 2"], cov: Float[np.ndarray, "run 2 2"] | None
 ) -> tuple[np.ndarray | None, np.ndarray]:
     """Probability of the region whose edge each end lies on, and the energy score of each [m].
 
@@ -168,7 +167,7 @@ def scores(
         return None, np.linalg.norm(gap, axis=1)
     q = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(cov), gap)
     level = fisher.cdf(q / 2, 2, DEGREES)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     normal = rng.normal(size=(500, 2)) / np.sqrt(rng.chisquare(DEGREES, (500, 1)) / DEGREES)
     draws = np.einsum("nij,kj->nki", np.linalg.cholesky(cov), normal)
     near = np.linalg.norm(draws - gap[:, None], axis=2).mean(axis=1)

@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.special import gammaln
@@ -26,14 +25,15 @@ from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import effects
-from slipid.identify.fit.problem import DEGREES, Problem, State
+from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit.sessions import Linear, by_axis, shared
-from slipid.identify.fit.variances import Search, Square, Vector
+from slipid.identify.fit.variances import DEGREES, Search, Square, Vector
 from slipid.model.robot import Robot
 from slipid.search_space import Space
 
 Gaps = Float[np.ndarray, "piece m"]
 Slopes = Float[np.ndarray, "piece m number"]
+Fitted = TypeVar("Fitted", bound="Predictive")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +84,25 @@ class Predictive(abc.ABC):
             _camera_log_jacobian(self.robot, problem.batch.pose)
         )
 
+    def with_sessions(
+        self: Fitted,
+        problem: Problem,
+        linear: tuple[Gaps, Slopes],
+        wide: np.ndarray,
+        keep: np.ndarray,
+    ) -> Fitted:
+        """The model with what runs of a session share in its variances and in its covariance."""
+        model = Linear(
+            *linear,
+            covariance=self.covariance,
+            wide=wide,
+            scale=np.asarray(problem.covariance("motion", self.log_variance(problem))),
+            effect=effects(problem.windows, problem.robot),
+            run=by_axis(self.variance, "run", problem.windows),
+        )
+        variance, covariance = shared(model, problem.windows, np.asarray(keep, float))
+        return replace(self, variance={**self.variance, **variance}, covariance=covariance)
+
 
 def log_student(
     gap: Gaps, scale: Float[np.ndarray, "piece m m"] | Float[np.ndarray, "m m"]
@@ -133,51 +152,23 @@ class Contact(Predictive):
         return np.asarray(blocks["motion"]), np.asarray(jac["motion"])
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
-        b, z = lk.batch(w, self.robot), jnp.asarray(self.z)
+        b = lk.batch(w, self.robot)
         tracks = replay.follow(self.robot, w, np.asarray(replay.contact_increments(self.robot, b)))
-        start = jnp.asarray(tracks.predicted[:, 0])
-        jac = np.asarray(replay.end_jacobian(self.space, z, b, start))[:, :2]
+        jac = np.asarray(replay.end_jacobian(self.space, self.z, b, tracks.predicted[:, 0]))
         own = np.einsum("nip,pq,njq->nij", jac, self.covariance, jac)
         return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, own)
 
 
-Fitted = TypeVar("Fitted", bound=Predictive)
-
-
 def contact_of(
-    problem: Problem,
-    state: State,
-    covariance: Square,
-    keep: Float[np.ndarray, " piece"] | None = None,
+    problem: Problem, state: State, covariance: Square, keep: Float[np.ndarray, " piece"]
 ) -> Contact:
-    """The force balance at the end of a fit of the kept pieces.
-
-    Without them it leaves out what sessions share.
-    """
+    """The force balance at the end of a fit of the kept pieces, with what sessions share."""
     robot, variance = problem.space.tree(state.z), by_name(problem, state.log_variance)
     plain = Contact(robot, variance, np.asarray(covariance), problem.space, np.asarray(state.z))
-    if keep is None:
-        return plain
     of_floor = problem.space.where(lambda e: e.surface is not None)
     wide = np.where(of_floor[:, None] | of_floor, 0.0, plain.covariance)
     wide[of_floor, of_floor] = problem.space.prior_std[of_floor] ** 2
-    return with_sessions(plain, problem, wide, keep)
-
-
-def with_sessions(plain: Fitted, problem: Problem, wide: np.ndarray, keep: np.ndarray) -> Fitted:
-    """The model with what runs of a session share in its variances and in its covariance."""
-    gap, slope = plain.linear(problem)
-    model = Linear(
-        gap=gap,
-        slope=slope,
-        covariance=plain.covariance,
-        wide=wide,
-        scale=np.asarray(problem.covariance("motion", plain.log_variance(problem))),
-        effect=effects(problem.windows, problem.robot),
-        run=by_axis(plain.variance, "run", problem.windows),
-    )
-    variance, covariance = shared(model, problem.windows, np.asarray(keep, float))
-    return replace(plain, variance={**plain.variance, **variance}, covariance=covariance)
+    return plain.with_sessions(problem, plain.linear(problem), wide, keep)
 
 
 def around(jac: Slopes, cov: np.ndarray) -> np.ndarray:

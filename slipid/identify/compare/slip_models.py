@@ -13,9 +13,8 @@ from scipy import sparse
 from scipy.optimize import least_squares, linprog, lsq_linear
 
 from slipid.data.windows import Windows
-from slipid.identify.compare.body_motion import body_twist, rims
 from slipid.identify.compare.heading_lookup import HeadingLookup
-from slipid.identify.compare.rung import Rung, of_floor
+from slipid.identify.compare.rung import Rung, body_twist, of_floor, rims
 from slipid.model.motor import signed
 from slipid.model.robot import Robot
 
@@ -56,7 +55,7 @@ class Curve(Rung):
         features: phi.
         torque: x is M = C_e I + R I^2/wm [N m] instead of the current [A].
         per_wheel: own coefficients for every wheel.
-        positive: coefficients from here on are not negative (a monotone curve).
+        monotone: no coefficient but the first is negative.
         insensitive: epsilon-insensitive loss instead of least squares, as support vector regression
             with a linear kernel has it; epsilon is a tenth of a robust std of what slip takes away.
     """
@@ -64,7 +63,7 @@ class Curve(Rung):
     features: Features
     torque: bool = False
     per_wheel: bool = False
-    positive: int | None = None
+    monotone: bool = False
     insensitive: bool = False
 
     def _design(self, w: Windows, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -85,12 +84,10 @@ class Curve(Rung):
             mine = np.asarray(w.surface) == name
             a = (lost[mine] * scale[:, None]).reshape(-1, lost.shape[-1])
             b = (gap[mine] * scale).ravel()
-            lower = np.full(a.shape[1], -np.inf)
-            if self.positive is not None:
-                lower[self.positive :] = 0.0
             if self.insensitive:
                 beta[name] = insensitive(a, b)
             else:
+                lower = np.where(self._held(a.shape[1]), 0.0, -np.inf)
                 beta[name] = lsq_linear(a, b, (lower, np.inf), method="bvls").x
         return replace(self, state=beta)
 
@@ -101,10 +98,15 @@ class Curve(Rung):
 
     def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
         """A coefficient that rests on its bound does not move with the data."""
-        if self.positive is None:
+        if not self.monotone:
             return {}
-        edge = np.arange(len(next(iter(self.state.values())))) >= self.positive
-        return {key: np.diag((edge & (b <= 0)) * HELD) for key, b in self.state.items()}
+        return {
+            key: np.diag((self._held(len(b)) & (b <= 0)) * HELD) for key, b in self.state.items()
+        }
+
+    def _held(self, count: int) -> np.ndarray:
+        """Which coefficients are not negative."""
+        return self.monotone & (np.arange(count) > 0)
 
 
 def insensitive(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -210,7 +212,7 @@ def rungs(has_current: bool) -> list[Rung]:
             Curve("svr", _powers(0, 1), torque=True, insensitive=True),
             Curve("quadratic", _powers(0, 1, 2), torque=True),
             Saturating(),
-            Curve("monotone_spline", _ramps(KNOTS), torque=True, positive=1),
+            Curve("monotone_spline", _ramps(KNOTS), torque=True, monotone=True),
             Curve("affine_current", _powers(0, 1)),
             Curve("paper", _above(0.4), per_wheel=True),
         ]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slipid.data.windows import Windows
-from slipid.identify.compare.body_motion import body_twist
+from slipid.identify.compare.rung import body_twist
 from slipid.identify.compare.validation import main_load
 from slipid.model.robot import Robot
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 ENDLESS = 1e3
-"""Times that every candidate is driven where "endless" is meant."""
+"""Times that every candidate is driven where "endless" is meant: what is left then stays."""
 
 
 class Rows(NamedTuple):
@@ -164,11 +164,6 @@ def exchanged(start: Knowledge, rows: Rows, goal: np.ndarray, chosen: Sequence[i
         ordered.append(kept.pop(first))
         now = now.plus(rows.pick(ordered[-1:]))
     return ordered
-
-
-def endless(start: Knowledge, rows: Rows) -> Knowledge:
-    """After every candidate was driven `ENDLESS` times: what is left then no run can take away."""
-    return start.plus(rows, ENDLESS)
 
 
 def _inverse(a: np.ndarray) -> np.ndarray:

@@ -1,7 +1,4 @@
-"""Which runs to drive next: the fitted robot simulates them, Fisher information judges them.
-
-What is assumed of new runs is said by `proposal.ASSUMPTIONS`.
-"""
+"""Which runs to drive next: the fitted robot simulates them, Fisher information judges them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +18,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import effects
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES, by_axis
+from slipid.identify.fit.variances import whitened
 from slipid.identify.result import Channels, Fit
 from slipid.model.robot import Robot
 from slipid.parameter import entries
@@ -43,13 +41,13 @@ class Planner:
         robot: Robot,
         choices: Sequence[Choice],
         variance: Mapping[str, float],
-        channels: Channels | None = None,
+        channels: Channels,
     ):
         camera = robot.camera
         if camera.sessions:
             camera = replace(camera, sessions=(SESSION,), session_yaw=jnp.zeros(1))
         self.robot = replace(robot, camera=camera)
-        self.channels = channels or Channels()
+        self.channels = channels
         self.variance = dict(variance)
         paths = [e.path for e in entries(self.robot)]
         choices = [c for c in choices if any(fnmatchcase(p, c.pattern) for p in paths)]
@@ -57,7 +55,7 @@ class Planner:
         self._problem = Problem(self._windows([first] * _TOGETHER), self.robot, choices)
         self.space = self._problem.space
         self.z = self.space.vector(self.robot)
-        electric = self._problem.electric & (not self._problem.joint)
+        electric = self._problem.space.electric & (not self._problem.joint)
         of_floor = [[f"session.{x}.{a}" for a in AXES] for x in robot.surfaces.labels]
         self._differ = np.array([any(map(self.variance.get, names)) for names in of_floor])
         self.effects = len(AXES) * int(self._differ.sum())
@@ -111,11 +109,9 @@ class Planner:
         wider = ((0, 0), (0, 0), (0, self.effects))
         of_motion = jnp.concatenate([jacobian["motion"], -moved], axis=2)
         jacobian = {k: jnp.pad(j, wider) for k, j in jacobian.items()} | {"motion": of_motion}
-        halves = this.whitened(jacobian, self._log_v)
+        halves = whitened(this.noise.blocks, jacobian, self._log_v, np.ones(_TOGETHER))
         motion = np.asarray(halves.pop("motion"))[: len(drives)]
         others = [np.asarray(h)[: len(drives)] for h in halves.values()]
-        if this.joint:
-            motion, others = np.concatenate([motion, *others], axis=1), []
         electric = np.concatenate([motion[:, :0], *others], axis=1)
         return Rows(
             motion[..., ~self.is_electric],
@@ -129,8 +125,7 @@ class Planner:
         What is of one session, the marker's deviation too, is no part of a prediction.
         """
         b = lk.batch(self._windows(drives, session=""), self.robot)
-        start = jnp.zeros((len(drives), 3))
-        jacobian = np.array(end_jacobian(self.space, jnp.asarray(self.z), b, start))[:, :2]
+        jacobian = np.array(end_jacobian(self.space, self.z, b, np.zeros((len(drives), 3))))
         jacobian /= np.array([d.distance for d in drives])[:, None, None]
         return np.pad(jacobian, ((0, 0), (0, 0), (0, self.effects)))
 

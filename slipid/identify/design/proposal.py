@@ -7,9 +7,8 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from slipid.identify.design import fisher as info
-from slipid.identify.design.planned_runs import Drive
+from slipid.identify.design.planned_runs import Drive, drivable, heading_grid, paper_grid
 from slipid.identify.design.planner import Goal, Planner, parameter_goal, prediction_goal, weighed
-from slipid.identify.design.savings import saved
 from slipid.identify.design.wish import Scope, Wish
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE
@@ -20,6 +19,10 @@ from slipid.support.errors import DataError
 SCHEMA = "slipid.design/1"
 REACHED = 0.9
 """A goal that keeps more than this part of its std however long one drives is out of reach."""
+ORDERS = 8
+"""Random orders of a grid that are averaged."""
+POINTS = 40
+"""Numbers of runs at which the curve of a grid is given."""
 ASSUMPTIONS = (
     "noise and run effects as fitted; a run is one piece however long it is",
     "all new runs are of one session, whose own offset they cannot average away",
@@ -53,7 +56,7 @@ def design(fit: Fit, wish: Wish) -> Design:
     scope, planner = Scope(fit, wish), Planner.of(fit)
     offered = scope.candidates()
     rows, now = planner.rows(offered), planner.after(fit)
-    last = info.endless(now, rows)
+    last = now.plus(rows, info.ENDLESS)
     weights = _goals(fit, wish, scope, planner)
     lost = {g.name: s for g in weights if (s := _out_of_reach(fit, g, now, last, len(offered)))}
     goals = [g for g in weights if g.name not in lost]
@@ -88,13 +91,24 @@ def design(fit: Fit, wish: Wish) -> Design:
         chosen, _ = info.greedy(now, rows, goal, wish.runs)
         chosen = info.exchanged(now, rows, goal, chosen)
         content["criterion"] = info.path(now, rows, goal, chosen)
-        content["runs_saved"] = saved(scope, planner, goals, goal, offered, rows)
+        content["runs_saved"] = _saved(scope, planner, goals, goal, offered, rows)
     drives = tuple(offered[k] for k in chosen)
     after = now
     for k, drive in zip(chosen, drives, strict=True):
         after = after.plus(rows.pick([k]))
         expected = {g.name: g.std(after) for g in goals}
-        content["runs"].append(_run(drive, scope.base) | {"expected": expected})
+        content["runs"].append(
+            {
+                "floor": drive.surface,
+                "load": drive.load,
+                "heading_deg": float(np.degrees(drive.heading)),
+                "speed": drive.speed,
+                "turn_rate": drive.turn,
+                "distance": drive.distance,
+                "seconds": drive.seconds(scope.base),
+                "expected": expected,
+            }
+        )
     content["messages"] = [*lost.values(), *_extrapolated(fit, drives)]
     content["data"] = {"hash": fit.data_hash, "runs": len(fit.runs)}
     asked = bool(wish.parameters or wish.predictions)
@@ -146,18 +160,6 @@ def _out_of_reach(
     return f"no candidate run shrinks {goal.name}: {why}"
 
 
-def _run(drive: Drive, base: float) -> Content:
-    return {
-        "floor": drive.surface,
-        "load": drive.load,
-        "heading_deg": float(np.degrees(drive.heading)),
-        "speed": drive.speed,
-        "turn_rate": drive.turn,
-        "distance": drive.distance,
-        "seconds": drive.seconds(base),
-    }
-
-
 def _extrapolated(fit: Fit, drives: Sequence[Drive]) -> list[str]:
     """Where proposed runs leave what the fit has seen: its form is not known to hold there."""
     out = []
@@ -177,6 +179,66 @@ def _extrapolated(fit: Fit, drives: Sequence[Drive]) -> list[str]:
         if other:
             out.append(f"{floor} was never driven with load {', '.join(sorted(other))}")
     return out
+
+
+def _saved(
+    scope: Scope,
+    planner: Planner,
+    goals: Sequence[Goal],
+    goal: np.ndarray,
+    offered: Sequence[Drive],
+    rows: info.Rows,
+) -> Content:
+    """How many runs, chosen one after another from nothing, tell as much as whole grids.
+
+    They are chosen from the candidates and the grid's own runs. The grids are driven wherever it
+    was driven before, but only with the floors and loads the goals are about.
+    """
+    setups = [s for s in scope.setups if any(g.is_about(s) for g in goals)]
+    setups = [s for s in setups if s in scope.driven] or setups or list(scope.setups)
+    headings = heading_grid(setups, scope.driven_speeds, scope.distance)
+    grids = {
+        "paper_grid": ("the 2021 paper's grid", paper_grid(setups, scope.distance)),
+        "heading_grid": ("the 2022 grid of headings every 5 deg", headings),
+    }
+    return {
+        key: {"name": name, "setups": [list(s) for s in setups]}
+        | _against(planner, goal, drivable(grid, scope.fit.robot), offered, rows, scope.base)
+        for key, (name, grid) in grids.items()
+    }
+
+
+def _against(
+    planner: Planner,
+    goal: np.ndarray,
+    grid: tuple[Drive, ...],
+    offered: Sequence[Drive],
+    rows: info.Rows,
+    base: float,
+) -> Content:
+    of_grid, start = planner.rows(grid), planner.nothing()
+    target = start.plus(of_grid).criterion(goal)
+    both, drives = rows.joined(of_grid), [*offered, *grid]
+    chosen, found = info.greedy(start, both, goal, len(grid), target)
+    count, reached = len(chosen), found[-1] <= target
+    at = sorted({*np.geomspace(1, len(grid), POINTS).round().astype(int).tolist(), count})
+    orders = [np.random.default_rng(k).permutation(len(grid)) for k in range(ORDERS)]
+    random = np.mean([info.path(start, of_grid, goal, order, at) for order in orders], axis=0)
+    in_order = info.path(start, of_grid, goal, np.arange(len(grid)), at)
+    return {
+        "grid_runs": len(grid),
+        "greedy_runs": count if reached else None,
+        "ratio": count / len(grid) if reached else None,
+        "grid_minutes": sum(d.seconds(base) for d in grid) / 60,
+        "greedy_minutes": sum(drives[k].seconds(base) for k in chosen) / 60,
+        "criterion": target,
+        "criterion_random_order": float(random[at.index(count)]),
+        "curves": {
+            "greedy": {"runs": list(range(1, count + 1)), "criterion": found[1:]},
+            "grid": {"runs": at, "criterion": in_order},
+            "random_order": {"runs": at, "criterion": random.tolist()},
+        },
+    }
 
 
 def commands(found: Design) -> str:

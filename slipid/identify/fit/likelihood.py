@@ -23,15 +23,13 @@ SMOOTH = 0.03
 FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
 """Variance added to every residual: rounding of the logs [m^2, A^2, V^2]."""
 
-
 _AS_THEY_ARE = ("dt", "turn", "faster", "pose", "current", "voltage", "current_var", "lag")
 
 
 class Batch(eqx.Module):
     """Windows as arrays for a jitted function; names are indices of the robot's stacks.
 
-    Attributes:
-        surface: under the robot (piece,), or under each of its wheels (piece, wheel).
+    The surface is the one under the robot (piece,), or under each of its wheels (piece, wheel).
     """
 
     surface: Int[Array, "piece *wheel"]
@@ -90,17 +88,14 @@ def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
     """Contact equilibrium of every window, looked for near twists as `model.robot.twist` does."""
     frame = robot.geometry.frame()
 
-    def window(
-        w: Array, dt: Array, near: Array | None, surface: Array, load: Array, session: Array
-    ) -> tuple[Array, Array, Array]:
+    def window(w: Array, near: Array | None, surface: Array, load: Array) -> tuple[Array, Array]:
         xi = model.twist(robot, frame, w, surface, load, near)
-        increment = robot.camera.seen(se2.advance(xi, dt), session)
-        return increment, xi, model.felt(robot, frame, xi, w, surface, load)
+        return xi, model.felt(robot, frame, xi, w, surface, load)
 
     each = None if near is None else 0
-    piece = jax.vmap(window, (0, 0, each, None, None, None))
-    pieces = jax.vmap(piece, (0, 0, each, 0, 0, 0))
-    return Predicted(*pieces(wheel_speed(robot, b), b.dt, near, b.surface, b.load, b.session))
+    pieces = jax.vmap(jax.vmap(window, (0, each, None, None)), (0, each, 0, 0))
+    twist, felt = pieces(wheel_speed(robot, b), near, b.surface, b.load)
+    return Predicted(seen(robot, twist, b.dt, b.session), twist, felt)
 
 
 def seen(
@@ -184,13 +179,6 @@ def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Flo
 def _spread(robot: Robot, b: Batch, voltage_std: Std) -> PerWheel:
     """Std of the voltage residual over that of the voltage noise."""
     return jnp.sqrt(1.0 + robot.motor.resistance**2 * b.current_var / voltage_std**2)
-
-
-def residuals(robot: Robot, b: Batch, voltage_std: Std) -> dict[str, Array]:
-    """Every block of residuals, `motion` first."""
-    p = predict(robot, b)
-    motion = {"motion": motion_residual(robot, b, p)}
-    return motion | electric_residuals(robot, b, p.felt, voltage_std)
 
 
 def voltage_std(log_variance: Float[Array, ""]) -> Float[Array, ""]:

@@ -1,6 +1,6 @@
 """Variance components of the residuals of a piece, and the covariance they make.
 
-A piece is a few neighbouring windows of one run. Its residuals have the covariance
+The residuals of a piece have the covariance
 
     V = sum_c v_c B_c,   B from: camera place and heading noise, shared by neighbouring windows;
                          process noise along, across and in yaw, growing with distance, per floor;
@@ -28,7 +28,9 @@ class Components(eqx.Module):
     which: Int[Array, "piece component"]
     floor: float = eqx.field(static=True)
 
-    def covariance(self, log_variance: Float[Array, " variance"]) -> Float[Array, "piece m m"]:
+    def covariance(
+        self, log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"]
+    ) -> Float[Array, "piece m m"]:
         """V of every piece."""
         v, m = jnp.exp(log_variance)[self.which], self.base.shape[-1]
         return jnp.einsum("nc,ncij->nij", v, self.base) + self.floor * jnp.eye(m)
@@ -38,10 +40,8 @@ class Components(eqx.Module):
 class Component:
     """One source of noise: `process` `along`, `camera` `place`, `current` `window` and so on.
 
-    Attributes:
-        floor: it is met on, None where it is of all.
-        unit: of its std.
-        typical: std that the weak log-normal prior is centred on.
+    It is met on a floor, None for all; unit and typical value, which the weak log-normal prior is
+    centred on, are of its std.
     """
 
     kind: str

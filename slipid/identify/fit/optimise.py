@@ -2,29 +2,24 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
-from jaxtyping import Float
+import optimistix as optx
+from jaxtyping import Array, Float
 
-from slipid.identify.fit.problem import DEGREES, Problem, State, linear
-from slipid.identify.fit.structure import Held, levenberg
-from slipid.identify.fit.variances import Search, Square, scored
+from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit.problem import Problem, State, linear, log_jacobian
+from slipid.identify.fit.variances import Blocks, Search, Square, Target, scored
 from slipid.search_space import Space
 
 CREEPS = (0.05, 0.4, 1.0)
 """Starts of the creep of every floor; others end in poor minima."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """How many rounds of weights, structure and variances at most.
-
-    The fit stops when no number moves more than `tolerance` posterior stds in a round.
-    """
-
-    most_rounds: int = 30
-    tolerance: float = 0.02
+_REFUSED = 12
+"""Steps of the solver that may be refused in a round."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +37,8 @@ def optimise(
     problem: Problem,
     keep: np.ndarray | None = None,
     start: State | None = None,
-    options: Options | None = None,
+    most_rounds: int = 30,
+    tolerance: float = 0.02,
     tell: Callable[[State], None] = lambda state: None,
     free: np.ndarray | None = None,
     variances: bool = True,
@@ -53,27 +49,28 @@ def optimise(
         keep: weight of each piece, 1 or 0 (piece,); all by default. Folds of a cross-validation
             differ in this only, so they share one compiled function.
         start: goes on from here instead of the staged start.
+        most_rounds: of weights, structure and variances.
+        tolerance: it stops when no number moves more posterior stds than this in a round.
         tell: called after every round, for progress and checkpoints.
         free: 1 for coordinates that may move from the start, 0 for those held there (free,).
         variances: whether to fit those of the noise, too.
     """
-    options = options or Options()
     keep = np.ones(len(problem.windows)) if keep is None else np.asarray(keep, float)
     state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
     mask = np.ones(problem.space.size) if free is None else np.asarray(free, float)
     history: list[float] = []
-    reason = f"{options.most_rounds} rounds without settling"
-    while state.round < options.most_rounds:
+    while state.round < most_rounds:
         early = state.round < 3
         scoring = (2 if early else 4) if variances else 0
         state = one_round(problem, state, keep, mask, steps=8 if early else 4, scoring=scoring)
         history.append(state.loss)
         tell(state)
-        if state.moved < options.tolerance:
-            reason = f"no number moved {options.tolerance:g} of its std in round {state.round}"
+        if state.moved < tolerance:
             break
     covariance = problem.laplace(state.z, state.log_variance, keep)
-    settled = state.moved < options.tolerance
+    reason = f"{most_rounds} rounds without settling"
+    if settled := state.moved < tolerance:
+        reason = f"no number moved {tolerance:g} of its std in round {state.round}"
     return Optimum(state, covariance, settled, reason, tuple(history))
 
 
@@ -100,9 +97,9 @@ def one_round(
         root=problem.whitening(residual, log_v, keep).root,
         volt=volt,
         felt=felt,
-        slope=problem.log_jacobian(state.z, volt, keep)[1],
+        slope=log_jacobian(target, state.z, volt, keep)[1],
     )
-    z = levenberg(held, steps)
+    z = np.asarray(levenberg(held, Steps(steps)))
     residual, jacobian = problem.linear(z, volt)
     own = problem.own(z, log_v)
     for _ in range(scoring):
@@ -149,7 +146,10 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
         for steps in (15, 6, 6):  # the damping has to grow from 1 to the size of the problem first
             state = one_round(problem, state, keep, mask, steps=steps, scoring=0)
             tell(state)
-        cost = _piece_cost(problem, state)
+        residual, _ = problem.linear(state.z, problem.volt(state.log_variance))
+        every = np.ones(len(floors))
+        weight = problem.whitening(residual, state.log_variance, every).weight["motion"]
+        cost = -np.log(np.asarray(weight))  # as good as the loss, but for factor and constant
         for number, label in enumerate(labels):
             mine = float(np.sum(cost[(floors == number) & (keep > 0)]))
             if mine < best[number]:
@@ -161,14 +161,6 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
 
 def _of_floor(space: Space, label: str) -> np.ndarray:
     return space.where(lambda e: e.surface == label)
-
-
-def _piece_cost(problem: Problem, state: State) -> np.ndarray:
-    residual, _ = problem.linear(state.z, problem.volt(state.log_variance))
-    v = np.asarray(problem.covariance("motion", state.log_variance))
-    r = np.asarray(residual["motion"])
-    q = np.einsum("ni,ni->n", r, np.linalg.solve(v, r[..., None])[..., 0])
-    return 0.5 * (DEGREES + r.shape[1]) * np.log1p(q / DEGREES)
 
 
 def _motor_start(problem: Problem) -> np.ndarray:
@@ -186,3 +178,69 @@ def _motor_start(problem: Problem) -> np.ndarray:
         if path in place and value > 0:
             z[place[path]] = np.log(value)
     return z
+
+
+class Held(eqx.Module):
+    """What is held while the structural numbers move from z.
+
+    The mask is 1 for coordinates that may move; root whitens residuals, volt is the std of the
+    voltage noise [V], felt the traction at z, which currents and voltages are predicted from, and
+    slope that of log |d residuals / d data| by the search vector.
+    """
+
+    target: Target
+    z: Float[Array, " free"]
+    mask: Float[Array, " free"]
+    root: Blocks
+    volt: Float[Array, ""]
+    felt: Float[Array, "piece window wheel"]
+    slope: Float[Array, " free"]
+
+
+class Steps(optx.LevenbergMarquardt):
+    """Levenberg-Marquardt that ends after so many steps that were taken.
+
+    One that is refused shrinks the next, and to stop among refused ones would look like having
+    arrived. The solver counts its look at the start as a step that was taken.
+    """
+
+    most: Array
+
+    def __init__(self, most: int):
+        super().__init__(rtol=1e-6, atol=1e-8, linear_solver=lx.Normal(lx.Cholesky()))
+        self.most = jnp.asarray(most)
+
+    def terminate(
+        self, fn: Any, y: Array, args: Held, options: Any, state: Any, tags: frozenset[object]
+    ) -> tuple[Array, optx.RESULTS]:
+        done, result = super().terminate(fn, y, args, options, state, tags)
+        taken = state.num_accepted_steps - 1 >= self.most
+        return done | taken | (state.num_steps >= self.most + _REFUSED), result
+
+
+@eqx.filter_jit
+def levenberg(held: Held, solver: Steps) -> Float[Array, " free"]:
+    """Search vector after the solver's steps with fixed whitening."""
+    start = jnp.zeros_like(held.z)
+    found = optx.least_squares(_stacked, solver, start, held, max_steps=None, throw=False)
+    return _at(held, found.value)
+
+
+def _at(held: Held, y: Array) -> Array:
+    """Search vector of a step in prior stds."""
+    return held.z + held.mask * held.target.space.prior_std * y
+
+
+def _stacked(y: Array, held: Held) -> Array:
+    """Whitened residuals of all blocks and of the prior."""
+    target, space = held.target, held.target.space
+    z = _at(held, y)
+    robot, given = space.tree(z), space.tree(jnp.where(space.electric, z, held.z))
+    motion = lk.motion_residual(robot, target.batch, lk.predict(robot, target.batch))
+    # currents and voltages given the motion of the round's start
+    electric = lk.electric_residuals(given, target.batch, held.felt, held.volt)
+    blocks = {"motion": motion} | electric
+    parts = [jnp.einsum("nij,nj->ni", held.root[k], r).ravel() for k, r in blocks.items()]
+    # the slope of the log Jacobian adds slope . z to the log posterior
+    mean = space.prior_mean + space.prior_std**2 * held.slope
+    return jnp.concatenate([*parts, (z - mean) / space.prior_std])

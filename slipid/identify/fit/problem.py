@@ -1,37 +1,25 @@
-"""Posterior of a robot given windows of its runs, compiled for all windows of the same shapes.
-
-Structural numbers are found by Levenberg-Marquardt steps (`structure`), variances by Fisher scoring
-of the restricted likelihood (`variances`).
-"""
+"""Posterior of a robot given windows of its runs, compiled for all windows of the same shapes."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from glob import escape
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from slipid.data.runs import Runs
 from slipid.data.windows import Windows
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import variances
 from slipid.identify.fit.noise import noise
-from slipid.identify.fit.variances import (
-    DEGREES,
-    VARIANCE_SPREAD,
-    Blocks,
-    Search,
-    Target,
-    Vector,
-    Whitening,
-)
+from slipid.identify.fit.variances import VARIANCE_SPREAD, Blocks, Search, Target, Vector, Whitening
 from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
-
-__all__ = ["DEGREES", "VARIANCE_SPREAD", "Problem", "State", "Target"]
 
 
 @dataclass(frozen=True)
@@ -53,7 +41,7 @@ class State:
 class Problem:
     """Likelihood of a set of windows as functions of the search vector.
 
-    By default currents and voltages do not move the numbers of the motion ("cut"): the torque scale
+    Currents and voltages do not move the numbers of the motion ("cut"): the torque scale
     is read from currents given the motion, whose errors are carried along. A friction model good to
     5 % in current would otherwise outvote forces that motion shows to 1 %.
 
@@ -66,10 +54,9 @@ class Problem:
         windows: Windows,
         robot: Robot,
         choices: Sequence[Choice],
-        current_informs_motion: bool = False,
     ):
         self.space = Space(robot, choices)
-        self.joint = current_informs_motion or not windows.has_current
+        self.joint = not windows.has_current
         self.robot: Robot = self.space.template
         self.compiled: dict[Any, Any] = {}
         self._read(windows)
@@ -94,49 +81,29 @@ class Problem:
     def batch(self) -> lk.Batch:
         return self.target.batch
 
-    @property
-    def electric(self) -> Bool[np.ndarray, " free"]:
-        return self.space.electric
-
-    def linear(self, z: Vector, volt: Vector) -> tuple[Blocks, Blocks]:
+    def linear(self, z: Vector, volt: Array) -> tuple[Blocks, Blocks]:
         """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
-        return linear(self.target, *_arrays(z, volt))[:2]
-
-    def log_jacobian(self, z: Vector, volt: Vector, keep: Vector) -> tuple[Array, Array]:
-        return log_jacobian(self.target, *_arrays(z, volt, keep))
-
-    def twists(self, z: Vector) -> tuple[Array, Array]:
-        """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
-        return _twists(self.space, self.batch, jnp.asarray(z))
+        return linear(self.target, z, volt)[:2]
 
     def covariance(self, block: str, log_v: Vector) -> Array:
         """Covariance of the residuals of a block (piece, m, m)."""
-        return self.noise.blocks[block].covariance(jnp.asarray(log_v))
+        return self.noise.blocks[block].covariance(log_v)
 
     def whitening(self, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
-        return variances.whitening(self.noise.blocks, residual, *_arrays(log_v, keep))
+        return variances.whitening(self.noise.blocks, residual, log_v, keep)
 
     def precision(self, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
-        return variances.precision(self.target, jacobian, *_arrays(log_v, keep))
+        return variances.precision(self.target, jacobian, log_v, keep)
 
     def laplace(self, z: Vector, log_v: Vector, keep: Vector) -> np.ndarray:
         """Covariance of the search vector (free, free): inverse information, prior included."""
         jacobian = self.linear(z, self.volt(log_v))[1]
         return np.linalg.inv(np.asarray(self.precision(jacobian, log_v, keep)))
 
-    def whitened(self, jacobian: Blocks, log_v: Vector) -> Blocks:
-        vectors = _arrays(log_v, np.ones(len(self.windows)))
-        return variances.whitened(self.noise.blocks, jacobian, *vectors)
-
-    def variance_precision(self, log_v: Vector, keep: Vector, z: Vector) -> Array:
-        """Expected information of the log variances at z, prior included (variance, variance)."""
-        at, counts = _arrays(log_v, keep)
-        return variances.information(self.noise.blocks, at, counts, self.own(z, log_v))
-
     def loss(self, z: Vector, log_v: Vector, keep: Vector, residual: Blocks) -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
         nll = float(self.whitening(residual, log_v, keep).loss)
-        nll -= float(self.log_jacobian(z, self.volt(log_v), keep)[0])
+        nll -= float(log_jacobian(self.target, z, self.volt(log_v), keep)[0])
         pull = (np.asarray(z) - self.space.prior_mean) / self.space.prior_std
         spread = (np.asarray(log_v) - np.asarray(self.target.typical)) / VARIANCE_SPREAD
         return nll + 0.5 * float(np.sum(pull**2)) + 0.5 * float(np.sum(spread**2))
@@ -144,7 +111,7 @@ class Problem:
     def volt(self, log_v: Vector) -> Array:
         """Std of the voltage noise [V], 1 where none is logged."""
         if "voltage" not in self.noise.blocks:
-            return jnp.asarray(1.0)
+            return jnp.ones(())
         return lk.voltage_std(jnp.asarray(log_v)[-1])
 
     def own(self, z: Vector, log_v: Vector) -> Blocks:
@@ -154,15 +121,11 @@ class Problem:
         """
         if "voltage" not in self.noise.blocks:
             return {}
-        return {"voltage": _share(self.space, self.batch, jnp.asarray(z), self.volt(log_v))}
-
-
-def _arrays(*vectors: Vector) -> tuple[Array, ...]:
-    return tuple(jnp.asarray(v, float) for v in vectors)
+        return {"voltage": _share(self.space, self.batch, z, self.volt(log_v))}
 
 
 @eqx.filter_jit
-def linear(target: Target, z: Array, volt: Array) -> tuple[Blocks, Blocks, Array]:
+def linear(target: Target, z: Vector, volt: Array) -> tuple[Blocks, Blocks, Array]:
     """Residual blocks, their Jacobians, and the traction of every wheel's motor."""
 
     def blocks(x: Array) -> tuple[Blocks, tuple[Blocks, Array]]:
@@ -177,17 +140,19 @@ def linear(target: Target, z: Array, volt: Array) -> tuple[Blocks, Blocks, Array
 
 
 @eqx.filter_jit
-def log_jacobian(target: Target, z: Array, volt: Array, keep: Array) -> tuple[Array, Array]:
+def log_jacobian(target: Target, z: Vector, volt: Array, keep: Vector) -> tuple[Array, Array]:
     """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
 
     def total(x: Array) -> Array:
-        return keep @ sum(lk.log_jacobians(target.space.tree(x), target.batch, volt))
+        return jnp.asarray(keep) @ sum(lk.log_jacobians(target.space.tree(x), target.batch, volt))
 
     return jax.value_and_grad(total)(z)
 
 
 @eqx.filter_jit
-def _twists(space: Space, batch: lk.Batch, z: Array) -> tuple[Array, Array]:
+def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
+    """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
+
     def twist(x: Array) -> tuple[Array, Array]:
         xi = lk.predict(space.tree(x), batch).twist
         return xi, xi
@@ -197,5 +162,23 @@ def _twists(space: Space, batch: lk.Batch, z: Array) -> tuple[Array, Array]:
 
 
 @eqx.filter_jit
-def _share(space: Space, batch: lk.Batch, z: Array, volt: Array) -> Array:
+def _share(space: Space, batch: lk.Batch, z: Vector, volt: Array) -> Array:
     return lk.voltage_share(space.tree(z), batch, volt)
+
+
+def still_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:
+    """Viscous terms held near zero on every floor that was driven at one speed only.
+
+    With one speed they cannot be told from creep, and what they take from it is wrong at every
+    other speed.
+    """
+    seen: dict[str, list[float]] = {}
+    for k in range(len(data)) if runs is None else runs:
+        seen.setdefault(data.logs[k].surface or "unknown", []).append(float(data.speed[k]))
+    out = []
+    for floor, speeds in seen.items():
+        known = np.asarray(speeds)[np.isfinite(speeds)]
+        if len(known) == len(speeds) and known.max() < 1.3 * max(known.min(), 1e-3):
+            names = (f"surface.{floor}.{name}" for name in ("slide_viscosity", "roller_viscosity"))
+            out += [Choice(escape(path), fixed=1e-4) for path in names]
+    return out

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
 from slipid.data.windows import Windows
-from slipid.identify.fit.problem import DEGREES
+from slipid.identify.fit.variances import DEGREES
 
 AXES = ("along", "across", "yaw")
 SPREAD = 3.0

@@ -8,12 +8,12 @@ likelihood of the variances takes into account what the structural numbers have 
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.linear import inverse_root
 from slipid.identify.fit.noise import Components
 from slipid.search_space import Space
 
@@ -36,8 +36,8 @@ VARIANCE_SPREAD = 3.0
 class Target(eqx.Module):
     """What a fit maximises, as an argument of compiled functions.
 
-    `typical` is the centre of the prior of the log variances; where it is joint, currents and
-    voltages move the numbers of the motion, too.
+    `typical` is the centre of the prior of the log variances; where it is joint, there are no
+    currents, and all numbers are the motion's.
     """
 
     space: Space
@@ -59,14 +59,14 @@ class Whitening(NamedTuple):
 
 
 @eqx.filter_jit
-def whitening(noises: Noises, residual: Blocks, log_v: Array, keep: Array) -> Whitening:
+def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
     """Weights of residuals, for pieces that count as `keep` says."""
     roots, weights, loss = {}, {}, jnp.zeros(())
     for k, r in residual.items():
         inverse = inverse_root(noises[k].covariance(log_v))
         m = inverse.shape[-1]
         q = jnp.sum(jnp.einsum("nij,nj->ni", inverse, r) ** 2, axis=-1)
-        weights[k] = keep * (DEGREES + m) / (DEGREES + q)
+        weights[k] = (DEGREES + m) / (DEGREES + q) * keep
         roots[k] = jnp.sqrt(weights[k])[:, None, None] * inverse
         log_det = -jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=-2, axis2=-1)), axis=-1)
         loss += jnp.sum(keep * (log_det + 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)))
@@ -74,7 +74,7 @@ def whitening(noises: Noises, residual: Blocks, log_v: Array, keep: Array) -> Wh
 
 
 @eqx.filter_jit
-def whitened(noises: Noises, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
+def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> Blocks:
     """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
     out = {}
     for k, jac in jacobian.items():
@@ -86,7 +86,7 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Array, keep: Array) -> Blo
 
 
 @eqx.filter_jit
-def precision(target: Target, jacobian: Blocks, log_v: Array, keep: Array) -> Array:
+def precision(target: Target, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
     """Expected information of the search vector, prior included (free, free)."""
     prior = jnp.diag(1 / jnp.asarray(target.space.prior_std) ** 2)
     total, of_motion = prior, prior
@@ -154,7 +154,7 @@ def scored_given(
 
 
 @eqx.filter_jit
-def information(noises: Noises, log_v: Array, keep: Array, own: Blocks) -> Array:
+def information(noises: Noises, log_v: Vector, keep: Vector, own: Blocks) -> Array:
     """Expected information of the log variances, prior included (variance, variance)."""
     info = jnp.eye(log_v.shape[0]) / VARIANCE_SPREAD**2
     for k, noise in noises.items():
@@ -173,3 +173,27 @@ def _shared(base: Array, own: Array | None) -> Array:
         return base
     root = jnp.sqrt(own)
     return base * root[:, None, :, None] * root[:, None, None, :]
+
+
+def inverse_root(v: Float[Array, "piece m m"]) -> Float[Array, "piece m m"]:
+    """L^-1 of V = L L^T for many small matrices, all at once, column by column.
+
+    Written out because batched LAPACK calls that run beside each other inside one compiled function
+    can wait for each other for ever on a machine with two cores (seen with jax 0.10).
+    """
+    a = jnp.moveaxis(v, 0, -1)
+    m = a.shape[0]
+    rows = jnp.arange(m)[:, None]
+
+    def column(j: Array, low: Array) -> Array:
+        rest = a[:, j] - jnp.sum(low * low[j], axis=1)
+        return low.at[:, j].set(jnp.where(rows >= j, rest / jnp.sqrt(rest[j]), 0.0))
+
+    low = jax.lax.fori_loop(0, m, column, jnp.zeros_like(a))
+
+    def row(i: Array, inverse: Array) -> Array:
+        known = jnp.sum(low[i][:, None] * inverse, axis=0)
+        return inverse.at[i].set(((rows == i) - known) / low[i, i])
+
+    inverse = jax.lax.fori_loop(0, m, row, jnp.zeros_like(a))
+    return jnp.moveaxis(inverse, -1, 0)

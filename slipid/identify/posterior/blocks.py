@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from slipid.identify.posterior.transport.bend import Bend
-from slipid.identify.posterior.transport.coordinatewise import Values, Warp
+from slipid.identify.posterior.transport.pieces import Bend, Values, Warp
 from slipid.identify.posterior.transport.transport_map import Stair, Transport
 
 FORMAT = 2

@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.problem import VARIANCE_SPREAD, Problem
+from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES
-from slipid.identify.posterior.anchor import Anchor, anchor_at, log_student, predict
-from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, Fitted, coordinates_of
+from slipid.identify.fit.variances import VARIANCE_SPREAD, information, whitened
+from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Coordinates, Fitted
 from slipid.model.robot import Robot
 
 Result = TypeVar("Result")
@@ -52,16 +52,16 @@ class Density:
     def __init__(self, problem: Problem, fitted: Fitted, part: str):
         self.problem, self.part = problem, part
         self.floors = problem.robot.surfaces.labels
-        self.coordinates = coordinates_of(problem, fitted, part)
-        self.anchor = anchor_at(problem, fitted, self.coordinates.sessions)
+        self.coordinates = Coordinates.of(problem, fitted, part)
+        self.anchor = Anchor.at(problem, fitted, self.coordinates.sessions)
         # the first of its form compiles for all
         form = part, self.coordinates.names, self.coordinates.group.tobytes()
         self._each: dict[Callable[..., object], Callable[..., Any]] = {}
         self._form: Density = problem.compiled.setdefault(form, self)
         at = self.coordinates
         effects = np.zeros(len(at.sessions) * len(AXES))
-        z, log_v = np.asarray(fitted.z), np.asarray(fitted.log_variance)
-        self.centre = np.concatenate([z[at.structure], log_v[at.variance], effects])
+        structure, variance = fitted.z[at.structure], fitted.log_variance[at.variance]
+        self.centre = np.concatenate([structure, variance, effects])
         self.covariance = self._laplace(fitted)
 
     def _laplace(self, fitted: Fitted) -> np.ndarray:
@@ -69,11 +69,11 @@ class Density:
         problem, at = self.problem, self.coordinates
         n, v = len(at.structure), len(at.variance)
         out = np.zeros((self.size, self.size))
-        z, log_v = jnp.asarray(fitted.z), jnp.asarray(fitted.log_variance)
-        keep = np.ones(len(problem.windows))
-        of_variance = np.linalg.inv(np.asarray(problem.variance_precision(log_v, keep, z)))
+        z, log_v, keep = fitted.z, fitted.log_variance, np.ones(len(problem.windows))
+        told = information(problem.noise.blocks, log_v, keep, problem.own(z, log_v))
+        of_variance = np.linalg.inv(np.asarray(told))
         out[n : n + v, n : n + v] = of_variance[np.ix_(at.variance, at.variance)]
-        own = np.asarray(fitted.covariance)[np.ix_(at.structure, at.structure)]
+        own = fitted.covariance[np.ix_(at.structure, at.structure)]
         mean = np.concatenate([np.arange(n), np.arange(n + v, self.size)])
         precision = np.zeros((len(mean), len(mean)))
         precision[:n, :n] = np.linalg.inv(own)
@@ -83,11 +83,12 @@ class Density:
             member = np.eye(len(at.sessions))[np.asarray(self.anchor.session)]
             moved = -shares[:, :, None, :] * member[:, None, :, None]
             both = [jacobian["motion"][..., at.structure], moved.reshape(*shares.shape[:2], -1)]
-            half = problem.whitened({"motion": jnp.concatenate(both, axis=-1)}, log_v)["motion"]
+            wider = {"motion": jnp.concatenate(both, axis=-1)}
+            half = whitened(problem.noise.blocks, wider, log_v, keep)["motion"]
             flat = np.asarray(half).reshape(-1, len(mean))
-            told = flat.T @ flat
-            told[:n, :n] = 0.0  # is in the Laplace covariance already
-            precision += told
+            of_data = flat.T @ flat
+            of_data[:n, :n] = 0.0  # is in the Laplace covariance already
+            precision += of_data
             precision[n:, n:] += np.eye(len(mean) - n)
         out[np.ix_(mean, mean)] = np.linalg.inv(precision)
         return out
@@ -98,7 +99,7 @@ class Density:
 
     @property
     def size(self) -> int:
-        return len(self.coordinates.names)
+        return len(self.names)
 
     def full(self, anchor: Anchor, x: Array) -> tuple[Array, Array]:
         """Search vector and log variances of chain coordinates, the others as at the fit."""
@@ -140,10 +141,6 @@ class Density:
     def _gradient(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
         return jax.grad(lambda x: jnp.sum(self._sums(anchor, x, held)))(x)
 
-    def logpdf(self, x: Float[Array, " size"]) -> Float[Array, ""]:
-        """Log posterior of one vector, differentiable, for samplers that want gradients."""
-        return jnp.sum(self._sums(self.anchor, x, None))
-
     def _sums(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
         likelihood = sum(self._pieces(anchor, x, held).values())
         at, space = self.coordinates, self.problem.space
@@ -157,16 +154,13 @@ class Density:
         out = jnp.zeros(count + 1).at[anchor.batch.surface].add(likelihood)
         return out.at[np.where(at.group < 0, count, at.group)].add(prior)
 
-    def pointwise(
-        self, x: Float[np.ndarray, "draw size"], held: Held | None = None
-    ) -> dict[str, Float[np.ndarray, "draw piece"]]:
-        """Log likelihood of every piece, by block of residuals."""
-        out = self._of_all(Density._pieces, x, held)
-        return {k: np.asarray(v) for k, v in out.items()}
+    def pointwise(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
+        """Log likelihood of every piece, by block of residuals (draw, piece)."""
+        return self._of_all(Density._pieces, x)
 
     def _pieces(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
         seen, log_v = self._residuals(anchor, x, held), self.full(anchor, x)[1]
-        out = {k: log_student(anchor, k, r, log_v) for k, r in seen.residuals.items()}
+        out = {k: anchor.log_student(k, r, log_v) for k, r in seen.residuals.items()}
         camera, spread = lk.log_jacobians(seen.robot, anchor.batch, seen.volt)
         if "motion" in out:
             out["motion"] += camera
@@ -176,10 +170,7 @@ class Density:
 
     def residuals(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
         """Blocks of residuals of many vectors (draw, piece, m)."""
-        return self._of_all(Density._gaps, x)
-
-    def _gaps(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
-        return self._residuals(anchor, x, held).residuals
+        return self._of_all(Density._residuals, x).residuals
 
     def _residuals(self, anchor: Anchor, x: Array, held: Held | None) -> _Seen:
         z, log_v = self.full(anchor, x)
@@ -190,7 +181,7 @@ class Density:
             robot = self.problem.space.tree(held.z.at[at.structure].set(z[at.structure]))
             return _Seen(lk.electric_residuals(robot, b, held.felt, volt), robot, volt)
         robot = self.problem.space.tree(z)
-        p = predict(robot, anchor, z)
+        p = anchor.predict(robot, z)
         out = {"motion": lk.motion_residual(robot, b, p)}
         if at.sessions:
             shared = at.parts(x)[2].reshape(-1, len(AXES))[anchor.session]
@@ -206,4 +197,4 @@ class Density:
 
     def _held(self, anchor: Anchor, x: Array, _: None) -> Held:
         z, _log_v = self.full(anchor, x)
-        return Held(z, predict(self.problem.space.tree(z), anchor, z).felt)
+        return Held(z, anchor.predict(self.problem.space.tree(z), z).felt)

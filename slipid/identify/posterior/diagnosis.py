@@ -1,4 +1,4 @@
-"""Whether chains may be believed: R-hat over ensembles, autocorrelation time, effective draws."""
+"""Draws of a posterior, and whether its chains may be believed; needs nothing that samples."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.identify.posterior.blocks import Chain, Plan
+from slipid.identify.posterior.coordinates import Fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +24,30 @@ class Diagnosis:
     steps: int
     converged: bool
     worst: int
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Draws, and whether and why they may be believed.
+
+    Effects are what runs of a session share, in stds. Log density, names and diagnosis are of the
+    first stage; accepted is the part of the moves that moved something, by stage. Of the second
+    stage's walkers, still is the part with a group that never moved, unsettled the worst drift or
+    memory, 1 where it is just enough.
+    """
+
+    z: Float[np.ndarray, "ensemble draw free"]
+    log_variance: Float[np.ndarray, "ensemble draw variance"]
+    effects: Float[np.ndarray, "ensemble draw effect"]
+    fitted: Fitted
+    log_prob: Float[np.ndarray, "ensemble draw"]
+    names: tuple[str, ...]
+    diagnosis: Diagnosis
+    accepted: dict[str, float]
+    still: float
+    unsettled: float
+    converged: bool
     reason: str
 
 

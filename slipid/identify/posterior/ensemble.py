@@ -8,7 +8,7 @@ that a chain that was interrupted goes on as if it had not been.
 
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -20,8 +20,7 @@ from slipid.identify.posterior import diagnosis
 from slipid.identify.posterior.blocks import Block, Chain, Plan, Record
 from slipid.identify.posterior.proposals import WAY, Hamiltonian, moves
 from slipid.identify.posterior.target import Target
-from slipid.identify.posterior.transport.learn import learnt
-from slipid.identify.posterior.transport.transport_map import Transport
+from slipid.identify.posterior.transport.transport_map import Transport, learnt
 
 RandomState = tuple[str, np.ndarray, int, int, float]
 """State of a Mersenne twister as numpy gives it."""
@@ -41,38 +40,22 @@ def extended(
     record: Record,
     done: Sequence[Block] | None = None,
 ) -> list[Block]:
-    """Blocks of a part up to the plan's end, each kept in the record as soon as it is made.
+    """Blocks of a part until `diagnose` finds them good or the plan's most, each kept when made.
 
     Targets, one for each ensemble, differ only where walkers are `apart`. Goes on from the blocks
     that are done, by default those of the record.
     """
-    blocks = list(record.done(part) if done is None else done)
-    stage = part.partition("-")[0]
-    for block in run(targets, plan, blocks, lambda steps: record.tell(stage, steps)):
-        blocks.append(block)
-        record.keep(part, block)
-    return blocks
-
-
-def run(
-    targets: Sequence[Target],
-    plan: Plan,
-    done: Sequence[Block] = (),
-    tell: Callable[[int], None] = lambda steps: None,
-) -> Iterator[Block]:
-    """Blocks after those that are done, until `diagnose` finds them good or the plan's most.
-
-    `tell` is called with the number of steps of a block that every ensemble has done.
-    """
     from threadpoolctl import threadpool_limits
 
-    blocks = list(done)
+    blocks = list(record.done(part) if done is None else done)
+    stage = part.partition("-")[0]
     while not _ended(blocks, plan):
         # many small matrices: threads of BLAS cost more than they bring
         with threadpool_limits(1):
-            block = _block(targets, plan, blocks, tell)
+            block = _block(targets, plan, blocks, lambda steps: record.tell(stage, steps))
         blocks.append(block)
-        yield block
+        record.keep(part, block)
+    return blocks
 
 
 def _ended(blocks: list[Block], plan: Plan) -> bool:

@@ -1,9 +1,7 @@
 """posterior.nc: draws in the layout of ArviZ, with names for everything."""
 
 import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
-from functools import reduce
 from pathlib import Path
 
 import jax
@@ -14,11 +12,11 @@ from jaxtyping import Float
 from xarray import DataTree
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.problem import DEGREES, Problem
+from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.variances import DEGREES
 from slipid.identify.posterior.coordinates import EVERYTHING
 from slipid.identify.posterior.density import Density
-from slipid.identify.posterior.draws import Posterior
-from slipid.parameter import Entry
+from slipid.identify.posterior.diagnosis import Posterior
 from slipid.search_space import Space
 from slipid.support.files import write_bytes
 
@@ -35,10 +33,15 @@ def tree(
     w, robot = problem.windows, problem.robot
     values, dims, units = _numbers(problem.space, found)
     noise, noise_dims = _noise(problem, found)
-    per_run = likelihoods(problem, found)
+    means = [each.mean(axis=(0, 1)) for each in (found.z, found.log_variance)]
+    middle = replace(found.fitted, z=means[0], log_variance=means[1])
+    density = Density(problem, middle, EVERYTHING)
+    x = np.concatenate([found.z, found.log_variance, found.effects], axis=-1)
+    of_piece = density.pointwise(x.reshape(-1, x.shape[-1]))
+    per_piece = {k: np.asarray(v).reshape(*x.shape[:2], -1) for k, v in of_piece.items()}
     run = np.unique(w.run)
     onto = (np.asarray(w.run)[:, None] == run).astype(float)
-    measured, predicted, data_dims = _data(problem, found)
+    measured, predicted, data_dims = _data(problem, found, _replicates(density, x))
     unconstrained = {"z": found.z, "log_variance": found.log_variance}
     if found.effects.shape[-1]:
         unconstrained["effects"] = found.effects
@@ -58,7 +61,7 @@ def tree(
         {
             "posterior": values | noise,
             "sample_stats": {"lp": found.log_prob},
-            "log_likelihood": {k: v @ onto for k, v in per_run.items()},
+            "log_likelihood": {k: v @ onto for k, v in per_piece.items()},
             "posterior_predictive": predicted,
             "observed_data": measured,
             "unconstrained_posterior": unconstrained,
@@ -68,7 +71,7 @@ def tree(
         | noise_dims
         | data_dims
         | {"z": ["coordinate"], "log_variance": ["component"], "effects": ["shared"]}
-        | {k: ["run"] for k in per_run},
+        | {k: ["run"] for k in per_piece},
     )
     for name, unit in units.items():
         made["posterior"][name].attrs["units"] = unit
@@ -82,23 +85,14 @@ def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
     shape = found.z.shape[:2]
     robots = jax.vmap(space.tree)(jnp.asarray(found.z.reshape(-1, space.size)))
     values, dims, units = {}, {}, {}
-    for name, entry, of_label in _leaves(space):
-        leaf = np.asarray(reduce(getattr, entry.leaf, robots))
-        values[name] = leaf.reshape(*shape, *leaf.shape[1:])
-        of_vector = [] if entry.size == 1 else ["axis"] if entry.size == 2 else ["wheel"]
-        dims[name] = [*of_label, *of_vector]
-        units[name] = entry.declaration.unit
-    return values, dims, units
-
-
-def _leaves(space: Space) -> Iterator[tuple[str, Entry, list[str]]]:
-    """Name, an entry and the labelled dimension of every leaf with a free number."""
-    told = set()
     for e in space.free:
-        if e.leaf not in told:
-            told.add(e.leaf)
-            of = {"surface": e.surface, "load": e.load, "session": e.session}
-            yield e.quantity, e, [label for label, name in of.items() if name is not None]
+        leaf = np.asarray(e.whole(robots))
+        values[e.quantity] = leaf.reshape(*shape, *leaf.shape[1:])
+        of = {"surface": e.surface, "load": e.load, "session": e.session}
+        of_vector = [] if e.size == 1 else ["axis"] if e.size == 2 else ["wheel"]
+        dims[e.quantity] = [label for label, name in of.items() if name is not None] + of_vector
+        units[e.quantity] = e.declaration.unit
+    return values, dims, units
 
 
 def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
@@ -113,12 +107,14 @@ def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
     return {k: np.stack(v, axis=-1) if dims[k] else v[0] for k, v in stds.items()}, dims
 
 
-def _data(problem: Problem, found: Posterior) -> tuple[dict, dict, dict]:
-    """What was measured of every window, and replicates of it.
+def _data(
+    problem: Problem, found: Posterior, new: dict[str, np.ndarray]
+) -> tuple[dict, dict, dict]:
+    """What was measured of every window, and replicates of it, given less what was measured.
 
     Marker increments are in metres corrected by the fitted camera.
     """
-    w, new = problem.windows, replicates(problem, found, REPLICATES)
+    w = problem.windows
     middle = problem.space.tree(jnp.asarray(found.z.mean(axis=(0, 1))))
     measured = {"increment": np.asarray(jax.jit(lk.measured)(middle, problem.batch.pose))}
     dims = {"increment": ["piece", "window", "direction"]}
@@ -142,43 +138,21 @@ def write(made: DataTree, path: Path) -> None:
         write_bytes(path, whole.read_bytes())
 
 
-def likelihoods(
-    problem: Problem, found: Posterior
-) -> dict[str, Float[np.ndarray, "ensemble draw piece"]]:
-    """Log likelihood of every piece under every draw, by block of residuals."""
-    density, x = _everything(problem, found)
-    shape = x.shape[:2]
-    out = density.pointwise(x.reshape(-1, x.shape[-1]))
-    return {k: v.reshape(*shape, -1) for k, v in out.items()}
-
-
-def replicates(
-    problem: Problem, found: Posterior, draws: int, seed: int = 0
+def _replicates(
+    density: Density, x: Float[np.ndarray, "ensemble draw size"]
 ) -> dict[str, Float[np.ndarray, "ensemble draw piece m"]]:
     """Replicated less measured data of every piece, from some draws of each ensemble.
 
     What the model says, less what was measured, plus noise of the draw's own variances.
     """
-    density, x = _everything(problem, found)
-    some = x[:, np.linspace(0, x.shape[1] - 1, draws).astype(int)]
-    rng = np.random.default_rng(seed)
+    some = x[:, np.linspace(0, x.shape[1] - 1, REPLICATES).astype(int)]
+    rng = np.random.default_rng(0)
     flat = some.reshape(-1, x.shape[-1])
     out = {k: np.array(v) for k, v in density.residuals(flat).items()}
     for k, r in out.items():
         for one, log_v in zip(r, density.coordinates.parts(flat)[1], strict=True):
-            root = np.linalg.cholesky(np.asarray(problem.covariance(k, log_v)))
+            root = np.linalg.cholesky(np.asarray(density.problem.covariance(k, log_v)))
             normal = rng.standard_normal(one.shape)
             normal *= np.sqrt(DEGREES / rng.chisquare(DEGREES, (len(normal), 1)))
             one += np.einsum("nij,nj->ni", root, normal)
     return {k: v.reshape(*some.shape[:2], *v.shape[1:]) for k, v in out.items()}
-
-
-def _everything(problem: Problem, found: Posterior) -> tuple[Density, np.ndarray]:
-    """A density of all numbers together, and the draws as its coordinates."""
-    middle = replace(
-        found.fitted,
-        z=found.z.mean(axis=(0, 1)),
-        log_variance=found.log_variance.mean(axis=(0, 1)),
-    )
-    density = Density(problem, middle, EVERYTHING)
-    return density, np.concatenate([found.z, found.log_variance, found.effects], axis=-1)

@@ -7,9 +7,8 @@ the shared ones, which groups then follow. Hamiltonian moves take all coordinate
 gradient where the density still bends, and walks along a single one cross its plateaus.
 """
 
-from typing import Protocol, runtime_checkable
-
 import numpy as np
+from emcee.model import Model
 from emcee.moves import Move
 from emcee.state import State
 from jaxtyping import Float
@@ -17,7 +16,7 @@ from numpy.random import RandomState
 from scipy.special import gammaln
 
 from slipid.identify.posterior.target import Family, Target, families
-from slipid.identify.posterior.transport.coordinatewise import Matrix
+from slipid.identify.posterior.transport.pieces import Matrix
 
 STUDENT = 0.2
 """Part of independent draws that come from a Student t, so that no tail is left out."""
@@ -36,16 +35,6 @@ STEEPEST = 100.0
 
 Jump = tuple[Matrix, Float[np.ndarray, " walker"]]
 """New coordinates of some places, and log q(old | new) - log q(new | old)."""
-
-
-@runtime_checkable
-class Model(Protocol):
-    """What emcee gives to moves: the log density, and the ensemble's own randomness."""
-
-    random: RandomState
-
-    def compute_log_prob_fn(self, x: Matrix) -> tuple[Float[np.ndarray, " walker"], Matrix]:
-        """Log density of every walker, and its terms."""
 
 
 class FamilyMove(Move):

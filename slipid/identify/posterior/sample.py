@@ -15,7 +15,7 @@ from slipid.identify.posterior import diagnosis, ensemble
 from slipid.identify.posterior.blocks import Block, Chain, Plan, Record
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.identify.posterior.density import Density
-from slipid.identify.posterior.draws import Posterior
+from slipid.identify.posterior.diagnosis import Posterior
 from slipid.identify.posterior.second_stage import electric_given_motion
 from slipid.identify.posterior.target import Target
 
@@ -61,7 +61,7 @@ def sample(
         effects=at.parts(x)[2],
         fitted=fitted,
         log_prob=log_prob,
-        names=first.names,
+        names=at.names,
         diagnosis=found,
         accepted=accepted,
         still=still,

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from slipid.identify.posterior.transport.coordinatewise import Matrix
-from slipid.identify.posterior.transport.learn import gaussian
-from slipid.identify.posterior.transport.transport_map import Transport
+from slipid.identify.posterior.transport.pieces import Matrix
+from slipid.identify.posterior.transport.transport_map import Transport, gaussian
 
 
 @dataclass(frozen=True, eq=False)

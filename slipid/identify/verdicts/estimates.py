@@ -1,8 +1,6 @@
 """What may be said of every number and of ratios of them: interval and verdict.
 
 Before a fit from the information expected at the start values, after it from the Laplace posterior.
-Directions in which nothing is said are found by `unidentified`, a number's likelihood beyond
-Laplace by `profile`.
 """
 
 from collections.abc import Sequence
@@ -15,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.variances import Search, Square
 from slipid.parameter import Declaration, Entry
 from slipid.search_space import Choice, Space
@@ -243,18 +240,3 @@ def _quotient(
         prior_mean=float(np.exp(log_prior)),
         prior_std=float(np.exp(log_prior)) * prior_std,
     )
-
-
-def expected_covariance(
-    problem: Problem,
-    z: Search | None = None,
-    log_variance: Float[np.ndarray, " variance"] | None = None,
-) -> Square:
-    """Posterior covariance to be expected of these windows: inverse information, prior included.
-
-    By default at the start values and with the typical variances of every noise component. What
-    the data really hold depends on where the fit ends.
-    """
-    z = problem.space.start if z is None else z
-    log_v = 2 * np.log(problem.noise.typical) if log_variance is None else log_variance
-    return problem.laplace(z, log_v, np.ones(len(problem.windows)))

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 from scipy.stats import chi2
 
-from slipid.identify.fit.optimise import Optimum, Options, optimise
+from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.parameter import Entry
@@ -124,8 +124,9 @@ class _Walk:
         self.free, self.of_motion = np.ones(problem.space.size), False
         covariance = optimum.covariance
         if not problem.joint:
-            self.of_motion = not problem.electric[at]
-            mine = problem.electric == problem.electric[at]
+            electric = problem.space.electric
+            self.of_motion = not electric[at]
+            mine = electric == electric[at]
             self.free = mine.astype(float)
             if not self.of_motion:  # given the motion: a block of the information
                 held = np.where(mine[:, None] & mine, np.linalg.inv(covariance), np.eye(len(mine)))
@@ -151,7 +152,6 @@ class _Walk:
         mean, wide = self.problem.space.prior_mean[self.at], self.problem.space.prior_std[self.at]
         base = self.lowest - 0.5 * ((self.start - mean) / wide) ** 2
         reach = max(sign * mean + _FAR * wide, sign * self.start + _FAR * self.std)
-        options = Options(most_rounds=12, tolerance=0.02)
         growth = 1.5
         while len(points) < _MOST:
             z = np.array(state.z)
@@ -160,7 +160,7 @@ class _Walk:
                 break
             held = replace(state, z=z, round=0)
             end = optimise(
-                self.problem, start=held, options=options, free=self.free, variances=False
+                self.problem, start=held, most_rounds=12, free=self.free, variances=False
             )
             loss = self.loss(end.state)
             points.append((float(z[self.at]), loss))

@@ -17,8 +17,7 @@ from jaxtyping import Float
 
 from slipid.identify.fit.variances import Search, Square
 from slipid.identify.verdicts.estimates import WEAK
-from slipid.identify.verdicts.formulas import NOTHING, SMALL, Axis, axes_of, formula
-from slipid.identify.verdicts.remedies import remedy
+from slipid.identify.verdicts.wording import NOTHING, SMALL, Axis, axes_of, formula, remedy
 from slipid.model.robot import Validity
 from slipid.search_space import Space
 
@@ -87,7 +86,6 @@ def flat_directions(
     has_current: bool,
     has_voltage: bool,
     validity: Mapping[str, Validity] | None = None,
-    current_informs_motion: bool = False,
 ) -> tuple[Flat, ...]:
     """Directions in which the data narrow the prior by less than a fifth.
 
@@ -102,8 +100,7 @@ def flat_directions(
     scale = [k for k in kept if axes[k].entry.quantity in TORQUE_SCALE]
     std = space.prior_std
     given = np.linalg.inv(covariance) * (std[:, None] * std)
-    apart = has_current and not current_informs_motion
-    told = _Told(given, space.electric if apart else None)
+    told = _Told(given, space.electric if has_current else None)
     out = []
     for picked, u in _sparse(told, kept, scale, 1 / std):
         main = _named(told, [axes[k] for k in picked], picked, u, std[picked])

@@ -19,14 +19,15 @@ from slipid.data.runs import collect
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.compare.folds import folds_of
 from slipid.identify.compare.noisy_rung import slopes, with_noise
-from slipid.identify.compare.predictive import contact_of, log_student
+from slipid.identify.compare.predictive import Contact, by_name, log_student
 from slipid.identify.compare.ranking import mean_error, ranking
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.compare.transfer import transfer
 from slipid.identify.compare.validation import Judged, Score
 from slipid.identify.design.planned_runs import Drive
-from slipid.identify.fit.problem import DEGREES, Problem, State
+from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import Linear, shared
+from slipid.identify.fit.variances import DEGREES
 from slipid.job.compare import finished
 from slipid.search_space import Choice
 from slipid.selftest.known import Sensors, grid, truth
@@ -173,8 +174,8 @@ def judged(w, names):
     """Rows of the odd runs under rungs fitted to the even ones, at the true camera."""
     problem = Problem(w, ROBOT, HELD)
     z = problem.space.vector(ROBOT)
-    start = State(z, 2 * np.log(problem.noise.typical), 0, np.inf, np.inf, "joint")
-    contact = contact_of(problem, start, 1e-12 * np.eye(len(z)))
+    variance = by_name(problem, 2 * np.log(problem.noise.typical))
+    contact = Contact(ROBOT, variance, 1e-12 * np.eye(len(z)), problem.space, z)
     half = w.run // 4 % 2
     keep = (half == 0).astype(float)
     models = [with_noise(ALL[name], contact, problem, keep) for name in names]

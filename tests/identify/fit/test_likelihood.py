@@ -13,12 +13,12 @@ from scipy.stats import multivariate_t
 
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
-from slipid.identify.fit.linear import inverse_root
-from slipid.identify.fit.problem import DEGREES, Problem
-from slipid.identify.fit.variances import scored
+from slipid.identify.fit import variances
+from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.variances import DEGREES, inverse_root, scored
 from slipid.identify.slip_curves import current_trend
 from slipid.search_space import Choice
-from tests.helpers.made_windows import made, robot
+from tests.helpers.made_windows import made, residuals, robot
 
 EVERYTHING = [Choice("*", free=True)]
 NOTHING = Choice("*", free=False)
@@ -54,7 +54,7 @@ def everything(request, truth):
 @pytest.mark.slow
 def test_without_noise_the_truth_leaves_no_residual(truth, signed):
     b = lk.batch(made(truth, signed=signed), truth)
-    blocks = jax.jit(lk.residuals)(truth, b, 1.0)
+    blocks = jax.jit(residuals)(truth, b, 1.0)
     assert sorted(blocks) == ["current", "motion", "voltage"]
     for name, r in blocks.items():
         assert r.shape == (24, 6)
@@ -64,9 +64,9 @@ def test_without_noise_the_truth_leaves_no_residual(truth, signed):
 @pytest.mark.slow
 def test_channels_that_were_not_logged_have_no_block(truth):
     w = made(truth, voltage=False)
-    assert sorted(lk.residuals(truth, lk.batch(w, truth), 1.0)) == ["current", "motion"]
+    assert sorted(residuals(truth, lk.batch(w, truth), 1.0)) == ["current", "motion"]
     w = replace(w, has_current=False)
-    assert sorted(lk.residuals(truth, lk.batch(w, truth), 1.0)) == ["motion"]
+    assert sorted(residuals(truth, lk.batch(w, truth), 1.0)) == ["motion"]
     assert list(of_noise.noise(w, truth).blocks) == ["motion"]
 
 
@@ -282,8 +282,9 @@ def information(problem, jacobian, log_v, blocks):
 
 
 @pytest.mark.slow
-def test_the_information_of_a_joint_fit_is_the_sum_over_blocks(truth):
-    problem = Problem(made(truth, std=NOISE), truth, EVERYTHING, current_informs_motion=True)
+def test_the_information_without_currents_is_that_of_the_motion_and_the_prior(truth):
+    w = replace(made(truth, std=NOISE), has_current=False, has_voltage=False)
+    problem = Problem(w, truth, EVERYTHING)
     log_v = 2 * np.log(problem.noise.typical)
     _, jacobian = problem.linear(problem.space.start, jnp.asarray(0.05))
     ours = problem.precision(jacobian, log_v, np.ones(24))
@@ -300,7 +301,7 @@ def test_a_cut_keeps_what_motion_alone_says_of_the_motion():
     _, jacobian = problem.linear(problem.space.start, jnp.asarray(0.05))
     cut = np.linalg.inv(np.asarray(problem.precision(jacobian, log_v, np.ones(24))))
     alone = np.linalg.inv(information(problem, jacobian, log_v, ["motion"]))
-    m, e = ~problem.electric, problem.electric
+    m, e = ~problem.space.electric, problem.space.electric
     assert e.any()
     np.testing.assert_allclose(cut[np.ix_(m, m)], alone[np.ix_(m, m)], rtol=1e-6, atol=1e-12)
     # electric numbers: what is left at fixed motion plus what the motion's uncertainty adds
@@ -463,7 +464,7 @@ def test_the_score_of_the_voltage_noise_is_the_slope_of_the_loss(truth):
     step = scored(problem.target, blocks, known, typical, jnp.asarray(keep), own) - log_v
     assert abs(step[-1]) < 1.5  # else it was cut short
     # it divides by the expected information, or by more where others explain the residuals
-    score = np.asarray(problem.variance_precision(log_v, keep, z) @ step)[-1]
+    score = np.asarray(variances.information(problem.noise.blocks, log_v, keep, own) @ step)[-1]
     assert score == pytest.approx(-slope, rel=1e-3)
 
 

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from slipid.identify.fit import problem as of_problem
-from slipid.identify.fit import structure, variances
-from slipid.identify.fit.optimise import Options, optimise
-from slipid.identify.fit.problem import DEGREES, Problem, State
+from slipid.identify.fit import variances
+from slipid.identify.fit.optimise import levenberg, optimise
+from slipid.identify.fit.problem import Problem, State
+from slipid.identify.fit.variances import DEGREES
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
@@ -32,7 +33,7 @@ NOISE = {
     "voltage.window": 0.07,
 }
 NOTHING = Choice("*", free=False)
-PRECISE = Options(most_rounds=60, tolerance=1e-4)
+PRECISE = {"most_rounds": 60, "tolerance": 1e-4}
 SURFACE = [
     NOTHING,
     Choice("surface.*.creep", free=True),
@@ -74,9 +75,7 @@ def surface_problem(truth):
 @pytest.fixture(scope="module")
 def surface_fit(surface_problem):
     told = []
-    best = optimise(
-        surface_problem, start=begin(surface_problem), options=PRECISE, tell=told.append
-    )
+    best = optimise(surface_problem, start=begin(surface_problem), **PRECISE, tell=told.append)
     return best, told
 
 
@@ -86,7 +85,7 @@ def test_a_fit_ends_where_the_loss_is_level(truth, path):
     w = made(truth, runs=48, std={**NOISE, "run.along": 0.05, "process.along": 0.02})
     w = replace(w, current_var=np.full_like(w.current_var, 0.02))
     problem = Problem(w, truth, [NOTHING, Choice(path, free=True)])
-    best = optimise(problem, start=begin(problem), options=PRECISE)
+    best = optimise(problem, start=begin(problem), **PRECISE)
     assert best.converged
     log_v, keep = jnp.asarray(best.state.log_variance), jnp.ones(len(w))
     volt, std = problem.volt(log_v), float(np.sqrt(best.covariance[0, 0]))
@@ -108,7 +107,7 @@ def test_a_voltage_without_noise_of_its_own_leaves_the_motor_alone(truth):
     numbers = ("resistance", "back_emf")
     choices = [NOTHING, *(Choice(f"motor.{name}", free=True) for name in numbers)]
     problem = Problem(w, truth, choices)
-    best = optimise(problem, start=begin(problem), options=Options(most_rounds=40))
+    best = optimise(problem, start=begin(problem), most_rounds=40)
     assert best.converged
     found = problem.space.tree(best.state.z).motor
     for name in numbers:
@@ -129,7 +128,7 @@ def test_resistance_and_brush_drop_are_those_of_linear_regression(truth, gaussia
         Choice("motor.brush_drop", prior_mean=0.0, prior_std=50.0),
     ]
     problem = Problem(w, truth, choices)
-    best = optimise(problem, start=begin(problem), options=PRECISE)
+    best = optimise(problem, start=begin(problem), **PRECISE)
     speed = (w.turn / w.dt[..., None]).ravel()
     amps = w.current.ravel()
     x = np.stack([amps, np.tanh(amps / 0.05)], axis=1)
@@ -158,7 +157,7 @@ def test_camera_scale_is_that_of_weighted_least_squares(truth):
     w = replace(made(truth, std=NOISE), has_current=False, has_voltage=False)
     choices = [NOTHING, Choice("camera.scale", prior_mean=1.1, prior_std=10.0)]
     problem = Problem(w, truth, choices)
-    best = optimise(problem, start=begin(problem, problem.space.start + 0.1), options=PRECISE)
+    best = optimise(problem, start=begin(problem, problem.space.start + 0.1), **PRECISE)
     assert best.converged, best.reason
     r = np.asarray(problem.linear(best.state.z, jnp.asarray(1.0))[0]["motion"])
     scale = float(value(problem, best.state, "camera.scale"))
@@ -216,19 +215,19 @@ def test_every_round_is_told_and_ends_in_the_result(surface_fit):
     assert [s.round for s in told] == list(range(1, len(told) + 1))
     assert told[-1] is best.state
     assert tuple(s.loss for s in told) == best.history
-    assert best.state.moved < PRECISE.tolerance
+    assert best.state.moved < PRECISE["tolerance"]
     assert "no number moved" in best.reason
 
 
 def test_going_on_from_a_state_is_the_same_as_not_having_stopped(surface_problem, surface_fit):
     best, told = surface_fit
-    again = optimise(surface_problem, start=told[1], options=PRECISE)
+    again = optimise(surface_problem, start=told[1], **PRECISE)
     np.testing.assert_array_equal(again.state.z, best.state.z)
     assert again.state.round == best.state.round
 
 
 def test_too_few_rounds_are_said(surface_problem):
-    short = optimise(surface_problem, start=begin(surface_problem), options=Options(most_rounds=1))
+    short = optimise(surface_problem, start=begin(surface_problem), most_rounds=1)
     assert not short.converged
     assert short.reason == "1 rounds without settling"
 
@@ -245,9 +244,9 @@ def test_left_out_runs_are_as_good_as_absent(truth, surface_problem):
         **{n: getattr(w, n)[rows] for n in arrays},
         **{n: tuple(getattr(w, n)[k] for k in rows) for n in names},
     )
-    masked = optimise(surface_problem, keep=keep, start=begin(surface_problem), options=PRECISE)
+    masked = optimise(surface_problem, keep=keep, start=begin(surface_problem), **PRECISE)
     alone = surface_problem.of(part)
-    subset = optimise(alone, start=begin(alone), options=PRECISE)
+    subset = optimise(alone, start=begin(alone), **PRECISE)
     np.testing.assert_allclose(masked.state.z, subset.state.z, atol=1e-4)
     np.testing.assert_allclose(masked.covariance, subset.covariance, rtol=0.01, atol=1e-9)
 
@@ -257,7 +256,7 @@ def test_a_run_gone_wrong_hardly_counts(surface_problem, surface_fit):
     pose = surface_problem.windows.pose.copy()
     pose[5, 1:, :2] += 0.5  # the camera jumped
     spoilt = surface_problem.of(replace(surface_problem.windows, pose=pose))
-    again = optimise(spoilt, start=begin(spoilt), options=PRECISE)
+    again = optimise(spoilt, start=begin(spoilt), **PRECISE)
     std = np.sqrt(np.diag(best.covariance))
     assert (np.abs(again.state.z - best.state.z) / std).max() < 1.0
     blocks = spoilt.linear(again.state.z, jnp.asarray(1.0))[0]
@@ -268,7 +267,7 @@ def test_a_run_gone_wrong_hardly_counts(surface_problem, surface_fit):
 
 def test_the_staged_start_finds_the_way_from_far_off(surface_problem, surface_fit):
     best, _ = surface_fit
-    found = optimise(surface_problem, options=Options(tolerance=1e-3))
+    found = optimise(surface_problem, tolerance=1e-3)
     assert found.converged, found.reason
     std = np.sqrt(np.diag(best.covariance))
     np.testing.assert_allclose(found.state.z / std, best.state.z / std, atol=0.02)
@@ -279,7 +278,6 @@ def test_the_staged_start_finds_the_way_from_far_off(surface_problem, surface_fi
 
 def test_a_problem_is_forgotten_after_use_and_those_like_it_compile_nothing(truth):
     """A fit of ten folds or replicates must not keep ten data sets, nor wait ten times."""
-    options = Options(most_rounds=1)
     w = replace(made(truth, std=NOISE), current_var=np.zeros((24, 2, 3)))
 
     def fit(seed):
@@ -287,7 +285,7 @@ def test_a_problem_is_forgotten_after_use_and_those_like_it_compile_nothing(trut
         made_of = Problem(
             replace(w, pose=moved), truth, [NOTHING, Choice("camera.scale", free=True)]
         )
-        optimise(made_of, start=begin(made_of), options=options)
+        optimise(made_of, start=begin(made_of), most_rounds=1)
         return made_of
 
     first = fit(0)
@@ -295,7 +293,7 @@ def test_a_problem_is_forgotten_after_use_and_those_like_it_compile_nothing(trut
     del first
     gc.collect()
     assert [ref() for ref in kept] == [None] * 3
-    jitted = (of_problem.linear, of_problem.log_jacobian, structure._moved)
+    jitted = (of_problem.linear, of_problem.log_jacobian, levenberg)
     jitted += (variances.whitening, variances.scored, variances.precision)
     before = [f._cached._cache_size() for f in jitted]
     assert min(before) > 0

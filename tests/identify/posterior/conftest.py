@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slipid.identify.posterior.transport.learn import learnt
+from slipid.identify.posterior.transport.transport_map import learnt
 
 
 @pytest.fixture(scope="session")

@@ -14,12 +14,13 @@ from scipy.stats import multivariate_t, norm
 
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
-from slipid.identify.fit.problem import DEGREES, VARIANCE_SPREAD, Problem
+from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import AXES
+from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.identify.posterior.density import Density
 from slipid.search_space import Choice
-from tests.helpers.made_windows import made, robot
+from tests.helpers.made_windows import made, residuals, robot
 
 pytestmark = pytest.mark.slow  # compiles densities
 
@@ -72,12 +73,12 @@ def expected(problem, z, log_v, blocks):
     """Log likelihood of every piece by scipy, straight from the definition."""
     volt = problem.volt(log_v)
     tree = problem.space.tree(jnp.asarray(z))
-    residuals = jax.jit(lk.residuals)(tree, problem.batch, volt)
+    gaps = jax.jit(residuals)(tree, problem.batch, volt)
     camera, spread = lk.log_jacobians(tree, problem.batch, volt)
     out = np.zeros(len(problem.windows))
     for k in blocks:
         v = np.asarray(problem.covariance(k, log_v))
-        for n, r in enumerate(np.asarray(residuals[k])):
+        for n, r in enumerate(np.asarray(gaps[k])):
             out[n] += multivariate_t.logpdf(r, shape=v[n], df=DEGREES)
         out += np.asarray({"motion": camera, "voltage": spread}.get(k, 0.0))
     return out
@@ -141,7 +142,7 @@ def test_runs_of_a_session_share_effects_with_the_priors_that_were_found(problem
     x = near(d, 2, width=0.7)
     z, log_v = d.full(d.anchor, jnp.asarray(x[0]))
     tree = problem.space.tree(jnp.asarray(z))
-    residual = np.array(jax.jit(lk.residuals)(tree, problem.batch, 1.0)["motion"])
+    residual = np.array(jax.jit(residuals)(tree, problem.batch, 1.0)["motion"])
     effect, w = of_noise.effects(problem.windows, problem.robot), problem.windows
     std, found = np.array([0.02, 0.01, 0.03]), np.zeros(3)
     for n, r in enumerate(residual):
@@ -214,9 +215,8 @@ def test_far_from_the_fit_the_root_is_found_from_scratch(problem):
 
 def test_gradients_are_those_of_finite_differences(problem):
     d = density(problem, MOTION)
-    x = jnp.asarray(near(d, 1)[0])
-    slope = np.asarray(jax.jit(jax.grad(d.logpdf))(x))
-    x, h = np.asarray(x), 1e-5 * np.eye(d.size)
+    [x], h = near(d, 1), 1e-5 * np.eye(d.size)
+    [slope] = d.slope(x[None])
     numeric = (d.terms(x + h).sum(axis=1) - d.terms(x - h).sum(axis=1)) / 2e-5
     np.testing.assert_allclose(slope, numeric, rtol=1e-4, atol=1e-3)
 

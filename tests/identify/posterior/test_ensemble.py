@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
+from emcee.model import Model
 
-from slipid.identify.posterior.blocks import Plan, packed, unpacked
+from slipid.identify.posterior.blocks import Plan, Record, packed, unpacked
 from slipid.identify.posterior.diagnosis import autocorrelation_time, diagnose
 from slipid.identify.posterior.ensemble import chain as positions
-from slipid.identify.posterior.ensemble import run
+from slipid.identify.posterior.ensemble import extended
 from slipid.identify.posterior.proposals import (
     Along,
     Differential,
@@ -126,8 +127,13 @@ def plateau():
     return known(terms, group, kind, np.array([0.0, -2.0]), covariance), mean, np.sqrt(var)
 
 
+def run(target, plan, done=()):
+    """Blocks up to the plan's end, of ensembles that share a target."""
+    return extended([target] * plan.ensembles, plan, "part", Record(), done)
+
+
 def sampled(target, plan=PLAN):
-    blocks = list(run([target] * plan.ensembles, plan))
+    blocks = run(target, plan)
     chain = positions(blocks, plan)
     return blocks, chain, diagnose(chain, plan)
 
@@ -180,10 +186,10 @@ def test_ensembles_in_different_modes_are_not_reported():
 def test_an_interrupted_chain_goes_on_as_if_it_had_not_been():
     target, _, _ = gaussian()
     plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=6)
-    whole = list(run([target] * 2, plan))
+    whole = run(target, plan)
     for stop in range(1, 6):
         kept = [unpacked(dict(packed(b))) for b in whole[:stop]]
-        rest = list(run([target] * 2, plan, kept))
+        rest = run(target, plan, kept)[stop:]
         assert len(rest) == 6 - stop
         for one, other in zip([*kept, *rest], whole, strict=True):
             np.testing.assert_array_equal(one.chain, other.chain)
@@ -193,8 +199,8 @@ def test_an_interrupted_chain_goes_on_as_if_it_had_not_been():
 def test_the_seed_decides():
     target, _, _ = banana()
     plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1,), most=3)
-    one, same = (np.concatenate([b.chain for b in run([target] * 2, plan)]) for _ in range(2))
-    other = np.concatenate([b.chain for b in run([target] * 2, Plan(**{**vars(plan), "seed": 1}))])
+    one, same = (np.concatenate([b.chain for b in run(target, plan)]) for _ in range(2))
+    other = np.concatenate([b.chain for b in run(target, replace(plan, seed=1))])
     np.testing.assert_array_equal(one, same)
     assert not np.array_equal(one, other)
     assert not np.array_equal(one[0], one[1])  # ensembles differ
@@ -234,23 +240,21 @@ def made_gaussian(map, group, kind):
     return Target(terms, np.negative, group, kind, centre, covariance, map=map)
 
 
-class Model:
+def model_of(target):
     """What emcee gives to moves."""
 
-    def __init__(self, target):
-        self.random = np.random.RandomState(0)
-        self.target = target
-
-    def compute_log_prob_fn(self, u):
-        out = self.target.log_prob(u)
+    def compute(u):
+        out = target.log_prob(u)
         return out[:, 0], out[:, 1:]
+
+    return Model(target.log_prob, compute, map, np.random.RandomState(0))
 
 
 def test_a_hamiltonian_move_is_exact_and_independent_for_a_gaussian(exact):
     from emcee.state import State
 
     target, u = exact
-    model = Model(target)
+    model = model_of(target)
     log_prob, terms = model.compute_log_prob_fn(u)
     state = State(u, log_prob=log_prob, blobs=terms, copy=True)
     state, took = Hamiltonian(target, 0.5).propose(model, state)
@@ -266,7 +270,7 @@ def test_walking_along_a_coordinate_keeps_the_distribution(bent, groups):
     map, _ = bent
     group, kind = np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1]), np.array([0, 1, 0, 0, 0, 1, 0, 0, 1])
     target = made_gaussian(map, group, kind)
-    model, u = Model(target), np.random.RandomState(1).standard_normal((4000, 9))
+    model, u = model_of(target), np.random.RandomState(1).standard_normal((4000, 9))
     log_prob, terms = model.compute_log_prob_fn(u)
     from emcee.state import State
 

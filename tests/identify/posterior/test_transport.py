@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from slipid.identify.posterior.blocks import Block, packed, unpacked
-from slipid.identify.posterior.transport.coordinatewise import Warp
-from slipid.identify.posterior.transport.learn import learnt
-from slipid.identify.posterior.transport.transport_map import _placed
+from slipid.identify.posterior.transport.pieces import Warp
+from slipid.identify.posterior.transport.transport_map import _placed, learnt
 
 
 def test_a_map_makes_draws_gaussian(bent):

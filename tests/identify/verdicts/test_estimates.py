@@ -10,14 +10,14 @@ import pint
 import pytest
 from scipy.stats import chi2
 
-from slipid.identify.fit.optimise import Options, optimise
+from slipid.identify.fit.optimise import optimise
 from slipid.identify.fit.problem import Problem
-from slipid.identify.verdicts import formulas
 from slipid.identify.verdicts import unidentified as flat_module
-from slipid.identify.verdicts.estimates import RATIOS, derived, expected_covariance
+from slipid.identify.verdicts import wording
+from slipid.identify.verdicts.estimates import RATIOS, derived
 from slipid.identify.verdicts.profile import RISE, _Walk, profile, profiled
-from slipid.identify.verdicts.remedies import VOLTAGE, remedy
 from slipid.identify.verdicts.unidentified import NOTICED, flat_directions, sentences
+from slipid.identify.verdicts.wording import VOLTAGE, remedy
 from slipid.model.robot import Validity
 from slipid.search_space import Choice, Space
 from tests.helpers.made_windows import made, robot
@@ -93,13 +93,13 @@ def test_nothing_is_flat_where_the_data_tell_every_direction(seed):
 
 def test_powers_differ_by_formula():
     a, b = "camera.scale", "robot.wheel_radius"
-    both = [axis for e in numbers(a, b) for axis in formulas.axes_of(e)]
-    assert formulas._product(both, np.array([1.0, 1.0])) == f"{a}, {b} only as {b}/{a}"
-    assert formulas._product(both, np.array([1.0, -1.0])) == f"{a} and {b} only as {a} * {b}"
-    assert formulas._product(both, np.array([-0.5, 1.0])) == f"{a} and {b} only as {a}^2 * {b}"
-    assert formulas._product(both, np.array([1.0, 0.5])) == f"{a} and {b} only as {a} / {b}^2"
-    assert formulas._sum([a, b], np.array([1.0, -1.0])) == f"{a} and {b} only as {b} + {a}"
-    assert formulas._sum([a, b], np.array([1.0, 0.5])) == f"{a} and {b} only as {a} - 2 {b}"
+    both = [axis for e in numbers(a, b) for axis in wording.axes_of(e)]
+    assert wording._product(both, np.array([1.0, 1.0])) == f"{a}, {b} only as {b}/{a}"
+    assert wording._product(both, np.array([1.0, -1.0])) == f"{a} and {b} only as {a} * {b}"
+    assert wording._product(both, np.array([-0.5, 1.0])) == f"{a} and {b} only as {a}^2 * {b}"
+    assert wording._product(both, np.array([1.0, 0.5])) == f"{a} and {b} only as {a} / {b}^2"
+    assert wording._sum([a, b], np.array([1.0, -1.0])) == f"{a} and {b} only as {b} + {a}"
+    assert wording._sum([a, b], np.array([1.0, 0.5])) == f"{a} and {b} only as {a} - 2 {b}"
 
 
 # remedies ----------------------------------------------------------------------------------------
@@ -165,14 +165,15 @@ def precision(voltage: bool, one_heading: bool = False) -> np.ndarray:
         w = this.windows
         rate = np.abs(w.turn).max(axis=-1, keepdims=True)
         this = this.of(replace(w, turn=rate * np.array([-1.0, 0.0, 1.0])))
-    return np.linalg.inv(expected_covariance(this))
+    typical, keep = 2 * np.log(this.noise.typical), np.ones(len(this.windows))
+    return np.linalg.inv(this.laplace(this.space.start, typical, keep))
 
 
 def seen(*patterns: str, voltage: bool = True, one_heading: bool = False):
     """Space in which only these are free, and the covariance to be expected in it."""
     space, names = space_of(*patterns), problem(voltage).space.names
     at = np.array([names.index(n) for n in space.names])
-    whole, electric = precision(voltage, one_heading), problem(voltage).electric
+    whole, electric = precision(voltage, one_heading), problem(voltage).space.electric
     motion = np.zeros_like(whole)  # currents do not inform it
     still = np.ix_(~electric, ~electric)
     motion[still] = np.linalg.inv(np.linalg.inv(whole)[still])
@@ -295,7 +296,7 @@ FITTED = (
 def fitted():
     w = made(TRUTH, runs=24, std=NOISE)
     this = Problem(w, TRUTH, [NOTHING, *FITTED])
-    return this, optimise(this, start=begin(this), options=Options(tolerance=1e-3))
+    return this, optimise(this, start=begin(this), tolerance=1e-3)
 
 
 @pytest.mark.slow
