@@ -109,11 +109,7 @@ def from_picture(
 
 
 def patchwork(
-    surfaces: Sequence[str],
-    seed: int,
-    patch: float = 0.25,
-    half: float = 1.2,
-    cell: float = 0.005,
+    surfaces: Sequence[str], seed: int, patch: float = 0.25, half: float = 1.2, cell: float = 0.005
 ) -> FloorMap:
     """Random site of patches, by default smaller than a Robotino: cells of a jittered grid.
 

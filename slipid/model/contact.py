@@ -110,9 +110,7 @@ def _root_near(problem: ContactProblem) -> Float[Array, "3"]:
 One = tuple[ContactProblem]
 
 
-def _implicit(
-    root: Callable[[ContactProblem], Array],
-) -> Callable[[One, One], tuple[Array, Array]]:
+def _implicit(root: Callable[[ContactProblem], Array]) -> Callable[[One, One], tuple[Array, Array]]:
     """Derivative of a root of the balance by what it depends on."""
 
     def rule(primals: One, tangents: One) -> tuple[Array, Array]:

@@ -205,10 +205,7 @@ def _no_drawing(error: Exception) -> DataError:
 
 
 def _carpet(
-    floor: FloorMap,
-    site: Site,
-    extent: tuple[float, float, float, float],
-    rng: np.random.Generator,
+    floor: FloorMap, site: Site, extent: tuple[float, float, float, float], rng: np.random.Generator
 ) -> np.ndarray:
     """Picture of the floor: every surface in its colour, with a grain."""
     step = 0.002

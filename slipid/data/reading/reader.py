@@ -186,10 +186,7 @@ def _channel(
 
 
 def _wheel_angle(
-    layout: Layout,
-    have: dict[str, np.ndarray],
-    time: Float[np.ndarray, " row"],
-    notes: list[str],
+    layout: Layout, have: dict[str, np.ndarray], time: Float[np.ndarray, " row"], notes: list[str]
 ) -> Float[np.ndarray, "row wheel"]:
     """Cumulative angle at the wheel: from ticks, else angles, else the integral of the speed."""
     if "wheel_ticks" in have:
