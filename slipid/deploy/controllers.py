@@ -11,9 +11,8 @@ import jax.numpy as jnp
 from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Correction, Gains
 from slipid.control.deployed import DeployedRobot
-from slipid.control.estimator import Estimator
+from slipid.control.estimator import Estimator, Odometry
 from slipid.control.interface import AbstractEstimator, Settings
-from slipid.control.odometry import Odometry
 from slipid.support.errors import DataError
 
 

@@ -27,7 +27,7 @@ PICTURES: dict[str, Callable[[Fit, Runs, Seen], Figure | None]] = {
         fit.robot, data, pieces.groups, PATHS + "runs of the fit"
     ),
     "slip_by_torque": lambda fit, data, pieces: curve_figure(fit, pieces),
-    "current_by_traction": lambda fit, data, pieces: current_figure(fit.robot, pieces),
+    "current_by_traction": lambda fit, data, pieces: current_figure(pieces),
     "load_share": lambda fit, data, pieces: load_figure(fit),
 }
 """Pictures of a fit by name."""

@@ -126,7 +126,7 @@ def wheel_curve(
     return np.asarray(frame.radius * weight * felt)
 
 
-def current_figure(robot: Robot, seen: Seen) -> Figure | None:
+def current_figure(seen: Seen) -> Figure | None:
     """Measured current against predicted traction, a row per wheel, a column per floor and load."""
     if seen.amps is None:
         return None

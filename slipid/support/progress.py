@@ -51,7 +51,7 @@ class Reporter:
 
     def line(self, text: str) -> None:
         """One sentence that stays."""
-        self._print(text)
+        self._console.print(text, markup=False, soft_wrap=True)
 
     def stage(self, name: str) -> None:
         """A new part of the work begins."""
@@ -62,7 +62,7 @@ class Reporter:
         self._task = self._bars.add_task(name, total=None, what="")
         self._stage, self._told = name, time.monotonic()
         if self._bars.disable:
-            self._print(f"{name} ...")
+            self.line(f"{name} ...")
 
     def note(self, what: str) -> None:
         """What is going on at this moment; on a bar only."""
@@ -85,7 +85,4 @@ class Reporter:
             return
         self._told = now
         left = next(task for task in self._bars.tasks if task.id == self._task).time_remaining
-        self._print(f"  {what}" + (f", about {left:.0f} s left" if left else ""))
-
-    def _print(self, text: str) -> None:
-        self._console.print(text, markup=False, soft_wrap=True)
+        self.line(f"  {what}" + (f", about {left:.0f} s left" if left else ""))

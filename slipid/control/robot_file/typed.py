@@ -63,13 +63,11 @@ def _float(value: object, where: str) -> float:
 def _one_of(kinds: tuple[Any, ...], value: object, where: str) -> Any:
     if value is None and NoneType in kinds:
         return None
-    rest = [k for k in kinds if k is not NoneType]
-    for k in rest[:-1]:
-        try:
+    *others, last = (k for k in kinds if k is not NoneType)
+    for k in others:
+        with suppress(ValueError):
             return _as(k, value, where)
-        except ValueError:
-            continue
-    return _as(rest[-1], value, where)
+    return _as(last, value, where)
 
 
 def _items(inner: tuple[Any, ...], value: object, where: str) -> tuple[Any, ...]:

@@ -145,9 +145,7 @@ def _check_wheels(log: Log, table: Table, layout: Layout) -> None:
     if command is None:
         return
     # Half a second and a radian of commanded motion that the wheel answers with none at all.
-    commanded = np.abs(
-        np.sum(0.5 * (command[1:] + command[:-1]) * np.diff(log.time)[:, None], axis=0)
-    )
+    commanded = np.abs(integral(log.time, command)[-1])
     still = np.ptp(log.wheel_angle, axis=0) == 0
     dead = np.flatnonzero(still & (commanded > 1.0))
     if len(dead):
