@@ -195,9 +195,6 @@ def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
     """Write a map as a TOML file and a picture of its name beside it.
 
     `colours` are those of the surfaces as `#rrggbb`, no two alike.
-
-    Raises:
-        DataError: nothing can be written there.
     """
     from matplotlib.colors import to_rgb
     from matplotlib.image import imsave

@@ -51,11 +51,7 @@ ROWS: Mapping[str, Row] = {
 
 
 def check_gains(out: Path, robot: DeployedRobot) -> None:
-    """Refuse gains that `slipid tune` found for other numbers or another load set-up.
-
-    Raises:
-        DataError: there are such gains in the folder.
-    """
+    """Refuse gains that `slipid tune` found for other numbers or another load set-up."""
     tuned, path = robot.record.gains, out / "gains.json"
     if tuned is None and path.is_file():
         raise DataError(

@@ -61,11 +61,7 @@ def starts(
 
 
 def known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
-    """Refuse a trial that the virtual test site cannot drive.
-
-    Raises:
-        DataError: another number of wheels, a load set-up or a surface that it does not have.
-    """
+    """Refuse wheels, a load set-up or a surface that the virtual test site does not have."""
     machine, other = Site().machine, "With --plant twin the identified model is driven itself"
     has = len(machine.wheel_azimuths_deg)
     if wheels != has:
@@ -98,9 +94,6 @@ class SitePlant:
         start: x, y [m], heading [rad].
         seed: of unevenness, the wheels' first angles and noise.
         gyro: whether the robot has one.
-
-    Raises:
-        DataError: MuJoCo is missing.
     """
 
     def __init__(

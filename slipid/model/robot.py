@@ -92,11 +92,7 @@ class Robot(eqx.Module):
         return _with_mass(replace(made, motor=self.motor), self.body.mass)
 
     def surface_index(self, name: str) -> int:
-        """Place of a floor in the stack.
-
-        Raises:
-            ValueError: no such floor; names those there are.
-        """
+        """Place of a floor in the stack; ValueError with the choices when there is none."""
         if name not in self.surfaces.labels:
             known = ", ".join(self.surfaces.labels)
             raise ValueError(f"no surface '{name}'; identified: {known}")

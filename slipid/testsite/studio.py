@@ -147,9 +147,6 @@ def film(
         true: time [s] (step,), pose (step, 3) and wheel_angle (step, wheel) of the run.
         frames: times of the video's frames [s].
         path: where the video goes (.avi, Motion JPEG).
-
-    Raises:
-        DataError: the video cannot be written.
     """
     import cv2
 

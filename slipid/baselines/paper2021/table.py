@@ -112,11 +112,7 @@ def fit_form(samples: Samples, name: str) -> FittedForm:
 
 
 def surface_tables(folder: Path) -> dict[int, MotorTable]:
-    """The table behind figures 3 and 4, motors 1 to 3, from experimental_data_<surface>.csv.
-
-    Raises:
-        DataError: if a file or a column is missing.
-    """
+    """The table behind figures 3 and 4, motors 1 to 3, from experimental_data_<surface>.csv."""
     recipe = FIGURES_3_AND_4
     tables = {}
     for surface in SURFACES:
@@ -133,11 +129,7 @@ def surface_tables(folder: Path) -> dict[int, MotorTable]:
 
 
 def field_table(folder: Path) -> MotorTable:
-    """Figure 2: motor 1 over the whole heterogeneous site, our least squares and the paper's SVR.
-
-    Raises:
-        DataError: if the file or a column is missing.
-    """
+    """Figure 2: motor 1 over the whole site, our least squares and the paper's SVR."""
     path = folder / "experimental_data_on_whole_field.csv"
     table = read_columns(path, "robotino2021_field", needed(FIGURE_2))
     samples = slip_samples(table, 1, FIGURE_2)

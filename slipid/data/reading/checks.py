@@ -62,11 +62,7 @@ def check_time(table: Table, layout: Layout, time: Float[np.ndarray, " row"]) ->
 def filled(
     table: Table, channel: Channel, time: Float[np.ndarray, " row"], notes: list[str]
 ) -> Float[np.ndarray, "row column"]:
-    """Cells of a channel, up to three missing in a row filled linearly in time; bursts are refused.
-
-    Raises:
-        DataError: an infinite cell, a burst of missing ones, or too many of them in all.
-    """
+    """Cells of a channel, up to three missing in a row filled linearly in time; refuses bursts."""
     cells = table.stacked(channel)
     for j, column in enumerate(channel.columns):
         values = cells[:, j]

@@ -13,11 +13,7 @@ from slipid.support.toml_file import checked
 
 
 def preset(name: str) -> Layout:
-    """Layout of a known kind of log file.
-
-    Raises:
-        DataError: there is no such preset; the message names the choices.
-    """
+    """Layout of a known kind of log file; DataError with the choices if there is none."""
     if name not in PRESETS:
         raise DataError(f"preset: {unknown('format', name, PRESETS)}")
     return PRESETS[name]
