@@ -78,12 +78,8 @@ def known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
 
 def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Floor:
     """A map as arrays, its surfaces counted as the fit counts them."""
-    index = np.array([labels.index(name) for name in floor.surfaces])
-    return Floor(
-        cells=jnp.asarray(index[floor.cells]),
-        corner=jnp.asarray(floor.corner),
-        cell=jnp.asarray(floor.cell),
-    )
+    cells = np.array([labels.index(name) for name in floor.surfaces])[floor.cells]
+    return Floor(jnp.asarray(cells), jnp.asarray(floor.corner), jnp.asarray(floor.cell))
 
 
 class SitePlant:

@@ -36,10 +36,7 @@ class ContactProblem(eqx.Module):
     """What the twist of a robot depends on.
 
     Attributes:
-        rim: r w, rim speed of each wheel [m/s].
-        frame: wheel directions.
-        surface: one floor, or one under each wheel.
-        rest: load shares at rest, sum 1.
+        rim, frame, surface, rest: as of `equilibrium`.
         start: where the twist is looked for.
     """
 
