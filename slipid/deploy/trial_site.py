@@ -36,15 +36,10 @@ def site(robot: DeployedRobot) -> FloorMap:
     return FloorMap(tuple(order), cells, drawn.corner, drawn.cell)
 
 
-def starts(
-    count: int, floor: FloorMap, sides: tuple[float, float] = (0.9, 0.4)
-) -> list[tuple[float, float, float]]:
+def starts(count: int, floor: FloorMap) -> list[tuple[float, float, float]]:
     """Poses all over a site in evenly spread headings, the same ones for every controller.
 
-    Args:
-        count: how many.
-        floor: the site; the rectangle's middle keeps 0.8 m from its edge where there is room.
-        sides: of the rectangle [m].
+    The middle of the rectangle keeps 0.8 m from the site's edge where there is room.
     """
     rng = np.random.default_rng(STARTS_SEED)
     x0, y0, x1, y1 = floor.extent
@@ -55,7 +50,7 @@ def starts(
         heading = (k + rng.uniform()) * 2 * np.pi / count - np.pi
         c, s = np.cos(heading), np.sin(heading)
         x, y = middle + reach * rng.uniform(-1.0, 1.0, 2)
-        a, b = 0.5 * sides[0], 0.5 * sides[1]
+        a, b = 0.5 * 0.9, 0.5 * 0.4  # of the sides [m]
         out.append((float(x - (c * a + s * b)), float(y - (s * a - c * b)), float(heading)))
     return out
 

@@ -58,19 +58,13 @@ class Ground:
         return float((self.softness_m / (1.9 * GRAVITY)) ** 0.5)
 
 
-# in the order friction, rolling_m, softness_m, shear_n_m, compaction, body_drag_n
+# friction, rolling_m, softness_m, shear_n_m, compaction, body_drag_n, then as declared
 GROUNDS: dict[str, Ground] = {
     "firm": Ground(rolling_m=0.0004, unevenness=0.05, colour="#e8e4da"),
     "short": Ground(0.75, 0.0008, 0.001, 1.2e4, 2e4, unevenness=0.1, colour="#8a5a35"),
     "medium": Ground(0.8, 0.0018, 0.004, 4.5e3, 4e3, unevenness=0.15, colour="#8f9194"),
     "soft": Ground(0.8, 0.0028, 0.007, 2.2e3, 3e3, 0.5, unevenness=0.15, colour="#1f6b45"),
-    "ribbed": Ground(
-        *(0.6, 0.0006, 0.001, 2e4, 0.0, 0.0),
-        rib_height_m=0.0012,
-        rib_distance_m=0.02,
-        unevenness=0.05,
-        colour="#3f4a5a",
-    ),
+    "ribbed": Ground(0.6, 0.0006, 0.001, 2e4, 0.0, 0.0, 0.0012, 0.02, 0.05, "#3f4a5a"),
 }
 """Surfaces by name: bare, a short carpet, two deeper ones, and a ribbed mat."""
 
