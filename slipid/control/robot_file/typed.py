@@ -1,6 +1,6 @@
 """JSON values as the types a dataclass declares, refused with their place where they are not."""
 
-import math
+import sys
 import typing
 from collections.abc import Mapping
 from contextlib import suppress
@@ -9,6 +9,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 Kind = TypeVar("Kind")
+_MOST = sys.float_info.max
 _PLAIN = {bool: "true or false", str: "text", int: "a whole number", NoneType: "null"}
 
 
@@ -44,20 +45,12 @@ def _as(kind: Any, value: object, where: str) -> Any:
     if is_dataclass(kind):
         return _object(kind, value, where)
     if kind is float:
-        return _float(value, where)
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _MOST:
+            return float(value)
+        raise _wrong(where, value, "a number")
     if type(value) is not kind:
         raise _wrong(where, value, _PLAIN[kind])
     return value
-
-
-def _float(value: object, where: str) -> float:
-    number = math.nan
-    with suppress(OverflowError):
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            number = float(value)
-    if not math.isfinite(number):
-        raise _wrong(where, value, "a number")
-    return number
 
 
 def _one_of(kinds: tuple[Any, ...], value: object, where: str) -> Any:
