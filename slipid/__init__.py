@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from slipid.api.fit import Fit as Fit
     from slipid.api.fit import Prior as Prior
     from slipid.api.fit import fit as fit
-    from slipid.api.made import made_runs as made_runs
-    from slipid.api.motion import move as move
+    from slipid.api.known_robot import made_runs as made_runs
+    from slipid.api.known_robot import move as move
     from slipid.api.posterior import Posterior as Posterior
     from slipid.api.results import Profile as Profile
     from slipid.api.results import Validation as Validation
@@ -46,8 +46,8 @@ _ROOMS = {
     "check": "slipid.api.check",
     "drive": "slipid.api.driving",
     "fit": "slipid.api.fit",
-    "made_runs": "slipid.api.made",
-    "move": "slipid.api.motion",
+    "made_runs": "slipid.api.known_robot",
+    "move": "slipid.api.known_robot",
     "plot_runs": "slipid.plots.raw",
     "read_runs": "slipid.data.reading.reader",
     "setup_jax": "slipid.support.jax_setup",

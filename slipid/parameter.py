@@ -2,7 +2,7 @@
 
 A class declares its numbers where its equations are:
 
-    resistance: Array = parameter(unit="ohm", symbol="R", lower=0.1, upper=50.0, start=1.0)
+    resistance: Array = parameter("ohm", "R", "of a winding", lower=0.1, upper=50.0, start=1.0)
 
 `entries` lists every declared number of a tree of such classes by its path name.
 """
@@ -91,14 +91,16 @@ def share_basis(n: int) -> np.ndarray:
     return basis
 
 
-def parameter(*, per: str | None = None, **declared: Any) -> Any:
+def parameter(
+    unit: str, symbol: str, doc: str = "", *, per: str | None = None, **declared: Any
+) -> Any:
     """Dataclass field that holds a fitted number, declared by the attributes of `Declaration`.
 
     Args:
         per: name of the attribute of the same object, `loads` or `sessions`, that holds one label
             per entry of the leading axis; the path then ends in `@label`.
     """
-    declaration = Declaration(**declared)
+    declaration = Declaration(unit=unit, symbol=symbol, doc=doc, **declared)
     return eqx.field(
         converter=lambda x: (
             jnp.asarray(x, dtype=float) if not isinstance(x, jax.core.Tracer) else x

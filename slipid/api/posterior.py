@@ -88,12 +88,11 @@ class Posterior:
         Raises:
             ValueError: no such picture.
         """
-        from slipid.plots.posterior import interval_figure, pair_figure
+        from slipid.plots.posterior import PICTURES
 
-        figures = {"intervals": interval_figure, "pairs": pair_figure}
-        if name not in figures:
-            raise ValueError(f"no picture '{name}'; there are {', '.join(figures)}")
-        return figures[name](self.fit, self.result.z.reshape(-1, self.fit.space.size))
+        if name not in PICTURES:
+            raise ValueError(f"no picture '{name}'; there are {', '.join(PICTURES)}")
+        return PICTURES[name](self.fit, self.result.z.reshape(-1, self.fit.space.size))
 
     def deploy(self) -> DeployedRobot:
         """What runs on the robot, with the intervals of the draws.

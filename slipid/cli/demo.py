@@ -91,11 +91,7 @@ def packaged_config(name: str) -> str:
 
 
 def unpack(out: Path) -> None:
-    """Write the recorded logs, their truth and nothing else below a folder.
-
-    Raises:
-        DataError: the recording is missing from this installation.
-    """
+    """Write the recorded logs, their truth and nothing else below a folder."""
     from zipfile import ZipFile
 
     from slipid.support.files import write_bytes
@@ -110,11 +106,7 @@ def unpack(out: Path) -> None:
 
 
 def drive_anew(out: Path, seed: int, jobs: int, report: Reporter) -> None:
-    """Drive the runs that ship recorded, and those to be predicted, on the test site.
-
-    Raises:
-        DataError: MuJoCo is missing, or the folder holds runs of another seed.
-    """
+    """Drive the runs that ship recorded, and those to be predicted, on the test site."""
     from slipid.testsite.simulate.config import plan
     from slipid.testsite.simulate.simulate import simulate
 

@@ -60,17 +60,8 @@ def design(
     from slipid.report.answers import show_design
     from slipid.support.jax_setup import setup_jax
 
-    wanted = Wish(
-        parameter or (),
-        predict or (),
-        runs,
-        headings,
-        speeds,
-        turns,
-        distance,
-        floor or (),
-        load or (),
-    )
+    ways = headings, speeds, turns, distance
+    wanted = Wish(parameter or (), predict or (), runs, *ways, floor or (), load or ())
     with Reporter(quiet=quiet) as report:
         setup_jax(quiet=True)
         fit = load_fit(out)

@@ -22,11 +22,7 @@ def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet =
 
 
 def run(out: Path, data: Path, report: Reporter) -> "Validated":
-    """The prediction and its pictures; arguments as of `slipid.job.validate.validate`.
-
-    Raises:
-        DataError: no fit there, or logs that it cannot predict.
-    """
+    """The prediction and its pictures; arguments as of `slipid.job.validate.validate`."""
     from slipid.job.validate import validate
     from slipid.plots.fit import validate_plots
 

@@ -128,21 +128,16 @@ def drive(pilot: Pilot[State], path: Path, plant: Plant, start: Pose) -> Course:
     """
     wheels = pilot.controller.robot.wheels
     state, reading, dt = pilot.init(start), plant.reset().filled(wheels), jnp.asarray(PERIOD)
-    time: list[float] = []
-    spent: list[float] = []
-    poses: list[tuple[float, float, float]] = []
-    said: list[PilotOutput] = []
+    rows: list[tuple[float, float, tuple[float, float, float], PilotOutput]] = []
     energy, own, begun = 0.0, 0.0, 0.0
     while own < path.duration - 1e-6 and begun < LONGEST * path.duration + 10.0:
         state, out = _step(pilot, path, state, reading, dt)
         own = float(out.time)
-        said.append(out)
-        time.append(begun)
-        spent.append(energy)
-        poses.append(plant.pose)
+        rows.append((begun, energy, plant.pose, out))
         reading = plant.step(np.asarray(out.command)).filled(wheels)
         energy += getattr(plant, "power", np.nan) * PERIOD
         begun += PERIOD
+    time, spent, poses, said = zip(*rows, strict=True)
     every: PilotOutput = jax.tree.map(lambda *x: np.stack([np.asarray(v) for v in x]), *said)
     pose = np.array(poses)
     pose[:, 2] = np.unwrap(pose[:, 2])

@@ -34,16 +34,13 @@ LONGEST_I = 0.06
 class Gains(eqx.Module):
     """Gains of a controller; by default those set by hand."""
 
-    place: Array = parameter(unit="1/s", symbol="k", start=1.5, doc="pose loop")
-    yaw: Array = parameter(unit="1/s", symbol="k_yaw", start=1.5, doc="heading loop")
-    integral: Array = parameter(unit="1/s^2", symbol="k_i", start=0.0, doc="pose error's integral")
-    ahead: Array = parameter(unit="1", symbol="k_f", start=0.0, doc="share of the inverse model")
-    observer: Array = parameter(unit="1", symbol="k_d", start=0.0, doc="disturbance observer")
+    place: Array = parameter("1/s", "k", "pose loop", start=1.5)
+    yaw: Array = parameter("1/s", "k_yaw", "heading loop", start=1.5)
+    integral: Array = parameter("1/s^2", "k_i", "pose error's integral", start=0.0)
+    ahead: Array = parameter("1", "k_f", "share of the inverse model", start=0.0)
+    observer: Array = parameter("1", "k_d", "disturbance observer", start=0.0)
     preview: Array = parameter(
-        unit="s",
-        symbol="t_p",
-        start=0.2,
-        doc="how early rates are asked for, as wheels follow late",
+        "s", "t_p", "how early rates are asked for, as wheels follow late", start=0.2
     )
 
     @classmethod

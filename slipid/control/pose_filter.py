@@ -190,11 +190,8 @@ def _fixed(now: PoseState, z: Readings) -> PoseState:
         & jnp.all(z.fix_std > 0)
         & (age < now.time - now.history[-1, 0] + 1e-6)
     )
-
-    std, kept = (
-        jnp.clip(z.fix_std, 1e-4, 10.0),
-        (now.pose, now.nuisance, now.covariance, now.history),
-    )
+    std = jnp.clip(z.fix_std, 1e-4, 10.0)
+    kept = now.pose, now.nuisance, now.covariance, now.history
     found = jax.lax.cond(has, lambda: _corrected(now, z.fix, std, age), lambda: kept)
     pose, nuisance, covariance, history = found
     return replace(now, pose=pose, nuisance=nuisance, covariance=covariance, history=history)

@@ -88,32 +88,8 @@ def from_polygons(
     return FloorMap(surfaces, cells.reshape(rows, columns), (extent[0], extent[1]), cell)
 
 
-def from_picture(
-    picture: Float[np.ndarray, "row column 3"],
-    colours: Mapping[str, str],
-    metres_per_pixel: float,
-    corner: tuple[float, float] = (0.0, 0.0),
-) -> FloorMap:
-    """Map from a picture seen from above, x to the right, y up: each pixel the nearest colour's.
-
-    Args:
-        picture: red, green, blue between 0 and 1, first row at the top.
-        colours: colour of every surface as `#rrggbb`.
-        corner: x, y of the lower left corner [m].
-    """
-    from matplotlib.colors import to_rgb
-
-    wanted = np.array([to_rgb(colour) for colour in colours.values()])
-    far = np.linalg.norm(picture[:, :, None, :] - wanted, axis=-1)
-    return FloorMap(tuple(colours), np.argmin(far, axis=-1)[::-1].copy(), corner, metres_per_pixel)
-
-
 def patchwork(
-    surfaces: Sequence[str],
-    seed: int,
-    patch: float = 0.25,
-    half: float = 1.2,
-    cell: float = 0.005,
+    surfaces: Sequence[str], seed: int, patch: float = 0.25, half: float = 1.2, cell: float = 0.005
 ) -> FloorMap:
     """Random site of patches, by default smaller than a Robotino: cells of a jittered grid.
 
@@ -219,9 +195,6 @@ def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
     """Write a map as a TOML file and a picture of its name beside it.
 
     `colours` are those of the surfaces as `#rrggbb`, no two alike.
-
-    Raises:
-        DataError: nothing can be written there.
     """
     from matplotlib.colors import to_rgb
     from matplotlib.image import imsave
@@ -243,6 +216,8 @@ def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
 
 
 def _pictured(path: Path, given: Pictured) -> FloorMap:
+    """Map of a picture: each pixel has the surface of the nearest colour."""
+    from matplotlib.colors import to_rgb
     from matplotlib.image import imread
 
     source = path.parent / given.picture
@@ -255,4 +230,7 @@ def _pictured(path: Path, given: Pictured) -> FloorMap:
     if picture.shape[0] * picture.shape[1] > MOST_CELLS:
         raise DataError(f"{path}: picture {source}: expected at most {MOST_CELLS} pixels")
     picture = picture[..., :3] if picture.max() <= 1 else picture[..., :3] / 255
-    return from_picture(picture, given.colours, given.metres_per_pixel, given.corner_m)
+    wanted = np.array([to_rgb(colour) for colour in given.colours.values()])
+    far = np.linalg.norm(picture[:, :, None, :] - wanted, axis=-1)
+    cells = np.argmin(far, axis=-1)[::-1].copy()
+    return FloorMap(tuple(given.colours), cells, given.corner_m, given.metres_per_pixel)

@@ -62,11 +62,7 @@ class Runs:
         return collect([self.logs[i] for i in index], [self.session[i] for i in index])
 
     def __add__(self, other: "Runs") -> "Runs":
-        """Runs of both.
-
-        Raises:
-            DataError: a run is in both, or they do not go together.
-        """
+        """Runs of both; DataError where a run is in both, or they do not go together."""
         if both := {log.name for log in self.logs} & {log.name for log in other.logs}:
             raise DataError(f"{min(both)}: in both sets of runs; expected it once")
         return collect([*self.logs, *other.logs], [*self.session, *other.session])
@@ -153,11 +149,7 @@ def _command(log: Log) -> tuple[float, float, float]:
 
 
 def first_row(data: Runs, run: int, wheel_radius: float) -> int:
-    """Row of the run in which the fastest wheel's rim has moved `MOVED`.
-
-    Raises:
-        DataError: it never does.
-    """
+    """Row in which the fastest wheel's rim has moved `MOVED`; DataError if it never does."""
     first = first_moved(data.wheel_angle[data.rows(run)], wheel_radius)
     if first is None:
         raise DataError(

@@ -65,11 +65,7 @@ class Windows:
 
 
 def windows(
-    data: Runs,
-    wheel_radius: float,
-    lag: float = 0.0,
-    per_piece: int = 4,
-    longest: float = 6.0,
+    data: Runs, wheel_radius: float, lag: float = 0.0, per_piece: int = 4, longest: float = 6.0
 ) -> Windows:
     """Cut every run from where it has moved `MOVED` into pieces of `per_piece` windows.
 

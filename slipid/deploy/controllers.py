@@ -11,9 +11,8 @@ import jax.numpy as jnp
 from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Correction, Gains
 from slipid.control.deployed import DeployedRobot
-from slipid.control.estimator import Estimator
+from slipid.control.estimator import Estimator, Odometry
 from slipid.control.interface import AbstractEstimator, Settings
-from slipid.control.odometry import Odometry
 from slipid.support.errors import DataError
 
 
@@ -52,11 +51,7 @@ ROWS: Mapping[str, Row] = {
 
 
 def check_gains(out: Path, robot: DeployedRobot) -> None:
-    """Refuse gains that `slipid tune` found for other numbers or another load set-up.
-
-    Raises:
-        DataError: there are such gains in the folder.
-    """
+    """Refuse gains that `slipid tune` found for other numbers or another load set-up."""
     tuned, path = robot.record.gains, out / "gains.json"
     if tuned is None and path.is_file():
         raise DataError(

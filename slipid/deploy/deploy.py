@@ -74,11 +74,7 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
 
 
 def write_robot(out: Path, fit: Fit, posterior: Posterior | None = None) -> tuple[str, ...]:
-    """Write robot.json beside a fit where its wheels allow a controller; names of files written.
-
-    Raises:
-        DataError: nothing can be written there.
-    """
+    """Write robot.json beside a fit where its wheels allow a controller; names of files written."""
     try:
         robot = deploy(fit, posterior)
     except ValueError as error:
@@ -96,11 +92,7 @@ def write_robot(out: Path, fit: Fit, posterior: Posterior | None = None) -> tupl
 
 
 def read_robot(out: Path, load: str | None = None) -> DeployedRobot:
-    """The robot of a folder.
-
-    Raises:
-        DataError: there is none, it is damaged, or it has no such load set-up.
-    """
+    """The robot of a folder; DataError where there is none, or as of `DeployedRobot.load`."""
     path = out / ROBOT
     if not path.is_file():
         raise DataError(

@@ -10,16 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from slipid.control.robot_file.record import (
-    Axes,
-    FloorRecord,
-    LoadRecord,
-    Number,
-    Numbers,
-    Pair,
-    RobotRecord,
-    Wheels,
-)
+from slipid.control.robot_file import record
 from slipid.identify.fit.sessions import AXES
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
@@ -30,13 +21,13 @@ from slipid.parameter import entries
 
 def record_of(
     robot: Robot,
-    numbers: Mapping[str, Number],
+    numbers: Mapping[str, record.Number],
     std: Mapping[str, float],
     draws: Robot,
     highest_speed: float,
-    current_trend: Pair,
+    current_trend: record.Pair,
     seen: Mapping[str, Validity],
-) -> RobotRecord:
+) -> record.RobotRecord:
     """The record of a robot, but for what is known of where its numbers come from.
 
     Args:
@@ -49,8 +40,10 @@ def record_of(
         current_trend: of currents over the model's in the fitted runs, all floors [A], [A s/m].
         seen: what the floors were seen with, as far as that is known.
     """
-    return RobotRecord(
-        wheels=Wheels(**{f.name: getattr(robot.geometry, f.name) for f in fields(Wheels)}),
+    return record.RobotRecord(
+        wheels=record.Wheels(
+            **{f.name: getattr(robot.geometry, f.name) for f in fields(record.Wheels)}
+        ),
         parameters={p: n for p, n in numbers.items() if not p.startswith("camera.")},
         floors=tuple(_floor(name, std, seen.get(name)) for name in robot.surfaces.labels),
         loads=tuple(_load(robot, name, highest_speed, draws) for name in robot.body.loads),
@@ -60,12 +53,12 @@ def record_of(
     )
 
 
-def plain(value: np.ndarray) -> Numbers:
+def plain(value: np.ndarray) -> record.Numbers:
     """A float, or a tuple of floats."""
     return float(value.reshape(())) if value.size == 1 else tuple(float(v) for v in value)
 
 
-def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[Numbers, ...]]]:
+def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numbers, ...]]]:
     """Paths and draws of all numbers that differ between draws, the camera's left out."""
     for e in entries(robot):
         leaf = np.asarray(reduce(getattr, e.leaf, draws))
@@ -74,17 +67,17 @@ def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[Numbers, ..
             yield e.path, tuple(plain(np.asarray(row)) for row in rows)
 
 
-def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> FloorRecord:
+def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> record.FloorRecord:
     """What the model misses on a floor."""
 
-    def of(kind: str, default: Axes) -> np.ndarray:
+    def of(kind: str, default: record.Axes) -> np.ndarray:
         return np.array(
             [std.get(f"{kind}.{name}.{a}", d) for a, d in zip(AXES, default, strict=True)]
         )
 
     effect = np.sqrt(of("run", (0.01, 0.01, 0.03)) ** 2 + of("session", (0.0, 0.0, 0.0)) ** 2)
     kinds = [std.get(f"current.{name}.{kind}", 0.05) for kind in ("window", "run")]
-    return FloorRecord(
+    return record.FloorRecord(
         name=name,
         process=_axes(of("process", (0.005, 0.002, 0.01))),
         effect=_axes(effect),
@@ -93,17 +86,17 @@ def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> FloorR
     )
 
 
-def _axes(row: Sequence[float] | np.ndarray) -> Axes:
+def _axes(row: Sequence[float] | np.ndarray) -> record.Axes:
     along, across, yaw = (float(x) for x in row)
     return along, across, yaw
 
 
-def _load(robot: Robot, name: str, top: float, draws: Robot) -> LoadRecord:
+def _load(robot: Robot, name: str, top: float, draws: Robot) -> record.LoadRecord:
     """What depends on how the robot is loaded."""
     frame, k = robot.geometry.frame(), jnp.asarray(robot.load_index(name))
     speed, amps, slip = _circle(robot, frame, k, jnp.asarray(top))
     curve = np.asarray(_wheel_curve(speed, amps, slip))
-    return LoadRecord(
+    return record.LoadRecord(
         name=name,
         spread=tuple(_axes(row) for row in np.asarray(_spread(draws, k))),
         highest_current=float(jnp.max(jnp.abs(amps))),

@@ -1,7 +1,6 @@
 """`slipid trial`: the rectangle of the 2021 paper's figure 7 with every controller, judged."""
 
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -92,11 +91,9 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
     """
     setup_jax(quiet=True)
     jobs = _jobs(out, wish)
-    todo = [job for job in jobs if _driven(job) is None]
+    todo = {job.name: job for job in jobs if _driven(job) is None}
     report.stage(f"driving {len(todo)} of {len(jobs)} runs")
-    with closing(spread(drive, todo, min(wish.jobs, max(len(todo), 1)))) as finished:
-        for done, (job, _) in enumerate(finished, 1):
-            report.advance(done, len(todo), f"{done} of {len(todo)}, {job.name}")
+    spread(drive, todo, wish.jobs, report)
     driven = {job.name: found for job in jobs if (found := _driven(job)) is not None}
     runs = [run for run, _ in driven.values()]
     table = summaries(runs)
@@ -157,8 +154,8 @@ def _driven(job: Job) -> tuple[Run, np.ndarray] | None:
     return None if run is None or path is None else (typed(Run, run), path["pose"])
 
 
-def drive(job: Job) -> float:
-    """Drive one run and write its metrics and its path; how long it took [s]."""
+def drive(job: Job) -> None:
+    """Drive one run and write its metrics and its path."""
     setup_jax(quiet=True)
     row = ROWS[job.row]
     robot = jax.tree.map(jnp.asarray, job.robot)
@@ -182,7 +179,6 @@ def drive(job: Job) -> float:
     path_of = {"time": course.time, "pose": course.pose, "believed": course.believed}
     job.kept.save(job.name, path_of)
     job.kept.save_json(job.name, asdict(run))
-    return float(course.time[-1])
 
 
 def names_of(text: str | None) -> tuple[str, ...]:

@@ -36,15 +36,10 @@ def site(robot: DeployedRobot) -> FloorMap:
     return FloorMap(tuple(order), cells, drawn.corner, drawn.cell)
 
 
-def starts(
-    count: int, floor: FloorMap, sides: tuple[float, float] = (0.9, 0.4)
-) -> list[tuple[float, float, float]]:
+def starts(count: int, floor: FloorMap) -> list[tuple[float, float, float]]:
     """Poses all over a site in evenly spread headings, the same ones for every controller.
 
-    Args:
-        count: how many.
-        floor: the site; the rectangle's middle keeps 0.8 m from its edge where there is room.
-        sides: of the rectangle [m].
+    The middle of the rectangle keeps 0.8 m from the site's edge where there is room.
     """
     rng = np.random.default_rng(STARTS_SEED)
     x0, y0, x1, y1 = floor.extent
@@ -55,17 +50,13 @@ def starts(
         heading = (k + rng.uniform()) * 2 * np.pi / count - np.pi
         c, s = np.cos(heading), np.sin(heading)
         x, y = middle + reach * rng.uniform(-1.0, 1.0, 2)
-        a, b = 0.5 * sides[0], 0.5 * sides[1]
+        a, b = 0.5 * 0.9, 0.5 * 0.4  # of the sides [m]
         out.append((float(x - (c * a + s * b)), float(y - (s * a - c * b)), float(heading)))
     return out
 
 
 def known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
-    """Refuse a trial that the virtual test site cannot drive.
-
-    Raises:
-        DataError: another number of wheels, a load set-up or a surface that it does not have.
-    """
+    """Refuse wheels, a load set-up or a surface that the virtual test site does not have."""
     machine, other = Site().machine, "With --plant twin the identified model is driven itself"
     has = len(machine.wheel_azimuths_deg)
     if wheels != has:
@@ -82,12 +73,8 @@ def known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
 
 def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Floor:
     """A map as arrays, its surfaces counted as the fit counts them."""
-    index = np.array([labels.index(name) for name in floor.surfaces])
-    return Floor(
-        cells=jnp.asarray(index[floor.cells]),
-        corner=jnp.asarray(floor.corner),
-        cell=jnp.asarray(floor.cell),
-    )
+    cells = np.array([labels.index(name) for name in floor.surfaces])[floor.cells]
+    return Floor(jnp.asarray(cells), jnp.asarray(floor.corner), jnp.asarray(floor.cell))
 
 
 class SitePlant:
@@ -98,9 +85,6 @@ class SitePlant:
         start: x, y [m], heading [rad].
         seed: of unevenness, the wheels' first angles and noise.
         gyro: whether the robot has one.
-
-    Raises:
-        DataError: MuJoCo is missing.
     """
 
     def __init__(

@@ -14,16 +14,8 @@ from slipid.control.closed_loop import PERIOD
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot, drawn
 from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
-from slipid.control.tuning.objective import (
-    BATCH,
-    GAINS,
-    HAND,
-    UNITS,
-    Cases,
-    Task,
-    combined,
-    evaluate,
-)
+from slipid.control.tuning import objective
+from slipid.control.tuning.objective import BATCH, GAINS, HAND, UNITS, Cases, Task
 from slipid.control.tuning.optimisers import GRADIENT, Method, Search, State
 from slipid.data.floor_map import patchwork
 from slipid.deploy.deploy import ROBOT, habits_of, read_robot
@@ -64,7 +56,9 @@ class Tuned:
 
     def record(self) -> GainsRecord:
         """As robot.json has it."""
-        loss = Losses(**{k: float(combined(jnp.asarray(v))) for k, v in self.losses.items()})
+        loss = Losses(
+            **{k: float(objective.combined(jnp.asarray(v))) for k, v in self.losses.items()}
+        )
         task, better = self.search.task, self.losses["tuned"] < self.losses["hand"]
         rows = zip(GAINS, self.best, UNITS, self.spread, strict=True)
         return GainsRecord(
@@ -115,13 +109,8 @@ class Tuned:
                 "voltage": task.habits.voltage,
             },
             "seed": kept.seed,
-            "fit": hashes(task.robot),
+            "fit": {"data": task.robot.record.data, "numbers": task.robot.record.numbers},
         }
-
-
-def hashes(robot: DeployedRobot) -> dict[str, str | None]:
-    """Of the runs a robot was made of, and of its numbers."""
-    return {"data": robot.record.data, "numbers": robot.record.numbers}
 
 
 def judged(search: Search, state: State, others: Cases, stable: DeployedRobot) -> Tuned:
@@ -132,7 +121,7 @@ def judged(search: Search, state: State, others: Cases, stable: DeployedRobot) -
         search=search,
         best=best,
         spread=search.spread(state),
-        losses={name: evaluate(task, g, others) for name, g in by.items()},
+        losses={name: objective.evaluate(task, g, others) for name, g in by.items()},
         margins={name: task.margins(Gains.at(g), stable) for name, g in by.items()},
     )
 
@@ -231,7 +220,7 @@ def _everything(search: Search) -> tuple[object, ...]:
         jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
         for leaf in jax.tree.leaves((search.task, search.cases, search.stable))
     ]
-    task = search.task
-    own = (hashes(task.robot), task.robot.load_setup, search.method, search.steps, search.seed)
+    task, robot = search.task, search.task.robot
+    own = (robot.record.numbers, robot.load_setup, search.method, search.steps, search.seed)
     hashed = source_hash("control", "model")
     return (hashed, *map(np.asarray, arrays), *own, task.habits, task.steps)

@@ -23,26 +23,14 @@ class Camera(eqx.Module):
     on.
     """
 
-    scale: Array = known(
-        unit="1", symbol="s", start=1.0, lower=0.0, spread=0.02, doc="true over logged length"
-    )
-    lag: Array = known(
-        unit="s", symbol="t_c", start=0.0, spread=0.03, doc="camera behind the encoders"
-    )
-    marker_yaw: Array = known(
-        unit="rad", symbol="psi", start=0.0, spread=0.03, doc="marker heading less body's"
-    )
-    session_yaw: Array = known(
-        unit="rad", symbol="dpsi", start=0.0, spread=0.01, per="sessions", doc="its change"
-    )
-    marker_place: Array = known(
-        unit="m", symbol="p_m", start=0.0, spread=0.02, doc="marker from the body's centre"
-    )
-    tilt: Array = known(
-        unit="1/m", symbol="h", start=0.0, spread=0.03, doc="perspective of a tilted camera"
-    )
-    radial: Array = known(unit="1/m^2", symbol="k", start=0.0, spread=0.02, doc="radial distortion")
-    tangential: Array = known(unit="1/m", symbol="p", start=0.0, spread=0.02, doc="decentred lens")
+    scale: Array = known("1", "s", "true over logged length", start=1.0, lower=0.0, spread=0.02)
+    lag: Array = known("s", "t_c", "camera behind the encoders", start=0.0, spread=0.03)
+    marker_yaw: Array = known("rad", "psi", "marker heading less body's", start=0.0, spread=0.03)
+    session_yaw: Array = known("rad", "dpsi", "its change", start=0.0, spread=0.01, per="sessions")
+    marker_place: Array = known("m", "p_m", "marker from the body's centre", start=0.0, spread=0.02)
+    tilt: Array = known("1/m", "h", "perspective of a tilted camera", start=0.0, spread=0.03)
+    radial: Array = known("1/m^2", "k", "radial distortion", start=0.0, spread=0.02)
+    tangential: Array = known("1/m", "p", "decentred lens", start=0.0, spread=0.02)
     centre: tuple[float, float] = eqx.field(static=True, default=(0.0, 0.0))
     sessions: tuple[str, ...] = eqx.field(static=True, default=())
 

@@ -36,10 +36,7 @@ class ContactProblem(eqx.Module):
     """What the twist of a robot depends on.
 
     Attributes:
-        rim: r w, rim speed of each wheel [m/s].
-        frame: wheel directions.
-        surface: one floor, or one under each wheel.
-        rest: load shares at rest, sum 1.
+        rim, frame, surface, rest: as of `equilibrium`.
         start: where the twist is looked for.
     """
 
@@ -110,9 +107,7 @@ def _root_near(problem: ContactProblem) -> Float[Array, "3"]:
 One = tuple[ContactProblem]
 
 
-def _implicit(
-    root: Callable[[ContactProblem], Array],
-) -> Callable[[One, One], tuple[Array, Array]]:
+def _implicit(root: Callable[[ContactProblem], Array]) -> Callable[[One, One], tuple[Array, Array]]:
     """Derivative of a root of the balance by what it depends on."""
 
     def rule(primals: One, tangents: One) -> tuple[Array, Array]:

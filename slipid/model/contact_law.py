@@ -60,32 +60,22 @@ class ContactSurface(eqx.Module):
     """
 
     friction: Array = positive(
-        unit="1", symbol="mu", start=0.4, spread=0.5, doc="friction coefficient", electric=True
+        "1", "mu", "friction coefficient", start=0.4, spread=0.5, electric=True
     )
-    creep: Array = positive(
-        unit="1", symbol="s0", start=0.3, spread=1.5, doc="slip ratio of full traction"
-    )
-    roller_drag: Array = positive(
-        unit="1", symbol="cr", start=0.3, spread=1.5, doc="drag of sideways rolling"
-    )
+    creep: Array = positive("1", "s0", "slip ratio of full traction", start=0.3, spread=1.5)
+    roller_drag: Array = positive("1", "cr", "drag of sideways rolling", start=0.3, spread=1.5)
     roller_creep: Array = positive(
-        unit="1", symbol="sr", start=0.2, spread=1.5, doc="roller speed ratio of full drag"
+        "1", "sr", "roller speed ratio of full drag", start=0.2, spread=1.5
     )
     rolling_resistance: Array = positive(
-        unit="1", symbol="crr", start=0.005, spread=2.0, doc="resistance along the drive"
+        "1", "crr", "resistance along the drive", start=0.005, spread=2.0
     )
     slide_viscosity: Array = positive(
-        unit="s/m", symbol="kv", start=0.02, spread=2.0, doc="traction per sliding speed"
+        "s/m", "kv", "traction per sliding speed", start=0.02, spread=2.0
     )
-    roller_viscosity: Array = positive(
-        unit="s/m", symbol="kl", start=0.02, spread=2.0, doc="drag per roller speed"
-    )
-    scrub: Array = positive(
-        unit="m", symbol="cz", start=0.002, spread=2.0, doc="moment against turning"
-    )
-    lead: Array = parameter(
-        unit="m", symbol="b", start=0.002, spread=0.01, doc="contact ahead of the wheel centre"
-    )
+    roller_viscosity: Array = positive("s/m", "kl", "drag per roller speed", start=0.02, spread=2.0)
+    scrub: Array = positive("m", "cz", "moment against turning", start=0.002, spread=2.0)
+    lead: Array = parameter("m", "b", "contact ahead of the wheel centre", start=0.002, spread=0.01)
     labels: tuple[str, ...] = eqx.field(static=True, default=())
 
     def at(self, index: Int[Array | np.ndarray, "..."] | int) -> "ContactSurface":

@@ -30,13 +30,13 @@ class Geometry(eqx.Module):
     """
 
     wheel_radius: Array = parameter(
-        unit="m", symbol="r", start=0.05, lower=0.0, spread=0.02, free=False, doc="wheel radius"
+        "m", "r", "wheel radius", start=0.05, lower=0.0, spread=0.02, free=False
     )
     base_radius: Array = parameter(
-        unit="m", symbol="L", start=0.15, lower=0.0, spread=0.02, free=False, doc="base radius"
+        "m", "L", "base radius", start=0.15, lower=0.0, spread=0.02, free=False
     )
     drive_offset: Array = parameter(
-        unit="rad", symbol="delta", start=0.0, spread=0.01, free=False, doc="drive direction offset"
+        "rad", "delta", "drive direction offset", start=0.0, spread=0.01, free=False
     )
     place: tuple[tuple[float, float], ...] = eqx.field(static=True, default=())
     drive_angle: tuple[float, ...] = eqx.field(static=True, default=())

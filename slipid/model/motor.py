@@ -25,33 +25,21 @@ class Motor(eqx.Module):
         gear_ratio: n, motor speed over wheel speed.
     """
 
-    resistance: Array = electric(
-        unit="ohm", symbol="R", start=1.0, lower=0.0, spread=0.5, doc="winding resistance"
-    )
+    resistance: Array = electric("ohm", "R", "winding resistance", start=1.0, lower=0.0, spread=0.5)
     back_emf: Array = electric(
-        unit="V*s/rad", symbol="C_e", start=0.05, lower=0.0, spread=0.5, doc="back-EMF constant"
+        "V*s/rad", "C_e", "back-EMF constant", start=0.05, lower=0.0, spread=0.5
     )
-    inductance: Array = held(
-        unit="H", symbol="L_a", start=0.005, lower=0.0, spread=1.0, doc="inductance"
-    )
-    brush_drop: Array = held(
-        unit="V", symbol="U_b", start=0.0, spread=0.5, doc="voltage drop of the brushes"
-    )
-    efficiency: Array = held(
-        unit="1", symbol="eta", start=0.9, lower=0.0, upper=1.001, spread=0.5, doc="gear"
-    )
+    inductance: Array = held("H", "L_a", "inductance", start=0.005, lower=0.0, spread=1.0)
+    brush_drop: Array = held("V", "U_b", "voltage drop of the brushes", start=0.0, spread=0.5)
+    efficiency: Array = held("1", "eta", "gear", start=0.9, lower=0.0, upper=1.001, spread=0.5)
     coulomb_friction: Array = electric(
-        unit="N*m", symbol="tau_c", start=0.02, lower=0.0, spread=1.5, doc="friction at the wheel"
+        "N*m", "tau_c", "friction at the wheel", start=0.02, lower=0.0, spread=1.5
     )
     viscous_friction: Array = electric(
-        unit="N*m*s/rad", symbol="b_w", start=0.005, lower=0.0, spread=1.5, doc="friction per speed"
+        "N*m*s/rad", "b_w", "friction per speed", start=0.005, lower=0.0, spread=1.5
     )
-    current_offset: Array = held(
-        unit="A", symbol="I_0", start=0.0, spread=0.05, doc="zero of the ammeter"
-    )
-    rotor_inertia: Array = held(
-        unit="kg*m^2", symbol="J_m", start=1e-5, lower=0.0, spread=1.0, doc="rotor"
-    )
+    current_offset: Array = held("A", "I_0", "zero of the ammeter", start=0.0, spread=0.05)
+    rotor_inertia: Array = held("kg*m^2", "J_m", "rotor", start=1e-5, lower=0.0, spread=1.0)
     gear_ratio: float = eqx.field(static=True, default=1.0)
 
     def voltage(

@@ -22,20 +22,18 @@ GRAVITY = 9.81
 class Body(eqx.Module):
     """Mass and how it rests on the wheels; the leading axis of `load_share` is the load set-up."""
 
-    mass: Array = parameter(
-        unit="kg", symbol="m", start=10.0, lower=0.0, spread=0.1, free=False, doc="mass"
-    )
+    mass: Array = parameter("kg", "m", "mass", start=10.0, lower=0.0, spread=0.1, free=False)
     yaw_inertia: Array = parameter(
-        unit="kg*m^2", symbol="I_z", start=0.2, lower=0.0, spread=0.5, free=False, doc="inertia"
+        "kg*m^2", "I_z", "inertia", start=0.2, lower=0.0, spread=0.5, free=False
     )
     load_share: Array = parameter(
-        unit="1",
-        symbol="N0",
+        "1",
+        "N0",
+        "share of the weight on each wheel at rest",
         start=1 / 3,
         spread=0.5,
         shares=True,
         per="loads",
-        doc="share of the weight on each wheel at rest",
     )
     loads: tuple[str, ...] = eqx.field(static=True, default=("as_built",))
 
@@ -94,11 +92,7 @@ class Robot(eqx.Module):
         return _with_mass(replace(made, motor=self.motor), self.body.mass)
 
     def surface_index(self, name: str) -> int:
-        """Place of a floor in the stack.
-
-        Raises:
-            ValueError: no such floor; names those there are.
-        """
+        """Place of a floor in the stack; ValueError with the choices when there is none."""
         if name not in self.surfaces.labels:
             known = ", ".join(self.surfaces.labels)
             raise ValueError(f"no surface '{name}'; identified: {known}")

@@ -101,11 +101,8 @@ def ladder_figure(found: Content, which: str) -> Figure:
     floors = found["summary"]
     models = list(next(iter(floors.values())))
     width = 2.7 * len(floors) + 2.4
-    made = drawing.figure(
-        max(width, 8.8),
-        1.7 + 0.32 * len(models),
-        f"How far from the camera's end each model ends, open loop; {which}",
-    )
+    title = f"How far from the camera's end each model ends, open loop; {which}"
+    made = drawing.figure(max(width, 8.8), 1.7 + 0.32 * len(models), title)
     axes = made.subplots(1, len(floors), sharey=True, squeeze=False)[0]
     for ax, (floor, by) in zip(axes, floors.items(), strict=True):
         bars(ax, {model: 100 * by[model]["endpoint_error_mean"] for model in models})

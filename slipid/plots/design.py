@@ -55,11 +55,7 @@ def _title(found: Design) -> str:
 
 
 def _commands(
-    ax: Axes,
-    found: Design,
-    setup: tuple[str, str],
-    mine: Counter[Drive],
-    order: dict[Drive, int],
+    ax: Axes, found: Design, setup: tuple[str, str], mine: Counter[Drive], order: dict[Drive, int]
 ) -> None:
     """Commanded velocities of one floor and load."""
     floor, load = setup

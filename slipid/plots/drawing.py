@@ -2,7 +2,7 @@
 
 import io
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -15,7 +15,8 @@ BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 INK, SHADE = "#222222", "#888888"
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, "#56B4E9", "#E69F00")
 """Okabe and Ito's colours: told apart with any colour vision."""
-MARKERS = ("o", "^", "s", "D", "v", "P")
+STYLES = tuple(zip(SERIES, ("o", "^", "s", "D", "v", "P"), strict=True))
+"""A colour and a marker for each series."""
 
 
 def figure(width: float, height: float, title: str) -> Figure:
@@ -38,12 +39,6 @@ def panels(count: int, width: float, height: float, title: str) -> tuple[Figure,
     for ax in axes[:count]:
         plain(ax)
     return made, axes[:count]
-
-
-def styled(count: int) -> Iterator[tuple[str, str]]:
-    """A colour and a marker for each of `count` series."""
-    for k in range(count):
-        yield SERIES[k % len(SERIES)], MARKERS[k % len(MARKERS)]
 
 
 def plain(axes: Axes) -> None:

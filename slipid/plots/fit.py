@@ -27,7 +27,7 @@ PICTURES: dict[str, Callable[[Fit, Runs, Seen], Figure | None]] = {
         fit.robot, data, pieces.groups, PATHS + "runs of the fit"
     ),
     "slip_by_torque": lambda fit, data, pieces: curve_figure(fit, pieces),
-    "current_by_traction": lambda fit, data, pieces: current_figure(fit.robot, pieces),
+    "current_by_traction": lambda fit, data, pieces: current_figure(pieces),
     "load_share": lambda fit, data, pieces: load_figure(fit),
 }
 """Pictures of a fit by name."""
@@ -40,11 +40,7 @@ def identify_plots(fit: Fit, data: Runs, out: Path) -> list[Path]:
 
 
 def picture(fit: Fit, data: Runs, name: str) -> Figure:
-    """One picture of a fit, by its name in `PICTURES`.
-
-    Raises:
-        ValueError: no such picture, or the runs have nothing for it.
-    """
+    """One picture by name; ValueError where there is none, or the runs have nothing for it."""
     if name not in PICTURES:
         raise ValueError(f"no picture '{name}'; there are {', '.join(PICTURES)}")
     made = PICTURES[name](fit, data, seen(fit.robot, data, fit.channels.windows))

@@ -51,7 +51,7 @@ def heading_figure(robot: Robot, seen: Seen) -> Figure | None:
         axes[row, 0].set_ylabel(label)
     handles = [
         axes[0, 0].plot([], [], color=c, marker=m, ms=4, label=f"{v:g} m/s")[0]
-        for v, (c, m) in zip(speeds, drawing.styled(len(speeds)), strict=True)
+        for v, (c, m) in zip(speeds, drawing.STYLES, strict=False)
     ]
     made.legend(handles=handles, loc="outside right upper", frameon=False, title="speed")
     return made
@@ -72,7 +72,7 @@ def _headings(robot: Robot, seen: Seen, g: int, speeds: list[float], axes: Seque
     mine = seen.straight & (seen.group == g)
     nearest = np.argmin(np.abs(seen.speed[:, None] - np.asarray(speeds)), axis=1)
     heading = np.linspace(0.0, 360.0, 181)
-    for k, (colour, marker) in enumerate(drawing.styled(len(speeds))):
+    for k, (colour, marker) in enumerate(drawing.STYLES[: len(speeds)]):
         picked = mine & (nearest == k)
         if not picked.any():
             continue

@@ -178,13 +178,7 @@ def _floor(track: Track) -> np.ndarray:
 
 
 def _medians(
-    axes: Axes,
-    x: np.ndarray,
-    slip: np.ndarray,
-    colour: str,
-    marker: str,
-    label: str,
-    width: float,
+    axes: Axes, x: np.ndarray, slip: np.ndarray, colour: str, marker: str, label: str, width: float
 ) -> None:
     """Running medians, where a bin holds enough points for one to mean something."""
     bins = np.floor(x / width).astype(int)

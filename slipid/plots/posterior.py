@@ -17,13 +17,9 @@ PANELS = 6
 
 
 def posterior_plots(fit: Fit, found: Posterior, out: Path) -> list[Path]:
-    """Files of intervals of every number, and of the pairs that are bent the most."""
+    """Files of all `PICTURES`."""
     z = found.z.reshape(-1, fit.space.size)
-    figures = {
-        "posterior_intervals": interval_figure(fit, z),
-        "posterior_pairs": pair_figure(fit, z),
-    }
-    return drawing.save_all(figures, out)
+    return drawing.save_all({f"posterior_{k}": draw(fit, z) for k, draw in PICTURES.items()}, out)
 
 
 def interval_figure(fit: Fit, z: np.ndarray) -> Figure:
@@ -73,6 +69,10 @@ def pair_figure(fit: Fit, z: np.ndarray) -> Figure:
         for name, put in ((fit.space.names[i], ax.set_xlabel), (fit.space.names[j], ax.set_ylabel)):
             put(name.removeprefix("surface."), fontsize=8)
     return made
+
+
+PICTURES = {"intervals": interval_figure, "pairs": pair_figure}
+"""Pictures of a posterior by name."""
 
 
 def bent(z: np.ndarray) -> list[tuple[int, int]]:

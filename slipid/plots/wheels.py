@@ -26,12 +26,8 @@ def curve_figure(fit: Fit, seen: Seen) -> Figure:
     """Slip over torque of every floor with its 90 % band, over what was seen of every wheel."""
     floors = list(dict.fromkeys(floor for floor, _ in seen.groups))
     measured = seen.amps is not None
-    made, axes = drawing.panels(
-        len(floors),
-        3.7,
-        3.9,
-        "A wheel that pushes harder slips more, and more still when it rolls sideways",
-    )
+    title = "A wheel that pushes harder slips more, and more still when it rolls sideways"
+    made, axes = drawing.panels(len(floors), 3.7, 3.9, title)
     drawn = None
     for ax, floor in zip(axes, floors, strict=True):
         drawn = _cloud(ax, fit.robot, seen, floor) or drawn
@@ -126,16 +122,13 @@ def wheel_curve(
     return np.asarray(frame.radius * weight * felt)
 
 
-def current_figure(robot: Robot, seen: Seen) -> Figure | None:
+def current_figure(seen: Seen) -> Figure | None:
     """Measured current against predicted traction, a row per wheel, a column per floor and load."""
     if seen.amps is None:
         return None
     wheels, groups = seen.amps.shape[1], seen.groups
-    made = drawing.figure(
-        1.4 + 2.9 * max(len(groups), 2),
-        0.9 + 2.5 * wheels,
-        "Motor currents rise with the traction that the force balance predicts for each wheel",
-    )
+    title = "Motor currents rise with the traction that the force balance predicts for each wheel"
+    made = drawing.figure(1.4 + 2.9 * max(len(groups), 2), 0.9 + 2.5 * wheels, title)
     axes = made.subplots(wheels, len(groups), sharex="col", sharey=True, squeeze=False)
     top = float(np.quantile(np.abs(seen.wheel_speed), 0.98))
     drawn = None

@@ -37,11 +37,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def writable(folder: Path) -> None:
-    """Make a folder and try to write to it, before hours of work that end there.
-
-    Raises:
-        DataError: nothing can be written there.
-    """
+    """Make a folder and try to write to it, before hours of work that end there."""
     write_bytes(folder / ".writable", b"")
     (folder / ".writable").unlink()
 
@@ -71,11 +67,7 @@ def _plain(value: object) -> object:
 
 
 def read_json(path: Path, what: str) -> Any:
-    """JSON of a file that this program wrote.
-
-    Raises:
-        DataError: absent or damaged; says what was expected there.
-    """
+    """JSON of a file that this program wrote; DataError says what was expected there."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

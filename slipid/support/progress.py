@@ -17,22 +17,16 @@ class Reporter:
 
     def __init__(self, quiet: bool = False):
         # late: every command names a reporter, and `--help` needs none
+        from rich import progress as bars
         from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
 
         self._console = Console(stderr=True, highlight=False, quiet=quiet)
-        self._bars = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            TextColumn("{task.fields[what]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
+        self._bars = bars.Progress(
+            bars.TextColumn("{task.description}"),
+            bars.BarColumn(bar_width=24),
+            bars.TextColumn("{task.fields[what]}"),
+            bars.TimeElapsedColumn(),
+            bars.TimeRemainingColumn(),
             console=self._console,
             transient=True,
             speed_estimate_period=MEMORY_S,
@@ -51,7 +45,7 @@ class Reporter:
 
     def line(self, text: str) -> None:
         """One sentence that stays."""
-        self._print(text)
+        self._console.print(text, markup=False, soft_wrap=True)
 
     def stage(self, name: str) -> None:
         """A new part of the work begins."""
@@ -62,7 +56,7 @@ class Reporter:
         self._task = self._bars.add_task(name, total=None, what="")
         self._stage, self._told = name, time.monotonic()
         if self._bars.disable:
-            self._print(f"{name} ...")
+            self.line(f"{name} ...")
 
     def note(self, what: str) -> None:
         """What is going on at this moment; on a bar only."""
@@ -85,7 +79,4 @@ class Reporter:
             return
         self._told = now
         left = next(task for task in self._bars.tasks if task.id == self._task).time_remaining
-        self._print(f"  {what}" + (f", about {left:.0f} s left" if left else ""))
-
-    def _print(self, text: str) -> None:
-        self._console.print(text, markup=False, soft_wrap=True)
+        self.line(f"  {what}" + (f", about {left:.0f} s left" if left else ""))

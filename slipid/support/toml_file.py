@@ -5,15 +5,7 @@ from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import UnionType
-from typing import (
-    Annotated,
-    Literal,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
@@ -39,11 +31,7 @@ class Section(BaseModel):
 
 
 def text_of(path: Path, what: str = "a config") -> str:
-    """Text of a file that should be of some kind.
-
-    Raises:
-        DataError: unreadable.
-    """
+    """Text of a file that should be of some kind; DataError where it is unreadable."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
@@ -53,11 +41,7 @@ def text_of(path: Path, what: str = "a config") -> str:
 
 
 def mapping_of(path: Path, text: str) -> Content:
-    """What TOML text says.
-
-    Raises:
-        DataError: no TOML.
-    """
+    """What TOML text says; DataError where it is no TOML."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -65,11 +49,7 @@ def mapping_of(path: Path, text: str) -> Content:
 
 
 def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
-    """A mapping as a pydantic model or dataclass.
-
-    Raises:
-        DataError: unknown or missing keys, wrong values; every one on a line.
-    """
+    """A mapping as a pydantic model or dataclass; DataError with every mistake on a line."""
     try:
         return TypeAdapter(model).validate_python(mapping)
     except ValidationError as error:

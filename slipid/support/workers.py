@@ -4,7 +4,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -12,36 +12,50 @@ from multiprocessing import active_children, get_context
 from typing import TypeVar
 
 from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
 def spread(
-    work: Callable[[Job], Result], todo: Sequence[Job], jobs: int, *, alone: bool = False
-) -> Generator[tuple[Job, Result], None, None]:
-    """Pieces of work and their results, in the order they are finished; to be closed.
+    work: Callable[[Job], Result],
+    todo: Mapping[str, Job],
+    jobs: int,
+    report: Reporter,
+    *,
+    alone: bool = False,
+) -> list[Result]:
+    """Results of pieces of work in the order they are finished, each of them reported.
 
     Args:
         work: a function of a module, what it takes and gives can be pickled.
-        todo: what it is called with.
-        jobs: processes at once.
+        todo: what it is called with, by name.
+        jobs: processes at once, where there is as much to do.
         alone: with one job, in this process.
 
     Raises:
         DataError: a process was ended by the system.
     """
-    if alone and jobs <= 1:
-        yield from ((job, work(job)) for job in todo)
-        return
+    found: list[Result] = []
+
+    def tell(name: str, result: Result) -> None:
+        found.append(result)
+        report.advance(len(found), len(todo), f"{len(found)} of {len(todo)}, {name}")
+
+    jobs = min(jobs, len(todo))
+    if not todo or (alone and jobs == 1):
+        for name, job in todo.items():
+            tell(name, work(job))
+        return found
     # forked processes would inherit the threads of whatever the caller has loaded
     others = set(active_children())
     pool = ProcessPoolExecutor(jobs, get_context("spawn"), _work_for, (os.getpid(),))
     try:
         with _deaf():  # Ctrl-C is for this process, from the start of the others on
-            waiting = {pool.submit(work, job): job for job in todo}
+            waiting = {pool.submit(work, job): name for name, job in todo.items()}
         for future in as_completed(waiting):
-            yield waiting[future], future.result()
+            tell(waiting[future], future.result())
         pool.shutdown()
     except BrokenProcessPool as error:
         raise DataError(
@@ -51,6 +65,7 @@ def spread(
         pool.shutdown(wait=False, cancel_futures=True)
         for child in set(active_children()) - others:
             child.terminate()
+    return found
 
 
 @contextmanager

@@ -81,12 +81,7 @@ class Run:
 
 
 def straight(
-    surface: str,
-    load: str,
-    heading: float,
-    speed: float,
-    distance: float,
-    turn: float = 0.0,
+    surface: str, load: str, heading: float, speed: float, distance: float, turn: float = 0.0
 ) -> Run:
     """A constant command that starts so that a robot without slip is in the middle halfway.
 

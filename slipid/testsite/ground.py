@@ -58,46 +58,13 @@ class Ground:
         return float((self.softness_m / (1.9 * GRAVITY)) ** 0.5)
 
 
+# friction, rolling_m, softness_m, shear_n_m, compaction, body_drag_n, then as declared
 GROUNDS: dict[str, Ground] = {
     "firm": Ground(rolling_m=0.0004, unevenness=0.05, colour="#e8e4da"),
-    "short": Ground(
-        friction=0.75,
-        rolling_m=0.0008,
-        softness_m=0.001,
-        shear_n_m=1.2e4,
-        compaction=2e4,
-        unevenness=0.1,
-        colour="#8a5a35",
-    ),
-    "medium": Ground(
-        friction=0.8,
-        rolling_m=0.0018,
-        softness_m=0.004,
-        shear_n_m=4.5e3,
-        compaction=4e3,
-        unevenness=0.15,
-        colour="#8f9194",
-    ),
-    "soft": Ground(
-        friction=0.8,
-        rolling_m=0.0028,
-        softness_m=0.007,
-        shear_n_m=2.2e3,
-        compaction=3e3,
-        body_drag_n=0.5,
-        unevenness=0.15,
-        colour="#1f6b45",
-    ),
-    "ribbed": Ground(
-        friction=0.6,
-        rolling_m=0.0006,
-        softness_m=0.001,
-        shear_n_m=2e4,
-        rib_height_m=0.0012,
-        rib_distance_m=0.02,
-        unevenness=0.05,
-        colour="#3f4a5a",
-    ),
+    "short": Ground(0.75, 0.0008, 0.001, 1.2e4, 2e4, unevenness=0.1, colour="#8a5a35"),
+    "medium": Ground(0.8, 0.0018, 0.004, 4.5e3, 4e3, unevenness=0.15, colour="#8f9194"),
+    "soft": Ground(0.8, 0.0028, 0.007, 2.2e3, 3e3, 0.5, unevenness=0.15, colour="#1f6b45"),
+    "ribbed": Ground(0.6, 0.0006, 0.001, 2e4, 0.0, 0.0, 0.0012, 0.02, 0.05, "#3f4a5a"),
 }
 """Surfaces by name: bare, a short carpet, two deeper ones, and a ribbed mat."""
 

@@ -23,11 +23,7 @@ CREEP = 0.02
 
 
 def engine() -> ModuleType:
-    """The mujoco module.
-
-    Raises:
-        DataError: it is not installed.
-    """
+    """The mujoco module; DataError where it is not installed."""
     try:
         import mujoco
     except ImportError:
@@ -51,9 +47,6 @@ class Plant:
         load: name of the load set-up.
         seed: seed of how the wheels stand at first, and of the floor's unevenness.
         timestep: [s].
-
-    Raises:
-        DataError: mujoco is not installed.
     """
 
     def __init__(

@@ -91,11 +91,9 @@ class Site:
     """Everything that stays the same from run to run.
 
     Attributes:
-        machine, motor, loop: the robot.
-        sensors: sensors that make its logs.
-        grounds: physics of every surface.
-        command_delay_s: delay from a command to the wheels.
-        acceleration: acceleration of the wheels' rims towards a new command [m/s^2].
+        machine, motor, loop: the robot; sensors: of its logs; grounds: every surface.
+        command_delay_s: from a command to the wheels.
+        acceleration: of the wheels' rims towards a new command [m/s^2].
     """
 
     machine: Machine = field(default_factory=Machine)

@@ -147,9 +147,6 @@ def film(
         true: time [s] (step,), pose (step, 3) and wheel_angle (step, wheel) of the run.
         frames: times of the video's frames [s].
         path: where the video goes (.avi, Motion JPEG).
-
-    Raises:
-        DataError: the video cannot be written.
     """
     import cv2
 
@@ -205,10 +202,7 @@ def _no_drawing(error: Exception) -> DataError:
 
 
 def _carpet(
-    floor: FloorMap,
-    site: Site,
-    extent: tuple[float, float, float, float],
-    rng: np.random.Generator,
+    floor: FloorMap, site: Site, extent: tuple[float, float, float, float], rng: np.random.Generator
 ) -> np.ndarray:
     """Picture of the floor: every surface in its colour, with a grain."""
     step = 0.002

@@ -71,8 +71,7 @@ def steps_of(kind):
 
     from slipid.control.closed_loop import Pilot
     from slipid.control.controller import Controller, Gains
-    from slipid.control.estimator import Estimator
-    from slipid.control.odometry import Odometry
+    from slipid.control.estimator import Estimator, Odometry
     from slipid.control.trajectory import rectangle
     from tests.helpers.compiled_pilot import CompiledPilot
 

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 
 from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains, Limits, limited
-from slipid.control.estimator import Estimator
+from slipid.control.estimator import Estimator, Odometry
 from slipid.control.interface import UNTIMED_S, Measurement, Readings, Settings
-from slipid.control.odometry import Odometry
 from slipid.control.pose_filter import _within
 from slipid.control.trajectory import rectangle
 from slipid.model.geometry import mecanum, omni

@@ -356,7 +356,7 @@ new = {name.split(".")[0] for name in set(sys.modules) - before}
 print(sorted(new - {"slipid", "jax", *sys.stdlib_module_names}))
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import Measurement
-from slipid.control.odometry import Odometry
+from slipid.control.estimator import Odometry
 from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller
 from slipid.control.trajectory import rectangle

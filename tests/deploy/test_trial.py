@@ -13,9 +13,9 @@ from slipid.control import trajectory as reference
 from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.deployed import DeployedRobot
+from slipid.control.estimator import Odometry
 from slipid.control.floor_filter import FloorFilter
 from slipid.control.interface import Measurement, Settings
-from slipid.control.odometry import Odometry
 from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.control.robot_file.typed import typed
 from slipid.data.floor_map import four_zones, uniform

@@ -143,7 +143,7 @@ def test_an_empty_figure_does_not_pass_for_a_picture(tmp_path):
 
 
 def test_without_currents_or_directions_those_pictures_are_left_out():
-    assert current_figure(ROBOT, replace(pieces(), amps=None)) is None
+    assert current_figure(replace(pieces(), amps=None)) is None
     one_way = replace(pieces(), heading=np.full(len(pieces().heading), 90.0))
     assert heading_figure(ROBOT, one_way) is None
 

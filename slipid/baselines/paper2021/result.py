@@ -48,11 +48,7 @@ class PaperResult:
 
 
 def find_folder(data: Path) -> Path:
-    """The 2021 data set under a data root, or the root itself if it is that set.
-
-    Raises:
-        DataError: if neither is.
-    """
+    """The 2021 data set under a data root, or the root itself; DataError if it is neither."""
     for folder in (data / "robotino2021", data):
         if (folder / "experimental_data_gray.csv").is_file():
             return folder
@@ -67,9 +63,6 @@ def regenerate(folder: Path, logs: Iterable[Log] | None = None) -> PaperResult:
 
     Args:
         logs: the 2022 runs on one surface each, for the transfer between surfaces; None without.
-
-    Raises:
-        DataError: if a file or a column is missing.
     """
     return PaperResult(
         field=field_table(folder),

@@ -84,10 +84,6 @@ class Samples:
     def __len__(self) -> int:
         return len(self.slip)
 
-    def of(self, regressor: str) -> np.ndarray:
-        """What a form is a function of: `torque` or `current`."""
-        return self.torque if regressor == "torque" else self.current
-
 
 def pool(parts: Sequence[Samples]) -> Samples:
     """All points of several sets of one motor, in order."""

@@ -98,7 +98,7 @@ def fit_form(samples: Samples, name: str) -> FittedForm:
         ValueError: if there are fewer samples than coefficients.
     """
     regressor, powers = _FORMS[name]
-    x = samples.of(regressor)
+    x = getattr(samples, regressor)
     if len(x) < len(powers):
         raise ValueError(f"{name}: {len(x)} samples cannot fix {len(powers)} coefficients")
     design = x[:, None] ** np.array(powers)
@@ -112,13 +112,8 @@ def fit_form(samples: Samples, name: str) -> FittedForm:
 
 
 def surface_tables(folder: Path) -> dict[int, MotorTable]:
-    """The table behind figures 3 and 4, motors 1 to 3, from experimental_data_<surface>.csv.
-
-    Raises:
-        DataError: if a file or a column is missing.
-    """
-    recipe = FIGURES_3_AND_4
-    tables = {}
+    """The table behind figures 3 and 4, motors 1 to 3, from experimental_data_<surface>.csv."""
+    recipe, tables = FIGURES_3_AND_4, {}
     for surface in SURFACES:
         path = folder / f"experimental_data_{surface}.csv"
         tables[surface] = read_columns(path, "robotino2021", needed(recipe))
@@ -133,11 +128,7 @@ def surface_tables(folder: Path) -> dict[int, MotorTable]:
 
 
 def field_table(folder: Path) -> MotorTable:
-    """Figure 2: motor 1 over the whole heterogeneous site, our least squares and the paper's SVR.
-
-    Raises:
-        DataError: if the file or a column is missing.
-    """
+    """Figure 2: motor 1 over the whole site, our least squares and the paper's SVR."""
     path = folder / "experimental_data_on_whole_field.csv"
     table = read_columns(path, "robotino2021_field", needed(FIGURE_2))
     samples = slip_samples(table, 1, FIGURE_2)
@@ -148,7 +139,7 @@ def field_table(folder: Path) -> MotorTable:
 
 def _stored(regressor: str, coefficients: tuple[float, ...], samples: Samples) -> FittedForm:
     form = FittedForm(regressor, coefficients, first_power=0, rmse=0.0)
-    return replace(form, rmse=_rms(samples.slip - form.slip(samples.of(regressor))))
+    return replace(form, rmse=_rms(samples.slip - form.slip(getattr(samples, regressor))))
 
 
 def _rms(error: np.ndarray) -> float:

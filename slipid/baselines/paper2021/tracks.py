@@ -98,11 +98,7 @@ class Track:
 
 
 def read_track(folder: Path, file: TrackFile) -> Track:
-    """One track of figure 7, below the folder of the 2021 data set.
-
-    Raises:
-        DataError: if the file or a column is missing or the track ends within its first side.
-    """
+    """One track of figure 7; DataError where the file is broken or ends within its first side."""
     path = folder / "figure7" / f"square_{file.square}_camera.csv"
     table = read_columns(path, "robotino2021_camera")
     frames = len(table["time_s"])

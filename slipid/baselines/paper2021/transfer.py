@@ -43,9 +43,6 @@ def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         |current| [A] and slip [-], both (window, wheel); slip is not finite where a wheel rests.
-
-    Raises:
-        ValueError: if the log has no pose or no current.
     """
     if log.pose is None or log.current is None:
         raise ValueError(f"{log.name}: slip against current needs both pose and current")

@@ -24,11 +24,7 @@ ANEW = "copy it again, or write it anew with `slipid identify`"
 
 
 def write_robot(path: Path, record: RobotRecord) -> None:
-    """Write a robot.
-
-    Raises:
-        DataError: nothing can be written there.
-    """
+    """Write a robot; DataError where nothing can be written."""
     content: dict[str, object] = {"schema": SCHEMA, "units": UNITS, **asdict(record)}
     content["numbers"] = record.numbers
     content["checksum"] = checksum(content)
@@ -36,11 +32,7 @@ def write_robot(path: Path, record: RobotRecord) -> None:
 
 
 def read_robot(path: Path) -> RobotRecord:
-    """Read a robot.
-
-    Raises:
-        DataError: absent, no robot, of a newer version, damaged or changed; says which.
-    """
+    """Read a robot; errors as of `DeployedRobot.load`."""
     content = _content(path)
     said = content.pop("checksum", None)
     now = checksum(content)
@@ -108,11 +100,7 @@ def _text(value: object, indent: str = "") -> str:
 
 
 def check(record: RobotRecord) -> None:
-    """Refuse a record whose parts do not fit together.
-
-    Raises:
-        ValueError: says which and how.
-    """
+    """Refuse a record whose parts do not fit together by a ValueError that says which and how."""
     wheels = len(record.wheels.place)
     if not wheels:
         raise ValueError("wheels.place: no entries; expected one for every wheel")

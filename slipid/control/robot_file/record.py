@@ -225,11 +225,7 @@ class RobotRecord:
         return tuple(floor.name for floor in self.floors)
 
     def load_index(self, name: str | None) -> int:
-        """Place of a load set-up, the first one where none is named.
-
-        Raises:
-            ValueError: no such load set-up; names those there are.
-        """
+        """Place of a load set-up, the first by default; ValueError with the choices if absent."""
         names = [load.name for load in self.loads]
         if name not in (None, *names):
             raise ValueError(f"no load set-up '{name}'; identified: {', '.join(names)}")

@@ -1,6 +1,6 @@
 """JSON values as the types a dataclass declares, refused with their place where they are not."""
 
-import math
+import sys
 import typing
 from collections.abc import Mapping
 from contextlib import suppress
@@ -9,6 +9,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 Kind = TypeVar("Kind")
+_MOST = sys.float_info.max
 _PLAIN = {bool: "true or false", str: "text", int: "a whole number", NoneType: "null"}
 
 
@@ -44,32 +45,22 @@ def _as(kind: Any, value: object, where: str) -> Any:
     if is_dataclass(kind):
         return _object(kind, value, where)
     if kind is float:
-        return _float(value, where)
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _MOST:
+            return float(value)
+        raise _wrong(where, value, "a number")
     if type(value) is not kind:
         raise _wrong(where, value, _PLAIN[kind])
     return value
 
 
-def _float(value: object, where: str) -> float:
-    number = math.nan
-    with suppress(OverflowError):
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            number = float(value)
-    if not math.isfinite(number):
-        raise _wrong(where, value, "a number")
-    return number
-
-
 def _one_of(kinds: tuple[Any, ...], value: object, where: str) -> Any:
     if value is None and NoneType in kinds:
         return None
-    rest = [k for k in kinds if k is not NoneType]
-    for k in rest[:-1]:
-        try:
+    *others, last = (k for k in kinds if k is not NoneType)
+    for k in others:
+        with suppress(ValueError):
             return _as(k, value, where)
-        except ValueError:
-            continue
-    return _as(rest[-1], value, where)
+    return _as(last, value, where)
 
 
 def _items(inner: tuple[Any, ...], value: object, where: str) -> tuple[Any, ...]:

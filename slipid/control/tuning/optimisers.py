@@ -12,20 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.tuning.objective import (
-    BATCH,
-    GAINS,
-    HAND,
-    Cases,
-    Task,
-    box_of,
-    combined,
-    gains_at,
-    losses,
-    penalties,
-    penalty_slope,
-    slopes,
-)
+from slipid.control.tuning import objective
+from slipid.control.tuning.objective import BATCH, GAINS, HAND, Cases, Task, box_of, gains_at
 
 Method = Literal["gradient", "pso"]
 GRADIENT = len(GAINS) + 1
@@ -93,7 +81,7 @@ class Search:
         """Gains a search has come to, as far on the way there from those by hand as is stable."""
         end, hand = self._places(state).mean(axis=0), box_of(HAND)
         way = hand + np.linspace(1.0, 0.0, _HALTS)[:, None] * (end - hand)
-        push = np.asarray(penalties(self.task, jnp.asarray(way), self.stable))
+        push = np.asarray(objective.penalties(self.task, jnp.asarray(way), self.stable))
         stable = np.flatnonzero(push <= 0)
         at = way[stable[0] if len(stable) else int(np.argmin(push))]
         return np.asarray(gains_at(jnp.asarray(at)))
@@ -116,8 +104,8 @@ class Search:
         rng = np.random.default_rng([self.seed, k + 1])
         cases = self.cases.at(rng.choice(len(self.cases), BATCH, replace=False))
         x = jnp.asarray(state["x"])
-        found, values = (np.asarray(a) for a in slopes(self.task, x, cases))
-        push = penalty_slope(self.task, x, self.stable)
+        found, values = (np.asarray(a) for a in objective.slopes(self.task, x, cases))
+        push = objective.penalty_slope(self.task, x, self.stable)
         worst = np.argsort(values)[-max(1, -(-BATCH // 10)) :]
         good = np.where(np.isfinite(found), found, 0.0)
         # one case where a floor's edge is touched must not decide
@@ -136,9 +124,9 @@ class Search:
         rng = np.random.default_rng([self.seed, k + 1])
         cases, x = self.cases.at(np.arange(BATCH)), state["x"]
         parts = x.reshape(-1, 6, len(GAINS))  # few at a time need less memory
-        push = [penalties(self.task, jnp.asarray(part), self.stable) for part in parts]
-        loss = [float(combined(losses(self.task, jnp.asarray(row), cases))) for row in x]
-        value = np.array(loss) + np.concatenate(push)
+        push = [objective.penalties(self.task, jnp.asarray(part), self.stable) for part in parts]
+        loss = [objective.losses(self.task, jnp.asarray(row), cases) for row in x]
+        value = np.array([float(objective.combined(each)) for each in loss]) + np.concatenate(push)
         value = np.where(np.isfinite(value), value, np.inf)
         better = value < state["value"]
         own = np.where(better[:, None], x, state["own"])

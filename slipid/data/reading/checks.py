@@ -62,11 +62,7 @@ def check_time(table: Table, layout: Layout, time: Float[np.ndarray, " row"]) ->
 def filled(
     table: Table, channel: Channel, time: Float[np.ndarray, " row"], notes: list[str]
 ) -> Float[np.ndarray, "row column"]:
-    """Cells of a channel, up to three missing in a row filled linearly in time; bursts are refused.
-
-    Raises:
-        DataError: an infinite cell, a burst of missing ones, or too many of them in all.
-    """
+    """Cells of a channel, up to three missing in a row filled linearly in time; refuses bursts."""
     cells = table.stacked(channel)
     for j, column in enumerate(channel.columns):
         values = cells[:, j]
@@ -145,9 +141,7 @@ def _check_wheels(log: Log, table: Table, layout: Layout) -> None:
     if command is None:
         return
     # Half a second and a radian of commanded motion that the wheel answers with none at all.
-    commanded = np.abs(
-        np.sum(0.5 * (command[1:] + command[:-1]) * np.diff(log.time)[:, None], axis=0)
-    )
+    commanded = np.abs(integral(log.time, command)[-1])
     still = np.ptp(log.wheel_angle, axis=0) == 0
     dead = np.flatnonzero(still & (commanded > 1.0))
     if len(dead):

@@ -122,13 +122,10 @@ def check_units(path: Path, line: str, header: list[str], layout: Layout) -> Non
             at = header.index(str(column))
             written = units[at] if at < len(units) else ""
             if not same_unit(written, channel.unit):
-                raise bad_data(
-                    path,
-                    f"the units row says '{written}'",
-                    f"'{channel.unit}' as the layout {layout.name} declares",
-                    row=layout.units_row,
-                    column=str(column),
-                )
+                found = f"the units row says '{written}'"
+                expected = f"'{channel.unit}' as the layout {layout.name} declares"
+                row = layout.units_row
+                raise bad_data(path, found, expected, row=row, column=str(column))
 
 
 def cell_by_cell(

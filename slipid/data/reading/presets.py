@@ -13,11 +13,7 @@ from slipid.support.toml_file import checked
 
 
 def preset(name: str) -> Layout:
-    """Layout of a known kind of log file.
-
-    Raises:
-        DataError: there is no such preset; the message names the choices.
-    """
+    """Layout of a known kind of log file; DataError with the choices if there is none."""
     if name not in PRESETS:
         raise DataError(f"preset: {unknown('format', name, PRESETS)}")
     return PRESETS[name]
@@ -61,12 +57,13 @@ _MOTORS_2022 = {
     "motor_speed_command": _motors("m{}setvel", "rad/s"),
     "current": _motors("m{}cur", "A"),
 }
-_TWIST_2022 = {
+_DRIVE_2022 = {
+    **_MOTORS_2022,
     "twist_command_x": _one("xsetspeed", "m/s"),
     "twist_command_y": _one("ysetspeed", "m/s"),
     "twist_command_yaw": _one("setvel", "rad/s"),
+    "wheel_ticks": _motors("m{}pos", "tick"),
 }
-_TICKS_2022 = _motors("m{}pos", "tick")
 _DRIVE_2021 = {
     "twist_command_x": _one("X axis speed, mm/s", "mm/s"),
     "twist_command_y": _one("Y axis speed, mm/s", "mm/s"),
@@ -83,19 +80,10 @@ _LAYOUTS = (
         _ROBOTINO_2022,
         name="robotino2022",
         metres_per_pixel=_METRES_PER_PIXEL,
-        channels={
-            **_MOTORS_2022,
-            **_TWIST_2022,
-            **_camera("xpos", "ypos", "ang"),
-            "wheel_ticks": _TICKS_2022,
-        },
+        channels=_DRIVE_2022 | _camera("xpos", "ypos", "ang"),
     ),
     # The same robot out of the camera's sight.
-    replace(
-        _ROBOTINO_2022,
-        name="robotino2022_blind",
-        channels={**_MOTORS_2022, **_TWIST_2022, "wheel_ticks": _TICKS_2022},
-    ),
+    replace(_ROBOTINO_2022, name="robotino2022_blind", channels=_DRIVE_2022),
     # Wheels in the air, speed steps. The tick columns are left out on purpose: they do not
     # accumulate in these files, so the angle comes from the reported speed.
     replace(_ROBOTINO_2022, name="robotino2022_motor", channels=_MOTORS_2022),

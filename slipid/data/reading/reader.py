@@ -75,9 +75,6 @@ def read_logs(
         root: data folder above the file, which the names of the runs are relative to.
         surface: name of the floor; `folder` stands for that of the file's folder less `_surface`.
         load: name of the load set-up.
-
-    Raises:
-        DataError: the file, row or column that is wrong, what is there and what was expected.
     """
     surface = path.parent.name.removesuffix("_surface") if surface == "folder" else surface
     table = read_table(path, layout)
@@ -96,11 +93,7 @@ def read_logs(
 
 
 def find_logs(root: Path, pattern: str) -> list[Path]:
-    """Files under `root` that match a glob, sorted by name.
-
-    Raises:
-        DataError: where none matches; names the folders and files next to it.
-    """
+    """Files under `root` that match a glob, sorted by name; DataError where there are none."""
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; expected the folder of the logs")
     found = sorted(p for p in root.glob(pattern) if p.is_file())
@@ -186,10 +179,7 @@ def _channel(
 
 
 def _wheel_angle(
-    layout: Layout,
-    have: dict[str, np.ndarray],
-    time: Float[np.ndarray, " row"],
-    notes: list[str],
+    layout: Layout, have: dict[str, np.ndarray], time: Float[np.ndarray, " row"], notes: list[str]
 ) -> Float[np.ndarray, "row wheel"]:
     """Cumulative angle at the wheel: from ticks, else angles, else the integral of the speed."""
     if "wheel_ticks" in have:

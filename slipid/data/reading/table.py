@@ -7,14 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from slipid.data.reading.csv_text import (
-    cell_by_cell,
-    check_fields,
-    check_units,
-    header_cells,
-    text_lines,
-    wanted_names,
-)
+from slipid.data.reading import csv_text
 from slipid.data.reading.layout import Channel, Layout
 from slipid.support.errors import bad_data
 
@@ -64,20 +57,20 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     if path.suffix == ".parquet":
         names, values = _parquet(path, raw, layout, all_columns)
         return Table(path, sha256, names, values, 1 + np.arange(len(values)))
-    text = text_lines(path, raw)
-    header = header_cells(path, text, layout)
-    names = wanted_names(path, header, layout, all_columns)
+    text = csv_text.text_lines(path, raw)
+    header = csv_text.header_cells(path, text, layout)
+    names = csv_text.wanted_names(path, header, layout, all_columns)
     body = text[layout.first_data_row - 1 :]
     if not body:
         raise bad_data(path, "no row of numbers after the header", "data", row=len(text))
-    check_fields(path, body, header, layout)
+    csv_text.check_fields(path, body, header, layout)
     if layout.units_row:
-        check_units(path, text[layout.units_row - 1], header, layout)
+        csv_text.check_units(path, text[layout.units_row - 1], header, layout)
     where = [header.index(str(name)) if layout.names_row else int(name) for name in names]
     try:
         values = np.loadtxt(body, delimiter=layout.delimiter, usecols=where, ndmin=2, comments=None)
     except ValueError:
-        values = cell_by_cell(path, body, names, where, layout)
+        values = csv_text.cell_by_cell(path, body, names, where, layout)
     lines_read = layout.first_data_row + np.arange(len(values))
     return Table(path, sha256, names, values, lines_read)
 
@@ -109,7 +102,7 @@ def _parquet(
         raise bad_data(path, f"no Parquet ({error})", "a whole Parquet file") from error
     header = list(table.column_names)
     layout = replace(layout, names_row=layout.names_row or 1)
-    names = wanted_names(path, header, layout, all_columns)
+    names = csv_text.wanted_names(path, header, layout, all_columns)
     if table.num_rows == 0:
         raise bad_data(path, "no rows", "rows of numbers")
     columns = []

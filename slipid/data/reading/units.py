@@ -1,5 +1,6 @@
 """Units of log columns: from the unit a column is declared in to SI, dimension checked."""
 
+from contextlib import suppress
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -82,7 +83,6 @@ def converts(unit: str, target: str) -> bool:
 
 def same_unit(one: str, other: str) -> bool:
     """Whether two texts mean the same unit, as "pix" and "pixel" do; False where unreadable."""
-    try:
+    with suppress(ValueError):
         return abs(factor(one, other) - 1.0) < 1e-9
-    except ValueError:
-        return False
+    return False

@@ -88,15 +88,9 @@ def plan(path: Path, text: str) -> Plan:
         }
         mapping = {**mapping, "surfaces": {**surfaces, **known}}
     content = checked(path, mapping, Content)
-    site = Site(
-        content.robot,
-        content.motor,
-        content.speed_loop,
-        content.sensors,
-        {**GROUNDS, **content.surfaces},
-        content.command_delay_s,
-        content.acceleration_m_s2,
-    )
+    robot = content.robot, content.motor, content.speed_loop, content.sensors
+    grounds = {**GROUNDS, **content.surfaces}
+    site = Site(*robot, grounds, content.command_delay_s, content.acceleration_m_s2)
     maps, everything = {}, list[ex.Run]()
     for name, given in content.maps.items():
         with _said_of(f"{path}: maps.{name}"):

@@ -64,10 +64,7 @@ def _averaged(
 
 
 def _camera(
-    trace: Trace,
-    site: Site,
-    rng: np.random.Generator,
-    time: Float[np.ndarray, " row"],
+    trace: Trace, site: Site, rng: np.random.Generator, time: Float[np.ndarray, " row"]
 ) -> tuple[Float[np.ndarray, "row 3"], Bool[np.ndarray, " row"]]:
     """Marker poses as the rows hold them, and which rows bring a new frame."""
     s = site.sensors

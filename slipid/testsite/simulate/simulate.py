@@ -69,14 +69,10 @@ def simulate(plan: Plan, out: Path, jobs: int, report: Reporter) -> Content:
         Job(name, run, plan.site, _seed(plan.content.seed, k), formats, out)
         for k, (name, run) in enumerate(plan.runs)
     ]
-    todo = [job for job in every if not _truth(job).is_file()]
+    todo = {job.name: job for job in every if not _truth(job).is_file()}
     report.stage(f"driving {len(todo)} of {len(every)} runs")
     began = time.monotonic()
-    seconds = 0.0
-    with closing(spread(drive_and_write, todo, min(jobs, len(todo)), alone=True)) as finished:
-        for done, (job, driven) in enumerate(finished, 1):
-            seconds += driven
-            report.advance(done, len(todo), f"{done} of {len(todo)}, {job.name}")
+    seconds = sum(spread(drive_and_write, todo, jobs, report, alone=True), 0.0)
     pace = seconds / max(time.monotonic() - began, 1e-9)
     _film([job for job in every if job.name in plan.filmed], plan.content.camera, jobs, report)
     content = {**about, "runs": [name for name, _ in plan.runs]}
@@ -86,15 +82,13 @@ def simulate(plan: Plan, out: Path, jobs: int, report: Reporter) -> Content:
 
 def _film(jobs: Sequence[Job], camera: Camera, processes: int, report: Reporter) -> None:
     """Videos of the runs that have none yet, with the camera's numbers beside them."""
-    todo = [(job, camera) for job in jobs if not _video(job).is_file()]
+    todo = {job.name: (job, camera) for job in jobs if not _video(job).is_file()}
     if not todo:
         return
     write_json(jobs[0].out / "video" / "camera.json", camera.as_dict())
     report.stage(f"filming {len(todo)} of {len(jobs)} runs")
     # in processes of their own, also one by one: what draws has to be chosen before MuJoCo is there
-    with closing(spread(film_and_write, todo, min(processes, len(todo)))) as finished:
-        for done, ((job, _), _) in enumerate(finished, 1):
-            report.advance(done, len(todo), f"{done} of {len(todo)}, {job.name}")
+    spread(film_and_write, todo, processes, report)
 
 
 def film_and_write(what: tuple[Job, Camera]) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slipid.control.controller import Controller, Gains
-from slipid.control.odometry import Odometry
+from slipid.control.estimator import Odometry
 from slipid.control.tuning import objective as tuning
 from slipid.control.tuning import optimisers as searching
 from slipid.control.tuning.actuation import Habits

@@ -7,7 +7,7 @@ import pytest
 
 from slipid.control.closed_loop import Pilot, Plant, drive
 from slipid.control.controller import Controller, Gains
-from slipid.control.odometry import Odometry
+from slipid.control.estimator import Odometry
 from slipid.control.trajectory import waypoints
 from slipid.control.tuning.actuation import RING, Habits
 from slipid.control.tuning.twin import Twin, TwinPlant, rollout
