@@ -49,12 +49,7 @@ class Problem:
     these shapes by others, under their own keys.
     """
 
-    def __init__(
-        self,
-        windows: Windows,
-        robot: Robot,
-        choices: Sequence[Choice],
-    ):
+    def __init__(self, windows: Windows, robot: Robot, choices: Sequence[Choice]):
         self.space = Space(robot, choices)
         self.joint = not windows.has_current
         self.robot: Robot = self.space.template
