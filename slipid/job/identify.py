@@ -173,7 +173,7 @@ def summarised(task: Task, problem: Problem, optimum: Optimum, report: Reporter)
         sets = [crossing(data, floor, fit.robot) for data, floor in task.mixed]
         found = update(fit.space, fit.z, fit.covariance, sets)
         report.line(_judged(found.about))
-        fit = updated(fit, found, problem, optimum, task.dataset)
+        fit = updated(fit, found, problem, task.dataset)
     report.stage("simpler models, for comparison")
     return _with_baselines(fit, task)
 
