@@ -13,11 +13,10 @@ from slipid.identify.posterior import netcdf
 from slipid.identify.posterior import sample as posterior
 from slipid.identify.posterior.blocks import FORMAT, Block, Plan, Record, packed, unpacked
 from slipid.identify.posterior.coordinates import ELECTRIC, Fitted
-from slipid.identify.posterior.diagnosis import Posterior
+from slipid.identify.posterior.diagnosis import Posterior, estimates, identified
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.config import read_config
-from slipid.job.drawn_estimates import estimates, identified
 from slipid.job.problem import Job, read_job
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.content import Content

@@ -15,11 +15,10 @@ from jaxtyping import Float
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.variances import Square
 from slipid.identify.posterior import diagnosis, ensemble
-from slipid.identify.posterior.blocks import Block, Chain, Plan, Record
+from slipid.identify.posterior.blocks import Block, Chain, Plan, Record, Target
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.identify.posterior.density import Density, Held
 from slipid.identify.posterior.diagnosis import Posterior
-from slipid.identify.posterior.target import Target
 
 STILL = 0.01
 """Part of the walkers of the second stage that may never have moved."""
@@ -72,7 +71,6 @@ def sample(
         names=at.names,
         diagnosis=found,
         accepted=accepted,
-        still=still,
         unsettled=drifting,
         converged=found.converged and still <= STILL and drifting <= 1,
         reason=reason,
