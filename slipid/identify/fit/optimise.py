@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem, State, linear, log_jacobian
 from slipid.identify.fit.variances import Blocks, Search, Square, Target, scored
-from slipid.search_space import Space
 
 CREEPS = (0.05, 0.4, 1.0)
 """Starts of the creep of every floor; others end in poor minima."""
@@ -151,16 +150,12 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
         weight = problem.whitening(residual, state.log_variance, every).weight["motion"]
         cost = -np.log(np.asarray(weight))  # as good as the loss, but for factor and constant
         for number, label in enumerate(labels):
+            own = space.where(lambda e, label=label: e.surface == label)
             mine = float(np.sum(cost[(floors == number) & (keep > 0)]))
             if mine < best[number]:
                 best[number] = mine
-                own = _of_floor(space, label)
                 z[own] = state.z[own]
     return State(z, log_v, 0, np.inf, np.inf, "joint")
-
-
-def _of_floor(space: Space, label: str) -> np.ndarray:
-    return space.where(lambda e: e.surface == label)
 
 
 def _motor_start(problem: Problem) -> np.ndarray:

@@ -23,6 +23,7 @@ from slipid.identify.verdicts.estimates import (
     by_ratio,
     derived,
     from_zero,
+    plain,
     provenance,
 )
 from slipid.support.content import Content
@@ -131,17 +132,14 @@ def estimates(fit: Fit, found: Posterior) -> dict[str, Estimate]:
         scaled = np.cov((z / fit.space.prior_std[at]).T).reshape(e.coordinates, e.coordinates)
         ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
         pairs = tuple(zip(low.tolist(), high.tolist(), strict=True))
-        mean = np.asarray(d.to_si(jnp.asarray(z.mean(axis=0)))).tolist()
-        std = values.std(axis=0).tolist()
-        single = len(pairs) == 1
         kept = old.verdict == "at_bound" or (e.path in NEEDS_VOLTAGE and not fit.channels.voltage)
         verdict = old.verdict if kept else by_ratio(ratio, from_zero(d, z.std(axis=0)))
         pull = (z.mean(axis=0) - fit.space.prior_mean[at]) / fit.space.prior_std[at]
         out[e.path] = replace(
             old,
-            value=mean[0] if single else tuple(mean),
-            std=std[0] if single else tuple(std),
-            interval90=pairs[0] if single else pairs,
+            value=plain(d.to_si(jnp.asarray(z.mean(axis=0)))),
+            std=plain(values.std(axis=0)),
+            interval90=pairs[0] if len(pairs) == 1 else pairs,
             ratio=ratio,
             verdict=verdict,
             provenance=provenance(verdict, ratio),
