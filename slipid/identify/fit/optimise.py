@@ -138,6 +138,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
     first = _motor_start(problem)
     best, z = np.full(len(labels), np.inf), first.copy()
     floors = np.asarray(problem.batch.surface)
+    of_floor = np.repeat([e.surface or "" for e in space.free], [e.coordinates for e in space.free])
     for attempt, value in enumerate(CREEPS):
         stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
         start = np.where(creep, np.log(value), first)
@@ -150,11 +151,10 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
         weight = problem.whitening(residual, state.log_variance, every).weight["motion"]
         cost = -np.log(np.asarray(weight))  # as good as the loss, but for factor and constant
         for number, label in enumerate(labels):
-            own = space.where(lambda e, label=label: e.surface == label)
             mine = float(np.sum(cost[(floors == number) & (keep > 0)]))
             if mine < best[number]:
                 best[number] = mine
-                z[own] = state.z[own]
+                z = np.where(of_floor == label, state.z, z)
     return State(z, log_v, 0, np.inf, np.inf, "joint")
 
 
