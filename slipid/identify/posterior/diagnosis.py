@@ -17,15 +17,7 @@ from slipid.identify.fit_file import curves_json, identified_json, number_json
 from slipid.identify.posterior.blocks import Chain, Plan
 from slipid.identify.posterior.coordinates import Fitted
 from slipid.identify.result import Fit
-from slipid.identify.verdicts.estimates import (
-    NEEDS_VOLTAGE,
-    Estimate,
-    by_ratio,
-    derived,
-    from_zero,
-    plain,
-    provenance,
-)
+from slipid.identify.verdicts import estimates as verdicts
 from slipid.support.content import Content
 
 
@@ -116,7 +108,7 @@ def autocorrelation_time(chain: Chain) -> Float[np.ndarray, " size"]:
     return np.asarray(np.maximum(sums[window, np.arange(sums.shape[1])], 1e-3))
 
 
-def estimates(fit: Fit, found: Posterior) -> dict[str, Estimate]:
+def estimates(fit: Fit, found: Posterior) -> dict[str, verdicts.Estimate]:
     """Every number with mean, interval and verdict from the draws.
 
     Means are taken in the search space, so that shares sum to one and positive numbers have their
@@ -132,17 +124,19 @@ def estimates(fit: Fit, found: Posterior) -> dict[str, Estimate]:
         scaled = np.cov((z / fit.space.prior_std[at]).T).reshape(e.coordinates, e.coordinates)
         ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
         pairs = tuple(zip(low.tolist(), high.tolist(), strict=True))
-        kept = old.verdict == "at_bound" or (e.path in NEEDS_VOLTAGE and not fit.channels.voltage)
-        verdict = old.verdict if kept else by_ratio(ratio, from_zero(d, z.std(axis=0)))
+        unsaid = e.path in verdicts.NEEDS_VOLTAGE and not fit.channels.voltage
+        verdict = verdicts.by_ratio(ratio, verdicts.from_zero(d, z.std(axis=0)))
+        if unsaid or old.verdict == "at_bound":
+            verdict = old.verdict
         pull = (z.mean(axis=0) - fit.space.prior_mean[at]) / fit.space.prior_std[at]
         out[e.path] = replace(
             old,
-            value=plain(d.to_si(jnp.asarray(z.mean(axis=0)))),
-            std=plain(values.std(axis=0)),
+            value=verdicts.plain(d.to_si(jnp.asarray(z.mean(axis=0)))),
+            std=verdicts.plain(values.std(axis=0)),
             interval90=pairs[0] if len(pairs) == 1 else pairs,
             ratio=ratio,
             verdict=verdict,
-            provenance=provenance(verdict, ratio),
+            provenance=verdicts.provenance(verdict, ratio),
             pull=float(pull[np.argmax(np.abs(pull))]),
             source="posterior",
         )
@@ -150,14 +144,14 @@ def estimates(fit: Fit, found: Posterior) -> dict[str, Estimate]:
 
 
 def identified(
-    fit: Fit, found: Posterior, numbers: Mapping[str, Estimate], problem: Problem
+    fit: Fit, found: Posterior, numbers: Mapping[str, verdicts.Estimate], problem: Problem
 ) -> Content:
     """Content of identified.json with what the posterior says, `numbers` being its estimates."""
     content = identified_json(fit)
     for path, e in numbers.items():
         content["parameters"][path] = number_json(e)
     flat = found.z.reshape(-1, fit.space.size)
-    ratios = derived(fit.space, flat.mean(axis=0), np.cov(flat.T), fit.channels.voltage)
+    ratios = verdicts.derived(fit.space, flat.mean(axis=0), np.cov(flat.T), fit.channels.voltage)
     content["derived"] = {e.path: number_json(_drawn(e, fit, flat)) for e in ratios}
     some = flat[:: max(1, len(flat) // 400)]
     curves = curves_of.curves(fit.space, flat.mean(axis=0), some, problem.batch)
@@ -167,7 +161,7 @@ def identified(
     return content
 
 
-def _drawn(ratio: Estimate, fit: Fit, flat: np.ndarray) -> Estimate:
+def _drawn(ratio: verdicts.Estimate, fit: Fit, flat: np.ndarray) -> verdicts.Estimate:
     """A quotient with the interval and the std of its draws."""
     over, under = (fit.space.place[path] for path in ratio.path.rsplit("/", 1))
     draws = np.exp(flat[:, over] - flat[:, under])
