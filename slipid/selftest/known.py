@@ -11,9 +11,6 @@ from slipid.model.robot import Robot, build
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
 
-ROBOTINO = (60.0, 180.0, 300.0)
-"""Azimuths of the wheels [deg]."""
-
 
 def numbers(robot: Robot) -> dict[str, float | list[float]]:
     """Every number of a robot by its path, as plain values."""
@@ -54,7 +51,7 @@ TRUTH: dict[str, float | tuple[float, ...]] = {
 def blank(drives: Sequence[Drive]) -> Robot:
     """Robotino at declared starts that knows the floors, loads and sessions of a plan."""
     return build(
-        omni(list(ROBOTINO), 0.125, 0.04, 16.0),
+        omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0),
         sorted({d.surface for d in drives}),
         tuple(dict.fromkeys(d.load for d in drives)),
         sorted({d.session for d in drives}),

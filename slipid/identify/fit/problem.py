@@ -51,7 +51,6 @@ class Problem:
 
     def __init__(self, windows: Windows, robot: Robot, choices: Sequence[Choice]):
         self.space = Space(robot, choices)
-        self.joint = not windows.has_current
         self.robot: Robot = self.space.template
         self.compiled: dict[Any, Any] = {}
         self._read(windows)
@@ -69,7 +68,7 @@ class Problem:
             batch=lk.batch(windows, self.robot),
             blocks=self.noise.blocks,
             typical=jnp.asarray(2 * np.log(self.noise.typical)),
-            joint=self.joint,
+            joint=not windows.has_current,
         )
 
     @property

@@ -35,7 +35,7 @@ def sample(
 ) -> Posterior:
     """Posterior around a fit, so many draws of each ensemble."""
     record = record or Record()
-    parts = (EVERYTHING,) if problem.joint else (MOTION, ELECTRIC)
+    parts = (EVERYTHING,) if problem.target.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
     at = first.coordinates
     target = Target(first.terms, first.slope, at.group, at.kind, first.centre, first.covariance)

@@ -135,7 +135,7 @@ def profile(
         interval90=(interval[0], interval[1]),
         ends=(ends[0], ends[1]),
         laplace90=(si(walk.start - half), si(walk.start + half)),
-        given="" if problem.joint or walk.of_motion else "the motion as fitted",
+        given="" if problem.target.joint or walk.of_motion else "the motion as fitted",
         settled=walk.settled,
         said=_sentence(entry, interval, ends, problem.windows.has_voltage)
         + ("" if walk.settled else "; some refits did not settle: it may be wider"),
@@ -151,7 +151,7 @@ class _Walk:
         self.problem, self.at, self.tell = problem, at, tell
         self.free, self.of_motion = np.ones(problem.space.size), False
         covariance = optimum.covariance
-        if not problem.joint:
+        if not problem.target.joint:
             electric = problem.space.electric
             self.of_motion = not electric[at]
             mine = electric == electric[at]
