@@ -167,12 +167,7 @@ def _residual(space: Space, z: Array, b: lk.Batch, u: Array) -> Float[Array, "pi
 
 @eqx.filter_jit
 def _linear(space: Space, z: Array, b: lk.Batch, u: Array) -> tuple[Array, Array]:
-    def both(x: Array) -> tuple[Array, Array]:
-        r = _residual(space, x, b, u)
-        return r, r
-
-    slope, r = jax.jacfwd(both, has_aux=True)(z)
-    return r, slope
+    return lk.with_slope(lambda x: _residual(space, x, b, u), z)
 
 
 @dataclass(frozen=True, eq=False)

@@ -146,13 +146,7 @@ def log_jacobian(target: Target, z: Vector, volt: Array, keep: Vector) -> tuple[
 @eqx.filter_jit
 def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
     """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
-
-    def twist(x: Array) -> tuple[Array, Array]:
-        xi = lk.predict(space.tree(x), batch).twist
-        return xi, xi
-
-    slope, xi = jax.jacfwd(twist, has_aux=True)(z)
-    return xi, slope
+    return lk.with_slope(lambda x: lk.predict(space.tree(x), batch).twist, z)
 
 
 @eqx.filter_jit
