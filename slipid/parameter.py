@@ -110,6 +110,10 @@ def parameter(
     )
 
 
+_OF = {"labels": "surface", "loads": "load", "sessions": "session"}
+"""What the labels under a name are of."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Entry:
     """One declared number (or short vector) of a tree.
@@ -172,32 +176,18 @@ def entries(tree: Any, prefix: str = "", leaf: tuple[str, ...] = ()) -> Iterator
     for field in dataclasses.fields(tree):
         value = getattr(tree, field.name)
         here = (*leaf, field.name)
-        if (declaration := field.metadata.get("parameter")) is not None:
-            yield from _of_field(tree, field, declaration, prefix, here)
-        elif isinstance(value, eqx.Module):
+        if isinstance(value, eqx.Module):
             name = field.metadata.get("path", field.name)
             yield from entries(value, f"{prefix}{name}.", here)
-
-
-def _of_field(
-    tree: Any,
-    field: dataclasses.Field,
-    declaration: Declaration,
-    prefix: str,
-    leaf: tuple[str, ...],
-) -> Iterator[Entry]:
-    shape = jnp.shape(getattr(tree, field.name))
-    quantity = f"{prefix}{field.name}"
-    stack = getattr(tree, "labels", ())
-    if not (stack or field.metadata["per"]):
-        yield Entry(quantity, quantity, declaration, leaf, None, shape[0] if shape else 1)
-        return
-    per = "labels" if stack else field.metadata["per"]
-    for k, label in enumerate(getattr(tree, per)):
-        path = f"{prefix}{label}.{field.name}" if stack else f"{quantity}@{label}"
-        size = 1 if len(shape) == 1 else shape[1]
-        yield Entry(path, quantity, declaration, leaf, k, size, **{_OF[per]: label})
-
-
-_OF = {"labels": "surface", "loads": "load", "sessions": "session"}
-"""What the labels under a name are of."""
+        if (declaration := field.metadata.get("parameter")) is None:
+            continue
+        shape, quantity = jnp.shape(value), f"{prefix}{field.name}"
+        stack = getattr(tree, "labels", ())
+        per = "labels" if stack else field.metadata["per"]
+        if not per:
+            yield Entry(quantity, quantity, declaration, here, None, shape[0] if shape else 1)
+            continue
+        for k, label in enumerate(getattr(tree, per)):
+            path = f"{prefix}{label}.{field.name}" if stack else f"{quantity}@{label}"
+            size = 1 if len(shape) == 1 else shape[1]
+            yield Entry(path, quantity, declaration, here, k, size, **{_OF[per]: label})

@@ -26,7 +26,13 @@ def test_import_is_light_and_silent():
 def test_all_but_extras_runs_without_their_libraries():
     """What `pip install slipid` brings is enough to identify, deploy, tune and run the demo."""
     rooms = (
-        *("cli.demo", "job.identify", "job.validate", "job.compare", "job.drawn_estimates"),
+        *(
+            "cli.demo",
+            "job.identify",
+            "job.validate",
+            "job.compare",
+            "identify.posterior.diagnosis",
+        ),
         *("deploy.deploy", "deploy.tune", "deploy.trial", "api.fit", "api.driving", "plots.fit"),
     )
     code = (

@@ -16,7 +16,6 @@ from slipid.identify.fit.problem import Problem
 from slipid.identify.posterior import diagnosis, netcdf
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
-from slipid.job.drawn_estimates import estimates
 from slipid.job.problem import Task
 from slipid.report import estimates as report
 from slipid.report.page import Page
@@ -57,7 +56,7 @@ class Posterior:
     @cached_property
     def parameters(self) -> dict[str, Estimate]:
         """Every number by path, with mean, interval and verdict from the draws."""
-        return estimates(self.fit, self.result)
+        return diagnosis.estimates(self.fit, self.result)
 
     def draws(self, path: str) -> Float[np.ndarray, "ensemble draw *number"]:
         """Draws of a free number [SI], a row per ensemble, early steps first.

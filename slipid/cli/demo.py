@@ -33,7 +33,7 @@ def demo(
     """The whole job on logs of the virtual test site, small: a folder to look at."""
     with Reporter(quiet=quiet) as report:
         done, found, truth = run(out, plant, seed, processes(None), report)
-    from slipid.report.near import show_truth, show_validation
+    from slipid.report.estimates import show_truth, show_validation
     from slipid.report.page import Page
 
     page, result = Page(), out / "result"
@@ -72,7 +72,7 @@ def run(
     write_bytes(out / "robotino.toml", packaged_config("robotino.toml").encode())
     result = out / "result"
     done = identify(out / "robotino.toml", source / "fit" / "logs", result, report)
-    found = validate(result, source / "unseen" / "logs", report).content
+    found = validate(result, source / "unseen" / "logs", report)
     write_json(result / "validation.json", found)
     truth = read_json(source / "fit/truth/truth.json", "the truth that slipid simulate wrote")
     return done, found, truth["parameters"]

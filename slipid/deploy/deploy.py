@@ -17,10 +17,9 @@ from slipid.control.robot_file.record import Number, Sensors, Source
 from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
 from slipid.deploy.record_of import record_of
-from slipid.identify.posterior.diagnosis import Posterior
+from slipid.identify.posterior.diagnosis import Posterior, estimates
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
-from slipid.job.drawn_estimates import estimates
 from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions

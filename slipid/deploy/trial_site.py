@@ -50,7 +50,7 @@ def starts(count: int, floor: FloorMap) -> list[tuple[float, float, float]]:
         heading = (k + rng.uniform()) * 2 * np.pi / count - np.pi
         c, s = np.cos(heading), np.sin(heading)
         x, y = middle + reach * rng.uniform(-1.0, 1.0, 2)
-        a, b = 0.5 * 0.9, 0.5 * 0.4  # of the sides [m]
+        a, b = 0.45, 0.2  # half of the rectangle's sides [m]
         out.append((float(x - (c * a + s * b)), float(y - (s * a - c * b)), float(heading)))
     return out
 

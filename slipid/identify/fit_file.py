@@ -30,8 +30,6 @@ from slipid.support.files import checksum, json_text, read_json, write_bytes
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
 SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/2"
-MATRICES = ("covariance", "laplace", "piece_run")
-BLOCKS = ("residual", "whitened", "weight")
 _PLAIN = ("converged", "reason", "rounds", "remaining")
 _CURVE = ("torque_nm", "slip", "slip_lo", "slip_hi")
 _SHAPE = ("place", "drive_angle", "roller_angle", "grips", "gear_ratio")
@@ -97,11 +95,8 @@ def load(folder: Path) -> Fit:
 
 
 def _packed(fit: Fit) -> bytes:
-    arrays = {name: getattr(fit, name) for name in MATRICES}
-    for name in BLOCKS:
-        arrays |= {f"{name}/{block}": v for block, v in getattr(fit, name).items()}
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    np.savez_compressed(buffer, allow_pickle=False, covariance=fit.covariance, laplace=fit.laplace)
     return buffer.getvalue()
 
 
@@ -162,7 +157,6 @@ def to_json(fit: Fit) -> Content:
             name: {"variance": v, "std": float(np.sqrt(v)), "unit": fit.variance_unit[name]}
             for name, v in fit.variance.items()
         },
-        "spectrum": fit.spectrum.tolist(),
         "names": fit.space.names,
         "z": fit.z.tolist(),
         "robot": _robot_json(fit.space.template),
@@ -194,13 +188,6 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
     if space.names != content["names"]:
         raise ValueError("it has other parameters than this version declares")
     variances, settings = content["variances"], content["settings"]
-    parts: Content = {name: content[name] for name in _PLAIN} | {name: {} for name in BLOCKS}
-    for name, array in arrays.items():
-        kind, _, block = name.partition("/")
-        if block:
-            parts[kind][block] = array
-        else:
-            parts[kind] = array
     return Fit(
         space=space,
         choices=choices,
@@ -208,7 +195,6 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         variance={name: v["variance"] for name, v in variances.items()},
         variance_unit={name: v["unit"] for name, v in variances.items()},
         runs=tuple((str(name), str(sha)) for name, sha in content["data"]["runs"]),
-        spectrum=np.asarray(content["spectrum"], float),
         channels=Channels(
             **content["has"],
             signed=settings["current_is_signed"],
@@ -222,7 +208,9 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         mixed=settings.get("mixed"),
         baselines=content["baselines"],
         current_trend=(content["current_trend"][0], content["current_trend"][1]),
-        **parts,
+        covariance=arrays["covariance"],
+        laplace=arrays["laplace"],
+        **{name: content[name] for name in _PLAIN},
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -15,9 +16,8 @@ from slipid.identify import slip_curves as curves_of
 from slipid.identify.compare.predictive import contact_of
 from slipid.identify.fit.mixed import Update, informed
 from slipid.identify.fit.optimise import Optimum
-from slipid.identify.fit.problem import Problem
-from slipid.identify.fit.variances import Search, Square
-from slipid.identify.rows import remaining, rows_at, spectrum
+from slipid.identify.fit.problem import Problem, log_jacobian
+from slipid.identify.fit.variances import Search, Square, Vector
 from slipid.identify.slip_curves import SlipCurve
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, sentences
@@ -54,12 +54,6 @@ class Fit:
         variance: every variance component by name, those of sessions included [unit squared].
         variance_unit: unit of each component's std.
         runs: (name, sha256) of every run that was fitted, those over several floors last.
-        piece_run: number of the run each residual row belongs to.
-        residual: predicted less measured, one row per piece, by block.
-        whitened: the same in units of its expected scatter.
-        weight: of each piece in the last round, by block; about 1, small for an outlier.
-        spectrum: singular values of the prior-scaled whitened Jacobian; at 1 the data know as much
-            as the prior.
         channels: that were logged.
         curves: slip over torque of every floor.
         current_trend: a + b v, measured currents over the model's at speed v [A], [A s/m].
@@ -80,11 +74,6 @@ class Fit:
     variance: Mapping[str, float]
     variance_unit: Mapping[str, str]
     runs: tuple[tuple[str, str], ...]
-    piece_run: np.ndarray
-    residual: Mapping[str, np.ndarray]
-    whitened: Mapping[str, np.ndarray]
-    weight: Mapping[str, np.ndarray]
-    spectrum: Search
     channels: Channels
     curves: Mapping[str, SlipCurve]
     validity: Mapping[str, Validity]
@@ -162,9 +151,8 @@ def summarise(
     `seed` is of the draws the curves' bands are made of.
     """
     z, log_v = optimum.state.z, optimum.state.log_variance
-    rows = rows_at(problem, z, log_v)
     contact = contact_of(problem, optimum.state, optimum.covariance, np.ones(len(problem.windows)))
-    left, name = remaining(problem, z, problem.volt(log_v), rows)
+    left, name = _remaining(problem, z, log_v)
     settled = left < REMAINING
     stuck = f"the solver stopped {left:.2g} stds of {name} away from where its own step leads"
     windows, robot = problem.windows, contact.robot
@@ -181,11 +169,6 @@ def summarise(
         variance=contact.variance,
         variance_unit={name: unit[name] for name in contact.variance},
         runs=tuple((log.name, log.sha256) for log in data.logs),
-        piece_run=np.asarray(windows.run),
-        residual=rows.residual,
-        whitened=rows.whitened,
-        weight=rows.weight,
-        spectrum=spectrum(rows.gram),
         channels=Channels(
             current=bool(windows.has_current),
             voltage=bool(windows.has_voltage),
@@ -207,10 +190,36 @@ def summarise(
     )
 
 
-def updated(fit: Fit, new: Update, problem: Problem, optimum: Optimum, data: Runs) -> Fit:
-    """The fit after runs over several floors; residuals are still those of the runs before."""
-    rows = rows_at(problem, new.z, optimum.state.log_variance)
-    outer = problem.space.prior_std[:, None] * problem.space.prior_std
+def _remaining(problem: Problem, z: Search, log_v: Vector) -> tuple[float, str]:
+    """Largest step of a full Gauss-Newton step in posterior stds, and the number that takes it.
+
+    delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), W with the weights of outliers, g
+    the slope of log |d residuals / d data|; where currents do not inform motion, their rows move
+    the electric numbers only.
+    """
+    every, volt = np.ones(len(problem.windows)), problem.volt(log_v)
+    residual, jacobian = problem.linear(z, volt)
+    roots = problem.whitening(residual, log_v, every).root
+    residual, jacobian, roots = jax.device_get((residual, jacobian, roots))
+    own = problem.space.electric.astype(float)
+    prior = problem.space.prior_std**-2
+    _, slope = log_jacobian(problem.target, z, volt, every)
+    gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
+    info = np.diag(prior)
+    for k, root in roots.items():
+        white = np.einsum("nij,nj->ni", root, residual[k]).ravel()
+        half = np.einsum("nij,njp->nip", root, jacobian[k]).reshape(-1, len(z))
+        half = half * (1.0 if k == "motion" else own)
+        gradient = gradient + half.T @ white
+        info = info + half.T @ half
+    std = np.sqrt(np.diag(np.linalg.inv(info)))
+    steps = np.abs(np.linalg.solve(info, gradient)) / std
+    worst = int(np.argmax(steps))
+    return float(steps[worst]), problem.space.names[worst]
+
+
+def updated(fit: Fit, new: Update, problem: Problem, data: Runs) -> Fit:
+    """The fit after runs over several floors."""
     several = draws(new.z, new.covariance, 400, fit.seed)
     unsettled = "the runs over several floors: no rest after all steps"
     return replace(
@@ -221,10 +230,6 @@ def updated(fit: Fit, new: Update, problem: Problem, optimum: Optimum, data: Run
         variance=dict(fit.variance) | dict(new.variance),
         variance_unit=dict(fit.variance_unit) | dict(new.unit),
         runs=fit.runs + new.runs,
-        residual=rows.residual,
-        whitened=rows.whitened,
-        weight=rows.weight,
-        spectrum=spectrum(rows.gram + outer * new.information),
         curves=curves_of.curves(problem.space, new.z, several, problem.batch),
         validity=curves_of.validity(data, problem.space.tree(jnp.asarray(new.z)), problem.batch),
         converged=fit.converged and new.settled,

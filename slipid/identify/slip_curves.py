@@ -125,15 +125,16 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
             torque_nm=(0.0, most[1]),
             slip=(0.0, most[2]),
             yaw_rate=(0.0, most[3]),
-            headings_deg=_different(np.degrees(data.heading[runs]), 1),
-            speeds=_different(data.speed[runs], 3),
-            turn_rates=_different(data.turn[runs], 2),
+            headings_deg=distinct(np.degrees(data.heading[runs]), 1),
+            speeds=distinct(data.speed[runs], 3),
+            turn_rates=distinct(data.turn[runs], 2),
             distance=round(float(far[mine].sum()) / max(len(runs), 1), 3),
         )
     return out
 
 
-def _different(x: np.ndarray, digits: int) -> tuple[float, ...]:
+def distinct(x: np.ndarray, digits: int) -> tuple[float, ...]:
+    """Values that are known, rounded, each once, rising."""
     return tuple(sorted({round(float(v), digits) for v in x[np.isfinite(x)]}))
 
 

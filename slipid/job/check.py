@@ -84,8 +84,8 @@ def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
                 "session": session,
                 "runs": len(runs),
                 "seconds": round(sum(data.logs[k].duration for k in runs), 1),
-                "headings": len(_distinct(np.degrees(data.heading[runs]), 1)),
-                "speeds": _distinct(data.speed[runs], 3),
+                "headings": len(curves_of.distinct(np.degrees(data.heading[runs]), 1)),
+                "speeds": list(curves_of.distinct(data.speed[runs], 3)),
             }
             for (surface, load, session), runs in sorted(groups.items())
         ],
@@ -94,12 +94,6 @@ def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
         "skipped": list(skipped),
         "data": {"hash": job.data_hash, "logs": {log.name: log.sha256 for log in data.logs}},
     }
-
-
-def _distinct(x: np.ndarray, places: int) -> list[float]:
-    """Values that are known, rounded, each once."""
-    found: list[float] = np.unique(np.round(x[np.isfinite(x)], places)).tolist()
-    return found
 
 
 def _channels(logs: tuple[Log, ...]) -> list[str]:

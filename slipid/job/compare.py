@@ -74,7 +74,7 @@ def compare(
             }
             for name, some in results.items()
         },
-        "surfaces": {k: asdict(v) for k, v in surfaces.items()},
+        "surfaces": surfaces,
         "data": {"hash": job.data_hash, "runs": len(job.dataset), "skipped": list(job.skipped)},
         "config": {"name": config.path.name, "sha256": config.hash},
         "versions": versions(),

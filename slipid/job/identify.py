@@ -115,14 +115,22 @@ def optimised(task: Task, problem: Problem, kept: Checkpoint | None, report: Rep
     start, history = _restored(kept)
     if start is not None and kept is not None:
         report.line(f"going on from round {start.round} of {kept.folder / CHECKPOINT}.npz")
-    progress = _Rounds(report, wanted.tolerance)
+    first: list[float] = []
 
     def tell(state: State) -> None:
-        progress.tell(state)
-        if state.stage == "joint":
-            history.append(state.loss)
-            if kept is not None:
-                kept.save(CHECKPOINT, vars(state) | {"history": np.array(history)})
+        report.stage(state.stage)
+        what = f"round {state.round}, loss {state.loss:.2f}, moved {state.moved:.3g} std"
+        if state.stage != "joint":  # the staged start ends after a given number of rounds
+            report.note(what)
+            return
+        # the end is where steps that shrink as they do fall below the tolerance
+        moved = max(state.moved, 1e-12)
+        first.append(max(moved, 2 * wanted.tolerance))
+        whole = math.log(first[0] / wanted.tolerance)
+        report.advance(min(math.log(first[0] / moved), whole), whole, what)
+        history.append(state.loss)
+        if kept is not None:
+            kept.save(CHECKPOINT, vars(state) | {"history": np.array(history)})
 
     report.stage("compiling")
     rounds = wanted.rounds
@@ -144,26 +152,6 @@ def _restored(kept: Checkpoint | None) -> tuple[State | None, list[float]]:
     return State(**plain), history
 
 
-class _Rounds:
-    """Progress of a fit; its end is where steps that shrink as they do fall below the tolerance."""
-
-    def __init__(self, report: Reporter, tolerance: float):
-        self.report, self.tolerance = report, tolerance
-        self.first: float | None = None
-
-    def tell(self, state: State) -> None:
-        """A round is done."""
-        self.report.stage(state.stage)
-        what = f"round {state.round}, loss {state.loss:.2f}, moved {state.moved:.3g} std"
-        if state.stage != "joint":  # the staged start ends after a given number of rounds
-            self.report.note(what)
-            return
-        moved = max(state.moved, 1e-12)
-        self.first = self.first or max(moved, 2 * self.tolerance)
-        whole = math.log(self.first / self.tolerance)
-        self.report.advance(min(math.log(self.first / moved), whole), whole, what)
-
-
 def summarised(task: Task, problem: Problem, optimum: Optimum, report: Reporter) -> Fit:
     """The fit with intervals, what runs over several floors add, and simpler models beside it."""
     report.stage("intervals and verdicts")
@@ -173,7 +161,7 @@ def summarised(task: Task, problem: Problem, optimum: Optimum, report: Reporter)
         sets = [crossing(data, floor, fit.robot) for data, floor in task.mixed]
         found = update(fit.space, fit.z, fit.covariance, sets)
         report.line(_judged(found.about))
-        fit = updated(fit, found, problem, optimum, task.dataset)
+        fit = updated(fit, found, problem, task.dataset)
     report.stage("simpler models, for comparison")
     return _with_baselines(fit, task)
 

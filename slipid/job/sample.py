@@ -13,11 +13,10 @@ from slipid.identify.posterior import netcdf
 from slipid.identify.posterior import sample as posterior
 from slipid.identify.posterior.blocks import FORMAT, Block, Plan, Record, packed, unpacked
 from slipid.identify.posterior.coordinates import ELECTRIC, Fitted
-from slipid.identify.posterior.diagnosis import Posterior
+from slipid.identify.posterior.diagnosis import Posterior, estimates, identified
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.config import read_config
-from slipid.job.drawn_estimates import estimates, identified
 from slipid.job.problem import Job, read_job
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.content import Content
@@ -68,7 +67,9 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     _same_logs(fit, job)
     report.stage("compiling")
     problem = job.problem()
-    kept = Checkpoint(out / FOLDER, key_of(*_everything(fit, plan, draws)))
+    # all that a chain depends on; how long it may become is not of it
+    told = FORMAT, fit.data_hash, replace(plan, most=0), draws, sorted(fit.variance.items())
+    kept = Checkpoint(out / FOLDER, key_of(*told, np.asarray(fit.z), np.asarray(fit.laplace)))
     found = sampled_around(fit, problem, plan, draws, kept, report)
     report.stage("writing")
     about = _summary(found, plan, time.monotonic() - began)
@@ -85,13 +86,6 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     return Sampled(fit, found, numbers, about, written)
 
 
-def _everything(fit: Fit, plan: Plan, draws: int) -> tuple[object, ...]:
-    """All that a chain depends on; how long it may become is not of it."""
-    variance = sorted(fit.variance.items())
-    arrays = np.asarray(fit.z), np.asarray(fit.laplace)
-    return FORMAT, fit.data_hash, replace(plan, most=0), draws, variance, *arrays
-
-
 def sampled_around(
     fit: Fit, problem: Problem, plan: Plan, draws: int, kept: Checkpoint | None, report: Reporter
 ) -> Posterior:
@@ -104,7 +98,7 @@ def sampled_around(
         blocks: list[Block] = []
         if kept is None:
             return blocks
-        while (arrays := kept.load(_name(part, len(blocks)))) is not None:
+        while (arrays := kept.load(f"{part}-{len(blocks):04d}")) is not None:
             blocks.append(unpacked(arrays))
         if blocks:
             report.line(f"going on from block {len(blocks)} ({part}) of {kept.folder}")
@@ -112,7 +106,7 @@ def sampled_around(
 
     def keep(part: str, block: Block) -> None:
         if kept is not None:
-            kept.save(_name(part, block.number), packed(block))
+            kept.save(f"{part}-{block.number:04d}", packed(block))
         _tell(part, block, plan, report)
 
     def steps(part: str, count: int) -> None:
@@ -122,10 +116,6 @@ def sampled_around(
     shared = {k: v for k, v in fit.variance.items() if k not in problem.noise.names}
     fitted = Fitted(fit.z, np.log(variance), fit.laplace, shared)
     return posterior.sample(problem, fitted, plan, draws=draws, record=Record(done, keep, steps))
-
-
-def _name(part: str, number: int) -> str:
-    return f"{part}-{number:04d}"
 
 
 def _tell(part: str, block: Block, plan: Plan, report: Reporter) -> None:

@@ -1,6 +1,5 @@
 """Open-loop prediction of runs by a fit: what `slipid validate` does, but for its pictures."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from slipid.data.runs import Runs
@@ -17,17 +16,10 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 
-@dataclass(frozen=True, eq=False)
-class Validated:
-    """End of `validate`: who predicted, which runs, and the content of the validation file."""
-
-    fit: Fit
-    dataset: Runs
-    content: Content
-
-
-def validate(out: Path, data: Path, report: Reporter) -> Validated:
+def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Content]:
     """Predict runs of `data` with the fit in `out`, and with every simpler model that it learnt.
+
+    Returns the fit, the runs, and the content of the validation file.
 
     Raises:
         DataError: no fit there, or logs that it cannot predict.
@@ -50,4 +42,4 @@ def validate(out: Path, data: Path, report: Reporter) -> Validated:
     except ValueError as error:
         raise DataError(f"{out / 'fit.json'}: {error}") from error
     fitted = Contact(fit.robot, fit.variance, fit.covariance, fit.space, fit.z)
-    return Validated(fit, dataset, validation(fitted, rungs, dataset).to_json())
+    return fit, dataset, validation(fitted, rungs, dataset).to_json()

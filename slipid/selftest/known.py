@@ -11,15 +11,24 @@ from slipid.model.robot import Robot, build
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
 
-ROBOTINO = (60.0, 180.0, 300.0)
-"""Azimuths of the wheels [deg]."""
-
 
 def numbers(robot: Robot) -> dict[str, float | list[float]]:
     """Every number of a robot by its path, as plain values."""
     return {e.path: np.asarray(e.get(robot)).tolist() for e in entries(robot)}
 
 
+_FLOORS = {
+    "friction": (0.5, 0.8),
+    "creep": (0.15, 0.45),
+    "roller_drag": (0.18, 0.33),
+    "roller_creep": (0.25, 0.2),
+    "rolling_resistance": (0.008, 0.02),
+    "slide_viscosity": (0.03, 0.05),
+    "roller_viscosity": (0.03, 0.05),
+    "scrub": (0.001, 0.002),
+    "lead": (0.0015, 0.0045),
+}
+"""Of the floors firm and soft."""
 TRUTH: dict[str, float | tuple[float, ...]] = {
     "robot.mass": 12.0,
     "robot.load_share@as_built": (0.29, 0.42, 0.29),
@@ -33,24 +42,8 @@ TRUTH: dict[str, float | tuple[float, ...]] = {
     "camera.scale": 1.117,
     "camera.lag": 0.056,
     "camera.marker_yaw": -0.015,
-    "surface.firm.friction": 0.5,
-    "surface.firm.creep": 0.15,
-    "surface.firm.roller_drag": 0.18,
-    "surface.firm.roller_creep": 0.25,
-    "surface.firm.rolling_resistance": 0.008,
-    "surface.firm.slide_viscosity": 0.03,
-    "surface.firm.roller_viscosity": 0.03,
-    "surface.firm.scrub": 0.001,
-    "surface.firm.lead": 0.0015,
-    "surface.soft.friction": 0.8,
-    "surface.soft.creep": 0.45,
-    "surface.soft.roller_drag": 0.33,
-    "surface.soft.roller_creep": 0.2,
-    "surface.soft.rolling_resistance": 0.02,
-    "surface.soft.slide_viscosity": 0.05,
-    "surface.soft.roller_viscosity": 0.05,
-    "surface.soft.scrub": 0.002,
-    "surface.soft.lead": 0.0045,
+    **{f"surface.firm.{name}": firm for name, (firm, _) in _FLOORS.items()},
+    **{f"surface.soft.{name}": soft for name, (_, soft) in _FLOORS.items()},
 }
 """Numbers of the default robot [SI], the rest as declared; of the size found on real logs."""
 
@@ -58,7 +51,7 @@ TRUTH: dict[str, float | tuple[float, ...]] = {
 def blank(drives: Sequence[Drive]) -> Robot:
     """Robotino at declared starts that knows the floors, loads and sessions of a plan."""
     return build(
-        omni(list(ROBOTINO), 0.125, 0.04, 16.0),
+        omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0),
         sorted({d.surface for d in drives}),
         tuple(dict.fromkeys(d.load for d in drives)),
         sorted({d.session for d in drives}),

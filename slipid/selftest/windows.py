@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from slipid.data.windows import Windows
 from slipid.identify.compare.open_loop import chain, corrected
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.noise import travel
+from slipid.identify.fit.noise import axes, travel
 from slipid.identify.fit.sessions import AXES
 from slipid.model.robot import Robot
 
@@ -83,13 +83,10 @@ def _process(
 ) -> Float[np.ndarray, "piece window 3"]:
     """Displacements that the model does not explain, growing with distance."""
     far, u = travel(w, truth)
-    axes = np.zeros((3, *far.shape, 3))
-    axes[0, ..., :2] = u
-    axes[1, ..., 0], axes[1, ..., 1] = -u[..., 1], u[..., 0]
-    axes[2, ..., 2] = 1.0
     total = np.zeros((*far.shape, 3))
-    for axis, name in zip(axes, AXES, strict=True):
+    for axis, name in zip(axes(u), AXES, strict=True):
         grown = _of(std, w, "process", name)[:, None] * np.sqrt(far)
         own = _of(std, w, "run", name) * rng.normal(size=len(w))
-        total += axis * (grown * rng.normal(size=far.shape) + own[:, None] * far)[..., None]
+        step = grown * rng.normal(size=far.shape) + own[:, None] * far
+        total += (axis @ step[..., None]).reshape(total.shape)
     return total

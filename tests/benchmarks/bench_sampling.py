@@ -82,9 +82,8 @@ def ess_of(chain):
 def by_slipid(density):
     """Chains (chain, draw, coordinate), seconds of sampling and of the warm-up, the last block."""
     from slipid.identify.posterior import ensemble as sampler
-    from slipid.identify.posterior.blocks import Plan
+    from slipid.identify.posterior.blocks import Plan, Target
     from slipid.identify.posterior.diagnosis import diagnose
-    from slipid.identify.posterior.target import Target
 
     d = density
     target = Target(

@@ -427,7 +427,7 @@ def test_a_posterior_that_has_not_converged_says_so_everywhere(sampled):
 def test_a_posterior_that_has_converged_is_0_and_takes_its_blocks_away(
     sampled, tmp_path, monkeypatch
 ):
-    from slipid.identify.posterior import diagnosis, second_stage
+    from slipid.identify.posterior import diagnosis
     from slipid.identify.posterior import sample as posterior
 
     shutil.copytree(sampled[0], tmp_path / "out")
@@ -436,7 +436,7 @@ def test_a_posterior_that_has_converged_is_0_and_takes_its_blocks_away(
     monkeypatch.setattr(
         diagnosis, "diagnose", lambda chain, plan: replace(found(chain, plan), converged=True)
     )
-    monkeypatch.setattr(second_stage, "unsettled", lambda chain: np.zeros(chain.shape[-1]))
+    monkeypatch.setattr(posterior, "unsettled", lambda chain: np.zeros(chain.shape[-1]))
     monkeypatch.setattr(posterior, "STILL", 1.0)
     result = invoke("sample", out, *FEW)
     assert result.exit_code == 0, result.output

@@ -11,7 +11,7 @@ import pytest
 
 from slipid.cli import demo
 from slipid.cli.demo import PARTS, RECORDED, drive_anew, packaged_config, unpack
-from slipid.report.near import compared
+from slipid.report.estimates import compared
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from slipid.testsite.driving import drive

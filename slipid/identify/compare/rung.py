@@ -1,9 +1,9 @@
-"""The interface of every slip model below the force balance; motion of wheels, body and marker."""
+"""The interface of every slip model below the force balance, and the rung without a slip model."""
 
 import abc
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TypeVar
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,8 @@ from slipid.model.robot import Robot
 
 Number = TypeVar("Number")
 Increments = Float[np.ndarray, "piece window 3"]
+HARMONICS = 6
+WEIGHTS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 _seen, _measured = jax.jit(seen), jax.jit(measured)
 
 
@@ -99,3 +101,100 @@ def turned(angle: np.ndarray, v: np.ndarray) -> np.ndarray:
 def sideways(v: np.ndarray) -> np.ndarray:
     """Plane vectors (..., 2), each turned by a quarter to the left."""
     return np.stack([-v[..., 1], v[..., 0]], -1)
+
+
+@dataclass(frozen=True)
+class HeadingLookup(Rung):
+    """Encoders corrected by a Fourier series in the direction of travel, per floor.
+
+        (along, across, yaw) = (far, 0, turn) + far sum_k c_k phi_k(angle)
+
+    with far, angle and turn the encoders' displacement, its direction and their yaw. Six harmonics,
+    the k-th held down by weight k^4; the weight by cross-validation over random runs within the
+    data it is fitted to, which is how such a table is made, and what makes it good in between.
+    A floor has one series for each load set-up it was driven with.
+    """
+
+    name: str = "heading_lookup"
+
+    def fit(self, w: Windows, robot: Robot) -> "HeadingLookup":
+        return replace(self, state={t.key: t.ridge(t.best_weight()) for t in _tables(w, robot)})
+
+    def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
+        """The ridge as a Gaussian prior: its penalty over the mean square of what is left."""
+        out = {}
+        for t in _tables(w, robot):
+            left = np.mean((t.gap - t.phi @ self.state[t.key]) ** 2, axis=(0, 1))
+            out[t.key] = np.kron(t.penalty(t.best_weight()), np.diag(1 / np.maximum(left, 1e-12)))
+        return out
+
+    def twist(self, w: Windows, robot: Robot) -> np.ndarray:
+        angle, out = _encoders(w, robot)
+        phi = _fourier(angle, out[..., 0])
+        for n, (floor, load) in enumerate(zip(w.surface, w.load, strict=True)):
+            out[n] += phi[n] @ self.state[self.series(floor, load)]
+        out[..., :2] = turned(angle, out[..., :2])
+        return np.asarray(out / w.dt[..., None])
+
+    def series(self, surface: str, load: str) -> str:
+        """Of this floor and load set-up, else of the load the floor was first driven with."""
+        if (exact := f"{surface}@{load}") in self.state:
+            return exact
+        return of_floor({key.rsplit("@", 1)[0]: key for key in reversed(self.state)}, surface)
+
+
+class _Table(NamedTuple):
+    """Features (piece, window, k) of a floor and load set-up, and the gap they have to explain."""
+
+    key: str
+    phi: np.ndarray
+    gap: np.ndarray
+    run: np.ndarray
+
+    def penalty(self, weight: float) -> np.ndarray:
+        rough = np.concatenate([[0.0], np.repeat(np.arange(1.0, HARMONICS + 1) ** 4, 2)])
+        return np.asarray(weight * np.sum(self.phi[..., 0] ** 2) * np.diag(rough))
+
+    def ridge(self, weight: float) -> np.ndarray:
+        a = self.phi.reshape(-1, self.phi.shape[-1])
+        gram = a.T @ a + self.penalty(weight)
+        return np.asarray(np.linalg.solve(gram, a.T @ self.gap.reshape(-1, 3)))
+
+    def best_weight(self) -> float:
+        return min(WEIGHTS, key=self._left_out)
+
+    def _left_out(self, weight: float) -> float:
+        """Squared error over five random folds of runs."""
+        fold = np.random.default_rng(0).integers(0, 5, self.run.max() + 1)[self.run]
+        loss = 0.0
+        for test in (fold == k for k in range(5)):
+            if test.any() and not test.all():
+                rest = self._replace(phi=self.phi[~test], gap=self.gap[~test])
+                gap = self.gap[test] - self.phi[test] @ rest.ridge(weight)
+                loss += float((gap**2 * np.array([1.0, 1.0, 0.02])).sum())
+        return loss
+
+
+def _tables(w: Windows, robot: Robot) -> Iterator[_Table]:
+    angle, plain = _encoders(w, robot)
+    gap = body_twist(w, robot) * w.dt[..., None]
+    gap[..., :2] = turned(-angle, gap[..., :2])
+    gap -= plain
+    phi = _fourier(angle, plain[..., 0])
+    series = np.asarray([f"{a}@{b}" for a, b in zip(w.surface, w.load, strict=True)])
+    for key in dict.fromkeys(series.tolist()):
+        mine = series == key
+        yield _Table(key, phi[mine], gap[mine], w.run[mine])
+
+
+def _encoders(w: Windows, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Direction of travel by the encoders, and (distance, 0, yaw) of every window."""
+    step = w.turn @ rims(w, robot)[0].T
+    far = np.hypot(step[..., 0], step[..., 1])
+    plain = np.stack([far, np.zeros_like(far), step[..., 2]], -1)
+    return np.arctan2(step[..., 1], step[..., 0]), plain
+
+
+def _fourier(angle: np.ndarray, far: np.ndarray) -> np.ndarray:
+    waves = [f(k * angle) for k in range(1, HARMONICS + 1) for f in (np.cos, np.sin)]
+    return np.stack([np.ones_like(angle), *waves], -1) * far[..., None]

@@ -13,8 +13,7 @@ from scipy import sparse
 from scipy.optimize import least_squares, linprog, lsq_linear
 
 from slipid.data.windows import Windows
-from slipid.identify.compare.heading_lookup import HeadingLookup
-from slipid.identify.compare.rung import Rung, body_twist, of_floor, rims
+from slipid.identify.compare.rung import HeadingLookup, Rung, body_twist, of_floor, rims
 from slipid.model.motor import signed
 from slipid.model.robot import Robot
 

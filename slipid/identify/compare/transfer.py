@@ -4,14 +4,13 @@ One curve s = b0 + b1 |I| for all wheels, fitted to all floors but one and judge
 beside a constant fitted to the same floors and a curve fitted to the floor itself.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from slipid.data.windows import Windows
 from slipid.identify.compare.rung import body_twist
 from slipid.identify.compare.validation import main_load
 from slipid.model.robot import Robot
+from slipid.support.content import Content
 
 LEAST = 0.2
 """A wheel counts in a window where it turns at least this part of the fastest one."""
@@ -26,30 +25,12 @@ VARIANTS: dict[str, tuple[float, bool, bool]] = {
 (which cuts the response off and so flatters what it leaves)."""
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Root mean squares of what a curve leaves of slip: over all rows, mean of floors, and each."""
-
-    rows: float
-    floors: float
-    each: dict[str, float]
-
-
-@dataclass(frozen=True)
-class Transfer:
-    """How slip is predicted on a floor that was not fitted, for one choice of rows.
-
-    By the curve of the other floors (pooled), by their mean slip, and by the floor's own curve.
-    """
-
-    pooled: Errors
-    constant: Errors
-    per_surface: Errors
-    count: int
-
-
-def transfer(w: Windows, robot: Robot) -> dict[str, Transfer]:
+def transfer(w: Windows, robot: Robot) -> dict[str, Content]:
     """Leave-one-surface-out errors of slip, per variant of what counts as a row; none of one floor.
+
+    Root mean squares over all `rows`, mean of `floors`, and of `each`, of what is left of slip by
+    the curve of the other floors (`pooled`), by their mean slip (`constant`), and by the floor's
+    own curve (`per_surface`); `count` is of rows.
 
     A row is one wheel in one window: s = 1 - J xi / (r w), xi the body twist from the camera in
     corrected metres, I the mean magnitude of the wheel's current.
@@ -75,7 +56,7 @@ def transfer(w: Windows, robot: Robot) -> dict[str, Transfer]:
     return out
 
 
-def _errors(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Transfer:
+def _errors(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Content:
     pooled, constant, own = {}, {}, {}
     line = np.stack([np.ones_like(amps), amps], axis=-1)
     for name in sorted(set(floor.tolist())):
@@ -85,10 +66,11 @@ def _errors(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Transfer:
         pooled[name] = slip[mine] - line[mine] @ others
         constant[name] = slip[mine] - slip[~mine].mean()
         own[name] = slip[mine] - line[mine] @ alone
-    return Transfer(_left(pooled), _left(constant), _left(own), len(slip))
+    gaps = {"pooled": pooled, "constant": constant, "per_surface": own}
+    return {name: _left(gap) for name, gap in gaps.items()} | {"count": len(slip)}
 
 
-def _left(gaps: dict[str, np.ndarray]) -> Errors:
+def _left(gaps: dict[str, np.ndarray]) -> Content:
     each = {name: float(np.sqrt(np.mean(gap**2))) for name, gap in gaps.items()}
     rows = float(np.sqrt(np.mean(np.concatenate(list(gaps.values())) ** 2)))
-    return Errors(rows, float(np.mean(list(each.values()))), each)
+    return {"rows": rows, "floors": float(np.mean(list(each.values()))), "each": each}

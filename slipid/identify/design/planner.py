@@ -55,7 +55,7 @@ class Planner:
         self._problem = Problem(self._windows([first] * _TOGETHER), self.robot, choices)
         self.space = self._problem.space
         self.z = self.space.vector(self.robot)
-        electric = self._problem.space.electric & (not self._problem.joint)
+        electric = self._problem.space.electric & (not self._problem.target.joint)
         of_floor = [[f"session.{x}.{a}" for a in AXES] for x in robot.surfaces.labels]
         self._differ = np.array([any(map(self.variance.get, names)) for names in of_floor])
         self.effects = len(AXES) * int(self._differ.sum())

@@ -3,6 +3,8 @@
 A piece is a few neighbouring windows of one run. How the difference is weighed is in `noise`.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -24,6 +26,12 @@ FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
 """Variance added to every residual: rounding of the logs [m^2, A^2, V^2]."""
 
 _AS_THEY_ARE = ("dt", "turn", "faster", "pose", "current", "voltage", "current_var", "lag")
+
+
+def with_slope(of: Callable[[Array], Array], z: Array | np.ndarray) -> tuple[Array, Array]:
+    """A function's value at a vector and its derivative by it, from one pass."""
+    slope, value = jax.jacfwd(lambda x: (of(x),) * 2, has_aux=True)(z)
+    return value, slope
 
 
 class Batch(eqx.Module):

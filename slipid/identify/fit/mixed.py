@@ -22,8 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.identify.fit.crossing import Crossing, Evidence
-from slipid.identify.fit.scatter import CHANNELS, Scatter, scatter
+from slipid.identify.fit.crossing import CHANNELS, Crossing, Evidence, Scatter, scatter
 from slipid.identify.fit.variances import Search, Square
 from slipid.search_space import Space
 
@@ -33,7 +32,7 @@ _GAIN, _IDLE = 0.1, 6
 """Or when so many steps on end have gained less than this in log density."""
 _MOST_STEPS, _FACTOR_STEPS, _TRIES = 40, 4, 8
 UNITS = ("m/s", "m/s", "rad/s", "A")
-"""Of the channels of `scatter` and of currents."""
+"""Of the channels of `crossing` and of currents."""
 
 
 @dataclass(frozen=True, eq=False)

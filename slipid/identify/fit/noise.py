@@ -132,7 +132,7 @@ def _motion_components(windows: Windows, robot: Robot) -> Components:
         move = np.einsum("nij,nj->ni", back, windows.pose[:, j + 1, :2] - windows.pose[:, j, :2])
         heading[:, 3 * j, j], heading[:, 3 * j + 1, j] = move[:, 1], -move[:, 0]
         heading[:, 3 * j + 2, j], heading[:, 3 * j + 2, j + 1] = -1.0, 1.0
-    grown = _axes(u) * np.sqrt(far)[None, :, None, :]
+    grown = axes(u) * np.sqrt(far)[None, :, None, :]
     effect = effects(windows, robot).transpose(2, 0, 1)[..., None]
     parts = [place, heading, *grown, *effect]
     base = np.stack([p @ p.transpose(0, 2, 1) for p in parts], axis=1)
@@ -144,21 +144,21 @@ def _floors(windows: Windows, robot: Robot) -> Int[np.ndarray, "piece 1"]:
     return np.array([[robot.surface_index(s)] for s in windows.surface])
 
 
-def _axes(u: np.ndarray) -> np.ndarray:
+def axes(u: np.ndarray) -> np.ndarray:
     """Direction of along, across and yaw in each window (axis, piece, 3 window, window)."""
     n, k, _ = u.shape
-    axes = np.zeros((3, n, 3 * k, k))
+    out = np.zeros((3, n, 3 * k, k))
     for j in range(k):
-        axes[0, :, 3 * j : 3 * j + 2, j] = u[:, j]
-        axes[1, :, 3 * j, j], axes[1, :, 3 * j + 1, j] = -u[:, j, 1], u[:, j, 0]
-        axes[2, :, 3 * j + 2, j] = 1.0
-    return axes
+        out[0, :, 3 * j : 3 * j + 2, j] = u[:, j]
+        out[1, :, 3 * j, j], out[1, :, 3 * j + 1, j] = -u[:, j, 1], u[:, j, 0]
+        out[2, :, 3 * j + 2, j] = 1.0
+    return out
 
 
 def effects(windows: Windows, robot: Robot) -> Float[np.ndarray, "piece m 3"]:
     """What one unit of an effect along, across and in yaw moves in the residuals of a piece."""
     far, u = travel(windows, robot)
-    return (_axes(u) * far[None, :, None, :]).sum(-1).transpose(1, 2, 0)
+    return (axes(u) * far[None, :, None, :]).sum(-1).transpose(1, 2, 0)
 
 
 def _current_components(windows: Windows, robot: Robot, start: int) -> Components:

@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem, State, linear, log_jacobian
 from slipid.identify.fit.variances import Blocks, Search, Square, Target, scored
-from slipid.search_space import Space
 
 CREEPS = (0.05, 0.4, 1.0)
 """Starts of the creep of every floor; others end in poor minima."""
@@ -139,6 +138,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
     first = _motor_start(problem)
     best, z = np.full(len(labels), np.inf), first.copy()
     floors = np.asarray(problem.batch.surface)
+    of_floor = np.repeat([e.surface or "" for e in space.free], [e.coordinates for e in space.free])
     for attempt, value in enumerate(CREEPS):
         stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
         start = np.where(creep, np.log(value), first)
@@ -154,13 +154,8 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
             mine = float(np.sum(cost[(floors == number) & (keep > 0)]))
             if mine < best[number]:
                 best[number] = mine
-                own = _of_floor(space, label)
-                z[own] = state.z[own]
+                z = np.where(of_floor == label, state.z, z)
     return State(z, log_v, 0, np.inf, np.inf, "joint")
-
-
-def _of_floor(space: Space, label: str) -> np.ndarray:
-    return space.where(lambda e: e.surface == label)
 
 
 def _motor_start(problem: Problem) -> np.ndarray:

@@ -51,7 +51,6 @@ class Problem:
 
     def __init__(self, windows: Windows, robot: Robot, choices: Sequence[Choice]):
         self.space = Space(robot, choices)
-        self.joint = not windows.has_current
         self.robot: Robot = self.space.template
         self.compiled: dict[Any, Any] = {}
         self._read(windows)
@@ -69,7 +68,7 @@ class Problem:
             batch=lk.batch(windows, self.robot),
             blocks=self.noise.blocks,
             typical=jnp.asarray(2 * np.log(self.noise.typical)),
-            joint=self.joint,
+            joint=not windows.has_current,
         )
 
     @property
@@ -147,13 +146,7 @@ def log_jacobian(target: Target, z: Vector, volt: Array, keep: Vector) -> tuple[
 @eqx.filter_jit
 def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
     """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
-
-    def twist(x: Array) -> tuple[Array, Array]:
-        xi = lk.predict(space.tree(x), batch).twist
-        return xi, xi
-
-    slope, xi = jax.jacfwd(twist, has_aux=True)(z)
-    return xi, slope
+    return lk.with_slope(lambda x: lk.predict(space.tree(x), batch).twist, z)
 
 
 @eqx.filter_jit

@@ -1,12 +1,24 @@
-"""Draws of a posterior, and whether its chains may be believed; needs nothing that samples."""
+"""Draws of a posterior, what they say of a robot, and whether its chains may be believed.
 
-from dataclasses import dataclass
+Needs nothing that samples.
+"""
 
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from slipid.identify import slip_curves as curves_of
+from slipid.identify.fit.problem import Problem
+from slipid.identify.fit_file import curves_json, identified_json, number_json
 from slipid.identify.posterior.blocks import Chain, Plan
 from slipid.identify.posterior.coordinates import Fitted
+from slipid.identify.result import Fit
+from slipid.identify.verdicts import estimates as verdicts
+from slipid.support.content import Content
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +44,8 @@ class Posterior:
     """Draws, and whether and why they may be believed.
 
     Effects are what runs of a session share, in stds. Log density, names and diagnosis are of the
-    first stage; accepted is the part of the moves that moved something, by stage. Of the second
-    stage's walkers, still is the part with a group that never moved, unsettled the worst drift or
-    memory, 1 where it is just enough.
+    first stage; accepted is the part of the moves that moved something, by stage, unsettled the
+    worst drift or memory of the second stage's walkers, 1 where it is just enough.
     """
 
     z: Float[np.ndarray, "ensemble draw free"]
@@ -45,7 +56,6 @@ class Posterior:
     names: tuple[str, ...]
     diagnosis: Diagnosis
     accepted: dict[str, float]
-    still: float
     unsettled: float
     converged: bool
     reason: str
@@ -96,3 +106,65 @@ def autocorrelation_time(chain: Chain) -> Float[np.ndarray, " size"]:
     enough = np.arange(steps)[:, None] >= 5 * sums
     window = np.where(enough.any(axis=0), enough.argmax(axis=0), steps - 1)
     return np.asarray(np.maximum(sums[window, np.arange(sums.shape[1])], 1e-3))
+
+
+def estimates(fit: Fit, found: Posterior) -> dict[str, verdicts.Estimate]:
+    """Every number with mean, interval and verdict from the draws.
+
+    Means are taken in the search space, so that shares sum to one and positive numbers have their
+    geometric mean.
+    """
+    flat = found.z.reshape(-1, fit.space.size)
+    out = dict(fit.parameters)
+    for e in fit.space.free:
+        at, d, old = fit.space.place[e.path], e.declaration, fit.parameters[e.path]
+        z = flat[:, at]
+        values = np.asarray(jax.vmap(d.to_si)(jnp.asarray(z)))
+        low, high = np.quantile(values, [0.05, 0.95], axis=0)
+        scaled = np.cov((z / fit.space.prior_std[at]).T).reshape(e.coordinates, e.coordinates)
+        ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
+        pairs = tuple(zip(low.tolist(), high.tolist(), strict=True))
+        unsaid = e.path in verdicts.NEEDS_VOLTAGE and not fit.channels.voltage
+        verdict = verdicts.by_ratio(ratio, verdicts.from_zero(d, z.std(axis=0)))
+        if unsaid or old.verdict == "at_bound":
+            verdict = old.verdict
+        pull = (z.mean(axis=0) - fit.space.prior_mean[at]) / fit.space.prior_std[at]
+        out[e.path] = replace(
+            old,
+            value=verdicts.plain(d.to_si(jnp.asarray(z.mean(axis=0)))),
+            std=verdicts.plain(values.std(axis=0)),
+            interval90=pairs[0] if len(pairs) == 1 else pairs,
+            ratio=ratio,
+            verdict=verdict,
+            provenance=verdicts.provenance(verdict, ratio),
+            pull=float(pull[np.argmax(np.abs(pull))]),
+            source="posterior",
+        )
+    return out
+
+
+def identified(
+    fit: Fit, found: Posterior, numbers: Mapping[str, verdicts.Estimate], problem: Problem
+) -> Content:
+    """Content of identified.json with what the posterior says, `numbers` being its estimates."""
+    content = identified_json(fit)
+    for path, e in numbers.items():
+        content["parameters"][path] = number_json(e)
+    flat = found.z.reshape(-1, fit.space.size)
+    ratios = verdicts.derived(fit.space, flat.mean(axis=0), np.cov(flat.T), fit.channels.voltage)
+    content["derived"] = {e.path: number_json(_drawn(e, fit, flat)) for e in ratios}
+    some = flat[:: max(1, len(flat) // 400)]
+    curves = curves_of.curves(fit.space, flat.mean(axis=0), some, problem.batch)
+    content["curves"] = curves_json(curves)
+    if not found.converged:
+        content["messages"].append(f"the posterior did not converge: {found.reason}")
+    return content
+
+
+def _drawn(ratio: verdicts.Estimate, fit: Fit, flat: np.ndarray) -> verdicts.Estimate:
+    """A quotient with the interval and the std of its draws."""
+    over, under = (fit.space.place[path] for path in ratio.path.rsplit("/", 1))
+    draws = np.exp(flat[:, over] - flat[:, under])
+    low, high = np.quantile(draws, [0.05, 0.95]).tolist()
+    std = float(draws.std())
+    return replace(ratio, std=std, interval90=(low, high), source="posterior")

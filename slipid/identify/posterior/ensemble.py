@@ -17,9 +17,8 @@ import numpy as np
 from emcee.state import State
 
 from slipid.identify.posterior import diagnosis
-from slipid.identify.posterior.blocks import Block, Chain, Plan, Record
+from slipid.identify.posterior.blocks import Block, Chain, Plan, Record, Target
 from slipid.identify.posterior.proposals import WAY, Hamiltonian, moves
-from slipid.identify.posterior.target import Target
 from slipid.identify.posterior.transport.transport_map import Transport, learnt
 
 RandomState = tuple[str, np.ndarray, int, int, float]

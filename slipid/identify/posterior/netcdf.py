@@ -140,7 +140,7 @@ def write(made: DataTree, path: Path) -> None:
 
 def _replicates(
     density: Density, x: Float[np.ndarray, "ensemble draw size"]
-) -> dict[str, Float[np.ndarray, "ensemble draw piece m"]]:
+) -> dict[str, Float[np.ndarray, "ensemble replicate piece m"]]:
     """Replicated less measured data of every piece, from some draws of each ensemble.
 
     What the model says, less what was measured, plus noise of the draw's own variances.

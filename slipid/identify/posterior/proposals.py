@@ -7,15 +7,17 @@ the shared ones, which groups then follow. Hamiltonian moves take all coordinate
 gradient where the density still bends, and walks along a single one cross its plateaus.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from emcee.model import Model
 from emcee.moves import Move
 from emcee.state import State
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.random import RandomState
 from scipy.special import gammaln
 
-from slipid.identify.posterior.target import Family, Target, families
+from slipid.identify.posterior.blocks import Target
 from slipid.identify.posterior.transport.pieces import Matrix
 
 STUDENT = 0.2
@@ -31,6 +33,28 @@ ALONE = 0.5
 """Part of walks along a coordinate that no other one of x follows."""
 STEEPEST = 100.0
 """Kicks are bounded by this many times the step, so that walkers far out are not thrown away."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """Coordinates that are moved together: those of each group, or the shared ones alone (None)."""
+
+    places: tuple[Int[np.ndarray, " _"], ...]
+    groups: tuple[int, ...] | None
+
+
+def families(target: Target) -> list[Family]:
+    """Coordinates of every kind, of all groups and shared."""
+    found = []
+    for k in np.unique(target.kind):
+        groups = tuple(int(g) for g in np.unique(target.group[target.kind == k]) if g >= 0)
+        places = [np.flatnonzero((target.kind == k) & (target.group == g)) for g in groups]
+        if groups:
+            found.append(Family(tuple(places), groups))
+        shared = np.flatnonzero((target.kind == k) & (target.group < 0))
+        if len(shared):
+            found.append(Family((shared,), None))
+    return found
 
 
 Jump = tuple[Matrix, Float[np.ndarray, " walker"]]

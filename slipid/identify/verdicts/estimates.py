@@ -27,7 +27,7 @@ TAIL, SMALL = 4.0, 0.05
 below this part of it: a tight prior that the data contradict is something else."""
 NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
 """Without a voltage nothing sets the scale of these; a prior elsewhere must not lend them one."""
-_Z95 = 1.6448536269514722
+Z95 = 1.6448536269514722
 
 
 class Ratio(NamedTuple):
@@ -104,7 +104,8 @@ def estimates(
     )
 
 
-def _plain(x: Any) -> Any:
+def plain(x: Any) -> Any:
+    """A single number, or a tuple of several."""
     x = np.asarray(x, float)
     return float(x.reshape(())) if x.size == 1 else tuple(float(v) for v in x)
 
@@ -119,7 +120,7 @@ def _fixed(entry: Entry, tree: Any, choices: Sequence[Choice]) -> Estimate:
         unit=entry.declaration.unit,
         doc=entry.declaration.doc,
         labels=entry.labels,
-        value=_plain(entry.get(tree)),
+        value=plain(entry.get(tree)),
         verdict="fixed",
         provenance="override" if chosen else "borrowed",
     )
@@ -142,7 +143,7 @@ def _free(
         std = draws.std(axis=0)
         wide = np.full(entry.size, prior_std.mean() / entry.size)
     else:
-        low, high = (np.asarray(d.to_si(jnp.asarray(mean + k * std_z))) for k in (-_Z95, _Z95))
+        low, high = (np.asarray(d.to_si(jnp.asarray(mean + k * std_z))) for k in (-Z95, Z95))
         std = d.slope(value) * std_z
         wide = d.slope(center) * prior_std
     scaled = block / prior_std[:, None] / prior_std[None, :]
@@ -160,15 +161,15 @@ def _free(
         unit=d.unit,
         doc=d.doc,
         labels=entry.labels,
-        value=_plain(value),
-        std=_plain(std),
+        value=plain(value),
+        std=plain(std),
         interval90=pairs[0] if len(pairs) == 1 else pairs,
         verdict=verdict,
         provenance=provenance(verdict, ratio),
         ratio=ratio,
         pull=float(pull[np.argmax(np.abs(pull))]),
-        prior_mean=_plain(center),
-        prior_std=_plain(wide),
+        prior_mean=plain(center),
+        prior_std=plain(wide),
     )
 
 
@@ -225,7 +226,7 @@ def _quotient(
     value, ratio = float(np.exp(log_value)), std / prior_std
     unknown = over == NEEDS_VOLTAGE[0] and not has_voltage
     verdict = "not_identified" if unknown else by_ratio(ratio, 1 / std)
-    low, high = (float(np.exp(log_value + k * std)) for k in (-_Z95, _Z95))
+    low, high = (float(np.exp(log_value + k * std)) for k in (-Z95, Z95))
     return Estimate(
         path=f"{over}/{wanted.under}",
         unit=wanted.unit,

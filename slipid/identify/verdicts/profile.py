@@ -16,13 +16,12 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 from scipy.stats import chi2
 
 from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, State
-from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE
+from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE, Z95
 from slipid.parameter import Entry
 from slipid.search_space import Space
 
@@ -111,7 +110,36 @@ def profile(
     own = 0.5 * ((z - problem.space.prior_mean[at]) / problem.space.prior_std[at]) ** 2
     likelihood = posterior - own
     posterior, likelihood = posterior - posterior.min(), likelihood - likelihood.min()
-    return _told(problem, entry, walk, z, posterior, likelihood)
+    d = entry.declaration
+
+    def si(x: float) -> float:
+        return float(np.asarray(d.to_si(jnp.atleast_1d(jnp.asarray(float(x))))).reshape(()))
+
+    low = int(np.argmin(likelihood))
+    sides = (slice(low, None, -1), slice(low, None))
+    cross = [_crossing(z[side], likelihood[side]) for side in sides]
+    ends = ["open" if x is None else "closed" for x in cross]
+    interval = [None if x is None else si(x) for x in cross]
+    for k, bound in enumerate((d.lower, d.upper)):
+        if ends[k] == "open" and ends[1 - k] == "closed" and np.isfinite(bound):
+            ends[k], interval[k] = "at_bound", float(bound)
+    half = Z95 * walk.std
+    return Profile(
+        path=entry.path,
+        unit=d.unit,
+        value=tuple(si(x) for x in z),
+        posterior=tuple(posterior.tolist()),
+        likelihood=tuple(likelihood.tolist()),
+        laplace=tuple((0.5 * ((z - walk.start) / walk.std) ** 2).tolist()),
+        estimate=si(walk.start),
+        interval90=(interval[0], interval[1]),
+        ends=(ends[0], ends[1]),
+        laplace90=(si(walk.start - half), si(walk.start + half)),
+        given="" if problem.target.joint or walk.of_motion else "the motion as fitted",
+        settled=walk.settled,
+        said=_sentence(entry, interval, ends, problem.windows.has_voltage)
+        + ("" if walk.settled else "; some refits did not settle: it may be wider"),
+    )
 
 
 class _Walk:
@@ -123,7 +151,7 @@ class _Walk:
         self.problem, self.at, self.tell = problem, at, tell
         self.free, self.of_motion = np.ones(problem.space.size), False
         covariance = optimum.covariance
-        if not problem.joint:
+        if not problem.target.joint:
             electric = problem.space.electric
             self.of_motion = not electric[at]
             mine = electric == electric[at]
@@ -177,46 +205,6 @@ class _Walk:
                 step *= growth
             state, before = end.state, rise
         return points
-
-
-def _told(
-    problem: Problem,
-    entry: Entry,
-    walk: _Walk,
-    z: Float[np.ndarray, " point"],
-    posterior: Float[np.ndarray, " point"],
-    likelihood: Float[np.ndarray, " point"],
-) -> Profile:
-    d = entry.declaration
-
-    def si(x: float) -> float:
-        return float(np.asarray(d.to_si(jnp.atleast_1d(jnp.asarray(float(x))))).reshape(()))
-
-    low = int(np.argmin(likelihood))
-    sides = (slice(low, None, -1), slice(low, None))
-    cross = [_crossing(z[side], likelihood[side]) for side in sides]
-    ends = ["open" if x is None else "closed" for x in cross]
-    interval = [None if x is None else si(x) for x in cross]
-    for k, bound in enumerate((d.lower, d.upper)):
-        if ends[k] == "open" and ends[1 - k] == "closed" and np.isfinite(bound):
-            ends[k], interval[k] = "at_bound", float(bound)
-    half = 1.6448536269514722 * walk.std
-    return Profile(
-        path=entry.path,
-        unit=d.unit,
-        value=tuple(si(x) for x in z),
-        posterior=tuple(posterior.tolist()),
-        likelihood=tuple(likelihood.tolist()),
-        laplace=tuple((0.5 * ((z - walk.start) / walk.std) ** 2).tolist()),
-        estimate=si(walk.start),
-        interval90=(interval[0], interval[1]),
-        ends=(ends[0], ends[1]),
-        laplace90=(si(walk.start - half), si(walk.start + half)),
-        given="" if problem.joint or walk.of_motion else "the motion as fitted",
-        settled=walk.settled,
-        said=_sentence(entry, interval, ends, problem.windows.has_voltage)
-        + ("" if walk.settled else "; some refits did not settle: it may be wider"),
-    )
 
 
 def _crossing(z: np.ndarray, rise: np.ndarray) -> float | None:

@@ -245,7 +245,7 @@ def test_slopes_by_a_rungs_numbers_are_those_of_a_step_in_them(name):
 def test_a_curve_carries_over_where_floors_share_it_and_nowhere_else(other):
     w = driven("affine_current", ([0.05, 0.1], [0.05 + other - 0.1, other]), 7)
     every = transfer(w, ROBOT)["all"]
-    lost = every.pooled.rows / every.per_surface.rows
+    lost = every["pooled"]["rows"] / every["per_surface"]["rows"]
     assert lost < 1.05 if other == 0.1 else lost > 1.5
 
 

@@ -11,7 +11,7 @@ import pytest
 from slipid.identify.posterior import sample as posterior
 from slipid.identify.posterior.blocks import Plan, Record
 from slipid.identify.posterior.coordinates import MOTION
-from slipid.identify.posterior.second_stage import unsettled
+from slipid.identify.posterior.sample import unsettled
 from tests.helpers import calibration
 
 SEEDS = (1, 4)

@@ -9,7 +9,7 @@ import pytest
 from arviz_stats.base import array_stats
 from emcee.model import Model
 
-from slipid.identify.posterior.blocks import Plan, Record, packed, unpacked
+from slipid.identify.posterior.blocks import Plan, Record, Target, packed, unpacked
 from slipid.identify.posterior.diagnosis import autocorrelation_time, diagnose
 from slipid.identify.posterior.ensemble import chain as positions
 from slipid.identify.posterior.ensemble import extended
@@ -18,8 +18,8 @@ from slipid.identify.posterior.proposals import (
     Differential,
     Hamiltonian,
     Independence,
+    families,
 )
-from slipid.identify.posterior.target import Target, families
 
 PLAN = Plan(ensembles=4, walkers=16, block=25, warm_up=(2, 4, 6), most=120, spread=6.0)
 
