@@ -178,11 +178,7 @@ def to_json(fit: Fit) -> Content:
 
 
 def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
-    """Fit from the content of fit.json and its arrays.
-
-    Raises:
-        KeyError, TypeError, ValueError: it is no such content.
-    """
+    """Fit from the content of fit.json and its arrays."""
     choices = tuple(Choice(**c) for c in content["choices"])
     space = Space(_robot_of(content["robot"]), choices)
     if space.names != content["names"]:

@@ -53,9 +53,6 @@ def check(
     """Say what the logs hold, and what they can be expected to tell, before any fit.
 
     That is the content of check.json, which is written to `out`, if that is wanted.
-
-    Raises:
-        DataError: config or logs are wrong.
     """
     setup_jax(quiet=True)
     job = read_job(read_config(config_path), data, report)

@@ -16,11 +16,7 @@ from slipid.support.progress import Reporter
 def read_dataset(
     config: Config, sections: Sequence[Logs], root: Path, report: Reporter
 ) -> tuple[Runs, list[str]]:
-    """Runs of some log sections, and a line for each section without files.
-
-    Raises:
-        DataError: no file at all, or one that cannot be read.
-    """
+    """Runs of some log sections, and a line for each section without files."""
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; expected the folder of the logs (--data)")
     found, skipped = files_of(config, sections, root)
@@ -54,11 +50,7 @@ def read_dataset(
 def files_of(
     config: Config, sections: Sequence[Logs], root: Path
 ) -> tuple[list[tuple[Logs, list[Path]]], list[str]]:
-    """Files of every log section that has some, and a line for each that has none.
-
-    Raises:
-        DataError: a glob that cannot be one.
-    """
+    """Files of every log section that has some, and a line for each that has none."""
     found: list[tuple[Logs, list[Path]]] = []
     skipped: list[str] = []
     for section in sections:

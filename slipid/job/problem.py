@@ -79,22 +79,14 @@ class Job(Task):
 
 
 def read_job(config: Config, root: Path, report: Reporter) -> Job:
-    """Read every log of runs on one floor that the config names below a folder, set up its robot.
-
-    Raises:
-        DataError: what is wrong with config or logs.
-    """
+    """Read every log of runs on one floor that the config names, and set up its robot."""
     report.stage("reading logs")
     dataset, skipped = read_dataset(config, one_floor(config.content.logs), root, report)
     return job_of(config, dataset, skipped, report)
 
 
 def with_mixed(job: Job, root: Path, report: Reporter) -> Job:
-    """The job with the runs over several floors that its config names.
-
-    Raises:
-        DataError: what is wrong with maps or logs.
-    """
+    """The job with the runs over several floors that its config names."""
     wanted = [section for section in job.config.content.logs if section.map is not None]
     found, absent = files_of(job.config, wanted, root)
     for section, _ in found:
@@ -139,11 +131,7 @@ def _go_together(job: Job, data: Runs) -> None:
 
 
 def job_of(config: Config, dataset: Runs, skipped: Sequence[str], report: Reporter) -> Job:
-    """Job of runs that are there already.
-
-    Raises:
-        DataError: config and runs do not belong together.
-    """
+    """Job of runs that are there already."""
     shape = shape_of(config)
     if shape.wheels != dataset.logs[0].wheels:
         raise DataError(

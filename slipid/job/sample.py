@@ -54,9 +54,6 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
 
     A chain that was interrupted there goes on. The logs lie in `data`, by default where they were
     fitted; `draws` are kept of each ensemble.
-
-    Raises:
-        DataError: no fit there, or other logs than it was made of.
     """
     began = time.monotonic()
     setup_jax(quiet=True)

@@ -20,9 +20,6 @@ def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Conten
     """Predict runs of `data` with the fit in `out`, and with every simpler model that it learnt.
 
     Returns the fit, the runs, and the content of the validation file.
-
-    Raises:
-        DataError: no fit there, or logs that it cannot predict.
     """
     setup_jax(quiet=True)
     fit = load(out)

@@ -49,9 +49,6 @@ def selftest(
         out: folder for selftest.json and the replicates, which a later call goes on from.
         count: replicates.
         seed: of truths and noise.
-
-    Raises:
-        DataError: config or logs are wrong.
     """
     setup_jax(quiet=True)
     config = read_config(config_path)
@@ -83,9 +80,6 @@ def planned(config: Config, report: Reporter) -> Job:
 
     Channels are those that the config's layouts name; every load set-up of the config is driven on
     every floor.
-
-    Raises:
-        DataError: a config that cannot be driven.
     """
     wanted, shape = config.content.selftest, shape_of(config)
     sections = one_floor(config.content.logs)

@@ -42,9 +42,8 @@ def measure(
     pose[..., :2] += rng.normal(size=(*pose.shape[:2], 2)) * std.get("camera.place", 0.0)
     pose[..., 2] += rng.normal(size=pose.shape[:2]) * std.get("camera.heading", 0.0)
     each = _of(std, w, "current", "window")[:, None, None]
-    same = _of(std, w, "current", "run")[:, None, None] * rng.normal(
-        size=(len(w), 1, amps.shape[2])
-    )
+    of_run = rng.normal(size=(len(w), 1, amps.shape[2]))
+    same = _of(std, w, "current", "run")[:, None, None] * of_run
     ammeter = np.minimum(w.current_var, each**2)
     flowing = amps + same + np.sqrt(each**2 - ammeter) * rng.normal(size=amps.shape)
     speed = w.turn / w.dt[..., None]

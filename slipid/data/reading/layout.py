@@ -104,7 +104,6 @@ class Layout:
         ticks_are_increments: whether the cells hold the ticks since the last row.
         tick_bits: width of the tick counter, at which it wraps around.
         current_is_signed: False where the cells are magnitudes.
-        current_step: step of the current's analogue-to-digital converter [A]; None where unknown.
         metres_per_pixel: scale of the camera along its x and its y [m].
         new_run: what tells that the next run starts inside the file.
         drop_repeated_time: whether to keep the last of rows with the same time; else such rows are
@@ -126,7 +125,6 @@ class Layout:
     ticks_are_increments: StrictBool = False
     tick_bits: Count = 32
     current_is_signed: StrictBool = True
-    current_step: StrictFloat | None = None
     metres_per_pixel: Annotated[tuple[Positive, Positive] | None, BeforeValidator(_pair)] = None
     new_run: Literal["never", "time_restarts", "ticks_restart"] = "never"
     drop_repeated_time: StrictBool = False

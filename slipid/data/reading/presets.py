@@ -48,7 +48,6 @@ _ROBOTINO = Layout(
     ticks_per_revolution=2000.0,
     gear_ratio=16.0,
     current_is_signed=False,
-    current_step=1 / 39,
 )
 _ROBOTINO_2022 = replace(_ROBOTINO, names_row=3, units_row=2, first_data_row=4)
 _MOTORS_2022 = {

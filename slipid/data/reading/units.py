@@ -74,11 +74,9 @@ def factor(unit: str, target: str) -> float:
 
 def converts(unit: str, target: str) -> bool:
     """Whether a unit is known and of the dimension of another."""
-    try:
-        factor(unit, target)
-    except ValueError:
-        return False
-    return True
+    with suppress(ValueError):
+        return factor(unit, target) > 0
+    return False
 
 
 def same_unit(one: str, other: str) -> bool:

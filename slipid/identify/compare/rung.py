@@ -43,11 +43,7 @@ class Rung(abc.ABC):
         return as_increments(self.twist(w, robot), w, robot)
 
     def series(self, surface: str, load: str) -> str:
-        """Key in `state` of the numbers that speak of a floor and load set-up.
-
-        Raises:
-            ValueError: no such floor was fitted.
-        """
+        """Key in `state` of the numbers that speak of a floor and load set-up."""
         of_floor(self.state, surface)
         return surface
 
@@ -57,11 +53,7 @@ class Rung(abc.ABC):
 
 
 def of_floor(floors: Mapping[str, Number], name: str) -> Number:
-    """What is kept for a floor.
-
-    Raises:
-        ValueError: no such floor was fitted.
-    """
+    """What is kept for a floor."""
     if name not in floors:
         raise ValueError(f"no surface '{name}'; identified: {', '.join(floors)}")
     return floors[name]

@@ -54,9 +54,6 @@ def crossing(data: Runs, floor: FloorMap, robot: Robot) -> Crossing:
 
     Where wheels stand is read through the camera of the fitted robot, which knows every surface of
     the map and every load of the runs.
-
-    Raises:
-        DataError: no such window.
     """
     radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
     w = windows(data, radius, lag, per_piece=1, longest=WINDOW)

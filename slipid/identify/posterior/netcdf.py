@@ -127,11 +127,7 @@ def _data(
 
 
 def write(made: DataTree, path: Path) -> None:
-    """Write the file, whole or not at all.
-
-    Raises:
-        DataError: nothing can be written there.
-    """
+    """Write the file, whole or not at all."""
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / path.name
         made.to_netcdf(whole, engine="h5netcdf")

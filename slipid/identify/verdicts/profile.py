@@ -97,9 +97,6 @@ def profile(
     currents tell is profiled given the motion, and one of the motion by the motion's likelihood:
     Laplace's parabola beside it is then the one of the same question. `tell` is called after every
     point with their number and the rise there.
-
-    Raises:
-        ValueError: as `profiled`.
     """
     entry = profiled(problem.space, path)
     at = problem.space.place[path].start
