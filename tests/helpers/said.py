@@ -18,3 +18,9 @@ class Said(Reporter):
 
     def line(self, text: str) -> None:
         self.lines.append(text)
+
+    def stage(self, name: str) -> None:
+        pass
+
+    def advance(self, done: int | float, total: int | float, what: str | None = None) -> None:
+        pass
