@@ -200,6 +200,8 @@ def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
     from matplotlib.image import imsave
 
     table = np.array([to_rgb(colours[name]) for name in floor.surfaces])
+    if len(np.unique(table, axis=0)) < len(table):
+        raise ValueError(f"surfaces with the same colour: {dict(colours)}; expected others")
     picture = BytesIO()
     imsave(picture, table[floor.cells[::-1]], format="png")
     write_bytes(path.with_suffix(".png"), picture.getvalue())

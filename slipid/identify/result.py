@@ -194,8 +194,8 @@ def _remaining(problem: Problem, z: Search, log_v: Vector) -> tuple[float, str]:
     """Largest step of a full Gauss-Newton step in posterior stds, and the number that takes it.
 
     delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), W with the weights of outliers, g
-    the slope of log |d residuals / d data|; where currents do not inform motion, their rows move
-    the electric numbers only.
+    the slope of log |d residuals / d data|; where currents were logged, their rows move the
+    electric numbers only.
     """
     every, volt = np.ones(len(problem.windows)), problem.volt(log_v)
     residual, jacobian = problem.linear(z, volt)

@@ -34,10 +34,8 @@ def compare(
     """Judge every rung of the ladder on left-out runs and write comparison.json to `out`.
 
     What is left out say the questions, some of `slipid.identify.compare.folds.QUESTIONS`; folds
-    that are finished in `out` are not done again.
-
-    Raises:
-        DataError: config, logs or questions are wrong; nothing was written then.
+    that are finished in `out` are not done again. DataError where config, logs or questions are
+    wrong; nothing was written then.
     """
     setup_jax(quiet=True)
     config = read_config(config_path)

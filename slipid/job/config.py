@@ -192,11 +192,7 @@ def read_config(path: Path) -> Config:
 
 
 def parsed(path: Path, text: str) -> Config:
-    """Config from TOML text; the path is for messages.
-
-    Raises:
-        DataError: no TOML, unknown or missing keys, wrong values; every one on a line.
-    """
+    """Config from TOML text; DataError with every mistake on a line that begins with the path."""
     return Config(path, text, checked(path, mapping_of(path, text), Content))
 
 

@@ -46,9 +46,7 @@ def identify(
     """Fit the robot of a config to its logs and write everything to `out`.
 
     A fit that was interrupted there goes on. Profile likelihoods are made of the numbers named.
-
-    Raises:
-        DataError: config or logs are wrong; nothing was written then.
+    DataError where config or logs are wrong; nothing was written then.
     """
     began = time.monotonic()
     setup_jax(quiet=True)

@@ -16,12 +16,8 @@ from slipid.support.errors import DataError
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file so that a reader, or a crash, sees the old one or the new one, never a part.
-
-    Raises:
-        DataError: nothing can be written there.
-    """
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    """Write a file so that a reader, or a crash, sees the old one or the new one, never a part."""
+    partial = path.parent / f".{path.name}.{secrets.token_hex(4)}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("xb") as file:

@@ -53,24 +53,23 @@ def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
     try:
         return TypeAdapter(model).validate_python(mapping)
     except ValidationError as error:
-        lines = dict.fromkeys(_line(path, model, e) for e in error.errors())
+        lines = dict.fromkeys(_line(path, mapping, model, e) for e in error.errors())
         raise DataError("\n".join(lines)) from None
 
 
-def _line(path: Path | str, root: type, error: ErrorDetails) -> str:
+def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) -> str:
     """One mistake as one line: file, key, what was found, what was expected."""
     kind, given, context = error["type"], error["input"], error.get("ctx", {})
-    steps, there = _place(root, error["loc"])
+    steps = _steps(mapping, error["loc"])
     where = f"{path}: {_spelled(steps)}" if steps else str(path)
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        _, (model, *_) = _place(root, error["loc"][:-1])
-        known = list(_annotations(model))
+        known = list(_annotations(_kinds_at(mapping, root, steps[:-1])[0]))
         return f"{where}: no such key{near(steps[-1], known)}; expected one of {', '.join(known)}"
     if kind in ("missing", "missing_argument"):
         return f"{where}: missing; expected a value for it"
     if kind == "union_tag_not_found":
         key = context["discriminator"].strip("'")
-        tags = [get_args(_annotations(model)[key]) for model in there]
+        tags = [get_args(_annotations(m)[key]) for m in _kinds_at(mapping, root, steps)]
         return f"{where}.{key}: missing; expected one of {', '.join(v for t in tags for v in t)}"
     if kind == "union_tag_invalid":
         key, tag = context["discriminator"].strip("'"), context["tag"]
@@ -83,24 +82,19 @@ def _line(path: Path | str, root: type, error: ErrorDetails) -> str:
     return f"{where}: {given!r}; expected: {error['msg'][0].lower()}{error['msg'][1:]}"
 
 
-def _place(root: object, loc: Sequence[Step]) -> tuple[list[Step], list[object]]:
-    """The part of pydantic's location that is in the file, and the types that may be there.
-
-    Tags and names of union members are not in the file.
-    """
+def _steps(mapping: object, loc: Sequence[Step]) -> list[Step]:
+    """The part of pydantic's location that is in the file: without names of union members."""
     steps: list[Step] = []
-    kinds = [root]
+    here = mapping
     for k, part in enumerate(loc):
-        tagged = [kind for kind in kinds if _has_tag(kind, part)]
-        if len(kinds) > 1 and tagged:
-            kinds = tagged
+        if (isinstance(here, dict) and part in here) or (
+            isinstance(here, list) and isinstance(part, int) and part < len(here)
+        ):
+            here = _below(here, part)
+        elif k < len(loc) - 1 or not isinstance(here, dict):
             continue
-        inner = [t for kind in kinds for t in _inner(kind, part)]
-        is_unknown_key = k == len(loc) - 1 and any(_annotations(kind) for kind in kinds)
-        if inner or isinstance(part, int) or is_unknown_key:
-            steps.append(part)
-            kinds = inner
-    return steps, kinds
+        steps.append(part)
+    return steps
 
 
 def _spelled(steps: Sequence[Step]) -> str:
@@ -114,11 +108,28 @@ def _spelled(steps: Sequence[Step]) -> str:
     return out.removeprefix(".")
 
 
+def _below(here: object, step: Step) -> object:
+    """What lies one step below; None where nothing does."""
+    if isinstance(here, list) and isinstance(step, int):
+        return here[step]
+    return here.get(step) if isinstance(here, dict) else None
+
+
+def _kinds_at(mapping: object, root: object, steps: Sequence[Step]) -> list[object]:
+    """Models and dataclasses that may describe a place of the file, by literals in it."""
+    found, here = [root], mapping
+    for step in steps:
+        inner = [t for kind in found for t in _inner(kind, step)]
+        here = _below(here, step)
+        found = [kind for kind in inner if _fits(kind, here)] or inner
+    return [kind for kind in found if _annotations(kind)]
+
+
 def _inner(kind: object, step: Step) -> list[object]:
     """Types of what lies one step below."""
-    if get_origin(kind) is dict or (get_origin(kind) is list and isinstance(step, int)):
+    if get_origin(kind) in (list, dict):
         return _members(get_args(kind)[-1])
-    return _members(annotation) if (annotation := _annotations(kind).get(str(step))) else []
+    return _members(_annotations(kind).get(str(step)))
 
 
 def _members(annotation: object) -> list[object]:
@@ -140,9 +151,10 @@ def _annotations(kind: object) -> dict[str, object]:
     return {}
 
 
-def _has_tag(kind: object, tag: Step) -> bool:
-    """Whether a literal of the model is this tag."""
-    return any(
-        get_origin(annotation) is Literal and tag in get_args(annotation)
-        for annotation in _annotations(kind).values()
+def _fits(kind: object, here: object) -> bool:
+    """Whether its literals are those of the file."""
+    return all(
+        here[key] in get_args(annotation)
+        for key, annotation in _annotations(kind).items()
+        if get_origin(annotation) is Literal and isinstance(here, dict) and key in here
     )

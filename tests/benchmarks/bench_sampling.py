@@ -82,7 +82,8 @@ def ess_of(chain):
 def by_slipid(density):
     """Chains (chain, draw, coordinate), seconds of sampling and of the warm-up, the last block."""
     from slipid.identify.posterior import ensemble as sampler
-    from slipid.identify.posterior.blocks import Plan, Target
+    from slipid.identify.posterior.blocks import Plan, Record, Target
+    from slipid.identify.posterior.coordinates import MOTION
     from slipid.identify.posterior.diagnosis import diagnose
 
     d = density
@@ -92,10 +93,9 @@ def by_slipid(density):
     plan = Plan()
     x = np.repeat(d.centre[None], plan.walkers, axis=0)
     d.terms(x), d.slope(x)  # compiles
-    blocks, times = [], [time.perf_counter()]
-    for block in sampler.run([target] * plan.ensembles, plan):
-        blocks.append(block)
-        times.append(time.perf_counter())
+    times = [time.perf_counter()]
+    record = Record(keep=lambda part, block: times.append(time.perf_counter()))
+    blocks = sampler.extended([target] * plan.ensembles, plan, MOTION, record)
     warm = plan.warm_up[-1]
     chain = sampler.chain(blocks, plan)
     found = diagnose(chain, plan)

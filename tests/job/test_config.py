@@ -252,10 +252,11 @@ def test_short_runs_can_be_left_out(tmp_path):
     assert said.lines == ["skipped: 1 runs shorter than their min_rows"]
 
 
-def test_duty_and_bus_voltage_make_a_voltage(tmp_path):
+def with_duty(folder, cells):
+    """A log with columns of two duties and the bus voltage, and the text of its config."""
     lines = generic_text().splitlines()
-    lines = [f"{lines[0]},d1,d2,bus"] + [f"{line},0.25,-50e-2,24" for line in lines[1:]]
-    (tmp_path / "run.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    lines = [f"{lines[0]},d1,d2,bus"] + [f"{line},{cells}" for line in lines[1:]]
+    (folder / "run.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     columns = {
         "time": {"column": "time", "unit": "s"},
         "wheel_ticks": {"columns": ["left", "right"], "unit": "tick"},
@@ -269,7 +270,7 @@ def test_duty_and_bus_voltage_make_a_voltage(tmp_path):
         f"{name} = {{ " + ", ".join(f"{k} = {json.dumps(v)}" for k, v in spec.items()) + " }"
         for name, spec in columns.items()
     )
-    text = (
+    return (
         '[robot]\ndrive = "general"\nwheel_radius_m = 0.05\n'
         "wheel_places_m = [[0, 0.1], [0, -0.1]]\ndrive_directions_deg = [0, 0]\n"
         'roller_angles_deg = ["none", "none"]\n'
@@ -277,6 +278,30 @@ def test_duty_and_bus_voltage_make_a_voltage(tmp_path):
         f"[layouts.mine.columns]\n{inline}\n"
         '[[logs]]\nglob = "*.csv"\nformat = "mine"\nsurface = "floor"\n'
     )
+
+
+def test_duty_and_bus_voltage_make_a_voltage(tmp_path):
+    text = with_duty(tmp_path, "0.25,-50e-2,24")
     voltage = job_of(tmp_path, text).dataset.voltage
     assert voltage is not None
     assert voltage[0] == pytest.approx([6.0, -12.0])
+
+
+@pytest.mark.parametrize(
+    ("cells", "expected"),
+    [
+        ("0.25,-50e-2,24000", "row 2, column 'bus': bus_voltage of 2.4e+04 V"),
+        ("50,-50e-2,24", "row 2, column 'd1': duty of 50 (a share of 1)"),
+    ],
+)
+def test_what_makes_a_voltage_is_refused_by_its_own_name(tmp_path, cells, expected):
+    text = with_duty(tmp_path, cells)
+    with pytest.raises(DataError) as caught:
+        job_of(tmp_path, text)
+    assert expected in str(caught.value)
+
+
+def test_a_mistake_in_a_column_names_its_key(tmp_path):
+    text = with_duty(tmp_path, "0.25,-50e-2,24").replace('column = "time"', "column = 1.5")
+    with pytest.raises(DataError, match=r"columns\.time: column: 1\.5; expected"):
+        job_of(tmp_path, text)

@@ -21,9 +21,9 @@ _LIMITS = {
     "wheel_speed": (1000.0, "rad/s"),
     "wheel_speed_command": (1000.0, "rad/s"),
     "current": (1000.0, "A"),
-    "voltage": (1000.0, "V"),
     "bus_voltage": (1000.0, "V"),
     "duty": (1.5, "(a share of 1)"),
+    "voltage": (1000.0, "V"),  # may be the product of both: they are named first
     "gyro": (100.0, "rad/s"),
 }
 

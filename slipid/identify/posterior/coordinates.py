@@ -27,7 +27,7 @@ A = TypeVar("A", Array, np.ndarray)
 class Fitted:
     """Where a fit ended, and the variances of what the runs of a session share.
 
-    The Laplace covariance is as if sessions shared nothing; where currents do not inform motion it
+    The Laplace covariance is as if sessions shared nothing; where currents were logged it
     is that of p(electric | motion, data) p(motion | motion data).
     """
 

@@ -62,11 +62,7 @@ class Posterior:
 
 
 def diagnose(chain: Chain, plan: Plan) -> Diagnosis:
-    """Diagnosis of chains without their warm-up.
-
-    Raises:
-        ImportError: arviz-stats is not installed.
-    """
+    """Diagnosis of chains without their warm-up; ImportError where arviz-stats is missing."""
     from arviz_stats.base import array_stats
 
     ensembles, steps, walkers, size = chain.shape

@@ -1,6 +1,6 @@
 """Posterior of a fit by sampling: motion first, then electric numbers given each draw of it.
 
-Where currents do not inform motion the posterior is p(motion | motion data) p(electric | motion,
+Where currents were logged the posterior is p(motion | motion data) p(electric | motion,
 data), which no single density describes: its normaliser depends on the motion. It is drawn from in
 two stages; in the second every walker keeps its own draw of the motion.
 """

@@ -93,7 +93,7 @@ def profile(
 ) -> Profile:
     """Profile of a number about the end of a fit; every other number is fitted again at each point.
 
-    The noise keeps the variances of the fit. Where currents do not inform motion, a number that
+    The noise keeps the variances of the fit. Where currents were logged, a number that
     currents tell is profiled given the motion, and one of the motion by the motion's likelihood:
     Laplace's parabola beside it is then the one of the same question. `tell` is called after every
     point with their number and the rise there.

@@ -5,7 +5,7 @@ eigenvalue 1 where the data say nothing. A direction u is flat where u^T P u < 1
 one prior std along it is hardly noticed, whatever else is known. Of all such directions those that
 move few numbers are sought: a sparse basis, found by leaving numbers out one by one.
 
-Where currents do not inform motion, a direction of the motion alone is judged by what motion tells,
+Where currents were logged, a direction of the motion alone is judged by what motion tells,
 whether or not the numbers that currents tell are known.
 """
 
