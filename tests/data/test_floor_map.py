@@ -161,3 +161,10 @@ def test_absent_and_broken_pictures_are_said(tmp_path):
     (tmp_path / "top.png").write_bytes(b"no picture")
     with pytest.raises(DataError, match="expected a PNG or JPEG"):
         read_map(path)
+
+
+def test_a_map_whose_colours_cannot_be_told_apart_is_not_written(tmp_path):
+    floor = patchwork(("a", "b"), seed=1, cell=0.05)
+    with pytest.raises(ValueError, match="same colour"):
+        write_map(tmp_path / "site.toml", floor, {"a": "#102030", "b": "#102030"})
+    assert not any(tmp_path.iterdir())

@@ -113,12 +113,14 @@ class Density:
     ) -> Result:
         """A method of one vector for many, by the density of this form that compiles for all."""
         form = self._form
+        if of not in form._each:
 
-        def each(anchor: Anchor, x: Array, held: Held | None) -> Result:
-            return jax.lax.map(lambda one: of(form, anchor, *one), (x, held))
+            def each(anchor: Anchor, x: Array, held: Held | None) -> Result:
+                return jax.lax.map(lambda one: of(form, anchor, *one), (x, held))
 
-        # belongs to the density: one that JAX held by its arguments would never be forgotten
-        compiled = form._each.setdefault(of, jax.jit(each))
+            # belongs to the density: one that JAX held by its arguments would never be forgotten
+            form._each[of] = jax.jit(each)
+        compiled: Callable[..., Result] = form._each[of]
         return compiled(self.anchor, jnp.asarray(x), held)
 
     def terms(
