@@ -34,6 +34,8 @@ class Declaration:
             space is logarithmic, in [unit] where there are no bounds.
         free: whether it is fitted unless the user says otherwise.
         shares: the numbers of the array are positive and sum to one.
+        deviation: the numbers of the array sum to zero and stand for what a model lacks; the spread
+            of all of them together is found from the data, up to about `spread`.
         doc: one line for people.
         electric: it is read from currents and voltages given the motion, not from the motion.
     """
@@ -46,14 +48,20 @@ class Declaration:
     spread: float = 1.0
     free: bool = True
     shares: bool = False
+    deviation: bool = False
     doc: str = ""
     electric: bool = False
+
+    @property
+    def tied(self) -> bool:
+        """Whether its numbers have one coordinate less than there are of them."""
+        return self.shares or self.deviation
 
     def to_search(self, value: Any) -> np.ndarray:
         """Search-space vector of an SI value (scalar or array)."""
         x = np.atleast_1d(np.asarray(value, float))
-        if self.shares:
-            return np.asarray(np.log(x) @ share_basis(len(x)))
+        if self.tied:
+            return np.asarray((np.log(x) if self.shares else x) @ share_basis(len(x)))
         if math.isinf(self.lower) and math.isinf(self.upper):
             return x
         if math.isinf(self.upper):
@@ -63,8 +71,9 @@ class Declaration:
 
     def to_si(self, z: Float[Array, " n"]) -> Float[Array, " m"]:
         """SI values of a search-space vector."""
-        if self.shares:
-            return jax.nn.softmax(share_basis(z.shape[-1] + 1) @ z)
+        if self.tied:
+            x = jnp.asarray(share_basis(z.shape[-1] + 1)) @ z
+            return jax.nn.softmax(x) if self.shares else x
         if math.isinf(self.lower) and math.isinf(self.upper):
             return z
         if math.isinf(self.upper):
@@ -72,7 +81,7 @@ class Declaration:
         return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(z)
 
     def slope(self, value: Any) -> Any:
-        """Derivative d SI / d search at SI values, shares excepted."""
+        """Derivative d SI / d search at SI values, of numbers that are not tied."""
         if math.isinf(self.lower) and math.isinf(self.upper):
             return np.ones_like(value)
         if math.isinf(self.upper):
@@ -163,7 +172,7 @@ class Entry:
     @property
     def coordinates(self) -> int:
         """How many search-space coordinates it takes when free."""
-        return self.size - 1 if self.declaration.shares else self.size
+        return self.size - 1 if self.declaration.tied else self.size
 
 
 def entries(tree: Any, prefix: str = "", leaf: tuple[str, ...] = ()) -> Iterator[Entry]:

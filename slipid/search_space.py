@@ -164,6 +164,8 @@ def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, A
         spread = np.full(
             entry.coordinates, np.mean(std_si) / np.sqrt((slopes**2).sum(axis=1).mean())
         )
+    elif d.deviation:
+        spread = np.full(entry.coordinates, np.mean(std_si))
     else:
         spread = std_si / d.slope(np.atleast_1d(np.asarray(mean_si, float)))
     return value, mean, spread, is_free
@@ -185,7 +187,9 @@ def _inside(entry: Entry, value: Any) -> np.ndarray:
     if x.size not in (1, entry.size):
         raise ValueError(f"{entry.path} takes {entry.size} numbers, got {x.size}")
     x = np.broadcast_to(x.ravel(), (entry.size,))
-    if d.shares:
+    if d.deviation:
+        inside, rule = abs(x.sum(keepdims=True)) < 1e-6, "numbers that sum to 0"
+    elif d.shares:
         inside, rule = (x > 0) & (abs(x.sum() - 1) < 1e-6), "positive shares that sum to 1"
     else:
         inside = (x > d.lower) & (x < d.upper)

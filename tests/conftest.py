@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from slipid.support.jax_setup import plain_loops
+from slipid.support.jax_setup import one_blas_thread, plain_loops
 
 ROOT = Path(__file__).resolve().parents[1]
 GOLDENS = Path(__file__).with_name("goldens")
@@ -33,6 +33,7 @@ import jax  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
+one_blas_thread()
 
 # Shapes and types of every annotated function of slipid are checked while tests run; under jit this
 # costs at tracing only. Must come before the first import of what computes.

@@ -10,7 +10,6 @@ import numpy as np
 from slipid.api.results import Comparison, Profile, Proposal, Validation, compared
 from slipid.data.runs import Runs
 from slipid.identify import fit_file, result
-from slipid.identify.compare.predictive import Contact
 from slipid.identify.compare.slip_models import restored
 from slipid.identify.compare.validation import validation
 from slipid.identify.design.proposal import design
@@ -124,7 +123,7 @@ class Fit:
         """
         fit = self.result
         rungs = restored(dict(fit.baselines))
-        fitted = Contact(fit.robot, fit.variance, fit.covariance, fit.space, fit.z)
+        fitted = fit.contact
         return Validation(validation(fitted, rungs, runs), fit, runs)
 
     def sample(

@@ -69,7 +69,7 @@ class Posterior:
             raise KeyError(f"no draws of '{path}'; there are {', '.join(space.place)}")
         d = next(e.declaration for e in space.free if e.path == path)
         found = jax.vmap(jax.vmap(d.to_si))(jnp.asarray(self.result.z[..., space.place[path]]))
-        return np.asarray(found if d.shares else found[..., 0])
+        return np.asarray(found if d.tied else found[..., 0])
 
     @cached_property
     def tree(self) -> "DataTree":

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from slipid.control.robot_file import record
-from slipid.identify.fit.sessions import AXES
+from slipid.identify.fit.shared import AXES
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame

@@ -16,6 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from slipid.identify.fit.shared import FoundShared, Pace
 from slipid.identify.result import Channels, Fit
 from slipid.identify.slip_curves import SlipCurve
 from slipid.identify.verdicts.estimates import Estimate
@@ -29,9 +30,10 @@ from slipid.support.files import checksum, json_text, read_json, write_bytes
 
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
-SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/2"
+SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/3"
 _PLAIN = ("converged", "reason", "rounds", "remaining")
 _CURVE = ("torque_nm", "slip", "slip_lo", "slip_hi")
+_SHARED = ("std", "coefs", "by_number", "covariance")
 _SHAPE = ("place", "drive_angle", "roller_angle", "grips", "gear_ratio")
 
 
@@ -96,7 +98,10 @@ def load(folder: Path) -> Fit:
 
 def _packed(fit: Fit) -> bytes:
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, covariance=fit.covariance, laplace=fit.laplace)
+    arrays = {"covariance": fit.covariance, "laplace": fit.laplace}
+    for floor, found in fit.shared.items():
+        arrays |= {f"shared/{floor}/{name}": getattr(found, name) for name in _SHARED}
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
 
 
@@ -172,6 +177,7 @@ def to_json(fit: Fit) -> Content:
         }
         | ({} if fit.mixed is None else {"mixed": dict(fit.mixed)}),
         "current_trend": list(fit.current_trend),
+        "shared": {floor: [asdict(p) for p in found.paces] for floor, found in fit.shared.items()},
         "baselines": dict(fit.baselines),
         "data": {"hash": fit.data_hash, "runs": [list(r) for r in fit.runs]},
     }
@@ -204,6 +210,13 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         mixed=settings.get("mixed"),
         baselines=content["baselines"],
         current_trend=(content["current_trend"][0], content["current_trend"][1]),
+        shared={
+            floor: FoundShared(
+                tuple(Pace(**pace) for pace in paces),
+                **{name: arrays[f"shared/{floor}/{name}"] for name in _SHARED},
+            )
+            for floor, paces in content["shared"].items()
+        },
         covariance=arrays["covariance"],
         laplace=arrays["laplace"],
         **{name: content[name] for name in _PLAIN},

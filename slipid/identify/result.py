@@ -9,15 +9,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from slipid.data.runs import Runs
 from slipid.identify import slip_curves as curves_of
-from slipid.identify.compare.predictive import contact_of
+from slipid.identify.compare.predictive import Contact, contact_of
 from slipid.identify.fit.mixed import Update, informed
 from slipid.identify.fit.optimise import Optimum
-from slipid.identify.fit.problem import Problem, log_jacobian
-from slipid.identify.fit.variances import Search, Square, Vector
+from slipid.identify.fit.problem import Problem, State, log_jacobian
+from slipid.identify.fit.shared import FoundShared, Tie, freed, freed_slopes
+from slipid.identify.fit.variances import Search, Square
 from slipid.identify.slip_curves import SlipCurve
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, sentences
@@ -48,9 +49,9 @@ class Fit:
         space: free and fixed numbers, priors; its template holds the fixed values.
         choices: what the user wanted.
         z: search vector at the optimum.
-        covariance: of the search vector: Laplace, grown by what runs of a session share
-            (`slipid.identify.fit.sessions`).
-        laplace: without what they share, the curvature of the likelihood alone.
+        covariance: of the search vector: Laplace, with what runs share marginalised.
+        laplace: as if runs shared nothing, the curvature of their likelihood alone.
+        shared: what neighbouring runs were found to share, by floor.
         variance: every variance component by name, those of sessions included [unit squared].
         variance_unit: unit of each component's std.
         runs: (name, sha256) of every run that was fitted, those over several floors last.
@@ -87,6 +88,12 @@ class Fit:
     baselines: Mapping[str, Any] = field(default_factory=dict)
     current_trend: tuple[float, float] = (0.0, 0.0)
     mixed: Mapping[str, Any] | None = None
+    shared: Mapping[str, FoundShared] = field(default_factory=dict)
+
+    @cached_property
+    def contact(self) -> Contact:
+        """The fit as a model that predicts runs."""
+        return Contact(self.robot, self.variance, self.covariance, self.space, self.z, self.shared)
 
     @cached_property
     def robot(self) -> Robot:
@@ -152,20 +159,20 @@ def summarise(
     """
     z, log_v = optimum.state.z, optimum.state.log_variance
     contact = contact_of(problem, optimum.state, optimum.covariance, np.ones(len(problem.windows)))
-    left, name = _remaining(problem, z, log_v)
+    left, name = _remaining(problem, optimum.state)
     settled = left < REMAINING
     stuck = f"the solver stopped {left:.2g} stds of {name} away from where its own step leads"
     windows, robot = problem.windows, contact.robot
     several = draws(z, contact.covariance, 400, seed)
-    of_runs = [c for c in problem.noise.components if c.kind == "run"]
-    of_sessions = [replace(c, kind="session") for c in of_runs]
-    unit = {c.name: c.unit for c in (*problem.noise.components, *of_sessions)}
+    unit = {c.name: c.unit for c in problem.noise.components}
+    every = np.ones(len(problem.windows))
     return Fit(
         space=problem.space,
         choices=tuple(choices),
         z=np.asarray(z),
         covariance=contact.covariance,
-        laplace=np.asarray(optimum.covariance),
+        laplace=problem.laplace(z, log_v, every, alone=True),
+        shared=contact.shared,
         variance=contact.variance,
         variance_unit={name: unit[name] for name in contact.variance},
         runs=tuple((log.name, log.sha256) for log in data.logs),
@@ -190,32 +197,40 @@ def summarise(
     )
 
 
-def _remaining(problem: Problem, z: Search, log_v: Vector) -> tuple[float, str]:
+def _remaining(problem: Problem, state: State) -> tuple[float, str]:
     """Largest step of a full Gauss-Newton step in posterior stds, and the number that takes it.
 
     delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), W with the weights of outliers, g
     the slope of log |d residuals / d data|; where currents were logged, their rows move the
     electric numbers only.
     """
-    every, volt = np.ones(len(problem.windows)), problem.volt(log_v)
+    z, log_v, every = state.z, state.log_variance, np.ones(len(problem.windows))
+    volt = problem.volt(log_v)
     residual, jacobian = problem.linear(z, volt)
-    roots = problem.whitening(residual, log_v, every).root
-    residual, jacobian, roots = jax.device_get((residual, jacobian, roots))
+    seen = problem.seen(residual, log_v, every, state.shared(len(every)))
+    roots = seen.whitening.root
     own = problem.space.electric.astype(float)
-    prior = problem.space.prior_std**-2
+    prior = np.asarray(problem.target.prior_std(log_v)) ** -2
     _, slope = log_jacobian(problem.target, z, volt, every)
     gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
     info = np.diag(prior)
     for k, root in roots.items():
-        white = np.einsum("nij,nj->ni", root, residual[k]).ravel()
-        half = np.einsum("nij,njp->nip", root, jacobian[k]).reshape(-1, len(z))
-        half = half * (1.0 if k == "motion" else own)
-        gradient = gradient + half.T @ white
-        info = info + half.T @ half
+        white = jnp.einsum("nij,nj->ni", root, residual[k])
+        half = jnp.einsum("nij,njp->nip", root, jacobian[k])
+        if k == "motion":
+            white, half = _freed(seen.tied, white, half)
+        flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k == "motion" else own)
+        gradient = gradient + flat.T @ np.asarray(white).ravel()
+        info = info + flat.T @ flat
     std = np.sqrt(np.diag(np.linalg.inv(info)))
     steps = np.abs(np.linalg.solve(info, gradient)) / std
     worst = int(np.argmax(steps))
     return float(steps[worst]), problem.space.names[worst]
+
+
+@jax.jit
+def _freed(tied: tuple[Tie, ...], white: Array, half: Array) -> tuple[Array, Array]:
+    return freed(tied, white), freed_slopes(tied, half)
 
 
 def updated(fit: Fit, new: Update, problem: Problem, data: Runs) -> Fit:
@@ -235,6 +250,7 @@ def updated(fit: Fit, new: Update, problem: Problem, data: Runs) -> Fit:
         converged=fit.converged and new.settled,
         reason=fit.reason if new.settled or not fit.converged else unsettled,
         mixed=dict(new.about),
+        shared={k: s.at(np.asarray(new.z) - fit.z) for k, s in fit.shared.items()},
     )
 
 

@@ -25,7 +25,7 @@ from slipid.support.files import read_json, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
-for _module in ("arviz_base", "arviz_stats", "h5netcdf", "threadpoolctl"):
+for _module in ("arviz_base", "arviz_stats", "h5netcdf"):
     importlib.import_module(_module)  # they are used after hours of work: what is missing shows now
 
 FOLDER = "sampling"

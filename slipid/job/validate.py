@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from slipid.data.runs import Runs
-from slipid.identify.compare.predictive import Contact
 from slipid.identify.compare.slip_models import restored
 from slipid.identify.compare.validation import validation
 from slipid.identify.fit_file import load
@@ -38,5 +37,5 @@ def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Conten
         rungs = restored(dict(fit.baselines))
     except ValueError as error:
         raise DataError(f"{out / 'fit.json'}: {error}") from error
-    fitted = Contact(fit.robot, fit.variance, fit.covariance, fit.space, fit.z)
+    fitted = fit.contact
     return fit, dataset, validation(fitted, rungs, dataset).to_json()

@@ -24,7 +24,8 @@ class Stance(eqx.Module):
     """A robot on its floors.
 
     Attributes:
-        frame, rest: wheel directions and load shares at rest, with an axis for the batch.
+        frame, rest: wheel directions and load shares at rest as the floors see them, with an axis
+            for the batch.
         hold, roll, shift: those of the frame by the parts of a twist, each (wheel, *one).
         floor: numbers under each wheel or under all; friction is that over its mean, scrub and lead
             are means over the loads, and what belongs to rollers is as of `law.sideways`.
@@ -36,7 +37,7 @@ class Stance(eqx.Module):
     hold: Planar
     roll: Planar
     shift: Float[Array, "2 wheel *one"]
-    rest: Float[Array, "wheel *one"]
+    rest: Float[Array, "wheel *batch"]
     floor: ContactSurface
     drag_onset: Float[Array, "wheel *one"]
     friction: Float[Array, "*batch"]
@@ -48,6 +49,8 @@ def stand(frame: Frame, surface: ContactSurface, rest: Float[Array, " wheel"]) -
     if jnp.ndim(friction) > 0:
         ones = (1,) * (jnp.ndim(friction) - 1)
         frame, rest = jax.tree.map(lambda a: a.reshape(*a.shape, *ones), (frame, rest))
+    rest = law.seen_load(rest, surface.load_bias)
+    if jnp.ndim(friction) > 0:
         friction = jnp.mean(surface.friction, axis=0)
         floor = replace(
             surface,
@@ -55,7 +58,7 @@ def stand(frame: Frame, surface: ContactSurface, rest: Float[Array, " wheel"]) -
             scrub=total(rest * surface.scrub),
             lead=total(rest * surface.lead),
         )
-    floor, onset = law.sideways(floor, frame.grip)
+    floor, onset = law.sideways(law.at_load(floor, len(rest) * rest), frame.grip)
     # parts first: XLA then keeps what belongs to a part, and its derivatives, side by side
     hold, roll, shift = (jnp.moveaxis(r, 1, 0) for r in (frame.hold, frame.roll, frame.shift))
     return Stance(frame, Planar(*hold), Planar(*roll), shift, rest, floor, onset, friction)

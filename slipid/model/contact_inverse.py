@@ -1,5 +1,7 @@
 """The contact law solved for the wheels: which speeds give a wanted twist."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -42,12 +44,15 @@ def inverse_contact(
 
     Source: `slipid.model.contact_law`; rollers at right angles.
     """
-    expected = stand(frame, jax.tree.map(lambda leaf: surface @ leaf, floors), rest)
-    share = Balance(rest, expected).share(Planar(*xi))
+    expected = jax.tree.map(lambda leaf: surface @ leaf, floors)
+    expected = replace(expected, load_bias=jnp.sum(surface * floors.load_bias.T, axis=1))
+    stance = stand(frame, expected, rest)
+    share = Balance(rest, stance).share(Planar(*xi))
+    floors = law.at_load(floors, len(rest) * stance.rest[:, None])
     floors, onset = law.sideways(floors, frame.grip[:, None])
     mu = law.load_force(jnp.maximum(share, _LEAST_LOAD)[:, None], floors)  # (wheel, floor), in m g
     along, roll = (frame.hold @ xi)[:, None], (frame.roll @ xi)[:, None]
-    scrub = expected.friction * law.scrub_moment(xi[2], expected.floor.scrub).force()
+    scrub = stance.friction * law.scrub_moment(xi[2], stance.floor.scrub).force()
     slide = jnp.zeros_like(mu)
     for _ in range(_PASSES):
         wheels = law.wheel_forces(along, roll, along + slide, jnp.ones(()), onset, floors)

@@ -4,13 +4,15 @@ With xi = (v_x, v_y, W) the body twist, r w_i the rim speed, J_i and K_i the row
 speed of wheel i along its drive and along its rollers' free direction, p_i its place, N_i its load
 share, v^ the direction of motion, and forces in units of mu m g:
 
+    N0_i  = (share of the weight) exp(delta_i), scaled to sum 1
+    g_i   = (w N0_i)^(p - 1)                           drag grows with the load; w wheels
     q_i   = K_i xi                                     roller speed
     c_i   = sqrt((r w_i)^2 + q_i^2)                    wheel activity
     vs_i  = r w_i - J_i xi                             sliding speed
     N     = N0 - P b v^                                contact patches lead the wheel centres by b;
                                                        P: loads that keep sum N and sum N (p + b v^)
-    T_i   =  N_i [tanh(vs_i / (v0 + s0 c_i)) + kv vs_i - crr tanh(J_i xi / (v0 + s1 c_i))]
-    D_i   = -N_i [cr tanh(q_i / (vr + sr c_i)) + kl q_i]
+    T_i   =  N_i [tanh(vs_i / (v0 + s0 c_i)) + kv vs_i - g_i crr tanh(J_i xi / (v0 + s1 c_i))]
+    D_i   = -N_i [g_i cr tanh(q_i / (vr + sr c_i)) + kl q_i]
     0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz tanh(W / W0))
 
 This is for omni wheels; where rollers stand at an angle g to the drive, vs_i is r w_i sin g less
@@ -21,6 +23,10 @@ Wheels may stand on different floors. Forces are then in units of mean(mu) m g, 
 weighted by mu_i / mean(mu), and b and cz are means over the loads. Creep and rolling resistance are
 rate-independent (s0 is a slip *ratio*): with a resistance that sets in at 20 mm/s instead, runs
 faster than the fitted ones are predicted worse.
+
+Friction grows with the load, drag faster: with N^(4/3) where bodies deform elastically (Hertz), up
+to N^2 where wheels sink in (Bekker). That is how motion tells a load from a drag. What the law
+still lacks bends the loads that one floor alone would tell; delta, per floor, stands for that.
 
 Every function here is elementwise: it takes arrays of any shapes that broadcast.
 """
@@ -37,6 +43,8 @@ from jaxtyping import Array, Float, Int
 from slipid.model.se2 import Planar
 from slipid.parameter import parameter
 
+_LIFTED = 0.03
+"""Load over an even one below which drag falls no faster than the load."""
 V0 = 0.002
 """Sliding speed below which traction is viscous [m/s]."""
 VR = 0.001
@@ -76,11 +84,28 @@ class ContactSurface(eqx.Module):
     roller_viscosity: Array = positive("s/m", "kl", "drag per roller speed", start=0.02, spread=2.0)
     scrub: Array = positive("m", "cz", "moment against turning", start=0.002, spread=2.0)
     lead: Array = parameter("m", "b", "contact ahead of the wheel centre", start=0.002, spread=0.01)
+    drag_exponent: Array = positive(
+        "1", "p", "power of the load that drag grows with", start=1.15, spread=0.25
+    )
+    load_bias: Array = parameter(
+        "1",
+        "delta",
+        "log of the load on each wheel as this floor seems to see it, over the true one",
+        start=0.0,
+        spread=0.05,
+        deviation=True,
+    )
     labels: tuple[str, ...] = eqx.field(static=True, default=())
 
     def at(self, index: Int[Array | np.ndarray, "..."] | int) -> "ContactSurface":
-        """Surface number `index` of the stack (may be traced), or those under each wheel."""
-        return jax.tree.map(lambda leaf: leaf[index], self)
+        """Surface number `index` of the stack (may be traced), or those under each wheel.
+
+        The index of wheels has their axis first. A load bias is then the wheel's own.
+        """
+        bias = self.load_bias[index]
+        if jnp.ndim(index):
+            bias = jnp.moveaxis(jnp.diagonal(bias, axis1=0, axis2=-1), -1, 0)
+        return replace(jax.tree.map(lambda leaf: leaf[index], self), load_bias=bias)
 
 
 class Friction(eqx.Module):
@@ -156,6 +181,22 @@ def wheel_traction(slide: Array, active: Array, floor: ContactSurface) -> Fricti
 def scrub_moment(yaw_rate: Array, scrub: Array) -> Friction:
     """Moment at a yaw rate [m]."""
     return Friction(yaw_rate, W0, 0.0, scrub)
+
+
+def at_load(floor: ContactSurface, relative: Array) -> ContactSurface:
+    """Floor for a wheel at rest under so many times an even load."""
+    grown = jnp.maximum(relative, _LIFTED) ** (floor.drag_exponent - 1)
+    return replace(
+        floor,
+        roller_drag=floor.roller_drag * grown,
+        rolling_resistance=floor.rolling_resistance * grown,
+    )
+
+
+def seen_load(rest: Float[Array, "wheel *one"], bias: Array) -> Float[Array, "wheel *batch"]:
+    """Load shares at rest as floors see them, for their load biases (wheel, *batch) or 0."""
+    seen = rest * jnp.exp(bias)
+    return seen / sum(seen[1:], start=seen[0])
 
 
 def sideways(floor: ContactSurface, grip: Array) -> tuple[ContactSurface, Array]:

@@ -149,6 +149,7 @@ def build(
     single = ContactSurface()
     stack = {e.path: jnp.full((len(names),), e.get(single)) for e in entries(single)}
     wheels = geometry.wheels
+    stack["load_bias"] = jnp.zeros((len(names), wheels))
     return Robot(
         geometry=geometry,
         body=Body(load_share=jnp.full((len(loads), wheels), 1 / wheels), loads=tuple(loads)),

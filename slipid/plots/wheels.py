@@ -116,7 +116,8 @@ def wheel_curve(
     pull, slip_through = frame.pull[0], frame.slip_through[0]
     rim = frame.radius * wheel_speed
     along, roll = rim * pull * (1 - jnp.asarray(slip)), rim * (pull * sideways - slip_through)
-    surface, onset = law.sideways(surface, frame.grip[0])
+    relative = jnp.asarray(share * robot.geometry.wheels)
+    surface, onset = law.sideways(law.at_load(surface, relative), frame.grip[0])
     felt = law.wheel_forces(along, roll, rim, pull, onset, surface).felt(pull, slip_through)
     weight = robot.body.mass * GRAVITY * law.load_force(jnp.asarray(share), surface)
     return np.asarray(frame.radius * weight * felt)

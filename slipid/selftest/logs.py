@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from slipid.data.log import Log
 from slipid.data.wheel_signals import interpolate
 from slipid.identify.design.planned_runs import Drive
-from slipid.identify.fit.sessions import AXES
+from slipid.identify.fit.shared import AXES
 from slipid.model.robot import Robot, twist, wheel_torque
 from slipid.model.se2 import compose, path
 from slipid.selftest.known import Sensors

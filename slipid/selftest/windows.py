@@ -17,7 +17,7 @@ from slipid.data.windows import Windows
 from slipid.identify.compare.open_loop import chain, corrected
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import axes, travel
-from slipid.identify.fit.sessions import AXES
+from slipid.identify.fit.shared import AXES
 from slipid.model.robot import Robot
 
 

@@ -23,6 +23,18 @@ def plain_loops() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} {PLAIN_LOOPS}".strip()
 
 
+def one_blas_thread() -> None:
+    """Have BLAS and LAPACK compute in one thread.
+
+    The matrices here are small, and threads that wait for each other by spinning make a Cholesky
+    factor of 570 rows take 800 ms instead of 3 on two cores on which another job runs.
+    """
+    import scipy.linalg  # noqa: F401  # loads what JAX computes with
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1, user_api="blas")
+
+
 def cache_folder() -> Path:
     """Where compiled functions are kept: SLIPID_CACHE, else the platform's place for caches."""
     if given := os.environ.get("SLIPID_CACHE"):
@@ -43,6 +55,8 @@ def setup_jax(quiet: bool = False) -> None:
     """
     plain_loops()
     import jax
+
+    one_blas_thread()
 
     jax.config.update("jax_enable_x64", True)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ or "SLIPID_CACHE" in os.environ:

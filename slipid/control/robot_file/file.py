@@ -164,6 +164,9 @@ def _inside(where: str, value: Numbers, declaration: Declaration, size: int) -> 
     if declaration.shares:
         if not ((x > 0).all() and abs(x.sum() - 1) < 1e-6):
             raise ValueError(f"{where} = {value}: expected positive shares that sum to 1")
+    elif declaration.deviation:
+        if not abs(x.sum()) < 1e-6:
+            raise ValueError(f"{where} = {value}: expected numbers that sum to 0")
     elif not ((x > declaration.lower) & (x < declaration.upper)).all():
         low, high = declaration.lower, declaration.upper
         raise ValueError(f"{where} = {value}: expected inside ({low:g}, {high:g})")

@@ -16,7 +16,7 @@ from slipid.identify.compare.predictive import Contact, Gaps, Predictive, Slopes
 from slipid.identify.compare.rung import Rung
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem
-from slipid.identify.fit.variances import DEGREES, scored_given
+from slipid.identify.fit.variances import DEGREES, scored
 from slipid.model.robot import Robot
 from slipid.search_space import Space
 
@@ -69,7 +69,8 @@ class Noisy(Predictive):
         own = slopes(self.rung, w, lambda rung: tracks_of(rung).predicted[:, -1, :2])
         jac = np.concatenate([own, np.asarray(camera)[..., contact.camera]], axis=-1)
         spread = around(jac, self.covariance)
-        return tracks, replay.end_covariance(robot, w, tracks, self.variance, spread)
+        effect = self.effect_covariance(w)
+        return tracks, replay.end_covariance(robot, w, tracks, self.variance, effect, spread)
 
 
 def with_noise(
@@ -88,6 +89,8 @@ def with_noise(
     plain = Noisy(robot, contact.variance, common, rung, contact)
     gap, slope = plain.linear(problem)
     log_v, count = jnp.asarray(contact.log_variance(problem)), jnp.asarray(keep, float)
+    own_effects = np.array([c.kind == "run" for c in problem.noise.components])
+    target = replace(problem.target, scored=problem.target.scored | own_effects)
     for _ in range(MOST_TURNS):
         last = log_v
         scale = np.asarray(problem.covariance("motion", log_v))
@@ -95,7 +98,7 @@ def with_noise(
         spread = jnp.asarray(around(slope, covariance))
         blocks = {"motion": jnp.asarray(gap)}, {"motion": spread}
         for _ in range(SCORING):
-            log_v = scored_given(problem.target, *blocks, log_v, count, {})
+            log_v = scored(target, *blocks, log_v, count, {})
         if float(jnp.abs(log_v - last).max()) < SETTLED:
             break
     plain = replace(plain, variance=by_name(problem, log_v), covariance=covariance)

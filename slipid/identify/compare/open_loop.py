@@ -105,19 +105,35 @@ def follow(robot: Robot, w: Windows, increment: Float[np.ndarray, "piece window 
     return Tracks(w.run, path, pose)
 
 
+class Correction(eqx.Module):
+    """What is taken off predicted increments, and its slope by the search vector."""
+
+    moved: Float[Array, "piece window 3"]
+    by_number: Float[Array, "piece window 3 free"]
+
+
 @eqx.filter_jit
 def end_jacobian(
-    space: Space, z: Numbers, b: lk.Batch, start: Numbers, twist: Numbers | None = None
+    space: Space,
+    z: Numbers,
+    b: lk.Batch,
+    start: Numbers,
+    twist: Numbers | None = None,
+    corrected: Correction | None = None,
 ) -> Float[Array, "piece 2 free"]:
     """Slope of the ends by the search vector, from given start poses.
 
-    Of the contact equilibrium, or where the body's twists are given (piece, window, 3).
+    Of the contact equilibrium with its correction, or where the body's twists are given
+    (piece, window, 3).
     """
 
     def end(x: Array) -> Array:
         robot = space.tree(x)
         if twist is None:
-            return chain(start, contact_increments(robot, b))[:, -1, :2]
+            step = contact_increments(robot, b)
+            if corrected is not None:
+                step -= corrected.moved + corrected.by_number @ (x - jnp.asarray(z))
+            return chain(start, step)[:, -1, :2]
         return chain(start, lk.seen(robot, jnp.asarray(twist), b.dt, b.session))[:, -1, :2]
 
     return jax.jacfwd(end)(z)
@@ -128,13 +144,14 @@ def end_covariance(
     w: Windows,
     tracks: Tracks,
     variance: Mapping[str, float],
+    shared: Float[np.ndarray, "piece 3 3"],
     of_parameters: Float[np.ndarray, "piece 2 2"],
 ) -> Float[np.ndarray, "piece 2 2"]:
     """Covariance of the gap between predicted and measured end [m^2], scale matrix of a Student t.
 
-    Process noise, the run's own effect and its session's, camera noise at both ends and in the
-    start heading, and the parameters' uncertainty, each carried to the end along the predicted
-    path.
+    Process noise, the run's own effect and what it shares with others, camera noise at both ends
+    and in the start heading, and the parameters' uncertainty, each carried to the end along the
+    predicted path.
     """
     far, u = travel(w, robot)
     p = tracks.predicted
@@ -142,11 +159,12 @@ def end_covariance(
     lever = sideways(p[:, -1:, :2] - p[:, 1:, :2])  # what a turn at each step moves
     way = p[:, :-1, 2]
     along, across = turned(way, u), turned(way, sideways(u))
-    process, run, session = (by_axis(variance, k, w) for k in ("process", "run", "session"))
-    for k, axis in enumerate((along, across, lever)):
-        cov += np.einsum("n,nk,nki,nkj->nij", process[:, k], far, axis, axis)
-        whole = np.einsum("nk,nki->ni", far, axis)
-        cov += (run + session)[:, k, None, None] * whole[:, :, None] * whole[:, None, :]
+    process, run = (by_axis(variance, k, w) for k in ("process", "run"))
+    axes = np.stack((along, across, lever))
+    cov += np.einsum("na,nk,anki,ankj->nij", process, far, axes, axes)
+    whole = np.einsum("nk,anki->nai", far, axes)
+    effect = shared + run[:, :, None] * np.eye(len(axes))
+    cov += np.einsum("nab,nai,nbj->nij", effect, whole, whole)
     turn = sideways(p[:, -1, :2] - p[:, 0, :2])
     cov += variance["camera.heading"] * turn[:, :, None] * turn[:, None, :]
     cov += 2 * variance["camera.place"] * float(robot.camera.scale) ** 2 * np.eye(2)

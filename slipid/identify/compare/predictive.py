@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.special import gammaln
@@ -27,7 +28,8 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import effects
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit.sessions import Linear, by_axis, shared
-from slipid.identify.fit.variances import DEGREES, Search, Square, Vector
+from slipid.identify.fit.shared import AXES, FoundShared, Told, told_of
+from slipid.identify.fit.variances import DEGREES, Search, Square, Vector, expected_ties, whitened
 from slipid.model.robot import Robot
 from slipid.search_space import Space
 
@@ -75,8 +77,12 @@ class Predictive(abc.ABC):
         gap, slope = self.linear(problem)
         noise = np.asarray(problem.covariance("motion", self.log_variance(problem)))
         e = effects(problem.windows, problem.robot)
-        v = by_axis(self.variance, "session", problem.windows)
-        return gap, noise + np.einsum("nma,na,nla->nml", e, v, e) + around(slope, self.covariance)
+        v = self.effect_covariance(problem.windows)
+        return gap, noise + np.einsum("nma,nab,nlb->nml", e, v, e) + around(slope, self.covariance)
+
+    def effect_covariance(self, w: Windows) -> Float[np.ndarray, "piece 3 3"]:
+        """Of what a run shares with others, in a session that was not seen."""
+        return by_axis(self.variance, "session", w)[:, :, None] * np.eye(len(AXES))
 
     def log_density(self, problem: Problem) -> Float[np.ndarray, " piece"]:
         """Log density of every piece's logged poses but the first, in logged units."""
@@ -129,10 +135,18 @@ class Contact(Predictive):
 
     space: Space
     z: Search
+    shared: Mapping[str, FoundShared]
 
     @property
     def name(self) -> str:
         return "identified"
+
+    def told(self, w: Windows) -> Told:
+        """What neighbours among the fitted runs tell of runs."""
+        return told_of(self.shared, w, self.robot, self.space.size)
+
+    def effect_covariance(self, w: Windows) -> Float[np.ndarray, "piece 3 3"]:
+        return super().effect_covariance(w) + self.told(w).covariance
 
     @property
     def numbers(self) -> dict[str, int]:
@@ -149,14 +163,24 @@ class Contact(Predictive):
 
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
         blocks, jac = problem.linear(self.z, problem.volt(self.log_variance(problem)))
-        return np.asarray(blocks["motion"]), np.asarray(jac["motion"])
+        told, e = self.told(problem.windows), effects(problem.windows, problem.robot)
+        gap = np.asarray(blocks["motion"]) - np.einsum("nma,na->nm", e, told.mean)
+        slope = np.asarray(jac["motion"]) - np.einsum("nma,nap->nmp", e, told.slope)
+        return gap, slope
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
-        b = lk.batch(w, self.robot)
-        tracks = replay.follow(self.robot, w, np.asarray(replay.contact_increments(self.robot, b)))
-        jac = np.asarray(replay.end_jacobian(self.space, self.z, b, tracks.predicted[:, 0]))
+        b, told, e = lk.batch(w, self.robot), self.told(w), effects(w, self.robot)
+        shape = (*w.dt.shape, 3)
+        moved = np.einsum("nma,na->nm", e, told.mean).reshape(shape)
+        increments = np.asarray(replay.contact_increments(self.robot, b)) - moved
+        tracks = replay.follow(self.robot, w, increments)
+        by_number = np.einsum("nma,nap->nmp", e, told.slope).reshape(*shape, -1)
+        more = replay.Correction(jnp.asarray(moved), jnp.asarray(by_number))
+        start = tracks.predicted[:, 0]
+        jac = np.asarray(replay.end_jacobian(self.space, self.z, b, start, corrected=more))
         own = np.einsum("nip,pq,njq->nij", jac, self.covariance, jac)
-        return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, own)
+        effect = self.effect_covariance(w)
+        return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, own)
 
 
 def contact_of(
@@ -164,11 +188,39 @@ def contact_of(
 ) -> Contact:
     """The force balance at the end of a fit of the kept pieces, with what sessions share."""
     robot, variance = problem.space.tree(state.z), by_name(problem, state.log_variance)
-    plain = Contact(robot, variance, np.asarray(covariance), problem.space, np.asarray(state.z))
-    of_floor = problem.space.where(lambda e: e.surface is not None)
-    wide = np.where(of_floor[:, None] | of_floor, 0.0, plain.covariance)
-    wide[of_floor, of_floor] = problem.space.prior_std[of_floor] ** 2
-    return plain.with_sessions(problem, plain.linear(problem), wide, keep)
+    shared = found_shared(problem, state, keep)
+    z = np.asarray(state.z)
+    return Contact(robot, variance, np.asarray(covariance), problem.space, z, shared)
+
+
+def found_shared(
+    problem: Problem, state: State, keep: Float[np.ndarray, " piece"]
+) -> dict[str, FoundShared]:
+    """What neighbouring runs on every floor share, by a fit of the kept pieces."""
+    log_v, free = jnp.asarray(state.log_variance), problem.space.size
+    residual, jacobian = problem.linear(state.z, problem.volt(log_v))
+    seen = problem.seen(residual, log_v, keep, state.shared(len(keep)))
+    white = jnp.einsum("nij,nj->ni", seen.whitening.root["motion"], residual["motion"])
+    half = whitened(problem.target.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]
+    expected = expected_ties(problem.target, log_v, jnp.asarray(keep))
+    std = np.exp(0.5 * np.asarray(log_v))
+    out = {}
+    for floor, of, tie, to in zip(
+        problem.robot.surfaces.labels, problem.target.shared, seen.tied, expected, strict=True
+    ):
+        near = of.near.shape[1]
+        count = near + of.session.shape[1]
+        inverse = np.linalg.inv(np.asarray(to.factor))
+        covariance = (inverse.T @ inverse).reshape(3, count, 3, count)
+        slope = jax.vmap(to.coefs, in_axes=-1, out_axes=-1)(half)
+        out[floor] = FoundShared(
+            paces=problem.paces[floor],
+            std=std[np.asarray(of.numbers)[1]],
+            coefs=np.asarray(tie.coefs(white)).reshape(3, count)[:, :near],
+            by_number=np.asarray(slope).reshape(3, count, free)[:, :near],
+            covariance=covariance[:, :near, :, :near],
+        )
+    return out
 
 
 def around(jac: Slopes, cov: np.ndarray) -> np.ndarray:

@@ -6,7 +6,8 @@ The residuals of a piece have the covariance
                          process noise along, across and in yaw, growing with distance, per floor;
                          the run's own effect along, across and in yaw, per floor
 
-so the run effects are marginalised.
+so the run effects are marginalised. What runs share with each other (`slipid.identify.fit.shared`)
+and how far floors differ from what is common to them have variances, too, beside these blocks.
 """
 
 from dataclasses import dataclass
@@ -78,6 +79,10 @@ _MOTION = (
     ("yaw", "rad/sqrt(m)", 0.01),
 )
 _EFFECT = (("along", "m/m", 0.01), ("across", "m/m", 0.01), ("yaw", "rad/m", 0.03))
+SHARED = {"neighbours": 0.5, "session": 0.3}
+"""Kinds of effects that runs share, and their typical std over that of the run's own effect."""
+POOLED = "pooled.load_bias"
+"""Name of the variance of the load biases of floors."""
 
 
 def noise(windows: Windows, robot: Robot) -> Noise:
@@ -90,6 +95,11 @@ def noise(windows: Windows, robot: Robot) -> Noise:
     for floor in floors:
         table += [Component("process", what, floor, u, v) for what, u, v in _MOTION]
         table += [Component("run", what, floor, u, v) for what, u, v in _EFFECT]
+    several = [floor for floor in floors if len(sessions_on(windows, floor)) > 1]
+    for kind, part in SHARED.items():
+        for floor in several if kind == "session" else floors:
+            table += [Component(kind, what, floor, u, part * v) for what, u, v in _EFFECT]
+    table.append(Component("pooled", "load_bias", None, "1", 0.05))
     blocks = {"motion": _motion_components(windows, robot)}
     if windows.has_current:
         start = len(table)
@@ -102,6 +112,12 @@ def noise(windows: Windows, robot: Robot) -> Noise:
         blocks["voltage"] = _components("voltage", base, np.full((n, 1), len(table)))
         table.append(Component("voltage", "window", None, "V", 0.05))
     return Noise(tuple(table), blocks)
+
+
+def sessions_on(windows: Windows, floor: str) -> list[str]:
+    """Sessions in which a floor was driven on, in alphabetical order."""
+    pairs = zip(windows.surface, windows.session, strict=True)
+    return sorted({session for name, session in pairs if name == floor})
 
 
 def _components(block: str, base: np.ndarray, which: np.ndarray) -> Components:

@@ -12,8 +12,18 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.problem import Problem, State, linear, log_jacobian
-from slipid.identify.fit.variances import Blocks, Search, Square, Target, scored
+from slipid.identify.fit.hierarchy import effect_variances, pooled
+from slipid.identify.fit.noise import SHARED
+from slipid.identify.fit.problem import (
+    Problem,
+    State,
+    effects_of,
+    less,
+    linear,
+    log_jacobian,
+)
+from slipid.identify.fit.shared import Tie, freed
+from slipid.identify.fit.variances import Blocks, Search, Square, Target, scored, spread_of
 
 CREEPS = (0.05, 0.4, 1.0)
 """Starts of the creep of every floor; others end in poor minima."""
@@ -89,37 +99,53 @@ def one_round(
     target, log_v = problem.target, jnp.asarray(state.log_variance)
     volt = problem.volt(log_v)
     residual, _, felt = linear(target, jnp.asarray(state.z), volt)
+    seen = problem.seen(residual, log_v, keep, state.shared(len(keep)))
     held = Held(
         target=target,
         z=jnp.asarray(state.z),
         mask=jnp.asarray(mask),
-        root=problem.whitening(residual, log_v, keep).root,
+        root=seen.whitening.root,
+        tied=seen.tied,
+        prior_std=target.prior_std(log_v),
         volt=volt,
         felt=felt,
         slope=log_jacobian(target, state.z, volt, keep)[1],
     )
     z = np.asarray(levenberg(held, Steps(steps)))
     residual, jacobian = problem.linear(z, volt)
+    whole = residual
+    effect = effects_of(seen.tied, seen.whitening.root["motion"], residual["motion"])
+    residual = less(target, residual, effect)
     own = problem.own(z, log_v)
+    if scoring:
+        spread = spread_of(target, jacobian, log_v, jnp.asarray(keep))
     for _ in range(scoring):
-        log_v = scored(target, residual, jacobian, log_v, jnp.asarray(keep), own)
+        log_v = scored(target, residual, spread, log_v, jnp.asarray(keep), own)
         before, own = own, problem.own(z, log_v)
         for k, share in own.items():  # these residuals are in units of the noise just found
             scale = jnp.sqrt(share / before[k])
             residual = residual | {k: residual[k] * scale}
-            jacobian = jacobian | {k: jacobian[k] * scale[..., None]}
+            spread = spread | {k: spread[k] * scale[..., None] * scale[:, None]}
     if own and scoring:  # the Jacobian by R changes by more than its scale
-        residual, jacobian = problem.linear(z, problem.volt(log_v))
-    std = np.sqrt(np.diag(np.linalg.inv(np.asarray(problem.precision(jacobian, log_v, keep)))))
+        whole, jacobian = problem.linear(z, problem.volt(log_v))
+    told = np.asarray(problem.precision(jacobian, log_v, keep))
+    covariance = np.linalg.inv(told)
+    if scoring:
+        weight, motion = seen.whitening.weight["motion"], (whole["motion"], jacobian["motion"])
+        found = effect_variances(target, motion, weight, covariance, np.asarray(log_v))
+        found[target.pooled] = pooled(told, z, target, np.asarray(log_v))
+        log_v = jnp.asarray(found)
+    std = np.sqrt(np.diag(covariance))
     moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
     moved = max(moved, float(np.max(np.abs(np.asarray(log_v) - state.log_variance)) / 3))
     return State(
         z=z,
         log_variance=np.asarray(log_v),
         round=state.round + 1,
-        loss=problem.loss(z, log_v, keep, residual),
+        loss=problem.loss(z, log_v, keep, problem.seen(whole, log_v, keep, effect)),
         moved=moved,
         stage=state.stage,
+        effect=np.asarray(effect),
     )
 
 
@@ -133,9 +159,11 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
     mask = space.where(lambda e: e.surface is not None).astype(float)
     creep = space.where(lambda e: e.quantity == "surface.creep")
     # far from the optimum every run is an outlier
-    wide = [1.0 if c.kind == "camera" else 3.0 for c in problem.noise.components]
+    usual = {"camera": 1.0, "pooled": 1.0} | dict.fromkeys(SHARED, 0.1)
+    wide = [usual.get(c.kind, 3.0) for c in problem.noise.components]
     log_v = 2 * np.log(problem.noise.typical) + 2 * np.log(wide)
     first = _motor_start(problem)
+    apart = problem.apart()
     best, z = np.full(len(labels), np.inf), first.copy()
     floors = np.asarray(problem.batch.surface)
     of_floor = np.repeat([e.surface or "" for e in space.free], [e.coordinates for e in space.free])
@@ -144,9 +172,9 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
         start = np.where(creep, np.log(value), first)
         state = State(start, log_v, 0, np.inf, np.inf, stage)
         for steps in (15, 6, 6):  # the damping has to grow from 1 to the size of the problem first
-            state = one_round(problem, state, keep, mask, steps=steps, scoring=0)
+            state = one_round(apart, state, keep, mask, steps=steps, scoring=0)
             tell(state)
-        residual, _ = problem.linear(state.z, problem.volt(state.log_variance))
+        residual, _ = apart.linear(state.z, problem.volt(state.log_variance))
         every = np.ones(len(floors))
         weight = problem.whitening(residual, state.log_variance, every).weight["motion"]
         cost = -np.log(np.asarray(weight))  # as good as the loss, but for factor and constant
@@ -178,7 +206,8 @@ def _motor_start(problem: Problem) -> np.ndarray:
 class Held(eqx.Module):
     """What is held while the structural numbers move from z.
 
-    The mask is 1 for coordinates that may move; root whitens residuals, volt is the std of the
+    The mask is 1 for coordinates that may move; root whitens residuals, tied is what runs share
+    given these; prior_std is of every coordinate; volt is the std of the
     voltage noise [V], felt the traction at z, which currents and voltages are predicted from, and
     slope that of log |d residuals / d data| by the search vector.
     """
@@ -187,6 +216,8 @@ class Held(eqx.Module):
     z: Float[Array, " free"]
     mask: Float[Array, " free"]
     root: Blocks
+    tied: tuple[Tie, ...]
+    prior_std: Float[Array, " free"]
     volt: Float[Array, ""]
     felt: Float[Array, "piece window wheel"]
     slope: Float[Array, " free"]
@@ -223,7 +254,7 @@ def levenberg(held: Held, solver: Steps) -> Float[Array, " free"]:
 
 def _at(held: Held, y: Array) -> Array:
     """Search vector of a step in prior stds."""
-    return held.z + held.mask * held.target.space.prior_std * y
+    return held.z + held.mask * held.prior_std * y
 
 
 def _stacked(y: Array, held: Held) -> Array:
@@ -235,7 +266,8 @@ def _stacked(y: Array, held: Held) -> Array:
     # currents and voltages given the motion of the round's start
     electric = lk.electric_residuals(given, target.batch, held.felt, held.volt)
     blocks = {"motion": motion} | electric
-    parts = [jnp.einsum("nij,nj->ni", held.root[k], r).ravel() for k, r in blocks.items()]
+    white = {k: jnp.einsum("nij,nj->ni", held.root[k], r) for k, r in blocks.items()}
+    parts = [freed(held.tied, w) if k == "motion" else w.ravel() for k, w in white.items()]
     # the slope of the log Jacobian adds slope . z to the log posterior
-    mean = space.prior_mean + space.prior_std**2 * held.slope
-    return jnp.concatenate([*parts, (z - mean) / space.prior_std])
+    mean = space.prior_mean + held.prior_std**2 * held.slope
+    return jnp.concatenate([*parts, (z - mean) / held.prior_std])

@@ -2,9 +2,9 @@
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from glob import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +16,8 @@ from slipid.data.runs import Runs
 from slipid.data.windows import Windows
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import variances
-from slipid.identify.fit.noise import noise
+from slipid.identify.fit.noise import POOLED, SHARED, noise
+from slipid.identify.fit.shared import Tie, freed, shared_effects, shared_of, ties
 from slipid.identify.fit.variances import VARIANCE_SPREAD, Blocks, Search, Target, Vector, Whitening
 from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
@@ -26,7 +27,8 @@ from slipid.search_space import Choice, Space
 class State:
     """Where a fit stands; enough to go on from.
 
-    The loss is minus log posterior up to a constant, `moved` the largest step of the last round in
+    The effect is what runs were found to share, along, across and in yaw. The loss is minus log
+    posterior up to a constant, `moved` the largest step of the last round in
     posterior stds, the stage what it was doing, for progress.
     """
 
@@ -36,6 +38,11 @@ class State:
     loss: float
     moved: float
     stage: str
+    effect: Float[np.ndarray, "piece 3"] | None = None
+
+    def shared(self, pieces: int) -> Float[np.ndarray, "piece 3"]:
+        """The effects, zero where none were found yet."""
+        return np.zeros((pieces, 3)) if self.effect is None else self.effect
 
 
 class Problem:
@@ -63,13 +70,25 @@ class Problem:
 
     def _read(self, windows: Windows) -> None:
         self.windows, self.noise = windows, noise(windows, self.robot)
+        shared, self.paces = shared_of(windows, self.robot, self.noise)
+        kinds = np.array([c.kind for c in self.noise.components])
         self.target = Target(
             space=self.space,
             batch=lk.batch(windows, self.robot),
             blocks=self.noise.blocks,
+            shared=shared,
             typical=jnp.asarray(2 * np.log(self.noise.typical)),
+            scored=~np.isin(kinds, ("run", "pooled", *SHARED)),
+            deviation=self.space.where(lambda e: e.declaration.deviation),
+            pooled=self.noise.names.index(POOLED),
             joint=not windows.has_current,
         )
+
+    def apart(self) -> "Problem":
+        """The same problem as if runs shared nothing."""
+        other = copy.copy(self)
+        other.target = replace(self.target, shared=())
+        return other
 
     @property
     def batch(self) -> lk.Batch:
@@ -89,16 +108,29 @@ class Problem:
     def precision(self, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
         return variances.precision(self.target, jacobian, log_v, keep)
 
-    def laplace(self, z: Vector, log_v: Vector, keep: Vector) -> np.ndarray:
-        """Covariance of the search vector (free, free): inverse information, prior included."""
+    def laplace(
+        self, z: Vector, log_v: Vector, keep: Vector, alone: bool = False
+    ) -> Float[np.ndarray, "free free"]:
+        """Covariance of the search vector: inverse information, prior included."""
         jacobian = self.linear(z, self.volt(log_v))[1]
-        return np.linalg.inv(np.asarray(self.precision(jacobian, log_v, keep)))
+        told = variances.precision(self.target, jacobian, log_v, keep, alone)
+        return np.linalg.inv(np.asarray(told))
 
-    def loss(self, z: Vector, log_v: Vector, keep: Vector, residual: Blocks) -> float:
+    def seen(self, residual: Blocks, log_v: Vector, keep: Vector, effect: Vector) -> "Seen":
+        """Residuals weighed: outliers are so only for what they do not share with other runs.
+
+        The effect is what they were found to share (piece, 3).
+        """
+        where = jnp.asarray(log_v), jnp.asarray(keep), jnp.asarray(effect)
+        return _seen(self.target, residual, *where)
+
+    def loss(self, z: Vector, log_v: Vector, keep: Vector, seen: "Seen") -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
-        nll = float(self.whitening(residual, log_v, keep).loss)
+        nll = float(seen.loss)
         nll -= float(log_jacobian(self.target, z, self.volt(log_v), keep)[0])
-        pull = (np.asarray(z) - self.space.prior_mean) / self.space.prior_std
+        prior_std = np.asarray(self.target.prior_std(log_v))
+        pull = (np.asarray(z) - self.space.prior_mean) / prior_std
+        nll += float(np.log(prior_std).sum())
         spread = (np.asarray(log_v) - np.asarray(self.target.typical)) / VARIANCE_SPREAD
         return nll + 0.5 * float(np.sum(pull**2)) + 0.5 * float(np.sum(spread**2))
 
@@ -116,6 +148,48 @@ class Problem:
         if "voltage" not in self.noise.blocks:
             return {}
         return {"voltage": _share(self.space, self.batch, z, self.volt(log_v))}
+
+
+class Seen(NamedTuple):
+    """Residuals of a problem at given variances, and what runs share.
+
+    Attributes:
+        whitening: weights and roots of residuals less the effects that runs share.
+        tied: what runs share, given residuals whitened by these roots.
+        loss: minus log posterior of the residuals, less constants.
+    """
+
+    whitening: Whitening
+    tied: tuple[Tie, ...]
+    loss: Array
+
+
+@eqx.filter_jit
+def _seen(target: Target, residual: Blocks, log_v: Array, keep: Array, effect: Array) -> Seen:
+    found = variances.whitening(target.blocks, less(target, residual, effect), log_v, keep)
+    root = found.root["motion"]
+    tied = ties(target.shared, log_v, root)
+    coefs = freed(tied, jnp.einsum("nij,nj->ni", root, residual["motion"]))[
+        residual["motion"].size :
+    ]
+    log_det = sum(jnp.sum(jnp.log(jnp.diagonal(tie.factor))) for tie in tied)
+    return Seen(found, tied, found.loss + 0.5 * jnp.sum(coefs**2) + log_det)
+
+
+@eqx.filter_jit
+def less(target: Target, residual: Blocks, effect: Array) -> Blocks:
+    """Residual blocks less effects that runs share (piece, 3)."""
+    motion = residual["motion"]
+    for of in target.shared:
+        off = jnp.einsum("nma,na->nm", of.effect, effect[of.pieces])
+        motion = motion.at[of.pieces].add(-off)
+    return residual | {"motion": motion}
+
+
+@eqx.filter_jit
+def effects_of(tied: tuple[Tie, ...], root: Array, motion: Array) -> Array:
+    """Conditional mean of the effects that runs share (piece, 3) given residuals of the motion."""
+    return shared_effects(tied, jnp.einsum("nij,nj->ni", root, motion))
 
 
 @eqx.filter_jit

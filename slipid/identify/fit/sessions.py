@@ -21,9 +21,9 @@ from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
 from slipid.data.windows import Windows
+from slipid.identify.fit.shared import AXES
 from slipid.identify.fit.variances import DEGREES
 
-AXES = ("along", "across", "yaw")
 SPREAD = 3.0
 """Std of the prior of a log variance, around that of the run effects."""
 TURNS = 4

@@ -11,10 +11,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import Components
+from slipid.identify.fit.shared import FloorShared, Tie, freed_slopes, shared_spread, ties
 from slipid.search_space import Space
 
 Vector = Array | np.ndarray
@@ -36,15 +37,28 @@ VARIANCE_SPREAD = 3.0
 class Target(eqx.Module):
     """What a fit maximises, as an argument of compiled functions.
 
-    `typical` is the centre of the prior of the log variances; where it is joint, there are no
-    currents, and all numbers are the motion's.
+    Attributes:
+        shared: what runs on each floor share.
+        typical: centre of the prior of the log variances.
+        scored: variances that are found from the residuals of each piece alone.
+        deviation: coordinates whose prior std is found from the data, as variance number `pooled`.
+        joint: there are no currents, and all numbers are the motion's.
     """
 
     space: Space
     batch: lk.Batch
     blocks: dict[str, Components]
+    shared: tuple[FloorShared, ...]
     typical: Float[Array, " variance"]
+    deviation: Bool[np.ndarray, " free"]
+    scored: Bool[np.ndarray, " variance"]
+    pooled: int = eqx.field(static=True)
     joint: bool = eqx.field(static=True)
+
+    def prior_std(self, log_v: Vector) -> Array:
+        """Std of the prior of every coordinate at given variances."""
+        pooled = jnp.exp(0.5 * jnp.asarray(log_v)[self.pooled])
+        return jnp.where(self.deviation, pooled, jnp.asarray(self.space.prior_std))
 
 
 class Whitening(NamedTuple):
@@ -79,22 +93,43 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> B
     out = {}
     for k, jac in jacobian.items():
         m = jac.shape[1]
-        factor = keep * (DEGREES + m) / (DEGREES + m + 2)  # Fisher information of a t location
+        factor = keep * _expected(m)
         root = inverse_root(noises[k].covariance(log_v)) * jnp.sqrt(factor)[:, None, None]
         out[k] = jnp.einsum("nij,njp->nip", root, jac)
     return out
 
 
 @eqx.filter_jit
-def precision(target: Target, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
-    """Expected information of the search vector, prior included (free, free)."""
-    prior = jnp.diag(1 / jnp.asarray(target.space.prior_std) ** 2)
+def precision(
+    target: Target, jacobian: Blocks, log_v: Vector, keep: Vector, alone: bool = False
+) -> Array:
+    """Expected information of the search vector, prior included (free, free).
+
+    What runs share is marginalised; `alone` counts every run as if it shared nothing.
+    """
+    prior = jnp.diag(1 / target.prior_std(log_v) ** 2)
     total, of_motion = prior, prior
     for k, half in whitened(target.blocks, jacobian, log_v, keep).items():
         flat = half.reshape(-1, half.shape[-1])
+        if k == "motion" and not alone:
+            tied = expected_ties(target, log_v, keep)
+            flat = freed_slopes(tied, half)
         total += flat.T @ flat
         of_motion += flat.T @ flat if k == "motion" else 0.0
     return total if target.joint else _cut(total, of_motion, jnp.asarray(target.space.electric))
+
+
+def expected_ties(target: Target, log_v: Vector, keep: Vector) -> tuple[Tie, ...]:
+    """What runs share, given residuals whitened by `whitened`."""
+    block = target.blocks["motion"]
+    roots = inverse_root(block.covariance(jnp.asarray(log_v)))
+    factor = _expected(roots.shape[-1]) * jnp.asarray(keep)
+    return ties(target.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None])
+
+
+def _expected(m: int) -> float:
+    """Fisher information of a Student-t location in m dimensions, over that of a Gaussian."""
+    return (DEGREES + m) / (DEGREES + m + 2)
 
 
 def _cut(total: Array, of_motion: Array, e: Array) -> Array:
@@ -107,27 +142,30 @@ def _cut(total: Array, of_motion: Array, e: Array) -> Array:
 
 
 @eqx.filter_jit
-def scored(
-    target: Target, residual: Blocks, jacobian: Blocks, log_v: Array, keep: Array, own: Blocks
-) -> Array:
-    """One Fisher-scoring step of the restricted likelihood in the log variances.
+def spread_of(target: Target, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
+    """Covariance of the residuals from fitted numbers and from what runs share (piece, m, m).
 
-    Residuals and Jacobian are of the structural numbers. `own` is the part that the variances have
-    in that of the residuals (piece, m), all where absent.
+    The Jacobian is of the structural numbers.
     """
     cov = jnp.linalg.inv(precision(target, jacobian, log_v, keep))
     spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in jacobian.items()}
-    return scored_given(target, residual, spread, log_v, keep, own)
+    around = shared_spread(expected_ties(target, log_v, keep), len(keep))
+    for of in target.shared:
+        more = jnp.einsum("nma,nab,nlb->nml", of.effect, around[of.pieces], of.effect)
+        spread["motion"] = spread["motion"].at[of.pieces].add(more)
+    return spread
 
 
 @eqx.filter_jit
-def scored_given(
+def scored(
     target: Target, residual: Blocks, spread: Blocks, log_v: Array, keep: Array, own: Blocks
 ) -> Array:
-    """The same where it is known what the fitted numbers of a model, this or another, make of V.
+    """One Fisher-scoring step of the restricted likelihood in the log variances of blocks.
 
-    `spread` is the covariance of the residuals from the model's fitted numbers (piece, m, m); the
-    degrees of freedom it stands for are not the variances' to have.
+    Residuals are those of a model, this or another, less what runs share. `spread` is their
+    covariance from what was fitted to them (piece, m, m); the degrees of freedom it stands for are
+    not the variances' to have. `own` is the part that the variances have in that of the residuals
+    (piece, m), all where absent.
     """
     _, weights, _ = whitening(target.blocks, residual, log_v, keep)
     score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])
@@ -150,7 +188,8 @@ def scored_given(
     score -= (log_v - target.typical) / VARIANCE_SPREAD**2
     info = information(target.blocks, log_v, keep, own)
     info += jnp.diag(jnp.maximum(steeper, 0.0))
-    return log_v + jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
+    step = jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
+    return log_v + jnp.where(target.scored, step, 0.0)
 
 
 @eqx.filter_jit

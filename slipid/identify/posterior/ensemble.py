@@ -44,14 +44,10 @@ def extended(
     Targets, one for each ensemble, differ only where walkers are `apart`. Goes on from the blocks
     that are done, by default those of the record.
     """
-    from threadpoolctl import threadpool_limits
-
     blocks = list(record.done(part) if done is None else done)
     stage = part.partition("-")[0]
     while not _ended(blocks, plan):
-        # many small matrices: threads of BLAS cost more than they bring
-        with threadpool_limits(1):
-            block = _block(targets, plan, blocks, lambda steps: record.tell(stage, steps))
+        block = _block(targets, plan, blocks, lambda steps: record.tell(stage, steps))
         blocks.append(block)
         record.keep(part, block)
     return blocks

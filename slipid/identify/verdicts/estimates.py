@@ -135,7 +135,7 @@ def _free(
     value = np.atleast_1d(np.asarray(entry.get(tree), float))
     std_z = np.sqrt(np.diag(block))
     center = np.asarray(d.to_si(jnp.asarray(prior_mean)))
-    if d.shares:
+    if d.tied:
         rng = np.random.default_rng(0)
         spread = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
         draws = np.asarray(jax.vmap(d.to_si)(jnp.asarray(spread)))

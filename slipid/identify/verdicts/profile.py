@@ -168,7 +168,9 @@ class _Walk:
         blocks, _ = problem.linear(jnp.asarray(state.z), problem.volt(log_v))
         if self.of_motion:
             blocks = {"motion": blocks["motion"]}
-        return problem.loss(state.z, log_v, np.ones(len(problem.windows)), blocks)
+        keep = np.ones(len(problem.windows))
+        seen = problem.seen(blocks, log_v, keep, state.shared(len(keep)))
+        return problem.loss(state.z, log_v, keep, seen)
 
     def side(self, sign: float) -> list[tuple[float, float]]:
         """Points from the estimate outward until the data object or the prior ends."""

@@ -19,6 +19,7 @@ from slipid.identify.fit.variances import Search, Square
 from slipid.identify.verdicts.estimates import WEAK
 from slipid.identify.verdicts.wording import NOTHING, SMALL, Axis, axes_of, formula, remedy
 from slipid.model.robot import Validity
+from slipid.parameter import Entry
 from slipid.search_space import Space
 
 NOTICED = 1 / WEAK**2
@@ -90,13 +91,13 @@ def flat_directions(
     """Directions in which the data narrow the prior by less than a fifth.
 
     Numbers of which the data say nothing come first, each by itself: they would mix into the
-    directions of others. The yaws of single sessions are deviations by declaration and are taken as
-    known.
+    directions of others. The yaws of single sessions and what a floor's law lacks are deviations by
+    declaration and are taken as known.
 
     `validity`, what every floor was driven with, makes the remedies definite.
     """
     axes = [axis for e in space.free for axis in axes_of(e)]
-    kept = [k for k, axis in enumerate(axes) if axis.entry.session is None]
+    kept = [k for k, axis in enumerate(axes) if not _known(axis.entry)]
     scale = [k for k in kept if axes[k].entry.quantity in TORQUE_SCALE]
     std = space.prior_std
     given = np.linalg.inv(covariance) * (std[:, None] * std)
@@ -118,6 +119,10 @@ def flat_directions(
             )
         )
     return tuple(out)
+
+
+def _known(entry: Entry) -> bool:
+    return entry.session is not None or entry.declaration.deviation
 
 
 def sentences(found: Iterable[Flat]) -> tuple[str, ...]:

@@ -42,7 +42,8 @@ def axes_of(entry: Entry) -> list[Axis]:
         before = ["wheel 1", *(f"wheels {several}" for several in wheels[1:])]
         each = [f"{entry.path} ({first} : wheel {k})" for k, first in enumerate(before, start=2)]
         return [Axis(entry, label, d.unit, True) for label in each]
-    return [Axis(entry, f"{entry.path} [{label}]", unit, is_log) for label in entry.labels]
+    labels = entry.labels[: entry.coordinates]
+    return [Axis(entry, f"{entry.path} [{label}]", unit, is_log) for label in labels]
 
 
 def formula(axes: list[Axis], power: np.ndarray, step: np.ndarray) -> str:
