@@ -66,7 +66,7 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     problem = job.problem()
     # all that a chain depends on; how long it may become is not of it
     told = FORMAT, fit.data_hash, replace(plan, most=0), draws, sorted(fit.variance.items())
-    kept = Checkpoint(out / FOLDER, key_of(*told, np.asarray(fit.z), np.asarray(fit.laplace)))
+    kept = Checkpoint(out / FOLDER, key_of(*told, np.asarray(fit.z), np.asarray(fit.covariance)))
     found = sampled_around(fit, problem, plan, draws, kept, report)
     report.stage("writing")
     about = _summary(found, plan, time.monotonic() - began)
@@ -110,8 +110,7 @@ def sampled_around(
         report.stage(f"sampling {part}")
 
     variance = np.array([fit.variance[name] for name in problem.noise.names])
-    shared = {k: v for k, v in fit.variance.items() if k not in problem.noise.names}
-    fitted = Fitted(fit.z, np.log(variance), fit.laplace, shared)
+    fitted = Fitted(fit.z, np.log(variance), fit.covariance)
     return posterior.sample(problem, fitted, plan, draws=draws, record=Record(done, keep, steps))
 
 
@@ -144,7 +143,6 @@ def _summary(found: Posterior, plan: Plan, seconds: float) -> Content:
         "draws": int(np.prod(found.log_prob.shape)),
         "seconds": round(seconds, 1),
         "accepted": found.accepted,
-        "electric_unsettled": found.unsettled,
         "seed": plan.seed,
         "worst": {
             "r_hat": float(np.max(d.r_hat)),

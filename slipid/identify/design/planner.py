@@ -17,7 +17,8 @@ from slipid.identify.design.planned_runs import SESSION, Drive, Setup, steady_wi
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import effects
 from slipid.identify.fit.problem import Problem
-from slipid.identify.fit.sessions import AXES, by_axis
+from slipid.identify.fit.sessions import by_axis
+from slipid.identify.fit.shared import AXES
 from slipid.identify.fit.variances import whitened
 from slipid.identify.result import Channels, Fit
 from slipid.model.robot import Robot

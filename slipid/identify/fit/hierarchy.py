@@ -14,6 +14,9 @@ a session, T the slope by the model's numbers and C their covariance before the 
 were seen.
 """
 
+from collections.abc import Iterator
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -25,6 +28,20 @@ _STEPS = 3
 """Scoring steps in a turn."""
 _GRID = np.geomspace(0.1, 4.0, 60)
 """Stds of the load biases that are weighed, over the typical one."""
+
+
+class _Axis(NamedTuple):
+    """The effects of the runs on a floor along one axis.
+
+    Attributes:
+        left: effects left; fixed: their covariance but for the variances asked for.
+        numbers: of these variances; bases: what each makes of the covariance.
+    """
+
+    left: Float[np.ndarray, " run"]
+    fixed: Float[np.ndarray, "run run"]
+    numbers: list[int]
+    bases: list[np.ndarray]
 
 
 def effect_variances(
@@ -41,7 +58,38 @@ def effect_variances(
         weight: Student-t weight of every piece, 0 for one that does not count.
         covariance: of the search vector.
     """
-    space, out = target.space, np.array(log_v)
+    out = np.array(log_v)
+    for axis in _axes(target, motion, weight, covariance, log_v):
+        typical = np.asarray(target.typical)[axis.numbers]
+        out[axis.numbers] = _scored(axis, out[axis.numbers], typical)
+    return out
+
+
+def effect_information(
+    target: Target,
+    motion: tuple[Array, Array],
+    weight: Array,
+    covariance: Square,
+    log_v: Float[np.ndarray, " variance"],
+) -> Float[np.ndarray, "variance variance"]:
+    """Expected information of the same log variances, zero for the others."""
+    out = np.zeros((len(log_v), len(log_v)))
+    for axis in _axes(target, motion, weight, covariance, log_v):
+        v = np.exp(log_v)[axis.numbers]
+        inverse = np.linalg.inv(_whole(axis, v))
+        grown = [k * (inverse @ b) for k, b in zip(v, axis.bases, strict=True)]
+        out[np.ix_(axis.numbers, axis.numbers)] += _information(grown)
+    return out
+
+
+def _axes(
+    target: Target,
+    motion: tuple[Array, Array],
+    weight: Array,
+    covariance: Square,
+    log_v: Float[np.ndarray, " variance"],
+) -> Iterator[_Axis]:
+    space = target.space
     of_floor = space.where(lambda e: e.surface is not None)
     wide = np.where(of_floor[:, None] | of_floor, 0.0, covariance)
     wide[of_floor, of_floor] = space.prior_std[of_floor] ** 2
@@ -52,23 +100,12 @@ def effect_variances(
         mine = np.asarray(floor.pieces)[kept]
         if len(mine) < 2:
             continue
-        run = np.exp(log_v)[np.asarray(floor.numbers)[0]]
-        left, noise, by = _left(
-            gap[mine], slope[mine], scale[mine], np.asarray(floor.effect)[kept], run
-        )
+        run, effect = np.exp(log_v)[np.asarray(floor.numbers)[0]], np.asarray(floor.effect)[kept]
+        left, noise, by = _left(gap[mine], slope[mine], scale[mine], effect, run)
         for k in range(len(AXES)):
-            base = noise[:, k] / counted[mine]
-            fixed = np.diag(base) + by[:, k] @ wide @ by[:, k].T
+            fixed = np.diag(noise[:, k] / counted[mine]) + by[:, k] @ wide @ by[:, k].T
             pieces = _pieces(floor, k, kept, counted[mine])
-            number = [n for n, _ in pieces]
-            out[number] = _scored(
-                left[:, k],
-                fixed,
-                [c for _, c in pieces],
-                out[number],
-                np.asarray(target.typical)[number],
-            )
-    return out
+            yield _Axis(left[:, k], fixed, [n for n, _ in pieces], [c for _, c in pieces])
 
 
 def _pieces(
@@ -93,45 +130,43 @@ def _left(
     return left, np.diagonal(cov, axis1=1, axis2=2), take @ slope
 
 
-def _scored(
-    left: np.ndarray,
-    fixed: np.ndarray,
-    bases: list[np.ndarray],
-    log_v: np.ndarray,
-    typical: np.ndarray,
-) -> Float[np.ndarray, " component"]:
+def _whole(axis: _Axis, v: np.ndarray) -> Float[np.ndarray, "run run"]:
+    """Covariance of the effects at some variances."""
+    return np.asarray(axis.fixed + sum(k * b for k, b in zip(v, axis.bases, strict=True)))
+
+
+def _information(grown: list[np.ndarray]) -> np.ndarray:
+    return np.array([[0.5 * np.sum(a * b.T) for b in grown] for a in grown])
+
+
+def _scored(axis: _Axis, log_v: np.ndarray, typical: np.ndarray) -> np.ndarray:
     """Log variances after Fisher scoring steps of the restricted likelihood.
 
     A step that makes it smaller is halved.
     """
 
     def loss(at: np.ndarray) -> float:
-        root = np.linalg.cholesky(
-            fixed + sum(k * b for k, b in zip(np.exp(at), bases, strict=True))
-        )
-        white = np.linalg.solve(root, left)
+        root = np.linalg.cholesky(_whole(axis, np.exp(at)))
+        white = np.linalg.solve(root, axis.left)
         pull = (at - typical) / VARIANCE_SPREAD
         return float(np.log(np.diag(root)).sum() + 0.5 * white @ white + 0.5 * pull @ pull)
 
     before = loss(log_v)
     for _ in range(_STEPS):
         v = np.exp(log_v)
-        inverse = np.linalg.inv(fixed + sum(k * b for k, b in zip(v, bases, strict=True)))
-        white = inverse @ left
-        grown = [k * (inverse @ b) for k, b in zip(v, bases, strict=True)]
-        score = [
-            0.5 * (k * white @ b @ white - np.trace(g))
-            for k, b, g in zip(v, bases, grown, strict=True)
-        ]
-        info = [[0.5 * np.sum(a * b.T) for b in grown] for a in grown]
-        pull = (log_v - typical) / VARIANCE_SPREAD**2
-        whole = np.array(info) + np.eye(len(v)) / VARIANCE_SPREAD**2
-        step = np.clip(np.linalg.solve(whole, np.array(score) - pull), -1.5, 1.5)
+        inverse = np.linalg.inv(_whole(axis, v))
+        white = inverse @ axis.left
+        grown = [k * (inverse @ b) for k, b in zip(v, axis.bases, strict=True)]
+        told = [k * white @ b @ white for k, b in zip(v, axis.bases, strict=True)]
+        score = 0.5 * (np.array(told) - [np.trace(g) for g in grown])
+        score -= (log_v - typical) / VARIANCE_SPREAD**2
+        info = _information(grown) + np.eye(len(v)) / VARIANCE_SPREAD**2
+        step = np.clip(np.linalg.solve(info, score), -1.5, 1.5)
         while (after := loss(log_v + step)) > before and np.abs(step).max() > 1e-3:
             step = step / 2
         if after <= before:
             log_v, before = log_v + step, after
-    return np.asarray(log_v)
+    return log_v
 
 
 def pooled(

@@ -93,7 +93,7 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> B
     out = {}
     for k, jac in jacobian.items():
         m = jac.shape[1]
-        factor = keep * _expected(m)
+        factor = keep * expected(m)
         root = inverse_root(noises[k].covariance(log_v)) * jnp.sqrt(factor)[:, None, None]
         out[k] = jnp.einsum("nij,njp->nip", root, jac)
     return out
@@ -123,11 +123,11 @@ def expected_ties(target: Target, log_v: Vector, keep: Vector) -> tuple[Tie, ...
     """What runs share, given residuals whitened by `whitened`."""
     block = target.blocks["motion"]
     roots = inverse_root(block.covariance(jnp.asarray(log_v)))
-    factor = _expected(roots.shape[-1]) * jnp.asarray(keep)
+    factor = expected(roots.shape[-1]) * jnp.asarray(keep)
     return ties(target.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None])
 
 
-def _expected(m: int) -> float:
+def expected(m: int) -> float:
     """Fisher information of a Student-t location in m dimensions, over that of a Gaussian."""
     return (DEGREES + m) / (DEGREES + m + 2)
 

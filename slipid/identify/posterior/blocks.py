@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt32
 from slipid.identify.posterior.transport.pieces import Bend, Matrix, Values, Warp
 from slipid.identify.posterior.transport.transport_map import Stair, Transport, gaussian
 
-FORMAT = 2
+FORMAT = 3
 """Version of the block files; bump it when their content or the way they are made changes."""
 Chain = Float[np.ndarray, "ensemble step walker size"]
 

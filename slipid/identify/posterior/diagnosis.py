@@ -43,20 +43,17 @@ class Diagnosis:
 class Posterior:
     """Draws, and whether and why they may be believed.
 
-    Effects are what runs of a session share, in stds. Log density, names and diagnosis are of the
-    first stage; accepted is the part of the moves that moved something, by stage, unsettled the
-    worst drift or memory of the second stage's walkers, 1 where it is just enough.
+    Log density, names and diagnosis are of the numbers that are sampled first; accepted is the part
+    of the moves that moved something, by stage.
     """
 
     z: Float[np.ndarray, "ensemble draw free"]
     log_variance: Float[np.ndarray, "ensemble draw variance"]
-    effects: Float[np.ndarray, "ensemble draw effect"]
     fitted: Fitted
     log_prob: Float[np.ndarray, "ensemble draw"]
     names: tuple[str, ...]
     diagnosis: Diagnosis
     accepted: dict[str, float]
-    unsettled: float
     converged: bool
     reason: str
 

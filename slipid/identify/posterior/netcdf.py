@@ -33,18 +33,18 @@ def tree(
     w, robot = problem.windows, problem.robot
     values, dims, units = _numbers(problem.space, found)
     noise, noise_dims = _noise(problem, found)
-    means = [each.mean(axis=(0, 1)) for each in (found.z, found.log_variance)]
-    middle = replace(found.fitted, z=means[0], log_variance=means[1])
+    means = found.z.mean(axis=(0, 1))
+    middle = replace(found.fitted, z=means)
     density = Density(problem, middle, EVERYTHING)
-    x = np.concatenate([found.z, found.log_variance, found.effects], axis=-1)
+    x = found.z
     of_piece = density.pointwise(x.reshape(-1, x.shape[-1]))
     per_piece = {k: np.asarray(v).reshape(*x.shape[:2], -1) for k, v in of_piece.items()}
     run = np.unique(w.run)
     onto = (np.asarray(w.run)[:, None] == run).astype(float)
-    measured, predicted, data_dims = _data(problem, found, _replicates(density, x))
+    measured, predicted, data_dims = _data(
+        problem, found, _replicates(density, x, found.log_variance)
+    )
     unconstrained = {"z": found.z, "log_variance": found.log_variance}
-    if found.effects.shape[-1]:
-        unconstrained["effects"] = found.effects
     coords = {
         "surface": list(robot.surfaces.labels),
         "load": list(robot.body.loads),
@@ -55,7 +55,6 @@ def tree(
         "run": [runs[k] for k in run],
         "coordinate": problem.space.names,
         "component": list(problem.noise.names),
-        "shared": [n for n in found.names if n.startswith("session.")],
     }
     made = from_dict(
         {
@@ -70,7 +69,7 @@ def tree(
         dims=dims
         | noise_dims
         | data_dims
-        | {"z": ["coordinate"], "log_variance": ["component"], "effects": ["shared"]}
+        | {"z": ["coordinate"], "log_variance": ["component"]}
         | {k: ["run"] for k in per_piece},
     )
     for name, unit in units.items():
@@ -98,13 +97,18 @@ def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
 def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
     """Std of every noise component, floors side by side."""
     rows = np.moveaxis(np.exp(0.5 * found.log_variance), -1, 0)
-    stds: dict[str, list[np.ndarray]] = {}
+    labels = problem.robot.surfaces.labels
+    stds: dict[str, np.ndarray] = {}
     dims: dict[str, list[str]] = {}
     for component, std in zip(problem.noise.components, rows, strict=True):
         name = f"noise.{component.kind}.{component.what}"
-        stds.setdefault(name, []).append(std)
-        dims[name] = [] if component.floor is None else ["surface"]
-    return {k: np.stack(v, axis=-1) if dims[k] else v[0] for k, v in stds.items()}, dims
+        if component.floor is None:
+            stds[name], dims[name] = std, []
+            continue
+        # sessions share nothing on a floor that was driven on in one of them only
+        whole = stds.setdefault(name, np.zeros((*std.shape, len(labels))))
+        whole[..., labels.index(component.floor)], dims[name] = std, ["surface"]
+    return stds, dims
 
 
 def _data(
@@ -135,18 +139,21 @@ def write(made: DataTree, path: Path) -> None:
 
 
 def _replicates(
-    density: Density, x: Float[np.ndarray, "ensemble draw size"]
+    density: Density,
+    x: Float[np.ndarray, "ensemble draw size"],
+    log_variance: Float[np.ndarray, "ensemble draw variance"],
 ) -> dict[str, Float[np.ndarray, "ensemble replicate piece m"]]:
     """Replicated less measured data of every piece, from some draws of each ensemble.
 
     What the model says, less what was measured, plus noise of the draw's own variances.
     """
-    some = x[:, np.linspace(0, x.shape[1] - 1, REPLICATES).astype(int)]
+    picked = np.linspace(0, x.shape[1] - 1, REPLICATES).astype(int)
+    some, noise = x[:, picked], log_variance[:, picked].reshape(-1, log_variance.shape[-1])
     rng = np.random.default_rng(0)
     flat = some.reshape(-1, x.shape[-1])
     out = {k: np.array(v) for k, v in density.residuals(flat).items()}
     for k, r in out.items():
-        for one, log_v in zip(r, density.coordinates.parts(flat)[1], strict=True):
+        for one, log_v in zip(r, noise, strict=True):
             root = np.linalg.cholesky(np.asarray(density.problem.covariance(k, log_v)))
             normal = rng.standard_normal(one.shape)
             normal *= np.sqrt(DEGREES / rng.chisquare(DEGREES, (len(normal), 1)))
