@@ -135,7 +135,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
     # far from the optimum every run is an outlier
     wide = [1.0 if c.kind == "camera" else 3.0 for c in problem.noise.components]
     log_v = 2 * np.log(problem.noise.typical) + 2 * np.log(wide)
-    first = _motor_start(problem)
+    first = _motor_start(problem, keep)
     best, z = np.full(len(labels), np.inf), first.copy()
     floors = np.asarray(problem.batch.surface)
     of_floor = np.repeat([e.surface or "" for e in space.free], [e.coordinates for e in space.free])
@@ -158,10 +158,10 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
     return State(z, log_v, 0, np.inf, np.inf, "joint")
 
 
-def _motor_start(problem: Problem) -> np.ndarray:
+def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
     """Search vector with R and C_e by regression of the voltage where it is logged."""
     z = problem.space.start.copy()
-    w = problem.windows
+    w = problem.windows.pieces(np.flatnonzero(keep > 0))
     if not (w.has_voltage and w.has_current):
         return z
     speed = (w.turn / w.dt[..., None]).ravel()
