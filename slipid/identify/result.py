@@ -20,7 +20,7 @@ from slipid.identify.fit.problem import Problem, log_jacobian
 from slipid.identify.fit.variances import Search, Square, Vector
 from slipid.identify.slip_curves import SlipCurve
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
-from slipid.identify.verdicts.unidentified import Flat, flat_directions, sentences
+from slipid.identify.verdicts.unidentified import Flat, flat_directions, members, sentences
 from slipid.model.robot import Robot, Validity
 from slipid.search_space import Choice, Space
 
@@ -96,12 +96,9 @@ class Fit:
     @cached_property
     def parameters(self) -> dict[str, Estimate]:
         """Every number by path, with interval and verdict."""
-        volts = self.channels.voltage
-        found = estimates(self.space, self.choices, self.z, self.covariance, volts)
-        # a number whose scale rests on another one's prior was not measured, however narrow
-        open_ = {path for f in self.flat for path in f.paths}
-        rests = {e.path for e in found if e.path in open_ and e.provenance == "measured"}
-        return {e.path: replace(e, provenance="borrowed") if e.path in rests else e for e in found}
+        volts, flat = self.channels.voltage, members(self.flat)
+        found = estimates(self.space, self.choices, self.z, self.covariance, volts, flat)
+        return {e.path: e for e in found}
 
     @cached_property
     def flat(self) -> tuple[Flat, ...]:

@@ -120,6 +120,11 @@ def flat_directions(
     return tuple(out)
 
 
+def members(found: Iterable[Flat]) -> frozenset[str]:
+    """Paths of the numbers that move along flat directions."""
+    return frozenset(path for f in found for path in f.paths)
+
+
 def sentences(found: Iterable[Flat]) -> tuple[str, ...]:
     """One sentence per direction; numbers by themselves that one remedy would tell share one."""
     alone: dict[str, list[str]] = {}
