@@ -34,7 +34,7 @@ def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
     far, _ = travel(w, robot)
     left = _left(w, robot)
     variance = dict(zip(problem.noise.names, problem.noise.typical**2, strict=True))
-    for floor in robot.surfaces.labels:
+    for floor in dict.fromkeys(w.surface):
         mine = np.asarray(w.surface) == floor
         e, d, whole = left[mine], far[mine][..., None], far[mine].sum(axis=1)[:, None]
         level = e.sum(axis=1) / whole
