@@ -31,7 +31,7 @@ _CHANNELS = (
 
 @dataclass(frozen=True)
 class Expected:
-    """What logs can be expected to tell of every number and ratio, at the start values by path.
+    """What logs can be expected to tell of every number and ratio, by path.
 
     `messages` say what stays open and what would close it, one sentence each.
     """

@@ -1,6 +1,6 @@
 """What may be said of every number and of ratios of them: interval and verdict.
 
-Before a fit from the information expected at the start values, after it from the Laplace posterior.
+Before a fit from the information that is expected, after it from the Laplace posterior.
 """
 
 from collections.abc import Collection, Sequence

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from slipid.identify.compare.scatter import scatter
 from slipid.identify.fit.problem import Problem
@@ -31,9 +32,10 @@ def test_noise_is_found_where_it_is_and_what_is_typical_elsewhere():
         assert 0.8 < std[name] / true < 1.6, name  # of runs that others predict
         # what a smooth function leaves of the slip of a quiet floor counts as its noise
         quiet = name.replace("soft", "firm")
-        assert typical[quiet] <= std[quiet] < 0.5 * true, quiet
-    others = [name for name in std if name.split(".")[0] not in KINDS]
-    assert {name: std[name] for name in others} == {name: typical[name] for name in others}
+        assert 0.999 * typical[quiet] < std[quiet] < 0.5 * true, quiet
+    for name in std:
+        if name.split(".")[0] not in KINDS:
+            assert std[name] == pytest.approx(typical[name])
 
 
 def test_runs_too_few_to_be_predicted_from_each_other_scatter_far():
