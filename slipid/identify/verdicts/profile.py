@@ -165,7 +165,7 @@ class _Walk:
     def loss(self, state: State) -> float:
         """Minus log posterior at fixed noise, of the motion alone where that is the question."""
         problem, log_v = self.problem, state.log_variance
-        blocks, _ = problem.linear(jnp.asarray(state.z), problem.volt(log_v))
+        blocks, _ = problem.linear(jnp.asarray(state.z), problem.electric(log_v))
         if self.of_motion:
             blocks = {"motion": blocks["motion"]}
         return problem.loss(state.z, log_v, np.ones(len(problem.windows)), blocks)

@@ -88,7 +88,7 @@ def test_a_fit_ends_where_the_loss_is_level(truth, path):
     best = optimise(problem, start=begin(problem), **PRECISE)
     assert best.converged
     log_v, keep = jnp.asarray(best.state.log_variance), jnp.ones(len(w))
-    volt, std = problem.volt(log_v), float(np.sqrt(best.covariance[0, 0]))
+    volt, std = problem.electric(log_v), float(np.sqrt(best.covariance[0, 0]))
 
     def loss(z):
         blocks, _ = problem.linear(jnp.asarray(z), volt)

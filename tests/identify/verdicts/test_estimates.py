@@ -323,9 +323,9 @@ def test_a_profile_refits_all_others():
     k = this.space.place["motor.back_emf"].start
     z = end.state.z.copy()
     z[k] = np.log(p.value[-1])
-    blocks, _ = this.linear(z, this.volt(end.state.log_variance))
+    blocks, _ = this.linear(z, this.electric(end.state.log_variance))
     alone = this.loss(z, end.state.log_variance, np.ones(len(this.windows)), blocks)
-    blocks, _ = this.linear(end.state.z, this.volt(end.state.log_variance))
+    blocks, _ = this.linear(end.state.z, this.electric(end.state.log_variance))
     best = this.loss(end.state.z, end.state.log_variance, np.ones(len(this.windows)), blocks)
     assert p.posterior[-1] < 0.9 * (alone - best)
 
