@@ -197,7 +197,7 @@ def _remaining(problem: Problem, z: Search, log_v: Vector) -> tuple[float, str]:
     the slope of log |d residuals / d data|; where currents were logged, their rows move the
     electric numbers only.
     """
-    every, electric = np.ones(len(problem.windows)), problem.electric(log_v)
+    every, electric = np.ones(len(problem.windows)), problem.electric(z, log_v)
     residual, jacobian = problem.linear(z, electric)
     roots = problem.whitening(residual, log_v, every).root
     residual, jacobian, roots = jax.device_get((residual, jacobian, roots))

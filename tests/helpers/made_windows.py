@@ -81,10 +81,11 @@ def made(truth, runs=24, count=2, seed=0, std=None, signed=True, voltage=True):
     return measure(truth, w, rng, std)
 
 
-def electric_noise(b, voltage_std, scatter=0.05):
+def electric_noise(b, voltage_std, scatter=0.05, resistance=5.5):
     """What voltages are predicted with when currents scatter so much around predicted ones [A]."""
     pieces, *others = b.turn.shape
-    return lk.ElectricNoise(voltage_std, jnp.full((pieces, int(np.prod(others))), scatter**2))
+    wide = jnp.full((pieces, int(np.prod(others))), scatter**2)
+    return lk.ElectricNoise(voltage_std, wide, resistance)
 
 
 def residuals(robot, b, noise):

@@ -34,7 +34,9 @@ STD = {
     "voltage.window": 0.05,
 }
 SIGNAL = 0.1
-"""Std of the currents that flow [A]."""
+"""Std of the currents that flow, about [A]."""
+MU = 0.14
+"""Friction of the floors, for currents of this size."""
 FREE = [
     Choice("*", free=False),
     Choice("motor.resistance", start=5.0, free=True),
@@ -62,14 +64,10 @@ def truth():
     )
 
 
-MU = 0.14
-"""Friction of the floors, for currents of the size of `SIGNAL`."""
-
-
 @functools.cache
-def problem(signed: bool = True, runs: int = 96) -> Problem:
+def problem(signed: bool = True, runs: int = 480) -> Problem:
     """What experiments have in common; its windows say what was driven."""
-    return Problem(made(truth(), runs=runs, signed=signed), truth(), FREE)
+    return Problem(made(truth(), runs=runs, count=4, signed=signed), truth(), FREE)
 
 
 @dataclass(frozen=True)

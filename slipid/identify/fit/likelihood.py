@@ -82,11 +82,14 @@ class ElectricNoise(eqx.Module):
     """What voltages are predicted with: the voltmeter's std [V], and how far currents scatter.
 
     The scatter is the variance of the true current of every window around the predicted one [A^2],
-    without the ammeter's noise.
+    without the ammeter's noise. The resistance [ohm] says how far what stays unknown of the true
+    current moves voltages: a fit holds it in every round, as it holds the variances, because these
+    are fitted to the size of the residuals, which then tells nothing more of R.
     """
 
     voltage_std: Std
     scatter: PerChannel
+    resistance: Std
 
 
 class Predicted(eqx.Module):
@@ -174,7 +177,7 @@ def electric_residuals(
         amps = predicted + _flow(b, noise)[0] * (b.current - predicted)
         w = b.turn / b.dt[..., None]
         volts = robot.motor.voltage((amps - robot.motor.current_offset) * _direction(b), w)
-        out["voltage"] = _flat(volts - b.voltage) / spread(robot, b, noise)
+        out["voltage"] = _flat(volts - b.voltage) / spread(b, noise)
     return out
 
 
@@ -208,7 +211,7 @@ def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, 
     camera = camera_log_jacobian(robot, b.pose)
     if not (b.has_current and b.has_voltage):
         return camera, jnp.zeros_like(camera)
-    return camera, -jnp.sum(jnp.log(spread(robot, b, noise)), axis=1)
+    return camera, -jnp.sum(jnp.log(spread(b, noise)), axis=1)
 
 
 def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, " piece"]:
@@ -216,12 +219,12 @@ def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Flo
     return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
 
 
-def spread(robot: Robot, b: Batch, noise: ElectricNoise) -> PerChannel:
+def spread(b: Batch, noise: ElectricNoise) -> PerChannel:
     """Std of the voltage residual over that of the voltage noise.
 
     The rest is of the true current that the ammeter and the model leave unknown, times R.
     """
-    unknown = (robot.motor.resistance * _direction(b)) ** 2 * _flow(b, noise)[1]
+    unknown = (noise.resistance * _direction(b)) ** 2 * _flow(b, noise)[1]
     return _flat(jnp.sqrt(1.0 + unknown / noise.voltage_std**2))
 
 

@@ -115,13 +115,14 @@ def noise(windows: Windows, robot: Robot) -> Noise:
 def electric_noise(
     blocks: dict[str, Components],
     log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"],
+    resistance: Array,
 ) -> ElectricNoise:
     """What voltages are predicted with; nothing of meaning where none are logged."""
     if "voltage" not in blocks:
-        return ElectricNoise(jnp.ones(()), jnp.ones((1, 1)))
+        return ElectricNoise(jnp.ones(()), jnp.ones((1, 1)), resistance)
     current, log_v = blocks["current"], jnp.asarray(log_variance)
     scatter = jnp.einsum("nc,nci->ni", jnp.exp(log_v)[current.which], current.single)
-    return ElectricNoise(voltage_std(log_v[-1]), scatter + FLOOR["current"])
+    return ElectricNoise(voltage_std(log_v[-1]), scatter + FLOOR["current"], resistance)
 
 
 def _components(

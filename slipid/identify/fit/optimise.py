@@ -87,7 +87,7 @@ def one_round(
     1 for coordinates that may move, 0 for those held.
     """
     target, log_v = problem.target, jnp.asarray(state.log_variance)
-    electric = problem.electric(log_v)
+    electric = problem.electric(state.z, log_v)
     residual, _, felt = linear(target, jnp.asarray(state.z), electric)
     held = Held(
         target=target,
@@ -99,6 +99,7 @@ def one_round(
         slope=log_jacobian(target, state.z, electric, keep)[1],
     )
     z = np.asarray(levenberg(held, Steps(steps)))
+    electric = problem.electric(z, log_v)
     residual, jacobian, felt = linear(target, jnp.asarray(z), electric)
     told = problem.through_voltage(z, log_v, felt)
     for _ in range(scoring):
@@ -109,7 +110,8 @@ def one_round(
             residual = residual | {"voltage": told.residual}
             jacobian = jacobian | {"voltage": jacobian["voltage"] * scale}
     if told is not None and scoring:  # the Jacobian by R changes by more than its scale
-        residual, jacobian = problem.linear(z, problem.electric(log_v))
+        electric = problem.electric(z, log_v)
+        residual, jacobian = problem.linear(z, electric)
     std = np.sqrt(np.diag(np.linalg.inv(np.asarray(problem.precision(jacobian, log_v, keep)))))
     moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
     moved = max(moved, float(np.max(np.abs(np.asarray(log_v) - state.log_variance)) / 3))
@@ -117,7 +119,7 @@ def one_round(
         z=z,
         log_variance=np.asarray(log_v),
         round=state.round + 1,
-        loss=problem.loss(z, log_v, keep, residual),
+        loss=problem.loss(z, log_v, keep, residual, electric),
         moved=moved,
         stage=state.stage,
     )
@@ -146,7 +148,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
         for steps in (15, 6, 6):  # the damping has to grow from 1 to the size of the problem first
             state = one_round(problem, state, keep, mask, steps=steps, scoring=0)
             tell(state)
-        residual, _ = problem.linear(state.z, problem.electric(state.log_variance))
+        residual, _ = problem.linear(state.z, problem.electric(state.z, state.log_variance))
         every = np.ones(len(floors))
         weight = problem.whitening(residual, state.log_variance, every).weight["motion"]
         cost = -np.log(np.asarray(weight))  # as good as the loss, but for factor and constant

@@ -100,20 +100,27 @@ class Problem:
 
     def laplace(self, z: Vector, log_v: Vector, keep: Vector) -> np.ndarray:
         """Covariance of the search vector (free, free): inverse information, prior included."""
-        jacobian = self.linear(z, self.electric(log_v))[1]
+        jacobian = self.linear(z, self.electric(z, log_v))[1]
         return np.linalg.inv(np.asarray(self.precision(jacobian, log_v, keep)))
 
-    def loss(self, z: Vector, log_v: Vector, keep: Vector, residual: Blocks) -> float:
+    def loss(
+        self,
+        z: Vector,
+        log_v: Vector,
+        keep: Vector,
+        residual: Blocks,
+        electric: lk.ElectricNoise,
+    ) -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
         nll = float(self.whitening(residual, log_v, keep).loss)
-        nll -= float(log_jacobian(self.target, z, self.electric(log_v), keep)[0])
+        nll -= float(log_jacobian(self.target, z, electric, keep)[0])
         pull = (np.asarray(z) - self.space.prior_mean) / self.space.prior_std
         spread = (np.asarray(log_v) - np.asarray(self.target.typical)) / VARIANCE_SPREAD
         return nll + 0.5 * float(np.sum(pull**2)) + 0.5 * float(np.sum(spread**2))
 
-    def electric(self, log_v: Vector) -> lk.ElectricNoise:
-        """What voltages are predicted with at these variances."""
-        return electric_noise(self.noise.blocks, log_v)
+    def electric(self, z: Vector, log_v: Vector) -> lk.ElectricNoise:
+        """What voltages are predicted with at this resistance and these variances."""
+        return _electric(self.target, z, log_v)
 
     def through_voltage(self, z: Vector, log_v: Vector, felt: Array) -> ThroughVoltage | None:
         """What voltages tell of variances given the traction, None where none are logged."""
@@ -135,6 +142,11 @@ def linear(target: Target, z: Vector, electric: lk.ElectricNoise) -> tuple[Block
 
     jacobian, (out, felt) = jax.jacfwd(blocks, has_aux=True)(z)
     return out, jacobian, felt
+
+
+@eqx.filter_jit
+def _electric(target: Target, z: Vector, log_v: Vector) -> lk.ElectricNoise:
+    return electric_noise(target.blocks, log_v, target.space.tree(z).motor.resistance)
 
 
 @eqx.filter_jit

@@ -66,22 +66,26 @@ class ThroughVoltage(NamedTuple):
         share: part that this noise has in the variance of every residual.
         slope: derivative of the log likelihood by the scatter of the true current.
         information: expected, of that scatter.
+        steeper: by how much the loss bends more than expected in the log of the voltage noise,
+            where others explain the residuals.
     """
 
     residual: Array
     share: Array
     slope: Array
     information: Array
+    steeper: Array
 
 
 @eqx.filter_jit
 def through_voltage(target: Target, z: Vector, log_v: Vector, felt: Array) -> ThroughVoltage:
     """What voltages tell of variances given the traction of every wheel's motor."""
-    robot, b, noise = target.space.tree(z), target.batch, electric_noise(target.blocks, log_v)
+    robot, b = target.space.tree(z), target.batch
+    noise = electric_noise(target.blocks, log_v, robot.motor.resistance)
 
     def scaled(scatter: Array) -> tuple[Array, Array]:
-        at = lk.ElectricNoise(noise.voltage_std, scatter)
-        return lk.electric_residuals(robot, b, felt, at)["voltage"], lk.spread(robot, b, at)
+        at = lk.ElectricNoise(noise.voltage_std, scatter, noise.resistance)
+        return lk.electric_residuals(robot, b, felt, at)["voltage"], lk.spread(b, at)
 
     # every residual depends on its own scatter only
     (r, spread), (more, wider) = jax.jvp(scaled, (noise.scatter,), (jnp.ones_like(noise.scatter),))
@@ -89,7 +93,9 @@ def through_voltage(target: Target, z: Vector, log_v: Vector, felt: Array) -> Th
     weight = (DEGREES + m) / (DEGREES + jnp.sum(r**2, axis=1, keepdims=True) / variance)
     moved = (more + r * wider) ** 2 / variance * (DEGREES + m) / (DEGREES + m + 2)
     slope = -wider - weight * r * more / variance
-    return ThroughVoltage(r, 1 / spread**2, slope, moved + 2 * wider**2)
+    share = 1 / spread**2
+    steeper = 0.5 * share * (2 * share - 1) * (weight * r**2 / variance - 1)
+    return ThroughVoltage(r, share, slope, moved + 2 * wider**2, steeper)
 
 
 @eqx.filter_jit
@@ -191,15 +197,13 @@ def scored_given(
             told = jnp.einsum("ni,nci->nc", voltage.slope, noise.single)
             slope += v * keep[:, None] * told
         score = score.at[which].add(slope)
-        if mine is not None:  # where others explain the residual the loss bends more than expected
-            rest = jnp.clip(1 - 2 * jnp.mean(mine, axis=1), 0.0)
-            steeper = steeper.at[which].add(-rest[:, None] * slope)
+        if voltage is not None and k == "voltage":
+            steeper = steeper.at[which].add((keep * jnp.sum(voltage.steeper, axis=1))[:, None])
+        if voltage is not None and k == "current":  # a logarithm that falls bends the more
+            steeper = steeper.at[which].add(-slope)
     score -= (log_v - target.typical) / VARIANCE_SPREAD**2
     info = information(target.blocks, log_v, keep, voltage)
     info += jnp.diag(jnp.maximum(steeper, 0.0))
-    if voltage is not None:  # window and run are hardly told apart: each moves as if it were alone
-        both = _through(target.blocks["current"], log_v, keep, voltage)
-        info += jnp.diag(jnp.sum(both, axis=1)) - both
     return log_v + jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
 
 

@@ -67,7 +67,7 @@ class Coordinates:
     @staticmethod
     def of(problem: Problem, fitted: Fitted, part: str) -> "Coordinates":
         """Coordinates of a part; the floors that each touches are those of the fit's Jacobian."""
-        _, jacobian = problem.linear(fitted.z, problem.electric(fitted.log_variance))
+        _, jacobian = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
         blocks = {
             MOTION: ["motion"],
             ELECTRIC: [k for k in jacobian if k != "motion"],
@@ -160,13 +160,17 @@ class Anchor(eqx.Module):
         arrived = jnp.all(jnp.isfinite(p.twist))
         return jax.lax.cond(arrived, lambda: p, lambda: lk.predict(robot, b))
 
-    def electric_noise(self, log_v: Float[Array, " variance"]) -> lk.ElectricNoise:
+    def electric_noise(
+        self, log_v: Float[Array, " variance"], resistance: Array
+    ) -> lk.ElectricNoise:
         """What voltages are predicted with, as `fit.noise` has it for pieces that come first."""
         if "voltage" not in self.base:
-            return lk.ElectricNoise(jnp.ones(()), jnp.ones((1, 1)))
+            return lk.ElectricNoise(jnp.ones(()), jnp.ones((1, 1)), resistance)
         v = jnp.exp(log_v)[self.which["current"]]
         scatter = jnp.einsum("cn,ciin->ni", v, self.base["current"])
-        return lk.ElectricNoise(lk.voltage_std(log_v[-1]), scatter + lk.FLOOR["current"])
+        return lk.ElectricNoise(
+            lk.voltage_std(log_v[-1]), scatter + lk.FLOOR["current"], resistance
+        )
 
     def log_student(
         self, k: str, r: Float[Array, "piece m"], log_v: Float[Array, " variance"]

@@ -70,7 +70,7 @@ class Density:
         n, v = len(at.structure), len(at.variance)
         out = np.zeros((self.size, self.size))
         z, log_v, keep = fitted.z, fitted.log_variance, np.ones(len(problem.windows))
-        _, jacobian, felt = linear(problem.target, z, problem.electric(log_v))
+        _, jacobian, felt = linear(problem.target, z, problem.electric(z, log_v))
         told = problem.through_voltage(z, log_v, felt)
         info = information(problem.noise.blocks, log_v, keep, told)
         of_variance = np.linalg.inv(np.asarray(info))
@@ -178,12 +178,13 @@ class Density:
     def _residuals(self, anchor: Anchor, x: Array, held: Held | None) -> _Seen:
         z, log_v = self.full(anchor, x)
         b, at = anchor.batch, self.coordinates
-        electric = anchor.electric_noise(log_v)
         if self.part == ELECTRIC:
             assert held is not None, "what the electric part holds of the motion"
             robot = self.problem.space.tree(held.z.at[at.structure].set(z[at.structure]))
+            electric = anchor.electric_noise(log_v, robot.motor.resistance)
             return _Seen(lk.electric_residuals(robot, b, held.felt, electric), robot, electric)
         robot = self.problem.space.tree(z)
+        electric = anchor.electric_noise(log_v, robot.motor.resistance)
         p = anchor.predict(robot, z)
         out = {"motion": lk.motion_residual(robot, b, p)}
         if at.sessions:
