@@ -13,7 +13,6 @@ from scipy.stats import multivariate_t
 
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
-from slipid.identify.fit import variances
 from slipid.identify.fit.problem import Problem, linear
 from slipid.identify.fit.variances import DEGREES, inverse_root, scored
 from slipid.identify.slip_curves import current_trend
