@@ -194,13 +194,13 @@ def _remaining(problem: Problem, z: Search, log_v: Vector) -> tuple[float, str]:
     the slope of log |d residuals / d data|; where currents were logged, their rows move the
     electric numbers only.
     """
-    every, volt = np.ones(len(problem.windows)), problem.volt(log_v)
-    residual, jacobian = problem.linear(z, volt)
+    every, electric = np.ones(len(problem.windows)), problem.electric(z, log_v)
+    residual, jacobian = problem.linear(z, electric)
     roots = problem.whitening(residual, log_v, every).root
     residual, jacobian, roots = jax.device_get((residual, jacobian, roots))
     own = problem.space.electric.astype(float)
     prior = problem.space.prior_std**-2
-    _, slope = log_jacobian(problem.target, z, volt, every)
+    _, slope = log_jacobian(problem.target, z, electric, every)
     gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
     info = np.diag(prior)
     for k, root in roots.items():

@@ -148,7 +148,8 @@ class Contact(Predictive):
         return np.flatnonzero(self.space.where(lambda e: e.part == "camera"))
 
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
-        blocks, jac = problem.linear(self.z, problem.volt(self.log_variance(problem)))
+        electric = problem.electric(self.z, self.log_variance(problem))
+        blocks, jac = problem.linear(self.z, electric)
         return np.asarray(blocks["motion"]), np.asarray(jac["motion"])
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:

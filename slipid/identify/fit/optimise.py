@@ -87,29 +87,31 @@ def one_round(
     1 for coordinates that may move, 0 for those held.
     """
     target, log_v = problem.target, jnp.asarray(state.log_variance)
-    volt = problem.volt(log_v)
-    residual, _, felt = linear(target, jnp.asarray(state.z), volt)
+    electric = problem.electric(state.z, log_v)
+    residual, _, felt = linear(target, jnp.asarray(state.z), electric)
     held = Held(
         target=target,
         z=jnp.asarray(state.z),
         mask=jnp.asarray(mask),
         root=problem.whitening(residual, log_v, keep).root,
-        volt=volt,
+        electric=electric,
         felt=felt,
-        slope=log_jacobian(target, state.z, volt, keep)[1],
+        slope=log_jacobian(target, state.z, electric, keep)[1],
     )
     z = np.asarray(levenberg(held, Steps(steps)))
-    residual, jacobian = problem.linear(z, volt)
-    own = problem.own(z, log_v)
+    electric = problem.electric(z, log_v)
+    residual, jacobian, felt = linear(target, jnp.asarray(z), electric)
+    told = problem.through_voltage(z, log_v, felt)
     for _ in range(scoring):
-        log_v = scored(target, residual, jacobian, log_v, jnp.asarray(keep), own)
-        before, own = own, problem.own(z, log_v)
-        for k, share in own.items():  # these residuals are in units of the noise just found
-            scale = jnp.sqrt(share / before[k])
-            residual = residual | {k: residual[k] * scale}
-            jacobian = jacobian | {k: jacobian[k] * scale[..., None]}
-    if own and scoring:  # the Jacobian by R changes by more than its scale
-        residual, jacobian = problem.linear(z, problem.volt(log_v))
+        log_v = scored(target, residual, jacobian, log_v, jnp.asarray(keep), told)
+        before, told = told, problem.through_voltage(z, log_v, felt)
+        if before is not None and told is not None:  # in units of the noise just found
+            scale = jnp.sqrt(told.share / before.share)[..., None]
+            residual = residual | {"voltage": told.residual}
+            jacobian = jacobian | {"voltage": jacobian["voltage"] * scale}
+    if told is not None and scoring:  # the Jacobian by R changes by more than its scale
+        electric = problem.electric(z, log_v)
+        residual, jacobian = problem.linear(z, electric)
     std = np.sqrt(np.diag(np.linalg.inv(np.asarray(problem.precision(jacobian, log_v, keep)))))
     moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
     moved = max(moved, float(np.max(np.abs(np.asarray(log_v) - state.log_variance)) / 3))
@@ -117,7 +119,7 @@ def one_round(
         z=z,
         log_variance=np.asarray(log_v),
         round=state.round + 1,
-        loss=problem.loss(z, log_v, keep, residual),
+        loss=problem.loss(z, log_v, keep, residual, electric),
         moved=moved,
         stage=state.stage,
     )
@@ -146,7 +148,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
         for steps in (15, 6, 6):  # the damping has to grow from 1 to the size of the problem first
             state = one_round(problem, state, keep, mask, steps=steps, scoring=0)
             tell(state)
-        residual, _ = problem.linear(state.z, problem.volt(state.log_variance))
+        residual, _ = problem.linear(state.z, problem.electric(state.z, state.log_variance))
         every = np.ones(len(floors))
         weight = problem.whitening(residual, state.log_variance, every).weight["motion"]
         cost = -np.log(np.asarray(weight))  # as good as the loss, but for factor and constant
@@ -178,8 +180,8 @@ def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
 class Held(eqx.Module):
     """What is held while the structural numbers move from z.
 
-    The mask is 1 for coordinates that may move; root whitens residuals, volt is the std of the
-    voltage noise [V], felt the traction at z, which currents and voltages are predicted from, and
+    The mask is 1 for coordinates that may move; root whitens residuals, electric is what voltages
+    are predicted with, felt the traction at z, which currents and voltages are predicted from, and
     slope that of log |d residuals / d data| by the search vector.
     """
 
@@ -187,7 +189,7 @@ class Held(eqx.Module):
     z: Float[Array, " free"]
     mask: Float[Array, " free"]
     root: Blocks
-    volt: Float[Array, ""]
+    electric: lk.ElectricNoise
     felt: Float[Array, "piece window wheel"]
     slope: Float[Array, " free"]
 
@@ -233,7 +235,7 @@ def _stacked(y: Array, held: Held) -> Array:
     robot, given = space.tree(z), space.tree(jnp.where(space.electric, z, held.z))
     motion = lk.motion_residual(robot, target.batch, lk.predict(robot, target.batch))
     # currents and voltages given the motion of the round's start
-    electric = lk.electric_residuals(given, target.batch, held.felt, held.volt)
+    electric = lk.electric_residuals(given, target.batch, held.felt, held.electric)
     blocks = {"motion": motion} | electric
     parts = [jnp.einsum("nij,nj->ni", held.root[k], r).ravel() for k, r in blocks.items()]
     # the slope of the log Jacobian adds slope . z to the log posterior

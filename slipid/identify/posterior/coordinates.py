@@ -67,7 +67,7 @@ class Coordinates:
     @staticmethod
     def of(problem: Problem, fitted: Fitted, part: str) -> "Coordinates":
         """Coordinates of a part; the floors that each touches are those of the fit's Jacobian."""
-        _, jacobian = problem.linear(fitted.z, problem.volt(fitted.log_variance))
+        _, jacobian = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
         blocks = {
             MOTION: ["motion"],
             ELECTRIC: [k for k in jacobian if k != "motion"],
@@ -112,7 +112,8 @@ def _groups(touched: Bool[np.ndarray, "size floor"]) -> Int[np.ndarray, " size"]
 class Anchor(eqx.Module):
     """Windows and the fit that a density is anchored at; an argument of what is compiled.
 
-    Covariance pieces of every block, pieces last, go with the number of the variance of each.
+    Covariance pieces of every block, pieces last, go with the number of the variance of each, and
+    with the variances that are known beside them.
     Twists are those at the fit, with their derivative by the search vector; `typical` is the centre
     of the prior of the log variances. Shares are how far session effects of one std move residuals,
     session is the place among those that have effects.
@@ -121,6 +122,7 @@ class Anchor(eqx.Module):
     batch: lk.Batch
     base: dict[str, Array]
     which: dict[str, Array]
+    known: dict[str, Float[Array, "m piece"]]
     z: Array
     log_variance: Array
     twist: Float[Array, "piece window 3"]
@@ -140,6 +142,7 @@ class Anchor(eqx.Module):
             batch=problem.batch,
             base={k: jnp.moveaxis(c.base, 0, -1) for k, c in problem.noise.blocks.items()},
             which={k: c.which.T for k, c in problem.noise.blocks.items()},
+            known={k: c.known.T for k, c in problem.noise.blocks.items()},
             z=jnp.asarray(fitted.z),
             log_variance=jnp.asarray(fitted.log_variance),
             twist=twist,
@@ -157,6 +160,18 @@ class Anchor(eqx.Module):
         arrived = jnp.all(jnp.isfinite(p.twist))
         return jax.lax.cond(arrived, lambda: p, lambda: lk.predict(robot, b))
 
+    def electric_noise(
+        self, log_v: Float[Array, " variance"], resistance: Array
+    ) -> lk.ElectricNoise:
+        """What voltages are predicted with, as `fit.noise` has it for pieces that come first."""
+        if "voltage" not in self.base:
+            return lk.ElectricNoise(jnp.ones(()), jnp.ones((1, 1)), resistance)
+        v = jnp.exp(log_v)[self.which["current"]]
+        scatter = jnp.einsum("cn,ciin->ni", v, self.base["current"])
+        return lk.ElectricNoise(
+            lk.voltage_std(log_v[-1]), scatter + lk.FLOOR["current"], resistance
+        )
+
     def log_student(
         self, k: str, r: Float[Array, "piece m"], log_v: Float[Array, " variance"]
     ) -> Float[Array, " piece"]:
@@ -164,8 +179,8 @@ class Anchor(eqx.Module):
         base, which = self.base[k], self.which[k]
         m = base.shape[1]
         v = jnp.exp(log_v)[which]
-        floor = lk.FLOOR[k] * jnp.eye(m)[:, :, None]
-        cov = sum((v[c] * base[c] for c in range(len(base))), floor)
+        known = self.known[k] * jnp.eye(m)[:, :, None]
+        cov = sum((v[c] * base[c] for c in range(len(base))), known)
         log_det, q = squares(jax.lax.optimization_barrier(cov), r.T)
         constant = gammaln(0.5 * (DEGREES + m)) - gammaln(0.5 * DEGREES)
         constant -= 0.5 * m * np.log(DEGREES * np.pi)

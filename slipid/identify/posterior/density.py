@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.problem import Problem, linear
 from slipid.identify.fit.sessions import AXES
 from slipid.identify.fit.variances import VARIANCE_SPREAD, information, whitened
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Coordinates, Fitted
@@ -35,11 +35,11 @@ class Held(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """Blocks of residuals (piece, m), the robot they are of, and the voltmeter's std [V]."""
+    """Blocks of residuals (piece, m), the robot and the noise of voltages they are of."""
 
     residuals: dict[str, Array]
     robot: Robot
-    volt: Array
+    electric: lk.ElectricNoise
 
 
 class Density:
@@ -70,15 +70,16 @@ class Density:
         n, v = len(at.structure), len(at.variance)
         out = np.zeros((self.size, self.size))
         z, log_v, keep = fitted.z, fitted.log_variance, np.ones(len(problem.windows))
-        told = information(problem.noise.blocks, log_v, keep, problem.own(z, log_v))
-        of_variance = np.linalg.inv(np.asarray(told))
+        _, jacobian, felt = linear(problem.target, z, problem.electric(z, log_v))
+        told = problem.through_voltage(z, log_v, felt)
+        info = information(problem.noise.blocks, log_v, keep, told)
+        of_variance = np.linalg.inv(np.asarray(info))
         out[n : n + v, n : n + v] = of_variance[np.ix_(at.variance, at.variance)]
         own = fitted.covariance[np.ix_(at.structure, at.structure)]
         mean = np.concatenate([np.arange(n), np.arange(n + v, self.size)])
         precision = np.zeros((len(mean), len(mean)))
         precision[:n, :n] = np.linalg.inv(own)
         if at.sessions:
-            _, jacobian = problem.linear(z, problem.volt(log_v))
             shares = np.asarray(self.anchor.shares)
             member = np.eye(len(at.sessions))[np.asarray(self.anchor.session)]
             moved = -shares[:, :, None, :] * member[:, None, :, None]
@@ -163,7 +164,7 @@ class Density:
     def _pieces(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
         seen, log_v = self._residuals(anchor, x, held), self.full(anchor, x)[1]
         out = {k: anchor.log_student(k, r, log_v) for k, r in seen.residuals.items()}
-        camera, spread = lk.log_jacobians(seen.robot, anchor.batch, seen.volt)
+        camera, spread = lk.log_jacobians(seen.robot, anchor.batch, seen.electric)
         if "motion" in out:
             out["motion"] += camera
         if "voltage" in out:
@@ -177,21 +178,22 @@ class Density:
     def _residuals(self, anchor: Anchor, x: Array, held: Held | None) -> _Seen:
         z, log_v = self.full(anchor, x)
         b, at = anchor.batch, self.coordinates
-        volt = lk.voltage_std(log_v[-1]) if b.has_current and b.has_voltage else jnp.asarray(1.0)
         if self.part == ELECTRIC:
             assert held is not None, "what the electric part holds of the motion"
             robot = self.problem.space.tree(held.z.at[at.structure].set(z[at.structure]))
-            return _Seen(lk.electric_residuals(robot, b, held.felt, volt), robot, volt)
+            electric = anchor.electric_noise(log_v, robot.motor.resistance)
+            return _Seen(lk.electric_residuals(robot, b, held.felt, electric), robot, electric)
         robot = self.problem.space.tree(z)
+        electric = anchor.electric_noise(log_v, robot.motor.resistance)
         p = anchor.predict(robot, z)
         out = {"motion": lk.motion_residual(robot, b, p)}
         if at.sessions:
             shared = at.parts(x)[2].reshape(-1, len(AXES))[anchor.session]
             out["motion"] -= jnp.sum(anchor.shares * shared[:, None], axis=-1)
         if self.part == EVERYTHING:
-            out |= lk.electric_residuals(robot, b, p.felt, volt)
+            out |= lk.electric_residuals(robot, b, p.felt, electric)
         # or the root finder is computed again for every consumer
-        return _Seen(jax.lax.optimization_barrier(out), robot, volt)
+        return _Seen(jax.lax.optimization_barrier(out), robot, electric)
 
     def hold(self, x: Float[np.ndarray, "walker size"]) -> Held:
         """What the electric part holds of walkers of the motion part."""
