@@ -168,8 +168,11 @@ class FloorFilter(eqx.Module):
             floor = replace(on.floor, friction=mu)
             return replace(balance, on=replace(on, floor=floor)).force(xi)
 
-        pushed = jax.vmap(lambda there: jax.jvp(force, (mu,), (mu * there,))[1])(beneath)
-        slope = -jnp.stack(solve3(balance.jacobian(xi), pushed))
+        def pushed(there: Array) -> Planar:  # frictions count over their mean
+            part = mu * there
+            return jax.jvp(force, (mu,), (part - mu * jnp.mean(part, axis=0),))[1]
+
+        slope = -jnp.stack(solve3(balance.jacobian(xi), jax.vmap(pushed)(beneath)))
         most = length(twist[:2].T) + self.robot.frame.base * jnp.abs(twist[2])
         most = jnp.stack([most, most, most / self.robot.frame.base])[:, None]
         return jnp.where(jnp.isfinite(slope), jnp.clip(slope, -most, most), 0.0)
