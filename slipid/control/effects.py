@@ -5,8 +5,8 @@ of travel u, the unit vector of the twist without slip, yaw as rim speed. Its st
 everywhere; between directions it correlates as a Gaussian process with a periodic kernel does, and
 once the robot has left the floor, less and less:
 
-    e <- k e + sqrt(1 - k^2) std noise,   k = exp(-(1 - a^2) |u - v|^2 / (2 TURN^2) - left far / AWAY)
-    v <- u + a (v - u),                   a = exp(-far / SETTLES)
+    k = exp(-(1 - a^2) |u - v|^2 / (2 TURN^2) - left far / AWAY),   a = exp(-far / SETTLES)
+    e <- k e + sqrt(1 - k^2) std noise,   v <- u + a (v - u)
 
 Over a turn from v to u that makes exp(-|u - v|^2 / (2 TURN^2)), in however many steps, and
 directions that tremble make next to nothing: a way back errs anew.

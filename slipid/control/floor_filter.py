@@ -26,7 +26,7 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import Settings
 from slipid.control.wheels import Currents
 from slipid.model.contact import settle
-from slipid.model.contact_balance import Balance, Stance, stand
+from slipid.model.contact_balance import Balance, stand
 from slipid.model.robot import GRAVITY
 from slipid.model.se2 import Planar, advance, compose, solve3
 
@@ -117,7 +117,7 @@ class FloorFilter(eqx.Module):
             w: wheel speeds [rad/s]; currents: what is known of them.
             turn: yaw rate by the gyro, its bias taken off, NaN without one [rad/s].
         """
-        xi, predicted, by_friction = self.solve(old.twist, w)
+        xi, predicted = self.solve(old.twist, w)
         told, none = self._evidence(xi, predicted, currents, w, turn)
         # what the equilibrium does not know, inertia, weighs little while wheels speed up
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)
@@ -128,24 +128,21 @@ class FloorFilter(eqx.Module):
         known = belief[:-1] / jnp.maximum(jnp.sum(belief[:-1]), 1e-12)
         mean = known @ xi
         apart, jump = self._moved(apart, known, xi, turn, tick)
+        under = self._marginal(known)
         motion = Motion(
             twist=mean,
             scatter=(xi - mean).T @ (known[:, None] * (xi - mean)),
             rolling=self.robot.inverse @ (self.robot.frame.radius * w),
-            by_friction=by_friction @ known,
-            under=self._marginal(known),
+            by_friction=self._by_friction(mean, w, under),
+            under=under,
             jump=jump,
         )
         return FloorState(belief=belief, twist=xi, apart=apart), motion
 
     def solve(
         self, near: Float[Array, "hypothesis 3"], w: Float[Array, " wheel"]
-    ) -> tuple[Array, Array, Array]:
-        """Twist [m/s, m/s, rad/s] and currents [A] of every hypothesis, `near` a moment ago.
-
-        The third is the derivative of the twists by the log friction of each floor
-        (3, floor, hypothesis).
-        """
+    ) -> tuple[Float[Array, "hypothesis 3"], Float[Array, "hypothesis wheel"]]:
+        """Twist [m/s, m/s, rad/s] and currents [A] of every hypothesis, `near` a moment ago."""
         f = self.robot
         on = stand(f.frame, f.floors.at(self.hypotheses.T), f.rest)
         rim = f.frame.radius * w
@@ -153,29 +150,31 @@ class FloorFilter(eqx.Module):
         torque = on.friction * f.mass * GRAVITY * f.frame.radius * pull
         amps = f.motor.current(torque.T, jnp.broadcast_to(w, torque.T.shape))
         more = f.current_trend @ jnp.stack([1.0, length((f.inverse @ rim)[:2])])
-        return twist.T, amps + jnp.sign(amps) * more, self._by_friction(twist, rim, on)
+        return twist.T, amps + jnp.sign(amps) * more
 
-    def _by_friction(self, twist: Array, rim: Array, on: Stance) -> Array:
-        """Derivative of the twists by log frictions: the balance moves, and the twist with it.
+    def _by_friction(self, twist: Array, w: Array, under: Array) -> Float[Array, "3 floor"]:
+        """Derivative of a twist by the log friction of each floor, of which wheels have a share.
 
-        No more than the twist itself: where all wheels slide, a straight line leads too far.
+        The balance moves, and the twist with it; no more than there is of it, since a straight line
+        leads too far where all wheels slide.
         """
-        balance, xi = Balance(rim[:, None], on), Planar(*twist)
+        f = self.robot
+        rim = f.frame.radius * w
+        shared = jax.tree.map(lambda leaf: under @ leaf, f.floors)
+        on, xi = stand(f.frame, shared, f.rest), Planar(*twist)
         mu = on.floor.friction
-        beneath = jnp.asarray(self.hypotheses.T == np.arange(len(self.robot.labels))[:, None, None])
 
         def force(mu: Array) -> Planar:
-            floor = replace(on.floor, friction=mu)
-            return replace(balance, on=replace(on, floor=floor)).force(xi)
+            return Balance(rim, replace(on, floor=replace(on.floor, friction=mu))).force(xi)
 
-        def pushed(there: Array) -> Planar:  # frictions count over their mean
-            part = mu * there
-            return jax.jvp(force, (mu,), (part - mu * jnp.mean(part, axis=0),))[1]
+        def pushed(share: Array) -> Planar:  # frictions count over their mean
+            part = mu * share
+            return jax.jvp(force, (mu,), (part - mu * jnp.mean(part),))[1]
 
-        slope = -jnp.stack(solve3(balance.jacobian(xi), jax.vmap(pushed)(beneath)))
-        most = length(twist[:2].T) + self.robot.frame.base * jnp.abs(twist[2])
-        most = jnp.stack([most, most, most / self.robot.frame.base])[:, None]
-        return jnp.where(jnp.isfinite(slope), jnp.clip(slope, -most, most), 0.0)
+        slope = solve3(Balance(rim, on).jacobian(xi), jax.vmap(pushed)(under.T))
+        most = length(twist[:2]) + f.frame.base * jnp.abs(twist[2])
+        most = most * jnp.stack([jnp.ones(()), jnp.ones(()), 1 / f.frame.base])[:, None]
+        return -jnp.nan_to_num(jnp.clip(jnp.stack(slope), -most, most))
 
     def _evidence(
         self, xi: Array, predicted: Array, currents: Currents, w: Array, turn: Array

@@ -2,9 +2,9 @@
 
 Process noise and effects that stay for a while grow the covariance; the effects, the floors'
 friction and a gyro's bias are further unknowns that pose fixes and rest correct. Friction counts
-where wheels stand on several floors: on one it moves no robot, so that runs on one floor each leave
-it open. Which floors are under the wheels is in doubt as the hypotheses scatter, and what is wrongly
-believed stays wrong for a while:
+where wheels stand on several floors: on one it moves no robot, so that runs on one floor each
+leave it open. Which floors are under the wheels is in doubt as the hypotheses scatter, and what is
+wrongly believed stays wrong for a while:
 
     S = sum_c p_c (xi_c - xi) (xi_c - xi)^T = L L^T,   xi_true = xi + L d,   d ~ N(0, 1)
     d <- k d + sqrt(1 - k^2) noise,   k = exp(-far / doubt_m)
@@ -37,8 +37,10 @@ class PoseState(eqx.Module):
         covariance: of pose and nuisance.
         toward: direction of travel that counts as taken, see `slipid.control.effects`.
         time, still: since the start, and for which the robot has stood [s].
-        noise: covariance that has come into the pose since the start.
-        history: last steps, the newest first: time, pose, yaw rate of the contact model, noise.
+        noise: covariance that has come into the pose since the start; far: way since then [m].
+        push: d pose / d nuisance per metre of the last way, the gyro's bias left out.
+        history: last steps, the newest first: time, pose, yaw rate of the contact model, noise and
+            way until then.
     """
 
     pose: Float[Array, "3"]
@@ -48,7 +50,9 @@ class PoseState(eqx.Module):
     time: Float[Array, ""]
     still: Float[Array, ""]
     noise: Float[Array, "3 3"]
-    history: Float[Array, "entry 14"]
+    far: Float[Array, ""]
+    push: Float[Array, "3 push"]
+    history: Float[Array, "entry 15"]
 
 
 class _Way(eqx.Module):
@@ -82,7 +86,7 @@ class PoseFilter(eqx.Module):
         floors = len(self.robot.labels)
         parts = [begin, self.robot.effect.reshape(-1), jnp.zeros(floors), jnp.ones(3), bias]
         friction = slice(3 + 3 * floors, 3 + 4 * floors)
-        entry = jnp.concatenate([jnp.zeros(1), pose, jnp.zeros(10)])
+        entry = jnp.concatenate([jnp.zeros(1), pose, jnp.zeros(11)])
         return PoseState(
             pose=pose,
             nuisance=jnp.zeros(4 * floors + 4),
@@ -93,7 +97,9 @@ class PoseFilter(eqx.Module):
             time=jnp.zeros(()),
             still=jnp.zeros(()),
             noise=jnp.zeros((3, 3)),
-            history=jnp.broadcast_to(entry, (HISTORY, 14)),
+            far=jnp.zeros(()),
+            push=jnp.zeros((3, 4 * floors + 3)),
+            history=jnp.broadcast_to(entry, (HISTORY, 15)),
         )
 
     def step(
@@ -116,12 +122,11 @@ class PoseFilter(eqx.Module):
         time = old.time + dt
         twist = free.at[2].set(self._turned(old, time, free[2], gyro))
         pose = compose(old.pose, advance(twist, dt) + motion.jump)
-        covariance, noise = self._grow(old, pose, way, tick)
-        noise = old.noise + noise
         still = jnp.where(moves, 0.0, jnp.minimum(old.still + dt, 1e3))
-        new = replace(old, pose=pose, covariance=covariance, time=time, still=still, noise=noise)
+        new = replace(self._grow(old, pose, way, tick), time=time, still=still)
         new = self._rest(new, gyro)
-        entry = jnp.concatenate([time[None], new.pose, free[2:], noise.reshape(-1)])
+        begun, ended = jnp.concatenate([time[None], new.pose, free[2:]]), new.far[None]
+        entry = jnp.concatenate([begun, new.noise.reshape(-1), ended])
         history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
         new, left = _fixed(replace(new, history=history), z)
         world = _turned_axes(new.pose[2])
@@ -154,7 +159,9 @@ class PoseFilter(eqx.Module):
         doubt = jnp.exp(-far / self.settings.doubt_m)
         parts = [jnp.repeat(keep, 3), jnp.ones(len(left)), jnp.full(3, doubt), jnp.ones(1)]
         kept = jnp.concatenate(parts)
-        std = jnp.concatenate([f.effect.reshape(-1), jnp.zeros(len(left)), jnp.ones(3), jnp.zeros(1)])
+        std = jnp.concatenate(
+            [f.effect.reshape(-1), jnp.zeros(len(left)), jnp.ones(3), jnp.zeros(1)]
+        )
         new = (1 - kept**2) * std**2
         whole = jnp.concatenate([jnp.ones(3), kept])
         covariance = whole[:, None] * old.covariance * whole
@@ -189,21 +196,19 @@ class PoseFilter(eqx.Module):
             covariance=cov - jnp.outer(gain, cov[-1]),
         )
 
-    def _grow(
-        self, old: PoseState, pose: Array, way: _Way, tick: Tick
-    ) -> tuple[Array, Array]:
-        """Covariance of pose and nuisance after the step; noise that came in with it."""
+    def _grow(self, old: PoseState, pose: Array, way: _Way, tick: Tick) -> PoseState:
+        """At the pose after the step, with the covariance and what came into it."""
         f, s, dt = self.robot, self.settings, tick.dt
         world = _turned_axes(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))
         gone = pose[:2] - old.pose[:2]
         on = jnp.where(tick.moves, dt, 0.0)
         # yaw comes from the gyro, not from the floor
         keep = jnp.where(way.by_gyro, jnp.array([1.0, 1.0, 0.0]), jnp.ones(3))
-        push = world @ (keep[:, None] * way.slope) * on
+        far = way.speed * on
+        push = world @ (keep[:, None] * way.slope)
         drift = jnp.array([[0.0], [0.0], [1.0]]) * jnp.where(way.by_gyro, -dt, 0.0)
         turned = jnp.array([[1.0, 0.0, -gone[1]], [0.0, 1.0, gone[0]], [0.0, 0.0, 1.0]])
-        by = jnp.concatenate([turned, push, drift], axis=1)  # d pose / d (pose, nuisance)
-        far = way.speed * on
+        by = jnp.concatenate([turned, push * on, drift], axis=1)  # d pose / d (pose, nuisance)
         grown = (way.share @ f.process**2) * far
         floor_axes = world @ (keep[:, None] * way.axes)
         noise = (floor_axes * grown) @ floor_axes.T
@@ -211,7 +216,14 @@ class PoseFilter(eqx.Module):
         rows = by @ old.covariance  # what is not the pose stays as it is
         pose_rows = jnp.concatenate([rows @ by.T + noise, rows[:, 3:]], axis=1)
         rest = jnp.concatenate([rows[:, 3:].T, old.covariance[3:, 3:]], axis=1)
-        return jnp.concatenate([pose_rows, rest]), noise
+        return replace(
+            old,
+            pose=pose,
+            covariance=jnp.concatenate([pose_rows, rest]),
+            noise=old.noise + noise,
+            far=old.far + far,
+            push=jnp.where(far > 1e-6, push / jnp.maximum(way.speed, 1e-9), old.push),
+        )
 
 
 def _turned_axes(heading: Float[Array, ""]) -> Float[Array, "3 3"]:
@@ -253,13 +265,14 @@ def _corrected(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Pose, nuisance, covariance and history after a fix of the pose as it was `age` ago [s].
 
-    The last is what is left of how far another pose is from this one. What came in since then, a
-    covariance of the pose, the fix has not seen: it is set aside. What the pose no longer holds of
-    it, a later fix having seen it, is so much noise of this one.
+    The last is what is left of how far another pose is from this one. What nuisance has done since
+    then is as on the last way. The noise that came in since then, a covariance of the pose, the fix
+    has not seen: it is set aside. What the pose no longer holds of it, a later fix having seen it,
+    is so much noise of this one.
     """
     pose, cov, history = now.pose, now.covariance, now.history
     then = _nearest(history, now.time - age)
-    since = now.noise - then[5:].reshape(3, 3)
+    since = now.noise - then[5:14].reshape(3, 3)
     held = _within(since, cov[:3, :3])
     aside = jnp.zeros_like(cov).at[:3, :3].set(held)
     cov = cov - aside
@@ -268,6 +281,7 @@ def _corrected(
     gone = pose[:2] - then[1:3]
     look = jnp.zeros((3, cov.shape[0])).at[:, :3].set(jnp.eye(3))
     look = look.at[0, 2].set(gone[1]).at[1, 2].set(-gone[0])
+    look = look.at[:, 3:-1].set(-now.push * (now.far - then[14]))
     noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2) + since - held
     total = look @ cov @ look.T + noise
     # a fix far from what is believed counts less, yet counts
