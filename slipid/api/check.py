@@ -19,7 +19,7 @@ class Check:
 
     Attributes:
         content: runs by floor, channels, what the reader repaired.
-        result: verdicts at the start values, and what stays open.
+        result: verdicts that can be expected, and what stays open.
     """
 
     content: Content

@@ -56,7 +56,7 @@ class Posterior:
     @cached_property
     def parameters(self) -> dict[str, Estimate]:
         """Every number by path, with mean, interval and verdict from the draws."""
-        return diagnosis.estimates(self.fit, self.result)
+        return diagnosis.estimates(self.fit, self.result.z)
 
     def draws(self, path: str) -> Float[np.ndarray, "ensemble draw *number"]:
         """Draws of a free number [SI], a row per ensemble, early steps first.

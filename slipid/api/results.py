@@ -121,5 +121,5 @@ def compared(task: Task, problem: Problem, question: str, parts: int, quiet: boo
         for k in sorted(set(fold[fold >= 0].tolist())):
             report.stage(f"{question}: without part {k + 1} of {fold.max() + 1}")
             out = np.flatnonzero(fold == k)
-            rows += judge(problem, task.choices, task.dataset, out).rows
+            rows += judge(problem, task.choices, task.dataset, question, out).rows
     return Comparison(ranking(rows), question)

@@ -23,21 +23,25 @@ def trial(
     ] = None,
     starts: Annotated[int, typer.Option(min=1, max=99, help="Poses to start from.")] = 20,
     load: Load = None,
+    tuned_gains: Annotated[
+        bool, typer.Option("--tuned-gains", help="Even where they are no better than by hand.")
+    ] = False,
     jobs: Jobs = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
     """Drive the 2021 paper's rectangle with every controller and say which one to deploy.
 
-    Gains are those that `slipid tune` put into robot.json, if any. Writes trial.json and trial.png
-    to OUT; runs that are done are kept and not driven again.
+    Gains are those that `slipid tune` put into robot.json, if it found them better than those set
+    by hand. Writes trial.json and trial.png to OUT; runs that are done are kept and not driven
+    again.
     """
     from slipid.deploy.trial import Wish, names_of
     from slipid.deploy.trial import trial as run
     from slipid.plots.trial import trial_plot
     from slipid.report.answers import show_trial
 
-    wish = Wish(plant, map, names_of(controllers), starts, load, processes(jobs))
+    wish = Wish(plant, map, names_of(controllers), starts, load, processes(jobs), tuned_gains)
     with Reporter(quiet=quiet) as report:
         done = run(out, wish, report)
         report.stage("drawing")

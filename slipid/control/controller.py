@@ -44,10 +44,15 @@ class Gains(eqx.Module):
     )
 
     @classmethod
-    def of(cls, robot: DeployedRobot) -> "Gains":
-        """Those tuned for a robot and its load set-up, else those set by hand."""
+    def of(cls, robot: DeployedRobot, forced: bool = False) -> "Gains":
+        """Those tuned for a robot and its load set-up if they are better, else those set by hand.
+
+        If they are forced, those tuned for them, whether they are better or not.
+        """
         tuned = robot.record.gains
         if tuned is None or tuned.load != robot.load_setup:
+            return cls()
+        if not (tuned.is_better or forced):
             return cls()
         return cls.at([g["value"] for g in asdict(tuned.values).values()])
 
@@ -128,7 +133,7 @@ class Controller(eqx.Module):
     """Pose loop with whatever a row of the trial adds to it.
 
     Attributes:
-        gains: by default those tuned for the robot where there are any, else those set by hand.
+        gains: by default those tuned for the robot where they are better, else those set by hand.
         correction: torque correction of the 2021 paper, in the form it prints, the form its authors
             ran, or corrected.
     """

@@ -33,6 +33,7 @@ class DeployedRobot(eqx.Module):
             across [m/sqrt(m)] and in yaw [rad/sqrt(m)].
         effect: std of what it misses all the way, [m/m], [m/m], [rad/m]; the spread of the fitted
             numbers included.
+        friction_covariance: of the log frictions, by the spread of the fitted numbers.
         current_std: of a measured current from the model's [A].
         current_trend: a + b v, measured currents over the model's at speed v [A, A s/m].
         highest: wheel speed up to which the fit has seen the robot [rad/s], and the model's largest
@@ -52,6 +53,7 @@ class DeployedRobot(eqx.Module):
     mass: Float[Array, ""]
     process: Float[Array, "floor 3"]
     effect: Float[Array, "floor 3"]
+    friction_covariance: Float[Array, "floor floor"]
     current_std: Float[Array, " floor"]
     current_trend: Float[Array, "2"]
     highest: Float[Array, "2"]
@@ -177,6 +179,7 @@ def _arrays(
         mass=_array(values["robot.mass"]),
         process=_array([floor.process for floor in floors]),
         effect=jnp.sqrt(effect**2 + _array(chosen.spread) ** 2) if spread else effect,
+        friction_covariance=_friction_covariance(record) * spread,
         current_std=_array([floor.current_std for floor in floors]),
         current_trend=_array(record.current_trend),
         highest=_array([record.highest_speed, chosen.highest_current]),
@@ -188,3 +191,12 @@ def _arrays(
 
 def _array(value: Numbers | Sequence[object]) -> Array:
     return jnp.asarray(value, dtype=float)
+
+
+def _friction_covariance(record: RobotRecord) -> Array:
+    """Covariance of the floors' log frictions over the posterior; of fixed ones zero."""
+    still = (1.0,) * max(record.drawn, 1)
+    paths = [f"surface.{name}.friction" for name in record.labels]
+    logs = np.log(np.array([record.draws.get(path, still) for path in paths], dtype=float))
+    off = logs - logs.mean(axis=1, keepdims=True)
+    return jnp.asarray(off @ off.T / off.shape[1])

@@ -3,8 +3,10 @@
 In `Estimator` wheel readings go through a filter over the floors under the wheels (`floor_filter`)
 to the motion of the body, and that through a filter of the pose (`pose_filter`):
 
-    xi = sum_c p_c xi_c,   pose <- pose * exp(xi dt)
+    xi = sum_c p_c xi_c,   pose <- pose * exp(xi dt) * (late news of the floors)
 """
+
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -83,7 +85,8 @@ class Estimator(AbstractEstimator[EstimatorState]):
         gyro = jnp.where(jnp.isfinite(z.gyro) & (jnp.abs(z.gyro) < 50.0), z.gyro, jnp.nan)
         turn = gyro - old.place.nuisance[-1]
         floors, motion = FloorFilter(f, s).step(old.floors, w, currents, turn, tick)
-        place, twist = PoseFilter(f, s).step(old.place, motion, gyro, z, tick)
+        place, twist, left = PoseFilter(f, s).step(old.place, motion, gyro, z, tick)
+        floors = replace(floors, apart=floors.apart @ left.T)
         stuck = self._stuck(old.stuck, w, twist, tick)
         new = EstimatorState(wheels, currents.filtered, floors, place, stuck)
         unknown = floors.belief[-1]

@@ -5,13 +5,16 @@ wheel, all of them together (27 with three wheels on three floors), and one that
 
     xi_c, I_c     contact equilibrium and motor currents of hypothesis c at the wheel speeds
     p_c <- p_c * (p(I | I_c) p(gyro | xi_c))^(dt / tau)   once wheels may be on other floors
-    xi = sum_c p_c xi_c
+    g_c <- g_c * exp(xi_c dt)                             pose if c is true, ways to c averaged
+    g = sum_c p_c g_c
 
 A wheel's current shows its share of the whole drag, not the drag beneath it; only together do they
-tell the floors.
+tell the floors. News that comes late corrects the pose by the ways that the hypotheses went apart
+(interacting multiple models; Blom and Bar-Shalom 1988).
 """
 
 import itertools
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -23,8 +26,9 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import Settings
 from slipid.control.wheels import Currents
 from slipid.model.contact import settle
-from slipid.model.contact_balance import stand
+from slipid.model.contact_balance import Balance, stand
 from slipid.model.robot import GRAVITY
+from slipid.model.se2 import Planar, advance, compose, solve3
 
 HASTE = 30.0
 """Wheel acceleration from which inertia, which the equilibrium lacks, hides floors [rad/s^2]."""
@@ -49,7 +53,7 @@ class FloorState(eqx.Module):
     Attributes:
         belief: probability of each, and of none of them in the last place.
         twist: of the body if it were true [m/s, m/s, rad/s].
-        apart: how far the way it would have gone is from the mean one [m, m, rad].
+        apart: pose if it were true, seen from the believed one [m, m, rad].
     """
 
     belief: Float[Array, " hypothesis_or_none"]
@@ -62,12 +66,16 @@ class Motion(eqx.Module):
 
     Attributes:
         twist: mean [m/s, m/s, rad/s]; scatter: covariance over hypotheses.
+        rolling: twist of wheels that do not slip.
+        by_friction: derivative of the mean by the log friction of each floor [m/s, m/s, rad/s].
         under: probability of each floor under each wheel, given that it is one of them.
-        jump: correction of the pose by what was not believed in time [m, m, rad].
+        jump: what the pose moves beyond the mean twist, news that came late [m, m, rad].
     """
 
     twist: Float[Array, "3"]
     scatter: Float[Array, "3 3"]
+    rolling: Float[Array, "3"]
+    by_friction: Float[Array, "3 floor"]
     under: Float[Array, "wheel floor"]
     jump: Float[Array, "3"]
 
@@ -104,10 +112,6 @@ class FloorFilter(eqx.Module):
     ) -> tuple[FloorState, Motion]:
         """Beliefs a time step later, and the motion they say.
 
-        A hypothesis keeps the way it would have gone: when currents later speak for it, the pose is
-        corrected by what was not believed in time (interacting multiple models; Blom and
-        Bar-Shalom 1988).
-
         Args:
             old, tick: the beliefs before the step, and the step.
             w: wheel speeds [rad/s]; currents: what is known of them.
@@ -118,15 +122,22 @@ class FloorFilter(eqx.Module):
         # what the equilibrium does not know, inertia, weighs little while wheels speed up
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)
         weight = weight / (1 + (tick.acceleration / HASTE) ** 2)
-        prior, way = self._mixed(old, xi, tick)
+        prior, apart = self._mixed(old, xi, tick)
         log = jnp.log(jnp.maximum(prior, 1e-12)) + weight * jnp.append(told, none)
         belief = jax.nn.softmax(log)
         known = belief[:-1] / jnp.maximum(jnp.sum(belief[:-1]), 1e-12)
         mean = known @ xi
-        scatter = (xi - mean).T @ (known[:, None] * (xi - mean))
-        jump = known @ way
-        motion = Motion(twist=mean, scatter=scatter, under=self._marginal(known), jump=jump)
-        return FloorState(belief=belief, twist=xi, apart=way - jump), motion
+        apart, jump = self._moved(apart, known, xi, turn, tick)
+        under = self._marginal(known)
+        motion = Motion(
+            twist=mean,
+            scatter=(xi - mean).T @ (known[:, None] * (xi - mean)),
+            rolling=self.robot.inverse @ (self.robot.frame.radius * w),
+            by_friction=self._by_friction(mean, w, under),
+            under=under,
+            jump=jump,
+        )
+        return FloorState(belief=belief, twist=xi, apart=apart), motion
 
     def solve(
         self, near: Float[Array, "hypothesis 3"], w: Float[Array, " wheel"]
@@ -140,6 +151,30 @@ class FloorFilter(eqx.Module):
         amps = f.motor.current(torque.T, jnp.broadcast_to(w, torque.T.shape))
         more = f.current_trend @ jnp.stack([1.0, length((f.inverse @ rim)[:2])])
         return twist.T, amps + jnp.sign(amps) * more
+
+    def _by_friction(self, twist: Array, w: Array, under: Array) -> Float[Array, "3 floor"]:
+        """Derivative of a twist by the log friction of each floor, of which wheels have a share.
+
+        The balance moves, and the twist with it; no more than there is of it, since a straight line
+        leads too far where all wheels slide.
+        """
+        f = self.robot
+        rim = f.frame.radius * w
+        shared = jax.tree.map(lambda leaf: under @ leaf, f.floors)
+        on, xi = stand(f.frame, shared, f.rest), Planar(*twist)
+        mu = on.floor.friction
+
+        def force(mu: Array) -> Planar:
+            return Balance(rim, replace(on, floor=replace(on.floor, friction=mu))).force(xi)
+
+        def pushed(share: Array) -> Planar:  # frictions count over their mean
+            part = mu * share
+            return jax.jvp(force, (mu,), (part - mu * jnp.mean(part),))[1]
+
+        slope = solve3(Balance(rim, on).jacobian(xi), jax.vmap(pushed)(under.T))
+        most = length(twist[:2]) + f.frame.base * jnp.abs(twist[2])
+        most = most * jnp.stack([jnp.ones(()), jnp.ones(()), 1 / f.frame.base])[:, None]
+        return -jnp.nan_to_num(jnp.clip(jnp.stack(slope), -most, most))
 
     def _evidence(
         self, xi: Array, predicted: Array, currents: Currents, w: Array, turn: Array
@@ -171,27 +206,43 @@ class FloorFilter(eqx.Module):
 
     def _mixed(self, old: FloorState, xi: Array, tick: Tick) -> tuple[Array, Array]:
         """Probabilities and ways once wheels may have come to other floors."""
-        known, unknown = old.belief[:-1], old.belief[-1]
-        mean = known @ xi / jnp.maximum(jnp.sum(known), 1e-12)
-        change = 1 - jnp.exp(-length(mean[:2]) * tick.dt / self.settings.patch_m)
-        way = old.apart + jnp.where(tick.moves, tick.dt, 0.0) * (xi - mean)
-        whole = jnp.concatenate([known[:, None], known[:, None] * way], axis=1)
-        whole = jax.vmap(self._changed, (1, None), 1)(whole, change)
+        known, unknown = jnp.maximum(old.belief[:-1], 1e-12), old.belief[-1]
+        sure = jnp.sum(known)
+        speed = length((known @ xi)[:2] / sure)
+        change = 1 - jnp.exp(-speed * tick.dt / self.settings.patch_m)
+        whole = jnp.concatenate([known[:, None], known[:, None] * old.apart], axis=1)
+        whole = self._changed(whole, change)
         moved = whole[:, 0]
-        way = whole[:, 1:] / jnp.maximum(moved, 1e-9)[:, None]
+        apart = whole[:, 1:] / moved[:, None]
         of_known = moved * (1 - 0.05 * change) + 0.2 * change * unknown * self.prior()
-        of_none = unknown * (1 - 0.2 * change) + 0.05 * change * jnp.sum(known)
-        return jnp.append(of_known, of_none), way
+        of_none = unknown * (1 - 0.2 * change) + 0.05 * change * sure
+        return jnp.append(of_known, of_none), apart
 
-    def _changed(self, p: Array, change: Array) -> Array:
+    def _changed(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
         """Every wheel may come to another floor, as likely as the prior says given the others."""
         wheels, floors = self.robot.wheels, len(self.robot.labels)
-        prior = self.prior().reshape((floors,) * wheels)
-        p = p.reshape((floors,) * wheels)
+        prior, shape = self.prior().reshape((floors,) * wheels), p.shape
+        p = p.reshape((floors,) * wheels + (-1,))
         for axis in range(wheels):
-            given = prior / jnp.sum(prior, axis=axis, keepdims=True)
+            given = (prior / jnp.sum(prior, axis=axis, keepdims=True))[..., None]
             p = (1 - change) * p + change * jnp.sum(p, axis=axis, keepdims=True) * given
-        return p.reshape(-1)
+        return p.reshape(shape)
+
+    def _moved(
+        self, apart: Array, known: Array, xi: Array, turn: Array, tick: Tick
+    ) -> tuple[Array, Array]:
+        """Poses of the hypotheses seen from their mean after the step; its way beyond the twist.
+
+        Each goes on from where it was by its own twist, all of them turning as a gyro says.
+        """
+        dt = jnp.where(tick.moves, tick.dt, 0.0)
+        xi = xi.at[:, 2].set(jnp.where(jnp.isfinite(turn), turn, xi[:, 2]))
+        ways = jax.vmap(compose)(apart, jax.vmap(advance, (0, None))(xi, dt))
+        mean = known @ ways
+        x, y, yaw = (ways - mean).T
+        c, s = jnp.cos(mean[2]), jnp.sin(mean[2])
+        seen = jnp.stack([c * x + s * y, c * y - s * x, yaw], axis=-1)
+        return seen, mean - advance(known @ xi, dt)
 
     def _marginal(self, known: Array) -> Array:
         """Probability of each floor under each wheel (wheel, floor)."""

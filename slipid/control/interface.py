@@ -35,6 +35,7 @@ class Settings:
         forget_s: currents nearer than this in time tell the same twice [s].
         filter_s: time constant in which currents are averaged [s].
         patch_m: length on which the floor under a wheel changes.
+        doubt_m: length on which what is wrongly believed of the floors stays as wrong.
         alike: how much rarer each further floor under the robot is, in log probability.
         unknown_std: from what it predicts, in stds of a current, a hypothesis loses to "unknown".
         ammeter_std_a, voltmeter_std_v: of the sensors.
@@ -49,6 +50,7 @@ class Settings:
     forget_s: float = 0.4
     filter_s: float = 0.05
     patch_m: float = 0.1
+    doubt_m: float = 0.7
     alike: float = 3.0
     unknown_std: float = 3.0
     ammeter_std_a: float = 0.07

@@ -1,7 +1,13 @@
 """Pose and its covariance, with what the fit says the model misses carried along.
 
-Process noise and effects that stay grow the covariance; the effects and a gyro's bias are further
-unknowns that pose fixes and rest correct.
+Process noise and effects that stay for a while grow the covariance; the effects, the floors'
+friction and a gyro's bias are further unknowns that pose fixes and rest correct. Friction counts
+where wheels stand on several floors: on one it moves no robot, so that runs on one floor each
+leave it open. Which floors are under the wheels is in doubt as the hypotheses scatter, and what is
+wrongly believed stays wrong for a while:
+
+    S = sum_c p_c (xi_c - xi) (xi_c - xi)^T = L L^T,   xi_true = xi + L d,   d ~ N(0, 1)
+    d <- k d + sqrt(1 - k^2) noise,   k = exp(-far / doubt_m)
 """
 
 from dataclasses import replace
@@ -12,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from slipid.control.deployed import DeployedRobot
+from slipid.control.effects import direction, stays
 from slipid.control.floor_filter import Motion, Tick, length
 from slipid.control.interface import Readings, Settings
 from slipid.model.se2 import advance, compose
@@ -25,38 +32,44 @@ class PoseState(eqx.Module):
 
     Attributes:
         pose: x, y [m], heading [rad].
-        nuisance: effects of every floor along, across [m/m] and in yaw [rad/m], then the gyro's
-            bias [rad/s].
+        nuisance: effects of every floor along, across [m/m] and in yaw [rad/m], by how much its
+            log friction is off, the doubt d, then the gyro's bias [rad/s].
         covariance: of pose and nuisance.
+        toward: direction of travel that counts as taken, see `slipid.control.effects`.
         time, still: since the start, and for which the robot has stood [s].
-        noise: covariance that has come into the pose since the start.
-        history: last steps, the newest first: time, pose, yaw rate of the contact model, noise.
+        noise: covariance that has come into the pose since the start; far: way since then [m].
+        push: d pose / d nuisance per metre of the last way, the gyro's bias left out.
+        history: last steps, the newest first: time, pose, yaw rate of the contact model, noise and
+            way until then.
     """
 
     pose: Float[Array, "3"]
     nuisance: Float[Array, " nuisance"]
     covariance: Float[Array, "unknown unknown"]
+    toward: Float[Array, "3"]
     time: Float[Array, ""]
     still: Float[Array, ""]
     noise: Float[Array, "3 3"]
-    history: Float[Array, "entry 14"]
+    far: Float[Array, ""]
+    push: Float[Array, "3 push"]
+    history: Float[Array, "entry 15"]
 
 
 class _Way(eqx.Module):
     """Where the body goes in a step, and what pushes it off.
 
     Attributes:
-        speed: at which the effects of floors count [m/s]; slope: d twist / d effects.
+        speed: at which the effects of floors count [m/s].
+        slope: d twist / d nuisance, the gyro's bias left out.
         axes: along, across and yaw as columns in the body frame.
-        share: of the load on each floor; scatter: of the twist over hypotheses.
+        share: of the load on each floor.
         by_gyro: whether yaw is measured.
     """
 
     speed: Float[Array, ""]
     axes: Float[Array, "3 3"]
-    slope: Float[Array, "3 effect"]
+    slope: Float[Array, "3 push"]
     share: Float[Array, " floor"]
-    scatter: Float[Array, "3 3"]
     by_gyro: Bool[Array, ""]
 
 
@@ -70,22 +83,31 @@ class PoseFilter(eqx.Module):
         """At rest at a pose [m, m, rad], known this well [m], [rad]."""
         place, turn = std
         begin, bias = jnp.asarray([place, place, turn]), jnp.asarray([self.settings.gyro_bias_std])
-        parts = jnp.concatenate([begin, self.robot.effect.reshape(-1), bias])
-        entry = jnp.concatenate([jnp.zeros(1), pose, jnp.zeros(10)])
+        floors = len(self.robot.labels)
+        parts = [begin, self.robot.effect.reshape(-1), jnp.zeros(floors), jnp.ones(3), bias]
+        friction = slice(3 + 3 * floors, 3 + 4 * floors)
+        entry = jnp.concatenate([jnp.zeros(1), pose, jnp.zeros(11)])
         return PoseState(
             pose=pose,
-            nuisance=jnp.zeros(3 * len(self.robot.labels) + 1),
-            covariance=jnp.diag(parts**2),
+            nuisance=jnp.zeros(4 * floors + 4),
+            covariance=jnp.diag(jnp.concatenate(parts) ** 2)
+            .at[friction, friction]
+            .set(self.robot.friction_covariance),
+            toward=jnp.zeros(3),
             time=jnp.zeros(()),
             still=jnp.zeros(()),
             noise=jnp.zeros((3, 3)),
-            history=jnp.broadcast_to(entry, (HISTORY, 14)),
+            far=jnp.zeros(()),
+            push=jnp.zeros((3, 4 * floors + 3)),
+            history=jnp.broadcast_to(entry, (HISTORY, 15)),
         )
 
     def step(
         self, old: PoseState, motion: Motion, gyro: Array, z: Readings, tick: Tick
-    ) -> tuple[PoseState, Float[Array, "3"]]:
+    ) -> tuple[PoseState, Float[Array, "3"], Float[Array, "3 3"]]:
         """Pose a time step later, and the twist that took it there.
+
+        The third is what a pose fix leaves of how far another pose is from it, in the body's axes.
 
         Args:
             old, tick: the state before the step, and the step.
@@ -95,19 +117,20 @@ class PoseFilter(eqx.Module):
         """
         dt, moves = tick.dt, tick.moves
         way = self._way(motion, gyro)
+        old = self._forgotten(old, motion, way, tick)
         free = jnp.where(moves, motion.twist + way.slope @ old.nuisance[:-1], 0.0)
         time = old.time + dt
         twist = free.at[2].set(self._turned(old, time, free[2], gyro))
-        jump = motion.jump.at[2].multiply(jnp.where(way.by_gyro, 0.0, 1.0))
-        pose = compose(old.pose, advance(twist, dt) + jump)
-        covariance, noise = self._grow(old, pose, way, tick)
-        noise = old.noise + noise
+        pose = compose(old.pose, advance(twist, dt) + motion.jump)
         still = jnp.where(moves, 0.0, jnp.minimum(old.still + dt, 1e3))
-        new = replace(old, pose=pose, covariance=covariance, time=time, still=still, noise=noise)
+        new = replace(self._grow(old, pose, way, tick), time=time, still=still)
         new = self._rest(new, gyro)
-        entry = jnp.concatenate([time[None], new.pose, free[2:], noise.reshape(-1)])
+        begun, ended = jnp.concatenate([time[None], new.pose, free[2:]]), new.far[None]
+        entry = jnp.concatenate([begun, new.noise.reshape(-1), ended])
         history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
-        return _fixed(replace(new, history=history), z), twist
+        new, left = _fixed(replace(new, history=history), z)
+        world = _turned_axes(new.pose[2])
+        return new, twist, world.T @ left @ world
 
     def _way(self, motion: Motion, gyro: Array) -> _Way:
         mean = motion.twist
@@ -115,14 +138,35 @@ class PoseFilter(eqx.Module):
         speed = length(mean[:2]) + self.robot.frame.base * jnp.abs(mean[2])
         u = jnp.where(speed > 1e-6, mean[:2] / jnp.maximum(length(mean[:2]), 1e-9), 0.0)
         axes = jnp.array([[u[0], -u[1], 0.0], [u[1], u[0], 0.0], [0.0, 0.0, 1.0]])
+        by_effect = speed * (share[:, None, None] * axes.T).reshape(-1, 3).T
+        doubt = axes @ _root(axes.T @ motion.scatter @ axes)
         return _Way(
             speed=speed,
             axes=axes,
-            slope=speed * (share[:, None, None] * axes.T).reshape(-1, 3).T,
+            slope=jnp.concatenate([by_effect, motion.by_friction, doubt], axis=1),
             share=share,
-            scatter=motion.scatter,
             by_gyro=jnp.isfinite(gyro),
         )
+
+    def _forgotten(self, old: PoseState, motion: Motion, way: _Way, tick: Tick) -> PoseState:
+        """With effects as far as they stay the same over the step, their variance as it was."""
+        f = self.robot
+        far = way.speed * jnp.where(tick.moves, tick.dt, 0.0)
+        left = jnp.prod(1 - motion.under, axis=0)
+        now = direction(motion.rolling, f.frame.base)
+        toward, keep = stays(old.toward, now, left, far)
+        toward = jnp.where(far > 0, toward, old.toward)
+        doubt = jnp.exp(-far / self.settings.doubt_m)
+        parts = [jnp.repeat(keep, 3), jnp.ones(len(left)), jnp.full(3, doubt), jnp.ones(1)]
+        kept = jnp.concatenate(parts)
+        std = jnp.concatenate(
+            [f.effect.reshape(-1), jnp.zeros(len(left)), jnp.ones(3), jnp.zeros(1)]
+        )
+        new = (1 - kept**2) * std**2
+        whole = jnp.concatenate([jnp.ones(3), kept])
+        covariance = whole[:, None] * old.covariance * whole
+        covariance = covariance + jnp.diag(jnp.concatenate([jnp.zeros(3), new]))
+        return replace(old, nuisance=kept * old.nuisance, covariance=covariance, toward=toward)
 
     def _turned(self, old: PoseState, time: Array, free: Array, gyro: Array) -> Array:
         """Yaw rate: the gyro's less its bias; over its delay, as the contact model goes on from it.
@@ -152,36 +196,54 @@ class PoseFilter(eqx.Module):
             covariance=cov - jnp.outer(gain, cov[-1]),
         )
 
-    def _grow(self, old: PoseState, pose: Array, way: _Way, tick: Tick) -> tuple[Array, Array]:
-        """Covariance of pose and nuisance after the step; noise that came in with it."""
+    def _grow(self, old: PoseState, pose: Array, way: _Way, tick: Tick) -> PoseState:
+        """At the pose after the step, with the covariance and what came into it."""
         f, s, dt = self.robot, self.settings, tick.dt
-        middle = old.pose[2] + 0.5 * (pose[2] - old.pose[2])
-        c, sn = jnp.cos(middle), jnp.sin(middle)
-        world = jnp.array([[c, -sn, 0.0], [sn, c, 0.0], [0.0, 0.0, 1.0]])
+        world = _turned_axes(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))
         gone = pose[:2] - old.pose[:2]
         on = jnp.where(tick.moves, dt, 0.0)
         # yaw comes from the gyro, not from the floor
         keep = jnp.where(way.by_gyro, jnp.array([1.0, 1.0, 0.0]), jnp.ones(3))
-        push = world @ (keep[:, None] * way.slope) * on
+        far = way.speed * on
+        push = world @ (keep[:, None] * way.slope)
         drift = jnp.array([[0.0], [0.0], [1.0]]) * jnp.where(way.by_gyro, -dt, 0.0)
         turned = jnp.array([[1.0, 0.0, -gone[1]], [0.0, 1.0, gone[0]], [0.0, 0.0, 1.0]])
-        by = jnp.concatenate([turned, push, drift], axis=1)  # d pose / d (pose, nuisance)
-        far = way.speed * on
+        by = jnp.concatenate([turned, push * on, drift], axis=1)  # d pose / d (pose, nuisance)
         grown = (way.share @ f.process**2) * far
         floor_axes = world @ (keep[:, None] * way.axes)
-        # which floor it is stays in doubt for about a patch
-        doubt = way.scatter * keep[:, None] * keep[None, :] * on * s.patch_m
-        doubt = doubt / jnp.maximum(way.speed, 0.02)
-        noise = (floor_axes * grown) @ floor_axes.T + world @ doubt @ world.T
+        noise = (floor_axes * grown) @ floor_axes.T
         noise = noise.at[2, 2].add(jnp.where(way.by_gyro, (s.gyro_std * dt) ** 2, 0.0))
         rows = by @ old.covariance  # what is not the pose stays as it is
         pose_rows = jnp.concatenate([rows @ by.T + noise, rows[:, 3:]], axis=1)
         rest = jnp.concatenate([rows[:, 3:].T, old.covariance[3:, 3:]], axis=1)
-        return jnp.concatenate([pose_rows, rest]), noise
+        return replace(
+            old,
+            pose=pose,
+            covariance=jnp.concatenate([pose_rows, rest]),
+            noise=old.noise + noise,
+            far=old.far + far,
+            push=jnp.where(far > 1e-6, push / jnp.maximum(way.speed, 1e-9), old.push),
+        )
 
 
-def _fixed(now: PoseState, z: Readings) -> PoseState:
-    """Corrected by a pose fix of some time ago, if there is one."""
+def _turned_axes(heading: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Turns a covariance of a body's motion from its axes to the world's."""
+    c, s = jnp.cos(heading), jnp.sin(heading)
+    return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _root(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Lower triangular root of a covariance of twists; 0.1 mm/s more, so that it has one."""
+    a = jnp.sqrt(m[0, 0] + 1e-8)
+    b, d = m[1, 0] / a, m[2, 0] / a
+    c = jnp.sqrt(jnp.maximum(m[1, 1] - b * b, 0.0) + 1e-8)
+    e = (m[2, 1] - b * d) / c
+    f = jnp.sqrt(jnp.maximum(m[2, 2] - d * d - e * e, 0.0) + 1e-8)
+    return jnp.array([[a, 0.0, 0.0], [b, c, 0.0], [d, e, f]])
+
+
+def _fixed(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3"]]:
+    """Corrected by a pose fix of some time ago, if there is one, and what it leaves of a gap."""
     age = jnp.where(jnp.isfinite(z.fix_age) & (z.fix_age >= 0), z.fix_age, 0.0)
     has = (
         jnp.all(jnp.isfinite(z.fix))
@@ -191,23 +253,26 @@ def _fixed(now: PoseState, z: Readings) -> PoseState:
         & (age < now.time - now.history[-1, 0] + 1e-6)
     )
     std = jnp.clip(z.fix_std, 1e-4, 10.0)
-    kept = now.pose, now.nuisance, now.covariance, now.history
+    kept = now.pose, now.nuisance, now.covariance, now.history, jnp.eye(3)
     found = jax.lax.cond(has, lambda: _corrected(now, z.fix, std, age), lambda: kept)
-    pose, nuisance, covariance, history = found
-    return replace(now, pose=pose, nuisance=nuisance, covariance=covariance, history=history)
+    pose, nuisance, covariance, history, left = found
+    new = replace(now, pose=pose, nuisance=nuisance, covariance=covariance, history=history)
+    return new, left
 
 
 def _corrected(
     now: PoseState, fix: Array, std: Array, age: Array
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array]:
     """Pose, nuisance, covariance and history after a fix of the pose as it was `age` ago [s].
 
-    What came in since then, a covariance of the pose, the fix has not seen: it is set aside. What
-    the pose no longer holds of it, a later fix having seen it, is so much noise of this one.
+    The last is what is left of how far another pose is from this one. What nuisance has done since
+    then is as on the last way. The noise that came in since then, a covariance of the pose, the fix
+    has not seen: it is set aside. What the pose no longer holds of it, a later fix having seen it,
+    is so much noise of this one.
     """
     pose, cov, history = now.pose, now.covariance, now.history
     then = _nearest(history, now.time - age)
-    since = now.noise - then[5:].reshape(3, 3)
+    since = now.noise - then[5:14].reshape(3, 3)
     held = _within(since, cov[:3, :3])
     aside = jnp.zeros_like(cov).at[:3, :3].set(held)
     cov = cov - aside
@@ -216,6 +281,7 @@ def _corrected(
     gone = pose[:2] - then[1:3]
     look = jnp.zeros((3, cov.shape[0])).at[:, :3].set(jnp.eye(3))
     look = look.at[0, 2].set(gone[1]).at[1, 2].set(-gone[0])
+    look = look.at[:, 3:-1].set(-now.push * (now.far - then[14]))
     noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2) + since - held
     total = look @ cov @ look.T + noise
     # a fix far from what is believed counts less, yet counts
@@ -228,7 +294,8 @@ def _corrected(
     back = history[:, 1:3] - pose[:2]
     moved = change[:2] + change[2] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
     history = history.at[:, 1:3].add(moved).at[:, 3].add(change[2])
-    return pose + change[:3], now.nuisance + change[3:], cov, history
+    left = jnp.eye(3) - gain[:3] @ look[:, :3]
+    return pose + change[:3], now.nuisance + change[3:], cov, history, left
 
 
 def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Array, "3 3"]:

@@ -24,7 +24,7 @@ class Row:
         observer: `encoder`, `curve` (slip over current, wheel by wheel) or `contact`.
         about: one sentence for people.
         correction: of the 2021 paper.
-        tuned: whether it has the gains of `slipid tune`, where there are any.
+        tuned: whether it has the gains of `slipid tune`, where they are better than by hand.
         ahead: whether wheel speeds come from the inverse contact model, whatever the gains say.
         gyro: whether the robot has one.
     """
@@ -45,7 +45,7 @@ ROWS: Mapping[str, Row] = {
     "torque": Row("curve", "and torque correction, corrected", "torque"),
     "lyapunov": Row("contact", "the common pose loop, a Lyapunov law; gains set by hand"),
     "contact_ahead": Row("contact", "and wheel speeds of the inverse contact model", ahead=True),
-    "contact": Row("contact", "as lyapunov, tuned gains where there are any", tuned=True),
+    "contact": Row("contact", "as lyapunov, tuned gains where they are better", tuned=True),
     "contact_gyro": Row("contact", "contact, with a gyro", tuned=True, gyro=True),
 }
 
@@ -65,9 +65,25 @@ def check_gains(out: Path, robot: DeployedRobot) -> None:
         )
 
 
-def pilot_of(robot: DeployedRobot, row: Row, settings: Settings | None = None) -> Pilot[eqx.Module]:
-    """Estimator and controller of a row; some rows have the gains tuned for the robot."""
-    own = Gains.of(robot) if row.tuned else Gains()
+def unused_gains(robot: DeployedRobot, forced: bool) -> str:
+    """What a driver must know of tuned gains that are not taken; empty where there are none."""
+    tuned = robot.record.gains
+    if tuned is None or tuned.is_better or forced:
+        return ""
+    return (
+        f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "
+        f"{tuned.loss.hand:.1f} mm): driving with those set by hand; --tuned-gains takes the others"
+    )
+
+
+def pilot_of(
+    robot: DeployedRobot, row: Row, settings: Settings | None = None, forced: bool = False
+) -> Pilot[eqx.Module]:
+    """Estimator and controller of a row; some rows have the gains tuned for the robot.
+
+    Those are taken where they are better than gains set by hand, or forced.
+    """
+    own = Gains.of(robot, forced) if row.tuned else Gains()
     if row.ahead:
         own = replace(own, ahead=jnp.asarray(1.0))
     estimator: AbstractEstimator[Any] = Estimator(robot, settings)

@@ -43,7 +43,7 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
     numbers, messages = fit.parameters, fit.messages
     vectors = fit.draws(DRAWS)
     if posterior is not None:
-        source, numbers = "posterior", estimates(fit, posterior)
+        source, numbers = "posterior", estimates(fit, posterior.z)
         flat = posterior.z.reshape(-1, fit.space.size)
         rows = np.random.default_rng(0).choice(len(flat), DRAWS, replace=len(flat) < DRAWS)
         vectors = flat[rows]

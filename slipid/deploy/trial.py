@@ -16,7 +16,7 @@ from slipid.control.interface import Settings
 from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
 from slipid.data.floor_map import FloorMap, read_map
-from slipid.deploy.controllers import ROWS, check_gains, pilot_of
+from slipid.deploy.controllers import ROWS, check_gains, pilot_of, unused_gains
 from slipid.deploy.deploy import habits_of, read_robot
 from slipid.deploy.trial_site import SitePlant, known_to_site, site, starts, twin
 from slipid.deploy.trial_summary import Run, summaries
@@ -48,6 +48,7 @@ class Job:
     robot: DeployedRobot
     settings: Settings
     habits: Habits
+    forced: bool
     kept: Checkpoint
 
 
@@ -61,6 +62,7 @@ class Wish:
         controllers: names of `ROWS`.
         load: name of the load set-up; None for the first.
         starts, jobs: how many, and processes at once.
+        tuned_gains: whether tuned gains are taken that are no better than those set by hand.
     """
 
     plant: str = "testsite"
@@ -69,6 +71,7 @@ class Wish:
     starts: int = 20
     load: str | None = None
     jobs: int = 1
+    tuned_gains: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +94,8 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
     """
     setup_jax(quiet=True)
     jobs = _jobs(out, wish)
+    if unused := unused_gains(jobs[0].robot, wish.tuned_gains):
+        report.line(unused)
     todo = {job.name: job for job in jobs if _driven(job) is None}
     report.stage(f"driving {len(todo)} of {len(jobs)} runs")
     spread(drive, todo, wish.jobs, report)
@@ -101,7 +106,7 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
         "schema": SCHEMA,
         "plant": wish.plant,
         "map": "patches" if wish.map is None else str(wish.map),
-        "gains": _named(jobs[0].robot),
+        "gains": _named(jobs[0].robot, wish.tuned_gains),
         "closes_best": min(table, key=lambda name: table[name].median["closure_error_median"]),
         "summary": {name: row.to_json() for name, row in table.items()},
         "controllers": {name: ROWS[name].about for name in wish.controllers},
@@ -128,14 +133,21 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         raise DataError(f"{wish.map}: no surface '{absent[0]}'; identified: {', '.join(known)}")
     check_gains(out, robot)
     key = key_of(
-        *(wish.plant, robot.load_setup, _named(robot), settings, habits, *jax.tree.leaves(robot)),
+        *(
+            wish.plant,
+            robot.load_setup,
+            _named(robot, wish.tuned_gains),
+            settings,
+            habits,
+            *jax.tree.leaves(robot),
+        ),
         *(floor.surfaces, floor.corner, floor.cell, floor.cells),
         # runs of other code are not taken for this one's
         source_hash("control", "model", "testsite", "data", "deploy"),
     )
     # trials of other gains or floors lie beside this one, so that going back to them costs nothing
     kept = Checkpoint(out / FOLDER / key[:12] / f"of{wish.starts}", key)
-    shared = wish.plant, floor, robot, settings, habits, kept
+    shared = wish.plant, floor, robot, settings, habits, wish.tuned_gains, kept
     return [
         Job(f"{row}/start{k:02d}", row, start, 1000 + k, *shared)
         for row in wish.controllers
@@ -143,8 +155,8 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
     ]
 
 
-def _named(robot: DeployedRobot) -> dict[str, float]:
-    gains = Gains.of(robot)
+def _named(robot: DeployedRobot, forced: bool) -> dict[str, float]:
+    gains = Gains.of(robot, forced)
     return {f.name: float(getattr(gains, f.name)) for f in fields(gains)}
 
 
@@ -165,7 +177,7 @@ def drive(job: Job) -> None:
         plant = twin(robot, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro))
     else:
         plant = SitePlant(job.floor, robot.load_setup, job.start, job.seed, row.gyro)
-    pilot = pilot_of(robot, row, job.settings)
+    pilot = pilot_of(robot, row, job.settings, job.forced)
     course = closed_loop.drive(pilot, path, plant, job.start)
     off = course.pose[-1] - course.believed[-1]
     run = Run(

@@ -13,7 +13,13 @@ from slipid.control import trajectory
 from slipid.control.closed_loop import PERIOD
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot, drawn
-from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
+from slipid.control.robot_file.record import (
+    GainRecord,
+    GainsRecord,
+    GainsVerdict,
+    GainValues,
+    Losses,
+)
 from slipid.control.tuning import objective
 from slipid.control.tuning.objective import BATCH, GAINS, HAND, UNITS, Cases, Task
 from slipid.control.tuning.optimisers import GRADIENT, Method, Search, State
@@ -35,6 +41,10 @@ SLACK = 1.2
 """Time a rehearsal gives the path, over the path's own."""
 TRIED, JUDGED, STABLE = 64, 48, 4
 """Cases the search draws from, other ones it is judged on, draws whose loops must be stable."""
+SURE = 2.0
+"""Standard errors from which on a difference of losses is no chance."""
+RESAMPLED = 2000
+"""Times the cases are drawn anew for that error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +79,13 @@ class Tuned:
             loss=loss,
             better_than_hand=float(better.mean()),
             stability_margin=float(self.margins["tuned"].min()),
-            verdict="no worse than by hand" if loss.tuned <= loss.hand else "worse than by hand",
+            verdict=verdict(*improvement(self.losses)),
         )
 
     def to_json(self) -> dict[str, object]:
         """Content of gains.json."""
         task, kept, record = self.search.task, self.search, self.record()
+        gained, error = improvement(self.losses)
         quantiles = {k: np.quantile(v, [0.05, 0.95]).tolist() for k, v in self.losses.items()}
         return {
             "schema": SCHEMA,
@@ -84,6 +95,8 @@ class Tuned:
             "loss": asdict(record.loss),
             "loss_mean": {k: float(v.mean()) for k, v in self.losses.items()},
             "loss_interval90": quantiles,
+            "improvement": {"value": gained, "se": error},
+            "verdict": record.verdict,
             "better_than_hand": record.better_than_hand,
             "stability_margin": {
                 "worst": record.stability_margin,
@@ -111,6 +124,29 @@ class Tuned:
             "seed": kept.seed,
             "fit": {"data": task.robot.record.data, "numbers": task.robot.record.numbers},
         }
+
+
+_both = jax.jit(jax.vmap(jax.vmap(objective.combined)))
+
+
+def improvement(losses: Mapping[str, Float[np.ndarray, " case"]]) -> tuple[float, float]:
+    """Loss by hand less tuned [mm] and its standard error, by drawing pairs of losses anew.
+
+    Both gains drive the same cases, which differ more from each other than gains do.
+    """
+    pairs = np.stack([losses["hand"], losses["tuned"]])
+    count = pairs.shape[1]
+    picked = np.random.default_rng(0).integers(count, size=(RESAMPLED, count))
+    by_hand, tuned = np.asarray(_both(jnp.asarray(pairs[:, picked])))
+    gained = np.subtract(*np.asarray(_both(jnp.asarray(pairs[:, None])))[:, 0])
+    return float(gained), float(np.std(by_hand - tuned, ddof=1))
+
+
+def verdict(gained: float, error: float) -> GainsVerdict:
+    """Better only by more than `SURE` standard errors."""
+    if gained > SURE * error:
+        return "better than by hand"
+    return "worse than by hand" if gained < -SURE * error else "no better than by hand"
 
 
 def judged(search: Search, state: State, others: Cases, stable: DeployedRobot) -> Tuned:

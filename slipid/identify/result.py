@@ -21,7 +21,7 @@ from slipid.identify.fit.shared import FoundShared, Tie, freed, freed_slopes
 from slipid.identify.fit.variances import Search, Square
 from slipid.identify.slip_curves import SlipCurve
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
-from slipid.identify.verdicts.unidentified import Flat, flat_directions, sentences
+from slipid.identify.verdicts.unidentified import Flat, flat_directions, members, sentences
 from slipid.model.robot import Robot, Validity
 from slipid.search_space import Choice, Space
 
@@ -103,12 +103,9 @@ class Fit:
     @cached_property
     def parameters(self) -> dict[str, Estimate]:
         """Every number by path, with interval and verdict."""
-        volts = self.channels.voltage
-        found = estimates(self.space, self.choices, self.z, self.covariance, volts)
-        # a number whose scale rests on another one's prior was not measured, however narrow
-        open_ = {path for f in self.flat for path in f.paths}
-        rests = {e.path for e in found if e.path in open_ and e.provenance == "measured"}
-        return {e.path: replace(e, provenance="borrowed") if e.path in rests else e for e in found}
+        volts, flat = self.channels.voltage, members(self.flat)
+        found = estimates(self.space, self.choices, self.z, self.covariance, volts, flat)
+        return {e.path: e for e in found}
 
     @cached_property
     def flat(self) -> tuple[Flat, ...]:
@@ -205,13 +202,13 @@ def _remaining(problem: Problem, state: State) -> tuple[float, str]:
     electric numbers only.
     """
     z, log_v, every = state.z, state.log_variance, np.ones(len(problem.windows))
-    volt = problem.volt(log_v)
-    residual, jacobian = problem.linear(z, volt)
+    electric = problem.electric(z, log_v)
+    residual, jacobian = problem.linear(z, electric)
     seen = problem.seen(residual, log_v, every, state.shared(len(every)))
     roots = seen.whitening.root
     own = problem.space.electric.astype(float)
     prior = np.asarray(problem.target.prior_std(log_v)) ** -2
-    _, slope = log_jacobian(problem.target, z, volt, every)
+    _, slope = log_jacobian(problem.target, z, electric, every)
     gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
     info = np.diag(prior)
     for k, root in roots.items():

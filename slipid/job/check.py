@@ -1,7 +1,7 @@
 """What a set of logs holds and can tell before anything is fitted: what `slipid check` does."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,9 +11,11 @@ import numpy as np
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.identify import slip_curves as curves_of
+from slipid.identify.compare.scatter import scatter
+from slipid.identify.fit.optimise import CREEPS
 from slipid.identify.fit.problem import Problem
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
-from slipid.identify.verdicts.unidentified import flat_directions, sentences
+from slipid.identify.verdicts.unidentified import Flat, flat_directions, members, sentences
 from slipid.job.config import read_config
 from slipid.job.problem import Task, read_job
 from slipid.support.content import Content
@@ -29,7 +31,7 @@ _CHANNELS = (
 
 @dataclass(frozen=True)
 class Expected:
-    """What logs can be expected to tell of every number and ratio, at the start values by path.
+    """What logs can be expected to tell of every number and ratio, by path.
 
     `messages` say what stays open and what would close it, one sentence each.
     """
@@ -105,16 +107,42 @@ def _channels(logs: tuple[Log, ...]) -> list[str]:
 
 
 def expected(job: Task, problem: Problem) -> Expected:
-    """Verdicts from the information expected at the start values with typical noise."""
+    """Verdicts from the expected information, with noise as the runs scatter, if not typical.
+
+    What floors are like is not known yet: of the start values and of every creep that a fit starts
+    from, the one counts for a number at which the runs tell least of it, and for what stays open
+    the one at which they tell least of all.
+    """
     space, w = problem.space, problem.windows
-    log_v, keep = 2 * np.log(problem.noise.typical), np.ones(len(w))
-    covariance = problem.laplace(space.start, log_v, keep)
+    log_v, keep, volt = scatter(problem), np.ones(len(w)), w.has_voltage
     robot = space.tree(jnp.asarray(space.start))
     validity = curves_of.validity(job.dataset, robot, problem.batch)
-    flat = flat_directions(space, covariance, w.has_current, w.has_voltage, validity)
-    found = estimates(space, job.choices, space.start, covariance, w.has_voltage)
-    ratios = derived(space, space.start, covariance, w.has_voltage)
-    return Expected({e.path: e for e in found}, {e.path: e for e in ratios}, sentences(flat))
+    creep = space.where(lambda e: e.quantity == "surface.creep")
+    parameters: dict[str, Estimate] = {}
+    ratios: dict[str, Estimate] = {}
+    open_: tuple[Flat, ...] = ()
+    most = -np.inf
+    for z in (space.start, *(np.where(creep, np.log(c), space.start) for c in CREEPS)):
+        covariance = problem.laplace(z, log_v, keep)
+        flat = flat_directions(space, covariance, w.has_current, volt, validity)
+        found = estimates(space, job.choices, space.start, covariance, volt, members(flat))
+        _least(parameters, found)
+        _least(ratios, derived(space, space.start, covariance, volt))
+        left = float(np.linalg.slogdet(covariance)[1])
+        if left > most:
+            most, open_ = left, flat
+    return Expected(parameters, ratios, sentences(open_))
+
+
+def _least(kept: dict[str, Estimate], found: Iterable[Estimate]) -> None:
+    """Keep of every number the estimate that promises less."""
+    order = ("identified", "weak", "not_identified")
+
+    def promise(e: Estimate) -> tuple[int, float]:
+        return order.index(e.verdict) if e.verdict in order else -1, e.ratio or 0.0
+
+    for e in found:
+        kept[e.path] = max(kept.get(e.path, e), e, key=promise)
 
 
 def _before(e: Estimate) -> Content:

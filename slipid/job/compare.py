@@ -116,11 +116,11 @@ def _folds(
         z, log_variance = optimum.state.z, optimum.state.log_variance
         return {"z": z, "log_variance": log_variance, "covariance": optimum.covariance}
 
-    def one(judged: np.ndarray) -> Content:
-        return judge(problem, job.choices, job.dataset, judged, fit).to_json()
+    def one(name: str, judged: np.ndarray) -> Content:
+        return judge(problem, job.choices, job.dataset, name, judged, fit).to_json()
 
     work: dict[tuple[str, int], Callable[[], Content]] = {
-        (name, k): partial(one, np.flatnonzero(fold == k))
+        (name, k): partial(one, name, np.flatnonzero(fold == k))
         for name, fold in asked.items()
         for k in sorted({int(f) for f in fold if f >= 0})
     }

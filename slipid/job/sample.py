@@ -70,7 +70,7 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     found = sampled_around(fit, problem, plan, draws, kept, report)
     report.stage("writing")
     about = _summary(found, plan, time.monotonic() - began)
-    numbers = estimates(fit, found)
+    numbers = estimates(fit, found.z)
     marks = {k: str(v) for k, v in about.items() if not isinstance(v, dict)}
     marks |= {"schema": netcdf.SCHEMA, "data_hash": fit.data_hash}
     runs = tuple(log.name for log in job.dataset.logs)

@@ -139,6 +139,10 @@ def show_gains(page: Page, found: Content) -> None:
         f"loss on {found['settings']['judged_on']} cases not tuned on: by hand {loss['hand']:.1f} "
         f"mm, tuned {loss['tuned']:.1f} mm; better in {found['better_than_hand']:.0%} of them"
     )
+    gained = found["improvement"]
+    page.line(
+        f"tuned gains are {found['verdict']}: {gained['value']:.1f} +- {gained['se']:.1f} mm less"
+    )
     page.line(
         f"stability margin (1 - spectral radius): worst {margin['worst']:.4f}, "
         f"median {margin['median']:.4f}"

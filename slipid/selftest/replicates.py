@@ -26,6 +26,7 @@ from slipid.identify.fit.problem import Problem, State
 from slipid.identify.result import draws
 from slipid.identify.slip_curves import curves, slip_on
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
+from slipid.identify.verdicts.unidentified import flat_directions, members
 from slipid.job.config import Config
 from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
@@ -169,10 +170,11 @@ def compared(
     truth = space.tree(jnp.asarray(true))
     off = (z - true) / np.sqrt(np.diag(covariance))
     values = {e.path: np.atleast_1d(np.asarray(e.get(truth), float)) for e in space.free}
+    flat = members(flat_directions(space, covariance, problem.windows.has_current, volt))
     judged = {e.path for e in space.free if e.session is None}
     numbers = {
         e.path: _number(e, values[e.path], off[space.place[e.path]])
-        for e in estimates(space, choices, z, covariance, volt)
+        for e in estimates(space, choices, z, covariance, volt, flat)
         if e.path in judged
     }
     known = {e.path: e.value for e in derived(space, true, covariance, volt)}

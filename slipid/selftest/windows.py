@@ -26,8 +26,8 @@ def measure(
 ) -> Windows:
     """The windows with poses, currents and voltages as a robot gives them, plus noise.
 
-    Every piece starts at the pose it has. Of the scatter of the mean current, `current_var` is the
-    ammeter's and the voltage does not see it; the rest is current that flows.
+    Every piece starts at the pose it has. The scatter of the current is of the one that flows, and
+    voltages follow it; `current_var` comes on top, is the ammeter's, and no voltage sees it.
 
     Args:
         truth: knows the floors, loads and sessions of the windows.
@@ -44,13 +44,12 @@ def measure(
     each = _of(std, w, "current", "window")[:, None, None]
     of_run = rng.normal(size=(len(w), 1, amps.shape[2]))
     same = _of(std, w, "current", "run")[:, None, None] * of_run
-    ammeter = np.minimum(w.current_var, each**2)
-    flowing = amps + same + np.sqrt(each**2 - ammeter) * rng.normal(size=amps.shape)
+    flowing = amps + same + each * rng.normal(size=amps.shape)
     speed = w.turn / w.dt[..., None]
     signed = flowing - float(truth.motor.current_offset)
     signed = signed if w.current_is_signed else signed * np.tanh(speed / 0.2)
     volts = np.asarray(truth.motor.voltage(jnp.asarray(signed), jnp.asarray(speed)))
-    current = flowing + np.sqrt(ammeter) * rng.normal(size=amps.shape)
+    current = flowing + np.sqrt(w.current_var) * rng.normal(size=amps.shape)
     voltage = volts + rng.normal(size=amps.shape) * std.get("voltage.window", 0.0)
     return replace(
         w,

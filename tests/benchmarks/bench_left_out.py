@@ -9,8 +9,9 @@ Prints mean end-point errors in percent; asserts that every run was judged, and 
 that gray and green agree.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from glob import escape
 from pathlib import Path
 
 import jax
@@ -18,18 +19,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from slipid.api.results import compared
 from slipid.data.runs import Runs
-from slipid.identify.compare.folds import random_headings, sectors
-from slipid.identify.compare.slip_models import rungs
-from slipid.identify.compare.validation import Judged, Validation, validation
-from slipid.identify.fit.optimise import Optimum
+from slipid.identify.compare.folds import judge
+from slipid.identify.compare.ranking import Ranking, ranking
+from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.identify.result import draws
 from slipid.job.config import read_config
 from slipid.job.problem import Job, read_job
 from slipid.model.robot import build
+from slipid.search_space import Choice
 from slipid.support.progress import Reporter
-from tests.helpers.left_out import left_out, only, train
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -40,17 +41,23 @@ def job(real_data: Path) -> Job:
     return read_job(config, real_data / "robotino2022", Reporter())
 
 
-def show(title: str, rows: Sequence[Judged]) -> None:
-    report = Validation(tuple(rows))
-    print(f"\n{title}\n{report.table}")
-    for floor, by in report.summary.items():
-        mine = by["identified"]
-        share = mine.endpoint_error_mean / by["heading_lookup"].endpoint_error_mean
+def show(title: str, floors: Mapping[str, Ranking]) -> None:
+    print(f"\n{title}\nend-point error, %{''.join(f'{floor:>16}' for floor in floors)}")
+    for model in next(iter(floors.values())).models:
+        errors = (100 * floor.models[model].endpoint_error for floor in floors.values())
+        print(f"{model:18}{''.join(f'{error:16.2f}' for error in errors)}")
+    for name, floor in floors.items():
+        mine, lookup = floor.models["identified"], floor.models["heading_lookup"]
         print(
-            f"  {floor:12} coverage of 90 % regions {100 * mine.coverage90:.0f} %, "
+            f"  {name:12} {floor.runs} runs, coverage of 90 % regions {mine.coverage90:.0%}, "
             f"energy score {1000 * mine.energy_score:.1f} mm, "
-            f"yaw {mine.heading_error_median_deg:.1f} deg, {100 * share:.0f} % of heading_lookup"
+            f"yaw {mine.heading_error_median_deg:.1f} deg, "
+            f"{mine.endpoint_error / lookup.endpoint_error:.0%} of heading_lookup"
         )
+
+
+def count(floors: Mapping[str, Ranking]) -> int:
+    return sum(floor.runs for floor in floors.values())
 
 
 def some(job: Job, runs: np.ndarray) -> tuple[Runs, Problem]:
@@ -74,15 +81,15 @@ def some(job: Job, runs: np.ndarray) -> tuple[Runs, Problem]:
 
 
 def test_sectors(job: Job) -> None:
-    rows = left_out(job.problem(), job.dataset, sectors(job.dataset))
-    show("(a) left-out 60-degree sectors", rows)
-    assert len(rows) == len(job.dataset)
+    floors = compared(job, job.problem(), "sectors", 6, quiet=True).floors
+    show("(a) left-out 60-degree sectors", floors)
+    assert count(floors) == len(job.dataset)
 
 
 def test_random_headings(job: Job) -> None:
-    rows = left_out(job.problem(), job.dataset, random_headings(job.dataset))
-    show("(d) random headings", rows)
-    assert len(rows) == len(job.dataset)
+    floors = compared(job, job.problem(), "random", 6, quiet=True).floors
+    show("(d) random headings", floors)
+    assert count(floors) == len(job.dataset)
 
 
 @pytest.mark.parametrize("seen", [(0.1,), (0.1, 0.2)])
@@ -91,39 +98,50 @@ def test_speeds(job: Job, seen: tuple[float, ...]) -> None:
     speed = np.round(data.speed, 2)
     several = np.array([log.surface in ("gray", "green") for log in data.logs])
     built = np.array([log.load == "as_built" for log in data.logs])
-    fitted = np.flatnonzero(np.isin(speed, seen))
-    judged = np.flatnonzero(~np.isin(speed, seen) & several & built)
-    part, problem = some(job, fitted)
-    _, *fitted = train(problem, part, np.arange(len(part)))
-    rows = validation(*fitted, data.subset(judged)).runs
-    show(f"(b) fitted at {seen} m/s, faster runs predicted", rows)
-    assert len(rows) == len(judged)
+    fitted = np.isin(speed, seen)
+    used = np.flatnonzero(fitted | (several & built))
+    part, problem = some(job, used)
+    judged = np.flatnonzero(~fitted[used])
+    floors = ranking(judge(problem, job.choices, part, "speeds", judged).rows)
+    show(f"(b) fitted at {seen} m/s, faster runs predicted", floors)
+    assert count(floors) == len(judged)
 
 
 def test_moved_load(job: Job) -> None:
     """Fit of one_surface; of the moved load only the shares, from a third of its headings."""
     data, problem = job.dataset, job.problem()
     moved = np.array([log.load == "moved" for log in data.logs])
-    built, (third, rest) = np.flatnonzero(~moved), thirds(data, np.flatnonzero(moved))
-    optimum, *_ = train(problem, data, built)
+    built, rest = np.flatnonzero(~moved), without_third(data, np.flatnonzero(moved))
+    optimum = optimise(problem, keep=np.isin(problem.windows.run, built).astype(float))
     held = only(problem, optimum.state.z, "robot.load_share@moved")
     refit = Problem(problem.windows, problem.robot, held)
     assert refit.space.names == ["robot.load_share@moved[1]", "robot.load_share@moved[2]"]
-    again, contact, _ = train(refit, data, third)
-    w = problem.windows  # the simpler models see all that the force balance has seen
-    seen = w.pieces(np.flatnonzero(np.isin(w.run, np.concatenate([built, third]))))
-    simple = [rung.fit(seen, contact.robot) for rung in rungs(w.has_current)]
-    rows = validation(contact, simple, data.subset(rest)).runs
-    show("(c) moved load, shares from a third of its headings", rows)
-    print_shares("shares of the third", refit, again, ("moved",))
-    assert len(rows) == len(rest)
+    again: list[Optimum] = []
+
+    def fit(part: Problem, keep: np.ndarray) -> Optimum:
+        again.append(optimise(part, keep=keep))
+        return again[0]
+
+    floors = ranking(judge(refit, held, data, "random", rest, fit).rows)
+    show("(c) moved load, shares from a third of its headings", floors)
+    print_shares("shares of the third", refit, again[0], ("moved",))
+    assert count(floors) == len(rest)
 
 
-def thirds(data: Runs, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every third heading of some runs, and the others."""
+def only(problem: Problem, z: np.ndarray, pattern: str) -> list[Choice]:
+    """Choices that hold every number at a fitted value and leave those of a pattern free.
+
+    Those have their declared prior again.
+    """
+    robot = problem.space.tree(jnp.asarray(z))
+    values = {e.path: np.asarray(e.get(robot)).tolist() for e in problem.space.all}
+    return [*(Choice(escape(p), fixed=v) for p, v in values.items()), Choice(pattern, free=True)]
+
+
+def without_third(data: Runs, runs: np.ndarray) -> np.ndarray:
+    """Some runs without every third heading."""
     heading = np.round(np.degrees(data.heading[runs])) % 360
-    chosen = np.isin(heading, np.unique(heading)[::3])
-    return runs[chosen], runs[~chosen]
+    return runs[~np.isin(heading, np.unique(heading)[::3])]
 
 
 def test_load_shares(job: Job) -> None:
@@ -134,7 +152,7 @@ def test_load_shares(job: Job) -> None:
     for name in ("gray", "green", None):
         mine = np.arange(len(floor)) if name is None else np.flatnonzero(floor == name)
         data, problem = some(job, mine)
-        optimum, *_ = train(problem, data, np.arange(len(data)))
+        optimum = optimise(problem)
         loads = sorted({log.load for log in data.logs})
         found[name] = print_shares(name or "all floors", problem, optimum, loads)
     apart = np.abs(found["gray"]["as_built"] - found["green"]["as_built"]).max()

@@ -18,9 +18,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from slipid.api.results import compared
 from slipid.data.floor_map import FloorMap, four_zones, patchwork
-from slipid.identify.compare.folds import sectors
-from slipid.identify.compare.validation import Validation
 from slipid.job.config import parsed
 from slipid.job.problem import read_job
 from slipid.support.progress import Reporter
@@ -33,7 +32,6 @@ from slipid.testsite.simulate.observe import observe
 from slipid.testsite.simulate.sections import Headings, PaperGrid, Rectangle, Wander
 from slipid.testsite.simulate.simulate import simulate, truth
 from slipid.testsite.site import Site
-from tests.helpers.left_out import left_out
 
 ROOT = Path(__file__).resolve().parents[2]
 CODE = sha256(b"".join(p.read_bytes() for p in sorted((ROOT / "slipid").rglob("*.py"))))
@@ -135,17 +133,18 @@ def test_left_out_sectors() -> None:
     out = OUT / "sectors"
     driven(text, out)
     job = job_of(out)
-    rows = left_out(job.problem(), job.dataset, sectors(job.dataset))
-    report = Validation(tuple(rows))
-    print(f"\n{report.table}")
-    for floor, by in report.summary.items():
-        mine, encoder = (by[m].endpoint_error_mean for m in ("identified", "encoder"))
+    floors = compared(job, job.problem(), "sectors", 6, quiet=True).floors
+    print()
+    for name, floor in floors.items():
+        errors = {model: one.endpoint_error for model, one in floor.models.items()}
+        mine = floor.models["identified"]
+        print(f"{name}: " + ", ".join(f"{model} {e:.2%}" for model, e in errors.items()))
         print(
-            f"{floor}: {encoder / mine:.1f} times better than encoders, 90 % regions hold "
-            f"{100 * by['identified'].coverage90:.0f} %"
+            f"{name}: {errors['encoder'] / mine.endpoint_error:.1f} times better than encoders, "
+            f"90 % regions hold {mine.coverage90:.0%}"
         )
-    soft = report.summary["soft"]
-    assert soft["encoder"].endpoint_error_mean > 4 * soft["identified"].endpoint_error_mean
+    soft = floors["soft"].models
+    assert soft["encoder"].endpoint_error > 4 * soft["identified"].endpoint_error
 
 
 def _experiment(seed: int) -> dict:

@@ -40,7 +40,7 @@ GAINS = GainsRecord(
     loss=Losses(2.0, 1.0),
     better_than_hand=0.7,
     stability_margin=0.02,
-    verdict="no worse than by hand",
+    verdict="better than by hand",
 )
 
 
@@ -91,6 +91,16 @@ def test_every_number_survives_to_the_last_bit(robot, path):
     first.save(path)
     assert path.read_bytes() == text
     assert len(text) < 20_000
+
+
+@pytest.mark.parametrize("verdict", ["no better than by hand", "no worse than by hand"])
+def test_gains_that_are_not_known_to_be_better_are_read_and_not_used(tmp_path, robot, verdict):
+    gains = replace(GAINS, verdict=verdict)
+    DeployedRobot.of(replace(robot.record, gains=gains), "moved").save(tmp_path / "robot.json")
+    back = DeployedRobot.load(tmp_path / "robot.json", "moved")
+    assert back.record.gains == gains
+    assert jax.tree.leaves(Gains.of(back)) == jax.tree.leaves(Gains())
+    assert jax.tree.leaves(Gains.of(back, forced=True)) == [0.1 * k for k in range(6)]
 
 
 def test_gains_are_those_of_the_load_set_up_they_were_tuned_for(path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from slipid.data.log import Log
 from slipid.data.runs import MOVED, collect, first_row
-from slipid.data.windows import windows
+from slipid.data.windows import ammeter_variance, windows
 from slipid.support.errors import DataError
 
 RADIUS = 0.04
@@ -199,7 +200,7 @@ def test_lag_shifts_the_wheels_and_not_the_poses(logs):
     np.testing.assert_allclose(w.turn[0], np.diff(phi, axis=0), atol=1e-12)
 
 
-def test_means_and_their_variance_are_those_of_the_rows():
+def test_means_are_those_of_the_rows_and_their_variance_the_ammeters_over_their_count():
     data = collect([run(pose_fresh=None)])
     log = data.logs[0]
     w = windows(data, RADIUS, per_piece=2)
@@ -207,8 +208,33 @@ def test_means_and_their_variance_are_those_of_the_rows():
     for k, (a, b) in enumerate(pairwise(edges)):
         np.testing.assert_allclose(w.current[0, k], log.current[a:b].mean(axis=0), rtol=1e-9)
         np.testing.assert_allclose(w.voltage[0, k], log.voltage[a:b].mean(axis=0), rtol=1e-9)
-        expected = log.current[a:b].var(axis=0) / (b - a)
-        np.testing.assert_allclose(w.current_var[0, k], expected, rtol=1e-7)
+        expected = ammeter_variance(data)[0] / (b - a)
+        np.testing.assert_allclose(w.current_var[0, k], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("ripple", [0.0, 0.3])
+def test_ripple_is_no_noise_of_the_ammeter(ripple):
+    """White noise of 0.1 A under a ripple of ten readings a period, in four runs of 30 s."""
+    logs = []
+    for seed in range(4):
+        blank = run(f"{seed}.csv", seconds=30.0, seed=seed)
+        wave = ripple * np.sin(2 * np.pi * np.arange(blank.samples) / 10 + seed)
+        logs.append(replace(blank, current=blank.current + wave[:, None]))
+    found = ammeter_variance(collect(logs))
+    assert (found == found[0]).all()
+    # 3870 readings; what is left of the ripple is (2 - 2 cos 36 deg)^2 / 6 of its 0.045 A^2
+    np.testing.assert_allclose(found[0], 0.01 + 0.0243 * ripple**2 / 2, rtol=0.08)
+
+
+def test_jumps_stalls_and_other_sessions_do_not_make_an_ammeter_noisy():
+    quiet = run("a.csv", seconds=30.0)
+    jumps = quiet.current.copy()
+    jumps[[100, 200, 300]] = 50.0
+    noisy = run("b.csv", seconds=30.0, seed=1, current=4 * run(seconds=30.0, seed=1).current)
+    data = collect([replace(quiet, current=jumps), noisy], ["one", "two"])
+    found = ammeter_variance(data)
+    np.testing.assert_allclose(found[0], 0.01, rtol=0.15)
+    np.testing.assert_allclose(found[1], 0.16, rtol=0.15)
 
 
 def test_unsigned_currents_are_averaged_as_magnitudes():

@@ -91,7 +91,7 @@ def test_gains_outlive_the_same_numbers_and_no_others(fitted, tmp_path, monkeypa
     for name, gain in kept["gains"].items():
         assert getattr(tuned.gains.values, name).value == gain["value"]
     assert kept["fit"] == {"data": fit.data_hash, "numbers": tuned.numbers}
-    assert (tuned.gains.verdict == "no worse than by hand") == (done.exit_code == 0)
+    assert (tuned.gains.verdict == "better than by hand") == (done.exit_code == 0)
     write_robot(out, fit)
     assert read_robot(out).record == tuned
     done = invoke("trial", out, "--plant", "twin", "--starts", 1, "--controllers", "encoder")

@@ -20,7 +20,7 @@ from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues
 from slipid.control.robot_file.typed import typed
 from slipid.data.floor_map import four_zones, uniform
 from slipid.deploy import trial as tr
-from slipid.deploy.controllers import ROWS, check_gains, pilot_of
+from slipid.deploy.controllers import ROWS, check_gains, pilot_of, unused_gains
 from slipid.deploy.trial_site import SitePlant, floor_of, known_to_site, starts
 from slipid.deploy.trial_summary import Run, summaries
 from slipid.model.geometry import omni
@@ -262,10 +262,10 @@ def values(gains):
     return [float(x) for x in jax.tree.leaves(gains)]
 
 
-def tuned_for(load):
+def tuned_for(load, verdict="better than by hand"):
     values = GainValues(*(GainRecord(k + 0.5, "1", 0.1) for k in range(6)))
     losses = Losses(hand=2.0, tuned=1.0)
-    return GainsRecord(values, load, False, "pso", losses, 0.9, 0.01, "no worse than by hand")
+    return GainsRecord(values, load, False, "pso", losses, 0.9, 0.01, verdict)
 
 
 def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
@@ -281,6 +281,21 @@ def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
     (tmp_path / "gains.json").write_text("{}")
     with pytest.raises(DataError, match="tuned for another fit; run slipid tune again, or remove"):
         check_gains(tmp_path, deployed)
+
+
+def test_tuned_gains_that_are_no_better_are_left_aside_and_that_is_said(deployed):
+    gains = tuned_for("as_built", "no better than by hand")
+    robot = DeployedRobot.of(replace(deployed.record, gains=gains))
+    said = unused_gains(robot, forced=False)
+    assert said.startswith("tuned gains are no better than by hand (loss 1.0 mm, by hand 2.0 mm)")
+    assert "--tuned-gains" in said
+    row = ROWS["contact"]
+    assert values(pilot_of(robot, row).controller.gains) == values(Gains())
+    assert unused_gains(robot, forced=True) == ""
+    assert values(pilot_of(robot, row, forced=True).controller.gains) == [k + 0.5 for k in range(6)]
+    assert unused_gains(deployed, forced=False) == ""
+    better = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
+    assert unused_gains(better, forced=False) == ""
 
 
 def test_the_summary_is_of_medians_over_starts_with_intervals():

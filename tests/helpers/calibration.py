@@ -117,14 +117,31 @@ def filled(common: Problem, z: np.ndarray, log_v: np.ndarray, rng: np.random.Gen
     gap = noise(common.of(w), "motion", log_v, rng).reshape(clean.shape)
     w = replace(w, pose=_logged(truth, start, clean - gap))
     this = common.of(w)
-    current = amps - noise(this, "current", log_v, rng).reshape(amps.shape)
-    w = replace(w, current=current, voltage=np.zeros_like(current))
-    volt = common.volt(log_v)
-    batch = lk.batch(w, truth)
-    still = np.asarray(_electric(truth, batch, volt)["voltage"])
-    gap = still - noise(this, "voltage", log_v, rng)
-    spread = np.sqrt(1 + float(truth.motor.resistance) ** 2 * w.current_var / float(volt) ** 2)
-    return replace(w, voltage=gap.reshape(amps.shape) * spread)
+    gap, ammeter = currents(this, log_v, rng)
+    flowing = amps + gap.reshape(amps.shape)
+    speed = w.turn / w.dt[..., None]
+    amps_of_motor = jnp.asarray(flowing - float(truth.motor.current_offset))
+    volts = np.asarray(truth.motor.voltage(amps_of_motor, jnp.asarray(speed)))
+    return replace(
+        w,
+        current=flowing + ammeter.reshape(amps.shape),
+        voltage=volts + noise(this, "voltage", log_v, rng).reshape(amps.shape),
+    )
+
+
+def currents(
+    this: Problem, log_v: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """What flows beside the predicted current, and what the ammeter adds to it (piece, m).
+
+    Pieces differ in how wide both are, so that what is measured is Student t.
+    """
+    known = np.asarray(this.noise.blocks["current"].known)
+    wide = this.covariance("current", jnp.asarray(log_v)) - jax.vmap(jnp.diag)(known)
+    heavy = np.sqrt(DEGREES / rng.chisquare(DEGREES, (len(known), 1)))
+    root = np.linalg.cholesky(np.asarray(wide))
+    gap = np.einsum("nij,nj->ni", root, rng.standard_normal(known.shape))
+    return heavy * gap, heavy * np.sqrt(known) * rng.standard_normal(known.shape)
 
 
 def noise(this: Problem, block: str, log_v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -139,11 +156,6 @@ def noise(this: Problem, block: str, log_v: np.ndarray, rng: np.random.Generator
 def _predicted(truth, b):
     p = lk.predict(truth, b)
     return p.increment, corrected(truth, b.pose)[:, 0], lk.predicted_current(truth, b, p.felt)
-
-
-@jax.jit
-def _electric(truth, b, volt):
-    return lk.electric_residuals(truth, b, lk.predict(truth, b).felt, volt)
 
 
 @jax.jit

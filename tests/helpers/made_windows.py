@@ -49,7 +49,8 @@ def made(truth, runs=24, count=2, seed=0, std=None, signed=True, voltage=True):
     """Windows of straight and turning runs on every floor, load and session in turn.
 
     Args:
-        std: of the variance components by name (`lk.noise`), those left out are zero.
+        std: of the variance components by name (`fit.noise`), those left out are zero; with none
+            at all the ammeter has no noise, either.
     """
     rng = np.random.default_rng(seed)
     std = std or {}
@@ -71,7 +72,7 @@ def made(truth, runs=24, count=2, seed=0, std=None, signed=True, voltage=True):
         pose=rng.normal(0, 0.5, (runs, 1, 3)) * np.ones((count + 1, 1)),
         current=np.zeros((runs, count, 3)),
         voltage=np.zeros((runs, count, 3)),
-        current_var=np.full((runs, count, 3), 1e-4),
+        current_var=np.full((runs, count, 3), 1e-4 if std else 0.0),
         has_current=True,
         has_voltage=voltage,
         current_is_signed=signed,
@@ -80,8 +81,15 @@ def made(truth, runs=24, count=2, seed=0, std=None, signed=True, voltage=True):
     return measure(truth, w, rng, std)
 
 
-def residuals(robot, b, voltage_std):
-    """Every block of residuals, `motion` first."""
+def electric_noise(b, voltage_std, scatter=0.05, resistance=5.5):
+    """What voltages are predicted with when currents scatter so much around predicted ones [A]."""
+    pieces, *others = b.turn.shape
+    wide = jnp.full((pieces, int(np.prod(others))), scatter**2)
+    return lk.ElectricNoise(voltage_std, wide, resistance)
+
+
+def residuals(robot, b, noise):
+    """Every block of residuals, `motion` first; the noise is what voltages are predicted with."""
     p = lk.predict(robot, b)
     motion = {"motion": lk.motion_residual(robot, b, p)}
-    return motion | lk.electric_residuals(robot, b, p.felt, voltage_std)
+    return motion | lk.electric_residuals(robot, b, p.felt, noise)

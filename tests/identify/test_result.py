@@ -23,9 +23,10 @@ from slipid.identify.fit.optimise import Optimum, one_round
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit.variances import DEGREES
 from slipid.identify.fit_file import identified_json, load, save, to_json
+from slipid.identify.posterior import diagnosis
 from slipid.identify.result import Fit, hash_of, summarise
 from slipid.identify.verdicts.estimates import estimates
-from slipid.identify.verdicts.unidentified import flat_directions
+from slipid.identify.verdicts.unidentified import flat_directions, members
 from slipid.search_space import Choice
 from slipid.selftest.known import Sensors, blank, grid, truth
 from slipid.selftest.logs import make_logs
@@ -88,6 +89,7 @@ def verdicts(
     choices: tuple[Choice, ...] = CHOICES,
     shift: float = 0.0,
     prior_std: float | None = None,
+    flat: tuple[str, ...] = (),
 ):
     """Estimates when every posterior is `ratio` times its prior, `shift` prior stds from it.
 
@@ -100,7 +102,7 @@ def verdicts(
         space = eqx.tree_at(lambda s: s.prior_std, space, np.full(space.size, prior_std))
     cov = np.diag((ratio * space.prior_std) ** 2)
     z = space.prior_mean + shift * space.prior_std
-    return {e.path: e for e in estimates(space, choices, z, cov, has_voltage=True)}
+    return {e.path: e for e in estimates(space, choices, z, cov, has_voltage=True, flat=flat)}
 
 
 @pytest.mark.parametrize(
@@ -154,14 +156,33 @@ def test_without_voltage_neither_resistance_nor_back_emf_is_identified():
     assert "surface.soft.friction" in joint.paths
     assert joint.powers == pytest.approx([1.0] * len(joint.paths), abs=0.05)
     assert "surface.soft.friction/motor.back_emf" in joint.text
-    # nothing whose scale hangs on another number's prior is called measured
-    assert {fit.parameters[p].provenance for p in joint.paths} == {"borrowed"}
+
+
+def test_a_number_known_as_part_of_a_ratio_is_not_identified_however_narrow_neither_in_draws():
+    fit = fit_of(False)
+    [joint] = [f for f in fit.flat if "motor.back_emf" in f.paths]
+    rng = np.random.default_rng(0)
+    narrow = fit.z + 0.01 * fit.space.prior_std * rng.normal(size=(2, 200, fit.space.size))
+    sampled = diagnosis.estimates(fit, narrow)
+    for path in joint.paths:
+        assert sampled[path].ratio < 0.02
+        for e in (fit.parameters[path], sampled[path]):
+            assert e.provenance == "borrowed"
+            assert e.verdict in ("weak", "not_identified")
+    assert {sampled[path].verdict for path in joint.paths} == {"weak", "not_identified"}
+    known = [e.path for e in fit.space.free if e.path not in members(fit.flat)]
+    assert "robot.load_share@as_built" in known
+    assert {sampled[path].verdict for path in known} <= {"identified", "at_bound"}
+    assert {sampled[path].provenance for path in known} == {"measured"}
+    # the same interval by itself would do
+    assert verdicts(0.1)["surface.soft.creep"].verdict == "identified"
+    assert verdicts(0.1, flat=("surface.soft.creep",))["surface.soft.creep"].verdict == "weak"
 
 
 def test_no_prior_however_tight_lends_the_motor_a_verdict_without_voltage():
     problem, _, end = made(False)
     tight = end.covariance * 1e-6
-    found = estimates(problem.space, CHOICES, end.state.z, tight, has_voltage=False)
+    found = estimates(problem.space, CHOICES, end.state.z, tight, has_voltage=False, flat=())
     by = {e.path: e.verdict for e in found}
     assert by["motor.resistance"] == by["motor.back_emf"] == "not_identified"
     assert by["motor.coulomb_friction"] == "identified"

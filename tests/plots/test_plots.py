@@ -54,7 +54,7 @@ def fit() -> Fit:
     problem = Problem(windows(data(), 0.04, lag=0.056), blank(DRIVES), choices)
     z = problem.space.vector(ROBOT)
     log_v = 2 * np.log(problem.noise.typical)
-    _, jacobian = problem.linear(jnp.asarray(z), problem.volt(log_v))
+    _, jacobian = problem.linear(jnp.asarray(z), problem.electric(z, log_v))
     keep = jnp.ones(len(problem.windows))
     info = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep))
     state = State(z, log_v, 7, -1.5, 0.01, "joint")

@@ -28,7 +28,7 @@ from slipid.selftest.replicates import Curve, Number, Replicate
 from slipid.selftest.windows import measure
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.progress import Reporter
-from tests.helpers.made_windows import made, residuals, robot
+from tests.helpers.made_windows import electric_noise, made, residuals, robot
 from tests.identify.fit.test_optimise import begin
 
 BENT = eqx.tree_at(
@@ -49,7 +49,8 @@ STD = {
 
 @jax.jit
 def gaps(truth, b):
-    return residuals(truth, b, jnp.asarray(STD["voltage.window"]))
+    scatter = np.hypot(STD["current.window"], STD["current.run"])
+    return residuals(truth, b, electric_noise(b, STD["voltage.window"], scatter))
 
 
 def test_a_camera_logs_what_its_correction_undoes():

@@ -19,6 +19,9 @@ Axes = tuple[float, float, float]
 Source = Literal["laplace", "posterior", "given"]
 Verdict = Literal["identified", "weak", "not_identified", "at_bound", "fixed"]
 Provenance = Literal["measured", "borrowed", "override"]
+GainsVerdict = Literal[
+    "better than by hand", "no better than by hand", "no worse than by hand", "worse than by hand"
+]
 UNITS = {
     "wheels.place": "base radius",
     "wheels.drive_angle": "rad",
@@ -152,7 +155,8 @@ class GainsRecord:
         method: of the search.
         better_than_hand: part of the cases in which they are.
         stability_margin: 1 - the largest spectral radius of a loop.
-        verdict: what the losses say.
+        verdict: what the losses say; "better" where they differ by more than chance. Older files
+            say "no worse" where nobody has asked whether chance would do.
     """
 
     values: GainValues
@@ -162,7 +166,12 @@ class GainsRecord:
     loss: Losses
     better_than_hand: float
     stability_margin: float
-    verdict: Literal["no worse than by hand", "worse than by hand"]
+    verdict: GainsVerdict
+
+    @property
+    def is_better(self) -> bool:
+        """Whether they are to be preferred to those set by hand."""
+        return self.verdict == "better than by hand"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

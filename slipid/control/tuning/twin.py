@@ -1,7 +1,8 @@
 """The identified robot as a plant: what closed-loop runs are tuned and rehearsed on.
 
 Commands reach the wheels late, a slew and a lag after; wheels on several floors move the body as
-the contact says, and what the fit says the model misses is drawn anew for every run:
+the contact says, and what the fit says the model misses is drawn anew for every run, effects as
+`slipid.control.effects` has them:
 
     set <- set + clip(command(t - delay) - set, slew h),   w <- w + (1 - exp(-h / lag)) (set - w)
     xi = equilibrium(r w; floor under each wheel)
@@ -23,6 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from slipid.control.closed_loop import PERIOD, Pilot, PilotOutput, PilotState
 from slipid.control.deployed import DeployedRobot
+from slipid.control.effects import direction, stays
 from slipid.control.interface import Measurement, Pose, Readings, State
 from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import RING, Habits
@@ -67,7 +69,8 @@ class TwinState(eqx.Module):
         pose: x, y [m], heading [rad]; twist: of the body [m/s, m/s, rad/s].
         wanted: wheel speeds that the motors' control is set to [rad/s].
         speed: of the wheels [rad/s]; angle: of the wheels [rad].
-        effect: what this run has of its own on every floor [m/m], [m/m], [rad/m].
+        effect: what the model misses now on every floor [m/m], [m/m], [rad/m].
+        toward: direction of travel that counts as taken, see `slipid.control.effects`.
         offset, drift: of the currents, all the way and for a moment [A].
         bias: of the gyro [rad/s].
         ring: commands on their way, the newest first [rad/s].
@@ -79,6 +82,7 @@ class TwinState(eqx.Module):
     speed: Float[Array, " wheel"]
     angle: Float[Array, " wheel"]
     effect: Float[Array, "floor 3"]
+    toward: Float[Array, "3"]
     offset: Float[Array, " wheel"]
     drift: Float[Array, " wheel"]
     bias: Float[Array, ""]
@@ -106,7 +110,7 @@ class Twin(eqx.Module):
 
     def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:
         """Standard normal numbers of a step by its number; 0 is the reading at rest."""
-        count = 3 * self.robot.wheels + 1 + 3 * self.habits.substeps
+        count = 3 * (self.robot.wheels + self.habits.substeps + len(self.robot.labels)) + 1
         return jax.random.normal(jax.random.fold_in(key, number), (count,))
 
     def init(self, pose: Pose, key: Array) -> TwinState:
@@ -122,6 +126,7 @@ class Twin(eqx.Module):
             speed=zero,
             angle=zero,
             effect=f.effect * jax.random.normal(one, f.effect.shape),
+            toward=jnp.zeros(3),
             offset=off,
             drift=zero,
             bias=self.habits.gyro_bias * jax.random.normal(three),
@@ -146,7 +151,9 @@ class Twin(eqx.Module):
         now = replace(old, pose=pose, twist=xi, wanted=wanted, speed=w, angle=angle, ring=ring)
         amps, drift = self._amps(now, noise[3 * b.substeps :])
         turned = (pose[2] - old.pose[2]) / PERIOD
-        return replace(now, drift=drift), self._read(angle, w, amps, turned + old.bias, noise)
+        effect, toward = self._errs(now, noise[-3 * len(self.robot.labels) :])
+        now = replace(now, drift=drift, effect=effect, toward=toward)
+        return now, self._read(angle, w, amps, turned + old.bias, noise)
 
     def first(self, state: TwinState, noise: Array) -> Readings:
         """Readings of a robot at rest."""
@@ -168,6 +175,17 @@ class Twin(eqx.Module):
         off += jnp.sqrt(far + 1e-12) * push * jnp.sqrt(jnp.sum(share * f.process[under] ** 2, 0))
         turned = jnp.stack([u[0] * off[0] - u[1] * off[1], u[1] * off[0] + u[0] * off[1], off[2]])
         return compose(pose, advance(xi + turned / h, h)), xi
+
+    def _errs(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
+        """Effects of the floors, and the direction that counts as taken, for the next period."""
+        f, xi = self.robot, now.twist
+        far = (jnp.sqrt(xi[:2] @ xi[:2] + 1e-12) + f.frame.base * jnp.abs(xi[2])) * PERIOD
+        under = self.floor.under(now.pose, f.places)
+        left = jnp.all(under[:, None] != jnp.arange(len(f.labels)), axis=0)
+        way = direction(f.inverse @ (f.frame.radius * now.speed), f.frame.base)
+        toward, keep = stays(now.toward, way, left.astype(float), far)
+        fresh = jnp.sqrt(1 - keep**2 + 1e-15)[:, None] * f.effect * noise.reshape(-1, 3)
+        return keep[:, None] * now.effect + fresh, toward
 
     def _amps(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
         """Signed currents [A], and how far they have drifted from the model's since the last."""

@@ -65,6 +65,22 @@ QUESTIONS: dict[str, Callable[[Runs], Fold]] = {
 """What is left out together: 60-degree sectors of headings, one speed, headings dealt at random."""
 
 
+def nested(data: Runs, question: str, judged: np.ndarray) -> Fold:
+    """Fold of every run while a rung tunes itself for a question on the runs that are not judged.
+
+    A sector beside one that is judged would leave a wider gap than is asked about: it is -1, seen
+    always, where two sectors or more are left.
+    """
+    fold = QUESTIONS[question](data)
+    if question != "sectors":
+        return fold
+    left_out = np.unique(fold[judged])
+    beside = np.isin(fold, [(left_out + 1) % 6, (left_out - 1) % 6])
+    inner = np.where(beside, -1, fold)
+    rest = np.setdiff1d(inner, [-1, *left_out.tolist()])
+    return inner if len(rest) > 1 else fold
+
+
 def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
     """Fold of every run; -1 for one that cannot be judged and is always fitted.
 
@@ -113,17 +129,30 @@ class FoldResult:
         return asdict(self, dict_factory=told)
 
 
-def judge(
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """Every model, the force balance first, fitted to some runs of a problem.
+
+    Seconds are to fit, by model.
+    """
+
+    problem: Problem
+    optimum: Optimum
+    models: tuple[Predictive, ...]
+    seconds: dict[str, float]
+
+
+def learn(
     problem: Problem,
     choices: Sequence[Choice],
     data: Runs,
+    question: str,
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
-) -> FoldResult:
-    """One fold: every rung fitted without some runs, and what it says of them.
+) -> Learnt:
+    """Every rung fitted without some runs; arguments as of `judge`.
 
-    The problem is of all the runs of `data`, made with these choices; `judged` are numbers of runs,
-    `fit` is how it is fitted.
+    Of the runs left out nothing is used but which they are.
     """
     fitted = np.setdiff1d(np.arange(len(data)), judged)
     held = [*still_viscosities(data, fitted), *choices]
@@ -134,15 +163,35 @@ def judge(
     optimum = fit(problem, keep=keep)
     contact = contact_of(problem, optimum.state, optimum.covariance, keep)
     models: list[Predictive] = [contact]
-    seconds = {contact.name: {"fit": time.perf_counter() - began}}
-    for rung in rungs(problem.windows.has_current):
+    seconds = {contact.name: time.perf_counter() - began}
+    for rung in rungs(problem.windows.has_current, nested(data, question, judged)):
         began = time.perf_counter()
         models.append(with_noise(rung, contact, problem, keep))
-        seconds[rung.name] = {"fit": time.perf_counter() - began}
+        seconds[rung.name] = time.perf_counter() - began
+    return Learnt(problem, optimum, tuple(models), seconds)
+
+
+def judge(
+    problem: Problem,
+    choices: Sequence[Choice],
+    data: Runs,
+    question: str,
+    judged: np.ndarray,
+    fit: Callable[..., Optimum] = optimise,
+) -> FoldResult:
+    """One fold: every rung fitted without some runs, and what it says of them.
+
+    The problem is of all the runs of `data`, made with these choices; `judged` are numbers of runs,
+    left out for one of the `QUESTIONS`; a rung that tunes itself does so for that question, on the
+    other runs. `fit` is how the problem is fitted.
+    """
+    learnt = learn(problem, choices, data, question, judged, fit)
+    problem, optimum = learnt.problem, learnt.optimum
+    seconds = {name: {"fit": spent} for name, spent in learnt.seconds.items()}
     part = data.subset(judged)
     runs: dict[int, Judged] = {}
-    cuts = replay.cuts(part, contact.robot)
-    for model in models:
+    cuts = replay.cuts(part, learnt.models[0].robot)
+    for model in learnt.models:
         began = time.perf_counter()
         for w in cuts:
             score(runs, part, model.name, *model.ends(w))
@@ -154,7 +203,7 @@ def judge(
     return FoldResult(
         rows=tuple(replace(runs[k], session=name) for k, name in enumerate(part.session)),
         seconds=seconds,
-        numbers={model.name: model.numbers for model in models},
+        numbers={model.name: model.numbers for model in learnt.models},
         converged=bool(optimum.converged),
         reason=optimum.reason,
     )

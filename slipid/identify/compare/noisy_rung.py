@@ -98,7 +98,7 @@ def with_noise(
         spread = jnp.asarray(around(slope, covariance))
         blocks = {"motion": jnp.asarray(gap)}, {"motion": spread}
         for _ in range(SCORING):
-            log_v = scored(target, *blocks, log_v, count, {})
+            log_v = scored(target, *blocks, log_v, count, None)
         if float(jnp.abs(log_v - last).max()) < SETTLED:
             break
     plain = replace(plain, variance=by_name(problem, log_v), covariance=covariance)

@@ -162,7 +162,8 @@ class Contact(Predictive):
         return np.flatnonzero(self.space.where(lambda e: e.part == "camera"))
 
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
-        blocks, jac = problem.linear(self.z, problem.volt(self.log_variance(problem)))
+        electric = problem.electric(self.z, self.log_variance(problem))
+        blocks, jac = problem.linear(self.z, electric)
         told, e = self.told(problem.windows), effects(problem.windows, problem.robot)
         gap = np.asarray(blocks["motion"]) - np.einsum("nma,na->nm", e, told.mean)
         slope = np.asarray(jac["motion"]) - np.einsum("nma,nap->nmp", e, told.slope)
@@ -198,7 +199,7 @@ def found_shared(
 ) -> dict[str, FoundShared]:
     """What neighbouring runs on every floor share, by a fit of the kept pieces."""
     log_v, free = jnp.asarray(state.log_variance), problem.space.size
-    residual, jacobian = problem.linear(state.z, problem.volt(log_v))
+    residual, jacobian = problem.linear(state.z, problem.electric(state.z, log_v))
     seen = problem.seen(residual, log_v, keep, state.shared(len(keep)))
     white = jnp.einsum("nij,nj->ni", seen.whitening.root["motion"], residual["motion"])
     half = whitened(problem.target.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]

@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from slipid.data.windows import Windows
 from slipid.identify.fit.likelihood import measured, seen
@@ -16,8 +16,10 @@ from slipid.model.robot import Robot
 
 Number = TypeVar("Number")
 Increments = Float[np.ndarray, "piece window 3"]
+Together = Int[np.ndarray, " run"]
+"""A number for every run: runs of one number are left out together, those of -1 never are."""
 HARMONICS = 6
-WEIGHTS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+WEIGHTS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 _seen, _measured = jax.jit(seen), jax.jit(measured)
 
 
@@ -102,20 +104,24 @@ class HeadingLookup(Rung):
         (along, across, yaw) = (far, 0, turn) + far sum_k c_k phi_k(angle)
 
     with far, angle and turn the encoders' displacement, its direction and their yaw. Six harmonics,
-    the k-th held down by weight k^4; the weight by cross-validation over random runs within the
-    data it is fitted to, which is how such a table is made, and what makes it good in between.
+    the k-th held down by weight k^4; the weight by cross-validation within the data it is fitted
+    to: over runs that are left out `together`, so that the table is made for the question it will
+    be asked, else over random runs, which makes it good in between.
     A floor has one series for each load set-up it was driven with.
     """
 
     name: str = "heading_lookup"
+    together: Together | None = None
 
     def fit(self, w: Windows, robot: Robot) -> "HeadingLookup":
-        return replace(self, state={t.key: t.ridge(t.best_weight()) for t in _tables(w, robot)})
+        return replace(
+            self, state={t.key: t.ridge(t.best_weight()) for t in self._tables(w, robot)}
+        )
 
     def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
         """The ridge as a Gaussian prior: its penalty over the mean square of what is left."""
         out = {}
-        for t in _tables(w, robot):
+        for t in self._tables(w, robot):
             left = np.mean((t.gap - t.phi @ self.state[t.key]) ** 2, axis=(0, 1))
             out[t.key] = np.kron(t.penalty(t.best_weight()), np.diag(1 / np.maximum(left, 1e-12)))
         return out
@@ -134,14 +140,32 @@ class HeadingLookup(Rung):
             return exact
         return of_floor({key.rsplit("@", 1)[0]: key for key in reversed(self.state)}, surface)
 
+    def _tables(self, w: Windows, robot: Robot) -> Iterator["_Table"]:
+        angle, plain = _encoders(w, robot)
+        gap = body_twist(w, robot) * w.dt[..., None]
+        gap[..., :2] = turned(-angle, gap[..., :2])
+        gap -= plain
+        phi = _fourier(angle, plain[..., 0])
+        series = np.asarray([f"{a}@{b}" for a, b in zip(w.surface, w.load, strict=True)])
+        for key in dict.fromkeys(series.tolist()):
+            mine = series == key
+            yield _Table(key, phi[mine], gap[mine], self._fold(w.run[mine]))
+
+    def _fold(self, run: Int[np.ndarray, " piece"]) -> Int[np.ndarray, " piece"]:
+        """Fold of every piece of a series, five of random runs where it has fewer than two."""
+        fold = np.full(len(run), -1) if self.together is None else self.together[run]
+        if len(set(fold[fold >= 0].tolist())) > 1:
+            return fold
+        return np.random.default_rng(0).integers(0, 5, run.max() + 1)[run]
+
 
 class _Table(NamedTuple):
-    """Features (piece, window, k) of a floor and load set-up, and the gap they have to explain."""
+    """Features (piece, window, k) of a floor and load set-up, the gap they explain, and folds."""
 
     key: str
     phi: np.ndarray
     gap: np.ndarray
-    run: np.ndarray
+    fold: np.ndarray
 
     def penalty(self, weight: float) -> np.ndarray:
         rough = np.concatenate([[0.0], np.repeat(np.arange(1.0, HARMONICS + 1) ** 4, 2)])
@@ -156,27 +180,14 @@ class _Table(NamedTuple):
         return min(WEIGHTS, key=self._left_out)
 
     def _left_out(self, weight: float) -> float:
-        """Squared error over five random folds of runs."""
-        fold = np.random.default_rng(0).integers(0, 5, self.run.max() + 1)[self.run]
+        """Squared error over the folds."""
         loss = 0.0
-        for test in (fold == k for k in range(5)):
-            if test.any() and not test.all():
+        for test in (self.fold == k for k in set(self.fold.tolist()) - {-1}):
+            if not test.all():
                 rest = self._replace(phi=self.phi[~test], gap=self.gap[~test])
                 gap = self.gap[test] - self.phi[test] @ rest.ridge(weight)
                 loss += float((gap**2 * np.array([1.0, 1.0, 0.02])).sum())
         return loss
-
-
-def _tables(w: Windows, robot: Robot) -> Iterator[_Table]:
-    angle, plain = _encoders(w, robot)
-    gap = body_twist(w, robot) * w.dt[..., None]
-    gap[..., :2] = turned(-angle, gap[..., :2])
-    gap -= plain
-    phi = _fourier(angle, plain[..., 0])
-    series = np.asarray([f"{a}@{b}" for a, b in zip(w.surface, w.load, strict=True)])
-    for key in dict.fromkeys(series.tolist()):
-        mine = series == key
-        yield _Table(key, phi[mine], gap[mine], w.run[mine])
 
 
 def _encoders(w: Windows, robot: Robot) -> tuple[np.ndarray, np.ndarray]:

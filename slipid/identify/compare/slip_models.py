@@ -13,7 +13,14 @@ from scipy import sparse
 from scipy.optimize import least_squares, linprog, lsq_linear
 
 from slipid.data.windows import Windows
-from slipid.identify.compare.rung import HeadingLookup, Rung, body_twist, of_floor, rims
+from slipid.identify.compare.rung import (
+    HeadingLookup,
+    Rung,
+    Together,
+    body_twist,
+    of_floor,
+    rims,
+)
 from slipid.model.motor import signed
 from slipid.model.robot import Robot
 
@@ -198,10 +205,11 @@ def _ramps(knots: Sequence[float]) -> Features:
     return phi
 
 
-def rungs(has_current: bool) -> list[Rung]:
+def rungs(has_current: bool, together: Together | None = None) -> list[Rung]:
     """Every rung the logs allow, unfitted; `paper` is the form the authors ran on the robot.
 
-    Its threshold of 0.4 A and the spline's knots are for motors of that size.
+    Its threshold of 0.4 A and the spline's knots are for motors of that size. Runs that will be
+    left out `together` are so, too, where a rung tunes itself.
     """
     out: list[Rung] = [Encoder(), Curve("constant", _powers(0))]
     if has_current:
@@ -215,7 +223,7 @@ def rungs(has_current: bool) -> list[Rung]:
             Curve("affine_current", _powers(0, 1)),
             Curve("paper", _above(0.4), per_wheel=True),
         ]
-    return [*out, HeadingLookup()]
+    return [*out, HeadingLookup(together=together)]
 
 
 def restored(states: Mapping[str, Mapping[str, Sequence]]) -> list[Rung]:

@@ -101,7 +101,7 @@ class Planner:
         filled = [*drives, *[drives[-1]] * (_TOGETHER - len(drives))]
         windows = self._windows(filled)
         this = self._problem.of(windows)
-        _, jacobian = this.linear(self.z, this.volt(self._log_v))
+        _, jacobian = this.linear(self.z, this.electric(self.z, self._log_v))
         std = np.sqrt(by_axis(self.variance, "session", windows))
         felt = effects(windows, self.robot) * std[:, None]
         on = np.eye(len(self._differ))[np.asarray(this.batch.surface)][:, self._differ]

@@ -19,6 +19,8 @@ from slipid.model.robot import Robot
 Marker = Float[Array, "piece window 3"]
 """Increments of the marker [m, m, rad], or body twists [m/s, m/s, rad/s], of every window."""
 PerWheel = Float[Array, "piece window wheel"]
+PerChannel = Float[Array, "piece m"]
+"""Window by window the wheels of every piece, as residuals are."""
 Std = Float[Array, ""] | float
 SMOOTH = 0.03
 """Magnitude below which the mean of an unsigned current levels off [A]."""
@@ -74,6 +76,20 @@ def batch(
         has_voltage=windows.has_voltage,
         signed=windows.current_is_signed,
     )
+
+
+class ElectricNoise(eqx.Module):
+    """What voltages are predicted with: the voltmeter's std [V], and how far currents scatter.
+
+    The scatter is the variance of the true current of every window around the predicted one [A^2],
+    without the ammeter's noise. The resistance [ohm] says how far what stays unknown of the true
+    current moves voltages: a fit holds it in every round, as it holds the variances, because these
+    are fitted to the size of the residuals, which then tells nothing more of R.
+    """
+
+    voltage_std: Std
+    scatter: PerChannel
+    resistance: Std
 
 
 class Predicted(eqx.Module):
@@ -146,28 +162,47 @@ def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "piece
 
 
 def electric_residuals(
-    robot: Robot, b: Batch, felt: PerWheel, voltage_std: Std
+    robot: Robot, b: Batch, felt: PerWheel, noise: ElectricNoise
 ) -> dict[str, Array]:
     """Predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
 
-    The noise of the measured current is carried into the voltage equation by R, which keeps R from
-    being attenuated; `voltage_std` is the voltmeter's own [V].
+    Voltages are predicted from what is expected of the true current given the measured and the
+    predicted one: predicted from the measured one alone, its noise would make R too small.
     """
-    n = b.dt.shape[0]
-    out = {}
-    if b.has_current:
-        out["current"] = (predicted_current(robot, b, felt) - b.current).reshape(n, -1)
-    if b.has_current and b.has_voltage:
+    if not b.has_current:
+        return {}
+    predicted = predicted_current(robot, b, felt)
+    out = {"current": _flat(predicted - b.current)}
+    if b.has_voltage:
+        amps = predicted + _flow(b, noise)[0] * (b.current - predicted)
         w = b.turn / b.dt[..., None]
-        amps = b.current - robot.motor.current_offset
-        if not b.signed:
-            amps = amps * jnp.tanh(w / 0.2)
-        gap = robot.motor.voltage(amps, w) - b.voltage
-        out["voltage"] = (gap / _spread(robot, b, voltage_std)).reshape(n, -1)
+        volts = robot.motor.voltage((amps - robot.motor.current_offset) * _direction(b), w)
+        out["voltage"] = _flat(volts - b.voltage) / spread(b, noise)
     return out
 
 
-def log_jacobians(robot: Robot, b: Batch, voltage_std: Std) -> tuple[Array, Array]:
+def _flat(x: PerWheel) -> PerChannel:
+    return x.reshape(x.shape[0], -1)
+
+
+def _direction(b: Batch) -> PerWheel:
+    """What a logged current counts for in the direction of the wheel: 1 if it is signed."""
+    return jnp.ones_like(b.turn) if b.signed else jnp.tanh(b.turn / b.dt[..., None] / 0.2)
+
+
+def _flow(b: Batch, noise: ElectricNoise) -> tuple[PerWheel, PerWheel]:
+    """Share k of the gap of a measured current that is true current, and what stays unknown of it.
+
+    The true current is N(predicted, s^2) before it is measured with the noise sigma^2. Afterwards
+    it is N(predicted + k (measured - predicted), k sigma^2) with k = s^2 / (s^2 + sigma^2).
+    Source: Kelly 2007, ApJ 665(2), whose population of true values is here the model's prediction.
+    """
+    scatter = noise.scatter.reshape(b.current.shape)
+    share = scatter / (scatter + b.current_var)
+    return share, share * b.current_var
+
+
+def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, Array]:
     """Log |d residuals / d data| of the motion and of the voltage of every piece.
 
     The camera corrects measured places and the voltage residual is scaled by its own spread:
@@ -176,7 +211,7 @@ def log_jacobians(robot: Robot, b: Batch, voltage_std: Std) -> tuple[Array, Arra
     camera = camera_log_jacobian(robot, b.pose)
     if not (b.has_current and b.has_voltage):
         return camera, jnp.zeros_like(camera)
-    return camera, -jnp.sum(jnp.log(_spread(robot, b, voltage_std)), axis=(1, 2))
+    return camera, -jnp.sum(jnp.log(spread(b, noise)), axis=1)
 
 
 def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, " piece"]:
@@ -184,9 +219,13 @@ def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Flo
     return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
 
 
-def _spread(robot: Robot, b: Batch, voltage_std: Std) -> PerWheel:
-    """Std of the voltage residual over that of the voltage noise."""
-    return jnp.sqrt(1.0 + robot.motor.resistance**2 * b.current_var / voltage_std**2)
+def spread(b: Batch, noise: ElectricNoise) -> PerChannel:
+    """Std of the voltage residual over that of the voltage noise.
+
+    The rest is of the true current that the ammeter and the model leave unknown, times R.
+    """
+    unknown = (noise.resistance * _direction(b)) ** 2 * _flow(b, noise)[1]
+    return _flat(jnp.sqrt(1.0 + unknown / noise.voltage_std**2))
 
 
 def voltage_std(log_variance: Float[Array, ""]) -> Float[Array, ""]:
@@ -195,8 +234,3 @@ def voltage_std(log_variance: Float[Array, ""]) -> Float[Array, ""]:
     The voltage residual is in units of it: without the floor it would vanish with the noise.
     """
     return jnp.sqrt(jnp.exp(log_variance) + FLOOR["voltage"])
-
-
-def voltage_share(robot: Robot, b: Batch, voltage_std: Std) -> Float[Array, "piece m"]:
-    """Part that the voltage's own noise has in the variance of every voltage residual."""
-    return (1 / _spread(robot, b, voltage_std) ** 2).reshape(b.dt.shape[0], -1)

@@ -7,7 +7,8 @@ The residuals of a piece have the covariance
                          the run's own effect along, across and in yaw, per floor
 
 so the run effects are marginalised. What runs share with each other (`slipid.identify.fit.shared`)
-and how far floors differ from what is common to them have variances, too, beside these blocks.
+and how far floors differ from what is common to them have variances, too, beside these blocks. What
+is known beside them, as the ammeter's noise is, is added.
 """
 
 from dataclasses import dataclass
@@ -18,23 +19,31 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from slipid.data.windows import Windows
-from slipid.identify.fit.likelihood import FLOOR, Batch
+from slipid.identify.fit.likelihood import FLOOR, Batch, ElectricNoise, voltage_std
 from slipid.model.robot import Robot
 
 
 class Components(eqx.Module):
-    """Covariance pieces B_c of one block, the variance each belongs to, and one beside them all."""
+    """Covariance pieces B_c of one block, the variance each belongs to, and what is known beside.
+
+    Known are variances of single residuals: rounding, and the ammeter's noise.
+    """
 
     base: Float[Array, "piece component m m"]
     which: Int[Array, "piece component"]
-    floor: float = eqx.field(static=True)
+    known: Float[Array, "piece m"]
 
     def covariance(
         self, log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"]
     ) -> Float[Array, "piece m m"]:
         """V of every piece."""
         v, m = jnp.exp(log_variance)[self.which], self.base.shape[-1]
-        return jnp.einsum("nc,ncij->nij", v, self.base) + self.floor * jnp.eye(m)
+        return jnp.einsum("nc,ncij->nij", v, self.base) + self.known[..., None] * jnp.eye(m)
+
+    @property
+    def single(self) -> Float[Array, "piece component m"]:
+        """How the variance of every single residual grows with each component."""
+        return jnp.diagonal(self.base, axis1=-2, axis2=-1)
 
 
 @dataclass(frozen=True)
@@ -120,8 +129,25 @@ def sessions_on(windows: Windows, floor: str) -> list[str]:
     return sorted({session for name, session in pairs if name == floor})
 
 
-def _components(block: str, base: np.ndarray, which: np.ndarray) -> Components:
-    return Components(jnp.asarray(base), jnp.asarray(which), FLOOR[block])
+def electric_noise(
+    blocks: dict[str, Components],
+    log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"],
+    resistance: Array,
+) -> ElectricNoise:
+    """What voltages are predicted with; nothing of meaning where none are logged."""
+    if "voltage" not in blocks:
+        return ElectricNoise(jnp.ones(()), jnp.ones((1, 1)), resistance)
+    current, log_v = blocks["current"], jnp.asarray(log_variance)
+    scatter = jnp.einsum("nc,nci->ni", jnp.exp(log_v)[current.which], current.single)
+    return ElectricNoise(voltage_std(log_v[-1]), scatter + FLOOR["current"], resistance)
+
+
+def _components(
+    block: str, base: np.ndarray, which: np.ndarray, more: np.ndarray | float = 0.0
+) -> Components:
+    """Covariance pieces with the rounding of the logs, and with known variances (piece, m)."""
+    known = np.full((base.shape[0], base.shape[-1]), FLOOR[block]) + more
+    return Components(jnp.asarray(base), jnp.asarray(which), jnp.asarray(known))
 
 
 def travel(windows: Windows | Batch, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -182,4 +208,4 @@ def _current_components(windows: Windows, robot: Robot, start: int) -> Component
     same = np.kron(np.ones((k, k)), np.eye(w))
     base = np.broadcast_to(np.stack([np.eye(k * w), same]), (n, 2, k * w, k * w)).copy()
     which = start + 2 * _floors(windows, robot) + np.arange(2)
-    return _components("current", base, which)
+    return _components("current", base, which, windows.current_var.reshape(n, -1))

@@ -97,8 +97,8 @@ def one_round(
     1 for coordinates that may move, 0 for those held.
     """
     target, log_v = problem.target, jnp.asarray(state.log_variance)
-    volt = problem.volt(log_v)
-    residual, _, felt = linear(target, jnp.asarray(state.z), volt)
+    electric = problem.electric(state.z, log_v)
+    residual, _, felt = linear(target, jnp.asarray(state.z), electric)
     seen = problem.seen(residual, log_v, keep, state.shared(len(keep)))
     held = Held(
         target=target,
@@ -107,33 +107,34 @@ def one_round(
         root=seen.whitening.root,
         tied=seen.tied,
         prior_std=target.prior_std(log_v),
-        volt=volt,
+        electric=electric,
         felt=felt,
-        slope=log_jacobian(target, state.z, volt, keep)[1],
+        slope=log_jacobian(target, state.z, electric, keep)[1],
     )
     z = np.asarray(levenberg(held, Steps(steps)))
-    residual, jacobian = problem.linear(z, volt)
-    whole = residual
-    effect = effects_of(seen.tied, seen.whitening.root["motion"], residual["motion"])
-    residual = less(target, residual, effect)
-    own = problem.own(z, log_v)
+    electric = problem.electric(z, log_v)
+    whole, jacobian, felt = linear(target, jnp.asarray(z), electric)
+    effect = effects_of(seen.tied, seen.whitening.root["motion"], whole["motion"])
+    residual, told = less(target, whole, effect), problem.through_voltage(z, log_v, felt)
     if scoring:
         spread = spread_of(target, jacobian, log_v, jnp.asarray(keep))
     for _ in range(scoring):
-        log_v = scored(target, residual, spread, log_v, jnp.asarray(keep), own)
-        before, own = own, problem.own(z, log_v)
-        for k, share in own.items():  # these residuals are in units of the noise just found
-            scale = jnp.sqrt(share / before[k])
-            residual = residual | {k: residual[k] * scale}
-            spread = spread | {k: spread[k] * scale[..., None] * scale[:, None]}
-    if own and scoring:  # the Jacobian by R changes by more than its scale
-        whole, jacobian = problem.linear(z, problem.volt(log_v))
-    told = np.asarray(problem.precision(jacobian, log_v, keep))
-    covariance = np.linalg.inv(told)
+        log_v = scored(target, residual, spread, log_v, jnp.asarray(keep), told)
+        before, told = told, problem.through_voltage(z, log_v, felt)
+        if before is not None and told is not None:  # in units of the noise just found
+            scale = jnp.sqrt(told.share / before.share)
+            residual = residual | {"voltage": told.residual}
+            both = scale[:, :, None] * scale[:, None, :]
+            spread = spread | {"voltage": spread["voltage"] * both}
+    if told is not None and scoring:  # the Jacobian by R changes by more than its scale
+        electric = problem.electric(z, log_v)
+        whole, jacobian = problem.linear(z, electric)
+    information = np.asarray(problem.precision(jacobian, log_v, keep))
+    covariance = np.linalg.inv(information)
     if scoring:
         weight, motion = seen.whitening.weight["motion"], (whole["motion"], jacobian["motion"])
         found = effect_variances(target, motion, weight, covariance, np.asarray(log_v))
-        found[target.pooled] = pooled(told, z, target, np.asarray(log_v))
+        found[target.pooled] = pooled(information, z, target, np.asarray(log_v))
         log_v = jnp.asarray(found)
     std = np.sqrt(np.diag(covariance))
     moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
@@ -142,7 +143,7 @@ def one_round(
         z=z,
         log_variance=np.asarray(log_v),
         round=state.round + 1,
-        loss=problem.loss(z, log_v, keep, problem.seen(whole, log_v, keep, effect)),
+        loss=problem.loss(z, log_v, keep, problem.seen(whole, log_v, keep, effect), electric),
         moved=moved,
         stage=state.stage,
         effect=np.asarray(effect),
@@ -162,7 +163,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
     usual = {"camera": 1.0, "pooled": 1.0} | dict.fromkeys(SHARED, 0.1)
     wide = [usual.get(c.kind, 3.0) for c in problem.noise.components]
     log_v = 2 * np.log(problem.noise.typical) + 2 * np.log(wide)
-    first = _motor_start(problem)
+    first = _motor_start(problem, keep)
     apart = problem.apart()
     best, z = np.full(len(labels), np.inf), first.copy()
     floors = np.asarray(problem.batch.surface)
@@ -174,7 +175,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
         for steps in (15, 6, 6):  # the damping has to grow from 1 to the size of the problem first
             state = one_round(apart, state, keep, mask, steps=steps, scoring=0)
             tell(state)
-        residual, _ = apart.linear(state.z, problem.volt(state.log_variance))
+        residual, _ = apart.linear(state.z, problem.electric(state.z, state.log_variance))
         every = np.ones(len(floors))
         weight = problem.whitening(residual, state.log_variance, every).weight["motion"]
         cost = -np.log(np.asarray(weight))  # as good as the loss, but for factor and constant
@@ -186,10 +187,10 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
     return State(z, log_v, 0, np.inf, np.inf, "joint")
 
 
-def _motor_start(problem: Problem) -> np.ndarray:
+def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
     """Search vector with R and C_e by regression of the voltage where it is logged."""
     z = problem.space.start.copy()
-    w = problem.windows
+    w = problem.windows.pieces(np.flatnonzero(keep > 0))
     if not (w.has_voltage and w.has_current):
         return z
     speed = (w.turn / w.dt[..., None]).ravel()
@@ -207,8 +208,8 @@ class Held(eqx.Module):
     """What is held while the structural numbers move from z.
 
     The mask is 1 for coordinates that may move; root whitens residuals, tied is what runs share
-    given these; prior_std is of every coordinate; volt is the std of the
-    voltage noise [V], felt the traction at z, which currents and voltages are predicted from, and
+    given these; prior_std is of every coordinate, electric what voltages are predicted with, felt
+    the traction at z, which currents and voltages are predicted from, and
     slope that of log |d residuals / d data| by the search vector.
     """
 
@@ -218,7 +219,7 @@ class Held(eqx.Module):
     root: Blocks
     tied: tuple[Tie, ...]
     prior_std: Float[Array, " free"]
-    volt: Float[Array, ""]
+    electric: lk.ElectricNoise
     felt: Float[Array, "piece window wheel"]
     slope: Float[Array, " free"]
 
@@ -264,7 +265,7 @@ def _stacked(y: Array, held: Held) -> Array:
     robot, given = space.tree(z), space.tree(jnp.where(space.electric, z, held.z))
     motion = lk.motion_residual(robot, target.batch, lk.predict(robot, target.batch))
     # currents and voltages given the motion of the round's start
-    electric = lk.electric_residuals(given, target.batch, held.felt, held.volt)
+    electric = lk.electric_residuals(given, target.batch, held.felt, held.electric)
     blocks = {"motion": motion} | electric
     white = {k: jnp.einsum("nij,nj->ni", held.root[k], r) for k, r in blocks.items()}
     parts = [freed(held.tied, w) if k == "motion" else w.ravel() for k, w in white.items()]

@@ -16,9 +16,18 @@ from slipid.data.runs import Runs
 from slipid.data.windows import Windows
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import variances
-from slipid.identify.fit.noise import POOLED, SHARED, noise
+from slipid.identify.fit.noise import POOLED, SHARED, electric_noise, noise
 from slipid.identify.fit.shared import Tie, freed, shared_effects, shared_of, ties
-from slipid.identify.fit.variances import VARIANCE_SPREAD, Blocks, Search, Target, Vector, Whitening
+from slipid.identify.fit.variances import (
+    VARIANCE_SPREAD,
+    Blocks,
+    Search,
+    Target,
+    ThroughVoltage,
+    Vector,
+    Whitening,
+    through_voltage,
+)
 from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
 
@@ -94,9 +103,9 @@ class Problem:
     def batch(self) -> lk.Batch:
         return self.target.batch
 
-    def linear(self, z: Vector, volt: Array) -> tuple[Blocks, Blocks]:
+    def linear(self, z: Vector, electric: lk.ElectricNoise) -> tuple[Blocks, Blocks]:
         """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
-        return linear(self.target, z, volt)[:2]
+        return linear(self.target, z, electric)[:2]
 
     def covariance(self, block: str, log_v: Vector) -> Array:
         """Covariance of the residuals of a block (piece, m, m)."""
@@ -112,7 +121,7 @@ class Problem:
         self, z: Vector, log_v: Vector, keep: Vector, alone: bool = False
     ) -> Float[np.ndarray, "free free"]:
         """Covariance of the search vector: inverse information, prior included."""
-        jacobian = self.linear(z, self.volt(log_v))[1]
+        jacobian = self.linear(z, self.electric(z, log_v))[1]
         told = variances.precision(self.target, jacobian, log_v, keep, alone)
         return np.linalg.inv(np.asarray(told))
 
@@ -124,30 +133,27 @@ class Problem:
         where = jnp.asarray(log_v), jnp.asarray(keep), jnp.asarray(effect)
         return _seen(self.target, residual, *where)
 
-    def loss(self, z: Vector, log_v: Vector, keep: Vector, seen: "Seen") -> float:
+    def loss(
+        self, z: Vector, log_v: Vector, keep: Vector, seen: "Seen", electric: lk.ElectricNoise
+    ) -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
         nll = float(seen.loss)
-        nll -= float(log_jacobian(self.target, z, self.volt(log_v), keep)[0])
+        nll -= float(log_jacobian(self.target, z, electric, keep)[0])
         prior_std = np.asarray(self.target.prior_std(log_v))
         pull = (np.asarray(z) - self.space.prior_mean) / prior_std
         nll += float(np.log(prior_std).sum())
         spread = (np.asarray(log_v) - np.asarray(self.target.typical)) / VARIANCE_SPREAD
         return nll + 0.5 * float(np.sum(pull**2)) + 0.5 * float(np.sum(spread**2))
 
-    def volt(self, log_v: Vector) -> Array:
-        """Std of the voltage noise [V], 1 where none is logged."""
-        if "voltage" not in self.noise.blocks:
-            return jnp.ones(())
-        return lk.voltage_std(jnp.asarray(log_v)[-1])
+    def electric(self, z: Vector, log_v: Vector) -> lk.ElectricNoise:
+        """What voltages are predicted with at this resistance and these variances."""
+        return _electric(self.target, z, log_v)
 
-    def own(self, z: Vector, log_v: Vector) -> Blocks:
-        """Part that the variance components have in the variance of residuals, where not all.
-
-        The ammeter's noise is known and lies in the voltage residual, too (`electric_residuals`).
-        """
+    def through_voltage(self, z: Vector, log_v: Vector, felt: Array) -> ThroughVoltage | None:
+        """What voltages tell of variances given the traction, None where none are logged."""
         if "voltage" not in self.noise.blocks:
-            return {}
-        return {"voltage": _share(self.space, self.batch, z, self.volt(log_v))}
+            return None
+        return through_voltage(self.target, z, log_v, felt)
 
 
 class Seen(NamedTuple):
@@ -193,14 +199,14 @@ def effects_of(tied: tuple[Tie, ...], root: Array, motion: Array) -> Array:
 
 
 @eqx.filter_jit
-def linear(target: Target, z: Vector, volt: Array) -> tuple[Blocks, Blocks, Array]:
+def linear(target: Target, z: Vector, electric: lk.ElectricNoise) -> tuple[Blocks, Blocks, Array]:
     """Residual blocks, their Jacobians, and the traction of every wheel's motor."""
 
     def blocks(x: Array) -> tuple[Blocks, tuple[Blocks, Array]]:
         robot = target.space.tree(x)
         p = lk.predict(robot, target.batch)
         motion = {"motion": lk.motion_residual(robot, target.batch, p)}
-        out = motion | lk.electric_residuals(robot, target.batch, p.felt, volt)
+        out = motion | lk.electric_residuals(robot, target.batch, p.felt, electric)
         return out, (out, p.felt)
 
     jacobian, (out, felt) = jax.jacfwd(blocks, has_aux=True)(z)
@@ -208,11 +214,19 @@ def linear(target: Target, z: Vector, volt: Array) -> tuple[Blocks, Blocks, Arra
 
 
 @eqx.filter_jit
-def log_jacobian(target: Target, z: Vector, volt: Array, keep: Vector) -> tuple[Array, Array]:
+def _electric(target: Target, z: Vector, log_v: Vector) -> lk.ElectricNoise:
+    return electric_noise(target.blocks, log_v, target.space.tree(z).motor.resistance)
+
+
+@eqx.filter_jit
+def log_jacobian(
+    target: Target, z: Vector, electric: lk.ElectricNoise, keep: Vector
+) -> tuple[Array, Array]:
     """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
 
     def total(x: Array) -> Array:
-        return jnp.asarray(keep) @ sum(lk.log_jacobians(target.space.tree(x), target.batch, volt))
+        both = lk.log_jacobians(target.space.tree(x), target.batch, electric)
+        return jnp.asarray(keep) @ sum(both)
 
     return jax.value_and_grad(total)(z)
 
@@ -221,11 +235,6 @@ def log_jacobian(target: Target, z: Vector, volt: Array, keep: Vector) -> tuple[
 def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
     """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
     return lk.with_slope(lambda x: lk.predict(space.tree(x), batch).twist, z)
-
-
-@eqx.filter_jit
-def _share(space: Space, batch: lk.Batch, z: Vector, volt: Array) -> Array:
-    return lk.voltage_share(space.tree(z), batch, volt)
 
 
 def still_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.noise import Components
+from slipid.identify.fit.noise import Components, electric_noise
 from slipid.identify.fit.shared import FloorShared, Tie, freed_slopes, shared_spread, ties
 from slipid.search_space import Space
 
@@ -70,6 +70,46 @@ class Whitening(NamedTuple):
     root: Blocks
     weight: Blocks
     loss: Array
+
+
+class ThroughVoltage(NamedTuple):
+    """What voltages tell of variances, each (piece, m).
+
+    Attributes:
+        residual: of the voltages, in units of their own noise.
+        share: part that this noise has in the variance of every residual.
+        slope: derivative of the log likelihood by the scatter of the true current.
+        information: expected, of that scatter.
+        steeper: by how much the loss bends more than expected in the log of the voltage noise,
+            where others explain the residuals.
+    """
+
+    residual: Array
+    share: Array
+    slope: Array
+    information: Array
+    steeper: Array
+
+
+@eqx.filter_jit
+def through_voltage(target: Target, z: Vector, log_v: Vector, felt: Array) -> ThroughVoltage:
+    """What voltages tell of variances given the traction of every wheel's motor."""
+    robot, b = target.space.tree(z), target.batch
+    noise = electric_noise(target.blocks, log_v, robot.motor.resistance)
+
+    def scaled(scatter: Array) -> tuple[Array, Array]:
+        at = lk.ElectricNoise(noise.voltage_std, scatter, noise.resistance)
+        return lk.electric_residuals(robot, b, felt, at)["voltage"], lk.spread(b, at)
+
+    # every residual depends on its own scatter only
+    (r, spread), (more, wider) = jax.jvp(scaled, (noise.scatter,), (jnp.ones_like(noise.scatter),))
+    variance, m, wider = noise.voltage_std**2, r.shape[1], wider / spread
+    weight = (DEGREES + m) / (DEGREES + jnp.sum(r**2, axis=1, keepdims=True) / variance)
+    moved = (more + r * wider) ** 2 / variance * (DEGREES + m) / (DEGREES + m + 2)
+    slope = -wider - weight * r * more / variance
+    share = 1 / spread**2
+    steeper = 0.5 * share * (2 * share - 1) * (weight * r**2 / variance - 1)
+    return ThroughVoltage(r, share, slope, moved + 2 * wider**2, steeper)
 
 
 @eqx.filter_jit
@@ -158,7 +198,12 @@ def spread_of(target: Target, jacobian: Blocks, log_v: Array, keep: Array) -> Bl
 
 @eqx.filter_jit
 def scored(
-    target: Target, residual: Blocks, spread: Blocks, log_v: Array, keep: Array, own: Blocks
+    target: Target,
+    residual: Blocks,
+    spread: Blocks,
+    log_v: Array,
+    keep: Array,
+    voltage: ThroughVoltage | None,
 ) -> Array:
     """One Fisher-scoring step of the restricted likelihood in the log variances of blocks.
 
@@ -170,7 +215,7 @@ def scored(
     _, weights, _ = whitening(target.blocks, residual, log_v, keep)
     score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])
     for k, r in residual.items():
-        noise, mine = target.blocks[k], own.get(k)
+        noise, mine = target.blocks[k], _own(k, voltage)
         root = inverse_root(noise.covariance(log_v))
         inverse = jnp.einsum("nji,njk->nik", root, root)
         base, which = _shared(noise.base, mine), noise.which
@@ -181,29 +226,49 @@ def scored(
         spent = jnp.einsum("nij,njk,nkl->nil", inverse, spread[k], inverse)
         lost = jnp.einsum("nij,ncij->nc", spent, base)
         slope = 0.5 * v * (fit + keep[:, None] * (lost - trace))
+        if voltage is not None and k == "current":
+            told = jnp.einsum("ni,nci->nc", voltage.slope, noise.single)
+            slope += v * keep[:, None] * told
         score = score.at[which].add(slope)
-        if mine is not None:  # where others explain the residual the loss bends more than expected
-            rest = jnp.clip(1 - 2 * jnp.mean(mine, axis=1), 0.0)
-            steeper = steeper.at[which].add(-rest[:, None] * slope)
+        if voltage is not None and k == "voltage":
+            steeper = steeper.at[which].add((keep * jnp.sum(voltage.steeper, axis=1))[:, None])
+        if voltage is not None and k == "current":  # a logarithm that falls bends the more
+            steeper = steeper.at[which].add(-slope)
     score -= (log_v - target.typical) / VARIANCE_SPREAD**2
-    info = information(target.blocks, log_v, keep, own)
+    info = information(target.blocks, log_v, keep, voltage)
     info += jnp.diag(jnp.maximum(steeper, 0.0))
     step = jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
     return log_v + jnp.where(target.scored, step, 0.0)
 
 
 @eqx.filter_jit
-def information(noises: Noises, log_v: Vector, keep: Vector, own: Blocks) -> Array:
+def information(
+    noises: Noises, log_v: Vector, keep: Vector, voltage: ThroughVoltage | None
+) -> Array:
     """Expected information of the log variances, prior included (variance, variance)."""
     info = jnp.eye(log_v.shape[0]) / VARIANCE_SPREAD**2
     for k, noise in noises.items():
-        base, which = _shared(noise.base, own.get(k)), noise.which
+        base, which = _shared(noise.base, _own(k, voltage)), noise.which
         root = inverse_root(noise.covariance(log_v))
         vb = jnp.einsum("nji,njk,nckl->ncil", root, root, base)
         v = jnp.exp(log_v)[which]
-        cross = 0.5 * jnp.einsum("ncij,ndji->ncd", vb, vb) * (v[:, :, None] * v[:, None, :])
+        cross = 0.5 * jnp.einsum("ncij,ndji->ncd", vb, vb)
+        cross *= v[:, :, None] * v[:, None, :]
         info = info.at[which[:, :, None], which[:, None, :]].add(keep[:, None, None] * cross)
-    return info
+    return info if voltage is None else info + _through(noises["current"], log_v, keep, voltage)
+
+
+def _through(noise: Components, log_v: Vector, keep: Vector, voltage: ThroughVoltage) -> Array:
+    """Expected information of the log variances that voltages have of the scatter of currents."""
+    grown = jnp.exp(log_v)[noise.which][..., None] * noise.single
+    cross = jnp.einsum("n,ni,nci,ndi->ncd", keep, voltage.information, grown, grown)
+    info = jnp.zeros((log_v.shape[0],) * 2)
+    return info.at[noise.which[:, :, None], noise.which[:, None, :]].add(cross)
+
+
+def _own(block: str, voltage: ThroughVoltage | None) -> Array | None:
+    """Part that the variances have in that of the residuals of a block, None for all."""
+    return voltage.share if voltage is not None and block == "voltage" else None
 
 
 def _shared(base: Array, own: Array | None) -> Array:

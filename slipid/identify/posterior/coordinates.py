@@ -48,7 +48,7 @@ class Coordinates:
     @staticmethod
     def of(problem: Problem, fitted: Fitted, part: str) -> "Coordinates":
         """Coordinates of a part; the floors that each touches are those of the fit's Jacobian."""
-        _, jacobian = problem.linear(fitted.z, problem.volt(fitted.log_variance))
+        _, jacobian = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
         blocks = {
             MOTION: ["motion"],
             ELECTRIC: [k for k in jacobian if k != "motion"],
@@ -85,7 +85,7 @@ class Anchor(eqx.Module):
         log_det: log determinant of each piece's noise.
         shared, tied: what runs share, given residuals whitened by root and scale.
         twist, twist_slope: at the fit, and by the search vector.
-        volt: std of the voltmeter's noise [V].
+        electric: what voltages are predicted with, but for the resistance.
     """
 
     batch: lk.Batch
@@ -98,7 +98,7 @@ class Anchor(eqx.Module):
     tied: tuple[Tie, ...]
     twist: Float[Array, "piece window 3"]
     twist_slope: Float[Array, "piece window 3 free"]
-    volt: Array
+    electric: lk.ElectricNoise
 
     @staticmethod
     def at(problem: Problem, fitted: Fitted) -> "Anchor":
@@ -108,8 +108,8 @@ class Anchor(eqx.Module):
         Gaussian: the information is then the one that Laplace's covariance has.
         """
         log_v, keep = jnp.asarray(fitted.log_variance), np.ones(len(problem.windows))
-        volt = problem.volt(log_v)
-        residual, _ = problem.linear(fitted.z, volt)
+        electric = problem.electric(fitted.z, log_v)
+        residual, _ = problem.linear(fitted.z, electric)
         effect = np.zeros((len(keep), 3))
         for _ in range(_TURNS):
             seen = problem.seen(residual, log_v, keep, effect)
@@ -132,7 +132,7 @@ class Anchor(eqx.Module):
             tied=seen.tied,
             twist=twist,
             twist_slope=slope,
-            volt=volt,
+            electric=electric,
         )
 
     def predict(self, robot: Robot, z: Array) -> lk.Predicted:
@@ -142,6 +142,11 @@ class Anchor(eqx.Module):
         p = lk.predict(robot, b, jax.lax.stop_gradient(start))
         arrived = jnp.all(jnp.isfinite(p.twist))
         return jax.lax.cond(arrived, lambda: p, lambda: lk.predict(robot, b))
+
+    def noise(self, robot: Robot) -> lk.ElectricNoise:
+        """What voltages are predicted with at the resistance of a robot."""
+        held = self.electric
+        return lk.ElectricNoise(held.voltage_std, held.scatter, robot.motor.resistance)
 
     def white(self, k: str, r: Float[Array, "piece m"]) -> Float[Array, "piece m"]:
         """Residuals of a block, whitened and weighed."""

@@ -120,7 +120,7 @@ class Density:
         """Terms of one vector."""
         seen, count, b = self._residuals(anchor, x, held), len(self.floors), anchor.batch
         out = jnp.zeros(count + 1)
-        camera, spread = lk.log_jacobians(seen.robot, b, anchor.volt)
+        camera, spread = lk.log_jacobians(seen.robot, b, anchor.noise(seen.robot))
         for k, r in seen.residuals.items():
             white, more = anchor.white(k, r), jnp.zeros(len(r))
             if k == "motion":
@@ -152,7 +152,7 @@ class Density:
     def _pieces(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
         left, robot = self.left(anchor, x, held)
         out = {k: anchor.log_student(k, r) for k, r in left.items()}
-        camera, spread = lk.log_jacobians(robot, anchor.batch, anchor.volt)
+        camera, spread = lk.log_jacobians(robot, anchor.batch, anchor.noise(robot))
         if "motion" in out:
             out["motion"] += camera
         if "voltage" in out:
@@ -183,13 +183,13 @@ class Density:
         if self.part == ELECTRIC:
             assert held is not None, "what the electric part holds of the motion"
             robot = self.problem.space.tree(held.z.at[at.structure].set(x))
-            return _Seen(lk.electric_residuals(robot, b, held.felt, anchor.volt), robot)
+            return _Seen(lk.electric_residuals(robot, b, held.felt, anchor.noise(robot)), robot)
         z = self.full(anchor, x)
         robot = self.problem.space.tree(z)
         p = anchor.predict(robot, z)
         out = {"motion": lk.motion_residual(robot, b, p)}
         if self.part == EVERYTHING:
-            out |= lk.electric_residuals(robot, b, p.felt, anchor.volt)
+            out |= lk.electric_residuals(robot, b, p.felt, anchor.noise(robot))
         # or the root finder is computed again for every consumer
         return _Seen(jax.lax.optimization_barrier(out), robot)
 

@@ -18,6 +18,7 @@ from slipid.identify.posterior.blocks import Chain, Plan
 from slipid.identify.posterior.coordinates import Fitted
 from slipid.identify.result import Fit
 from slipid.identify.verdicts import estimates as verdicts
+from slipid.identify.verdicts.unidentified import members
 from slipid.support.content import Content
 
 
@@ -101,13 +102,15 @@ def autocorrelation_time(chain: Chain) -> Float[np.ndarray, " size"]:
     return np.asarray(np.maximum(sums[window, np.arange(sums.shape[1])], 1e-3))
 
 
-def estimates(fit: Fit, found: Posterior) -> dict[str, verdicts.Estimate]:
-    """Every number with mean, interval and verdict from the draws.
+def estimates(
+    fit: Fit, draws: Float[np.ndarray, "ensemble draw free"]
+) -> dict[str, verdicts.Estimate]:
+    """Every number with mean, interval and verdict from the draws of a posterior.
 
     Means are taken in the search space, so that shares sum to one and positive numbers have their
-    geometric mean.
+    geometric mean. Directions that the fit found open stay so.
     """
-    flat = found.z.reshape(-1, fit.space.size)
+    flat, open_ = draws.reshape(-1, fit.space.size), members(fit.flat)
     out = dict(fit.parameters)
     for e in fit.space.free:
         at, d, old = fit.space.place[e.path], e.declaration, fit.parameters[e.path]
@@ -118,9 +121,9 @@ def estimates(fit: Fit, found: Posterior) -> dict[str, verdicts.Estimate]:
         ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
         pairs = tuple(zip(low.tolist(), high.tolist(), strict=True))
         unsaid = e.path in verdicts.NEEDS_VOLTAGE and not fit.channels.voltage
-        verdict = verdicts.by_ratio(ratio, verdicts.from_zero(d, z.std(axis=0)))
-        if unsaid or old.verdict == "at_bound":
-            verdict = old.verdict
+        forced = old.verdict if unsaid or old.verdict == "at_bound" else None
+        from_zero = verdicts.from_zero(d, z.std(axis=0))
+        verdict, provenance = verdicts.said(ratio, from_zero, forced, e.path in open_)
         pull = (z.mean(axis=0) - fit.space.prior_mean[at]) / fit.space.prior_std[at]
         out[e.path] = replace(
             old,
@@ -129,7 +132,7 @@ def estimates(fit: Fit, found: Posterior) -> dict[str, verdicts.Estimate]:
             interval90=pairs[0] if len(pairs) == 1 else pairs,
             ratio=ratio,
             verdict=verdict,
-            provenance=verdicts.provenance(verdict, ratio),
+            provenance=provenance,
             pull=float(pull[np.argmax(np.abs(pull))]),
             source="posterior",
         )

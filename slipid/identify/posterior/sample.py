@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.identify.fit.hierarchy import effect_information
-from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.problem import Problem, linear
 from slipid.identify.fit.variances import VARIANCE_SPREAD, information
 from slipid.identify.posterior import diagnosis, ensemble
 from slipid.identify.posterior.blocks import Block, Chain, Plan, Record, Target
@@ -85,10 +85,12 @@ def drawn_variances(
     They hardly depend on the numbers of the model, which the chains hold them for.
     """
     log_v, keep = fitted.log_variance, np.ones(len(problem.windows))
-    residual, jacobian = problem.linear(fitted.z, problem.volt(log_v))
+    electric = problem.electric(fitted.z, log_v)
+    residual, jacobian, felt = linear(problem.target, fitted.z, electric)
+    through = problem.through_voltage(fitted.z, log_v, felt)
     weight = problem.whitening(residual, log_v, keep).weight["motion"]
     motion = residual["motion"], jacobian["motion"]
-    told = np.array(information(problem.noise.blocks, log_v, keep, problem.own(fitted.z, log_v)))
+    told = np.array(information(problem.noise.blocks, log_v, keep, through))
     of_blocks = np.asarray(problem.target.scored)
     told *= of_blocks[:, None] & of_blocks
     told += effect_information(problem.target, motion, weight, fitted.covariance, log_v)

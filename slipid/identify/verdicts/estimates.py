@@ -1,9 +1,9 @@
 """What may be said of every number and of ratios of them: interval and verdict.
 
-Before a fit from the information expected at the start values, after it from the Laplace posterior.
+Before a fit from the information that is expected, after it from the Laplace posterior.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
@@ -92,12 +92,20 @@ class Estimate:
 
 
 def estimates(
-    space: Space, choices: Sequence[Choice], z: Search, covariance: Square, has_voltage: bool
+    space: Space,
+    choices: Sequence[Choice],
+    z: Search,
+    covariance: Square,
+    has_voltage: bool,
+    flat: Collection[str],
 ) -> tuple[Estimate, ...]:
-    """Every declared number with its interval and verdict, in order of declaration."""
+    """Every declared number with its interval and verdict, in order of declaration.
+
+    `flat` are the paths of the numbers that move along directions which the data leave open.
+    """
     tree = space.tree(jnp.asarray(z))
     return tuple(
-        _free(space, e, tree, z, covariance, has_voltage)
+        _free(space, e, tree, z, covariance, has_voltage, e.path in flat)
         if e.path in space.place
         else _fixed(e, tree, choices)
         for e in space.all
@@ -127,7 +135,13 @@ def _fixed(entry: Entry, tree: Any, choices: Sequence[Choice]) -> Estimate:
 
 
 def _free(
-    space: Space, entry: Entry, tree: Any, z: np.ndarray, covariance: np.ndarray, has_voltage: bool
+    space: Space,
+    entry: Entry,
+    tree: Any,
+    z: np.ndarray,
+    covariance: np.ndarray,
+    has_voltage: bool,
+    is_flat: bool,
 ) -> Estimate:
     at, d = space.place[entry.path], entry.declaration
     mean, block = np.asarray(z)[at], covariance[at, at]
@@ -150,12 +164,12 @@ def _free(
     ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
     pull = (mean - prior_mean) / prior_std
     pairs = tuple(zip(low.tolist(), high.tolist(), strict=True))
+    forced = None
     if entry.path in NEEDS_VOLTAGE and not has_voltage:
-        verdict = "not_identified"
+        forced = "not_identified"
     elif _at_bound(d, value, pull, prior_std):
-        verdict = "at_bound"
-    else:
-        verdict = by_ratio(ratio, from_zero(d, std_z))
+        forced = "at_bound"
+    verdict, provenance = said(ratio, from_zero(d, std_z), forced, is_flat)
     return Estimate(
         path=entry.path,
         unit=d.unit,
@@ -165,7 +179,7 @@ def _free(
         std=plain(std),
         interval90=pairs[0] if len(pairs) == 1 else pairs,
         verdict=verdict,
-        provenance=provenance(verdict, ratio),
+        provenance=provenance,
         ratio=ratio,
         pull=float(pull[np.argmax(np.abs(pull))]),
         prior_mean=plain(center),
@@ -195,10 +209,24 @@ def by_ratio(ratio: float, from_zero: float = np.inf) -> str:
     return "weak" if ratio < WEAK else "not_identified"
 
 
-def provenance(verdict: str, ratio: float) -> str:
-    """Below 1/sqrt(2) the data hold more information than the prior."""
-    held = verdict != "not_identified" and ratio < np.sqrt(0.5)
-    return "measured" if held else "borrowed"
+def said(ratio: float, from_zero: float, forced: str | None, is_flat: bool) -> tuple[str, str]:
+    """Verdict and provenance of a number, after a fit as after sampling.
+
+    Below 1/sqrt(2) the data hold more information than the prior. A number that moves along a
+    direction which the data leave open is known as part of a ratio at most: however narrow its
+    interval, another number's prior decides on its scale.
+
+    Args:
+        ratio: std(posterior) / std(prior).
+        from_zero: stds by which a positive number is from 0.
+        forced: verdict that no interval changes.
+        is_flat: whether it moves along an open direction.
+    """
+    verdict = forced or by_ratio(ratio, from_zero)
+    if is_flat and verdict == "identified":
+        verdict = "weak"
+    held = verdict != "not_identified" and ratio < np.sqrt(0.5) and not is_flat
+    return verdict, "measured" if held else "borrowed"
 
 
 def derived(space: Space, z: Search, covariance: Square, has_voltage: bool) -> tuple[Estimate, ...]:
@@ -224,8 +252,8 @@ def _quotient(
     std = float(np.sqrt(c @ covariance @ c))
     prior_std = float(np.sqrt(np.sum((c * space.prior_std) ** 2)))
     value, ratio = float(np.exp(log_value)), std / prior_std
-    unknown = over == NEEDS_VOLTAGE[0] and not has_voltage
-    verdict = "not_identified" if unknown else by_ratio(ratio, 1 / std)
+    forced = "not_identified" if over == NEEDS_VOLTAGE[0] and not has_voltage else None
+    verdict, provenance = said(ratio, 1 / std, forced, is_flat=False)
     low, high = (float(np.exp(log_value + k * std)) for k in (-Z95, Z95))
     return Estimate(
         path=f"{over}/{wanted.under}",
@@ -235,7 +263,7 @@ def _quotient(
         std=value * std,
         interval90=(low, high),
         verdict=verdict,
-        provenance=provenance(verdict, ratio),
+        provenance=provenance,
         ratio=ratio,
         pull=float((log_value - log_prior) / prior_std),
         prior_mean=float(np.exp(log_prior)),

@@ -160,17 +160,18 @@ class _Walk:
         self.std = float(np.sqrt(covariance[at, at]))
         self.start, self.state = float(optimum.state.z[at]), optimum.state
         self.count, self.settled = 0, True
+        self.electric = problem.electric(optimum.state.z, optimum.state.log_variance)
         self.lowest = self.loss(optimum.state)
 
     def loss(self, state: State) -> float:
         """Minus log posterior at fixed noise, of the motion alone where that is the question."""
         problem, log_v = self.problem, state.log_variance
-        blocks, _ = problem.linear(jnp.asarray(state.z), problem.volt(log_v))
+        blocks, _ = problem.linear(jnp.asarray(state.z), self.electric)
         if self.of_motion:
             blocks = {"motion": blocks["motion"]}
         keep = np.ones(len(problem.windows))
         seen = problem.seen(blocks, log_v, keep, state.shared(len(keep)))
-        return problem.loss(state.z, log_v, keep, seen)
+        return problem.loss(state.z, log_v, keep, seen, self.electric)
 
     def side(self, sign: float) -> list[tuple[float, float]]:
         """Points from the estimate outward until the data object or the prior ends."""

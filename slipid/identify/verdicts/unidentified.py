@@ -121,6 +121,11 @@ def flat_directions(
     return tuple(out)
 
 
+def members(found: Iterable[Flat]) -> frozenset[str]:
+    """Paths of the numbers that move along flat directions."""
+    return frozenset(path for f in found for path in f.paths)
+
+
 def _known(entry: Entry) -> bool:
     return entry.session is not None or entry.declaration.deviation
 

@@ -149,6 +149,27 @@ def test_gains_that_are_handed_over_are_stable(robots, cases):
     assert np.any(found > HAND)
 
 
+@pytest.mark.parametrize(
+    ("gain", "scatter", "verdict"),
+    [
+        (4.0, 2.0, "better than by hand"),
+        (0.3, 20.0, "no better than by hand"),
+        (-4.0, 2.0, "worse than by hand"),
+    ],
+)
+def test_gains_are_better_only_by_more_than_chance(gain, scatter, verdict):
+    """Worlds differ far more from each other than gains do: the error is of paired differences."""
+    rng = np.random.default_rng(1)
+    hand = rng.uniform(20.0, 200.0, 48)
+    tuned = hand - gain - scatter * rng.normal(size=48)
+    gained, error = app.improvement({"hand": hand, "tuned": tuned})
+    assert app.verdict(gained, error) == verdict
+    by = [float(combined(jnp.asarray(x))) for x in (hand, tuned)]
+    assert gained == pytest.approx(by[0] - by[1])
+    # as large as that of twice the mean would be, roughly: the worst tenth has a larger one
+    assert scatter / 48**0.5 < error < 6 * scatter / 48**0.5
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_what_is_written_names_every_gain(robots, cases):
@@ -158,6 +179,8 @@ def test_what_is_written_names_every_gain(robots, cases):
     assert tuple(content["gains"]) == GAINS
     assert set(content["gains"]["yaw"]) == {"value", "unit", "spread"}
     assert content["loss"].keys() == {"hand", "tuned"}
+    assert content["improvement"].keys() == {"value", "se"}
+    assert content["verdict"].endswith("than by hand")
     low, high = content["loss_interval90"]["tuned"]
     assert low <= content["loss_mean"]["tuned"] <= high
     margin = content["stability_margin"]

@@ -17,7 +17,7 @@ from slipid.cli.demo import packaged_config
 from slipid.cli.main import app
 from slipid.data.runs import collect
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.folds import folds_of
+from slipid.identify.compare.folds import folds_of, nested
 from slipid.identify.compare.noisy_rung import slopes, with_noise
 from slipid.identify.compare.predictive import Contact, by_name, log_student
 from slipid.identify.compare.ranking import mean_error, ranking
@@ -283,6 +283,21 @@ def test_folds_that_are_left_out_together_leave_some_of_every_floor(logs):
     assert set(folds_of(even, "sectors", 2)) == {-1}
     with pytest.raises(ValueError, match="1 parts; expected 2 or more"):
         folds_of(data, "sectors", 1)
+
+
+def test_a_rung_that_tunes_itself_leaves_out_gaps_as_wide_as_the_one_it_is_asked_about(logs):
+    data = collect(logs)
+    sector = folds_of(data, "sectors")
+    inner = nested(data, "sectors", np.flatnonzero(sector == 0))
+    assert set(inner[(sector == 1) | (sector == 5)]) == {-1}
+    np.testing.assert_array_equal(
+        inner[(sector > 1) & (sector < 5)], sector[(sector > 1) & (sector < 5)]
+    )
+    every_second = nested(data, "sectors", np.flatnonzero(sector % 2 == 0))
+    np.testing.assert_array_equal(every_second, sector)
+    for question in ("speeds", "random"):
+        mine = folds_of(data, question)
+        np.testing.assert_array_equal(nested(data, question, np.flatnonzero(mine == 0)), mine)
 
 
 def test_a_fold_is_kept_whole_and_only_for_the_job_it_is_of(tmp_path):

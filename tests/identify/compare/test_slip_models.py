@@ -126,6 +126,32 @@ def test_the_lookup_learns_a_smooth_series_of_each_floor_and_load():
     assert np.abs(gap).mean() < 0.05 * np.abs(plain).mean()
 
 
+def test_the_lookup_is_tuned_on_runs_left_out_as_they_will_be():
+    """Where a sector is left out it has to be held down harder than where it interpolates."""
+    w = made(ROBOT, runs=96, count=2, seed=4)
+    sector = w.run * 6 // 96
+    error, size = {}, {}
+    for name, together in {"sectors": sector, "at random": None}.items():
+        rung = replace(ALL["heading_lookup"], together=together)
+        found = [rung.fit(w.pieces(np.flatnonzero(sector != k)), ROBOT) for k in range(6)]
+        size[name] = sum(np.abs(v[1:]).sum() for rung in found for v in rung.state.values())
+        error[name] = 0.0
+        for k, fitted in enumerate(found):
+            other = w.pieces(np.flatnonzero(sector == k))
+            gap = replay.follow(ROBOT, other, fitted.increments(other, ROBOT)).gap
+            error[name] += np.hypot(*gap.T[:2]).mean()
+    assert error["sectors"] < 0.9 * error["at random"]
+    assert size["sectors"] < 0.6 * size["at random"]
+
+
+def test_a_lookup_that_has_nothing_to_leave_out_is_tuned_on_random_runs():
+    w = made(ROBOT, runs=48, count=2, seed=4)
+    one = replace(ALL["heading_lookup"], together=np.where(w.run < 20, 3, -1))
+    plain = ALL["heading_lookup"].fit(w, ROBOT)
+    for key, series in one.fit(w, ROBOT).state.items():
+        np.testing.assert_array_equal(series, plain.state[key])
+
+
 def test_the_lookup_lends_a_load_it_never_saw_the_series_of_another():
     state = {"firm@as_built": np.ones((13, 3)), "soft@as_built": np.zeros((13, 3))}
     rung = replace(ALL["heading_lookup"], state=state)

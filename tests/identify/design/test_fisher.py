@@ -78,7 +78,7 @@ def test_is_what_the_likelihood_says_of_the_same_windows(current, voltage):
     this = planner(current, voltage)
     problem = Problem(windows(DRIVES, current, voltage), robot(), CHOICES)
     log_v = jnp.asarray(2 * np.log(problem.noise.typical))
-    blocks, jacobian = problem.linear(jnp.asarray(this.z), problem.volt(log_v))
+    blocks, jacobian = problem.linear(jnp.asarray(this.z), problem.electric(this.z, log_v))
     assert all(np.abs(r).max() < 1e-9 for r in blocks.values())  # logged as predicted
     std = this.space.prior_std
     for some in ([0], [2], [1, 3], [0, 1, 2, 3]):
@@ -100,7 +100,7 @@ def test_runs_of_a_session_cannot_average_away_what_they_share():
     w = windows([DRIVES[k] for k in runs], False, False)
     problem = Problem(w, robot(), CHOICES)
     log_v = jnp.asarray(2 * np.log(problem.noise.typical))
-    _, jacobian = problem.linear(jnp.asarray(this.z), problem.volt(log_v))
+    _, jacobian = problem.linear(jnp.asarray(this.z), problem.electric(this.z, log_v))
     j = np.asarray(jacobian["motion"]).reshape(-1, this.space.size)
     effect = np.asarray(of_noise.effects(w, robot()))
     on = np.array([DRIVES[k].surface == "firm" for k in runs])[:, None, None]

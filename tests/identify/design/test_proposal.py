@@ -42,7 +42,7 @@ def folder(tmp_path_factory):
     ]
     problem = Problem(windows(data, 0.04, lag=0.056), blank(DRIVES), choices)
     z, log_v = problem.space.vector(robot), 2 * np.log(problem.noise.typical)
-    _, jacobian = problem.linear(jnp.asarray(z), problem.volt(log_v))
+    _, jacobian = problem.linear(jnp.asarray(z), problem.electric(z, log_v))
     info = problem.precision(jacobian, jnp.asarray(log_v), jnp.ones(len(problem.windows)))
     state = State(z, log_v, 7, -1.5, 0.01, "joint")
     end = Optimum(state, np.linalg.inv(np.asarray(info)), True, "settled", (0.0,))

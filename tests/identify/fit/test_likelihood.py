@@ -13,12 +13,11 @@ from scipy.stats import multivariate_t
 
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
-from slipid.identify.fit import variances
-from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.problem import Problem, linear
 from slipid.identify.fit.variances import DEGREES, inverse_root, scored
 from slipid.identify.slip_curves import current_trend
 from slipid.search_space import Choice
-from tests.helpers.made_windows import made, residuals, robot
+from tests.helpers.made_windows import electric_noise, made, residuals, robot
 
 EVERYTHING = [Choice("*", free=True)]
 NOTHING = Choice("*", free=False)
@@ -54,7 +53,7 @@ def everything(request, truth):
 @pytest.mark.slow
 def test_without_noise_the_truth_leaves_no_residual(truth, signed):
     b = lk.batch(made(truth, signed=signed), truth)
-    blocks = jax.jit(residuals)(truth, b, 1.0)
+    blocks = jax.jit(residuals)(truth, b, electric_noise(b, 1.0))
     assert sorted(blocks) == ["current", "motion", "voltage"]
     for name, r in blocks.items():
         assert r.shape == (24, 6)
@@ -64,9 +63,11 @@ def test_without_noise_the_truth_leaves_no_residual(truth, signed):
 @pytest.mark.slow
 def test_channels_that_were_not_logged_have_no_block(truth):
     w = made(truth, voltage=False)
-    assert sorted(residuals(truth, lk.batch(w, truth), 1.0)) == ["current", "motion"]
+    b = lk.batch(w, truth)
+    assert sorted(residuals(truth, b, electric_noise(b, 1.0))) == ["current", "motion"]
     w = replace(w, has_current=False)
-    assert sorted(residuals(truth, lk.batch(w, truth), 1.0)) == ["motion"]
+    b = lk.batch(w, truth)
+    assert sorted(residuals(truth, b, electric_noise(b, 1.0))) == ["motion"]
     assert list(of_noise.noise(w, truth).blocks) == ["motion"]
 
 
@@ -83,7 +84,7 @@ def test_the_frame_of_the_world_does_not_matter(truth):
 
 @pytest.mark.slow
 def test_jacobians_are_those_of_finite_differences(everything):
-    z, volt = jnp.asarray(everything.space.start), jnp.asarray(0.05)
+    z, volt = jnp.asarray(everything.space.start), electric_noise(everything.batch, 0.05)
     _, jacobian = everything.linear(z, volt)
     for k, name in enumerate(everything.space.names):
         h = 1e-5
@@ -99,32 +100,33 @@ def test_jacobians_are_those_of_finite_differences(everything):
 
 @pytest.mark.slow
 def test_every_number_but_the_known_silent_ones_moves_the_residuals(everything):
-    _, jacobian = everything.linear(everything.space.start, jnp.asarray(0.05))
+    _, jacobian = everything.linear(everything.space.start, electric_noise(everything.batch, 0.05))
     size = sum(np.abs(np.asarray(j)).sum(axis=(0, 1)) for j in jacobian.values())
     silent = {n for n, s in zip(everything.space.names, size, strict=True) if s < 1e-9}
     # inertia and inductance act in transients, which windows average out
     assert silent == {"motor.inductance", "motor.rotor_inertia", "robot.yaw_inertia"}
 
 
-@pytest.mark.slow
-def test_the_noise_of_the_current_is_carried_into_the_voltage(truth):
-    w = made(truth, std=NOISE)
-    b = lk.batch(w, truth)
-    felt = lk.predict(truth, b).felt
-    plain = lk.electric_residuals(truth, replace_var(b, 0.0), felt, 0.1)["voltage"]
-    wide = lk.electric_residuals(truth, replace_var(b, 0.04), felt, 0.1)["voltage"]
-    expected = np.asarray(plain) / np.sqrt(1 + 5.5**2 * 0.04 / 0.1**2)
-    np.testing.assert_allclose(wide, expected, rtol=1e-10)
+@pytest.mark.parametrize("signed", [True, False])
+def test_voltages_are_predicted_from_what_is_expected_of_the_true_current(truth, signed):
+    """A normal around the predicted current, seen with the ammeter's noise."""
+    w = made(truth, std=NOISE, signed=signed)
+    truth = eqx.tree_at(lambda r: r.motor.current_offset, truth, jnp.asarray(0.02))
+    b, felt = lk.batch(w, truth), lk.predict(truth, lk.batch(w, truth)).felt
+    sigma, s, volt = 0.2, 0.05, 0.1
+    b = replace(b, current_var=jnp.full_like(b.current, sigma**2))
+    found = lk.electric_residuals(truth, b, felt, electric_noise(b, volt, s))["voltage"]
+    speed, m = w.turn / w.dt[..., None], np.asarray(lk.predicted_current(truth, b, felt))
+    amps = (m / s**2 + w.current / sigma**2) / (1 / s**2 + 1 / sigma**2) - 0.02
+    way = 1.0 if signed else np.tanh(speed / 0.2)
+    left = 1 / (1 / s**2 + 1 / sigma**2) * (5.5 * way) ** 2
+    gap = np.asarray(truth.motor.voltage(jnp.asarray(amps * way), jnp.asarray(speed))) - w.voltage
+    expected = gap / np.sqrt(1 + left / volt**2)
+    np.testing.assert_allclose(found, expected.reshape(24, 6), rtol=1e-9)
 
 
 def only_piece(b, k):
     return jax.tree.map(lambda x: x[k : k + 1] if x.ndim else x, b)
-
-
-def replace_var(b, value):
-    return jax.tree_util.tree_map(
-        lambda x: x, replace(b, current_var=jnp.full_like(b.dt[..., None] * b.turn, value))
-    )
 
 
 @pytest.mark.slow
@@ -138,7 +140,7 @@ def test_log_jacobian_is_the_determinant_of_residuals_by_data(truth):
     w = made(truth, runs=6, std=NOISE)
     b = lk.batch(w, bent)
     b = replace(b, current_var=jnp.full_like(b.current, 0.02))
-    found = sum(lk.log_jacobians(bent, b, 0.05))
+    found = sum(lk.log_jacobians(bent, b, electric_noise(b, 0.05)))
     for k in range(len(w)):
         pose, one = jnp.asarray(w.pose[k]), only_piece(b, k)
 
@@ -148,7 +150,8 @@ def test_log_jacobian_is_the_determinant_of_residuals_by_data(truth):
         def of_volts(volt, one=one):
             still = jnp.zeros_like(one.current)
             b = replace(one, voltage=volt[None])
-            return lk.electric_residuals(bent, b, still, 0.05)["voltage"].ravel()
+            noise = electric_noise(b, 0.05)
+            return lk.electric_residuals(bent, b, still, noise)["voltage"].ravel()
 
         expected = 0.0
         for residual, data in ((of_poses, pose[1:]), (of_volts, b.voltage[k])):
@@ -238,7 +241,7 @@ def test_inverse_root_is_numpy_s(size):
 def test_the_loss_is_a_student_t_per_run(everything):
     """Up to a constant, against scipy's multivariate t."""
     z = everything.space.start
-    blocks = everything.linear(z, jnp.asarray(0.05))[0]
+    blocks = everything.linear(z, electric_noise(everything.batch, 0.05))[0]
     typical = 2 * np.log(everything.noise.typical)
     keep = np.ones(24)
     keep[3:7] = 0.0
@@ -259,7 +262,7 @@ def test_the_loss_is_a_student_t_per_run(everything):
 
 
 def test_whitened_residuals_are_weighted_mahalanobis_distances(everything):
-    blocks = everything.linear(everything.space.start, jnp.asarray(0.05))[0]
+    blocks = everything.linear(everything.space.start, electric_noise(everything.batch, 0.05))[0]
     log_v = 2 * np.log(everything.noise.typical)
     root, weight, _ = everything.whitening(blocks, log_v, np.ones(24))
     for k, r in blocks.items():
@@ -286,7 +289,7 @@ def test_the_information_without_currents_is_that_of_the_motion_and_the_prior(tr
     w = replace(made(truth, std=NOISE), has_current=False, has_voltage=False)
     problem = Problem(w, truth, EVERYTHING)
     log_v = 2 * np.log(problem.noise.typical)
-    _, jacobian = problem.linear(problem.space.start, jnp.asarray(0.05))
+    _, jacobian = problem.linear(problem.space.start, problem.electric(problem.space.start, log_v))
     ours = problem.precision(jacobian, log_v, np.ones(24))
     theirs = information(problem, jacobian, log_v, jacobian)
     np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-8 * np.abs(theirs).max())
@@ -298,7 +301,7 @@ def test_a_cut_keeps_what_motion_alone_says_of_the_motion():
     choices = [Choice("camera.*", free=True), Choice("motor.inductance", free=False)]
     problem = Problem(made(truth, std=NOISE), truth, choices)
     log_v = 2 * np.log(problem.noise.typical)
-    _, jacobian = problem.linear(problem.space.start, jnp.asarray(0.05))
+    _, jacobian = problem.linear(problem.space.start, problem.electric(problem.space.start, log_v))
     cut = np.linalg.inv(np.asarray(problem.precision(jacobian, log_v, np.ones(24))))
     alone = np.linalg.inv(information(problem, jacobian, log_v, ["motion"]))
     m, e = ~problem.space.electric, problem.space.electric
@@ -324,9 +327,11 @@ def test_runs_that_are_left_out_change_nothing(truth):
     for pose in (w.pose, spoilt):
         problem = Problem(replace(w, pose=pose), truth, [])
         log_v = 2 * np.log(problem.noise.typical)
-        blocks, jacobian = problem.linear(problem.space.start, jnp.asarray(0.05))
+        blocks, jacobian = problem.linear(
+            problem.space.start, problem.electric(problem.space.start, log_v)
+        )
         info = problem.precision(jacobian, log_v, keep)
-        step = scored(problem.target, blocks, jacobian, jnp.asarray(log_v), jnp.asarray(keep), {})
+        step = scored(problem.target, blocks, jacobian, jnp.asarray(log_v), jnp.asarray(keep), None)
         loss = problem.whitening(blocks, log_v, keep)[2]
         results.append((np.asarray(info), np.asarray(step), float(loss)))
     for one, two in zip(*results, strict=True):
@@ -367,7 +372,7 @@ def alternate(problem, jacobian, y, rounds=60):
         before = log_v
         log_v = np.asarray(
             scored(
-                problem.target, r, {"motion": jnp.asarray(jacobian)}, jnp.asarray(log_v), keep, {}
+                problem.target, r, {"motion": jnp.asarray(jacobian)}, jnp.asarray(log_v), keep, None
             )
         )
     assert np.abs(log_v - before).max() < 1e-6
@@ -441,31 +446,33 @@ def fitted(problem, jacobian, y, std):
     return jacobian @ np.linalg.solve(info, np.einsum("nip,nij,nj->p", jacobian, v, y))
 
 
-# voltage noise: the ammeter's noise lies in the same residuals
+# electric noise: voltages tell of the scatter of currents, too
 
 
-def test_the_score_of_the_voltage_noise_is_the_slope_of_the_loss(truth):
-    w = made(truth, runs=48, std={**NOISE, "voltage.window": 0.05})
-    w = replace(w, current_var=np.random.default_rng(0).uniform(0, 2e-4, w.current_var.shape))
-    problem = Problem(w, truth, [NOTHING, Choice("motor.resistance", free=True)])
-    z, keep = problem.space.start, np.ones(len(w))
-    typical = jnp.asarray(2 * np.log(problem.noise.typical))
-    log_v = np.array(typical)
+@pytest.mark.parametrize("ammeter", [2e-4, 5e-3])
+def test_scoring_steps_end_where_the_loss_is_level_in_electric_noise(truth, ammeter):
+    w = made(truth, runs=48, std=NOISE)
+    noisy = np.random.default_rng(0).uniform(0, ammeter, w.current_var.shape)
+    problem = Problem(
+        replace(w, current_var=noisy), truth, [NOTHING, Choice("motor.inductance", free=True)]
+    )
+    z, keep, target = problem.space.start, jnp.ones(len(w)), problem.target
+    log_v = np.asarray(target.typical)
+    blocks, jacobian, felt = linear(target, z, problem.electric(z, log_v))
+    for _ in range(60):
+        told = problem.through_voltage(z, log_v, felt)
+        blocks = blocks | {"voltage": told.residual}
+        log_v = np.asarray(scored(target, blocks, jacobian, jnp.asarray(log_v), keep, told))
 
-    def loss(last):
-        at = np.array([*log_v[:-1], last])
-        blocks, _ = problem.linear(z, problem.volt(at))
-        return problem.loss(z, jnp.asarray(at), keep, blocks)
+    def loss(step):
+        electric = problem.electric(z, log_v + step)
+        blocks, _ = problem.linear(z, electric)
+        return problem.loss(z, log_v + step, keep, blocks, electric)
 
-    slope = (loss(log_v[-1] + 1e-4) - loss(log_v[-1] - 1e-4)) / 2e-4
-    blocks, jacobian = problem.linear(z, problem.volt(log_v))
-    known = {k: jnp.zeros_like(j) for k, j in jacobian.items()}  # no degree of freedom is spent
-    own = problem.own(z, log_v)
-    step = scored(problem.target, blocks, known, typical, jnp.asarray(keep), own) - log_v
-    assert abs(step[-1]) < 1.5  # else it was cut short
-    # it divides by the expected information, or by more where others explain the residuals
-    score = np.asarray(variances.information(problem.noise.blocks, log_v, keep, own) @ step)[-1]
-    assert score == pytest.approx(-slope, rel=1e-3)
+    for k, name in enumerate(problem.noise.names):
+        if name.startswith(("current", "voltage")):
+            step = 1e-4 * np.eye(len(log_v))[k]
+            assert (loss(step) - loss(-step)) / 2e-4 == pytest.approx(0.0, abs=0.01), name
 
 
 @pytest.mark.parametrize("signed", [True, False])

@@ -88,11 +88,11 @@ def test_a_fit_ends_where_the_loss_is_level(truth, path):
     best = optimise(problem, start=begin(problem), **PRECISE)
     assert best.converged
     log_v, keep = jnp.asarray(best.state.log_variance), jnp.ones(len(w))
-    volt, std = problem.volt(log_v), float(np.sqrt(best.covariance[0, 0]))
+    volt, std = problem.electric(best.state.z, log_v), float(np.sqrt(best.covariance[0, 0]))
 
     def loss(z):
         blocks, _ = problem.linear(jnp.asarray(z), volt)
-        return problem.loss(z, best.state.log_variance, keep, blocks)
+        return problem.loss(z, best.state.log_variance, keep, blocks, volt)
 
     z = best.state.z
     rise = [loss(z + k * std) - loss(z) for k in (-1.0, 1.0)]
@@ -159,7 +159,8 @@ def test_camera_scale_is_that_of_weighted_least_squares(truth):
     problem = Problem(w, truth, choices)
     best = optimise(problem, start=begin(problem, problem.space.start + 0.1), **PRECISE)
     assert best.converged, best.reason
-    r = np.asarray(problem.linear(best.state.z, jnp.asarray(1.0))[0]["motion"])
+    electric = problem.electric(best.state.z, best.state.log_variance)
+    r = np.asarray(problem.linear(best.state.z, electric)[0]["motion"])
     scale = float(value(problem, best.state, "camera.scale"))
     raw = np.zeros((24, 2, 3))  # increments per unit of scale; yaw does not depend on it
     for k in range(2):
@@ -196,10 +197,11 @@ def test_the_optimum_is_one(surface_problem, surface_fit):
     """At the variances found no step in the structure lowers the loss."""
     best, _ = surface_fit
     log_v = best.state.log_variance
+    volt = surface_problem.electric(best.state.z, log_v)
 
     def loss(z):
-        blocks = surface_problem.linear(z, jnp.asarray(1.0))[0]
-        return surface_problem.loss(z, log_v, np.ones(48), blocks)
+        blocks = surface_problem.linear(z, volt)[0]
+        return surface_problem.loss(z, log_v, np.ones(48), blocks, volt)
 
     lowest = loss(best.state.z)
     std = np.sqrt(np.diag(best.covariance))
@@ -259,7 +261,8 @@ def test_a_run_gone_wrong_hardly_counts(surface_problem, surface_fit):
     again = optimise(spoilt, start=begin(spoilt), **PRECISE)
     std = np.sqrt(np.diag(best.covariance))
     assert (np.abs(again.state.z - best.state.z) / std).max() < 1.0
-    blocks = spoilt.linear(again.state.z, jnp.asarray(1.0))[0]
+    electric = spoilt.electric(again.state.z, again.state.log_variance)
+    blocks = spoilt.linear(again.state.z, electric)[0]
     weight = spoilt.whitening(blocks, again.state.log_variance, np.ones(48))[1]["motion"]
     assert np.argmin(weight) == 5
     assert float(weight[5]) < 0.05 * float(np.median(weight))

@@ -124,7 +124,8 @@ def test_motion_does_not_need_the_voltage():
 @pytest.mark.slow
 def test_windows_of_one_shape_share_what_is_compiled():
     problem, compiled = recovery.problem(), linear._cached._cache_size
-    z, volt = problem.space.start, problem.volt(2 * np.log(problem.noise.typical))
+    z = problem.space.start
+    volt = problem.electric(z, 2 * np.log(problem.noise.typical))
     problem.linear(z, volt)
     before = compiled()
     other = problem.of(windows(recovery.dataset(7), 0.04, recovery.LAG))

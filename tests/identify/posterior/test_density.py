@@ -71,7 +71,7 @@ def near(d, count=4, width=0.1):
 
 def expected(problem, z, log_v, blocks):
     """Log likelihood of every piece by scipy, straight from the definition."""
-    volt = problem.volt(log_v)
+    volt = problem.electric(z, log_v)
     tree = problem.space.tree(jnp.asarray(z))
     gaps = jax.jit(residuals)(tree, problem.batch, volt)
     camera, spread = lk.log_jacobians(tree, problem.batch, volt)
@@ -141,8 +141,8 @@ def test_runs_of_a_session_share_effects_with_the_priors_that_were_found(problem
     assert (d.coordinates.group[plain.size :] == d.floors.index("soft")).all()
     x = near(d, 2, width=0.7)
     z, log_v = d.full(d.anchor, jnp.asarray(x[0]))
-    tree = problem.space.tree(jnp.asarray(z))
-    residual = np.array(jax.jit(residuals)(tree, problem.batch, 1.0)["motion"])
+    tree, noise = problem.space.tree(jnp.asarray(z)), problem.electric(z, log_v)
+    residual = np.array(jax.jit(residuals)(tree, problem.batch, noise)["motion"])
     effect, w = of_noise.effects(problem.windows, problem.robot), problem.windows
     std, found = np.array([0.02, 0.01, 0.03]), np.zeros(3)
     for n, r in enumerate(residual):
@@ -151,7 +151,7 @@ def test_runs_of_a_session_share_effects_with_the_priors_that_were_found(problem
             r = r - effect[n] @ (std * x[0, first : first + 3])
         v = np.asarray(problem.covariance("motion", log_v))[n]
         found[problem.batch.surface[n]] += multivariate_t.logpdf(r, shape=v, df=DEGREES)
-        found[problem.batch.surface[n]] += lk.log_jacobians(tree, problem.batch, 1.0)[0][n]
+        found[problem.batch.surface[n]] += lk.log_jacobians(tree, problem.batch, noise)[0][n]
     of_prior = norm.logpdf(x[0, plain.size :]).sum()
     alone = plain.terms(x[:1, : plain.size])[0]
     soft = d.floors.index("soft")
@@ -170,7 +170,7 @@ def test_sessions_widen_the_curvature_as_the_fit_says(problem):
     d, small = density(problem, MOTION), {k: 1e-6 * v for k, v in SHARED.items()}
     n = len(d.coordinates.structure)
     z, log_v = problem.space.start, 2 * np.log(problem.noise.typical)
-    _, jacobian = problem.linear(z, problem.volt(log_v))
+    _, jacobian = problem.linear(z, problem.electric(z, log_v))
     precision = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), np.ones(24)))
     fitted = Fitted(z, log_v, np.linalg.inv(precision), small)
     grown = Density(problem, fitted, MOTION).covariance[:n, :n]

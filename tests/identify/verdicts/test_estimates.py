@@ -323,10 +323,12 @@ def test_a_profile_refits_all_others():
     k = this.space.place["motor.back_emf"].start
     z = end.state.z.copy()
     z[k] = np.log(p.value[-1])
-    blocks, _ = this.linear(z, this.volt(end.state.log_variance))
-    alone = this.loss(z, end.state.log_variance, np.ones(len(this.windows)), blocks)
-    blocks, _ = this.linear(end.state.z, this.volt(end.state.log_variance))
-    best = this.loss(end.state.z, end.state.log_variance, np.ones(len(this.windows)), blocks)
+    log_v, every = end.state.log_variance, np.ones(len(this.windows))
+    electric = this.electric(end.state.z, log_v)
+    blocks, _ = this.linear(z, electric)
+    alone = this.loss(z, log_v, every, blocks, electric)
+    blocks, _ = this.linear(end.state.z, electric)
+    best = this.loss(end.state.z, log_v, every, blocks, electric)
     assert p.posterior[-1] < 0.9 * (alone - best)
 
 

@@ -1,0 +1,273 @@
+"""Errors of the estimator are as large as it says: news counted once, NEES, NIS, effects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from slipid.control.effects import SETTLES, TURN, stays
+from slipid.control.estimator import Estimator
+from slipid.control.floor_filter import FloorFilter
+from slipid.control.interface import MIXED, Measurement, Settings
+from slipid.control.tuning.actuation import Habits
+from slipid.control.tuning.twin import Floor, Twin
+from slipid.model import contact
+from slipid.model.se2 import advance, compose
+from tests.helpers.small_twin import deployed, floor
+
+DT = 0.05
+FIRM = floor([[0]])
+ROUND = ((0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (-0.2, 0.0, 0.0), (0.1, -0.15, 0.3))
+
+
+def rolling(robot, twist):
+    """Wheel speeds of a twist without slip [rad/s]."""
+    return robot.forward @ jnp.asarray(twist) / robot.frame.radius
+
+
+def settled(robot, w, surface):
+    """Twist on a floor [m/s, m/s, rad/s]."""
+    rim = robot.frame.radius * jnp.asarray(w)
+    return contact.equilibrium(rim, robot.frame, robot.floors.at(surface), robot.rest)
+
+
+def ended(*ways):
+    """Pose after some times [s] at some twists."""
+    pose = jnp.zeros(3)
+    for twist, seconds in ways:
+        pose = compose(pose, advance(twist, seconds))
+    return np.asarray(pose)
+
+
+def sure_of(state, hypothesis, count, of_others=1e-9):
+    """The state with another belief."""
+    belief = jnp.full(count + 1, of_others).at[hypothesis].set(1.0)
+    return eqx.tree_at(lambda s: s.floors.belief, state, belief / belief.sum())
+
+
+# belief changes are handed over once -----------------------------------------------------------
+
+
+def test_news_that_comes_late_corrects_the_pose_by_the_difference_of_the_ways_once():
+    robot = deployed()
+    est = Estimator(robot, Settings(patch_m=1e9))  # floors do not change on the way
+    run = jax.jit(lambda s, z: est.step(s, z, DT))
+    w = rolling(robot, (0.2, 0.05, 0.1))
+    state = est.init()
+    for _ in range(5):  # hypotheses settle; this way is not counted
+        state, _ = run(state, Measurement(wheel_speed=w).filled(3))
+    place, twists = est.init().place, state.floors.twist
+    state = eqx.tree_at(lambda s: (s.place, s.floors.apart), state, (place, jnp.zeros((8, 3))))
+    state, steps = sure_of(state, 0, 8), 30
+    for _ in range(steps):
+        state, said = run(state, Measurement(wheel_speed=w).filled(3))
+    np.testing.assert_allclose(said.pose, ended((twists[0], steps * DT)), atol=2e-5)
+    state = sure_of(state, 7, 8)
+    for more in (1, 2, 3):
+        state, said = run(state, Measurement(wheel_speed=w).filled(3))
+        there = ended((twists[7], (steps + more) * DT))
+        np.testing.assert_allclose(said.pose, there, atol=2e-5)
+    assert np.hypot(*(there - ended((twists[0], (steps + more) * DT)))[:2]) > 0.02
+
+
+def test_a_floor_that_changes_within_a_step_moves_the_pose_by_what_was_travelled():
+    robot = eqx.tree_at(lambda r: r.current_std, deployed(), jnp.full(2, 0.003))
+    sure = Settings(
+        current_is_signed=True, ammeter_std_a=0.003, forget_s=DT, filter_s=1e-3, patch_m=0.05
+    )
+    est = Estimator(robot, sure)
+    run = jax.jit(lambda s, z: est.step(s, z, DT))
+    w = rolling(robot, (0.2, 0.05, 0.1))
+    near, amps = FloorFilter(robot, sure).solve(jnp.zeros((8, 3)), w)
+    for _ in range(5):
+        near, amps = FloorFilter(robot, sure).solve(near, w)
+    state = est.init()
+    for _ in range(10):
+        state, said = run(state, Measurement(wheel_speed=w, current=amps[0]).filled(3))
+    assert float(said.surface_probability[:, 0].min()) > 0.99
+    begin = eqx.tree_at(lambda s: s.place, state, est.init().place)
+    state, steps = begin, 20
+    for k in range(2 * steps):
+        z = Measurement(wheel_speed=w, current=amps[0 if k < steps else 7]).filled(3)
+        state, said = run(state, z)
+        at_once = float(said.surface_probability[:, 0 if k < steps else 1].min())
+        assert at_once > 0.99
+    a, b = (settled(robot, w, k) for k in (0, 1))
+    there = ended((a, steps * DT), (b, steps * DT))
+    # a step of the way on the other floor is 5 mm and 10 mrad
+    np.testing.assert_allclose(said.pose, there, atol=1e-3)
+
+
+# effects ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("steps", [1, 7, 200])
+def test_an_effect_correlates_over_a_turn_as_the_kernel_says_in_however_many_steps(steps):
+    for turn in (0.0, 0.1, 0.3, np.pi):
+        before, now = np.eye(3)[0], np.array([np.cos(turn), np.sin(turn), 0.0])
+        far = jnp.asarray(10 * SETTLES / steps)
+        kept, v = 1.0, jnp.asarray(before)
+        for _ in range(steps):
+            v, keep = stays(v, jnp.asarray(now), jnp.zeros(1), far)
+            kept *= float(keep[0])
+        expected = np.exp(-np.sum((now - before) ** 2) / (2 * TURN**2))
+        assert kept == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_direction_that_trembles_keeps_its_effect_and_a_floor_left_does_not():
+    rng, v, kept = np.random.default_rng(0), jnp.zeros(3), 1.0
+    for angle in rng.normal(0.0, np.radians(0.5), 200):
+        now = jnp.array([jnp.cos(angle), jnp.sin(angle), 0.0])
+        v, keep = stays(v, now, jnp.zeros(1), jnp.asarray(0.005))  # a metre
+        kept *= float(keep[0])
+    assert kept > 0.9
+    _, keep = stays(v, v, jnp.array([0.0, 1.0]), jnp.asarray(0.5))
+    assert keep[0] == pytest.approx(1.0, abs=1e-6)
+    assert keep[1] < 0.01
+
+
+def test_a_way_back_errs_anew():
+    """Errors of a way on add up, those of a way back are independent of the way out."""
+    robot = deployed(run=1.0).on("firm")
+    robot = eqx.tree_at(lambda r: r.effect, robot, robot.effect.at[:, 2].set(0.0))
+    est = Estimator(robot)
+    run = jax.jit(lambda s, z: est.step(s, z, DT))
+
+    def along(*speeds):
+        state = est.init()
+        for speed in speeds:
+            w = rolling(robot, (speed, 0.0, 0.0))
+            for _ in range(200):
+                state, said = run(state, Measurement(wheel_speed=w).filled(3))
+        return float(said.covariance[0, 0])
+
+    once = along(0.1)
+    assert along(0.1, 0.1) == pytest.approx(4 * once, rel=0.02)
+    assert along(0.1, -0.1) == pytest.approx(2 * once, rel=0.1)
+
+
+@pytest.mark.parametrize("under", [(0, 0, 0), (1, 0, 0), (0, 1, 1)])
+def test_motion_by_friction_is_that_of_finite_differences(under):
+    robot = deployed()
+    w = rolling(robot, (0.2, 0.1, 0.1))
+    rim = robot.frame.radius * w
+
+    def twist(friction):
+        floors = eqx.tree_at(lambda f: f.friction, robot.floors, friction).at(np.array(under))
+        return contact.equilibrium(rim, robot.frame, floors, robot.rest)
+
+    sure, mu = jnp.eye(2)[jnp.asarray(under)], robot.floors.friction
+    slope = FloorFilter(robot, Settings())._by_friction(twist(mu), w, sure)
+    by_hand = jax.jacfwd(twist)(mu) * mu
+    np.testing.assert_allclose(slope, by_hand, atol=1e-6)
+    assert (np.abs(slope).max() > 0.01) == (len(set(under)) > 1)
+
+
+# errors are as large as it says --------------------------------------------------------------
+
+
+def path(robot):
+    """Wheel speeds of a second at rest and of four ways in other directions (step, wheel)."""
+    legs = [jnp.broadcast_to(rolling(robot, twist), (60, 3)) for twist in ROUND]
+    return jnp.concatenate([jnp.zeros((20, 3)), *legs])
+
+
+def squared(pose, cov, truth):
+    """Square of an error over its covariance."""
+    gap = pose - truth
+    gap = gap.at[2].set(jnp.arctan2(jnp.sin(gap[2]), jnp.cos(gap[2])))
+    return gap @ jnp.linalg.solve(cov + 1e-12 * jnp.eye(3), gap)
+
+
+@cache
+def runs(gyro, fixes, count=200):
+    """Squared errors of the pose, of a fix at every step, and of gyro readings at rest.
+
+    Robots drawn from what a fit says that the model misses, on a floor that is known; with `fixes`
+    every twentieth is heard.
+    """
+    whole, sure = deployed(process=1.0, run=1.0, current=1.0), Settings(gyro_bias_std=0.005)
+    twin = Twin(whole, FIRM, Habits(gyro=gyro, smooth=True, voltage=False))
+    est, commands, std = Estimator(whole.on("firm"), sure), path(whole), jnp.array([0.002, 0.004])
+    wide = std[jnp.array([0, 0, 1])]
+
+    def one(key):
+        def step(carry, now):
+            true, state = carry
+            command, number, off = now
+            true, z = twin.step(true, command, twin.noise(key, number))
+            turned = z.gyro - state.place.nuisance[-1]
+            by_rest = turned**2 / (state.place.covariance[-1, -1] + sure.gyro_std**2)
+            new, said = est.step(state, z, DT)
+            fix = true.pose + wide * off
+            by_fix = squared(said.pose, said.covariance + jnp.diag(wide**2), fix)
+            if fixes:
+                heard = jnp.where(number % 20 == 0, fix, jnp.nan)
+                new, _ = est.step(state, replace(z, fix=heard, fix_std=std), DT)
+            return (true, new), (squared(said.pose, said.covariance, true.pose), by_fix, by_rest)
+
+        off = jax.random.normal(jax.random.fold_in(key, 7), (len(commands), 3))
+        begin = twin.init((0.0, 0.0, 0.0), key), est.init((0.0, 0.0, 0.0))
+        steps = jnp.arange(1, len(commands) + 1)
+        return jax.lax.scan(step, begin, (commands, steps, off))[1]
+
+    keys = jax.random.split(jax.random.key(21), count)
+    return [np.asarray(x) for x in jax.jit(lambda k: jax.lax.map(one, k))(keys)]
+
+
+def within(values, freedom):
+    """Whether the mean of so many chi-squares lies within its 95 % band."""
+    values = np.ravel(values)
+    low, high = chi2.ppf([0.025, 0.975], freedom * values.size) / values.size
+    print(f"mean {values.mean():.2f} of {freedom}, band {low:.2f} to {high:.2f}")
+    return low < values.mean() < high
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gyro", [False, True])
+def test_nees_of_the_pose_after_four_ways(gyro):
+    nees, _, _ = runs(gyro, False)
+    assert within(nees[:, -1], 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gyro", [False, True])
+def test_nis_of_fixes_and_of_the_gyro(gyro):
+    _, by_fix, by_rest = runs(gyro, True)
+    assert within(by_fix[:, 39::20], 3)
+    if gyro:  # its bias is learnt at rest, each reading once
+        assert within(by_rest[:, 8:20:12], 1)
+
+
+@pytest.mark.slow
+def test_regions_on_floors_that_are_not_known_are_not_too_narrow():
+    """Patches drawn for every run, crossed over and over."""
+    whole = deployed(process=1.0, run=1.0, current=1.0)
+    est, commands = Estimator(whole, Settings(alike=MIXED)), path(whole)
+
+    def one(key):
+        cells = jax.random.bernoulli(jax.random.fold_in(key, 3), 0.5, (5, 5)).astype(int)
+        drawn = Floor(cells, jnp.array([-1.0, -1.0]), jnp.asarray(0.4))
+        twin = Twin(whole, drawn, Habits(smooth=True, voltage=False))
+
+        def step(carry, now):
+            true, state = carry
+            true, z = twin.step(true, now[0], twin.noise(key, now[1]))
+            state, said = est.step(state, z, DT)
+            return (true, state), squared(said.pose, said.covariance, true.pose)
+
+        begin = twin.init((0.0, 0.0, 0.0), key), est.init((0.0, 0.0, 0.0))
+        steps = jnp.arange(1, len(commands) + 1)
+        return jax.lax.scan(step, begin, (commands, steps))[1][-1]
+
+    keys = jax.random.split(jax.random.key(5), 60)
+    nees = np.asarray(jax.jit(lambda k: jax.lax.map(one, k))(keys))
+    assert np.mean(nees < chi2.ppf(0.9, 3)) > 0.85
+    assert nees.mean() > 0.5  # nor are they as wide as one likes
