@@ -100,7 +100,7 @@ def windows(
 
 
 def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
-    """Variance of a single reading of every ammeter in every run, the same in a session [A^2].
+    """Variance of a single reading of every ammeter in every run, from that run alone [A^2].
 
     By second differences d_t = x_(t-1) - 2 x_t + x_(t+1), which have six times the variance of
     white noise and lose what is smooth between readings: of a ripple of n readings a period only
@@ -115,16 +115,12 @@ def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
     if data.current is None:
         return out
     amps = data.current if data.current_is_signed else np.abs(data.current)
-    for name in set(data.session):
-        mine = [k for k in range(len(data)) if data.session[k] == name]
-        bent = []
-        for rows in map(data.rows, mine):
-            live = data.live[rows]
-            whole = live[:-2] & live[1:-1] & live[2:]
-            bent.append(np.abs(np.diff(amps[rows], 2, axis=0))[whole])
-        together = np.concatenate(bent)
-        if len(together):
-            out[mine] = np.quantile(together, NORMAL_STD, axis=0) ** 2 / 6
+    for k in range(len(data)):
+        rows = data.rows(k)
+        live = data.live[rows]
+        bent = np.abs(np.diff(amps[rows], 2, axis=0))[live[:-2] & live[1:-1] & live[2:]]
+        if len(bent):
+            out[k] = np.quantile(bent, NORMAL_STD, axis=0) ** 2 / 6
     return out
 
 

@@ -232,9 +232,13 @@ def within(values, freedom):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gyro", [False, True])
-def test_nees_of_the_pose_after_four_ways(gyro):
+def test_nees_of_the_pose_after_each_of_four_ways(gyro):
+    """Right to a fifth: 200 runs tell the mean to a ninth, and the filter is a linearised one."""
     nees, _, _ = runs(gyro, False)
-    assert within(nees[:, -1], 3)
+    after = nees[:, 79::60].mean(axis=0)
+    assert len(after) == len(ROUND)
+    assert after.min() > 0.8 * 3
+    assert after.max() < 1.2 * 3
 
 
 @pytest.mark.slow

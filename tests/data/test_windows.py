@@ -220,18 +220,17 @@ def test_ripple_is_no_noise_of_the_ammeter(ripple):
         blank = run(f"{seed}.csv", seconds=30.0, seed=seed)
         wave = ripple * np.sin(2 * np.pi * np.arange(blank.samples) / 10 + seed)
         logs.append(replace(blank, current=blank.current + wave[:, None]))
-    found = ammeter_variance(collect(logs))
-    assert (found == found[0]).all()
+    found = ammeter_variance(collect(logs)).mean(axis=0)
     # 3870 readings; what is left of the ripple is (2 - 2 cos 36 deg)^2 / 6 of its 0.045 A^2
-    np.testing.assert_allclose(found[0], 0.01 + 0.0243 * ripple**2 / 2, rtol=0.08)
+    np.testing.assert_allclose(found, 0.01 + 0.0243 * ripple**2 / 2, rtol=0.08)
 
 
-def test_jumps_stalls_and_other_sessions_do_not_make_an_ammeter_noisy():
+def test_jumps_and_other_runs_do_not_make_an_ammeter_noisy():
     quiet = run("a.csv", seconds=30.0)
     jumps = quiet.current.copy()
     jumps[[100, 200, 300]] = 50.0
     noisy = run("b.csv", seconds=30.0, seed=1, current=4 * run(seconds=30.0, seed=1).current)
-    data = collect([replace(quiet, current=jumps), noisy], ["one", "two"])
+    data = collect([replace(quiet, current=jumps), noisy])
     found = ammeter_variance(data)
     np.testing.assert_allclose(found[0], 0.01, rtol=0.15)
     np.testing.assert_allclose(found[1], 0.16, rtol=0.15)

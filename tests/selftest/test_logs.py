@@ -17,7 +17,7 @@ from slipid.identify.fit.noise import noise
 from slipid.selftest.known import TRUTH, Sensors, grid, truth
 from slipid.selftest.logs import make_logs
 from tests.helpers.made_logs import LAYOUT, write_logs
-from tests.helpers.made_windows import residuals
+from tests.helpers.made_windows import electric_noise, residuals
 from tests.helpers.one_log import read_log
 
 SETUPS = (("firm", "as_built"), ("soft", "as_built"), ("soft", "moved"))
@@ -28,7 +28,7 @@ STILL = dict.fromkeys(Sensors().std, 0.0)
 
 @jax.jit
 def gaps(robot, b):
-    return residuals(robot, b, jnp.ones(()))
+    return residuals(robot, b, electric_noise(b, jnp.ones(())))
 
 
 def at_truth(robot, plan, seed, sensors):
