@@ -277,7 +277,9 @@ def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
     other = DeployedRobot.of(replace(deployed.record, gains=tuned_for("far")))
     assert values(Controller(other).gains) == values(Gains())
     with pytest.raises(DataError, match=r"another load set-up \(far\); run slipid tune again with"):
-        check_gains(tmp_path, other)
+        check_gains(tmp_path, other, False)
+    with pytest.raises(DataError, match="it has no tuned gains; run slipid tune, or leave out"):
+        check_gains(tmp_path, deployed, True)
     (tmp_path / "gains.json").write_text("{}")
     with pytest.raises(DataError, match="tuned for another fit; run slipid tune again, or remove"):
         check_gains(tmp_path, deployed, False)
