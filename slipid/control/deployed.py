@@ -34,7 +34,7 @@ class DeployedRobot(eqx.Module):
         effect: std of what it misses all the way, [m/m], [m/m], [rad/m]; the spread of the fitted
             numbers included.
         friction_covariance: of the log frictions, by the spread of the fitted numbers.
-        current_std: of a measured current from the model's [A].
+        current_std: of the current that flows from the model's, the ammeter's noise aside [A].
         current_trend: a + b v, measured currents over the model's at speed v [A, A s/m].
         highest: wheel speed up to which the fit has seen the robot [rad/s], and the model's largest
             current up to 0.8 of it [A].

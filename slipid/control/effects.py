@@ -2,14 +2,16 @@
 
 An effect is a motion per metre along, across and in yaw. It belongs to a floor and to a direction
 of travel u, the unit vector of the twist without slip, yaw as rim speed. Its std is the same
-everywhere; between directions it correlates as a Gaussian process with a periodic kernel does, and
-once the robot has left the floor, less and less:
+everywhere; it correlates less and less as the direction changes, and once the robot has left the
+floor:
 
     k = exp(-(1 - a^2) |u - v|^2 / (2 TURN^2) - left far / AWAY),   a = exp(-far / SETTLES)
     e <- k e + sqrt(1 - k^2) std noise,   v <- u + a (v - u)
 
-Over a turn from v to u that makes exp(-|u - v|^2 / (2 TURN^2)), in however many steps, and
-directions that tremble make next to nothing: a way back errs anew.
+Over a direction that changes at once from v to u that makes exp(-|u - v|^2 / (2 TURN^2)), in
+however many steps of the way, and directions that tremble make next to nothing: a way back errs
+anew. Along an arc on which the direction turns by an angle at a curvature c it fades more slowly,
+by exp(-angle c SETTLES / TURN^2) about: of a quarter turn on a radius of a metre a fifth stays.
 """
 
 import jax.numpy as jnp

@@ -162,16 +162,15 @@ class FloorFilter(eqx.Module):
         rim = f.frame.radius * w
         shared = jax.tree.map(lambda leaf: under @ leaf, f.floors)
         on, xi = stand(f.frame, shared, f.rest), Planar(*twist)
-        mu = on.floor.friction
+        mu, each = on.floor.friction, under * f.floors.friction / jnp.mean(shared.friction)
 
         def force(mu: Array) -> Planar:
             return Balance(rim, replace(on, floor=replace(on.floor, friction=mu))).force(xi)
 
-        def pushed(share: Array) -> Planar:  # frictions count over their mean
-            part = mu * share
+        def pushed(part: Array) -> Planar:  # frictions count over their mean
             return jax.jvp(force, (mu,), (part - mu * jnp.mean(part),))[1]
 
-        slope = solve3(Balance(rim, on).jacobian(xi), jax.vmap(pushed)(under.T))
+        slope = solve3(Balance(rim, on).jacobian(xi), jax.vmap(pushed)(each.T))
         most = length(twist[:2]) + f.frame.base * jnp.abs(twist[2])
         most = most * jnp.stack([jnp.ones(()), jnp.ones(()), 1 / f.frame.base])[:, None]
         return -jnp.nan_to_num(jnp.clip(jnp.stack(slope), -most, most))
@@ -212,9 +211,10 @@ class FloorFilter(eqx.Module):
         change = 1 - jnp.exp(-speed * tick.dt / self.settings.patch_m)
         whole = jnp.concatenate([known[:, None], known[:, None] * old.apart], axis=1)
         whole = self._changed(whole, change)
-        moved = whole[:, 0]
-        apart = whole[:, 1:] / moved[:, None]
-        of_known = moved * (1 - 0.05 * change) + 0.2 * change * unknown * self.prior()
+        stayed = whole[:, 0] * (1 - 0.05 * change)
+        of_known = stayed + 0.2 * change * unknown * self.prior()
+        # what comes back from "unknown" has gone the mean way
+        apart = whole[:, 1:] * ((1 - 0.05 * change) / of_known)[:, None]
         of_none = unknown * (1 - 0.2 * change) + 0.05 * change * sure
         return jnp.append(of_known, of_none), apart
 

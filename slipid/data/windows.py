@@ -109,7 +109,8 @@ def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
 
     Limits: ripple that is faster than that, or folded down by slow sampling, cannot be told from
     noise; readings that are repeated, or noise that a driver has smoothed, make the noise look
-    small; magnitudes of currents near zero have less of it than signed ones.
+    small; readings in steps that are coarser than the noise make it that of a few steps, and never
+    less than that of rounding; magnitudes of currents near zero have less of it than signed ones.
     """
     out = np.zeros((len(data), data.wheel_angle.shape[1]))
     if data.current is None:
@@ -120,7 +121,10 @@ def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
         live = data.live[rows]
         bent = np.abs(np.diff(amps[rows], 2, axis=0))[live[:-2] & live[1:-1] & live[2:]]
         if len(bent):
-            out[k] = np.quantile(bent, NORMAL_STD, axis=0) ** 2 / 6
+            step = np.abs(np.diff(amps[rows], axis=0))
+            rounding = np.where(step > 0, step, np.inf).min(axis=0) ** 2 / 12
+            noise = np.quantile(bent, NORMAL_STD, axis=0) ** 2 / 6
+            out[k] = np.maximum(noise, np.where(np.isfinite(rounding), rounding, 0.0))
     return out
 
 

@@ -50,15 +50,23 @@ ROWS: Mapping[str, Row] = {
 }
 
 
-def check_gains(out: Path, robot: DeployedRobot) -> None:
-    """Refuse gains that `slipid tune` found for other numbers or another load set-up."""
+def check_gains(out: Path, robot: DeployedRobot, forced: bool) -> None:
+    """Refuse gains that `slipid tune` found for other numbers or another load set-up.
+
+    So are gains that are wanted (`forced`) and not there.
+    """
     tuned, path = robot.record.gains, out / "gains.json"
     if tuned is None and path.is_file():
         raise DataError(
             f"{path}: tuned for another fit; run slipid tune again, or remove it to drive with "
             "gains set by hand"
         )
-    if tuned is not None and tuned.load != robot.load_setup:
+    if forced and tuned is None:
+        raise DataError(
+            f"{out / 'robot.json'}: it has no tuned gains; run slipid tune, or leave out "
+            "--tuned-gains"
+        )
+    if tuned is not None and (tuned.is_better or forced) and tuned.load != robot.load_setup:
         raise DataError(
             f"{out / 'robot.json'}: gains were tuned for another load set-up ({tuned.load}); run "
             f"slipid tune again with --load {robot.load_setup}"

@@ -131,7 +131,7 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         settings, habits = replace(settings, current_is_signed=False), Habits()
     elif absent := [name for name in floor.surfaces if name not in known]:
         raise DataError(f"{wish.map}: no surface '{absent[0]}'; identified: {', '.join(known)}")
-    check_gains(out, robot)
+    check_gains(out, robot, wish.tuned_gains)
     key = key_of(
         *(
             wish.plant,

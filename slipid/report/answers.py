@@ -141,7 +141,8 @@ def show_gains(page: Page, found: Content) -> None:
     )
     gained = found["improvement"]
     page.line(
-        f"tuned gains are {found['verdict']}: {gained['value']:.1f} +- {gained['se']:.1f} mm less"
+        f"tuned gains are {found['verdict']}: the loss changes by {-gained['value']:+.1f} mm "
+        f"(standard error {gained['se']:.1f})"
     )
     page.line(
         f"stability margin (1 - spectral radius): worst {margin['worst']:.4f}, "

@@ -225,6 +225,16 @@ def test_ripple_is_no_noise_of_the_ammeter(ripple):
     np.testing.assert_allclose(found, 0.01 + 0.0243 * ripple**2 / 2, rtol=0.08)
 
 
+def test_readings_in_steps_are_at_least_as_noisy_as_their_rounding():
+    """Steps of 0.5 A on noise of 0.02 A: most second differences are zero."""
+    quiet = run("a.csv", seconds=30.0)
+    smooth = 2.0 + np.linspace(0, 1, quiet.samples)[:, None] * np.ones(3)
+    noise = 0.02 * np.random.default_rng(0).standard_normal(smooth.shape)
+    stepped = 0.5 * np.round((smooth + noise) / 0.5)
+    found = ammeter_variance(collect([replace(quiet, current=stepped)]))
+    np.testing.assert_allclose(found, 0.5**2 / 12, rtol=1e-9)
+
+
 def test_jumps_and_other_runs_do_not_make_an_ammeter_noisy():
     quiet = run("a.csv", seconds=30.0)
     jumps = quiet.current.copy()

@@ -269,18 +269,20 @@ def tuned_for(load, verdict="better than by hand"):
 
 
 def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
-    check_gains(tmp_path, deployed)
+    check_gains(tmp_path, deployed, False)
     assert values(Controller(deployed).gains) == values(Gains())
     tuned = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
-    check_gains(tmp_path, tuned)
+    check_gains(tmp_path, tuned, False)
     assert values(Controller(tuned).gains) == [k + 0.5 for k in range(6)]
     other = DeployedRobot.of(replace(deployed.record, gains=tuned_for("far")))
     assert values(Controller(other).gains) == values(Gains())
     with pytest.raises(DataError, match=r"another load set-up \(far\); run slipid tune again with"):
-        check_gains(tmp_path, other)
+        check_gains(tmp_path, other, False)
+    with pytest.raises(DataError, match="it has no tuned gains; run slipid tune, or leave out"):
+        check_gains(tmp_path, deployed, True)
     (tmp_path / "gains.json").write_text("{}")
     with pytest.raises(DataError, match="tuned for another fit; run slipid tune again, or remove"):
-        check_gains(tmp_path, deployed)
+        check_gains(tmp_path, deployed, False)
 
 
 def test_tuned_gains_that_are_no_better_are_left_aside_and_that_is_said(deployed):

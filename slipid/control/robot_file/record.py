@@ -81,7 +81,7 @@ class FloorRecord:
 
     Attributes:
         process: growing with the root of the distance; effect: all the way.
-        current_std: of a measured current from the model's.
+        current_std: of the current that flows from the model's, the ammeter's noise aside.
         seen: None where the numbers were given, not fitted.
     """
 
