@@ -64,7 +64,7 @@ def std_of(name, rows=40):
 
 @functools.cache
 def planner():
-    names = of_noise.noise(steady_windows([ANY], TRUTH, Channels(), {}), TRUTH).names
+    names = of_noise.noise(steady_windows([ANY], TRUTH, Channels()), TRUTH).names
     return Planner(TRUTH, CHOICES, {n: std_of(n) ** 2 for n in names}, Channels())
 
 
@@ -99,14 +99,14 @@ def plans(count):
 @functools.cache
 def problem(count):
     """Compiled for so many runs."""
-    return Problem(steady_windows([ANY] * count, TRUTH, Channels(), {}), blank([ANY]), CHOICES)
+    return Problem(steady_windows([ANY] * count, TRUTH, Channels()), blank([ANY]), CHOICES)
 
 
 def fit_windows(drives, seed):
     """Fit of windows made from the model, begun at the truth; (z, converged)."""
     rng = np.random.default_rng(seed)
     std = {n: std_of(n) for n in problem(len(drives)).noise.names}
-    clean = steady_windows(drives, TRUTH, Channels(), {})
+    clean = steady_windows(drives, TRUTH, Channels())
     made = measure(TRUTH, clean, rng, {**std, "current": std["current.soft.window"]})
     this = problem(len(drives)).of(made)
     log_v = np.log([std[n] ** 2 for n in this.noise.names])
@@ -127,7 +127,7 @@ def errors(z):
     this = planner()
     found = this.space.tree(jnp.asarray(z))
     share = np.asarray(found.body.load_share - TRUTH.body.load_share)
-    w = steady_windows(PREDICTED, TRUTH, Channels(), {})
+    w = steady_windows(PREDICTED, TRUTH, Channels())
     ends = []
     for robot in (found, this.robot):
         step = replay.contact_increments(robot, lk.batch(w, robot))

@@ -131,14 +131,13 @@ def steady_windows(
     drives: Sequence[Drive],
     robot: Robot,
     channels: Channels,
-    current_var: Mapping[str, float],
     session: str = SESSION,
 ) -> Windows:
     """Windows that drives at steady wheel speeds would give without noise, each run one piece.
 
     However long a run is, it is one piece: its own effect is met once. Runs are centred on the
-    middle of the image, the marker's heading is zero at their start. `current_var` is the variance
-    of a window's mean current on each floor [A^2].
+    middle of the image, the marker's heading is zero at their start. The ammeter counts as exact:
+    its noise is not known beforehand, and averages out over a window.
     """
     n, per_piece, wheels = len(drives), channels.windows, robot.geometry.wheels
     base, radius = float(robot.geometry.base_radius), float(robot.geometry.wheel_radius)
@@ -146,7 +145,6 @@ def steady_windows(
     rate = command @ np.asarray(robot.geometry.forward()).T / radius
     dt = np.array([d.seconds(base) for d in drives])[:, None] / per_piece * np.ones((n, per_piece))
     blank = np.zeros((n, per_piece, wheels))
-    spread = np.array([current_var.get(d.surface, 0.0) for d in drives])
     w = Windows(
         run=np.arange(n),
         surface=tuple(d.surface for d in drives),
@@ -158,7 +156,7 @@ def steady_windows(
         pose=np.zeros((n, per_piece + 1, 3)),
         current=blank,
         voltage=blank,
-        current_var=blank + spread[:, None, None],
+        current_var=blank,
         has_current=channels.current,
         has_voltage=channels.voltage,
         current_is_signed=channels.signed,

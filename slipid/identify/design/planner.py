@@ -68,8 +68,7 @@ class Planner:
         return cls(fit.robot, fit.choices, fit.variance, fit.channels)
 
     def _windows(self, drives: Sequence[Drive], session: str = SESSION) -> Windows:
-        # the ammeter's own noise is not known beforehand; over a window it averages out
-        return steady_windows(drives, self.robot, self.channels, {}, session)
+        return steady_windows(drives, self.robot, self.channels, session)
 
     def nothing(self) -> Knowledge:
         """Before any run: the prior; of a single session the marker's yaw is the common one."""

@@ -50,8 +50,7 @@ def planner(current, voltage):
 
 
 def windows(drives, current, voltage):
-    spread = dict.fromkeys(("firm", "soft"), 0.05**2) if current else {}
-    return steady_windows(drives, robot(), Channels(current, voltage), spread)
+    return steady_windows(drives, robot(), Channels(current, voltage))
 
 
 @functools.cache
