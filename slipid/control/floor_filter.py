@@ -160,7 +160,7 @@ class FloorFilter(eqx.Module):
         """
         f = self.robot
         rim = f.frame.radius * w
-        shared = jax.tree.map(lambda leaf: under @ leaf, f.floors)
+        shared = f.floors.mixed(under)
         on, xi = stand(f.frame, shared, f.rest), Planar(*twist)
         mu, each = on.floor.friction, under * f.floors.friction / jnp.mean(shared.friction)
 

@@ -12,6 +12,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import travel
 from slipid.model import contact_law as law
 from slipid.model import robot as model
+from slipid.model.contact_law import ContactSurface
 from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.search_space import Space
 
@@ -62,11 +63,14 @@ def torque_of_slip(
     At this speed [rad/s], with this share of the weight on the wheel. Source:
     `slipid.model.contact_law` without sideways rolling.
     """
-    floor = jax.tree.map(lambda leaf: leaf[:, None], robot.surfaces)
-    rim = (robot.geometry.wheel_radius * wheel_speed)[:, None]
-    traction = law.wheel_traction(jnp.asarray(_SLIP) * rim, rim, floor).force()
-    weight = robot.body.mass * GRAVITY * law.load_force(jnp.asarray(share), floor)
-    return robot.geometry.wheel_radius * weight * traction
+    radius, weight = robot.geometry.wheel_radius, robot.body.mass * GRAVITY
+
+    def one(floor: ContactSurface, speed: Array) -> Array:
+        rim = radius * speed
+        traction = law.wheel_traction(jnp.asarray(_SLIP) * rim, rim, floor).force()
+        return radius * weight * law.load_force(jnp.asarray(share), floor) * traction
+
+    return jax.vmap(one)(robot.surfaces, wheel_speed)
 
 
 def curves(

@@ -1,8 +1,5 @@
 """The contact law solved for the wheels: which speeds give a wanted twist."""
 
-from dataclasses import replace
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -37,16 +34,14 @@ def inverse_contact(
     goes by the last one's.
 
     Args:
-        floors: stacked, leaves (floor,).
+        floors: stacked.
         rest: load shares at rest.
         inverse: J^+, twist per rim speed without slip.
         surface: probability of each floor under each wheel, sums 1.
 
     Source: `slipid.model.contact_law`; rollers at right angles.
     """
-    expected = jax.tree.map(lambda leaf: surface @ leaf, floors)
-    expected = replace(expected, load_bias=jnp.sum(surface * floors.load_bias.T, axis=1))
-    stance = stand(frame, expected, rest)
+    stance = stand(frame, floors.mixed(surface), rest)
     share = Balance(rest, stance).share(Planar(*xi))
     floors = law.at_load(floors, len(rest) * stance.rest[:, None])
     floors, onset = law.sideways(floors, frame.grip[:, None])

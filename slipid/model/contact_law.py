@@ -107,6 +107,11 @@ class ContactSurface(eqx.Module):
             bias = jnp.moveaxis(jnp.diagonal(bias, axis1=0, axis2=-1), -1, 0)
         return replace(jax.tree.map(lambda leaf: leaf[index], self), load_bias=bias)
 
+    def mixed(self, share: Float[Array, "wheel floor"]) -> "ContactSurface":
+        """Mean floor under each wheel, for the share of each floor of the stack there."""
+        bias = jnp.sum(share * self.load_bias.T, axis=1)
+        return replace(jax.tree.map(lambda leaf: share @ leaf, self), load_bias=bias)
+
 
 class Friction(eqx.Module):
     """A force against a speed that saturates: top tanh(speed / onset) + viscosity speed.

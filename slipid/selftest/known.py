@@ -127,7 +127,7 @@ class Sensors:
     has_voltage: bool = True
 
     def of(self, name: str) -> float:
-        """Std of a variance component."""
+        """Std of a variance component, 0 for one that these logs are made without."""
         head, _, last = name.partition(".")
         of_any_floor = f"{head}.floor.{last.split('.')[-1]}"
-        return self.std[name if name in self.std else of_any_floor]
+        return self.std.get(name, self.std.get(of_any_floor, 0.0))

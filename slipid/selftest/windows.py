@@ -16,8 +16,8 @@ from jaxtyping import Array, Float
 from slipid.data.windows import Windows
 from slipid.identify.compare.open_loop import chain, corrected
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.noise import axes, travel
-from slipid.identify.fit.shared import AXES
+from slipid.identify.fit.noise import SHARED, axes, noise, travel
+from slipid.identify.fit.shared import AXES, shared_of
 from slipid.model.robot import Robot
 
 
@@ -81,10 +81,28 @@ def _process(
 ) -> Float[np.ndarray, "piece window 3"]:
     """Displacements that the model does not explain, growing with distance."""
     far, u = travel(w, truth)
-    total = np.zeros((*far.shape, 3))
-    for axis, name in zip(axes(u), AXES, strict=True):
+    total, shared = np.zeros((*far.shape, 3)), _shared(truth, w, rng, std)
+    for k, (axis, name) in enumerate(zip(axes(u), AXES, strict=True)):
         grown = _of(std, w, "process", name)[:, None] * np.sqrt(far)
-        own = _of(std, w, "run", name) * rng.normal(size=len(w))
+        own = _of(std, w, "run", name) * rng.normal(size=len(w)) + shared[:, k]
         step = grown * rng.normal(size=far.shape) + own[:, None] * far
         total += (axis @ step[..., None]).reshape(total.shape)
     return total
+
+
+def _shared(
+    truth: Robot, w: Windows, rng: np.random.Generator, std: Mapping[str, float]
+) -> Float[np.ndarray, "piece 3"]:
+    """Effects that neighbouring runs, and runs of one session, share."""
+    components = noise(w, truth)
+    named = [
+        std.get(c.name, std.get(f"{c.kind}.{c.what}", 0.0) if c.kind in SHARED else 0.0)
+        for c in components.components
+    ]
+    log_v = jnp.asarray(2 * np.log(np.maximum(named, 1e-30)))
+    out = np.zeros((len(w), len(AXES)))
+    for of in shared_of(w, truth, components)[0]:
+        root = np.asarray(of.root(log_v))
+        drawn = np.einsum("anq,aq->na", root, rng.normal(size=root.shape[::2]))
+        out[np.asarray(of.pieces)] = drawn
+    return out

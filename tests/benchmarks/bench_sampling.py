@@ -1,8 +1,8 @@
 """The posterior of one real floor by slipid, by NUTS and by stock emcee: do they agree, how fast?
 
-All three see the motion part of the same posterior (2022 logs of one floor, what sessions share
-included) and begin at its Laplace approximation, whose covariance NUTS has as its metric. emcee has
-its default move and the same likelihood in vectorised numpy. Time is that of sampling after the
+All three see the motion part of the same posterior (2022 logs of one floor, what runs share
+marginalised) and begin at its Laplace approximation, whose covariance NUTS has as its metric. emcee
+has its default move and the same likelihood in vectorised numpy. Time is that of sampling after the
 warm-up; reading, fitting and compiling are left out. Whether they agree is asked of NUTS in the
 coordinates that slipid has learnt, too, where it has enough effective draws to say.
 """
@@ -47,16 +47,12 @@ def problem_of(floor):
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     """The problem, where its fit ended, and a file of the latter."""
-    from slipid.identify.compare.predictive import contact_of
     from slipid.identify.fit.optimise import optimise
     from slipid.identify.posterior.coordinates import Fitted
 
     problem = problem_of(FLOOR)
     optimum = optimise(problem)
-    keep = np.ones(len(problem.windows))
-    variance = contact_of(problem, optimum.state, optimum.covariance, keep).variance
-    shared = {k: v for k, v in variance.items() if k.startswith("session.")}
-    found = Fitted(optimum.state.z, optimum.state.log_variance, optimum.covariance, shared)
+    found = Fitted(optimum.state.z, optimum.state.log_variance, optimum.covariance)
     path = tmp_path_factory.mktemp("fit") / "fitted.pickle"
     path.write_bytes(pickle.dumps(found))
     return problem, found, path
@@ -148,7 +144,7 @@ def nuts(path, seed, out, block=None):
     @jax.jit
     def potential(u):
         x, log = _placed(steps, u[None])
-        return -jnp.sum(density._sums(density.anchor, x[0], None)) - jnp.sum(log)
+        return -jnp.sum(density.sums(density.anchor, x[0], None)) - jnp.sum(log)
 
     kernel = NUTS(potential_fn=potential, dense_mass=False)
     chain = MCMC(kernel, num_warmup=NUTS_WARM_UP, num_samples=NUTS_DRAWS, progress_bar=False)

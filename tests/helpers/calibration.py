@@ -1,7 +1,8 @@
 """Made experiments whose truths come from the fit's own prior: do intervals hold what they say?
 
-The noise is what the likelihood says it is, run effects and heavy tails included, so that draws of
-a right posterior have ranks of the truth that are uniform (Talts et al. 2018, arXiv:1804.06788).
+The noise is what the likelihood says it is, effects that runs share and heavy tails included, so
+that draws of a right posterior have ranks of the truth that are uniform (Talts et al. 2018,
+arXiv:1804.06788).
 """
 
 from __future__ import annotations
@@ -86,7 +87,10 @@ def experiment(seed: int) -> tuple[Problem, Fitted, np.ndarray]:
     rng, common = np.random.default_rng(seed), problem()
     space, typical = common.space, 2 * np.log(common.noise.typical)
     z = space.prior_mean + space.prior_std * rng.standard_normal(space.size)
-    log_v = typical + VARIANCE_SPREAD * rng.standard_normal(len(typical))
+    normal = rng.standard_normal(len(typical))
+    log_v = typical + VARIANCE_SPREAD * normal
+    pooled = common.target.pooled  # the prior of its root is half-normal
+    log_v[pooled] = typical[pooled] + 2 * np.log(np.abs(normal[pooled]))
     this = common.of(filled(common, z, log_v, rng))
     optimum = optimise(this)
     fitted = Fitted(optimum.state.z, np.asarray(optimum.state.log_variance), optimum.covariance)
@@ -114,7 +118,9 @@ def filled(common: Problem, z: np.ndarray, log_v: np.ndarray, rng: np.random.Gen
     truth, w = common.space.tree(jnp.asarray(z)), common.windows
     clean, start, amps = (np.asarray(x) for x in _predicted(truth, common.batch))
     w = replace(w, pose=_logged(truth, start, clean))
-    gap = noise(common.of(w), "motion", log_v, rng).reshape(clean.shape)
+    this = common.of(w)
+    gap = noise(this, "motion", log_v, rng) + shared(this, log_v, rng)
+    gap = gap.reshape(clean.shape)
     w = replace(w, pose=_logged(truth, start, clean - gap))
     this = common.of(w)
     gap, ammeter = currents(this, log_v, rng)
@@ -150,6 +156,16 @@ def noise(this: Problem, block: str, log_v: np.ndarray, rng: np.random.Generator
     normal = rng.standard_normal(root.shape[:2])
     normal *= np.sqrt(DEGREES / rng.chisquare(DEGREES, (len(root), 1)))
     return np.einsum("nij,nj->ni", root, normal)
+
+
+def shared(this: Problem, log_v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """What effects that runs share move in the motion residuals of every piece (piece, m)."""
+    out = np.zeros(np.asarray(this.noise.blocks["motion"].known).shape)
+    for of in this.target.shared:
+        root = np.asarray(of.root(jnp.asarray(log_v)))
+        effect = np.einsum("anq,aq->na", root, rng.standard_normal(root.shape[::2]))
+        out[np.asarray(of.pieces)] = np.einsum("nma,na->nm", np.asarray(of.effect), effect)
+    return out
 
 
 @jax.jit

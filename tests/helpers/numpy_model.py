@@ -6,10 +6,9 @@ import math
 from functools import reduce
 
 import numpy as np
-from scipy.special import gammaln
+from scipy.linalg import solve_triangular
 
-from slipid.identify.fit.likelihood import FLOOR, SMOOTH
-from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD
+from slipid.identify.fit.likelihood import SMOOTH
 from slipid.model import contact, contact_law
 from slipid.parameter import entries, share_basis
 
@@ -62,8 +61,12 @@ class Rival:
         late = v["camera", "lag"] - float(self.b.lag)
         speed = (self.turn - late * self.faster) / self.dt[:, None]
         rim = v["geometry", "wheel_radius"] * speed
-        s = {k[1]: x[self.floor][:, None] for k, x in v.items() if k[0] == "surfaces"}
-        rest = v["body", "load_share"][self.load]
+        s = {k[1]: x[self.floor] for k, x in v.items() if k[0] == "surfaces"}
+        rest = v["body", "load_share"][self.load] * np.exp(s.pop("load_bias"))
+        rest = rest / rest.sum(axis=1, keepdims=True)
+        s = {name: x[:, None] for name, x in s.items()}
+        grown = (rest.shape[1] * rest) ** (s["drag_exponent"] - 1)
+        s |= {name: s[name] * grown for name in ("roller_drag", "rolling_resistance")}
         base = v["geometry", "base_radius"]
         xi = equilibrium(rim, hold, roll, pull, shift, s, rest, base, near)
         return xi, (speed, rim, s, rest, hold, roll, pull, shift)
@@ -233,52 +236,39 @@ def equilibrium(rim, hold, roll, pull, shift, s, rest, base, near=None):
 
 
 class Posterior:
-    """Log density of the motion as the `Density` has it, walker by walker.
+    """Log density of the motion as the `Density` has it, walker by walker, up to a constant.
 
     All windows are computed at once; `density` says where they are anchored.
     """
 
     def __init__(self, density):
-        self.at, self.space = density.coordinates, density.problem.space
+        self.at, self.space = density.coordinates.structure, density.problem.space
         self.rival, a = Rival(density.problem), density.anchor
-        self.start = numbers(self.space.template)
-        self.z, self.log_v = np.asarray(a.z), np.asarray(a.log_variance)
+        self.start, self.z = numbers(self.space.template), np.asarray(a.z)
         self.twist = np.asarray(a.twist).reshape(-1, 3)
         self.slope = np.asarray(a.twist_slope).reshape(-1, 3, len(self.z))
-        self.base = np.asarray(a.base["motion"]).transpose(3, 0, 1, 2)
-        self.which = np.asarray(a.which["motion"]).T
-        self.shares, self.session = np.asarray(a.shares), np.asarray(a.session)
+        self.root = np.asarray(a.root["motion"]) * np.asarray(a.scale["motion"])[:, None, None]
         self.pose = np.asarray(a.batch.pose)
-        size, n, v = density.size, len(self.at.structure), len(self.at.variance)
-        self.mean, self.std = np.zeros(size), np.ones(size)
-        self.mean[:n] = self.space.prior_mean[self.at.structure]
-        self.std[:n] = self.space.prior_std[self.at.structure]
-        self.mean[n : n + v] = np.asarray(a.typical)[self.at.variance]
-        self.std[n : n + v] = VARIANCE_SPREAD
+        self.mean, self.std = self.space.prior_mean[self.at], np.asarray(a.prior_std)[self.at]
+        self.tied = []
+        for tie in a.tied:
+            span, root = np.asarray(tie.span), np.asarray(tie.root)
+            rows = np.einsum("nma,anq->nmaq", span, root).reshape(-1, root.shape[0] * root.shape[2])
+            self.tied.append((np.asarray(tie.pieces), rows, np.asarray(tie.factor)))
 
     def __call__(self, x):
         return np.array([self.one(row) for row in x])
 
     def one(self, x):
-        structure, variance, effects = self.at.parts(x)
-        z, log_v = self.z.copy(), self.log_v.copy()
-        z[self.at.structure], log_v[self.at.variance] = structure, variance
+        z = self.z.copy()
+        z[self.at] = x
         v = self.numbers(z)
         xi, _ = self.rival.twist(v, self.twist + self.slope @ (z - self.z))
-        r = self.rival.motion(v, xi)
-        if len(effects):
-            shared = effects.reshape(-1, 3)[self.session]
-            r = r - np.einsum("nmk,nk->nm", self.shares, shared)
-        cov = np.einsum("nc,ncij->nij", np.exp(log_v)[self.which], self.base)
-        m = r.shape[1]
-        root = np.linalg.cholesky(cov + FLOOR["motion"] * np.eye(m))
-        q = (np.linalg.solve(root, r[..., None])[..., 0] ** 2).sum(axis=1)
-        log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        constant = gammaln(0.5 * (DEGREES + m)) - gammaln(0.5 * DEGREES)
-        constant -= 0.5 * m * np.log(DEGREES * np.pi)
-        told = constant - 0.5 * log_det - 0.5 * (DEGREES + m) * np.log1p(q / DEGREES)
-        prior = -0.5 * ((x - self.mean) / self.std) ** 2 - np.log(self.std)
-        total = told.sum() + self.camera(v) + (prior - 0.5 * np.log(2 * np.pi)).sum()
+        white = np.einsum("nij,nj->ni", self.root, self.rival.motion(v, xi))
+        told = (white**2).sum()
+        for pieces, rows, factor in self.tied:  # what shared effects explain
+            told -= (solve_triangular(factor, white[pieces].ravel() @ rows, lower=True) ** 2).sum()
+        total = -0.5 * told - 0.5 * (((x - self.mean) / self.std) ** 2).sum() + self.camera(v)
         return total if np.isfinite(total) else -np.inf
 
     def numbers(self, z):
@@ -286,9 +276,9 @@ class Posterior:
         out = {k: v.copy() for k, v in self.start.items()}
         for e in self.space.free:
             mine, d = z[self.space.place[e.path]], e.declaration
-            if d.shares:
-                value = np.exp(share_basis(len(mine) + 1) @ mine)
-                value = value / value.sum()
+            if d.tied:
+                value = share_basis(len(mine) + 1) @ mine
+                value = np.exp(value) / np.exp(value).sum() if d.shares else value
             elif math.isinf(d.upper):
                 value = mine if math.isinf(d.lower) else d.lower + np.exp(mine)
             else:

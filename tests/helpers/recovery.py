@@ -31,7 +31,11 @@ def choices(robot=TRUTH, factor=2.0):
         Choice("camera.marker_yaw", free=True),
         Choice("robot.mass", fixed=12.0),
     ]
-    free = [e for e in Space(robot, known).free if e.path.startswith(("surface.", "motor."))]
+    free = [
+        e
+        for e in Space(robot, known).free
+        if e.path.startswith(("surface.", "motor.")) and not e.declaration.deviation
+    ]
     return known + [
         Choice(e.path, start=float(e.get(robot)) * factor ** (1 if k % 2 else -1))
         for k, e in enumerate(free)
@@ -65,7 +69,8 @@ def design():
         for name in this.noise.names
     ]
     keep = np.ones(len(this.windows))
-    covariance = this.laplace(this.space.vector(TRUTH), 2 * np.log(std), keep)
+    log_v = 2 * np.log(np.maximum(std, 1e-6))
+    covariance = this.laplace(this.space.vector(TRUTH), log_v, keep)
     return said_identified(this.space, np.sqrt(np.diag(covariance)))
 
 

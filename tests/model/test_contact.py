@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,6 +14,7 @@ import optimistix as optx
 import pytest
 
 from slipid.model import contact
+from slipid.model import contact_law as law
 from slipid.model.contact_balance import Balance, stand
 from slipid.model.contact_law import S1, V0, W0, ContactSurface
 from slipid.model.geometry import mecanum, omni, skid_steer
@@ -32,12 +34,14 @@ RANGES = {
         "roller_drag": (0.01, 0.45),
         "roller_creep": (0.02, 1.0),
         "lead": 0.02,
+        "load_bias": 0.2,
     },
     "ordinary": {
         "creep": (0.03, 2.0),
         "roller_drag": (0.01, 0.4),
         "roller_creep": (0.08, 1.0),
         "lead": 0.01,
+        "load_bias": 0.1,
     },
 }
 
@@ -81,6 +85,12 @@ def cases(kind, count, geometry=ROBOTINO, seed=0):
     rim[wild] = rng.normal(size=(wild.sum(), geometry.wheels)) * speed[wild, None]
     rim[rng.random(count) < 0.01] = 0.0
     rest = rng.dirichlet(np.full(geometry.wheels, 20.0), count)
+    bias = rng.normal(size=rest.shape) * ranges["load_bias"]
+    floors = replace(
+        floors,
+        drag_exponent=jnp.asarray(rng.uniform(1.0, 1.6, count)),
+        load_bias=jnp.asarray(bias - bias.mean(axis=1, keepdims=True)),
+    )
     fast = np.abs(rim).max(axis=1) > 1.5
     rim[fast] *= 1.5 / np.abs(rim[fast]).max(axis=1, keepdims=True)
     return floors, jnp.asarray(rim), jnp.asarray(rest)
@@ -217,20 +227,22 @@ def test_the_jacobian_is_the_derivative_of_the_balance(name):
 # its derivative
 
 
-NUMBERS = [e.path for e in entries(ContactSurface()) if e.path != "friction"]
+NUMBERS = [e.path for e in entries(ContactSurface()) if e.path not in ("friction", "load_bias")]
+BIAS = jnp.array([0.1, -0.15, 0.05])
 
 
 def everything(rim, floor, rest):
     """Everything a twist depends on, as one vector."""
     floor = jnp.stack([getattr(floor, n) for n in NUMBERS])
-    return jnp.concatenate([rim, rest, floor, jnp.array([0.125]), jnp.zeros(3)])
+    return jnp.concatenate([rim, rest, floor, BIAS, jnp.array([0.125]), jnp.zeros(3)])
 
 
 @jax.jit
 def twist(vector):
-    rim, rest, values, base, offset = jnp.split(vector, np.cumsum([3, 3, len(NUMBERS), 1]))
+    sizes = [3, 3, len(NUMBERS), 3, 1]
+    rim, rest, values, bias, base, offset = jnp.split(vector, np.cumsum(sizes))
     g = eqx.tree_at(lambda g: (g.base_radius, g.drive_offset), ROBOTINO, (base[0], offset))
-    floor = ContactSurface(**dict(zip(NUMBERS, values, strict=True)))
+    floor = ContactSurface(**dict(zip(NUMBERS, values, strict=True)), load_bias=bias)
     return contact.equilibrium(rim, g.frame(), floor, rest)
 
 
@@ -385,6 +397,47 @@ def test_loads_carry_the_weight_at_the_centre_of_pressure():
         np.testing.assert_allclose(got @ (places + ahead), np.asarray(rest) @ places, atol=1e-9)
 
 
+def test_drag_grows_with_a_power_of_the_load():
+    """A wheel under k times an even load drags k^(p - 1) times as much per load."""
+    floor = surface(roller_drag=0.3, rolling_resistance=0.01, drag_exponent=1.6)
+    for relative in (0.25, 1.0, 1.0 + 1 / 3, 2.5):
+        found = law.at_load(floor, jnp.asarray(relative))
+        np.testing.assert_allclose(found.roller_drag, 0.3 * relative**0.6, rtol=1e-14)
+        np.testing.assert_allclose(found.rolling_resistance, 0.01 * relative**0.6, rtol=1e-14)
+        for e in entries(floor):
+            if e.path not in ("roller_drag", "rolling_resistance"):
+                assert e.get(found) == e.get(floor)
+    for lifted in (0.0, -0.1):  # no wheel that is lifted drags without bounds
+        flat = replace(floor, drag_exponent=jnp.asarray(0.5))
+        assert np.isfinite(law.at_load(flat, jnp.asarray(lifted)).roller_drag)
+
+
+@pytest.mark.parametrize("power", [1.0, 1.15, 1.6])
+def test_drag_of_a_wheel_goes_with_that_power_of_its_load(power):
+    """N g tanh with g = (w N)^(p - 1): from one load to another as the ratio to the power p."""
+    floor = surface(roller_drag=0.3, roller_viscosity=1e-300, lead=0.0, drag_exponent=power)
+    frame, xi = ROBOTINO.frame(), jnp.array([0.2, 0.05, 0.3])
+    rim = jnp.array([0.15, -0.02, -0.1])
+    loads = jnp.array([0.25, 0.3, 0.45]), jnp.array([0.5, 0.3, 0.2])
+    one, other = (np.asarray(forces_of(xi, rim, frame, floor, rest).drag) for rest in loads)
+    assert (np.abs(one) > 1e-3).all()
+    np.testing.assert_allclose(other / one, np.asarray(loads[1] / loads[0]) ** power, rtol=1e-12)
+
+
+def test_a_load_bias_is_a_load_that_the_floor_alone_sees():
+    rest, bias = jnp.array([0.25, 0.3, 0.45]), jnp.array([0.2, -0.3, 0.1])
+    np.testing.assert_array_equal(law.seen_load(rest, jnp.zeros(3)), rest)
+    np.testing.assert_array_equal(law.seen_load(rest, jnp.asarray(0.0)), rest)
+    seen = law.seen_load(rest, bias)
+    assert float(seen.sum()) == pytest.approx(1.0, abs=1e-15)
+    np.testing.assert_allclose(seen / seen[0], rest / rest[0] * np.exp(bias - bias[0]), rtol=1e-14)
+    frame, rim = ROBOTINO.frame(), jnp.array([0.1, 0.03, -0.12])
+    biased = replace(FLOORS["gray"], load_bias=bias)
+    here = equilibrium(rim, frame, biased, rest)
+    np.testing.assert_allclose(here, equilibrium(rim, frame, FLOORS["gray"], seen), atol=1e-14)
+    assert abs(here - equilibrium(rim, frame, FLOORS["gray"], rest)).max() > 1e-3
+
+
 @pytest.mark.parametrize("name", GEOMETRIES)
 @pytest.mark.slow
 def test_energy_is_lost_at_every_wheel_and_the_motors_pay_for_it(name):
@@ -406,8 +459,11 @@ def test_energy_is_lost_at_every_wheel_and_the_motors_pay_for_it(name):
     sliding = held * (rim * pull - along)
     rollers = -drag * (roll - rim * through)
     active = np.hypot(rim, roll - rim * through)
+    seen = np.asarray(rest) * np.exp(np.asarray(floors.load_bias))
+    even = g.wheels * seen / seen.sum(axis=1, keepdims=True)
     rolling = (
         np.asarray(floors.rolling_resistance)[:, None]
+        * even ** (np.asarray(floors.drag_exponent)[:, None] - 1)
         * np.asarray(felt.load)
         * np.tanh(along / (V0 + S1 * active))
         * along
@@ -428,6 +484,72 @@ def test_no_wheel_pushes_harder_than_friction_allows():
     xi = solve(rim, frame, floors, rest)
     felt = forces(xi, rim, frame, floors, rest)
     assert (np.abs(felt.traction) <= np.abs(felt.load) * (1 + 1e-12)).all()
+
+
+# several floors
+
+STACK = ContactSurface(
+    **{e.path: jnp.full(3, e.get(ContactSurface())) for e in entries(ContactSurface())}
+    | {
+        "friction": jnp.array([0.3, 0.45, 0.6]),
+        "creep": jnp.array([0.05, 0.4, 0.9]),
+        "roller_drag": jnp.array([0.14, 0.3, 0.45]),
+        "lead": jnp.array([0.0015, 0.004, 0.005]),
+        "drag_exponent": jnp.array([1.0, 1.2, 1.6]),
+        "load_bias": jnp.array([[0.1, -0.15, 0.05], [-0.2, 0.05, 0.15], [0.0, 0.1, -0.1]]),
+    },
+    labels=("a", "b", "c"),
+)
+
+
+def test_every_wheel_has_its_own_load_bias_of_the_floor_beneath_it():
+    bias = np.asarray(STACK.load_bias)
+    np.testing.assert_array_equal(STACK.at(1).load_bias, bias[1])
+    np.testing.assert_array_equal(jax.jit(lambda k: STACK.at(k).load_bias)(2), bias[2])
+    under = np.array([[2, 0, 1], [1, 1, 0], [2, 2, 2]])
+    own = np.array([[bias[floor, wheel] for wheel, floor in enumerate(row)] for row in under])
+    for row, want in zip(under, own, strict=True):
+        found = STACK.at(row)
+        np.testing.assert_array_equal(found.load_bias, want)
+        np.testing.assert_array_equal(found.drag_exponent, STACK.drag_exponent[row])
+    many = STACK.at(under.T)  # wheels first
+    np.testing.assert_array_equal(many.load_bias, own.T)
+    np.testing.assert_array_equal(many.creep, STACK.creep[under.T])
+
+
+def test_the_mean_floor_of_sure_shares_is_the_floor_itself():
+    under = np.array([2, 0, 1])
+    sure, one = STACK.mixed(jnp.eye(3)[under]), STACK.at(under)
+    for a, b in zip(jax.tree.leaves(sure), jax.tree.leaves(one), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-15)
+    even = STACK.mixed(jnp.full((3, 3), 1 / 3))
+    np.testing.assert_allclose(even.load_bias, STACK.load_bias.mean(axis=0), atol=1e-16)
+    np.testing.assert_allclose(even.drag_exponent, 3 * [1.9 / 1.5], rtol=1e-15)
+
+
+@pytest.mark.parametrize("floor", range(3))
+def test_one_floor_under_every_wheel_is_that_floor(floor):
+    frame, rest = ROBOTINO.frame(), jnp.array([0.25, 0.3, 0.45])
+    for rim in headings(0.2, 5):
+        each = equilibrium(rim, frame, STACK.at(np.full(3, floor)), rest)
+        np.testing.assert_allclose(each, equilibrium(rim, frame, STACK.at(floor), rest), atol=1e-12)
+
+
+@pytest.mark.parametrize("under", [1, (2, 0, 1), (0, 0, 2)])
+def test_wheels_in_another_order_move_the_robot_as_before(under):
+    """With their loads, the floors beneath them and what these see of the loads."""
+    order, angles = np.array([2, 0, 1]), np.array([60.0, 180.0, 300.0])
+    there = omni(angles[order].tolist(), 0.125, 0.04, 16.0)
+    moved = replace(STACK, load_bias=STACK.load_bias[:, order])
+    rest = jnp.array([0.25, 0.3, 0.45])
+    on = np.array(under)
+    beneath = STACK.at(on), moved.at(on[order] if on.ndim else on)
+    for rim in headings(0.2, 7) + jnp.array([0.03, 0.01, -0.02]):
+        here = equilibrium(rim, ROBOTINO.frame(), beneath[0], rest)
+        again = equilibrium(rim[order], there.frame(), beneath[1], rest[order])
+        np.testing.assert_allclose(again, here, atol=1e-12)
+        kept = equilibrium(rim[order], there.frame(), STACK.at(on), rest[order])
+        assert abs(kept - here).max() > 1e-4  # the order of the biases counts
 
 
 # other vehicles

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.model import contact
+from slipid.model import contact, contact_inverse
 from slipid.model.contact_balance import Balance, stand
 from slipid.model.contact_inverse import inverse_contact
 from slipid.model.contact_law import ContactSurface
@@ -25,6 +25,8 @@ FLOORS = ContactSurface(
     roller_viscosity=jnp.full(3, 0.02),
     scrub=jnp.full(3, 0.002),
     lead=jnp.full(3, 0.002),
+    drag_exponent=jnp.array([1.6, 1.3, 1.0]),
+    load_bias=jnp.array([[0.1, -0.15, 0.05], [-0.2, 0.05, 0.15], [0.0, 0.1, -0.1]]),
     labels=("a", "b", "c"),
 )
 REST = jnp.full(3, 1 / 3)
@@ -51,3 +53,19 @@ def test_the_inverse_model_inverts_the_contact(mixed):
         off = jnp.abs(back(rim, floor) - xi) * jnp.array([1.0, 1.0, frame.base])
         assert off.max() < 0.001, (index, xi, off)
     assert checked > 15
+
+
+@pytest.mark.parametrize("floor", range(3))
+def test_more_passes_invert_it_to_rounding(floor, monkeypatch):
+    monkeypatch.setattr(contact_inverse, "_PASSES", 15)
+    frame, on = GEOMETRY.frame(), FLOORS.at(floor)
+    rest, sure = jnp.array([0.3, 0.25, 0.45]), jnp.eye(3)[np.full(3, floor)]
+    plain = GEOMETRY.inverse()
+
+    @jax.jit
+    def there_and_back(xi):
+        speed = inverse_contact(frame, FLOORS, rest, plain, xi, sure)
+        return contact.equilibrium(frame.radius * speed, frame, on, rest)
+
+    for xi in np.random.default_rng(2).uniform(-1, 1, (10, 3)) * [0.2, 0.2, 0.5]:
+        np.testing.assert_allclose(there_and_back(jnp.asarray(xi)), xi, atol=1e-9)

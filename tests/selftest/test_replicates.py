@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
@@ -20,6 +21,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.shared import AXES
 from slipid.job.config import parsed
 from slipid.job.problem import Job
 from slipid.selftest import replicates as selftest
@@ -28,6 +30,7 @@ from slipid.selftest.replicates import Curve, Number, Replicate
 from slipid.selftest.windows import measure
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.progress import Reporter
+from tests.helpers.dense import of_shared
 from tests.helpers.made_windows import electric_noise, made, residuals, robot
 from tests.identify.fit.test_optimise import begin
 
@@ -71,7 +74,7 @@ def test_windows_without_noise_are_the_model():
 def test_the_noise_made_is_the_noise_the_likelihood_expects():
     def std_of(name):
         head, _, rest = name.partition(".")
-        return STD[name] if name in STD else STD[f"{head}.{rest.split('.')[-1]}"]
+        return STD[name] if name in STD else STD.get(f"{head}.{rest.split('.')[-1]}", 0.0)
 
     driven = made(BENT, std={}, signed=False)
     driven = replace(driven, current_var=np.full_like(driven.current_var, 1e-3))
@@ -81,13 +84,34 @@ def test_the_noise_made_is_the_noise_the_likelihood_expects():
         noise = of_noise.noise(w, BENT)
         variance = np.array([std_of(name) ** 2 for name in noise.names])
         for block, r in gaps(BENT, lk.batch(w, BENT)).items():
-            v = np.asarray(noise.blocks[block].covariance(jnp.log(variance)))
+            v = np.asarray(noise.blocks[block].covariance(jnp.log(variance + 1e-60)))
             q = np.einsum("ni,nij,nj->n", r, np.linalg.inv(v), np.asarray(r)).sum()
             square[block] = square.get(block, 0.0) + q
             count = 15 * r.size  # 24 pieces of two windows with three numbers, in every block
     low, high = chi2.ppf([1e-4, 1 - 1e-4], count)
     assert set(square) == {"motion", "current", "voltage"}
     assert all(low < q < high for q in square.values()), (square, count)
+
+
+@pytest.mark.slow
+def test_effects_made_are_shared_as_the_likelihood_expects():
+    """Against the covariance of all runs together, written out."""
+    shared = {f"{kind}.{axis}": 0.02 for kind in ("neighbours", "session") for axis in AXES}
+    std = {name: value for name, value in STD.items() if name[0] in "cpr"} | shared
+    driven, rng = made(BENT, std={}, signed=False), np.random.default_rng(6)
+    problem = Problem(replace(driven, has_current=False, has_voltage=False), BENT, [])
+    components = problem.noise.components
+    named = [std.get(c.name, std.get(f"{c.kind}.{c.what}", 1e-9)) for c in components]
+    log_v = 2 * np.log(named)
+    own = np.asarray(problem.covariance("motion", log_v))
+    whole = block_diag(*own) + of_shared(problem, log_v)
+    root, square = np.linalg.cholesky(whole), 0.0
+    for _ in range(15):
+        w = measure(BENT, driven, rng, std)
+        r = np.asarray(gaps(BENT, lk.batch(w, BENT))["motion"]).ravel()
+        square += float((np.linalg.solve(root, r) ** 2).sum())
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], 15 * len(whole))
+    assert low < square < high
 
 
 # what is concluded -------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from slipid.parameter import Declaration, entries
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_bytes
 
-SCHEMA = "slipid.robot/1"
+SCHEMA = "slipid.robot/2"
 ANEW = "copy it again, or write it anew with `slipid identify`"
 
 
@@ -71,8 +71,10 @@ def _content(path: Path) -> dict[str, object]:
             "that `slipid identify` writes"
         )
     if schema != SCHEMA:
+        newer = int(schema.partition("/")[2]) > int(SCHEMA.partition("/")[2])
+        age, then = ("a newer", "update slipid") if newer else ("an older", ANEW)
         raise DataError(
-            f"{path}: written by a newer slipid as {schema}, this one reads {SCHEMA}; update slipid"
+            f"{path}: written by {age} slipid as {schema}, this one reads {SCHEMA}; {then}"
         )
     return dict(content)
 

@@ -19,9 +19,7 @@ Axes = tuple[float, float, float]
 Source = Literal["laplace", "posterior", "given"]
 Verdict = Literal["identified", "weak", "not_identified", "at_bound", "fixed"]
 Provenance = Literal["measured", "borrowed", "override"]
-GainsVerdict = Literal[
-    "better than by hand", "no better than by hand", "no worse than by hand", "worse than by hand"
-]
+GainsVerdict = Literal["better than by hand", "no better than by hand", "worse than by hand"]
 UNITS = {
     "wheels.place": "base radius",
     "wheels.drive_angle": "rad",
@@ -155,8 +153,7 @@ class GainsRecord:
         method: of the search.
         better_than_hand: part of the cases in which they are.
         stability_margin: 1 - the largest spectral radius of a loop.
-        verdict: what the losses say; "better" where they differ by more than chance. Older files
-            say "no worse" where nobody has asked whether chance would do.
+        verdict: what the losses say; "better" where they differ by more than chance.
     """
 
     values: GainValues

@@ -53,7 +53,7 @@ class Planner:
         paths = [e.path for e in entries(self.robot)]
         choices = [c for c in choices if any(fnmatchcase(p, c.pattern) for p in paths)]
         first = Drive(robot.surfaces.labels[0], robot.body.loads[0], 0.0, 0.1)
-        self._problem = Problem(self._windows([first] * _TOGETHER), self.robot, choices)
+        self._problem = Problem(self._windows([first] * _TOGETHER), self.robot, choices).apart()
         self.space = self._problem.space
         self.z = self.space.vector(self.robot)
         electric = self._problem.space.electric & (not self._problem.target.joint)
@@ -61,7 +61,14 @@ class Planner:
         self._differ = np.array([any(map(self.variance.get, names)) for names in of_floor])
         self.effects = len(AXES) * int(self._differ.sum())
         self.is_electric = np.concatenate([electric, np.zeros(self.effects, bool)])
-        self._log_v = np.log([self.variance[name] for name in self._problem.noise.names])
+        # what a run shares with its neighbours counts as its own
+        own = {f"run.{x}.{a}": f"neighbours.{x}.{a}" for x in robot.surfaces.labels for a in AXES}
+        self._log_v = np.log(
+            [
+                self.variance[name] + self.variance.get(own.get(name, ""), 0.0)
+                for name in self._problem.noise.names
+            ]
+        )
 
     @classmethod
     def of(cls, fit: Fit) -> "Planner":

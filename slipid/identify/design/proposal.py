@@ -25,6 +25,7 @@ POINTS = 40
 """Numbers of runs at which the curve of a grid is given."""
 ASSUMPTIONS = (
     "noise and run effects as fitted; a run is one piece however long it is",
+    "what runs in nearly one direction share counts as each run's own",
     "all new runs are of one session, whose own offset they cannot average away",
     "linear around the fitted numbers; what the fit holds fixed stays fixed",
     "steady wheel speeds: nothing is learnt from starting and stopping",

@@ -24,8 +24,8 @@ from jaxtyping import Array, Bool, Float
 from slipid.identify.fit.shared import AXES, FloorShared
 from slipid.identify.fit.variances import VARIANCE_SPREAD, Search, Square, Target
 
-_STEPS = 3
-"""Scoring steps in a turn."""
+_STEPS, _SETTLED = 20, 1e-5
+"""Most scoring steps in a turn, and a step of a log variance that counts as rest."""
 _GRID = np.geomspace(0.1, 4.0, 60)
 """Stds of the load biases that are weighed, over the typical one."""
 
@@ -162,17 +162,35 @@ def _scored(axis: _Axis, log_v: np.ndarray, typical: np.ndarray) -> np.ndarray:
         score -= (log_v - typical) / VARIANCE_SPREAD**2
         info = _information(grown) + np.eye(len(v)) / VARIANCE_SPREAD**2
         step = np.clip(np.linalg.solve(info, score), -1.5, 1.5)
-        while (after := loss(log_v + step)) > before and np.abs(step).max() > 1e-3:
+        while (after := loss(log_v + step)) > before and np.abs(step).max() > _SETTLED:
             step = step / 2
-        if after <= before:
-            log_v, before = log_v + step, after
+        if after > before:
+            break
+        log_v, before = log_v + step, after
+        if np.abs(step).max() < _SETTLED:
+            break
     return log_v
 
 
 def pooled(
     precision: Square, z: Search, target: Target, log_v: Float[np.ndarray, " variance"]
 ) -> float:
-    """Log of the mean variance of the load biases of floors, with a half-normal prior of its root.
+    """Log of the mean variance of the load biases of floors; arguments as of `pooled_stds`."""
+    found = pooled_stds(precision, z, target, log_v)
+    return float(np.log(found.weight @ found.std**2))
+
+
+class PooledStds(NamedTuple):
+    """Stds that the load biases of floors may have, and how likely each is; these sum to one."""
+
+    std: Float[np.ndarray, " grid"]
+    weight: Float[np.ndarray, " grid"]
+
+
+def pooled_stds(
+    precision: Square, z: Search, target: Target, log_v: Float[np.ndarray, " variance"]
+) -> PooledStds:
+    """Stds of the load biases with a half-normal prior, on a grid.
 
     The fit is a Gaussian of that precision around z; its evidence for every std is known.
 
@@ -200,4 +218,4 @@ def pooled(
             + np.log(part)  # of the grid's steps
         )
     weight = np.exp(np.array(log) - max(log))
-    return float(np.log(np.sum(weight * (_GRID * typical) ** 2) / weight.sum()))
+    return PooledStds(_GRID * typical, weight / weight.sum())

@@ -115,6 +115,8 @@ def one_round(
     electric = problem.electric(z, log_v)
     whole, jacobian, felt = linear(target, jnp.asarray(z), electric)
     effect = effects_of(seen.tied, seen.whitening.root["motion"], whole["motion"])
+    # weights follow effects and effects follow weights: half way, or they can swing for ever
+    effect = 0.5 * (effect + state.shared(len(keep))) if state.round else effect
     residual, told = less(target, whole, effect), problem.through_voltage(z, log_v, felt)
     if scoring:
         spread = spread_of(target, jacobian, log_v, jnp.asarray(keep))

@@ -86,6 +86,8 @@ class Directions:
 
         Its rows have length 1, less where the pace is another.
         """
+        if not paces:
+            return np.zeros((len(self.pace), 0))
         wave = 1 / LENGTH**2
         k = np.arange(1, _HARMONICS + 1)
         angle = np.nan_to_num(self.direction)[:, None] * k
@@ -97,7 +99,7 @@ class Directions:
         root = np.linalg.cholesky(seen + 1e-9 * np.eye(len(paces)))
         met = {pace: np.array([pace.near(b) for b in paces]) for pace in set(self.pace)}
         share = {pace: np.linalg.solve(root, row) for pace, row in met.items()}
-        of_pace = np.array([share[pace] for pace in self.pace])
+        of_pace = np.array([share[pace] for pace in self.pace]).reshape(-1, len(paces))
         return np.asarray(np.einsum("pc,pd->pcd", of_pace, around).reshape(len(angle), -1))
 
 
@@ -238,6 +240,13 @@ def freed_slopes(
 ) -> Float[Array, "rows free"]:
     """`freed` of every column."""
     return jax.vmap(lambda column: freed(tied, column), in_axes=-1, out_axes=-1)(white)
+
+
+def shared_slopes(
+    tied: tuple[Tie, ...], white: Float[Array, "piece m free"]
+) -> Float[Array, "piece 3 free"]:
+    """`shared_effects` of every column."""
+    return jax.vmap(lambda column: shared_effects(tied, column), in_axes=-1, out_axes=-1)(white)
 
 
 class Told(NamedTuple):

@@ -15,7 +15,14 @@ from jaxtyping import Array, Bool, Float
 
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import Components, electric_noise
-from slipid.identify.fit.shared import FloorShared, Tie, freed_slopes, shared_spread, ties
+from slipid.identify.fit.shared import (
+    FloorShared,
+    Tie,
+    freed_slopes,
+    shared_slopes,
+    shared_spread,
+    ties,
+)
 from slipid.search_space import Space
 
 Vector = Array | np.ndarray
@@ -185,11 +192,19 @@ def _cut(total: Array, of_motion: Array, e: Array) -> Array:
 def spread_of(target: Target, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
     """Covariance of the residuals from fitted numbers and from what runs share (piece, m, m).
 
-    The Jacobian is of the structural numbers.
+    The Jacobian is of the structural numbers; what runs share follows them.
     """
     cov = jnp.linalg.inv(precision(target, jacobian, log_v, keep))
-    spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in jacobian.items()}
-    around = shared_spread(expected_ties(target, log_v, keep), len(keep))
+    tied = expected_ties(target, log_v, keep)
+    half = whitened(target.blocks, jacobian, log_v, keep)["motion"]
+    followed = shared_slopes(tied, half)
+    motion = jacobian["motion"]
+    for of in target.shared:
+        off = jnp.einsum("nma,nap->nmp", of.effect, followed[of.pieces])
+        motion = motion.at[of.pieces].add(-off)
+    slopes = jacobian | {"motion": motion}
+    spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in slopes.items()}
+    around = shared_spread(tied, len(keep))
     for of in target.shared:
         more = jnp.einsum("nma,nab,nlb->nml", of.effect, around[of.pieces], of.effect)
         spread["motion"] = spread["motion"].at[of.pieces].add(more)
@@ -209,8 +224,7 @@ def scored(
 
     Residuals are those of a model, this or another, less what runs share. `spread` is their
     covariance from what was fitted to them (piece, m, m); the degrees of freedom it stands for are
-    not the variances' to have. `own` is the part that the variances have in that of the residuals
-    (piece, m), all where absent.
+    not the variances' to have.
     """
     _, weights, _ = whitening(target.blocks, residual, log_v, keep)
     score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])

@@ -1,8 +1,9 @@
 """A draw of the electric numbers for every draw of the motion.
 
 Given the motion their most likely values are found by Gauss-Newton steps, and proposals are drawn
-from the Gaussian there, a little wider. Each is accepted or not by the exact density (Metropolis-
-Hastings with independent proposals; Tierney 1994, Annals of Statistics 22(4)).
+from a Student t there, whose tails reach where a skewed density does. Each is accepted or not by
+the exact density (Metropolis-Hastings with independent proposals; Tierney 1994, Annals of
+Statistics 22(4)).
 """
 
 from dataclasses import dataclass
@@ -16,10 +17,12 @@ from slipid.identify.fit.variances import Square
 from slipid.identify.posterior.coordinates import Anchor
 from slipid.identify.posterior.density import Density, Held
 
-_STEPS, _PROPOSALS = 4, 12
+_STEPS, _PROPOSALS = 4, 16
 """Gauss-Newton steps, and proposals of every draw."""
+_DEGREES = 5.0
+"""Degrees of freedom of proposals."""
 _WIDER = 1.15
-"""Std of proposals over that of the Gaussian."""
+"""Scale of proposals over that of the Gaussian at the most likely values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +56,10 @@ def electric_given_motion(
     flat = x.reshape(-1, x.shape[-1])
     start = second.centre + (flat - first.centre) @ slope
     rng = np.random.default_rng(seed)
-    normal = rng.standard_normal((len(flat), _PROPOSALS + 1, second.size))
+    student = rng.standard_normal((len(flat), _PROPOSALS + 1, second.size))
+    student *= np.sqrt(_DEGREES / rng.chisquare(_DEGREES, student.shape[:2]))[..., None]
     chance = np.log(rng.uniform(size=(len(flat), _PROPOSALS)))
-    many = (first.hold(flat), *map(jnp.asarray, (start, normal, chance)))
+    many = (first.hold(flat), *map(jnp.asarray, (start, student, chance)))
     drawn, moves = second.mapped(_draw, many)
     moved = np.asarray(moves)
     return ElectricDraws(
@@ -66,7 +70,7 @@ def electric_given_motion(
 
 
 def _draw(
-    density: Density, anchor: Anchor, held: Held, start: Array, normal: Array, chance: Array
+    density: Density, anchor: Anchor, held: Held, start: Array, student: Array, chance: Array
 ) -> tuple[Array, Array]:
     """The last of the proposals that were accepted, and which were."""
 
@@ -82,8 +86,9 @@ def _draw(
 
     centre, _ = jax.lax.scan(step, start, None, length=_STEPS)
     root = jnp.linalg.cholesky(jnp.linalg.inv(information(centre)))
-    at = centre + _WIDER * normal @ root.T
-    log_ratio = jax.vmap(log_prob)(at) + 0.5 * jnp.sum(normal**2, axis=1)
+    at = centre + _WIDER * student @ root.T
+    tail = 0.5 * (_DEGREES + len(start)) * jnp.log1p(jnp.sum(student**2, axis=1) / _DEGREES)
+    log_ratio = jax.vmap(log_prob)(at) + tail
     log_ratio = jnp.where(jnp.isfinite(log_ratio), log_ratio, -jnp.inf)
 
     def choose(now: Array, k: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from slipid.identify.fit.hierarchy import effect_information
+from slipid.identify.fit.hierarchy import effect_information, pooled_stds
 from slipid.identify.fit.problem import Problem, linear
 from slipid.identify.fit.variances import VARIANCE_SPREAD, information
 from slipid.identify.posterior import diagnosis, ensemble
@@ -82,7 +82,8 @@ def drawn_variances(
 ) -> Float[np.ndarray, "ensemble draw variance"]:
     """Log variances from the Gaussian with their information at the fit.
 
-    They hardly depend on the numbers of the model, which the chains hold them for.
+    They hardly depend on the numbers of the model, which the chains hold them for. That of the load
+    biases of floors, of which there are few, is drawn by how likely each of a grid is.
     """
     log_v, keep = fitted.log_variance, np.ones(len(problem.windows))
     electric = problem.electric(fitted.z, log_v)
@@ -96,5 +97,9 @@ def drawn_variances(
     told += effect_information(problem.target, motion, weight, fitted.covariance, log_v)
     told[np.diag_indices_from(told)] += np.where(of_blocks, 0.0, 1 / VARIANCE_SPREAD**2)
     root = np.linalg.cholesky(np.linalg.inv(told))
-    normal = np.random.default_rng([seed, 1]).standard_normal((*shape, len(log_v)))
-    return np.asarray(log_v + normal @ root.T)
+    rng = np.random.default_rng([seed, 1])
+    out = log_v + rng.standard_normal((*shape, len(log_v))) @ root.T
+    precision = np.linalg.inv(fitted.covariance)
+    pooled = pooled_stds(precision, fitted.z, problem.target, log_v)
+    out[..., problem.target.pooled] = 2 * np.log(rng.choice(pooled.std, shape, p=pooled.weight))
+    return np.asarray(out)

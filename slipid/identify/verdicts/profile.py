@@ -159,6 +159,7 @@ class _Walk:
         self.free[at] = 0.0
         self.std = float(np.sqrt(covariance[at, at]))
         self.start, self.state = float(optimum.state.z[at]), optimum.state
+        self.fitted = optimum.state
         self.count, self.settled = 0, True
         self.electric = problem.electric(optimum.state.z, optimum.state.log_variance)
         self.lowest = self.loss(optimum.state)
@@ -170,7 +171,9 @@ class _Walk:
         if self.of_motion:
             blocks = {"motion": blocks["motion"]}
         keep = np.ones(len(problem.windows))
-        seen = problem.seen(blocks, log_v, keep, state.shared(len(keep)))
+        moving = problem.target.joint or self.of_motion
+        effect = (state if moving else self.fitted).shared(len(keep))
+        seen = problem.seen(blocks, log_v, keep, effect)
         return problem.loss(state.z, log_v, keep, seen, self.electric)
 
     def side(self, sign: float) -> list[tuple[float, float]]:

@@ -175,7 +175,7 @@ def judged(w, names):
     problem = Problem(w, ROBOT, HELD)
     z = problem.space.vector(ROBOT)
     variance = by_name(problem, 2 * np.log(problem.noise.typical))
-    contact = Contact(ROBOT, variance, 1e-12 * np.eye(len(z)), problem.space, z)
+    contact = Contact(ROBOT, variance, 1e-12 * np.eye(len(z)), problem.space, z, shared={})
     half = w.run // 4 % 2
     keep = (half == 0).astype(float)
     models = [with_noise(ALL[name], contact, problem, keep) for name in names]
@@ -200,22 +200,30 @@ def width_of_student(m):
 
 @pytest.mark.slow
 def test_linear_slip_is_told_from_constant_slip():
-    told, models, problem, half = judged(
+    told, models, _, _ = judged(
         driven("linear", ([1.0], [3.0]), 3, runs=480), ("encoder", "constant", "linear", "affine")
     )
     for floor in ranking(told).values():
         verdict = {name: one.verdict for name, one in floor.models.items()}
         assert verdict["encoder"] == verdict["constant"] == "worse"
         assert "worse" not in (verdict["linear"], verdict["affine"])  # affine contains linear
-    # the distribution of runs it has not seen is as wide as it has to be: as a Student t fitted to
-    # Gaussian gaps is, and 0.13 is three stds of the mean
     linear = models["linear"]
-    gap, scale = linear.scale(problem)
-    q = np.einsum("ni,ni->n", gap, np.linalg.solve(scale, gap[..., None])[..., 0])[half == 1]
-    assert q.mean() / gap.shape[1] == pytest.approx(width_of_student(gap.shape[1]), abs=0.13)
     for axis in ("along", "across", "yaw"):
         found = [np.sqrt(linear.variance[f"run.{f}.{axis}"]) for f in ROBOT.surfaces.labels]
         np.testing.assert_allclose(found, STD[f"run.{axis}"], rtol=0.25)
+
+
+@pytest.mark.slow
+def test_the_distribution_of_runs_it_has_not_seen_is_as_wide_as_it_has_to_be():
+    """As a Student t fitted to Gaussian gaps is; 0.1 is three stds of the mean of four seeds."""
+    found = []
+    for seed in range(20, 24):
+        made = driven("linear", ([1.0], [3.0]), seed, runs=480)
+        _, models, problem, half = judged(made, ("linear",))
+        gap, scale = models["linear"].scale(problem)
+        q = np.einsum("ni,ni->n", gap, np.linalg.solve(scale, gap[..., None])[..., 0])[half == 1]
+        found.append(q.mean() / gap.shape[1])
+    assert np.mean(found) == pytest.approx(width_of_student(gap.shape[1]), abs=0.1)
 
 
 @pytest.mark.slow

@@ -109,7 +109,7 @@ def test_without_a_wish_it_predicts_every_floor(folder):
 
 def test_limits_of_the_candidates_hold(folder):
     words = ("--headings", "0,90", "--speeds", "0.15", "--turns", "-20", "--distance", 0.5)
-    done = design(folder, "--parameter", "*load_share*", "--runs", 3, *words, "--json", "-")
+    done = design(folder, "--parameter", "*.soft.creep", "--runs", 3, *words, "--json", "-")
     assert done.exit_code == 0, done.output
     for run in json.loads(done.stdout)["runs"]:
         assert run["distance"] == 0.5

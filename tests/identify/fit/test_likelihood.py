@@ -9,14 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.stats import multivariate_t
 
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
 from slipid.identify.fit.problem import Problem, linear
-from slipid.identify.fit.variances import DEGREES, inverse_root, scored
+from slipid.identify.fit.variances import DEGREES, inverse_root, scored, spread_of
 from slipid.identify.slip_curves import current_trend
 from slipid.search_space import Choice
+from tests.helpers.dense import of_shared
 from tests.helpers.made_windows import electric_noise, made, residuals, robot
 
 EVERYTHING = [Choice("*", free=True)]
@@ -274,13 +276,16 @@ def test_whitened_residuals_are_weighted_mahalanobis_distances(everything):
 
 
 def information(problem, jacobian, log_v, blocks):
-    """Expected information in numpy, prior included."""
-    total = np.diag(1 / problem.space.prior_std**2)
+    """Expected information in numpy, prior included, what runs share by their whole covariance."""
+    total = np.diag(1 / np.asarray(problem.target.prior_std(log_v)) ** 2)
     for k in blocks:
         j = np.asarray(jacobian[k])
         factor = (DEGREES + j.shape[1]) / (DEGREES + j.shape[1] + 2)
-        v = np.linalg.inv(np.asarray(problem.covariance(k, log_v)))
-        total = total + factor * np.einsum("nip,nij,njq->pq", j, v, j)
+        covariance = block_diag(*np.asarray(problem.covariance(k, log_v)) / factor)
+        if k == "motion":
+            covariance = covariance + of_shared(problem, log_v)
+        flat = j.reshape(-1, j.shape[-1])
+        total = total + flat.T @ np.linalg.solve(covariance, flat)
     return total
 
 
@@ -331,9 +336,10 @@ def test_runs_that_are_left_out_change_nothing(truth):
             problem.space.start, problem.electric(problem.space.start, log_v)
         )
         info = problem.precision(jacobian, log_v, keep)
-        step = scored(problem.target, blocks, jacobian, jnp.asarray(log_v), jnp.asarray(keep), None)
-        loss = problem.whitening(blocks, log_v, keep)[2]
-        results.append((np.asarray(info), np.asarray(step), float(loss)))
+        at = jnp.asarray(log_v), jnp.asarray(keep)
+        step = scored(problem.target, blocks, spread_of(problem.target, jacobian, *at), *at, None)
+        seen = problem.seen(blocks, log_v, keep, np.zeros((24, 3)))
+        results.append((np.asarray(info), np.asarray(step), float(seen.loss)))
     for one, two in zip(*results, strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-7, atol=1e-9)
 
@@ -349,9 +355,12 @@ def toy(gaussian):
     """
     true = robot(floors=("soft",), loads=("as_built",), sessions=("one",))
     w = replace(made(true, runs=80), has_current=False, has_voltage=False)
-    problem = Problem(w, true, [Choice("*", free=True)])
+    held = [Choice(f"surface.*.{name}", free=False) for name in ("load_bias", "drag_exponent")]
+    problem = Problem(w, true, [Choice("*", free=True), *held]).apart()
     rng = np.random.default_rng(11)
-    std = np.array([0.0008, 0.004, 0.006, 0.004, 0.012, 0.008, 0.012, 0.03])
+    std = problem.noise.typical.copy()
+    std[:8] = [0.0008, 0.004, 0.006, 0.004, 0.012, 0.008, 0.012, 0.03]
+    assert problem.noise.names[7] == "run.soft.yaw"
     v = np.asarray(problem.covariance("motion", 2 * np.log(std)))
     columns = problem.space.size
     jacobian = rng.normal(size=(80, 6, columns)) * np.sqrt(np.einsum("nii->ni", v))[..., None]
@@ -360,21 +369,25 @@ def toy(gaussian):
     return problem, jacobian, noise + jacobian @ beta, std
 
 
+OF_MOTION = np.arange(8)
+"""Numbers of the variances of camera, process and runs on the one floor of `toy`."""
+
+
 def alternate(problem, jacobian, y, rounds=60):
     """Generalised least squares and a scoring step in turn, until both rest."""
     log_v, keep = 2 * np.log(problem.noise.typical), jnp.ones(len(y))
+    of_effects = np.isin(np.arange(len(log_v)), OF_MOTION)  # as for a rung
+    target = replace(problem.target, scored=problem.target.scored | of_effects)
     for _ in range(rounds):
         v = np.linalg.inv(np.asarray(problem.covariance("motion", log_v)))
         info = np.einsum("nip,nij,njq->pq", jacobian, v, jacobian)
         info += np.diag(1 / problem.space.prior_std**2)
         beta = np.linalg.solve(info, np.einsum("nip,nij,nj->p", jacobian, v, y))
         r = {"motion": jnp.asarray(y - jacobian @ beta)}
+        spread = np.einsum("nip,pq,njq->nij", jacobian, np.linalg.inv(info), jacobian)
         before = log_v
-        log_v = np.asarray(
-            scored(
-                problem.target, r, {"motion": jnp.asarray(jacobian)}, jnp.asarray(log_v), keep, None
-            )
-        )
+        told = {"motion": jnp.asarray(spread)}
+        log_v = np.asarray(scored(target, r, told, jnp.asarray(log_v), keep, None))
     assert np.abs(log_v - before).max() < 1e-6
     return log_v
 
@@ -422,7 +435,7 @@ def test_variances_are_recovered_although_the_structure_eats_degrees_of_freedom(
         at = slice(6 * k, 6 * k + 6)
         total[at, at] += v
         plain[at, at] += v
-        base[:, at, at] = pieces[k]
+        base[OF_MOTION, at, at] = pieces[k]
     scaled = [v * np.linalg.solve(total, b) for v, b in zip(std**2, base, strict=True)]
     info = 0.5 * np.array([[np.sum(a * b.T) for a in scaled] for b in scaled])
     info += np.eye(len(std)) / 9
@@ -458,16 +471,18 @@ def test_scoring_steps_end_where_the_loss_is_level_in_electric_noise(truth, amme
     )
     z, keep, target = problem.space.start, jnp.ones(len(w)), problem.target
     log_v = np.asarray(target.typical)
-    blocks, jacobian, felt = linear(target, z, problem.electric(z, log_v))
+    blocks, _, felt = linear(target, z, problem.electric(z, log_v))
+    certain = {k: jnp.zeros((*r.shape, r.shape[1])) for k, r in blocks.items()}
     for _ in range(60):
         told = problem.through_voltage(z, log_v, felt)
         blocks = blocks | {"voltage": told.residual}
-        log_v = np.asarray(scored(target, blocks, jacobian, jnp.asarray(log_v), keep, told))
+        log_v = np.asarray(scored(target, blocks, certain, jnp.asarray(log_v), keep, told))
 
     def loss(step):
         electric = problem.electric(z, log_v + step)
         blocks, _ = problem.linear(z, electric)
-        return problem.loss(z, log_v + step, keep, blocks, electric)
+        seen = problem.seen(blocks, log_v + step, keep, np.zeros((len(w), 3)))
+        return problem.loss(z, log_v + step, keep, seen, electric)
 
     for k, name in enumerate(problem.noise.names):
         if name.startswith(("current", "voltage")):

@@ -27,7 +27,8 @@ def test_starts_are_two_fold_off_the_truth():
     space = recovery.problem().space
     off = space.start - space.vector(recovery.TRUTH)
     for k, name in enumerate(space.names):
-        if name.startswith(("motor.", "surface.")) and not name.endswith(".lead"):
+        is_lead, is_bias = name.endswith(".lead"), ".load_bias" in name
+        if name.startswith(("motor.", "surface.")) and not (is_lead or is_bias):
             assert abs(off[k]) == pytest.approx(np.log(2)), name
 
 
@@ -43,12 +44,20 @@ def test_motor_and_curves_are_recovered(seed):
 
 @pytest.mark.slow
 def test_errors_are_as_large_as_the_fit_says():
-    """Of coordinates the plan identifies; bench_recovery.py does it for 40 seeds."""
-    z = np.stack([recovered(seed).score for seed in SEEDS])[:, recovery.design()]
+    """Of coordinates the plan identifies; bench_recovery.py does it for 40 seeds.
+
+    Loads are said to be less sure than they are here: two floors cannot show that the law of every
+    floor is right about them, as it is in these logs.
+    """
+    names, sure = np.array(recovery.problem().space.names), recovery.design()
+    z = np.stack([recovered(seed).score for seed in SEEDS])[:, sure]
+    of_load = np.array(["load" in name for name in names[sure]])
     assert np.abs(z).max() < 4
-    low, high = chi2.ppf([5e-4, 1 - 5e-4], z.size)  # as if none were correlated, which is stricter
-    assert low < np.sum(z**2) < high
-    assert z.size >= 12 * len(SEEDS)
+    for chosen, least in ((~of_load, 5e-4), (of_load, 0.0)):
+        some = z[:, chosen]
+        low, high = chi2.ppf([least, 1 - 5e-4], some.size)  # as if none were correlated: stricter
+        assert low < np.sum(some**2) < high
+    assert z[:, ~of_load].size >= 8 * len(SEEDS)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""A short chain of the sampler, both stages, against reviewed numbers."""
+"""A short chain of the sampler, and what is drawn beside it, against reviewed numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_a_short_chain(golden):
     """Chains amplify rounding; so few steps do not."""
     problem, fitted, _ = calibration.experiment(3)
     blocks = []
-    posterior.sample(
+    found = posterior.sample(
         problem,
         fitted,
         PLAN,
@@ -25,12 +25,12 @@ def test_a_short_chain(golden):
         record=Record(keep=lambda part, block: blocks.append((part, block))),
     )
     rows = []
-    for part, block in blocks[:5]:
+    for part, block in blocks:
         last = np.asarray(block.chain)[:, -1].mean(axis=1)
         for ensemble, mean in enumerate(last):
             rows.append(
                 {
-                    "part": part.partition("-")[0],
+                    "part": part,
                     "block": block.number,
                     "ensemble": ensemble,
                     "log_prob": float(block.log_prob[ensemble, -1].mean()),
@@ -39,3 +39,16 @@ def test_a_short_chain(golden):
                 | {f"x{k}": float(v) for k, v in enumerate(mean[:12])}
             )
     golden("chain", rows, rtol=1e-4, atol=1e-5)
+    of_electric = found.z[..., problem.space.electric].mean(axis=1)
+    beside = {"electric": of_electric, "variance": found.log_variance.mean(axis=1)}
+    golden(
+        "chain_beside",
+        [
+            {"part": part, "ensemble": ensemble, "number": k, "mean": float(value)}
+            for part, means in beside.items()
+            for ensemble, mean in enumerate(means)
+            for k, value in enumerate(mean)
+        ],
+        rtol=1e-4,
+        atol=1e-5,
+    )

@@ -1,4 +1,4 @@
-"""The density the sampler sees against the likelihood the fit maximises."""
+"""The density the sampler sees against its definition, written out with dense covariances."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import multivariate_t, norm
+from scipy.linalg import block_diag
+from scipy.stats import multivariate_t
 
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
+from slipid.identify.fit.noise import POOLED
 from slipid.identify.fit.problem import Problem
-from slipid.identify.fit.sessions import AXES
-from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD
+from slipid.identify.fit.shared import AXES
+from slipid.identify.fit.variances import DEGREES
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.identify.posterior.density import Density
 from slipid.search_space import Choice
@@ -44,6 +46,7 @@ FREE = [
     Choice("camera.scale", free=True),
     Choice("camera.session_yaw@*", free=True),
     Choice("motor.resistance", free=True),
+    Choice("surface.*.load_bias", free=True),
 ]
 
 
@@ -59,9 +62,14 @@ def problem():
     return stated()
 
 
-def density(problem, part, session=None):
+def fitted(problem):
+    """A place to hold variances and weights at, as a fit would."""
     z, log_v = problem.space.start, 2 * np.log(problem.noise.typical)
-    return Density(problem, Fitted(z, log_v, 0.01 * np.eye(len(z)), session or {}), part)
+    return Fitted(z, log_v, 0.01 * np.eye(len(z)))
+
+
+def density(problem, part):
+    return Density(problem, fitted(problem), part)
 
 
 def near(d, count=4, width=0.1):
@@ -69,50 +77,142 @@ def near(d, count=4, width=0.1):
     return d.centre + width * rng.normal(size=(count, d.size))
 
 
-def expected(problem, z, log_v, blocks):
-    """Log likelihood of every piece by scipy, straight from the definition."""
-    volt = problem.electric(z, log_v)
+def seen(problem, z):
+    """Residuals of every block, and log |d residuals / d data| of the pieces, in plain numpy."""
+    volt = problem.electric(z, fitted(problem).log_variance)
     tree = problem.space.tree(jnp.asarray(z))
-    gaps = jax.jit(residuals)(tree, problem.batch, volt)
-    camera, spread = lk.log_jacobians(tree, problem.batch, volt)
-    out = np.zeros(len(problem.windows))
-    for k in blocks:
-        v = np.asarray(problem.covariance(k, log_v))
-        for n, r in enumerate(np.asarray(gaps[k])):
-            out[n] += multivariate_t.logpdf(r, shape=v[n], df=DEGREES)
-        out += np.asarray({"motion": camera, "voltage": spread}.get(k, 0.0))
-    return out
+    gaps = {k: np.asarray(r) for k, r in jax.jit(residuals)(tree, problem.batch, volt).items()}
+    camera, spread = (np.asarray(x) for x in lk.log_jacobians(tree, problem.batch, volt))
+    return gaps, {"motion": camera, "voltage": spread}
+
+
+def spread_of(problem, block):
+    """Covariance V of the residuals of a block at the fit, piece by piece."""
+    return np.asarray(problem.covariance(block, fitted(problem).log_variance))
+
+
+def shared_covariance(problem):
+    """What effects that runs share make of the covariance of all motion residuals (n m, n m)."""
+    w, index = problem.windows, problem.noise.names.index
+    moved, v = of_noise.effects(w, problem.robot), np.exp(fitted(problem).log_variance)
+    n, m, _ = moved.shape
+    session = np.asarray(w.session)[:, None] == np.asarray(w.session)
+    out = np.zeros((n, m, n, m))
+    for floor, of in zip(problem.robot.surfaces.labels, problem.target.shared, strict=True):
+        mine, near = np.asarray(of.pieces), np.asarray(of.near)
+        assert [w.surface[k] for k in mine] == [floor] * len(mine)
+        for k, axis in enumerate(AXES):
+            like = v[index(f"neighbours.{floor}.{axis}")] * near @ near.T
+            like += v[index(f"session.{floor}.{axis}")] * session[np.ix_(mine, mine)]
+            by = moved[mine, :, k]
+            out[np.ix_(mine, range(m), mine, range(m))] += np.einsum("im,ij,jl->imjl", by, like, by)
+    return out.reshape(n * m, n * m)
+
+
+def weights(problem):
+    """Weight of every piece in every block: of a Student t at the fit, less what it tells less.
+
+    A run is an outlier for what it does not share with others, found in turn with the weights.
+    """
+    gaps, _ = seen(problem, fitted(problem).z)
+    shared, moved = shared_covariance(problem), np.zeros_like(gaps["motion"])
+
+    def weight(block, r):
+        q = np.einsum(
+            "ni,ni->n", r, np.linalg.solve(spread_of(problem, block), r[..., None])[..., 0]
+        )
+        return (DEGREES + r.shape[1]) / (DEGREES + q)
+
+    for _ in range(3):
+        own = spread_of(problem, "motion") / weight("motion", gaps["motion"] - moved)[:, None, None]
+        told = np.linalg.solve(shared + block_diag(*own), gaps["motion"].ravel())
+        moved = (shared @ told).reshape(moved.shape)
+    out = {k: weight(k, r - moved if k == "motion" else r) for k, r in gaps.items()}
+    less = {k: (DEGREES + r.shape[1]) / (DEGREES + r.shape[1] + 2) for k, r in gaps.items()}
+    return {k: w * less[k] for k, w in out.items()}
+
+
+class Dense:
+    """Log density of each floor by the Gaussian of all its residuals, without what is constant."""
+
+    def __init__(self, problem, blocks, alone=False):
+        self.problem, self.blocks, weight = problem, blocks, weights(problem)
+        self.own = {k: spread_of(problem, k) / weight[k][:, None, None] for k in blocks}
+        self.shared = shared_covariance(problem) * (0.0 if alone else 1.0)
+
+    def floors(self, z):
+        surface = np.asarray(self.problem.batch.surface)
+        gaps, jacobian = seen(self.problem, z)
+        out = np.zeros(surface.max() + 1)
+        for k in self.blocks:
+            m = gaps[k].shape[1]
+            whole = block_diag(*self.own[k]) + (self.shared if k == "motion" else 0.0)
+            for g in range(len(out)):
+                rows = (surface[:, None] == g).repeat(m, axis=1).ravel()
+                r = gaps[k].ravel()[rows]
+                out[g] -= 0.5 * r @ np.linalg.solve(whole[np.ix_(rows, rows)], r)
+                out[g] += jacobian.get(k, np.zeros(len(surface)))[surface == g].sum()
+        return out
+
+    def effects(self, z):
+        """Conditional mean of what the shared effects move in the motion residuals (piece, m)."""
+        gap = seen(self.problem, z)[0]["motion"]
+        told = np.linalg.solve(self.shared + block_diag(*self.own["motion"]), gap.ravel())
+        return (self.shared @ told).reshape(gap.shape)
 
 
 def prior(problem, d, x):
-    at, space = d.coordinates, problem.space
-    typical = 2 * np.log(problem.noise.typical)
-    mean = np.concatenate([space.prior_mean[at.structure], typical[at.variance]])
-    wide = np.full(len(at.variance), VARIANCE_SPREAD)
-    std = np.concatenate([space.prior_std[at.structure], wide])
-    return norm.logpdf(x, mean, std)
+    """Log prior of every coordinate, without what is constant."""
+    at, space = d.coordinates.structure, problem.space
+    found = np.exp(0.5 * fitted(problem).log_variance[problem.noise.names.index(POOLED)])
+    std = np.where(["load_bias" in name for name in space.names], found, space.prior_std)
+    return -0.5 * ((x - space.prior_mean[at]) / std[at]) ** 2
+
+
+def terms_of(problem, d, dense, x):
+    """Terms of the log density of one vector, by definition."""
+    z = np.asarray(d.full(d.anchor, jnp.asarray(x)))
+    of_prior, group = prior(problem, d, x), d.coordinates.group
+    own = [of_prior[group == g].sum() for g in (0, 1)]
+    return np.append(dense.floors(z) + own, of_prior[group < 0].sum())
+
+
+BLOCKS = {MOTION: ["motion"], EVERYTHING: ["motion", "current", "voltage"]}
 
 
 @pytest.mark.parametrize("part", [MOTION, EVERYTHING])
 def test_it_is_the_posterior_by_definition(problem, part):
-    d = density(problem, part)
+    """A Gaussian of all runs on a floor, which share effects; without these it would be another."""
+    d, dense = density(problem, part), Dense(problem, BLOCKS[part])
     x = near(d)
-    terms = d.terms(x)
-    blocks = ["motion"] if part == MOTION else ["motion", "current", "voltage"]
-    for one, found in zip(x, terms, strict=True):
-        z, log_v = d.full(d.anchor, jnp.asarray(one))
-        pieces = expected(problem, np.asarray(z), np.asarray(log_v), blocks)
-        of_prior = prior(problem, d, one)
-        group, floor = d.coordinates.group, np.asarray(problem.batch.surface)
-        for g in (0, 1):
-            total = pieces[floor == g].sum() + of_prior[group == g].sum()
-            assert found[g] == pytest.approx(total, rel=1e-9)
-        assert found[-1] == pytest.approx(of_prior[group < 0].sum(), rel=1e-9)
-    for k, each in d.pointwise(x).items():
-        z, log_v = d.full(d.anchor, jnp.asarray(x[0]))
-        np.testing.assert_allclose(
-            each[0], expected(problem, np.asarray(z), np.asarray(log_v), [k]), rtol=1e-8
-        )
+    found = d.terms(x)
+    expected = np.array([terms_of(problem, d, dense, one) for one in x])
+    np.testing.assert_allclose(found - found[0], expected - expected[0], rtol=1e-8, atol=1e-7)
+    alone = Dense(problem, BLOCKS[part], alone=True)
+    other = np.array([terms_of(problem, d, alone, one) for one in x])
+    assert (np.abs((other - other[0]) - (found - found[0]))[1:, :2] > 0.1).all()
+
+
+def test_what_is_left_of_runs_is_less_what_they_share(problem):
+    """Residuals less shared effects at their conditional mean, a Student t each."""
+    d, dense = density(problem, EVERYTHING), Dense(problem, BLOCKS[EVERYTHING])
+    x = near(d)
+    left, told = d.residuals(x), d.pointwise(x)
+    assert left.keys() == told.keys() == set(BLOCKS[EVERYTHING])
+    for j, one in enumerate(x):
+        z = np.asarray(d.full(d.anchor, jnp.asarray(one)))
+        gaps, jacobian = seen(problem, z)
+        moved = dense.effects(z)
+        assert np.abs(moved).max() > 0.001
+        gaps["motion"] = gaps["motion"] - moved
+        for k, r in gaps.items():
+            np.testing.assert_allclose(left[k][j], r, rtol=1e-8, atol=1e-10)
+            v = spread_of(problem, k)
+            each = [
+                multivariate_t.logpdf(a, shape=b, df=DEGREES) for a, b in zip(r, v, strict=True)
+            ]
+            expected = np.array(each) + jacobian.get(k, 0.0)
+            np.testing.assert_allclose(told[k][j], expected, rtol=1e-8)
 
 
 def test_the_electric_part_holds_the_motion_of_each_walker(problem):
@@ -129,66 +229,25 @@ def test_the_electric_part_holds_the_motion_of_each_walker(problem):
     np.testing.assert_allclose(found, rest, rtol=1e-8)
 
 
-SHARED = {f"session.soft.{axis}": v for axis, v in zip(AXES, (4e-4, 1e-4, 9e-4), strict=True)}
-
-
-def test_runs_of_a_session_share_effects_with_the_priors_that_were_found(problem):
-    """Residuals less E a, a = std e; e standard normal beforehand; the other floor is untouched."""
-    plain, d = density(problem, MOTION), density(problem, MOTION, SHARED)
-    assert d.names[: plain.size] == plain.names
-    assert d.names[plain.size] == "session.soft.along@one"
-    assert d.size == plain.size + 6
-    assert (d.coordinates.group[plain.size :] == d.floors.index("soft")).all()
-    x = near(d, 2, width=0.7)
-    z, log_v = d.full(d.anchor, jnp.asarray(x[0]))
-    tree, noise = problem.space.tree(jnp.asarray(z)), problem.electric(z, log_v)
-    residual = np.array(jax.jit(residuals)(tree, problem.batch, noise)["motion"])
-    effect, w = of_noise.effects(problem.windows, problem.robot), problem.windows
-    std, found = np.array([0.02, 0.01, 0.03]), np.zeros(3)
-    for n, r in enumerate(residual):
-        if w.surface[n] == "soft":
-            first = plain.size + 3 * ("one", "two").index(w.session[n])
-            r = r - effect[n] @ (std * x[0, first : first + 3])
-        v = np.asarray(problem.covariance("motion", log_v))[n]
-        found[problem.batch.surface[n]] += multivariate_t.logpdf(r, shape=v, df=DEGREES)
-        found[problem.batch.surface[n]] += lk.log_jacobians(tree, problem.batch, noise)[0][n]
-    of_prior = norm.logpdf(x[0, plain.size :]).sum()
-    alone = plain.terms(x[:1, : plain.size])[0]
-    soft = d.floors.index("soft")
-    known = prior(problem, plain, x[0, : plain.size])
-    found[soft] += of_prior
-    for g in (0, 1):
-        found[g] += known[plain.coordinates.group == g].sum()
-    terms = d.terms(x[:1])[0]
-    np.testing.assert_allclose(terms[:2], found[:2], rtol=1e-9)
-    assert terms[1 - soft] == pytest.approx(alone[1 - soft], rel=1e-12)
-    assert terms[-1] == pytest.approx(alone[-1], rel=1e-12)
-
-
-def test_sessions_widen_the_curvature_as_the_fit_says(problem):
-    """Marginal of the joint curvature: C + C (sum_s v u u^T) C where effects are told by little."""
-    d, small = density(problem, MOTION), {k: 1e-6 * v for k, v in SHARED.items()}
-    n = len(d.coordinates.structure)
-    z, log_v = problem.space.start, 2 * np.log(problem.noise.typical)
+def test_its_curvature_is_the_information_of_the_fit():
+    """At residuals of zero, where runs weigh (nu + m) / nu and no bend of the model counts."""
+    truth = robot()
+    w = replace(made(truth), has_current=False, has_voltage=False)
+    # the camera's scale is logarithmic, so that it does not bend the Jacobian
+    problem = Problem(w, truth, FREE)
+    z, log_v = problem.space.vector(truth), 2 * np.log(problem.noise.typical)
+    keep = np.full(len(w), (DEGREES + 6) / DEGREES)
     _, jacobian = problem.linear(z, problem.electric(z, log_v))
-    precision = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), np.ones(24)))
-    fitted = Fitted(z, log_v, np.linalg.inv(precision), small)
-    grown = Density(problem, fitted, MOTION).covariance[:n, :n]
-    at = d.coordinates.structure
-    laplace = fitted.covariance[np.ix_(at, at)]
-    v = np.asarray(problem.covariance("motion", log_v))
-    weight = (DEGREES + 6) / (DEGREES + 8)
-    meat, w = np.zeros_like(laplace), problem.windows
-    for name in ("one", "two"):
-        u = np.zeros((3, n))
-        for k in range(24):
-            if (w.surface[k], w.session[k]) == ("soft", name):
-                e = of_noise.effects(w, problem.robot)[k]
-                u += weight * e.T @ np.linalg.solve(v[k], np.asarray(jacobian["motion"])[k][:, at])
-        meat += u.T @ np.diag(list(small.values())) @ u
-    more = laplace @ meat @ laplace
-    assert np.abs(more).max() > 0
-    np.testing.assert_allclose(grown - laplace, more, atol=2e-3 * np.abs(more).max())
+    precision = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep))
+    d = Density(problem, Fitted(z, log_v, np.linalg.inv(precision)), EVERYTHING)
+    h = 1e-2 * np.sqrt(np.diag(d.covariance)) * np.eye(d.size)
+    bend = -(d.slope(z + h) - d.slope(z - h)) / (2 * np.diag(h)[:, None])
+    scale = np.sqrt(np.diag(precision))
+    np.testing.assert_allclose(
+        bend / scale / scale[:, None], precision / scale / scale[:, None], atol=1e-3
+    )
+    alone = np.asarray(problem.apart().precision(jacobian, jnp.asarray(log_v), keep))
+    assert (np.diag(alone) / np.diag(precision)).max() > 1.2
 
 
 def test_numbers_of_one_floor_move_its_term_only(problem):
@@ -205,12 +264,10 @@ def test_numbers_of_one_floor_move_its_term_only(problem):
 
 
 def test_far_from_the_fit_the_root_is_found_from_scratch(problem):
-    d = density(problem, MOTION)
+    d, dense = density(problem, MOTION), Dense(problem, BLOCKS[MOTION])
     far = near(d, 3, width=2.0)
-    for one, found in zip(far, d.terms(far).sum(axis=1), strict=True):
-        z, log_v = d.full(d.anchor, jnp.asarray(one))
-        total = expected(problem, np.asarray(z), np.asarray(log_v), ["motion"]).sum()
-        assert found == pytest.approx(total + prior(problem, d, one).sum(), rel=1e-7)
+    for one, found in zip(far, d.terms(far), strict=True):
+        np.testing.assert_allclose(found, terms_of(problem, d, dense, one), rtol=1e-7)
 
 
 def test_gradients_are_those_of_finite_differences(problem):
