@@ -7,7 +7,7 @@ the shared ones, which groups then follow. Hamiltonian moves take all coordinate
 gradient where the density still bends, and walks along a single one cross its plateaus.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from emcee.model import Model
@@ -69,6 +69,7 @@ class FamilyMove(Move):
 
     def __init__(self, family: Family):
         self.family = family
+        self.accepted: list[float] = []
 
     def jump(self, old: Matrix, still: Matrix, random: RandomState) -> Jump:
         raise NotImplementedError
@@ -101,6 +102,7 @@ class FamilyMove(Move):
                 state.blobs[rows, of] = terms[took[:, k], of]
             state.log_prob[mine] = state.blobs[mine].sum(axis=1)
             accepted[mine] = took.any(axis=1)
+            self.accepted.append(float(took.mean()))
         return state, accepted
 
 
@@ -178,39 +180,40 @@ class Along(FamilyMove):
         return new, np.stack([change[:, own].sum(axis=1) for own in self.family.places], axis=1)
 
 
-class Hamiltonian(Move):
+class Hamiltonian(FamilyMove):
     """Turns of position and momentum that suit a Gaussian, kicked by what it does not know.
 
     With momentum p and the log density l, steps of
 
         turn (u, p) by h/2;    p += h (dl/du + u);    turn (u, p) by h/2
 
+    Given what they share groups do not feel each other, so that each takes its turn or not.
+
     Source: Beskos et al. 2011, Stochastic Processes and their Applications 121, section 4.
     """
 
-    def __init__(self, target: Target, angle: float):
+    def __init__(self, target: Target, family: Family, angle: float):
+        super().__init__(family)
         self.target, self.angle = target, angle
-        self.accepted: list[float] = []
 
-    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
-        random, (count, size) = model.random, state.coords.shape
+    def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
+        own = np.concatenate(self.family.places)
         # shorter steps, now and then, for walkers where the density is steep
-        h = self.angle * (1 - 0.8 * random.uniform(size=(count, 1)) ** 3)
+        h = self.angle * (1 - 0.8 * random.uniform(size=(len(x), 1)) ** 3)
         steps = int(np.clip(random.uniform(1.0, 1.4) * WAY / self.angle, 1, MOST_STEPS))
-        u, start = state.coords, random.standard_normal((count, size))
-        u, p = _turn(u, start, h / 2)
+        start, u, q = np.zeros(x.shape), x.copy(), x[:, own]
+        start[:, own] = p = random.standard_normal(q.shape)
+        q, p = _turn(q, p, h / 2)
         for step in range(steps):
-            kick = np.nan_to_num(self.target.slope(u)) + u
+            u[:, own] = q
+            kick = np.nan_to_num(self.target.slope(u))[:, own] + q
             most = np.linalg.norm(kick, axis=1, keepdims=True) / STEEPEST
             p = p + h * kick / np.maximum(most, 1.0)
-            u, p = _turn(u, p, h if step < steps - 1 else h / 2)
-        log_prob, terms = model.compute_log_prob_fn(u)
-        gain = log_prob - state.log_prob + 0.5 * (start**2 - p**2).sum(axis=1)
-        took = np.log(random.uniform(size=count)) < np.where(np.isnan(gain), -np.inf, gain)
-        state.coords[took], state.blobs[took] = u[took], terms[took]
-        state.log_prob[took] = log_prob[took]
-        self.accepted.append(float(took.mean()))
-        return state, took
+            q, p = _turn(q, p, h if step < steps - 1 else h / 2)
+        end = np.zeros(x.shape)
+        u[:, own], end[:, own] = q, p
+        lost = 0.5 * (start**2 - end**2)
+        return u, np.stack([lost[:, places].sum(axis=1) for places in self.family.places], axis=1)
 
 
 def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
@@ -229,4 +232,5 @@ def moves(target: Target, angle: float) -> list[tuple[Move, float]]:
     found += [(Independence(family), INDEPENDENT / len(of_family)) for family in of_family]
     if not target.apart:
         found += [(Differential(family), DIFFERENTIAL / len(of_family)) for family in of_family]
-    return [*found, (Hamiltonian(target, angle), HAMILTONIAN)]
+    whole = families(replace(target, kind=np.zeros_like(target.kind)))
+    return [*found, *((Hamiltonian(target, f, angle), HAMILTONIAN / len(whole)) for f in whole)]
