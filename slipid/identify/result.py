@@ -15,11 +15,13 @@ from slipid.data.runs import Runs
 from slipid.identify import slip_curves as curves_of
 from slipid.identify.compare.predictive import Contact, contact_of
 from slipid.identify.fit.mixed import Update, informed
+from slipid.identify.fit.noise import POOLED
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem, State, log_jacobian
 from slipid.identify.fit.shared import FoundShared, Tie, freed, freed_slopes
 from slipid.identify.fit.variances import Search, Square
 from slipid.identify.slip_curves import SlipCurve
+from slipid.identify.verdicts.disputed import Dispute, disputes, marked
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, members, sentences
 from slipid.model.robot import Robot, Validity
@@ -105,7 +107,12 @@ class Fit:
         """Every number by path, with interval and verdict."""
         volts, flat = self.channels.voltage, members(self.flat)
         found = estimates(self.space, self.choices, self.z, self.covariance, volts, flat)
-        return {e.path: e for e in found}
+        return marked({e.path: e for e in found}, self.disputes)
+
+    @cached_property
+    def disputes(self) -> tuple[Dispute, ...]:
+        """Floors that disagree about the loads on the wheels."""
+        return disputes(self.space, self.z, self.covariance, self.variance.get(POOLED, np.inf))
 
     @cached_property
     def flat(self) -> tuple[Flat, ...]:
@@ -122,7 +129,7 @@ class Fit:
     @property
     def messages(self) -> tuple[str, ...]:
         """What a reader of the numbers must know, one sentence each."""
-        said = list(sentences(self.flat))
+        said = [*sentences(self.flat), *(d.sentence for d in self.disputes)]
         said += [
             f"{e.path} ended at its bound ({e.value:.3g} {e.unit})"
             for e in self.parameters.values()

@@ -6,7 +6,13 @@ from io import StringIO
 from rich.console import Console
 from rich.table import Table
 
-COLOUR = {"identified": "green", "weak": "yellow", "not_identified": "red", "at_bound": "magenta"}
+COLOUR = {
+    "identified": "green",
+    "weak": "yellow",
+    "disputed": "yellow",
+    "not_identified": "red",
+    "at_bound": "magenta",
+}
 
 WIDTH = 140
 """Of text that no terminal shows [characters]."""

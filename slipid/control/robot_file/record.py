@@ -17,7 +17,7 @@ Pair = tuple[float, float]
 Axes = tuple[float, float, float]
 """Along, across and in yaw."""
 Source = Literal["laplace", "posterior", "given"]
-Verdict = Literal["identified", "weak", "not_identified", "at_bound", "fixed"]
+Verdict = Literal["identified", "weak", "disputed", "not_identified", "at_bound", "fixed"]
 Provenance = Literal["measured", "borrowed", "override"]
 GainsVerdict = Literal["better than by hand", "no better than by hand", "worse than by hand"]
 UNITS = {

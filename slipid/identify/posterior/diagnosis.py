@@ -18,6 +18,7 @@ from slipid.identify.posterior.blocks import Chain, Plan
 from slipid.identify.posterior.coordinates import Fitted
 from slipid.identify.result import Fit
 from slipid.identify.verdicts import estimates as verdicts
+from slipid.identify.verdicts.disputed import marked
 from slipid.identify.verdicts.unidentified import members
 from slipid.support.content import Content
 
@@ -136,7 +137,7 @@ def estimates(
             pull=float(pull[np.argmax(np.abs(pull))]),
             source="posterior",
         )
-    return out
+    return marked(out, fit.disputes)
 
 
 def identified(

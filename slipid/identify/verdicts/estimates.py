@@ -66,8 +66,8 @@ class Estimate:
         value, std: [unit], a float or one per label; std is None where it was fixed.
         interval90: equal-tailed, (low, high), or one such pair per label.
         labels: of a vector's entries, () for a scalar.
-        verdict: identified, weak, not_identified, at_bound or fixed; of a vector the verdict of its
-            worst direction.
+        verdict: identified, weak, disputed, not_identified, at_bound or fixed; of a vector the
+            verdict of its worst direction.
         provenance: measured (data decide), borrowed (a prior decides), override (a choice
             fixed it: the user's, or slipid's where one speed cannot tell).
         ratio: std(posterior) / std(prior) in the search space, None where it was fixed.
