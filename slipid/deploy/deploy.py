@@ -52,7 +52,7 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
     record = record_of(
         _at(fit.robot, numbers),
         {path: _number(e) for path, e in numbers.items()},
-        {name: float(v) ** 0.5 for name, v in fit.variance.items()},
+        {name: float(v) ** 0.5 for name, v in fit.contact.forecast.items()},
         jax.vmap(fit.space.tree)(jnp.asarray(vectors)),
         max(max(v.wheel_speed) for v in fit.validity.values()),
         fit.current_trend,

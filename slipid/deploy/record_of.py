@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from slipid.control.robot_file import record
+from slipid.identify.fit.noise import SHARED
 from slipid.identify.fit.shared import AXES
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
@@ -33,7 +34,8 @@ def record_of(
     Args:
         robot: with every number at its value in `numbers`.
         numbers: by path; those that the deployed robot does not need, the camera's, are left out.
-        std: of every variance component by name, as fit.json has them (`process.gray.along`).
+        std: of every variance component by name (`process.gray.along`), as runs that were not seen
+            are forecast with.
         draws: the robot's posterior, stacked, for what the uncertainty of the numbers adds to the
             effects.
         highest_speed: of the wheels in the fitted runs [rad/s].
@@ -75,7 +77,8 @@ def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> record
             [std.get(f"{kind}.{name}.{a}", d) for a, d in zip(AXES, default, strict=True)]
         )
 
-    effect = np.sqrt(of("run", (0.01, 0.01, 0.03)) ** 2 + of("session", (0.0, 0.0, 0.0)) ** 2)
+    shared = [of(kind, (0.0, 0.0, 0.0)) ** 2 for kind in SHARED]
+    effect = np.sqrt(of("run", (0.01, 0.01, 0.03)) ** 2 + sum(shared))
     kinds = [std.get(f"current.{name}.{kind}", 0.05) for kind in ("window", "run")]
     return record.FloorRecord(
         name=name,

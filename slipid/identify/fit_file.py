@@ -178,6 +178,7 @@ def to_json(fit: Fit) -> Content:
         | ({} if fit.mixed is None else {"mixed": dict(fit.mixed)}),
         "current_trend": list(fit.current_trend),
         "shared": {floor: [asdict(p) for p in found.paces] for floor, found in fit.shared.items()},
+        "extrapolation": dict(fit.extrapolation),
         "baselines": dict(fit.baselines),
         "data": {"hash": fit.data_hash, "runs": [list(r) for r in fit.runs]},
     }
@@ -208,6 +209,7 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         lag=settings["lag"],
         seed=settings["seed"],
         mixed=settings.get("mixed"),
+        extrapolation=content["extrapolation"],
         baselines=content["baselines"],
         current_trend=(content["current_trend"][0], content["current_trend"][1]),
         shared={

@@ -54,6 +54,7 @@ class Fit:
         covariance: of the search vector: Laplace, with what runs share marginalised.
         laplace: as if runs shared nothing, the curvature of their likelihood alone.
         shared: what neighbouring runs were found to share, by floor.
+        extrapolation: by what variances of effects are too small for unseen runs, by floor@load.
         variance: every variance component by name, those of sessions included [unit squared].
         variance_unit: unit of each component's std.
         runs: (name, sha256) of every run that was fitted, those over several floors last.
@@ -91,11 +92,15 @@ class Fit:
     current_trend: tuple[float, float] = (0.0, 0.0)
     mixed: Mapping[str, Any] | None = None
     shared: Mapping[str, FoundShared] = field(default_factory=dict)
+    extrapolation: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def contact(self) -> Contact:
         """The fit as a model that predicts runs."""
-        return Contact(self.robot, self.variance, self.covariance, self.space, self.z, self.shared)
+        shared, extrapolation = self.shared, self.extrapolation
+        return Contact(
+            self.robot, self.variance, self.covariance, self.space, self.z, shared, extrapolation
+        )
 
     @cached_property
     def robot(self) -> Robot:
@@ -177,6 +182,7 @@ def summarise(
         covariance=contact.covariance,
         laplace=problem.laplace(z, log_v, every, alone=True),
         shared=contact.shared,
+        extrapolation=contact.extrapolation,
         variance=contact.variance,
         variance_unit={name: unit[name] for name in contact.variance},
         runs=tuple((log.name, log.sha256) for log in data.logs),

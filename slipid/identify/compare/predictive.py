@@ -25,10 +25,11 @@ from scipy.special import gammaln
 from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.noise import effects
+from slipid.identify.fit.hierarchy import extrapolation
+from slipid.identify.fit.noise import SHARED, effects
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit.sessions import Linear, by_axis, shared
-from slipid.identify.fit.shared import AXES, FoundShared, Told, told_of
+from slipid.identify.fit.shared import AXES, Directions, FoundShared, Told, told_of
 from slipid.identify.fit.variances import DEGREES, Search, Square, Vector, expected_ties, whitened
 from slipid.model.robot import Robot
 from slipid.search_space import Space
@@ -131,22 +132,41 @@ _camera_log_jacobian = jax.jit(lk.camera_log_jacobian)
 
 @dataclass(frozen=True, eq=False)
 class Contact(Predictive):
-    """The force balance where a fit has left it, at the search vector z."""
+    """The force balance where a fit has left it, at the search vector z.
+
+    Variances of effects are too small for runs it has not seen, by the factor `extrapolation` of
+    their floor and load.
+    """
 
     space: Space
     z: Search
     shared: Mapping[str, FoundShared]
+    extrapolation: Mapping[str, float]
 
     @property
     def name(self) -> str:
         return "identified"
+
+    @property
+    def forecast(self) -> dict[str, float]:
+        """Variances of runs it has not seen, with the load of each floor that is the least sure."""
+        out = dict(self.variance)
+        for name in out:
+            kind, _, rest = name.partition(".")
+            if kind in ("run", *SHARED):
+                floor = f"{rest.rpartition('.')[0]}@"
+                out[name] *= max([x for k, x in self.extrapolation.items() if k.startswith(floor)])
+        return out
 
     def told(self, w: Windows) -> Told:
         """What neighbours among the fitted runs tell of runs."""
         return told_of(self.shared, w, self.robot, self.space.size)
 
     def effect_covariance(self, w: Windows) -> Float[np.ndarray, "piece 3 3"]:
-        return super().effect_covariance(w) + self.told(w).covariance
+        grown = np.array([self.extrapolation.get(name, 1.0) for name in setups(w)])[:, None, None]
+        own = by_axis(self.variance, "run", w)[:, :, None] * np.eye(len(AXES))
+        shared = super().effect_covariance(w) + self.told(w).covariance
+        return grown * shared + (grown - 1) * own
 
     @property
     def numbers(self) -> dict[str, int]:
@@ -189,9 +209,22 @@ def contact_of(
 ) -> Contact:
     """The force balance at the end of a fit of the kept pieces, with what sessions share."""
     robot, variance = problem.space.tree(state.z), by_name(problem, state.log_variance)
-    shared = found_shared(problem, state, keep)
-    z = np.asarray(state.z)
-    return Contact(robot, variance, np.asarray(covariance), problem.space, z, shared)
+    z, log_v = np.asarray(state.z), np.asarray(state.log_variance)
+    blocks, jacobian = problem.linear(z, problem.electric(z, log_v))
+    motion = blocks["motion"], jacobian["motion"]
+    direction = Directions.of(problem.windows, problem.robot).direction
+    grown = extrapolation(
+        problem.target, motion, keep, covariance, log_v, direction, setups(problem.windows)
+    )
+    return Contact(
+        robot,
+        variance,
+        np.asarray(covariance),
+        problem.space,
+        z,
+        shared=found_shared(problem, state, keep),
+        extrapolation=grown,
+    )
 
 
 def found_shared(
@@ -234,6 +267,11 @@ def around(jac: Slopes, cov: np.ndarray) -> np.ndarray:
         some = jac[mine][..., columns]
         out[mine] = (some @ cov[np.ix_(columns, columns)]) @ np.swapaxes(some, -1, -2)
     return out
+
+
+def setups(w: Windows) -> list[str]:
+    """Floor and load of every piece, `floor@load`."""
+    return [f"{floor}@{load}" for floor, load in zip(w.surface, w.load, strict=True)]
 
 
 def by_name(problem: Problem, log_v: Vector) -> dict[str, float]:

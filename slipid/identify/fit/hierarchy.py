@@ -14,18 +14,20 @@ a session, T the slope by the model's numbers and C their covariance before the 
 were seen.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from slipid.identify.fit.shared import AXES, FloorShared
-from slipid.identify.fit.variances import VARIANCE_SPREAD, Search, Square, Target
+from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD, Search, Square, Target
 
 _STEPS, _SETTLED = 20, 1e-5
 """Most scoring steps in a turn, and a step of a log variance that counts as rest."""
+_SECTOR = np.pi / 3
+"""Directions that are left out together [rad]."""
 _GRID = np.geomspace(0.1, 4.0, 60)
 """Stds of the load biases that are weighed, over the typical one."""
 
@@ -34,10 +36,12 @@ class _Axis(NamedTuple):
     """The effects of the runs on a floor along one axis.
 
     Attributes:
+        pieces: numbers of the runs.
         left: effects left; fixed: their covariance but for the variances asked for.
         numbers: of these variances; bases: what each makes of the covariance.
     """
 
+    pieces: Int[np.ndarray, " run"]
     left: Float[np.ndarray, " run"]
     fixed: Float[np.ndarray, "run run"]
     numbers: list[int]
@@ -82,6 +86,53 @@ def effect_information(
     return out
 
 
+def extrapolation(
+    target: Target,
+    motion: tuple[Array, Array],
+    keep: Float[np.ndarray, " piece"],
+    covariance: Square,
+    log_v: Float[np.ndarray, " variance"],
+    direction: Float[np.ndarray, " piece"],
+    setup: Sequence[str],
+) -> dict[str, float]:
+    """By what variances of effects are too small where nothing near was seen, by set-up of a piece.
+
+    Every sector of directions is predicted from the others, with the numbers of the floor learnt
+    anew (to first order): mean square of the gaps over their variance and that of a Student t, 1
+    where it is less or where there are fewer than three sectors. A likelihood finds the variances
+    that are best between the runs it has, which are too small where the model is wrong in the
+    large, and weighs outliers away that a forecast meets again.
+
+    Sources: Sundararajan and Keerthi 2001, Neural Computation 13(5), eq. for leaving out; Bachoc
+    2013, Computational Statistics and Data Analysis 66, on wrong models.
+    """
+    axes = _axes(target, motion, jnp.asarray(keep), covariance, log_v)
+    return _too_small(axes, log_v, direction, setup)
+
+
+def _too_small(
+    axes: Iterable[_Axis],
+    log_v: Float[np.ndarray, " variance"],
+    direction: Float[np.ndarray, " piece"],
+    setup: Sequence[str],
+) -> dict[str, float]:
+    found: dict[str, list[float]] = {name: [] for name in setup}
+    usual, names = DEGREES / (DEGREES - 2), np.asarray(setup)
+    for axis in axes:
+        inverse = np.linalg.inv(_whole(axis, np.exp(log_v)[axis.numbers]))
+        white, way = inverse @ axis.left, direction[axis.pieces]
+        sector = np.where(np.isfinite(way), np.floor(np.nan_to_num(way) / _SECTOR), np.nan)
+        groups = [np.flatnonzero(sector == k) for k in np.unique(sector[np.isfinite(sector)])]
+        if len(groups) < 3:
+            continue
+        for mine in groups:
+            spread = np.linalg.inv(inverse[np.ix_(mine, mine)])
+            ratios = (spread @ white[mine]) ** 2 / np.diag(spread) / usual
+            for name, ratio in zip(names[axis.pieces[mine]], ratios, strict=True):
+                found[name].append(float(ratio))
+    return {name: max(1.0, float(np.mean(ratios or 1.0))) for name, ratios in found.items()}
+
+
 def _axes(
     target: Target,
     motion: tuple[Array, Array],
@@ -105,7 +156,8 @@ def _axes(
         for k in range(len(AXES)):
             fixed = np.diag(noise[:, k] / counted[mine]) + by[:, k] @ wide @ by[:, k].T
             pieces = _pieces(floor, k, kept, counted[mine])
-            yield _Axis(left[:, k], fixed, [n for n, _ in pieces], [c for _, c in pieces])
+            numbers, bases = [n for n, _ in pieces], [c for _, c in pieces]
+            yield _Axis(mine, left[:, k], fixed, numbers, bases)
 
 
 def _pieces(

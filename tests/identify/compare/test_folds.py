@@ -175,7 +175,7 @@ def judged(w, names):
     problem = Problem(w, ROBOT, HELD)
     z = problem.space.vector(ROBOT)
     variance = by_name(problem, 2 * np.log(problem.noise.typical))
-    contact = Contact(ROBOT, variance, 1e-12 * np.eye(len(z)), problem.space, z, shared={})
+    contact = Contact(ROBOT, variance, 1e-12 * np.eye(len(z)), problem.space, z, {}, {})
     half = w.run // 4 % 2
     keep = (half == 0).astype(float)
     models = [with_noise(ALL[name], contact, problem, keep) for name in names]

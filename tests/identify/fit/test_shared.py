@@ -203,7 +203,7 @@ def axis_of(rng, runs=60):
     true = np.array([1.0, 2.0, 0.5])
     whole = fixed + sum(v * b for v, b in zip(true, bases, strict=True))
     left = np.linalg.cholesky(whole + 1e-9 * np.eye(runs)) @ rng.normal(size=runs)
-    return hierarchy._Axis(left, fixed, [0, 1, 2], bases)
+    return hierarchy._Axis(np.arange(runs), left, fixed, [0, 1, 2], bases)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -221,6 +221,31 @@ def test_scoring_ends_at_the_summit_of_the_likelihood(seed):
     slope = [(loss(found + e) - loss(found - e)) / 2e-4 for e in step]
     np.testing.assert_allclose(slope, 0.0, atol=1e-2)
     assert all(loss(found + 0.3 * s * e / 1e-4) > loss(found) for e in step for s in (-1, 1))
+
+
+def test_sectors_left_out_tell_by_what_variances_are_too_small():
+    """A gap is what the dense Gaussian of the others says; larger ones are by their square."""
+    rng, log_v = np.random.default_rng(0), np.zeros(3)
+    axis = axis_of(rng)
+    way = np.linspace(0.1, 2 * np.pi - 0.1, 60)
+    setup = ["a@x" if k % 3 else "a@y" for k in range(60)]
+
+    def factors(size):
+        one = axis._replace(left=axis.left * np.where(np.arange(60) % 3, size, 1.0))
+        return one, hierarchy._too_small([one], log_v, way, setup)
+
+    one, found = factors(3.0)
+    whole, ratio = hierarchy._whole(axis, np.ones(3)), {"a@x": [], "a@y": []}
+    for k in range(6):
+        out = np.floor(way / (np.pi / 3)) == k
+        to = whole[np.ix_(out, ~out)] @ np.linalg.inv(whole[np.ix_(~out, ~out)])
+        gap = one.left[out] - to @ one.left[~out]
+        spread = np.diag(whole[np.ix_(out, out)] - to @ whole[np.ix_(~out, out)])
+        for j, r in zip(np.flatnonzero(out), gap**2 / spread, strict=True):
+            ratio[setup[j]].append(r / (8 / 6))
+    assert found == pytest.approx({name: max(1.0, np.mean(r)) for name, r in ratio.items()})
+    assert found["a@x"] > 3.0
+    assert set(factors(1e-3)[1].values()) == {1.0}
 
 
 def test_the_pooled_variance_weighs_every_std_by_its_evidence(problem):
