@@ -230,11 +230,8 @@ def test_sectors_left_out_tell_by_what_variances_are_too_small():
     way = np.linspace(0.1, 2 * np.pi - 0.1, 60)
     setup = ["a@x" if k % 3 else "a@y" for k in range(60)]
 
-    def factors(size):
-        one = axis._replace(left=axis.left * np.where(np.arange(60) % 3, size, 1.0))
-        return one, hierarchy._too_small([one], log_v, way, setup)
-
-    one, found = factors(3.0)
+    one = axis._replace(left=axis.left * np.where(np.arange(60) % 3, 3.0, 1.0))
+    found = hierarchy._too_small([one], log_v, way, setup)
     whole, ratio = hierarchy._whole(axis, np.ones(3)), {"a@x": [], "a@y": []}
     for k in range(6):
         out = np.floor(way / (np.pi / 3)) == k
@@ -245,7 +242,8 @@ def test_sectors_left_out_tell_by_what_variances_are_too_small():
             ratio[setup[j]].append(r / (8 / 6))
     assert found == pytest.approx({name: max(1.0, np.mean(r)) for name, r in ratio.items()})
     assert found["a@x"] > 3.0
-    assert set(factors(1e-3)[1].values()) == {1.0}
+    small = axis._replace(left=1e-3 * axis.left)
+    assert set(hierarchy._too_small([small], log_v, way, setup).values()) == {1.0}
 
 
 def test_the_pooled_variance_weighs_every_std_by_its_evidence(problem):
