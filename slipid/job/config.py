@@ -71,7 +71,8 @@ class Logs(Section):
     """Log files of one kind, found by a glob below the data folder.
 
     Runs of a section with a `map` (its file, relative to the config) cross the floors it shows;
-    their poses are in its frame.
+    their poses are in its frame. `session_name` says which runs belong together, of this section
+    and of others with the same name: those of a day, or between two set-ups of the robot.
     """
 
     glob: str
@@ -80,12 +81,15 @@ class Logs(Section):
     map: str | None = None
     load: str = "as_built"
     session: Literal["surface/load/speed", "folder", "file"] = "surface/load/speed"
+    session_name: str | None = Field(default=None, min_length=1)
     min_rows: int = Field(default=2, ge=2)
 
     @model_validator(mode="after")
     def _one_floor_or_many(self) -> "Logs":
         if self.map is not None and self.surface != "folder":
             raise ValueError("surface and map at once; expected one of them")
+        if self.session_name is not None and "session" in self.model_fields_set:
+            raise ValueError("session and session_name at once; expected one of them")
         return self
 
 
@@ -114,6 +118,30 @@ class Setting(Section):
     def _not_both(self) -> "Setting":
         if self.fixed is not None and (self.prior is not None or self.free):
             raise ValueError("fixed and free or prior at once; expected one of them")
+        return self
+
+
+class Weights(Section):
+    """What is known of the weight on the wheels in a load set-up.
+
+    Either what scales show under each wheel, `kg`; or that it is `like` another set-up, with
+    `mass_kg` more (or less) at `place_m` of the body's frame. `std_kg` is of each scale, or of the
+    weight that the mass adds to each wheel.
+    """
+
+    std_kg: Positive
+    kg: list[Positive] | None = None
+    like: str | None = None
+    mass_kg: Number | None = None
+    place_m: tuple[Number, Number] | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "Weights":
+        added = (self.like, self.mass_kg, self.place_m)
+        if self.kg is None and None in added:
+            raise ValueError("expected kg, or like, mass_kg and place_m")
+        if self.kg is not None and added != (None, None, None):
+            raise ValueError("kg and like, mass_kg or place_m at once; expected one of both ways")
         return self
 
 
@@ -153,6 +181,7 @@ class Content(Section):
     logs: list[Logs] = Field(min_length=1)
     camera: Camera = Camera()
     parameters: dict[str, Setting] = Field(default_factory=dict)
+    weights: dict[str, Weights] = Field(default_factory=dict)
     fit: FitSection = FitSection()
     selftest: SelftestSection = SelftestSection()
     validate_: ValidateSection = Field(default_factory=ValidateSection, alias="validate")

@@ -38,7 +38,8 @@ def read_dataset(
                     raise DataError(
                         f"{log.name}: found by two globs of {config.path}; expected it once"
                     )
-                sessions[log.name] = session_of(log, section.session)
+                named = section.session_name
+                sessions[log.name] = named or session_of(log, section.session)
                 logs.append(log)
             done += 1
             report.advance(done, count)

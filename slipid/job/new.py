@@ -50,6 +50,10 @@ surface = "folder"                    # the folder names the floor; or write a n
 load = "as_built"                     # one name per way the robot was loaded
 # map = "maps/site.toml"              # instead of surface: a floor map, for runs that cross floors
 
+# [weights.as_built]                  # what scales show under each wheel, if you weighed the robot
+# kg = [3.1, 5.2, 3.2]
+# std_kg = 0.05
+
 # Patterns of parameter names. fixed = value; start = value; free = true or false; prior is Gaussian
 # in the parameter's own unit. `slipid check` lists the names.
 [parameters]

@@ -13,6 +13,7 @@ from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.identify.result import hash_of
 from slipid.job.config import Config, FitSection, Logs, geometry, one_floor
 from slipid.job.logs import files_of, read_dataset
+from slipid.job.weights import share_priors
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.parameter import entries
@@ -181,6 +182,15 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
     """The config's parameter settings, checked, less those of floors and loads that are absent."""
     paths, skipped = [e.path for e in entries(robot)], []
     choices = said_of(robot, config.content.robot.mass_kg or float(robot.body.mass))
+    try:
+        known = share_priors(config.content.weights, robot.geometry)
+    except ValueError as error:
+        raise DataError(f"{config.path}: {error}") from error
+    for load, prior in known.items():
+        if load in robot.body.loads:
+            choices.append(prior)
+        else:
+            skipped.append(f"skipped: weights.{load}: no run that has it")
     for pattern, setting in config.content.parameters.items():
         if not fnmatch.filter(paths, pattern):
             if fnmatch.filter(paths, _any_label(pattern)):
@@ -190,8 +200,8 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
                 f"{config.path}: parameters.'{pattern}': no such parameter{near(pattern, paths)}; "
                 f"expected one of {', '.join(paths)}"
             )
-        prior = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)
-        choice = Choice(pattern, setting.start, setting.fixed, setting.free, *prior)
+        gauss = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)
+        choice = Choice(pattern, setting.start, setting.fixed, setting.free, *gauss)
         try:
             Space(robot, [choice])
         except ValueError as error:
