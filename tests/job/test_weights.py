@@ -86,9 +86,9 @@ std_kg = 0.06
 )
 def test_what_makes_no_weight_is_refused(tmp_path, text, expected):
     write_good(tmp_path)
+    whole = f"{GOOD}\n[weights.as_built]\n{text}\n"
     with pytest.raises(DataError, match=r"my\.toml: ") as caught:
-        config = parsed(tmp_path / "my.toml", f"{GOOD}\n[weights.as_built]\n{text}\n")
-        read_job(config, tmp_path, Said())
+        read_job(parsed(tmp_path / "my.toml", whole), tmp_path, Said())
     assert expected in str(caught.value)
 
 
