@@ -175,7 +175,8 @@ def to_json(fit: Fit) -> Content:
             "current_is_signed": fit.channels.signed,
             "seed": fit.seed,
         }
-        | ({} if fit.mixed is None else {"mixed": dict(fit.mixed)}),
+        | ({} if fit.mixed is None else {"mixed": dict(fit.mixed)})
+        | ({} if fit.refused is None else {"refused": dict(fit.refused)}),
         "current_trend": list(fit.current_trend),
         "shared": {floor: [asdict(p) for p in found.paces] for floor, found in fit.shared.items()},
         "extrapolation": dict(fit.extrapolation),
@@ -209,6 +210,7 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         lag=settings["lag"],
         seed=settings["seed"],
         mixed=settings.get("mixed"),
+        refused=settings.get("refused"),
         extrapolation=content["extrapolation"],
         baselines=content["baselines"],
         current_trend=(content["current_trend"][0], content["current_trend"][1]),

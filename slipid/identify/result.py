@@ -67,7 +67,9 @@ class Fit:
             solver that finds no way ahead is not at an optimum because of it.
         lag, seed: of the windows [s]; of the draws the curves' bands are made of.
         baselines: what simpler models learnt from the same runs, for comparison.
-        mixed: what runs over several floors did, see `slipid.identify.fit.mixed.Update.about`.
+        mixed: what runs over several floors did, see `slipid.identify.fit.mixed.Update.about`, and
+            end-point errors of the others before and after by floor.
+        refused: the same, and why, where they contradict the others and were not learnt from.
     """
 
     space: Space
@@ -91,6 +93,7 @@ class Fit:
     baselines: Mapping[str, Any] = field(default_factory=dict)
     current_trend: tuple[float, float] = (0.0, 0.0)
     mixed: Mapping[str, Any] | None = None
+    refused: Mapping[str, Any] | None = None
     shared: Mapping[str, FoundShared] = field(default_factory=dict)
     extrapolation: Mapping[str, float] = field(default_factory=dict)
 
@@ -146,6 +149,8 @@ class Fit:
             for e in self.parameters.values()
             if e.pull is not None and abs(e.pull) > CONFLICT and e.verdict != "at_bound"
         ]
+        if self.refused is not None:
+            said.append(str(self.refused["reason"]))
         if not self.converged:
             said.append(f"the fit did not converge: {self.reason}")
         return tuple(said)

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from slipid.data.runs import Runs
+from slipid.identify.compare.agreement import floor_errors, sentence
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.fit.crossing import crossing
 from slipid.identify.fit.mixed import update
@@ -159,9 +161,20 @@ def summarised(task: Task, problem: Problem, optimum: Optimum, report: Reporter)
         sets = [crossing(data, floor, fit.robot) for data, floor in task.mixed]
         found = update(fit.space, fit.z, fit.covariance, sets)
         report.line(_judged(found.about))
-        fit = updated(fit, found, problem, task.dataset)
+        fit = _with_mixed(fit, updated(fit, found, problem, task.dataset), task.dataset, report)
     report.stage("simpler models, for comparison")
     return _with_baselines(fit, task)
+
+
+def _with_mixed(fit: Fit, new: Fit, data: Runs, report: Reporter) -> Fit:
+    """What runs over several floors made of a fit, or the fit where they contradict its own."""
+    errors = floor_errors(fit.contact, new.contact, data)
+    about = {**(new.mixed or {}), "floors": {name: asdict(e) for name, e in errors.items()}}
+    if not any(e.is_worse for e in errors.values()):
+        return replace(new, mixed=about)
+    said = sentence(errors)
+    report.line(said)
+    return replace(fit, refused={**about, "reason": said})
 
 
 def _judged(about: Mapping[str, Any]) -> str:

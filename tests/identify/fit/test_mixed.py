@@ -346,6 +346,8 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path):
     assert fit.converged
     assert len(fit.runs) == 16
     assert fit.mixed["runs"] == 4
+    assert fit.refused is None
+    assert not fit.mixed["floors"]["soft"]["is_worse"]
     assert {"mixed.along", "mixed.across", "mixed.yaw", "mixed.current"} < set(fit.variance)
     run = json.loads((out / "run.json").read_text())
     assert run["data"]["hash"] == fit.data_hash
@@ -379,3 +381,31 @@ def deployed(out):
     again = invoke(*wish)
     assert "driving 0 of 4 runs" in again.stderr
     assert json.loads((out / "t.json").read_text())["runs"] == said["runs"]
+
+
+@pytest.mark.slow
+def test_runs_with_a_wrong_map_are_refused(tmp_path):
+    """They were driven on `soft`, and their map says `firm`: runs on firm would be predicted worse."""
+    drives = grid(
+        setups=(("soft", "as_built"), ("firm", "as_built")), headings=6, speeds=(0.1, 0.3), turns=0
+    )
+    true = truth(drives)
+    write_logs(make_logs(true, drives, 1, Sensors()), true, tmp_path / "logs", tmp_path / "t")
+    soft = [d for d in drives if d.surface == "soft"]
+    write_logs(make_logs(true, soft, 2, Sensors()), true, tmp_path / "site", tmp_path / "t")
+    (tmp_path / "site/as_built/soft").rename(tmp_path / "logs/site")
+    (tmp_path / "site.toml").write_text(MAP.replace("gray", "firm"), encoding="utf-8")
+    section = '[[logs]]\nglob = "site/*.csv"\nformat = "demo"\nmap = "site.toml"\n[parameters]'
+    text = packaged_config("robotino.toml").replace("[parameters]", section)
+    config, out = written(tmp_path, text), tmp_path / "out"
+    said = invoke("identify", config, "--data", tmp_path / "logs", "--out", out)
+    assert said.exit_code == 0, said.stderr
+    assert "were not learnt from: they contradict those on one floor" in said.stderr
+    fit = load(out)
+    assert fit.mixed is None
+    assert fit.refused["reason"] in fit.messages
+    errors = fit.refused["floors"]["firm"]
+    assert errors["is_worse"]
+    assert errors["after"] > 1.5 * errors["before"]
+    assert len(fit.runs) == 24  # those on one floor
+    assert not any(name.startswith("mixed.") for name in fit.variance)

@@ -1,0 +1,50 @@
+"""What other runs taught is refused where it predicts a floor's own runs worse beyond chance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slipid.identify.compare.agreement import FloorErrors, compared, sentence
+
+RUNS = 12
+FLOORS = ["gray"] * RUNS + ["green"] * RUNS
+
+
+def errors(seed=0):
+    return 0.02 + 0.01 * np.random.default_rng(seed).uniform(size=2 * RUNS)
+
+
+@pytest.mark.parametrize(
+    ("factor", "noise", "worse"),
+    [
+        (1.0, 0.0, False),
+        (1.3, 0.0, False),  # a small price is paid
+        (5.6, 0.0, True),
+        (0.2, 0.0, False),
+        (1.7, 0.3, False),  # by chance: some runs much better, some much worse
+    ],
+)
+def test_a_floor_is_worse_where_its_errors_grow_much_and_surely(factor, noise, worse):
+    old, rng = errors(), np.random.default_rng(1)
+    new = old.copy()
+    new[RUNS:] = np.abs(factor * old[RUNS:] + noise * rng.normal(size=RUNS))
+    found = compared(FLOORS, old, new, np.full(2 * RUNS, 0.5))
+    assert list(found) == ["gray", "green"]
+    assert found["green"].is_worse == worse
+    assert not found["gray"].is_worse
+    assert found["gray"].before == found["gray"].after == pytest.approx(old[:RUNS].mean() / 0.5)
+
+
+def test_a_single_run_shows_nothing():
+    [found] = compared(["gray"], np.array([0.01]), np.array([0.5]), np.ones(1)).values()
+    assert not found.is_worse
+
+
+def test_the_sentence_names_floors_that_are_worse_and_no_others():
+    said = sentence(
+        {"gray": FloorErrors(0.0126, 0.0702, True), "green": FloorErrors(0.1, 0.1, False)}
+    )
+    assert "gray from 1.3 to 7.0 % of the way" in said
+    assert "green" not in said
+    assert "map may be wrong" in said
