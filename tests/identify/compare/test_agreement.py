@@ -22,13 +22,13 @@ def errors(seed=0):
         (1.3, 0.0, False),  # a small price is paid
         (5.6, 0.0, True),
         (0.2, 0.0, False),
-        (1.7, 0.3, False),  # by chance: some runs much better, some much worse
+        (1.7, 0.1, False),  # by chance: some runs much better, some much worse
     ],
 )
 def test_a_floor_is_worse_where_its_errors_grow_much_and_surely(factor, noise, worse):
     old, rng = errors(), np.random.default_rng(1)
     new = old.copy()
-    new[RUNS:] = np.abs(factor * old[RUNS:] + noise * rng.normal(size=RUNS))
+    new[RUNS:] = factor * old[RUNS:] + noise * rng.normal(size=RUNS)
     found = compared(FLOORS, old, new, np.full(2 * RUNS, 0.5))
     assert list(found) == ["gray", "green"]
     assert found["green"].is_worse == worse
