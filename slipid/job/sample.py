@@ -12,7 +12,7 @@ from slipid.identify.fit_file import load, write_identified
 from slipid.identify.posterior import netcdf
 from slipid.identify.posterior import sample as posterior
 from slipid.identify.posterior.blocks import FORMAT, Block, Plan, Record, packed, unpacked
-from slipid.identify.posterior.coordinates import ELECTRIC, Fitted
+from slipid.identify.posterior.coordinates import Fitted
 from slipid.identify.posterior.diagnosis import Posterior, estimates, identified
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
@@ -104,7 +104,7 @@ def sampled_around(
     def keep(part: str, block: Block) -> None:
         if kept is not None:
             kept.save(f"{part}-{block.number:04d}", packed(block))
-        _tell(part, block, plan, report)
+        _tell(block, plan, report)
 
     def steps(part: str, count: int) -> None:
         report.stage(f"sampling {part}")
@@ -114,20 +114,16 @@ def sampled_around(
     return posterior.sample(problem, fitted, plan, draws=draws, record=Record(done, keep, steps))
 
 
-def _tell(part: str, block: Block, plan: Plan, report: Reporter) -> None:
+def _tell(block: Block, plan: Plan, report: Reporter) -> None:
     """Progress of a chain; the time left is what it takes at most."""
     count = block.number + 1
-    first = not part.startswith(ELECTRIC)
-    warm = "warm-up, " if first and count <= plan.warm_up[-1] else ""
+    warm = "warm-up, " if count <= plan.warm_up[-1] else ""
     what = (
         f"block {count}: {warm}{count * block.chain.shape[1]} steps, "
         f"{100 * block.accepted.mean():.0f} % moved, "
         f"log density {block.log_prob[:, -1].mean():.1f}"
     )
-    if first:
-        report.advance(count, plan.most, what)
-    else:  # how many blocks the second stage takes is not known
-        report.note(what)
+    report.advance(count, plan.most, what)
 
 
 def _summary(found: Posterior, plan: Plan, seconds: float) -> Content:

@@ -83,15 +83,13 @@ def by_slipid(density):
     from slipid.identify.posterior.diagnosis import diagnose
 
     d = density
-    target = Target(
-        d.terms, d.slope, d.coordinates.group, d.coordinates.kind, d.centre, d.covariance
-    )
+    target = Target(d.terms, d.slope, d.coordinates.group, d.centre, d.covariance)
     plan = Plan()
     x = np.repeat(d.centre[None], plan.walkers, axis=0)
     d.terms(x), d.slope(x)  # compiles
     times = [time.perf_counter()]
     record = Record(keep=lambda part, block: times.append(time.perf_counter()))
-    blocks = sampler.extended([target] * plan.ensembles, plan, MOTION, record)
+    blocks = sampler.extended(target, plan, MOTION, record)
     warm = plan.warm_up[-1]
     chain = sampler.chain(blocks, plan)
     found = diagnose(chain, plan)
@@ -134,7 +132,7 @@ def nuts(path, seed, out, block=None):
     from slipid.identify.posterior.transport.transport_map import _placed, gaussian
 
     d = density = density_of(problem_of(FLOOR), pickle.loads(Path(path).read_bytes()))
-    map = gaussian(d.centre, d.covariance, d.coordinates.group, d.coordinates.kind)
+    map = gaussian(d.centre, d.covariance, d.coordinates.group)
     if block is not None:
         with np.load(block) as kept:
             map = unpacked(dict(kept)).map

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt32
 from slipid.identify.posterior.transport.pieces import Bend, Matrix, Values, Warp
 from slipid.identify.posterior.transport.transport_map import Stair, Transport, gaussian
 
-FORMAT = 3
+FORMAT = 4
 """Version of the block files; bump it when their content or the way they are made changes."""
 Chain = Float[np.ndarray, "ensemble step walker size"]
 
@@ -19,19 +19,15 @@ class Target:
     """A log density, and what is known of it beforehand.
 
     Terms of vectors (walker, size) are (walker, group + 1), the shared one last; the slope is that
-    of their sum. Coordinates have a group, -1 where groups share them, and a kind, which is moved
-    apart; centre and covariance are of a Gaussian near it (Laplace). Where walkers are `apart`,
-    each has a density of its own, so that all are evaluated together and in order, and none can be
-    moved by what others do. The map is what it is seen through; None for x itself.
+    of their sum. Coordinates have a group, -1 where groups share them; centre and covariance are of
+    a Gaussian near it (Laplace). The map is what it is seen through; None for x itself.
     """
 
     terms: Callable[[Matrix], Matrix]
     slope: Callable[[Matrix], Matrix]
     group: Int[np.ndarray, " size"]
-    kind: Int[np.ndarray, " size"]
     centre: Float[np.ndarray, " size"]
     covariance: Matrix
-    apart: bool = False
     map: Transport | None = None
 
     def log_prob(self, x: Matrix) -> Matrix:
@@ -41,7 +37,7 @@ class Target:
 
     def laplace(self) -> Transport:
         """Map of the Gaussian near it."""
-        return gaussian(self.centre, self.covariance, self.group, self.kind)
+        return gaussian(self.centre, self.covariance, self.group)
 
     def seen_by(self, map: Transport) -> "Target":
         """The same distribution in other coordinates; centre and covariance are left alone."""
@@ -113,14 +109,13 @@ class Block:
 class Record:
     """Where blocks of an earlier call are found and where new ones go.
 
-    `done` gives the blocks of a part that are there already; the name of the second part tells
-    which draws of the first its blocks are of. `tell` is called with the stage and the number of
-    steps of a block that are done.
+    `done` gives the blocks of a part that are there already. `tell` is called with the part and the
+    number of steps of a block that are done.
     """
 
     done: Callable[[str], Sequence[Block]] = lambda part: ()
     keep: Callable[[str, Block], None] = lambda part, block: None
-    tell: Callable[[str, int], None] = lambda stage, steps: None
+    tell: Callable[[str, int], None] = lambda part, steps: None
 
 
 def packed(block: Block) -> dict[str, np.ndarray]:

@@ -6,7 +6,7 @@ least squares,
 
     log p(x | data) = -1/2 |y(x)|^2 - 1/2 |(x - mean) / std|^2 + log |d residuals / d data|
 
-with y as `slipid.identify.fit.shared.freed` has it. Floors share some coordinates and have the
+with |y|^2 that of `slipid.identify.fit.shared.freed`. Floors share some coordinates and have the
 others to themselves, so that the log posterior is a sum
 
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
@@ -20,11 +20,12 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem
-from slipid.identify.fit.shared import freed, shared_effects
+from slipid.identify.fit.shared import Tie, shared_effects
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Coordinates, Fitted
 from slipid.model.robot import Robot
 
@@ -124,12 +125,9 @@ class Density:
         for k, r in seen.residuals.items():
             white, more = anchor.white(k, r), jnp.zeros(len(r))
             if k == "motion":
-                n, rows, more = white.size, freed(anchor.tied, white), camera
-                white, left = rows[:n].reshape(white.shape), rows[n:]
+                more = camera
                 for floor, tie in enumerate(anchor.tied):
-                    size = tie.factor.shape[0]
-                    out = out.at[floor].add(-0.5 * jnp.sum(left[:size] ** 2))
-                    left = left[size:]
+                    out = out.at[floor].add(0.5 * _explained(tie, white))
             elif k == "voltage":
                 more = spread
             out = out.at[b.surface].add(more - 0.5 * jnp.sum(white**2, axis=1))
@@ -200,3 +198,10 @@ class Density:
     def _held(self, anchor: Anchor, x: Array, _: None) -> Held:
         z = self.full(anchor, x)
         return Held(z, anchor.predict(self.problem.space.tree(z), z).felt)
+
+
+def _explained(tie: Tie, white: Float[Array, "piece m"]) -> Array:
+    """How much smaller |y|^2 is than that of whitened residuals, by shared effects of a floor."""
+    told = jnp.einsum("nma,nm->an", tie.span, white[tie.pieces])
+    along = jnp.einsum("anq,an->aq", tie.root, told).ravel()
+    return jnp.sum(solve_triangular(tie.factor, along, lower=True) ** 2)

@@ -24,16 +24,16 @@ from slipid.identify.posterior.transport.transport_map import Transport, learnt
 RandomState = tuple[str, np.ndarray, int, int, float]
 """State of a Mersenne twister as numpy gives it."""
 
-ACCEPTED = 0.8
+ACCEPTED = 0.65
 """Part of Hamiltonian moves that shall be accepted; their step is adapted in the warm-up."""
-FIRST_ANGLE, LEAST_ANGLE = 0.15, 0.03
+FIRST_ANGLE, LEAST_ANGLE = 0.3, 0.03
 """First and smallest step of Hamiltonian moves [rad]."""
-DRAWS_PER_EFFECTIVE = 24.0
+DRAWS_PER_EFFECTIVE = 50.0
 """Draws of the warm-up that tell as much as an independent one, about."""
 
 
 def extended(
-    targets: Sequence[Target],
+    target: Target,
     plan: Plan,
     part: str,
     record: Record,
@@ -41,13 +41,11 @@ def extended(
 ) -> list[Block]:
     """Blocks of a part until `diagnose` finds them good or the plan's most, each kept when made.
 
-    Targets, one for each ensemble, differ only where walkers are `apart`. Goes on from the blocks
-    that are done, by default those of the record.
+    Goes on from the blocks that are done, by default those of the record.
     """
     blocks = list(record.done(part) if done is None else done)
-    stage = part.partition("-")[0]
     while not _ended(blocks, plan):
-        block = _block(targets, plan, blocks, lambda steps: record.tell(stage, steps))
+        block = _block(target, plan, blocks, lambda steps: record.tell(part, steps))
         blocks.append(block)
         record.keep(part, block)
     return blocks
@@ -68,14 +66,12 @@ def chain(blocks: Sequence[Block], plan: Plan) -> Chain:
     return np.concatenate([b.chain for b in blocks[plan.warm_up[-1] :]], axis=1)
 
 
-def _block(
-    targets: Sequence[Target], plan: Plan, blocks: list[Block], tell: Callable[[int], None]
-) -> Block:
-    states, map, angle = _begin(targets, plan, blocks)
+def _block(target: Target, plan: Plan, blocks: list[Block], tell: Callable[[int], None]) -> Block:
+    states, map, angle = _begin(target, plan, blocks)
     stop, told = threading.Event(), [0] * plan.ensembles
 
     def ensemble(k: int) -> tuple[np.ndarray, np.ndarray, State, float, list[float]]:
-        inner = targets[k].seen_by(map)
+        inner = target.seen_by(map)
         made = moves(inner, angle)
         sampler = emcee.EnsembleSampler(
             plan.walkers,
@@ -122,16 +118,14 @@ def _block(
         angle=angle,
     )
     turns = [a for f in found for a in f[4]]
-    return _with_learnt(block, targets[0], plan, blocks, turns)
+    return _with_learnt(block, target, plan, blocks, turns)
 
 
-def _begin(
-    targets: Sequence[Target], plan: Plan, blocks: list[Block]
-) -> tuple[list[State], Transport, float]:
+def _begin(target: Target, plan: Plan, blocks: list[Block]) -> tuple[list[State], Transport, float]:
     """State of every ensemble in mapped coordinates, the map, and the angle."""
     if not blocks:
-        map = targets[0].laplace()
-        starts = [_start(t, plan, k) for k, t in enumerate(targets)]
+        map = target.laplace()
+        starts = [_start(target, plan, k) for k in range(plan.ensembles)]
         return [State(map.forward(x), random_state=r) for x, r in starts], map, FIRST_ANGLE
     last, states = blocks[-1], []
     for x, key, (place, has_gauss, gauss) in zip(last.chain[:, -1], *last.random, strict=True):
@@ -175,6 +169,6 @@ def _with_learnt(
         recent = [b.chain for b in [*blocks, block][count // 2 :]]
         draws = np.concatenate(recent, axis=1).reshape(-1, len(target.centre))
         effective = len(draws) / DRAWS_PER_EFFECTIVE
-        map = learnt(draws, effective, target.covariance, target.group, target.kind)
+        map = learnt(draws, effective, target.covariance, target.group)
         block = replace(block, map=map)
     return block

@@ -7,7 +7,7 @@ the shared ones, which groups then follow. Hamiltonian moves take all coordinate
 gradient where the density still bends, and walks along a single one cross its plateaus.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from emcee.model import Model
@@ -27,11 +27,16 @@ DEGREES = 8.0
 WAY = 0.5 * np.pi
 """Length of a Hamiltonian move [rad]: a quarter turn leads to an independent draw of a Gaussian."""
 MOST_STEPS = 12
-ALONG, ALONG_APART, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 0.6, 1.2, 0.1, 0.35
-"""How often, relatively, moves of each kind are made; a Hamiltonian one takes ten times longer."""
+ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 1.2, 0.1, 1.0
+"""How often, relatively, moves of each kind are made.
+
+A Hamiltonian one takes ten times longer, but is what frees walkers from where the map is wrong.
+"""
 ALONE = 0.5
 """Part of walks along a coordinate that no other one of x follows."""
-STEEPEST = 100.0
+_FINITE = 1e100
+"""Bound of slopes whose squares are summed."""
+STEEPEST = 50.0
 """Kicks are bounded by this many times the step, so that walkers far out are not thrown away."""
 
 
@@ -44,17 +49,12 @@ class Family:
 
 
 def families(target: Target) -> list[Family]:
-    """Coordinates of every kind, of all groups and shared."""
-    found = []
-    for k in np.unique(target.kind):
-        groups = tuple(int(g) for g in np.unique(target.group[target.kind == k]) if g >= 0)
-        places = [np.flatnonzero((target.kind == k) & (target.group == g)) for g in groups]
-        if groups:
-            found.append(Family(tuple(places), groups))
-        shared = np.flatnonzero((target.kind == k) & (target.group < 0))
-        if len(shared):
-            found.append(Family((shared,), None))
-    return found
+    """Coordinates of all groups, and those that they share."""
+    groups = tuple(int(g) for g in np.unique(target.group) if g >= 0)
+    places = tuple(np.flatnonzero(target.group == g) for g in groups)
+    shared = np.flatnonzero(target.group < 0)
+    found = [Family(places, groups)] if groups else []
+    return [*found, Family((shared,), None)] if len(shared) else found
 
 
 Jump = tuple[Matrix, Float[np.ndarray, " walker"]]
@@ -69,7 +69,6 @@ class FamilyMove(Move):
 
     def __init__(self, family: Family):
         self.family = family
-        self.accepted: list[float] = []
 
     def jump(self, old: Matrix, still: Matrix, random: RandomState) -> Jump:
         raise NotImplementedError
@@ -102,7 +101,6 @@ class FamilyMove(Move):
                 state.blobs[rows, of] = terms[took[:, k], of]
             state.log_prob[mine] = state.blobs[mine].sum(axis=1)
             accepted[mine] = took.any(axis=1)
-            self.accepted.append(float(took.mean()))
         return state, accepted
 
 
@@ -180,40 +178,39 @@ class Along(FamilyMove):
         return new, np.stack([change[:, own].sum(axis=1) for own in self.family.places], axis=1)
 
 
-class Hamiltonian(FamilyMove):
+class Hamiltonian(Move):
     """Turns of position and momentum that suit a Gaussian, kicked by what it does not know.
 
     With momentum p and the log density l, steps of
 
         turn (u, p) by h/2;    p += h (dl/du + u);    turn (u, p) by h/2
 
-    Given what they share groups do not feel each other, so that each takes its turn or not.
-
     Source: Beskos et al. 2011, Stochastic Processes and their Applications 121, section 4.
     """
 
-    def __init__(self, target: Target, family: Family, angle: float):
-        super().__init__(family)
+    def __init__(self, target: Target, angle: float):
         self.target, self.angle = target, angle
+        self.accepted: list[float] = []
 
-    def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
-        own = np.concatenate(self.family.places)
+    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
+        random, (count, size) = model.random, state.coords.shape
         # shorter steps, now and then, for walkers where the density is steep
-        h = self.angle * (1 - 0.8 * random.uniform(size=(len(x), 1)) ** 3)
+        h = self.angle * (1 - 0.8 * random.uniform(size=(count, 1)) ** 3)
         steps = int(np.clip(random.uniform(1.0, 1.4) * WAY / self.angle, 1, MOST_STEPS))
-        start, u, q = np.zeros(x.shape), x.copy(), x[:, own]
-        start[:, own] = p = random.standard_normal(q.shape)
-        q, p = _turn(q, p, h / 2)
+        u, start = state.coords, random.standard_normal((count, size))
+        u, p = _turn(u, start, h / 2)
         for step in range(steps):
-            u[:, own] = q
-            kick = np.nan_to_num(self.target.slope(u))[:, own] + q
+            kick = np.clip(np.nan_to_num(self.target.slope(u)), -_FINITE, _FINITE) + u
             most = np.linalg.norm(kick, axis=1, keepdims=True) / STEEPEST
             p = p + h * kick / np.maximum(most, 1.0)
-            q, p = _turn(q, p, h if step < steps - 1 else h / 2)
-        end = np.zeros(x.shape)
-        u[:, own], end[:, own] = q, p
-        lost = 0.5 * (start**2 - end**2)
-        return u, np.stack([lost[:, places].sum(axis=1) for places in self.family.places], axis=1)
+            u, p = _turn(u, p, h if step < steps - 1 else h / 2)
+        log_prob, terms = model.compute_log_prob_fn(u)
+        gain = log_prob - state.log_prob + 0.5 * (start**2 - p**2).sum(axis=1)
+        took = np.log(random.uniform(size=count)) < np.where(np.isnan(gain), -np.inf, gain)
+        state.coords[took], state.blobs[took] = u[took], terms[took]
+        state.log_prob[took] = log_prob[took]
+        self.accepted.append(float(took.mean()))
+        return state, took
 
 
 def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
@@ -224,13 +221,8 @@ def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
 def moves(target: Target, angle: float) -> list[tuple[Move, float]]:
     """Moves in the target's coordinates, and how often each is made."""
     of_family = families(target)
-    groups = tuple(int(g) for g in np.unique(target.group) if g >= 0)
-    along = ALONG_APART if target.apart else ALONG
-    found: list[tuple[Move, float]] = [(Along(target, groups), along)] if groups else []
-    if (target.group < 0).any():
-        found.append((Along(target, None), along))
-    found += [(Independence(family), INDEPENDENT / len(of_family)) for family in of_family]
-    if not target.apart:
-        found += [(Differential(family), DIFFERENTIAL / len(of_family)) for family in of_family]
-    whole = families(replace(target, kind=np.zeros_like(target.kind)))
-    return [*found, *((Hamiltonian(target, f, angle), HAMILTONIAN / len(whole)) for f in whole)]
+    found: list[tuple[Move, float]] = [(Along(target, f.groups), ALONG) for f in of_family]
+    for family in of_family:
+        found.append((Independence(family), INDEPENDENT / len(of_family)))
+        found.append((Differential(family), DIFFERENTIAL / len(of_family)))
+    return [*found, (Hamiltonian(target, angle), HAMILTONIAN)]

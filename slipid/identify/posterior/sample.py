@@ -33,9 +33,8 @@ def sample(
     parts = (EVERYTHING,) if problem.target.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
     at = first.coordinates
-    kind = np.zeros(first.size, int)
-    target = Target(first.terms, first.slope, at.group, kind, first.centre, first.covariance)
-    blocks = ensemble.extended([target] * plan.ensembles, plan, parts[0], record)
+    target = Target(first.terms, first.slope, at.group, first.centre, first.covariance)
+    blocks = ensemble.extended(target, plan, parts[0], record)
     chain = ensemble.chain(blocks, plan)
     found = diagnosis.diagnose(chain, plan)
     x, log_prob = thinned(chain, blocks[plan.warm_up[-1] :], draws)

@@ -385,7 +385,7 @@ def deployed(out):
 
 @pytest.mark.slow
 def test_runs_with_a_wrong_map_are_refused(tmp_path):
-    """They were driven on `soft`, their map says `firm`: runs on `firm` would be predicted worse."""
+    """They were driven on `soft`, and their map says `firm`."""
     drives = grid(
         setups=(("soft", "as_built"), ("firm", "as_built")), headings=6, speeds=(0.1, 0.3), turns=0
     )

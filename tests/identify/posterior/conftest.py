@@ -11,7 +11,7 @@ from slipid.identify.posterior.transport.transport_map import learnt
 @pytest.fixture(scope="session")
 def bent():
     """A map learnt from draws with a parabola, a funnel, two plateaus and shared numbers."""
-    group, kind = np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1]), np.array([0, 1, 0, 0, 0, 1, 0, 0, 1])
+    group = np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1])
     x = np.random.default_rng(0).normal(size=(5000, 9))
     x[:, 3] += x[:, 2] ** 2
     x[:, 4] *= np.exp(0.5 * x[:, 2])
@@ -19,4 +19,4 @@ def bent():
     x[:, 8] = np.exp(0.5 * x[:, 8])
     x[:, [1, 6]] = np.log(np.abs(x[:, [1, 6]]))
     x[:, 7] = 0.5 * x[:, 7] + 3 * np.exp(x[:, 6])
-    return learnt(x, 1250.0, np.eye(9), group, kind), x
+    return learnt(x, 1250.0, np.eye(9), group), x

@@ -24,7 +24,7 @@ from slipid.identify.posterior.proposals import (
 PLAN = Plan(ensembles=4, walkers=16, block=25, warm_up=(2, 4, 6), most=120, spread=6.0)
 
 
-def known(terms, group, kind, centre, covariance):
+def known(terms, group, centre, covariance):
     """A target with slopes by central differences."""
 
     def slope(x):
@@ -32,7 +32,7 @@ def known(terms, group, kind, centre, covariance):
         ends = [terms(x + s).sum(axis=1) - terms(x - s).sum(axis=1) for s in step]
         return np.stack(ends, axis=1) / 2e-5
 
-    return Target(terms, slope, group, kind, centre, covariance)
+    return Target(terms, slope, group, centre, covariance)
 
 
 def gaussian():
@@ -67,8 +67,7 @@ def gaussian():
 
     assert np.abs(precision[np.ix_(group == 0, group == 1)]).max() < 1e-9
     off = mean + 0.7 * np.sqrt(np.diag(covariance))
-    kind = np.array([0, 0, 0, 1, 0, 1, 1, 1])
-    return known(terms, group, kind, off, 0.6 * covariance), mean, np.sqrt(np.diag(covariance))
+    return known(terms, group, off, 0.6 * covariance), mean, np.sqrt(np.diag(covariance))
 
 
 def banana():
@@ -76,7 +75,7 @@ def banana():
         bent = -0.5 * x[:, 0] ** 2 - 2.0 * (x[:, 1] - x[:, 0] ** 2) ** 2
         return np.stack([bent, 0 * bent], axis=1)
 
-    target = known(terms, np.zeros(2, int), np.zeros(2, int), np.zeros(2), np.diag([1.0, 0.25]))
+    target = known(terms, np.zeros(2, int), np.zeros(2), np.diag([1.0, 0.25]))
     return target, np.array([0.0, 1.0]), np.array([1.0, 1.5])
 
 
@@ -88,7 +87,7 @@ def funnel():
         own = -0.5 * (x[:, 1:] ** 2 * np.exp(-v)[:, None] + v[:, None])
         return np.concatenate([own, -0.5 * v[:, None] ** 2], axis=1)
 
-    target = known(terms, np.array([-1, 0, 1, 2]), np.zeros(4, int), np.zeros(4), np.eye(4))
+    target = known(terms, np.array([-1, 0, 1, 2]), np.zeros(4), np.eye(4))
     return target, np.zeros(4), np.array([1.0, *[np.exp(0.25)] * 3])
 
 
@@ -101,7 +100,7 @@ def two_modes():
         )
         return np.stack([d - 0.5 * x[:, 1] ** 2, 0 * d], axis=1)
 
-    target = known(terms, np.zeros(2, int), np.zeros(2, int), np.array([-4.0, 0.0]), np.eye(2))
+    target = known(terms, np.zeros(2, int), np.array([-4.0, 0.0]), np.eye(2))
     return target, np.array([1.6, 0.0]), np.array([np.sqrt(1 + 16 * 4 * 0.3 * 0.7), 1.0])
 
 
@@ -114,7 +113,7 @@ def plateau():
     def terms(x):
         with np.errstate(over="ignore"):
             own = below(x[:, 0]) - 0.5 * ((x[:, 1] - 1 + 3 * np.exp(x[:, 0])) / 0.1) ** 2
-        return np.stack([own, 0 * own], axis=1)
+        return np.stack([own, np.zeros(len(own))], axis=1)
 
     grid = np.linspace(-12, 3, 20001)
     weight = np.exp(below(grid))
@@ -123,13 +122,12 @@ def plateau():
     mean = about @ weight
     var = (about - mean[:, None]) ** 2 @ weight + np.array([0.0, 0.01])
     covariance = np.array([[0.16, -0.48], [-0.48, 1.45]])
-    group, kind = np.zeros(2, int), np.zeros(2, int)
-    return known(terms, group, kind, np.array([0.0, -2.0]), covariance), mean, np.sqrt(var)
+    return known(terms, np.zeros(2, int), np.array([0.0, -2.0]), covariance), mean, np.sqrt(var)
 
 
 def run(target, plan, done=()):
-    """Blocks up to the plan's end, of ensembles that share a target."""
-    return extended([target] * plan.ensembles, plan, "part", Record(), done)
+    """Blocks up to the plan's end."""
+    return extended(target, plan, "part", Record(), done)
 
 
 def sampled(target, plan=PLAN):
@@ -175,7 +173,7 @@ def test_ensembles_in_different_modes_are_not_reported():
         d = np.logaddexp(-0.5 * (x[:, 0] + 50) ** 2, -0.5 * (x[:, 0] - 50) ** 2)
         return np.stack([d, 0 * d], axis=1)
 
-    target = known(terms, np.zeros(1, int), np.zeros(1, int), np.zeros(1), np.eye(1))
+    target = known(terms, np.zeros(1, int), np.zeros(1), np.eye(1))
     plan = Plan(ensembles=4, walkers=4, block=25, warm_up=(2,), most=12, spread=30.0)
     _, chain, found = sampled(target, plan)
     assert {-1, 1} == set(np.sign(chain[:, -1, 0, 0]).astype(int)) or not found.converged
@@ -219,7 +217,7 @@ def test_independence_accepts_nearly_everything_where_laplace_is_exact(exact):
     """All but for the tails of the Student t; shared numbers take the groups along."""
     target, u = exact
     before, random = target.terms(u), np.random.RandomState(0)
-    assert len(families(target)) == 3  # two kinds of the groups' numbers, one of the shared ones
+    assert len(families(target)) == 2
     for family in families(target):
         new, factor = Independence(family).proposed(u, u, random)
         gain = target.terms(new) - before
@@ -229,7 +227,7 @@ def test_independence_accepts_nearly_everything_where_laplace_is_exact(exact):
         np.testing.assert_array_equal(new[:, others], u[:, others])
 
 
-def made_gaussian(map, group, kind):
+def made_gaussian(map, group):
     """Target that is a standard Gaussian in the coordinates of a map."""
     onto = np.eye(3)[np.where(group < 0, 2, group)]
 
@@ -237,7 +235,7 @@ def made_gaussian(map, group, kind):
         return -0.5 * u**2 @ onto
 
     centre, covariance = np.zeros(len(group)), np.eye(len(group))
-    return Target(terms, np.negative, group, kind, centre, covariance, map=map)
+    return Target(terms, np.negative, group, centre, covariance, map=map)
 
 
 def model_of(target):
@@ -268,8 +266,7 @@ def test_a_hamiltonian_move_is_exact_and_independent_for_a_gaussian(exact):
 def test_walking_along_a_coordinate_keeps_the_distribution(bent, groups):
     """Exact draws of what a bent map makes of a Gaussian stay that."""
     map, _ = bent
-    group, kind = np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1]), np.array([0, 1, 0, 0, 0, 1, 0, 0, 1])
-    target = made_gaussian(map, group, kind)
+    target = made_gaussian(map, np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1]))
     model, u = model_of(target), np.random.RandomState(1).standard_normal((4000, 9))
     log_prob, terms = model.compute_log_prob_fn(u)
     from emcee.state import State

@@ -110,8 +110,8 @@ def test_how_far_floors_differ_is_drawn_by_how_likely_it_is(problem):
 
 def test_thinned_draws_are_spread_over_steps_and_walkers_and_keep_their_log_density():
     chain = np.arange(2 * 60 * 8, dtype=float).reshape(2, 60, 8, 1)
-    random, one = (np.zeros((2, 624), np.uint32), np.zeros((2, 3))), np.zeros(1, int)
-    map = gaussian(np.zeros(1), np.eye(1), one, one)
+    random = np.zeros((2, 624), np.uint32), np.zeros((2, 3))
+    map = gaussian(np.zeros(1), np.eye(1), np.zeros(1, int))
     blocks = [
         Block(k, part, 0.5 * part[..., 0], random, np.zeros(2), map, 0.1)
         for k, part in enumerate(np.split(chain, 3, axis=1))

@@ -16,8 +16,12 @@ Leaf = Array | np.ndarray
 """An array of numpy while a map is learnt, of jax where the way back is computed."""
 A = TypeVar("A", Array, np.ndarray)
 """Either of them; what comes out is what went in."""
-SKEW = -0.8
-"""Coordinates with draws more skewed than this are taken for plateaus; a wrong guess costs pace."""
+SKEW, FALL = -0.3, np.log(10.0)
+"""Coordinates with draws more skewed, one in a hundred of which fall so far below the median.
+
+They are taken for plateaus: the number itself is then next to nothing there. A wrong guess costs
+pace: where a number does not vanish, others follow its logarithm along a valley.
+"""
 MOST_VALUE = 3.0
 """Numbers stay what they are beyond exp of this, in units of their median."""
 FAR = 4.0
@@ -38,7 +42,7 @@ class Values:
     """What coordinates say to those that follow: themselves, or numbers they are logarithms of.
 
     Plateau is 1 where it is the number; these have a stair of their own, which the others of their
-    kind and group follow. The middle is the median less the mean; mean and std are of the number,
+    group follow. The middle is the median less the mean; mean and std are of the number,
     in units of its median.
     """
 
@@ -68,8 +72,9 @@ class Values:
         """Plateaus of draws less their means: they are where the way down is long."""
         skew = (about**3).mean(axis=0) / about.std(axis=0) ** 3
         middle = np.median(about, axis=0)
+        flat = (skew < SKEW) & (middle - np.quantile(about, 0.01, axis=0) > FALL)
         value = np.exp(np.minimum(about - middle, MOST_VALUE))
-        return Values((skew < SKEW) * 1.0, middle, value.mean(axis=0), value.std(axis=0))
+        return Values(flat * 1.0, middle, value.mean(axis=0), value.std(axis=0))
 
 
 @jax.tree_util.register_dataclass

@@ -183,34 +183,30 @@ def _pulled(map: Steps, u: Array, slope: Array) -> Array:
     return jnp.asarray(out)
 
 
-def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray, kind: np.ndarray) -> Transport:
+def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray) -> Transport:
     """Map of a Gaussian.
 
-    Groups are those of each coordinate, -1 where groups share it; within a group a higher kind
-    follows the lower ones.
+    Groups are those of each coordinate, -1 where groups share it.
     """
     values = Values.none(len(mean))
-    stairs = _stairs(np.tile(covariance, (2, 2)), group, kind, values, covariance)
+    stairs = _stairs(np.tile(covariance, (2, 2)), group, values, covariance)
     return Transport(mean, values, stairs, Warp.none(len(mean)))
 
 
-def _order(
-    group: np.ndarray, kind: np.ndarray, values: Values
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _order(group: np.ndarray, values: Values) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Coordinates of every stair, and those before it that they are given."""
     plateau = values.plateau > 0
     for g in range(-1, int(group.max()) + 1):
         before = np.flatnonzero(group < 0) if g >= 0 else np.zeros(0, int)
-        for k in np.unique(kind):
-            for first in (True, False):
-                own = np.flatnonzero((group == g) & (kind == k) & (plateau == first))
-                if len(own):
-                    yield own, before
-                    before = np.concatenate([before, own])
+        for first in (True, False):
+            own = np.flatnonzero((group == g) & (plateau == first))
+            if len(own):
+                yield own, before
+                before = np.concatenate([before, own])
 
 
 def _stairs(
-    covariance: Matrix, group: np.ndarray, kind: np.ndarray, values: Values, at_mode: Matrix
+    covariance: Matrix, group: np.ndarray, values: Values, at_mode: Matrix
 ) -> tuple[Stair, ...]:
     """Stairs of a Gaussian; the coordinates that are widest at the mode come first in a stair.
 
@@ -218,7 +214,7 @@ def _stairs(
     covariance is of all coordinates, followed by what they say.
     """
     stairs = []
-    for own, given in _order(group, kind, values):
+    for own, given in _order(group, values):
         own = own[np.argsort(-np.diag(_given(at_mode, own, given)[1]))]
         slope, left = _given(covariance, own, given + len(group))
         plateaus = given[(values.plateau[given] > 0) & (group[given] >= 0)]
@@ -234,9 +230,7 @@ def _given(covariance: Matrix, own: np.ndarray, given: np.ndarray) -> tuple[Matr
     return slope, covariance[np.ix_(own, own)] - cross.T @ slope
 
 
-def learnt(
-    draws: Matrix, effective: float, covariance: Matrix, group: np.ndarray, kind: np.ndarray
-) -> Transport:
+def learnt(draws: Matrix, effective: float, covariance: Matrix, group: np.ndarray) -> Transport:
     """Map learnt from draws (draw, size) that are worth so many independent ones, about.
 
     The Laplace covariance counts as many draws as there are coordinates.
@@ -250,7 +244,7 @@ def learnt(
     at_mode = np.tile(covariance, (2, 2)) * np.outer(steps, steps)
     both = effective * np.cov(np.concatenate([about, said], axis=1).T) + size * at_mode
     stairs = []
-    for s in _stairs(both / (effective + size), group, kind, values, covariance):
+    for s in _stairs(both / (effective + size), group, values, covariance):
         left, of_plateaus = s.left(about, said), said[:, s.plateaus]
         bend = Bend.learnt(left, of_plateaus, effective) if s.bend else None
         stairs.append(replace(s, bend=bend))
