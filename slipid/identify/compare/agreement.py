@@ -47,9 +47,10 @@ def compared(
         grown = new[mine] - old[mine]
         error = float(grown.std(ddof=1)) / np.sqrt(mine.sum()) if mine.sum() > 1 else np.inf
         much = new[mine].mean() > WORSE * old[mine].mean()
+        way = max(float(far[mine].sum()), 1e-9)  # runs may only have turned
         out[name] = FloorErrors(
-            float(old[mine].sum() / far[mine].sum()),
-            float(new[mine].sum() / far[mine].sum()),
+            float(old[mine].sum() / way),
+            float(new[mine].sum() / way),
             bool(much and grown.mean() > SURE * error),
         )
     return out

@@ -1,12 +1,15 @@
 """What any model of the ladder says of runs it has not seen, and how sure it may be.
 
-Every model gets the same predictive distribution: a Student t around what it predicts, with scale
+Every model gets a predictive distribution of the same form: a Student t around what it predicts,
+with scale
 
     V + E diag(v) E^T + J C J^T
 
 V of its own camera, process and run variances, found by restricted likelihood from its own
-residuals; v what runs of a session share (`slipid.identify.fit.sessions`), E what that moves; J the
-slope by its own numbers and the camera's, C their covariance. All models share the fitted camera;
+residuals; v what runs share, E what that moves; J the slope by its own numbers and the camera's, C
+their covariance. Simpler models have v of sessions (`slipid.identify.fit.sessions`); the force
+balance has what its fit found of sessions and neighbours (`slipid.identify.fit.shared`), and v
+grows where leaving out sectors asks for it. All models share the fitted camera;
 a rung's numbers follow it.
 """
 
@@ -155,7 +158,8 @@ class Contact(Predictive):
             kind, _, rest = name.partition(".")
             if kind in ("run", *SHARED):
                 floor = f"{rest.rpartition('.')[0]}@"
-                out[name] *= max([x for k, x in self.extrapolation.items() if k.startswith(floor)])
+                grown = [x for k, x in self.extrapolation.items() if k.startswith(floor)]
+                out[name] *= max(grown, default=1.0)
         return out
 
     def told(self, w: Windows) -> Told:

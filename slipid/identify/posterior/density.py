@@ -4,9 +4,10 @@ A coordinate is a free number of the search space. Variances and the weights of 
 the fit found them, and what runs share is marginalised, so that the density is that of nonlinear
 least squares,
 
-    log p(x | data) = -1/2 |y(x)|^2 - 1/2 |(x - mean) / std|^2 + log |d residuals / d data|
+    log p(x | data) = -1/2 |y(x)|^2 - 1/2 |(x - mean) / std|^2 + f log |d residuals / d data|
 
-with |y|^2 that of `slipid.identify.fit.shared.freed`. Floors share some coordinates and have the
+with |y|^2 that of `slipid.identify.fit.shared.freed`, and f what a Student t tells of its centre
+over what a Gaussian does, as it is in y. Floors share some coordinates and have the
 others to themselves, so that the log posterior is a sum
 
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
@@ -26,6 +27,7 @@ from jaxtyping import Array, Float
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.shared import Tie, shared_effects
+from slipid.identify.fit.variances import expected
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Coordinates, Fitted
 from slipid.model.robot import Robot
 
@@ -124,12 +126,13 @@ class Density:
         camera, spread = lk.log_jacobians(seen.robot, b, anchor.noise(seen.robot))
         for k, r in seen.residuals.items():
             white, more = anchor.white(k, r), jnp.zeros(len(r))
+            less = expected(r.shape[-1])  # residuals weigh less by as much, or the summit moves
             if k == "motion":
-                more = camera
+                more = less * camera
                 for floor, tie in enumerate(anchor.tied):
                     out = out.at[floor].add(0.5 * _explained(tie, white))
             elif k == "voltage":
-                more = spread
+                more = less * spread
             out = out.at[b.surface].add(more - 0.5 * jnp.sum(white**2, axis=1))
         at = self.coordinates
         pull = (x - self.problem.space.prior_mean[at.structure]) / anchor.prior_std[at.structure]

@@ -84,7 +84,9 @@ def _draw(
     def step(x: Array, _: None) -> tuple[Array, None]:
         return x + jnp.linalg.solve(information(x), jax.grad(log_prob)(x)), None
 
-    centre, _ = jax.lax.scan(step, start, None, length=_STEPS)
+    found, _ = jax.lax.scan(step, start, None, length=_STEPS)
+    # steps that run away end in nan; proposals from the start are poor, and seen to be by `still`
+    centre = jnp.where(jnp.all(jnp.isfinite(found)), found, start)
     root = jnp.linalg.cholesky(jnp.linalg.inv(information(centre)))
     at = centre + _WIDER * student @ root.T
     tail = 0.5 * (_DEGREES + len(start)) * jnp.log1p(jnp.sum(student**2, axis=1) / _DEGREES)

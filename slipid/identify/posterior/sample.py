@@ -2,8 +2,8 @@
 
 Where currents were logged the posterior is p(motion | motion data) p(electric | motion,
 data), which no single density describes: its normaliser depends on the motion. Given the motion the
-electric numbers are nearly linear with Gaussian noise, so that they are drawn from the Gaussian at
-their most likely values and corrected for the difference.
+electric numbers are nearly linear with Gaussian noise, so that they are drawn by
+Metropolis-Hastings steps with proposals around their most likely values.
 """
 
 from collections.abc import Sequence
@@ -50,7 +50,9 @@ def sample(
             later = electric_given_motion(first, second, fitted.covariance, x, plan.seed)
             out[..., second.coordinates.structure] = later.x
             accepted[ELECTRIC], still = later.accepted, later.still
-    if found.converged and still > STILL:
+    if not np.isfinite(out).all():
+        still, reason = 1.0, "electric draws that are not finite"
+    elif found.converged and still > STILL:
         reason = f"{100 * still:.1f} % of the electric draws, which never moved"
     return Posterior(
         z=out,

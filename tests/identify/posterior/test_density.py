@@ -151,7 +151,8 @@ class Dense:
                 rows = (surface[:, None] == g).repeat(m, axis=1).ravel()
                 r = gaps[k].ravel()[rows]
                 out[g] -= 0.5 * r @ np.linalg.solve(whole[np.ix_(rows, rows)], r)
-                out[g] += jacobian.get(k, np.zeros(len(surface)))[surface == g].sum()
+                more = jacobian.get(k, np.zeros(len(surface)))[surface == g].sum()
+                out[g] += more * (DEGREES + m) / (DEGREES + m + 2)
         return out
 
     def effects(self, z):
