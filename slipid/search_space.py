@@ -43,6 +43,7 @@ class Space(eqx.Module):
     Attributes:
         template: the tree; what is fixed keeps its value here.
         start, prior_mean, prior_std: in the search space.
+        pooled: deviations whose prior std is found from the data, for the user gave none.
         all: every declared number of the tree.
         free: those that are fitted.
     """
@@ -51,6 +52,7 @@ class Space(eqx.Module):
     start: Float[np.ndarray, " free"]
     prior_mean: Float[np.ndarray, " free"]
     prior_std: Float[np.ndarray, " free"]
+    pooled: Bool[np.ndarray, " free"]
     all: tuple[Entry, ...] = eqx.field(static=True)
     free: tuple[Entry, ...] = eqx.field(static=True)
 
@@ -66,7 +68,7 @@ class Space(eqx.Module):
                 paths = ", ".join(e.path for e in self.all)
                 raise ValueError(f"no parameter '{c.pattern}'; there are: {paths}")
         values: dict[Entry, Any] = {}
-        free, starts, means, spreads = [], [], [], []
+        free, starts, means, spreads, pooled = [], [], [], [], []
         for entry in self.all:
             picked = [c for c in choices if fnmatch.fnmatchcase(entry.path, c.pattern)]
             value, mean, spread, is_free = _settle(entry, entry.get(tree), picked)
@@ -76,11 +78,19 @@ class Space(eqx.Module):
                 starts.append(entry.declaration.to_search(value))
                 means.append(mean)
                 spreads.append(spread)
+                found = entry.declaration.deviation and all(c.prior_std is None for c in picked)
+                pooled.append(np.full(entry.coordinates, found))
         self.template = put(tree, values)
         self.free = tuple(free)
         self.start, self.prior_mean, self.prior_std = (
             np.concatenate([np.zeros(0), *parts]) for parts in (starts, means, spreads)
         )
+        self.pooled = np.concatenate([np.zeros(0, bool), *pooled])
+
+    def with_pooled(self, std: float) -> "Space":
+        """The same with the prior std that was found for the deviations."""
+        prior_std = np.where(self.pooled, std, self.prior_std)
+        return eqx.tree_at(lambda space: space.prior_std, self, prior_std)
 
     @property
     def place(self) -> dict[str, slice]:

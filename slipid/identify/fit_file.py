@@ -16,6 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from slipid.identify.fit.hierarchy import PerAxis
 from slipid.identify.fit.shared import FoundShared, Pace
 from slipid.identify.result import Channels, Fit
 from slipid.identify.slip_curves import SlipCurve
@@ -30,7 +31,7 @@ from slipid.support.files import checksum, json_text, read_json, write_bytes
 
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
-SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/3"
+SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/4"
 _PLAIN = ("converged", "reason", "rounds", "remaining")
 _CURVE = ("torque_nm", "slip", "slip_lo", "slip_hi")
 _SHARED = ("std", "coefs", "by_number", "covariance")
@@ -179,7 +180,7 @@ def to_json(fit: Fit) -> Content:
         | ({} if fit.refused is None else {"refused": dict(fit.refused)}),
         "current_trend": list(fit.current_trend),
         "shared": {floor: [asdict(p) for p in found.paces] for floor, found in fit.shared.items()},
-        "extrapolation": dict(fit.extrapolation),
+        "extrapolation": {name: x._asdict() for name, x in fit.extrapolation.items()},
         "baselines": dict(fit.baselines),
         "data": {"hash": fit.data_hash, "runs": [list(r) for r in fit.runs]},
     }
@@ -211,7 +212,7 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         seed=settings["seed"],
         mixed=settings.get("mixed"),
         refused=settings.get("refused"),
-        extrapolation=content["extrapolation"],
+        extrapolation={k: PerAxis(**x) for k, x in content["extrapolation"].items()},
         baselines=content["baselines"],
         current_trend=(content["current_trend"][0], content["current_trend"][1]),
         shared={

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -14,12 +14,12 @@ from jaxtyping import Array, Float
 from slipid.data.runs import Runs
 from slipid.identify import slip_curves as curves_of
 from slipid.identify.compare.predictive import Contact, contact_of
-from slipid.identify.fit.mixed import Update, informed
+from slipid.identify.fit.hierarchy import PerAxis
 from slipid.identify.fit.noise import POOLED
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem, State, log_jacobian
 from slipid.identify.fit.shared import FoundShared, Tie, freed, freed_slopes
-from slipid.identify.fit.variances import Search, Square
+from slipid.identify.fit.variances import MOTIONS, Search, Square
 from slipid.identify.slip_curves import SlipCurve
 from slipid.identify.verdicts.disputed import Dispute, disputes, marked
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
@@ -67,8 +67,8 @@ class Fit:
             solver that finds no way ahead is not at an optimum because of it.
         lag, seed: of the windows [s]; of the draws the curves' bands are made of.
         baselines: what simpler models learnt from the same runs, for comparison.
-        mixed: what runs over several floors did, see `slipid.identify.fit.mixed.Update.about`, and
-            end-point errors of the others before and after by floor.
+        mixed: how runs over several floors were predicted before they were learnt from, and by a
+            fit to half of them; end-point errors of the others before and after, by floor.
         refused: the same, and why, where they contradict the others and were not learnt from.
     """
 
@@ -95,7 +95,7 @@ class Fit:
     mixed: Mapping[str, Any] | None = None
     refused: Mapping[str, Any] | None = None
     shared: Mapping[str, FoundShared] = field(default_factory=dict)
-    extrapolation: Mapping[str, float] = field(default_factory=dict)
+    extrapolation: Mapping[str, PerAxis] = field(default_factory=dict)
 
     @cached_property
     def contact(self) -> Contact:
@@ -114,8 +114,18 @@ class Fit:
     def parameters(self) -> dict[str, Estimate]:
         """Every number by path, with interval and verdict."""
         volts, flat = self.channels.voltage, members(self.flat)
-        found = estimates(self.space, self.choices, self.z, self.covariance, volts, flat)
+        found = estimates(self.judged, self.choices, self.z, self.covariance, volts, flat)
         return marked({e.path: e for e in found}, self.disputes)
+
+    @cached_property
+    def judged(self) -> Space:
+        """The space with the prior that deviations were found to have.
+
+        Against it a number is told to be measured or not.
+        """
+        if POOLED not in self.variance:
+            return self.space
+        return self.space.with_pooled(float(np.sqrt(self.variance[POOLED])))
 
     @cached_property
     def disputes(self) -> tuple[Dispute, ...]:
@@ -168,18 +178,18 @@ def summarise(
 ) -> Fit:
     """Fit from the end of an optimisation, and what runs of one session were found to share.
 
-    `data` are the runs that the problem's windows were cut from, `choices` what it was given, and
-    `seed` is of the draws the curves' bands are made of.
+    `data` are the runs on one floor each that the problem's windows were cut from, `choices` what
+    it was given, and `seed` is of the draws the curves' bands are made of.
     """
     z, log_v = optimum.state.z, optimum.state.log_variance
-    contact = contact_of(problem, optimum.state, optimum.covariance, np.ones(len(problem.windows)))
+    contact = contact_of(problem, optimum.state, optimum.covariance, problem.every)
     left, name = _remaining(problem, optimum.state)
     settled = left < REMAINING
     stuck = f"the solver stopped {left:.2g} stds of {name} away from where its own step leads"
     windows, robot = problem.windows, contact.robot
     several = draws(z, contact.covariance, 400, seed)
     unit = {c.name: c.unit for c in problem.noise.components}
-    every = np.ones(len(problem.windows))
+    every = problem.every
     return Fit(
         space=problem.space,
         choices=tuple(choices),
@@ -190,7 +200,8 @@ def summarise(
         extrapolation=contact.extrapolation,
         variance=contact.variance,
         variance_unit={name: unit[name] for name in contact.variance},
-        runs=tuple((log.name, log.sha256) for log in data.logs),
+        runs=tuple((log.name, log.sha256) for log in data.logs)
+        + (() if problem.several is None else problem.several.runs),
         channels=Channels(
             current=bool(windows.has_current),
             voltage=bool(windows.has_voltage),
@@ -219,10 +230,10 @@ def _remaining(problem: Problem, state: State) -> tuple[float, str]:
     the slope of log |d residuals / d data|; where currents were logged, their rows move the
     electric numbers only.
     """
-    z, log_v, every = state.z, state.log_variance, np.ones(len(problem.windows))
+    z, log_v, every = state.z, state.log_variance, problem.every
     electric = problem.electric(z, log_v)
     residual, jacobian = problem.linear(z, electric)
-    seen = problem.seen(residual, log_v, every, state.shared(len(every)))
+    seen = problem.seen(residual, log_v, every, state.shared(len(problem.windows)))
     roots = seen.whitening.root
     own = problem.space.electric.astype(float)
     prior = np.asarray(problem.target.prior_std(log_v)) ** -2
@@ -234,7 +245,7 @@ def _remaining(problem: Problem, state: State) -> tuple[float, str]:
         half = jnp.einsum("nij,njp->nip", root, jacobian[k])
         if k == "motion":
             white, half = _freed(seen.tied, white, half)
-        flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k == "motion" else own)
+        flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k in MOTIONS else own)
         gradient = gradient + flat.T @ np.asarray(white).ravel()
         info = info + flat.T @ flat
     std = np.sqrt(np.diag(np.linalg.inv(info)))
@@ -246,27 +257,6 @@ def _remaining(problem: Problem, state: State) -> tuple[float, str]:
 @jax.jit
 def _freed(tied: tuple[Tie, ...], white: Array, half: Array) -> tuple[Array, Array]:
     return freed(tied, white), freed_slopes(tied, half)
-
-
-def updated(fit: Fit, new: Update, problem: Problem, data: Runs) -> Fit:
-    """The fit after runs over several floors."""
-    several = draws(new.z, new.covariance, 400, fit.seed)
-    unsettled = "the runs over several floors: no rest after all steps"
-    return replace(
-        fit,
-        z=np.asarray(new.z),
-        covariance=new.covariance,
-        laplace=informed(fit.space, fit.laplace, new.information),
-        variance=dict(fit.variance) | dict(new.variance),
-        variance_unit=dict(fit.variance_unit) | dict(new.unit),
-        runs=fit.runs + new.runs,
-        curves=curves_of.curves(problem.space, new.z, several, problem.batch),
-        validity=curves_of.validity(data, problem.space.tree(jnp.asarray(new.z)), problem.batch),
-        converged=fit.converged and new.settled,
-        reason=fit.reason if new.settled or not fit.converged else unsettled,
-        mixed=dict(new.about),
-        shared={k: s.at(np.asarray(new.z) - fit.z) for k, s in fit.shared.items()},
-    )
 
 
 def draws(z: Search, covariance: Square, count: int, seed: int) -> Float[np.ndarray, "draw free"]:

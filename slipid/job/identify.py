@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from slipid.data.runs import Runs
 from slipid.identify.compare.agreement import floor_errors, sentence
 from slipid.identify.compare.slip_models import rungs
+from slipid.identify.fit.across import across
 from slipid.identify.fit.crossing import crossing
-from slipid.identify.fit.mixed import update
 from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit_file import save
-from slipid.identify.result import Fit, summarise, updated
+from slipid.identify.result import Fit, summarise
 from slipid.identify.verdicts.profile import Profile, profile, profiled
 from slipid.job.config import read_config
 from slipid.job.problem import Job, Task, read_job, with_mixed
@@ -157,22 +156,36 @@ def summarised(task: Task, problem: Problem, optimum: Optimum, report: Reporter)
     report.stage("intervals and verdicts")
     fit = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
     if task.mixed:
-        report.stage("runs over several floors")
-        sets = [crossing(data, floor, fit.robot) for data, floor in task.mixed]
-        found = update(fit.space, fit.z, fit.covariance, sets)
-        report.line(_judged(found.about))
-        fit = _with_mixed(fit, updated(fit, found, problem, task.dataset), task.dataset, report)
+        fit = _with_several(fit, task, problem, optimum, report)
     report.stage("simpler models, for comparison")
     return _with_baselines(fit, task)
 
 
-def _with_mixed(fit: Fit, new: Fit, data: Runs, report: Reporter) -> Fit:
-    """What runs over several floors made of a fit, or the fit where they contradict its own."""
-    errors = floor_errors(fit.contact, new.contact, data)
-    about = {**(new.mixed or {}), "floors": {name: asdict(e) for name, e in errors.items()}}
-    if not any(e.is_worse for e in errors.values()):
+def _with_several(
+    fit: Fit, task: Task, problem: Problem, optimum: Optimum, report: Reporter
+) -> Fit:
+    """The fit of runs on one floor and on several together, or the former where both contradict."""
+    report.stage("runs over several floors")
+    several = crossing(task.mixed, fit.robot)
+
+    def tell(state: State) -> None:
+        report.note(f"round {state.round}, loss {state.loss:.2f}, moved {state.moved:.3g} std")
+
+    found = across(problem, optimum, several, tell)
+    new = summarise(found.problem, found.optimum, task.dataset, task.choices, task.settings.seed)
+    floors = floor_errors(fit.contact, new.contact, task.dataset)
+    after = found.after and found.after._asdict()
+    about: dict[str, Any] = {
+        "runs": len(several.runs),
+        "windows": int(several.counts.sum()),
+        "before": found.before._asdict(),
+        "after": after,
+        "floors": {name: asdict(e) for name, e in floors.items()},
+    }
+    report.line(_judged(about))
+    if not any(e.is_worse for e in floors.values()):
         return replace(new, mixed=about)
-    said = sentence(errors)
+    said = sentence(floors)
     report.line(said)
     return replace(fit, refused={**about, "reason": said})
 

@@ -28,7 +28,7 @@ from scipy.special import gammaln
 from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.hierarchy import extrapolation
+from slipid.identify.fit.hierarchy import PerAxis, extrapolation
 from slipid.identify.fit.noise import SHARED, effects
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit.sessions import Linear, by_axis, shared
@@ -137,14 +137,14 @@ _camera_log_jacobian = jax.jit(lk.camera_log_jacobian)
 class Contact(Predictive):
     """The force balance where a fit has left it, at the search vector z.
 
-    Variances of effects are too small for runs it has not seen, by the factor `extrapolation` of
+    Variances of effects are too small for runs it has not seen, by the factors `extrapolation` of
     their floor and load.
     """
 
     space: Space
     z: Search
     shared: Mapping[str, FoundShared]
-    extrapolation: Mapping[str, float]
+    extrapolation: Mapping[str, PerAxis]
 
     @property
     def name(self) -> str:
@@ -157,8 +157,9 @@ class Contact(Predictive):
         for name in out:
             kind, _, rest = name.partition(".")
             if kind in ("run", *SHARED):
-                floor = f"{rest.rpartition('.')[0]}@"
-                grown = [x for k, x in self.extrapolation.items() if k.startswith(floor)]
+                floor, _, axis = rest.rpartition(".")
+                of_floor = [x for k, x in self.extrapolation.items() if k.startswith(f"{floor}@")]
+                grown = [getattr(x, axis) for x in of_floor]
                 out[name] *= max(grown, default=1.0)
         return out
 
@@ -167,10 +168,10 @@ class Contact(Predictive):
         return told_of(self.shared, w, self.robot, self.space.size)
 
     def effect_covariance(self, w: Windows) -> Float[np.ndarray, "piece 3 3"]:
-        grown = np.array([self.extrapolation.get(name, 1.0) for name in setups(w)])[:, None, None]
-        own = by_axis(self.variance, "run", w)[:, :, None] * np.eye(len(AXES))
+        grown = np.array([self.extrapolation.get(name, PerAxis()) for name in setups(w)])
+        own = ((grown - 1) * by_axis(self.variance, "run", w))[:, :, None] * np.eye(len(AXES))
         shared = super().effect_covariance(w) + self.told(w).covariance
-        return grown * shared + (grown - 1) * own
+        return np.sqrt(grown[:, :, None] * grown[:, None, :]) * shared + own
 
     @property
     def numbers(self) -> dict[str, int]:
@@ -218,7 +219,13 @@ def contact_of(
     motion = blocks["motion"], jacobian["motion"]
     direction = Directions.of(problem.windows, problem.robot).direction
     grown = extrapolation(
-        problem.target, motion, keep, covariance, log_v, direction, setups(problem.windows)
+        problem.target,
+        motion,
+        keep[: len(direction)],
+        covariance,
+        log_v,
+        direction,
+        setups(problem.windows),
     )
     return Contact(
         robot,
@@ -237,7 +244,7 @@ def found_shared(
     """What neighbouring runs on every floor share, by a fit of the kept pieces."""
     log_v, free = jnp.asarray(state.log_variance), problem.space.size
     residual, jacobian = problem.linear(state.z, problem.electric(state.z, log_v))
-    seen = problem.seen(residual, log_v, keep, state.shared(len(keep)))
+    seen = problem.seen(residual, log_v, keep, state.shared(len(problem.windows)))
     white = jnp.einsum("nij,nj->ni", seen.whitening.root["motion"], residual["motion"])
     half = whitened(problem.target.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]
     expected = expected_ties(problem.target, log_v, jnp.asarray(keep))

@@ -1,7 +1,16 @@
-"""Runs over several floors in short windows, each wheel on one floor: residuals, their scatter."""
+"""Runs over several floors: short windows in a row, with the floor under each wheel in each window.
+
+How hard a floor grips is not to be seen where all wheels stand on it: the forces balance whatever
+they are in units of. Where wheels stand on different floors the ratio of their frictions turns the
+robot. A run is one piece of many short windows, so that its camera noise, its process noise and
+what its motion and its currents are off all run long are in the covariance of the piece, as they
+are for runs that keep to one floor. Windows in which a wheel changes floors, in which wheels do not
+turn evenly or beyond the end of a run do not count: their residuals are zero.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,66 +22,118 @@ from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.noise import travel
-from slipid.identify.fit.variances import DEGREES
 from slipid.model.robot import Robot
-from slipid.search_space import Space
 from slipid.support.errors import DataError
 
-WINDOW = 0.25
-"""Length of a window [s]: short against the time a wheel stays on a patch."""
+SHORTEST, LONGEST = 0.25, 0.5
+"""Lengths of windows [s]: short against the time a wheel stays on a patch."""
 LEAST_SPEED = 0.04
 """Speed of the fastest rim below which a window says nothing [m/s]."""
 MOST_ACCELERATION = 0.6
 """Of a rim: beyond it the balance of forces is not that of rest [m/s^2]."""
-TOGETHER = 256
-"""Windows whose residuals are found in one call."""
-CHANNELS = ("along", "across", "yaw")
-"""The first columns of the residuals; those after them are currents of wheels."""
+MOST_WINDOWS = 40
+"""Most windows in a piece, for which windows are made longer; a run that has still more of them
+makes several pieces, as if it were several runs."""
+MOTION, CURRENT = "crossing.motion", "crossing.current"
+"""Names of their blocks of residuals."""
 
 
 @dataclass(frozen=True, eq=False)
 class Crossing:
-    """Windows of runs over several floors, one per piece; runs are (name, sha256).
+    """Runs over several floors, a piece per run; runs are (name, sha256).
 
-    The floor is that under each wheel all the while, by number in the robot's stack, the place a
-    window's number in its run, gaps counted.
+    The floor is that under each wheel in the middle of each window, by number in the robot's stack.
+    A window that does not `count` says nothing.
     """
 
     windows: Windows
-    floor: Int[np.ndarray, "piece wheel"]
-    place: Int[np.ndarray, " piece"]
+    floor: Int[np.ndarray, "piece window wheel"]
+    counts: Bool[np.ndarray, "piece window"]
     runs: tuple[tuple[str, str], ...]
 
-    def of(self, picked: Bool[np.ndarray, " piece"]) -> "Crossing":
-        windows = self.windows.pieces(np.flatnonzero(picked))
-        return Crossing(windows, self.floor[picked], self.place[picked], self.runs)
 
-
-def crossing(data: Runs, floor: FloorMap, robot: Robot) -> Crossing:
-    """Windows of runs whose poses are in the frame of a map, in which no wheel changes floors.
+def crossing(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Crossing:
+    """Pieces of runs whose poses are in the frame of a map, for every map its runs.
 
     Where wheels stand is read through the camera of the fitted robot, which knows every surface of
-    the map and every load of the runs.
+    the maps and every load of the runs.
+
+    Raises:
+        DataError: runs of a map in which no window counts, or of which only some log currents.
     """
-    radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
-    w = windows(data, radius, lag, per_piece=1, longest=WINDOW)
+    cut = [_windows_on(data, floor, robot) for data, floor in sets]
+    if len({c.windows.has_current for c in cut}) > 1:
+        raise DataError(
+            "some runs over several floors log currents and others do not; expected all or none"
+        )
+    floor, counts = (np.concatenate([getattr(c, f) for c in cut]) for f in ("floor", "counts"))
+    first = np.cumsum([0, *(len(c.runs) for c in cut)])
+    run = np.concatenate([c.windows.run + k for c, k in zip(cut, first, strict=False)])
+    rows = [part for k in np.unique(run) for part in _parts(np.flatnonzero(run == k))]
+    rows = [row for row in rows if counts[row].any()]
+    at, there = _padded(rows)
+    w = _joined([c.windows for c in cut], run)
+    whole = replace(
+        w.pieces(at[:, 0]),
+        pose=np.concatenate([w.pose[at[:, :1], 0], w.pose[at, 1]], axis=1),
+        **{name: getattr(w, name)[at, 0] for name in _PER_WINDOW},
+    )
+    names = tuple(name for c in cut for name in c.runs)
+    return Crossing(whole, floor[at, 0], counts[at, 0] & there, names)
+
+
+_PER_WINDOW = ("dt", "turn", "faster", "current", "voltage", "current_var")
+
+
+def _windows_on(data: Runs, floor: FloorMap, robot: Robot) -> Crossing:
+    """The same of one map, each window a piece of its own."""
+    radius = float(robot.geometry.wheel_radius)
+    w = _short(data, radius, float(robot.camera.lag))
     number = np.array([robot.surface_index(name) for name in floor.surfaces])
     under = number[floor.at(wheel_places(robot, w))]
-    found = Crossing(
-        windows=w,
-        floor=under[:, 1],
-        place=np.arange(len(w)) - np.searchsorted(w.run, w.run),
-        runs=tuple((log.name, log.sha256) for log in data.logs),
-    )
-    stays = (under == under[:, 1:2]).all(axis=(1, 2))
-    found = found.of(stays & _steady(w, radius))
-    if not len(found.windows):
+    counts = (under == under[:, 1:2]).all(axis=(1, 2)) & _steady(w, radius)
+    if not counts.any():
         raise DataError(
-            f"{data.logs[0].name} and the other runs over several floors: no {WINDOW:g} s in which "
+            f"{data.logs[0].name} and the other runs over several floors: no window in which "
             "wheels turn evenly and each keeps to its floor; expected larger patches or slower runs"
         )
-    return found
+    names = tuple((log.name, log.sha256) for log in data.logs)
+    return Crossing(w, under[:, 1:2], counts[:, None], names)
+
+
+def _short(data: Runs, radius: float, lag: float) -> Windows:
+    """Windows of every run, each a piece of its own; arguments are those of `windows`."""
+    each = []
+    for k in range(len(data)):
+        t = data.time[data.rows(k)]
+        length = np.clip((t[-1] - t[0]) / MOST_WINDOWS, SHORTEST, LONGEST)
+        each.append(windows(data.subset([k]), radius, lag, per_piece=1, longest=float(length)))
+    return _joined(each, np.repeat(np.arange(len(each)), [len(w) for w in each]))
+
+
+def _parts(windows_of_run: Int[np.ndarray, " window"]) -> list[Int[np.ndarray, " part"]]:
+    return np.array_split(windows_of_run, -(-len(windows_of_run) // MOST_WINDOWS))
+
+
+def _padded(
+    rows: Sequence[Int[np.ndarray, " _"]],
+) -> tuple[Int[np.ndarray, "row longest"], Bool[np.ndarray, "row longest"]]:
+    """Rows of one length, their last number repeated, and what was there before."""
+    longest = max(len(row) for row in rows)
+    at = np.array([np.pad(row, (0, longest - len(row)), mode="edge") for row in rows])
+    return at, np.array([np.arange(longest) < len(row) for row in rows])
+
+
+def _joined(each: Sequence[Windows], run: Int[np.ndarray, " piece"]) -> Windows:
+    """Windows of several sets as one, their runs numbered anew."""
+    whole: dict[str, Any] = {"run": run}
+    for name in (f.name for f in fields(Windows) if f.name != "run"):
+        values = [getattr(w, name) for w in each]
+        if isinstance(values[0], np.ndarray):
+            whole[name] = np.concatenate(values)
+        elif isinstance(values[0], tuple):
+            whole[name] = tuple(x for value in values for x in value)
+    return replace(each[0], **whole)
 
 
 def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "piece time wheel 2"]:
@@ -93,163 +154,68 @@ def _steady(w: Windows, radius: float) -> Bool[np.ndarray, " piece"]:
     rim, jump = radius * w.turn[:, 0] / w.dt, radius * w.faster[:, 0] / w.dt
     moves = np.abs(rim).max(axis=1) >= LEAST_SPEED
     even = np.abs(jump).max(axis=1) <= MOST_ACCELERATION
-    return np.asarray(moves & even & (w.dt[:, 0] < 2 * WINDOW))
+    return np.asarray(moves & even & (w.dt[:, 0] < 2 * LONGEST))
 
 
-@dataclass(frozen=True, eq=False)
-class Pieces:
-    """Where windows come from: run, place in it, and whether its currents were logged."""
+class Several(eqx.Module):
+    """Runs over several floors as arrays for compiled functions.
 
-    run: Int[np.ndarray, " window"]
-    place: Int[np.ndarray, " window"]
-    has_current: Bool[np.ndarray, " window"]
-
-
-class Evidence:
-    """Residuals of all windows, and how they scatter.
-
-    Rows are windows, columns along, across [m/s], yaw [rad/s] and the current of each wheel [A];
-    a set without currents has none there.
+    Counts are 1 for windows that count, else 0.
     """
 
-    def __init__(self, space: Space, sets: Sequence[Crossing]):
-        self.space, self.sets = space, sets
-        first = np.cumsum([0, *(len(s.runs) for s in sets)])
-        has = [np.full(len(s.windows), s.windows.has_current) for s in sets]
-        self.pieces = Pieces(
-            run=np.concatenate([s.windows.run + k for s, k in zip(sets, first, strict=False)]),
-            place=np.concatenate([s.place for s in sets]),
-            has_current=np.concatenate(has),
-        )
-        self.chunks = [chunk for s in sets for chunk in _chunks(s, space.template)]
+    batch: lk.Batch
+    counts: Float[Array, "piece window"]
 
-    def linear(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (window, channel) and their slope by the search vector (.., free)."""
-        parts = [_linear(self.space, jnp.asarray(z), b, u) for b, u, _ in self.chunks]
-        return self._joined(0, parts), self._joined(1, parts)
+    @staticmethod
+    def of(crossing: Crossing, robot: Robot) -> "Several":
+        b = lk.batch(crossing.windows, robot, crossing.floor)
+        return Several(b, jnp.asarray(crossing.counts, float))
 
-    def residual(self, z: np.ndarray) -> np.ndarray:
-        parts = [(_residual(self.space, jnp.asarray(z), b, u),) for b, u, _ in self.chunks]
-        return self._joined(0, parts)
+    def residuals(self, robot: Robot, p: lk.Predicted) -> dict[str, Array]:
+        """Predicted less measured motion and, where they are logged, currents."""
+        b = self.batch
+        gap = lk.motion_residual(robot, b, p)
+        out = {MOTION: gap * jnp.repeat(self.counts, 3, axis=1)}
+        if b.has_current:
+            amps = lk.predicted_current(robot, b, p.felt) - b.current
+            out[CURRENT] = (amps * self.counts[..., None]).reshape(len(gap), -1)
+        return out
 
-    def _joined(self, k: int, parts: Sequence[Sequence[Array]]) -> np.ndarray:
-        kept = [np.asarray(p[k])[:count] for p, (*_, count) in zip(parts, self.chunks, strict=True)]
-        return np.concatenate(kept)
-
-
-def _chunks(s: Crossing, robot: Robot) -> list[tuple[lk.Batch, Array, int]]:
-    """Batches of one size, with directions of travel and how many of their windows count."""
-    out = []
-    for first in range(0, len(s.windows), TOGETHER):
-        some = np.minimum(np.arange(first, first + TOGETHER), len(s.windows) - 1)
-        w, count = s.windows.pieces(some), min(TOGETHER, len(s.windows) - first)
-        u = jnp.asarray(travel(w, robot)[1][:, 0])
-        out.append((lk.batch(w, robot, s.floor[some]), u, count))
-    return out
+    def log_jacobian(self, robot: Robot) -> Float[Array, " piece"]:
+        """Log |d motion residuals / d logged poses| of every piece."""
+        each = jax.vmap(jax.vmap(robot.camera.log_jacobian))(self.batch.pose[:, 1:])
+        return jnp.sum(each * self.counts, axis=1)
 
 
-@eqx.filter_jit
-def _residual(space: Space, z: Array, b: lk.Batch, u: Array) -> Float[Array, "piece channel"]:
-    """Predicted less measured speeds along and across the way, yaw rates and currents."""
-    robot = space.tree(z)
-    p = lk.predict(robot, b)
-    rate = lk.motion_residual(robot, b, p) / b.dt
-    along = u[:, 0] * rate[:, 0] + u[:, 1] * rate[:, 1]
-    across = u[:, 0] * rate[:, 1] - u[:, 1] * rate[:, 0]
-    amps = jnp.zeros_like(b.current)
-    if b.has_current:
-        amps = lk.predicted_current(robot, b, p.felt) - b.current
-    return jnp.concatenate([jnp.stack([along, across, rate[:, 2]], axis=1), amps[:, 0]], axis=1)
+class Errors(NamedTuple):
+    """Root mean square errors of windows: `speed` [m/s], `yaw_rate` [rad/s], `current` [A].
 
-
-@eqx.filter_jit
-def _linear(space: Space, z: Array, b: lk.Batch, u: Array) -> tuple[Array, Array]:
-    return lk.with_slope(lambda x: _residual(space, x, b, u), z)
-
-
-@dataclass(frozen=True, eq=False)
-class Scatter:
-    """How residuals scatter: what each counts for.
-
-    The weight is the t weight of a residual's block, 0 where nothing was measured, `expected` its
-    mean where the scatter is as found. Variances are of columns, wheels alike; the factor is
-    windows over the number they are worth.
+    The current is None where it was not logged.
     """
 
-    weight: Float[np.ndarray, "window channel"]
-    expected: Float[np.ndarray, "window channel"]
-    variance: Float[np.ndarray, " channel"]
-    factor: Float[np.ndarray, " channel"]
-
-    def counted(self, weight: np.ndarray) -> np.ndarray:
-        return np.asarray(weight / (self.variance * self.factor))
+    speed: float
+    yaw_rate: float
+    current: float | None
 
 
-def scatter(r: np.ndarray, of: Pieces, factor: np.ndarray | None) -> Scatter:
-    """Variances and weights of residuals in turn, from their mean squares, then correlation.
-
-    A factor that is given is kept: which lags count changes by jumps, and steps would not settle.
-    """
-    motion = np.arange(r.shape[1]) < len(CHANNELS)
-    counts = np.where(motion, 1.0, of.has_current[:, None])
-    weight, expected = counts.copy(), counts.copy()
-    for _ in range(5):
-        variance = _pooled(weight * r**2, counts)
-        for block in (motion, ~motion):
-            m = int(block.sum())
-            q = (r[:, block] ** 2 / variance[block]).sum(axis=1)
-            t = (DEGREES + m) / (DEGREES + q)
-            weight[:, block] = counts[:, block] * t[:, None]
-            expected[:, block] = counts[:, block] * (DEGREES + m) / (DEGREES + m + 2)
-    scaled = np.where(counts > 0, np.sqrt(weight) * r / np.sqrt(variance), np.nan)
-    if factor is not None:
-        return Scatter(weight, expected, variance, factor)
-    # what a motor's current is off all run long is the motor's: no floor is known better without it
-    scaled[:, ~motion] -= _mean_of_runs(scaled[:, ~motion], of.run)
-    factor = np.array([_dilution(column, of.run, of.place) for column in scaled.T])
-    factor[~motion] = factor[~motion].max(initial=1.0)
-    return Scatter(weight, expected, variance, factor)
-
-
-def _mean_of_runs(x: np.ndarray, run: np.ndarray) -> Float[np.ndarray, "window channel"]:
-    """Mean of every column over the run a window is of; nan counts for nothing."""
-    there = np.isfinite(x)
-    total, count = np.zeros((2, run.max() + 1, x.shape[1]))
-    np.add.at(total, run, np.where(there, x, 0.0))
-    np.add.at(count, run, there.astype(float))
-    return np.asarray((total / np.maximum(count, 1.0))[run])
-
-
-def _pooled(square: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, " channel"]:
-    """Mean squares of the columns; wheels share that of their currents."""
-    total, number = square.sum(axis=0), counts.sum(axis=0)
-    k = len(CHANNELS)
-    total[k:], number[k:] = total[k:].sum(), number[k:].sum()
-    return np.asarray(np.maximum(total / np.maximum(number, 1.0), 1e-12))
-
-
-def _dilution(x: np.ndarray, run: np.ndarray, place: np.ndarray) -> float:
-    """Windows over the number of independent ones that tell as much; at least 1.
-
-    1 + 2 sum of the correlations over lags within runs, in pairs of lags while these are positive
-    (Geyer 1992, Stat. Sci. 7, section 3.3). Residuals x, nan where nothing was measured, are taken
-    about zero: of motion, what a whole run has in common counts as correlation.
-    """
-    grid = np.full((run.max() + 1, place.max() + 2), np.nan)
-    grid[run, place] = x
-    if not np.isfinite(grid).any():
-        return 1.0
-    power, longest = np.nanmean(grid**2), grid.shape[1]
-
-    def correlation(lag: int) -> float:
-        pairs = grid[:, lag:] * grid[:, : longest - lag]
-        share = np.isfinite(pairs).sum() / np.isfinite(grid).sum()  # few pairs say little
-        return float(np.nanmean(pairs) / power * share) if share > 0 else 0.0
-
-    total = -1.0
-    for lag in range(0, longest - 1, 2):
-        pair = correlation(lag) + correlation(lag + 1)
-        if pair <= 0:
-            break
-        total += 2 * pair
-    return max(1.0, total)
+def errors(
+    several: Several, judged: Sequence[tuple[dict[str, Array], Float[np.ndarray, " piece"]]]
+) -> Errors:
+    """Of residuals by block, each with the weight of every piece in it, 1 or 0."""
+    counts, dt = np.asarray(several.counts), np.asarray(several.batch.dt)
+    motion, current, total = np.zeros(3), 0.0, 0.0
+    for residual, weight in judged:
+        count = counts * weight[:, None]
+        rate = np.asarray(residual[MOTION]).reshape(*dt.shape, 3) / dt[..., None]
+        motion += (count[..., None] * rate**2).sum(axis=(0, 1))
+        total += count.sum()
+        if CURRENT in residual:
+            amps = np.asarray(residual[CURRENT]).reshape(*dt.shape, -1)
+            current += (count * (amps**2).mean(axis=2)).sum()
+    x, y, yaw = motion / total
+    has_current = several.batch.has_current
+    return Errors(
+        speed=float(np.sqrt(x + y)),
+        yaw_rate=float(np.sqrt(yaw)),
+        current=float(np.sqrt(current / total)) if has_current else None,
+    )

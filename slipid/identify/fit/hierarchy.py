@@ -26,21 +26,30 @@ from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD, Search, Squa
 
 _STEPS, _SETTLED = 20, 1e-5
 """Most scoring steps in a turn, and a step of a log variance that counts as rest."""
-_SECTOR = np.pi / 3
-"""Directions that are left out together [rad]."""
+_SECTORS = 6
+"""Parts of the circle of directions, each of which is left out in turn."""
 _GRID = np.geomspace(0.1, 4.0, 60)
 """Stds of the load biases that are weighed, over the typical one."""
+
+
+class PerAxis(NamedTuple):
+    """A number for effects along the way, across it and in yaw."""
+
+    along: float = 1.0
+    across: float = 1.0
+    yaw: float = 1.0
 
 
 class _Axis(NamedTuple):
     """The effects of the runs on a floor along one axis.
 
     Attributes:
-        pieces: numbers of the runs.
+        number: of the axis; pieces: numbers of the runs.
         left: effects left; fixed: their covariance but for the variances asked for.
         numbers: of these variances; bases: what each makes of the covariance.
     """
 
+    number: int
     pieces: Int[np.ndarray, " run"]
     left: Float[np.ndarray, " run"]
     fixed: Float[np.ndarray, "run run"]
@@ -94,14 +103,14 @@ def extrapolation(
     log_v: Float[np.ndarray, " variance"],
     direction: Float[np.ndarray, " piece"],
     setup: Sequence[str],
-) -> dict[str, float]:
+) -> dict[str, PerAxis]:
     """By what variances of effects are too small where nothing near was seen, by set-up of a piece.
 
     Every sector of directions is predicted from the others, with the numbers of the floor learnt
-    anew (to first order): mean square of the gaps over their variance and that of a Student t, 1
-    where it is less or where there are fewer than three sectors. A likelihood finds the variances
-    that are best between the runs it has, which are too small where the model is wrong in the
-    large, and weighs outliers away that a forecast meets again.
+    anew (to first order). For each axis it is the mean square of the gaps over their variance and
+    that of a Student t, 1 where it is less or where there are fewer than three sectors. A
+    likelihood finds the variances that are best between the runs it has, which are too small where
+    the model is wrong in the large, and weighs outliers away that a forecast meets again.
 
     Sources: Sundararajan and Keerthi 2001, Neural Computation 13(5), eq. for leaving out; Bachoc
     2013, Computational Statistics and Data Analysis 66, on wrong models.
@@ -115,22 +124,40 @@ def _too_small(
     log_v: Float[np.ndarray, " variance"],
     direction: Float[np.ndarray, " piece"],
     setup: Sequence[str],
-) -> dict[str, float]:
-    found: dict[str, list[float]] = {name: [] for name in setup}
+) -> dict[str, PerAxis]:
+    found: dict[str, list[list[float]]] = {name: [[] for _ in AXES] for name in setup}
     usual, names = DEGREES / (DEGREES - 2), np.asarray(setup)
     for axis in axes:
         inverse = np.linalg.inv(_whole(axis, np.exp(log_v)[axis.numbers]))
-        white, way = inverse @ axis.left, direction[axis.pieces]
-        sector = np.where(np.isfinite(way), np.floor(np.nan_to_num(way) / _SECTOR), np.nan)
-        groups = [np.flatnonzero(sector == k) for k in np.unique(sector[np.isfinite(sector)])]
+        white, groups = inverse @ axis.left, _sectors(direction[axis.pieces])
         if len(groups) < 3:
             continue
         for mine in groups:
             spread = np.linalg.inv(inverse[np.ix_(mine, mine)])
             ratios = (spread @ white[mine]) ** 2 / np.diag(spread) / usual
             for name, ratio in zip(names[axis.pieces[mine]], ratios, strict=True):
-                found[name].append(float(ratio))
-    return {name: max(1.0, float(np.mean(ratios or 1.0))) for name, ratios in found.items()}
+                found[name][axis.number].append(float(ratio))
+    return {
+        name: PerAxis(*(max(1.0, float(np.mean(ratios or 1.0))) for ratios in each))
+        for name, each in found.items()
+    }
+
+
+def _sectors(direction: Float[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]]:
+    """Runs whose directions lie in each sector, none where a sector is empty.
+
+    Their edges are where the fewest runs are cut from others in nearly the same direction: in the
+    middle of the widest gap between directions, taken modulo a sector.
+    """
+    moves = np.flatnonzero(np.isfinite(direction))
+    if not len(moves):
+        return []
+    width = 2 * np.pi / _SECTORS
+    along = np.sort(direction[moves] % width)
+    gap = np.diff(along, append=along[0] + width)
+    edge = along[gap.argmax()] + 0.5 * gap.max()
+    sector = np.floor((direction[moves] - edge) % (2 * np.pi) / width).astype(int) % _SECTORS
+    return [moves[sector == k] for k in np.unique(sector)]
 
 
 def _axes(
@@ -143,7 +170,7 @@ def _axes(
     space = target.space
     of_floor = space.where(lambda e: e.surface is not None)
     wide = np.where(of_floor[:, None] | of_floor, 0.0, covariance)
-    wide[of_floor, of_floor] = space.prior_std[of_floor] ** 2
+    wide[of_floor, of_floor] = np.asarray(target.prior_std(log_v))[of_floor] ** 2
     scale = np.asarray(target.blocks["motion"].covariance(jnp.asarray(log_v)))
     gap, slope, counted = np.asarray(motion[0]), np.asarray(motion[1]), np.asarray(weight)
     for floor in target.shared:
@@ -157,7 +184,7 @@ def _axes(
             fixed = np.diag(noise[:, k] / counted[mine]) + by[:, k] @ wide @ by[:, k].T
             pieces = _pieces(floor, k, kept, counted[mine])
             numbers, bases = [n for n, _ in pieces], [c for _, c in pieces]
-            yield _Axis(mine, left[:, k], fixed, numbers, bases)
+            yield _Axis(k, mine, left[:, k], fixed, numbers, bases)
 
 
 def _pieces(
@@ -248,7 +275,7 @@ def pooled_stds(
 
     Source: Gelman 2006, Bayesian Analysis 1(3), on half-normal priors of group stds.
     """
-    at = np.flatnonzero(target.space.where(lambda e: e.declaration.deviation))
+    at = np.flatnonzero(target.space.pooled)
     now = np.exp(-log_v[target.pooled])
     told = np.asarray(precision).copy()
     away = np.zeros(len(told))

@@ -39,10 +39,11 @@ def with_slope(of: Callable[[Array], Array], z: Array | np.ndarray) -> tuple[Arr
 class Batch(eqx.Module):
     """Windows as arrays for a jitted function; names are indices of the robot's stacks.
 
-    The surface is the one under the robot (piece,), or under each of its wheels (piece, wheel).
+    The surface is the one under the robot (piece,), or under each of its wheels in every window
+    (piece, window, wheel).
     """
 
-    surface: Int[Array, "piece *wheel"]
+    surface: Int[Array, "piece *window_wheel"]
     load: Int[Array, " piece"]
     session: Int[Array, " piece"]
     dt: Float[Array, "piece window"]
@@ -59,11 +60,11 @@ class Batch(eqx.Module):
 
 
 def batch(
-    windows: Windows, robot: Robot, floor: Int[np.ndarray, "piece wheel"] | None = None
+    windows: Windows, robot: Robot, floor: Int[np.ndarray, "piece window wheel"] | None = None
 ) -> Batch:
     """Batch for a robot that knows the floors, loads and sessions of the windows.
 
-    The floor is the surface under each wheel, where the windows do not know theirs.
+    The floor is the surface under each wheel in every window, where the windows do not know theirs.
     """
     if floor is None:
         floor = np.asarray([robot.surface_index(s) for s in windows.surface])
@@ -116,8 +117,8 @@ def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
         xi = model.twist(robot, frame, w, surface, load, near)
         return xi, model.felt(robot, frame, xi, w, surface, load)
 
-    each = None if near is None else 0
-    pieces = jax.vmap(jax.vmap(window, (0, each, None, None)), (0, each, 0, 0))
+    each, on = None if near is None else 0, 0 if b.surface.ndim > 1 else None
+    pieces = jax.vmap(jax.vmap(window, (0, each, on, None)), (0, each, 0, 0))
     twist, felt = pieces(wheel_speed(robot, b), near, b.surface, b.load)
     return Predicted(seen(robot, twist, b.dt, b.session), twist, felt)
 
@@ -135,9 +136,10 @@ def seen(
 
 def predicted_current(robot: Robot, b: Batch, felt: PerWheel) -> PerWheel:
     """Motor current of every window [A] given the traction, a magnitude where the log has those."""
-    friction = robot.surfaces.friction[b.surface].reshape(b.dt.shape[0], -1).mean(axis=1)
+    friction = robot.surfaces.friction[b.surface]  # of the wheels on average, as `felt` has it
+    friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
     weight = friction * robot.body.mass * model.GRAVITY
-    torque = robot.geometry.wheel_radius * weight[:, None, None] * felt
+    torque = robot.geometry.wheel_radius * weight[..., None] * felt
     amps = robot.motor.current(torque, wheel_speed(robot, b))
     if b.signed:
         return amps + robot.motor.current_offset

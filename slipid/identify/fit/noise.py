@@ -6,7 +6,8 @@ The residuals of a piece have the covariance
                          process noise along, across and in yaw, growing with distance, per floor;
                          the run's own effect along, across and in yaw, per floor
 
-so the run effects are marginalised. What runs share with each other (`slipid.identify.fit.shared`)
+so the run effects are marginalised. Runs over several floors have variances of their own, as if
+they were driven on one more floor. What runs share with each other (`slipid.identify.fit.shared`)
 and how far floors differ from what is common to them have variances, too, beside these blocks. What
 is known beside them, as the ammeter's noise is, is added.
 """
@@ -16,9 +17,10 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from slipid.data.windows import Windows
+from slipid.identify.fit.crossing import CURRENT, MOTION, Crossing
 from slipid.identify.fit.likelihood import FLOOR, Batch, ElectricNoise, voltage_std
 from slipid.model.robot import Robot
 
@@ -26,12 +28,17 @@ from slipid.model.robot import Robot
 class Components(eqx.Module):
     """Covariance pieces B_c of one block, the variance each belongs to, and what is known beside.
 
-    Known are variances of single residuals: rounding, and the ammeter's noise.
+    Attributes:
+        known: variances of single residuals: rounding, and the ammeter's noise.
+        pieces: numbers of its pieces among all pieces of a problem.
+        count: how many of the residuals of each piece say something.
     """
 
     base: Float[Array, "piece component m m"]
     which: Int[Array, "piece component"]
     known: Float[Array, "piece m"]
+    pieces: Int[Array, " piece"]
+    count: Float[Array, " piece"]
 
     def covariance(
         self, log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"]
@@ -88,14 +95,25 @@ _MOTION = (
     ("yaw", "rad/sqrt(m)", 0.01),
 )
 _EFFECT = (("along", "m/m", 0.01), ("across", "m/m", 0.01), ("yaw", "rad/m", 0.03))
+_CROSSING = (
+    ("process.along", "m/sqrt(m)", 0.02),
+    ("process.across", "m/sqrt(m)", 0.01),
+    ("process.yaw", "rad/sqrt(m)", 0.05),
+    ("run.along", "m/m", 0.03),
+    ("run.across", "m/m", 0.02),
+    ("run.yaw", "rad/m", 0.06),
+)
 SHARED = {"neighbours": 0.5, "session": 0.3}
 """Kinds of effects that runs share, and their typical std over that of the run's own effect."""
 POOLED = "pooled.load_bias"
 """Name of the variance of the load biases of floors."""
 
 
-def noise(windows: Windows, robot: Robot) -> Noise:
-    """Variance components for these windows, with distances and directions from the encoders."""
+def noise(windows: Windows, robot: Robot, crossing: Crossing | None = None) -> Noise:
+    """Variance components for these windows, with distances and directions from the encoders.
+
+    Pieces of runs over several floors are numbered after those of the windows.
+    """
     floors = robot.surfaces.labels
     table = [
         Component("camera", "place", None, "m", 0.0005),
@@ -109,12 +127,15 @@ def noise(windows: Windows, robot: Robot) -> Noise:
         for floor in several if kind == "session" else floors:
             table += [Component(kind, what, floor, u, part * v) for what, u, v in _EFFECT]
     table.append(Component("pooled", "load_bias", None, "1", 0.05))
-    blocks = {"motion": _motion_components(windows, robot)}
+    on = _floors(windows, robot)
+    blocks = {"motion": _motion_components(windows, robot, 2 + 6 * on)}
+    if crossing is not None:
+        table += _crossing_components(crossing, robot, len(windows), len(table), blocks)
     if windows.has_current:
         start = len(table)
         for floor in floors:
             table += [Component("current", what, floor, "A", 0.05) for what in ("window", "run")]
-        blocks["current"] = _current_components(windows, robot, start)
+        blocks["current"] = _current_components(windows, start + 2 * on)
     if windows.has_current and windows.has_voltage:
         n, m = len(windows), windows.turn.shape[1] * windows.turn.shape[2]
         base = np.broadcast_to(np.eye(m), (n, 1, m, m)).copy()
@@ -142,25 +163,73 @@ def electric_noise(
     return ElectricNoise(voltage_std(log_v[-1]), scatter + FLOOR["current"], resistance)
 
 
+def _crossing_components(
+    crossing: Crossing, robot: Robot, pieces: int, start: int, blocks: dict[str, Components]
+) -> list[Component]:
+    """Variances of runs over several floors, whose covariance pieces go into the blocks.
+
+    `pieces` is how many pieces come before theirs, `start` how many variances.
+    """
+    w, none = crossing.windows, np.zeros((len(crossing.windows), 1), int)
+    table = [Component("crossing", what, None, unit, typical) for what, unit, typical in _CROSSING]
+    motion = _motion_components(w, robot, none + start)
+    blocks[MOTION] = _counted(motion, np.repeat(crossing.counts, 3, axis=1), pieces)
+    if w.has_current:
+        current = _current_components(w, none + start + len(table))
+        live = np.repeat(crossing.counts, w.turn.shape[2], axis=1)
+        blocks[CURRENT] = _counted(current, live, pieces)
+        table += [Component("crossing", f"current.{k}", None, "A", 0.05) for k in ("window", "run")]
+    return table
+
+
+def _counted(of: Components, live: Bool[np.ndarray, "piece m"], first: int) -> Components:
+    """Covariance pieces in which residuals that say nothing, and are zero, have the variance 1."""
+    both = live[:, None, :, None] & live[:, None, None, :]
+    return Components(
+        base=jnp.where(both, of.base, 0.0),
+        which=of.which,
+        known=jnp.where(live, of.known, 1.0),
+        pieces=of.pieces + first,
+        count=jnp.asarray(live.sum(axis=1), float),
+    )
+
+
 def _components(
     block: str, base: np.ndarray, which: np.ndarray, more: np.ndarray | float = 0.0
 ) -> Components:
     """Covariance pieces with the rounding of the logs, and with known variances (piece, m)."""
-    known = np.full((base.shape[0], base.shape[-1]), FLOOR[block]) + more
-    return Components(jnp.asarray(base), jnp.asarray(which), jnp.asarray(known))
+    n, m = base.shape[0], base.shape[-1]
+    return Components(
+        base=jnp.asarray(base),
+        which=jnp.asarray(which),
+        known=jnp.asarray(np.full((n, m), FLOOR[block]) + more),
+        pieces=jnp.arange(n),
+        count=jnp.full(n, float(m)),
+    )
+
+
+def steps(windows: Windows | Batch, robot: Robot) -> Float[np.ndarray, "piece window 3"]:
+    """Movement of the body in each window by the encoders, in its own frame [m, m, rad]."""
+    j = np.linalg.pinv(np.asarray(robot.geometry.forward()))
+    return np.asarray(windows.turn) * float(robot.geometry.wheel_radius) @ j.T
 
 
 def travel(windows: Windows | Batch, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of each window by the encoders (piece, window) [m], and its unit direction."""
-    j = np.linalg.pinv(np.asarray(robot.geometry.forward()))
-    step = np.asarray(windows.turn) * float(robot.geometry.wheel_radius) @ j.T
+    """Distance of each window by the encoders (piece, window) [m], and its unit direction.
+
+    Turning counts with the way of the wheels.
+    """
+    step = steps(windows, robot)
     far = np.linalg.norm(step[..., :2], axis=-1)
     turned = np.abs(step[..., 2]) * float(robot.geometry.base_radius)
     way = step[..., :2] / np.maximum(far, 1e-9)[..., None]
     return far + turned, np.where(far[..., None] > 1e-6, way, [1.0, 0.0])
 
 
-def _motion_components(windows: Windows, robot: Robot) -> Components:
+def _motion_components(
+    windows: Windows, robot: Robot, first: Int[np.ndarray, "piece 1"]
+) -> Components:
+    """Those of the motion; first is the number of the first variance of each piece's floor."""
     far, u = travel(windows, robot)
     n, k = far.shape
     scale = float(robot.camera.scale)
@@ -178,7 +247,7 @@ def _motion_components(windows: Windows, robot: Robot) -> Components:
     effect = effects(windows, robot).transpose(2, 0, 1)[..., None]
     parts = [place, heading, *grown, *effect]
     base = np.stack([p @ p.transpose(0, 2, 1) for p in parts], axis=1)
-    of_floor = 2 + 6 * _floors(windows, robot) + np.arange(6)
+    of_floor = first + np.arange(6)
     return _components("motion", base, np.insert(of_floor, 0, [[0], [1]], axis=1))
 
 
@@ -203,9 +272,10 @@ def effects(windows: Windows, robot: Robot) -> Float[np.ndarray, "piece m 3"]:
     return (axes(u) * far[None, :, None, :]).sum(-1).transpose(1, 2, 0)
 
 
-def _current_components(windows: Windows, robot: Robot, start: int) -> Components:
+def _current_components(windows: Windows, first: Int[np.ndarray, "piece 1"]) -> Components:
+    """Those of the currents; first is the number of the first variance of each piece's floor."""
     n, k, w = windows.turn.shape
     same = np.kron(np.ones((k, k)), np.eye(w))
     base = np.broadcast_to(np.stack([np.eye(k * w), same]), (n, 2, k * w, k * w)).copy()
-    which = start + 2 * _floors(windows, robot) + np.arange(2)
+    which = first + np.arange(2)
     return _components("current", base, which, windows.current_var.reshape(n, -1))

@@ -12,6 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit.crossing import MOTION, Several
 from slipid.identify.fit.hierarchy import effect_variances, pooled
 from slipid.identify.fit.noise import SHARED
 from slipid.identify.fit.problem import (
@@ -24,6 +25,7 @@ from slipid.identify.fit.problem import (
 )
 from slipid.identify.fit.shared import Tie, freed
 from slipid.identify.fit.variances import Blocks, Search, Square, Target, scored, spread_of
+from slipid.model.robot import Robot
 
 CREEPS = (0.05, 0.4, 1.0)
 """Starts of the creep of every floor; others end in poor minima."""
@@ -55,8 +57,8 @@ def optimise(
     """Maximum a posteriori from a staged start, or going on from a state.
 
     Args:
-        keep: weight of each piece, 1 or 0 (piece,); all by default. Folds of a cross-validation
-            differ in this only, so they share one compiled function.
+        keep: weight of each piece, 1 or 0, as `Problem.every` has them (piece,); all by default.
+            Folds of a cross-validation differ in this only, so they share one compiled function.
         start: goes on from here instead of the staged start.
         most_rounds: of weights, structure and variances.
         tolerance: it stops when no number moves more posterior stds than this in a round.
@@ -64,7 +66,7 @@ def optimise(
         free: 1 for coordinates that may move from the start, 0 for those held there (free,).
         variances: whether to fit those of the noise, too.
     """
-    keep = np.ones(len(problem.windows)) if keep is None else np.asarray(keep, float)
+    keep = problem.every if keep is None else np.asarray(keep, float)
     state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
     mask = np.ones(problem.space.size) if free is None else np.asarray(free, float)
     history: list[float] = []
@@ -99,7 +101,8 @@ def one_round(
     target, log_v = problem.target, jnp.asarray(state.log_variance)
     electric = problem.electric(state.z, log_v)
     residual, _, felt = linear(target, jnp.asarray(state.z), electric)
-    seen = problem.seen(residual, log_v, keep, state.shared(len(keep)))
+    before = state.shared(len(problem.windows))
+    seen = problem.seen(residual, log_v, keep, before)
     held = Held(
         target=target,
         z=jnp.asarray(state.z),
@@ -116,15 +119,15 @@ def one_round(
     whole, jacobian, felt = linear(target, jnp.asarray(z), electric)
     effect = effects_of(seen.tied, seen.whitening.root["motion"], whole["motion"])
     # weights follow effects and effects follow weights: half way, or they can swing for ever
-    effect = 0.5 * (effect + state.shared(len(keep))) if state.round else effect
+    effect = 0.5 * (effect + before) if state.round else effect
     residual, told = less(target, whole, effect), problem.through_voltage(z, log_v, felt)
     if scoring:
         spread = spread_of(target, jacobian, log_v, jnp.asarray(keep))
     for _ in range(scoring):
         log_v = scored(target, residual, spread, log_v, jnp.asarray(keep), told)
-        before, told = told, problem.through_voltage(z, log_v, felt)
-        if before is not None and told is not None:  # in units of the noise just found
-            scale = jnp.sqrt(told.share / before.share)
+        last, told = told, problem.through_voltage(z, log_v, felt)
+        if last is not None and told is not None:  # in units of the noise just found
+            scale = jnp.sqrt(told.share / last.share)
             residual = residual | {"voltage": told.residual}
             both = scale[:, :, None] * scale[:, None, :]
             spread = spread | {"voltage": spread["voltage"] * both}
@@ -178,11 +181,10 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
             state = one_round(apart, state, keep, mask, steps=steps, scoring=0)
             tell(state)
         residual, _ = apart.linear(state.z, problem.electric(state.z, state.log_variance))
-        every = np.ones(len(floors))
-        weight = problem.whitening(residual, state.log_variance, every).weight["motion"]
+        weight = problem.whitening(residual, state.log_variance, problem.every).weight["motion"]
         cost = -np.log(np.asarray(weight))  # as good as the loss, but for factor and constant
         for number, label in enumerate(labels):
-            mine = float(np.sum(cost[(floors == number) & (keep > 0)]))
+            mine = float(np.sum(cost[(floors == number) & (keep[: len(floors)] > 0)]))
             if mine < best[number]:
                 best[number] = mine
                 z = np.where(of_floor == label, state.z, z)
@@ -255,6 +257,15 @@ def levenberg(held: Held, solver: Steps) -> Float[Array, " free"]:
     return _at(held, found.value)
 
 
+def _several(of: Several, robot: Robot, given: Robot) -> Blocks:
+    """Residuals of runs over several floors: their currents move electric numbers only.
+
+    Friction moves the equilibrium that currents come from, so that it is found for them, too.
+    """
+    motion = {MOTION: of.residuals(robot, lk.predict(robot, of.batch))[MOTION]}
+    return of.residuals(given, lk.predict(given, of.batch)) | motion
+
+
 def _at(held: Held, y: Array) -> Array:
     """Search vector of a step in prior stds."""
     return held.z + held.mask * held.prior_std * y
@@ -269,6 +280,8 @@ def _stacked(y: Array, held: Held) -> Array:
     # currents and voltages given the motion of the round's start
     electric = lk.electric_residuals(given, target.batch, held.felt, held.electric)
     blocks = {"motion": motion} | electric
+    if target.several is not None:
+        blocks |= _several(target.several, robot, given)
     white = {k: jnp.einsum("nij,nj->ni", held.root[k], r) for k, r in blocks.items()}
     parts = [freed(held.tied, w) if k == "motion" else w.ravel() for k, w in white.items()]
     # the slope of the log Jacobian adds slope . z to the log posterior

@@ -16,6 +16,7 @@ from slipid.data.runs import Runs
 from slipid.data.windows import Windows
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import variances
+from slipid.identify.fit.crossing import Crossing, Several
 from slipid.identify.fit.noise import POOLED, SHARED, electric_noise, noise
 from slipid.identify.fit.shared import Tie, freed, shared_effects, shared_of, ties
 from slipid.identify.fit.variances import (
@@ -65,33 +66,61 @@ class Problem:
     these shapes by others, under their own keys.
     """
 
-    def __init__(self, windows: Windows, robot: Robot, choices: Sequence[Choice]):
+    def __init__(
+        self,
+        windows: Windows,
+        robot: Robot,
+        choices: Sequence[Choice],
+        several: Crossing | None = None,
+    ):
+        """Problem of runs that each keep to one floor, and of those over several floors."""
         self.space = Space(robot, choices)
         self.robot: Robot = self.space.template
         self.compiled: dict[Any, Any] = {}
-        self._read(windows)
+        self._read(windows, several)
 
     def of(self, windows: Windows) -> "Problem":
         """The same problem for other windows; those of the same shapes share what is compiled."""
         other = copy.copy(self)
-        other._read(windows)
+        other._read(windows, self.several)
         return other
 
-    def _read(self, windows: Windows) -> None:
-        self.windows, self.noise = windows, noise(windows, self.robot)
+    def crossed(self, several: Crossing) -> "Problem":
+        """The same problem with runs over several floors."""
+        other = copy.copy(self)
+        other.compiled = {}
+        other._read(self.windows, several)
+        return other
+
+    def _read(self, windows: Windows, several: Crossing | None) -> None:
+        self.windows, self.several = windows, several
+        self.noise = noise(windows, self.robot, several)
         shared, self.paces = shared_of(windows, self.robot, self.noise)
         kinds = np.array([c.kind for c in self.noise.components])
         self.target = Target(
             space=self.space,
             batch=lk.batch(windows, self.robot),
+            several=None if several is None else Several.of(several, self.robot),
             blocks=self.noise.blocks,
             shared=shared,
             typical=jnp.asarray(2 * np.log(self.noise.typical)),
             scored=~np.isin(kinds, ("run", "pooled", *SHARED)),
-            deviation=self.space.where(lambda e: e.declaration.deviation),
             pooled=self.noise.names.index(POOLED),
             joint=not windows.has_current,
         )
+
+    @property
+    def every(self) -> Float[np.ndarray, " piece"]:
+        """Weights with which every piece counts, those of runs over several floors last."""
+        return np.ones(
+            len(self.windows) + (0 if self.several is None else len(self.several.counts))
+        )
+
+    def restated(self, state: State, of: "Problem") -> State:
+        """A state of another problem with the same numbers as one of this problem."""
+        known = dict(zip(of.noise.names, state.log_variance, strict=True))
+        log_v = [known.get(c.name, 2 * np.log(c.typical)) for c in self.noise.components]
+        return replace(state, log_variance=np.array(log_v), moved=np.inf)
 
     def apart(self) -> "Problem":
         """The same problem as if runs shared nothing."""
@@ -207,6 +236,8 @@ def linear(target: Target, z: Vector, electric: lk.ElectricNoise) -> tuple[Block
         p = lk.predict(robot, target.batch)
         motion = {"motion": lk.motion_residual(robot, target.batch, p)}
         out = motion | lk.electric_residuals(robot, target.batch, p.felt, electric)
+        if (of := target.several) is not None:
+            out |= of.residuals(robot, lk.predict(robot, of.batch))
         return out, (out, p.felt)
 
     jacobian, (out, felt) = jax.jacfwd(blocks, has_aux=True)(z)
@@ -225,8 +256,11 @@ def log_jacobian(
     """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
 
     def total(x: Array) -> Array:
-        both = lk.log_jacobians(target.space.tree(x), target.batch, electric)
-        return jnp.asarray(keep) @ sum(both)
+        robot = target.space.tree(x)
+        each = sum(lk.log_jacobians(robot, target.batch, electric))
+        if target.several is not None:
+            each = jnp.concatenate([each, target.several.log_jacobian(robot)])
+        return jnp.asarray(keep) @ each
 
     return jax.value_and_grad(total)(z)
 

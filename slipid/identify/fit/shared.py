@@ -28,7 +28,7 @@ from jaxtyping import Array, Float, Int
 from scipy.special import ive
 
 from slipid.data.windows import Windows
-from slipid.identify.fit.noise import Noise, effects, sessions_on, travel
+from slipid.identify.fit.noise import Noise, effects, sessions_on, steps, travel
 from slipid.model.robot import Robot
 
 AXES = ("along", "across", "yaw")
@@ -70,15 +70,15 @@ class Directions:
     @staticmethod
     def of(w: Windows, robot: Robot) -> "Directions":
         """As the encoders have it."""
-        far, way = travel(w, robot)
-        moved = (far[..., None] * way).sum(axis=1)
+        far = travel(w, robot)[0]
+        moved = steps(w, robot)[..., :2].sum(axis=1)
         straight = np.hypot(*moved.T)
         moves = straight > 0.2 * far.sum(axis=1)
         speed = np.log(np.maximum(straight / w.dt.sum(axis=1), 1e-3))
-        steps = np.round(speed / _SPEED) * _SPEED
+        rounded = np.round(speed / _SPEED) * _SPEED
         return Directions(
             np.where(moves, np.arctan2(moved[:, 1], moved[:, 0]), np.nan),
-            tuple(Pace(float(s), load) for s, load in zip(steps, w.load, strict=True)),
+            tuple(Pace(float(s), load) for s, load in zip(rounded, w.load, strict=True)),
         )
 
     def basis(self, paces: tuple[Pace, ...]) -> Float[np.ndarray, "piece coef"]:

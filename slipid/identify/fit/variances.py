@@ -5,7 +5,7 @@ likelihood of the variances takes into account what the structural numbers have 
 (Patterson and Thompson 1971, Biometrika 58(3)).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit.crossing import MOTION, Several
 from slipid.identify.fit.noise import Components, electric_noise
 from slipid.identify.fit.shared import (
     FloorShared,
@@ -32,9 +33,11 @@ Search = Float[np.ndarray, " free"]
 Square = Float[np.ndarray, "free free"]
 """Covariance or information of the search vector."""
 Blocks = dict[str, Array]
-"""An array for every block of residuals: `motion`, `current`, `voltage`."""
+"""An array for every block of residuals: `motion`, `current`, `voltage`, those of `crossing`."""
 Noises = dict[str, Components]
 """Covariance pieces of every block."""
+MOTIONS = ("motion", MOTION)
+"""Blocks of residuals of the motion; the others are read given it."""
 DEGREES = 8.0
 """Degrees of freedom of the Student-t weight of a run."""
 VARIANCE_SPREAD = 3.0
@@ -45,19 +48,20 @@ class Target(eqx.Module):
     """What a fit maximises, as an argument of compiled functions.
 
     Attributes:
+        several: runs over several floors, None where there are none.
         shared: what runs on each floor share.
         typical: centre of the prior of the log variances.
         scored: variances that are found from the residuals of each piece alone.
-        deviation: coordinates whose prior std is found from the data, as variance number `pooled`.
+        pooled: number of the variance that the space's pooled coordinates have a priori.
         joint: there are no currents, and all numbers are the motion's.
     """
 
     space: Space
     batch: lk.Batch
+    several: Several | None
     blocks: dict[str, Components]
     shared: tuple[FloorShared, ...]
     typical: Float[Array, " variance"]
-    deviation: Bool[np.ndarray, " free"]
     scored: Bool[np.ndarray, " variance"]
     pooled: int = eqx.field(static=True)
     joint: bool = eqx.field(static=True)
@@ -65,7 +69,7 @@ class Target(eqx.Module):
     def prior_std(self, log_v: Vector) -> Array:
         """Std of the prior of every coordinate at given variances."""
         pooled = jnp.exp(0.5 * jnp.asarray(log_v)[self.pooled])
-        return jnp.where(self.deviation, pooled, jnp.asarray(self.space.prior_std))
+        return jnp.where(self.space.pooled, pooled, jnp.asarray(self.space.prior_std))
 
 
 class Whitening(NamedTuple):
@@ -125,12 +129,12 @@ def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> 
     roots, weights, loss = {}, {}, jnp.zeros(())
     for k, r in residual.items():
         inverse = inverse_root(noises[k].covariance(log_v))
-        m = inverse.shape[-1]
+        m, kept = noises[k].count, jnp.asarray(keep)[noises[k].pieces]
         q = jnp.sum(jnp.einsum("nij,nj->ni", inverse, r) ** 2, axis=-1)
-        weights[k] = (DEGREES + m) / (DEGREES + q) * keep
+        weights[k] = (DEGREES + m) / (DEGREES + q) * kept
         roots[k] = jnp.sqrt(weights[k])[:, None, None] * inverse
         log_det = -jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=-2, axis2=-1)), axis=-1)
-        loss += jnp.sum(keep * (log_det + 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)))
+        loss += jnp.sum(kept * (log_det + 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)))
     return Whitening(roots, weights, loss)
 
 
@@ -139,8 +143,7 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> B
     """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
     out = {}
     for k, jac in jacobian.items():
-        m = jac.shape[1]
-        factor = keep * expected(m)
+        factor = jnp.asarray(keep)[noises[k].pieces] * expected(noises[k].count)
         root = inverse_root(noises[k].covariance(log_v)) * jnp.sqrt(factor)[:, None, None]
         out[k] = jnp.einsum("nij,njp->nip", root, jac)
     return out
@@ -162,7 +165,7 @@ def precision(
             tied = expected_ties(target, log_v, keep)
             flat = freed_slopes(tied, half)
         total += flat.T @ flat
-        of_motion += flat.T @ flat if k == "motion" else 0.0
+        of_motion += flat.T @ flat if k in MOTIONS else 0.0
     return total if target.joint else _cut(total, of_motion, jnp.asarray(target.space.electric))
 
 
@@ -170,22 +173,31 @@ def expected_ties(target: Target, log_v: Vector, keep: Vector) -> tuple[Tie, ...
     """What runs share, given residuals whitened by `whitened`."""
     block = target.blocks["motion"]
     roots = inverse_root(block.covariance(jnp.asarray(log_v)))
-    factor = expected(roots.shape[-1]) * jnp.asarray(keep)
+    factor = expected(block.count) * jnp.asarray(keep)[block.pieces]
     return ties(target.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None])
 
 
-def expected(m: int) -> float:
+def expected(m: Array | float) -> Any:
     """Fisher information of a Student-t location in m dimensions, over that of a Gaussian."""
     return (DEGREES + m) / (DEGREES + m + 2)
 
 
 def _cut(total: Array, of_motion: Array, e: Array) -> Array:
-    """Information when p(electric | motion, all data) multiplies p(motion | motion data)."""
-    own = jnp.where(e[:, None] & e[None, :], total, jnp.where(jnp.eye(len(e)) > 0, 1.0, 0.0))
-    cross = jnp.where(e[:, None] & ~e[None, :], total, 0.0)
-    carried = cross.T @ jnp.linalg.solve(own, cross)
+    """Information of p(motion | motion data) p(electric | motion, all data).
+
+    Where wheels stand on several floors motion depends on their friction, which is electric: it is
+    marginalised in the first factor, as if currents told nothing of it.
+    """
+    first = of_motion - _carried(of_motion, e)
     motion = ~e[:, None] & ~e[None, :]
-    return jnp.where(motion, of_motion + carried, total)
+    return jnp.where(motion, first + _carried(total, e), total)
+
+
+def _carried(information: Array, e: Array) -> Array:
+    """B^T A^-1 B for the block A of the coordinates e, and B between these and the others."""
+    own = jnp.where(e[:, None] & e[None, :], information, jnp.diag(jnp.where(e, 0.0, 1.0)))
+    cross = jnp.where(e[:, None] & ~e[None, :], information, 0.0)
+    return cross.T @ jnp.linalg.solve(own, cross)
 
 
 @eqx.filter_jit
@@ -204,7 +216,7 @@ def spread_of(target: Target, jacobian: Blocks, log_v: Array, keep: Array) -> Bl
         motion = motion.at[of.pieces].add(-off)
     slopes = jacobian | {"motion": motion}
     spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in slopes.items()}
-    around = shared_spread(tied, len(keep))
+    around = shared_spread(tied, len(motion))
     for of in target.shared:
         more = jnp.einsum("nma,nab,nlb->nml", of.effect, around[of.pieces], of.effect)
         spread["motion"] = spread["motion"].at[of.pieces].add(more)
@@ -234,19 +246,19 @@ def scored(
         inverse = jnp.einsum("nji,njk->nik", root, root)
         base, which = _shared(noise.base, mine), noise.which
         v = jnp.exp(log_v)[which]
-        vr = jnp.einsum("nij,nj->ni", inverse, r)
+        vr, kept = jnp.einsum("nij,nj->ni", inverse, r), keep[noise.pieces]
         fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
         trace = jnp.einsum("nij,ncij->nc", inverse, base)
         spent = jnp.einsum("nij,njk,nkl->nil", inverse, spread[k], inverse)
         lost = jnp.einsum("nij,ncij->nc", spent, base)
-        slope = 0.5 * v * (fit + keep[:, None] * (lost - trace))
+        slope = 0.5 * v * (fit + kept[:, None] * (lost - trace))
         if voltage is not None and k == "current":
             told = jnp.einsum("ni,nci->nc", voltage.slope, noise.single)
-            slope += v * keep[:, None] * told
+            slope += v * kept[:, None] * told
         score = score.at[which].add(slope)
         if voltage is not None and k == "voltage":
-            steeper = steeper.at[which].add((keep * jnp.sum(voltage.steeper, axis=1))[:, None])
-        if voltage is not None and k == "current":  # a logarithm that falls bends the more
+            steeper = steeper.at[which].add((kept * jnp.sum(voltage.steeper, axis=1))[:, None])
+        else:  # a logarithm that falls bends the more: its slope is in proportion to the variance
             steeper = steeper.at[which].add(-slope)
     score -= (log_v - target.typical) / VARIANCE_SPREAD**2
     info = information(target.blocks, log_v, keep, voltage)
@@ -268,14 +280,16 @@ def information(
         v = jnp.exp(log_v)[which]
         cross = 0.5 * jnp.einsum("ncij,ndji->ncd", vb, vb)
         cross *= v[:, :, None] * v[:, None, :]
-        info = info.at[which[:, :, None], which[:, None, :]].add(keep[:, None, None] * cross)
+        kept = jnp.asarray(keep)[noise.pieces, None, None]
+        info = info.at[which[:, :, None], which[:, None, :]].add(kept * cross)
     return info if voltage is None else info + _through(noises["current"], log_v, keep, voltage)
 
 
 def _through(noise: Components, log_v: Vector, keep: Vector, voltage: ThroughVoltage) -> Array:
     """Expected information of the log variances that voltages have of the scatter of currents."""
     grown = jnp.exp(log_v)[noise.which][..., None] * noise.single
-    cross = jnp.einsum("n,ni,nci,ndi->ncd", keep, voltage.information, grown, grown)
+    kept = jnp.asarray(keep)[noise.pieces]
+    cross = jnp.einsum("n,ni,nci,ndi->ncd", kept, voltage.information, grown, grown)
     info = jnp.zeros((log_v.shape[0],) * 2)
     return info.at[noise.which[:, :, None], noise.which[:, None, :]].add(cross)
 

@@ -112,20 +112,20 @@ def estimates(
     geometric mean. Directions that the fit found open stay so.
     """
     flat, open_ = draws.reshape(-1, fit.space.size), members(fit.flat)
-    out = dict(fit.parameters)
+    out, prior_std = dict(fit.parameters), fit.judged.prior_std
     for e in fit.space.free:
         at, d, old = fit.space.place[e.path], e.declaration, fit.parameters[e.path]
         z = flat[:, at]
         values = np.asarray(jax.vmap(d.to_si)(jnp.asarray(z)))
         low, high = np.quantile(values, [0.05, 0.95], axis=0)
-        scaled = np.cov((z / fit.space.prior_std[at]).T).reshape(e.coordinates, e.coordinates)
+        scaled = np.cov((z / prior_std[at]).T).reshape(e.coordinates, e.coordinates)
         ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
         pairs = tuple(zip(low.tolist(), high.tolist(), strict=True))
         unsaid = e.path in verdicts.NEEDS_VOLTAGE and not fit.channels.voltage
         forced = old.verdict if unsaid or old.verdict == "at_bound" else None
         from_zero = verdicts.from_zero(d, z.std(axis=0))
         verdict, provenance = verdicts.said(ratio, from_zero, forced, e.path in open_)
-        pull = (z.mean(axis=0) - fit.space.prior_mean[at]) / fit.space.prior_std[at]
+        pull = (z.mean(axis=0) - fit.space.prior_mean[at]) / prior_std[at]
         out[e.path] = replace(
             old,
             value=verdicts.plain(d.to_si(jnp.asarray(z.mean(axis=0)))),

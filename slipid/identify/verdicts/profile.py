@@ -21,6 +21,7 @@ from scipy.stats import chi2
 
 from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, State
+from slipid.identify.fit.variances import MOTIONS
 from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE, Z95
 from slipid.parameter import Entry
 from slipid.search_space import Space
@@ -169,10 +170,10 @@ class _Walk:
         problem, log_v = self.problem, state.log_variance
         blocks, _ = problem.linear(jnp.asarray(state.z), self.electric)
         if self.of_motion:
-            blocks = {"motion": blocks["motion"]}
-        keep = np.ones(len(problem.windows))
+            blocks = {k: r for k, r in blocks.items() if k in MOTIONS}
+        keep = problem.every
         moving = problem.target.joint or self.of_motion
-        effect = (state if moving else self.fitted).shared(len(keep))
+        effect = (state if moving else self.fitted).shared(len(problem.windows))
         seen = problem.seen(blocks, log_v, keep, effect)
         return problem.loss(state.z, log_v, keep, seen, self.electric)
 

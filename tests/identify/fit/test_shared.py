@@ -252,7 +252,7 @@ def test_the_pooled_variance_weighs_every_std_by_its_evidence(problem):
     free = problem.space.size
     rng = np.random.default_rng(3)
     root = rng.normal(size=(free, free)) * 5
-    at = np.flatnonzero(problem.target.deviation)
+    at = np.flatnonzero(problem.space.pooled)
     told = root @ root.T + np.eye(free)
     precision = told.copy()
     precision[at, at] += np.exp(-log_v[problem.target.pooled])
@@ -260,7 +260,7 @@ def test_the_pooled_variance_weighs_every_std_by_its_evidence(problem):
     best[np.setdiff1d(np.arange(free), at)] = 0.0
     found = hierarchy.pooled(precision, best, problem.target, log_v)
     # the likelihood that has this posterior: information told, and where it is highest
-    centre = precision @ np.where(problem.target.deviation, best, 0.0)
+    centre = precision @ np.where(problem.space.pooled, best, 0.0)
     typical = np.exp(0.5 * float(problem.target.typical[problem.target.pooled]))
     std = np.linspace(0.1, 4.0, 4000) * typical
     log = np.empty(len(std))

@@ -48,7 +48,7 @@ def test_sigma_is_that_of_the_likelihood_alone(problem, size):
     root = 40 * rng.normal(size=(space.size, space.size))
     own = root @ root.T + np.eye(space.size)  # information, wide priors of the biases included
     alone = 0.05 * size * rng.normal(size=space.size)  # what the data would say by themselves
-    at = np.flatnonzero(problem.target.deviation)
+    at = np.flatnonzero(problem.space.pooled)
     precision = own.copy()
     precision[at, at] += 1 / pooled - 1.0
     # the prior of the biases is around zero, that of all others in what the data say

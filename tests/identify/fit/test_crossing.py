@@ -23,18 +23,21 @@ from slipid.data.windows import Windows
 from slipid.deploy.deploy import read_robot
 from slipid.identify.fit import crossing as cut
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit import mixed
+from slipid.identify.fit.across import across
+from slipid.identify.fit.optimise import optimise
+from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.variances import _cut, whitened
 from slipid.identify.fit_file import load
 from slipid.job.config import read_config
 from slipid.job.problem import read_job, with_mixed
 from slipid.model import se2
-from slipid.search_space import Choice, Space
+from slipid.search_space import Choice
 from slipid.selftest.known import Sensors, grid, truth
 from slipid.selftest.logs import make_logs
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import ROBOTINO, robotino_text, write_good
 from tests.helpers.made_logs import write_logs
-from tests.helpers.made_windows import robot
+from tests.helpers.made_windows import made, robot
 from tests.helpers.said import Said
 from tests.job.test_config import GOOD, written
 
@@ -42,9 +45,11 @@ NUMBERS = ("friction", "creep", "roller_drag")
 CHOICES = [
     Choice("*", free=False),
     *(Choice(f"surface.*.{name}", free=True) for name in NUMBERS),
-    Choice("camera.scale", prior_mean=1.1, prior_std=0.002),
+    Choice("surface.*.friction", prior_mean=0.6, prior_std=0.4),
+    Choice("motor.back_emf", prior_mean=0.0514, prior_std=0.0025),
 ]
-PLACE, HEADING, CURRENT = 0.0002, 0.0005, 0.05
+PLACE, HEADING, CURRENT, OFFSET = 0.0002, 0.0005, 0.05, 0.1
+PER_RUN = 20
 
 
 def made_robot(friction=(0.8, 0.45)):
@@ -54,17 +59,16 @@ def made_robot(friction=(0.8, 0.45)):
 
 def still(lag, runs, per_run):
     """Windows of wheels that do not turn, at the origin."""
-    n = runs * per_run
-    zero = np.zeros((n, 1, 3))
+    zero = np.zeros((runs, per_run, 3))
     return Windows(
-        run=np.repeat(np.arange(runs), per_run),
-        surface=("unknown",) * n,
-        load=("as_built",) * n,
-        session=("elsewhere",) * n,
-        dt=np.full((n, 1), 0.25),
+        run=np.arange(runs),
+        surface=("unknown",) * runs,
+        load=("as_built",) * runs,
+        session=("elsewhere",) * runs,
+        dt=np.full((runs, per_run), 0.25),
         turn=zero,
         faster=zero,
-        pose=np.zeros((n, 2, 3)),
+        pose=np.zeros((runs, per_run + 1, 3)),
         current=zero,
         voltage=zero,
         current_var=zero + 1e-4,
@@ -75,126 +79,181 @@ def still(lag, runs, per_run):
     )
 
 
-def crossed(truth_, runs, seed, per_run=40):
-    """Windows of wheels that stand on floors drawn at random, with camera and ammeter noise."""
-    rng, n = np.random.default_rng(seed), runs * per_run
-    way, speed = rng.uniform(0, 2 * np.pi, n), rng.uniform(0.1, 0.25, n)
-    xi = np.stack([speed * np.cos(way), speed * np.sin(way), np.zeros(n)], 1)
+def crossed(truth_, runs, seed, offset=OFFSET):
+    """Runs whose wheels stand on floors drawn at random, with camera and ammeter noise.
+
+    The currents of a run have an offset in common; one window in five does not count.
+    """
+    rng = np.random.default_rng(seed)
+    shape = (runs, PER_RUN)
+    way, speed = rng.uniform(0, 2 * np.pi, shape), rng.uniform(0.1, 0.25, shape)
+    xi = np.stack([speed * np.cos(way), speed * np.sin(way), np.zeros(shape)], -1)
     rate = xi @ np.asarray(truth_.geometry.forward()).T / 0.04
-    floor = rng.integers(2, size=(n, 3))
-    pose = np.zeros((n, 2, 3))
-    pose[:, 0] = rng.uniform(-0.4, 0.4, (n, 3))
-    w = replace(still(truth_.camera.lag, runs, per_run), turn=0.25 * rate[:, None], pose=pose)
+    floor = rng.integers(2, size=(*shape, 3))
+    w = replace(still(truth_.camera.lag, runs, PER_RUN), turn=0.25 * rate)
 
     @jax.jit
     def seen(b):
         p = lk.predict(truth_, b)
-        start = jax.vmap(truth_.camera.corrected)(b.pose[:, 0])
-        end = jax.vmap(se2.compose)(start, p.increment[:, 0])
-        return jax.vmap(truth_.camera.logged)(end), lk.predicted_current(truth_, b, p.felt)
+        return p.increment, lk.predicted_current(truth_, b, p.felt)
 
-    end, amps = seen(lk.batch(w, truth_, floor))
-    pose[:, 1] = end
+    increment, amps = seen(lk.batch(w, truth_, floor))
+
+    def onward(pose, step):
+        pose = se2.compose(pose, step)
+        return pose, pose
+
+    first = jnp.zeros((runs, 3))
+    _, places = jax.lax.scan(jax.vmap(onward), first, jnp.swapaxes(increment, 0, 1))
+    poses = jnp.concatenate([first[:, None], jnp.swapaxes(places, 0, 1)], axis=1)
+    pose = np.array(jax.vmap(jax.vmap(truth_.camera.logged))(poses))
     pose += rng.normal(size=pose.shape) * [PLACE, PLACE, HEADING]
-    w = replace(w, pose=pose, current=np.asarray(amps) + CURRENT * rng.normal(size=amps.shape))
+    noise = CURRENT * rng.normal(size=amps.shape) + offset * rng.normal(size=(runs, 1, 3))
+    w = replace(w, pose=pose, current=np.asarray(amps) + noise)
     runs_ = tuple((f"site/run{k}.csv", f"{k:x}") for k in range(runs))
-    return cut.Crossing(w, floor, np.tile(np.arange(per_run), runs), runs_)
+    return cut.Crossing(w, floor, rng.uniform(size=shape) > 0.2, runs_)
+
+
+STD = {"camera.place": PLACE, "camera.heading": HEADING, "current.window": CURRENT}
 
 
 @pytest.fixture(scope="module")
-def learnt():
-    """Truth, a prior that knows all but how hard each floor grips, and what the windows add."""
+def fitted():
+    """Truth, the problem of runs on one floor each, and its optimum."""
     true = made_robot()
-    space = Space(true, CHOICES)
-    z = space.vector(true)
-    flat = np.zeros((2, space.size))
-    for k, floor in enumerate(("firm", "soft")):
-        for name, power in zip(NUMBERS, (1.0, 1.0, -1.0), strict=True):
-            flat[k, space.place[f"surface.{floor}.{name}"]] = power
-    std = np.where(mixed.held(space), space.prior_std, 0.02)
-    covariance = np.diag(std**2) + 0.8**2 * flat.T @ flat
-    mean = z - 0.7 * flat[0] + 0.9 * flat[1]
-    return (
-        true,
-        space,
-        z,
-        mean,
-        covariance,
-        mixed.update(space, mean, covariance, [crossed(true, 12, 1), crossed(true, 4, 2)]),
-    )
+    w = replace(made(true, runs=24, std=STD, signed=False), has_voltage=False)
+    problem = Problem(w, true, CHOICES)
+    return true, problem, optimise(problem)
+
+
+@pytest.fixture(scope="module")
+def learnt(fitted):
+    true, problem, optimum = fitted
+    return across(problem, optimum, crossed(true, 12, 1), lambda state: None)
+
+
+def ratio(space, z, covariance):
+    """Log of the ratio of both frictions, and its std."""
+    c = np.zeros(space.size)
+    for floor, sign in (("firm", 1.0), ("soft", -1.0)):
+        c[space.place[f"surface.{floor}.friction"]] = sign
+    return float(c @ z), float(np.sqrt(c @ covariance @ c))
 
 
 @pytest.mark.slow
-def test_what_one_floor_leaves_open_several_tell(learnt):
-    _, space, z, _, covariance, found = learnt
-    assert found.settled
-    moved = ~mixed.held(space)
-    away = (found.z - z)[moved]
-    assert away @ np.linalg.inv(found.covariance[np.ix_(moved, moved)]) @ away < chi2(6).ppf(0.999)
-    for floor in ("firm", "soft"):
-        at = space.place[f"surface.{floor}.friction"].start
-        assert np.sqrt(found.covariance[at, at]) < 0.15 * np.sqrt(covariance[at, at])
-    assert len(found.runs) == found.about["runs"] == 16
-    assert found.about["windows"] == 640
+def test_what_one_floor_leaves_open_several_tell(fitted, learnt):
+    true, problem, before = fitted
+    _, wide = ratio(problem.space, before.state.z, before.covariance)
+    found, std = ratio(problem.space, learnt.optimum.state.z, learnt.optimum.covariance)
+    assert learnt.optimum.converged
+    assert std < 0.7 * wide
+    assert found == pytest.approx(np.log(0.8 / 0.45), abs=3 * std)
+    away = learnt.optimum.state.z - problem.space.vector(true)
+    told = away @ np.linalg.solve(learnt.optimum.covariance, away)
+    assert told < chi2(problem.space.size).ppf(0.999)
 
 
+@pytest.mark.slow
 def test_left_out_halves_are_predicted_down_to_the_noise(learnt):
-    about = learnt[-1].about
     noise = np.sqrt(2) * np.array([1.1 * PLACE, HEADING]) / 0.25
-    assert about["before"]["yaw_rate"] > 2 * noise[1]
-    assert about["after"]["yaw_rate"] == pytest.approx(noise[1], rel=0.1)
-    assert about["after"]["speed"] == pytest.approx(np.sqrt(2) * noise[0], rel=0.2)
-    assert about["after"]["current"] == pytest.approx(CURRENT, rel=0.1)
-    assert max(about["correlation"].values()) < 1.6
-    std = {name: np.sqrt(v) for name, v in learnt[-1].variance.items()}
-    assert std["mixed.current"] == pytest.approx(CURRENT, rel=0.2)
-    assert set(learnt[-1].unit) == set(std)
+    assert learnt.after.yaw_rate < learnt.before.yaw_rate
+    assert learnt.after.speed < learnt.before.speed
+    assert learnt.after.yaw_rate == pytest.approx(noise[1], rel=0.15)
+    assert learnt.after.speed == pytest.approx(np.sqrt(2) * noise[0], rel=0.25)
+    assert learnt.after.current == pytest.approx(np.hypot(CURRENT, OFFSET), rel=0.25)
 
 
-def test_the_camera_stays_as_the_first_fit_left_it(learnt):
-    _, space, _, mean, covariance, found = learnt
-    held = mixed.held(space)
-    assert held.sum() == 1
-    np.testing.assert_array_equal(found.z[held], mean[held])
-    np.testing.assert_array_equal(found.covariance[held][:, held], covariance[held][:, held])
+@pytest.mark.slow
+def test_the_noise_of_currents_and_the_offsets_of_runs_are_told_apart(learnt):
+    problem, log_v = learnt.problem, learnt.optimum.state.log_variance
+    std = dict(zip(problem.noise.names, np.exp(0.5 * np.asarray(log_v)), strict=True))
+    assert std["crossing.current.window"] == pytest.approx(CURRENT, rel=0.15)
+    assert std["crossing.current.run"] == pytest.approx(OFFSET, rel=0.35)
 
 
-def test_its_uncertainty_is_carried_along():
-    space = Space(made_robot(), CHOICES)
-    rng = np.random.default_rng(0)
-    a, b = rng.normal(size=(2, space.size, space.size))
-    covariance, information = a @ a.T, b @ b.T
-    h, new = mixed.held(space), mixed.informed(space, covariance, information)
-    np.testing.assert_allclose(new, new.T)
-    assert np.linalg.eigvalsh(new).min() > 0
-    # given the camera: as if it were known
-    given = np.linalg.inv(np.linalg.inv(new)[np.ix_(~h, ~h)])
-    total = np.linalg.inv(covariance) + information
-    np.testing.assert_allclose(given, np.linalg.inv(total[np.ix_(~h, ~h)]), rtol=1e-8)
+def test_what_a_run_is_off_all_along_counts_once_not_once_a_window(fitted):
+    """Information of currents falls to that of a mean over runs as their offsets grow."""
+    true, problem, optimum = fitted
+    whole = problem.crossed(crossed(true, 12, 1))
+    state = whole.restated(optimum.state, problem)
+    jacobian = whole.linear(state.z, whole.electric(state.z, state.log_variance))[1]
+    at = whole.noise.names.index("crossing.current.run")
+    told = []
+    for offset in (1e-4, OFFSET):
+        log_v = np.array(state.log_variance)
+        log_v[at] = 2 * np.log(offset)
+        half = whitened(whole.noise.blocks, jacobian, log_v, whole.every)[cut.CURRENT]
+        k = whole.space.place["motor.back_emf"]
+        told.append(float((half[..., k] ** 2).sum()))
+    assert told[1] < 0.3 * told[0]
 
 
-def test_a_single_run_judges_nothing(learnt):
-    _, space, _, mean, covariance, _ = learnt
-    several = crossed(made_robot(), 2, 3)
-    one = replace(several.of(several.windows.run == 0), runs=several.runs[:1])
-    found = mixed.update(space, mean, covariance, [one])
-    assert found.about["after"] is None
-    assert found.about["runs"] == 1
+def test_windows_that_do_not_count_say_nothing(fitted):
+    true, problem, optimum = fitted
+    several = crossed(true, 6, 5)
+    whole = problem.crossed(several)
+    state = whole.restated(optimum.state, problem)
+    where = state.z, whole.electric(state.z, state.log_variance)
+    dead = ~several.counts
+    moved = replace(
+        several.windows,
+        current=np.where(dead[..., None], 7.0, several.windows.current),
+        turn=np.where(dead[..., None], 0.3, several.windows.turn),
+    )
+    other = problem.crossed(replace(several, windows=moved))
+    for k in (cut.MOTION, cut.CURRENT):
+        (r, slope), (r2, slope2) = (
+            (p.linear(*where)[0][k], p.linear(*where)[1][k]) for p in (whole, other)
+        )
+        np.testing.assert_array_equal(np.asarray(r), np.asarray(r2))
+        np.testing.assert_array_equal(np.asarray(slope), np.asarray(slope2))
+        live = np.repeat(several.counts, 3, axis=1)
+        assert not np.asarray(r)[~live].any()
+        assert np.asarray(r)[live].all()
+        v = np.asarray(whole.covariance(k, state.log_variance))
+        piece, row = np.argwhere(~live)[0]
+        np.testing.assert_array_equal(v[piece, row], np.eye(v.shape[1])[row])
+        np.testing.assert_array_equal(
+            np.asarray(whole.noise.blocks[k].count), 3.0 * several.counts.sum(axis=1)
+        )
 
 
-@pytest.mark.parametrize(("keep", "worth"), [(0.0, 1.0), (0.6, 4.0)])
-def test_correlated_windows_count_for_fewer(keep, worth):
-    """A first-order process with correlation a is worth (1 - a) / (1 + a) of its samples."""
-    rng = np.random.default_rng(1)
-    x = rng.normal(size=(60, 200))
-    for k in range(1, 200):
-        x[:, k] = keep * x[:, k - 1] + np.sqrt(1 - keep**2) * x[:, k]
-    x[rng.random(x.shape) < 0.2] = np.nan
-    run, place = (i.ravel() for i in np.indices(x.shape))
-    assert cut._dilution(x.ravel(), run, place) == pytest.approx(worth, rel=0.2)
-    picked = np.isfinite(x.ravel())  # gaps are gaps, however they are told
-    same = cut._dilution(x.ravel()[picked], run[picked], place[picked])
-    assert same == pytest.approx(cut._dilution(x.ravel(), run, place))
+def test_pieces_left_out_change_nothing(fitted):
+    """The loss of kept pieces does not know what was measured in the others."""
+    true, problem, optimum = fitted
+    several = crossed(true, 6, 5)
+    keep = np.concatenate([np.ones(len(problem.windows)), np.arange(6) % 2])
+    losses = []
+    for shift in (0.0, 0.4):
+        current = several.windows.current + shift * (1 - np.arange(6) % 2)[:, None, None]
+        whole = problem.crossed(replace(several, windows=replace(several.windows, current=current)))
+        state = whole.restated(optimum.state, problem)
+        electric = whole.electric(state.z, state.log_variance)
+        blocks, _ = whole.linear(state.z, electric)
+        seen = whole.seen(blocks, state.log_variance, keep, state.shared(len(problem.windows)))
+        losses.append(whole.loss(state.z, state.log_variance, keep, seen, electric))
+    assert losses[0] == losses[1]
+
+
+def test_a_single_run_judges_nothing(fitted):
+    true, problem, optimum = fitted
+    found = across(problem, optimum, crossed(true, 1, 3), lambda state: None)
+    assert found.after is None
+    assert len(found.problem.every) == len(problem.windows) + 1
+
+
+def test_electric_numbers_that_move_motion_are_marginalised_first():
+    """Information of a cut, against Gaussians written out: y1 tells all, y2 electric numbers."""
+    rng = np.random.default_rng(2)
+    e = np.array([False, True, False, True, False])
+    first, second = rng.normal(size=(2, 7, 5))
+    of_motion = np.eye(5) + first.T @ first
+    total = of_motion + second.T @ second
+    found = np.asarray(_cut(jnp.asarray(total), jnp.asarray(of_motion), jnp.asarray(e)))
+    marginal = np.linalg.inv(of_motion)[np.ix_(~e, ~e)]
+    np.testing.assert_allclose(np.linalg.inv(found)[np.ix_(~e, ~e)], marginal, rtol=1e-9)
+    given = np.linalg.inv(total[np.ix_(e, e)])
+    np.testing.assert_allclose(np.linalg.inv(found[np.ix_(e, e)]), given, rtol=1e-9)
 
 
 # where wheels stand -----------------------------------------------------------------------------
@@ -229,23 +288,48 @@ RIGHT = [[0.0, -9.0], [9.0, -9.0], [9.0, 9.0], [0.0, 9.0]]
 def test_windows_in_which_no_wheel_changes_floors(driven):
     true, data = driven
     half = from_polygons("soft", [("firm", RIGHT)], (-3.0, -3.0, 3.0, 3.0))
-    whole = cut.crossing(data, uniform("soft", 3.0), true)
-    some = cut.crossing(data, half, true)
+    whole = cut.crossing([(data, uniform("soft", 3.0))], true)
+    some = cut.crossing([(data, half)], true)
     assert set(whole.floor.ravel()) == {true.surface_index("soft")}
-    assert len(some.windows) < len(whole.windows)
-    x = cut.wheel_places(true, some.windows)[..., 0]
-    assert ((x > 0) == (some.floor == true.surface_index("firm"))[:, None]).all()
-    assert whole.windows.dt.max() < 2 * cut.WINDOW
-    assert (np.diff(whole.place)[np.diff(whole.windows.run) == 0] > 0).all()
-    rim = 0.04 * np.abs(whole.windows.turn[:, 0]) / whole.windows.dt
-    assert rim.max(axis=1).min() >= cut.LEAST_SPEED
+    assert 0 < some.counts.sum() < whole.counts.sum()
+    for run, window in np.argwhere(some.counts):
+        w = some.windows
+        edges = w.pose[run : run + 1, window : window + 2]
+        alone = replace(w.pieces(np.array([run])), pose=edges)
+        x = cut.wheel_places(true, alone)[0, ..., 0]
+        assert ((x > 0) == (some.floor[run, window] == true.surface_index("firm"))).all()
+    w = whole.windows
+    assert w.dt[whole.counts].max() < 2 * cut.LONGEST
+    rim = 0.04 * np.abs(w.turn) / w.dt[..., None]
+    assert rim.max(axis=2)[whole.counts].min() >= cut.LEAST_SPEED
+
+
+def test_windows_of_a_run_stand_in_a_row_and_two_maps_go_together(driven):
+    true, data = driven
+    floor = uniform("soft", 3.0)
+    one = cut.crossing([(data, floor)], true)
+    assert one.counts.shape[1] <= cut.MOST_WINDOWS
+    length = {len(data.time[data.rows(k)]) for k in range(len(data))}
+    assert len(length) >= 1
+    for k in range(len(data)):
+        row = one.windows.pieces(np.array([k]))
+        poses = data.pose[data.rows(k)]
+        for place in row.pose[0]:  # every edge is a pose that was logged, in their order
+            assert (poses == place).all(axis=1).any()
+        live = one.counts[k]
+        steps = np.diff(row.pose[0], axis=0)[live]
+        assert (np.abs(steps).max(axis=1) > 0).all()
+    both = cut.crossing([(data, floor), (data.subset([0]), floor)], true)
+    assert both.runs == (*one.runs, one.runs[0])
+    assert both.windows.run.tolist() == [*one.windows.run.tolist(), len(data)]
+    np.testing.assert_array_equal(both.windows.turn[-1], one.windows.turn[0])
 
 
 def test_runs_without_a_window_are_refused(driven, monkeypatch):
     true, data = driven
     monkeypatch.setattr(cut, "LEAST_SPEED", 9.0)
-    with pytest.raises(DataError, match=r"no 0\.25 s in which .*expected larger patches"):
-        cut.crossing(data, uniform("soft", 3.0), true)
+    with pytest.raises(DataError, match=r"no window in which .*expected larger patches"):
+        cut.crossing([(data, uniform("soft", 3.0))], true)
 
 
 # configs ----------------------------------------------------------------------------------------
@@ -348,7 +432,9 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path):
     assert fit.mixed["runs"] == 4
     assert fit.refused is None
     assert not fit.mixed["floors"]["soft"]["is_worse"]
-    assert {"mixed.along", "mixed.across", "mixed.yaw", "mixed.current"} < set(fit.variance)
+    assert {"crossing.run.yaw", "crossing.process.along", "crossing.current.run"} < set(
+        fit.variance
+    )
     run = json.loads((out / "run.json").read_text())
     assert run["data"]["hash"] == fit.data_hash
     assert len(run["data"]["logs"]) == 16
@@ -408,4 +494,4 @@ def test_runs_with_a_wrong_map_are_refused(tmp_path):
     assert errors["is_worse"]
     assert errors["after"] > 1.5 * errors["before"]
     assert len(fit.runs) == 24  # those on one floor
-    assert not any(name.startswith("mixed.") for name in fit.variance)
+    assert not any(name.startswith("crossing.") for name in fit.variance)
