@@ -38,7 +38,9 @@ def densities(job: Job) -> np.ndarray:
     end = optimise(problem)
     out, free = np.zeros(len(fold)), problem.space.electric.astype(float)
     for k in range(6):
-        part = optimise(problem, (fold != k).astype(float), replace(end.state, round=0), free=free)
+        part = optimise(
+            problem, (fold != k).astype(float), replace(end.state, round=3), 10, free=free
+        )
         at = part.state.z, part.state.log_variance
         gap = np.asarray(problem.linear(at[0], problem.electric(*at))[0]["current"])
         density = log_student(gap, np.asarray(problem.covariance("current", at[1])))
