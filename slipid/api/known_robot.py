@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.data.runs import Runs, collect
-from slipid.model.robot import Robot, twist, wheel_torque
+from slipid.model.robot import Robot, twist, wheel_current, wheel_torque
 from slipid.selftest import known
 from slipid.selftest.logs import make_logs
 
@@ -119,7 +119,7 @@ def _moved(
         xi = twist(robot, frame, speed, floor, load)
         torque = wheel_torque(robot, frame, xi, speed, floor, load)
         rim = jnp.where(stands, jnp.nan, frame.radius * frame.pull * speed)
-        current = robot.motor.current(torque, speed)
+        current = wheel_current(robot, frame, xi, speed, floor, load)
         return xi, speed, 1 - frame.hold @ xi / rim, torque * way, current * way
 
     return jax.vmap(one)(command)

@@ -147,7 +147,9 @@ class FloorFilter(eqx.Module):
         on = stand(f.frame, f.floors.at(self.hypotheses.T), f.rest)
         rim = f.frame.radius * w
         twist, pull = settle(near.T, rim, on, f.inverse)
-        torque = on.friction * f.mass * GRAVITY * f.frame.radius * pull
+        drag = Balance(rim[:, None], on).rolled(Planar(*twist))
+        borne = f.motor.borne(jnp.stack([pull, drag], axis=-1))
+        torque = on.friction * f.mass * GRAVITY * f.frame.radius * borne
         amps = f.motor.current(torque.T, jnp.broadcast_to(w, torque.T.shape))
         more = f.current_trend @ jnp.stack([1.0, length((f.inverse @ rim)[:2])])
         return twist.T, amps + jnp.sign(amps) * more

@@ -124,9 +124,12 @@ def _circle(robot: Robot, frame: Frame, load: Array, top: Array) -> tuple[Array,
         rim = frame.radius * w
         xi = contact.equilibrium(rim, frame, floor, rest)
         force = floor.friction * robot.body.mass * GRAVITY * frame.radius
-        torque = force * contact.traction(xi, rim, frame, floor, rest)
+        where = xi, rim, frame, floor, rest
+        felt = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
         lost = rim - robot.geometry.forward() @ xi
-        return robot.motor.current(torque, w), lost / jnp.where(jnp.abs(rim) < 1e-9, 1e-9, rim)
+        return robot.motor.current(force * robot.motor.borne(felt), w), lost / jnp.where(
+            jnp.abs(rim) < 1e-9, 1e-9, rim
+        )
 
     flat = speed.reshape(-1, speed.shape[-1])
     amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(robot.surfaces)

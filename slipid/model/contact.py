@@ -169,6 +169,20 @@ def traction(
     return Balance(rim, stand(frame, surface, rest)).felt(Planar(*xi))
 
 
+def rolled(
+    xi: Float[Array, "3"],
+    rim: Float[Array, " wheel"],
+    frame: Frame,
+    surface: ContactSurface,
+    rest: Float[Array, " wheel"],
+) -> Float[Array, " wheel"]:
+    """Drag of each wheel along its drive at a twist, if it is that of its rollers [mu m g].
+
+    The motor bears it, in units of `Motor.rolling_drag`, and the body does not feel it.
+    """
+    return Balance(rim, stand(frame, surface, rest)).rolled(Planar(*xi))
+
+
 def settle(
     start: Float[Array, "3 floors"], rim: Array, on: Stance, plain: Float[Array, "3 wheel"]
 ) -> tuple[Float[Array, "3 floors"], Float[Array, "wheel floors"]]:

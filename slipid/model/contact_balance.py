@@ -31,6 +31,7 @@ class Stance(eqx.Module):
             are means over the loads, and what belongs to rollers is as of `law.sideways`.
         drag_onset: roller speed below which drag is viscous [m/s].
         friction: mean over the wheels; forces are in units of it times m g.
+        sunk: drag of the rollers of each wheel under an even load.
     """
 
     frame: Frame
@@ -41,6 +42,7 @@ class Stance(eqx.Module):
     floor: ContactSurface
     drag_onset: Float[Array, "wheel *one"]
     friction: Float[Array, "*batch"]
+    sunk: Float[Array, "wheel *batch"]
 
 
 def stand(frame: Frame, surface: ContactSurface, rest: Float[Array, " wheel"]) -> Stance:
@@ -58,10 +60,11 @@ def stand(frame: Frame, surface: ContactSurface, rest: Float[Array, " wheel"]) -
             scrub=total(rest * surface.scrub),
             lead=total(rest * surface.lead),
         )
+    sunk = (1 - frame.grip) * floor.friction * floor.roller_drag / len(rest)
     floor, onset = law.sideways(law.at_load(floor, len(rest) * rest), frame.grip)
     # parts first: XLA then keeps what belongs to a part, and its derivatives, side by side
     hold, roll, shift = (jnp.moveaxis(r, 1, 0) for r in (frame.hold, frame.roll, frame.shift))
-    return Stance(frame, Planar(*hold), Planar(*roll), shift, rest, floor, onset, friction)
+    return Stance(frame, Planar(*hold), Planar(*roll), shift, rest, floor, onset, friction, sunk)
 
 
 def total(of_wheels: Float[Array, "wheel *batch"]) -> Float[Array, "*batch"]:
@@ -140,6 +143,11 @@ class Balance(eqx.Module):
         """Traction that each motor works against."""
         f = self.on.frame
         return self.load(xi) * self.wheels(*self._speeds(xi)).felt(f.pull, f.slip_through)
+
+    def rolled(self, xi: Planar) -> Float[Array, "wheel *batch"]:
+        """Drag of wheels that roll along their drive, if it is that of rollers; motors bear it."""
+        _, roll = self._speeds(xi)
+        return self.on.sunk * law.rolled(self.rim, roll, self.on.frame.pull)
 
     def size(self, force: Planar) -> Float[Array, "*batch"]:
         """Square of a force, its moment over the base radius."""

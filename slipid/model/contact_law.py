@@ -183,6 +183,12 @@ def wheel_traction(slide: Array, active: Array, floor: ContactSurface) -> Fricti
     return Friction(slide, onset, floor.creep, 1.0, floor.slide_viscosity)
 
 
+def rolled(rim: Array, roll: Array, pull: Array) -> Array:
+    """Part of a wheel's motion that is along its drive, (r w / c) |r w / c|: how it drags there."""
+    along = rim * pull * jax.lax.rsqrt(rim**2 + roll**2 + 1e-12)
+    return along * jnp.abs(along)
+
+
 def scrub_moment(yaw_rate: Array, scrub: Array) -> Friction:
     """Moment at a yaw rate [m]."""
     return Friction(yaw_rate, W0, 0.0, scrub)

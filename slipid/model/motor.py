@@ -38,6 +38,13 @@ class Motor(eqx.Module):
     viscous_friction: Array = electric(
         "N*m*s/rad", "b_w", "friction per speed", start=0.005, lower=0.0, spread=1.5
     )
+    rolling_drag: Array = held(
+        "1",
+        "k_d",
+        "drag of a wheel that rolls along its drive, over that of its rollers at an even load",
+        start=0.0,
+        spread=1.0,
+    )
     current_offset: Array = held("A", "I_0", "zero of the ammeter", start=0.0, spread=0.05)
     rotor_inertia: Array = held("kg*m^2", "J_m", "rotor", start=1e-5, lower=0.0, spread=1.0)
     gear_ratio: float = eqx.field(static=True, default=1.0)
@@ -56,6 +63,10 @@ class Motor(eqx.Module):
             self.coulomb_friction * jnp.tanh(wheel_speed / 0.2)
             + self.viscous_friction * wheel_speed
         )
+
+    def borne(self, felt: Float[Array, "*w 2"]) -> Float[Array, " *w"]:
+        """What a motor works against: traction, and drag along the drive (`robot.felt`)."""
+        return felt[..., 0] + self.rolling_drag * felt[..., 1]
 
     @property
     def gain(self) -> Array:

@@ -189,11 +189,15 @@ def felt(
     wheel_speed: Float[Array, " wheel"],
     surface: Array,
     load: Array,
-) -> Float[Array, " wheel"]:
-    """Traction each motor works against at a twist, in units of mean(mu) m g."""
-    rim = frame.radius * wheel_speed
-    floor = robot.surfaces.at(surface)
-    return contact.traction(xi, rim, frame, floor, robot.body.load_share[load])
+) -> Float[Array, "wheel 2"]:
+    """What each motor works against at a twist, in units of mean(mu) m g.
+
+    The traction, and the drag along the drive if it is as large as that of rollers
+    (`contact.rolled`).
+    """
+    rim, floor = frame.radius * wheel_speed, robot.surfaces.at(surface)
+    where = xi, rim, frame, floor, robot.body.load_share[load]
+    return jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
 
 
 def wheel_torque(
@@ -204,6 +208,20 @@ def wheel_torque(
     surface: Array,
     load: Array,
 ) -> Float[Array, " wheel"]:
-    """Torque each motor delivers at the wheel, friction excluded: r mu m g T [N m]."""
+    """Torque of the traction of each wheel: r mu m g T [N m]."""
     force = jnp.mean(robot.surfaces.friction[surface]) * robot.body.mass * GRAVITY
-    return frame.radius * force * felt(robot, frame, xi, wheel_speed, surface, load)
+    return frame.radius * force * felt(robot, frame, xi, wheel_speed, surface, load)[..., 0]
+
+
+def wheel_current(
+    robot: Robot,
+    frame: Frame,
+    xi: Float[Array, "3"],
+    wheel_speed: Float[Array, " wheel"],
+    surface: Array,
+    load: Array,
+) -> Float[Array, " wheel"]:
+    """Signed current of each motor [A]: traction, drag along the drive, friction."""
+    force = jnp.mean(robot.surfaces.friction[surface]) * robot.body.mass * GRAVITY
+    borne = robot.motor.borne(felt(robot, frame, xi, wheel_speed, surface, load))
+    return robot.motor.current(frame.radius * force * borne, wheel_speed)

@@ -40,7 +40,8 @@ class Seen:
         sideways: speed across the wheel over its rim speed.
         share: of the weight on the wheel in motion.
         amps: measured current [A], None where not logged; amps_model: predicted.
-        torque: predicted traction torque at the wheel [N m].
+        torque: predicted traction torque at the wheel [N m]; dragged: that of the drag along the
+            drive, which the motor bears beside it.
         unsigned: the log has magnitudes of currents only.
     """
 
@@ -59,6 +60,7 @@ class Seen:
     amps: Float[np.ndarray, "piece wheel"] | None
     amps_model: Float[np.ndarray, "piece wheel"]
     torque: Float[np.ndarray, "piece wheel"]
+    dragged: Float[np.ndarray, "piece wheel"]
     unsigned: bool
 
 
@@ -68,9 +70,7 @@ def seen(robot: Robot, data: Runs, per_piece: int) -> Seen:
     w = windows(data, radius, lag, per_piece=per_piece, longest=1.5)
     b, dt = lk.batch(w, robot), w.dt[..., None]
     speed, torque = (np.asarray(x) for x in curves.seen(robot, b)[:2])
-    amps = np.asarray(robot.motor.current(jnp.asarray(torque), jnp.asarray(speed)))
-    if not w.current_is_signed:
-        amps = np.sqrt(amps**2 + lk.SMOOTH**2)
+    amps, dragged = (np.asarray(x) for x in _borne(robot, b))
     inverse = np.linalg.pinv(np.asarray(robot.geometry.forward())) * radius
     frame = robot.geometry.frame()
     free = (w.turn @ inverse.T).sum(axis=1)
@@ -107,8 +107,9 @@ def seen(robot: Robot, data: Runs, per_piece: int) -> Seen:
         sideways=np.abs((true @ np.asarray(frame.roll).T) / safe),
         share=np.asarray(robot.body.load_share)[np.asarray(b.load)],
         amps=whole(w.current) if w.has_current else None,
-        amps_model=whole(amps) + float(robot.motor.current_offset),
+        amps_model=whole(amps),
         torque=whole(torque),
+        dragged=whole(dragged),
         unsigned=not w.current_is_signed,
     )
 
@@ -132,6 +133,16 @@ def by_heading(
     return np.stack(
         [1 - along / speed, np.degrees(np.arctan2(across, along)), np.degrees(xi[:, 2]) / speed], -1
     )
+
+
+@jax.jit
+def _borne(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
+    """Predicted currents [A], and torques of the drag along the drive [N m]."""
+    felt = lk.predict(robot, b).felt
+    force = robot.surfaces.friction[b.surface] * robot.body.mass * model.GRAVITY
+    drag = robot.motor.rolling_drag * felt[..., 1]
+    torque = robot.geometry.wheel_radius * force[:, None, None] * drag
+    return lk.predicted_current(robot, b, felt), torque
 
 
 @jax.jit

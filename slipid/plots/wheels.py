@@ -72,9 +72,13 @@ def driving_torque(robot: Robot, seen: Seen) -> np.ndarray:
     speed = np.abs(seen.wheel_speed)
     amps = seen.amps * turning
     if seen.unsigned:
-        driven = (seen.torque * turning + np.asarray(robot.motor.friction(jnp.asarray(speed)))) >= 0
+        driven = (
+            (seen.torque + seen.dragged) * turning
+            + np.asarray(robot.motor.friction(jnp.asarray(speed)))
+        ) >= 0
         amps = (seen.amps - float(robot.motor.current_offset)) * np.where(driven, 1.0, -1.0)
-    return np.asarray(robot.motor.torque(jnp.asarray(amps), jnp.asarray(speed)))
+    torque = np.asarray(robot.motor.torque(jnp.asarray(amps), jnp.asarray(speed)))
+    return torque - seen.dragged * turning
 
 
 def _curve(ax: Axes, fit: Fit, floor: str) -> None:

@@ -20,7 +20,7 @@ from slipid.data.log import Log
 from slipid.data.wheel_signals import interpolate
 from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.shared import AXES
-from slipid.model.robot import Robot, twist, wheel_torque
+from slipid.model.robot import Robot, twist, wheel_current
 from slipid.model.se2 import compose, path
 from slipid.selftest.known import Sensors
 
@@ -170,7 +170,7 @@ def _twists(robot: Robot, speed: Array, floor: Array, load: Array) -> tuple[Arra
 
     def one(w: Array, f: Array, s: Array) -> tuple[Array, Array]:
         xi = twist(robot, frame, w, f, s)
-        return xi, robot.motor.current(wheel_torque(robot, frame, xi, w, f, s), w)
+        return xi, wheel_current(robot, frame, xi, w, f, s)
 
     return jax.vmap(jax.vmap(one, (0, None, None)))(speed, floor, load)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -119,3 +121,10 @@ def test_an_unsigned_current_gets_the_sign_of_the_speed():
 def test_braking_looks_like_driving():
     braking = jnp.asarray([-0.7])
     np.testing.assert_allclose(signed(braking, jnp.asarray([5.0]), 16.0)[0], 0.7, rtol=1e-3)
+
+
+def test_a_motor_bears_drag_along_the_drive_beside_traction():
+    felt = jnp.asarray([[0.2, 0.1], [-0.3, -0.05]])
+    np.testing.assert_array_equal(MOTOR.borne(felt), [0.2, -0.3])
+    dragged = replace(MOTOR, rolling_drag=jnp.asarray(1.2))
+    np.testing.assert_allclose(dragged.borne(felt), [0.32, -0.36], rtol=1e-12)

@@ -19,6 +19,8 @@ from slipid.model.robot import Robot
 Marker = Float[Array, "piece window 3"]
 """Increments of the marker [m, m, rad], or body twists [m/s, m/s, rad/s], of every window."""
 PerWheel = Float[Array, "piece window wheel"]
+Felt = Float[Array, "piece window wheel 2"]
+"""What `model.robot.felt` says of every wheel."""
 PerChannel = Float[Array, "piece m"]
 """Window by window the wheels of every piece, as residuals are."""
 Std = Float[Array, ""] | float
@@ -96,12 +98,12 @@ class ElectricNoise(eqx.Module):
 class Predicted(eqx.Module):
     """What the robot says of each window: marker increments (x, y [m], yaw [rad]), body twists.
 
-    Felt is the traction of each wheel's motor in units of mu m g.
+    Felt is what each wheel's motor works against, in units of mu m g.
     """
 
     increment: Marker
     twist: Marker
-    felt: PerWheel
+    felt: Felt
 
 
 def wheel_speed(robot: Robot, b: Batch) -> PerWheel:
@@ -134,12 +136,12 @@ def seen(
     return jax.vmap(jax.vmap(window, (0, 0, None)))(twist, dt, session)
 
 
-def predicted_current(robot: Robot, b: Batch, felt: PerWheel) -> PerWheel:
-    """Motor current of every window [A] given the traction, a magnitude where the log has those."""
+def predicted_current(robot: Robot, b: Batch, felt: Felt) -> PerWheel:
+    """Motor current of every window [A] given what motors work against, or its size."""
     friction = robot.surfaces.friction[b.surface]  # of the wheels on average, as `felt` has it
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
     weight = friction * robot.body.mass * model.GRAVITY
-    torque = robot.geometry.wheel_radius * weight[..., None] * felt
+    torque = robot.geometry.wheel_radius * weight[..., None] * robot.motor.borne(felt)
     amps = robot.motor.current(torque, wheel_speed(robot, b))
     if b.signed:
         return amps + robot.motor.current_offset
@@ -164,7 +166,7 @@ def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "piece
 
 
 def electric_residuals(
-    robot: Robot, b: Batch, felt: PerWheel, noise: ElectricNoise
+    robot: Robot, b: Batch, felt: Felt, noise: ElectricNoise
 ) -> dict[str, Array]:
     """Predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
 

@@ -213,7 +213,7 @@ class Held(eqx.Module):
 
     The mask is 1 for coordinates that may move; root whitens residuals, tied is what runs share
     given these; prior_std is of every coordinate, electric what voltages are predicted with, felt
-    the traction at z, which currents and voltages are predicted from, and
+    what motors work against at z, which currents and voltages are predicted from, and
     slope that of log |d residuals / d data| by the search vector.
     """
 
@@ -224,7 +224,7 @@ class Held(eqx.Module):
     tied: tuple[Tie, ...]
     prior_std: Float[Array, " free"]
     electric: lk.ElectricNoise
-    felt: Float[Array, "piece window wheel"]
+    felt: lk.Felt
     slope: Float[Array, " free"]
 
 

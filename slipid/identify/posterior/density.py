@@ -38,7 +38,7 @@ class Held(NamedTuple):
     """What the electric part holds of the motion of each walker: search vector and traction."""
 
     z: Float[Array, "*walker free"]
-    felt: Float[Array, "*walker piece window wheel"]
+    felt: Float[Array, "*walker piece window wheel 2"]
 
 
 class _Seen(NamedTuple):
