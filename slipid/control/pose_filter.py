@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.effects import direction, stays
-from slipid.control.floor_filter import Motion, Tick
+from slipid.control.floor_filter import Motion, Tick, length
 from slipid.control.interface import Readings, Settings
 from slipid.control.pose_fix import HISTORY, PoseState, fixed, handed_over, nearest
 from slipid.model.se2 import advance, compose
@@ -119,7 +119,8 @@ class PoseFilter(eqx.Module):
     def _forgotten(self, old: PoseState, motion: Motion, way: _Way, tick: Tick) -> PoseState:
         """With effects as far as they stay the same over the step, their variance as it was."""
         f = self.robot
-        far = way.speed * jnp.where(tick.moves, tick.dt, 0.0)
+        speed = length(motion.twist[:2]) + f.frame.base * jnp.abs(motion.twist[2])
+        far = speed * jnp.where(tick.moves, tick.dt, 0.0)  # what is truly left behind
         left = jnp.prod(1 - motion.under, axis=0)
         now = direction(motion.rolling, f.frame.base)
         toward, keep = stays(old.toward, now, left, far)

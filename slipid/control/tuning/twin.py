@@ -179,12 +179,12 @@ class Twin(eqx.Module):
 
     def _errs(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
         """Effects of the floors, and the direction that counts as taken, for the next period."""
-        f = self.robot
-        rolling = f.inverse @ (f.frame.radius * now.speed)
-        far = Course.of(rolling, f.frame.base).speed * PERIOD
+        f, xi = self.robot, now.twist
+        far = (jnp.sqrt(xi[:2] @ xi[:2] + 1e-12) + f.frame.base * jnp.abs(xi[2])) * PERIOD
         under = self.floor.under(now.pose, f.places)
         left = jnp.all(under[:, None] != jnp.arange(len(f.labels)), axis=0)
-        toward, keep = stays(now.toward, direction(rolling, f.frame.base), left.astype(float), far)
+        way = direction(f.inverse @ (f.frame.radius * now.speed), f.frame.base)
+        toward, keep = stays(now.toward, way, left.astype(float), far)
         fresh = jnp.sqrt(1 - keep**2 + 1e-15)[:, None] * noise.reshape(-1, 3)
         return keep[:, None] * now.effect + fresh, toward
 
