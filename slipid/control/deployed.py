@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.control.effects import Told
 from slipid.control.robot_file.file import ANEW, check, read_robot, write_robot
-from slipid.control.robot_file.record import Numbers, RobotRecord
+from slipid.control.robot_file.record import LoadRecord, Numbers, RobotRecord
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame, Geometry
 from slipid.model.motor import Motor
@@ -33,6 +34,7 @@ class DeployedRobot(eqx.Module):
             across [m/sqrt(m)] and in yaw [rad/sqrt(m)].
         effect: std of what it misses all the way, [m/m], [m/m], [rad/m]; the spread of the fitted
             numbers included.
+        told: what the fitted runs tell of that effect, by direction of travel and speed.
         friction_covariance: of the log frictions, by the spread of the fitted numbers.
         current_std: of the current that flows from the model's, the ammeter's noise aside [A].
         current_trend: a + b v, measured currents over the model's at speed v [A, A s/m].
@@ -53,6 +55,7 @@ class DeployedRobot(eqx.Module):
     mass: Float[Array, ""]
     process: Float[Array, "floor 3"]
     effect: Float[Array, "floor 3"]
+    told: Told
     friction_covariance: Float[Array, "floor floor"]
     current_std: Float[Array, " floor"]
     current_trend: Float[Array, "2"]
@@ -137,6 +140,7 @@ def drawn(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
     """Robots that the posterior holds possible, stacked along a leading axis.
 
     What runs differ by stays in `DeployedRobot.effect`; the spread of the numbers is in the draws.
+    What is told of effects is so with the robot's own numbers, and the same part of them is left.
     What the robot was seen with (`highest`, `wheel_curve`) is that of the robot.
     """
     record, one = robot.record, []
@@ -165,6 +169,7 @@ def _arrays(
     geometry = Geometry(**shape)
     rows = [of(f"surface.{floor.name}", ContactSurface) for floor in floors]
     effect = _array([floor.effect for floor in floors])
+    whole = jnp.sqrt(effect**2 + _array(chosen.spread) ** 2)
     return DeployedRobot(
         frame=geometry.frame(),
         places=jnp.asarray(geometry.place) * geometry.base_radius,
@@ -178,7 +183,8 @@ def _arrays(
         rest=_array(values[f"robot.load_share@{chosen.name}"]),
         mass=_array(values["robot.mass"]),
         process=_array([floor.process for floor in floors]),
-        effect=jnp.sqrt(effect**2 + _array(chosen.spread) ** 2) if spread else effect,
+        effect=whole if spread else effect,
+        told=_told(chosen, whole),
         friction_covariance=_friction_covariance(record) * spread,
         current_std=_array([floor.current_std for floor in floors]),
         current_trend=_array(record.current_trend),
@@ -191,6 +197,15 @@ def _arrays(
 
 def _array(value: Numbers | Sequence[object]) -> Array:
     return jnp.asarray(value, dtype=float)
+
+
+def _told(load: LoadRecord, whole: Array) -> Told:
+    """What is told of effects, what is left over the whole std of every floor."""
+    if load.told is None:
+        return Told.nothing(len(whole))
+    mean, left = _array(load.told.mean), _array(load.told.left)
+    part = left / jnp.maximum(whole[:, None, None], 1e-12)
+    return Told(jnp.log(_array(load.told.speeds)), jnp.concatenate([mean, part], axis=-1))
 
 
 def _friction_covariance(record: RobotRecord) -> Array:

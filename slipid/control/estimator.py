@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Float
 from slipid.control.deployed import DeployedRobot
 from slipid.control.floor_filter import FloorFilter, FloorState, Tick, length
 from slipid.control.interface import AbstractEstimator, Estimate, Pose, Readings, Settings
-from slipid.control.pose_filter import PoseFilter, PoseState
+from slipid.control.pose_filter import PoseFilter
+from slipid.control.pose_fix import PoseState
 from slipid.control.wheels import WheelState, read_currents, read_wheels, time_step
 from slipid.model.se2 import advance, compose
 

@@ -3,7 +3,8 @@
 A robot whose wheels stand on several floors moves as one body, so every hypothesis is one floor per
 wheel, all of them together (27 with three wheels on three floors), and one that says "unknown":
 
-    xi_c, I_c     contact equilibrium and motor currents of hypothesis c at the wheel speeds
+    xi_c, I_c     contact equilibrium, with what runs tell that it misses, and motor currents of
+                  hypothesis c at the wheel speeds
     p_c <- p_c * (p(I | I_c) p(gyro | xi_c))^(dt / tau)   once wheels may be on other floors
     g_c <- g_c * exp(xi_c dt)                             pose if c is true, ways to c averaged
     g = sum_c p_c g_c
@@ -23,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.control.deployed import DeployedRobot
+from slipid.control.effects import Course
 from slipid.control.interface import Settings
 from slipid.control.wheels import Currents
 from slipid.model.contact import settle
@@ -52,7 +54,7 @@ class FloorState(eqx.Module):
 
     Attributes:
         belief: probability of each, and of none of them in the last place.
-        twist: of the body if it were true [m/s, m/s, rad/s].
+        twist: of the body by the contact alone, if it were true [m/s, m/s, rad/s].
         apart: pose if it were true, seen from the believed one [m, m, rad].
     """
 
@@ -66,18 +68,23 @@ class Motion(eqx.Module):
 
     Attributes:
         twist: mean [m/s, m/s, rad/s]; scatter: covariance over hypotheses.
-        rolling: twist of wheels that do not slip.
+        rolling: twist of wheels that do not slip; course: where it leads.
+        left: std of the effects of every floor that is left along this course.
         by_friction: derivative of the mean by the log friction of each floor [m/s, m/s, rad/s].
         under: probability of each floor under each wheel, given that it is one of them.
         jump: what the pose moves beyond the mean twist, news that came late [m, m, rad].
+        news: mean twist less what it was believed to be before the news [m/s, m/s, rad/s].
     """
 
     twist: Float[Array, "3"]
     scatter: Float[Array, "3 3"]
     rolling: Float[Array, "3"]
+    course: Course
+    left: Float[Array, "floor 3"]
     by_friction: Float[Array, "3 floor"]
     under: Float[Array, "wheel floor"]
     jump: Float[Array, "3"]
+    news: Float[Array, "3"]
 
 
 class FloorFilter(eqx.Module):
@@ -117,7 +124,12 @@ class FloorFilter(eqx.Module):
             w: wheel speeds [rad/s]; currents: what is known of them.
             turn: yaw rate by the gyro, its bias taken off, NaN without one [rad/s].
         """
-        xi, predicted = self.solve(old.twist, w)
+        settled, predicted = self.solve(old.twist, w)
+        f = self.robot
+        rolling = f.inverse @ (f.frame.radius * w)
+        course = Course.of(rolling, f.frame.base)
+        mean, part = f.told.at(course)
+        xi = settled + self._on_each(course.speed * mean @ course.axes.T)
         told, none = self._evidence(xi, predicted, currents, w, turn)
         # what the equilibrium does not know, inertia, weighs little while wheels speed up
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)
@@ -126,18 +138,28 @@ class FloorFilter(eqx.Module):
         log = jnp.log(jnp.maximum(prior, 1e-12)) + weight * jnp.append(told, none)
         belief = jax.nn.softmax(log)
         known = belief[:-1] / jnp.maximum(jnp.sum(belief[:-1]), 1e-12)
-        mean = known @ xi
+        middle = known @ xi
+        before = prior[:-1] / jnp.maximum(jnp.sum(prior[:-1]), 1e-12)
         apart, jump = self._moved(apart, known, xi, turn, tick)
         under = self._marginal(known)
         motion = Motion(
-            twist=mean,
-            scatter=(xi - mean).T @ (known[:, None] * (xi - mean)),
-            rolling=self.robot.inverse @ (self.robot.frame.radius * w),
-            by_friction=self._by_friction(mean, w, under),
+            twist=middle,
+            scatter=(xi - middle).T @ (known[:, None] * (xi - middle)),
+            rolling=rolling,
+            course=course,
+            left=f.effect * part,
+            by_friction=self._by_friction(known @ settled, w, under),
             under=under,
             jump=jump,
+            news=jnp.where(jnp.isfinite(turn), jnp.array([1.0, 1.0, 0.0]), 1.0)
+            * ((known - before) @ xi),
         )
-        return FloorState(belief=belief, twist=xi, apart=apart), motion
+        return FloorState(belief=belief, twist=settled, apart=apart), motion
+
+    def _on_each(self, of_floor: Float[Array, "floor 3"]) -> Float[Array, "hypothesis 3"]:
+        """What floors do to the body under every hypothesis, by the load on each."""
+        under = jax.nn.one_hot(self.hypotheses, len(self.robot.labels), dtype=float)
+        return jnp.einsum("w,cwf,fk->ck", self.robot.rest, under, of_floor)
 
     def solve(
         self, near: Float[Array, "hypothesis 3"], w: Float[Array, " wheel"]

@@ -17,6 +17,7 @@ from slipid.control.robot_file.record import Number, Sensors, Source
 from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
 from slipid.deploy.record_of import record_of
+from slipid.deploy.told import told_by_load
 from slipid.identify.posterior.diagnosis import Posterior, estimates
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
@@ -41,12 +42,12 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
     """
     source: Source = "laplace"
     numbers, messages = fit.parameters, fit.messages
-    vectors = fit.draws(DRAWS)
+    vectors, center = fit.draws(DRAWS), fit.z
     if posterior is not None:
         source, numbers = "posterior", estimates(fit, posterior.z)
         flat = posterior.z.reshape(-1, fit.space.size)
         rows = np.random.default_rng(0).choice(len(flat), DRAWS, replace=len(flat) < DRAWS)
-        vectors = flat[rows]
+        vectors, center = flat[rows], flat.mean(axis=0)
         if not posterior.converged:
             messages += (f"the posterior did not converge: {posterior.reason}",)
     record = record_of(
@@ -57,6 +58,7 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
         max(max(v.wheel_speed) for v in fit.validity.values()),
         fit.current_trend,
         fit.validity,
+        told_by_load(fit.contact, center, vectors),
     )
     # one that has learnt from runs over several floors expects to drive on several
     alike = record.alike if fit.mixed is None else MIXED

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from slipid.control.robot_file import record
 from slipid.identify.fit.noise import SHARED
@@ -28,6 +28,7 @@ def record_of(
     highest_speed: float,
     current_trend: record.Pair,
     seen: Mapping[str, Validity],
+    told: Mapping[str, record.ToldRecord] | None = None,
 ) -> record.RobotRecord:
     """The record of a robot, but for what is known of where its numbers come from.
 
@@ -41,6 +42,7 @@ def record_of(
         highest_speed: of the wheels in the fitted runs [rad/s].
         current_trend: of currents over the model's in the fitted runs, all floors [A], [A s/m].
         seen: what the floors were seen with, as far as that is known.
+        told: what the fitted runs tell of effects, by load set-up, as far as that is known.
     """
     return record.RobotRecord(
         wheels=record.Wheels(
@@ -48,7 +50,10 @@ def record_of(
         ),
         parameters={p: n for p, n in numbers.items() if not p.startswith("camera.")},
         floors=tuple(_floor(name, std, seen.get(name)) for name in robot.surfaces.labels),
-        loads=tuple(_load(robot, name, highest_speed, draws) for name in robot.body.loads),
+        loads=tuple(
+            _load(robot, name, highest_speed, draws, (told or {}).get(name))
+            for name in robot.body.loads
+        ),
         current_trend=current_trend,
         highest_speed=highest_speed,
         draws=dict(_varied(robot, draws)),
@@ -94,7 +99,9 @@ def _axes(row: Sequence[float] | np.ndarray) -> record.Axes:
     return along, across, yaw
 
 
-def _load(robot: Robot, name: str, top: float, draws: Robot) -> record.LoadRecord:
+def _load(
+    robot: Robot, name: str, top: float, draws: Robot, told: record.ToldRecord | None
+) -> record.LoadRecord:
     """What depends on how the robot is loaded."""
     frame, k = robot.geometry.frame(), jnp.asarray(robot.load_index(name))
     speed, amps, slip = _circle(robot, frame, k, jnp.asarray(top))
@@ -102,6 +109,7 @@ def _load(robot: Robot, name: str, top: float, draws: Robot) -> record.LoadRecor
     return record.LoadRecord(
         name=name,
         spread=tuple(_axes(row) for row in np.asarray(_spread(draws, k))),
+        told=told,
         highest_current=float(jnp.max(jnp.abs(amps))),
         wheel_curve=tuple((float(a), float(b)) for a, b in curve),
     )
@@ -152,21 +160,31 @@ def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
     return jax.vmap(wheel, 1)(*flat)
 
 
-@eqx.filter_jit
 def _spread(draws: Robot, load: Array) -> Array:
     """Std over posterior draws of the motion per metre, a row per floor (along, across, yaw)."""
+    moved = moved_per_metre(draws, load, jnp.asarray(0.2), 12)
+    return jnp.sqrt(jnp.mean(jnp.var(moved, axis=0), axis=1))
+
+
+@eqx.filter_jit
+def moved_per_metre(
+    draws: Robot, load: Array, speed: Array, count: int
+) -> Float[Array, "draw floor direction 3"]:
+    """Motion along, across and in yaw per metre of wheels that would not slip, at a speed [m/s].
+
+    In so many directions, of robots that are stacked.
+    """
 
     def one(robot: Robot) -> Array:
         frame = robot.geometry.frame()
-        way = _ways(12)
-        rim = 0.2 * way @ robot.geometry.forward().T
+        way = _ways(count)
+        rim = speed * way @ robot.geometry.forward().T
         rest = robot.body.load_share[load]
         xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
             robot.surfaces
         )
         along = jnp.einsum("fkc,kc->fk", xi, way)
         across = xi[..., 1] * way[:, 0] - xi[..., 0] * way[:, 1]
-        return jnp.stack([along, across, xi[..., 2]], axis=-1) / 0.2
+        return jnp.stack([along, across, xi[..., 2]], axis=-1) / speed
 
-    seen = jax.vmap(one)(draws)
-    return jnp.sqrt(jnp.mean(jnp.var(seen, axis=0), axis=1))
+    return jax.vmap(one)(draws)

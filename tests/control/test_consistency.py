@@ -105,6 +105,33 @@ def test_a_floor_that_changes_within_a_step_moves_the_pose_by_what_was_travelled
     np.testing.assert_allclose(said.pose, there, atol=1e-3)
 
 
+def test_a_late_fix_after_news_of_the_floors_does_not_count_the_hand_over_twice():
+    """News, then a fix of a moment before it that says the same: the pose is where the robot is."""
+    robot = eqx.tree_at(lambda r: r.current_std, deployed(1.0, 1.0, 1.0), jnp.full(2, 0.003))
+    # floors do not change on the way, and currents tell them at once
+    sure = Settings(
+        current_is_signed=True, ammeter_std_a=0.003, forget_s=DT, filter_s=1e-3, patch_m=1e9
+    )
+    est = Estimator(robot, sure)
+    run = jax.jit(lambda s, z, dt: est.step(s, z, dt))
+    w, near = rolling(robot, (0.2, 0.05, 0.1)), jnp.zeros((8, 3))
+    for _ in range(8):  # hypotheses settle
+        near, amps = FloorFilter(robot, sure).solve(near, w)
+    state, steps, late = est.init(std=(0.01, 0.02)), 40, 10
+    state = eqx.tree_at(lambda s: s.floors.twist, sure_of(state, 0, 8), near)
+    for k in range(steps + 3):  # what was taken for the first floor is the second
+        z = Measurement(wheel_speed=w, current=amps[0 if k < steps else 7])
+        state, said = run(state, z.filled(3), DT)
+        if k == steps - 1:
+            np.testing.assert_allclose(said.pose, ended((near[0], steps * DT)), atol=1e-3)
+    there, then = (ended((near[7], (steps + 3 - k) * DT)) for k in (0, late))
+    np.testing.assert_allclose(said.pose, there, atol=1e-3)
+    assert np.hypot(*(there - ended((near[0], (steps + 3) * DT)))[:2]) > 0.03
+    fix = Measurement(fix=then, fix_std=(0.001, 0.002), fix_age=late * DT)
+    after, _ = run(state, fix.filled(3), 1e-4)
+    np.testing.assert_allclose(after.place.pose, there, atol=2e-3)
+
+
 # effects ---------------------------------------------------------------------------------------
 
 

@@ -17,7 +17,7 @@ from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains, Limits, limited
 from slipid.control.estimator import Estimator, Odometry
 from slipid.control.interface import UNTIMED_S, Measurement, Readings, Settings
-from slipid.control.pose_filter import _within
+from slipid.control.pose_fix import _within
 from slipid.control.trajectory import rectangle
 from slipid.model.geometry import mecanum, omni
 from slipid.model.robot import build

@@ -19,7 +19,13 @@ import pytest
 
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot, drawn
-from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
+from slipid.control.robot_file.record import (
+    GainRecord,
+    GainsRecord,
+    GainValues,
+    Losses,
+    ToldRecord,
+)
 from slipid.deploy.record_of import record_of
 from slipid.model.geometry import omni
 from slipid.model.robot import Validity, build
@@ -32,6 +38,10 @@ SCHEMA = json.loads(resources.files("slipid.control").joinpath("robot.schema.jso
 SEEN = Validity(
     3, ("as_built",), (0.0, 8.0), (0.0, 0.4), (0.0, 0.3), (0.0, 1.0), (0.0,), (), (), 1.1
 )
+ONE = (((0.01, -0.02, 1 / 3), (0.0, 0.1 + 0.2, 0.0)), ((0.0, 0.0, 0.0), (0.001, 0.0, -0.1)))
+"""What is told of a floor at two speeds and in two directions."""
+LEFT = (((0.01, 0.02, 0.03), (0.03, 0.02, 0.01)), ((0.01, 0.01, 0.01), (0.02, 0.02, 0.0)))
+TOLD = ToldRecord((0.1, 0.3), (ONE, ONE[::-1]), (LEFT, LEFT[::-1]))
 GAINS = GainsRecord(
     values=GainValues(*(GainRecord(0.1 * k, "1", 0.01) for k in range(6))),
     load="moved",
@@ -75,7 +85,9 @@ def robot() -> DeployedRobot:
     known = {"std": (0.01, 0.01, 0.01), "interval90": pairs, "verdict": "identified"}
     numbers[share_path] = replace(numbers[share_path], **known)
     std = {"process.firm.along": 0.003, "session.soft.yaw": 0.02}
-    record = record_of(made, numbers, std, several, 8.1, (0.01, -0.02), {"firm": SEEN})
+    record = record_of(
+        made, numbers, std, several, 8.1, (0.01, -0.02), {"firm": SEEN}, {"moved": TOLD}
+    )
     record = replace(record, messages=("say \u00e9 aloud",), versions={"jax": "0.1"})
     return DeployedRobot.of(replace(record, gains=GAINS), "moved")
 
@@ -103,6 +115,8 @@ def test_every_number_survives_to_the_last_bit(robot, path):
     assert float(again.floors.friction[1]) == 0.1 + 0.2
     np.testing.assert_array_equal(again.floors.load_bias, [[0.1, -0.3, 0.2], [0.0, 1 / 3, -1 / 3]])
     np.testing.assert_array_equal(again.floors.drag_exponent, [1.0, 1.6])
+    np.testing.assert_array_equal(again.told.table[..., :3], TOLD.mean)
+    np.testing.assert_array_equal(first.told.table, [[[[0, 0, 0, 1, 1, 1]]]] * 2)
     text = path.read_bytes()
     first.save(path)
     assert path.read_bytes() == text
@@ -151,6 +165,7 @@ def test_what_is_known_of_the_floors_is_saved_with_them(robot, tmp_path):
     only = robot.on("soft")
     only.save(tmp_path / "soft.json")
     same(DeployedRobot.load(tmp_path / "soft.json", "moved"), only)
+    np.testing.assert_array_equal(only.told.table[0, ..., :3], ONE[::-1])
 
 
 def test_the_schema_tells_what_is_written_and_names_every_gain(path, robot):
@@ -213,16 +228,16 @@ def test_what_is_no_robot_is_refused(tmp_path):
 
 
 def test_a_newer_file_asks_for_an_update(path):
-    rewritten(path, lambda c: c.update(schema="slipid.robot/3", more=3))
+    rewritten(path, lambda c: c.update(schema="slipid.robot/4", more=3))
     said = refused(path)
-    assert "written by a newer slipid as slipid.robot/3" in said
+    assert "written by a newer slipid as slipid.robot/4" in said
     assert "update slipid" in said
 
 
 def test_an_older_file_whose_law_was_another_is_to_be_written_anew(path):
-    rewritten(path, lambda c: c.update(schema="slipid.robot/1"))
+    rewritten(path, lambda c: c.update(schema="slipid.robot/2"))
     said = refused(path)
-    assert "written by an older slipid as slipid.robot/1" in said
+    assert "written by an older slipid as slipid.robot/2" in said
     assert "write it anew with `slipid identify`" in said
 
 
@@ -256,6 +271,24 @@ def test_a_changed_digit_is_refused(path):
             "floors[0].process: 1 entries; expected 3",
         ),
         (lambda c: c["loads"][0].update(spread=[]), "loads, own: spread: 0 entries; expected 2"),
+        (lambda c: c["loads"][1].pop("told"), "loads[1].told is missing"),
+        (
+            lambda c: c["loads"][1]["told"].update(speeds=[0.3, 0.1]),
+            "loads, moved: told.speeds: [0.3, 0.1]; expected positive ones that rise",
+        ),
+        (lambda c: c["loads"][1]["told"]["mean"].pop(), "told.mean: 1 entries; expected 2"),
+        (
+            lambda c: c["loads"][1]["told"]["left"][0].pop(),
+            "told.left, of a floor: 1 entries; expected 2",
+        ),
+        (
+            lambda c: c["loads"][1]["told"]["left"][1][0].pop(),
+            "told.left, of a speed: 1 entries; expected 2",
+        ),
+        (
+            lambda c: c["loads"][1]["told"]["left"][0][0][0].__setitem__(2, -1),
+            "told.left: a std below 0",
+        ),
         (
             lambda c: c["wheels"].update(drive_angle=[0.0]),
             "wheels.drive_angle: 1 entries; expected 3",

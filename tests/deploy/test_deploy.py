@@ -16,7 +16,9 @@ from slipid.control.interface import MIXED, Settings
 from slipid.control.tuning import optimisers
 from slipid.deploy import tune
 from slipid.deploy.deploy import DRAWS, deploy, read_robot, write_robot
+from slipid.deploy.told import DIRECTIONS
 from slipid.deploy.tune import robots_of
+from slipid.identify.fit.shared import Directions, Pace
 from slipid.identify.fit_file import load
 from slipid.support.errors import DataError
 from tests.helpers.shared import DRIVES, invoke
@@ -63,6 +65,20 @@ def test_a_fit_writes_its_robot(fitted):
     assert again.record == record
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(robot), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_what_it_is_told_of_effects_is_what_forecasts_know(fitted):
+    robot, contact = read_robot(fitted), load(fitted).contact
+    told = robot.record.loads[0].told
+    for n, speed in enumerate(told.speeds):
+        for k in (0, 17, 50):
+            pace = (Pace(float(np.log(speed)), robot.load_setup),)
+            way = Directions(np.array([2 * np.pi * k / DIRECTIONS]), pace)
+            known = contact.shared[robot.labels[0]].told(way)
+            np.testing.assert_allclose(told.mean[0][n][k], -known.mean[0], rtol=2e-3, atol=1e-6)
+            # the numbers are not known either
+            least = np.sqrt(np.diag(known.covariance[0]))
+            assert (np.array(told.left[0][n][k]) > 0.999 * least).all()
 
 
 def test_draws_to_search_with_and_to_judge_on_are_different_ones(fitted):

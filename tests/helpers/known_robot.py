@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.robot_file.record import Number
+from slipid.control.robot_file.record import Number, ToldRecord
 from slipid.deploy.record_of import plain, record_of
 from slipid.model.robot import Robot
 from slipid.parameter import entries
@@ -21,13 +21,16 @@ def deploy_known(
     draws: Robot | None = None,
     highest_speed: float = 20.0,
     current_trend: tuple[float, float] = (0.0, 0.0),
+    told: Mapping[str, ToldRecord] | None = None,
 ) -> DeployedRobot:
     """The robot as it drives with a load set-up; arguments as of `record_of`.
 
     Without draws of its posterior its numbers have no spread.
     """
     several = jax.tree.map(lambda x: x[None], robot) if draws is None else draws
-    record = record_of(robot, given(robot), std or {}, several, highest_speed, current_trend, {})
+    record = record_of(
+        robot, given(robot), std or {}, several, highest_speed, current_trend, {}, told
+    )
     return DeployedRobot.of(record, load)
 
 

@@ -6,12 +6,13 @@
 import json
 import re
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.control.robot_file.record import UNITS, Numbers, RobotRecord
+from slipid.control.robot_file.record import UNITS, Numbers, RobotRecord, ToldRecord
 from slipid.control.robot_file.typed import typed
 from slipid.model.geometry import Geometry
 from slipid.model.robot import build
@@ -19,7 +20,7 @@ from slipid.parameter import Declaration, entries
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_bytes
 
-SCHEMA = "slipid.robot/2"
+SCHEMA = "slipid.robot/3"
 ANEW = "copy it again, or write it anew with `slipid identify`"
 
 
@@ -114,7 +115,25 @@ def check(record: RobotRecord) -> None:
     for load in record.loads:
         _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
         _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, wheels)
+        if load.told is not None:
+            _told(f"loads, {load.name}: told", load.told, len(record.floors))
     _numbers(record, wheels)
+
+
+def _told(where: str, told: ToldRecord, floors: int) -> None:
+    """Refuse a table whose speeds do not rise, or whose rows are not as many as they should be."""
+    speeds = told.speeds
+    if not speeds or speeds[0] <= 0 or any(a >= b for a, b in pairwise(speeds)):
+        raise ValueError(f"{where}.speeds: {list(speeds)}; expected positive ones that rise")
+    around = len(told.mean[0][0]) if told.mean and told.mean[0] else 0
+    for name, table in (("mean", told.mean), ("left", told.left)):
+        _counted(f"{where}.{name}", table, floors)
+        for rows in table:
+            _counted(f"{where}.{name}, of a floor", rows, len(speeds))
+            for row in rows:
+                _counted(f"{where}.{name}, of a speed", row, max(around, 1))
+    if any(x < 0 for rows in told.left for row in rows for axes in row for x in axes):
+        raise ValueError(f"{where}.left: a std below 0")
 
 
 def _known(record: RobotRecord, wheels: int) -> dict[str, tuple[Declaration, int]]:

@@ -37,6 +37,9 @@ UNITS = {
     "floors.seen.turn_rates": "rad/s",
     "floors.seen.distance": "m",
     "loads.spread": "m/m, m/m, rad/m",
+    "loads.told.speeds": "m/s",
+    "loads.told.mean": "m/m, m/m, rad/m",
+    "loads.told.left": "m/m, m/m, rad/m",
     "loads.highest_current": "A",
     "loads.wheel_curve": "1, 1/A",
     "current_trend": "A, A*s/m",
@@ -91,19 +94,47 @@ class FloorRecord:
 
 
 @dataclass(frozen=True)
+class ToldRecord:
+    """What the fitted runs tell of effects, a table of floors, speeds and directions of travel.
+
+    The directions are those of the body's motion relative to the body, evenly spaced from ahead
+    counter-clockwise.
+
+    Attributes:
+        speeds: of the table, rising.
+        mean: of the effect, what is to be added to the motion that the model predicts.
+        left: std of what then is left of effects and of the uncertainty of the numbers together.
+    """
+
+    speeds: tuple[float, ...]
+    mean: tuple[tuple[tuple[Axes, ...], ...], ...]
+    left: tuple[tuple[tuple[Axes, ...], ...], ...]
+
+
+@dataclass(frozen=True)
 class LoadRecord:
     """What depends on how the robot is loaded.
 
     Attributes:
         spread: std of the motion per metre by the uncertainty of the numbers, on every floor.
+        told: of the effects by the fitted runs; None where no runs are known.
         highest_current: of the model up to 0.8 of the highest wheel speed.
         wheel_curve: a + b |I|, the slip ratio of each wheel, of all floors together.
     """
 
     name: str
     spread: tuple[Axes, ...]
+    told: ToldRecord | None
     highest_current: float
     wheel_curve: tuple[Pair, ...]
+
+    def on(self, rows: tuple[int, ...]) -> "LoadRecord":
+        """With some of the floors only, by their numbers."""
+        spread = tuple(self.spread[k] for k in rows)
+        if self.told is None:
+            return replace(self, spread=spread)
+        mean, left = (tuple(x[k] for k in rows) for x in (self.told.mean, self.told.left))
+        return replace(self, spread=spread, told=replace(self.told, mean=mean, left=left))
 
 
 @dataclass(frozen=True)
@@ -248,7 +279,7 @@ class RobotRecord:
         return replace(
             self,
             floors=floors,
-            loads=tuple(replace(x, spread=tuple(x.spread[k] for k in rows)) for x in self.loads),
+            loads=tuple(load.on(rows) for load in self.loads),
             parameters={path: n for path, n in self.parameters.items() if stays(path)},
             draws={path: n for path, n in self.draws.items() if stays(path)},
         )

@@ -6,7 +6,9 @@ the contact says, and what the fit says the model misses is drawn anew for every
 
     set <- set + clip(command(t - delay) - set, slew h),   w <- w + (1 - exp(-h / lag)) (set - w)
     xi = equilibrium(r w; floor under each wheel)
-    pose <- pose * exp(xi h + |xi| h effect + sqrt(|xi| h) process)
+    pose <- pose * exp(xi h + s h (told + left effect) + sqrt(s h) process)
+
+with s the speed at which the wheels would take the body if none slipped.
 
 Everything is differentiable but for which floor a wheel is on; ticks pass derivatives through.
 Differentiate forwards (`jax.jvp`, `jax.jacfwd`): readings that are no numbers would spoil a pass
@@ -24,7 +26,7 @@ from jaxtyping import Array, Float, Int
 
 from slipid.control.closed_loop import PERIOD, Pilot, PilotOutput, PilotState
 from slipid.control.deployed import DeployedRobot
-from slipid.control.effects import direction, stays
+from slipid.control.effects import Course, direction, stays
 from slipid.control.interface import Measurement, Pose, Readings, State
 from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import RING, Habits
@@ -69,7 +71,7 @@ class TwinState(eqx.Module):
         pose: x, y [m], heading [rad]; twist: of the body [m/s, m/s, rad/s].
         wanted: wheel speeds that the motors' control is set to [rad/s].
         speed: of the wheels [rad/s]; angle: of the wheels [rad].
-        effect: what the model misses now on every floor [m/m], [m/m], [rad/m].
+        effect: what the model misses now on every floor beyond what is told, in stds left.
         toward: direction of travel that counts as taken, see `slipid.control.effects`.
         offset, drift: of the currents, all the way and for a moment [A].
         bias: of the gyro [rad/s].
@@ -125,7 +127,7 @@ class Twin(eqx.Module):
             wanted=zero,
             speed=zero,
             angle=zero,
-            effect=f.effect * jax.random.normal(one, f.effect.shape),
+            effect=jax.random.normal(one, f.effect.shape),
             toward=jnp.zeros(3),
             offset=off,
             drift=zero,
@@ -168,13 +170,12 @@ class Twin(eqx.Module):
         under = self.floor.under(pose, f.places)
         rim = f.frame.radius * w
         xi = contact.equilibrium(rim, f.frame, f.floors.at(under), f.rest)
-        size = jnp.sqrt(xi[:2] @ xi[:2] + 1e-12)
-        u, far = xi[:2] / size, (size + f.frame.base * jnp.abs(xi[2])) * h
-        share = f.rest[:, None]
-        off = far * jnp.sum(share * effect[under], axis=0)
+        course = Course.of(f.inverse @ rim, f.frame.base)
+        mean, part = f.told.at(course)
+        missed, far, share = mean + part * f.effect * effect, course.speed * h, f.rest[:, None]
+        off = far * jnp.sum(share * missed[under], axis=0)
         off += jnp.sqrt(far + 1e-12) * push * jnp.sqrt(jnp.sum(share * f.process[under] ** 2, 0))
-        turned = jnp.stack([u[0] * off[0] - u[1] * off[1], u[1] * off[0] + u[0] * off[1], off[2]])
-        return compose(pose, advance(xi + turned / h, h)), xi
+        return compose(pose, advance(xi + course.axes @ off / h, h)), xi
 
     def _errs(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
         """Effects of the floors, and the direction that counts as taken, for the next period."""
@@ -184,7 +185,7 @@ class Twin(eqx.Module):
         left = jnp.all(under[:, None] != jnp.arange(len(f.labels)), axis=0)
         way = direction(f.inverse @ (f.frame.radius * now.speed), f.frame.base)
         toward, keep = stays(now.toward, way, left.astype(float), far)
-        fresh = jnp.sqrt(1 - keep**2 + 1e-15)[:, None] * f.effect * noise.reshape(-1, 3)
+        fresh = jnp.sqrt(1 - keep**2 + 1e-15)[:, None] * noise.reshape(-1, 3)
         return keep[:, None] * now.effect + fresh, toward
 
     def _amps(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
