@@ -18,6 +18,7 @@ from jaxtyping import Float
 from slipid.control.robot_file.record import Axes, ToldRecord
 from slipid.deploy.record_of import moved_per_metre
 from slipid.identify.compare.predictive import Contact
+from slipid.identify.fit.hierarchy import PerAxis
 from slipid.identify.fit.shared import AXES, Directions, Pace
 
 DIRECTIONS = 72
@@ -60,7 +61,7 @@ def _table(
     for n, floor in enumerate(labels):
         found = contact.shared[floor]
         told = found.told(way)
-        grown = contact.extrapolation.get(f"{floor}@{load}", 1.0)
+        grown = np.asarray(contact.extrapolation.get(f"{floor}@{load}", PerAxis()))
         given = np.diagonal(told.covariance, axis1=1, axis2=2) + _alone(contact, floor)
         off = predicted[:, n] - np.einsum("nap,kp->kna", told.slope, draws - center)
         at = told.mean + told.slope @ (center - contact.z)
