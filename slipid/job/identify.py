@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from slipid.identify.compare.agreement import floor_errors, sentence
+from slipid.identify.compare.agreement import contradiction, floor_errors
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.fit.across import across
 from slipid.identify.fit.crossing import crossing
@@ -180,12 +180,15 @@ def _with_several(
         "windows": int(several.counts.sum()),
         "before": found.before._asdict(),
         "after": after,
+        "learnt": found.learnt._asdict(),
+        "as_if": {name: e._asdict() for name, e in found.as_if.items()},
         "floors": {name: asdict(e) for name, e in floors.items()},
     }
     report.line(_judged(about))
-    if not any(e.is_worse for e in floors.values()):
+    alone = {name: e.speed for name, e in found.as_if.items()}
+    said = contradiction(floors, found.learnt.speed, alone)
+    if said is None:
         return replace(new, mixed=about)
-    said = sentence(floors)
     report.line(said)
     return replace(fit, refused={**about, "reason": said})
 

@@ -12,6 +12,8 @@ from slipid.identify.compare.predictive import Predictive
 
 WORSE = 1.5
 """Factor by which end-point errors on a floor may grow; a map that is wrong makes it several."""
+BETTER = 0.8
+"""Part of the error by a map below which a single floor explains runs better than the map does."""
 SURE = 3.0
 """Standard errors of paired differences beyond which a growth is not chance."""
 
@@ -68,14 +70,33 @@ def end_errors(
     return error, far
 
 
-def sentence(found: Mapping[str, FloorErrors]) -> str:
-    """Floors that became worse, with their errors."""
+def contradiction(
+    found: Mapping[str, FloorErrors], by_map: float, as_if: Mapping[str, float]
+) -> str | None:
+    """Why runs over several floors are not learnt from, None where they agree with the others.
+
+    Args:
+        found: errors of the runs on one floor each.
+        by_map: error of the runs over several floors [m/s], whose map says where wheels stand.
+        as_if: the same had all wheels stood on one floor all the while, by floor [m/s].
+    """
     worse = [
         f"{floor} from {100 * e.before:.1f} to {100 * e.after:.1f} % of the way"
         for floor, e in found.items()
         if e.is_worse
     ]
-    return (
-        "the runs over several floors were not learnt from: they contradict those on one floor "
-        f"(end-point errors on {', '.join(worse)}); their map may be wrong or out of place"
-    )
+    if worse:
+        return f"{_NOT_LEARNT} (end-point errors on {', '.join(worse)}); {_WHY}"
+    best = min(as_if, key=lambda floor: as_if[floor])
+    if as_if[best] < BETTER * by_map:
+        told = (
+            f"{1000 * by_map:.1f} mm/s by their map, {1000 * as_if[best]:.1f} as if all on {best}"
+        )
+        return f"{_NOT_LEARNT} (errors of {told}); {_WHY}"
+    return None
+
+
+_NOT_LEARNT = (
+    "the runs over several floors were not learnt from: they contradict those on one floor"
+)
+_WHY = "their map may be wrong or out of place"

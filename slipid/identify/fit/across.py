@@ -4,14 +4,14 @@ They are further pieces of the one likelihood. How well they are predicted is to
 each half of the runs is judged by a fit that has seen the other half only.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from slipid.identify.fit.crossing import Crossing, Errors, errors
+from slipid.identify.fit.crossing import Crossing, Errors, Several, errors, residuals_at
 from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, State
 
@@ -27,12 +27,17 @@ class Across:
         problem, optimum: of all runs.
         before: errors of the runs over several floors by a fit that has seen none of them.
         after: of each half by a fit that has seen the other, None where there is only one run.
+        learnt: by the fit to all of them.
+        as_if: the same had all wheels stood on one floor all the while, by floor; a map that is
+            right predicts better than that.
     """
 
     problem: Problem
     optimum: Optimum
     before: Errors
     after: Errors | None
+    learnt: Errors
+    as_if: Mapping[str, Errors]
 
 
 def across(
@@ -45,26 +50,32 @@ def across(
     whole = problem.crossed(several)
     start = replace(whole.restated(optimum.state, problem), round=0)
     on_one, odd = len(problem.windows), several.windows.run % 2 == 1
-    before = _errors(whole, (start, np.ones(len(odd))))
+    target, every = whole.target, np.ones(len(odd))
+    assert target.several is not None, "runs over several floors"
+
+    def off(several: Several, *judged: tuple[State, Float[np.ndarray, " run"]]) -> Errors:
+        """Errors, each run by the state that judges it with weight 1 and the others with 0."""
+        found = [(residuals_at(target.space, several, jnp.asarray(s.z)), w) for s, w in judged]
+        return errors(several, found)
+
     learnt = optimise(whole, start=start, tell=tell)
     after = None
     if odd.any() and not odd.all():
         parts = []
         for half in (odd, ~odd):
             keep = np.concatenate([np.ones(on_one), ~half])
-            end = optimise(whole, keep=keep, start=start, most_rounds=_ROUNDS)
-            parts.append((end.state, half.astype(float)))
-        after = _errors(whole, *parts)
-    return Across(whole, learnt, before, after)
-
-
-def _errors(problem: Problem, *judged: tuple[State, Float[np.ndarray, " run"]]) -> Errors:
-    """Errors of runs over several floors, each by the state that judges it, with weight 1 or 0."""
-    several = problem.target.several
-    assert several is not None, "a problem with runs over several floors"
-    found = []
-    for state, weight in judged:
-        electric = problem.electric(state.z, jnp.asarray(state.log_variance))
-        residual, _ = problem.linear(jnp.asarray(state.z), electric)
-        found.append((residual, weight))
-    return errors(several, found)
+            other = optimise(whole, keep=keep, start=start, most_rounds=_ROUNDS)
+            parts.append((other.state, half.astype(float)))
+        after = off(target.several, *parts)
+    end = (learnt.state, every)
+    return Across(
+        problem=whole,
+        optimum=learnt,
+        before=off(target.several, (start, every)),
+        after=after,
+        learnt=off(target.several, end),
+        as_if={
+            floor: off(target.several.as_if_on(k), end)
+            for k, floor in enumerate(whole.robot.surfaces.labels)
+        },
+    )

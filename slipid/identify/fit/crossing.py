@@ -23,6 +23,7 @@ from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
 from slipid.identify.fit import likelihood as lk
 from slipid.model.robot import Robot
+from slipid.search_space import Space
 from slipid.support.errors import DataError
 
 SHORTEST, LONGEST = 0.25, 0.5
@@ -171,6 +172,11 @@ class Several(eqx.Module):
         b = lk.batch(crossing.windows, robot, crossing.floor)
         return Several(b, jnp.asarray(crossing.counts, float))
 
+    def as_if_on(self, floor: int) -> "Several":
+        """The same runs as if all wheels had stood on one floor all the while."""
+        alone = jnp.full_like(self.batch.surface, floor)
+        return replace(self, batch=replace(self.batch, surface=alone))
+
     def residuals(self, robot: Robot, p: lk.Predicted) -> dict[str, Array]:
         """Predicted less measured motion and, where they are logged, currents."""
         b = self.batch
@@ -185,6 +191,13 @@ class Several(eqx.Module):
         """Log |d motion residuals / d logged poses| of every piece."""
         each = jax.vmap(jax.vmap(robot.camera.log_jacobian))(self.batch.pose[:, 1:])
         return jnp.sum(each * self.counts, axis=1)
+
+
+@eqx.filter_jit
+def residuals_at(space: Space, several: Several, z: Array) -> dict[str, Array]:
+    """Residuals of runs over several floors at a search vector."""
+    robot = space.tree(z)
+    return several.residuals(robot, lk.predict(robot, several.batch))
 
 
 class Errors(NamedTuple):

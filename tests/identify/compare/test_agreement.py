@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slipid.identify.compare.agreement import FloorErrors, compared, sentence
+from slipid.identify.compare.agreement import FloorErrors, compared, contradiction
 
 RUNS = 12
 FLOORS = ["gray"] * RUNS + ["green"] * RUNS
@@ -41,10 +41,22 @@ def test_a_single_run_shows_nothing():
     assert not found.is_worse
 
 
-def test_the_sentence_names_floors_that_are_worse_and_no_others():
-    said = sentence(
-        {"gray": FloorErrors(0.0126, 0.0702, True), "green": FloorErrors(0.1, 0.1, False)}
+def test_floors_that_are_worse_are_named_and_no_others():
+    said = contradiction(
+        {"gray": FloorErrors(0.0126, 0.0702, True), "green": FloorErrors(0.1, 0.1, False)},
+        0.02,
+        {"gray": 0.03, "green": 0.03},
     )
     assert "gray from 1.3 to 7.0 % of the way" in said
     assert "green" not in said
     assert "map may be wrong" in said
+
+
+@pytest.mark.parametrize(("green", "refused"), [(0.017, False), (0.015, True)])
+def test_a_map_that_predicts_worse_than_a_single_floor_is_said_to_be_wrong(green, refused):
+    fine = {"gray": FloorErrors(0.01, 0.01, False), "green": FloorErrors(0.01, 0.01, False)}
+    said = contradiction(fine, 0.02, {"gray": 0.05, "green": green})
+    assert (said is not None) == refused
+    if refused:
+        assert "20.0 mm/s by their map, 15.0 as if all on green" in said
+        assert "map may be wrong" in said

@@ -459,10 +459,10 @@ def deployed(out):
     first = invoke(*wish)
     assert first.exit_code == 0, first.stderr
     said = json.loads((out / "t.json").read_text())
-    assert said["closes_best"] == "contact"
     encoder, contact = (said["summary"][name] for name in ("encoder", "contact"))
-    assert contact["closure_error_median"] < encoder["closure_error_median"]
-    assert encoder["first_side_along_track_mm"] > 20  # it slips
+    # two starts say nothing of closure, but along the first side encoders lose what slips
+    assert contact["first_side_along_track_mm"] < 0.5 * encoder["first_side_along_track_mm"]
+    assert encoder["first_side_along_track_mm"] > 20
     assert (out / "trial.png").stat().st_size > 10_000
     again = invoke(*wish)
     assert "driving 0 of 4 runs" in again.stderr
@@ -490,8 +490,10 @@ def test_runs_with_a_wrong_map_are_refused(tmp_path):
     fit = load(out)
     assert fit.mixed is None
     assert fit.refused["reason"] in fit.messages
-    errors = fit.refused["floors"]["firm"]
-    assert errors["is_worse"]
-    assert errors["after"] > 1.5 * errors["before"]
+    assert "as if all on soft" in fit.refused["reason"]
+    by_map, soft = fit.refused["learnt"]["speed"], fit.refused["as_if"]["soft"]["speed"]
+    assert soft < 0.5 * by_map
+    for errors in fit.refused["floors"].values():  # its noise absorbs what the map has wrong
+        assert errors["after"] < 1.5 * errors["before"]
     assert len(fit.runs) == 24  # those on one floor
     assert not any(name.startswith("crossing.") for name in fit.variance)
