@@ -74,7 +74,7 @@ class Plan:
     ensembles: int = 4
     walkers: int = 8
     block: int = 20
-    warm_up: tuple[int, ...] = (3, 6, 10, 16, 20)
+    warm_up: tuple[int, ...] = (3, 6, 10, 16, 24, 34, 36)
     most: int = 400
     spread: float = 4.0
     r_hat: float = 1.01

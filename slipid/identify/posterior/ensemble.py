@@ -24,11 +24,11 @@ from slipid.identify.posterior.transport.transport_map import Transport, learnt
 RandomState = tuple[str, np.ndarray, int, int, float]
 """State of a Mersenne twister as numpy gives it."""
 
-ACCEPTED = 0.65
+ACCEPTED = 0.8
 """Part of Hamiltonian moves that shall be accepted; their step is adapted in the warm-up."""
 FIRST_ANGLE, LEAST_ANGLE = 0.3, 0.03
 """First and smallest step of Hamiltonian moves [rad]."""
-DRAWS_PER_EFFECTIVE = 50.0
+DRAWS_PER_EFFECTIVE = 20.0
 """Draws of the warm-up that tell as much as an independent one, about."""
 
 

@@ -26,11 +26,12 @@ DEGREES = 8.0
 """Degrees of freedom of that Student t."""
 WAY = 0.5 * np.pi
 """Length of a Hamiltonian move [rad]: a quarter turn leads to an independent draw of a Gaussian."""
-MOST_STEPS = 12
-ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 1.2, 0.1, 1.0
+MOST_STEPS, SHORTEST = 12, 0.2
+"""Steps of a Hamiltonian move at most, and the shortest over the longest that is made."""
+ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 1.2, 0.1, 0.8
 """How often, relatively, moves of each kind are made.
 
-A Hamiltonian one takes ten times longer, but is what frees walkers from where the map is wrong.
+A Hamiltonian one takes six times longer, but is what frees walkers from where the map is wrong.
 """
 ALONE = 0.5
 """Part of walks along a coordinate that no other one of x follows."""
@@ -198,9 +199,10 @@ class Hamiltonian(FamilyMove):
 
     def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
         count, places = len(x), self.family.places
-        # shorter steps, now and then, for walkers where the density is steep
-        h = self.angle * (1 - 0.8 * random.uniform(size=(count, 1)) ** 3)
-        steps = int(np.clip(random.uniform(1.0, 1.4) * WAY / self.angle, 1, MOST_STEPS))
+        # shorter steps, now and then, and more of them, for walkers where the density is steep
+        h = self.angle * SHORTEST ** (random.uniform() ** 3)
+        steps = int(np.clip(random.uniform(0.7, 1.3) * WAY / h + 0.5, 1, MOST_STEPS))
+        h *= random.uniform(0.8, 1.0, (count, 1))
         u, start, lost = x.copy(), np.zeros(x.shape), np.zeros(count, bool)
         own = np.concatenate(places)
         start[:, own] = random.standard_normal((count, len(own)))
@@ -222,11 +224,13 @@ class Hamiltonian(FamilyMove):
 
 
 def _bounded(kick: Matrix) -> Matrix:
+    """Kicks of coordinates of one group, so long at most that they are not thrown far away."""
     most = np.linalg.norm(np.clip(kick, -_FINITE, _FINITE), axis=1, keepdims=True) / STEEPEST
     return kick / np.maximum(most, 1.0)
 
 
 def _energy(p: Matrix) -> Float[np.ndarray, " walker"]:
+    """Kinetic energy of momenta of one group."""
     return np.asarray(0.5 * (p**2).sum(axis=1))
 
 

@@ -84,6 +84,24 @@ def test_variances_are_drawn_from_the_gaussian_of_their_information(problem):
 
 
 @pytest.mark.slow
+def test_runs_that_err_alike_are_no_outliers_to_variances(problem, monkeypatch):
+    """A wrong creep moves neighbouring runs alike, which is what they are known to share."""
+    weights = []
+
+    def spied(target, motion, weight, *rest):
+        weights.append(np.asarray(weight))
+        return effect_information(target, motion, weight, *rest)
+
+    monkeypatch.setattr("slipid.identify.posterior.sample.effect_information", spied)
+    z, log_v = problem.space.start + 0.3, 2 * np.log(problem.noise.typical)
+    every = np.ones(len(problem.windows))
+    drawn_variances(problem, Fitted(z, log_v, problem.laplace(z, log_v, every)), (1, 2), 0)
+    residual, _ = problem.linear(z, problem.electric(z, log_v))
+    whole = np.asarray(problem.whitening(residual, log_v, every).weight["motion"])
+    assert weights[0].mean() > whole.mean() + 0.03
+
+
+@pytest.mark.slow
 def test_how_far_floors_differ_is_drawn_by_how_likely_it_is(problem):
     """Load biases that are known by themselves, with a half-normal prior of their common std."""
     end, at = fitted(problem), problem.target.deviation
