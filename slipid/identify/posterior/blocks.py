@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int, UInt32
 
-from slipid.identify.posterior.transport.pieces import Bend, Matrix, Values, Warp
+from slipid.identify.posterior.transport.pieces import Bend, Matrix, Warp
 from slipid.identify.posterior.transport.transport_map import Stair, Transport, gaussian
 
-FORMAT = 4
+FORMAT = 5
 """Version of the block files; bump it when their content or the way they are made changes."""
 Chain = Float[np.ndarray, "ensemble step walker size"]
 
@@ -74,7 +74,7 @@ class Plan:
     ensembles: int = 4
     walkers: int = 8
     block: int = 20
-    warm_up: tuple[int, ...] = (3, 6, 10, 16, 20)
+    warm_up: tuple[int, ...] = (3, 6, 10, 16, 24, 34, 36)
     most: int = 400
     spread: float = 4.0
     r_hat: float = 1.01
@@ -93,7 +93,7 @@ class Block:
         random: Mersenne twister keys, and (place, has Gaussian, Gaussian) of each.
         accepted: part of the moves that moved something, for each ensemble.
         map: map to the coordinates in which the next block is made.
-        angle: step of the Hamiltonian moves of the next block [rad].
+        angle: step of the Hamiltonian moves of every family in the next block [rad].
     """
 
     number: int
@@ -102,7 +102,7 @@ class Block:
     random: tuple[UInt32[np.ndarray, "ensemble 624"], Float[np.ndarray, "ensemble 3"]]
     accepted: Float[np.ndarray, " ensemble"]
     map: Transport
-    angle: float
+    angle: Float[np.ndarray, " family"]
 
 
 @dataclass(frozen=True)
@@ -127,9 +127,8 @@ def packed(block: Block) -> dict[str, np.ndarray]:
         "random_key": block.random[0],
         "random_rest": block.random[1],
         "accepted": block.accepted,
-        "angle": np.asarray(block.angle),
+        "angle": block.angle,
         "mean": block.map.mean,
-        "values": np.stack(list(vars(block.map.values).values())),
         "last": np.stack(list(vars(block.map.last).values())),
     }
     for k, stair in enumerate(block.map.stairs):
@@ -147,17 +146,16 @@ def unpacked(arrays: Mapping[str, np.ndarray]) -> Block:
         bend = {n: arrays[f"{k}/bend/{n}"] for n in _OF_BEND if f"{k}/bend/{n}" in arrays}
         fields = {n: arrays[f"{k}/{n}"] for n in _OF_STAIR}
         stairs.append(Stair(**fields, bend=Bend(**bend) if bend else None))
-    values = Values(*arrays["values"])
     return Block(
         number=int(arrays["number"]),
         chain=arrays["chain"],
         log_prob=arrays["log_prob"],
         random=(arrays["random_key"], arrays["random_rest"]),
         accepted=arrays["accepted"],
-        map=Transport(arrays["mean"], values, tuple(stairs), Warp(*arrays["last"])),
-        angle=float(arrays["angle"]),
+        map=Transport(arrays["mean"], tuple(stairs), Warp(*arrays["last"])),
+        angle=arrays["angle"],
     )
 
 
-_OF_STAIR = ("own", "given", "slope", "root", "plateaus")
+_OF_STAIR = ("own", "given", "slope", "root")
 _OF_BEND = ("factors", "shift", "scale")

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem, effects_of, twists
 from slipid.identify.fit.shared import FloorShared, Tie
-from slipid.identify.fit.variances import DEGREES, Square, expected, inverse_root
+from slipid.identify.fit.variances import DEGREES, Blocks, Square, Vector, expected, inverse_root
 from slipid.model.robot import Robot
 
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
@@ -74,6 +74,17 @@ def _groups(touched: Bool[np.ndarray, "size floor"]) -> Int[np.ndarray, " size"]
     return np.where(alone, touched.argmax(axis=1), -1)
 
 
+def effects_at(problem: Problem, residual: Blocks, log_v: Vector) -> Float[np.ndarray, "piece 3"]:
+    """Effects that runs share at a fit, in turns with the weights of runs that they leave."""
+    keep = np.ones(len(problem.windows))
+    effect = np.zeros((len(keep), 3))
+    for _ in range(_TURNS):
+        seen = problem.seen(residual, log_v, keep, effect)
+        root = seen.whitening.root["motion"]
+        effect = np.asarray(effects_of(seen.tied, root, residual["motion"]))
+    return effect
+
+
 class Anchor(eqx.Module):
     """Windows and the fit that a density is anchored at; an argument of what is compiled.
 
@@ -110,11 +121,7 @@ class Anchor(eqx.Module):
         log_v, keep = jnp.asarray(fitted.log_variance), np.ones(len(problem.windows))
         electric = problem.electric(fitted.z, log_v)
         residual, _ = problem.linear(fitted.z, electric)
-        effect = np.zeros((len(keep), 3))
-        for _ in range(_TURNS):
-            seen = problem.seen(residual, log_v, keep, effect)
-            root = seen.whitening.root["motion"]
-            effect = np.asarray(effects_of(seen.tied, root, residual["motion"]))
+        effect = effects_at(problem, residual, log_v)
         part = {k: expected(r.shape[-1]) for k, r in residual.items()}
         seen = problem.seen(residual, log_v, keep * part["motion"], effect)
         plain = {k: inverse_root(c.covariance(log_v)) for k, c in problem.noise.blocks.items()}

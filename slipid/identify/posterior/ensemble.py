@@ -18,17 +18,17 @@ from emcee.state import State
 
 from slipid.identify.posterior import diagnosis
 from slipid.identify.posterior.blocks import Block, Chain, Plan, Record, Target
-from slipid.identify.posterior.proposals import WAY, Hamiltonian, moves
+from slipid.identify.posterior.proposals import WAY, Hamiltonian, families, moves
 from slipid.identify.posterior.transport.transport_map import Transport, learnt
 
 RandomState = tuple[str, np.ndarray, int, int, float]
 """State of a Mersenne twister as numpy gives it."""
 
-ACCEPTED = 0.65
+ACCEPTED = 0.8
 """Part of Hamiltonian moves that shall be accepted; their step is adapted in the warm-up."""
 FIRST_ANGLE, LEAST_ANGLE = 0.3, 0.03
 """First and smallest step of Hamiltonian moves [rad]."""
-DRAWS_PER_EFFECTIVE = 50.0
+DRAWS_PER_EFFECTIVE = 20.0
 """Draws of the warm-up that tell as much as an independent one, about."""
 
 
@@ -70,7 +70,7 @@ def _block(target: Target, plan: Plan, blocks: list[Block], tell: Callable[[int]
     states, map, angle = _begin(target, plan, blocks)
     stop, told = threading.Event(), [0] * plan.ensembles
 
-    def ensemble(k: int) -> tuple[np.ndarray, np.ndarray, State, float, list[float]]:
+    def ensemble(k: int) -> tuple[np.ndarray, np.ndarray, State, float, list[list[float]]]:
         inner = target.seen_by(map)
         made = moves(inner, angle)
         sampler = emcee.EnsembleSampler(
@@ -94,7 +94,7 @@ def _block(target: Target, plan: Plan, blocks: list[Block], tell: Callable[[int]
             before = places[-1]
             told[k] += 1
             tell(min(told))
-        turns = [a for move, _ in made if isinstance(move, Hamiltonian) for a in move.accepted]
+        turns = [move.accepted for move, _ in made if isinstance(move, Hamiltonian)]
         return np.stack(places), np.stack(log_probs), state, moved, turns
 
     with ThreadPoolExecutor(min(os.cpu_count() or 1, plan.ensembles)) as pool:
@@ -117,16 +117,19 @@ def _block(target: Target, plan: Plan, blocks: list[Block], tell: Callable[[int]
         map=map,
         angle=angle,
     )
-    turns = [a for f in found for a in f[4]]
+    turns = [[a for of in every for a in of] for every in zip(*(f[4] for f in found), strict=True)]
     return _with_learnt(block, target, plan, blocks, turns)
 
 
-def _begin(target: Target, plan: Plan, blocks: list[Block]) -> tuple[list[State], Transport, float]:
+def _begin(
+    target: Target, plan: Plan, blocks: list[Block]
+) -> tuple[list[State], Transport, np.ndarray]:
     """State of every ensemble in mapped coordinates, the map, and the angle."""
     if not blocks:
         map = target.laplace()
         starts = [_start(target, plan, k) for k in range(plan.ensembles)]
-        return [State(map.forward(x), random_state=r) for x, r in starts], map, FIRST_ANGLE
+        angle = np.full(len(families(target)), FIRST_ANGLE)
+        return [State(map.forward(x), random_state=r) for x, r in starts], map, angle
     last, states = blocks[-1], []
     for x, key, (place, has_gauss, gauss) in zip(last.chain[:, -1], *last.random, strict=True):
         random: RandomState = ("MT19937", key, int(place), int(has_gauss), float(gauss))
@@ -156,15 +159,14 @@ def _start(target: Target, plan: Plan, ensemble: int) -> tuple[np.ndarray, Rando
 
 
 def _with_learnt(
-    block: Block, target: Target, plan: Plan, blocks: list[Block], turns: list[float]
+    block: Block, target: Target, plan: Plan, blocks: list[Block], turns: list[list[float]]
 ) -> Block:
     """The block with what the warm-up has learnt for the next."""
     count = block.number + 1
     if count > plan.warm_up[-1]:
         return block
-    if turns:
-        angle = block.angle * np.exp(np.mean(turns) - ACCEPTED)
-        block = replace(block, angle=float(np.clip(angle, LEAST_ANGLE, WAY)))
+    more = np.array([np.mean(of) - ACCEPTED if of else 0.0 for of in turns])
+    block = replace(block, angle=np.clip(block.angle * np.exp(more), LEAST_ANGLE, WAY))
     if count in plan.warm_up[:-1]:
         recent = [b.chain for b in [*blocks, block][count // 2 :]]
         draws = np.concatenate(recent, axis=1).reshape(-1, len(target.centre))

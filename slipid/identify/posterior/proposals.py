@@ -3,8 +3,8 @@
 A target's log density is a sum of one term per group of coordinates, given those that groups share,
 and a term of the shared ones. In the coordinates of `transport_map` independence moves and
 differential evolution move all groups in one evaluation, each accepted or not by its own term, or
-the shared ones, which groups then follow. Hamiltonian moves take all coordinates far along the
-gradient where the density still bends, and walks along a single one cross its plateaus.
+the shared ones, which groups then follow. So do Hamiltonian moves, which take them far along the
+gradient where the density still bends; walks along a single coordinate cross its plateaus.
 """
 
 from dataclasses import dataclass
@@ -26,11 +26,12 @@ DEGREES = 8.0
 """Degrees of freedom of that Student t."""
 WAY = 0.5 * np.pi
 """Length of a Hamiltonian move [rad]: a quarter turn leads to an independent draw of a Gaussian."""
-MOST_STEPS = 12
-ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 1.2, 0.1, 1.0
+MOST_STEPS, SHORTEST = 12, 0.2
+"""Steps of a Hamiltonian move at most, and the shortest over the longest that is made."""
+ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 1.2, 0.1, 0.8
 """How often, relatively, moves of each kind are made.
 
-A Hamiltonian one takes ten times longer, but is what frees walkers from where the map is wrong.
+A Hamiltonian one takes six times longer, but is what frees walkers from where the map is wrong.
 """
 ALONE = 0.5
 """Part of walks along a coordinate that no other one of x follows."""
@@ -82,7 +83,7 @@ class FamilyMove(Move):
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         random, count = model.random, len(state.coords)
-        accepted = np.zeros(count, bool)
+        accepted, taken = np.zeros(count, bool), []
         order = random.permutation(count) if self.halves == 2 else np.arange(count)
         for mine in np.array_split(order, self.halves):
             still = state.coords[np.setdiff1d(order, mine)]
@@ -101,6 +102,8 @@ class FamilyMove(Move):
                 state.blobs[rows, of] = terms[took[:, k], of]
             state.log_prob[mine] = state.blobs[mine].sum(axis=1)
             accepted[mine] = took.any(axis=1)
+            taken.append(took.mean())
+        self.taken = float(np.mean(taken))
         return state, accepted
 
 
@@ -147,8 +150,8 @@ class Along(FamilyMove):
     """Random walk of x of one coordinate of each group, or of a shared one.
 
     Where data say no more than that a number is small, its logarithm may be anything: a plateau
-    that no map of the whole has straight, but along which this walks. The others of u are held, so
-    that those of x follow as the map says, or else the others of x.
+    that no map of the whole has straight, but along which this walks far. The others of u are held,
+    so that those of x follow as the map says, or else the others of x.
     """
 
     def __init__(self, target: Target, groups: tuple[int, ...] | None):
@@ -159,16 +162,13 @@ class Along(FamilyMove):
         self.map = target.map
         self.mine = tuple(of_group or [np.flatnonzero(target.group < 0)])
         self.std = np.sqrt(np.diag(target.covariance))
-        # every other walk is along a plateau, where there are any
-        flat = [self.map.values.plateau[mine] > 0 for mine in self.mine]
-        self.often = [np.where(f, 1 / max(f.sum(), 1), 1 / max((~f).sum(), 1)) for f in flat]
 
     def proposed(self, u: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
         rows = np.arange(len(u))
         x, before = self.map.placed(u)
         moved = np.zeros(u.shape, bool)
-        for mine, often in zip(self.mine, self.often, strict=True):
-            which = random.choice(mine, len(u), p=often / often.sum())
+        for mine in self.mine:
+            which = random.choice(mine, len(u))
             reach = 10 ** random.uniform(-0.5, 1.0, len(u)) * self.std[which]
             x[rows, which] += reach * random.standard_normal(len(u))
             moved[rows, which] = True
@@ -178,39 +178,60 @@ class Along(FamilyMove):
         return new, np.stack([change[:, own].sum(axis=1) for own in self.family.places], axis=1)
 
 
-class Hamiltonian(Move):
+class Hamiltonian(FamilyMove):
     """Turns of position and momentum that suit a Gaussian, kicked by what it does not know.
 
     With momentum p and the log density l, steps of
 
         turn (u, p) by h/2;    p += h (dl/du + u);    turn (u, p) by h/2
 
+    Groups do not feel each other while the shared coordinates are held, so that each has a way of
+    its own, accepted or not by itself. A walker whose slope is lost on the way stays where it was
+    with all its groups: a slope that is no number may be so for any of them.
+
     Source: Beskos et al. 2011, Stochastic Processes and their Applications 121, section 4.
     """
 
-    def __init__(self, target: Target, angle: float):
+    def __init__(self, target: Target, family: Family, angle: float):
+        super().__init__(family)
         self.target, self.angle = target, angle
         self.accepted: list[float] = []
 
-    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
-        random, (count, size) = model.random, state.coords.shape
-        # shorter steps, now and then, for walkers where the density is steep
-        h = self.angle * (1 - 0.8 * random.uniform(size=(count, 1)) ** 3)
-        steps = int(np.clip(random.uniform(1.0, 1.4) * WAY / self.angle, 1, MOST_STEPS))
-        u, start = state.coords, random.standard_normal((count, size))
-        u, p = _turn(u, start, h / 2)
+    def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
+        count, places = len(x), self.family.places
+        # shorter steps, now and then, and more of them, for walkers where the density is steep
+        h = self.angle * SHORTEST ** (random.uniform() ** 3)
+        steps = int(np.clip(random.uniform(0.7, 1.3) * WAY / h + 0.5, 1, MOST_STEPS))
+        h *= random.uniform(0.8, 1.0, (count, 1))
+        u, start, lost = x.copy(), np.zeros(x.shape), np.zeros(count, bool)
+        own = np.concatenate(places)
+        start[:, own] = random.standard_normal((count, len(own)))
+        p = start.copy()
+        u[:, own], p[:, own] = _turn(u[:, own], p[:, own], h / 2)
         for step in range(steps):
-            kick = np.clip(np.nan_to_num(self.target.slope(u)), -_FINITE, _FINITE) + u
-            most = np.linalg.norm(kick, axis=1, keepdims=True) / STEEPEST
-            p = p + h * kick / np.maximum(most, 1.0)
-            u, p = _turn(u, p, h if step < steps - 1 else h / 2)
-        log_prob, terms = model.compute_log_prob_fn(u)
-        gain = log_prob - state.log_prob + 0.5 * (start**2 - p**2).sum(axis=1)
-        took = np.log(random.uniform(size=count)) < np.where(np.isnan(gain), -np.inf, gain)
-        state.coords[took], state.blobs[took] = u[took], terms[took]
-        state.log_prob[took] = log_prob[took]
-        self.accepted.append(float(took.mean()))
-        return state, took
+            slope = self.target.slope(u)
+            lost |= ~np.isfinite(slope).all(axis=1)
+            for place in places:
+                p[:, place] += h * _bounded(np.where(lost[:, None], 0.0, slope + u)[:, place])
+            u[:, own], p[:, own] = _turn(u[:, own], p[:, own], h if step < steps - 1 else h / 2)
+        factor = np.stack([_energy(start[:, k]) - _energy(p[:, k]) for k in places], axis=1)
+        return u, np.where(lost[:, None], -np.inf, factor)
+
+    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
+        state, accepted = super().propose(model, state)
+        self.accepted.append(self.taken)
+        return state, accepted
+
+
+def _bounded(kick: Matrix) -> Matrix:
+    """Kicks of coordinates of one group, so long at most that they are not thrown far away."""
+    most = np.linalg.norm(np.clip(kick, -_FINITE, _FINITE), axis=1, keepdims=True) / STEEPEST
+    return kick / np.maximum(most, 1.0)
+
+
+def _energy(p: Matrix) -> Float[np.ndarray, " walker"]:
+    """Kinetic energy of momenta of one group."""
+    return np.asarray(0.5 * (p**2).sum(axis=1))
 
 
 def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
@@ -218,11 +239,16 @@ def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
     return c * u + s * p, c * p - s * u
 
 
-def moves(target: Target, angle: float) -> list[tuple[Move, float]]:
-    """Moves in the target's coordinates, and how often each is made."""
+def moves(target: Target, angles: Float[np.ndarray, " family"]) -> list[tuple[Move, float]]:
+    """Moves in the target's coordinates, and how often each is made.
+
+    Angles are the steps of Hamiltonian moves of every family.
+    """
     of_family = families(target)
-    found: list[tuple[Move, float]] = [(Along(target, f.groups), ALONG) for f in of_family]
-    for family in of_family:
+    found: list[tuple[Move, float]] = []
+    for family, angle in zip(of_family, angles, strict=True):
+        found.append((Along(target, family.groups), ALONG))
         found.append((Independence(family), INDEPENDENT / len(of_family)))
         found.append((Differential(family), DIFFERENTIAL / len(of_family)))
-    return [*found, (Hamiltonian(target, angle), HAMILTONIAN)]
+        found.append((Hamiltonian(target, family, float(angle)), HAMILTONIAN / len(of_family)))
+    return found

@@ -16,7 +16,7 @@ from slipid.identify.fit.problem import Problem, linear
 from slipid.identify.fit.variances import VARIANCE_SPREAD, information
 from slipid.identify.posterior import diagnosis, ensemble
 from slipid.identify.posterior.blocks import Block, Chain, Plan, Record, Target
-from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
+from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted, effects_at
 from slipid.identify.posterior.density import Density
 from slipid.identify.posterior.diagnosis import Posterior
 from slipid.identify.posterior.electric import electric_given_motion
@@ -90,7 +90,8 @@ def drawn_variances(
     electric = problem.electric(fitted.z, log_v)
     residual, jacobian, felt = linear(problem.target, fitted.z, electric)
     through = problem.through_voltage(fitted.z, log_v, felt)
-    weight = problem.whitening(residual, log_v, keep).weight["motion"]
+    effect = effects_at(problem, residual, log_v)
+    weight = problem.seen(residual, log_v, keep, effect).whitening.weight["motion"]
     motion = residual["motion"], jacobian["motion"]
     told = np.array(information(problem.noise.blocks, log_v, keep, through))
     of_blocks = np.asarray(problem.target.scored)

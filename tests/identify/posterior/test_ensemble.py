@@ -248,18 +248,70 @@ def model_of(target):
     return Model(target.log_prob, compute, map, np.random.RandomState(0))
 
 
-def test_a_hamiltonian_move_is_exact_and_independent_for_a_gaussian(exact):
+def state_of(target, u):
+    """State of walkers, and the model that emcee gives to moves."""
     from emcee.state import State
 
-    target, u = exact
     model = model_of(target)
     log_prob, terms = model.compute_log_prob_fn(u)
-    state = State(u, log_prob=log_prob, blobs=terms, copy=True)
-    state, took = Hamiltonian(target, 0.5).propose(model, state)
-    assert took.mean() > 0.999  # there is no error to reject for
+    return model, State(u, log_prob=log_prob, blobs=terms, copy=True)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_hamiltonian_move_is_exact_and_independent_for_a_gaussian(exact, which):
+    target, u = exact
+    model, state = state_of(target, u)
+    family = families(target)[which]
+    move = Hamiltonian(target, family, 0.5)
+    state, _ = move.propose(model, state)
+    assert move.accepted[0] > 0.999  # there is no error to reject for
     np.testing.assert_allclose(state.log_prob, target.terms(state.coords).sum(axis=1), rtol=1e-9)
+    own = np.concatenate(family.places)
     together = np.mean(u * state.coords, axis=0)
-    assert np.abs(together).max() < 0.7  # some way towards a quarter turn
+    assert np.abs(together[own]).max() < 0.7  # some way towards a quarter turn
+    others = np.setdiff1d(np.arange(8), own)
+    np.testing.assert_array_equal(state.coords[:, others], u[:, others])
+
+
+def two_widths():
+    """Two groups of two numbers: one far from a standard Gaussian, one near it."""
+    precision = np.array([1.0, 6.0, 1.2, 1.0, 1.0])
+    group = np.array([0, 0, 1, 1, -1])
+
+    def terms(x):
+        each = -0.5 * precision * x**2
+        return np.stack([each[:, group == g].sum(axis=1) for g in (0, 1, -1)], axis=1)
+
+    target = Target(terms, lambda x: -precision * x, group, np.zeros(5), np.eye(5))
+    return target.seen_by(target.laplace()), precision
+
+
+def test_each_group_goes_its_own_hamiltonian_way():
+    """With steps that are long for one group only that one is thrown back, and both stay exact."""
+    target, precision = two_widths()
+    u = np.random.RandomState(1).standard_normal((4000, 5)) / np.sqrt(precision)
+    model, state = state_of(target, u)
+    move, moved = Hamiltonian(target, families(target)[0], 1.0), []
+    for _ in range(6):
+        before = state.coords.copy()
+        state, _ = move.propose(model, state)
+        moved.append((state.coords != before).mean(axis=0))
+    moved = np.mean(moved, axis=0)
+    assert moved[1] < 0.8
+    assert moved[2] > 0.95
+    np.testing.assert_allclose(state.coords.std(axis=0) * np.sqrt(precision), 1.0, atol=0.05)
+
+
+def test_a_walker_whose_slope_is_lost_stays_with_all_its_groups():
+    target, _ = two_widths()
+    lost = replace(target, slope=lambda x: np.where(x[:, :1] > 1, np.nan, target.slope(x)))
+    u = np.zeros((200, 5))
+    u[:100, 0] = 1.5
+    model, state = state_of(target, u)
+    state, _ = Hamiltonian(lost, families(target)[0], 0.1).propose(model, state)
+    moved = (state.coords != u).any(axis=1)
+    assert moved[100:].mean() > 0.7
+    assert moved[:100].mean() == 0  # so short a way ends where it began
 
 
 @pytest.mark.parametrize("groups", [(0, 1), None])
@@ -268,10 +320,8 @@ def test_walking_along_a_coordinate_keeps_the_distribution(bent, groups):
     map, _ = bent
     target = made_gaussian(map, np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1]))
     model, u = model_of(target), np.random.RandomState(1).standard_normal((4000, 9))
-    log_prob, terms = model.compute_log_prob_fn(u)
-    from emcee.state import State
-
-    state, moved = State(u, log_prob=log_prob, blobs=terms, copy=True), 0.0
+    _, state = state_of(target, u)
+    moved = 0.0
     move = Along(target, groups)
     for _ in range(8):
         state, took = move.propose(model, state)

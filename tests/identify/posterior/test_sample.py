@@ -13,7 +13,7 @@ from slipid.identify.fit.hierarchy import effect_information
 from slipid.identify.fit.noise import POOLED
 from slipid.identify.fit.problem import Problem
 from slipid.identify.posterior.blocks import Block
-from slipid.identify.posterior.coordinates import Fitted
+from slipid.identify.posterior.coordinates import Fitted, effects_at
 from slipid.identify.posterior.sample import drawn_variances, thinned
 from slipid.identify.posterior.transport.transport_map import gaussian
 from slipid.search_space import Choice
@@ -64,7 +64,8 @@ def test_variances_are_drawn_from_the_gaussian_of_their_information(problem):
     draws = drawn_variances(problem, end, SHAPE, 0).reshape(-1, len(names))
     single = np.array([n.startswith(("camera", "process", "current")) for n in names])
     residual, jacobian = problem.linear(end.z, problem.electric(end.z, log_v))
-    weight = problem.whitening(residual, log_v, np.ones(24)).weight["motion"]
+    effect = effects_at(problem, residual, log_v)
+    weight = problem.seen(residual, log_v, np.ones(24), effect).whitening.weight["motion"]
     motion = residual["motion"], jacobian["motion"]
     of_effects = effect_information(problem.target, motion, weight, end.covariance, log_v)
     of_effects += np.eye(len(log_v)) / 9
@@ -80,6 +81,24 @@ def test_variances_are_drawn_from_the_gaussian_of_their_information(problem):
     # data tell some of them much, others next to nothing beside the prior's 3
     assert std.min() < 0.3
     assert std.max() > 2
+
+
+@pytest.mark.slow
+def test_runs_that_err_alike_are_no_outliers_to_variances(problem, monkeypatch):
+    """A wrong creep moves neighbouring runs alike, which is what they are known to share."""
+    weights = []
+
+    def spied(target, motion, weight, *rest):
+        weights.append(np.asarray(weight))
+        return effect_information(target, motion, weight, *rest)
+
+    monkeypatch.setattr("slipid.identify.posterior.sample.effect_information", spied)
+    z, log_v = problem.space.start + 0.3, 2 * np.log(problem.noise.typical)
+    every = np.ones(len(problem.windows))
+    drawn_variances(problem, Fitted(z, log_v, problem.laplace(z, log_v, every)), (1, 2), 0)
+    residual, _ = problem.linear(z, problem.electric(z, log_v))
+    whole = np.asarray(problem.whitening(residual, log_v, every).weight["motion"])
+    assert weights[0].mean() > whole.mean() + 0.03
 
 
 @pytest.mark.slow
@@ -113,7 +132,7 @@ def test_thinned_draws_are_spread_over_steps_and_walkers_and_keep_their_log_dens
     random = np.zeros((2, 624), np.uint32), np.zeros((2, 3))
     map = gaussian(np.zeros(1), np.eye(1), np.zeros(1, int))
     blocks = [
-        Block(k, part, 0.5 * part[..., 0], random, np.zeros(2), map, 0.1)
+        Block(k, part, 0.5 * part[..., 0], random, np.zeros(2), map, np.array([0.1]))
         for k, part in enumerate(np.split(chain, 3, axis=1))
     ]
     x, log_prob = thinned(chain, blocks, 40)

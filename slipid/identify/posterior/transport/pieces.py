@@ -1,4 +1,4 @@
-"""What a transport map is made of: plateaus and warps of single coordinates, bends by others."""
+"""What a transport map is made of: warps of single coordinates, bends by others."""
 
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
@@ -16,14 +16,6 @@ Leaf = Array | np.ndarray
 """An array of numpy while a map is learnt, of jax where the way back is computed."""
 A = TypeVar("A", Array, np.ndarray)
 """Either of them; what comes out is what went in."""
-SKEW, FALL = -0.3, np.log(10.0)
-"""Coordinates with draws more skewed, one in a hundred of which fall so far below the median.
-
-They are taken for plateaus: the number itself is then next to nothing there. A wrong guess costs
-pace: where a number does not vanish, others follow its logarithm along a valley.
-"""
-MOST_VALUE = 3.0
-"""Numbers stay what they are beyond exp of this, in units of their median."""
 FAR = 4.0
 """Polynomials stay what they are beyond this many stds."""
 SQUARED = 5
@@ -34,47 +26,6 @@ WORTH = 3.0
 """Gain in log likelihood [nats] that a monomial must bring to be taken in."""
 MOST_MONOMIALS = 12
 """Largest number of monomials in the mean and in the log std of a coordinate."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
-class Values:
-    """What coordinates say to those that follow: themselves, or numbers they are logarithms of.
-
-    Plateau is 1 where it is the number; these have a stair of their own, which the others of their
-    group follow. The middle is the median less the mean; mean and std are of the number,
-    in units of its median.
-    """
-
-    plateau: Leaf
-    middle: Leaf
-    mean: Leaf
-    std: Leaf
-
-    def said(self, about: A) -> A:
-        """What coordinates say, from all of them less their means."""
-        xp = about.__array_namespace__()
-        value = (xp.exp(xp.clip(about - self.middle, None, MOST_VALUE)) - self.mean) / self.std
-        return xp.where(self.plateau > 0, value, about)
-
-    def slope(self) -> Vector:
-        """Derivative of what is said by the coordinate, in the middle."""
-        return np.where(self.plateau > 0, 1.0 / self.std, 1.0)
-
-    @staticmethod
-    def none(size: int) -> "Values":
-        """Coordinates none of which is on a plateau."""
-        zero = np.zeros(size)
-        return Values(zero, zero, zero, zero + 1.0)
-
-    @staticmethod
-    def learnt(about: Matrix) -> "Values":
-        """Plateaus of draws less their means: they are where the way down is long."""
-        skew = (about**3).mean(axis=0) / about.std(axis=0) ** 3
-        middle = np.median(about, axis=0)
-        flat = (skew < SKEW) & (middle - np.quantile(about, 0.01, axis=0) > FALL)
-        value = np.exp(np.minimum(about - middle, MOST_VALUE))
-        return Values(flat * 1.0, middle, value.mean(axis=0), value.std(axis=0))
 
 
 @jax.tree_util.register_dataclass
@@ -139,43 +90,40 @@ def _sinh_arcsinh(x: Vector) -> tuple[float, float, float, float]:
 class Bend:
     """Polynomials a (shift) and b (scale) of a group's coordinates.
 
-    Factors are the columns whose product each monomial is, from (w, told, 1), where told is what
-    plateaus say.
+    Factors are the columns whose product each monomial is, from (w, 1).
     """
 
     factors: Int[np.ndarray, "monomial 3"]
     shift: Float[np.ndarray, "coordinate monomial"]
     scale: Float[np.ndarray, "coordinate monomial"]
 
-    def monomials(self, w: Matrix, told: Matrix) -> Matrix:
+    def monomials(self, w: Matrix) -> Matrix:
         """Products of columns (row, monomial)."""
-        columns = np.clip(np.concatenate([w, told], axis=1), -FAR, FAR)
-        columns = np.concatenate([columns, np.ones((len(w), 1))], axis=1)
+        columns = np.concatenate([np.clip(w, -FAR, FAR), np.ones((len(w), 1))], axis=1)
         return np.asarray(columns[:, self.factors].prod(axis=2))
 
-    def forward(self, w: Matrix, told: Matrix) -> Matrix:
+    def forward(self, w: Matrix) -> Matrix:
         """The way from w to v."""
-        f = self.monomials(w, told)
+        f = self.monomials(w)
         return np.asarray((w - f @ self.shift.T) * np.exp(-f @ self.scale.T))
 
     @staticmethod
-    def none(size: int, plateaus: int) -> "Bend":
+    def none(size: int) -> "Bend":
         """No bend, with all monomials that there can be."""
-        one, values = size + plateaus, range(size, size + plateaus)
-        factors = [(one, one, one)] + [(k, one, one) for k in range(one)]
-        squared = [*values, *range(min(SQUARED, size - 1))]
-        cubed = [*values, *range(min(CUBED, size - 1))]
+        one = size
+        factors = [(one, one, one)] + [(k, one, one) for k in range(size)]
+        squared, cubed = range(min(SQUARED, size - 1)), range(min(CUBED, size - 1))
         factors += [(*pair, one) for pair in combinations_with_replacement(squared, 2)]
         factors += [(k, k, k) for k in cubed]
         nothing = np.zeros((size, len(factors)))
         return Bend(np.array(factors), nothing, nothing.copy())
 
     @staticmethod
-    def learnt(w: Matrix, told: Matrix, effective: float) -> "Bend":
+    def learnt(w: Matrix, effective: float) -> "Bend":
         """Polynomials for draws that are worth so many independent ones."""
         size = w.shape[1]
-        bend = Bend.none(size, told.shape[1])
-        f = bend.monomials(w, told)
+        bend = Bend.none(size)
+        f = bend.monomials(w)
         reach = np.where(bend.factors >= size, -1, bend.factors).max(axis=1)
         for i in range(size):
             own = np.flatnonzero(reach < i)

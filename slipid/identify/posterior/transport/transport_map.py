@@ -2,24 +2,21 @@
 
 A triangular map (Knothe-Rosenblatt) from coordinates x to u:
 
-    shared ones       v = L^-1 (x - m - B s)
+    shared ones       v = L^-1 (x - m)
     those of a group  w = L^-1 (x - m - B s), widest first
-                      v_i = (w_i - a_i(w_1 .. w_i-1, t)) exp(-b_i(w_1 .. w_i-1, t))
+                      v_i = (w_i - a_i(w_1 .. w_i-1)) exp(-b_i(w_1 .. w_i-1))
 
-with polynomials a and b, s what coordinates before them say, t the part of it that plateaus of the
-group say, and a sinh-arcsinh map (Jones and Pewsey 2009, Biometrika 96, eq. 2) of every coordinate
-from v to u,
+with polynomials a and b, s the shared x - m, and a sinh-arcsinh map (Jones and Pewsey 2009,
+Biometrika 96, eq. 2) of every coordinate from v to u,
 
     sinh(tail arcsinh((v - place) / scale) - skew)
 
-A coordinate says x - m; or, on a plateau, where x is the logarithm of a number of which data say no
-more than that it is small, that number: x may then be anything far below, and those that follow
-stay where they are (other plateaus of its stair follow the logarithm). Groups follow the shared
-coordinates and are bent by themselves, so that groups that are independent given the shared ones
-stay so. It is one of the maps of Marzouk et al. 2016 (Sampling via measure transport, section 3).
+Groups follow the shared coordinates and are bent by themselves, so that groups that are independent
+given the shared ones stay so. It is one of the maps of Marzouk et al. 2016 (Sampling via measure
+transport, section 3).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -33,7 +30,6 @@ from slipid.identify.posterior.transport.pieces import (
     MOST_MONOMIALS,
     Bend,
     Matrix,
-    Values,
     Vector,
     Warp,
 )
@@ -47,8 +43,7 @@ class Stair:
     """Some coordinates, by their places, after those they follow.
 
     Slope is the derivative of own ones by what given ones say, root the Cholesky factor of the
-    covariance of what is left, bend the bend of that, None for shared coordinates. Plateaus are
-    those of the group among the given; their numbers bend it.
+    covariance of what is left, bend the bend of that, None for shared coordinates.
     """
 
     own: Int[np.ndarray, " own"]
@@ -56,14 +51,13 @@ class Stair:
     slope: Float[np.ndarray, "given own"]
     root: Float[np.ndarray, "own own"]
     bend: Bend | None
-    plateaus: Int[np.ndarray, " plateau"]
 
-    def left(self, about: Matrix, said: Matrix) -> Matrix:
+    def left(self, about: Matrix) -> Matrix:
         """What others do not say of own coordinates, by the root.
 
-        From all coordinates less their means, and what all of them say.
+        From all coordinates less their means.
         """
-        left = about[:, self.own] - said[:, self.given] @ self.slope
+        left = about[:, self.own] - about[:, self.given] @ self.slope
         return np.asarray(np.linalg.solve(self.root, left.T).T)
 
 
@@ -75,17 +69,16 @@ class Transport:
     """
 
     mean: Vector
-    values: Values
     stairs: tuple[Stair, ...]
     last: Warp
 
     def forward(self, x: Matrix) -> Matrix:
         """The way from x to u."""
         about = x - self.mean
-        said, v = self.values.said(about), np.empty_like(about)
+        v = np.empty_like(about)
         for s in self.stairs:
-            w = s.left(about, said)
-            v[:, s.own] = s.bend.forward(w, said[:, s.plateaus]) if s.bend else w
+            w = s.left(about)
+            v[:, s.own] = s.bend.forward(w) if s.bend else w
         return self.last.forward(v)
 
     def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
@@ -108,8 +101,8 @@ class Transport:
 class Steps:
     """The way from u to x, a coordinate at a time, in arrays whose shapes nothing learnt changes.
 
-    XLA compiles it once so, though stairs, plateaus and monomials are others after every look at
-    the draws. With columns of all w and of all that is said, zeros until their turn, and of ones:
+    XLA compiles it once so, though stairs and monomials are others after every look at the draws.
+    With columns of all w and of all x - m, zeros until their turn, and of ones:
 
         w_i = f_i . shift_i + exp(f_i . scale_i) v_i,   x_i - m_i = columns . slope_i
 
@@ -118,7 +111,6 @@ class Steps:
     """
 
     mean: Array
-    values: Values
     last: Warp
     order: Array
     slope: Array
@@ -135,7 +127,7 @@ def _steps(map: Transport) -> Steps:
     shift, scale = np.zeros((2, size, MOST_MONOMIALS + 1))
     k = 0
     for s in map.stairs:
-        columns = np.concatenate([s.own, size + np.asarray(s.plateaus, int), [2 * size]])
+        columns = np.append(s.own, 2 * size)
         for i in range(len(s.own)):
             slope[k, s.own], slope[k, size + s.given] = s.root[i], s.slope[:, i]
             root[k] = np.log(s.root[i, i])
@@ -147,12 +139,12 @@ def _steps(map: Transport) -> Steps:
             k += 1
     order = np.concatenate([s.own for s in map.stairs])
     # on the device once, not in every call
-    arrays = (map.mean, map.values, map.last, order, slope, root, factors, shift, scale)
+    arrays = (map.mean, map.last, order, slope, root, factors, shift, scale)
     return Steps(*jax.device_put(arrays))
 
 
-_Step = tuple[Array, Array, Array, Array, Array, Array, Values]
-"""A row of `Steps`: place, slope, root, factors, shift, scale, and its values."""
+_Step = tuple[Array, Array, Array, Array, Array, Array]
+"""A row of `Steps`: place, slope, root, factors, shift, scale."""
 
 
 @jax.jit
@@ -161,16 +153,15 @@ def _placed(map: Steps, u: Array) -> tuple[Array, Array]:
     v = map.last.back(u)
 
     def step(columns: Array, s: _Step) -> tuple[Array, tuple[Array, Array]]:
-        i, slope, root, factors, shift, scale, values = s
+        i, slope, root, factors, shift, scale = s
         f = jnp.clip(columns[:, factors], -FAR, FAR).prod(axis=2)
         spread = f @ scale
         columns = columns.at[:, i].set(f @ shift + jnp.exp(spread) * v[:, i])
         about = columns @ slope
-        return columns.at[:, size + i].set(values.said(about)), (about, spread + root)
+        return columns.at[:, size + i].set(about), (about, spread + root)
 
     start = jnp.zeros((rows, 2 * size + 1)).at[:, -1].set(1.0)
-    values = jax.tree.map(lambda x: x[map.order], map.values)
-    steps = (map.order, map.slope, map.root, map.factors, map.shift, map.scale, values)
+    steps = (map.order, map.slope, map.root, map.factors, map.shift, map.scale)
     _, (about, log) = jax.lax.scan(step, start, steps)
     there = jnp.zeros_like(u).at[:, map.order].set(about.T)
     return map.mean + there, map.last.log_slope(u).at[:, map.order].add(log.T)
@@ -188,38 +179,24 @@ def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray) -> Transport:
 
     Groups are those of each coordinate, -1 where groups share it.
     """
-    values = Values.none(len(mean))
-    stairs = _stairs(np.tile(covariance, (2, 2)), group, values, covariance)
-    return Transport(mean, values, stairs, Warp.none(len(mean)))
+    return Transport(mean, _stairs(covariance, group, covariance), Warp.none(len(mean)))
 
 
-def _order(group: np.ndarray, values: Values) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Coordinates of every stair, and those before it that they are given."""
-    plateau = values.plateau > 0
-    for g in range(-1, int(group.max()) + 1):
-        before = np.flatnonzero(group < 0) if g >= 0 else np.zeros(0, int)
-        for first in (True, False):
-            own = np.flatnonzero((group == g) & (plateau == first))
-            if len(own):
-                yield own, before
-                before = np.concatenate([before, own])
+def _stairs(covariance: Matrix, group: np.ndarray, at_mode: Matrix) -> tuple[Stair, ...]:
+    """Stairs of a Gaussian, shared coordinates first, then group by group.
 
-
-def _stairs(
-    covariance: Matrix, group: np.ndarray, values: Values, at_mode: Matrix
-) -> tuple[Stair, ...]:
-    """Stairs of a Gaussian; the coordinates that are widest at the mode come first in a stair.
-
-    A valley has its direction at the mode, where draws are as wide across as they are bent. The
-    covariance is of all coordinates, followed by what they say.
+    Coordinates that are widest at the mode come first in a stair: a valley has its direction at the
+    mode, where draws are as wide across as they are bent.
     """
-    stairs = []
-    for own, given in _order(group, values):
+    stairs, shared = [], np.flatnonzero(group < 0)
+    for g in range(-1, int(group.max()) + 1):
+        own, given = np.flatnonzero(group == g), shared if g >= 0 else shared[:0]
+        if not len(own):
+            continue
         own = own[np.argsort(-np.diag(_given(at_mode, own, given)[1]))]
-        slope, left = _given(covariance, own, given + len(group))
-        plateaus = given[(values.plateau[given] > 0) & (group[given] >= 0)]
-        bend = Bend.none(len(own), len(plateaus)) if group[own[0]] >= 0 else None
-        stairs.append(Stair(own, given, slope, np.linalg.cholesky(left), bend, plateaus))
+        slope, left = _given(covariance, own, given)
+        bend = Bend.none(len(own)) if g >= 0 else None
+        stairs.append(Stair(own, given, slope, np.linalg.cholesky(left), bend))
     return tuple(stairs)
 
 
@@ -237,16 +214,10 @@ def learnt(draws: Matrix, effective: float, covariance: Matrix, group: np.ndarra
     """
     some = draws[:: max(1, len(draws) // MOST_DRAWS)]
     size, mean = some.shape[1], some.mean(axis=0)
-    about = some - mean
-    values = Values.learnt(about)
-    said = values.said(about)
-    steps = np.concatenate([np.ones(size), values.slope()])
-    at_mode = np.tile(covariance, (2, 2)) * np.outer(steps, steps)
-    both = effective * np.cov(np.concatenate([about, said], axis=1).T) + size * at_mode
-    stairs = []
-    for s in _stairs(both / (effective + size), group, values, covariance):
-        left, of_plateaus = s.left(about, said), said[:, s.plateaus]
-        bend = Bend.learnt(left, of_plateaus, effective) if s.bend else None
+    about, stairs = some - mean, []
+    both = (effective * np.cov(about.T) + size * covariance) / (effective + size)
+    for s in _stairs(both, group, covariance):
+        bend = Bend.learnt(s.left(about), effective) if s.bend else None
         stairs.append(replace(s, bend=bend))
-    found = Transport(mean, values, tuple(stairs), Warp.none(size))
+    found = Transport(mean, tuple(stairs), Warp.none(size))
     return replace(found, last=Warp.learnt(found.forward(some)))
