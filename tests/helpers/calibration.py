@@ -40,6 +40,7 @@ CHOICES = [
     Choice("*", free=False),
     *(Choice(path, prior_mean=x, prior_std=0.4 * x) for path, x in CENTRE.items()),
     Choice("robot.load_share@*", free=True),
+    Choice("surface.*.load_bias", free=True),
     Choice("camera.scale", prior_mean=1.1, prior_std=0.01),
     Choice("camera.marker_yaw", prior_mean=0.0, prior_std=0.05),
 ]
@@ -86,11 +87,12 @@ def experiment(seed: int) -> tuple[Problem, Fitted, np.ndarray]:
     """A truth drawn, windows filled and fitted; the truth of numbers and log variances."""
     rng, common = np.random.default_rng(seed), problem()
     space, typical = common.space, 2 * np.log(common.noise.typical)
-    z = space.prior_mean + space.prior_std * rng.standard_normal(space.size)
     normal = rng.standard_normal(len(typical))
     log_v = typical + VARIANCE_SPREAD * normal
     pooled = common.target.pooled  # the prior of its root is half-normal
     log_v[pooled] = typical[pooled] + 2 * np.log(np.abs(normal[pooled]))
+    prior_std = np.asarray(common.target.prior_std(log_v))
+    z = space.prior_mean + prior_std * rng.standard_normal(space.size)
     this = common.of(filled(common, z, log_v, rng))
     optimum = optimise(this)
     fitted = Fitted(optimum.state.z, np.asarray(optimum.state.log_variance), optimum.covariance)
