@@ -177,7 +177,7 @@ def expected_ties(target: Target, log_v: Vector, keep: Vector) -> tuple[Tie, ...
     return ties(target.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None])
 
 
-def expected(m: Array | float) -> Any:
+def expected(m: Array | float | int) -> Any:
     """Fisher information of a Student-t location in m dimensions, over that of a Gaussian."""
     return (DEGREES + m) / (DEGREES + m + 2)
 
