@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from slipid.identify.compare.agreement import contradiction, floor_errors
+from slipid.identify.compare.agreement import contradiction, floor_errors, most_moved
 from slipid.identify.compare.slip_models import rungs
 from slipid.identify.fit.across import across
 from slipid.identify.fit.crossing import crossing
@@ -186,7 +186,9 @@ def _with_several(
     }
     report.line(_judged(about))
     alone = {name: e.speed for name, e in found.as_if.items()}
-    said = contradiction(floors, found.learnt.speed, alone)
+    end = found.optimum
+    moved = most_moved(fit.space, fit.z, fit.covariance, end.state.z, end.converged)
+    said = contradiction(floors, moved, found.learnt.speed, alone)
     if said is None:
         return replace(new, mixed=about)
     report.line(said)

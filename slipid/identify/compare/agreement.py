@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -9,9 +10,13 @@ from jaxtyping import Float
 from slipid.data.runs import Runs
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.compare.predictive import Predictive
+from slipid.identify.fit.variances import Search, Square
+from slipid.search_space import Space
 
 WORSE = 1.5
 """Factor by which end-point errors on a floor may grow; a map that is wrong makes it several."""
+FAR = 4.0
+"""Standard errors beyond which no number that runs on one floor tell may move."""
 BETTER = 0.8
 """Part of the error by a map below which a single floor explains runs better than the map does."""
 SURE = 3.0
@@ -70,13 +75,35 @@ def end_errors(
     return error, far
 
 
+class Moved(NamedTuple):
+    """The number that other runs moved most, and by how many of its standard errors before."""
+
+    name: str
+    sigma: float
+
+
+def most_moved(
+    space: Space, before: Search, covariance: Square, after: Search, settled: bool
+) -> Moved:
+    """Of the numbers that runs on one floor tell from motion; infinite where no rest was found.
+
+    Runs that agree move a number by less than the standard error it had without them (Hausman
+    1978, Econometrica 46(6)).
+    """
+    told = ~space.electric & ~space.where(lambda e: e.part == "camera")
+    sigma = np.where(told, np.abs(after - before) / np.sqrt(np.diag(covariance)), 0.0)
+    worst = int(np.argmax(sigma))
+    return Moved(space.names[worst], float(sigma[worst]) if settled else np.inf)
+
+
 def contradiction(
-    found: Mapping[str, FloorErrors], by_map: float, as_if: Mapping[str, float]
+    found: Mapping[str, FloorErrors], moved: Moved, by_map: float, as_if: Mapping[str, float]
 ) -> str | None:
     """Why runs over several floors are not learnt from, None where they agree with the others.
 
     Args:
         found: errors of the runs on one floor each.
+        moved: what they moved most.
         by_map: error of the runs over several floors [m/s], whose map says where wheels stand.
         as_if: the same had all wheels stood on one floor all the while, by floor [m/s].
     """
@@ -87,6 +114,10 @@ def contradiction(
     ]
     if worse:
         return f"{_NOT_LEARNT} (end-point errors on {', '.join(worse)}); {_WHY}"
+    if not np.isfinite(moved.sigma):
+        return f"{_NOT_LEARNT} (no numbers suit both); {_WHY}"
+    if moved.sigma > FAR:
+        return f"{_NOT_LEARNT} ({moved.name} moves by {moved.sigma:.0f} standard errors); {_WHY}"
     best = min(as_if, key=lambda floor: as_if[floor])
     if as_if[best] < BETTER * by_map:
         told = (
@@ -99,4 +130,4 @@ def contradiction(
 _NOT_LEARNT = (
     "the runs over several floors were not learnt from: they contradict those on one floor"
 )
-_WHY = "their map may be wrong or out of place"
+_WHY = "their map may be wrong or out of place, or the contact law where floors meet"
