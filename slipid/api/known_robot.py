@@ -75,7 +75,7 @@ class Motion:
         twist: of the body, x [m/s], y [m/s], yaw rate [rad/s].
         wheel_speed: that the command asks for [rad/s].
         slip: 1 - v / (r w) of every wheel along its drive; of one that stands it is no number.
-        torque: at every wheel, positive where it drives [N m].
+        torque: of the traction at every wheel, positive where it drives [N m].
         current: of every motor, positive where it drives [A].
     """
 

@@ -130,7 +130,7 @@ class Fit:
     @cached_property
     def disputes(self) -> tuple[Dispute, ...]:
         """Floors that disagree about the loads on the wheels."""
-        return disputes(self.space, self.z, self.covariance, self.variance.get(POOLED, np.inf))
+        return disputes(self.judged, self.z, self.covariance)
 
     @cached_property
     def flat(self) -> tuple[Flat, ...]:

@@ -164,14 +164,15 @@ def summarised(task: Task, problem: Problem, optimum: Optimum, report: Reporter)
 def _with_several(
     fit: Fit, task: Task, problem: Problem, optimum: Optimum, report: Reporter
 ) -> Fit:
-    """The fit of runs on one floor and on several together, or the former where both contradict."""
+    """The fit of runs on one floor and on several, or of the former where they contradict."""
     report.stage("runs over several floors")
     several = crossing(task.mixed, fit.robot)
 
     def tell(state: State) -> None:
         report.note(f"round {state.round}, loss {state.loss:.2f}, moved {state.moved:.3g} std")
 
-    found = across(problem, optimum, several, tell)
+    limits = task.settings
+    found = across(problem, optimum, several, tell, limits.rounds, limits.tolerance)
     new = summarise(found.problem, found.optimum, task.dataset, task.choices, task.settings.seed)
     floors = floor_errors(fit.contact, new.contact, task.dataset)
     after = found.after and found.after._asdict()

@@ -95,11 +95,7 @@ def with_mixed(job: Job, root: Path, report: Reporter) -> Job:
         data, short = read_dataset(job.config, [section], root, report)
         absent += short
         _go_together(job, data)
-        sessions = sorted({*job.robot.camera.sessions, *data.session})
-        robot = job.robot.on(
-            job.robot.surfaces.labels, job.robot.body.loads, sessions, job.robot.camera.centre
-        )
-        job = replace(job, robot=robot, mixed=(*job.mixed, (data, floor)))
+        job = replace(job, mixed=(*job.mixed, (data, floor)))
     for sentence in absent:
         report.line(sentence)
     return replace(job, skipped=(*job.skipped, *absent))

@@ -25,7 +25,7 @@ def posterior_plots(fit: Fit, found: Posterior, out: Path) -> list[Path]:
 def interval_figure(fit: Fit, z: np.ndarray) -> Figure:
     """90 % intervals of draws and of the fit's curvature, in prior standard deviations."""
     chosen = np.flatnonzero(fit.space.where(lambda e: e.session is None)).tolist()
-    mean, std = fit.space.prior_mean[chosen], fit.space.prior_std[chosen]
+    mean, std = fit.judged.prior_mean[chosen], fit.judged.prior_std[chosen]
     low, middle, high = (np.quantile(z[:, chosen], (0.05, 0.5, 0.95), axis=0) - mean) / std
     half = 1.645 * np.sqrt(np.diag(fit.covariance))[chosen] / std
     fitted = (fit.z[chosen] - mean) / std

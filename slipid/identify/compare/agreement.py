@@ -35,7 +35,7 @@ class FloorErrors:
 def floor_errors(before: Predictive, after: Predictive, data: Runs) -> dict[str, FloorErrors]:
     """Errors of runs on one floor each under two models, by floor.
 
-    The second learnt from other runs than these; the first is what it started from.
+    Both learnt from these runs, the second from others, too.
     """
     (old, far), (new, _) = end_errors(before, data), end_errors(after, data)
     return compared([log.surface or "unknown" for log in data.logs], old, new, far)
@@ -115,7 +115,7 @@ def contradiction(
     if worse:
         return f"{_NOT_LEARNT} (end-point errors on {', '.join(worse)}); {_WHY}"
     if not np.isfinite(moved.sigma):
-        return f"{_NOT_LEARNT} (no numbers suit both); {_WHY}"
+        return f"{_NOT_LEARNT} (the fit to all found no rest); {_WHY}"
     if moved.sigma > FAR:
         return f"{_NOT_LEARNT} ({moved.name} moves by {moved.sigma:.0f} standard errors); {_WHY}"
     best = min(as_if, key=lambda floor: as_if[floor])

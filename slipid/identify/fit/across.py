@@ -41,15 +41,21 @@ class Across:
 
 
 def across(
-    problem: Problem, optimum: Optimum, several: Crossing, tell: Callable[[State], None]
+    problem: Problem,
+    optimum: Optimum,
+    several: Crossing,
+    tell: Callable[[State], None],
+    most_rounds: int = 30,
+    tolerance: float = 0.02,
 ) -> Across:
     """Goes on from the optimum of a problem with runs over several floors.
 
-    `tell` is called after every round of the fit to all runs.
+    `tell` is called after every round of the fit to all runs; the limits are those of `optimise`.
     """
     whole = problem.crossed(several)
     start = replace(whole.restated(optimum.state, problem), round=0)
-    on_one, odd = len(problem.windows), several.windows.run % 2 == 1
+    on_one, number = len(problem.windows), np.unique(several.windows.run, return_inverse=True)[1]
+    odd = number % 2 == 1
     target, every = whole.target, np.ones(len(odd))
     assert target.several is not None, "runs over several floors"
 
@@ -58,7 +64,7 @@ def across(
         found = [(residuals_at(target.space, several, jnp.asarray(s.z)), w) for s, w in judged]
         return errors(several, found)
 
-    learnt = optimise(whole, start=start, tell=tell)
+    learnt = optimise(whole, start=start, tell=tell, most_rounds=most_rounds, tolerance=tolerance)
     after = None
     if odd.any() and not odd.all():
         parts = []

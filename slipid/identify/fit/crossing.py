@@ -63,9 +63,10 @@ def crossing(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Crossing:
         DataError: runs of a map in which no window counts, or of which only some log currents.
     """
     cut = [_windows_on(data, floor, robot) for data, floor in sets]
-    if len({c.windows.has_current for c in cut}) > 1:
+    if len({(c.windows.has_current, c.windows.current_is_signed) for c in cut}) > 1:
         raise DataError(
-            "some runs over several floors log currents and others do not; expected all or none"
+            "the sets of runs over several floors log currents, or their sign, differently; "
+            "expected all of them with signed, with unsigned or without currents"
         )
     floor, counts = (np.concatenate([getattr(c, f) for c in cut]) for f in ("floor", "counts"))
     first = np.cumsum([0, *(len(c.runs) for c in cut)])

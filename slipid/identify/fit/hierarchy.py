@@ -144,7 +144,7 @@ def _too_small(
 
 
 def _sectors(direction: Float[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]]:
-    """Runs whose directions lie in each sector, none where a sector is empty.
+    """Runs whose directions lie in each sector; sectors without runs are left out.
 
     Their edges are where the fewest runs are cut from others in nearly the same direction: in the
     middle of the widest gap between directions, taken modulo a sector.
@@ -279,7 +279,7 @@ def pooled_stds(
     now = np.exp(-log_v[target.pooled])
     told = np.asarray(precision).copy()
     away = np.zeros(len(told))
-    away[at] = z[at]
+    away[at] = (z - target.space.prior_mean)[at]
     pull = told @ away
     told[at, at] -= now
     typical = np.exp(0.5 * float(target.typical[target.pooled]))

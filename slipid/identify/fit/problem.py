@@ -16,7 +16,7 @@ from slipid.data.runs import Runs
 from slipid.data.windows import Windows
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import variances
-from slipid.identify.fit.crossing import Crossing, Several
+from slipid.identify.fit.crossing import CURRENT, Crossing, Several
 from slipid.identify.fit.noise import POOLED, SHARED, electric_noise, noise
 from slipid.identify.fit.shared import Tie, freed, shared_effects, shared_of, ties
 from slipid.identify.fit.variances import (
@@ -66,18 +66,11 @@ class Problem:
     these shapes by others, under their own keys.
     """
 
-    def __init__(
-        self,
-        windows: Windows,
-        robot: Robot,
-        choices: Sequence[Choice],
-        several: Crossing | None = None,
-    ):
-        """Problem of runs that each keep to one floor, and of those over several floors."""
+    def __init__(self, windows: Windows, robot: Robot, choices: Sequence[Choice]):
         self.space = Space(robot, choices)
         self.robot: Robot = self.space.template
         self.compiled: dict[Any, Any] = {}
-        self._read(windows, several)
+        self._read(windows, None)
 
     def of(self, windows: Windows) -> "Problem":
         """The same problem for other windows; those of the same shapes share what is compiled."""
@@ -106,7 +99,7 @@ class Problem:
             typical=jnp.asarray(2 * np.log(self.noise.typical)),
             scored=~np.isin(kinds, ("run", "pooled", *SHARED)),
             pooled=self.noise.names.index(POOLED),
-            joint=not windows.has_current,
+            joint=not windows.has_current and CURRENT not in self.noise.blocks,
         )
 
     @property

@@ -16,7 +16,7 @@ u of unit variance, e = S u, the effects are marginalised:
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
@@ -273,10 +273,6 @@ class FoundShared:
     coefs: Float[np.ndarray, "3 coef"]
     by_number: Float[np.ndarray, "3 coef free"]
     covariance: Float[np.ndarray, "3 coef 3 coef"]
-
-    def at(self, step: Float[np.ndarray, " free"]) -> "FoundShared":
-        """The same after a step of the search vector."""
-        return replace(self, coefs=self.coefs + self.by_number @ step)
 
     def told(self, way: Directions) -> Told:
         """Of new runs on this floor."""

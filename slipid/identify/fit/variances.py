@@ -186,7 +186,8 @@ def _cut(total: Array, of_motion: Array, e: Array) -> Array:
     """Information of p(motion | motion data) p(electric | motion, all data).
 
     Where wheels stand on several floors motion depends on their friction, which is electric: it is
-    marginalised in the first factor, as if currents told nothing of it.
+    marginalised in the first factor, as if currents told nothing of it. The fit's estimate of the
+    motion does follow what currents tell of friction: its interval is rather too wide there.
     """
     first = of_motion - _carried(of_motion, e)
     motion = ~e[:, None] & ~e[None, :]

@@ -29,6 +29,7 @@ def sample(
     problem: Problem, fitted: Fitted, plan: Plan, draws: int = 400, record: Record | None = None
 ) -> Posterior:
     """Posterior around a fit, so many draws of each ensemble."""
+    assert problem.several is None, "runs on one floor each"
     record = record or Record()
     parts = (EVERYTHING,) if problem.target.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])

@@ -45,18 +45,19 @@ class Dispute:
         )
 
 
-def disputes(
-    space: Space, z: Search, covariance: Square, pooled_variance: float
-) -> tuple[Dispute, ...]:
-    """Pairs of floors whose biases of the load differ by more than noise, the worst first."""
+def disputes(space: Space, z: Search, covariance: Square) -> tuple[Dispute, ...]:
+    """Pairs of floors whose biases of the load differ by more than noise, the worst first.
+
+    The space has the prior that biases were found to have (`Space.with_pooled`).
+    """
     bias = {e.surface: space.place[e.path] for e in space.free if e.declaration.deviation}
     if len(bias) < 2:
         return ()
     at = np.concatenate([np.arange(p.start, p.stop) for p in bias.values()])
-    told, less = np.linalg.inv(covariance), 1 / pooled_variance - 1 / _WIDE**2
+    told, less = np.linalg.inv(covariance), 1 / space.prior_std[at] ** 2 - 1 / _WIDE**2
     told[at, at] -= less
     wide = np.linalg.inv(told)
-    apart = np.asarray(z) + wide[:, at] @ (less * np.asarray(z)[at])
+    apart = np.asarray(z) + wide[:, at] @ (less * (np.asarray(z) - space.prior_mean)[at])
     found = []
     for one, other in combinations(bias, 2):
         difference = np.zeros((bias[one].stop - bias[one].start, len(apart)))

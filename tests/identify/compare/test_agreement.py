@@ -76,7 +76,7 @@ def test_a_map_that_predicts_worse_than_a_single_floor_is_said_to_be_wrong(green
 
 @pytest.mark.parametrize(
     ("sigma", "said"),
-    [(3.9, None), (25.0, "moves by 25 standard errors"), (np.inf, "no numbers suit both")],
+    [(3.9, None), (25.0, "moves by 25 standard errors"), (np.inf, "found no rest")],
 )
 def test_numbers_that_move_far_are_a_contradiction(sigma, said):
     found = contradiction(FINE, Moved("robot.load_share", sigma), 0.02, {"gray": 0.05})

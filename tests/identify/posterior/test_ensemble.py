@@ -311,7 +311,7 @@ def test_a_walker_whose_slope_is_lost_stays_with_all_its_groups():
     state, _ = Hamiltonian(lost, families(target)[0], 0.1).propose(model, state)
     moved = (state.coords != u).any(axis=1)
     assert moved[100:].mean() > 0.7
-    assert moved[:100].mean() == 0  # so short a way ends where it began
+    assert moved[:100].mean() == 0  # they are refused, wherever the way led
 
 
 @pytest.mark.parametrize("groups", [(0, 1), None])

@@ -58,7 +58,7 @@ def test_sigma_is_that_of_the_likelihood_alone(problem, size):
     cov = np.linalg.inv(own)
     spread = cov[one, one] + cov[other, other] - cov[one, other] - cov[other, one]
     chance = chi2.sf(gap @ np.linalg.solve(spread, gap), 2)
-    found = disputes(space, z, np.linalg.inv(precision), pooled)
+    found = disputes(space.with_pooled(np.sqrt(pooled)), z, np.linalg.inv(precision))
     assert [d.floors for d in found] == [("firm", "soft")] * int(chance < 0.01)
     if found:
         assert found[0].sigma == pytest.approx(norm.isf(chance / 2), rel=1e-6)
@@ -73,7 +73,7 @@ def test_a_floor_with_another_law_is_named(bias):
     problem = problem_of(truth)
     end = optimise(problem)
     pooled = np.exp(end.state.log_variance[problem.target.pooled])
-    found = disputes(problem.space, end.state.z, end.covariance, pooled)
+    found = disputes(problem.space.with_pooled(np.sqrt(pooled)), end.state.z, end.covariance)
     assert [d.floors for d in found] == [("firm", "soft")] * (bias > 0)
 
 

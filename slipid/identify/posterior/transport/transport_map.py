@@ -42,7 +42,7 @@ MOST_DRAWS = 4000
 class Stair:
     """Some coordinates, by their places, after those they follow.
 
-    Slope is the derivative of own ones by what given ones say, root the Cholesky factor of the
+    Slope is the derivative of own ones by given ones, root the Cholesky factor of the
     covariance of what is left, bend the bend of that, None for shared coordinates.
     """
 
