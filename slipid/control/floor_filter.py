@@ -3,8 +3,8 @@
 A robot whose wheels stand on several floors moves as one body, so every hypothesis is one floor per
 wheel, all of them together (27 with three wheels on three floors), and one that says "unknown":
 
-    xi_c, I_c     contact equilibrium, with what runs tell that it misses, and motor currents of
-                  hypothesis c at the wheel speeds
+    xi_c, I_c     contact equilibrium, with what runs on one floor tell that it misses there, and
+                  motor currents of hypothesis c at the wheel speeds
     p_c <- p_c * (p(I | I_c) p(gyro | xi_c))^(dt / tau)   once wheels may be on other floors
     g_c <- g_c * exp(xi_c dt)                             pose if c is true, ways to c averaged
     g = sum_c p_c g_c
@@ -129,7 +129,7 @@ class FloorFilter(eqx.Module):
         rolling = f.inverse @ (f.frame.radius * w)
         course = Course.of(rolling, f.frame.base)
         mean, part = f.told.at(course)
-        xi = settled + self._on_each(course.speed * mean @ course.axes.T)
+        xi = settled + self._told(course.speed * mean @ course.axes.T)
         told, none = self._evidence(xi, predicted, currents, w, turn)
         # what the equilibrium does not know, inertia, weighs little while wheels speed up
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)
@@ -147,7 +147,7 @@ class FloorFilter(eqx.Module):
             scatter=(xi - middle).T @ (known[:, None] * (xi - middle)),
             rolling=rolling,
             course=course,
-            left=f.effect * part,
+            left=f.effect * self._left(part, known, under),
             by_friction=self._by_friction(known @ settled, w, under),
             under=under,
             jump=jump,
@@ -156,10 +156,18 @@ class FloorFilter(eqx.Module):
         )
         return FloorState(belief=belief, twist=settled, apart=apart), motion
 
-    def _on_each(self, of_floor: Float[Array, "floor 3"]) -> Float[Array, "hypothesis 3"]:
-        """What floors do to the body under every hypothesis, by the load on each."""
-        under = jax.nn.one_hot(self.hypotheses, len(self.robot.labels), dtype=float)
-        return jnp.einsum("w,cwf,fk->ck", self.robot.rest, under, of_floor)
+    def _told(self, of_floor: Float[Array, "floor 3"]) -> Float[Array, "hypothesis 3"]:
+        """What is told of the body under every hypothesis: of all wheels on one floor, no more."""
+        under = self.hypotheses
+        whole = (under == under[:, :1]).all(axis=1)
+        return jnp.where(whole[:, None], of_floor[under[:, 0]], 0.0)
+
+    def _left(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
+        """Part of the std of every floor's effects that is left; all of it, wheels on several."""
+        floors, wheels = len(self.robot.labels), self.robot.wheels
+        alone = known.reshape((floors,) * wheels)[(np.arange(floors),) * wheels]
+        share = alone / jnp.maximum(self.robot.rest @ under, 1e-12)
+        return jnp.sqrt(1 - share[:, None] * (1 - part**2))
 
     def solve(
         self, near: Float[Array, "hypothesis 3"], w: Float[Array, " wheel"]
@@ -208,7 +216,7 @@ class FloorFilter(eqx.Module):
         std = f.current_std[jnp.asarray(self.hypotheses)]
         size = jnp.sqrt(predicted**2 + 0.03**2)
         gap = jnp.where(told_of == 2, predicted - amps, size - jnp.abs(amps))
-        var = std**2 + (currents.variance + self._stiction(w))
+        var = std**2 + (currents.variance + self._stiction(w)) + self._of_friction(predicted)
         worst = (s.unknown_std + 1.0) ** 2
         score = jnp.minimum(gap**2 / var, worst)
         told = jnp.sum(jnp.where(told_of > 0, -0.5 * (score + jnp.log(var)), 0.0), axis=1)
@@ -221,6 +229,16 @@ class FloorFilter(eqx.Module):
         told += jnp.where(has, -0.5 * (off + jnp.log(gyro_var)), 0.0)
         none += jnp.where(has, -0.5 * (s.unknown_std**2 + jnp.log(jnp.mean(gyro_var))), 0.0)
         return told, none
+
+    def _of_friction(self, amps: Float[Array, "hypothesis wheel"]) -> Array:
+        """Variance of currents as frictions of several floors under the wheels are unsure [A^2].
+
+        A wheel has so much of the whole drag as its friction is over their mean.
+        """
+        on = np.eye(len(self.robot.labels))[self.hypotheses]
+        over = (on - on.mean(axis=1, keepdims=True)).reshape(-1, on.shape[2])
+        var = jnp.sum((over @ self.robot.friction_covariance) * over, axis=1)
+        return amps**2 * var.reshape(amps.shape)
 
     def _stiction(self, w: Array) -> Array:
         """Variance of the current that holds a standing wheel, between friction's bounds [A^2]."""

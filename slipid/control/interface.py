@@ -50,7 +50,7 @@ class Settings:
     forget_s: float = 0.4
     filter_s: float = 0.05
     patch_m: float = 0.1
-    doubt_m: float = 0.7
+    doubt_m: float = 1.5
     alike: float = 3.0
     unknown_std: float = 3.0
     ammeter_std_a: float = 0.07

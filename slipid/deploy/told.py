@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.control.robot_file.record import Axes, ToldRecord
-from slipid.deploy.record_of import moved_per_metre
+from slipid.deploy.record_of import moved_per_metre, spread_of
 from slipid.identify.compare.predictive import Contact
 from slipid.identify.fit.hierarchy import PerAxis
 from slipid.identify.fit.shared import AXES, Directions, Pace
@@ -66,7 +66,7 @@ def _table(
         off = predicted[:, n] - np.einsum("nap,kp->kna", told.slope, draws - center)
         at = told.mean + told.slope @ (center - contact.z)
         mean[n] = -at.reshape(shape[1:])
-        left[n] = np.sqrt(grown * given + off.var(axis=0)).reshape(shape[1:])
+        left[n] = np.sqrt(grown * given + spread_of(off) ** 2).reshape(shape[1:])
     speeds = tuple(_short(np.exp(s)) for s in log_speed)
     return ToldRecord(speeds, _rows(mean), _rows(left))
 

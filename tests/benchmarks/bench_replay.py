@@ -2,7 +2,7 @@
 
     .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks/bench_replay.py
 
-(-k one_floor or two_floors). Fits of the parts, half a minute to two minutes each, are kept in
+(-k one_floor or two_floors). Fits of the parts, one to three minutes each, are kept in
 out/bench_replay/CODE.
 
 One floor: fits of two opposite pairs of 60-degree sectors, the third pair judged, three times over,
@@ -14,14 +14,14 @@ that these two floors are all there are.
 
 from __future__ import annotations
 
-import json
+import pickle
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -29,10 +29,9 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.interface import MIXED, Settings
 from slipid.identify.compare.folds import sectors
-from slipid.identify.compare.predictive import contact_of
+from slipid.identify.compare.predictive import Contact, contact_of
 from slipid.identify.fit.crossing import crossing
 from slipid.identify.fit.likelihood import batch
-from slipid.identify.fit.mixed import update
 from slipid.identify.fit.optimise import optimise
 from slipid.identify.slip_curves import current_trend
 from slipid.job.config import parsed
@@ -65,8 +64,7 @@ format = "robotino2022"
 map = "maps/green_table.toml"
 load = "as_built"
 """
-Part = tuple[np.ndarray, np.ndarray, dict[str, float]]
-"""Search vector, its covariance, variance of every noise component."""
+Made = TypeVar("Made")
 
 
 @pytest.fixture(scope="module")
@@ -77,33 +75,48 @@ def job(real_data: Path) -> Job:
     return with_mixed(read_job(config, root, report), root, report)
 
 
-def kept(name: str, make: Callable[[], Part]) -> Part:
-    """A fit, made once."""
-    path = OUT / f"{name}.npz"
+def kept(name: str, make: Callable[[], Made]) -> Made:
+    """Fits, made once."""
+    path = OUT / f"{name}.pickle"
     if not path.is_file():
-        z, covariance, variance = make()
+        made = pickle.dumps(make())
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(path, z=z, covariance=covariance, variance=json.dumps(variance))
-    with np.load(path) as found:
-        return found["z"], found["covariance"], json.loads(str(found["variance"]))
+        path.write_bytes(made)
+    found: Made = pickle.loads(path.read_bytes())
+    return found
 
 
-def fitted(job: Job, runs: np.ndarray) -> Part:
+def fitted(job: Job, runs: np.ndarray) -> Contact:
     """Fit of some of the runs on one floor."""
     problem = job.problem()
     keep = np.isin(problem.windows.run, runs).astype(float)
     optimum = optimise(problem, keep=keep)
-    contact = contact_of(problem, optimum.state, optimum.covariance, keep)
-    return np.asarray(contact.z), np.asarray(contact.covariance), dict(contact.variance)
+    return contact_of(problem, optimum.state, optimum.covariance, keep)
 
 
-def deployed(job: Job, part: Part, runs: np.ndarray) -> DeployedRobot:
-    """From a part; `runs` on one floor are those it was fitted to."""
+def crossed(job: Job) -> tuple[Contact, Contact, Contact]:
+    """Fits of all runs on one floor; with the even runs over several; with the odd ones."""
     problem = job.problem()
-    seen = problem.windows.pieces(np.flatnonzero(np.isin(problem.windows.run, runs)))
-    robot = problem.space.tree(jnp.asarray(part[0]))
-    trend = current_trend(robot, batch(seen, robot))
-    return replayed.deployed(problem.space, *part, "as_built", TOP, trend)
+    optimum, every = optimise(problem), problem.every
+    first = contact_of(problem, optimum.state, optimum.covariance, every)
+    several = crossing(job.mixed, first.robot)
+    whole = problem.crossed(several)
+    start = replace(whole.restated(optimum.state, problem), round=0)
+
+    def learnt(half: int) -> Contact:
+        keep = np.concatenate([every, several.windows.run % 2 == half])
+        end = optimise(whole, keep=keep, start=start)
+        return contact_of(whole, end.state, end.covariance, keep)
+
+    return first, learnt(0), learnt(1)
+
+
+def deployed(job: Job, contact: Contact, runs: np.ndarray) -> DeployedRobot:
+    """From a fit; `runs` on one floor are those it was fitted to."""
+    windows = job.problem().windows
+    seen = windows.pieces(np.flatnonzero(np.isin(windows.run, runs)))
+    trend = current_trend(contact.robot, batch(seen, contact.robot))
+    return replayed.deployed(contact, "as_built", TOP, trend)
 
 
 def show(rows: list[Judged]) -> None:
@@ -138,12 +151,11 @@ def test_one_floor(job: Job) -> None:
     built = np.array([log.load == "as_built" for log in data.logs])
     rows: list[Judged] = []
     for k in range(3):
-        part = kept(f"fold{k}", lambda k=k: fitted(job, np.flatnonzero(fold != k)))
-        est = Estimator(deployed(job, part, np.flatnonzero(fold != k)))
+        fit = kept(f"fold{k}", lambda k=k: fitted(job, np.flatnonzero(fold != k)))
+        est = Estimator(deployed(job, fit, np.flatnonzero(fold != k)))
         some = data.subset(np.flatnonzero(built & (fold == k)))
-        robot = job.problem().space.tree(jnp.asarray(part[0]))
         said = replayed.replay(est, some.logs)
-        rows += replayed.judged(robot, est.robot.labels, some, said, part[2])
+        rows += replayed.judged(fit.robot, est.robot.labels, some, said, fit.variance)
     print("\nruns on one floor, none of whose headings was fitted")
     show(rows)
     assert len(rows) == built.sum()
@@ -154,18 +166,10 @@ def test_one_floor(job: Job) -> None:
 
 
 def test_two_floors(job: Job) -> None:
-    (data, floor), space = job.mixed[0], job.problem().space
-    first = kept("all", lambda: fitted(job, np.arange(len(job.dataset))))
-    cross = crossing(data, floor, space.tree(jnp.asarray(first[0])))
-
-    def learnt(half: int) -> Part:
-        some = cross.of(cross.windows.run % 2 == half)
-        found = update(space, first[0], first[1], [some])
-        return found.z, found.covariance, first[2]
-
+    data, floor = job.mixed[0]
+    first, even, odd = kept("crossed", lambda: crossed(job))
     halves, everything = np.arange(len(data)) % 2, np.arange(len(job.dataset))
-    one = [(first, halves >= 0)]
-    half = [(kept(f"half{h}", lambda h=h: learnt(h)), halves != h) for h in (0, 1)]
+    one, half = [(first, halves >= 0)], [(even, halves == 1), (odd, halves == 0)]
     print("\nacross green and table, wheel by wheel; bars: a third of the encoders' error, 80 %")
     for title, parts, settings, there in (
         ("one floor each, of four", one, Settings(), ()),
@@ -174,13 +178,13 @@ def test_two_floors(job: Job) -> None:
         ("half of them, of these two", half, Settings(alike=MIXED), PAIR),
     ):
         found: list[Any] = []
-        for part, judged in parts:
-            known = deployed(job, part, everything)
+        for fit, judged in parts:
+            known = deployed(job, fit, everything)
             est = Estimator(known.on(*(there or known.labels)), settings)
-            robot, some = space.tree(jnp.asarray(part[0])), data.subset(np.flatnonzero(judged))
+            some = data.subset(np.flatnonzero(judged))
             said, labels = replayed.replay(est, some.logs), est.robot.labels
-            rows = replayed.judged(robot, labels, some, said, part[2])
-            found.append((rows, replayed.wheels(robot, labels, floor, some, said)))
+            rows = replayed.judged(fit.robot, labels, some, said, fit.variance)
+            found.append((rows, replayed.wheels(fit.robot, labels, floor, some, said)))
         every = [r for rows, _ in found for r in rows]
         error, straight = (np.mean([getattr(r, k) for r in every]) for k in ("error", "straight"))
         truth, said_of = (np.concatenate([f[1][k] for f in found]) for k in (0, 1))

@@ -10,7 +10,7 @@ import pytest
 
 from slipid.control.effects import FORGETS, Course, Told
 from slipid.control.estimator import Estimator
-from slipid.control.interface import Measurement
+from slipid.control.interface import Measurement, Settings
 from slipid.identify.fit import shared
 from tests.control.test_consistency import DT, rolling, settled
 from tests.helpers.small_twin import deployed
@@ -57,27 +57,44 @@ def test_effects_fade_with_speed_as_the_fit_has_it():
     assert FORGETS == shared.SPEED_LENGTH
 
 
+MISSED = jnp.asarray([[0.02, -0.01, 0.1], [-0.05, 0.03, -0.2]])
+PARTS = jnp.asarray([[0.5, 0.5, 0.5], [0.2, 0.2, 0.2]])
+WAY = np.array([0.16, 0.12, 0.0])
+
+
+def driven(told, hypothesis):
+    """The robot, what it says and its state, sure of a hypothesis."""
+    robot = deployed(run=1.0)
+    if told:
+        rows = jnp.concatenate([MISSED, PARTS], axis=1)[:, None, None]
+        robot = eqx.tree_at(lambda r: r.told, robot, Told(jnp.log(jnp.asarray([0.2])), rows))
+    watched = Estimator(robot, Settings(patch_m=1e9))
+    run = jax.jit(lambda s, z: watched.step(s, z, DT))
+    belief, state = jnp.full(9, 1e-12).at[hypothesis].set(1.0), watched.init()
+    for _ in range(20):
+        state = eqx.tree_at(lambda s: s.floors.belief, state, belief)
+        state, said = run(state, Measurement(wheel_speed=rolling(robot, WAY)).filled(3))
+    return robot, said, state
+
+
 @pytest.mark.parametrize("under", [0, 1])
 def test_the_twist_is_that_of_the_contact_and_what_is_told_of_its_floor(under):
     """Along, across and in yaw, per metre of wheels that do not slip; what is left is the std."""
-    missed = jnp.asarray([[0.02, -0.01, 0.1], [-0.05, 0.03, -0.2]])
-    parts = jnp.asarray([[0.5, 0.5, 0.5], [0.2, 0.2, 0.2]])
-    rows = jnp.concatenate([missed, parts], axis=1)[:, None, None]
-    told = Told(jnp.log(jnp.asarray([0.2])), rows)
-    robot = eqx.tree_at(lambda r: r.told, deployed(run=1.0), told)
-    watched = Estimator(robot)
-    run = jax.jit(lambda s, z: watched.step(s, z, DT))
-    way = np.array([0.16, 0.12, 0.0])
-    w, state = rolling(robot, way), watched.init()
-    belief = jnp.full(9, 1e-12).at[7 * under].set(1.0)
-    for _ in range(20):
-        state = eqx.tree_at(lambda s: s.floors.belief, state, belief)
-        state, said = run(state, Measurement(wheel_speed=w).filled(3))
-    along, across, yaw = np.asarray(missed[under])
+    robot, said, state = driven(told=True, hypothesis=7 * under)
+    along, across, yaw = np.asarray(MISSED[under])
     u, v = np.array([0.8, 0.6]), np.array([-0.6, 0.8])
     more = 0.2 * np.array([*(along * u + across * v), yaw])
-    expected = np.asarray(settled(robot, w, under)) + more
+    expected = np.asarray(settled(robot, rolling(robot, WAY), under)) + more
     np.testing.assert_allclose(said.twist, expected, atol=1e-3)
     push = np.asarray(state.place.push)[:, 3 * under : 3 * under + 3]
     left = np.sqrt(np.linalg.eigvalsh(push @ push.T))
-    np.testing.assert_allclose(left, np.sort(parts[under] * robot.effect[under]), rtol=0.01)
+    np.testing.assert_allclose(left, np.sort(PARTS[under] * robot.effect[under]), rtol=0.01)
+
+
+def test_of_wheels_on_several_floors_nothing_is_told():
+    """Twist and std are those of a robot that is told nothing: what is told is of one floor."""
+    (_, said, state), (_, alone, bare) = (driven(told, hypothesis=1) for told in (True, False))
+    np.testing.assert_allclose(said.twist, alone.twist, atol=1e-5)
+    np.testing.assert_allclose(
+        state.place.push[:, :6], bare.place.push[:, :6], rtol=0.03, atol=1e-4
+    )

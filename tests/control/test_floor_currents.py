@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from slipid.control.estimator import Estimator
 from slipid.control.floor_filter import FloorFilter
-from slipid.control.interface import Settings
+from slipid.control.interface import Measurement, Settings
 from slipid.model.geometry import omni
 from slipid.model.robot import build, twist, wheel_current
 from tests.helpers.known_robot import deploy_known
+from tests.helpers.small_twin import deployed
 
 
 def test_drag_along_the_drive_is_in_the_currents_that_tell_floors():
@@ -32,3 +35,26 @@ def test_drag_along_the_drive_is_in_the_currents_that_tell_floors():
         np.testing.assert_allclose(
             amps[alike], wheel_current(robot, frame, xi, w, *place), rtol=1e-6
         )
+
+
+def test_where_frictions_are_open_currents_rule_out_no_mixture_of_floors():
+    """The soft floor has thrice the friction it is thought to have, two wheels stand on it."""
+    robot, w = deployed(current=1.0), jnp.array([5.0, -1.0, -4.0])
+    truth = eqx.tree_at(lambda r: r.floors.friction, robot, jnp.array([0.6, 1.0]))
+    near = jnp.zeros((8, 3))
+    for _ in range(10):
+        near, amps = eqx.filter_jit(FloorFilter(truth, Settings()).solve)(near, w)
+
+    def believed(covariance):
+        known = eqx.tree_at(lambda r: r.friction_covariance, robot, covariance)
+        watched = Estimator(known, Settings(current_is_signed=True, alike=0.0))
+        run = jax.jit(lambda s, z: watched.step(s, z, 0.02)[0])
+        state = watched.init()
+        for _ in range(100):
+            state = run(state, Measurement(wheel_speed=w, current=amps[3]).filled(3))
+        return float(state.floors.belief[3] / state.floors.belief[0])
+
+    sure, unsure = believed(jnp.zeros((2, 2))), believed(jnp.diag(jnp.array([0.0, 0.5])))
+    assert unsure > 2 * sure
+    alike = believed(jnp.full((2, 2), 0.5))  # what floors share tells nothing apart
+    np.testing.assert_allclose(alike, sure, rtol=1e-6)

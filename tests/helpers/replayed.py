@@ -7,7 +7,7 @@ is taken off.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,9 +21,12 @@ from slipid.control.interface import AbstractEstimator, Estimate, Readings
 from slipid.data.floor_map import FloorMap
 from slipid.data.log import Log
 from slipid.data.runs import Runs, first_row
+from slipid.deploy.deploy import DRAWS
+from slipid.deploy.told import told_by_load
+from slipid.identify.compare.predictive import Contact
+from slipid.identify.result import draws
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
-from slipid.search_space import Space
 from tests.helpers.known_robot import deploy_known
 
 TOGETHER = 32
@@ -34,30 +37,20 @@ STARTS = 0.001
 """A robot moves from where the rim of a wheel has moved this far [m]."""
 
 
-def deployed(
-    space: Space,
-    z: Any,
-    covariance: Any,
-    variance: dict[str, float],
-    load: str,
-    top: float,
-    trend: tuple[float, float],
-) -> DeployedRobot:
-    """The deployed robot of a fit.
+def deployed(contact: Contact, load: str, top: float, trend: tuple[float, float]) -> DeployedRobot:
+    """The robot of a fit, as `slipid.deploy.deploy` has it.
 
     Args:
-        space, z, covariance: of the search vector.
-        variance: of every noise component, by name.
+        contact: the fit.
         load: set-up it drives with.
         top: highest wheel speed in the fitted runs [rad/s].
         trend: of the currents in the fitted runs, see `slipid.identify.slip_curves.current_trend`.
     """
-    rng = np.random.default_rng(0)
-    root = np.linalg.cholesky(np.asarray(covariance))
-    several = np.asarray(z) + rng.standard_normal((24, len(root))) @ root.T
-    draws = jax.vmap(space.tree)(jnp.asarray(several))
-    std = {name: float(np.sqrt(v)) for name, v in variance.items()}
-    return deploy_known(space.tree(jnp.asarray(z)), load, std, draws, top, trend)
+    several = draws(contact.z, contact.covariance, DRAWS, seed=0)
+    robots = jax.vmap(contact.space.tree)(jnp.asarray(several))
+    std = {name: float(np.sqrt(v)) for name, v in contact.forecast.items()}
+    told = told_by_load(contact, contact.z, several)
+    return deploy_known(contact.robot, load, std, robots, top, trend, told)
 
 
 def heard(estimator: AbstractEstimator, angle: Any, current: Any) -> Readings:
@@ -122,7 +115,7 @@ class Judged:
 
 
 def judged(
-    robot: Robot, labels: Sequence[str], data: Runs, said: Sequence[Any], noise: dict[str, float]
+    robot: Robot, labels: Sequence[str], data: Runs, said: Sequence[Any], noise: Mapping[str, float]
 ) -> list[Judged]:
     """Runs against the camera.
 
