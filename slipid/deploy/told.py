@@ -18,7 +18,6 @@ from jaxtyping import Float
 from slipid.control.robot_file.record import Axes, ToldRecord
 from slipid.deploy.record_of import moved_per_metre, spread_of
 from slipid.identify.compare.predictive import Contact
-from slipid.identify.fit.hierarchy import PerAxis
 from slipid.identify.fit.shared import AXES, Directions, Pace
 
 DIRECTIONS = 72
@@ -61,20 +60,21 @@ def _table(
     for n, floor in enumerate(labels):
         found = contact.shared[floor]
         told = found.told(way)
-        grown = np.asarray(contact.extrapolation.get(f"{floor}@{load}", PerAxis()))
-        given = np.diagonal(told.covariance, axis1=1, axis2=2) + _alone(contact, floor)
+        grown = contact.extrapolation.get(f"{floor}@{load}", 1.0)
+        given = np.diagonal(told.covariance, axis1=1, axis2=2) + _of(contact, "session", floor)
         off = predicted[:, n] - np.einsum("nap,kp->kna", told.slope, draws - center)
         at = told.mean + told.slope @ (center - contact.z)
         mean[n] = -at.reshape(shape[1:])
-        left[n] = np.sqrt(grown * given + spread_of(off) ** 2).reshape(shape[1:])
+        left[n] = np.sqrt(
+            _of(contact, "run", floor) + grown * (given + spread_of(off) ** 2)
+        ).reshape(shape[1:])
     speeds = tuple(_short(np.exp(s)) for s in log_speed)
     return ToldRecord(speeds, _rows(mean), _rows(left))
 
 
-def _alone(contact: Contact, floor: str) -> Float[np.ndarray, "3"]:
-    """Variances of what a run has of its own and of what a session shares."""
-    kinds = [[f"{kind}.{floor}.{axis}" for axis in AXES] for kind in ("run", "session")]
-    return np.array([[contact.variance.get(name, 0.0) for name in row] for row in kinds]).sum(0)
+def _of(contact: Contact, kind: str, floor: str) -> Float[np.ndarray, "3"]:
+    """Variances of what a run has of its own, or of what a session shares, by axis."""
+    return np.array([contact.variance.get(f"{kind}.{floor}.{axis}", 0.0) for axis in AXES])
 
 
 def _rows(grid: _Grid) -> tuple[tuple[tuple[Axes, ...], ...], ...]:

@@ -16,7 +16,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.identify.fit.hierarchy import PerAxis
 from slipid.identify.fit.shared import FoundShared, Pace
 from slipid.identify.result import Channels, Fit
 from slipid.identify.slip_curves import SlipCurve
@@ -180,7 +179,7 @@ def to_json(fit: Fit) -> Content:
         | ({} if fit.refused is None else {"refused": dict(fit.refused)}),
         "current_trend": list(fit.current_trend),
         "shared": {floor: [asdict(p) for p in found.paces] for floor, found in fit.shared.items()},
-        "extrapolation": {name: x._asdict() for name, x in fit.extrapolation.items()},
+        "extrapolation": dict(fit.extrapolation),
         "baselines": dict(fit.baselines),
         "data": {"hash": fit.data_hash, "runs": [list(r) for r in fit.runs]},
     }
@@ -212,7 +211,7 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         seed=settings["seed"],
         mixed=settings.get("mixed"),
         refused=settings.get("refused"),
-        extrapolation={k: PerAxis(**x) for k, x in content["extrapolation"].items()},
+        extrapolation=content["extrapolation"],
         baselines=content["baselines"],
         current_trend=(content["current_trend"][0], content["current_trend"][1]),
         shared={

@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 from slipid.data.runs import Runs
 from slipid.identify import slip_curves as curves_of
 from slipid.identify.compare.predictive import Contact, contact_of
-from slipid.identify.fit.hierarchy import PerAxis
 from slipid.identify.fit.noise import POOLED
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem, State, log_jacobian
@@ -54,7 +53,7 @@ class Fit:
         covariance: of the search vector: Laplace, with what runs share marginalised.
         laplace: as if runs shared nothing, the curvature of their likelihood alone.
         shared: what neighbouring runs were found to share, by floor.
-        extrapolation: by what variances of effects are too small for unseen runs, by floor@load.
+        extrapolation: by what variances are too small for unseen runs, by floor@load.
         variance: every variance component by name, those of sessions included [unit squared].
         variance_unit: unit of each component's std.
         runs: (name, sha256) of every run that was fitted, those over several floors last.
@@ -95,7 +94,7 @@ class Fit:
     mixed: Mapping[str, Any] | None = None
     refused: Mapping[str, Any] | None = None
     shared: Mapping[str, FoundShared] = field(default_factory=dict)
-    extrapolation: Mapping[str, PerAxis] = field(default_factory=dict)
+    extrapolation: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def contact(self) -> Contact:

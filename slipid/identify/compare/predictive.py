@@ -28,8 +28,8 @@ from scipy.special import gammaln
 from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.hierarchy import PerAxis, extrapolation
-from slipid.identify.fit.noise import SHARED, effects
+from slipid.identify.fit.hierarchy import Courses, extrapolation
+from slipid.identify.fit.noise import SHARED, effects, travel
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit.sessions import Linear, by_axis, shared
 from slipid.identify.fit.shared import AXES, Directions, FoundShared, Told, told_of
@@ -82,7 +82,12 @@ class Predictive(abc.ABC):
         noise = np.asarray(problem.covariance("motion", self.log_variance(problem)))
         e = effects(problem.windows, problem.robot)
         v = self.effect_covariance(problem.windows)
-        return gap, noise + np.einsum("nma,nab,nlb->nml", e, v, e) + around(slope, self.covariance)
+        numbers = self.growth(problem.windows)[:, None, None] * around(slope, self.covariance)
+        return gap, noise + np.einsum("nma,nab,nlb->nml", e, v, e) + numbers
+
+    def growth(self, w: Windows) -> Float[np.ndarray, " piece"]:
+        """Factor of the variances of numbers and shared effects, of runs it has not seen."""
+        return np.ones(len(w))
 
     def effect_covariance(self, w: Windows) -> Float[np.ndarray, "piece 3 3"]:
         """Of what a run shares with others, in a session that was not seen."""
@@ -137,14 +142,14 @@ _camera_log_jacobian = jax.jit(lk.camera_log_jacobian)
 class Contact(Predictive):
     """The force balance where a fit has left it, at the search vector z.
 
-    Variances of effects are too small for runs it has not seen, by the factors `extrapolation` of
-    their floor and load.
+    Variances of numbers and of shared effects are too small for runs it has not seen, by the factor
+    `extrapolation` of their floor and load.
     """
 
     space: Space
     z: Search
     shared: Mapping[str, FoundShared]
-    extrapolation: Mapping[str, PerAxis]
+    extrapolation: Mapping[str, float]
 
     @property
     def name(self) -> str:
@@ -156,10 +161,9 @@ class Contact(Predictive):
         out = dict(self.variance)
         for name in out:
             kind, _, rest = name.partition(".")
-            if kind in ("run", *SHARED):
-                floor, _, axis = rest.rpartition(".")
-                of_floor = [x for k, x in self.extrapolation.items() if k.startswith(f"{floor}@")]
-                grown = [getattr(x, axis) for x in of_floor]
+            if kind in SHARED:
+                floor = f"{rest.rpartition('.')[0]}@"
+                grown = [x for k, x in self.extrapolation.items() if k.startswith(floor)]
                 out[name] *= max(grown, default=1.0)
         return out
 
@@ -168,10 +172,11 @@ class Contact(Predictive):
         return told_of(self.shared, w, self.robot, self.space.size)
 
     def effect_covariance(self, w: Windows) -> Float[np.ndarray, "piece 3 3"]:
-        grown = np.array([self.extrapolation.get(name, PerAxis()) for name in setups(w)])
-        own = ((grown - 1) * by_axis(self.variance, "run", w))[:, :, None] * np.eye(len(AXES))
         shared = super().effect_covariance(w) + self.told(w).covariance
-        return np.sqrt(grown[:, :, None] * grown[:, None, :]) * shared + own
+        return self.growth(w)[:, None, None] * shared
+
+    def growth(self, w: Windows) -> Float[np.ndarray, " piece"]:
+        return np.array([self.extrapolation.get(name, 1.0) for name in setups(w)])
 
     @property
     def numbers(self) -> dict[str, int]:
@@ -205,6 +210,7 @@ class Contact(Predictive):
         start = tracks.predicted[:, 0]
         jac = np.asarray(replay.end_jacobian(self.space, self.z, b, start, corrected=more))
         own = np.einsum("nip,pq,njq->nij", jac, self.covariance, jac)
+        own *= self.growth(w)[:, None, None]
         effect = self.effect_covariance(w)
         return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, own)
 
@@ -217,16 +223,10 @@ def contact_of(
     z, log_v = np.asarray(state.z), np.asarray(state.log_variance)
     blocks, jacobian = problem.linear(z, problem.electric(z, log_v))
     motion = blocks["motion"], jacobian["motion"]
-    direction = Directions.of(problem.windows, problem.robot).direction
-    grown = extrapolation(
-        problem.target,
-        motion,
-        keep[: len(direction)],
-        covariance,
-        log_v,
-        direction,
-        setups(problem.windows),
-    )
+    w = problem.windows
+    direction = Directions.of(w, problem.robot).direction
+    courses = Courses(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
+    grown = extrapolation(problem.target, motion, keep[: len(w)], covariance, log_v, courses)
     return Contact(
         robot,
         variance,

@@ -20,6 +20,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.optimize import brentq
+from scipy.stats import f as fisher
 
 from slipid.identify.fit.shared import AXES, FloorShared
 from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD, Search, Square, Target
@@ -28,16 +30,12 @@ _STEPS, _SETTLED = 20, 1e-5
 """Most scoring steps in a turn, and a step of a log variance that counts as rest."""
 _SECTORS = 6
 """Parts of the circle of directions, each of which is left out in turn."""
+LEAST_RUNS = 30
+"""Runs below which a tenth of them says too little of the tail."""
+_MOST_GROWTH = 10.0
+"""Largest factor of variances that is believed."""
 _GRID = np.geomspace(0.1, 4.0, 60)
 """Stds of the load biases that are weighed, over the typical one."""
-
-
-class PerAxis(NamedTuple):
-    """A number for effects along the way, across it and in yaw."""
-
-    along: float = 1.0
-    across: float = 1.0
-    yaw: float = 1.0
 
 
 class _Axis(NamedTuple):
@@ -46,6 +44,7 @@ class _Axis(NamedTuple):
     Attributes:
         number: of the axis; pieces: numbers of the runs.
         left: effects left; fixed: their covariance but for the variances asked for.
+        noise: part of its diagonal that is noise of the camera and of the process.
         numbers: of these variances; bases: what each makes of the covariance.
     """
 
@@ -53,6 +52,7 @@ class _Axis(NamedTuple):
     pieces: Int[np.ndarray, " run"]
     left: Float[np.ndarray, " run"]
     fixed: Float[np.ndarray, "run run"]
+    noise: Float[np.ndarray, " run"]
     numbers: list[int]
     bases: list[np.ndarray]
 
@@ -95,52 +95,96 @@ def effect_information(
     return out
 
 
+class Courses(NamedTuple):
+    """Direction of travel of every piece [rad], nan on the spot, its way [m], and its set-up."""
+
+    direction: Float[np.ndarray, " piece"]
+    far: Float[np.ndarray, " piece"]
+    setup: Sequence[str]
+
+
 def extrapolation(
     target: Target,
     motion: tuple[Array, Array],
     keep: Float[np.ndarray, " piece"],
     covariance: Square,
     log_v: Float[np.ndarray, " variance"],
-    direction: Float[np.ndarray, " piece"],
-    setup: Sequence[str],
-) -> dict[str, PerAxis]:
-    """By what variances of effects are too small where nothing near was seen, by set-up of a piece.
+    courses: Courses,
+) -> dict[str, float]:
+    """By what variances are too small where nothing near was seen, by set-up of a piece.
 
     Every sector of directions is predicted from the others, with the numbers of the floor learnt
-    anew (to first order). For each axis it is the mean square of the gaps over their variance and
-    that of a Student t, 1 where it is less or where there are fewer than three sectors. A
-    likelihood finds the variances that are best between the runs it has, which are too small where
-    the model is wrong in the large, and weighs outliers away that a forecast meets again.
+    anew (to first order). What runs share and the numbers have variances that are too small by so
+    much that 90 % of the ends lie in their regions once they have grown; the run's own effects and
+    noise stay, which neighbours do not tell. It is 1 where enough lie there, and where there are
+    fewer than three sectors or `LEAST_RUNS` runs. A likelihood finds the variances that are best
+    between the runs it has, which are too small where the model is wrong in the large, and weighs
+    outliers away that a forecast meets again.
 
     Sources: Sundararajan and Keerthi 2001, Neural Computation 13(5), eq. for leaving out; Bachoc
     2013, Computational Statistics and Data Analysis 66, on wrong models.
     """
     axes = _axes(target, motion, jnp.asarray(keep), covariance, log_v)
-    return _too_small(axes, log_v, direction, setup)
+    left = _left_out(axes, log_v, courses.direction)
+    names = np.asarray(courses.setup)
+    return {name: _growth(left, courses.far, names == name) for name in dict.fromkeys(names)}
 
 
-def _too_small(
+class _LeftOut(NamedTuple):
+    """Effects of pieces along, across and in yaw as others predict them; nan where none do.
+
+    Attributes:
+        gap: of the effect from its prediction.
+        spread: variance of the gap; own: the part of it that others cannot tell.
+    """
+
+    gap: Float[np.ndarray, "piece 3"]
+    spread: Float[np.ndarray, "piece 3"]
+    own: Float[np.ndarray, "piece 3"]
+
+
+def _left_out(
     axes: Iterable[_Axis],
     log_v: Float[np.ndarray, " variance"],
     direction: Float[np.ndarray, " piece"],
-    setup: Sequence[str],
-) -> dict[str, PerAxis]:
-    found: dict[str, list[list[float]]] = {name: [[] for _ in AXES] for name in setup}
-    usual, names = DEGREES / (DEGREES - 2), np.asarray(setup)
+) -> _LeftOut:
+    found = _LeftOut(*(np.full((len(direction), len(AXES)), np.nan) for _ in range(3)))
     for axis in axes:
-        inverse = np.linalg.inv(_whole(axis, np.exp(log_v)[axis.numbers]))
-        white, groups = inverse @ axis.left, _sectors(direction[axis.pieces])
+        v = np.exp(log_v)[axis.numbers]
+        inverse, groups = np.linalg.inv(_whole(axis, v)), _sectors(direction[axis.pieces])
         if len(groups) < 3:
             continue
+        white = inverse @ axis.left
+        own = axis.noise + v[0] * np.diag(axis.bases[0])
         for mine in groups:
             spread = np.linalg.inv(inverse[np.ix_(mine, mine)])
-            ratios = (spread @ white[mine]) ** 2 / np.diag(spread) / usual
-            for name, ratio in zip(names[axis.pieces[mine]], ratios, strict=True):
-                found[name][axis.number].append(float(ratio))
-    return {
-        name: PerAxis(*(max(1.0, float(np.mean(ratios or 1.0))) for ratios in each))
-        for name, each in found.items()
-    }
+            at = axis.pieces[mine], axis.number
+            found.gap[at], found.spread[at] = spread @ white[mine], np.diag(spread)
+            found.own[at] = np.minimum(own[mine], np.diag(spread))
+    return found
+
+
+def _growth(
+    left: _LeftOut, far: Float[np.ndarray, " piece"], mine: Bool[np.ndarray, " piece"]
+) -> float:
+    """Of what a region of ends is made of beside own effects, to hold 90 % of those left out."""
+    mine = mine & np.isfinite(left.gap).all(axis=1)
+    if mine.sum() < LEAST_RUNS:
+        return 1.0
+    way = far[mine]
+    gap, spread, own = (x[mine] for x in left)
+    # a yaw that grows along the way moves the end across by half of it
+    along, across = gap[:, 0], gap[:, 1] + 0.5 * way * gap[:, 2]
+
+    def too_far(log_growth: float) -> float:
+        v = own + np.exp(log_growth) * (spread - own)
+        square = along**2 / v[:, 0] + across**2 / (v[:, 1] + 0.25 * way**2 * v[:, 2])
+        return float(np.quantile(square, 0.9) - 2 * fisher.ppf(0.9, 2, DEGREES))
+
+    most = np.log(_MOST_GROWTH)
+    if too_far(0.0) <= 0:
+        return 1.0
+    return _MOST_GROWTH if too_far(most) >= 0 else float(np.exp(brentq(too_far, 0.0, most)))
 
 
 def _sectors(direction: Float[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]]:
@@ -181,10 +225,11 @@ def _axes(
         run, effect = np.exp(log_v)[np.asarray(floor.numbers)[0]], np.asarray(floor.effect)[kept]
         left, noise, by = _left(gap[mine], slope[mine], scale[mine], effect, run)
         for k in range(len(AXES)):
-            fixed = np.diag(noise[:, k] / counted[mine]) + by[:, k] @ wide @ by[:, k].T
+            alone = noise[:, k] / counted[mine]
+            fixed = np.diag(alone) + by[:, k] @ wide @ by[:, k].T
             pieces = _pieces(floor, k, kept, counted[mine])
             numbers, bases = [n for n, _ in pieces], [c for _, c in pieces]
-            yield _Axis(k, mine, left[:, k], fixed, numbers, bases)
+            yield _Axis(k, mine, left[:, k], fixed, alone, numbers, bases)
 
 
 def _pieces(

@@ -203,7 +203,8 @@ def axis_of(rng, runs=60):
     true = np.array([1.0, 2.0, 0.5])
     whole = fixed + sum(v * b for v, b in zip(true, bases, strict=True))
     left = np.linalg.cholesky(whole + 1e-9 * np.eye(runs)) @ rng.normal(size=runs)
-    return hierarchy._Axis(np.arange(runs), left, fixed, [0, 1, 2], bases)
+    noise = np.full(runs, 0.2)
+    return hierarchy._Axis(0, np.arange(runs), left, fixed, noise, [0, 1, 2], bases)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -223,27 +224,55 @@ def test_scoring_ends_at_the_summit_of_the_likelihood(seed):
     assert all(loss(found + 0.3 * s * e / 1e-4) > loss(found) for e in step for s in (-1, 1))
 
 
-def test_sectors_left_out_tell_by_what_variances_are_too_small():
-    """A gap is what the dense Gaussian of the others says; larger ones are by their square."""
+def test_sectors_left_out_are_predicted_as_the_dense_gaussian_of_the_others_does():
     rng, log_v = np.random.default_rng(0), np.zeros(3)
     axis = axis_of(rng)
     way = np.linspace(0.1, 2 * np.pi - 0.1, 60)
-    setup = ["a@x" if k % 3 else "a@y" for k in range(60)]
-
-    one = axis._replace(left=axis.left * np.where(np.arange(60) % 3, 3.0, 1.0))
-    found = hierarchy._too_small([one], log_v, way, setup)
-    whole, ratio = hierarchy._whole(axis, np.ones(3)), {"a@x": [], "a@y": []}
-    for k in range(6):
-        out = np.floor(way / (np.pi / 3)) == k
+    found = hierarchy._left_out([axis], log_v, way)
+    whole = hierarchy._whole(axis, np.ones(3))
+    for out in (np.arange(60) // 10 == k for k in range(6)):
         to = whole[np.ix_(out, ~out)] @ np.linalg.inv(whole[np.ix_(~out, ~out)])
-        gap = one.left[out] - to @ one.left[~out]
         spread = np.diag(whole[np.ix_(out, out)] - to @ whole[np.ix_(~out, out)])
-        for j, r in zip(np.flatnonzero(out), gap**2 / spread, strict=True):
-            ratio[setup[j]].append(r / (8 / 6))
-    assert found == pytest.approx({name: max(1.0, np.mean(r)) for name, r in ratio.items()})
-    assert found["a@x"] > 3.0
-    small = axis._replace(left=1e-3 * axis.left)
-    assert set(hierarchy._too_small([small], log_v, way, setup).values()) == {1.0}
+        np.testing.assert_allclose(found.gap[out, 0], axis.left[out] - to @ axis.left[~out])
+        np.testing.assert_allclose(found.spread[out, 0], spread)
+    np.testing.assert_allclose(found.own[:, 0], 1.2)  # its own effect and noise
+    assert np.isnan(found.gap[:, 1:]).all()
+
+
+def left_out(size, runs=4000):
+    """Gaps whose shared part is so many times as wide as it is said to be."""
+    rng = np.random.default_rng(3)
+    own, share = np.array([0.3, 0.2, 0.4]), np.array([1.0, 0.7, 2.0])
+    normal, other = rng.standard_normal((2, runs, 3))
+    gap = np.sqrt(own) * normal + size * np.sqrt(share) * other
+    gap *= np.sqrt(8.0 / rng.chisquare(8.0, (runs, 1)))  # of one run together, as ends are
+    spread = np.broadcast_to(own + share, gap.shape)
+    return hierarchy._LeftOut(gap, spread, np.broadcast_to(own, gap.shape))
+
+
+@pytest.mark.parametrize(("size", "growth"), [(1.0, 1.0), (0.5, 1.0), (1.5, 2.25), (9.0, 10.0)])
+def test_variances_grow_until_nine_ends_in_ten_lie_in_their_regions(size, growth):
+    far, every = np.full(4000, 0.6), np.ones(4000, bool)
+    assert hierarchy._growth(left_out(size), far, every) == pytest.approx(growth, rel=0.08)
+
+
+def test_few_runs_or_sectors_say_nothing_of_the_tail():
+    few = np.arange(4000) < hierarchy.LEAST_RUNS - 1
+    assert hierarchy._growth(left_out(1.5), np.full(4000, 0.6), few) == 1.0
+    axis = axis_of(np.random.default_rng(0))
+    found = hierarchy._left_out([axis], np.zeros(3), np.linspace(0.0, 1.5, 60))
+    assert np.isnan(found.gap).all()
+
+
+def test_sectors_are_cut_where_no_runs_are_parted():
+    """Headings every five degrees, driven three times and seen with noise."""
+    rng = np.random.default_rng(1)
+    heading = np.repeat(np.radians(np.arange(0, 360, 5)), 3)
+    found = hierarchy._sectors(heading + np.radians(0.4) * rng.uniform(-1, 1, len(heading)))
+    assert sorted(np.concatenate(found)) == list(range(len(heading)))
+    assert [len(mine) for mine in found] == [36] * 6
+    for mine in found:
+        assert {k // 3 for k in mine} == {k // 3 for k in mine if k % 3 == 0}
 
 
 def test_the_pooled_variance_weighs_every_std_by_its_evidence(problem):
