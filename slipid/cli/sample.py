@@ -19,7 +19,7 @@ def sample(
     draws: Annotated[
         int, typer.Option("--draws", min=10, help="Kept of each of four ensembles.")
     ] = 400,
-    most: Annotated[int, typer.Option("--most", min=24, help="Blocks before it gives up.")] = 400,
+    most: Annotated[int, typer.Option("--most", min=40, help="Blocks before it gives up.")] = 400,
     block: Annotated[
         int, typer.Option("--block", min=1, hidden=True, help="Steps that are kept together.")
     ] = 20,

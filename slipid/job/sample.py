@@ -65,7 +65,7 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     report.stage("compiling")
     problem = job.problem()
     # all that a chain depends on; how long it may become is not of it
-    told = FORMAT, fit.data_hash, replace(plan, most=0), draws, sorted(fit.variance.items())
+    told = FORMAT, fit.data_hash, replace(plan, most=10**9), draws, sorted(fit.variance.items())
     kept = Checkpoint(out / FOLDER, key_of(*told, np.asarray(fit.z), np.asarray(fit.covariance)))
     found = sampled_around(fit, problem, plan, draws, kept, report)
     report.stage("writing")

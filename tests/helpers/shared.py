@@ -20,7 +20,7 @@ from tests.helpers.made_logs import write_logs
 
 DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
 UNSEEN = [type(d)(d.surface, d.load, d.heading + 0.4, d.speed) for d in DRIVES[:3]]
-FEW = ("--draws", "10", "--most", "24", "--block", "2", "--quiet")  # blocks: 20 are to warm up
+FEW = ("--draws", "10", "--most", "40", "--block", "2", "--quiet")  # blocks: 36 are to warm up
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.crossing import MOTION, Several
+from slipid.identify.fit.crossing import CURRENT, MOTION, Several
 from slipid.identify.fit.noise import Components, electric_noise
 from slipid.identify.fit.shared import (
     FloorShared,
@@ -259,7 +259,8 @@ def scored(
         score = score.at[which].add(slope)
         if voltage is not None and k == "voltage":
             steeper = steeper.at[which].add((kept * jnp.sum(voltage.steeper, axis=1))[:, None])
-        else:  # a logarithm that falls bends the more: its slope is in proportion to the variance
+        if k in (MOTION, CURRENT) or (voltage is not None and k == "current"):
+            # a logarithm that falls bends the more: its slope is in proportion to the variance
             steeper = steeper.at[which].add(-slope)
     score -= (log_v - target.typical) / VARIANCE_SPREAD**2
     info = information(target.blocks, log_v, keep, voltage)

@@ -82,6 +82,12 @@ class Plan:
     least_draws: float = 1000.0
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        if self.most <= self.warm_up[-1]:
+            raise ValueError(
+                f"at most {self.most} blocks; expected more than the {self.warm_up[-1]} of the warm-up"
+            )
+
 
 @dataclass(frozen=True, eq=False)
 class Block:
