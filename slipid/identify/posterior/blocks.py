@@ -84,9 +84,8 @@ class Plan:
 
     def __post_init__(self) -> None:
         if self.most <= self.warm_up[-1]:
-            raise ValueError(
-                f"at most {self.most} blocks; expected more than the {self.warm_up[-1]} of the warm-up"
-            )
+            least = self.warm_up[-1] + 1
+            raise ValueError(f"{self.most} blocks; expected {least} or more, past the warm-up")
 
 
 @dataclass(frozen=True, eq=False)
