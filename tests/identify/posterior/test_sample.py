@@ -104,7 +104,7 @@ def test_runs_that_err_alike_are_no_outliers_to_variances(problem, monkeypatch):
 @pytest.mark.slow
 def test_how_far_floors_differ_is_drawn_by_how_likely_it_is(problem):
     """Load biases that are known by themselves, with a half-normal prior of their common std."""
-    end, at = fitted(problem), problem.target.deviation
+    end, at = fitted(problem), problem.space.pooled
     now, typical = np.exp(0.5 * end.log_variance[problem.target.pooled]), 0.05
     sure = 0.02**-2  # what data alone tell of each
     seen = np.array([0.06, -0.09, 0.12, -0.05])
