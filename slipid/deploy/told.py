@@ -50,7 +50,7 @@ def _table(
     count, labels = len(log_speed), contact.robot.surfaces.labels
     angle = np.linspace(0.0, 2 * np.pi, DIRECTIONS, endpoint=False)
     paces = tuple(Pace(float(s), load) for s in log_speed for _ in angle)
-    way = Directions(np.tile(angle, count), paces)
+    way = Directions(np.tile(angle, count), paces, contact.robot.geometry.mirror())
     robots = jax.vmap(contact.space.tree)(jnp.asarray(draws))
     k = jnp.asarray(contact.robot.load_index(load))
     moved = [moved_per_metre(robots, k, jnp.exp(s), DIRECTIONS) for s in log_speed]

@@ -63,6 +63,24 @@ class Geometry(eqx.Module):
         """The wheels as rows of matrices, at the current radius, base and offsets."""
         return _frame(self)
 
+    def mirror(self) -> float | None:
+        """Axis of the body about which its wheels are their own mirror image [rad], or None.
+
+        Ahead is asked before sideways. Wheels count by their places and by the lines of their drives
+        and rollers.
+        """
+        drive = np.asarray(self.drive_angle)
+        free = np.where(self.grips, drive, drive - np.asarray(self.roller_angle))
+        place = np.asarray(self.place) @ (1, 1j)
+        # a line is the same half a turn on
+        wheels = np.stack([place, np.exp(2j * drive), np.exp(2j * free)], axis=1)
+        for axis in (0.0, 0.5 * math.pi):
+            mirrored = np.exp(2j * axis * np.array([1, 2, 2])) * wheels.conj()
+            apart = np.abs(wheels[:, None] - mirrored).max(axis=-1)
+            if apart.min(axis=1).max() < 1e-6:
+                return axis
+        return None
+
     def forward(self) -> Float[Array, "wheel 3"]:
         """J: rim speed of each wheel without slip [m/s] from the body twist."""
         frame = self.frame()

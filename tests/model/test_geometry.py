@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -159,3 +161,20 @@ def test_a_wheel_without_rollers_drives_like_an_omni_wheel_and_grips():
     np.testing.assert_allclose(frame.pull, 1.0)
     np.testing.assert_allclose(frame.slip_through, 0.0, atol=1e-15)
     np.testing.assert_allclose(frame.hold[:, :2], [[1.0, 0.0]] * 4, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("made", "axis"),
+    [
+        (omni([60.0, 180.0, 300.0], 0.125, 0.04), 0.0),
+        (omni([30.0, 150.0, 270.0], 0.125, 0.04), np.pi / 2),
+        (omni([10.0, 130.0, 250.0], 0.125, 0.04), None),
+        (mecanum(0.2, 0.15, 0.05), 0.0),
+        (skid_steer(0.2, 0.15, 0.05), 0.0),
+    ],
+)
+def test_the_mirror_of_a_body(made, axis):
+    assert made.mirror() == axis
+    if axis is not None:  # one wheel that drives another way has no image
+        turned = (made.drive_angle[0] + 0.1, *made.drive_angle[1:])
+        assert replace(made, drive_angle=turned).mirror() is None

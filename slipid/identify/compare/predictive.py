@@ -253,7 +253,7 @@ def found_shared(
     for floor, of, tie, to in zip(
         problem.robot.surfaces.labels, problem.target.shared, seen.tied, expected, strict=True
     ):
-        near = of.near.shape[1]
+        near = of.near.shape[-1]
         count = near + of.session.shape[1]
         inverse = np.linalg.inv(np.asarray(to.factor))
         covariance = (inverse.T @ inverse).reshape(3, count, 3, count)

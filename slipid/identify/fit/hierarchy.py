@@ -237,7 +237,7 @@ def _pieces(
 ) -> list[tuple[int, np.ndarray]]:
     """Variance numbers, and what each makes of the covariance of the effects along an axis."""
     own, near, session = np.asarray(floor.numbers)[:, axis].tolist()
-    root, member = np.asarray(floor.near)[kept], np.asarray(floor.session)[kept]
+    root, member = np.asarray(floor.near)[axis, kept], np.asarray(floor.session)[kept]
     found = [(own, np.diag(1 / weight)), (near, root @ root.T), (session, member @ member.T)]
     return [(number, matrix) for number, matrix in found if number >= 0]
 

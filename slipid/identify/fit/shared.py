@@ -7,7 +7,9 @@ of a run along, across and in yaw is
 
 d is a Gaussian process per floor and axis, with a kernel that is periodic in the direction of
 travel relative to the body, and s one number per floor, axis and session; `own` is in the noise of
-the run. With r the residuals of a floor's runs, whitened by roots W of their own noise, and coefs
+the run. A robot whose wheels are their own mirror image errs alike to either side, along its way by
+as much and across it and in yaw by as much the other way: k(a, b) = k0(a - b) +- h k0(a + b), with
+angles from the axis of the mirror. With r the residuals of a floor's runs, whitened by roots W of their own noise, and coefs
 u of unit variance, e = S u, the effects are marginalised:
 
     min over u of |W (r - E S u)|^2 + |u|^2,    u^ = C^-1 (W E S)^T W r,    C = 1 + (W E S)^T W E S
@@ -38,6 +40,8 @@ SPEED_LENGTH = 0.5
 """Length of the kernel over logarithms of speed."""
 OTHER_LOAD = 0.5
 """Correlation of effects with different load set-ups."""
+OTHER_SIDE = 0.7
+"""Correlation of effects in mirrored directions, h."""
 _HARMONICS = 15
 """Of the kernel over directions; those beyond hold 1 % of its variance."""
 _SPEED = 0.25
@@ -61,11 +65,12 @@ class Pace:
 class Directions:
     """Direction of travel of every piece relative to the body [rad], and its pace.
 
-    The direction is nan where a robot turns on the spot.
+    The direction is nan where a robot turns on the spot; `mirror` is the axis of `Geometry.mirror`.
     """
 
     direction: Float[np.ndarray, " piece"]
     pace: tuple[Pace, ...]
+    mirror: float | None
 
     @staticmethod
     def of(w: Windows, robot: Robot) -> "Directions":
@@ -79,28 +84,42 @@ class Directions:
         return Directions(
             np.where(moves, np.arctan2(moved[:, 1], moved[:, 0]), np.nan),
             tuple(Pace(float(s), load) for s, load in zip(rounded, w.load, strict=True)),
+            robot.geometry.mirror(),
         )
 
-    def basis(self, paces: tuple[Pace, ...]) -> Float[np.ndarray, "piece coef"]:
-        """Root of the kernel: effects of unit coefs, from paces that were seen.
+    def of_pieces(self, mine: Int[np.ndarray, " some"]) -> "Directions":
+        """Those of some pieces."""
+        return Directions(self.direction[mine], tuple(self.pace[k] for k in mine), self.mirror)
 
-        Its rows have length 1, less where the pace is another.
-        """
-        if not paces:
-            return np.zeros((len(self.pace), 0))
+    def around(self) -> Float[np.ndarray, "3 piece harmonic"]:
+        """Root of the kernel over directions, along, across and in yaw; zero on the spot."""
+        alike = 0.0 if self.mirror is None else OTHER_SIDE
         wave = 1 / LENGTH**2
         k = np.arange(1, _HARMONICS + 1)
-        angle = np.nan_to_num(self.direction)[:, None] * k
+        angle = np.nan_to_num(self.direction - (self.mirror or 0.0))[:, None] * k
         size = np.sqrt(2 * ive(k, wave))
         constant = np.full((len(angle), 1), np.sqrt(ive(0, wave)))
-        around = np.concatenate([constant, size * np.cos(angle), size * np.sin(angle)], axis=1)
-        around *= np.isfinite(self.direction)[:, None]
+        even = np.concatenate([constant, size * np.cos(angle)], axis=1)
+        odd = size * np.sin(angle)
+        more, less = np.sqrt(1 + alike), np.sqrt(1 - alike)
+        of_even, of_odd = (more, less, less), (less, more, more)
+        root = [np.concatenate([a * even, b * odd], axis=1) for a, b in zip(of_even, of_odd)]
+        return np.stack(root) * np.isfinite(self.direction)[:, None]
+
+    def basis(self, paces: tuple[Pace, ...]) -> Float[np.ndarray, "3 piece coef"]:
+        """Root of the kernel: effects of unit coefs, from paces that were seen.
+
+        Its rows are as long as those of `around`, less where the pace is another.
+        """
+        if not paces:
+            return np.zeros((len(AXES), len(self.pace), 0))
         seen = np.array([[a.near(b) for b in paces] for a in paces])
         root = np.linalg.cholesky(seen + 1e-9 * np.eye(len(paces)))
         met = {pace: np.array([pace.near(b) for b in paces]) for pace in set(self.pace)}
         share = {pace: np.linalg.solve(root, row) for pace, row in met.items()}
         of_pace = np.array([share[pace] for pace in self.pace]).reshape(-1, len(paces))
-        return np.asarray(np.einsum("pc,pd->pcd", of_pace, around).reshape(len(angle), -1))
+        whole = np.einsum("pc,apd->apcd", of_pace, self.around())
+        return np.asarray(whole.reshape(len(AXES), len(self.pace), -1))
 
 
 class FloorShared(eqx.Module):
@@ -109,20 +128,20 @@ class FloorShared(eqx.Module):
     Attributes:
         pieces: their numbers.
         effect: what one unit along, across and in yaw moves in their residuals.
-        near: root of the kernel, a row per piece; session: 1 for the session of each piece.
+        near: root of the kernel by axis and piece; session: 1 for the session of each piece.
         numbers: of the variances of own, neighbours' and session's effects, -1 where there is none.
     """
 
     pieces: Int[Array, " run"]
     effect: Float[Array, "run m 3"]
-    near: Float[Array, "run condition"]
+    near: Float[Array, "3 run condition"]
     session: Float[Array, "run session"]
     numbers: Int[Array, "3 3"]
 
     def root(self, log_v: Float[Array, " variance"]) -> Float[Array, "3 run coef"]:
         """S, by which unit coefs make effects along, across and in yaw."""
         std = jnp.where(self.numbers < 0, 0.0, jnp.exp(0.5 * log_v)[self.numbers])
-        parts = [std[k, :, None, None] * x for k, x in ((1, self.near), (2, self.session))]
+        parts = [std[k, :, None, None] * x for k, x in ((1, self.near), (2, self.session[None]))]
         return jnp.concatenate(parts, axis=-1)
 
 
@@ -136,7 +155,7 @@ def shared_of(w: Windows, robot: Robot, noise: Noise) -> tuple[tuple[FloorShared
     floors, found, paces = np.asarray(w.surface), [], {}
     for floor in robot.surfaces.labels:
         mine = np.flatnonzero(floors == floor)
-        here = Directions(every.direction[mine], tuple(every.pace[k] for k in mine))
+        here = every.of_pieces(mine)
         paces[floor] = tuple(dict.fromkeys(here.pace))
         names = sessions_on(w, floor)
         session = np.array([w.session[k] for k in mine])[:, None] == np.asarray(names)
@@ -276,9 +295,10 @@ class FoundShared:
 
     def told(self, way: Directions) -> Told:
         """Of new runs on this floor."""
-        basis = way.basis(self.paces)
+        basis, around = way.basis(self.paces), way.around()
         of = self.std[:, None, None] * basis
-        rest = self.std**2 * (1 - np.minimum((basis**2).sum(axis=1), 1.0))[:, None]
+        whole = np.where(np.isfinite(way.direction), (around**2).sum(axis=-1), 1.0)
+        rest = (self.std[:, None] ** 2 * np.maximum(whole - (basis**2).sum(axis=-1), 0.0)).T
         known = np.einsum("anq,aqbr->nabr", of, self.covariance)
         return Told(
             np.einsum("anq,aq->na", of, self.coefs),
@@ -298,7 +318,7 @@ def told_of(found: Mapping[str, FoundShared], w: Windows, robot: Robot, free: in
         mine = np.flatnonzero(floors == floor)
         if not len(mine):
             continue
-        here = Directions(every.direction[mine], tuple(every.pace[k] for k in mine))
+        here = every.of_pieces(mine)
         for whole, part in zip(out, one.told(here), strict=True):
             whole[mine] = part
     return out

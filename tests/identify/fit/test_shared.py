@@ -18,8 +18,10 @@ from slipid.identify.fit.problem import Problem, effects_of, less
 from slipid.identify.fit.shared import (
     LENGTH,
     OTHER_LOAD,
+    OTHER_SIDE,
     SPEED_LENGTH,
     Directions,
+    FoundShared,
     Pace,
     freed,
     told_of,
@@ -69,23 +71,54 @@ def motion(problem, log_v, z=None):
 # the kernel -------------------------------------------------------------------------------------
 
 
-def test_neighbours_are_correlated_as_the_periodic_kernel_says():
-    turn = np.radians([0.0, 3.0, 10.0, 25.0, 180.0, 357.0])
+@pytest.mark.parametrize("mirror", [None, 0.0, np.pi / 2])
+def test_neighbours_are_correlated_as_the_periodic_kernel_says(mirror):
+    turn = np.radians([0.0, 3.0, 10.0, 25.0, 180.0, 350.0])
     slow, fast, moved = Pace(-2.25, "a"), Pace(-1.5, "a"), Pace(-2.25, "b")
     pace = (slow, fast, moved)
-    rows = [Directions(turn, (p,) * len(turn)).basis(pace) for p in pace]
-    expected = np.exp(-2 * (np.sin((turn[:, None] - turn) / 2) / LENGTH) ** 2)
+    rows = [Directions(turn, (p,) * len(turn), mirror).basis(pace) for p in pace]
+
+    def near(apart):
+        return np.exp(-2 * (np.sin(apart / 2) / LENGTH) ** 2)
+
     between = {(0, 0): 1.0, (0, 1): np.exp(-0.5 * (0.75 / SPEED_LENGTH) ** 2), (0, 2): OTHER_LOAD}
     for (i, j), share in between.items():
-        np.testing.assert_allclose(rows[i] @ rows[j].T, share * expected, atol=0.011)
+        # along alike to either side of the axis, across and in yaw the other way round
+        for k, sign in enumerate((1, -1, -1)):
+            expected = near(turn[:, None] - turn)
+            if mirror is not None:
+                expected += sign * OTHER_SIDE * near(turn[:, None] + turn - 2 * mirror)
+            np.testing.assert_allclose(rows[i][k] @ rows[j][k].T, share * expected, atol=0.02)
 
 
 def test_a_run_on_the_spot_has_no_neighbours_and_a_new_speed_is_less_known():
     pace = (Pace(-2.0, "a"),)
-    still = Directions(np.array([np.nan]), pace).basis(pace)
+    still = Directions(np.array([np.nan]), pace, 0.0).basis(pace)
     assert not still.any()
-    other = Directions(np.zeros(1), (Pace(-1.0, "a"),)).basis(pace)
-    assert (other**2).sum() == pytest.approx(np.exp(-((1 / SPEED_LENGTH) ** 2)), abs=0.01)
+    other = Directions(np.zeros(1), (Pace(-1.0, "a"),), None).basis(pace)
+    squares = (other**2).sum(axis=-1)
+    np.testing.assert_allclose(squares, np.exp(-((1 / SPEED_LENGTH) ** 2)), atol=0.01)
+
+
+@pytest.mark.parametrize("mirror", [None, 0.0])
+def test_new_paces_keep_the_variance_of_the_process(mirror):
+    """What neighbours cannot tell is left, so that far from them all of it is."""
+    seen, other = Pace(-2.0, "a"), Pace(-1.4, "b")
+    turn, count = np.array([0.0, 0.05, 1.0, np.nan]), 3 * 31
+    of = FoundShared(
+        paces=(seen,),
+        std=np.array([0.1, 0.2, 0.3]),
+        coefs=np.zeros((3, 31)),
+        by_number=np.zeros((3, 31, 1)),
+        covariance=np.eye(count).reshape(3, 31, 3, 31),  # nothing was learnt
+    )
+    near = np.exp(-2 * (np.sin(turn) / LENGTH) ** 2)
+    for pace in (seen, other):
+        told = of.told(Directions(turn, (pace,) * 4, mirror))
+        for k, sign in enumerate((1, -1, -1)):
+            whole = 1.0 if mirror is None else 1 + sign * OTHER_SIDE * near
+            expected = of.std[k] ** 2 * np.where(np.isfinite(turn), whole, 1.0)
+            np.testing.assert_allclose(told.covariance[:, k, k], expected, rtol=0.03)
 
 
 # marginalised -----------------------------------------------------------------------------------

@@ -102,7 +102,7 @@ def shared_covariance(problem):
         mine, near = np.asarray(of.pieces), np.asarray(of.near)
         assert [w.surface[k] for k in mine] == [floor] * len(mine)
         for k, axis in enumerate(AXES):
-            like = v[index(f"neighbours.{floor}.{axis}")] * near @ near.T
+            like = v[index(f"neighbours.{floor}.{axis}")] * near[k] @ near[k].T
             like += v[index(f"session.{floor}.{axis}")] * session[np.ix_(mine, mine)]
             by = moved[mine, :, k]
             out[np.ix_(mine, range(m), mine, range(m))] += np.einsum("im,ij,jl->imjl", by, like, by)
