@@ -66,8 +66,8 @@ class Geometry(eqx.Module):
     def mirror(self) -> float | None:
         """Axis of the body about which its wheels are their own mirror image [rad], or None.
 
-        Ahead is asked before sideways. Wheels count by their places and by the lines of their drives
-        and rollers.
+        Ahead is asked before sideways. Wheels count by their places and by the lines of their
+        drives and rollers.
         """
         drive = np.asarray(self.drive_angle)
         free = np.where(self.grips, drive, drive - np.asarray(self.roller_angle))

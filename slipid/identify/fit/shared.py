@@ -8,9 +8,11 @@ of a run along, across and in yaw is
 d is a Gaussian process per floor and axis, with a kernel that is periodic in the direction of
 travel relative to the body, and s one number per floor, axis and session; `own` is in the noise of
 the run. A robot whose wheels are their own mirror image errs alike to either side, along its way by
-as much and across it and in yaw by as much the other way: k(a, b) = k0(a - b) +- h k0(a + b), with
-angles from the axis of the mirror. With r the residuals of a floor's runs, whitened by roots W of their own noise, and coefs
-u of unit variance, e = S u, the effects are marginalised:
+as much, and across it and in yaw by as much the other way: k(a, b) = k0(a - b) +- h k0(a + b), with
+angles from the axis of the mirror.
+
+With r the residuals of a floor's runs, whitened by roots W of their own noise, and coefs u of unit
+variance, e = S u, the effects are marginalised:
 
     min over u of |W (r - E S u)|^2 + |u|^2,    u^ = C^-1 (W E S)^T W r,    C = 1 + (W E S)^T W E S
 
@@ -103,7 +105,10 @@ class Directions:
         odd = size * np.sin(angle)
         more, less = np.sqrt(1 + alike), np.sqrt(1 - alike)
         of_even, of_odd = (more, less, less), (less, more, more)
-        root = [np.concatenate([a * even, b * odd], axis=1) for a, b in zip(of_even, of_odd)]
+        root = [
+            np.concatenate([a * even, b * odd], axis=1)
+            for a, b in zip(of_even, of_odd, strict=True)
+        ]
         return np.stack(root) * np.isfinite(self.direction)[:, None]
 
     def basis(self, paces: tuple[Pace, ...]) -> Float[np.ndarray, "3 piece coef"]:
