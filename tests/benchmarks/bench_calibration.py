@@ -28,7 +28,9 @@ def test_coverage_and_ranks():
     kept = folder / "calibration.jsonl"
     rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
     began, done = time.perf_counter(), {row["seed"] for row in rows}
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), get_context("spawn")) as pool:
+    with ProcessPoolExecutor(
+        len(os.sched_getaffinity(0)), get_context("spawn"), max_tasks_per_child=50
+    ) as pool:
         asked = [pool.submit(replicate, k) for k in range(REPLICATES) if k not in done]
         for answer in as_completed(asked):
             rows.append(answer.result())

@@ -468,7 +468,7 @@ def deployed(out):
     assert json.loads((out / "t.json").read_text())["runs"] == said["runs"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_runs_with_a_wrong_map_are_refused(tmp_path):
     """They were driven on `soft`, and their map says `firm`."""
     drives = grid(
