@@ -174,8 +174,8 @@ def show_truth(page: Page, fit: Fit, truth: Content) -> None:
     page.table(made)
     page.line(
         f"{sum(r.inside for r in rows)} of {len(rows)} intervals hold the truth: the logs come "
-        "from another physics (MuJoCo's rollers) than the model's, and intervals know nothing of "
-        "that\n"
+        "from another physics (MuJoCo's rollers) than the model's, and intervals know of that only "
+        "what runs and floors show by disagreeing\n"
     )
 
 
