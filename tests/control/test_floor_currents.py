@@ -37,6 +37,7 @@ def test_drag_along_the_drive_is_in_the_currents_that_tell_floors():
         )
 
 
+@pytest.mark.slow
 def test_where_frictions_are_open_currents_rule_out_no_mixture_of_floors():
     """The soft floor has thrice the friction it is thought to have, two wheels stand on it."""
     robot, w = deployed(current=1.0), jnp.array([5.0, -1.0, -4.0])

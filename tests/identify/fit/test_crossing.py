@@ -171,6 +171,7 @@ def test_the_noise_of_currents_and_the_offsets_of_runs_are_told_apart(learnt):
     assert std["crossing.current.run"] == pytest.approx(OFFSET, rel=0.35)
 
 
+@pytest.mark.slow
 def test_what_a_run_is_off_all_along_counts_once_not_once_a_window(fitted):
     """Information of currents falls to that of a mean over runs as their offsets grow."""
     true, problem, optimum = fitted
@@ -188,6 +189,7 @@ def test_what_a_run_is_off_all_along_counts_once_not_once_a_window(fitted):
     assert told[1] < 0.3 * told[0]
 
 
+@pytest.mark.slow
 def test_windows_that_do_not_count_say_nothing(fitted):
     true, problem, optimum = fitted
     several = crossed(true, 6, 5)
@@ -218,6 +220,7 @@ def test_windows_that_do_not_count_say_nothing(fitted):
         )
 
 
+@pytest.mark.slow
 def test_pieces_left_out_change_nothing(fitted):
     """The loss of kept pieces does not know what was measured in the others."""
     true, problem, optimum = fitted
@@ -235,6 +238,7 @@ def test_pieces_left_out_change_nothing(fitted):
     assert losses[0] == losses[1]
 
 
+@pytest.mark.slow
 def test_a_single_run_judges_nothing(fitted):
     true, problem, optimum = fitted
     found = across(problem, optimum, crossed(true, 1, 3), lambda state: None, most_rounds=2)

@@ -182,6 +182,7 @@ def test_the_spread_of_residuals_is_that_of_numbers_and_effects_together(problem
 # predictions of other runs ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_neighbours_tell_is_that_of_the_dense_gaussian(problem):
     """Mean and covariance of a new run's effect given the fitted ones, numbers held."""
     keep = np.ones(RUNS)
