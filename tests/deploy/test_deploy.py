@@ -73,7 +73,8 @@ def test_what_it_is_told_of_effects_is_what_forecasts_know(fitted):
     for n, speed in enumerate(told.speeds):
         for k in (0, 17, 50):
             pace = (Pace(float(np.log(speed)), robot.load_setup),)
-            way = Directions(np.array([2 * np.pi * k / DIRECTIONS]), pace, 0.0)
+            mirror = contact.robot.geometry.mirror()
+            way = Directions(np.array([2 * np.pi * k / DIRECTIONS]), pace, mirror)
             known = contact.shared[robot.labels[0]].told(way)
             np.testing.assert_allclose(told.mean[0][n][k], -known.mean[0], rtol=2e-3, atol=1e-6)
             # the numbers are not known either
