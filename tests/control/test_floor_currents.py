@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from slipid.control.estimator import Estimator
 from slipid.control.floor_filter import FloorFilter
