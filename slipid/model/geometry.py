@@ -11,6 +11,9 @@ from jaxtyping import Array, Float
 
 from slipid.parameter import parameter
 
+_MIRRORED = 0.01
+"""Largest distance of a wheel from its mirror image: base radii, or twice the radians of a line."""
+
 
 class Geometry(eqx.Module):
     """Wheels on a rigid body, REP-103 axes (x ahead, y left, yaw counter-clockwise).
@@ -67,7 +70,7 @@ class Geometry(eqx.Module):
         """Axis of the body about which its wheels are their own mirror image [rad], or None.
 
         Ahead is asked before sideways. Wheels count by their places and by the lines of their
-        drives and rollers.
+        drives and rollers, up to what a config that was measured by hand is off.
         """
         drive = np.asarray(self.drive_angle)
         free = np.where(self.grips, drive, drive - np.asarray(self.roller_angle))
@@ -77,7 +80,7 @@ class Geometry(eqx.Module):
         for axis in (0.0, 0.5 * math.pi):
             mirrored = np.exp(2j * axis * np.array([1, 2, 2])) * wheels.conj()
             apart = np.abs(wheels[:, None] - mirrored).max(axis=-1)
-            if apart.min(axis=1).max() < 1e-6:
+            if apart.min(axis=1).max() < _MIRRORED:
                 return axis
         return None
 

@@ -110,7 +110,7 @@ class Bend:
     @staticmethod
     def none(size: int) -> "Bend":
         """No bend, with all monomials that there can be."""
-        one = size
+        one = size  # the column of ones
         factors = [(one, one, one)] + [(k, one, one) for k in range(size)]
         squared, cubed = range(min(SQUARED, size - 1)), range(min(CUBED, size - 1))
         factors += [(*pair, one) for pair in combinations_with_replacement(squared, 2)]
