@@ -10,11 +10,11 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.stats import multivariate_normal
 
-from slipid.identify.compare.predictive import contact_of
+from slipid.identify.compare.predictive import contact_of, setups
 from slipid.identify.fit import hierarchy
-from slipid.identify.fit.noise import effects
+from slipid.identify.fit.noise import SHARED, effects
 from slipid.identify.fit.optimise import optimise
-from slipid.identify.fit.problem import Problem, effects_of, less
+from slipid.identify.fit.problem import Problem, State, effects_of, less
 from slipid.identify.fit.shared import (
     LENGTH,
     OTHER_LOAD,
@@ -296,6 +296,45 @@ def test_few_runs_or_sectors_say_nothing_of_the_tail():
     axis = axis_of(np.random.default_rng(0))
     found = hierarchy._left_out([axis], np.zeros(3), np.linspace(0.0, 1.5, 60))
     assert np.isnan(found.gap).all()
+
+
+@pytest.mark.slow
+def test_every_axis_has_the_covariance_of_its_own_effects(problem):
+    """Scoring of the variances sees what the fit marginalises, along, across and in yaw."""
+    log_v = log_variance(problem)
+    blocks, jacobian = motion(problem, log_v)
+    moved = blocks["motion"], jacobian["motion"]
+    covariance = np.diag(problem.space.prior_std**2)
+    axes = list(hierarchy._axes(problem.target, moved, jnp.ones(RUNS), covariance, log_v))
+    assert len(axes) == 3 * len(problem.target.shared)
+    for k, axis in enumerate(axes):
+        root = problem.target.shared[k // 3].root(jnp.asarray(log_v))[axis.number]
+        v = np.exp(log_v)[axis.numbers]
+        found = sum(v[j] * axis.bases[j] for j in range(1, len(v)))  # but what each has alone
+        np.testing.assert_allclose(found, root @ root.T, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_forecasts_grow_but_for_what_each_run_has_alone(problem):
+    """Ends and increments; the own part is that of a model which knows all else for sure."""
+    log_v, w = log_variance(problem), problem.windows
+    covariance = np.diag((0.1 * problem.space.prior_std) ** 2)
+    state = State(problem.space.start, log_v, 0, 0.0, 0.0, "joint", np.zeros((RUNS, 3)))
+    plain = replace(contact_of(problem, state, covariance, np.ones(RUNS)), extrapolation={})
+    grown = replace(plain, extrapolation=dict.fromkeys(setups(w), 4.0))
+    kept = {n: v for n, v in plain.variance.items() if n.split(".")[0] not in SHARED}
+    sure = {name: replace(x, covariance=0 * x.covariance) for name, x in plain.shared.items()}
+    alone = replace(plain, shared=sure, variance=kept, covariance=0 * covariance)
+    told = plain.effect_covariance(w)
+    np.testing.assert_allclose(grown.effect_covariance(w), 4 * told, rtol=1e-12)
+    one, four, own = (m.ends(w)[1] for m in (plain, grown, alone))
+    assert np.trace(own, axis1=1, axis2=2).min() > 0
+    # the covariance of the ends is linear in what grows
+    np.testing.assert_allclose(four - own, 4 * (one - own), rtol=1e-4, atol=1e-11)
+    noise = np.asarray(problem.covariance("motion", log_v))
+    before, after = (m.scale(problem)[1] - noise for m in (plain, grown))
+    assert np.abs(before).max() > 1e-6
+    np.testing.assert_allclose(after, 4 * before, rtol=1e-8, atol=1e-12)
 
 
 def test_sectors_are_cut_where_no_runs_are_parted():
