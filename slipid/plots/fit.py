@@ -24,7 +24,7 @@ PATHS = (
 PICTURES: dict[str, Callable[[Fit, Runs, Seen], Figure | None]] = {
     "slip_by_heading": lambda fit, data, pieces: heading_figure(fit.robot, pieces),
     "paths": lambda fit, data, pieces: path_figure(
-        fit.robot, data, pieces.groups, PATHS + "runs of the fit"
+        fit.contact, data, pieces.groups, PATHS + "runs of the fit"
     ),
     "slip_by_torque": lambda fit, data, pieces: curve_figure(fit, pieces),
     "current_by_traction": lambda fit, data, pieces: current_figure(pieces),
@@ -63,6 +63,6 @@ def validate_plots(fit: Fit, data: Runs, found: Content, out: Path) -> list[Path
     order = [(floor, load) for floor in sorted(names) for load in fit.robot.body.loads]
     figures = {
         "validation_errors": ladder_figure(found, which),
-        "validation_paths": path_figure(fit.robot, data, order, PATHS + which),
+        "validation_paths": path_figure(fit.contact, data, order, PATHS + which),
     }
     return save_all(figures, out)

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from slipid.data.runs import Runs
 from slipid.identify.compare import open_loop as replay
+from slipid.identify.compare.predictive import Contact
 from slipid.identify.compare.slip_models import Encoder
-from slipid.identify.fit import likelihood as lk
 from slipid.model.robot import Robot
 from slipid.plots import drawing
 from slipid.plots.seen import Seen, by_heading
@@ -95,10 +95,11 @@ def named(surface: str, load: str, groups: Sequence[tuple[str, str]]) -> str:
     return f"{surface}, load {load}" if several else surface
 
 
-def path_figure(robot: Robot, data: Runs, order: Sequence[tuple[str, str]], title: str) -> Figure:
+def path_figure(model: Contact, data: Runs, order: Sequence[tuple[str, str]], title: str) -> Figure:
     """Some runs per floor and load, started at one point with the robot looking to the right.
 
     Args:
+        model: what predicts, told by neighbouring runs as in the table of errors.
         order: of the panels, (floor, load set-up).
         title: says whether the fit has seen these runs.
     """
@@ -106,7 +107,7 @@ def path_figure(robot: Robot, data: Runs, order: Sequence[tuple[str, str]], titl
     for k, log in enumerate(data.logs):
         groups.setdefault((log.surface or "unknown", log.load), []).append(k)
     names = [name for name in order if name in groups]
-    paths = _paths(robot, data)
+    paths = _paths(model, data)
     made, axes = drawing.panels(len(names), 3.7, 4.3, title)
     for ax, (surface, load) in zip(axes, names, strict=True):
         runs = groups[surface, load]
@@ -142,13 +143,12 @@ def _spread(data: Runs, runs: list[int]) -> list[int]:
     return [runs[k] for k in at]
 
 
-def _paths(robot: Robot, data: Runs) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _paths(model: Contact, data: Runs) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Measured, predicted and encoder path (edge, 2) of every run, from the origin, x ahead."""
     out: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = [None] * len(data)
+    robot = model.robot
     for w in replay.cuts(data, robot):
-        b = lk.batch(w, robot)
-        steps = np.asarray(replay.contact_increments(robot, b))
-        tracks = replay.follow(robot, w, steps)
+        tracks = model.tracks(w)
         encoder = replay.follow(robot, w, Encoder().increments(w, robot))
         for n, k in enumerate(tracks.run):
             yaw = float(robot.camera.yaw(jnp.asarray(robot.session_index(w.session[n]))))
@@ -169,7 +169,7 @@ def _errors(paths: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> str:
     gap = np.linalg.norm(ends[:, 1:] - ends[:, :1], axis=2) / chord[:, None]
     own, encoder = 100 * gap.mean(axis=0)
     count = f"{len(paths)} runs" if len(paths) > 1 else "1 run"
-    return f"{count}: end off by {own:.1f} % (encoders {encoder:.0f} %)"
+    return f"{count}: end off by {own:.1f} % (encoders {encoder:.1f} %)"
 
 
 def _ray(ax: Axes, paths: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:

@@ -11,6 +11,9 @@ import pytest
 
 from slipid.cli import demo
 from slipid.cli.demo import PARTS, RECORDED, drive_anew, packaged_config, unpack
+from slipid.job.config import read_config
+from slipid.job.problem import read_job
+from slipid.plots.motion import path_figure
 from slipid.report.estimates import compared
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -133,3 +136,12 @@ def test_the_demo_finds_the_motor_weighs_the_robot_and_beats_the_encoders(tmp_pa
     identified = json.loads((tmp_path / "result" / "identified.json").read_text())
     golden("demo_identified", list(of_identified(identified)), rtol=1e-3, atol=1e-6)
     golden("demo_validation", list(of_validation(found)), rtol=1e-3, atol=1e-6)
+    # the picture of the paths says what the table says
+    config = read_config(tmp_path / "result" / "config.toml")
+    data = read_job(config, tmp_path / "recorded" / "unseen" / "logs", Reporter(quiet=True)).dataset
+    order = [("firm", "as_built"), ("soft", "as_built"), ("soft", "moved")]
+    drawn = path_figure(done.fit.contact, data, order, "unseen runs").axes
+    for ax, floor in zip(drawn, ("firm", "soft", "soft@moved"), strict=False):
+        by = found["summary"][floor]
+        mine, encoder = (100 * by[m]["endpoint_error_mean"] for m in ("identified", "encoder"))
+        assert f"end off by {mine:.1f} % (encoders {encoder:.1f} %)" in ax.get_title()

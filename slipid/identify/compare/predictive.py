@@ -199,13 +199,25 @@ class Contact(Predictive):
         slope = np.asarray(jac["motion"]) - np.einsum("nma,nap->nmp", e, told.slope)
         return gap, slope
 
+    def tracks(self, w: Windows) -> replay.Tracks:
+        """Of whole runs, as the force balance and what neighbours tell have them."""
+        return self._tracks(w, self._moved(w, self.told(w)))
+
+    def _moved(self, w: Windows, told: Told) -> Float[np.ndarray, "piece window 3"]:
+        """By what neighbours tell that the force balance moves too far."""
+        moved = np.einsum("nma,na->nm", effects(w, self.robot), told.mean)
+        return moved.reshape(*w.dt.shape, 3)
+
+    def _tracks(self, w: Windows, moved: Float[np.ndarray, "piece window 3"]) -> replay.Tracks:
+        b = lk.batch(w, self.robot)
+        increments = np.asarray(replay.contact_increments(self.robot, b)) - moved
+        return replay.follow(self.robot, w, increments)
+
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
         b, told, e = lk.batch(w, self.robot), self.told(w), effects(w, self.robot)
-        shape = (*w.dt.shape, 3)
-        moved = np.einsum("nma,na->nm", e, told.mean).reshape(shape)
-        increments = np.asarray(replay.contact_increments(self.robot, b)) - moved
-        tracks = replay.follow(self.robot, w, increments)
-        by_number = np.einsum("nma,nap->nmp", e, told.slope).reshape(*shape, -1)
+        moved = self._moved(w, told)
+        tracks = self._tracks(w, moved)
+        by_number = np.einsum("nma,nap->nmp", e, told.slope).reshape(*moved.shape, -1)
         more = replay.Correction(jnp.asarray(moved), jnp.asarray(by_number))
         start = tracks.predicted[:, 0]
         jac = np.asarray(replay.end_jacobian(self.space, self.z, b, start, corrected=more))
