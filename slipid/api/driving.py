@@ -8,7 +8,7 @@ from slipid.data.floor_map import FloorMap
 from slipid.deploy.controllers import ROWS, pilot_of
 from slipid.deploy.deploy import habits_of
 from slipid.deploy.trial import REST_S
-from slipid.deploy.trial_site import site, starts, twin
+from slipid.deploy.trial_site import floor_of, site, starts, twin
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,5 +55,7 @@ def drive(
     row, begin = ROWS[controller], places[start]
     plant = twin(robot, floor, begin, seed, habits_of(robot, gyro=row.gyro))
     path = trajectory.rectangle().moved(begin).waiting(REST_S)
-    course = closed_loop.drive(pilot_of(robot, row), path, plant, begin)
+    course = closed_loop.drive(
+        pilot_of(robot, row, floor=floor_of(floor, robot.labels)), path, plant, begin
+    )
     return Drive(course, floor, closed_loop.metrics(course))

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import UNTIMED_S, Estimate, Numbers
-from slipid.model.contact_inverse import inverse_contact
+from slipid.control.least_error import wheel_speeds
 from slipid.parameter import parameter
 
 Correction = Literal["none", "torque", "paper_print", "paper_code"]
@@ -188,7 +188,7 @@ class Controller(eqx.Module):
         a = 1 - jnp.exp(-dt / OBSERVE_S)
         miss = old.miss + a * (twist - old.wanted - old.miss)
         asked = wanted - k.observer * miss
-        wheels = self._wheels(asked, e) + self._torque(wanted, e)
+        wheels = self._wheels(old, asked, e) + self._torque(wanted, e)
         before = jnp.where(old.begun, old.command, jnp.where(safe, e.wheel_speed, 0.0))
         wheels = jnp.where(safe, wheels, 0.0)
         since = jnp.where(safe, dt, jnp.maximum(dt, UNTIMED_S))
@@ -213,25 +213,13 @@ class Controller(eqx.Module):
         fast = jnp.sqrt(wanted[:2] @ wanted[:2] + 1e-12) / self.limits.twist
         return wanted.at[:2].divide(jnp.maximum(fast, 1.0))
 
-    def _wheels(self, asked: Array, e: Estimate) -> Array:
-        """Wheel speeds for a twist: a share of the inverse model, the rest kinematics.
-
-        Mecanum wheels, whose inverse model is another, go by kinematics alone.
-        """
-        f = self.robot
+    def _wheels(self, old: ControllerState, asked: Array, e: Estimate) -> Array:
+        """Wheel speeds for a twist: a share of those by the contact model, the rest kinematics."""
+        f, ahead = self.robot, self.gains.ahead
         plain = f.forward @ asked / f.frame.radius
-        ahead = self.gains.ahead
         if not isinstance(ahead, jax.core.Tracer) and float(ahead) == 0.0:
-            return plain  # the compiled code goes without the inverse model
-        share = e.surface_probability[:, :-1]
-        total = jnp.sum(share, axis=1, keepdims=True)
-        known = jnp.where(total > 1e-3, share / jnp.maximum(total, 1e-3), 0.0)
-        known = jnp.where(jnp.isfinite(known), known, 0.0)
-        moves = jnp.clip(jnp.max(jnp.abs(plain)) * f.frame.radius / 0.02 - 0.25, 0.0, 1.0)
-        right = jnp.all(jnp.abs(f.frame.slip_through) < 1e-9)  # rollers at right angles
-        extra = inverse_contact(f.frame, f.floors, f.rest, f.inverse, asked, known) - plain
-        extra = jnp.where(right & (total[:, 0] > 1e-3), extra, 0.0)
-        return plain + ahead * moves * (1 - e.surface_probability[0, -1]) * extra
+            return plain  # the compiled code goes without the contact model
+        return plain + ahead * (wheel_speeds(f, asked, e.believed, old.command) - plain)
 
     def _torque(self, wanted: Array, e: Estimate) -> Array:
         """The 2021 paper's correction by the forces off the commanded direction [rad/s]."""

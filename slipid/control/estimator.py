@@ -13,10 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.floor_filter import FloorFilter, FloorState, Tick, length
-from slipid.control.interface import AbstractEstimator, Estimate, Pose, Readings, Settings
-from slipid.control.pose_filter import PoseFilter
-from slipid.control.pose_fix import PoseState
+from slipid.control.floor import Floor
+from slipid.control.floor_filter import FloorFilter, FloorState, Tick, hypotheses_of, length
+from slipid.control.interface import AbstractEstimator, Believed, Estimate, Pose, Readings, Settings
+from slipid.control.pose_filter import PoseFilter, turned_axes
+from slipid.control.pose_fix import PoseState, placed
 from slipid.control.wheels import WheelState, read_currents, read_wheels, time_step
 from slipid.model.se2 import advance, compose
 
@@ -47,13 +48,18 @@ class Estimator(AbstractEstimator[EstimatorState]):
         robot: the identified robot; its `labels` name the floors in the order of
             `Estimate.surface_probability`.
         settings: by default as the robot's logs were.
+        floor: map of the place, its surfaces by number in the robot's `labels`; None where there
+            is none.
     """
 
     robot: DeployedRobot
     settings: Settings = eqx.field(static=True)
+    floor: Floor | None = None
 
-    def __init__(self, robot: DeployedRobot, settings: Settings | None = None):
-        self.robot = robot
+    def __init__(
+        self, robot: DeployedRobot, settings: Settings | None = None, floor: Floor | None = None
+    ):
+        self.robot, self.floor = robot, floor
         self.settings = Settings.of(robot) if settings is None else settings
 
     def init(
@@ -85,8 +91,18 @@ class Estimator(AbstractEstimator[EstimatorState]):
         )
         gyro = jnp.where(jnp.isfinite(z.gyro) & (jnp.abs(z.gyro) < 50.0), z.gyro, jnp.nan)
         turn = gyro - old.place.nuisance[-1]
-        floors, motion = FloorFilter(f, s).step(old.floors, w, currents, turn, tick)
-        place, twist, left = PoseFilter(f, s).step(old.place, motion, gyro, z, tick)
+        by_floor, by_pose, before = FloorFilter(f, s), PoseFilter(f, s), old.place
+        if self.floor is None:
+            floors, motion = by_floor.step(old.floors, w, currents, turn, tick)
+        else:
+            hypotheses = hypotheses_of(f)
+            root, supports = by_pose.mapped(before, self.floor, hypotheses)
+            mapped = jnp.mean(supports, axis=0)
+            floors, motion = by_floor.step(old.floors, w, currents, turn, tick, mapped)
+            before, left = placed(before, root, supports, motion)
+            supports = by_pose.mapped(before, self.floor, hypotheses)[1]
+            floors = _corrected(floors, left, before, jnp.mean(supports, axis=0))
+        place, twist, left = by_pose.step(before, motion, gyro, z, tick)
         floors = replace(floors, apart=floors.apart @ left.T)
         stuck = self._stuck(old.stuck, w, twist, tick)
         new = EstimatorState(wheels, currents.filtered, floors, place, stuck)
@@ -103,6 +119,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
             stale=jnp.any(wheels.age > s.stale_s),
             immobilised=stuck > 0.4,
             out_of_range=self._beyond(w, currents.filtered, unknown),
+            believed=Believed(floors.belief, floors.twist),
             labels=f.labels,
         )
 
@@ -127,6 +144,12 @@ class Estimator(AbstractEstimator[EstimatorState]):
         highest = self.robot.highest
         fast = jnp.max(jnp.abs(w)) > 1.3 * highest[0]
         return fast | (jnp.max(jnp.abs(amps)) > 1.3 * highest[1]) | (unknown > 0.5)
+
+
+def _corrected(floors: FloorState, left: Array, place: PoseState, expected: Array) -> FloorState:
+    """Hypotheses once a map has corrected the pose, `left` in the world's axes."""
+    world = turned_axes(place.pose[2])
+    return replace(floors, apart=floors.apart @ (world.T @ left @ world).T, expected=expected)
 
 
 class OdometryState(eqx.Module):
@@ -193,5 +216,6 @@ class Odometry(AbstractEstimator[OdometryState]):
             stale=jnp.any(wheels.age > s.stale_s),
             immobilised=jnp.zeros((), bool),
             out_of_range=jnp.max(jnp.abs(w)) > 1.3 * f.highest[0],
+            believed=Believed.nothing(f.wheels, len(f.labels)),
             labels=f.labels,
         )

@@ -21,7 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.effects import Course
@@ -54,11 +54,13 @@ class FloorState(eqx.Module):
 
     Attributes:
         belief: probability of each, and of none of them in the last place.
+        expected: probability of each before anything is measured, where the robot is.
         twist: of the body by the contact alone, if it were true [m/s, m/s, rad/s].
         apart: pose if it were true, seen from the believed one [m, m, rad].
     """
 
     belief: Float[Array, " hypothesis_or_none"]
+    expected: Float[Array, " hypothesis"]
     twist: Float[Array, "hypothesis 3"]
     apart: Float[Array, "hypothesis 3"]
 
@@ -71,6 +73,8 @@ class Motion(eqx.Module):
         rolling: twist of wheels that do not slip; course: where it leads.
         left: std of the effects of every floor that is left along this course.
         by_friction: derivative of the mean by the log friction of each floor [m/s, m/s, rad/s].
+        known: probability of every hypothesis, given that it is one of them; before: that without
+            the evidence of this step.
         under: probability of each floor under each wheel, given that it is one of them.
         jump: what the pose moves beyond the mean twist, news that came late [m, m, rad].
         news: mean twist less what it was believed to be before the news [m/s, m/s, rad/s].
@@ -82,6 +86,8 @@ class Motion(eqx.Module):
     course: Course
     left: Float[Array, "floor 3"]
     by_friction: Float[Array, "3 floor"]
+    known: Float[Array, " hypothesis"]
+    before: Float[Array, " hypothesis"]
     under: Float[Array, "wheel floor"]
     jump: Float[Array, "3"]
     news: Float[Array, "3"]
@@ -93,29 +99,30 @@ class FloorFilter(eqx.Module):
     robot: DeployedRobot
     settings: Settings = eqx.field(static=True)
 
-    @property
-    def hypotheses(self) -> np.ndarray:
-        """Floor under every wheel in every hypothesis (hypothesis, wheel)."""
-        floors, wheels = len(self.robot.labels), self.robot.wheels
-        return np.array(list(itertools.product(range(floors), repeat=wheels)))
-
     def init(self) -> FloorState:
         """Before anything is measured."""
         count = len(self.robot.labels) ** self.robot.wheels
         return FloorState(
             belief=jnp.concatenate([self.prior() * 0.99, jnp.asarray([0.01])]),
+            expected=self.prior(),
             twist=jnp.zeros((count, 3)),
             apart=jnp.zeros((count, 3)),
         )
 
     def prior(self) -> Float[Array, " hypothesis"]:
         """Probability of every hypothesis before anything is measured."""
-        kinds = np.array([len(set(row)) for row in self.hypotheses.tolist()])
+        kinds = np.array([len(set(row)) for row in hypotheses_of(self.robot).tolist()])
         weight = np.exp(-self.settings.alike * (kinds - 1))
         return jnp.asarray(weight / weight.sum())
 
     def step(
-        self, old: FloorState, w: Array, currents: Currents, turn: Array, tick: Tick
+        self,
+        old: FloorState,
+        w: Array,
+        currents: Currents,
+        turn: Array,
+        tick: Tick,
+        mapped: Float[Array, " hypothesis"] | None = None,
     ) -> tuple[FloorState, Motion]:
         """Beliefs a time step later, and the motion they say.
 
@@ -123,18 +130,19 @@ class FloorFilter(eqx.Module):
             old, tick: the beliefs before the step, and the step.
             w: wheel speeds [rad/s]; currents: what is known of them.
             turn: yaw rate by the gyro, its bias taken off, NaN without one [rad/s].
+            mapped: probability of every hypothesis by a floor map where the robot now is.
         """
         settled, predicted = self.solve(old.twist, w)
         f = self.robot
         rolling = f.inverse @ (f.frame.radius * w)
         course = Course.of(rolling, f.frame.base)
         mean, part = f.told.at(course)
-        xi = settled + self._told(course.speed * mean @ course.axes.T)
+        xi = settled + told_of(f, course.speed * mean @ course.axes.T)
         told, none = self._evidence(xi, predicted, currents, w, turn)
         # what the equilibrium does not know, inertia, weighs little while wheels speed up
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)
         weight = weight / (1 + (tick.acceleration / HASTE) ** 2)
-        prior, apart = self._mixed(old, xi, tick)
+        prior, apart = self._mixed(old, xi, tick, mapped)
         log = jnp.log(jnp.maximum(prior, 1e-12)) + weight * jnp.append(told, none)
         belief = jax.nn.softmax(log)
         known = belief[:-1] / jnp.maximum(jnp.sum(belief[:-1]), 1e-12)
@@ -149,18 +157,15 @@ class FloorFilter(eqx.Module):
             course=course,
             left=f.effect * self._left(part, known, under),
             by_friction=self._by_friction(known @ settled, w, under),
+            known=known,
+            before=before,
             under=under,
             jump=jump,
             news=jnp.where(jnp.isfinite(turn), jnp.array([1.0, 1.0, 0.0]), 1.0)
             * ((known - before) @ xi),
         )
-        return FloorState(belief=belief, twist=settled, apart=apart), motion
-
-    def _told(self, of_floor: Float[Array, "floor 3"]) -> Float[Array, "hypothesis 3"]:
-        """What is told of the body under every hypothesis: of all wheels on one floor, no more."""
-        under = self.hypotheses
-        whole = (under == under[:, :1]).all(axis=1)
-        return jnp.where(whole[:, None], of_floor[under[:, 0]], 0.0)
+        expected = old.expected if mapped is None else mapped
+        return FloorState(belief, expected, twist=settled, apart=apart), motion
 
     def _left(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
         """Part of the std of every floor's effects that is left; all of it, wheels on several."""
@@ -174,7 +179,7 @@ class FloorFilter(eqx.Module):
     ) -> tuple[Float[Array, "hypothesis 3"], Float[Array, "hypothesis wheel"]]:
         """Twist [m/s, m/s, rad/s] and currents [A] of every hypothesis, `near` a moment ago."""
         f = self.robot
-        on = stand(f.frame, f.floors.at(self.hypotheses.T), f.rest)
+        on = stand(f.frame, f.floors.at(hypotheses_of(self.robot).T), f.rest)
         rim = f.frame.radius * w
         twist, pull = settle(near.T, rim, on, f.inverse)
         drag = Balance(rim[:, None], on).rolled(Planar(*twist))
@@ -213,7 +218,7 @@ class FloorFilter(eqx.Module):
         """Log likelihood of what is measured under every hypothesis, and under none of them."""
         f, s = self.robot, self.settings
         amps, told_of = currents.filtered, currents.told
-        std = f.current_std[jnp.asarray(self.hypotheses)]
+        std = f.current_std[jnp.asarray(hypotheses_of(self.robot))]
         size = jnp.sqrt(predicted**2 + 0.03**2)
         gap = jnp.where(told_of == 2, predicted - amps, size - jnp.abs(amps))
         var = std**2 + (currents.variance + self._stiction(w)) + self._of_friction(predicted)
@@ -235,7 +240,7 @@ class FloorFilter(eqx.Module):
 
         A wheel has so much of the whole drag as its friction is over their mean.
         """
-        on = np.eye(len(self.robot.labels))[self.hypotheses]
+        on = np.eye(len(self.robot.labels))[hypotheses_of(self.robot)]
         over = (on - on.mean(axis=1, keepdims=True)).reshape(-1, on.shape[2])
         var = jnp.sum((over @ self.robot.friction_covariance) * over, axis=1)
         return amps**2 * var.reshape(amps.shape)
@@ -245,16 +250,21 @@ class FloorFilter(eqx.Module):
         motor = self.robot.motor
         return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / motor.gain) ** 2 / 3
 
-    def _mixed(self, old: FloorState, xi: Array, tick: Tick) -> tuple[Array, Array]:
+    def _mixed(
+        self, old: FloorState, xi: Array, tick: Tick, mapped: Array | None
+    ) -> tuple[Array, Array]:
         """Probabilities and ways once wheels may have come to other floors."""
         known, unknown = jnp.maximum(old.belief[:-1], 1e-12), old.belief[-1]
         sure = jnp.sum(known)
         speed = length((known @ xi)[:2] / sure)
         change = 1 - jnp.exp(-speed * tick.dt / self.settings.patch_m)
         whole = jnp.concatenate([known[:, None], known[:, None] * old.apart], axis=1)
-        whole = self._changed(whole, change)
+        if mapped is None:
+            fresh, whole = self.prior(), self._changed(whole, change)
+        else:
+            fresh, whole = mapped, _followed(whole, old.expected, mapped, change)
         stayed = whole[:, 0] * (1 - 0.05 * change)
-        of_known = stayed + 0.2 * change * unknown * self.prior()
+        of_known = stayed + 0.2 * change * unknown * fresh
         # what comes back from "unknown" has gone the mean way
         apart = whole[:, 1:] * ((1 - 0.05 * change) / of_known)[:, None]
         of_none = unknown * (1 - 0.2 * change) + 0.05 * change * sure
@@ -292,6 +302,36 @@ class FloorFilter(eqx.Module):
         p = known.reshape((floors,) * wheels)
         others = [tuple(k for k in range(wheels) if k != axis) for axis in range(wheels)]
         return jnp.stack([jnp.sum(p, axis=o) for o in others])
+
+
+def hypotheses_of(robot: DeployedRobot) -> Int[np.ndarray, "hypothesis wheel"]:
+    """Floor under every wheel in every hypothesis."""
+    floors = range(len(robot.labels))
+    return np.array(list(itertools.product(floors, repeat=robot.wheels)))
+
+
+def told_of(
+    robot: DeployedRobot, of_floor: Float[Array, "floor 3"]
+) -> Float[Array, "hypothesis 3"]:
+    """What is told of the body under every hypothesis: of all wheels on one floor, no more."""
+    under = hypotheses_of(robot)
+    whole = (under == under[:, :1]).all(axis=1)
+    return jnp.where(whole[:, None], of_floor[under[:, 0]], 0.0)
+
+
+def _followed(
+    p: Float[Array, "hypothesis column"], before: Array, now: Array, change: Array
+) -> Float[Array, "hypothesis column"]:
+    """Hypotheses as a map has them follow each other where the robot goes.
+
+    Of what the map expects less than before, so much goes over to what it expects more, and no more
+    than that; beyond it, a wheel may have come to what the map does not show.
+    """
+    gone = jnp.clip(1 - now / jnp.maximum(before, 1e-12), 0.0, 1.0)[:, None]
+    more = jnp.maximum(now - before, 0.0)
+    more = more / jnp.maximum(jnp.sum(more), 1e-12)
+    p = p * (1 - gone) + more[:, None] * jnp.sum(gone * p, axis=0)
+    return (1 - change) * p + change * now[:, None] * jnp.sum(p, axis=0)
 
 
 def length(v: Float[Array, "*batch axis"]) -> Float[Array, "*batch"]:

@@ -14,14 +14,19 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.effects import direction, stays
-from slipid.control.floor_filter import Motion, Tick, length
+from slipid.control.floor import Floor
+from slipid.control.floor_filter import HASTE, Motion, Tick, length
 from slipid.control.interface import Readings, Settings
 from slipid.control.pose_fix import HISTORY, PoseState, fixed, handed_over, nearest
 from slipid.model.se2 import advance, compose
+
+CREEPS = 0.05
+"""Speed up to which no fit has seen how a robot turns [m/s]."""
 
 
 class _Way(eqx.Module):
@@ -71,6 +76,13 @@ class PoseFilter(eqx.Module):
             history=jnp.broadcast_to(entry, (HISTORY, 15)),
         )
 
+    def mapped(
+        self, now: PoseState, floor: Floor, hypotheses: Int[np.ndarray, "hypothesis wheel"]
+    ) -> tuple[Float[Array, "3 3"], Float[Array, "sample hypothesis"]]:
+        """Root of the pose's covariance, and what a map supports at poses drawn from it."""
+        root, floors = root_of(now.covariance[:3, :3]), len(self.robot.labels)
+        return root, floor.supports(now.pose, root, self.robot.places, hypotheses, floors)
+
     def step(
         self, old: PoseState, motion: Motion, gyro: Array, z: Readings, tick: Tick
     ) -> tuple[PoseState, Float[Array, "3"], Float[Array, "3 3"]]:
@@ -94,12 +106,12 @@ class PoseFilter(eqx.Module):
         still = jnp.where(moves, 0.0, jnp.minimum(old.still + dt, 1e3))
         old = replace(old, history=handed_over(old, motion, self.robot.frame.base))
         new = replace(self._grow(old, pose, way, tick), time=time, still=still)
-        new = self._rest(new, gyro)
+        new = self._rest(self._turns(new, way, gyro, free[2], tick), gyro)
         begun, ended = jnp.concatenate([time[None], new.pose, free[2:]]), new.far[None]
         entry = jnp.concatenate([begun, new.noise.reshape(-1), ended])
         history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
         new, left = fixed(replace(new, history=history), z)
-        world = _turned_axes(new.pose[2])
+        world = turned_axes(new.pose[2])
         return new, twist, world.T @ left @ world
 
     def _way(self, motion: Motion, gyro: Array) -> _Way:
@@ -107,7 +119,7 @@ class PoseFilter(eqx.Module):
         speed, axes = motion.course.speed, motion.course.axes
         std = speed * share[:, None] * motion.left
         by_effect = (std[:, :, None] * axes.T).reshape(-1, 3).T
-        doubt = axes @ _root(axes.T @ motion.scatter @ axes)
+        doubt = axes @ root_of(axes.T @ motion.scatter @ axes)
         return _Way(
             speed=speed,
             axes=axes,
@@ -142,9 +154,46 @@ class PoseFilter(eqx.Module):
 
         `free` is the contact model's [rad/s], `time` that after the step.
         """
-        delay = self.settings.gyro_delay_s
-        then = free if delay == 0.0 else nearest(old.history, time - delay)[4]
+        then = self._then(replace(old, time=time), free)
         return jnp.where(jnp.isfinite(gyro), free + gyro - old.nuisance[-1] - then, free)
+
+    def _then(self, now: PoseState, free: Array) -> Array:
+        """Yaw rate of the contact model at the time of the gyro's reading [rad/s]."""
+        delay = self.settings.gyro_delay_s
+        return free if delay == 0.0 else nearest(now.history, now.time - delay)[4]
+
+    def _turns(self, now: PoseState, way: _Way, gyro: Array, free: Array, tick: Tick) -> PoseState:
+        """Compare a gyro with the contact model while the robot moves.
+
+        The gyro reads the model's yaw rate, what pushes it off, and its own bias, so that it tells
+        of both and of whatever pushes the body sideways together with them:
+
+            gyro = (twist + slope nuisance)_yaw + bias + noise
+
+        The noise is the gyro's and that of the model per root of the distance; a reading far from
+        what is believed counts less, as do all while wheels speed up, which the equilibrium does
+        not know. Only heading and bias learn from it: what pushes the body is considered and stays
+        as it is (Schmidt 1966), since the floors are told by the same gyro.
+        """
+        dt, cov = jnp.maximum(tick.dt, 1e-3), now.covariance
+        look = jnp.concatenate([jnp.zeros(3), way.slope[2], jnp.ones(1)])
+        told = (way.speed > CREEPS) & jnp.isfinite(gyro) & (tick.dt > 0)
+        gap = jnp.where(told, gyro - now.nuisance[-1] - self._then(now, free), 0.0)
+        walk = (way.share @ self.robot.process[:, 2] ** 2) * way.speed / dt
+        noise = (self.settings.gyro_std**2 + walk) * (1 + (tick.acceleration / HASTE) ** 2)
+        by = cov @ look
+        var = look @ by + noise
+        var = var * jnp.maximum(gap**2 / (9.0 * var), 1.0)
+        learns = jnp.zeros(len(cov)).at[jnp.array([2, -1])].set(1.0)
+        gain = jnp.where(told, learns * by / var, 0.0)
+        change = gain * gap
+        off = jnp.outer(gain, by)
+        return replace(
+            now,
+            pose=now.pose + change[:3],
+            nuisance=now.nuisance + change[3:],
+            covariance=cov - off - off.T + var * jnp.outer(gain, gain),
+        )
 
     def _rest(self, now: PoseState, gyro: Array) -> PoseState:
         """Learn the gyro's bias while the robot rests.
@@ -168,7 +217,7 @@ class PoseFilter(eqx.Module):
     def _grow(self, old: PoseState, pose: Array, way: _Way, tick: Tick) -> PoseState:
         """At the pose after the step, with the covariance and what came into it."""
         f, s, dt = self.robot, self.settings, tick.dt
-        world = _turned_axes(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))
+        world = turned_axes(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))
         gone = pose[:2] - old.pose[:2]
         on = jnp.where(tick.moves, dt, 0.0)
         # yaw comes from the gyro, not from the floor
@@ -195,14 +244,17 @@ class PoseFilter(eqx.Module):
         )
 
 
-def _turned_axes(heading: Float[Array, ""]) -> Float[Array, "3 3"]:
+def turned_axes(heading: Float[Array, ""]) -> Float[Array, "3 3"]:
     """Turns a covariance of a body's motion from its axes to the world's."""
     c, s = jnp.cos(heading), jnp.sin(heading)
     return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _root(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Lower triangular root of a covariance of twists; 0.1 mm/s more, so that it has one."""
+def root_of(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Lower triangular root of a covariance of twists or of poses.
+
+    It has 0.1 mm/s, or 0.1 mm and 0.1 mrad, more, so that there is one.
+    """
     a = jnp.sqrt(m[0, 0] + 1e-8)
     b, d = m[1, 0] / a, m[2, 0] / a
     c = jnp.sqrt(jnp.maximum(m[1, 1] - b * b, 0.0) + 1e-8)

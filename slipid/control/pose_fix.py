@@ -7,11 +7,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from slipid.control.floor import SPREAD
 from slipid.control.floor_filter import Motion
 from slipid.control.interface import Readings
 
 HISTORY = 48
 """Steps a delayed measurement may reach back."""
+TRUST = 0.5
+"""Part of the evidence for floors that counts for the pose: one map is wrong in many steps."""
 
 
 class PoseState(eqx.Module):
@@ -92,9 +95,45 @@ def _corrected(
     change = gain @ gap
     cov = cov - gain @ look @ cov
     cov = 0.5 * (cov + cov.T) + aside
-    history = _shifted(history, pose, jnp.broadcast_to(change[:3], (len(history), 3)))
+    history = shifted(history, pose, jnp.broadcast_to(change[:3], (len(history), 3)))
     left = jnp.eye(3) - gain[:3] @ look[:, :3]
     return pose + change[:3], now.nuisance + change[3:], cov, history, left
+
+
+def placed(
+    now: PoseState,
+    root: Float[Array, "3 3"],
+    supports: Float[Array, "sample hypothesis"],
+    motion: Motion,
+) -> tuple[PoseState, Float[Array, "3 3"]]:
+    """Corrected by what is believed of the floors, where a map has them elsewhere.
+
+    The second is what it leaves of how far another pose is from this one, in the world's axes.
+
+    Args:
+        now: pose and covariance; root: of the pose's covariance, as the poses were drawn.
+        supports: probability of every hypothesis at every pose drawn, see `Floor.supports`.
+        motion: what is believed of the hypotheses, before this step's evidence and after.
+    """
+    share = supports / jnp.maximum(jnp.mean(supports, axis=0), 1e-12)
+    weight = (share @ motion.known) / jnp.maximum(share @ motion.before, 1e-12)
+    weight = weight**TRUST
+    weight = weight / jnp.sum(weight)
+    mean = weight @ SPREAD
+    scatter = (SPREAD - mean).T @ (weight[:, None] * (SPREAD - mean))
+    whole = root @ root.T
+    gain = now.covariance[:, :3] @ _inverse(whole)
+    lost = gain @ (whole - root @ scatter @ root.T) @ gain.T
+    change = gain @ (root @ mean)
+    history = shifted(now.history, now.pose, jnp.broadcast_to(change[:3], (len(now.history), 3)))
+    new = replace(
+        now,
+        pose=now.pose + change[:3],
+        nuisance=now.nuisance + change[3:],
+        covariance=now.covariance - lost,
+        history=history,
+    )
+    return new, root @ scatter @ root.T @ _inverse(whole)
 
 
 def handed_over(old: PoseState, motion: Motion, base: Float[Array, ""]) -> Float[Array, "entry 15"]:
@@ -116,10 +155,10 @@ def handed_over(old: PoseState, motion: Motion, base: Float[Array, ""]) -> Float
     c, s = jnp.cos(old.pose[2]), jnp.sin(old.pose[2])
     x, y, yaw = motion.jump
     world = jnp.stack([c * x - s * y, s * x + c * y, yaw])
-    return _shifted(old.history, old.pose, part[:, None] * world)
+    return shifted(old.history, old.pose, part[:, None] * world)
 
 
-def _shifted(
+def shifted(
     history: Float[Array, "entry 15"], pose: Float[Array, "3"], change: Float[Array, "entry 3"]
 ) -> Float[Array, "entry 15"]:
     """History of a pose that was off by so much, a turn about where it is now."""

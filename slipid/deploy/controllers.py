@@ -12,6 +12,7 @@ from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Correction, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator, Odometry
+from slipid.control.floor import Floor
 from slipid.control.interface import AbstractEstimator, Settings
 from slipid.support.errors import DataError
 
@@ -25,8 +26,9 @@ class Row:
         about: one sentence for people.
         correction: of the 2021 paper.
         tuned: whether it has the gains of `slipid tune`, where they are better than by hand.
-        ahead: whether wheel speeds come from the inverse contact model, whatever the gains say.
+        ahead: whether wheel speeds come from the contact model, whatever the gains say.
         gyro: whether the robot has one.
+        mapped: whether it is told the map of its floors.
     """
 
     observer: str
@@ -35,6 +37,7 @@ class Row:
     tuned: bool = False
     ahead: bool = False
     gyro: bool = False
+    mapped: bool = False
 
 
 ROWS: Mapping[str, Row] = {
@@ -43,9 +46,9 @@ ROWS: Mapping[str, Row] = {
     "paper_print": Row("curve", "and torque correction as printed", "paper_print"),
     "paper_code": Row("curve", "and torque correction as its authors ran it", "paper_code"),
     "torque": Row("curve", "and torque correction, corrected", "torque"),
-    "lyapunov": Row("contact", "the common pose loop, a Lyapunov law; gains set by hand"),
-    "contact_ahead": Row("contact", "and wheel speeds of the inverse contact model", ahead=True),
-    "contact": Row("contact", "as lyapunov, tuned gains where they are better", tuned=True),
+    "contact": Row("contact", "contact estimator, tuned gains where they are better", tuned=True),
+    "contact_ahead": Row("contact", "and wheel speeds by the contact model", ahead=True),
+    "contact_map": Row("contact", "contact, told the map of its floors", tuned=True, mapped=True),
     "contact_gyro": Row("contact", "contact, with a gyro", tuned=True, gyro=True),
 }
 
@@ -85,16 +88,21 @@ def unused_gains(robot: DeployedRobot, forced: bool) -> str:
 
 
 def pilot_of(
-    robot: DeployedRobot, row: Row, settings: Settings | None = None, forced: bool = False
+    robot: DeployedRobot,
+    row: Row,
+    settings: Settings | None = None,
+    forced: bool = False,
+    floor: Floor | None = None,
 ) -> Pilot[eqx.Module]:
     """Estimator and controller of a row; some rows have the gains tuned for the robot.
 
-    Those are taken where they are better than gains set by hand, or forced.
+    Those are taken where they are better than gains set by hand, or forced. A map of the floors is
+    told to the rows that may know it.
     """
     own = Gains.of(robot, forced) if row.tuned else Gains()
     if row.ahead:
         own = replace(own, ahead=jnp.asarray(1.0))
-    estimator: AbstractEstimator[Any] = Estimator(robot, settings)
+    estimator: AbstractEstimator[Any] = Estimator(robot, settings, floor if row.mapped else None)
     if row.observer != "contact":
         estimator = Odometry(robot, settings, curve=row.observer == "curve")
         own = replace(own, preview=jnp.asarray(0.0))  # the paper's loop has none

@@ -12,14 +12,14 @@ import numpy as np
 from slipid.control import closed_loop, trajectory
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot
-from slipid.control.interface import Settings
+from slipid.control.interface import MIXED, Settings
 from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import ROWS, check_gains, pilot_of, unused_gains
 from slipid.deploy.deploy import habits_of, read_robot
-from slipid.deploy.trial_site import SitePlant, known_to_site, site, starts, twin
-from slipid.deploy.trial_summary import Run, summaries
+from slipid.deploy.trial_site import SitePlant, floor_of, known_to_site, one_of, site, starts, twin
+from slipid.deploy.trial_summary import Run, closes_best, not_told_apart, summaries
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.errors import DataError
 from slipid.support.files import write_json
@@ -57,7 +57,8 @@ class Wish:
     """What is asked of a trial.
 
     Attributes:
-        plant: `testsite` (MuJoCo) or `twin` (the identified model itself).
+        plant: `testsite` (MuJoCo) or `twin` (the identified model itself, another draw of its
+            numbers for every start).
         map: file of a floor map; None for patches of the identified floors.
         controllers: names of `ROWS`.
         load: name of the load set-up; None for the first.
@@ -107,7 +108,8 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
         "plant": wish.plant,
         "map": "patches" if wish.map is None else str(wish.map),
         "gains": _named(jobs[0].robot, wish.tuned_gains),
-        "closes_best": min(table, key=lambda name: table[name].median["closure_error_median"]),
+        "closes_best": closes_best(runs),
+        "not_told_apart": list(not_told_apart(runs)),
         "summary": {name: row.to_json() for name, row in table.items()},
         "controllers": {name: ROWS[name].about for name in wish.controllers},
         "runs": [run.to_json() for run in runs],
@@ -125,7 +127,10 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         raise DataError(f"no controller{said}; expected some of {', '.join(ROWS)}")
     robot = jax.tree.map(np.asarray, read_robot(out, wish.load))
     floor = site(robot) if wish.map is None else read_map(wish.map)
+    # a floor of several surfaces is known to be one, whatever the fit was taught on
     settings, habits, known = Settings.of(robot), habits_of(robot, gyro=False), robot.labels
+    if len(floor.surfaces) > 1:
+        settings = replace(settings, alike=min(settings.alike, MIXED))
     if wish.plant == "testsite":  # it has the sensors it has, whatever the logs had
         known_to_site(floor, robot.load_setup, robot.wheels)
         settings, habits = replace(settings, current_is_signed=False), Habits()
@@ -174,10 +179,12 @@ def drive(job: Job) -> None:
     path = trajectory.rectangle().moved(job.start).waiting(REST_S)
     plant: closed_loop.Plant
     if job.plant == "twin":
-        plant = twin(robot, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro))
+        truth = one_of(robot, job.seed)
+        plant = twin(truth, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro))
     else:
         plant = SitePlant(job.floor, robot.load_setup, job.start, job.seed, row.gyro)
-    pilot = pilot_of(robot, row, job.settings, job.forced)
+    there = floor_of(job.floor, robot.labels)
+    pilot = pilot_of(robot, row, job.settings, job.forced, there)
     course = closed_loop.drive(pilot, path, plant, job.start)
     off = course.pose[-1] - course.believed[-1]
     run = Run(

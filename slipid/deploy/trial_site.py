@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from slipid.control.deployed import DeployedRobot
+from slipid.control.deployed import DeployedRobot, drawn
+from slipid.control.floor import Floor
 from slipid.control.interface import Measurement
 from slipid.control.tuning.actuation import Habits
-from slipid.control.tuning.twin import Floor, Twin, TwinPlant
+from slipid.control.tuning.twin import Twin, TwinPlant
 from slipid.data.floor_map import FloorMap, patchwork
 from slipid.support.errors import DataError
 from slipid.testsite.driving import PERIOD, Rims
@@ -135,6 +136,15 @@ class SitePlant:
             voltage=volts if s.voltage else np.full_like(volts, np.nan),
             gyro=turn if s.gyro else float("nan"),
         )
+
+
+def one_of(robot: DeployedRobot, seed: int) -> DeployedRobot:
+    """A robot that the posterior holds possible; the robot itself where nothing was drawn."""
+    count = robot.record.drawn
+    if count == 0:
+        return robot
+    picked = int(np.random.default_rng(seed).integers(count))
+    return jax.tree.map(lambda x: x[0], drawn(robot, (picked,)))
 
 
 def twin(

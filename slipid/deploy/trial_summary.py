@@ -49,6 +49,7 @@ class Summary:
     Attributes:
         median: by name, see `columns`; what a plant does not know (the twin's energy) is left out.
         finished_share: part of the runs that reached the end.
+        worse_share: part of the starts that it closes worse than the controller `encoder`.
         to_encoder: ratios of medians; None without the controller `encoder`.
     """
 
@@ -56,13 +57,14 @@ class Summary:
     interval90: Mapping[str, Interval]
     runs: int
     finished_share: float
+    worse_share: float | None
     to_encoder: Mapping[str, Ratio] | None
 
     def to_json(self) -> dict[str, object]:
         """As trial.json has it."""
         rest = asdict(self)
         if self.to_encoder is None:
-            del rest["to_encoder"]
+            del rest["to_encoder"], rest["worse_share"]
         return {**rest.pop("median"), **rest}
 
 
@@ -85,9 +87,39 @@ def summaries(runs: Sequence[Run], draws: int = 2000) -> dict[str, Summary]:
             interval90={k: _interval(np.median(v[again], axis=1)) for k, v in known.items()},
             runs=len(of[name]),
             finished_share=float(np.mean([run.metrics.finished for run in of[name]])),
+            worse_share=_worse(mine, table["encoder"]) if "encoder" in table else None,
             to_encoder=_ratios(mine, table["encoder"], again) if "encoder" in table else None,
         )
     return out
+
+
+def not_told_apart(runs: Sequence[Run], draws: int = 2000) -> tuple[str, ...]:
+    """Controllers that may close best, the one with the lowest median first.
+
+    Of the others they are those whose errors, start by start, are not larger for sure: the 90 %
+    bootstrap interval of the difference of medians over the starts that both drove has no more
+    than 0 at its lower end. One that left more runs unfinished than another does not close best.
+    """
+    names = list(dict.fromkeys(run.controller for run in runs))
+    of = {name: [run for run in runs if run.controller == name] for name in names}
+    unfinished = {name: sum(not run.metrics.finished for run in of[name]) for name in names}
+    able = [name for name in names if unfinished[name] == min(unfinished.values())]
+    closes = {name: np.array([run.metrics.closure_mm for run in of[name]]) for name in able}
+    best = min(able, key=lambda name: float(np.median(closes[name])))
+    count = min(len(v) for v in closes.values())
+    again = np.random.default_rng(0).integers(count, size=(draws, count))
+
+    def surely_worse(name: str) -> bool:
+        gap = np.median(closes[name][again], axis=1) - np.median(closes[best][again], axis=1)
+        return _interval(gap)[0] > 0
+
+    return (best, *(name for name in able if name != best and not surely_worse(name)))
+
+
+def closes_best(runs: Sequence[Run]) -> str | None:
+    """The controller that closes best for sure; None where the starts do not tell it apart."""
+    first, *others = not_told_apart(runs)
+    return None if others else first
 
 
 def columns(runs: Sequence[Run]) -> Columns:
@@ -110,6 +142,12 @@ def columns(runs: Sequence[Run]) -> Columns:
         "seconds": np.array([x.seconds for x in m]),
         "believed_error_mm": np.array([run.believed_error_mm for run in runs]),
     }
+
+
+def _worse(mine: Columns, base: Columns) -> float:
+    key = "closure_error_median"
+    count = min(len(mine[key]), len(base[key]))
+    return float(np.mean(mine[key][:count] > base[key][:count]))
 
 
 def _ratios(mine: Columns, base: Columns, again: np.ndarray) -> dict[str, Ratio]:

@@ -2,10 +2,14 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import wrap
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from slipid.data.floor_map import FloorMap
 from slipid.plots.drawing import INK, SHADE, figure, plain, save
@@ -14,6 +18,7 @@ from slipid.support.content import Content
 Paths = Mapping[str, np.ndarray]
 TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
 """Of floors, in the order of the map."""
+OTHERS, MARKED = "#56B4E9", "#D55E00"
 ERRORS = {
     "closure_error_median": "closure error [mm]",
     "cross_track_rmse": "cross-track rms [mm]",
@@ -27,20 +32,27 @@ def trial_plot(content: Content, paths: Paths, floor: FloorMap, path: Path) -> P
     `content` is that of trial.json, `paths` are true poses (step, 3) by run, `CONTROLLER/startNN`.
     """
     names = list(content["summary"])
-    best = content["closes_best"]
-    ratio = content["summary"][best].get("to_encoder", {}).get("closure_error_median", {})
-    said = f", {100 * ratio['value']:.0f} % of the encoders'" if ratio else ""
     rows = -(-len(names) // 3)
-    title = f"Rectangle trial on the {content['plant']}: {best} closes best{said}"
+    title = f"Rectangle trial on the {content['plant']}: {_verdict(content)}"
     made = figure(13.0, 3.1 * rows + 3.4, title)
     grid = made.add_gridspec(rows + 1, 3, height_ratios=[1.0] * rows + [1.1])
     one = _typical(content)
     for k, name in enumerate(names):
         axes = made.add_subplot(grid[k // 3, k % 3])
         _one(axes, name, content, paths, floor, one)
+    _legend(made, floor)
     for k, (key, label) in enumerate(ERRORS.items()):
         _bars(made.add_subplot(grid[rows, k]), content["summary"], key, label)
     return save(made, path)
+
+
+def _verdict(content: Content) -> str:
+    """Which controller closes best, if the starts tell it."""
+    best = content["closes_best"]
+    if best is None:
+        return f"{' and '.join(content['not_told_apart'])} are not told apart"
+    ratio = content["summary"][best].get("to_encoder", {}).get("closure_error_median", {})
+    return f"{best} closes best" + (f", {100 * ratio['value']:.0f} % of encoders'" if ratio else "")
 
 
 def _typical(content: Content) -> int:
@@ -65,16 +77,34 @@ def _one(axes: Axes, name: str, content: Content, paths: Paths, floor: FloorMap,
     tints = ListedColormap(TINTS[:kinds])
     axes.pcolormesh(x, y, floor.at(places), cmap=tints, vmin=0, vmax=kinds - 1)
     for p in own:
-        axes.plot(*p.T, color="#56B4E9", lw=0.5, alpha=0.6)
+        axes.plot(*p.T, color=OTHERS, lw=0.5, alpha=0.6)
     axes.plot([0, 0.9, 0.9, 0, 0], [0, 0, -0.4, -0.4, 0], "--", color=INK, lw=1.0)
-    axes.plot(*own[one].T, color="#D55E00", lw=1.8)
-    axes.plot(*own[one][-1], "o", color="#D55E00", ms=5)
+    axes.plot(*own[one].T, color=MARKED, lw=1.8)
+    axes.plot(*own[one][-1], "o", color=MARKED, ms=5)
     row = content["summary"][name]
     closes, off = row["closure_error_median"], row["heading_error_deg"]
-    title = f"{name}: closes to {closes:.0f} mm, heading {off:.0f} deg off"
-    axes.set_title(title, fontsize=9, loc="left")
+    done = f"{100 * row['finished_share']:.0f} % finish"
+    title = f"{name}: {closes:.0f} mm, {off:.0f} deg off, {done}"
+    about = "\n".join(wrap(content["controllers"][name], 60))
+    axes.set_title(f"{title}\n{about}", fontsize=8, loc="left")
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
     axes.tick_params(labelsize=7)
+
+
+def _legend(made: Figure, floor: FloorMap) -> None:
+    """What tints and lines are."""
+    patches = [
+        Patch(facecolor=tint, edgecolor=SHADE, label=name)
+        for name, tint in zip(floor.surfaces, TINTS, strict=False)
+    ]
+    lines = [
+        Line2D([], [], color=INK, ls="--", lw=1.0, label="wanted"),
+        Line2D([], [], color=OTHERS, lw=1.0, label="every start"),
+        Line2D(
+            [], [], color=MARKED, lw=1.8, marker="o", ms=5, label="the start typical of encoders"
+        ),
+    ]
+    made.legend(handles=[*patches, *lines], loc="outside lower center", ncols=8, fontsize=8)
 
 
 def _turned(heading: float) -> np.ndarray:

@@ -152,25 +152,36 @@ def show_gains(page: Page, found: Content) -> None:
 
 def show_trial(page: Page, found: Content, out: Path) -> None:
     """Write what every controller came to, medians over the starts."""
-    numbers = ("closure", "cross-track", "first side", "heading", "path", "of encoders'")
+    numbers = (
+        "closure",
+        "of encoders'",
+        "worse",
+        "finished",
+        "cross-track",
+        "first side",
+        "heading",
+    )
     made = table(("controller", *numbers), right=numbers)
     for name, row in found["summary"].items():
         ratio = row.get("to_encoder", {}).get("closure_error_median")
-        told = "" if ratio is None else f"{100 * ratio['value']:.0f} % closure"
-        if row["finished_share"] < 1:
-            told += f", {100 * row['finished_share']:.0f} % of runs finished"
+        worse = row.get("worse_share")
         made.add_row(
             name,
             f"{row['closure_error_median']:.0f} mm",
+            "" if ratio is None else f"{100 * ratio['value']:.0f} %",
+            "" if worse is None else f"{100 * worse:.0f} %",
+            f"{100 * row['finished_share']:.0f} %",
             f"{row['cross_track_rmse']:.0f} mm",
             f"{row['first_side_along_track_mm']:.0f} mm",
             f"{row['heading_error_deg']:.1f} deg",
-            f"{row['path_length_mm']:.0f} mm",
-            told,
         )
     page.table(made)
     best = found["closes_best"]
-    page.line(f"closes best: {best} ({found['controllers'][best]})")
+    if best is None:
+        page.line(f"not told apart by these starts: {', '.join(found['not_told_apart'])}")
+    else:
+        page.line(f"closes best: {best} ({found['controllers'][best]})")
     count = min(row["runs"] for row in found["summary"].values())
+    page.line("worse: part of the starts from which it closes worse than encoders do")
     page.line(f"medians of {count} starts; 90 % intervals and every run: {out / 'trial.json'}")
     page.line(f"look at: {out / 'trial.png'}")

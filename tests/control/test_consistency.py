@@ -14,10 +14,11 @@ from scipy.stats import chi2
 
 from slipid.control.effects import SETTLES, TURN, stays
 from slipid.control.estimator import Estimator
+from slipid.control.floor import Floor
 from slipid.control.floor_filter import FloorFilter
 from slipid.control.interface import MIXED, Measurement, Settings
 from slipid.control.tuning.actuation import Habits
-from slipid.control.tuning.twin import Floor, Twin
+from slipid.control.tuning.twin import Twin
 from slipid.model import contact
 from slipid.model.se2 import advance, compose
 from tests.helpers.small_twin import deployed, floor

@@ -16,9 +16,11 @@ from hypothesis import strategies as st
 from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains, Limits, limited
 from slipid.control.estimator import Estimator, Odometry
-from slipid.control.interface import UNTIMED_S, Measurement, Readings, Settings
+from slipid.control.floor_filter import FloorFilter
+from slipid.control.interface import UNTIMED_S, Believed, Measurement, Readings, Settings
 from slipid.control.pose_fix import _within
 from slipid.control.trajectory import rectangle
+from slipid.model import contact
 from slipid.model.geometry import mecanum, omni
 from slipid.model.robot import build
 from tests.helpers.compiled_pilot import CompiledPilot, Flat
@@ -407,17 +409,37 @@ def test_the_gyro_bias_is_learnt_at_rest_and_not_while_it_creeps():
     assert abs(float(state.place.nuisance[-1])) < 1e-9
 
 
-def test_heading_is_the_integral_of_the_gyro_whatever_is_believed_of_the_floors():
-    est, _ = watch()
+def test_heading_is_the_integral_of_a_gyro_without_bias_whatever_is_believed_of_the_floors():
+    est, run = watch(Settings(gyro_bias_std=0.0))
     rng = np.random.default_rng(0)
     state, rates, pose = est.init(), rng.uniform(-0.4, 0.4, 50), None
     for k, rate in enumerate(rates):  # currents say another thing at every step
         amps = rng.uniform(0.0, float(robot().highest[1]), 3)
         speed = wheels([0.2 * np.cos(k), 0.2 * np.sin(k), 0.0])
-        state, said = drive(state, 1, speed, gyro=rate, current=amps)
-        assert float(said[0].twist[2]) == pytest.approx(rate, abs=1e-9)
-        pose = said[0].pose
+        state, said = run(state, reading(wheel_speed=speed, gyro=rate, current=amps), DT)
+        assert float(said.twist[2]) == pytest.approx(rate, abs=1e-9)
+        pose = said.pose
     assert float(pose[2]) == pytest.approx(rates.sum() * DT, abs=1e-9)
+
+
+@pytest.mark.parametrize("bias", [0.012, -0.008])
+def test_a_robot_that_starts_at_once_learns_its_gyro_bias_from_the_contact_model(bias):
+    one = robot().on("b")
+    est, there = Estimator(one), FloorFilter(one, Settings())
+    state, true, twist = est.init(), 0.0, jnp.zeros((1, 3))
+    turns = jax.jit(lambda near, w: there.solve(near, w))
+    run = jax.jit(lambda state, z, dt: est.step(state, z, dt))
+    for k in range(500):
+        speed = wheels([0.2 * np.cos(0.01 * k), 0.2 * np.sin(0.01 * k), 0.0])
+        twist, amps = turns(twist, speed)
+        rate = float(twist[0, 2])
+        true += rate * DT
+        z = reading(wheel_speed=speed, current=jnp.abs(amps[0]), gyro=rate + bias)
+        state, said = run(state, z, DT)
+    assert float(state.place.nuisance[-1]) == pytest.approx(bias, abs=0.002)
+    off = abs(float(said.pose[2]) - true)
+    assert off < 0.25 * abs(bias) * 500 * DT
+    assert off < 3 * float(jnp.sqrt(said.covariance[2, 2])) + 1e-3
 
 
 def test_a_late_gyro_is_taken_for_its_own_time():
@@ -480,12 +502,20 @@ def test_gains_that_are_known_when_compiled_command_the_same():
         assert np.abs(commands).max() > 1.0
 
 
-def test_mecanum_wheels_go_by_kinematics():
+def test_mecanum_wheels_miss_less_of_a_twist_by_the_contact_model():
     f = deploy_known(build(mecanum(0.2, 0.15, 0.05), ("a",)), highest_speed=10.0)
     con = Controller(f, Gains.at((1.0, 1.0, 0.0, 1.0, 0.0, 0.0)))
-    said = estimate(f, surface_probability=jnp.array([[1.0, 0.0]] * 4))
-    asked = jnp.array([0.1, 0.1, 0.0])
-    np.testing.assert_allclose(con._wheels(asked, said), f.forward @ asked / f.frame.radius)
+    asked = jnp.array([0.1, 0.1, 0.2])
+    plain = f.forward @ asked / f.frame.radius
+    sure = Believed(jnp.array([1.0, 0.0]), asked[None])
+    state = eqx.tree_at(lambda s: s.command, con.init(), plain)
+    speeds = con._wheels(state, asked, estimate(f, believed=sure))
+
+    def missed(w):
+        moved = contact.equilibrium(f.frame.radius * w, f.frame, f.floors.at(0), f.rest)
+        return float(jnp.linalg.norm((moved - asked) * jnp.array([1.0, 1.0, f.frame.base])))
+
+    assert missed(speeds) < 0.5 * missed(plain)
 
 
 def test_flags_come_on_and_go_off():

@@ -16,9 +16,10 @@ import pytest
 from slipid.control import trajectory as reference
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
+from slipid.control.floor import Floor
 from slipid.control.interface import Settings
 from slipid.control.tuning.actuation import Habits
-from slipid.control.tuning.twin import Floor, Twin, rollout
+from slipid.control.tuning.twin import Twin, rollout
 from slipid.data.floor_map import patchwork
 from slipid.data.reading.presets import preset
 from slipid.data.runs import Runs, collect
@@ -103,10 +104,17 @@ def test_twin_and_controllers_do_what_was_reviewed(deployed: DeployedRobot, gold
     for k, start in enumerate(((0.0, 0.0, 0.3), (-0.4, 0.2, 2.0), (0.3, -0.3, -1.6))):
         drawn = patchwork(deployed.labels, seed=40 + k, patch=0.35, half=2.0)
         floor = Floor(jnp.asarray(drawn.cells), jnp.asarray(drawn.corner), jnp.asarray(drawn.cell))
-        for row in ("encoder", "paper_code", "contact", "contact_ahead", "contact_gyro"):
+        for row in (
+            "encoder",
+            "paper_code",
+            "contact",
+            "contact_ahead",
+            "contact_map",
+            "contact_gyro",
+        ):
             kind = ROWS[row]
             habits = Habits(voltage=False, gyro=kind.gyro)
-            pilot = pilot_of(deployed, kind, Settings())
+            pilot = pilot_of(deployed, kind, Settings(), floor=floor)
             path = reference.rectangle().moved(start).waiting(1.0)
             twin = Twin(deployed, floor, habits)
             key = jax.random.key(1000 + k)

@@ -20,11 +20,12 @@ from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
+from slipid.control.floor import Floor
 from slipid.control.interface import Numbers
 from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.stability import SPARE, radii
-from slipid.control.tuning.twin import Floor, Twin, rollout
+from slipid.control.tuning.twin import Twin, rollout
 
 GAINS = tuple(f.name for f in fields(Gains))
 """Names of the gains, in the order of vectors of them."""

@@ -21,7 +21,8 @@ from jaxtyping import Array, Float
 from slipid.control.closed_loop import PERIOD
 from slipid.control.controller import Controller, ControllerState, Gains
 from slipid.control.deployed import DeployedRobot
-from slipid.control.interface import Estimate
+from slipid.control.floor_filter import hypotheses_of
+from slipid.control.interface import Believed, Estimate
 from slipid.control.tuning.actuation import RING, Habits
 from slipid.model import contact
 from slipid.model.se2 import advance, compose
@@ -112,11 +113,20 @@ class Loop(eqx.Module):
             current=jnp.zeros(f.wheels),
             surface_probability=floor.at[:, self.surface].set(1.0),
             covariance=jnp.zeros((3, 3)),
+            believed=self._believed(old.speed),
             stale=no,
             immobilised=no,
             out_of_range=no,
             labels=f.labels,
         )
+
+    def _believed(self, speed: Array) -> Believed:
+        """All wheels on the floor, for sure."""
+        f = self.controller.robot
+        count = len(f.labels) ** f.wheels
+        same = jnp.all(jnp.asarray(hypotheses_of(f)) == self.surface, axis=1)
+        twist = jnp.broadcast_to(self._twist(f, speed), (count, 3))
+        return Believed(jnp.append(same.astype(float), 0.0), twist)
 
 
 def linearised(loop: Loop) -> Float[Array, "state state"]:

@@ -22,46 +22,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from slipid.control.closed_loop import PERIOD, Pilot, PilotOutput, PilotState
 from slipid.control.deployed import DeployedRobot
 from slipid.control.effects import Course, direction, stays
+from slipid.control.floor import Floor
 from slipid.control.interface import Measurement, Pose, Readings, State
 from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import RING, Habits
 from slipid.model import contact
 from slipid.model.robot import GRAVITY
 from slipid.model.se2 import advance, compose
-
-
-class Floor(eqx.Module):
-    """Which surface lies where, as arrays a jitted function can look up.
-
-    Attributes:
-        cells: index of the surface in every square cell (row, column), row 0 at the lowest y.
-        corner: x, y of the corner with the lowest coordinates [m].
-        cell: edge of a cell [m].
-    """
-
-    cells: Int[Array, "row column"]
-    corner: Float[Array, "2"]
-    cell: Float[Array, ""]
-
-    def under(
-        self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
-    ) -> Int[Array, " wheel"]:
-        """Surface under wheels at these places in the body frame [m], of a body at a pose.
-
-        Beyond the edge it is that of the nearest cell.
-        """
-        c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
-        turned = jnp.stack(
-            [c * wheels[:, 0] - s * wheels[:, 1], s * wheels[:, 0] + c * wheels[:, 1]], axis=-1
-        )
-        steps = jnp.floor((pose[:2] + turned - self.corner) / self.cell).astype(jnp.int32)
-        rows, columns = self.cells.shape
-        return self.cells[steps[:, 1].clip(0, rows - 1), steps[:, 0].clip(0, columns - 1)]
 
 
 class TwinState(eqx.Module):

@@ -1,0 +1,86 @@
+"""A floor map as a jitted function looks it up, and what it says of the floors and of the pose.
+
+Where a map is known, the believed pose and its covariance say which floors are likely under the
+wheels. Poses x_s drawn from the belief, fixed ones in its own axes, make of it a prior of every
+hypothesis c, one floor under each wheel:
+
+    W_sc = prod_wheel [(1 - leak) (map at the wheel of x_s is c's) + leak / floors]
+    prior_c = mean_s W_sc
+
+What currents and gyro then say of the hypotheses, p_c, says how likely each pose is:
+
+    P(x_s) = mean_c p_c W_sc / prior_c
+
+so that an edge that is crossed where it was not expected corrects the pose. Nothing is counted
+twice: where p_c is the prior, no pose moves.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+LEAK = 0.1
+"""Probability that a map is wrong under a wheel."""
+HALF = 16
+"""Pairs of opposite poses that are drawn from a belief."""
+
+
+def _spread() -> Float[np.ndarray, "sample 3"]:
+    """Poses in a belief's own axes: mean 0 and covariance 1, exactly."""
+    some = np.random.default_rng(0).normal(size=(HALF, 3))
+    some = some @ np.linalg.inv(np.linalg.cholesky(some.T @ some / HALF)).T
+    return np.concatenate([some, -some])
+
+
+SPREAD = _spread()
+
+
+class Floor(eqx.Module):
+    """Which surface lies where, as arrays a jitted function can look up.
+
+    Attributes:
+        cells: index of the surface in every square cell (row, column), row 0 at the lowest y.
+        corner: x, y of the corner with the lowest coordinates [m].
+        cell: edge of a cell [m].
+    """
+
+    cells: Int[Array, "row column"]
+    corner: Float[Array, "2"]
+    cell: Float[Array, ""]
+
+    def under(
+        self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
+    ) -> Int[Array, " wheel"]:
+        """Surface under wheels at these places in the body frame [m], of a body at a pose.
+
+        Beyond the edge it is that of the nearest cell.
+        """
+        c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+        turned = jnp.stack(
+            [c * wheels[:, 0] - s * wheels[:, 1], s * wheels[:, 0] + c * wheels[:, 1]], axis=-1
+        )
+        steps = jnp.floor((pose[:2] + turned - self.corner) / self.cell).astype(jnp.int32)
+        rows, columns = self.cells.shape
+        return self.cells[steps[:, 1].clip(0, rows - 1), steps[:, 0].clip(0, columns - 1)]
+
+    def supports(
+        self,
+        pose: Float[Array, "3"],
+        root: Float[Array, "3 3"],
+        wheels: Float[Array, "wheel 2"],
+        hypotheses: Int[np.ndarray, "hypothesis wheel"],
+        floors: int,
+    ) -> Float[Array, "sample hypothesis"]:
+        """Probability W of every hypothesis by the map, at every pose drawn from a belief.
+
+        Args:
+            pose: believed; root: of its covariance, lower triangular.
+            wheels: their places in the body frame [m].
+            hypotheses: floor under every wheel; floors: how many there are.
+        """
+        poses = pose + SPREAD @ root.T
+        under = jax.vmap(self.under, (0, None))(poses, wheels)
+        same = under[:, None, :] == jnp.asarray(hypotheses)
+        return jnp.prod((1 - LEAK) * same + LEAK / floors, axis=-1)
