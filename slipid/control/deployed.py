@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.control.effects import Told
+from slipid.control.filter.effects import Told
 from slipid.control.robot_file.file import ANEW, check, read_robot, write_robot
 from slipid.control.robot_file.record import LoadRecord, Numbers, RobotRecord
 from slipid.model.contact_law import ContactSurface

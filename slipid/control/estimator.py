@@ -13,12 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.floor import Floor
-from slipid.control.floor_filter import FloorFilter, FloorState, Tick, hypotheses_of, length
+from slipid.control.filter.floor import Floor
+from slipid.control.filter.floor_filter import FloorFilter, FloorState, Tick, hypotheses_of, length
+from slipid.control.filter.pose_filter import PoseFilter, turned_axes
+from slipid.control.filter.pose_fix import PoseState, placed
+from slipid.control.filter.wheels import WheelState, read_currents, read_wheels, time_step
 from slipid.control.interface import AbstractEstimator, Believed, Estimate, Pose, Readings, Settings
-from slipid.control.pose_filter import PoseFilter, turned_axes
-from slipid.control.pose_fix import PoseState, placed
-from slipid.control.wheels import WheelState, read_currents, read_wheels, time_step
 from slipid.model.se2 import advance, compose
 
 CURRENT_FROM = 0.4

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.effects import Course
-from slipid.control.floor_filter import hypotheses_of, told_of
+from slipid.control.filter.effects import Course
+from slipid.control.filter.floor_filter import hypotheses_of, told_of
 from slipid.control.interface import Believed
 from slipid.model.contact import settle, steered
 from slipid.model.contact_balance import stand

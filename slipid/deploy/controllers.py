@@ -12,7 +12,7 @@ from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Correction, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator, Odometry
-from slipid.control.floor import Floor
+from slipid.control.filter.floor import Floor
 from slipid.control.interface import AbstractEstimator, Settings
 from slipid.support.errors import DataError
 

@@ -12,14 +12,14 @@ import numpy as np
 from slipid.control import closed_loop, trajectory
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot
-from slipid.control.interface import MIXED, Settings
+from slipid.control.interface import Settings
 from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import ROWS, check_gains, pilot_of, unused_gains
 from slipid.deploy.deploy import habits_of, read_robot
 from slipid.deploy.trial_site import SitePlant, floor_of, known_to_site, one_of, site, starts, twin
-from slipid.deploy.trial_summary import Run, closes_best, not_told_apart, summaries
+from slipid.deploy.trial_summary import Run, not_told_apart, summaries
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.errors import DataError
 from slipid.support.files import write_json
@@ -102,14 +102,14 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
     spread(drive, todo, wish.jobs, report)
     driven = {job.name: found for job in jobs if (found := _driven(job)) is not None}
     runs = [run for run, _ in driven.values()]
-    table = summaries(runs)
+    table, able = summaries(runs), list(not_told_apart(runs))
     content = {
         "schema": SCHEMA,
         "plant": wish.plant,
         "map": "patches" if wish.map is None else str(wish.map),
         "gains": _named(jobs[0].robot, wish.tuned_gains),
-        "closes_best": closes_best(runs),
-        "not_told_apart": list(not_told_apart(runs)),
+        "closes_best": None if len(able) > 1 else able[0],
+        "not_told_apart": able,
         "summary": {name: row.to_json() for name, row in table.items()},
         "controllers": {name: ROWS[name].about for name in wish.controllers},
         "runs": [run.to_json() for run in runs],
@@ -127,10 +127,7 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         raise DataError(f"no controller{said}; expected some of {', '.join(ROWS)}")
     robot = jax.tree.map(np.asarray, read_robot(out, wish.load))
     floor = site(robot) if wish.map is None else read_map(wish.map)
-    # a floor of several surfaces is known to be one, whatever the fit was taught on
     settings, habits, known = Settings.of(robot), habits_of(robot, gyro=False), robot.labels
-    if len(floor.surfaces) > 1:
-        settings = replace(settings, alike=min(settings.alike, MIXED))
     if wish.plant == "testsite":  # it has the sensors it has, whatever the logs had
         known_to_site(floor, robot.load_setup, robot.wheels)
         settings, habits = replace(settings, current_is_signed=False), Habits()

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.control.deployed import DeployedRobot, drawn
-from slipid.control.floor import Floor
+from slipid.control.filter.floor import Floor
 from slipid.control.interface import Measurement
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Twin, TwinPlant
@@ -73,8 +73,9 @@ def known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
 
 
 def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Floor:
-    """A map as arrays, its surfaces counted as the fit counts them."""
-    cells = np.array([labels.index(name) for name in floor.surfaces])[floor.cells]
+    """A map as arrays, its surfaces counted as the fit counts them, -1 for one it does not know."""
+    counted = [labels.index(name) if name in labels else -1 for name in floor.surfaces]
+    cells = np.array(counted)[floor.cells]
     return Floor(jnp.asarray(cells), jnp.asarray(floor.corner), jnp.asarray(floor.cell))
 
 

@@ -116,12 +116,6 @@ def not_told_apart(runs: Sequence[Run], draws: int = 2000) -> tuple[str, ...]:
     return (best, *(name for name in able if name != best and not surely_worse(name)))
 
 
-def closes_best(runs: Sequence[Run]) -> str | None:
-    """The controller that closes best for sure; None where the starts do not tell it apart."""
-    first, *others = not_told_apart(runs)
-    return None if others else first
-
-
 def columns(runs: Sequence[Run]) -> Columns:
     """What is judged of every run.
 
@@ -145,9 +139,8 @@ def columns(runs: Sequence[Run]) -> Columns:
 
 
 def _worse(mine: Columns, base: Columns) -> float:
-    key = "closure_error_median"
-    count = min(len(mine[key]), len(base[key]))
-    return float(np.mean(mine[key][:count] > base[key][:count]))
+    pairs = zip(mine["closure_error_median"], base["closure_error_median"], strict=False)
+    return float(np.mean([a > b for a, b in pairs]))
 
 
 def _ratios(mine: Columns, base: Columns, again: np.ndarray) -> dict[str, Ratio]:

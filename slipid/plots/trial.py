@@ -50,7 +50,7 @@ def _verdict(content: Content) -> str:
     """Which controller closes best, if the starts tell it."""
     best = content["closes_best"]
     if best is None:
-        return f"{' and '.join(content['not_told_apart'])} are not told apart"
+        return f"{', '.join(content['not_told_apart'])} are not told apart"
     ratio = content["summary"][best].get("to_encoder", {}).get("closure_error_median", {})
     return f"{best} closes best" + (f", {100 * ratio['value']:.0f} % of encoders'" if ratio else "")
 

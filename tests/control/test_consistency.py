@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from slipid.control.effects import SETTLES, TURN, stays
 from slipid.control.estimator import Estimator
-from slipid.control.floor import Floor
-from slipid.control.floor_filter import FloorFilter
+from slipid.control.filter.effects import SETTLES, TURN, stays
+from slipid.control.filter.floor import Floor
+from slipid.control.filter.floor_filter import FloorFilter
 from slipid.control.interface import MIXED, Measurement, Settings
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Twin

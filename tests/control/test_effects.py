@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.control.effects import FORGETS, Course, Told
 from slipid.control.estimator import Estimator
+from slipid.control.filter.effects import FORGETS, Course, Told
 from slipid.control.interface import Measurement, Settings
 from slipid.identify.fit import shared
 from tests.control.test_consistency import DT, rolling, settled

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains, Limits, limited
 from slipid.control.estimator import Estimator, Odometry
-from slipid.control.floor_filter import FloorFilter
+from slipid.control.filter.floor_filter import FloorFilter
+from slipid.control.filter.pose_fix import _within
 from slipid.control.interface import UNTIMED_S, Believed, Measurement, Readings, Settings
-from slipid.control.pose_fix import _within
 from slipid.control.trajectory import rectangle
 from slipid.model import contact
 from slipid.model.geometry import mecanum, omni

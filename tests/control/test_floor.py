@@ -14,8 +14,8 @@ from slipid.control import trajectory
 from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.estimator import Estimator
-from slipid.control.floor import LEAK, SPREAD
-from slipid.control.floor_filter import _followed, hypotheses_of
+from slipid.control.filter.floor import LEAK, SPREAD
+from slipid.control.filter.floor_filter import _followed, hypotheses_of
 from slipid.control.interface import MIXED, Measurement, Settings
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Twin, rollout

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slipid.control.estimator import Estimator
-from slipid.control.floor_filter import FloorFilter, hypotheses_of
+from slipid.control.filter.floor_filter import FloorFilter, hypotheses_of
 from slipid.control.interface import Measurement, Settings
 from slipid.model.geometry import omni
 from slipid.model.robot import build, twist, wheel_current

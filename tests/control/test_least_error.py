@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.control.floor_filter import hypotheses_of
+from slipid.control.filter.floor_filter import hypotheses_of
 from slipid.control.interface import Believed
 from slipid.control.least_error import wheel_speeds
 from slipid.model import contact

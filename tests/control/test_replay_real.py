@@ -16,7 +16,7 @@ import pytest
 from slipid.control import trajectory as reference
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
-from slipid.control.floor import Floor
+from slipid.control.filter.floor import Floor
 from slipid.control.interface import Settings
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Twin, rollout

@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict, replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,15 +15,15 @@ from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Odometry
-from slipid.control.floor_filter import FloorFilter
+from slipid.control.filter.floor_filter import FloorFilter, hypotheses_of
 from slipid.control.interface import Measurement, Settings
 from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.control.robot_file.typed import typed
 from slipid.data.floor_map import four_zones, uniform
 from slipid.deploy import trial as tr
 from slipid.deploy.controllers import ROWS, check_gains, pilot_of, unused_gains
-from slipid.deploy.trial_site import SitePlant, floor_of, known_to_site, starts
-from slipid.deploy.trial_summary import Run, summaries
+from slipid.deploy.trial_site import SitePlant, floor_of, known_to_site, one_of, starts
+from slipid.deploy.trial_summary import Run, not_told_apart, summaries
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.support.errors import DataError
@@ -240,6 +241,32 @@ def test_a_map_is_looked_up_under_the_wheels(deployed):
     assert len(set(names)) == 2
 
 
+def test_a_map_may_show_a_floor_that_the_fit_does_not_know(deployed):
+    floor = four_zones(["firm", "ice", "firm", "soft"], middle=(0.0, 0.0))
+    lookup = floor_of(floor, deployed.labels)
+    counted = np.asarray(lookup.cells)
+    assert (counted == -1).sum() == (floor.cells == floor.surfaces.index("ice")).sum() > 0
+    row, column = np.round(np.argwhere(counted == -1).mean(axis=0)).astype(int)
+    x, y = np.asarray(lookup.corner) + (np.array([column, row]) + 0.5) * float(lookup.cell)
+    here = jnp.array([x, y, 0.0])
+    hypotheses = hypotheses_of(deployed)
+    inside = lookup.under(here, deployed.places)
+    supports = lookup.supports(here, jnp.zeros((3, 3)), deployed.places, hypotheses, 2)
+    assert bool(jnp.all(inside == -1))
+    np.testing.assert_allclose(supports, supports[0, 0])  # it says nothing of any hypothesis
+
+
+def test_the_twin_is_another_robot_of_the_posterior_for_every_start():
+    robot = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"])
+    eight = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 8), robot)
+    frictions = jnp.linspace(0.3, 0.9, 8)[:, None] * jnp.ones(2)
+    several = eqx.tree_at(lambda r: r.surfaces.friction, eight, frictions)
+    known = deploy_known(robot, draws=several, highest_speed=7.5)
+    found = {float(one_of(known, seed).floors.friction[0]) for seed in range(12)}
+    assert len(found) > 3
+    assert one_of(known, 3).floors.friction[0] == one_of(known, 3).floors.friction[0]
+
+
 def test_what_a_trial_cannot_do_is_said(tmp_path):
     with pytest.raises(DataError, match="expected testsite or twin"):
         tr._jobs(tmp_path, tr.Wish(plant="moon"))
@@ -300,22 +327,44 @@ def test_tuned_gains_that_are_no_better_are_left_aside_and_that_is_said(deployed
     assert unused_gains(better, forced=False) == ""
 
 
+def run_of(name, k, closure, finished=True):
+    """A run whose numbers follow from its closure."""
+    metrics = closed_loop.Metrics(
+        along_track_mm=(-90.0 * (1 + 0.1 * k), 0.0, 0.0, 0.0),
+        closure_mm=closure,
+        cross_track_rmse_mm=closure / 2,
+        heading_error_deg=-3.0,
+        path_length_mm=2500.0,
+        energy_j=None if name == "contact" else 10.0,
+        effort=0.1,
+        seconds=19.0,
+        finished=finished,
+    )
+    return Run(name, (0.0, 0.0, 0.1), k, metrics, 1.0)
+
+
+def test_the_best_is_told_apart_by_differences_from_the_same_starts():
+    rng = np.random.default_rng(0)
+    base = rng.uniform(50, 500, 20)  # starts differ by far more than controllers do
+
+    def runs(name, closures, finished=True):
+        return [run_of(name, k, float(c), finished) for k, c in enumerate(closures)]
+
+    one, two = runs("encoder", base), runs("contact", 0.8 * base)
+    assert not_told_apart(one + two) == ("contact",)
+    same = runs("contact", base * rng.uniform(0.7, 1.25, 20))
+    assert set(not_told_apart(one + same)) == {"encoder", "contact"}
+    # one that leaves a run unfinished does not close best, however near it comes
+    stuck = [*two[:-1], run_of("contact", 19, 1.0, finished=False)]
+    assert not_told_apart(one + stuck) == ("encoder",)
+    assert not_told_apart(one) == ("encoder",)
+
+
 def test_the_summary_is_of_medians_over_starts_with_intervals():
     rng = np.random.default_rng(0)
 
     def run(name, k, closure):
-        metrics = closed_loop.Metrics(
-            along_track_mm=(-90.0 * (1 + 0.1 * k), 0.0, 0.0, 0.0),
-            closure_mm=closure,
-            cross_track_rmse_mm=closure / 2,
-            heading_error_deg=-3.0,
-            path_length_mm=2500.0,
-            energy_j=None if name == "contact" else 10.0,
-            effort=0.1,
-            seconds=19.0,
-            finished=True,
-        )
-        made = Run(name, (0.0, 0.0, 0.1), k, metrics, 1.0)
+        made = run_of(name, k, closure)
         assert typed(Run, json.loads(json.dumps(asdict(made)))) == made
         return made
 
@@ -327,6 +376,9 @@ def test_the_summary_is_of_medians_over_starts_with_intervals():
     assert found["encoder"]["heading_error_deg"] == 3.0
     assert "energy_j" in found["encoder"]
     assert "energy_j" not in found["contact"]
+    assert (found["encoder"]["worse_share"], found["contact"]["worse_share"]) == (0.0, 0.0)
+    worse = [run("contact", k, b + (-1.0 if k < 15 else 1.0)) for k, b in enumerate(base)]
+    assert summaries(runs[:20] + worse)["contact"].worse_share == pytest.approx(0.25)
     ratio = found["contact"]["to_encoder"]["closure_error_median"]
     assert ratio["value"] == pytest.approx(0.4)
     assert ratio["interval90"] == pytest.approx([0.4, 0.4])

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.floor import Floor
+from slipid.control.filter.floor import Floor
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from tests.helpers.known_robot import deploy_known

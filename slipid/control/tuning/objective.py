@@ -20,7 +20,7 @@ from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
-from slipid.control.floor import Floor
+from slipid.control.filter.floor import Floor
 from slipid.control.interface import Numbers
 from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import Habits

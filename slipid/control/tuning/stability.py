@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from slipid.control.closed_loop import PERIOD
 from slipid.control.controller import Controller, ControllerState, Gains
 from slipid.control.deployed import DeployedRobot
-from slipid.control.floor_filter import hypotheses_of
+from slipid.control.filter.floor_filter import hypotheses_of
 from slipid.control.interface import Believed, Estimate
 from slipid.control.tuning.actuation import RING, Habits
 from slipid.model import contact

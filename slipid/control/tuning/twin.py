@@ -2,7 +2,7 @@
 
 Commands reach the wheels late, a slew and a lag after; wheels on several floors move the body as
 the contact says, and what the fit says the model misses is drawn anew for every run, effects as
-`slipid.control.effects` has them:
+`slipid.control.filter.effects` has them:
 
     set <- set + clip(command(t - delay) - set, slew h),   w <- w + (1 - exp(-h / lag)) (set - w)
     xi = equilibrium(r w; floor under each wheel)
@@ -26,8 +26,8 @@ from jaxtyping import Array, Float
 
 from slipid.control.closed_loop import PERIOD, Pilot, PilotOutput, PilotState
 from slipid.control.deployed import DeployedRobot
-from slipid.control.effects import Course, direction, stays
-from slipid.control.floor import Floor
+from slipid.control.filter.effects import Course, direction, stays
+from slipid.control.filter.floor import Floor
 from slipid.control.interface import Measurement, Pose, Readings, State
 from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import RING, Habits
@@ -44,7 +44,7 @@ class TwinState(eqx.Module):
         wanted: wheel speeds that the motors' control is set to [rad/s].
         speed: of the wheels [rad/s]; angle: of the wheels [rad].
         effect: what the model misses now on every floor beyond what is told, in stds left.
-        toward: direction of travel that counts as taken, see `slipid.control.effects`.
+        toward: direction of travel that counts as taken, see `slipid.control.filter.effects`.
         offset, drift: of the currents, all the way and for a moment [A].
         bias: of the gyro [rad/s].
         ring: commands on their way, the newest first [rad/s].

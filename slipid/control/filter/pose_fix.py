@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.control.floor import SPREAD
-from slipid.control.floor_filter import Motion
+from slipid.control.filter.floor import SPREAD
+from slipid.control.filter.floor_filter import Motion
 from slipid.control.interface import Readings
 
 HISTORY = 48
@@ -26,7 +26,7 @@ class PoseState(eqx.Module):
             stds left, by how much its log friction is off, the doubt d, then the gyro's bias
             [rad/s].
         covariance: of pose and nuisance.
-        toward: direction of travel that counts as taken, see `slipid.control.effects`.
+        toward: direction of travel that counts as taken, see `slipid.control.filter.effects`.
         time, still: since the start, and for which the robot has stood [s].
         noise: covariance that has come into the pose since the start; far: way since then [m].
         push: d pose / d nuisance per metre of the last way, the gyro's bias left out.

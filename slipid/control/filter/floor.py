@@ -7,12 +7,13 @@ hypothesis c, one floor under each wheel:
     W_sc = prod_wheel [(1 - leak) (map at the wheel of x_s is c's) + leak / floors]
     prior_c = mean_s W_sc
 
-What currents and gyro then say of the hypotheses, p_c, says how likely each pose is:
+What the currents and the gyro of a step say of the hypotheses, p_c before and p_c' after it, says
+how likely each pose is, beside how likely it was (`slipid.control.filter.pose_fix.placed`):
 
-    P(x_s) = mean_c p_c W_sc / prior_c
+    P(x_s) ~ (sum_c p_c' W_sc / prior_c  /  sum_c p_c W_sc / prior_c)^(1/2)
 
-so that an edge that is crossed where it was not expected corrects the pose. Nothing is counted
-twice: where p_c is the prior, no pose moves.
+so that an edge that is crossed where it was not expected corrects the pose. Evidence counts in the
+step in which it comes, and where none comes no pose moves.
 """
 
 import equinox as eqx
@@ -41,7 +42,8 @@ class Floor(eqx.Module):
     """Which surface lies where, as arrays a jitted function can look up.
 
     Attributes:
-        cells: index of the surface in every square cell (row, column), row 0 at the lowest y.
+        cells: index of the surface in every square cell (row, column), row 0 at the lowest y; -1
+            where it is none that the robot knows.
         corner: x, y of the corner with the lowest coordinates [m].
         cell: edge of a cell [m].
     """

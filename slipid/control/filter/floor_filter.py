@@ -24,9 +24,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.effects import Course
+from slipid.control.filter.effects import Course
+from slipid.control.filter.wheels import Currents
 from slipid.control.interface import Settings
-from slipid.control.wheels import Currents
 from slipid.model.contact import settle
 from slipid.model.contact_balance import Balance, stand
 from slipid.model.robot import GRAVITY
@@ -37,7 +37,7 @@ HASTE = 30.0
 
 
 class Tick(eqx.Module):
-    """One time step [s], as `slipid.control.wheels.time_step` counts it.
+    """One time step [s], as `slipid.control.filter.wheels.time_step` counts it.
 
     Attributes:
         moves: whether a wheel turns.

@@ -18,11 +18,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.effects import direction, stays
-from slipid.control.floor import Floor
-from slipid.control.floor_filter import HASTE, Motion, Tick, length
+from slipid.control.filter.effects import direction, stays
+from slipid.control.filter.floor import Floor
+from slipid.control.filter.floor_filter import HASTE, Motion, Tick, length
+from slipid.control.filter.pose_fix import HISTORY, PoseState, fixed, handed_over, nearest
 from slipid.control.interface import Readings, Settings
-from slipid.control.pose_fix import HISTORY, PoseState, fixed, handed_over, nearest
 from slipid.model.se2 import advance, compose
 
 CREEPS = 0.05
@@ -181,19 +181,10 @@ class PoseFilter(eqx.Module):
         gap = jnp.where(told, gyro - now.nuisance[-1] - self._then(now, free), 0.0)
         walk = (way.share @ self.robot.process[:, 2] ** 2) * way.speed / dt
         noise = (self.settings.gyro_std**2 + walk) * (1 + (tick.acceleration / HASTE) ** 2)
-        by = cov @ look
-        var = look @ by + noise
+        var = look @ cov @ look + noise
         var = var * jnp.maximum(gap**2 / (9.0 * var), 1.0)
-        learns = jnp.zeros(len(cov)).at[jnp.array([2, -1])].set(1.0)
-        gain = jnp.where(told, learns * by / var, 0.0)
-        change = gain * gap
-        off = jnp.outer(gain, by)
-        return replace(
-            now,
-            pose=now.pose + change[:3],
-            nuisance=now.nuisance + change[3:],
-            covariance=cov - off - off.T + var * jnp.outer(gain, gain),
-        )
+        learns = told * jnp.zeros(len(cov)).at[jnp.array([2, -1])].set(1.0)
+        return _learnt(now, look, gap, var, learns)
 
     def _rest(self, now: PoseState, gyro: Array) -> PoseState:
         """Learn the gyro's bias while the robot rests.
@@ -205,14 +196,8 @@ class PoseFilter(eqx.Module):
         gap = gyro - now.nuisance[-1]
         var = cov[-1, -1] + self.settings.gyro_std**2
         rests = jnp.isfinite(gyro) & (now.still > 0.3) & (gap**2 < 9.0 * var)
-        gain = jnp.where(rests, cov[:, -1] / var, 0.0)
-        change = gain * jnp.where(rests, gap, 0.0)
-        return replace(
-            now,
-            pose=now.pose + change[:3],
-            nuisance=now.nuisance + change[3:],
-            covariance=cov - jnp.outer(gain, cov[-1]),
-        )
+        look, learns = jnp.zeros(len(cov)).at[-1].set(1.0), jnp.broadcast_to(rests, len(cov))
+        return _learnt(now, look, jnp.where(rests, gap, 0.0), var, learns.astype(float))
 
     def _grow(self, old: PoseState, pose: Array, way: _Way, tick: Tick) -> PoseState:
         """At the pose after the step, with the covariance and what came into it."""
@@ -242,6 +227,29 @@ class PoseFilter(eqx.Module):
             far=old.far + far,
             push=jnp.where(far > 1e-6, push / jnp.maximum(way.speed, 1e-9), old.push),
         )
+
+
+def _learnt(
+    now: PoseState, look: Array, gap: Array, var: Array, learns: Float[Array, " unknown"]
+) -> PoseState:
+    """Corrected by a reading that differs by `gap` from `look` times what is unknown.
+
+    What does not learn keeps its value, and its covariance with what does is right (Joseph's form).
+
+    Args:
+        now: before the reading.
+        look: derivative of the reading by pose and nuisance; gap: measured less predicted.
+        var: of the gap; learns: 1 for each unknown that learns, else 0.
+    """
+    by = now.covariance @ look
+    gain = learns * by / var
+    change, off = gain * gap, jnp.outer(gain, by)
+    return replace(
+        now,
+        pose=now.pose + change[:3],
+        nuisance=now.nuisance + change[3:],
+        covariance=now.covariance - off - off.T + var * jnp.outer(gain, gain),
+    )
 
 
 def turned_axes(heading: Float[Array, ""]) -> Float[Array, "3 3"]:
