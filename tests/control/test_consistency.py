@@ -16,6 +16,7 @@ from slipid.control.estimator import Estimator
 from slipid.control.filter.effects import SETTLES, TURN, stays
 from slipid.control.filter.floor import Floor
 from slipid.control.filter.floor_filter import FloorFilter
+from slipid.control.filter.pose_filter import PoseFilter, _learnt
 from slipid.control.interface import MIXED, Measurement, Settings
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Twin
@@ -201,6 +202,36 @@ def test_motion_by_friction_is_that_of_finite_differences(under):
     by_hand = jax.jacfwd(twist)(mu) * mu
     np.testing.assert_allclose(slope, by_hand, atol=1e-6)
     assert (np.abs(slope).max() > 0.01) == (len(set(under)) > 1)
+
+
+def test_a_reading_moves_what_learns_and_leaves_the_rest_with_the_right_covariance():
+    robot = deployed(process=1.0, run=1.0)
+    state = PoseFilter(robot, Settings()).init(jnp.zeros(3), (0.05, 0.1))
+    rng, count = np.random.default_rng(0), len(state.covariance)
+    mix = rng.normal(size=(count, count))
+    cov, look = mix @ mix.T / count, rng.normal(size=count)
+    noise, learns = 0.3, np.isin(np.arange(count), [2, count - 1]).astype(float)
+    state, var = replace(state, covariance=jnp.asarray(cov)), look @ cov @ look + noise
+    now = _learnt(state, jnp.asarray(look), jnp.asarray(0.7), jnp.asarray(var), jnp.asarray(learns))
+    change = np.concatenate([now.pose - state.pose, now.nuisance - state.nuisance])
+    np.testing.assert_array_equal(change[learns == 0], 0.0)
+    assert np.abs(change[learns == 1]).min() > 0
+    gain = learns * (cov @ look) / var
+    left = np.eye(count) - np.outer(gain, look)
+    exact = left @ cov @ left.T + noise * np.outer(gain, gain)
+    np.testing.assert_allclose(now.covariance, exact, atol=1e-12)
+
+
+def test_a_gyro_leaves_what_pushes_the_body_as_it_is():
+    """The belief about the floors has heard the same gyro."""
+    robot = deployed(process=1.0, run=1.0, current=1.0)
+    state, speed = Estimator(robot).init(), rolling(robot, (0.2, 0.0, 0.0))
+    run = jax.jit(lambda s, z: Estimator(robot).step(s, z, DT))
+    for k in range(40):
+        reading = Measurement(wheel_angle=k * DT * speed, current=jnp.full(3, 0.4), gyro=0.1)
+        state, _ = run(state, reading)
+    np.testing.assert_array_equal(state.place.nuisance[:-1], 0.0)
+    assert float(state.place.nuisance[-1]) > 0.001
 
 
 # errors are as large as it says --------------------------------------------------------------

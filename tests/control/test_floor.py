@@ -15,7 +15,10 @@ from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.estimator import Estimator
 from slipid.control.filter.floor import LEAK, SPREAD
-from slipid.control.filter.floor_filter import _followed, hypotheses_of
+from slipid.control.filter.floor_filter import FloorFilter, Tick, _followed, hypotheses_of
+from slipid.control.filter.pose_filter import PoseFilter
+from slipid.control.filter.pose_fix import placed
+from slipid.control.filter.wheels import Currents
 from slipid.control.interface import MIXED, Measurement, Settings
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Twin, rollout
@@ -55,6 +58,57 @@ def test_beliefs_follow_a_map_as_it_changes_beneath_the_robot():
     np.testing.assert_allclose(
         _followed(other[:, None], before, before, no)[:, 0], other, atol=1e-12
     )
+
+
+HALVES = floor([[0, 1], [0, 1]])
+"""Floor 0 where x is negative, floor 1 where it is positive."""
+
+
+def met(after, before):
+    """Pose filter before and after beliefs about floors, at the origin known to 0.2 m and 0.1 rad.
+
+    Beliefs are by the floor under all wheels, `{floor: probability}`.
+    """
+    robot = deployed()
+    hypotheses = hypotheses_of(robot)
+    by_pose, by_floor = PoseFilter(robot, SETTINGS), FloorFilter(robot, SETTINGS)
+    state = by_pose.init(jnp.zeros(3), (0.2, 0.1))
+    none, still = jnp.zeros(3), Tick(jnp.asarray(0.05), jnp.zeros((), bool), jnp.zeros(()))
+    currents = Currents(none, jnp.zeros(3, int), jnp.ones(3))
+    _, motion = by_floor.step(by_floor.init(), none, currents, jnp.asarray(jnp.nan), still)
+
+    def of(belief):
+        alike = [(hypotheses == k).all(axis=1) * p for k, p in belief.items()]
+        return jnp.asarray(np.sum(alike, axis=0, dtype=float))
+
+    motion = replace(motion, known=of(after), before=of(before))
+    root, supports = by_pose.mapped(state, HALVES, hypotheses)
+    return state, *placed(state, root, supports, motion)
+
+
+def test_a_floor_met_on_one_side_of_an_edge_puts_the_pose_there():
+    state, now, left = met({0: 0.01, 1: 0.99}, {0: 0.5, 1: 0.5})
+    assert float(now.pose[0]) > 0.05
+    assert abs(float(now.pose[1])) < 0.03
+    assert float(now.covariance[0, 0]) < 0.8 * float(state.covariance[0, 0])
+    assert float(now.covariance[1, 1]) > 0.8 * float(state.covariance[1, 1])
+    np.testing.assert_allclose(
+        now.history[:, 1:3] - state.history[:, 1:3], jnp.tile(now.pose[:2], (48, 1)), atol=1e-9
+    )
+    _, other, _ = met({0: 0.99, 1: 0.01}, {0: 0.5, 1: 0.5})
+    assert float(other.pose[0]) < -0.05
+    # of how far another pose is off along x, less is left than of how far across
+    assert float(left[0, 0]) < 0.8
+    assert float(left[1, 1]) > 0.8
+
+
+@pytest.mark.parametrize("belief", [{0: 0.5, 1: 0.5}, {0: 0.99, 1: 0.01}, {1: 1.0}])
+def test_beliefs_that_nothing_has_changed_move_no_pose(belief):
+    """However far from the map they are: their evidence has counted when it came."""
+    state, now, left = met(belief, belief)
+    np.testing.assert_allclose(now.pose, state.pose, atol=1e-12)
+    np.testing.assert_allclose(now.covariance, state.covariance, atol=1e-9)
+    np.testing.assert_allclose(left, np.eye(3), atol=1e-9)
 
 
 @eqx.filter_jit
