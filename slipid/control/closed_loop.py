@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from slipid.control.controller import Controller, ControllerState
 from slipid.control.interface import (
@@ -38,12 +38,15 @@ class PilotState(eqx.Module, Generic[State]):
 class PilotOutput(eqx.Module):
     """What a pilot says after a step: wheel speeds [rad/s], an estimate, time of the path [s].
 
+    `given_up` says that the robot was stuck and has stopped for good.
+
     Runs have leading axes in front of every array.
     """
 
     command: Float[Array, " wheel"]
     estimate: Estimate
     time: Float[Array, ""]
+    given_up: Bool[Array, ""]
 
 
 class Pilot(eqx.Module, Generic[State]):
@@ -70,7 +73,7 @@ class Pilot(eqx.Module, Generic[State]):
         here = jnp.where(jnp.isfinite(estimate.pose), estimate.pose, 1e3)
         time, reference = path.follow(state.time, here, dt, self.controller.gains.preview)
         held, command = self.controller.step(state.held, reference, estimate, dt)
-        return PilotState(seen, held, time), PilotOutput(command, estimate, time)
+        return PilotState(seen, held, time), PilotOutput(command, estimate, time, held.given_up)
 
 
 @runtime_checkable
@@ -124,15 +127,17 @@ _step = eqx.filter_jit(Pilot.step)
 def drive(pilot: Pilot[State], path: Path, plant: Plant, start: Pose) -> Course:
     """Run a pilot on a plant at rest until its path is over.
 
-    The path is as it lies for the start, where the pilot believes it stands [m, m, rad].
+    It also ends when the pilot gives up. The path is as it lies for the start, where the pilot
+    believes it stands [m, m, rad].
     """
     wheels = pilot.controller.robot.wheels
     state, reading, dt = pilot.init(start), plant.reset().filled(wheels), jnp.asarray(PERIOD)
     rows: list[tuple[float, float, tuple[float, float, float], PilotOutput]] = []
     energy, own, begun = 0.0, 0.0, 0.0
-    while own < path.duration - 1e-6 and begun < LONGEST * path.duration + 10.0:
+    helpless, longest = False, LONGEST * path.duration + 10.0
+    while own < path.duration - 1e-6 and begun < longest and not helpless:
         state, out = _step(pilot, path, state, reading, dt)
-        own = float(out.time)
+        own, helpless = float(out.time), bool(out.given_up)
         rows.append((begun, energy, plant.pose, out))
         reading = plant.step(np.asarray(out.command)).filled(wheels)
         energy += getattr(plant, "power", np.nan) * PERIOD

@@ -5,6 +5,10 @@ wheel speeds)`, one limiter that keeps the direction of motion, and one safe sto
 what they do beyond the pose loop
 
     v = R(-heading) (v_ref + k (p_ref - p)),   W = W_ref + k_yaw sin(heading_ref - heading)
+
+A robot whose wheels turn and which does not move turns and goes by turns, ever harder: demands to
+go and to turn that cancel at the wheels that have grip, so that only a wheel without any spins, are
+a rest of the loop far from its path. If that does not help it stops and says so.
 """
 
 from collections.abc import Sequence
@@ -29,6 +33,15 @@ OBSERVE_S = 0.4
 """Time constant of the disturbance observer [s]."""
 LONGEST_I = 0.06
 """Largest velocity the integral may ask for [m/s]."""
+STUCK_S, SLOW, ASKED = 0.5, 0.2, 0.1
+"""A robot that goes at less than this part of what it is asked for, if that is more than so much
+[m/s], is stuck after so long [s]."""
+TURN_S, GO_S = 0.6, 1.2
+"""For which a robot that is stuck turns, then goes, by turns [s]."""
+HARDER = 0.6
+"""By which part it then tries harder each second."""
+GIVES_UP_S = 15.0
+"""For which it tries before it stops [s]."""
 
 
 class Gains(eqx.Module):
@@ -84,6 +97,8 @@ class ControllerState(eqx.Module):
         command: the last one [rad/s]; integral: velocity it asks for [m/s].
         wanted: twist asked for last [m/s, m/s, rad/s]; miss: what the robot was seen to do beyond
             it, smoothed.
+        stuck: for how long it has not moved though its wheels turned; moving counts back [s].
+        given_up: whether it has stopped for good, being stuck.
         begun: whether anything was commanded.
     """
 
@@ -91,6 +106,8 @@ class ControllerState(eqx.Module):
     integral: Float[Array, "2"]
     wanted: Float[Array, "3"]
     miss: Float[Array, "3"]
+    stuck: Float[Array, ""]
+    given_up: Bool[Array, ""]
     begun: Bool[Array, ""]
 
 
@@ -129,6 +146,13 @@ def limited(
     return jnp.clip(out, -limits.wheel_speed, limits.wheel_speed)
 
 
+def _freeing(stuck: Float[Array, ""]) -> Float[Array, "3"]:
+    """What a robot that has been stuck for so long [s] makes of the twist it is asked for."""
+    turns = jnp.mod(stuck, TURN_S + GO_S) < TURN_S
+    one = jnp.where(turns, jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 1.0, 0.0]))
+    return jnp.where(stuck > STUCK_S, one * (1 + HARDER * (stuck - STUCK_S)), 1.0)
+
+
 class Controller(eqx.Module):
     """Pose loop with whatever a row of the trial adds to it.
 
@@ -155,8 +179,8 @@ class Controller(eqx.Module):
 
     def init(self) -> ControllerState:
         """State of a controller that has commanded nothing yet."""
-        none, still = jnp.zeros(self.robot.wheels), jnp.zeros(3)
-        return ControllerState(none, jnp.zeros(2), still, still, jnp.zeros((), bool))
+        none, still, no = jnp.zeros(self.robot.wheels), jnp.zeros(3), jnp.zeros((), bool)
+        return ControllerState(none, jnp.zeros(2), still, still, jnp.zeros(()), no, no)
 
     def step(
         self,
@@ -182,6 +206,9 @@ class Controller(eqx.Module):
         dt = jnp.asarray(dt, dtype=float)
         dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, 0.5), 0.0)
         gap = ref[:2] - pose[:2]
+        stuck = jnp.maximum(old.stuck + jnp.where(self._stuck(old, e) & safe, dt, -dt), 0.0)
+        given_up = old.given_up | (stuck > GIVES_UP_S)
+        safe &= ~given_up
         wanted = self._wanted(old, ref, pose, gap)
         # what the robot does less what it was asked to do, as far as the estimator sees it
         twist = jnp.where(safe, e.twist, 0.0)
@@ -200,9 +227,17 @@ class Controller(eqx.Module):
             integral=jnp.where(free, summed, jnp.where(safe, old.integral, 0.0)),
             wanted=jnp.where(safe, asked, 0.0),
             miss=jnp.where(safe, jnp.clip(miss, -0.2, 0.2), 0.0),
+            stuck=stuck,
+            given_up=given_up,
             begun=jnp.ones((), bool),
         )
         return new, command
+
+    def _stuck(self, old: ControllerState, e: Estimate) -> Bool[Array, ""]:
+        """Whether the body hardly goes where it was asked to go."""
+        asked = jnp.sqrt(old.wanted[:2] @ old.wanted[:2] + 1e-12)
+        goes = jnp.sqrt(e.twist[:2] @ e.twist[:2] + 1e-12)
+        return e.immobilised | ((asked > ASKED) & (goes < SLOW * asked))
 
     def _wanted(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
         """Twist that the pose loop asks for, its speed limited [m/s, m/s, rad/s]."""
@@ -210,6 +245,7 @@ class Controller(eqx.Module):
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         turn = ref[5] + self.gains.yaw * jnp.sin(ref[2] - pose[2])
         wanted = jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0], turn])
+        wanted = wanted * _freeing(old.stuck)
         fast = jnp.sqrt(wanted[:2] @ wanted[:2] + 1e-12) / self.limits.twist
         return wanted.at[:2].divide(jnp.maximum(fast, 1.0))
 

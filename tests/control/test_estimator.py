@@ -477,6 +477,52 @@ def test_the_observer_takes_a_constant_disturbance_out():
         np.testing.assert_allclose(twist, [0.1, 0.05, 0.0] + left * off, atol=1e-3)
 
 
+def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_and_says_so():
+    """Going and turning cancel at two of its three wheels, as they do where only one spins."""
+    f = robot()
+    con = Controller(f, Gains.at((1.5, 1.5, 0.0, 0.0, 0.0, 0.0)), Limits(acceleration=1e4))
+    reference = jnp.array([0.0, 0.1, np.arcsin(0.5), 0.0, 0.0, 0.0])
+    said = estimate(f, immobilised=jnp.ones((), bool))
+    step = jax.jit(lambda s, e: con.step(s, reference, e, DT))
+    state, commands, helpless = con.init(), [], []
+    for _ in range(400):
+        state, command = step(state, said)
+        commands.append(np.asarray(command))
+        helpless.append(bool(state.given_up))
+    rows = np.array(commands)
+    end = helpless.index(True)
+    assert 14.0 < end * DT < 16.0
+    tried = rows[20:end]
+    turns = np.ptp(tried, axis=1) < 1e-6
+    goes = np.abs(tried.sum(axis=1)) < 1e-6
+    assert turns.sum() > 60
+    assert goes.sum() > 60
+    assert np.abs(tried[turns][-1]).max() > 1.5 * np.abs(tried[turns][0]).max()
+    assert np.abs(rows).max() <= LIMITS.wheel_speed
+    np.testing.assert_allclose(rows[end + 20 :], 0.0)
+    # it has stopped for good, whatever is believed of it afterwards
+    for _ in range(20):
+        state, command = step(state, estimate(f))
+    assert bool(state.given_up)
+    np.testing.assert_allclose(command, 0.0)
+
+
+def test_a_robot_that_hardly_goes_where_it_is_asked_to_go_counts_as_stuck_and_one_that_goes_not():
+    f = robot()
+    con = Controller(f, Gains.at((1.5, 1.5, 0.0, 0.0, 0.0, 0.0)))
+    reference = jnp.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0])
+    step = jax.jit(lambda s, e: con.step(s, reference, e, DT))
+    for speed, stuck in ((0.02, True), (0.1, False)):
+        state, said = con.init(), estimate(f, twist=jnp.array([speed, 0.0, 0.0]))
+        for _ in range(20):
+            state, _ = step(state, said)
+        assert (float(state.stuck) > 0.5) == stuck
+    for _ in range(40):
+        state, command = step(state, estimate(f, twist=jnp.array([0.2, 0.0, 0.0])))
+    assert float(state.stuck) == 0.0
+    np.testing.assert_allclose(command, wheels([0.2, 0.0, 0.0]), atol=1e-9)
+
+
 def estimate(f, **known):
     """An estimate of zeros but for what is given."""
     _, said = Odometry(f).step(Odometry(f).init(), Measurement(), DT)
