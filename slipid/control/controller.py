@@ -8,7 +8,8 @@ what they do beyond the pose loop
 
 A robot whose wheels turn and which does not move turns and goes by turns, ever harder: demands to
 go and to turn that cancel at the wheels that have grip, so that only a wheel without any spins, are
-a rest of the loop far from its path. If that does not help it stops and says so.
+a rest of the loop far from its path. It goes on as usual once it has moved for a while; if that
+does not come about it stops and says so.
 """
 
 from collections.abc import Sequence
@@ -35,7 +36,7 @@ LONGEST_I = 0.06
 """Largest velocity the integral may ask for [m/s]."""
 STUCK_S, SLOW, ASKED = 0.5, 0.2, 0.1
 """A robot that goes at less than this part of what it is asked for, if that is more than so much
-[m/s], is stuck after so long [s]."""
+[m/s], is stuck after so long, and free once it has gone for as long [s]."""
 TURN_S, GO_S = 0.6, 1.2
 """For which a robot that is stuck turns, then goes, by turns [s]."""
 HARDER = 0.6
@@ -97,8 +98,8 @@ class ControllerState(eqx.Module):
         command: the last one [rad/s]; integral: velocity it asks for [m/s].
         wanted: twist asked for last [m/s, m/s, rad/s]; miss: what the robot was seen to do beyond
             it, smoothed.
-        stuck: for how long it has not moved though its wheels turned; moving counts back [s].
-        given_up: whether it has stopped for good, being stuck.
+        still: for how long it has not gone where it was asked to go; going counts back [s].
+        tried: for how long it has tried to free itself, since it was last free [s].
         begun: whether anything was commanded.
     """
 
@@ -106,9 +107,14 @@ class ControllerState(eqx.Module):
     integral: Float[Array, "2"]
     wanted: Float[Array, "3"]
     miss: Float[Array, "3"]
-    stuck: Float[Array, ""]
-    given_up: Bool[Array, ""]
+    still: Float[Array, ""]
+    tried: Float[Array, ""]
     begun: Bool[Array, ""]
+
+    @property
+    def given_up(self) -> Bool[Array, ""]:
+        """Whether it has stopped for good, being stuck."""
+        return self.tried > GIVES_UP_S
 
 
 def limited(
@@ -146,11 +152,15 @@ def limited(
     return jnp.clip(out, -limits.wheel_speed, limits.wheel_speed)
 
 
-def _freeing(stuck: Float[Array, ""]) -> Float[Array, "3"]:
-    """What a robot that has been stuck for so long [s] makes of the twist it is asked for."""
-    turns = jnp.mod(stuck, TURN_S + GO_S) < TURN_S
-    one = jnp.where(turns, jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 1.0, 0.0]))
-    return jnp.where(stuck > STUCK_S, one * (1 + HARDER * (stuck - STUCK_S)), 1.0)
+def _turns(tried: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a robot that has tried to free itself for so long [s] is turning on the spot."""
+    return (tried > 0) & (jnp.mod(tried, TURN_S + GO_S) < TURN_S)
+
+
+def _freeing(tried: Float[Array, ""]) -> Float[Array, "3"]:
+    """What it makes of the twist it is asked for."""
+    one = jnp.where(_turns(tried), jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 1.0, 0.0]))
+    return jnp.where(tried > 0, one * (1 + HARDER * tried), 1.0)
 
 
 class Controller(eqx.Module):
@@ -179,8 +189,8 @@ class Controller(eqx.Module):
 
     def init(self) -> ControllerState:
         """State of a controller that has commanded nothing yet."""
-        none, still, no = jnp.zeros(self.robot.wheels), jnp.zeros(3), jnp.zeros((), bool)
-        return ControllerState(none, jnp.zeros(2), still, still, jnp.zeros(()), no, no)
+        none, still, zero = jnp.zeros(self.robot.wheels), jnp.zeros(3), jnp.zeros(())
+        return ControllerState(none, jnp.zeros(2), still, still, zero, zero, jnp.zeros((), bool))
 
     def step(
         self,
@@ -191,8 +201,8 @@ class Controller(eqx.Module):
     ) -> tuple[ControllerState, Float[Array, " wheel"]]:
         """Wheel speeds to command [rad/s].
 
-        Stops, at the allowed deceleration, while the estimate is stale or anything is no number;
-        starts from the speed the wheels have.
+        Stops, at the allowed deceleration, while the estimate is stale or anything is no number,
+        and for good once it has given up; starts from the speed the wheels have.
 
         Args:
             state, estimate: from `init` or the last step; of an estimator.
@@ -206,9 +216,8 @@ class Controller(eqx.Module):
         dt = jnp.asarray(dt, dtype=float)
         dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, 0.5), 0.0)
         gap = ref[:2] - pose[:2]
-        stuck = jnp.maximum(old.stuck + jnp.where(self._stuck(old, e) & safe, dt, -dt), 0.0)
-        given_up = old.given_up | (stuck > GIVES_UP_S)
-        safe &= ~given_up
+        safe &= ~old.given_up
+        still, tried = self._held(old, e, jnp.where(safe, dt, 0.0))
         wanted = self._wanted(old, ref, pose, gap)
         # what the robot does less what it was asked to do, as far as the estimator sees it
         twist = jnp.where(safe, e.twist, 0.0)
@@ -227,17 +236,25 @@ class Controller(eqx.Module):
             integral=jnp.where(free, summed, jnp.where(safe, old.integral, 0.0)),
             wanted=jnp.where(safe, asked, 0.0),
             miss=jnp.where(safe, jnp.clip(miss, -0.2, 0.2), 0.0),
-            stuck=stuck,
-            given_up=given_up,
+            still=still,
+            tried=tried,
             begun=jnp.ones((), bool),
         )
         return new, command
 
-    def _stuck(self, old: ControllerState, e: Estimate) -> Bool[Array, ""]:
-        """Whether the body hardly goes where it was asked to go."""
+    def _held(self, old: ControllerState, e: Estimate, dt: Array) -> tuple[Array, Array]:
+        """For how long the body has not gone where it should, and has tried to free itself [s].
+
+        While it turns on the spot it is asked to go nowhere, which tells nothing of that.
+        """
         asked = jnp.sqrt(old.wanted[:2] @ old.wanted[:2] + 1e-12)
         goes = jnp.sqrt(e.twist[:2] @ e.twist[:2] + 1e-12)
-        return e.immobilised | ((asked > ASKED) & (goes < SLOW * asked))
+        held = e.immobilised | ((asked > ASKED) & (goes < SLOW * asked))
+        since = jnp.where(_turns(old.tried), 0.0, jnp.where(held, dt, -dt))
+        still = jnp.clip(old.still + since, 0.0, 2 * STUCK_S)
+        tries = still > STUCK_S
+        still = jnp.where(tries & (old.tried == 0), 2 * STUCK_S, still)
+        return still, jnp.where(tries, old.tried + dt, 0.0)
 
     def _wanted(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
         """Twist that the pose loop asks for, its speed limited [m/s, m/s, rad/s]."""
@@ -245,7 +262,7 @@ class Controller(eqx.Module):
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         turn = ref[5] + self.gains.yaw * jnp.sin(ref[2] - pose[2])
         wanted = jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0], turn])
-        wanted = wanted * _freeing(old.stuck)
+        wanted = wanted * _freeing(old.tried)
         fast = jnp.sqrt(wanted[:2] @ wanted[:2] + 1e-12) / self.limits.twist
         return wanted.at[:2].divide(jnp.maximum(fast, 1.0))
 
