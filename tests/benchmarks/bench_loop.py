@@ -11,9 +11,10 @@ pose fix in every step, or drive with the true numbers.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,8 +27,7 @@ STEPS = 960
 """Of a rollout; `slipid trial` gives a run up no later."""
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """A row of the trial, whether it has a gyro, and what it is told beside its readings."""
 
     name: str = "contact"
