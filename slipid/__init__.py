@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from slipid.control.estimator import Estimator as Estimator
     from slipid.control.interface import Measurement as Measurement
     from slipid.data.reading.reader import read_runs as read_runs
+    from slipid.deploy.floors import floor_map as floor_map
     from slipid.identify.posterior.blocks import Plan as Plan
     from slipid.model.robot import Robot as Robot
     from slipid.plots.raw import plot_runs as plot_runs
@@ -46,6 +47,7 @@ _ROOMS = {
     "check": "slipid.api.check",
     "drive": "slipid.api.driving",
     "fit": "slipid.api.fit",
+    "floor_map": "slipid.deploy.floors",
     "made_runs": "slipid.api.known_robot",
     "move": "slipid.api.known_robot",
     "plot_runs": "slipid.plots.raw",

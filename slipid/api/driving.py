@@ -1,14 +1,16 @@
 """A deployed robot that drives on its own model: is the path kept, and does it know where it is?"""
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from slipid.control import closed_loop, trajectory
+from slipid.control import closed_loop
 from slipid.control.deployed import DeployedRobot
-from slipid.data.floor_map import FloorMap
+from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import ROWS, pilot_of
 from slipid.deploy.deploy import habits_of
-from slipid.deploy.trial import REST_S
-from slipid.deploy.trial_site import floor_of, site, starts, twin
+from slipid.deploy.floors import floor_of
+from slipid.deploy.trial import REST_S, path_of
+from slipid.deploy.trial_site import known_to_fit, site, starts, twin
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,27 +37,41 @@ class Drive:
 
 
 def drive(
-    robot: DeployedRobot, controller: str = "contact", *, start: int = 0, seed: int = 0
+    robot: DeployedRobot,
+    controller: str = "contact",
+    *,
+    map: Path | str | None = None,
+    path: str = "rectangle",
+    speed: float = 0.2,
+    start: int = 0,
+    seed: int = 0,
 ) -> Drive:
-    """Drive the 2021 paper's rectangle on the twin: the model itself, with delays and noise.
+    """Drive the 2021 paper's rectangle, or another path, on the twin of a robot.
+
+    The twin is the model itself, with delays and noise.
 
     Args:
         robot: a fit's or a posterior's `deploy()`, or `DeployedRobot.load`.
-        controller: as of `slipid trial`: `encoder`, `contact`, `contact_gyro`, ...
-        start: which of twenty poses on patches of the robot's floors.
+        controller: as of `slipid trial`: `encoder`, `contact`, `contact_map`, `contact_gyro`, ...
+        map: file of a floor map; patches of the robot's floors by default.
+        path: `rectangle`, `circle`, `eight` or `turning`; speed: along it [m/s].
+        start: which of twenty poses on the map.
         seed: of the sensors' noise.
 
     Raises:
         ValueError: no such controller or start.
+        DataError: no such path or map, a speed beyond what the fit has seen, or a floor that the
+            robot does not know.
     """
-    places = starts(20, floor := site(robot))
+    course = path_of(path, speed, robot)
+    floor = site(robot) if map is None else read_map(Path(map))
+    known_to_fit(floor, robot, str(map))
+    places = starts(20, floor, course)
     if controller not in ROWS or not 0 <= start < len(places):
         names = ", ".join(ROWS)
         raise ValueError(f"controller '{controller}' from start {start}; expected {names}; 0 to 19")
     row, begin = ROWS[controller], places[start]
     plant = twin(robot, floor, begin, seed, habits_of(robot, gyro=row.gyro))
-    path = trajectory.rectangle().moved(begin).waiting(REST_S)
-    course = closed_loop.drive(
-        pilot_of(robot, row, floor=floor_of(floor, robot.labels)), path, plant, begin
-    )
-    return Drive(course, floor, closed_loop.metrics(course))
+    pilot = pilot_of(robot, row, floor=floor_of(floor, robot.labels))
+    driven = closed_loop.drive(pilot, course.moved(begin).waiting(REST_S), plant, begin)
+    return Drive(driven, floor, closed_loop.metrics(driven))

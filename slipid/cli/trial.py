@@ -1,4 +1,4 @@
-"""`slipid trial`: the 2021 paper's rectangle with every controller."""
+"""`slipid trial`: the 2021 paper's rectangle, or another path, with every controller."""
 
 from pathlib import Path
 from typing import Annotated
@@ -21,6 +21,10 @@ def trial(
     controllers: Annotated[
         str | None, typer.Option(metavar="NAMES", help="By commas; all by default.")
     ] = None,
+    path: Annotated[
+        str, typer.Option(metavar="NAME", help="rectangle, circle, eight, or turning: it turns.")
+    ] = "rectangle",
+    speed: Annotated[float, typer.Option(metavar="M_S", help="Along the path [m/s].")] = 0.2,
     starts: Annotated[int, typer.Option(min=1, max=99, help="Poses to start from.")] = 20,
     load: Load = None,
     tuned_gains: Annotated[
@@ -30,7 +34,7 @@ def trial(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Drive the 2021 paper's rectangle with every controller and say which one to deploy.
+    """Drive the 2021 paper's rectangle, or another path, with every controller, and judge them.
 
     Gains are those that `slipid tune` put into robot.json, if it found them better than those set
     by hand. Writes trial.json and trial.png to OUT; runs that are done are kept and not driven
@@ -41,10 +45,20 @@ def trial(
     from slipid.plots.trial import trial_plot
     from slipid.report.answers import show_trial
 
-    wish = Wish(plant, map, names_of(controllers), starts, load, processes(jobs), tuned_gains)
+    wish = Wish(
+        plant=plant,
+        map=map,
+        controllers=names_of(controllers),
+        path=path,
+        speed=speed,
+        starts=starts,
+        load=load,
+        jobs=processes(jobs),
+        tuned_gains=tuned_gains,
+    )
     with Reporter(quiet=quiet) as report:
         done = run(out, wish, report)
         report.stage("drawing")
-        trial_plot(done.content, done.paths, done.floor, out / "trial.png")
+        trial_plot(done.content, done.paths, done.wanted, done.floor, out / "trial.png")
     emit(json, done.content, lambda page: show_trial(page, done.content, out))
     return 0

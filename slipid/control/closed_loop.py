@@ -173,7 +173,8 @@ class Metrics:
     """What became of a path, from true poses.
 
     Attributes:
-        along_track_mm: travelled less wanted at the end of every side.
+        along_track_mm: travelled less wanted at the end of every side, or quarter of a curve.
+        sides_mm: what was wanted, straight from one end to the next.
         closure_mm: from the end to where it should be, and what was left of the way where the run
             was given up.
         cross_track_rmse_mm: distance from the path as a line, over time.
@@ -186,6 +187,7 @@ class Metrics:
     """
 
     along_track_mm: tuple[float, ...]
+    sides_mm: tuple[float, ...]
     closure_mm: float
     cross_track_rmse_mm: float
     heading_error_deg: float
@@ -200,13 +202,10 @@ def metrics(course: Course) -> Metrics:
     """What became of a path, from true poses."""
     p, path = course.pose, course.path
     corners = np.vstack([np.asarray(path.rows[0, :2]), np.asarray(path.corners)])
-    along = []
-    for k, mark in enumerate(np.asarray(path.marks)):
-        at = min(int(np.searchsorted(course.own, mark - 1e-6)), len(p) - 1)
-        side = corners[k + 1] - corners[k]
-        size = np.hypot(*side)
-        u = side / size if size > 1e-9 else np.zeros(2)
-        along.append(1000 * float((p[at, :2] - corners[k + 1]) @ u))
+    sides = np.diff(corners, axis=0)
+    sizes = np.hypot(*sides.T)
+    at = np.minimum(np.searchsorted(course.own, np.asarray(path.marks) - 1e-6), len(p) - 1)
+    along = ((p[at, :2] - corners[1:]) * sides).sum(axis=1) / np.maximum(sizes, 1e-9)
     rows = np.asarray(path.rows[:, :2])
     near = _from_line(p[:, :2], rows[::5] if len(rows) > 5 else rows)
     left = rows[int(course.own[-1] / STEP + 1e-6) :]
@@ -214,7 +213,8 @@ def metrics(course: Course) -> Metrics:
     wanted = float(path.rows[-1, 2])
     turned = np.degrees((p[-1, 2] - wanted + np.pi) % (2 * np.pi) - np.pi)
     return Metrics(
-        along_track_mm=tuple(along),
+        along_track_mm=tuple((1000 * along).tolist()),
+        sides_mm=tuple((1000 * sizes).tolist()),
         closure_mm=1000 * float(np.hypot(*(p[-1, :2] - corners[-1]))) + left_mm,
         cross_track_rmse_mm=1000 * float(np.sqrt((near**2).mean())),
         heading_error_deg=float(turned),

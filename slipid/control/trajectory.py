@@ -1,7 +1,7 @@
 """Paths in time: where the robot should be and how fast, and when to wait for it."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,7 +21,8 @@ class Path(eqx.Module):
 
     Attributes:
         rows: x, y [m], heading [rad], their rates [m/s, m/s, rad/s], a row every `STEP`.
-        marks: times at which a side ends, the robot having had time to settle [s].
+        marks: times at which a side ends, the robot having had time to settle, or a quarter of a
+            curve [s].
         corners: where it then should be (mark, 2) [m].
     """
 
@@ -94,42 +95,116 @@ def waypoints(
     speed: float = 0.2,
     acceleration: float = 0.5,
     pause: float = 0.6,
+    turn: float = 0.0,
 ) -> Path:
-    """Straight from place to place with a stop at each, without turning.
+    """Straight from place to place with a stop at each.
 
     Args:
         places: x, y [m], the first one is where it starts.
         speed: between stops [m/s]; acceleration: [m/s^2].
         pause: at every place [s].
+        turn: by which it turns on the way to each place [rad].
 
     Raises:
         ValueError: fewer than two places, neighbours that are the same, or a speed or acceleration
             that is not positive.
     """
-    if not (speed > 0 and acceleration > 0):
-        raise ValueError(f"speed {speed}, acceleration {acceleration}; expected both positive")
+    _positive(speed, acceleration)
     p = np.asarray(places, float)
     if p.ndim != 2 or len(p) < 2 or p.shape[1] != 2:
         raise ValueError(f"way-points {p.tolist()}; expected two or more places x, y")
     parts, marks, time = [np.array([[*p[0], 0.0, 0.0, 0.0, 0.0]])], [], 0.0
-    for a, b in itertools.pairwise(p):
+    for k, (a, b) in enumerate(itertools.pairwise(p)):
         far = float(np.hypot(*(b - a)))
         if far < 1e-9:
             raise ValueError(f"way-point {b.tolist()} twice in a row; expected another place")
         gone, pace = _trapezoid(far, speed, acceleration, pause)
-        u = (b - a) / far
-        still = np.zeros((len(gone), 1))
-        parts.append(np.hstack([a + gone[:, None] * u, still, pace[:, None] * u, still]))
+        way = np.array([*(b - a), turn]) / far
+        parts.append(np.hstack([[*a, k * turn] + gone[:, None] * way, pace[:, None] * way]))
         time += len(gone) * STEP
         marks.append(time)
     rows = np.concatenate(parts)
     return Path(jnp.asarray(rows), jnp.asarray(marks), jnp.asarray(p[1:]))
 
 
-def rectangle(length: float = 0.9, width: float = 0.4, speed: float = 0.2) -> Path:
-    """The 2021 paper's trial (figure 7): ahead, to the right, back, to the left [m], [m/s]."""
+def rectangle(
+    length: float = 0.9, width: float = 0.4, speed: float = 0.2, turn: float = 0.0
+) -> Path:
+    """The 2021 paper's trial (figure 7): ahead, to the right, back, to the left [m], [m/s].
+
+    The robot turns by `turn` on each side [rad].
+    """
     corners = [(0.0, 0.0), (length, 0.0), (length, -width), (0.0, -width), (0.0, 0.0)]
-    return waypoints(corners, speed)
+    return waypoints(corners, speed, turn=turn)
+
+
+def curve(
+    places: Sequence[Sequence[float]] | Float[np.ndarray, "place 2"],
+    speed: float = 0.2,
+    acceleration: float = 0.5,
+    pause: float = 0.6,
+) -> Path:
+    """Along a smooth line without turning and without a stop, at rest in the end.
+
+    Args:
+        places: x, y [m], dense enough that straight lines between them are the curve.
+        speed: along it [m/s]; acceleration: at its ends [m/s^2].
+        pause: at its end [s].
+
+    Raises:
+        ValueError: fewer than two places, neighbours that are the same, or a speed or acceleration
+            that is not positive.
+    """
+    _positive(speed, acceleration)
+    p = np.asarray(places, float)
+    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p, axis=0).T))])
+    if len(p) < 2 or np.diff(far).min() < 1e-9:
+        raise ValueError("a curve's places; expected two or more, each another than the last")
+    gone, pace = _trapezoid(float(far[-1]), speed, acceleration, pause)
+    gone, pace = np.append(0.0, gone), np.append(0.0, pace)
+    place = np.stack([np.interp(gone, far, x) for x in p.T], axis=1)
+    rate = np.stack([np.interp(gone, far, np.gradient(x, far)) for x in p.T], axis=1)
+    still = np.zeros((len(gone), 1))
+    quarters = np.searchsorted(gone, far[-1] * np.array([0.25, 0.5, 0.75]))
+    at = np.append(quarters, len(gone) - 1)
+    rows = np.hstack([place, still, pace[:, None] * rate, still])
+    return Path(jnp.asarray(rows), jnp.asarray(at * STEP), jnp.asarray(place[at]))
+
+
+def circle(radius: float = 0.35, speed: float = 0.2) -> Path:
+    """Once round to the right, without turning [m], [m/s]."""
+    return curve(_round(radius), speed)
+
+
+def eight(radius: float = 0.25, speed: float = 0.2) -> Path:
+    """A circle to the right and one to the left, without turning [m], [m/s]."""
+    right = _round(radius)
+    return curve(np.concatenate([right, right[1:] * [1.0, -1.0]]), speed)
+
+
+def turning(speed: float = 0.2) -> Path:
+    """The 2021 paper's rectangle, turning by a quarter to the right on each side [m/s]."""
+    return rectangle(speed=speed, turn=-0.5 * np.pi)
+
+
+PATHS: Mapping[str, Callable[[float], Path]] = {
+    "rectangle": lambda speed: rectangle(speed=speed),
+    "circle": lambda speed: circle(speed=speed),
+    "eight": lambda speed: eight(speed=speed),
+    "turning": turning,
+}
+"""Of a trial, by name, at a speed [m/s]."""
+
+
+def _round(radius: float) -> Float[np.ndarray, "place 2"]:
+    """Places of a circle to the right that begins ahead [m]."""
+    angle = np.linspace(0.0, 2 * np.pi, 721)
+    return radius * np.stack([np.sin(angle), np.cos(angle) - 1.0], axis=1)
+
+
+def _positive(speed: float, acceleration: float) -> None:
+    if not (speed > 0 and acceleration > 0):
+        raise ValueError(f"speed {speed}, acceleration {acceleration}; expected both positive")
 
 
 def _trapezoid(

@@ -1,4 +1,4 @@
-"""`slipid trial`: the rectangle of the 2021 paper's figure 7 with every controller, judged."""
+"""`slipid trial`: the rectangle of the 2021 paper's figure 7, or another path, judged."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
@@ -18,7 +18,16 @@ from slipid.control.tuning.actuation import Habits
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import ROWS, check_gains, pilot_of, unused_gains
 from slipid.deploy.deploy import habits_of, read_robot
-from slipid.deploy.trial_site import SitePlant, floor_of, known_to_site, one_of, site, starts, twin
+from slipid.deploy.floors import floor_of
+from slipid.deploy.trial_site import (
+    SitePlant,
+    known_to_fit,
+    known_to_site,
+    one_of,
+    site,
+    starts,
+    twin,
+)
 from slipid.deploy.trial_summary import Run, not_told_apart, summaries
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.errors import DataError
@@ -41,6 +50,7 @@ class Job:
 
     name: str
     row: str
+    path: trajectory.Path
     start: tuple[float, float, float]
     seed: int
     plant: str
@@ -62,6 +72,7 @@ class Wish:
         map: file of a floor map; None for patches of the identified floors.
         controllers: names of `ROWS`.
         load: name of the load set-up; None for the first.
+        path: name of `trajectory.PATHS`; speed: along it [m/s].
         starts, jobs: how many, and processes at once.
         tuned_gains: whether tuned gains are taken that are no better than those set by hand.
     """
@@ -69,6 +80,8 @@ class Wish:
     plant: str = "testsite"
     map: Path | None = None
     controllers: tuple[str, ...] = tuple(ROWS)
+    path: str = "rectangle"
+    speed: float = 0.2
     starts: int = 20
     load: str | None = None
     jobs: int = 1
@@ -77,10 +90,18 @@ class Wish:
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """End of a trial: content of trial.json, true poses of every run by its name (step, 3)."""
+    """End of a trial.
+
+    Attributes:
+        content: of trial.json.
+        paths: true poses of every run by its name (step, 3); wanted: places from the origin
+            (row, 2) [m].
+        floor: the map it was driven on.
+    """
 
     content: dict[str, Any]
     paths: Mapping[str, np.ndarray]
+    wanted: np.ndarray
     floor: FloorMap
 
 
@@ -90,8 +111,8 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
     Runs that are done are kept, and not driven again as long as nothing they depend on changes.
 
     Raises:
-        DataError: no fit, no such plant, controller, load or map, MuJoCo missing, or floors that
-            the plant or the fit does not know.
+        DataError: no fit, no such plant, controller, path, load or map, MuJoCo missing, floors that
+            the plant or the fit does not know, or a speed beyond what the fit has seen.
     """
     setup_jax(quiet=True)
     jobs = _jobs(out, wish)
@@ -107,6 +128,8 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
         "schema": SCHEMA,
         "plant": wish.plant,
         "map": "patches" if wish.map is None else str(wish.map),
+        "path": wish.path,
+        "speed_m_s": wish.speed,
         "gains": _named(jobs[0].robot, wish.tuned_gains),
         "closes_best": None if len(able) > 1 else able[0],
         "not_told_apart": able,
@@ -115,7 +138,8 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
         "runs": [run.to_json() for run in runs],
     }
     write_json(out / "trial.json", content)
-    return Driven(content, {name: path for name, (_, path) in driven.items()}, jobs[0].floor)
+    paths = {name: path for name, (_, path) in driven.items()}
+    return Driven(content, paths, np.asarray(jobs[0].path.rows)[:, :2], jobs[0].floor)
 
 
 def _jobs(out: Path, wish: Wish) -> list[Job]:
@@ -126,17 +150,20 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         said = strange[0] if strange else ""
         raise DataError(f"no controller{said}; expected some of {', '.join(ROWS)}")
     robot = jax.tree.map(np.asarray, read_robot(out, wish.load))
+    path = path_of(wish.path, wish.speed, robot)
     floor = site(robot) if wish.map is None else read_map(wish.map)
-    settings, habits, known = Settings.of(robot), habits_of(robot, gyro=False), robot.labels
+    settings, habits = Settings.of(robot), habits_of(robot, gyro=False)
     if wish.plant == "testsite":  # it has the sensors it has, whatever the logs had
         known_to_site(floor, robot.load_setup, robot.wheels)
         settings, habits = replace(settings, current_is_signed=False), Habits()
-    elif absent := [name for name in floor.surfaces if name not in known]:
-        raise DataError(f"{wish.map}: no surface '{absent[0]}'; identified: {', '.join(known)}")
+    else:
+        known_to_fit(floor, robot, str(wish.map))
     check_gains(out, robot, wish.tuned_gains)
     key = key_of(
         *(
             wish.plant,
+            wish.path,
+            wish.speed,
             robot.load_setup,
             _named(robot, wish.tuned_gains),
             settings,
@@ -151,10 +178,27 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
     kept = Checkpoint(out / FOLDER / key[:12] / f"of{wish.starts}", key)
     shared = wish.plant, floor, robot, settings, habits, wish.tuned_gains, kept
     return [
-        Job(f"{row}/start{k:02d}", row, start, 1000 + k, *shared)
+        Job(f"{row}/start{k:02d}", row, path, start, 1000 + k, *shared)
         for row in wish.controllers
-        for k, start in enumerate(starts(wish.starts, floor))
+        for k, start in enumerate(starts(wish.starts, floor, path))
     ]
+
+
+def path_of(name: str, speed: float, robot: DeployedRobot) -> trajectory.Path:
+    """A path from the origin at a speed [m/s].
+
+    Raises:
+        DataError: no such path, or a speed at which wheels are faster than the fit has seen them.
+    """
+    if name not in trajectory.PATHS:
+        raise DataError(f"no path '{name}'; expected one of {', '.join(trajectory.PATHS)}")
+    most = float(robot.highest[0] * robot.frame.radius)
+    if not 0 < speed <= most:
+        raise DataError(
+            f"speed {speed:g} m/s; expected above 0 and at most {most:.2g} m/s, the rim speed up "
+            "to which the fit has seen the wheels"
+        )
+    return trajectory.PATHS[name](speed)
 
 
 def _named(robot: DeployedRobot, forced: bool) -> dict[str, float]:
@@ -173,7 +217,7 @@ def drive(job: Job) -> None:
     setup_jax(quiet=True)
     row = ROWS[job.row]
     robot = jax.tree.map(jnp.asarray, job.robot)
-    path = trajectory.rectangle().moved(job.start).waiting(REST_S)
+    path = job.path.moved(job.start).waiting(REST_S)
     plant: closed_loop.Plant
     if job.plant == "twin":
         truth = one_of(robot, job.seed)
@@ -192,8 +236,8 @@ def drive(job: Job) -> None:
         believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
     )
     # the path first: a run that has metrics is done
-    path_of = {"time": course.time, "pose": course.pose, "believed": course.believed}
-    job.kept.save(job.name, path_of)
+    poses = {"time": course.time, "pose": course.pose, "believed": course.believed}
+    job.kept.save(job.name, poses)
     job.kept.save_json(job.name, asdict(run))
 
 

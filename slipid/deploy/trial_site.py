@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.control.deployed import DeployedRobot, drawn
-from slipid.control.filter.floor import Floor
 from slipid.control.interface import Measurement
+from slipid.control.trajectory import Path
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Twin, TwinPlant
 from slipid.data.floor_map import FloorMap, patchwork
+from slipid.deploy.floors import floor_of
 from slipid.support.errors import DataError
 from slipid.testsite.driving import PERIOD, Rims
 from slipid.testsite.ground import GROUNDS
@@ -37,23 +38,32 @@ def site(robot: DeployedRobot) -> FloorMap:
     return FloorMap(tuple(order), cells, drawn.corner, drawn.cell)
 
 
-def starts(count: int, floor: FloorMap) -> list[tuple[float, float, float]]:
+def starts(count: int, floor: FloorMap, path: Path) -> list[tuple[float, float, float]]:
     """Poses all over a site in evenly spread headings, the same ones for every controller.
 
-    The middle of the rectangle keeps 0.8 m from the site's edge where there is room.
+    The middle of the path, which begins at the origin, keeps 0.8 m from the site's edge where there
+    is room.
     """
     rng = np.random.default_rng(STARTS_SEED)
     x0, y0, x1, y1 = floor.extent
     middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
     reach = np.maximum([0.5 * (x1 - x0) - 0.8, 0.5 * (y1 - y0) - 0.8], 0.0)
+    places = np.asarray(path.rows)[:, :2]
+    a, b = (0.5 * (places.min(axis=0) + places.max(axis=0))).tolist()
     out = []
     for k in range(count):
         heading = (k + rng.uniform()) * 2 * np.pi / count - np.pi
         c, s = np.cos(heading), np.sin(heading)
         x, y = middle + reach * rng.uniform(-1.0, 1.0, 2)
-        a, b = 0.45, 0.2  # half of the rectangle's sides [m]
-        out.append((float(x - (c * a + s * b)), float(y - (s * a - c * b)), float(heading)))
+        out.append((float(x - (c * a - s * b)), float(y - (s * a + c * b)), float(heading)))
     return out
+
+
+def known_to_fit(floor: FloorMap, robot: DeployedRobot, path: str) -> None:
+    """Refuse a map, from this file, with a surface that the twin of a robot does not have."""
+    if absent := [name for name in floor.surfaces if name not in robot.labels]:
+        known = ", ".join(robot.labels)
+        raise DataError(f"{path}: no surface '{absent[0]}'; identified: {known}")
 
 
 def known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
@@ -70,13 +80,6 @@ def known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
             raise DataError(
                 f"the test site has no {what} '{name}'; it has {', '.join(there)}. {other}"
             )
-
-
-def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Floor:
-    """A map as arrays, its surfaces counted as the fit counts them, -1 for one it does not know."""
-    counted = [labels.index(name) if name in labels else -1 for name in floor.surfaces]
-    cells = np.array(counted)[floor.cells]
-    return Floor(jnp.asarray(cells), jnp.asarray(floor.corner), jnp.asarray(floor.cell))
 
 
 class SitePlant:

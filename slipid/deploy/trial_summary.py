@@ -120,13 +120,13 @@ def columns(runs: Sequence[Run]) -> Columns:
     """What is judged of every run.
 
     `first_side_along_track_mm` and `heading_error_deg` are the errors' sizes;
-    `first_side_travelled` is the part of the first side.
+    `first_side_travelled` is the part of the first side. Of a curve, that is its first quarter.
     """
     m = [run.metrics for run in runs]
-    side = np.array([x.along_track_mm[0] for x in m])
+    side, whole = np.array([(x.along_track_mm[0], x.sides_mm[0]) for x in m]).T
     return {
         "first_side_along_track_mm": np.abs(side),
-        "first_side_travelled": 1 + side / 900.0,
+        "first_side_travelled": 1 + side / whole,
         "closure_error_median": np.array([x.closure_mm for x in m]),
         "cross_track_rmse": np.array([x.cross_track_rmse_mm for x in m]),
         "heading_error_deg": np.abs([x.heading_error_deg for x in m]),

@@ -25,7 +25,7 @@ from slipid.control.tuning.objective import BATCH, GAINS, HAND, UNITS, Cases, Ta
 from slipid.control.tuning.optimisers import GRADIENT, Method, Search, State
 from slipid.data.floor_map import patchwork
 from slipid.deploy.deploy import ROBOT, habits_of, read_robot
-from slipid.deploy.trial_site import floor_of
+from slipid.deploy.floors import floor_of
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.errors import DataError
 from slipid.support.files import write_json

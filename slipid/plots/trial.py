@@ -22,24 +22,31 @@ OTHERS, MARKED = "#56B4E9", "#D55E00"
 ERRORS = {
     "closure_error_median": "closure error [mm]",
     "cross_track_rmse": "cross-track rms [mm]",
-    "first_side_along_track_mm": "first side, along-track [mm]",
+    "first_side_along_track_mm": "first side or quarter, along-track [mm]",
 }
 
 
-def trial_plot(content: Content, paths: Paths, floor: FloorMap, path: Path) -> Path:
+def trial_plot(
+    content: Content, paths: Paths, wanted: np.ndarray, floor: FloorMap, path: Path
+) -> Path:
     """Paths of the start nearest to the medians over the map, all starts from one corner, errors.
 
-    `content` is that of trial.json, `paths` are true poses (step, 3) by run, `CONTROLLER/startNN`.
+    Args:
+        content: of trial.json.
+        paths: true poses (step, 3) by run, `CONTROLLER/startNN`; wanted: places (row, 2) [m].
+        floor: the map it was driven on.
+        path: of the picture.
     """
     names = list(content["summary"])
     rows = -(-len(names) // 3)
-    title = f"Rectangle trial on the {content['plant']}: {_verdict(content)}"
+    course = f"{content['path'].capitalize()} at {content['speed_m_s']:g} m/s"
+    title = f"{course} on the {content['plant']}: {_verdict(content)}"
     made = figure(13.0, 3.1 * rows + 3.4, title)
     grid = made.add_gridspec(rows + 1, 3, height_ratios=[1.0] * rows + [1.1])
     one = _typical(content)
     for k, name in enumerate(names):
         axes = made.add_subplot(grid[k // 3, k % 3])
-        _one(axes, name, content, paths, floor, one)
+        _one(axes, name, content, paths, wanted, floor, one)
     _legend(made, floor)
     for k, (key, label) in enumerate(ERRORS.items()):
         _bars(made.add_subplot(grid[rows, k]), content["summary"], key, label)
@@ -63,14 +70,23 @@ def _typical(content: Content) -> int:
     return int(np.argmin([abs(r["closure_mm"] - middle) for r in runs]))
 
 
-def _one(axes: Axes, name: str, content: Content, paths: Paths, floor: FloorMap, one: int) -> None:
+def _one(
+    axes: Axes,
+    name: str,
+    content: Content,
+    paths: Paths,
+    wanted: np.ndarray,
+    floor: FloorMap,
+    one: int,
+) -> None:
     """All starts of a controller laid on one another, the typical one over its floor."""
     runs = [r for r in content["runs"] if r["controller"] == name]
     own = [
         (paths[f"{name}/start{k:02d}"][:, :2] - r["start"][:2]) @ _turned(r["start"][2])
         for k, r in enumerate(runs)
     ]
-    x, y = np.linspace(-0.35, 1.25, 320), np.linspace(-0.75, 0.35, 220)
+    (left, low), (right, high) = wanted.min(axis=0) - 0.35, wanted.max(axis=0) + 0.35
+    x, y = np.linspace(left, right, 320), np.linspace(low, high, 220)
     start = runs[one]["start"]
     places = start[:2] + np.stack(np.meshgrid(x, y), -1) @ _turned(start[2]).T
     kinds = max(len(floor.surfaces), 2)
@@ -78,7 +94,7 @@ def _one(axes: Axes, name: str, content: Content, paths: Paths, floor: FloorMap,
     axes.pcolormesh(x, y, floor.at(places), cmap=tints, vmin=0, vmax=kinds - 1)
     for p in own:
         axes.plot(*p.T, color=OTHERS, lw=0.5, alpha=0.6)
-    axes.plot([0, 0.9, 0.9, 0, 0], [0, 0, -0.4, -0.4, 0], "--", color=INK, lw=1.0)
+    axes.plot(*wanted.T, "--", color=INK, lw=1.0)
     axes.plot(*own[one].T, color=MARKED, lw=1.8)
     axes.plot(*own[one][-1], "o", color=MARKED, ms=5)
     row = content["summary"][name]

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from slipid.data.floor_map import uniform
+from slipid.deploy.floors import floor_of
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from tests.helpers.known_robot import deploy_known
@@ -22,11 +24,13 @@ jax.config.update("jax_enable_x64", True)
 from slipid.control.controller import Controller
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
+from slipid.control.filter.floor import Floor
 from slipid.control.interface import Measurement
 from slipid.control.trajectory import rectangle
 
 robot = DeployedRobot.load(sys.argv[1])
-estimator, controller, path = Estimator(robot), Controller(robot), rectangle()
+floor = Floor.load(sys.argv[2], robot.labels)
+estimator, controller, path = Estimator(robot, floor=floor), Controller(robot), rectangle()
 state, held = estimator.init(), controller.init()
 for k in range(3):
     z = Measurement(wheel_angle=[0.1 * k, 0.0, -0.1 * k], current=[0.1, 0.0, 0.1])
@@ -40,6 +44,7 @@ print(seen.surface.tolist(), bool(seen.finite), command.shape)
 def test_a_robot_is_loaded_and_driven_with_jax_and_equinox_alone(tmp_path):
     made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"])
     deploy_known(made, highest_speed=8.0).save(tmp_path / "robot.json")
+    floor_of(uniform("soft"), ("soft",)).save(tmp_path / "lab.npz", ("soft",))
     venv.create(tmp_path / "env", with_pip=True)
     python = tmp_path / "env" / "bin" / "python"
     install = [python, "-m", "pip", "install", "-q", "jax", "equinox", "numpy"]
@@ -54,7 +59,7 @@ def test_a_robot_is_loaded_and_driven_with_jax_and_equinox_alone(tmp_path):
         assert absent not in listed.stdout.lower()
     assert sys.prefix not in str(python)
     done = subprocess.run(
-        [python, "-c", ON_THE_ROBOT, str(tmp_path / "robot.json")],
+        [python, "-c", ON_THE_ROBOT, str(tmp_path / "robot.json"), str(tmp_path / "lab.npz")],
         env=bare | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,

@@ -14,7 +14,8 @@ from slipid.control import trajectory as reference
 from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.deployed import DeployedRobot
-from slipid.control.estimator import Odometry
+from slipid.control.estimator import Estimator, Odometry
+from slipid.control.filter.floor import Floor
 from slipid.control.filter.floor_filter import FloorFilter, hypotheses_of
 from slipid.control.interface import Measurement, Settings
 from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
@@ -22,8 +23,9 @@ from slipid.control.robot_file.typed import typed
 from slipid.data.floor_map import four_zones, uniform
 from slipid.deploy import trial as tr
 from slipid.deploy.controllers import ROWS, check_gains, pilot_of, unused_gains
-from slipid.deploy.trial_site import SitePlant, floor_of, known_to_site, one_of, starts
-from slipid.deploy.trial_summary import Run, not_told_apart, summaries
+from slipid.deploy.floors import floor_map, floor_of
+from slipid.deploy.trial_site import SitePlant, known_to_site, one_of, starts
+from slipid.deploy.trial_summary import Run, columns, not_told_apart, summaries
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.support.errors import DataError
@@ -53,6 +55,44 @@ def test_the_rectangle_is_that_of_the_paper_and_stops_at_its_corners():
         np.gradient(rows[:, :2], reference.STEP, axis=0)[5:-5], rows[5:-5, 3:5], atol=0.011
     )
     assert np.hypot(rows[:, 3], rows[:, 4]).max() <= 0.2 + 1e-9
+
+
+@pytest.mark.parametrize("name", reference.PATHS)
+@pytest.mark.parametrize("speed", [0.1, 0.2])
+def test_paths_have_the_rates_of_their_places_and_rest_where_they_began(name, speed):
+    path = reference.PATHS[name](speed)
+    rows = np.asarray(path.rows)
+    rates = np.gradient(rows[:, :3], reference.STEP, axis=0)
+    np.testing.assert_allclose(rates[5:-5], rows[5:-5, 3:], atol=0.02)
+    pace = np.hypot(rows[:, 3], rows[:, 4])
+    assert pace.max() == pytest.approx(speed, rel=1e-4)
+    np.testing.assert_allclose(rows[[0, -1], :2], 0.0, atol=1e-9)
+    np.testing.assert_allclose(rows[[0, -1], 3:], 0.0, atol=1e-9)
+    assert rows[-1, 2] % (2 * np.pi) == pytest.approx(0.0, abs=1e-9)
+    at = np.stack([np.asarray(path.at(t)) for t in np.asarray(path.marks)])
+    np.testing.assert_allclose(at[:, :2], path.corners, atol=1e-6)
+
+
+def test_a_circle_is_round_an_eight_goes_both_ways_round_and_one_path_turns():
+    circle = np.asarray(reference.circle(0.35).rows)[:, :2]
+    np.testing.assert_allclose(np.hypot(circle[:, 0], circle[:, 1] + 0.35), 0.35, atol=1e-4)
+    np.testing.assert_allclose(
+        reference.circle(0.35).corners,
+        [[0.35, -0.35], [0, -0.7], [-0.35, -0.35], [0, 0]],
+        atol=4e-3,
+    )
+    eight = np.asarray(reference.eight(0.25).rows)[:, :2]
+    side = np.sign(eight[:, 1].round(6))
+    np.testing.assert_allclose(
+        np.hypot(eight[:, 0], eight[:, 1] - 0.25 * side)[side != 0], 0.25, atol=1e-4
+    )
+    changes = side[side != 0]
+    assert (changes[0], changes[-1], np.count_nonzero(np.diff(changes))) == (-1, 1, 1)
+    turning = reference.turning()
+    headings = [float(turning.at(t)[2]) for t in np.asarray(turning.marks)]
+    np.testing.assert_allclose(headings, -0.5 * np.pi * np.arange(1, 5), atol=1e-9)
+    still = np.asarray(reference.rectangle().rows)[:, :2]
+    np.testing.assert_allclose(np.asarray(turning.rows)[:, :2], still, atol=1e-12)
 
 
 def test_a_path_moved_to_a_start_has_its_shape():
@@ -96,6 +136,10 @@ def test_way_points_are_refused_with_the_reason():
         reference.rectangle(speed=-0.2)
     with pytest.raises(ValueError, match="twice in a row"):
         reference.waypoints([(0.0, 0.0), (0.0, 0.0)])
+    with pytest.raises(ValueError, match="each another than the last"):
+        reference.curve([(0.0, 0.0), (0.0, 0.0)])
+    with pytest.raises(ValueError, match="expected both positive"):
+        reference.circle(speed=0.0)
 
 
 class Perfect:
@@ -129,6 +173,18 @@ def pilot(deployed, preview=0.0):
     return Pilot(Odometry(deployed), Controller(deployed, gains))
 
 
+@pytest.mark.parametrize("name", reference.PATHS)
+def test_encoders_close_every_path_without_slip(deployed, name):
+    start = (0.2, 0.1, -1.0)
+    path = reference.PATHS[name](0.2).moved(start)
+    course = closed_loop.drive(pilot(deployed, 0.05), path, Perfect(deployed, start), start)
+    found = closed_loop.metrics(course)
+    assert found.finished
+    assert found.closure_mm < 5
+    assert found.cross_track_rmse_mm < 10
+    assert abs(found.heading_error_deg) < 0.5
+
+
 def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(deployed):
     start = (0.2, 0.1, -1.0)
     path = reference.rectangle().moved(start)
@@ -141,6 +197,7 @@ def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(deployed):
     assert np.abs(found.along_track_mm).max() < 10
     assert abs(found.heading_error_deg) < 0.5
     assert found.path_length_mm == pytest.approx(2600, rel=0.03)
+    np.testing.assert_allclose(found.sides_mm, [900, 400, 900, 400], atol=1e-6)
 
 
 def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
@@ -162,6 +219,16 @@ def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
     assert found.along_track_mm[1] == pytest.approx(-80, abs=12)
     assert found.closure_mm < 12  # every side is as short as its opposite
     assert found.cross_track_rmse_mm > 30
+
+
+def test_of_a_curve_the_first_quarter_is_judged(deployed):
+    start = (0.0, 0.0, 0.0)
+    path = reference.circle(0.35)
+    course = closed_loop.drive(pilot(deployed), path, Perfect(deployed, start, 0.8), start)
+    found = closed_loop.metrics(course)
+    assert found.sides_mm[0] == pytest.approx(350 * np.sqrt(2), rel=0.01)
+    run = Run("encoder", start, 0, found, 0.0)
+    assert float(columns([run])["first_side_travelled"][0]) == pytest.approx(0.8, abs=0.03)
 
 
 def test_a_robot_that_does_not_move_has_its_whole_way_left(deployed):
@@ -198,8 +265,8 @@ def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
 
 def test_starts_are_spread_and_the_same_for_everyone():
     floor = uniform("firm", 2.0)
-    every = starts(20, floor)
-    assert every == starts(20, floor)
+    every = starts(20, floor, reference.rectangle())
+    assert every == starts(20, floor, reference.rectangle())
     headings = np.sort([s[2] for s in every])
     assert np.diff(headings).max() < 2 * 2 * np.pi / 20
     middles = []
@@ -208,6 +275,8 @@ def test_starts_are_spread_and_the_same_for_everyone():
         middles.append((x + 0.45 * c + 0.2 * s, y + 0.45 * s - 0.2 * c))
     assert np.abs(middles).max() <= 1.2 + 1e-9
     assert np.std(middles, axis=0).min() > 0.4
+    for start in starts(20, floor, reference.eight()):  # its middle is where it begins
+        assert np.abs(start[:2]).max() <= 1.2 + 1e-3
 
 
 def test_a_robot_can_be_told_which_floors_there_are(deployed):
@@ -227,6 +296,54 @@ def test_a_robot_can_be_told_which_floors_there_are(deployed):
     for wrong in ((), (a, a)):
         with pytest.raises(ValueError, match=f"expected each once of {a}, {b}"):
             deployed.on(*wrong)
+
+
+LAB = """schema = "slipid.map/1"
+base = "firm"
+extent_m = [-1, -1, 1, 1]
+cell_m = 0.05
+[[patch]]
+surface = "soft"
+polygon = [[0, -1], [1, -1], [1, 1], [0, 1]]
+"""
+
+
+def test_a_map_file_reaches_an_estimator_and_a_robot_that_has_numpy_alone(tmp_path, deployed):
+    (tmp_path / "lab.toml").write_text(LAB)
+    made = floor_map(tmp_path / "lab.toml", deployed)
+    pose = jnp.array([0.9, 0.0, 0.0])
+    estimator = Estimator(deployed, floor=made)
+    state = estimator.init(pose)
+    state, seen = estimator.step(state, Measurement([0.0] * 3, [0.1] * 3), 0.05)
+    state, seen = estimator.step(state, Measurement([0.3, 0.0, -0.3], [0.1] * 3), 0.05)
+    assert seen.surface.tolist() == ["soft"] * 3
+    made.save(tmp_path / "lab.npz", deployed.labels)
+    for labels, swapped in ((deployed.labels, False), (("soft", "firm"), True)):
+        again = Floor.load(tmp_path / "lab.npz", labels)
+        np.testing.assert_array_equal(again.cells, 1 - made.cells if swapped else made.cells)
+        np.testing.assert_array_equal(again.corner, made.corner)
+        assert float(again.cell) == float(made.cell)
+    unknown = Floor.load(tmp_path / "lab.npz", ("firm",))
+    assert set(np.unique(unknown.cells)) == {-1, 0}
+
+
+def test_a_map_that_says_nothing_and_a_damaged_one_are_refused(tmp_path, deployed):
+    (tmp_path / "lab.toml").write_text(LAB.replace("firm", "ice").replace("soft", "mud"))
+    with pytest.raises(DataError, match="surfaces ice, mud; expected some of those identified: fi"):
+        floor_map(tmp_path / "lab.toml", deployed)
+    with pytest.raises(DataError, match=r"absent\.npz: .*expected a map that Floor\.save wrote"):
+        Floor.load(tmp_path / "absent.npz", deployed.labels)
+    floor_of(uniform("firm"), deployed.labels).save(tmp_path / "one.npz", deployed.labels)
+    whole = (tmp_path / "one.npz").read_bytes()
+    for cut in (b"", whole[:100], whole[:-30], b"not a map"):
+        (tmp_path / "cut.npz").write_bytes(cut)
+        with pytest.raises(DataError, match="expected a map that"):
+            Floor.load(tmp_path / "cut.npz", deployed.labels)
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    with pytest.raises(DataError, match="expected a map that"):
+        Floor.load(tmp_path / "other.npz", deployed.labels)
+    with pytest.raises(DataError, match="nowhere"):
+        floor_of(uniform("firm"), deployed.labels).save(tmp_path / "nowhere" / "x.npz", ("firm",))
 
 
 def test_a_map_is_looked_up_under_the_wheels(deployed):
@@ -267,7 +384,7 @@ def test_the_twin_is_another_robot_of_the_posterior_for_every_start():
     assert one_of(known, 3).floors.friction[0] == one_of(known, 3).floors.friction[0]
 
 
-def test_what_a_trial_cannot_do_is_said(tmp_path):
+def test_what_a_trial_cannot_do_is_said(tmp_path, deployed):
     with pytest.raises(DataError, match="expected testsite or twin"):
         tr._jobs(tmp_path, tr.Wish(plant="moon"))
     with pytest.raises(DataError, match="no controller 'magic'; expected some of encoder"):
@@ -281,6 +398,14 @@ def test_what_a_trial_cannot_do_is_said(tmp_path):
     with pytest.raises(DataError, match="no controller; expected some of encoder"):
         tr._jobs(tmp_path, tr.Wish(controllers=tr.names_of(",")))
     assert tr.names_of("contact, encoder,contact") == ("contact", "encoder")
+    with pytest.raises(DataError, match="no path 'square'; expected one of rectangle, circle"):
+        tr.path_of("square", 0.2, deployed)
+    for speed in (0.0, 0.31, float("nan")):
+        with pytest.raises(DataError, match=r"expected above 0 and at most 0\.3 m/s"):
+            tr.path_of("circle", speed, deployed)
+    assert (
+        tr.path_of("circle", 0.3, deployed).duration < tr.path_of("circle", 0.1, deployed).duration
+    )
     with pytest.raises(DataError, match=r"robot\.json: not there; `slipid identify` writes it"):
         tr._jobs(tmp_path, tr.Wish())
 
@@ -331,6 +456,7 @@ def run_of(name, k, closure, finished=True):
     """A run whose numbers follow from its closure."""
     metrics = closed_loop.Metrics(
         along_track_mm=(-90.0 * (1 + 0.1 * k), 0.0, 0.0, 0.0),
+        sides_mm=(900.0, 400.0, 900.0, 400.0),
         closure_mm=closure,
         cross_track_rmse_mm=closure / 2,
         heading_error_deg=-3.0,

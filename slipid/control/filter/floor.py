@@ -16,11 +16,18 @@ so that an edge that is crossed where it was not expected corrects the pose. Evi
 step in which it comes, and where none comes no pose moves.
 """
 
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+from zipfile import BadZipFile
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+
+from slipid.support.errors import DataError
 
 LEAK = 0.1
 """Probability that a map is wrong under a wheel."""
@@ -51,6 +58,57 @@ class Floor(eqx.Module):
     cells: Int[Array, "row column"]
     corner: Float[Array, "2"]
     cell: Float[Array, ""]
+
+    @classmethod
+    def of(
+        cls,
+        surfaces: Sequence[str],
+        cells: Int[np.ndarray, "row column"],
+        corner: tuple[float, float],
+        cell: float,
+        labels: Sequence[str],
+    ) -> "Floor":
+        """The map whose cells count its own surfaces, for a robot that knows these labels."""
+        counted = [labels.index(name) if name in labels else -1 for name in surfaces]
+        found = np.array(counted)[np.asarray(cells)]
+        return cls(jnp.asarray(found), jnp.asarray(corner), jnp.asarray(cell))
+
+    def save(self, path: Path | str, labels: Sequence[str]) -> None:
+        """Write a map of a robot with these labels; numpy alone reads it again.
+
+        Raises:
+            DataError: nothing can be written there.
+        """
+        kept = {"cells": self.cells, "corner": self.corner, "cell": self.cell}
+        out = BytesIO()
+        np.savez_compressed(out, labels=np.array(labels), **jax.tree.map(np.asarray, kept))
+        try:
+            Path(path).write_bytes(out.getvalue())
+        except OSError as error:
+            raise DataError(f"{path}: {error.strerror}") from error
+
+    @classmethod
+    def load(cls, path: Path | str, labels: Sequence[str]) -> "Floor":
+        """The map of a file that `save` wrote, for a robot with these labels.
+
+        Raises:
+            DataError: the file is absent or no such map.
+        """
+        try:
+            with np.load(BytesIO(Path(path).read_bytes()), allow_pickle=False) as kept:
+                names = [*kept["labels"].tolist(), ""]  # -1 is none that was known
+                place = tuple(kept["corner"].tolist()), float(kept["cell"])
+                return cls.of(names, kept["cells"], *place, labels)
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            IndexError,
+            TypeError,
+            EOFError,
+            BadZipFile,
+        ) as error:
+            raise DataError(f"{path}: {error}; expected a map that Floor.save wrote") from error
 
     def under(
         self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
