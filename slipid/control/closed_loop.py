@@ -19,7 +19,7 @@ from slipid.control.interface import (
     Readings,
     State,
 )
-from slipid.control.trajectory import STEP, Path
+from slipid.control.trajectory import Path
 
 PERIOD = 0.05
 """Between commands [s]."""
@@ -208,8 +208,7 @@ def metrics(course: Course) -> Metrics:
     along = ((p[at, :2] - corners[1:]) * sides).sum(axis=1) / np.maximum(sizes, 1e-9)
     rows = np.asarray(path.rows[:, :2])
     near = _from_line(p[:, :2], rows[::5] if len(rows) > 5 else rows)
-    left = rows[int(course.own[-1] / STEP + 1e-6) :]
-    left_mm = 1000 * float(np.hypot(*np.diff(left, axis=0).T).sum())
+    left_mm = 1000 * float(path.left(course.own[-1]))
     wanted = float(path.rows[-1, 2])
     turned = np.degrees((p[-1, 2] - wanted + np.pi) % (2 * np.pi) - np.pi)
     return Metrics(

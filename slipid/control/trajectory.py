@@ -42,6 +42,12 @@ class Path(eqx.Module):
         high, part = jnp.minimum(low + 1, len(self.rows) - 1), place - low
         return (1 - part) * self.rows[low] + part * self.rows[high]
 
+    def left(self, time: Float[Array, ""] | float) -> Float[Array, ""]:
+        """Way that is left at a time of the path [m]."""
+        steps = jnp.diff(self.rows[:, :2], axis=0)
+        after = jnp.clip(jnp.arange(1, len(self.rows)) - jnp.asarray(time) / STEP, 0.0, 1.0)
+        return jnp.sum(after * jnp.sqrt(jnp.sum(steps**2, axis=1)))
+
     def follow(
         self,
         time: Float[Array, ""],

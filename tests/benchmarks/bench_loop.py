@@ -31,7 +31,8 @@ STEPS = 960
 class Row(NamedTuple):
     """A row of the trial, whether it has a gyro, and what it is told beside its readings.
 
-    Its map, where it has one, may be flawed: `tenth` or `shift`.
+    It may be told the floors under its wheels, or have encoders without ticks. Its map, where it
+    has one, may be flawed: `tenth` or `shift`.
     """
 
     name: str = "contact"
@@ -40,6 +41,8 @@ class Row(NamedTuple):
     place_std: float = np.nan
     heading_std: float = np.nan
     flaw: str = ""
+    floors: bool = False
+    smooth: bool = False
 
 
 ROWS = {
@@ -51,6 +54,9 @@ ROWS = {
     "map, a tenth wrong": Row("contact_map", flaw="tenth"),
     "map, 30 mm beside": Row("contact_map", flaw="shift"),
     "told the numbers": Row(numbers=True),
+    "told the floors": Row("contact_map", floors=True),
+    "told floors and numbers": Row("contact_map", floors=True, numbers=True),
+    "perfect encoders": Row(smooth=True),
     "told the heading": Row(place_std=10.0, heading_std=1e-3),
     "told the pose": Row(place_std=1e-3, heading_std=1e-3),
     "gyro, told the numbers": Row(gyro=True, numbers=True),
@@ -126,7 +132,8 @@ def flawed(ground, flaw, seed):
 
 def driven(robot, row, path, steps=STEPS):
     """Closure [mm], cross-track rms [mm], whether it finished and whether it gave up, by start."""
-    from slipid.control.closed_loop import PERIOD, Course, metrics
+    from slipid.control.closed_loop import PERIOD, Course, Pilot, metrics
+    from slipid.control.filter.floor import Floor
     from slipid.control.interface import Settings
     from slipid.control.tuning.twin import Twin, rollout
     from slipid.deploy.controllers import ROWS as TRIAL
@@ -143,6 +150,26 @@ def driven(robot, row, path, steps=STEPS):
             std = jnp.array([row.place_std, row.heading_std])
             return new, replace(reading, fix=new.pose, fix_std=std, fix_age=jnp.zeros(()))
 
+    class UnderWheels(Floor):
+        """A map that is asked where the robot is, not where it is believed to be."""
+
+        true: jax.Array
+
+        def supports(self, pose, root, wheels, hypotheses, floors):
+            there = self.under(self.true, wheels) == jnp.asarray(hypotheses)
+            share = jnp.where(jnp.all(there, axis=1), 1.0, 1e-9)
+            return jnp.broadcast_to(share, (32, len(hypotheses)))
+
+    class ToldFloors(Pilot):
+        """A pilot that learns from its fix which floors are under its wheels, and no more."""
+
+        def step(self, path, state, measurement, dt):
+            at, known = measurement.fix, self.estimator.floor
+            there = UnderWheels(known.cells, known.corner, known.cell, jnp.nan_to_num(at))
+            pilot = eqx.tree_at(lambda p: p.estimator.floor, self, there)
+            blind = replace(measurement, fix=jnp.full(3, jnp.nan))
+            return Pilot.step(pilot, path, state, blind, dt)
+
     ground = site(robot)
     floor, seeds = floor_of(ground, robot.labels), range(SEED, SEED + STARTS)
     stack = partial(jax.tree.map, lambda *x: jnp.stack(x))
@@ -151,13 +178,15 @@ def driven(robot, row, path, steps=STEPS):
     places = starts(STARTS, ground, path)
     paths = [path.moved(place).waiting(1.0) for place in places]
     keys = jnp.stack([jax.random.key(seed) for seed in seeds])
-    habits = habits_of(robot, gyro=row.gyro)
+    habits = replace(habits_of(robot, gyro=row.gyro), smooth=row.smooth)
 
     @eqx.filter_jit
     def all_of(*cases):
         def one(truth, path, place, key, there):
             known = truth if row.numbers else robot
             pilot = pilot_of(known, TRIAL[row.name], Settings.of(robot), floor=there)
+            if row.floors:
+                pilot = ToldFloors(pilot.estimator, pilot.controller)
             return rollout(pilot, path, Telling(truth, floor, habits), place, key, steps)
 
         return jax.vmap(one)(*cases)

@@ -10,7 +10,7 @@ hypothesis c, one floor under each wheel:
 What the currents and the gyro of a step say of the hypotheses, p_c before and p_c' after it, says
 how likely each pose is, beside how likely it was (`slipid.control.filter.pose_fix.placed`):
 
-    P(x_s) ~ (sum_c p_c' W_sc / prior_c  /  sum_c p_c W_sc / prior_c)^(1/2)
+    P(x_s) ~ (sum_c p_c' W_sc / prior_c  /  sum_c p_c W_sc / prior_c)^(1/4)
 
 so that an edge that is crossed where it was not expected corrects the pose. Evidence counts in the
 step in which it comes, and where none comes no pose moves.

@@ -13,7 +13,7 @@ from slipid.control.interface import Readings
 
 HISTORY = 48
 """Steps a delayed measurement may reach back."""
-TRUST = 0.5
+TRUST = 0.25
 """Part of the evidence for floors that counts for the pose: one map is wrong in many steps."""
 
 
