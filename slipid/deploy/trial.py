@@ -93,13 +93,14 @@ class Driven:
     """End of a trial.
 
     Attributes:
-        content: of trial.json.
+        content: of trial.json; runs: that it is of.
         paths: true poses of every run by its name (step, 3); wanted: places from the origin
             (row, 2) [m].
         floor: the map it was driven on.
     """
 
     content: dict[str, Any]
+    runs: tuple[Run, ...]
     paths: Mapping[str, np.ndarray]
     wanted: np.ndarray
     floor: FloorMap
@@ -139,7 +140,7 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
     }
     write_json(out / "trial.json", content)
     paths = {name: path for name, (_, path) in driven.items()}
-    return Driven(content, paths, np.asarray(jobs[0].path.rows)[:, :2], jobs[0].floor)
+    return Driven(content, tuple(runs), paths, np.asarray(jobs[0].path.rows)[:, :2], jobs[0].floor)
 
 
 def _jobs(out: Path, wish: Wish) -> list[Job]:

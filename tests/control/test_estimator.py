@@ -17,6 +17,7 @@ from slipid.control import closed_loop
 from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains, Limits, limited
 from slipid.control.estimator import Estimator, Odometry
+from slipid.control.filter.floor import Floor
 from slipid.control.filter.floor_filter import FloorFilter
 from slipid.control.filter.pose_fix import _within
 from slipid.control.interface import UNTIMED_S, Believed, Measurement, Readings, Settings
@@ -33,6 +34,7 @@ PATH = rectangle()
 LIMITS = Limits()
 DT = 0.05
 KINDS = ("contact", "curve")
+CHESS = Floor.of("abc", np.add.outer(np.arange(9), np.arange(9)) % 3, (-1.0, -1.0), 0.25, "abc")
 BAD = (np.nan, np.inf, -np.inf, 1e300, -1e300, 1e-310, 0.0, -1.0, 1e9, 3e7, 50.0)
 
 
@@ -61,7 +63,8 @@ def pilot(kind):
         gains = Gains.at((2.0, 2.0, 0.2, 0.0, 0.0, 0.15))
         return Pilot(Odometry(deployed, curve=True), Controller(deployed, gains))
     gains = Gains.at((2.0, 2.0, 0.2, 1.0, 0.3, 0.15))
-    return Pilot(Estimator(deployed), Controller(deployed, gains))
+    there = CHESS if kind == "mapped" else None
+    return Pilot(Estimator(deployed, floor=there), Controller(deployed, gains))
 
 
 @cache
@@ -141,11 +144,14 @@ def adversary(key, count, angle):
     [
         ("contact", 100),
         ("curve", 700),
-        pytest.param("contact", 1200, marks=pytest.mark.nightly),
-        pytest.param("curve", 8800, marks=pytest.mark.nightly),  # a million of both
+        ("mapped", 100),
+        pytest.param("contact", 10_000, marks=pytest.mark.nightly),
+        pytest.param("mapped", 2000, marks=pytest.mark.nightly),
+        pytest.param("curve", 10_000, marks=pytest.mark.nightly),
     ],
 )
 def test_adversarial_steps(kind, steps):
+    """A hundred robots at once, so that the nightly ones take a million steps."""
     p, robots = pilot(kind), 100
 
     def one(carry, key):

@@ -95,6 +95,12 @@ def test_a_circle_is_round_an_eight_goes_both_ways_round_and_one_path_turns():
     np.testing.assert_allclose(np.asarray(turning.rows)[:, :2], still, atol=1e-12)
 
 
+def test_the_way_that_is_left_of_a_path_ends_with_it():
+    path = reference.rectangle()
+    left = [float(path.left(t)) for t in (0.0, *np.asarray(path.marks), 99.0)]
+    np.testing.assert_allclose(left, [2.6, 1.7, 1.3, 0.4, 0.0, 0.0], atol=1e-6)
+
+
 def test_a_path_moved_to_a_start_has_its_shape():
     start = (0.3, -0.2, 2.0)
     path = reference.rectangle()

@@ -1,0 +1,56 @@
+"""The trial's rectangle on the test site, from 48 starts on four maps that no other number is from.
+
+    SLIPID_FIT=demo_out/result .venv/bin/python -m pytest -s -o python_files='bench_*.py' \
+        tests/benchmarks/bench_trial.py
+
+Needs a folder `slipid identify` wrote for floors of the test site; finished runs are kept there.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+MAPS, STARTS = (101, 102, 103, 104), 12
+ROWS = ("encoder", "contact", "contact_map", "contact_gyro")
+
+
+def test_other_starts_on_other_maps(tmp_path):
+    folder = os.environ.get("SLIPID_FIT")
+    if not folder:
+        pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
+    from slipid.data.floor_map import patchwork, write_map
+    from slipid.deploy.deploy import read_robot
+    from slipid.deploy.trial import Wish, trial
+    from slipid.deploy.trial_summary import not_told_apart, summaries
+    from slipid.support.progress import Reporter
+
+    labels = read_robot(Path(folder)).labels
+    colours = {name: f"#{40 * k:02x}8080" for k, name in enumerate(labels)}
+    runs = []
+    for seed in MAPS:
+        there = tmp_path / f"map{seed}.toml"
+        write_map(there, patchwork(labels, seed, patch=0.35, half=2.0), colours)
+        wish = Wish(map=there, controllers=ROWS, starts=STARTS, jobs=os.cpu_count() or 1)
+        runs += trial(Path(folder), wish, Reporter(quiet=True)).runs
+    table = summaries(runs)
+    base = table["encoder"].median
+    print(
+        f"\n{len(MAPS)} maps, {STARTS} starts each; encoders {base['closure_error_median']:.0f} mm"
+    )
+    for name, row in table.items():
+        closes, across = (
+            row.to_encoder[key] for key in ("closure_error_median", "cross_track_rmse")
+        )
+        low, high = closes.interval90
+        print(
+            f"{name:13s} closes at {closes.value:4.0%} ({low:.0%} to {high:.0%}) of encoders, worse"
+            f" than they in {row.worse_share:3.0%}, cross-track {across.value:4.0%},"
+            f" {row.finished_share:4.0%} finish"
+        )
+    print("not told apart:", ", ".join(not_told_apart(runs)))
+    assert min(row.finished_share for row in table.values()) > 0.9
+    assert np.isfinite(base["closure_error_median"])
