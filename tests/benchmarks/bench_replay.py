@@ -8,8 +8,8 @@ out/bench_replay/CODE.
 One floor: fits of two opposite pairs of 60-degree sectors, the third pair judged, three times over,
 so that no judged heading was fitted on any floor. 64 joint hypotheses; the pose is used once, where
 the wheels have moved 10 mm. Two floors: deployed from runs on one floor each, without and with
-being told that these two floors are all there are; what the runs across the edge would teach is
-refused by `slipid identify`.
+being told that these two floors are all there are, and with their map and the pose at the start;
+what the runs across the edge would teach is refused by `slipid identify`.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ import pytest
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.interface import MIXED, Settings
+from slipid.deploy.floors import floor_of
 from slipid.identify.compare.folds import sectors
 from slipid.identify.compare.predictive import Contact, contact_of
 from slipid.identify.fit.likelihood import batch
@@ -152,12 +153,17 @@ def test_two_floors(job: Job) -> None:
     fit = kept("everything", lambda: fitted(job, everything))
     known = deployed(job, fit, everything)
     print("\nacross green and table, wheel by wheel")
-    for title, settings, there in (
-        ("any of four", Settings(), known.labels),
-        ("these two", Settings(alike=MIXED), PAIR),
+    begin = [
+        replayed.poses(fit.robot, log, session)[0]
+        for log, session in zip(data.logs, data.session, strict=True)
+    ]
+    for title, settings, there, mapped in (
+        ("any of four", Settings(), known.labels, None),
+        ("these two", Settings(alike=MIXED), PAIR, None),
+        ("their map", Settings(alike=MIXED), PAIR, floor_of(floor, PAIR)),
     ):
-        est = Estimator(known.on(*there), settings)
-        said, labels = replayed.replay(est, data.logs), est.robot.labels
+        est = Estimator(known.on(*there), settings, mapped)
+        said, labels = replayed.replay(est, data.logs, np.array(begin)), est.robot.labels
         every = replayed.judged(fit.robot, labels, data, said, fit.variance)
         truth, said_of = replayed.wheels(fit.robot, labels, floor, data, said)
         error, straight = (np.mean([getattr(r, k) for r in every]) for k in ("error", "straight"))

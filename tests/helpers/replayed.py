@@ -58,18 +58,21 @@ def heard(estimator: AbstractEstimator, angle: Any, current: Any) -> Readings:
     return replace(Readings.nothing(estimator.robot.wheels), wheel_angle=angle, current=current)
 
 
-def replay(estimator: AbstractEstimator, logs: Sequence[Log]) -> list[Estimate]:
-    """Estimates of every row of each run; it starts at rest at the origin."""
+def replay(
+    estimator: AbstractEstimator, logs: Sequence[Log], begin: np.ndarray | None = None
+) -> list[Estimate]:
+    """Estimates of every row of each run; it starts at rest at a pose (run, 3), or the origin."""
+    begin = np.zeros((len(logs), 3)) if begin is None else begin
 
     @jax.jit
-    def run(angle: Any, current: Any, dt: Any) -> Any:
+    def run(start: Any, angle: Any, current: Any, dt: Any) -> Any:
         def step(state: Any, row: Any) -> Any:
             return estimator.step(state, heard(estimator, *row[:2]), row[2])
 
-        def one(*rows: Any) -> Any:
-            return jax.lax.scan(step, estimator.init((0.0, 0.0, 0.0)), rows)[1]
+        def one(pose: Any, *rows: Any) -> Any:
+            return jax.lax.scan(step, estimator.init(pose), rows)[1]
 
-        return jax.vmap(one)(angle, current, dt)
+        return jax.vmap(one)(start, angle, current, dt)
 
     said: list[Any] = [None] * len(logs)
     by_length = np.argsort([log.samples for log in logs], kind="stable")
@@ -82,7 +85,10 @@ def replay(estimator: AbstractEstimator, logs: Sequence[Log]) -> list[Estimate]:
             assert log.current is not None
             wheels[:, n, : log.samples] = log.wheel_angle, log.current
             dt[n, 1 : log.samples] = np.diff(log.time)
-        out = jax.tree.map(np.asarray, run(*jnp.asarray(wheels), jnp.asarray(dt)))
+        start = np.zeros((TOGETHER, 3))
+        start[: len(some)] = begin[by_length[first : first + TOGETHER]]
+        rows = run(jnp.asarray(start), *jnp.asarray(wheels), jnp.asarray(dt))
+        out = jax.tree.map(np.asarray, rows)
         for n, k in enumerate(by_length[first : first + TOGETHER]):
             said[k] = jax.tree.map(lambda x, n=n, k=k: x[n, : logs[k].samples], out)
     return said
@@ -227,13 +233,18 @@ def wheels(
     return np.concatenate(truth), np.concatenate(belief)
 
 
-def _wheel_places(robot: Robot, log: Log, session: str) -> np.ndarray:
-    """Wheel centres at every row [m], in the frame of the corrected camera (row, wheel, 2)."""
+def poses(robot: Robot, log: Log, session: str) -> np.ndarray:
+    """Pose of the body at every row, in the frame of the corrected camera (row, 3)."""
     assert log.pose is not None
     pose = np.array(jax.vmap(robot.camera.corrected)(jnp.asarray(log.pose[log.pose_fresh])))
     pose[:, 2] = np.unwrap(pose[:, 2]) - float(robot.camera.yaw(robot.session_index(session)))
     at = log.time + float(robot.camera.lag)
-    x, y, turn = (np.interp(at, log.time[log.pose_fresh], pose[:, i])[:, None] for i in range(3))
+    return np.stack([np.interp(at, log.time[log.pose_fresh], x) for x in pose.T], axis=1)
+
+
+def _wheel_places(robot: Robot, log: Log, session: str) -> np.ndarray:
+    """Wheel centres at every row [m], in the frame of the corrected camera (row, wheel, 2)."""
+    x, y, turn = (column[:, None] for column in poses(robot, log, session).T)
     px, py = (np.asarray(robot.geometry.place) * float(robot.geometry.base_radius)).T
     c, s = np.cos(turn), np.sin(turn)
     return np.stack([x + c * px - s * py, y + s * px + c * py], axis=-1)
