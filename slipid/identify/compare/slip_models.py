@@ -28,8 +28,8 @@ KNOTS = (0.0, 0.02, 0.04, 0.06, 0.1, 0.15, 0.25)
 """Of the monotone spline [N m]."""
 HELD = 1e12
 """Precision of a coefficient that rests on its bound."""
-RIDGE = 1e-5
-"""Pull of coefficients towards zero, in the largest singular value of the design.
+RIDGE = 1e-6
+"""Pull of each coefficient towards zero, in the length of its column of the design.
 
 Too weak to matter where runs tell coefficients apart; where they do not, the smallest are taken
 instead of whichever rounding prefers.
@@ -100,7 +100,7 @@ class Curve(Rung):
                 beta[name] = insensitive(a, b)
             else:
                 lower = np.where(self._held(a.shape[1]), 0.0, -np.inf)
-                ridge = RIDGE * np.linalg.norm(a, 2) * np.eye(a.shape[1])
+                ridge = RIDGE * np.diag(np.linalg.norm(a, axis=0))
                 rows = np.concatenate([a, ridge]), np.concatenate([b, np.zeros(len(ridge))])
                 beta[name] = lsq_linear(*rows, (lower, np.inf), method="bvls").x
         return replace(self, state=beta)
