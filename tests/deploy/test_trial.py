@@ -348,8 +348,8 @@ def test_a_map_that_says_nothing_and_a_damaged_one_are_refused(tmp_path, deploye
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     with pytest.raises(DataError, match="expected a map that"):
         Floor.load(tmp_path / "other.npz", deployed.labels)
-    with pytest.raises(DataError, match="nowhere"):
-        floor_of(uniform("firm"), deployed.labels).save(tmp_path / "nowhere" / "x.npz", ("firm",))
+    with pytest.raises(DataError, match=r"cut\.npz.*cannot be written"):
+        floor_of(uniform("firm"), ("firm",)).save(tmp_path / "cut.npz" / "x.npz", ("firm",))
 
 
 def test_a_map_is_looked_up_under_the_wheels(deployed):
@@ -414,6 +414,23 @@ def test_what_a_trial_cannot_do_is_said(tmp_path, deployed):
     )
     with pytest.raises(DataError, match=r"robot\.json: not there; `slipid identify` writes it"):
         tr._jobs(tmp_path, tr.Wish())
+
+
+def test_runs_of_another_path_or_speed_are_driven_anew(tmp_path, deployed):
+    deployed.save(tmp_path / "robot.json")
+
+    def jobs(**wish):
+        return tr._jobs(tmp_path, tr.Wish(plant="twin", controllers=("encoder",), **wish))
+
+    plain = jobs()[0]
+    np.testing.assert_array_equal(plain.path.rows, reference.rectangle().rows)
+    for other in ({"path": "turning"}, {"speed": 0.1}):
+        job = jobs(**other)[0]
+        expected = reference.PATHS[other.get("path", "rectangle")](other.get("speed", 0.2))
+        np.testing.assert_array_equal(job.path.rows, expected.rows)
+        job.kept.save_json("mark", {})
+        assert plain.kept.load_json("mark") is None
+        assert jobs(**other)[0].kept.load_json("mark") == {}
 
 
 def values(gains):

@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from slipid.support.errors import DataError
+from slipid.support.files import write_bytes
 
 LEAK = 0.1
 """Probability that a map is wrong under a wheel."""
@@ -82,10 +83,7 @@ class Floor(eqx.Module):
         kept = {"cells": self.cells, "corner": self.corner, "cell": self.cell}
         out = BytesIO()
         np.savez_compressed(out, labels=np.array(labels), **jax.tree.map(np.asarray, kept))
-        try:
-            Path(path).write_bytes(out.getvalue())
-        except OSError as error:
-            raise DataError(f"{path}: {error.strerror}") from error
+        write_bytes(Path(path), out.getvalue())
 
     @classmethod
     def load(cls, path: Path | str, labels: Sequence[str]) -> "Floor":
