@@ -64,17 +64,20 @@ ROWS = {
 }
 
 
-def test_what_closes_and_what_limits_it():
-    folder = os.environ.get("SLIPID_FIT")
-    if not folder:
-        pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
-    from slipid.control import trajectory
+@pytest.fixture(scope="module")
+def robot():
     from slipid.deploy.deploy import read_robot
 
-    robot, path = read_robot(Path(folder)), trajectory.rectangle()
+    return read_robot(Path(folder))
+
+
+def test_what_closes_and_what_limits_it(robot):
+    from slipid.control import trajectory
+
+    path = trajectory.rectangle()
     found = {name: driven(robot, row, path) for name, row in ROWS.items()}
     base = found["encoders"]
-    print(f"\n{folder}: {STARTS} starts; closure of encoders {np.median(base[:, 0]):.0f} mm")
+    print(f"\n{STARTS} starts; closure of encoders {np.median(base[:, 0]):.0f} mm")
     for name, one in found.items():
         closure, across = np.median(one, axis=0)[:2] / np.median(base, axis=0)[:2]
         worse, ends = np.mean(one[:, 0] > base[:, 0]), np.mean(one[:, 2])
@@ -87,14 +90,10 @@ def test_what_closes_and_what_limits_it():
 
 @pytest.mark.parametrize("speed", [0.1, 0.2])
 @pytest.mark.parametrize("name", ["circle", "eight", "turning"])
-def test_other_paths_close(name, speed):
-    folder = os.environ.get("SLIPID_FIT")
-    if not folder:
-        pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
+def test_other_paths_close(robot, name, speed):
     from slipid.control import trajectory
-    from slipid.deploy.deploy import read_robot
 
-    robot, path = read_robot(Path(folder)), trajectory.PATHS[name](speed)
+    path = trajectory.PATHS[name](speed)
     steps = int(20 * (2 * path.duration + 10))
     rows = "encoders", "contact", "gyro"
     base, contact, gyro = (driven(robot, ROWS[row], path, steps) for row in rows)

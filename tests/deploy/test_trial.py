@@ -331,6 +331,9 @@ def test_a_map_file_reaches_an_estimator_and_a_robot_that_has_numpy_alone(tmp_pa
         assert float(again.cell) == float(made.cell)
     unknown = Floor.load(tmp_path / "lab.npz", ("firm",))
     assert set(np.unique(unknown.cells)) == {-1, 0}
+    unknown.save(tmp_path / "lab.npz", ("firm",))  # what is unknown stays so
+    again = Floor.load(tmp_path / "lab.npz", deployed.labels)
+    np.testing.assert_array_equal(again.cells, unknown.cells)
 
 
 def test_a_map_that_says_nothing_and_a_damaged_one_are_refused(tmp_path, deployed):
