@@ -32,8 +32,8 @@ from slipid.support.files import write_json
 from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.gains/1"
-SPEED = 0.2
-"""At which the trial's rectangle is rehearsed [m/s]."""
+CORNERS = ((0.0, 0.0), (0.4, 0.0), (0.4, -0.2))
+"""Of the path that is rehearsed [m]."""
 DRAWS = 16
 """Of the robot, to search with and to judge on."""
 CHECKPOINT = "tuning"
@@ -111,8 +111,7 @@ class Tuned:
                 "draws": DRAWS,
                 "batch": BATCH,
                 "gradient_counts_as": GRADIENT,
-                "path": "rectangle",
-                "speed_m_s": SPEED,
+                "path_m": [list(c) for c in CORNERS],
                 "delay_s": task.habits.delay_s,
                 "lag_s": task.habits.lag_s,
                 "period_s": PERIOD,
@@ -169,10 +168,10 @@ def cases(robots: DeployedRobot, count: int, seed: int) -> Cases:
     start = np.concatenate(
         [rng.uniform(-0.3, 0.3, (count, 2)), rng.uniform(-np.pi, np.pi, (count, 1))], axis=1
     )
-    path = trajectory.rectangle(speed=SPEED)
+    path = trajectory.waypoints(CORNERS)
     picked = rng.integers(len(robots.rest), size=count)
     seeds = rng.integers(2**31, size=count).tolist()
-    drawn = [patchwork(robots.labels, s, half=1.4, cell=0.02) for s in seeds]
+    drawn = [patchwork(robots.labels, s, half=1.0, cell=0.02) for s in seeds]
     floors = [floor_of(floor, robots.labels) for floor in drawn]
     return Cases(
         truth=jax.tree.map(lambda x: x[picked], robots),
@@ -185,7 +184,7 @@ def cases(robots: DeployedRobot, count: int, seed: int) -> Cases:
 
 def task_of(robot: DeployedRobot, gyro: bool) -> Task:
     """What is tuned for a robot: its sensors, its numbers, the rehearsed path."""
-    steps = int(np.ceil(SLACK * trajectory.rectangle(speed=SPEED).duration / PERIOD))
+    steps = int(np.ceil(SLACK * trajectory.waypoints(CORNERS).duration / PERIOD))
     return Task(robot, habits_of(robot, gyro), steps)
 
 

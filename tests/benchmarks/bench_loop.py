@@ -66,6 +66,9 @@ ROWS = {
 
 @pytest.fixture(scope="module")
 def robot():
+    folder = os.environ.get("SLIPID_FIT")
+    if not folder:
+        pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
     from slipid.deploy.deploy import read_robot
 
     return read_robot(Path(folder))

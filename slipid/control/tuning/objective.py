@@ -2,7 +2,7 @@
 
 One case is a draw of the robot, a floor, a start and noise; its loss is the root of the mean over
 the path of squared true errors in place and, times the base radius, in heading, and of the effort,
-and the way that is left where the path's end was not reached, in mm. What is minimised is
+in mm. What is minimised is
 
     mean over cases + mean of their worst tenth + penalty of a loop that is hardly stable
 """
@@ -39,8 +39,9 @@ BATCH = 16
 """Cases that are rolled out together."""
 REACH = 0.02
 """Over which losses are differenced, in parts of the box."""
-EFFORT_S = 0.05
-"""Rim speed a command changes by in a period, times this, counts as error [s]."""
+EFFORT_S, LATE = 0.05, 20.0
+"""Rim speed a command changes by in a period, times this, counts as error [s]; each second of the
+path that is not reached counts so much [mm]."""
 LARGEST_RADIUS, PENALTY = 0.9995, 10_000.0
 """Spectral radius from which, with gains `SPARE` times as large, a loop costs [mm]."""
 
@@ -91,7 +92,8 @@ class Task(eqx.Module):
         jump = EFFORT_S * self.robot.frame.radius * jnp.diff(said.command, axis=0)
         squares = jnp.mean(jnp.sum(gap**2, axis=1) + turned**2)
         effort = jnp.mean(jnp.sum(jump**2, axis=1))
-        return 1000.0 * (jnp.sqrt(squares + effort + 1e-12) + case.path.left(said.time[-1]))
+        missing = jax.nn.relu(case.path.duration - said.time[-1])
+        return 1000.0 * jnp.sqrt(squares + effort + 1e-12) + LATE * missing
 
     def margins(self, gains: Gains, truths: DeployedRobot) -> Float[np.ndarray, "draw loop"]:
         """1 - spectral radius of every draw, for every floor and direction, gains as they are."""

@@ -68,13 +68,6 @@ def test_the_worst_tenth_counts_as_much_as_all():
     assert float(combined(losses)) == pytest.approx(9.5 + 18.5)
 
 
-@pytest.mark.usefixtures("quick")
-def test_a_run_that_is_not_finished_costs_the_way_that_is_left(robots, cases):
-    hardly = Task(deployed(1.0, 1.0, 1.0), habits=HABITS, steps=3)
-    lost = evaluate(hardly, HAND, cases.at(slice(0, 2)))
-    np.testing.assert_allclose(lost, 2600.0, atol=20.0)
-
-
 def test_spectral_radius_is_that_of_the_eigenvalues():
     rng = np.random.default_rng(0)
     for size in (2, 7, 20):
