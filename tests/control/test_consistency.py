@@ -17,7 +17,8 @@ from slipid.control.filter.effects import SETTLES, TURN, stays
 from slipid.control.filter.floor import Floor
 from slipid.control.filter.floor_filter import FloorFilter
 from slipid.control.filter.pose_filter import PoseFilter, _learnt
-from slipid.control.interface import MIXED, Measurement, Settings
+from slipid.control.filter.pose_fix import _given, fixed
+from slipid.control.interface import MIXED, Measurement, Readings, Settings
 from slipid.control.tuning.actuation import Habits
 from slipid.control.tuning.twin import Twin
 from slipid.model import contact
@@ -105,6 +106,32 @@ def test_a_floor_that_changes_within_a_step_moves_the_pose_by_what_was_travelled
     there = ended((a, steps * DT), (b, steps * DT))
     # a step of the way on the other floor is 5 mm and 10 mrad
     np.testing.assert_allclose(said.pose, there, atol=1e-3)
+
+
+@pytest.mark.parametrize("own", [1.0, 1e-2, 1e-4])
+def test_what_a_late_fix_sets_aside_leaves_a_covariance(own):
+    """Most of the noise that came in since then is known by what it has in common with the rest."""
+    rng, start = np.random.default_rng(0), PoseFilter(deployed(), Settings()).init(jnp.zeros(3))
+    late = replace(
+        Readings.nothing(3),
+        fix=jnp.zeros(3),
+        fix_std=jnp.array([0.03, 1e-4]),
+        fix_age=jnp.asarray(1.0),
+    )
+    for _ in range(20):
+        a, b, way = rng.normal(size=(3, 3)), rng.normal(size=(12, 12)), rng.normal(size=(3, 12))
+        rest, alone = b @ b.T, own * (a @ a.T + 0.1 * np.eye(3))
+        cov = np.block([[way @ rest @ way.T + alone, way @ rest], [rest @ way.T, rest]])
+        np.testing.assert_allclose(_given(jnp.asarray(cov)), alone, atol=1e-6 * own)
+        now = replace(
+            start,
+            pose=jnp.array([8.0, 4.0, 0.0]),
+            covariance=jnp.asarray(cov),
+            noise=jnp.asarray(cov[:3, :3]),
+            time=jnp.asarray(1.0),
+        )
+        values = np.linalg.eigvalsh(fixed(now, late)[0].covariance)
+        assert values[0] > -1e-9 * values[-1]
 
 
 def test_a_late_fix_after_news_of_the_floors_does_not_count_the_hand_over_twice():

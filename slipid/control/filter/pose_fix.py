@@ -5,7 +5,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from slipid.control.filter.floor import SPREAD
 from slipid.control.filter.floor_filter import Motion
@@ -77,7 +77,7 @@ def _corrected(
     pose, cov, history = now.pose, now.covariance, now.history
     then = nearest(history, now.time - age)
     since = now.noise - then[5:14].reshape(3, 3)
-    held = _within(since, cov[:3, :3])
+    held = _within(since, _given(cov))
     aside = jnp.zeros_like(cov).at[:3, :3].set(held)
     cov = cov - aside
     gap = fix - then[1:4]
@@ -165,6 +165,21 @@ def shifted(
     back = history[:, 1:3] - pose[:2]
     moved = change[:, :2] + change[:, 2:] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
     return history.at[:, 1:3].add(moved).at[:, 3].add(change[:, 2])
+
+
+def _given(cov: Float[Array, "unknown unknown"]) -> Float[Array, "3 3"]:
+    """Covariance of the pose, were all else known.
+
+    No more than that can be set aside of the pose alone: what is known of the rest has part in the
+    remainder, and with more taken off, the whole would be no covariance.
+    """
+
+    def known(k: Int[Array, ""], c: Array) -> Array:
+        column, var = c[:, k], c[k, k]
+        gain = jnp.where(var > 1e-12, column / jnp.maximum(var, 1e-12), 0.0)
+        return c - jnp.outer(gain, column)
+
+    return jax.lax.fori_loop(3, len(cov), known, cov)[:3, :3]
 
 
 def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
