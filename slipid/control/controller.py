@@ -272,7 +272,8 @@ class Controller(eqx.Module):
         plain = f.forward @ asked / f.frame.radius
         if not isinstance(ahead, jax.core.Tracer) and float(ahead) == 0.0:
             return plain  # the compiled code goes without the contact model
-        return plain + ahead * (wheel_speeds(f, asked, e.believed, old.command) - plain)
+        known = wheel_speeds(f, asked, e.believed, e.wheel_speed, old.command)
+        return plain + ahead * (known - plain)
 
     def _torque(self, wanted: Array, e: Estimate) -> Array:
         """The 2021 paper's correction by the forces off the commanded direction [rad/s]."""

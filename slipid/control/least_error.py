@@ -4,11 +4,12 @@
 
 with xi_c(w) the contact equilibrium of hypothesis c, D = diag(1, 1, base radius), w_plain the
 speeds of wheels that do not slip and w_last the last command. A mean over what is believed changes
-gradually where beliefs do. The minimum is neared by a fixed number of Gauss-Newton steps from
-w_plain; derivatives of the equilibrium come from the implicit function theorem.
+gradually where beliefs do. Each control period takes one Gauss-Newton step from the speeds at which
+the wheels turn, where the estimator has just found the equilibria, so that over the periods they
+near the minimum (real-time iteration: Diehl, Bock and Schlöder 2005); derivatives of the
+equilibria come from the implicit function theorem.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -16,16 +17,14 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.filter.effects import Course
 from slipid.control.filter.floor_filter import hypotheses_of, told_of
 from slipid.control.interface import Believed
-from slipid.model.contact import settle, steered
+from slipid.model.contact import steered
 from slipid.model.contact_balance import stand
 from slipid.model.se2 import Planar
 
-PASSES = 3
-"""Gauss-Newton steps."""
 PLAIN, LAST = 0.02, 0.02
 """Weights of what a command differs by from wheels that do not slip, and from the last command."""
 FARTHEST = 0.15
-"""Rim speed that a pass may change [m/s]."""
+"""Rim speed by which a command may differ from wheels that do not slip [m/s]."""
 STEEPEST = 1.5
 """Bound of the change of the body's speed over that of a rim speed."""
 
@@ -34,38 +33,34 @@ def wheel_speeds(
     robot: DeployedRobot,
     asked: Float[Array, "3"],
     believed: Believed,
+    turning: Float[Array, " wheel"],
     last: Float[Array, " wheel"],
 ) -> Float[Array, " wheel"]:
     """Wheel speeds [rad/s] for a wanted twist; the more is unknown, the nearer to no slip.
 
     Args:
         robot: as it is known; asked: twist [m/s, m/s, rad/s].
-        believed: of the floors; last: wheel speeds commanded last [rad/s].
+        believed: of the floors, and what the body does on each at the wheels' speeds.
+        turning: wheel speeds now; last: those commanded last [rad/s].
     """
     f, radius = robot, robot.frame.radius
     p = believed.probability[:-1]
     sure = jnp.sum(p)
     p = p / jnp.maximum(sure, 1e-12)
-    on = stand(f.frame, f.floors.at(hypotheses_of(f).T), f.rest)
     scale = jnp.stack([jnp.ones(()), jnp.ones(()), f.frame.base])
-    plain = f.forward @ asked  # rim speeds
-
-    def nearer(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
-        rim, near = carry
-        near = settle(near, rim, on, f.inverse)[0]
-        course = Course.of(f.inverse @ rim, f.frame.base)
-        told = course.speed * f.told.at(course)[0] @ course.axes.T
-        gap = scale * (near.T + told_of(f, told) - asked)  # (hypothesis, 3)
-        slope = scale[None, :, None] * steered(Planar(*near), rim, on, STEEPEST / scale)
-        cost = jnp.einsum("c,wac,vac->wv", p, slope, slope) + (PLAIN + LAST) * jnp.eye(len(rim))
-        down = jnp.einsum("c,wac,ca->w", p, slope, gap)
-        down = down + PLAIN * (rim - plain) + LAST * (rim - radius * last)
-        step = -jnp.linalg.solve(cost, down)
-        size = jnp.max(jnp.abs(step))
-        return (rim + step * jnp.minimum(1.0, FARTHEST / jnp.maximum(size, 1e-9)), near), None
-
-    begin = jnp.where(jnp.isfinite(believed.twist), believed.twist, 0.0).T
-    rim = jax.lax.scan(nearer, (plain, begin), None, length=PASSES)[0][0]
-    moves = jnp.clip(jnp.max(jnp.abs(plain)) / 0.02 - 0.25, 0.0, 1.0)
-    extra = sure * moves * (rim - plain)
+    plain, rim = f.forward @ asked, radius * turning  # rim speeds
+    course = Course.of(f.inverse @ rim, f.frame.base)
+    told = course.speed * f.told.at(course)[0] @ course.axes.T
+    gap = scale * (believed.twist + told_of(f, told) - asked)  # (hypothesis, 3)
+    on = stand(f.frame, f.floors.at(hypotheses_of(f).T), f.rest)
+    slope = scale[None, :, None] * steered(Planar(*believed.twist.T), rim, on, STEEPEST / scale)
+    cost = jnp.einsum("c,wac,vac->wv", p, slope, slope) + (PLAIN + LAST) * jnp.eye(f.wheels)
+    down = jnp.einsum("c,wac,ca->w", p, slope, gap)
+    down = down + PLAIN * (rim - plain) + LAST * (rim - radius * last)
+    extra = rim - plain - jnp.linalg.solve(cost, down)
+    far = jnp.max(jnp.abs(extra))
+    extra = extra * jnp.minimum(1.0, FARTHEST / jnp.maximum(far, 1e-9))
+    # wheels that hardly turn, or are to, tell nothing of how floors answer
+    slow = jnp.minimum(jnp.max(jnp.abs(plain)), jnp.max(jnp.abs(rim)))
+    extra = extra * sure * jnp.clip(slow / 0.02 - 0.25, 0.0, 1.0)
     return (plain + jnp.where(jnp.isfinite(extra), extra, 0.0)) / radius

@@ -9,7 +9,7 @@ import pytest
 
 from slipid.control.filter.floor_filter import hypotheses_of
 from slipid.control.interface import Believed
-from slipid.control.least_error import wheel_speeds
+from slipid.control.least_error import PLAIN, wheel_speeds
 from slipid.model import contact
 from slipid.model.contact import steered
 from slipid.model.contact_balance import stand
@@ -20,27 +20,37 @@ ROBOT = deployed()
 HYPOTHESES = hypotheses_of(ROBOT)
 
 
-def believed(probability) -> Believed:
-    return Believed(jnp.asarray(probability), jnp.zeros((len(HYPOTHESES), 3)))
+@jax.jit
+def moved(speed):
+    """Twist of every hypothesis at these wheel speeds."""
+    f = ROBOT
+    rim = f.frame.radius * speed
+    each = jax.vmap(lambda under: contact.equilibrium(rim, f.frame, f.floors.at(under), f.rest))
+    return each(jnp.asarray(HYPOTHESES))
 
 
-def sure(k: int, unknown: float = 0.0) -> Believed:
+def sure(k: int, unknown: float = 0.0) -> np.ndarray:
     p = np.zeros(len(HYPOTHESES) + 1)
     p[k], p[-1] = 1 - unknown, unknown
-    return believed(p)
-
-
-speeds = jax.jit(lambda asked, seen, last: wheel_speeds(ROBOT, asked, seen, last))
+    return p
 
 
 @jax.jit
-def moved(speed, under):
-    f = ROBOT
-    return contact.equilibrium(f.frame.radius * speed, f.frame, f.floors.at(under), f.rest)
+def speeds(asked, probability, turning, last):
+    seen = Believed(jnp.asarray(probability), moved(turning))
+    return wheel_speeds(ROBOT, asked, seen, turning, last)
 
 
 def plain(asked):
     return ROBOT.forward @ asked / ROBOT.frame.radius
+
+
+def driven(asked, probability, periods=8):
+    """Wheel speeds after some periods in which the wheels follow every command at once."""
+    turning = plain(asked)
+    for _ in range(periods):
+        turning = speeds(asked, probability, turning, turning)
+    return turning
 
 
 @pytest.mark.parametrize("k", [0, 3, 7])
@@ -49,20 +59,39 @@ def test_known_floors_leave_little_of_what_wheels_without_slip_miss(k):
     missed, left = [], []
     for _ in range(10):
         asked = jnp.asarray(rng.uniform(-1, 1, 3) * [0.2, 0.2, 0.5])
-        kinematic, under = plain(asked), jnp.asarray(HYPOTHESES[k])
-        missed.append(np.linalg.norm(scale * (moved(kinematic, under) - asked)))
-        found = speeds(asked, sure(k), kinematic)
-        left.append(np.linalg.norm(scale * (moved(found, under) - asked)))
+        missed.append(np.linalg.norm(scale * (moved(plain(asked))[k] - asked)))
+        left.append(np.linalg.norm(scale * (moved(driven(asked, sure(k)))[k] - asked)))
     assert np.mean(left) < 0.4 * np.mean(missed)
     assert np.max(left) < np.max(missed)
 
 
+def test_periods_lead_to_the_minimum():
+    asked, p = jnp.array([0.15, -0.05, 0.2]), np.zeros(len(HYPOTHESES) + 1)
+    p[[0, 3]] = 0.6, 0.4
+    found = driven(asked, p, 40)
+    scale, radius = np.array([1.0, 1.0, float(ROBOT.frame.base)]), float(ROBOT.frame.radius)
+
+    def cost(speed):
+        miss = ((scale * (np.asarray(moved(speed)) - asked)) ** 2).sum(axis=1)
+        return p[:-1] @ miss + PLAIN * radius**2 * np.sum((speed - plain(asked)) ** 2)
+
+    least = cost(found)
+    around = np.random.default_rng(0).normal(size=(50, 3)) * 0.3
+    assert all(cost(found + step) > least for step in around)
+
+
 def test_an_unknown_floor_is_driven_by_kinematics():
     asked = jnp.array([0.15, -0.1, 0.3])
-    np.testing.assert_allclose(speeds(asked, sure(2, 1.0), plain(asked)), plain(asked), atol=1e-12)
-    half = speeds(asked, sure(2, 0.5), plain(asked)) - plain(asked)
-    whole = speeds(asked, sure(2), plain(asked)) - plain(asked)
+    wheels = plain(asked)
+    np.testing.assert_allclose(speeds(asked, sure(2, 1.0), wheels, wheels), wheels, atol=1e-12)
+    half = speeds(asked, sure(2, 0.5), wheels, wheels) - wheels
+    whole = speeds(asked, sure(2), wheels, wheels) - wheels
     np.testing.assert_allclose(half, 0.5 * whole, atol=1e-9)
+
+
+def test_wheels_that_stand_start_by_kinematics():
+    asked, still = jnp.array([0.15, -0.1, 0.3]), jnp.zeros(3)
+    np.testing.assert_allclose(speeds(asked, sure(0), still, still), plain(asked), atol=1e-12)
 
 
 def test_a_belief_that_moves_by_little_moves_the_wheels_by_little():
@@ -70,7 +99,7 @@ def test_a_belief_that_moves_by_little_moves_the_wheels_by_little():
     for part in np.linspace(0, 1, 51):
         p = np.zeros(len(HYPOTHESES) + 1)
         p[0], p[-2] = 1 - part, part
-        every.append(np.asarray(speeds(asked, believed(p), plain(asked))))
+        every.append(np.asarray(speeds(asked, p, plain(asked), plain(asked))))
     apart = np.abs(every[-1] - every[0]).max()
     assert apart > 0.1
     assert np.abs(np.diff(every, axis=0)).max() < 0.15 * apart
@@ -78,9 +107,9 @@ def test_a_belief_that_moves_by_little_moves_the_wheels_by_little():
 
 def test_the_last_command_holds_the_next_one_back():
     asked = jnp.array([0.2, 0.05, 0.0])
-    far = plain(asked) + 3.0
-    near = speeds(asked, sure(0), plain(asked))
-    held = speeds(asked, sure(0), far)
+    wheels = plain(asked)
+    near = speeds(asked, sure(0), wheels, wheels)
+    held = speeds(asked, sure(0), wheels, wheels + 3.0)
     assert (held > near).all()
 
 
@@ -101,4 +130,5 @@ def test_the_derivative_of_the_equilibrium_is_that_of_differences():
 def test_no_number_comes_out_of_a_belief_that_is_none():
     asked = jnp.array([0.2, 0.0, 0.0])
     seen = Believed(jnp.full(len(HYPOTHESES) + 1, jnp.nan), jnp.full((len(HYPOTHESES), 3), jnp.nan))
-    np.testing.assert_allclose(speeds(asked, seen, plain(asked)), plain(asked))
+    wheels = plain(asked)
+    np.testing.assert_allclose(wheel_speeds(ROBOT, asked, seen, wheels, wheels), wheels)
