@@ -6,8 +6,9 @@
 Needs a folder `slipid identify` wrote. Every case is a robot of the posterior each of whose wheels
 stays on a floor of its own for good, beside a path of 0.4 m, up to 0.3 m and 0.8 rad from its
 start. Patches of a real site would let a robot go that creeps on; here nothing does. A case may
-arrive, be on its way, have given up, or rest: stand still for the last 6 s of 60 s, neither arrived
-nor given up, which is a stable equilibrium of the loop that nobody acts on.
+arrive by its own belief, be on its way, have given up, or rest: stand still for the last 6 s of
+60 s, neither arrived nor given up, which is a stable equilibrium of the loop that nobody acts on.
+Without freeing there are some, which shows that the search finds them.
 """
 
 from __future__ import annotations
