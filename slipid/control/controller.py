@@ -51,7 +51,7 @@ class Gains(eqx.Module):
     place: Array = parameter("1/s", "k", "pose loop", start=1.5)
     yaw: Array = parameter("1/s", "k_yaw", "heading loop", start=1.5)
     integral: Array = parameter("1/s^2", "k_i", "pose error's integral", start=0.0)
-    ahead: Array = parameter("1", "k_f", "share of the inverse model", start=0.0)
+    ahead: Array = parameter("1", "k_f", "share of wheel speeds by the contact model", start=0.0)
     observer: Array = parameter("1", "k_d", "disturbance observer", start=0.0)
     preview: Array = parameter(
         "s", "t_p", "how early rates are asked for, as wheels follow late", start=0.2

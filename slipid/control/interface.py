@@ -142,7 +142,8 @@ class Believed(eqx.Module):
 
     Attributes:
         probability: of every hypothesis, and of none of them in the last place.
-        twist: of the body by the contact alone, if it were true [m/s, m/s, rad/s].
+        twist: of the body by the contact alone, if it were true, at the estimate's wheel speeds
+            [m/s, m/s, rad/s].
     """
 
     probability: Float[Array, " hypothesis_or_none"]

@@ -2,12 +2,16 @@
 
     w = argmin  sum_c p_c |D (xi_c(w) - xi)|^2 + a |r (w - w_plain)|^2 + b |r (w - w_last)|^2
 
-with xi_c(w) the contact equilibrium of hypothesis c, D = diag(1, 1, base radius), w_plain the
-speeds of wheels that do not slip and w_last the last command. A mean over what is believed changes
-gradually where beliefs do. Each control period takes one Gauss-Newton step from the speeds at which
-the wheels turn, where the estimator has just found the equilibria, so that over the periods they
-near the minimum (real-time iteration: Diehl, Bock and Schlöder 2005); derivatives of the
-equilibria come from the implicit function theorem.
+with xi_c(w) the contact equilibrium of hypothesis c beside what runs told of its floor, D = diag(1,
+1, base radius), w_plain the speeds of wheels that do not slip and w_last the last command. A mean
+over what is believed changes gradually where beliefs do. Each control period takes one Gauss-Newton
+step from the speeds at which the wheels turn, where the estimator has just found the equilibria, so
+that over the periods commands come close to the minimum (real-time iteration: Diehl, Bock and
+Schlöder 2005). Derivatives of the equilibria come from the implicit function theorem; what runs
+told is held where it is.
+
+What differs from w_plain is held below `FARTHEST`, counts by the probability that floors are known,
+and fades out where wheels hardly turn.
 """
 
 import jax.numpy as jnp
@@ -60,7 +64,7 @@ def wheel_speeds(
     extra = rim - plain - jnp.linalg.solve(cost, down)
     far = jnp.max(jnp.abs(extra))
     extra = extra * jnp.minimum(1.0, FARTHEST / jnp.maximum(far, 1e-9))
-    # wheels that hardly turn, or are to, tell nothing of how floors answer
+    # wheels that hardly turn tell nothing of how floors answer
     slow = jnp.minimum(jnp.max(jnp.abs(plain)), jnp.max(jnp.abs(rim)))
     extra = extra * sure * jnp.clip(slow / 0.02 - 0.25, 0.0, 1.0)
     return (plain + jnp.where(jnp.isfinite(extra), extra, 0.0)) / radius

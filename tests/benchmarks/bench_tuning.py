@@ -2,8 +2,7 @@
 
 Needs a folder `slipid identify` wrote, named by SLIPID_FIT. Every seed is another draw of robots,
 floors, starts, noise and of the search; intervals are over seeds. A case's gain over the hand set
-gains is compared with itself, since floors differ more than controllers do. On the test site's fit
-both better the gains set by hand, and neither the other beyond its scatter: docs/results.md.
+gains is compared with itself, since floors differ more than controllers do.
 """
 
 from __future__ import annotations

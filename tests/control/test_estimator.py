@@ -18,7 +18,7 @@ from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains, Limits, limited
 from slipid.control.estimator import Estimator, Odometry
 from slipid.control.filter.floor import Floor
-from slipid.control.filter.floor_filter import FloorFilter
+from slipid.control.filter.floor_filter import FloorFilter, hypotheses_of
 from slipid.control.filter.pose_fix import _within
 from slipid.control.interface import UNTIMED_S, Believed, Measurement, Readings, Settings
 from slipid.control.trajectory import rectangle
@@ -562,7 +562,7 @@ def estimate(f, **known):
 
 @pytest.mark.slow
 def test_gains_that_are_known_when_compiled_command_the_same():
-    """Zero ones skip the inverse model; the same gains as arguments do not."""
+    """Zero ones skip the contact model; the same gains as arguments do not."""
     for ahead in (0.0, 0.7):
         gains = Gains.at((1.5, 1.5, 0.1, ahead, 0.0, 0.2))
         p = Pilot(Estimator(robot()), Controller(robot(), gains))
@@ -596,6 +596,18 @@ def test_mecanum_wheels_miss_less_of_a_twist_by_the_contact_model():
         state = eqx.tree_at(lambda s: s.command, con.init(), speeds)
         speeds = con._wheels(state, asked, estimate(f, believed=sure, wheel_speed=speeds))
     assert missed(speeds) < 0.5 * missed(plain)
+
+
+def test_what_is_believed_of_the_body_is_at_the_wheels_speeds_of_the_estimate():
+    f, speed = robot(), wheels([0.15, -0.1, 0.4])
+    _, said = drive(watch()[0].init(), 30, speed, current=np.full(3, 0.4))
+    e = said[-1]
+    each = jax.vmap(
+        lambda under: contact.equilibrium(
+            f.frame.radius * e.wheel_speed, f.frame, f.floors.at(under), f.rest
+        )
+    )(jnp.asarray(hypotheses_of(f)))
+    np.testing.assert_allclose(e.believed.twist, each, atol=3e-3)
 
 
 def test_flags_come_on_and_go_off():

@@ -9,7 +9,7 @@ import pytest
 
 from slipid.control.filter.floor_filter import hypotheses_of
 from slipid.control.interface import Believed
-from slipid.control.least_error import PLAIN, wheel_speeds
+from slipid.control.least_error import FARTHEST, PLAIN, wheel_speeds
 from slipid.model import contact
 from slipid.model.contact import steered
 from slipid.model.contact_balance import stand
@@ -66,18 +66,41 @@ def test_known_floors_leave_little_of_what_wheels_without_slip_miss(k):
 
 
 def test_periods_lead_to_the_minimum():
-    asked, p = jnp.array([0.15, -0.05, 0.2]), np.zeros(len(HYPOTHESES) + 1)
+    asked, p = jnp.array([0.05, -0.02, 0.1]), np.zeros(len(HYPOTHESES) + 1)
     p[[0, 3]] = 0.6, 0.4
+    scale, radius = jnp.array([1.0, 1.0, ROBOT.frame.base]), ROBOT.frame.radius
+
+    @jax.grad
+    def slope(speed):
+        miss = jnp.sum((scale * (moved(speed) - asked)) ** 2, axis=1)
+        return p[:-1] @ miss + PLAIN * radius**2 * jnp.sum((speed - plain(asked)) ** 2)
+
     found = driven(asked, p, 40)
-    scale, radius = np.array([1.0, 1.0, float(ROBOT.frame.base)]), float(ROBOT.frame.radius)
+    assert np.linalg.norm(slope(found)) < 1e-3 * np.linalg.norm(slope(plain(asked)))
 
-    def cost(speed):
-        miss = ((scale * (np.asarray(moved(speed)) - asked)) ** 2).sum(axis=1)
-        return p[:-1] @ miss + PLAIN * radius**2 * np.sum((speed - plain(asked)) ** 2)
 
-    least = cost(found)
-    around = np.random.default_rng(0).normal(size=(50, 3)) * 0.3
-    assert all(cost(found + step) > least for step in around)
+@pytest.mark.parametrize("k", range(len(HYPOTHESES)))
+def test_wheels_that_follow_late_come_to_rest_too(k):
+    rng = np.random.default_rng(k)
+    for _ in range(3):
+        asked = jnp.asarray(rng.uniform(-1, 1, 3) * [0.2, 0.2, 0.5])
+        commands = [plain(asked)] * 4
+        for _ in range(60):
+            commands.append(speeds(asked, sure(k), commands[-3], commands[-1]))
+        assert np.abs(commands[-1] - commands[-2]).max() < 0.05
+
+
+def test_a_command_is_not_far_from_kinematics_and_never_no_number():
+    asked, radius = jnp.array([0.4, 0.3, 0.0]), float(ROBOT.frame.radius)
+    wheels = plain(asked)
+    for turning in (wheels, -wheels, 5 * wheels, jnp.full(3, jnp.nan), jnp.full(3, jnp.inf)):
+        found = speeds(asked, sure(3), turning, wheels)
+        assert radius * np.abs(found - wheels).max() < FARTHEST + 1e-9
+
+
+def test_wheels_that_shall_stand_are_told_to():
+    still, wheels = jnp.zeros(3), plain(jnp.array([0.2, 0.1, 0.0]))
+    np.testing.assert_allclose(speeds(still, sure(1), wheels, wheels), 0.0, atol=1e-12)
 
 
 def test_an_unknown_floor_is_driven_by_kinematics():
