@@ -287,14 +287,13 @@ class FloorFilter(eqx.Module):
 
         Each goes on from where it was by its own twist, all of them turning as a gyro says.
         """
-        dt = jnp.where(tick.moves, tick.dt, 0.0)
         xi = xi.at[:, 2].set(jnp.where(jnp.isfinite(turn), turn, xi[:, 2]))
-        ways = jax.vmap(compose)(apart, jax.vmap(advance, (0, None))(xi, dt))
+        ways = jax.vmap(compose)(apart, jax.vmap(advance, (0, None))(xi, tick.dt))
         mean = known @ ways
         x, y, yaw = (ways - mean).T
         c, s = jnp.cos(mean[2]), jnp.sin(mean[2])
         seen = jnp.stack([c * x + s * y, c * y - s * x, yaw], axis=-1)
-        return seen, mean - advance(known @ xi, dt)
+        return seen, mean - advance(known @ xi, tick.dt)
 
     def _marginal(self, known: Array) -> Array:
         """Probability of each floor under each wheel (wheel, floor)."""

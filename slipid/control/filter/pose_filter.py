@@ -96,14 +96,14 @@ class PoseFilter(eqx.Module):
             gyro: yaw rate, NaN without one [rad/s].
             z: for its pose fix.
         """
-        dt, moves = tick.dt, tick.moves
+        dt = tick.dt
         way = self._way(motion, gyro)
         old = self._forgotten(old, motion, way, tick)
-        free = jnp.where(moves, motion.twist + way.slope @ old.nuisance[:-1], 0.0)
+        free = motion.twist + way.slope @ old.nuisance[:-1]  # however slow: creeping adds up
         time = old.time + dt
         twist = free.at[2].set(self._turned(old, time, free[2], gyro))
         pose = compose(old.pose, advance(twist, dt) + motion.jump)
-        still = jnp.where(moves, 0.0, jnp.minimum(old.still + dt, 1e3))
+        still = jnp.where(tick.moves, 0.0, jnp.minimum(old.still + dt, 1e3))
         old = replace(old, history=handed_over(old, motion, self.robot.frame.base))
         new = replace(self._grow(old, pose, way, tick), time=time, still=still)
         new = self._rest(self._turns(new, way, gyro, free[2], tick), gyro)
@@ -204,14 +204,13 @@ class PoseFilter(eqx.Module):
         f, s, dt = self.robot, self.settings, tick.dt
         world = turned_axes(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))
         gone = pose[:2] - old.pose[:2]
-        on = jnp.where(tick.moves, dt, 0.0)
         # yaw comes from the gyro, not from the floor
         keep = jnp.where(way.by_gyro, jnp.array([1.0, 1.0, 0.0]), jnp.ones(3))
-        far = way.speed * on
+        far = way.speed * dt
         push = world @ (keep[:, None] * way.slope)
         drift = jnp.array([[0.0], [0.0], [1.0]]) * jnp.where(way.by_gyro, -dt, 0.0)
         turned = jnp.array([[1.0, 0.0, -gone[1]], [0.0, 1.0, gone[0]], [0.0, 0.0, 1.0]])
-        by = jnp.concatenate([turned, push * on, drift], axis=1)  # d pose / d (pose, nuisance)
+        by = jnp.concatenate([turned, push * dt, drift], axis=1)  # d pose / d (pose, nuisance)
         grown = (way.share @ f.process**2) * far
         floor_axes = world @ (keep[:, None] * way.axes)
         noise = (floor_axes * grown) @ floor_axes.T
