@@ -11,10 +11,8 @@ wrong, or lies 30 mm beside the floor, another way for every start.
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
@@ -62,16 +60,6 @@ ROWS = {
     "gyro, told the numbers": Row(gyro=True, numbers=True),
     "map, told the numbers": Row("contact_map", numbers=True),
 }
-
-
-@pytest.fixture(scope="module")
-def robot():
-    folder = os.environ.get("SLIPID_FIT")
-    if not folder:
-        pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
-    from slipid.deploy.deploy import read_robot
-
-    return read_robot(Path(folder))
 
 
 def test_what_closes_and_what_limits_it(robot):
@@ -137,20 +125,13 @@ def driven(robot, row, path, steps=STEPS):
     from slipid.control.closed_loop import PERIOD, Course, Pilot, metrics
     from slipid.control.filter.floor import Floor
     from slipid.control.interface import Settings
-    from slipid.control.tuning.twin import Twin, rollout
+    from slipid.control.tuning.twin import rollout
     from slipid.deploy.controllers import ROWS as TRIAL
     from slipid.deploy.controllers import pilot_of
     from slipid.deploy.deploy import habits_of
     from slipid.deploy.floors import floor_of
     from slipid.deploy.trial_site import one_of, site, starts
-
-    class Telling(Twin):
-        """A twin that tells its pose as well as the row is to know it."""
-
-        def step(self, state, command, noise):
-            new, reading = super().step(state, command, noise)
-            std = jnp.array([row.place_std, row.heading_std])
-            return new, replace(reading, fix=new.pose, fix_std=std, fix_age=jnp.zeros(()))
+    from tests.helpers.telling_twin import TellingTwin
 
     class UnderWheels(Floor):
         """A map that is asked where the robot is, not where it is believed to be."""
@@ -181,6 +162,7 @@ def driven(robot, row, path, steps=STEPS):
     paths = [path.moved(place).waiting(1.0) for place in places]
     keys = jnp.stack([jax.random.key(seed) for seed in seeds])
     habits = replace(habits_of(robot, gyro=row.gyro), smooth=row.smooth)
+    std = jnp.array([row.place_std, row.heading_std])
 
     @eqx.filter_jit
     def all_of(*cases):
@@ -189,7 +171,8 @@ def driven(robot, row, path, steps=STEPS):
             pilot = pilot_of(known, TRIAL[row.name], Settings.of(robot), floor=there)
             if row.floors:
                 pilot = ToldFloors(pilot.estimator, pilot.controller)
-            return rollout(pilot, path, Telling(truth, floor, habits), place, key, steps)
+            plant = TellingTwin(truth, floor, habits, fix_std=std)
+            return rollout(pilot, path, plant, place, key, steps)
 
         return jax.vmap(one)(*cases)
 

@@ -13,31 +13,16 @@ the loop that nobody acts on), or is on its way.
 
 from __future__ import annotations
 
-import os
-from dataclasses import replace
-from pathlib import Path
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 CASES, SEED = 256, 4000
 STEPS, LAST_S = 1200, 6.0
 STILL_M, STILL_RAD = 0.01, 0.05
 NEAR = 0.02
 """Distance from the end of its path in x and y [m], and in half the angle, at which it is there."""
-
-
-@pytest.fixture(scope="module")
-def robot():
-    folder = os.environ.get("SLIPID_FIT")
-    if not folder:
-        pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
-    from slipid.deploy.deploy import read_robot
-
-    return read_robot(Path(folder))
 
 
 def test_nothing_rests_away_from_its_path(robot, monkeypatch):
@@ -58,10 +43,11 @@ def ends(robot):
     from slipid.control.closed_loop import PERIOD
     from slipid.control.filter.floor import Floor
     from slipid.control.interface import Settings
-    from slipid.control.tuning.twin import Twin, rollout
+    from slipid.control.tuning.twin import rollout
     from slipid.deploy.controllers import ROWS, pilot_of
     from slipid.deploy.deploy import habits_of
     from slipid.deploy.trial_site import one_of
+    from tests.helpers.telling_twin import TellingTwin
 
     class OneEach(Floor):
         """A floor under every wheel, wherever the robot is."""
@@ -70,14 +56,6 @@ def ends(robot):
 
         def under(self, pose, wheels):
             return self.kept
-
-    class Telling(Twin):
-        """A twin that tells its pose."""
-
-        def step(self, state, command, noise):
-            new, reading = super().step(state, command, noise)
-            std = jnp.full(2, 1e-3)
-            return new, replace(reading, fix=new.pose, fix_std=std, fix_age=jnp.zeros(()))
 
     rng = np.random.default_rng(SEED)
     truths = jax.tree.map(lambda *x: jnp.stack(x), *[one_of(robot, SEED + k) for k in range(CASES)])
@@ -94,7 +72,8 @@ def ends(robot):
     @eqx.filter_jit
     def one(truth, kept, path, place, key):
         floor = OneEach(jnp.zeros((1, 1), int), jnp.zeros(2), jnp.ones(()), kept)
-        return rollout(pilot, path, Telling(truth, floor, habits), place, key, STEPS)
+        plant = TellingTwin(truth, floor, habits, fix_std=jnp.full(2, 1e-3))
+        return rollout(pilot, path, plant, place, key, STEPS)
 
     found = {name: np.zeros(CASES, bool) for name in ("arrive", "give up", "rest", "go on")}
     for k, path in enumerate(paths):

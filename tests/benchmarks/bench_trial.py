@@ -9,33 +9,27 @@ Needs a folder `slipid identify` wrote for floors of the test site; finished run
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import numpy as np
-import pytest
 
 MAPS, STARTS = (101, 102, 103, 104), 12
 ROWS = ("encoder", "contact", "contact_map", "contact_gyro")
 
 
-def test_other_starts_on_other_maps(tmp_path):
-    folder = os.environ.get("SLIPID_FIT")
-    if not folder:
-        pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
+def test_other_starts_on_other_maps(fit_folder, robot, tmp_path):
     from slipid.data.floor_map import patchwork, write_map
-    from slipid.deploy.deploy import read_robot
     from slipid.deploy.trial import Wish, trial
     from slipid.deploy.trial_summary import not_told_apart, summaries
     from slipid.support.progress import Reporter
 
-    labels = read_robot(Path(folder)).labels
+    labels = robot.labels
     colours = {name: f"#{40 * k:02x}8080" for k, name in enumerate(labels)}
     runs = []
     for seed in MAPS:
         there = tmp_path / f"map{seed}.toml"
         write_map(there, patchwork(labels, seed, patch=0.35, half=2.0), colours)
         wish = Wish(map=there, controllers=ROWS, starts=STARTS, jobs=os.cpu_count() or 1)
-        runs += trial(Path(folder), wish, Reporter(quiet=True)).runs
+        runs += trial(fit_folder, wish, Reporter(quiet=True)).runs
     table = summaries(runs)
     base = table["encoder"].median
     print(

@@ -7,25 +7,17 @@ gains is compared with itself, since floors differ more than controllers do.
 
 from __future__ import annotations
 
-import os
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 SEEDS, ROLLOUTS, JUDGED = 5, 3360, 96
 
 
-def test_gradient_against_swarm_and_hand():
-    folder = os.environ.get("SLIPID_FIT")
-    if not folder:
-        pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
-    from slipid.deploy.deploy import read_robot
-
-    rows = compared(read_robot(Path(folder)))
+def test_gradient_against_swarm_and_hand(robot):
+    rows = compared(robot)
     report(rows)
     # which one wins is what the table says; gains that are handed over must be stable
     for method in ("gradient", "pso"):

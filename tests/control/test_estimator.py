@@ -550,7 +550,8 @@ def test_a_robot_that_nothing_frees_gives_up_and_its_run_ends():
     )
     assert 15.0 < course.time[-1] < 25.0
     assert course.own[-1] < 0.5 * PATH.duration
-    assert np.abs(course.pose[:, :2]).max() < 0.1  # it creeps, a ninth of the first side at most
+    rolled = DT * float(slick.frame.radius) * np.abs(course.command).max(axis=1).sum()
+    assert np.abs(course.pose[:, :2]).max() < 0.02 * rolled
     assert np.abs(course.command[150:300]).max() > 2 * np.abs(course.command[:20]).max()
 
 

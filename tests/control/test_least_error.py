@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from slipid.control.filter.effects import Told
 from slipid.control.filter.floor_filter import hypotheses_of
 from slipid.control.interface import Believed
 from slipid.control.least_error import FARTHEST, PLAIN, wheel_speeds
@@ -77,6 +79,21 @@ def test_periods_lead_to_the_minimum():
 
     found = driven(asked, p, 40)
     assert np.linalg.norm(slope(found)) < 1e-3 * np.linalg.norm(slope(plain(asked)))
+
+
+def test_what_runs_told_of_a_floor_is_made_up_for():
+    """Runs told that the robot goes a tenth of its way to the left: it is sent to the right."""
+    left = jnp.array([0.0, 0.1, 0.0, 1.0, 1.0, 1.0])
+    told = Told(jnp.log(jnp.array([0.2])), jnp.broadcast_to(left, (2, 1, 1, 6)))
+    asked = jnp.array([0.2, 0.0, 0.0])
+    wheels = plain(asked)
+    seen = Believed(jnp.asarray(sure(0)), moved(wheels))
+    before = wheel_speeds(ROBOT, asked, seen, wheels, wheels)
+    known = eqx.tree_at(lambda r: r.told, ROBOT, told)
+    after = wheel_speeds(known, asked, seen, wheels, wheels)
+    change = ROBOT.inverse @ (ROBOT.frame.radius * (after - before))
+    assert -0.03 < change[1] < -0.01
+    assert abs(change[0]) < 0.3 * abs(change[1])
 
 
 @pytest.mark.parametrize("k", range(len(HYPOTHESES)))

@@ -132,7 +132,7 @@ class PoseFilter(eqx.Module):
         """With effects as far as they stay the same over the step, their variance as it was."""
         f = self.robot
         speed = length(motion.twist[:2]) + f.frame.base * jnp.abs(motion.twist[2])
-        far = speed * jnp.where(tick.moves, tick.dt, 0.0)  # what is truly left behind
+        far = speed * tick.dt  # what is truly left behind
         left = jnp.prod(1 - motion.under, axis=0)
         now = direction(motion.rolling, f.frame.base)
         toward, keep = stays(old.toward, now, left, far)
