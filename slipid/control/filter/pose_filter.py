@@ -119,7 +119,9 @@ class PoseFilter(eqx.Module):
         speed, axes = motion.course.speed, motion.course.axes
         std = speed * share[:, None] * motion.left
         by_effect = (std[:, :, None] * axes.T).reshape(-1, 3).T
-        doubt = axes @ root_of(axes.T @ motion.scatter @ axes)
+        # by the way, so that a robot that stands has none
+        per_metre = motion.scatter / jnp.maximum(speed**2, 1e-12)
+        doubt = speed * axes @ root_of(axes.T @ per_metre @ axes)
         return _Way(
             speed=speed,
             axes=axes,
@@ -258,9 +260,9 @@ def turned_axes(heading: Float[Array, ""]) -> Float[Array, "3 3"]:
 
 
 def root_of(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Lower triangular root of a covariance of twists or of poses.
+    """Lower triangular root of a covariance of ways per metre or of poses.
 
-    It has 0.1 mm/s, or 0.1 mm and 0.1 mrad, more, so that there is one.
+    It has 0.1 mm/m, or 0.1 mm and 0.1 mrad, more, so that there is one.
     """
     a = jnp.sqrt(m[0, 0] + 1e-8)
     b, d = m[1, 0] / a, m[2, 0] / a
