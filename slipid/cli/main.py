@@ -10,6 +10,7 @@ from slipid.cli.check import check
 from slipid.cli.compare import compare
 from slipid.cli.demo import demo
 from slipid.cli.design import design
+from slipid.cli.export import export
 from slipid.cli.identify import identify
 from slipid.cli.new import new
 from slipid.cli.paper import paper
@@ -29,7 +30,7 @@ app = typer.Typer(
 )
 for command in (
     *(new, check, selftest, identify, sample, validate, compare),
-    *(design, tune, trial, simulate, paper, demo),
+    *(design, tune, trial, export, simulate, paper, demo),
 ):
     app.command()(command)
 

@@ -97,7 +97,7 @@ class ControllerState(eqx.Module):
     Attributes:
         command: the last one [rad/s]; integral: velocity it asks for [m/s].
         wanted: twist asked for last [m/s, m/s, rad/s]; miss: what the robot was seen to do beyond
-            it, smoothed.
+            it, smoothed [m/s, m/s, rad/s].
         still: for how long it has not gone where it was asked to go; going counts back [s].
         tried: for how long it has tried to free itself, since it was last free [s].
         begun: whether anything was commanded.

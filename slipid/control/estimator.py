@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.filter.floor import Floor
-from slipid.control.filter.floor_filter import FloorFilter, FloorState, Tick, hypotheses_of, length
+from slipid.control.filter.floor_filter import FloorFilter, FloorState, Tick, length
+from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.filter.pose_filter import PoseFilter, turned_axes
 from slipid.control.filter.pose_fix import PoseState, placed
 from slipid.control.filter.wheels import WheelState, read_currents, read_wheels, time_step
@@ -95,7 +96,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
         if self.floor is None:
             floors, motion = by_floor.step(old.floors, w, currents, turn, tick)
         else:
-            hypotheses = hypotheses_of(f)
+            hypotheses = hypotheses_of(f).under
             root, supports = by_pose.mapped(before, self.floor, hypotheses)
             mapped = jnp.mean(supports, axis=0)
             floors, motion = by_floor.step(old.floors, w, currents, turn, tick, mapped)
@@ -216,6 +217,6 @@ class Odometry(AbstractEstimator[OdometryState]):
             stale=jnp.any(wheels.age > s.stale_s),
             immobilised=jnp.zeros((), bool),
             out_of_range=jnp.max(jnp.abs(w)) > 1.3 * f.highest[0],
-            believed=Believed.nothing(f.wheels, len(f.labels)),
+            believed=Believed.nothing(len(hypotheses_of(f))),
             labels=f.labels,
         )

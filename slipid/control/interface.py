@@ -150,10 +150,9 @@ class Believed(eqx.Module):
     twist: Float[Array, "hypothesis 3"]
 
     @classmethod
-    def nothing(cls, wheels: int, floors: int) -> "Believed":
+    def nothing(cls, hypotheses: int) -> "Believed":
         """Of an estimator that knows no floors."""
-        count = floors**wheels
-        return cls(jnp.zeros(count + 1).at[-1].set(1.0), jnp.zeros((count, 3)))
+        return cls(jnp.zeros(hypotheses + 1).at[-1].set(1.0), jnp.zeros((hypotheses, 3)))
 
 
 class Estimate(eqx.Module):
@@ -161,10 +160,11 @@ class Estimate(eqx.Module):
 
     Attributes:
         pose: x, y [m], heading [rad]; twist: of the body [m/s, m/s, rad/s].
-        slip: ratio of each wheel; wheel_speed: [rad/s]; current: signed and filtered [A].
+        slip: ratio of each wheel; wheel_speed: of each wheel [rad/s].
+        current: of each motor, signed and filtered [A].
         surface_probability: of each floor in the order of `labels`, and of none of them in the last
             column, under each wheel.
-        covariance: of the pose in the world frame.
+        covariance: of the pose in the world frame [m, m, rad, each times each].
         believed: of the floors, all wheels together.
         stale: wheels are not heard.
         immobilised: the wheels turn and the body does not move.

@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.filter.effects import Course
-from slipid.control.filter.floor_filter import hypotheses_of, told_of
+from slipid.control.filter.floor_filter import told_of
+from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.interface import Believed
 from slipid.model.contact import steered
 from slipid.model.contact_balance import stand
@@ -31,6 +32,26 @@ FARTHEST = 0.15
 """Rim speed by which a command may differ from wheels that do not slip [m/s]."""
 STEEPEST = 1.5
 """Bound of the change of the body's speed over that of a rim speed."""
+
+
+def solved(m: Float[Array, "wheel wheel"], b: Float[Array, " wheel"]) -> Float[Array, " wheel"]:
+    """Solution x of m x = b for a positive definite matrix, by Cholesky's factors written out.
+
+    A call of a library would have no form in the code that is exported to robots.
+    """
+    count = len(b)
+    root = [[jnp.zeros(())] * count for _ in range(count)]
+    for i in range(count):
+        for j in range(i + 1):
+            rest = m[i, j] - sum(root[i][k] * root[j][k] for k in range(j))
+            root[i][j] = jnp.sqrt(rest) if i == j else rest / root[j][j]
+    y: list[Array] = []
+    for i in range(count):
+        y.append((b[i] - sum(root[i][k] * y[k] for k in range(i))) / root[i][i])
+    x = [jnp.zeros(())] * count
+    for i in reversed(range(count)):
+        x[i] = (y[i] - sum(root[k][i] * x[k] for k in range(i + 1, count))) / root[i][i]
+    return jnp.stack(x)
 
 
 def wheel_speeds(
@@ -56,12 +77,12 @@ def wheel_speeds(
     course = Course.of(f.inverse @ rim, f.frame.base)
     told = course.speed * f.told.at(course)[0] @ course.axes.T
     gap = scale * (believed.twist + told_of(f, told) - asked)  # (hypothesis, 3)
-    on = stand(f.frame, f.floors.at(hypotheses_of(f).T), f.rest)
+    on = stand(f.frame, f.floors.at(hypotheses_of(f).under.T), f.rest)
     slope = scale[None, :, None] * steered(Planar(*believed.twist.T), rim, on, STEEPEST / scale)
     cost = jnp.einsum("c,wac,vac->wv", p, slope, slope) + (PLAIN + LAST) * jnp.eye(f.wheels)
     down = jnp.einsum("c,wac,ca->w", p, slope, gap)
     down = down + PLAIN * (rim - plain) + LAST * (rim - radius * last)
-    extra = rim - plain - jnp.linalg.solve(cost, down)
+    extra = rim - plain - solved(cost, down)
     far = jnp.max(jnp.abs(extra))
     extra = extra * jnp.minimum(1.0, FARTHEST / jnp.maximum(far, 1e-9))
     # wheels that hardly turn tell nothing of how floors answer

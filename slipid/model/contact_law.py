@@ -143,7 +143,7 @@ class Friction(eqx.Module):
 
     def by_activity(self) -> Array:
         """Derivative by the wheel's activity, at a constant speed."""
-        return -self._steep() * self.speed * self.ratio / self.onset**2
+        return -(self._steep() / self.onset) * (self.speed / self.onset) * self.ratio
 
     def _steep(self) -> Array:
         return self.top * (1 - jnp.tanh(self.speed / self.onset) ** 2)

@@ -1,13 +1,19 @@
 """Which model is right, what to drive next, and how the robot is best driven, as tables."""
 
+from __future__ import annotations
+
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 from rich.text import Text
 
 from slipid.report.page import Page, table
 from slipid.support.content import Content
+
+if TYPE_CHECKING:
+    from slipid.deploy.export import Exported
 
 SHOWN = 3
 """Goals of a design that have a column of their own."""
@@ -148,6 +154,12 @@ def show_gains(page: Page, found: Content) -> None:
         f"stability margin (1 - spectral radius): worst {margin['worst']:.4f}, "
         f"median {margin['median']:.4f}"
     )
+
+
+def show_export(page: Page, done: Exported) -> None:
+    """Write what is in a folder for a robot, and what must be known of its numbers."""
+    page.line(f"in {done.folder}: README.md, robot.json, {', '.join(f'{x}/' for x in done.forms)}")
+    page.notes(done.warnings)
 
 
 def show_trial(page: Page, found: Content, out: Path) -> None:

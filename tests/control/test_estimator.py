@@ -18,7 +18,8 @@ from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains, Limits, limited
 from slipid.control.estimator import Estimator, Odometry
 from slipid.control.filter.floor import Floor
-from slipid.control.filter.floor_filter import FloorFilter, hypotheses_of
+from slipid.control.filter.floor_filter import FloorFilter
+from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.filter.pose_fix import _within
 from slipid.control.interface import UNTIMED_S, Believed, Measurement, Readings, Settings
 from slipid.control.trajectory import rectangle
@@ -607,7 +608,7 @@ def test_what_is_believed_of_the_body_is_at_the_wheels_speeds_of_the_estimate():
         lambda under: contact.equilibrium(
             f.frame.radius * e.wheel_speed, f.frame, f.floors.at(under), f.rest
         )
-    )(jnp.asarray(hypotheses_of(f)))
+    )(jnp.asarray(hypotheses_of(f).under))
     np.testing.assert_allclose(e.believed.twist, each, atol=3e-3)
 
 

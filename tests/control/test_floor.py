@@ -15,7 +15,8 @@ from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.estimator import Estimator
 from slipid.control.filter.floor import LEAK, SPREAD
-from slipid.control.filter.floor_filter import FloorFilter, Tick, _followed, hypotheses_of
+from slipid.control.filter.floor_filter import FloorFilter, Tick, _followed
+from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.filter.pose_filter import PoseFilter
 from slipid.control.filter.pose_fix import placed
 from slipid.control.filter.wheels import Currents
@@ -38,7 +39,7 @@ def test_poses_drawn_have_the_mean_and_covariance_they_are_drawn_from():
 
 def test_a_pose_that_is_known_has_the_floors_of_the_map():
     robot, there = deployed(), floor(CHESS)
-    hypotheses = hypotheses_of(robot)
+    hypotheses = hypotheses_of(robot).under
     pose = jnp.array([0.1, 0.2, 0.3])
     got = there.supports(pose, 1e-9 * jnp.eye(3), robot.places, hypotheses, 2).mean(axis=0)
     under = np.asarray(there.under(pose, robot.places))
@@ -70,7 +71,7 @@ def met(after, before):
     Beliefs are by the floor under all wheels, `{floor: probability}`.
     """
     robot = deployed()
-    hypotheses = hypotheses_of(robot)
+    hypotheses = hypotheses_of(robot).under
     by_pose, by_floor = PoseFilter(robot, SETTINGS), FloorFilter(robot, SETTINGS)
     state = by_pose.init(jnp.zeros(3), (0.2, 0.1))
     none, still = jnp.zeros(3), Tick(jnp.asarray(0.05), jnp.zeros((), bool), jnp.zeros(()))

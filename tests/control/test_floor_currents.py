@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from slipid.control.estimator import Estimator
-from slipid.control.filter.floor_filter import FloorFilter, hypotheses_of
+from slipid.control.filter.floor_filter import FloorFilter
+from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.interface import Measurement, Settings
 from slipid.model.geometry import omni
 from slipid.model.robot import build, twist, wheel_current
@@ -32,7 +33,7 @@ def test_drag_along_the_drive_is_in_the_currents_that_tell_floors():
     for k in range(2):
         place = jnp.asarray(k), jnp.asarray(0)
         xi = twist(robot, frame, w, *place)
-        alike = int(np.flatnonzero((hypotheses_of(known) == k).all(axis=1))[0])
+        alike = int(np.flatnonzero((hypotheses_of(known).under == k).all(axis=1))[0])
         np.testing.assert_allclose(
             amps[alike], wheel_current(robot, frame, xi, w, *place), rtol=1e-6
         )

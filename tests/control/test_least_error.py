@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slipid.control.filter.effects import Told
-from slipid.control.filter.floor_filter import hypotheses_of
+from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.interface import Believed
 from slipid.control.least_error import FARTHEST, PLAIN, wheel_speeds
 from slipid.model import contact
@@ -19,7 +19,7 @@ from slipid.model.se2 import Planar
 from tests.helpers.small_twin import deployed
 
 ROBOT = deployed()
-HYPOTHESES = hypotheses_of(ROBOT)
+HYPOTHESES = hypotheses_of(ROBOT).under
 
 
 @jax.jit

@@ -16,7 +16,8 @@ from slipid.control.controller import Controller, Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator, Odometry
 from slipid.control.filter.floor import Floor
-from slipid.control.filter.floor_filter import FloorFilter, hypotheses_of
+from slipid.control.filter.floor_filter import FloorFilter
+from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.interface import Measurement, Settings
 from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.control.robot_file.typed import typed
@@ -375,7 +376,7 @@ def test_a_map_may_show_a_floor_that_the_fit_does_not_know(deployed):
     row, column = np.round(np.argwhere(counted == -1).mean(axis=0)).astype(int)
     x, y = np.asarray(lookup.corner) + (np.array([column, row]) + 0.5) * float(lookup.cell)
     here = jnp.array([x, y, 0.0])
-    hypotheses = hypotheses_of(deployed)
+    hypotheses = hypotheses_of(deployed).under
     inside = lookup.under(here, deployed.places)
     supports = lookup.supports(here, jnp.zeros((3, 3)), deployed.places, hypotheses, 2)
     assert bool(jnp.all(inside == -1))

@@ -4,7 +4,7 @@ Where a map is known, the believed pose and its covariance say which floors are 
 wheels. Poses x_s drawn from the belief, fixed ones in its own axes, make of it a prior of every
 hypothesis c, one floor under each wheel:
 
-    W_sc = prod_wheel [(1 - leak) (map at the wheel of x_s is c's) + leak / floors]
+    W_sc ~ prod_wheel [(1 - leak) (map at the wheel of x_s is c's) + leak / floors],  sum_c W_sc = 1
     prior_c = mean_s W_sc
 
 What the currents and the gyro of a step say of the hypotheses, p_c before and p_c' after it, says
@@ -141,4 +141,5 @@ class Floor(eqx.Module):
         poses = pose + SPREAD @ root.T
         under = jax.vmap(self.under, (0, None))(poses, wheels)
         same = under[:, None, :] == jnp.asarray(hypotheses)
-        return jnp.prod((1 - LEAK) * same + LEAK / floors, axis=-1)
+        weight = jnp.prod((1 - LEAK) * same + LEAK / floors, axis=-1)
+        return weight / jnp.sum(weight, axis=-1, keepdims=True)

@@ -1,7 +1,7 @@
 """Which floor is under each wheel: a filter over all ways in which the wheels may stand.
 
 A robot whose wheels stand on several floors moves as one body, so every hypothesis is one floor per
-wheel, all of them together (27 with three wheels on three floors), and one that says "unknown":
+wheel, all of them together (`hypotheses`), and one that says "unknown":
 
     xi_c, I_c     contact equilibrium, with what runs on one floor tell that it misses there, and
                   motor currents of hypothesis c at the wheel speeds
@@ -14,17 +14,17 @@ tell the floors. News that comes late corrects the pose by the ways that the hyp
 (interacting multiple models; Blom and Bar-Shalom 1988).
 """
 
-import itertools
 from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.filter.effects import Course
+from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.filter.wheels import Currents
 from slipid.control.interface import Settings
 from slipid.model.contact import settle
@@ -101,7 +101,7 @@ class FloorFilter(eqx.Module):
 
     def init(self) -> FloorState:
         """Before anything is measured."""
-        count = len(self.robot.labels) ** self.robot.wheels
+        count = len(hypotheses_of(self.robot))
         return FloorState(
             belief=jnp.concatenate([self.prior() * 0.99, jnp.asarray([0.01])]),
             expected=self.prior(),
@@ -111,7 +111,7 @@ class FloorFilter(eqx.Module):
 
     def prior(self) -> Float[Array, " hypothesis"]:
         """Probability of every hypothesis before anything is measured."""
-        kinds = np.array([len(set(row)) for row in hypotheses_of(self.robot).tolist()])
+        kinds = np.array([len(set(row)) for row in hypotheses_of(self.robot).under.tolist()])
         weight = np.exp(-self.settings.alike * (kinds - 1))
         return jnp.asarray(weight / weight.sum())
 
@@ -169,8 +169,7 @@ class FloorFilter(eqx.Module):
 
     def _left(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
         """Part of the std of every floor's effects that is left; all of it, wheels on several."""
-        floors, wheels = len(self.robot.labels), self.robot.wheels
-        alone = known.reshape((floors,) * wheels)[(np.arange(floors),) * wheels]
+        alone = known[hypotheses_of(self.robot).uniform]
         share = alone / jnp.maximum(self.robot.rest @ under, 1e-12)
         return jnp.sqrt(1 - share[:, None] * (1 - part**2))
 
@@ -179,7 +178,7 @@ class FloorFilter(eqx.Module):
     ) -> tuple[Float[Array, "hypothesis 3"], Float[Array, "hypothesis wheel"]]:
         """Twist [m/s, m/s, rad/s] and currents [A] of every hypothesis, `near` a moment ago."""
         f = self.robot
-        on = stand(f.frame, f.floors.at(hypotheses_of(self.robot).T), f.rest)
+        on = stand(f.frame, f.floors.at(hypotheses_of(f).under.T), f.rest)
         rim = f.frame.radius * w
         twist, pull = settle(near.T, rim, on, f.inverse)
         drag = Balance(rim[:, None], on).rolled(Planar(*twist))
@@ -218,7 +217,7 @@ class FloorFilter(eqx.Module):
         """Log likelihood of what is measured under every hypothesis, and under none of them."""
         f, s = self.robot, self.settings
         amps, told_of = currents.filtered, currents.told
-        std = f.current_std[jnp.asarray(hypotheses_of(self.robot))]
+        std = f.current_std[hypotheses_of(f).under]
         size = jnp.sqrt(predicted**2 + 0.03**2)
         gap = jnp.where(told_of == 2, predicted - amps, size - jnp.abs(amps))
         var = std**2 + (currents.variance + self._stiction(w)) + self._of_friction(predicted)
@@ -240,7 +239,7 @@ class FloorFilter(eqx.Module):
 
         A wheel has so much of the whole drag as its friction is over their mean.
         """
-        on = np.eye(len(self.robot.labels))[hypotheses_of(self.robot)]
+        on = hypotheses_of(self.robot).on.astype(float)
         over = (on - on.mean(axis=1, keepdims=True)).reshape(-1, on.shape[2])
         var = jnp.sum((over @ self.robot.friction_covariance) * over, axis=1)
         return amps**2 * var.reshape(amps.shape)
@@ -272,13 +271,12 @@ class FloorFilter(eqx.Module):
 
     def _changed(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
         """Every wheel may come to another floor, as likely as the prior says given the others."""
-        wheels, floors = self.robot.wheels, len(self.robot.labels)
-        prior, shape = self.prior().reshape((floors,) * wheels), p.shape
-        p = p.reshape((floors,) * wheels + (-1,))
-        for axis in range(wheels):
-            given = (prior / jnp.sum(prior, axis=axis, keepdims=True))[..., None]
-            p = (1 - change) * p + change * jnp.sum(p, axis=axis, keepdims=True) * given
-        return p.reshape(shape)
+        prior, none = self.prior(), jnp.zeros((1, p.shape[1]))
+        for beside in hypotheses_of(self.robot).beside:
+            given = prior / jnp.sum(jnp.append(prior, 0.0)[beside], axis=1)
+            others = jnp.sum(jnp.concatenate([p, none])[beside], axis=1)
+            p = (1 - change) * p + change * given[:, None] * others
+        return p
 
     def _moved(
         self, apart: Array, known: Array, xi: Array, turn: Array, tick: Tick
@@ -297,25 +295,15 @@ class FloorFilter(eqx.Module):
 
     def _marginal(self, known: Array) -> Array:
         """Probability of each floor under each wheel (wheel, floor)."""
-        wheels, floors = self.robot.wheels, len(self.robot.labels)
-        p = known.reshape((floors,) * wheels)
-        others = [tuple(k for k in range(wheels) if k != axis) for axis in range(wheels)]
-        return jnp.stack([jnp.sum(p, axis=o) for o in others])
-
-
-def hypotheses_of(robot: DeployedRobot) -> Int[np.ndarray, "hypothesis wheel"]:
-    """Floor under every wheel in every hypothesis."""
-    floors = range(len(robot.labels))
-    return np.array(list(itertools.product(floors, repeat=robot.wheels)))
+        return jnp.einsum("c,cwf->wf", known, hypotheses_of(self.robot).on.astype(float))
 
 
 def told_of(
     robot: DeployedRobot, of_floor: Float[Array, "floor 3"]
 ) -> Float[Array, "hypothesis 3"]:
     """What is told of the body under every hypothesis: of all wheels on one floor, no more."""
-    under = hypotheses_of(robot)
-    whole = (under == under[:, :1]).all(axis=1)
-    return jnp.where(whole[:, None], of_floor[under[:, 0]], 0.0)
+    ways = hypotheses_of(robot)
+    return jnp.zeros((len(ways), 3)).at[ways.uniform].set(of_floor)
 
 
 def _followed(

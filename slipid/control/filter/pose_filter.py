@@ -244,12 +244,13 @@ def _learnt(
     """
     by = now.covariance @ look
     gain = learns * by / var
-    change, off = gain * gap, jnp.outer(gain, by)
+    change = gain * gap
+    off = jnp.outer(gain, by) + jnp.outer(by, gain)
     return replace(
         now,
         pose=now.pose + change[:3],
         nuisance=now.nuisance + change[3:],
-        covariance=now.covariance - off - off.T + var * jnp.outer(gain, gain),
+        covariance=now.covariance - off + var * jnp.outer(gain, gain),
     )
 
 

@@ -23,15 +23,17 @@ class PoseState(eqx.Module):
     Attributes:
         pose: x, y [m], heading [rad].
         nuisance: effects of every floor along, across and in yaw beyond what is told of them, in
-            stds left, by how much its log friction is off, the doubt d, then the gyro's bias
+            stds left, by how much its log friction is off, the doubt d [1], then the gyro's bias
             [rad/s].
-        covariance: of pose and nuisance.
+        covariance: of pose and nuisance [units of both].
         toward: direction of travel that counts as taken, see `slipid.control.filter.effects`.
-        time, still: since the start, and for which the robot has stood [s].
-        noise: covariance that has come into the pose since the start; far: way since then [m].
-        push: d pose / d nuisance per metre of the last way, the gyro's bias left out.
-        history: last steps, the newest first: time, pose, yaw rate of the contact model, noise and
-            way until then.
+        time: since the start [s]; still: for how long the robot has stood [s].
+        noise: covariance that has come into the pose since the start [m, m, rad, each times each].
+        far: way since the start [m].
+        push: d pose / d nuisance per metre of the last way, the gyro's bias left out [m/m, m/m,
+            rad/m].
+        history: last steps, the newest first: time [s], pose [m, m, rad], yaw rate of the contact
+            model [rad/s], noise and way until then.
     """
 
     pose: Float[Array, "3"]
@@ -87,13 +89,14 @@ def _corrected(
     look = look.at[0, 2].set(gone[1]).at[1, 2].set(-gone[0])
     look = look.at[:, 3:-1].set(-now.push * (now.far - then[14]))
     noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2) + since - held
-    total = look @ cov @ look.T + noise
+    rows = look @ cov
+    total = rows @ look.T + noise
     # a fix far from what is believed counts less, yet counts
     far = gap @ _inverse(total) @ gap
     total = total + noise * jnp.maximum(far / 9.0 - 1.0, 0.0)
-    gain = cov @ look.T @ _inverse(total)
+    gain = rows.T @ _inverse(total)
     change = gain @ gap
-    cov = cov - gain @ look @ cov
+    cov = cov - gain @ rows
     cov = 0.5 * (cov + cov.T) + aside
     history = shifted(history, pose, jnp.broadcast_to(change[:3], (len(history), 3)))
     left = jnp.eye(3) - gain[:3] @ look[:, :3]

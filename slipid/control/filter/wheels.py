@@ -12,7 +12,7 @@ class WheelState(eqx.Module):
     """How the wheels turn.
 
     Attributes:
-        speed: [rad/s]; age: of the last reading [s].
+        speed: of each wheel [rad/s]; age: of its last reading [s].
         angle: up to which motion is counted [rad]; NaN before the first reading.
     """
 

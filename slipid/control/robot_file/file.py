@@ -26,10 +26,15 @@ ANEW = "copy it again, or write it anew with `slipid identify`"
 
 def write_robot(path: Path, record: RobotRecord) -> None:
     """Write a robot; DataError where nothing can be written."""
+    write_bytes(path, robot_bytes(record))
+
+
+def robot_bytes(record: RobotRecord) -> bytes:
+    """Content of robot.json."""
     content: dict[str, object] = {"schema": SCHEMA, "units": UNITS, **asdict(record)}
     content["numbers"] = record.numbers
     content["checksum"] = checksum(content)
-    write_bytes(path, (_text(content) + "\n").encode())
+    return (_text(content) + "\n").encode()
 
 
 def read_robot(path: Path) -> RobotRecord:

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from slipid.control.closed_loop import PERIOD
 from slipid.control.controller import Controller, ControllerState, Gains
 from slipid.control.deployed import DeployedRobot
-from slipid.control.filter.floor_filter import hypotheses_of
+from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.interface import Believed, Estimate
 from slipid.control.tuning.actuation import RING, Habits
 from slipid.model import contact
@@ -123,9 +123,9 @@ class Loop(eqx.Module):
     def _believed(self, speed: Array) -> Believed:
         """All wheels on the floor, for sure."""
         f = self.controller.robot
-        count = len(f.labels) ** f.wheels
-        same = jnp.all(jnp.asarray(hypotheses_of(f)) == self.surface, axis=1)
-        twist = jnp.broadcast_to(self._twist(f, speed), (count, 3))
+        ways = hypotheses_of(f)
+        same = jnp.arange(len(ways)) == jnp.asarray(ways.uniform)[self.surface]
+        twist = jnp.broadcast_to(self._twist(f, speed), (len(ways), 3))
         return Believed(jnp.append(same.astype(float), 0.0), twist)
 
 

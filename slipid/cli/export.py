@@ -1,0 +1,80 @@
+"""`slipid export`: a folder for a robot, in the forms that the field uses."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from slipid.cli.common import Json, Load, MaybeOut, Quiet, emit, guarded
+from slipid.support.progress import Reporter
+
+
+@guarded
+def export(
+    source: Annotated[
+        Path, typer.Argument(metavar="OUT|ROBOT.json", help="Folder identify wrote, or its robot.")
+    ],
+    to: Annotated[
+        str, typer.Option("--to", metavar="FORMS", help="By commas: c, ros2, stablehlo, table.")
+    ] = "c,ros2,stablehlo,table",
+    out: MaybeOut = None,
+    controller: Annotated[
+        str, typer.Option(metavar="NAME", help="Row of the trial: contact, slip_odometry, ...")
+    ] = "contact",
+    path: Annotated[
+        str, typer.Option(metavar="NAME", help="That the example in C follows.")
+    ] = "rectangle",
+    speed: Annotated[float, typer.Option(metavar="M_S", help="Along the path [m/s].")] = 0.2,
+    load: Load = None,
+    floors: Annotated[
+        str, typer.Option(metavar="NAMES", help="Floors there are, by commas; all by default.")
+    ] = "",
+    check: Annotated[
+        bool, typer.Option("--check", help="Only check a folder that was exported before.")
+    ] = False,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Write robot.json and what is made of it to a folder: C99, ROS 2, StableHLO, tables of gains.
+
+    The folder has a README, and the checksum of every file. With --check nothing is written, and
+    exit code 2 says that a byte was changed.
+    """
+    from slipid.control.export.folder import check_folder
+    from slipid.deploy.export import Wish, robot_at
+    from slipid.deploy.export import export as run
+    from slipid.report.answers import show_export
+    from slipid.support.errors import DataError
+    from slipid.support.jax_setup import setup_jax
+
+    setup_jax(quiet=True)
+    if check:
+        names = check_folder(source)
+        if (source / "stablehlo").is_dir():
+            from slipid.control.export.stablehlo import load_program
+
+            load_program(source / "stablehlo")
+        found = {"folder": str(source), "files": list(names), "intact": True}
+        emit(json, found, lambda page: page.line(f"{source}: all {len(names)} files as written"))
+        return 0
+    if out is None:
+        raise DataError("no folder to write to; name one with --out DIR")
+    with Reporter(quiet=quiet) as report:
+        report.stage("reading the robot")
+        robot = robot_at(source, load, _names(floors))
+        wish = Wish(_names(to), controller, path, speed, load, _names(floors))
+        done = run(robot, out, wish, report)
+    content = {
+        "schema": "slipid.export/1",
+        "folder": str(done.folder),
+        "robot": done.robot,
+        "forms": list(done.forms),
+        "files": list(done.files),
+        "warnings": list(done.warnings),
+    }
+    emit(json, content, lambda page: show_export(page, done))
+    return 0
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())

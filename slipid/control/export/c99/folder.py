@@ -1,0 +1,85 @@
+"""Files of a C folder: the code, its test, an example, and what builds them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from slipid.control.closed_loop import Pilot
+from slipid.control.export.c99.code import Code, filled, template
+from slipid.control.export.c99.golden import golden_header
+from slipid.control.export.header import made_with, warnings
+from slipid.control.trajectory import Path
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A run of a path that the library has driven from 0, 0, 0, a row per period.
+
+    Attributes:
+        plant: what it was driven on.
+        given: dt [s] and the leaves of the reading; command: wheel speeds [rad/s].
+        time: of the path [s].
+    """
+
+    plant: str
+    given: Float[np.ndarray, "step given"]
+    command: Float[np.ndarray, "step wheel"]
+    time: Float[np.ndarray, " step"]
+
+    @property
+    def readings(self) -> str:
+        """As lines for the example."""
+        rows = [" ".join(repr(float(x)) for x in row) for row in self.given]
+        return "\n".join(["0 0 0", *rows]) + "\n"
+
+    @property
+    def commands(self) -> str:
+        """As the example prints them."""
+        rows = zip(self.command, self.time, strict=True)
+        return "".join(f"{' '.join(f'{x:.9f}' for x in c)} {t:.6f}\n" for c, t in rows)
+
+
+def c_files(
+    pilot: Pilot[eqx.Module], path: Path, recording: Recording | None = None
+) -> dict[str, str]:
+    """Text of the files by their paths in the folder.
+
+    Args:
+        pilot: estimator and controller; path: that the example follows.
+        recording: a run of it, as a test of the example.
+
+    Raises:
+        UnsupportedError: a step uses a primitive that has no form in C.
+    """
+    code = Code(pilot, path)
+    named = {"VERSION": made_with()}
+    files = {
+        "src/slipid.h": code.header(),
+        "src/slipid.c": code.source(),
+        "test/golden.h": golden_header(code),
+        "test/check.c": template("check.c"),
+        "examples/drive/drive.c": template("drive.c"),
+        "examples/Slipid/Slipid.ino": template("Slipid.ino"),
+        "CMakeLists.txt": template("CMakeLists.txt"),
+        "library.json": filled("library.json", named),
+        "library.properties": filled("library.properties", named),
+    }
+    steps = ""
+    if recording is not None:
+        files["examples/drive/readings.txt"] = recording.readings
+        files["examples/drive/commands.txt"] = recording.commands
+        steps = filled("recording.md", {"PLANT": recording.plant})
+    robot = pilot.controller.robot
+    values = {
+        "WARNINGS": "\n".join(f"**{text}**\n" for text in warnings(robot)),
+        "ROBOT": robot.record.numbers,
+        "RECORDING": steps,
+        "FLOORS": ", ".join(f"`{name}` ({k})" for k, name in enumerate(robot.labels)),
+        "WHEELS": str(robot.wheels),
+    }
+    files["README.md"] = filled("README.md", values)
+    return files

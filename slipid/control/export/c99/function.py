@@ -1,0 +1,155 @@
+"""A traced function as one of C: its arguments, its body, and what it reads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax
+from jax.extend.core import ClosedJaxpr
+
+from slipid.control.export.c99.arrays import Value, in_memory
+from slipid.control.export.c99.fields import Field, Struct
+from slipid.control.export.c99.ir import Array, Builder, Memory, Names
+from slipid.control.export.c99.lower import apart, lowered, store
+from slipid.control.export.c99.text import Body, folded
+
+
+@dataclass(frozen=True)
+class Argument:
+    """An argument of a function of C.
+
+    Attributes:
+        name: of it; type: of what a pointer points to, empty for plain numbers.
+        fields: that it has; one alone for plain numbers.
+        read, written: whether the function reads and fills it.
+    """
+
+    name: str
+    type: str
+    fields: tuple[Field, ...]
+    read: bool
+    written: bool
+
+    @classmethod
+    def plain(
+        cls, name: str, shape: tuple[int, ...], read: bool = True, written: bool = False
+    ) -> Argument:
+        """A number or a row of numbers."""
+        return cls(name, "", (Field(name, "real", shape, ""),), read, written)
+
+    @classmethod
+    def of(cls, name: str, struct: Struct, read: bool = True, written: bool = False) -> Argument:
+        """A pointer to a struct."""
+        return cls(name, struct.name, struct.fields, read, written)
+
+    @property
+    def memories(self) -> list[Memory]:
+        """Where its fields lie."""
+        if self.type:
+            return [field.memory(self.name) for field in self.fields]
+        field = self.fields[0]
+        name = f"(*{self.name})" if self.written and not field.shape else self.name
+        return [Memory(name, field.kind, field.size, scalar=not field.shape)]
+
+    @property
+    def declared(self) -> str:
+        """As the function declares it."""
+        const = "" if self.written else "const "
+        if self.type:
+            return f"{const}{self.type} *{self.name}"
+        field = self.fields[0]
+        if field.shape:
+            return f"{const}slipid_real {self.name}[{field.size}]"
+        return f"slipid_real *{self.name}" if self.written else f"slipid_real {self.name}"
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function of C.
+
+    Attributes:
+        name: of it; about: comment of its declaration; arguments: in their order.
+        lines: of its body; reads: names of all memory it reads.
+    """
+
+    name: str
+    about: str
+    arguments: tuple[Argument, ...]
+    lines: tuple[str, ...]
+    reads: frozenset[str]
+
+    @property
+    def head(self) -> str:
+        """Declaration without the semicolon."""
+        return f"void {self.name}({', '.join(a.declared for a in self.arguments)})"
+
+    @property
+    def text(self) -> list[str]:
+        """Definition."""
+        return [*folded(f"{self.head} {{", ""), *self.lines, "}", ""]
+
+
+def function(
+    names: Names,
+    name: str,
+    about: str,
+    arguments: Sequence[Argument],
+    traced: ClosedJaxpr,
+) -> Function:
+    """A traced function as one of C.
+
+    Args:
+        names: of the file; name, about, arguments: of the function.
+        traced: from the fields of all arguments that are read to those of all that are written,
+            both in the order of the arguments.
+
+    Raises:
+        UnsupportedError: it uses a primitive without a rule.
+    """
+    builder = Builder(names)
+    values: list[Value] = [
+        in_memory(memory, field.shape)
+        for argument in arguments
+        if argument.read
+        for memory, field in zip(argument.memories, argument.fields, strict=True)
+    ]
+    found = lowered(builder, traced, values)
+    targets = [memory for a in arguments if a.written for memory in a.memories]
+    overwritten = frozenset(memory.name for memory in targets)
+    changed = [
+        (memory, apart(builder, value, overwritten))
+        for memory, value in zip(targets, found, strict=True)
+        if not _holds(memory, value)
+    ]
+    for memory, value in changed:
+        store(builder, value, memory)
+    body = Body(builder)
+    unused = _unused(arguments, body.reads)
+    return Function(name, about, tuple(arguments), (*unused, *body.lines()), frozenset(body.reads))
+
+
+def traced(run: Callable[..., object], *like: object) -> ClosedJaxpr:
+    """A function of some trees, traced as one from their leaves to those of its result."""
+    structure = jax.tree.structure(like)
+
+    def of(*given: jax.Array) -> list[jax.Array]:
+        return jax.tree.leaves(run(*jax.tree.unflatten(structure, given)))
+
+    return jax.make_jaxpr(of)(*jax.tree.leaves(like))
+
+
+def _holds(memory: Memory, value: Value) -> bool:
+    """Whether memory holds a value already."""
+    if not isinstance(value, Array):
+        return False
+    like = in_memory(memory, value.shape)
+    return value.axis == like.axis and bool((value.cells == like.cells).all())
+
+
+def _unused(arguments: Sequence[Argument], reads: set[str]) -> list[str]:
+    """Statements that tell a compiler that arguments are not read on purpose."""
+    idle = [
+        a.name for a in arguments if not a.written and not any(m.name in reads for m in a.memories)
+    ]
+    return [f"  (void){name};" for name in idle]

@@ -1,0 +1,230 @@
+"""From what JAX has traced to statements: constants are computed now, the rest on the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Var
+from jax.extend.core import Literal as JaxLiteral
+
+from slipid.control.export.c99.arrays import (
+    Value,
+    along,
+    cells_of,
+    in_memory,
+    kind_of_value,
+    rearranged,
+)
+from slipid.control.export.c99.elementwise import Shaped
+from slipid.control.export.c99.ir import DTYPES, Array, At, Block, Builder, Cell, Memory, Nested
+from slipid.control.export.c99.moves import MOVES, SOURCES, moved
+from slipid.control.export.c99.rules import RULES
+
+INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
+"""Primitives that are functions called."""
+
+
+class UnsupportedError(NotImplementedError):
+    """A step that has no form in C, with the primitive and the line of Python that asks for it."""
+
+
+def lowered(builder: Builder, closed: ClosedJaxpr, values: Sequence[Value]) -> list[Value]:
+    """Results of a traced function of these values.
+
+    Raises:
+        UnsupportedError: it uses a primitive without a rule.
+    """
+    return _Lowering(builder).run(closed.jaxpr, [np.asarray(c) for c in closed.consts], values)
+
+
+class _Lowering:
+    def __init__(self, builder: Builder):
+        self._builder = builder
+
+    def run(self, jaxpr: Jaxpr, consts: Sequence[Value], values: Sequence[Value]) -> list[Value]:
+        """Results of a function."""
+        known: dict[Var, Value] = {}
+        known.update(zip(jaxpr.constvars, consts, strict=True))
+        known.update(zip(jaxpr.invars, values, strict=True))
+
+        def of(atom: Var | JaxLiteral) -> Value:
+            return np.asarray(atom.val) if isinstance(atom, JaxLiteral) else known[atom]
+
+        for equation in jaxpr.eqns:
+            given = [_filled(of(atom)) for atom in equation.invars]
+            found = self._equation(equation, given)
+            known.update(zip(equation.outvars, found, strict=True))
+        return [of(atom) for atom in jaxpr.outvars]
+
+    def _equation(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        primitive, params = equation.primitive, equation.params
+        name = primitive.name
+        constant = not any(isinstance(v, Array) for v in values)
+        if name in INLINED:
+            inner = _inner(params)
+            return self.run(inner.jaxpr, [np.asarray(c) for c in inner.consts], values)
+        if constant:
+            return _evaluated(equation, values)
+        self._builder.source = _line(equation) or self._builder.source
+        try:
+            return self._ruled(equation, values)
+        except NotImplementedError as error:
+            if isinstance(error, UnsupportedError):
+                raise
+            said = str(error) or "no rule for it"
+            known = sorted({*RULES, *MOVES, *INLINED, "cond", "scan"})
+            raise UnsupportedError(
+                f"{self._builder.source}: '{name}' has no form in C ({said}); "
+                f"those that have one: {', '.join(known)}"
+            ) from error
+
+    def _ruled(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        primitive, params, name = equation.primitive, equation.params, equation.primitive.name
+        if name == "cond":
+            return self._cond(params, values)
+        if name == "scan":
+            return self._scan(params, values)
+        out: Any = equation.outvars[0].aval  # jax types it as less than it is
+        shaped = Shaped(out.shape, out.dtype)
+        where = [v for v in values[1:] if isinstance(v, Array)]
+        if name in ("split", "unstack"):
+            return self._several(equation, values[0])
+        if name in MOVES and not (name in SOURCES and where):
+            return [moved(primitive, SOURCES.get(name, 0))(self._builder, values, params, shaped)]
+        if name not in RULES:
+            raise NotImplementedError
+        return [RULES[name](self._builder, values, params, shaped)]
+
+    def _several(self, equation: JaxprEqn, value: Value) -> list[Value]:
+        """Results of a primitive that takes an array apart."""
+        places = np.arange(prod(value.shape)).reshape(value.shape)
+        parts = equation.primitive.bind(places, **equation.params)
+        return [rearranged(self._builder, [value], np.asarray(part)) for part in parts]
+
+    def _cond(self, params: dict[str, Any], values: list[Value]) -> list[Value]:
+        """One of two functions."""
+        builder, which = self._builder, values[0]
+        if len(params["branches"]) != 2:
+            raise NotImplementedError("more than two branches")
+        if not isinstance(which, Array):
+            branch = params["branches"][int(np.clip(which, 0, 1))]
+            return lowered(builder, branch, values[1:])
+        bodies = [Builder(builder.names, builder) for _ in range(2)]
+        found = [
+            lowered(body, branch, values[1:])
+            for body, branch in zip(bodies, params["branches"], strict=True)
+        ]
+        when = builder.compute("bool", "{0} != 0", (along(builder, which, (), None).item(),))
+        block = builder.append(nested=Nested(when, 1, bodies[::-1]))
+        out = []
+        for pair in zip(*found, strict=True):
+            memory = self._memory(pair[0], block)
+            for body, value in zip(bodies, pair, strict=True):
+                store(body, value, memory)
+            out.append(in_memory(memory, pair[0].shape))
+        return list(out)
+
+    def _memory(self, like: Value, block: Block) -> Memory:
+        number = self._builder.names.number()
+        return Memory(f"m{number}", kind_of_value(like), prod(like.shape), block)
+
+    def _scan(self, params: dict[str, Any], values: list[Value]) -> list[Value]:
+        """A function applied to its own result a fixed number of times."""
+        carried, consts = params["num_carry"], params["num_consts"]
+        if len(values) != carried + consts or len(params["jaxpr"].out_avals) != carried:
+            raise NotImplementedError("a loop that goes through an array")
+        builder = self._builder
+        body = Builder(builder.names, builder)
+        block = builder.append(nested=Nested(None, params["length"], [body]))
+        begun = values[consts:]
+        memories = [self._memory(value, block) for value in begun]
+        before = builder.blocks.pop()  # what the loop begins with is stored in front of it
+        for value, memory in zip(begun, memories, strict=True):
+            store(builder, value, memory)
+        before.place = len(builder.blocks)
+        builder.blocks.append(before)
+        carry = [in_memory(m, v.shape) for m, v in zip(memories, begun, strict=True)]
+        found = lowered(body, params["jaxpr"], [*values[:consts], *carry])
+        names = frozenset(memory.name for memory in memories)
+        kept = [apart(body, value, names) for value in found]
+        for value, memory in zip(kept, memories, strict=True):
+            store(body, value, memory)
+        return list(carry)
+
+
+def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
+    """A result without cells of memory that is about to be overwritten, by its names."""
+    if not isinstance(value, Array):
+        return value
+    lanes = 0 if value.axis is None else value.shape[value.axis]
+
+    def own(cell: Cell) -> Cell:
+        if not isinstance(cell, At) or cell.memory.name not in overwritten:
+            return cell
+        return builder.compute(cell.kind, "{0}", (cell,), lanes if cell.varies else 0)
+
+    cells = [own(cell) for cell in value.cells.reshape(-1)]
+    return Array(value.shape, value.kind, value.axis, cells_of(value.cells.shape, cells))
+
+
+def store(builder: Builder, value: Value, memory: Memory) -> None:
+    """Write an array, in row-major order, into memory at the end of a builder's code."""
+    shape = value.shape
+    axis = value.axis if isinstance(value, Array) else None
+    cells = along(builder, value, shape, axis)
+    places = np.arange(prod(shape)).reshape(shape)
+    lanes = 0 if axis is None else shape[axis]
+    rows = places.reshape(-1, 1) if axis is None else np.moveaxis(places, axis, -1)
+    end = builder.append(lanes)
+    for row, cell in zip(rows.reshape(-1, max(lanes, 1)), cells.reshape(-1), strict=True):
+        stride = int(row[1] - row[0]) if lanes > 1 else 0
+        builder.late(end, f"{_place(memory, int(row[0]), stride)} = {{0}};", cell, memory)
+
+
+def _place(memory: Memory, offset: int, stride: int) -> str:
+    if memory.scalar:
+        return "{memory}"
+    if not stride:
+        return f"{{memory}}[{offset}]"
+    step = "l" if stride == 1 else f"{stride} * l"
+    return f"{{memory}}[{offset} + {step}]" if offset else f"{{memory}}[{step}]"
+
+
+def _filled(value: Value) -> Value:
+    """The value itself; a constant if it has no numbers at all."""
+    return value if prod(value.shape) else np.zeros(value.shape, DTYPES[kind_of_value(value)])
+
+
+def _inner(params: dict[str, Any]) -> ClosedJaxpr:
+    """The function that a primitive calls."""
+    found = params.get("jaxpr", params.get("call_jaxpr", params.get("fun_jaxpr")))
+    if isinstance(found, Jaxpr):
+        return ClosedJaxpr(found, ())
+    assert isinstance(found, ClosedJaxpr)
+    return found
+
+
+def _evaluated(equation: JaxprEqn, values: list[Value]) -> list[Value]:
+    """Results that depend on constants alone."""
+    avals: list[Any] = [atom.aval for atom in equation.invars]
+    given = [jax.numpy.asarray(v, a.dtype) for v, a in zip(values, avals, strict=True)]
+    with jax.ensure_compile_time_eval():
+        found = equation.primitive.bind(*given, **equation.params)
+    many = equation.primitive.multiple_results
+    return [np.asarray(x) for x in (found if many else [found])]
+
+
+def _line(equation: JaxprEqn) -> str:
+    """File and line of the innermost own code that asks for an equation; empty if none does."""
+    traceback = equation.source_info.traceback
+    for frame in traceback.frames if traceback is not None else ():
+        path = Path(frame.file_name)
+        if "slipid" in path.parts and "export" not in path.parts:
+            start = len(path.parts) - 1 - path.parts[::-1].index("slipid")
+            return f"{'/'.join(path.parts[start:])}:{frame.line_num}"
+    return ""

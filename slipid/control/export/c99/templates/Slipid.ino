@@ -1,0 +1,28 @@
+/* One control period every 50 ms. Fill in how your robot reads its sensors and drives its wheels. */
+#include <slipid.h>
+
+static slipid_state state;
+static slipid_reading reading;
+static slipid_estimate estimate;
+static slipid_real command[SLIPID_WHEELS];
+static unsigned long last_ms;
+
+void setup() {
+  const slipid_real start[3] = {0, 0, 0};
+  slipid_init(&state, start);
+  last_ms = millis();
+}
+
+void loop() {
+  const unsigned long now_ms = millis();
+  if (now_ms - last_ms < 50) {
+    return;
+  }
+  const slipid_real dt = (slipid_real)(now_ms - last_ms) / 1000;
+  last_ms = now_ms;
+  const slipid_real reference[6] = {0, 0, 0, 0, 0, 0}; /* where the robot should be, and how fast */
+  slipid_nothing(&reading);
+  /* reading.wheel_angle[0] = ...; reading.current[0] = ...; */
+  slipid_step(&state, &reading, reference, dt, &estimate, command);
+  /* drive the wheels with command[0] ... [rad/s] */
+}

@@ -1,0 +1,54 @@
+/* Compares the code of this folder with what the library computed: cc -O2 -Isrc -o check test/check.c src/slipid.c -lm
+   Prints the largest difference and ends with 0 where it is small enough. */
+#include <math.h>
+#include <stdio.h>
+
+#include "slipid.h"
+
+#include "golden.h"
+
+#ifdef SLIPID_FLOAT
+#define TOLERANCE 1e-3 /* rounding of 32 bits over all steps */
+#else
+#define TOLERANCE 1e-9
+#endif
+
+static double worst = 0.0;
+
+static void compare(const char *what, int step, double got, double want, double scale) {
+  const double size = fabs(want) > scale ? fabs(want) : scale;
+  const double gap = got == want ? 0.0 : fabs(got - want) / size;
+  if (!(gap <= TOLERANCE)) {
+    printf("step %d, %s: %.17g where the library has %.17g\n", step, what, got, want);
+  }
+  worst = gap > worst || !(gap == gap) ? gap : worst;
+}
+
+int main(void) {
+  static slipid_state state;
+  static slipid_estimate estimate;
+  static slipid_reading reading;
+  const slipid_real start[3] = {0, 0, 0};
+  slipid_real command[SLIPID_WHEELS];
+  double said[GOLDEN_SAID];
+  slipid_init(&state, start);
+  for (int step = 0; step < GOLDEN_STEPS; ++step) {
+    slipid_real reference[6];
+    golden_reading(&reading, golden_given[step]);
+    for (int k = 0; k < 6; ++k) {
+      reference[k] = (slipid_real)golden_given[step][GOLDEN_GIVEN - 7 + k];
+    }
+    slipid_step(&state, &reading, reference, (slipid_real)golden_given[step][GOLDEN_GIVEN - 1],
+                &estimate, command);
+    golden_said_of(&estimate, said);
+    for (int k = 0; k < GOLDEN_SAID; ++k) {
+      compare(golden_names[k], step, said[k], golden_said[step][k], golden_scale[k]);
+    }
+    for (int k = 0; k < SLIPID_WHEELS; ++k) {
+      compare("command", step, (double)command[k], golden_command[step][k], 1.0);
+    }
+  }
+  printf("%d steps, %d numbers each: largest difference %.1e, allowed %.0e\n", GOLDEN_STEPS,
+         GOLDEN_SAID + SLIPID_WHEELS, worst, TOLERANCE);
+  return worst <= TOLERANCE ? 0 : 1;
+}

@@ -1,0 +1,41 @@
+/* A robot on a line: the start pose, then in each line dt and what the sensors give; out come wheel
+   speeds [rad/s] and the time of the path [s]. nan stands for what is not measured. */
+#include <stdio.h>
+
+#include "slipid.h"
+
+static int numbers(slipid_real *into, int count) {
+  double value;
+  for (int k = 0; k < count; ++k) {
+    if (scanf("%lf", &value) != 1) {
+      return 0;
+    }
+    into[k] = (slipid_real)value;
+  }
+  return 1;
+}
+
+int main(void) {
+  static slipid_state state;
+  slipid_reading in;
+  slipid_estimate estimate;
+  slipid_real pose[3], reference[6], command[SLIPID_WHEELS], dt;
+  if (!numbers(pose, 3)) {
+    return 1;
+  }
+  slipid_init(&state, pose);
+  while (numbers(&dt, 1) && numbers(in.wheel_angle, SLIPID_WHEELS) &&
+         numbers(in.wheel_speed, SLIPID_WHEELS) && numbers(in.current, SLIPID_WHEELS) &&
+         numbers(in.voltage, SLIPID_WHEELS) && numbers(&in.gyro, 1) && numbers(in.fix, 3) &&
+         numbers(in.fix_std, 2) && numbers(&in.fix_age, 1)) {
+    slipid_observe(&state.estimator, &in, dt, &estimate);
+    slipid_follow(&state.time, estimate.pose, dt, reference);
+    slipid_command(&state.controller, reference, &estimate, dt, command);
+    for (int k = 0; k < SLIPID_WHEELS; ++k) {
+      printf("%.9f ", (double)command[k]);
+    }
+    printf("%.6f\n", (double)state.time);
+    fflush(stdout);
+  }
+  return 0;
+}

@@ -1,0 +1,58 @@
+"""What stands at the head of every file that is made of a robot."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from importlib.metadata import PackageNotFoundError, version
+
+from slipid.control.deployed import DeployedRobot
+from slipid.control.export.rows import DOUBTED, declared, doubted
+from slipid.control.export.text import listed, one_line, wrapped
+from slipid.control.robot_file.record import Source, Verdict
+
+SOURCES: Mapping[Source, str] = {
+    "laplace": "a fit to logs (Laplace approximation)",
+    "posterior": "the posterior of a fit to logs",
+    "given": "given values, no logs",
+}
+WARNINGS: Mapping[Verdict, str] = {
+    "not_identified": "NOT IDENTIFIED, their values are assumed and no measurement",
+    "at_bound": "AT A BOUND, the model or a number that was held fixed may be wrong",
+    "disputed": "DISPUTED, floors disagree about them",
+}
+
+
+def header(robot: DeployedRobot) -> list[str]:
+    """Lines without a comment sign: origin, floors, loads, verdicts and messages of a robot.
+
+    Each is plain printable text, of 96 characters at most where no word is longer.
+    """
+    return [line for part in _parts(robot) for line in wrapped(part)]
+
+
+def warnings(robot: DeployedRobot) -> tuple[str, ...]:
+    """A sentence for each verdict of which a user must be warned, where a number has it."""
+    found = {verdict: doubted(robot, verdict) for verdict in DOUBTED}
+    return tuple(f"{WARNINGS[v]}: {listed(paths)}." for v, paths in found.items() if paths)
+
+
+def _parts(robot: DeployedRobot) -> Iterator[str]:
+    record = robot.record
+    yield f"Made by slipid {made_with()} from robot.json; make it anew rather than change it."
+    yield f"Numbers: {record.numbers} (`numbers` of robot.json)."
+    yield f"They come from {SOURCES[record.source]}."
+    loads = listed([load.name for load in record.loads])
+    yield f"Load set-up: {one_line(robot.load_setup)}, of those known: {loads}."
+    yield f"Floors: {listed(robot.labels)}."
+    counts = Counter(record.parameters[e.path].verdict for e in declared(robot))
+    said = ", ".join(f"{n} {v.replace('_', ' ')}" for v, n in counts.most_common())
+    yield f"Verdicts: {said}."
+    yield from (f"WARNING: {text}" for text in warnings(robot))
+    yield from (f"Note of the fit: {message}" for message in record.messages)
+
+
+def made_with() -> str:
+    """Version of slipid."""
+    try:
+        return version("slipid")
+    except PackageNotFoundError:
+        return "(not installed as a package)"

@@ -1,0 +1,152 @@
+"""From robot.json to a folder for a robot, with a run of its path that was driven on the twin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.control import trajectory
+from slipid.control.closed_loop import LONGEST, PERIOD, Pilot
+from slipid.control.deployed import DeployedRobot
+from slipid.control.export.c99.folder import Recording, c_files
+from slipid.control.export.c99.lower import UnsupportedError
+from slipid.control.export.folder import check_folder, write_folder
+from slipid.control.export.readme import readme
+from slipid.control.export.ros2 import ros2_files
+from slipid.control.export.stablehlo import load_program, stablehlo_files
+from slipid.control.export.table import table_files
+from slipid.deploy.controllers import ROWS, pilot_of
+from slipid.deploy.deploy import habits_of
+from slipid.deploy.trial import REST_S, path_of
+from slipid.deploy.trial_site import site, starts, twin
+from slipid.support.errors import DataError, near
+from slipid.support.progress import Reporter
+
+FORMS = ("c", "ros2", "stablehlo", "table")
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is to be exported.
+
+    Attributes:
+        forms: of `FORMS`; controller: row of the trial.
+        path: that the example in C follows; speed: along it [m/s].
+        load: set-up, the first by default; floors: that there are, all by default.
+    """
+
+    forms: Sequence[str] = FORMS
+    controller: str = "contact"
+    path: str = "rectangle"
+    speed: float = 0.2
+    load: str | None = None
+    floors: Sequence[str] = field(default_factory=tuple)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A folder that was written.
+
+    Attributes:
+        folder: it; files: their names; robot: hash of the robot's numbers.
+        forms: that are in it; warnings: of numbers that are not identified.
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    robot: str
+    forms: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedRobot:
+    """The robot of a file, or of the folder that `slipid identify` wrote.
+
+    Raises:
+        DataError: there is none, it is damaged, or has no such load set-up or floor.
+    """
+    path = source / "robot.json" if source.is_dir() else source
+    robot = DeployedRobot.load(path, load)
+    try:
+        return robot.on(*floors) if floors else robot
+    except ValueError as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+def export(robot: DeployedRobot, out: Path, wish: Wish, report: Reporter) -> Exported:
+    """Write a robot in all wanted forms to a folder.
+
+    Raises:
+        DataError: no such form, controller or path; a step that has no form in C; nothing can be
+            written there, or other files lie there.
+    """
+    from slipid.control.export.header import warnings
+    from slipid.control.robot_file.file import robot_bytes
+
+    for name in wish.forms:
+        if name not in FORMS:
+            raise DataError(f"no form '{name}'{near(name, FORMS)}; expected {', '.join(FORMS)}")
+    if wish.controller not in ROWS:
+        raise DataError(f"no controller '{wish.controller}'; expected one of {', '.join(ROWS)}")
+    row = ROWS[wish.controller]
+    if row.mapped:
+        raise DataError("a controller that is told a map has no export yet; export contact")
+    pilot = pilot_of(robot, row)
+    path = path_of(wish.path, wish.speed, robot).waiting(REST_S)
+    content: dict[str, bytes] = {"robot.json": robot_bytes(robot.record)}
+    forms = tuple(form for form in FORMS if form in wish.forms)
+    for form in forms:
+        report.stage(f"writing {form}")
+        files = _form(form, robot, pilot, path, wish)
+        content |= {f"{form}/{name}": data for name, data in files.items()}
+    content["README.md"] = readme(robot, forms, wish.controller).encode()
+    write_folder(out, content)
+    report.stage("checking what was written")
+    check_folder(out)
+    if "stablehlo" in forms:
+        load_program(out / "stablehlo")
+    return Exported(out, tuple(content), robot.record.numbers, forms, warnings(robot))
+
+
+def _form(
+    form: str, robot: DeployedRobot, pilot: Pilot[eqx.Module], path: trajectory.Path, wish: Wish
+) -> dict[str, bytes]:
+    if form == "stablehlo":
+        return stablehlo_files(pilot)
+    if form == "c":
+        try:
+            text = c_files(pilot, path, recorded(robot, pilot, path, wish))
+        except UnsupportedError as error:
+            raise DataError(f"controller {wish.controller}: {error}") from error
+    else:
+        text = ros2_files(robot) if form == "ros2" else table_files(robot)
+    return {name: data.encode() for name, data in text.items()}
+
+
+def recorded(
+    robot: DeployedRobot, pilot: Pilot[eqx.Module], path: trajectory.Path, wish: Wish
+) -> Recording:
+    """A run on the twin, seen from where the robot begins."""
+    floor = site(robot)
+    begin = starts(20, floor, path)[0]
+    plant = twin(robot, floor, begin, 0, habits_of(robot, gyro=ROWS[wish.controller].gyro))
+    step = eqx.filter_jit(lambda state, z: pilot.step(path, state, z, jnp.asarray(PERIOD)))
+    state, reading = pilot.init(), plant.reset().filled(robot.wheels)
+    given, commands, times = [], [], []
+    for _ in range(round(LONGEST * path.duration / PERIOD)):
+        leaves = [np.asarray(x).reshape(-1) for x in jax.tree.leaves(reading)]
+        given.append(np.concatenate([[PERIOD], *leaves]))
+        state, said = step(state, reading)
+        commands.append(np.asarray(said.command))
+        times.append(float(said.time))
+        if times[-1] >= path.duration - 1e-6 or bool(said.given_up):
+            break
+        reading = plant.step(commands[-1]).filled(robot.wheels)
+    about = f"the identified model as a plant, with delays and noise ({wish.path})"
+    return Recording(about, np.array(given), np.array(commands), np.array(times))

@@ -1,0 +1,157 @@
+"""Generated C code as functions on numpy arrays, compiled by whatever compiler is there."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from slipid.control.export.c99.code import Code
+from slipid.control.export.c99.fields import Struct
+
+MANY = """
+void slipid_many(int32_t count, slipid_estimator *estimator, slipid_controller *controller,
+                 const slipid_reading *reading, const slipid_real *reference, const slipid_real *dt,
+                 slipid_estimate *estimate, slipid_real *command);
+
+void slipid_many(int32_t count, slipid_estimator *estimator, slipid_controller *controller,
+                 const slipid_reading *reading, const slipid_real *reference, const slipid_real *dt,
+                 slipid_estimate *estimate, slipid_real *command) {
+  for (int32_t k = 0; k < count; ++k) {
+    slipid_observe(&estimator[k], &reading[k], dt[k], &estimate[k]);
+    slipid_command(&controller[k], &reference[6 * k], &estimate[k], dt[k],
+                   &command[SLIPID_WHEELS * k]);
+  }
+}
+"""
+"""One step of many robots."""
+QUICK = ("-O2", "-fno-math-errno", "-fno-trapping-math")
+NEEDS_COMPILER = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """How C stores the numbers of a build."""
+
+    real: type
+
+    def of(self, struct: Struct) -> np.dtype:
+        """A struct as numpy's."""
+        kinds = {"real": self.real, "int": np.int32, "bool": np.bool_}
+        return np.dtype([(f.name, kinds[f.kind], f.shape) for f in struct.fields], align=True)
+
+
+class CompiledC:
+    """A pilot's code, compiled: its structs as numpy records, its functions on them.
+
+    Attributes:
+        code: that was compiled; kinds: of its numbers.
+        estimator, controller, reading, estimate: records that the functions work on.
+    """
+
+    def __init__(
+        self, code: Code, folder: Path, flags: Sequence[str] = QUICK, compiler: str = "cc"
+    ):
+        self.code = code
+        single = "-DSLIPID_FLOAT" in flags
+        self.kinds = Kinds(np.float32 if single else np.float64)
+        self._number = ctypes.c_float if single else ctypes.c_double
+        (folder / "slipid.h").write_text(code.header())
+        (folder / "slipid.c").write_text(code.source() + MANY)
+        library = folder / f"slipid{len(list(folder.iterdir()))}.so"
+        command = [
+            compiler,
+            "-std=c99",
+            *flags,
+            "-shared",
+            "-fPIC",
+            "-o",
+            library,
+            "slipid.c",
+            "-lm",
+        ]
+        subprocess.run([str(word) for word in command], cwd=folder, check=True)
+        self._library = ctypes.CDLL(str(library))
+        self.estimator = np.zeros((), self.kinds.of(code.estimator))
+        self.controller = np.zeros((), self.kinds.of(code.controller))
+        self.reading = np.zeros((), self.kinds.of(code.reading))
+        self.estimate = np.zeros((), self.kinds.of(code.estimate))
+        self.command = np.zeros(code.pilot.controller.robot.wheels, self.kinds.real)
+        self.time = np.zeros((), self.kinds.real)
+        self.reference = np.zeros(6, self.kinds.real)
+
+    def begin(self, pose: Sequence[float]) -> None:
+        """Start at a pose."""
+        self._call("begin", self.estimator, self.controller, np.asarray(pose, self.kinds.real))
+
+    def observe(self, dt: float) -> None:
+        """The estimator's step."""
+        self._call("observe", self.estimator, self.reading, dt, self.estimate)
+
+    def control(self, dt: float) -> None:
+        """The controller's step."""
+        parts = (self.controller, self.reference, self.estimate, dt, self.command)
+        self._call("command", *parts)
+
+    def follow(self, dt: float) -> None:
+        """The path's step."""
+        pose = np.ascontiguousarray(self.estimate["pose"])
+        self._call("follow", self.time, pose, dt, self.reference)
+
+    def many(
+        self,
+        estimator: np.ndarray,
+        controller: np.ndarray,
+        reading: np.ndarray,
+        reference: np.ndarray,
+        dt: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """One step of as many robots as there are records; states are changed in place.
+
+        Returns:
+            Estimates, and commands (robot, wheel).
+        """
+        count = len(dt)
+        said = np.zeros(count, self.estimate.dtype)
+        command = np.zeros((count, len(self.command)), self.kinds.real)
+        given = [np.ascontiguousarray(x, self.kinds.real) for x in (reference, dt)]
+        arrays = (estimator, controller, reading, *given, said, command)
+        pointers = [a.ctypes.data_as(ctypes.c_void_p) for a in arrays]
+        self._library.slipid_many(ctypes.c_int32(count), *pointers)
+        return said, command
+
+    def _call(self, name: str, *arguments: np.ndarray | float) -> None:
+        given = [
+            a.ctypes.data_as(ctypes.c_void_p) if isinstance(a, np.ndarray) else self._number(a)
+            for a in arguments
+        ]
+        getattr(self._library, f"slipid_{name}")(*given)
+
+
+def put(record: np.ndarray, tree: object) -> None:
+    """Fill a record with the leaves of a tree."""
+    names = record.dtype.names
+    assert names is not None
+    for name, leaf in zip(names, jax.tree.leaves(tree), strict=True):
+        record[name] = np.asarray(leaf)
+
+
+def worst(record: np.ndarray, tree: object, least: float = 1e-3) -> dict[str, float]:
+    """Largest difference of each field of a record from a leaf, over the leaf's largest number."""
+    names = record.dtype.names
+    assert names is not None
+    out = {}
+    for name, leaf in zip(names, jax.tree.leaves(tree), strict=True):
+        a, b = np.asarray(record[name], float), np.asarray(leaf, float)
+        scale = max(np.nanmax(np.abs(b), initial=0.0), least)
+        same = (np.isnan(a) & np.isnan(b)) | (a == b)
+        gap = np.where(same, 0.0, np.abs(a - b))
+        out[name] = float(np.max(np.where(np.isnan(gap), np.inf, gap), initial=0.0) / scale)
+    return out
