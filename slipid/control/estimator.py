@@ -154,7 +154,12 @@ def _corrected(floors: FloorState, left: Array, place: PoseState, expected: Arra
 
 
 class OdometryState(eqx.Module):
-    """Pose [m, m, rad], how the wheels turn, and smoothed currents without a sign [A]."""
+    """What wheel-by-wheel odometry keeps from step to step.
+
+    Attributes:
+        pose: x, y [m], heading [rad].
+        wheels: how they turn; current: of the motors, smoothed and without a sign [A].
+    """
 
     pose: Float[Array, "3"]
     wheels: WheelState

@@ -121,7 +121,8 @@ class CompiledC:
         count = len(dt)
         said = np.zeros(count, self.estimate.dtype)
         command = np.zeros((count, len(self.command)), self.kinds.real)
-        given = [np.ascontiguousarray(x, self.kinds.real) for x in (reference, dt)]
+        with np.errstate(over="ignore"):
+            given = [np.ascontiguousarray(x, self.kinds.real) for x in (reference, dt)]
         arrays = (estimator, controller, reading, *given, said, command)
         pointers = [a.ctypes.data_as(ctypes.c_void_p) for a in arrays]
         self._library.slipid_many(ctypes.c_int32(count), *pointers)

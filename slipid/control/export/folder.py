@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -68,14 +69,18 @@ def check_folder(folder: Path | str) -> tuple[str, ...]:
 
 
 def _sums(folder: Path) -> dict[str, str]:
+    """Checksum of every file by its name, as they were written."""
     try:
-        lines = (folder / SUMS).read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        text = (folder / SUMS).read_text()
+    except (OSError, UnicodeDecodeError):
+        text = ""
+    lines = [re.fullmatch(r"([0-9a-f]{64})  ([\w.-]+(?:/[\w.-]+)*)", x) for x in text.splitlines()]
+    named = {line[2]: line[1] for line in lines if line and ".." not in line[2].split("/")}
+    if not lines or len(named) < len(lines):
         raise DataError(
             f"{folder / SUMS}: cannot be read; expected a folder that `slipid export` wrote"
-        ) from error
-    pairs = [line.partition("  ") for line in lines]
-    return {name: digest for digest, _, name in pairs}
+        )
+    return named
 
 
 def _sum(data: bytes) -> str:

@@ -23,6 +23,7 @@ from slipid.control.closed_loop import Pilot
 from slipid.control.export.c99.fields import Struct
 from slipid.control.export.c99.golden import Golden, golden
 from slipid.control.interface import Measurement, Readings
+from slipid.control.robot_file.typed import typed
 from slipid.support.errors import DataError
 
 SCHEMA = "slipid.stablehlo/1"
@@ -148,7 +149,7 @@ def load_program(folder: Path | str) -> Program:
         )
     try:
         kept = np.load(io.BytesIO(content["golden.npz"]), allow_pickle=False)
-        signature = Signature(**{k: tuple(_leaf(x) for x in about[k]) for k in about})
+        signature = typed(Signature, about)
         start = [jnp.asarray(kept[f"start{k}"]) for k in range(len(signature.state))]
         programs = [export.deserialize(bytearray(content[name])) for name in FILES[:2]]
         steps = Golden(kept["given"], kept["said"], kept["command"])
@@ -157,11 +158,6 @@ def load_program(folder: Path | str) -> Program:
     program = Program(signature, tuple(start), *programs)
     _repeated(program, steps, place)
     return program
-
-
-def _leaf(kept: dict[str, object]) -> Leaf:
-    leaf = Leaf(**kept)  # type: ignore[arg-type]
-    return Leaf(leaf.name, leaf.numbers, tuple(leaf.shape), leaf.about)
 
 
 def _repeated(program: Program, steps: Golden, place: Path) -> None:

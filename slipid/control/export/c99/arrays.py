@@ -321,4 +321,4 @@ def _goes_on(run: list[Cell], cell: Cell) -> bool:
     places = _places([*run[-2:], cell])
     if places is None:
         return False
-    return len(places) < 3 or places[2] - places[1] == places[1] - places[0]
+    return len(places) < 3 or bool(places[2] - places[1] == places[1] - places[0])

@@ -1,0 +1,86 @@
+"""A folder for a robot tells a changed byte, and is never written over other people's files."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+
+import pytest
+
+from slipid.control.export.folder import SUMS, check_folder, write_folder
+from slipid.support.errors import DataError
+
+CONTENT = {"README.md": b"# one\n", "c/src/slipid.c": b"int x;\n", "robot.json": b"{}\n"}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_folder(tmp_path / "robot", CONTENT)
+    return tmp_path / "robot"
+
+
+def test_what_was_written_is_whole(folder):
+    assert sorted(check_folder(folder)) == sorted(CONTENT)
+    assert (folder / "c/src/slipid.c").read_bytes() == CONTENT["c/src/slipid.c"]
+
+
+@pytest.mark.parametrize("name", CONTENT)
+def test_a_changed_byte_is_told_with_its_file(folder, name):
+    data = bytearray((folder / name).read_bytes())
+    data[0] ^= 1
+    (folder / name).write_bytes(bytes(data))
+    with pytest.raises(DataError, match=rf"{name}: changed or damaged"):
+        check_folder(folder)
+
+
+def test_a_lost_file_is_told(folder):
+    (folder / "c/src/slipid.c").unlink()
+    with pytest.raises(DataError, match=r"slipid\.c: No such file"):
+        check_folder(folder)
+
+
+@pytest.mark.parametrize("sums", [b"", b"no digest here\n", b"\xff\xfe"])
+def test_a_folder_without_its_checksums_is_none(folder, sums):
+    (folder / SUMS).write_bytes(sums)
+    with pytest.raises(DataError, match="expected a folder that `slipid export` wrote"):
+        check_folder(folder)
+    (folder / SUMS).unlink()
+    with pytest.raises(DataError, match="expected a folder that `slipid export` wrote"):
+        check_folder(folder)
+
+
+def test_a_name_that_leads_out_of_the_folder_is_refused(folder):
+    outside = folder.parent / "other"
+    outside.write_bytes(b"")
+    digest = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
+    (folder / SUMS).write_text(f"{digest}  ../other\n")
+    with pytest.raises(DataError, match="expected a folder that `slipid export` wrote"):
+        check_folder(folder)
+    with pytest.raises(DataError):
+        write_folder(folder, CONTENT)
+    assert outside.exists()
+
+
+@pytest.mark.skipif(shutil.which("sha256sum") is None, reason="needs sha256sum")
+def test_it_is_checked_where_there_is_no_slipid(folder):
+    command = ["sha256sum", "--quiet", "--strict", "-c", SUMS]
+    assert subprocess.run(command, cwd=folder).returncode == 0
+    (folder / "README.md").write_bytes(b"# two\n")
+    assert subprocess.run(command, cwd=folder, capture_output=True).returncode == 1
+
+
+def test_an_older_export_leaves_nothing_behind(folder):
+    write_folder(folder, {"README.md": b"# two\n"})
+    assert check_folder(folder) == ("README.md",)
+    assert not (folder / "c/src/slipid.c").exists()
+
+
+def test_other_files_are_never_touched(folder):
+    (folder / "mine.txt").write_text("kept")
+    with pytest.raises(DataError, match=r"files that no export wrote \(mine.txt\)"):
+        write_folder(folder, CONTENT)
+    assert (folder / "mine.txt").read_text() == "kept"
+    assert (folder / "README.md").read_bytes() == CONTENT["README.md"]
+    (folder.parent / "file").write_text("")
+    with pytest.raises(DataError, match="not a folder"):
+        write_folder(folder.parent / "file", CONTENT)
