@@ -9,6 +9,7 @@ TYPE_CHECKING = False  # known to type checkers by its name, without loading `ty
 if TYPE_CHECKING:
     from slipid.api.check import check as check
     from slipid.api.driving import drive as drive
+    from slipid.api.export import export as export
     from slipid.api.fit import Fit as Fit
     from slipid.api.fit import Prior as Prior
     from slipid.api.fit import fit as fit
@@ -46,6 +47,7 @@ _ROOMS = {
     "Validation": "slipid.api.results",
     "check": "slipid.api.check",
     "drive": "slipid.api.driving",
+    "export": "slipid.api.export",
     "fit": "slipid.api.fit",
     "floor_map": "slipid.deploy.floors",
     "made_runs": "slipid.api.known_robot",

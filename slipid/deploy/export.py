@@ -17,10 +17,12 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.export.c99.folder import Recording, c_files
 from slipid.control.export.c99.lower import UnsupportedError
 from slipid.control.export.folder import check_folder, write_folder
+from slipid.control.export.header import warnings
 from slipid.control.export.readme import readme
 from slipid.control.export.ros2 import ros2_files
 from slipid.control.export.stablehlo import load_program, stablehlo_files
 from slipid.control.export.table import table_files
+from slipid.control.robot_file.file import robot_bytes
 from slipid.deploy.controllers import ROWS, pilot_of
 from slipid.deploy.deploy import habits_of
 from slipid.deploy.trial import REST_S, path_of
@@ -71,7 +73,7 @@ def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedR
     Raises:
         DataError: there is none, it is damaged, or has no such load set-up or floor.
     """
-    path = source / "robot.json" if source.is_dir() else source
+    path = source if source.suffix == ".json" else source / "robot.json"
     robot = DeployedRobot.load(path, load)
     try:
         return robot.on(*floors) if floors else robot
@@ -86,14 +88,15 @@ def export(robot: DeployedRobot, out: Path, wish: Wish, report: Reporter) -> Exp
         DataError: no such form, controller or path; a step that has no form in C; nothing can be
             written there, or other files lie there.
     """
-    from slipid.control.export.header import warnings
-    from slipid.control.robot_file.file import robot_bytes
-
+    if not wish.forms:
+        raise DataError(f"no form; expected one or more of {', '.join(FORMS)}")
     for name in wish.forms:
         if name not in FORMS:
             raise DataError(f"no form '{name}'{near(name, FORMS)}; expected {', '.join(FORMS)}")
     if wish.controller not in ROWS:
-        raise DataError(f"no controller '{wish.controller}'; expected one of {', '.join(ROWS)}")
+        close = near(wish.controller, ROWS)
+        choices = ", ".join(ROWS)
+        raise DataError(f"no controller '{wish.controller}'{close}; expected one of {choices}")
     row = ROWS[wish.controller]
     if row.mapped:
         raise DataError("a controller that is told a map has no export yet; export contact")

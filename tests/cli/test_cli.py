@@ -49,7 +49,7 @@ def test_help_names_every_command():
     assert result.exit_code == 0
     for command in (
         *("new", "check", "selftest", "identify", "sample", "validate"),
-        *("compare", "paper", "demo", "simulate"),
+        *("compare", "paper", "demo", "simulate", "export"),
     ):
         assert command in result.stdout
 
@@ -553,6 +553,38 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monke
         write_bytes(path, b"new")
     assert json.loads(path.read_text()) == {"x": 1.5}
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+# export ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_export_writes_a_folder_and_tells_a_changed_byte(small, tmp_path):
+    out = tmp_path / "to_go"
+    done = invoke(
+        "export", small[0] / "out", "--to", "table, ros2", "--out", out, "--json", "-", "--quiet"
+    )
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    assert found["forms"] == ["ros2", "table"]
+    assert all((out / name).is_file() for name in found["files"])
+    assert invoke("export", out, "--check").exit_code == 0
+    path = out / "table/gains.csv"
+    path.write_bytes(path.read_bytes().replace(b"1", b"2", 1))
+    told = invoke("export", out, "--check")
+    assert told.exit_code == 2
+    assert "gains.csv: changed or damaged" in told.output
+    again = invoke("export", out / "robot.json", "--to", "table", "--out", out, "--quiet")
+    assert again.exit_code == 0, again.output
+    assert not (out / "ros2").exists() or not list((out / "ros2").rglob("*.*"))
+
+
+def test_export_says_what_is_missing(tmp_path):
+    assert "robot.json: No such file" in invoke("export", tmp_path, "--out", tmp_path / "o").output
+    told = invoke("export", tmp_path)
+    assert told.exit_code == 2
+    assert "name one with --out" in told.output
+    assert invoke("export", tmp_path, "--check").exit_code == 2
 
 
 def test_new_writes_a_config_that_reads_and_never_overwrites(tmp_path):

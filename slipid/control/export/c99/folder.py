@@ -40,7 +40,7 @@ class Recording:
     def commands(self) -> str:
         """As the example prints them."""
         rows = zip(self.command, self.time, strict=True)
-        return "".join(f"{' '.join(f'{x:.9f}' for x in c)} {t:.6f}\n" for c, t in rows)
+        return "".join(f"{' '.join(f'{x:.9f}' for x in c)} {t:.9f}\n" for c, t in rows)
 
 
 def c_files(

@@ -4,6 +4,10 @@
 
 #include "slipid.h"
 
+#ifndef DIGITS
+#define DIGITS 9 /* behind the point; 15 to close a loop with a plant */
+#endif
+
 static int numbers(slipid_real *into, int count) {
   double value;
   for (int k = 0; k < count; ++k) {
@@ -32,9 +36,9 @@ int main(void) {
     slipid_follow(&state.time, estimate.pose, dt, reference);
     slipid_command(&state.controller, reference, &estimate, dt, command);
     for (int k = 0; k < SLIPID_WHEELS; ++k) {
-      printf("%.9f ", (double)command[k]);
+      printf("%.*f ", DIGITS, (double)command[k]);
     }
-    printf("%.6f\n", (double)state.time);
+    printf("%.*f\n", DIGITS, (double)state.time);
     fflush(stdout);
   }
   return 0;

@@ -1,0 +1,185 @@
+"""A robot is taken along: the folder is whole, its C program drives as the library does."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from slipid.control import closed_loop
+from slipid.control.closed_loop import PERIOD
+from slipid.control.deployed import DeployedRobot
+from slipid.control.export.c99.folder import c_files
+from slipid.control.export.folder import check_folder
+from slipid.control.interface import Measurement
+from slipid.control.trajectory import rectangle
+from slipid.deploy.controllers import ROWS, pilot_of
+from slipid.deploy.export import FORMS, Wish, export, robot_at
+from slipid.deploy.trial import REST_S
+from slipid.deploy.trial_site import SitePlant, site, starts
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
+from tests.helpers import small_twin
+from tests.helpers.compiled_c import NEEDS_COMPILER
+
+ROBOT = small_twin.deployed(1.0, 1.0, 0.3)
+QUIET = Reporter(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Everything, for a controller that traces fast."""
+    out = tmp_path_factory.mktemp("export") / "robot"
+    export(ROBOT, out, Wish(controller="slip_odometry"), QUIET)
+    return out
+
+
+@pytest.mark.slow
+def test_all_forms_come_from_one_robot(folder):
+    names = check_folder(folder)
+    assert {name.split("/")[0] for name in names} == {"README.md", "robot.json", *FORMS}
+    again = DeployedRobot.load(folder / "robot.json")
+    assert again.record.numbers == ROBOT.record.numbers
+    for name in (
+        "README.md",
+        "c/src/slipid.h",
+        "c/src/slipid.c",
+        "c/README.md",
+        "ros2/slipid.yaml",
+    ):
+        assert ROBOT.record.numbers in (folder / name).read_text(), name
+    for name in ("ros2/README.md", "table/gains.md"):
+        assert ROBOT.record.numbers in (folder / name).read_text(), name
+
+
+@pytest.mark.slow
+@NEEDS_COMPILER
+def test_its_example_drives_as_the_library_did(folder, tmp_path):
+    """With a C compiler and the folder, and nothing else."""
+    here = tmp_path / "c"
+    shutil.copytree(folder / "c", here)
+    said = subprocess.run(
+        "cc -O2 -Isrc -o drive examples/drive/drive.c src/slipid.c -lm &&"
+        " ./drive < examples/drive/readings.txt | cmp - examples/drive/commands.txt",
+        shell=True,
+        cwd=here,
+        env={"PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+    )
+    assert said.returncode == 0, said.stdout + said.stderr
+    lines = (here / "examples/drive/commands.txt").read_text().splitlines()
+    assert len(lines) > 300
+    assert float(lines[-1].split()[-1]) == pytest.approx(rectangle().duration + REST_S, abs=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="needs cmake")
+def test_cmake_builds_and_tests_it(folder, tmp_path):
+    for words in (
+        ["cmake", "-S", folder / "c", "-B", tmp_path],
+        ["cmake", "--build", tmp_path],
+        ["ctest", "--test-dir", tmp_path],
+    ):
+        done = subprocess.run(words, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+class Program:
+    """The example's program as a robot's computer: lines in, lines out."""
+
+    def __init__(self, program: Path):
+        self._process = subprocess.Popen(
+            [program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        self._say("0 0 0")
+
+    def __call__(self, reading: Measurement) -> tuple[np.ndarray, float]:
+        leaves = [np.asarray(x).reshape(-1) for x in jax.tree.leaves(reading.filled(3))]
+        self._say(" ".join(repr(float(x)) for x in np.concatenate([[PERIOD], *leaves])))
+        assert self._process.stdout is not None
+        numbers = [float(word) for word in self._process.stdout.readline().split()]
+        return np.array(numbers[:3]), numbers[3]
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def _say(self, line: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+
+
+@pytest.mark.slow
+@NEEDS_COMPILER
+def test_the_program_drives_the_test_site_to_the_last_printed_digit(tmp_path):
+    """One process is the robot, in C; the other is the world, in MuJoCo."""
+    pytest.importorskip("mujoco")
+    pilot, path = pilot_of(ROBOT, ROWS["contact"]), rectangle(0.4, 0.2).waiting(REST_S)
+    for name, text in c_files(pilot, path).items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    sources = ("examples/drive/drive.c", "src/slipid.c", "-lm")
+    command = ["cc", "-O2", "-DDIGITS=15", "-Isrc", "-o", "drive", *sources]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    floor = site(ROBOT)
+    plant = SitePlant(floor, "as_built", starts(20, floor, rectangle())[3], 5, False)
+    wanted = closed_loop.drive(pilot, path, plant, (0.0, 0.0, 0.0))
+    program, reading, rows = Program(tmp_path / "drive"), plant.reset(), []
+    for _ in wanted.time:
+        pose = plant.pose
+        sent, time = program(reading)
+        rows.append((*pose, *sent, time))
+        reading = plant.step(sent)
+    program.close()
+    found = np.array(rows)
+    found[:, 2] = np.unwrap(found[:, 2])
+    np.testing.assert_allclose(found[:, 3:6], wanted.command, atol=1e-6)
+    same = replace(wanted, pose=found[:, :3], own=found[:, 6], command=found[:, 3:6])
+    assert printed(same) == printed(wanted)
+
+
+def printed(course: closed_loop.Course) -> list[str]:
+    """Metrics of a run as a trial prints them, and two digits more."""
+    numbers = asdict(closed_loop.metrics(course))
+    known = {name: value for name, value in numbers.items() if value is not None}
+    return [f"{name} {np.round(np.asarray(value, float), 2)}" for name, value in known.items()]
+
+
+def test_a_robot_is_found_in_a_folder_or_a_file_with_some_of_its_floors(tmp_path):
+    ROBOT.save(tmp_path / "robot.json")
+    assert robot_at(tmp_path, None, ()).labels == ("firm", "soft")
+    assert robot_at(tmp_path / "robot.json", None, ("soft",)).labels == ("soft",)
+    with pytest.raises(DataError, match="no floor 'ice'; identified: firm, soft"):
+        robot_at(tmp_path, None, ("ice",))
+    with pytest.raises(DataError, match="no load set-up 'moved'"):
+        robot_at(tmp_path, "moved", ())
+    content = json.loads((tmp_path / "robot.json").read_text())
+    content["schema"] = "slipid.robot/99"
+    (tmp_path / "robot.json").write_text(json.dumps(content))
+    with pytest.raises(DataError, match="written by a newer slipid"):
+        robot_at(tmp_path, None, ())
+
+
+@pytest.mark.parametrize(
+    ("wish", "said"),
+    [
+        (Wish(("c", "ros")), "no form 'ros', did you mean ros2"),
+        (Wish(()), "no form"),
+        (Wish(controller="contacts"), "no controller 'contacts', did you mean contact"),
+        (Wish(controller="contact_map"), "told a map"),
+        (Wish(path="square"), "no path 'square'"),
+        (Wish(speed=9.0), "speed 9 m/s"),
+    ],
+)
+def test_what_cannot_be_exported_is_said_before_anything_is_written(tmp_path, wish, said):
+    with pytest.raises(DataError, match=said):
+        export(ROBOT, tmp_path / "out", wish, QUIET)
+    assert not (tmp_path / "out").exists()
