@@ -17,6 +17,7 @@ def export(
     controller: str = "contact",
     path: str = "rectangle",
     speed: float = 0.2,
+    map: Path | str | None = None,
 ) -> Exported:
     """Write a robot to a folder: robot.json, a README, checksums, and what is made of it.
 
@@ -28,10 +29,12 @@ def export(
             of ros2_controllers and robot_localization), `stablehlo`, `table` (Markdown and CSV).
         controller: as of `slipid trial`.
         path: that the example in C follows; speed: along it [m/s].
+        map: file of a floor map, for `contact_map`, which is told one.
 
     Raises:
         DataError: no such form, controller or path, a step that has no form in C, or other files
             lie there.
     """
-    wish = Wish(tuple(to), controller, path, speed)
+    file = None if map is None else Path(map)
+    wish = Wish(tuple(to), controller, path, speed, map=file)
     return run(robot, Path(folder), wish, Reporter(quiet=True))

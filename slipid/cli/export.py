@@ -29,6 +29,9 @@ def export(
     floors: Annotated[
         str, typer.Option(metavar="NAMES", help="Floors there are, by commas; all by default.")
     ] = "",
+    map: Annotated[
+        Path | None, typer.Option("--map", metavar="FILE", help="Floor map, for contact_map.")
+    ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Only check a folder that was exported before.")
     ] = False,
@@ -62,7 +65,7 @@ def export(
     with Reporter(quiet=quiet) as report:
         report.stage("reading the robot")
         robot = robot_at(source, load, _names(floors))
-        wish = Wish(_names(to), controller, path, speed, load, _names(floors))
+        wish = Wish(_names(to), controller, path, speed, load, _names(floors), map)
         done = run(robot, out, wish, report)
     content = {
         "schema": "slipid.export/1",

@@ -23,10 +23,12 @@ from slipid.control.export.ros2 import ros2_files
 from slipid.control.export.stablehlo import load_program, stablehlo_files
 from slipid.control.export.table import table_files
 from slipid.control.robot_file.file import robot_bytes
+from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import ROWS, pilot_of
 from slipid.deploy.deploy import habits_of
+from slipid.deploy.floors import floor_of
 from slipid.deploy.trial import REST_S, path_of
-from slipid.deploy.trial_site import site, starts, twin
+from slipid.deploy.trial_site import known_to_fit, site, starts, twin
 from slipid.support.errors import DataError, near
 from slipid.support.progress import Reporter
 
@@ -41,6 +43,7 @@ class Wish:
         forms: of `FORMS`; controller: row of the trial.
         path: that the example in C follows; speed: along it [m/s].
         load: set-up, the first by default; floors: that there are, all by default.
+        map: file of a floor map, for a controller that is told one.
     """
 
     forms: Sequence[str] = FORMS
@@ -49,6 +52,7 @@ class Wish:
     speed: float = 0.2
     load: str | None = None
     floors: Sequence[str] = field(default_factory=tuple)
+    map: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,28 @@ class Exported:
     robot: str
     forms: tuple[str, ...]
     warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the example is driven.
+
+    Attributes:
+        floor: map of it; true: pose there from which the robot starts.
+        believed: the same as the robot has it: its own axes where it is told no map.
+    """
+
+    floor: FloorMap
+    true: tuple[float, float, float]
+    believed: tuple[float, float, float]
+
+
+def _place(robot: DeployedRobot, path: trajectory.Path, file: Path | None) -> Place:
+    """Patches of the robot's floors, or what a map shows; DataError if it shows other floors."""
+    floor = site(robot) if file is None else read_map(file)
+    known_to_fit(floor, robot, str(file))
+    begin = starts(20, floor, path)[0]
+    return Place(floor, begin, (0.0, 0.0, 0.0) if file is None else begin)
 
 
 def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedRobot:
@@ -98,15 +124,19 @@ def export(robot: DeployedRobot, out: Path, wish: Wish, report: Reporter) -> Exp
         choices = ", ".join(ROWS)
         raise DataError(f"no controller '{wish.controller}'{close}; expected one of {choices}")
     row = ROWS[wish.controller]
-    if row.mapped:
-        raise DataError("a controller that is told a map has no export yet; export contact")
-    pilot = pilot_of(robot, row)
-    path = path_of(wish.path, wish.speed, robot).waiting(REST_S)
+    if row.mapped != (wish.map is not None):
+        told = "the map of its floors; name one with --map"
+        none = "no map; leave out --map, or take contact_map"
+        raise DataError(f"controller {wish.controller} is told {told if row.mapped else none}")
+    path = path_of(wish.path, wish.speed, robot)
+    place = _place(robot, path, wish.map)
+    pilot = pilot_of(robot, row, floor=floor_of(place.floor, robot.labels))
+    path = path.moved(place.believed).waiting(REST_S)
     content: dict[str, bytes] = {"robot.json": robot_bytes(robot.record)}
     forms = tuple(form for form in FORMS if form in wish.forms)
     for form in forms:
         report.stage(f"writing {form}")
-        files = _form(form, robot, pilot, path, wish)
+        files = _form(form, robot, pilot, path, wish, place)
         content |= {f"{form}/{name}": data for name, data in files.items()}
     content["README.md"] = readme(robot, forms, wish.controller).encode()
     write_folder(out, content)
@@ -118,13 +148,18 @@ def export(robot: DeployedRobot, out: Path, wish: Wish, report: Reporter) -> Exp
 
 
 def _form(
-    form: str, robot: DeployedRobot, pilot: Pilot[eqx.Module], path: trajectory.Path, wish: Wish
+    form: str,
+    robot: DeployedRobot,
+    pilot: Pilot[eqx.Module],
+    path: trajectory.Path,
+    wish: Wish,
+    place: Place,
 ) -> dict[str, bytes]:
     if form == "stablehlo":
         return stablehlo_files(pilot)
     if form == "c":
         try:
-            text = c_files(pilot, path, recorded(robot, pilot, path, wish))
+            text = c_files(pilot, path, recorded(robot, pilot, path, wish, place))
         except UnsupportedError as error:
             raise DataError(f"controller {wish.controller}: {error}") from error
     else:
@@ -133,14 +168,17 @@ def _form(
 
 
 def recorded(
-    robot: DeployedRobot, pilot: Pilot[eqx.Module], path: trajectory.Path, wish: Wish
+    robot: DeployedRobot,
+    pilot: Pilot[eqx.Module],
+    path: trajectory.Path,
+    wish: Wish,
+    place: Place,
 ) -> Recording:
-    """A run on the twin, seen from where the robot begins."""
-    floor = site(robot)
-    begin = starts(20, floor, path)[0]
-    plant = twin(robot, floor, begin, 0, habits_of(robot, gyro=ROWS[wish.controller].gyro))
+    """A run of a path, as it lies for the robot's start, on the twin."""
+    habits = habits_of(robot, gyro=ROWS[wish.controller].gyro)
+    plant = twin(robot, place.floor, place.true, 0, habits)
     step = eqx.filter_jit(lambda state, z: pilot.step(path, state, z, jnp.asarray(PERIOD)))
-    state, reading = pilot.init(), plant.reset().filled(robot.wheels)
+    state, reading = pilot.init(place.believed), plant.reset().filled(robot.wheels)
     given, commands, times = [], [], []
     for _ in range(round(LONGEST * path.duration / PERIOD)):
         leaves = [np.asarray(x).reshape(-1) for x in jax.tree.leaves(reading)]
@@ -152,4 +190,4 @@ def recorded(
             break
         reading = plant.step(commands[-1]).filled(robot.wheels)
     about = f"the identified model as a plant, with delays and noise ({wish.path})"
-    return Recording(about, np.array(given), np.array(commands), np.array(times))
+    return Recording(about, place.believed, np.array(given), np.array(commands), np.array(times))

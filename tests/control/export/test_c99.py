@@ -412,13 +412,17 @@ def test_a_docstring_says_what_each_attribute_is():
 
 @pytest.mark.slow
 def test_the_loop_closes_in_c_as_it_does_in_the_library(tmp_path):
-    from slipid.deploy.export import Wish, recorded
+    from slipid.deploy.export import Place, Wish, recorded
+    from slipid.deploy.trial_site import site, starts
 
     made = code("contact")
     path = rectangle(length=0.4, width=0.2)
     loop = Code(made.pilot, path)
     compiled = CompiledC(loop, tmp_path)
-    kept = recorded(made.pilot.controller.robot, made.pilot, path, Wish())
+    robot = made.pilot.controller.robot
+    floor = site(robot)
+    place = Place(floor, starts(20, floor, path)[0], (0.0, 0.0, 0.0))
+    kept = recorded(robot, made.pilot, path, Wish(), place)
     compiled.begin((0.0, 0.0, 0.0))
     numbers = [f.size for f in loop.reading.fields]
     for row, command, time in zip(kept.given, kept.command, kept.time, strict=True):

@@ -110,6 +110,7 @@ class Code:
 
     def _follow(self, path: Path) -> Function:
         preview = self.pilot.controller.gains.preview
+        begin = ", ".join(f"{float(x):g}" for x in path.rows[0, :3])
 
         def follow(time: jnp.ndarray, pose: jnp.ndarray, dt: jnp.ndarray) -> object:
             here = jnp.where(jnp.isfinite(pose), pose, 1e3)
@@ -119,8 +120,8 @@ class Code:
             self._names,
             "slipid_follow",
             "Own time of the path [s], from 0, and the reference there, for a robot at a pose. "
-            f"The path begins at 0, 0, 0 and lasts {path.duration:g} s; it waits for a robot that "
-            "lags.",
+            f"The path begins at {begin} [m, m, rad] and lasts {path.duration:g} s; it waits for a "
+            "robot that lags.",
             (
                 Argument.plain("time", (), True, True),
                 Argument.plain("pose", (3,)),

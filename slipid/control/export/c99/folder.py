@@ -17,15 +17,16 @@ from slipid.control.trajectory import Path
 
 @dataclass(frozen=True)
 class Recording:
-    """A run of a path that the library has driven from 0, 0, 0, a row per period.
+    """A run of a path that the library has driven, a row per period.
 
     Attributes:
-        plant: what it was driven on.
+        plant: what it was driven on; start: pose at which it began [m, m, rad].
         given: dt [s] and the leaves of the reading; command: wheel speeds [rad/s].
         time: of the path [s].
     """
 
     plant: str
+    start: tuple[float, float, float]
     given: Float[np.ndarray, "step given"]
     command: Float[np.ndarray, "step wheel"]
     time: Float[np.ndarray, " step"]
@@ -34,7 +35,7 @@ class Recording:
     def readings(self) -> str:
         """As lines for the example."""
         rows = [" ".join(repr(float(x)) for x in row) for row in self.given]
-        return "\n".join(["0 0 0", *rows]) + "\n"
+        return "\n".join([" ".join(map(repr, self.start)), *rows]) + "\n"
 
     @property
     def commands(self) -> str:
