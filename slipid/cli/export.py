@@ -65,7 +65,7 @@ def export(
     with Reporter(quiet=quiet) as report:
         report.stage("reading the robot")
         robot = robot_at(source, load, _names(floors))
-        wish = Wish(_names(to), controller, path, speed, load, _names(floors), map)
+        wish = Wish(_names(to), controller, path, speed, map)
         done = run(robot, out, wish, report)
     content = {
         "schema": "slipid.export/1",

@@ -108,7 +108,8 @@ class Measurement(eqx.Module):
         gyro: yaw rate [rad/s].
         fix: pose from elsewhere, a camera say: x, y [m], heading [rad].
         fix_std: of its place [m] and of its heading [rad]; a fix without it counts for nothing.
-        fix_age: for how long the fix has been true [s]; not known counts as 0.
+        fix_age: for how long the fix has been true [s]; not known counts as 0, and one of more
+            than 47 steps ago counts for nothing.
     """
 
     wheel_angle: Given = None

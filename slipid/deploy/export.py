@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import equinox as eqx
@@ -42,7 +42,6 @@ class Wish:
     Attributes:
         forms: of `FORMS`; controller: row of the trial.
         path: that the example in C follows; speed: along it [m/s].
-        load: set-up, the first by default; floors: that there are, all by default.
         map: file of a floor map, for a controller that is told one.
     """
 
@@ -50,8 +49,6 @@ class Wish:
     controller: str = "contact"
     path: str = "rectangle"
     speed: float = 0.2
-    load: str | None = None
-    floors: Sequence[str] = field(default_factory=tuple)
     map: Path | None = None
 
 

@@ -133,7 +133,8 @@ class CompiledC:
             a.ctypes.data_as(ctypes.c_void_p) if isinstance(a, np.ndarray) else self._number(a)
             for a in arguments
         ]
-        getattr(self._library, f"slipid_{name}")(*given)
+        suffix = "_float" if self._number is ctypes.c_float else ""
+        getattr(self._library, f"slipid_{name}{suffix}")(*given)
 
 
 def put(record: np.ndarray, tree: object) -> None:

@@ -35,7 +35,7 @@ def _cleared(folder: Path) -> None:
         return
     if not folder.is_dir():
         raise DataError(f"{folder}: not a folder; name another one with --out")
-    here = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    here = _files(folder)
     if not here:
         return
     known = set(_sums(folder)) | {SUMS} if (folder / SUMS).is_file() else set()
@@ -65,6 +65,11 @@ def check_folder(folder: Path | str) -> tuple[str, ...]:
             raise DataError(
                 f"{place / name}: changed or damaged after it was written; export the robot again"
             )
+    if more := sorted(_files(place) - set(sums) - {SUMS}):
+        raise DataError(
+            f"{place / more[0]}: not there when the folder was written; move it elsewhere, or "
+            "export the robot again"
+        )
     return tuple(sums)
 
 
@@ -81,6 +86,10 @@ def _sums(folder: Path) -> dict[str, str]:
             f"{folder / SUMS}: cannot be read; expected a folder that `slipid export` wrote"
         )
     return named
+
+
+def _files(folder: Path) -> set[str]:
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
 
 
 def _sum(data: bytes) -> str:

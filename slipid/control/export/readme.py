@@ -11,7 +11,7 @@ ABOUT: Mapping[str, str] = {
     "library for PlatformIO and the Arduino IDE",
     "ros2": "parameters for drive controllers of ros2_controllers, for robot_localization, and of "
     "a node of your own with their declaration",
-    "stablehlo": "the same step for programs that run XLA: `jax.export.deserialize`, or "
+    "stablehlo": "the same step for programs in JAX: `jax.export.deserialize`, or "
     "`slipid.control.export.stablehlo.load_program`, which compares it first",
     "table": "gains, limits and matrices for a person who types them in",
 }

@@ -10,7 +10,7 @@ from slipid.control.export.header import header
 from slipid.control.export.ros import localization, node, noise
 from slipid.control.export.ros.drive import Drive, drive_of
 from slipid.control.export.ros.names import identifiers
-from slipid.control.export.ros.noise import DISTANCE_M, PERIOD_S, Errs, errs_of, top_speed
+from slipid.control.export.ros.noise import DISTANCE_M, PERIOD_S, Errs, diagonal, errs_of, top_speed
 from slipid.control.export.ros.readme import Folder, readme
 from slipid.control.export.ros.yaml_text import Parameter, comment, declaration, nodes
 from slipid.control.export.text import short
@@ -21,7 +21,7 @@ USES: Mapping[str, str] = {
     "robot_localization.yaml": "extended Kalman filter for the odometry of the drive controller, "
     "on the worst floor: `ros2 run robot_localization ekf_node --ros-args --params-file` this file",
     "robot_localization_slipid.yaml": "the same filter for odometry in which slip is estimated, "
-    "whoever publishes it with the covariance of that estimate",
+    "whoever publishes its twist, with the covariance that the file names",
     "slipid.yaml": "every number of the robot, gains and limits, as parameters of a node `slipid`",
     "slipid_parameters.yaml": "their declaration for generate_parameter_library: types, "
     "descriptions with verdicts, validators; the defaults are the numbers themselves",
@@ -46,9 +46,12 @@ def ros2_files(robot: DeployedRobot) -> dict[str, str]:
     if drive is not None:
         listed = (*drive.parameters, *_covariances(robot, drive, worst))
         bodies["drive_controller.yaml"] = nodes([(drive.controller.name, listed)])
+    known = noise.worst(own)
+    stated = diagonal(known.twist(top_speed(robot), PERIOD_S))
+    estimated = f"{_ESTIMATED}, which states this twist covariance diagonal: {list(stated)}"
     for name, e, topic, whose in (
         ("robot_localization.yaml", worst, odometry, _ENCODERS),
-        ("robot_localization_slipid.yaml", noise.worst(own), "/slipid/odometry", _ESTIMATED),
+        ("robot_localization_slipid.yaml", known, "/slipid/odometry", estimated),
     ):
         listed = localization.filter_parameters(robot, e, topic, whose)
         bodies[name] = nodes([(localization.NODE, listed)])

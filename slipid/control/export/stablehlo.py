@@ -29,7 +29,30 @@ from slipid.support.errors import DataError
 SCHEMA = "slipid.stablehlo/1"
 CLOSE = 1e-9
 """Over its scale, by which a number may differ once the program is loaded."""
+PLATFORMS = ("cpu", "cuda", "tpu")
+"""That the programs are for."""
 FILES = ("step.stablehlo", "step_batch.stablehlo", "step.json", "golden.npz")
+
+
+README = """# The step as StableHLO, for programs in JAX
+
+`step.json` lists the arrays that go in (`state`, then `given`) and come out (`state`, then `said`)
+in their order, all of them of 64 bits. `golden.npz` has the state of a robot at rest at 0, 0, 0 as
+`start0`, `start1` and so on, and steps to compare with.
+
+```python
+import jax, numpy as np
+
+jax.config.update("jax_enable_x64", True)
+step = jax.export.deserialize(bytearray(open("step.stablehlo", "rb").read()))
+kept = np.load("golden.npz")
+state = [kept[f"start{k}"] for k in range(sum(name.startswith("start") for name in kept))]
+found = step.call(*state, *given)  # given: reading, reference and dt, as step.json lists them
+state, said = found[: len(state)], found[len(state) :]
+```
+
+`step_batch.stablehlo` does the same for many robots, with an axis for them in front of every array.
+"""
 
 
 @dataclass(frozen=True)
@@ -84,8 +107,8 @@ def stablehlo_files(pilot: Pilot[eqx.Module]) -> dict[str, bytes]:
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in flat]
     (count,) = export.symbolic_shape("robot")
     many = [jax.ShapeDtypeStruct((count, *x.shape), x.dtype) for x in flat]
-    one = export.export(jax.jit(step))(*shapes)
-    batch = export.export(jax.jit(jax.vmap(step)))(*many)
+    one = export.export(jax.jit(step), platforms=PLATFORMS)(*shapes)
+    batch = export.export(jax.jit(jax.vmap(step)), platforms=PLATFORMS)(*many)
     kept = golden(pilot)
     buffer = io.BytesIO()
     arrays: dict[str, Any] = {
@@ -99,6 +122,7 @@ def stablehlo_files(pilot: Pilot[eqx.Module]) -> dict[str, bytes]:
         "step_batch.stablehlo": bytes(batch.serialize()),
         "step.json": (json.dumps(about, indent=1) + "\n").encode(),
         "golden.npz": buffer.getvalue(),
+        "README.md": README.encode(),
     }
 
 

@@ -21,7 +21,14 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.filter.effects import direction, stays
 from slipid.control.filter.floor import Floor
 from slipid.control.filter.floor_filter import HASTE, Motion, Tick, length
-from slipid.control.filter.pose_fix import HISTORY, PoseState, fixed, handed_over, nearest
+from slipid.control.filter.pose_fix import (
+    HISTORY,
+    PoseState,
+    fixed,
+    handed_over,
+    nearest,
+    recounted,
+)
 from slipid.control.interface import Readings, Settings
 from slipid.model.se2 import advance, compose
 
@@ -68,7 +75,6 @@ class PoseFilter(eqx.Module):
             .at[friction, friction]
             .set(self.robot.friction_covariance),
             toward=jnp.zeros(3),
-            time=jnp.zeros(()),
             still=jnp.zeros(()),
             noise=jnp.zeros((3, 3)),
             far=jnp.zeros(()),
@@ -100,17 +106,17 @@ class PoseFilter(eqx.Module):
         way = self._way(motion, gyro)
         old = self._forgotten(old, motion, way, tick)
         free = motion.twist + way.slope @ old.nuisance[:-1]  # however slow: creeping adds up
-        time = old.time + dt
-        twist = free.at[2].set(self._turned(old, time, free[2], gyro))
+        old = replace(old, history=old.history.at[:, 0].add(dt))
+        twist = free.at[2].set(self._turned(old, free[2], gyro))
         pose = compose(old.pose, advance(twist, dt) + motion.jump)
         still = jnp.where(tick.moves, 0.0, jnp.minimum(old.still + dt, 1e3))
         old = replace(old, history=handed_over(old, motion, self.robot.frame.base))
-        new = replace(self._grow(old, pose, way, tick), time=time, still=still)
+        new = replace(self._grow(old, pose, way, tick), still=still)
         new = self._rest(self._turns(new, way, gyro, free[2], tick), gyro)
-        begun, ended = jnp.concatenate([time[None], new.pose, free[2:]]), new.far[None]
+        begun, ended = jnp.concatenate([jnp.zeros(1), new.pose, free[2:]]), new.far[None]
         entry = jnp.concatenate([begun, new.noise.reshape(-1), ended])
         history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
-        new, left = fixed(replace(new, history=history), z)
+        new, left = fixed(recounted(replace(new, history=history)), z)
         world = turned_axes(new.pose[2])
         return new, twist, world.T @ left @ world
 
@@ -151,18 +157,18 @@ class PoseFilter(eqx.Module):
         covariance = covariance + jnp.diag(jnp.concatenate([jnp.zeros(3), new]))
         return replace(old, nuisance=kept * old.nuisance, covariance=covariance, toward=toward)
 
-    def _turned(self, old: PoseState, time: Array, free: Array, gyro: Array) -> Array:
+    def _turned(self, old: PoseState, free: Array, gyro: Array) -> Array:
         """Yaw rate: the gyro's less its bias; over its delay, as the contact model goes on from it.
 
-        `free` is the contact model's [rad/s], `time` that after the step.
+        `free` is the contact model's [rad/s]; the history is as old as after the step.
         """
-        then = self._then(replace(old, time=time), free)
+        then = self._then(old, free)
         return jnp.where(jnp.isfinite(gyro), free + gyro - old.nuisance[-1] - then, free)
 
     def _then(self, now: PoseState, free: Array) -> Array:
         """Yaw rate of the contact model at the time of the gyro's reading [rad/s]."""
         delay = self.settings.gyro_delay_s
-        return free if delay == 0.0 else nearest(now.history, now.time - delay)[4]
+        return free if delay == 0.0 else nearest(now.history, delay)[4]
 
     def _turns(self, now: PoseState, way: _Way, gyro: Array, free: Array, tick: Tick) -> PoseState:
         """Compare a gyro with the contact model while the robot moves.

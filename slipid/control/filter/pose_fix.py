@@ -27,12 +27,12 @@ class PoseState(eqx.Module):
             [rad/s].
         covariance: of pose and nuisance [units of both].
         toward: direction of travel that counts as taken, see `slipid.control.filter.effects`.
-        time: since the start [s]; still: for how long the robot has stood [s].
-        noise: covariance that has come into the pose since the start [m, m, rad, each times each].
-        far: way since the start [m].
+        still: for how long the robot has stood [s].
+        noise: covariance that has come into the pose over the history [m, m, rad, each times each].
+        far: way over the history [m].
         push: d pose / d nuisance per metre of the last way, the gyro's bias left out [m/m, m/m,
             rad/m].
-        history: last steps, the newest first: time [s], pose [m, m, rad], yaw rate of the contact
+        history: last steps, the newest first: age [s], pose [m, m, rad], yaw rate of the contact
             model [rad/s], noise and way until then.
     """
 
@@ -40,7 +40,6 @@ class PoseState(eqx.Module):
     nuisance: Float[Array, " nuisance"]
     covariance: Float[Array, "unknown unknown"]
     toward: Float[Array, "3"]
-    time: Float[Array, ""]
     still: Float[Array, ""]
     noise: Float[Array, "3 3"]
     far: Float[Array, ""]
@@ -56,7 +55,7 @@ def fixed(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3"]]:
         & jnp.all(jnp.abs(z.fix[:2]) < 1e4)
         & jnp.all(jnp.isfinite(z.fix_std))
         & jnp.all(z.fix_std > 0)
-        & (age < now.time - now.history[-1, 0] + 1e-6)
+        & (age < now.history[-1, 0] + 1e-6)
     )
     std = jnp.clip(z.fix_std, 1e-4, 10.0)
     kept = now.pose, now.nuisance, now.covariance, now.history, jnp.eye(3)
@@ -77,7 +76,7 @@ def _corrected(
     is so much noise of this one.
     """
     pose, cov, history = now.pose, now.covariance, now.history
-    then = nearest(history, now.time - age)
+    then = nearest(history, age)
     since = now.noise - then[5:14].reshape(3, 3)
     held = _within(since, _given(cov))
     aside = jnp.zeros_like(cov).at[:3, :3].set(held)
@@ -198,9 +197,21 @@ def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Arra
     return jnp.where(jnp.isfinite(most), part / jnp.maximum(most, 1.0), 0.0)
 
 
-def nearest(history: Array, time: Array) -> Array:
-    """Entry nearest to a time: time, pose, yaw rate of the contact model, noise until then."""
-    return history[jnp.argmin(jnp.abs(history[:, 0] - time))]
+def recounted(now: PoseState) -> PoseState:
+    """With noise and way counted from the oldest entry of the history.
+
+    They, and ages instead of times, stay small however long a robot drives: 32 bits hold them.
+    """
+    first = now.history[-1, 5:]
+    history = now.history.at[:, 5:].add(-first)
+    return replace(
+        now, history=history, noise=now.noise - first[:9].reshape(3, 3), far=now.far - first[9]
+    )
+
+
+def nearest(history: Array, age: Array | float) -> Array:
+    """Entry nearest to an age: age, pose, yaw rate of the contact model, noise and way."""
+    return history[jnp.argmin(jnp.abs(history[:, 0] - age))]
 
 
 def _inverse(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:

@@ -33,6 +33,12 @@ def test_a_changed_byte_is_told_with_its_file(folder, name):
         check_folder(folder)
 
 
+def test_a_file_that_was_added_is_told(folder):
+    (folder / "c/src/more.c").write_text("int y;\n")
+    with pytest.raises(DataError, match=r"more\.c: not there when the folder was written"):
+        check_folder(folder)
+
+
 def test_a_lost_file_is_told(folder):
     (folder / "c/src/slipid.c").unlink()
     with pytest.raises(DataError, match=r"slipid\.c: No such file"):

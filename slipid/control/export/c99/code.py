@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from importlib.resources import files
@@ -15,8 +16,10 @@ from slipid.control.export.c99.function import Argument, Function, function, tra
 from slipid.control.export.c99.ir import Names
 from slipid.control.export.c99.text import TYPES, WIDTH, folded, table
 from slipid.control.export.header import header
-from slipid.control.export.text import wrapped
-from slipid.control.interface import Measurement, Readings
+from slipid.control.export.ros.names import identifiers
+from slipid.control.export.text import listed, wrapped
+from slipid.control.filter.hypotheses import hypotheses_of
+from slipid.control.interface import Measurement, Readings, Settings
 from slipid.control.trajectory import Path
 
 TYPE = {**TYPES, "real": "slipid_real"}
@@ -136,12 +139,24 @@ class Code:
         """All generated structs."""
         return self.estimator, self.controller, self.reading, self.estimate
 
+    @property
+    def kept(self) -> int:
+        """Numbers in a state."""
+        return sum(f.size for s in (self.estimator, self.controller) for f in s.fields) + 1
+
+    @property
+    def scratch(self) -> int:
+        """Numbers in arrays that a step has on the stack."""
+        return max(f.scratch for f in self.functions)
+
     def header(self) -> str:
         """Text of slipid.h."""
         robot = self.pilot.controller.robot
-        floors = [f"SLIPID_{_macro(name)} {k}" for k, name in enumerate(robot.labels)]
+        named = identifiers(robot.labels, "floor")
+        floors = [f"SLIPID_FLOOR_{name.upper()} {k}" for k, name in enumerate(named)]
         sizes = [f"SLIPID_WHEELS {robot.wheels}", f"SLIPID_FLOORS {len(robot.labels)}"]
         defines = [f"#define {d}" for d in (*sizes, *floors, *self._duration())]
+        single = [f"#define {name} {name}_float" for name in self._names_of_functions]
         declared = [
             line
             for f in self.functions
@@ -151,10 +166,16 @@ class Code:
             "HEAD": "\n".join(_comment(*header(robot))),
             "ROBOT": robot.record.numbers,
             "DEFINES": "\n".join(defines),
+            "ABOUT": "\n".join(line for part in about(self.pilot) for line in _comment(part)),
+            "SINGLE": "\n".join(single),
             "STRUCTS": "\n".join(line for s in self.structs for line in _struct(s)),
             "FUNCTIONS": "\n".join(declared),
         }
         return filled("slipid.h", values)
+
+    @property
+    def _names_of_functions(self) -> list[str]:
+        return ["slipid_init", "slipid_step", *(f.name for f in self.functions)]
 
     def _duration(self) -> list[str]:
         return [] if self.path is None else [f"SLIPID_PATH_SECONDS {self.path.duration!r}"]
@@ -172,6 +193,29 @@ class Code:
         return filled("slipid.c", values)
 
 
+def about(pilot: Pilot[eqx.Module]) -> Iterator[str]:
+    """What a reader of the header must know of axes, wheels, sensors and floors."""
+    robot = pilot.controller.robot
+    yield (
+        "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: those in "
+        "which the start pose is given. A twist is in the body's axes."
+    )
+    rows = zip(robot.places.tolist(), robot.forward.tolist(), strict=True)
+    for k, ((x, y), row) in enumerate(rows):
+        drives = math.degrees(math.atan2(row[1], row[0]))
+        yield (
+            f"Wheel {k} stands at x = {x:.4f} m, y = {y:.4f} m; turning at a positive speed it "
+            f"pushes the body towards {drives:.1f} deg."
+        )
+    settings = getattr(pilot.estimator, "settings", Settings.of(robot))
+    signs = "with their signs" if settings.current_is_signed else "without a sign (a sign is lost)"
+    yield f"Currents are taken {signs}. A wheel unheard for {settings.stale_s:g} s is stale."
+    yield "Floors, as columns count them: " + listed([*robot.labels, "none of them"]) + "."
+    ways = hypotheses_of(robot).under.tolist()
+    each = "; ".join(f"{k}: {' '.join(map(str, way))}" for k, way in enumerate(ways))
+    yield f"Hypotheses of the floors, as rows count them, with the floor under each wheel: {each}."
+
+
 def template(name: str) -> str:
     """Text of a file of this folder's templates."""
     return (files(__package__) / "templates" / name).read_text()
@@ -180,10 +224,6 @@ def template(name: str) -> str:
 def filled(name: str, values: dict[str, str]) -> str:
     """A template with values for every @NAME@."""
     return re.sub(r"@([A-Z]+)@", lambda match: values[match.group(1)], template(name))
-
-
-def _macro(name: str) -> str:
-    return re.sub(r"\W", "_", name.upper(), flags=re.ASCII)
 
 
 def _comment(*parts: str) -> list[str]:

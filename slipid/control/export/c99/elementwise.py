@@ -80,9 +80,7 @@ def applied(
     simpler: Callable[[tuple[Cell, ...]], Cell | None] = lambda cells: None,
 ) -> Array:
     """A template applied to every number of some arrays, or of single numbers for all."""
-    axis = next((a for a in map(partial(_lanes, shape), values) if a is not None), None)
-    if axis is None and prod(shape) > UNROLLED:
-        axis = longest(shape)
+    axis = _axis(values, shape)
     rows = [along(builder, v, shape, axis) for v in values]
     lanes = 0 if axis is None else shape[axis]
     out = []
@@ -93,6 +91,18 @@ def applied(
             plain = builder.compute(kind, template, cells, count)
         out.append(plain)
     return Array(shape, kind, axis, cells_of(rows[0].shape, out))
+
+
+def _axis(values: Sequence[Value], shape: tuple[int, ...]) -> int | None:
+    """Axis of the lanes of what is computed from values, number by number."""
+    axis = next((a for a in map(partial(_lanes, shape), values) if a is not None), None)
+    return longest(shape) if axis is None and prod(shape) > UNROLLED else axis
+
+
+def lanes_of(values: Sequence[Value], shape: tuple[int, ...]) -> int:
+    """How many lanes there are then; 0 for none."""
+    axis = _axis(values, shape)
+    return 0 if axis is None else shape[axis]
 
 
 def _lanes(shape: tuple[int, ...], value: Value) -> int | None:
@@ -108,6 +118,8 @@ def unary(name: str) -> Rule:
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
         if UNARY[name] == "{0}":
             return values[0]
+        if name == "not" and kind_of_value(values[0]) != "bool":
+            raise NotImplementedError("of whole numbers")
         return applied(builder, UNARY[name], kind_of(out.dtype), values, out.shape)
 
     return rule
@@ -146,11 +158,11 @@ def divided(
 
     def once(cells: tuple[Cell, ...]) -> Cell | None:
         over, by = cells
-        if isinstance(over, Variable) and over.made_by[0] == UNARY["tanh"]:
-            both = (*over.made_by[1], by)
-            lanes = over.lanes or (by.lanes if isinstance(by, Variable) else 0)
-            return builder.compute("real", "r_tanh_over({0}, {1})", both, lanes)
-        return simpler(cells)
+        if not isinstance(over, Variable) or over.made_by[0] != UNARY["tanh"]:
+            return simpler(cells)
+        both = (*over.made_by[1], by)
+        count = lanes_of(values, out.shape) if any(varies(cell) for cell in both) else 0
+        return builder.compute("real", "r_tanh_over({0}, {1})", both, count)
 
     return applied(builder, BINARY["div"], kind_of(out.dtype), values, out.shape, once)
 
@@ -158,6 +170,8 @@ def divided(
 def integer_pow(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
     """A whole power, by multiplications."""
     power = params["y"]
+    if power == 0:
+        raise NotImplementedError("a power of 0")
     product = " * ".join(["{0}"] * abs(power))
     template = product if power > 0 else f"R(1.0) / ({product})"
     return applied(builder, template, kind_of(out.dtype), values, out.shape)
@@ -190,5 +204,7 @@ def select(builder: Builder, values: list[Value], params: Params, out: Shaped) -
             return no
         return (yes if which.value else no) if isinstance(which, Number) else None
 
+    if len(values) != 3 or kind_of_value(values[0]) != "bool":
+        raise NotImplementedError("more than two cases")
     kind = kind_of(out.dtype)
     return applied(builder, "{0} ? {2} : {1}", kind, values, out.shape, simpler)

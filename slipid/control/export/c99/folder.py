@@ -44,6 +44,16 @@ class Recording:
         return "".join(f"{' '.join(f'{x:.9f}' for x in c)} {t:.9f}\n" for c, t in rows)
 
 
+def _path(path: Path) -> str:
+    """Where a path leads, for people."""
+    corners = [f"({x:.2f}, {y:.2f})" for x, y in np.asarray(path.corners).tolist()]
+    x, y, heading = np.asarray(path.rows)[0, :3].tolist()
+    return (
+        f"from ({x:.2f}, {y:.2f}), heading {heading:.2f} rad, over {', '.join(corners)} [m] in "
+        f"{path.duration:g} s"
+    )
+
+
 def c_files(
     pilot: Pilot[eqx.Module], path: Path, recording: Recording | None = None
 ) -> dict[str, str]:
@@ -81,6 +91,9 @@ def c_files(
         "RECORDING": steps,
         "FLOORS": ", ".join(f"`{name}` ({k})" for k, name in enumerate(robot.labels)),
         "WHEELS": str(robot.wheels),
+        "STATE": f"{code.kept * 8 / 1024:.1f} KiB",
+        "STACK": f"{code.scratch * 8 / 1024:.0f} KiB",
+        "PATH": _path(path),
     }
     files["README.md"] = filled("README.md", values)
     return files

@@ -71,6 +71,7 @@ class Function:
     Attributes:
         name: of it; about: comment of its declaration; arguments: in their order.
         lines: of its body; reads: names of all memory it reads.
+        scratch: numbers in arrays that it has on the stack.
     """
 
     name: str
@@ -78,6 +79,7 @@ class Function:
     arguments: tuple[Argument, ...]
     lines: tuple[str, ...]
     reads: frozenset[str]
+    scratch: int
 
     @property
     def head(self) -> str:
@@ -126,7 +128,8 @@ def function(
         store(builder, value, memory)
     body = Body(builder)
     unused = _unused(arguments, body.reads)
-    return Function(name, about, tuple(arguments), (*unused, *body.lines()), frozenset(body.reads))
+    lines, reads = (*unused, *body.lines()), frozenset(body.reads)
+    return Function(name, about, tuple(arguments), lines, reads, body.scratch)
 
 
 def traced(run: Callable[..., object], *like: object) -> ClosedJaxpr:

@@ -29,10 +29,15 @@ class Cell:
 
 @dataclass(frozen=True)
 class Number(Cell):
-    """A constant."""
+    """A constant; 0 and -0 are two."""
 
-    value: float | int | bool
+    value: float | int | bool = field(compare=False)
     kind: Kind
+    text: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Compare by what is written."""
+        object.__setattr__(self, "text", repr(self.value))
 
 
 @dataclass(frozen=True)

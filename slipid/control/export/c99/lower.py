@@ -29,6 +29,10 @@ INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vj
 """Primitives that are functions called."""
 
 
+_TYPES = frozenset(map(np.dtype, ("float64", "float32", "int64", "int32", "bool")))
+"""Of numbers that have a type in C."""
+
+
 class UnsupportedError(NotImplementedError):
     """A step that has no form in C, with the primitive and the line of Python that asks for it."""
 
@@ -91,6 +95,8 @@ class _Lowering:
             return self._scan(params, values)
         out: Any = equation.outvars[0].aval  # jax types it as less than it is
         shaped = Shaped(out.shape, out.dtype)
+        if out.dtype not in _TYPES:
+            raise NotImplementedError(f"numbers of type {out.dtype}")
         where = [v for v in values[1:] if isinstance(v, Array)]
         if name in ("split", "unstack"):
             return self._several(equation, values[0])

@@ -72,7 +72,8 @@ def _scattered(
     old: np.ndarray, where: Value, shape: tuple[int, ...], params: Params, fresh: int
 ) -> np.ndarray:
     """Where every number comes from: `old`, or fresh ones that count from a number on."""
-    assert not isinstance(where, Array)
+    if isinstance(where, Array):
+        raise NotImplementedError("places that are not known before the robot runs")
     kept = {k: params[k] for k in ("dimension_numbers", "indices_are_sorted", "mode")}
     new = fresh + np.arange(prod(shape)).reshape(shape)
     options = {**kept, "unique_indices": False}
@@ -118,7 +119,9 @@ def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     whole, where = values
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     if numbers.operand_batching_dims or numbers.start_indices_batching_dims:
-        raise NotImplementedError("a gather with batches")
+        raise NotImplementedError("batches of places")
+    if params["mode"] == lax.GatherScatterMode.FILL_OR_DROP:
+        raise NotImplementedError("places out of range that are filled")
     memory = contiguous(builder, whole)
     batch = [d for d in range(len(out.shape)) if d not in numbers.offset_dims]
     kept = [d for d in range(len(whole.shape)) if d not in numbers.collapsed_slice_dims]

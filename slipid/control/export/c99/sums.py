@@ -1,4 +1,8 @@
-"""Sums and other reductions, over cells and over lanes."""
+"""Sums and other reductions, over cells and over lanes.
+
+A product with a constant 0 is left out of a sum of products. No finite number differs by it; what
+is infinite or no number does not pass through it, as it would in JAX.
+"""
 
 from __future__ import annotations
 
@@ -49,13 +53,19 @@ def reduced(name: str) -> Rule:
         rows = moved.reshape(prod(kept), -1)
         cells = [chained(builder, own, kind, row, lanes) for row in rows]
         if value.axis in axes:
-            first = "0" if kind == "int" and start == "R(0.0)" else start
+            first = _of_ints(start) if kind == "int" else start
             cells = [over_lanes(builder, own, kind, cell, lanes, first) for cell in cells]
             return Array(out.shape, kind, None, cells_of(kept, cells))
         axis = None if value.axis is None else value.axis - sum(d < value.axis for d in axes)
         return Array(out.shape, kind, axis, cells_of(kept, cells))
 
     return rule
+
+
+def _of_ints(start: str) -> str:
+    """What a reduction of whole numbers starts from."""
+    known = {"R(0.0)": "0", "R(1.0)": "1", "R_INFINITY": "INT32_MAX", "-R_INFINITY": "INT32_MIN"}
+    return known[start]
 
 
 def over_lanes(
@@ -81,7 +91,7 @@ def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -
 
 
 def dot(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Sums of products; a product with a constant 0 is left out, no finite number differs by it."""
+    """Sums of products."""
     (by_left, by_right), (batch_left, batch_right) = params["dimension_numbers"]
     left, right = values
     free_left = [d for d in range(len(left.shape)) if d not in (*by_left, *batch_left)]

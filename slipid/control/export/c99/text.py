@@ -25,6 +25,7 @@ from slipid.control.export.c99.ir import (
 TYPES: dict[Kind, str] = {"real": "real_t", "int": "int32_t", "bool": "bool"}
 """Of numbers, in C."""
 WIDTH = 100
+FLOAT_MAX = float(np.finfo(np.float32).max)
 
 
 def number(value: float | int | bool, kind: Kind) -> str:
@@ -37,8 +38,8 @@ def number(value: float | int | bool, kind: Kind) -> str:
         return "R_NAN"
     if math.isinf(value):
         return "R_INFINITY" if value > 0 else "(-R_INFINITY)"
-    if abs(value) > 1e300:
-        return "R_MAX" if value > 0 else "(-R_MAX)"
+    if abs(value) > FLOAT_MAX:
+        return f"R_WIDE({float(value)!r})"
     return f"R({float(value)!r})"
 
 
@@ -78,12 +79,22 @@ class Body:
 
     def lines(self) -> list[str]:
         """Declarations and statements."""
+        arrays = [f"  {TYPES[kind]} {slot}[{n}];" for (kind, slot), n in self._sizes.items()]
+        return [*arrays, *self._lines]
+
+    @property
+    def _sizes(self) -> dict[tuple[Kind, str], int]:
+        """Of all arrays on the stack, by kind and name."""
         sizes: dict[tuple[Kind, str], int] = {}
         for name, (kind, slot) in self._slots.items():
             size = self._arrays[name].memory.size
             sizes[kind, slot] = max(sizes.get((kind, slot), 0), size)
-        arrays = [f"  {TYPES[kind]} {slot}[{size}];" for (kind, slot), size in sizes.items()]
-        return [*arrays, *self._lines]
+        return sizes
+
+    @property
+    def scratch(self) -> int:
+        """Numbers in arrays on the stack."""
+        return sum(self._sizes.values())
 
     def _scan(self, builder: Builder) -> None:
         """Mark what is used, from the end to the beginning."""

@@ -2,7 +2,7 @@
 typedef slipid_real real_t;
 #ifdef SLIPID_FLOAT
 #define R(x) x##F
-#define R_MAX FLT_MAX
+#define R_WIDE(x) ((x) > 0 ? FLT_MAX : -FLT_MAX) /* beyond the range of float */
 #define r_abs fabsf
 #define r_atan2 atan2f
 #define r_cos cosf
@@ -15,7 +15,7 @@ typedef slipid_real real_t;
 #define r_sqrt sqrtf
 #else
 #define R(x) x
-#define R_MAX DBL_MAX
+#define R_WIDE(x) x
 #define r_abs fabs
 #define r_atan2 atan2
 #define r_cos cos

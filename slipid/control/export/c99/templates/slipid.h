@@ -12,6 +12,8 @@ extern "C" {
 /* Compile everything with SLIPID_FLOAT for numbers of 32 bits. */
 #ifdef SLIPID_FLOAT
 typedef float slipid_real;
+/* Names of their own, so that parts compiled for float and for double cannot be linked together. */
+@SINGLE@
 #else
 typedef double slipid_real;
 #endif
@@ -19,6 +21,8 @@ typedef double slipid_real;
 /* Hash of the robot's numbers, as robot.json has it. */
 #define SLIPID_ROBOT "@ROBOT@"
 @DEFINES@
+
+@ABOUT@
 
 @STRUCTS@
 /* All that a robot keeps from step to step. */
