@@ -128,7 +128,7 @@ def test_what_a_late_fix_sets_aside_leaves_a_covariance(own):
             pose=jnp.array([8.0, 4.0, 0.0]),
             covariance=jnp.asarray(cov),
             noise=jnp.asarray(cov[:3, :3]),
-            time=jnp.asarray(1.0),
+            history=start.history.at[:, 0].set(1.0),
         )
         values = np.linalg.eigvalsh(fixed(now, late)[0].covariance)
         assert values[0] > -1e-9 * values[-1]

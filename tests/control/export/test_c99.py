@@ -494,12 +494,11 @@ def test_a_clock_that_has_run_for_days_goes_on_in_float(tmp_path):
     compiled.begin((0.0, 0.0, 0.0))
     compiled._call("nothing", compiled.reading)
     compiled.reading["wheel_speed"] = [3.0, 0.0, -3.0]
-    for _ in range(60_000):
+    for _ in range(20_000):
         compiled.observe(0.05)
-    before = compiled.estimator.copy()
-    for name in before.dtype.names:
-        if name != "place_pose":
-            assert np.nanmax(np.abs(before[name]), initial=0.0) < 1.1e3, name
+    before = compiled.estimator
+    for name in ("place_noise", "place_far", "place_still", "wheels_age"):
+        assert np.max(np.abs(before[name])) < 1.0, name
     ages = before["place_history"].reshape(-1, 15)[:, 0]
     np.testing.assert_allclose(ages, 0.05 * np.arange(len(ages)), rtol=1e-4)
 
