@@ -1,0 +1,259 @@
+"""Time of a step of the generated C, beside C written by hand, and with many wheels and floors.
+
+How it is run is at the head of `export_builds.py`. All times are of one process written in C, over
+a drive on the twin; those of two codes are taken in turns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from slipid.control.controller import (
+    GIVES_UP_S,
+    GO_S,
+    HARDER,
+    LONGEST_I,
+    OBSERVE_S,
+    STUCK_S,
+    TURN_S,
+    Limits,
+)
+from slipid.control.estimator import CURRENT_FROM
+from slipid.control.export.c99.code import Code, template
+from slipid.control.export.c99.function import Argument, function, traced
+from slipid.control.export.c99.ir import Names
+from slipid.control.export.c99.text import table
+from slipid.control.filter import hypotheses
+from slipid.control.filter.hypotheses import hypotheses_of
+from slipid.control.interface import UNTIMED_S, Settings
+from slipid.deploy.controllers import ROWS, pilot_of
+from slipid.model import contact
+from slipid.model.contact_balance import stand
+from slipid.model.geometry import mecanum
+from tests.benchmarks.export_builds import (
+    FAST,
+    HERE,
+    KINDS,
+    PATH,
+    PLAIN,
+    Fleet,
+    code,
+    driven,
+    needs,
+    pilot,
+    ran,
+    three_floors,
+)
+from tests.helpers.exported import known
+
+BARS_NS = {"slip_odometry": 500.0, "contact": 10_000.0}
+BESIDE = 1.3
+SECONDS = 3.0
+FLAGS = {"-O3 -march=native -fno-math-errno -fno-trapping-math": FAST, "-O2": PLAIN}
+pytestmark = needs("gcc")
+
+
+@dataclass(frozen=True)
+class Took:
+    """Times of one code [ns]: median and shortest of its passes; state: its size [byte]."""
+
+    median: float
+    least: float
+    state: int
+
+
+def timed(folder: Path, drive: Path, flags, more=(), said: Path | None = None) -> list[Took]:
+    """Times of the code in a folder, and of the reference if it is among more sources."""
+    words = ["gcc", "-std=c99", *flags, *more, "-I.", HERE / "export_time.c", "slipid.c", "-lm"]
+    ran([*words, "-o", "timed"], folder)
+    last = [] if said is None else [said]
+    lines = ran(["./timed", drive, SECONDS, *last], folder).splitlines()
+    rows = [line.split() for line in lines]
+    return [Took(float(r[0]), float(r[1]), int(r[2])) for r in rows]
+
+
+def unfleeted(made: Code, folder: Path) -> Path:
+    """The code alone, in a folder of its own."""
+    folder.mkdir(exist_ok=True)
+    (folder / "slipid.h").write_text(made.header())
+    (folder / "slipid.c").write_text(made.source())
+    return folder
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("row", BARS_NS)
+def test_step(tmp_path, row, kind):
+    fleet = Fleet(code(row), tmp_path, (*FAST, *KINDS[kind]))
+    drive = driven(code(row), three_floors(), fleet).write(tmp_path / "drive")
+    alone = unfleeted(code(row), tmp_path / "alone")
+    for name, flags in FLAGS.items():
+        took = timed(alone, drive, (*flags, *KINDS[kind]))[0]
+        print(
+            f"\n{row} {kind} {name}: median {took.median:.0f} ns a step "
+            f"({took.median / BARS_NS[row]:.2f} of the bar), least {took.least:.0f}; "
+            f"state {took.state} byte",
+            end="",
+        )
+        if kind == "double" and flags == FAST:
+            assert took.median <= BARS_NS[row]
+
+
+# beside C written by hand -----------------------------------------------------------------------
+
+
+def numbers() -> str:
+    """The robot's numbers as macros and tables, for the step written by hand."""
+    p, s = pilot("slip_odometry"), Settings.of(three_floors())
+    f, k, most = p.controller.robot, p.controller.gains, Limits()
+    given = {
+        "RADIUS": f.frame.radius,
+        "HIGHEST_SPEED": f.highest[0],
+        "HIGHEST_CURRENT": f.highest[1],
+        "RESISTANCE": f.motor.resistance,
+        "VOLTS_PER_SPEED": f.motor.gear_ratio * f.motor.back_emf,
+        "PLACE": k.place,
+        "YAW": k.yaw,
+        "INTEGRAL": k.integral,
+        "OBSERVER": k.observer,
+        "SPEED_LIMIT": most.wheel_speed,
+        "ACCELERATION_LIMIT": most.acceleration,
+        "VOLTAGE_LIMIT": most.voltage,
+        "TWIST_LIMIT": most.twist,
+        "LONGEST_I": LONGEST_I,
+        "OBSERVE": OBSERVE_S,
+        "STUCK": STUCK_S,
+        "TURN": TURN_S,
+        "GO": GO_S,
+        "HARDER": HARDER,
+        "GIVES_UP": GIVES_UP_S,
+        "CURRENT_FROM": CURRENT_FROM,
+        "UNTIMED": UNTIMED_S,
+        "STALE": s.stale_s,
+        "LONGEST": s.longest_s,
+    }
+    tables = {"FORWARD": f.forward, "INVERSE": f.inverse, "CURVE": f.wheel_curve}
+    lines = [f"#define {name} ({float(value)!r})" for name, value in given.items()]
+    for name, value in tables.items():
+        rows = ", ".join("{" + ", ".join(repr(float(x)) for x in row) + "}" for row in value)
+        lines.append(f"static const double {name}[{len(value)}][{len(value[0])}] = {{{rows}}};")
+    return "\n".join(lines) + "\n"
+
+
+def test_odometry_beside_one_by_hand(tmp_path):
+    made = code("slip_odometry")
+    fleet = Fleet(made, tmp_path, FAST)
+    drive = driven(made, three_floors(), fleet).write(tmp_path / "drive")
+    alone = unfleeted(made, tmp_path / "alone")
+    (alone / "numbers.h").write_text(numbers())
+    reference = ["-DREFERENCE", HERE / "reference_odometry.c"]
+    said = tmp_path / "said"
+    row = np.dtype(
+        [("estimate", fleet.estimate.dtype), ("command", float, fleet.command.shape)], align=True
+    )
+    for name, flags in FLAGS.items():
+        ours, theirs = timed(alone, drive, flags, reference, said)
+        both = np.fromfile(said, row).reshape(2, -1)
+        apart = max(
+            float(np.abs(np.diff(x.astype(float), axis=0)).max(initial=0.0))
+            for x in (*(both["estimate"][n] for n in fleet.estimate.dtype.names), both["command"])
+        )
+        lean = timed(alone, drive, flags, ["-DLEAN", *reference])
+        print(
+            f"\nslip_odometry {name}: generated {ours.median:.0f} ns, by hand "
+            f"{theirs.median:.0f} ns, ratio {ours.median / theirs.median:.2f} (bar {BESIDE}); by "
+            f"hand without what never changes {lean[1].median:.0f} ns, ratio "
+            f"{lean[0].median / lean[1].median:.2f}; apart {apart:.1e}",
+            end="",
+        )
+        assert apart <= 1e-12
+        assert flags != FAST or ours.median <= BESIDE * theirs.median
+
+
+def settled(folder: Path) -> tuple[int, np.ndarray]:
+    """Generated code of the contact balance alone, and the same floors as its twin has them."""
+    f = three_floors()
+    under = hypotheses_of(f).under
+    on = stand(f.frame, f.floors.at(under.T), f.rest)
+    count = len(under)
+    arguments = (
+        Argument.plain("start", (3, count)),
+        Argument.plain("rim", (f.wheels,)),
+        Argument.plain("twist", (3, count), False, True),
+        Argument.plain("felt", (f.wheels, count), False, True),
+    )
+    run = traced(
+        lambda start, rim: contact.settle(start, rim, on, f.inverse),
+        jnp.zeros((3, count)),
+        jnp.zeros(f.wheels),
+    )
+    names = Names()
+    made = function(names, "settled", "", arguments, run)
+    head = [
+        "#include <float.h>",
+        "#include <math.h>",
+        "#include <stdbool.h>",
+        "#include <stdint.h>",
+    ]
+    lines = [*head, "typedef double slipid_real;", template("prelude.c"), f"{made.head};"]
+    lines += [x for m in names.tables.values() if m.name in made.reads for x in table(m)]
+    (folder / "settled.c").write_text("\n".join([*lines, *made.text]))
+    floor, rows = on.floor, []
+    for k in range(count):
+        one = [f.frame.hold, f.frame.roll, f.frame.shift, on.rest[:, k], f.inverse, f.frame.base]
+        per_wheel = (floor.friction, floor.creep, floor.roller_drag, floor.roller_creep)
+        per_wheel += (floor.rolling_resistance, floor.slide_viscosity, floor.roller_viscosity)
+        one += [jnp.broadcast_to(x, (f.wheels, count))[:, k] for x in per_wheel]
+        one += [jnp.broadcast_to(x, count)[k] for x in (floor.scrub, floor.lead)]
+        rows.append(np.concatenate([np.asarray(x).ravel() for x in one]))
+    return count, np.array(rows)
+
+
+def test_contact_balance_beside_its_twin(tmp_path):
+    count, floors = settled(tmp_path)
+    rng, steps = np.random.default_rng(0), 1000
+    speed = 3 * rng.normal(size=(1, 3)) + 0.2 * rng.normal(size=(steps, 3)).cumsum(0)
+    rims = float(three_floors().frame.radius) * speed
+    counts = np.array([steps, count], np.int64)
+    (tmp_path / "given").write_bytes(counts.tobytes() + rims.tobytes() + floors.tobytes())
+    sizes = [f"-DCOMBINATIONS={count}", f"-DCHORDS={contact.CHORD}", f"-DNEWTONS={contact.NEWTON}"]
+    twin = f'-DTWIN="{HERE / "twin.c"}"'
+    for name, flags in FLAGS.items():
+        words = ["gcc", "-std=c99", *flags, *sizes, twin, HERE / "export_settle.c", "settled.c"]
+        ran([*words, "-lm", "-o", "settled"], tmp_path)
+        ours, theirs, apart = map(float, ran(["./settled", "given"], tmp_path).split()[:3])
+        print(
+            f"\ncontact balance of {count} combinations, {name}: generated {ours:.0f} ns, by hand "
+            f"{theirs:.0f} ns, ratio {ours / theirs:.2f} (bar {BESIDE}); twists apart {apart:.1e}",
+            end="",
+        )
+        assert apart < 1e-9
+        assert ours <= BESIDE * theirs
+
+
+# many wheels and floors --------------------------------------------------------------------------
+
+ALL = 99
+"""More changes of floor than there are wheels."""
+
+
+@pytest.mark.parametrize(
+    ("floors", "changes"), [(2, 2), (3, 2), (4, 2), (5, 2), (2, ALL), (3, ALL), (4, ALL), (5, ALL)]
+)
+def test_many_floors(tmp_path, monkeypatch, floors, changes):
+    monkeypatch.setattr(hypotheses, "CHANGES", changes)
+    robot = known(mecanum(0.2, 0.15, 0.05, 20.0), [f"floor{k}" for k in range(floors)])
+    made = Code(pilot_of(robot, ROWS["contact"]), PATH)
+    fleet = Fleet(made, tmp_path, FAST)
+    drive = driven(made, robot, fleet, 400).write(tmp_path / "drive")
+    took = timed(unfleeted(made, tmp_path / "alone"), drive, FAST)[0]
+    print(
+        f"\nfour wheels, {floors} floors, {len(hypotheses_of(robot))} of {floors**4} combinations: "
+        f"median {took.median / 1000:.1f} us a step, least {took.least / 1000:.1f}; state "
+        f"{took.state} byte, source {len(made.source()) / 1024:.0f} KiB",
+        end="",
+    )
