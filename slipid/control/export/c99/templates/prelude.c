@@ -32,7 +32,7 @@ typedef slipid_real real_t;
 
 /* Inlined where speed counts, so that a loop over lanes becomes vector instructions. */
 #if defined(__GNUC__) && defined(__OPTIMIZE__) && !defined(__OPTIMIZE_SIZE__)
-#define SLIPID_INLINE __attribute__((always_inline)) static inline
+#define SLIPID_INLINE __attribute__((always_inline, unused)) static inline
 #elif defined(__GNUC__)
 #define SLIPID_INLINE __attribute__((unused)) static
 #else
