@@ -203,6 +203,7 @@ class AbstractEstimator(eqx.Module, Generic[State]):
     """An estimator as pure functions: `init` gives a state, `step` the next one and an estimate."""
 
     robot: eqx.AbstractVar[DeployedRobot]
+    settings: eqx.AbstractVar[Settings]
 
     @abstractmethod
     def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> State:

@@ -8,20 +8,21 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from slipid.control import trajectory
-from slipid.control.closed_loop import LONGEST, PERIOD, Pilot
+from slipid.control.closed_loop import PERIOD, Pilot, Plant, drive
 from slipid.control.deployed import DeployedRobot
 from slipid.control.export.c99.folder import Recording, c_files
-from slipid.control.export.c99.lower import UnsupportedError
+from slipid.control.export.c99.lowering.lower import UnsupportedError
 from slipid.control.export.folder import check_folder, write_folder
 from slipid.control.export.header import warnings
 from slipid.control.export.readme import readme
 from slipid.control.export.ros2 import ros2_files
 from slipid.control.export.stablehlo import load_program, stablehlo_files
 from slipid.control.export.table import table_files
+from slipid.control.interface import Measurement, Readings
 from slipid.control.robot_file.file import robot_bytes
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import ROWS, pilot_of
@@ -164,6 +165,28 @@ def _form(
     return {name: data.encode() for name, data in text.items()}
 
 
+class _Recorded:
+    """A plant whose readings are kept."""
+
+    def __init__(self, plant: Plant, wheels: int):
+        self._plant, self._wheels = plant, wheels
+        self.readings: list[Readings] = []
+
+    def reset(self) -> Readings:
+        return self._kept(self._plant.reset())
+
+    def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Readings:
+        return self._kept(self._plant.step(wheel_speed))
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        return self._plant.pose
+
+    def _kept(self, reading: Measurement | Readings) -> Readings:
+        self.readings.append(reading.filled(self._wheels))
+        return self.readings[-1]
+
+
 def recorded(
     robot: DeployedRobot,
     pilot: Pilot[eqx.Module],
@@ -173,18 +196,11 @@ def recorded(
 ) -> Recording:
     """A run of a path, as it lies for the robot's start, on the twin."""
     habits = habits_of(robot, gyro=ROWS[wish.controller].gyro)
-    plant = twin(robot, place.floor, place.true, 0, habits)
-    step = eqx.filter_jit(lambda state, z: pilot.step(path, state, z, jnp.asarray(PERIOD)))
-    state, reading = pilot.init(place.believed), plant.reset().filled(robot.wheels)
-    given, commands, times = [], [], []
-    for _ in range(round(LONGEST * path.duration / PERIOD)):
-        leaves = [np.asarray(x).reshape(-1) for x in jax.tree.leaves(reading)]
-        given.append(np.concatenate([[PERIOD], *leaves]))
-        state, said = step(state, reading)
-        commands.append(np.asarray(said.command))
-        times.append(float(said.time))
-        if times[-1] >= path.duration - 1e-6 or bool(said.given_up):
-            break
-        reading = plant.step(commands[-1]).filled(robot.wheels)
+    plant = _Recorded(twin(robot, place.floor, place.true, 0, habits), robot.wheels)
+    course = drive(pilot, path, plant, place.believed)
+    given = [
+        np.concatenate([[PERIOD], *(np.ravel(x) for x in jax.tree.leaves(reading))])
+        for reading in plant.readings[: len(course.command)]
+    ]
     about = f"the identified model as a plant, with delays and noise ({wish.path})"
-    return Recording(about, place.believed, np.array(given), np.array(commands), np.array(times))
+    return Recording(about, place.believed, np.array(given), course.command, course.own)

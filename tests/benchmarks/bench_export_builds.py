@@ -18,7 +18,7 @@ import pytest
 
 from slipid.control.export.c99.code import Code
 from slipid.control.export.c99.folder import c_files
-from slipid.control.export.c99.golden import golden
+from slipid.control.export.golden import golden
 from slipid.control.trajectory import rectangle
 from tests.benchmarks.export_builds import HERE, KINDS, needs, pilot, ran
 

@@ -25,9 +25,9 @@ from slipid.control.controller import (
 )
 from slipid.control.estimator import CURRENT_FROM
 from slipid.control.export.c99.code import Code, template
-from slipid.control.export.c99.function import Argument, function, traced
-from slipid.control.export.c99.ir import Names
-from slipid.control.export.c99.text import table
+from slipid.control.export.c99.lowering.builder import Names
+from slipid.control.export.c99.lowering.function import Argument, function, traced
+from slipid.control.export.c99.lowering.text import table
 from slipid.control.filter import hypotheses
 from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.interface import UNTIMED_S, Settings

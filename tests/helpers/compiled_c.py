@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from slipid.control.export.c99.code import Code
-from slipid.control.export.c99.fields import Struct
+from slipid.control.export.fields import Struct
 
 MANY = """
 void slipid_many(int32_t count, slipid_estimator *estimator, slipid_controller *controller,

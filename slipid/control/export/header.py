@@ -5,8 +5,9 @@ from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.export.rows import DOUBTED, declared, doubted
+from slipid.control.export.rows import DOUBTED, doubted
 from slipid.control.export.text import listed, one_line, wrapped
+from slipid.control.robot_file.file import declared
 from slipid.control.robot_file.record import Source, Verdict
 
 SOURCES: Mapping[Source, str] = {
@@ -22,11 +23,19 @@ WARNINGS: Mapping[Verdict, str] = {
 
 
 def header(robot: DeployedRobot) -> list[str]:
-    """Lines without a comment sign: origin, floors, loads, verdicts and messages of a robot.
+    """Lines of a comment without its sign: origin, floors, loads, verdicts and warnings of a robot.
 
     Each is plain printable text, of 96 characters at most where no word is longer.
     """
-    return [line for part in _parts(robot) for line in wrapped(part)]
+    said = (*_facts(robot), *(f"WARNING: {text}" for text in warnings(robot)))
+    return [line for part in said for line in wrapped(part)]
+
+
+def in_markdown(robot: DeployedRobot) -> list[str]:
+    """The same as Markdown, warnings first, with the messages of the fit."""
+    notes = (f"Note of the fit: {message}" for message in robot.record.messages)
+    warned = [line for text in warnings(robot) for line in (f"> **WARNING.** {text}", "")]
+    return [*warned, *(f"- {one_line(part)}" for part in (*_facts(robot), *notes)), ""]
 
 
 def warnings(robot: DeployedRobot) -> tuple[str, ...]:
@@ -35,7 +44,7 @@ def warnings(robot: DeployedRobot) -> tuple[str, ...]:
     return tuple(f"{WARNINGS[v]}: {listed(paths)}." for v, paths in found.items() if paths)
 
 
-def _parts(robot: DeployedRobot) -> Iterator[str]:
+def _facts(robot: DeployedRobot) -> Iterator[str]:
     record = robot.record
     yield f"Made by slipid {made_with()} from robot.json; make it anew rather than change it."
     yield f"Numbers: {record.numbers} (`numbers` of robot.json)."
@@ -43,11 +52,10 @@ def _parts(robot: DeployedRobot) -> Iterator[str]:
     loads = listed([load.name for load in record.loads])
     yield f"Load set-up: {one_line(robot.load_setup)}, of those known: {loads}."
     yield f"Floors: {listed(robot.labels)}."
-    counts = Counter(record.parameters[e.path].verdict for e in declared(robot))
+    numbers = declared(record, robot.wheels)
+    counts = Counter(record.parameters[e.path].verdict for e in numbers)
     said = ", ".join(f"{n} {v.replace('_', ' ')}" for v, n in counts.most_common())
     yield f"Verdicts: {said}."
-    yield from (f"WARNING: {text}" for text in warnings(robot))
-    yield from (f"Note of the fit: {message}" for message in record.messages)
 
 
 def made_with() -> str:

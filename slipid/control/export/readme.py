@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.export.header import header, warnings
-from slipid.control.export.text import hidden
+from slipid.control.export.header import in_markdown
 
 ABOUT: Mapping[str, str] = {
     "c": "estimator and controller in C99, with a test of themselves and an example; also a "
@@ -20,14 +19,11 @@ ABOUT: Mapping[str, str] = {
 def readme(robot: DeployedRobot, forms: Sequence[str], controller: str) -> str:
     """Text of README.md."""
     lines = [
-        *hidden(header(robot)),
         "# One identified robot, ready to be taken along",
         "",
-        f"Everything here is made of `robot.json`, whose numbers have the hash "
-        f"`{robot.record.numbers}`, for the load set-up `{robot.load_setup}` and the controller "
-        f"`{controller}`.",
+        *in_markdown(robot),
+        f"Everything here is made of `robot.json`, for the controller `{controller}`.",
         "",
-        *(line for text in warnings(robot) for line in (f"**{text}**", "")),
         *(f"- `{form}/`: {ABOUT[form]}." for form in forms),
         "",
         "`sha256sum -c SHA256SUMS` tells whether a byte was changed; with slipid, "

@@ -3,14 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 
 from slipid.control.deployed import DeployedRobot
+from slipid.control.robot_file.file import declared
 from slipid.control.robot_file.record import Number, Pair, Provenance, Verdict
-from slipid.model.geometry import Geometry
-from slipid.model.robot import build
-from slipid.parameter import Entry, entries
+from slipid.parameter import Entry
 
 VERDICTS: Mapping[Verdict, str] = {
     "identified": "the logs decide it; use it",
@@ -68,14 +66,6 @@ def said(verdict: Verdict) -> str:
     return words.upper() if verdict in DOUBTED else words
 
 
-def declared(robot: DeployedRobot) -> tuple[Entry, ...]:
-    """What is declared of every number of a robot, in order; the camera is no part of it."""
-    record = robot.record
-    shape = Geometry(**vars(record.wheels), drive_offset=jnp.zeros(robot.wheels))
-    made = build(shape, record.labels, [load.name for load in record.loads])
-    return tuple(e for e in entries(made) if e.part != "camera")
-
-
 def values_of(number: Number) -> tuple[float, ...]:
     """Its values, one or as many as wheels."""
     return number.value if isinstance(number.value, tuple) else (number.value,)
@@ -83,15 +73,16 @@ def values_of(number: Number) -> tuple[float, ...]:
 
 def rows_of(robot: DeployedRobot) -> tuple[Row, ...]:
     """Every number of a robot, those per wheel one by one."""
-    return tuple(
-        row for e in declared(robot) for row in _of_entry(e, robot.record.parameters[e.path])
-    )
+    known = robot.record.parameters
+    numbers = declared(robot.record, robot.wheels)
+    return tuple(row for e in numbers for row in _of_entry(e, known[e.path]))
 
 
 def doubted(robot: DeployedRobot, verdict: Verdict) -> tuple[str, ...]:
     """Paths of the numbers with a verdict."""
     known = robot.record.parameters
-    return tuple(e.path for e in declared(robot) if known[e.path].verdict == verdict)
+    numbers = declared(robot.record, robot.wheels)
+    return tuple(e.path for e in numbers if known[e.path].verdict == verdict)
 
 
 def _of_entry(e: Entry, number: Number) -> tuple[Row, ...]:

@@ -20,8 +20,8 @@ from jax import export
 from jaxtyping import Array
 
 from slipid.control.closed_loop import Pilot
-from slipid.control.export.c99.fields import Struct
-from slipid.control.export.c99.golden import Golden, golden
+from slipid.control.export.fields import Struct
+from slipid.control.export.golden import Golden, golden
 from slipid.control.interface import Measurement, Readings
 from slipid.control.robot_file.typed import typed
 from slipid.support.errors import DataError

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 from slipid.control.controller import Gains, Limits
 from slipid.control.deployed import DeployedRobot
 from slipid.control.export.gains import LIMITS, origin
-from slipid.control.export.header import header, warnings
+from slipid.control.export.header import header, in_markdown
 from slipid.control.export.rows import DOUBTED, VERDICTS, rows_of, said
-from slipid.control.export.text import hidden, interval, one_line, short, table
+from slipid.control.export.text import interval, one_line, short, table
 from slipid.control.robot_file.record import Pair
 from slipid.parameter import entries
 
@@ -140,11 +140,8 @@ def _csv(robot: DeployedRobot, lines: tuple[Line, ...]) -> str:
 
 
 def _markdown(robot: DeployedRobot, lines: tuple[Line, ...]) -> str:
-    text = hidden(header(robot))
-    text += ["# Numbers of a robot identified by slipid", ""]
-    for warning in warnings(robot):
-        text += [f"> **WARNING.** {warning}", ""]
-    text += [f"For the load set-up {one_line(robot.load_setup)}. {origin(robot)}", ""]
+    text = ["# Numbers of a robot identified by slipid", "", *in_markdown(robot)]
+    text += [origin(robot), ""]
     for group, title in _TITLES.items():
         rows = [_shown(x) for x in lines if x.group == group]
         head = ("name", "", "symbol", "rounded", "value", "unit", "90 % interval", "verdict")

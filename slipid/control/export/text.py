@@ -35,11 +35,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return ["| " + " | ".join(map(_cell, line)) + " |" for line in lines]
 
 
-def hidden(lines: Sequence[str]) -> list[str]:
-    """Lines as a comment of Markdown, which none of them can end."""
-    return ["<!--", *(line.replace("-->", "- ->") for line in lines), "-->"]
-
-
 def listed(names: Sequence[str]) -> str:
     """Names with commas, or the word that there are none."""
     return ", ".join(one_line(name) for name in names) or "none"

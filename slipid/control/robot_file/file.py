@@ -16,7 +16,7 @@ from slipid.control.robot_file.record import UNITS, Numbers, RobotRecord, ToldRe
 from slipid.control.robot_file.typed import typed
 from slipid.model.geometry import Geometry
 from slipid.model.robot import build
-from slipid.parameter import Declaration, entries
+from slipid.parameter import Declaration, Entry, entries
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_bytes
 
@@ -141,15 +141,15 @@ def _told(where: str, told: ToldRecord, floors: int) -> None:
         raise ValueError(f"{where}.left: a std below 0")
 
 
-def _known(record: RobotRecord, wheels: int) -> dict[str, tuple[Declaration, int]]:
-    """Declaration and size of every number that a robot of this shape has, by path."""
+def declared(record: RobotRecord, wheels: int) -> tuple[Entry, ...]:
+    """Every number that a robot of this shape has, in order; the camera is no part of it."""
     shape = Geometry(**vars(record.wheels), drive_offset=jnp.zeros(wheels))
     robot = build(shape, record.labels, [load.name for load in record.loads])
-    return {e.path: (e.declaration, e.size) for e in entries(robot) if e.part != "camera"}
+    return tuple(e for e in entries(robot) if e.part != "camera")
 
 
 def _numbers(record: RobotRecord, wheels: int) -> None:
-    known = _known(record, wheels)
+    known = {e.path: (e.declaration, e.size) for e in declared(record, wheels)}
     for path in known:
         if path not in record.parameters:
             raise ValueError(f"parameters['{path}'] is missing")

@@ -16,12 +16,12 @@ import pytest
 
 from slipid.control.closed_loop import PERIOD
 from slipid.control.export.c99.code import Code, template
-from slipid.control.export.c99.fields import described
 from slipid.control.export.c99.folder import c_files
-from slipid.control.export.c99.function import Argument, function, traced
-from slipid.control.export.c99.ir import Names
-from slipid.control.export.c99.lower import UnsupportedError
-from slipid.control.export.c99.text import table
+from slipid.control.export.c99.lowering.builder import Names
+from slipid.control.export.c99.lowering.function import Argument, function, traced
+from slipid.control.export.c99.lowering.lower import UnsupportedError
+from slipid.control.export.c99.lowering.text import table
+from slipid.control.export.fields import described
 from slipid.control.interface import Measurement
 from slipid.control.trajectory import rectangle
 from slipid.deploy.controllers import ROWS, pilot_of

@@ -11,15 +11,15 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from slipid.control.closed_loop import Pilot
-from slipid.control.export.c99.fields import Struct
-from slipid.control.export.c99.function import Argument, Function, function, traced
-from slipid.control.export.c99.ir import Names
-from slipid.control.export.c99.text import TYPES, WIDTH, folded, table
+from slipid.control.export.c99.lowering.builder import Names
+from slipid.control.export.c99.lowering.function import Argument, Function, function, traced
+from slipid.control.export.c99.lowering.text import TYPES, WIDTH, folded, table
+from slipid.control.export.fields import Struct
 from slipid.control.export.header import header
 from slipid.control.export.ros.names import identifiers
 from slipid.control.export.text import listed, wrapped
 from slipid.control.filter.hypotheses import hypotheses_of
-from slipid.control.interface import Measurement, Readings, Settings
+from slipid.control.interface import Measurement, Readings
 from slipid.control.trajectory import Path
 
 TYPE = {**TYPES, "real": "slipid_real"}
@@ -207,7 +207,7 @@ def about(pilot: Pilot[eqx.Module]) -> Iterator[str]:
             f"Wheel {k} stands at x = {x:.4f} m, y = {y:.4f} m; turning at a positive speed it "
             f"pushes the body towards {drives:.1f} deg."
         )
-    settings = getattr(pilot.estimator, "settings", Settings.of(robot))
+    settings = pilot.estimator.settings
     signs = "with their signs" if settings.current_is_signed else "without a sign (a sign is lost)"
     yield f"Currents are taken {signs}. A wheel unheard for {settings.stale_s:g} s is stale."
     yield "Floors, as columns count them: " + listed([*robot.labels, "none of them"]) + "."

@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from slipid.control.closed_loop import Pilot
 from slipid.control.export.c99.code import Code, filled, template
-from slipid.control.export.c99.golden import golden_header
-from slipid.control.export.header import made_with, warnings
+from slipid.control.export.c99.golden_header import golden_header
+from slipid.control.export.header import in_markdown, made_with
 from slipid.control.trajectory import Path
 
 
@@ -86,8 +86,7 @@ def c_files(
         steps = filled("recording.md", {"PLANT": recording.plant})
     robot = pilot.controller.robot
     values = {
-        "WARNINGS": "\n".join(f"**{text}**\n" for text in warnings(robot)),
-        "ROBOT": robot.record.numbers,
+        "HEAD": "\n".join(in_markdown(robot)),
         "RECORDING": steps,
         "FLOORS": ", ".join(f"`{name}` ({k})" for k, name in enumerate(robot.labels)),
         "WHEELS": str(robot.wheels),

@@ -16,8 +16,9 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.export.gains import LIMITS, origin
 from slipid.control.export.ros.names import identifiers
 from slipid.control.export.ros.yaml_text import Check, Parameter
-from slipid.control.export.rows import declared, said
+from slipid.control.export.rows import said
 from slipid.control.export.text import interval, listed
+from slipid.control.robot_file.file import declared
 from slipid.control.robot_file.record import Number
 from slipid.parameter import Declaration, Entry, entries
 
@@ -62,7 +63,7 @@ def _numbers(robot: DeployedRobot) -> Iterator[Parameter]:
             return f"{part}.{floors[e.surface]}.{last}"
         return quantity if e.load is None else f"{quantity}.{loads[e.load]}"
 
-    found = [(name(e), e) for e in declared(robot)]
+    found = [(name(e), e) for e in declared(robot.record, robot.wheels)]
     order = {group: k for k, group in enumerate(dict.fromkeys(_group(n) for n, _ in found))}
     for called, e in sorted(found, key=lambda pair: order[_group(pair[0])]):
         number = robot.record.parameters[e.path]

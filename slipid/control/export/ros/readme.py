@@ -7,12 +7,12 @@ import numpy as np
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.export.gains import origin
-from slipid.control.export.header import header, warnings
+from slipid.control.export.header import in_markdown
 from slipid.control.export.ros.drive import MOST, Drive, joint
 from slipid.control.export.ros.names import identifiers
 from slipid.control.export.ros.noise import DISTANCE_M, PERIOD_S, Errs, top_speed
 from slipid.control.export.rows import DOUBTED, PROVENANCES, VERDICTS, rows_of
-from slipid.control.export.text import hidden, interval, one_line, short, table
+from slipid.control.export.text import interval, short, table
 
 
 @dataclass(frozen=True)
@@ -39,18 +39,7 @@ def readme(folder: Folder) -> str:
 
 
 def _head(folder: Folder) -> Iterator[str]:
-    yield from hidden(header(folder.robot))
-    yield from ("# A robot identified by slipid, for ROS 2", "")
-    found = warnings(folder.robot)
-    for text in found:
-        yield f"> **WARNING.** {text}"
-        yield ">"
-    if found:
-        yield "> What that means for each number stands below, under *Numbers*."
-        yield ""
-    for message in folder.robot.record.messages:
-        yield f"- Note of the fit: {one_line(message)}"
-    yield ""
+    yield from ("# A robot identified by slipid, for ROS 2", "", *in_markdown(folder.robot))
 
 
 def _files(folder: Folder) -> Iterator[str]:

@@ -12,9 +12,21 @@ from math import prod
 
 import numpy as np
 
-from slipid.control.export.c99.arrays import Value, along, cells_of, varies
-from slipid.control.export.c99.elementwise import Params, Rule, Shaped
-from slipid.control.export.c99.ir import Array, At, Builder, Cell, Cells, Kind, Number, kind_of
+from slipid.control.export.c99.lowering.arrays import along
+from slipid.control.export.c99.lowering.builder import Builder
+from slipid.control.export.c99.lowering.elementwise import Params, Rule, Shaped
+from slipid.control.export.c99.lowering.ir import (
+    Array,
+    At,
+    Cell,
+    Cells,
+    NoFormError,
+    Number,
+    Value,
+    cells_of,
+    varies,
+)
+from slipid.control.export.fields import Kind, kind_of
 
 REDUCED = {
     "reduce_sum": ("{0} + {1}", "R(0.0)"),
@@ -81,7 +93,7 @@ def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     value = values[0]
     assert isinstance(value, Array)
     if value.axis is None or len(value.shape) > 1:
-        raise NotImplementedError("an argmin of other than one long axis")
+        raise NoFormError("an argmin of other than one long axis")
     cell, lanes = value.cells.item(), value.shape[0]
     least = builder.compute("real", "r_min({acc}, {0})", (cell,), lanes, "R_INFINITY")
     which = At(builder.names.table(np.arange(lanes), "int"), 0, 1)

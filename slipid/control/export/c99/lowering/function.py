@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import jax
 from jax.extend.core import ClosedJaxpr
 
-from slipid.control.export.c99.arrays import Value, in_memory
-from slipid.control.export.c99.fields import Field, Struct
-from slipid.control.export.c99.ir import Array, Builder, Memory, Names
-from slipid.control.export.c99.lower import apart, lowered, store
-from slipid.control.export.c99.text import Body, folded
+from slipid.control.export.c99.lowering.builder import Builder, Names
+from slipid.control.export.c99.lowering.ir import Array, Memory, Value, in_memory
+from slipid.control.export.c99.lowering.lower import apart, lowered, store
+from slipid.control.export.c99.lowering.text import Body, folded
+from slipid.control.export.fields import Field, Struct
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,10 @@ class Argument:
     def memories(self) -> list[Memory]:
         """Where its fields lie."""
         if self.type:
-            return [field.memory(self.name) for field in self.fields]
+            return [
+                Memory(f"{self.name}->{f.name}", f.kind, f.size, scalar=not f.shape)
+                for f in self.fields
+            ]
         field = self.fields[0]
         name = f"(*{self.name})" if self.written and not field.shape else self.name
         return [Memory(name, field.kind, field.size, scalar=not field.shape)]
@@ -128,8 +131,8 @@ def function(
         store(builder, value, memory)
     body = Body(builder)
     unused = _unused(arguments, body.reads)
-    lines, reads = (*unused, *body.lines()), frozenset(body.reads)
-    return Function(name, about, tuple(arguments), lines, reads, body.scratch)
+    lines = (*unused, *body.lines())
+    return Function(name, about, tuple(arguments), lines, body.reads, body.scratch)
 
 
 def traced(run: Callable[..., object], *like: object) -> ClosedJaxpr:
@@ -150,7 +153,7 @@ def _holds(memory: Memory, value: Value) -> bool:
     return value.axis == like.axis and bool((value.cells == like.cells).all())
 
 
-def _unused(arguments: Sequence[Argument], reads: set[str]) -> list[str]:
+def _unused(arguments: Sequence[Argument], reads: frozenset[str]) -> list[str]:
     """Statements that tell a compiler that arguments are not read on purpose."""
     idle = [
         a.name for a in arguments if not a.written and not any(m.name in reads for m in a.memories)

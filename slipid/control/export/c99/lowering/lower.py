@@ -12,28 +12,57 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Var
 from jax.extend.core import Literal as JaxLiteral
 
-from slipid.control.export.c99.arrays import (
+from slipid.control.export.c99.lowering import elementwise, moves, sums
+from slipid.control.export.c99.lowering.arrays import along, rearranged
+from slipid.control.export.c99.lowering.builder import Builder
+from slipid.control.export.c99.lowering.elementwise import BINARY, UNARY, Rule, Shaped
+from slipid.control.export.c99.lowering.ir import (
+    Array,
+    At,
+    Block,
+    Cell,
+    Memory,
+    Nested,
+    NoFormError,
+    Statement,
     Value,
-    along,
     cells_of,
     in_memory,
     kind_of_value,
-    rearranged,
+    varies,
 )
-from slipid.control.export.c99.elementwise import Shaped
-from slipid.control.export.c99.ir import DTYPES, Array, At, Block, Builder, Cell, Memory, Nested
-from slipid.control.export.c99.moves import MOVES, SOURCES, moved
-from slipid.control.export.c99.rules import RULES
+from slipid.control.export.c99.lowering.moves import MOVES, SOURCES, moved
+from slipid.control.export.c99.lowering.sums import REDUCED
+from slipid.control.export.fields import DTYPES
 
+RULES: dict[str, Rule] = {
+    **{name: elementwise.unary(name) for name in UNARY},
+    **{name: elementwise.binary(name) for name in BINARY},
+    **{name: sums.reduced(name) for name in REDUCED},
+    "argmin": sums.argmin,
+    "convert_element_type": elementwise.converted,
+    "dot_general": sums.dot,
+    "dynamic_slice": moves.dynamic_slice,
+    "gather": moves.gather,
+    "integer_pow": elementwise.integer_pow,
+    "scatter": moves.scatter,
+    "scatter-add": moves.scattered("add", 0.0),
+    "scatter-mul": moves.scattered("mul", 1.0),
+    "select_n": elementwise.select,
+}
+"""How a primitive becomes C, by its name.
+
+Primitives that only move numbers need no rule of their own: they are asked, by JAX itself, where
+the numbers of their result come from.
+"""
 INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
 """Primitives that are functions called."""
-
 
 _TYPES = frozenset(map(np.dtype, ("float64", "float32", "int64", "int32", "bool")))
 """Of numbers that have a type in C."""
 
 
-class UnsupportedError(NotImplementedError):
+class UnsupportedError(Exception):
     """A step that has no form in C, with the primitive and the line of Python that asks for it."""
 
 
@@ -77,13 +106,10 @@ class _Lowering:
         self._builder.source = _line(equation) or self._builder.source
         try:
             return self._ruled(equation, values)
-        except NotImplementedError as error:
-            if isinstance(error, UnsupportedError):
-                raise
-            said = str(error) or "no rule for it"
+        except NoFormError as error:
             known = sorted({*RULES, *MOVES, *INLINED, "cond", "scan"})
             raise UnsupportedError(
-                f"{self._builder.source}: '{name}' has no form in C ({said}); "
+                f"{self._builder.source}: '{name}' has no form in C ({error}); "
                 f"those that have one: {', '.join(known)}"
             ) from error
 
@@ -96,14 +122,14 @@ class _Lowering:
         out: Any = equation.outvars[0].aval  # jax types it as less than it is
         shaped = Shaped(out.shape, out.dtype)
         if out.dtype not in _TYPES:
-            raise NotImplementedError(f"numbers of type {out.dtype}")
+            raise NoFormError(f"numbers of type {out.dtype}")
         where = [v for v in values[1:] if isinstance(v, Array)]
         if name in ("split", "unstack"):
             return self._several(equation, values[0])
         if name in MOVES and not (name in SOURCES and where):
             return [moved(primitive, SOURCES.get(name, 0))(self._builder, values, params, shaped)]
         if name not in RULES:
-            raise NotImplementedError
+            raise NoFormError("no rule for it")
         return [RULES[name](self._builder, values, params, shaped)]
 
     def _several(self, equation: JaxprEqn, value: Value) -> list[Value]:
@@ -116,7 +142,7 @@ class _Lowering:
         """One of two functions."""
         builder, which = self._builder, values[0]
         if len(params["branches"]) != 2:
-            raise NotImplementedError("more than two branches")
+            raise NoFormError("more than two branches")
         if not isinstance(which, Array):
             branch = params["branches"][int(np.clip(which, 0, 1))]
             return lowered(builder, branch, values[1:])
@@ -143,7 +169,7 @@ class _Lowering:
         """A function applied to its own result a fixed number of times."""
         carried, consts = params["num_carry"], params["num_consts"]
         if len(values) != carried + consts or len(params["jaxpr"].out_avals) != carried:
-            raise NotImplementedError("a loop that goes through an array")
+            raise NoFormError("a loop that goes through an array")
         builder = self._builder
         body = Builder(builder.names, builder)
         block = builder.append(nested=Nested(None, params["length"], [body]))
@@ -172,7 +198,7 @@ def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
     def own(cell: Cell) -> Cell:
         if not isinstance(cell, At) or cell.memory.name not in overwritten:
             return cell
-        return builder.compute(cell.kind, "{0}", (cell,), lanes if cell.varies else 0)
+        return builder.compute(cell.kind, "{0}", (cell,), lanes if varies(cell) else 0)
 
     cells = [own(cell) for cell in value.cells.reshape(-1)]
     return Array(value.shape, value.kind, value.axis, cells_of(value.cells.shape, cells))
@@ -189,7 +215,8 @@ def store(builder: Builder, value: Value, memory: Memory) -> None:
     end = builder.append(lanes)
     for row, cell in zip(rows.reshape(-1, max(lanes, 1)), cells.reshape(-1), strict=True):
         stride = int(row[1] - row[0]) if lanes > 1 else 0
-        builder.late(end, f"{_place(memory, int(row[0]), stride)} = {{0}};", cell, memory)
+        text = f"{_place(memory, int(row[0]), stride)} = {{0}};"
+        end.statements.append(Statement(None, text, (cell,), memory, always=True))
 
 
 def _place(memory: Memory, offset: int, stride: int) -> str:

@@ -10,11 +10,13 @@ import inspect
 import re
 from dataclasses import dataclass, fields, is_dataclass
 from math import prod
+from typing import Literal
 
 import jax.numpy as jnp
+import numpy as np
 
-from slipid.control.export.c99.ir import Kind, Memory, kind_of
-
+Kind = Literal["real", "int", "bool"]
+DTYPES: dict[Kind, type] = {"real": np.float64, "int": np.int64, "bool": np.bool_}
 UNIT = re.compile(r"\[[^\]]+\]")
 ONE = "[1]"
 """Unit of what has none."""
@@ -39,10 +41,6 @@ class Field:
         """How many numbers."""
         return prod(self.shape)
 
-    def memory(self, holder: str) -> Memory:
-        """Where it lies, for a pointer to its struct."""
-        return Memory(f"{holder}->{self.name}", self.kind, self.size, scalar=self.shape == ())
-
 
 @dataclass(frozen=True)
 class Struct:
@@ -60,6 +58,13 @@ class Struct:
     def of(cls, name: str, about: str, tree: object, said: type | None = None) -> Struct:
         """For a tree of arrays, of modules with documented attributes, or documented by a class."""
         return cls(name, about, tuple(_fields(tree, "", "", said)))
+
+
+def kind_of(dtype: np.dtype) -> Kind:
+    """Of the numbers of a jax or numpy type."""
+    if dtype == np.bool_:
+        return "bool"
+    return "int" if np.issubdtype(dtype, np.integer) else "real"
 
 
 def described(kind: type) -> dict[str, str]:

@@ -4,23 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
-from slipid.control.export.c99.ir import (
-    DTYPES,
-    At,
-    Block,
-    Builder,
-    Cell,
-    Kind,
-    Memory,
-    Nested,
-    Number,
-    Statement,
-    Variable,
-)
+from slipid.control.export.c99.lowering.builder import Builder
+from slipid.control.export.c99.lowering.ir import Block, Cell, Memory, Number, Statement, Variable
+from slipid.control.export.c99.lowering.usage import Usage
+from slipid.control.export.fields import DTYPES, Kind
 
 TYPES: dict[Kind, str] = {"real": "real_t", "int": "int32_t", "bool": "bool"}
 """Of numbers, in C."""
@@ -64,101 +54,24 @@ def wrapped(words: Iterable[str], indent: str) -> list[str]:
 
 
 class Body:
-    """Text of the code of a builder, without what nothing uses."""
+    """Text of the code of a builder, without what nothing uses.
+
+    Attributes:
+        reads: names of all memory that is read; scratch: numbers in arrays on the stack.
+    """
 
     def __init__(self, builder: Builder):
-        self._used: set[Variable] = set()
-        self._read: set[str] = set()
-        self._live: set[int] = set()
-        self._kept: set[Variable] = set()
-        self._arrays: dict[str, _Life] = {}
-        self._said, self._step = "", 0
-        self._scan(builder)
-        self._slots = _shared(self._arrays)
+        self._usage = Usage(builder)
+        self._said = ""
         self._lines = self._text(builder, "  ")
+        self.reads = frozenset(self._usage.read)
+        self.scratch = sum(self._usage.sizes.values())
 
     def lines(self) -> list[str]:
         """Declarations and statements."""
-        arrays = [f"  {TYPES[kind]} {slot}[{n}];" for (kind, slot), n in self._sizes.items()]
+        sizes = self._usage.sizes
+        arrays = [f"  {TYPES[kind]} {name}[{size}];" for (kind, name), size in sizes.items()]
         return [*arrays, *self._lines]
-
-    @property
-    def _sizes(self) -> dict[tuple[Kind, str], int]:
-        """Of all arrays on the stack, by kind and name."""
-        sizes: dict[tuple[Kind, str], int] = {}
-        for name, (kind, slot) in self._slots.items():
-            size = self._arrays[name].memory.size
-            sizes[kind, slot] = max(sizes.get((kind, slot), 0), size)
-        return sizes
-
-    @property
-    def scratch(self) -> int:
-        """Numbers in arrays on the stack."""
-        return sum(self._sizes.values())
-
-    def _scan(self, builder: Builder) -> None:
-        """Mark what is used, from the end to the beginning."""
-        for block in reversed(builder.blocks):
-            self._step += 1
-            if block.nested is not None:
-                self._inside(block.nested)
-                if block.nested.when is not None:
-                    self._uses(block.nested.when, block)
-            for statement in reversed(block.statements):
-                if self._needed(statement):
-                    self._live.add(id(statement))
-                    if statement.writes is not None and statement.writes.home is not None:
-                        self._lives(statement.writes)
-                    if statement.target is not None and statement.target.lanes:
-                        name = f"m{statement.target.number}"
-                        if name in self._arrays:
-                            self._lives(statement.target.memory)
-                    for cell in statement.cells:
-                        self._uses(cell, block)
-
-    def _inside(self, nested: Nested) -> None:
-        """Mark what bodies use; what a repetition finds there lives until it is over."""
-        end = self._step
-        for body in nested.bodies:
-            self._scan(body)
-        for life in self._arrays.values():
-            if life.first > end and not _within(life.memory, nested):
-                life.last = min(life.last, end)
-        self._step += 1
-
-    def _needed(self, statement: Statement) -> bool:
-        if statement.target is None:
-            written = statement.writes
-            return statement.always or (written is not None and written.name in self._read)
-        name = f"m{statement.target.number}"
-        return statement.target in self._used or name in self._read
-
-    def _uses(self, cell: Cell, block: Block) -> None:
-        if isinstance(cell, Variable):
-            self._used.add(cell)
-            if cell.lanes and cell.home is not block:
-                self._keep(cell.memory)
-        elif isinstance(cell, At):
-            self._keep(cell.memory)
-            if cell.table is not None:
-                self._read.add(cell.table.name)
-            if cell.index is not None:
-                self._uses(cell.index, block)
-
-    def _keep(self, memory: Memory) -> None:
-        self._read.add(memory.name)
-        if memory.home is not None:
-            self._lives(memory)
-
-    def _lives(self, memory: Memory) -> None:
-        """Note that an array is used in this step, counted from the end."""
-        life = self._arrays.setdefault(memory.name, _Life(memory, self._step, self._step))
-        life.first = max(life.first, self._step)
-
-    @property
-    def reads(self) -> set[str]:
-        """Names of all memory that is read."""
-        return self._read
 
     def _text(self, builder: Builder, indent: str) -> list[str]:
         lines: list[str] = []
@@ -178,7 +91,7 @@ class Body:
         return [head, *bodies[0], f"{indent}}}"]
 
     def _block(self, block: Block, indent: str) -> list[str]:
-        live = [s for s in block.statements if id(s) in self._live]
+        live = [s for s in block.statements if id(s) in self._usage.live]
         if not block.lanes:
             return [line for s in live for line in self._statement(s, block, indent)]
         if not live:
@@ -203,7 +116,7 @@ class Body:
         text = statement.template.format(*cells, acc=name)
         declared = "" if statement.start else f"const {TYPES[target.kind]} "
         lines = [*self._where(statement, indent), *folded(f"{declared}{name} = {text};", indent)]
-        if f"m{target.number}" in self._read and target.lanes:
+        if target.lanes and target.memory.name in self._usage.read:
             kept = f"{name} ? R(1.0) : R(0.0)" if target.kind == "bool" else name
             lines.append(f"{indent}{self._name(target.memory)}[l] = {kept};")
         return lines
@@ -230,7 +143,6 @@ class Body:
         if isinstance(cell, Variable):
             away = cell.lanes and cell.home is not block
             return self._number(cell.memory, "l") if away else f"t{cell.number}"
-        assert isinstance(cell, At)
         if cell.memory.scalar:
             return cell.memory.name
         if cell.table is not None:
@@ -249,43 +161,8 @@ class Body:
 
     def _name(self, memory: Memory) -> str:
         """Of the array that memory shares with other memory, or its own."""
-        return self._slots[memory.name][1] if memory.name in self._slots else memory.name
-
-
-@dataclass
-class _Life:
-    """From when to when an array is used, in steps counted from the end.
-
-    Attributes:
-        memory: the array.
-        first: of its steps in the order of the program, the largest number; last: the smallest.
-    """
-
-    memory: Memory
-    first: int
-    last: int
-
-
-def _within(memory: Memory, nested: Nested) -> bool:
-    """Whether memory is filled by the bodies of a condition or repetition, or deeper inside."""
-    owner = None if memory.home is None else memory.home.owner
-    while owner is not None and owner not in nested.bodies:
-        owner = owner.parent
-    return owner is not None
-
-
-def _shared(arrays: dict[str, _Life]) -> dict[str, tuple[Kind, str]]:
-    """Kind and name of an array for each; those used one after another share one."""
-    slots: dict[tuple[Kind, int], list[_Life]] = {}
-    names: dict[str, tuple[Kind, str]] = {}
-    for life in sorted(arrays.values(), key=lambda life: -life.first):
-        memory = life.memory
-        kind: Kind = "real" if memory.lanes and memory.kind == "bool" else memory.kind
-        taken = slots.setdefault((kind, memory.size), [])
-        free = next((k for k, other in enumerate(taken) if other.last > life.first), len(taken))
-        taken[free : free + 1] = [life]
-        names[memory.name] = kind, f"{kind[0]}{memory.size}_{free}"
-    return names
+        shared = self._usage.shared.get(memory.name)
+        return memory.name if shared is None else shared[1]
 
 
 def folded(text: str, indent: str) -> list[str]:

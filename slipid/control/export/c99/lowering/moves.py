@@ -9,16 +9,21 @@ import numpy as np
 from jax import lax
 from jax.extend.core import Primitive
 
-from slipid.control.export.c99.arrays import (
+from slipid.control.export.c99.lowering.arrays import along, rearranged
+from slipid.control.export.c99.lowering.builder import Builder
+from slipid.control.export.c99.lowering.elementwise import Params, Rule, Shaped, binary
+from slipid.control.export.c99.lowering.ir import (
+    Array,
+    At,
+    Cell,
+    NoFormError,
+    Number,
     Value,
-    along,
+    Variable,
     cells_of,
-    contiguous,
     longest,
-    rearranged,
 )
-from slipid.control.export.c99.elementwise import Params, Rule, Shaped, binary
-from slipid.control.export.c99.ir import Array, At, Builder, Cell, Number, Variable
+from slipid.control.export.c99.lowering.sources import contiguous
 
 MOVES = frozenset(
     {
@@ -73,13 +78,13 @@ def _scattered(
 ) -> np.ndarray:
     """Where every number comes from: `old`, or fresh ones that count from a number on."""
     if isinstance(where, Array):
-        raise NotImplementedError("places that are not known before the robot runs")
+        raise NoFormError("places that are not known before the robot runs")
     kept = {k: params[k] for k in ("dimension_numbers", "indices_are_sorted", "mode")}
     new = fresh + np.arange(prod(shape)).reshape(shape)
     options = {**kept, "unique_indices": False}
     times = lax.scatter_add(np.zeros(old.shape, int), where, np.ones(shape, int), **options)
     if np.max(times, initial=0) > 1:
-        raise NotImplementedError("a place that is written twice")
+        raise NoFormError("a place that is written twice")
     return np.asarray(lax.scatter(old, where, new, **options))
 
 
@@ -119,9 +124,9 @@ def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     whole, where = values
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     if numbers.operand_batching_dims or numbers.start_indices_batching_dims:
-        raise NotImplementedError("batches of places")
+        raise NoFormError("batches of places")
     if params["mode"] == lax.GatherScatterMode.FILL_OR_DROP:
-        raise NotImplementedError("places out of range that are filled")
+        raise NoFormError("places out of range that are filled")
     memory = contiguous(builder, whole)
     batch = [d for d in range(len(out.shape)) if d not in numbers.offset_dims]
     kept = [d for d in range(len(whole.shape)) if d not in numbers.collapsed_slice_dims]

@@ -1,153 +1,34 @@
-"""Arrays of cells: taken apart, put together anew, and brought to the same lanes."""
+"""Where the numbers of an array come from, and how they are brought side by side."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from math import prod
 
 import numpy as np
 
-from slipid.control.export.c99.ir import (
+from slipid.control.export.c99.lowering.builder import Builder
+from slipid.control.export.c99.lowering.ir import (
+    LANES,
     Array,
     At,
-    Builder,
     Cell,
-    Cells,
-    Kind,
     Memory,
     Number,
+    Value,
     Variable,
-    kind_of,
+    in_memory,
+    kind_of_value,
+    longest,
+    varies,
 )
+from slipid.control.export.fields import kind_of
 
-Value = Array | np.ndarray
-"""What is computed at run time, or a constant."""
-LANES = 7
-"""Length from which an axis is a loop."""
 UNROLLED = 64
 """Numbers up to which an array without lanes stays so."""
 
 
-def cells_of(shape: Sequence[int], cells: Sequence[Cell]) -> Cells:
-    """An array of cells in row-major order."""
-    out = np.empty(len(cells), dtype=object)
-    out[:] = cells
-    return out.reshape(shape)
-
-
-def kind_of_value(value: Value) -> Kind:
-    """Of its numbers."""
-    return value.kind if isinstance(value, Array) else kind_of(value.dtype)
-
-
-def varies(cell: Cell) -> bool:
-    """Whether it differs from lane to lane."""
-    if isinstance(cell, At):
-        return cell.varies
-    return isinstance(cell, Variable) and cell.lanes > 0
-
-
-def longest(shape: Sequence[int]) -> int | None:
-    """Axis that is a loop where nothing else says which; None where all are short."""
-    if max(shape, default=0) < LANES:
-        return None
-    return max(range(len(shape)), key=lambda axis: (shape[axis], axis))
-
-
-def in_memory(memory: Memory, shape: tuple[int, ...]) -> Array:
-    """The array that lies in memory in row-major order."""
-    return _arranged(memory, np.arange(prod(shape)).reshape(shape))
-
-
-def _arranged(memory: Memory, places: np.ndarray) -> Array:
-    axis = longest(places.shape)
-    if axis is None:
-        cells: list[Cell] = [At(memory, int(k)) for k in places.reshape(-1)]
-        return Array(places.shape, memory.kind, None, cells_of(places.shape, cells))
-    rows = np.moveaxis(places, axis, -1)
-    cells = [At(memory, int(r[0]), int(r[1] - r[0])) for r in rows.reshape(-1, rows.shape[-1])]
-    return Array(places.shape, memory.kind, axis, cells_of(rows.shape[:-1], cells))
-
-
-def rearranged(
-    builder: Builder, sources: Sequence[Value], places: np.ndarray, axis: int | None = -1
-) -> Value:
-    """The array whose numbers stand at these places of all sources, flat and one after the other.
-
-    Args:
-        builder: of the code; sources: arrays.
-        places: of every number of the result.
-        axis: of the result's lanes, None for none; by default the one that costs least.
-    """
-    known = _Sources(builder, sources)
-    if known.constant:
-        return known.numbers[places]
-    if axis == -1:
-        axis = known.best_axis(places)
-    if axis is None:
-        cells = [known.one(int(k)) for k in places.reshape(-1)]
-        return Array(places.shape, known.kind, None, cells_of(places.shape, cells))
-    rows = np.moveaxis(places, axis, -1)
-    cells = [known.row(row) for row in rows.reshape(-1, rows.shape[-1])]
-    return Array(places.shape, known.kind, axis, cells_of(rows.shape[:-1], cells))
-
-
-def along(builder: Builder, value: Value, shape: tuple[int, ...], axis: int | None) -> Cells:
-    """Cells of a value spread over a shape, with lanes along an axis."""
-    if not isinstance(value, Array):
-        value = np.broadcast_to(value, shape)
-        if axis is None:
-            flat = [Number(x, kind_of(value.dtype)) for x in value.reshape(-1).tolist()]
-            return cells_of(shape, flat)
-        rows = np.moveaxis(value, axis, -1)
-        cells = [_table(builder, row) for row in rows.reshape(-1, rows.shape[-1])]
-        return cells_of(rows.shape[:-1], cells)
-    if value.axis == axis and value.shape == shape:
-        return value.cells
-    places = np.arange(prod(value.shape)).reshape(value.shape)
-    moved = rearranged(builder, [value], np.broadcast_to(places, shape), axis)
-    assert isinstance(moved, Array)
-    return moved.cells
-
-
-def contiguous(builder: Builder, value: Value) -> Memory:
-    """Memory that holds an array in row-major order."""
-    if not isinstance(value, Array):
-        return builder.names.table(value, kind_of(value.dtype))
-    key = id(value.cells)
-    if key not in builder.contiguous:
-        builder.contiguous[key] = value, _contiguous(builder, value)
-    return builder.contiguous[key][1]
-
-
-def _contiguous(builder: Builder, value: Array) -> Memory:
-    places = np.arange(prod(value.shape))
-    flat = value.cells.reshape(-1)
-    lies = in_memory(flat[0].memory, value.shape) if isinstance(flat[0], At) else None
-    if lies is not None and lies.axis == value.axis and bool((lies.cells == value.cells).all()):
-        return flat[0].memory
-    if value.axis is None:
-        return _Sources(builder, [value]).copied(places)
-    lanes = value.shape[value.axis]
-    stride = prod(value.shape[value.axis + 1 :])
-    starts = np.take(places.reshape(value.shape), 0, value.axis).reshape(-1)
-    cells = tuple(flat)
-    memory = builder.array(value.kind, len(places), cells, lanes)
-    for start, cell in zip(starts, cells, strict=True):
-        builder.fill(f"{{memory}}[{start} + {stride} * l] = {{0}};", cell, memory)
-    return memory
-
-
-def _table(builder: Builder, row: np.ndarray) -> Cell:
-    """A row of constants."""
-    kind = kind_of(row.dtype)
-    if (row == row[0]).all():
-        return Number(row[0].item(), kind)
-    return At(builder.names.table(row, kind), 0, 1)
-
-
-class _Sources:
+class Sources:
     """Numbers of some arrays, one after the other.
 
     Attributes:
@@ -281,13 +162,41 @@ class _Sources:
         """Fill memory from a place on with numbers that lie evenly apart, or with one."""
         first = run[0]
         if len(run) == 1:
-            self._builder.write(f"{{memory}}[{start}] = {{0}};", (first,), memory)
+            self._builder.fill(memory, f"{{memory}}[{start}] = {{0}};", first)
             return
         assert isinstance(first, At)
         second = run[1]
         assert isinstance(second, At)
         many = At(first.memory, first.offset, second.offset - first.offset, first.index)
-        self._builder.write(f"{{memory}}[{start} + l] = {{0}};", (many,), memory, len(run))
+        self._builder.fill(memory, f"{{memory}}[{start} + l] = {{0}};", many, len(run))
+
+
+def contiguous(builder: Builder, value: Value) -> Memory:
+    """Memory that holds an array in row-major order."""
+    if not isinstance(value, Array):
+        return builder.names.table(value, kind_of(value.dtype))
+    key = id(value.cells)
+    if key not in builder.contiguous:
+        builder.contiguous[key] = value, _contiguous(builder, value)
+    return builder.contiguous[key][1]
+
+
+def _contiguous(builder: Builder, value: Array) -> Memory:
+    places = np.arange(prod(value.shape))
+    flat = value.cells.reshape(-1)
+    lies = in_memory(flat[0].memory, value.shape) if isinstance(flat[0], At) else None
+    if lies is not None and lies.axis == value.axis and bool((lies.cells == value.cells).all()):
+        return flat[0].memory
+    if value.axis is None:
+        return Sources(builder, [value]).copied(places)
+    lanes = value.shape[value.axis]
+    stride = prod(value.shape[value.axis + 1 :])
+    starts = np.take(places.reshape(value.shape), 0, value.axis).reshape(-1)
+    cells = tuple(flat)
+    memory = builder.array(value.kind, len(places), cells, lanes)
+    for start, cell in zip(starts, cells, strict=True):
+        builder.fill(memory, f"{{memory}}[{start} + {stride} * l] = {{0}};", cell)
+    return memory
 
 
 def _values(table: Memory) -> np.ndarray:
@@ -306,15 +215,14 @@ def _places(cells: Sequence[Cell]) -> np.ndarray | None:
 
 
 def _runs(cells: Sequence[Cell]) -> list[list[Cell]]:
-    """Cells in their order, those that lie evenly apart in the same memory together."""
+    """Cells in their order; three or more that lie evenly apart in the same memory together."""
     runs: list[list[Cell]] = []
     for cell in cells:
         if runs and _goes_on(runs[-1], cell):
             runs[-1].append(cell)
         else:
             runs.append([cell])
-    short = [run if len(run) > 2 else [[cell] for cell in run] for run in runs]
-    return list(itertools.chain.from_iterable(r if isinstance(r[0], list) else [r] for r in short))
+    return [part for run in runs for part in ([run] if len(run) > 2 else [[c] for c in run])]
 
 
 def _goes_on(run: list[Cell], cell: Cell) -> bool:

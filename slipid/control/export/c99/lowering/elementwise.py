@@ -9,16 +9,22 @@ from typing import Any
 
 import jax
 
-from slipid.control.export.c99.arrays import (
-    UNROLLED,
+from slipid.control.export.c99.lowering.arrays import along
+from slipid.control.export.c99.lowering.builder import Builder
+from slipid.control.export.c99.lowering.ir import (
+    Array,
+    Cell,
+    NoFormError,
+    Number,
     Value,
-    along,
+    Variable,
     cells_of,
     kind_of_value,
     longest,
     varies,
 )
-from slipid.control.export.c99.ir import Array, Builder, Cell, Kind, Number, Variable, kind_of
+from slipid.control.export.c99.lowering.sources import UNROLLED
+from slipid.control.export.fields import Kind, kind_of
 
 Params = dict[str, Any]
 """Of a primitive, as JAX has them."""
@@ -26,6 +32,7 @@ Shaped = jax.ShapeDtypeStruct
 Rule = Callable[[Builder, list[Value], Params, Shaped], Value]
 Simpler = Callable[[tuple[Cell, ...]], Cell | None]
 """What cells come to without a statement; None where it takes one."""
+
 
 UNARY = {
     "abs": "r_abs({0})",
@@ -71,13 +78,17 @@ NEUTRAL = {"add": (0.0, 0.0), "sub": (None, 0.0), "mul": (1.0, 1.0), "div": (Non
 """Numbers that, in the first or second place, leave the other as it is."""
 
 
+def _never(cells: tuple[Cell, ...]) -> Cell | None:
+    return None
+
+
 def applied(
     builder: Builder,
     template: str,
     kind: Kind,
     values: Sequence[Value],
     shape: tuple[int, ...],
-    simpler: Callable[[tuple[Cell, ...]], Cell | None] = lambda cells: None,
+    simpler: Simpler = _never,
 ) -> Array:
     """A template applied to every number of some arrays, or of single numbers for all."""
     axis = _axis(values, shape)
@@ -119,7 +130,7 @@ def unary(name: str) -> Rule:
         if UNARY[name] == "{0}":
             return values[0]
         if name == "not" and kind_of_value(values[0]) != "bool":
-            raise NotImplementedError("of whole numbers")
+            raise NoFormError("of whole numbers")
         return applied(builder, UNARY[name], kind_of(out.dtype), values, out.shape)
 
     return rule
@@ -152,7 +163,7 @@ def divided(
     builder: Builder,
     values: list[Value],
     out: Shaped,
-    simpler: Callable[[tuple[Cell, ...]], Cell | None],
+    simpler: Simpler,
 ) -> Value:
     """Quotients; a hyperbolic tangent, itself a quotient, over a number is a single one."""
 
@@ -171,7 +182,7 @@ def integer_pow(builder: Builder, values: list[Value], params: Params, out: Shap
     """A whole power, by multiplications."""
     power = params["y"]
     if power == 0:
-        raise NotImplementedError("a power of 0")
+        raise NoFormError("a power of 0")
     product = " * ".join(["{0}"] * abs(power))
     template = product if power > 0 else f"R(1.0) / ({product})"
     return applied(builder, template, kind_of(out.dtype), values, out.shape)
@@ -205,6 +216,6 @@ def select(builder: Builder, values: list[Value], params: Params, out: Shaped) -
         return (yes if which.value else no) if isinstance(which, Number) else None
 
     if len(values) != 3 or kind_of_value(values[0]) != "bool":
-        raise NotImplementedError("more than two cases")
+        raise NoFormError("more than two cases")
     kind = kind_of(out.dtype)
     return applied(builder, "{0} ? {2} : {1}", kind, values, out.shape, simpler)

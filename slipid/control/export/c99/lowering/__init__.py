@@ -1,0 +1,1 @@
+"""From what JAX has traced to text of C99."""
