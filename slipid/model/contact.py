@@ -202,9 +202,13 @@ def settle(
         Twists, and tractions [m g mean(mu)].
     """
     rim = rim.reshape(plain.shape[1], -1)
-    balance, near = Balance(rim, on), Planar(*start)
-    for _ in range(CHORD):
-        near = balance.chord(near)
+    balance = Balance(rim, on)
+
+    def chord(xi: Planar, _: None) -> tuple[Planar, None]:
+        return balance.chord(xi), None
+
+    # XLA is to write the steps out, generated code keeps them a loop
+    near, _ = jax.lax.scan(chord, Planar(*start), length=CHORD, unroll=CHORD)
     xi = near
     for _ in range(NEWTON):
         xi = jax.tree.map(jnp.subtract, xi, balance.newton(xi))

@@ -20,10 +20,7 @@ import pytest
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot, drawn
 from slipid.control.robot_file.record import (
-    GainRecord,
-    GainsRecord,
     GainValues,
-    Losses,
     ToldRecord,
 )
 from slipid.deploy.record_of import record_of
@@ -32,7 +29,7 @@ from slipid.model.robot import Validity, build
 from slipid.parameter import entries
 from slipid.support.errors import DataError
 from slipid.support.files import checksum
-from tests.helpers.known_robot import deploy_known, given
+from tests.helpers.known_robot import GAINS, deploy_known, given
 
 SCHEMA = json.loads(resources.files("slipid.control").joinpath("robot.schema.json").read_text())
 SEEN = Validity(
@@ -42,16 +39,6 @@ ONE = (((0.01, -0.02, 1 / 3), (0.0, 0.1 + 0.2, 0.0)), ((0.0, 0.0, 0.0), (0.001, 
 """What is told of a floor at two speeds and in two directions."""
 LEFT = (((0.01, 0.02, 0.03), (0.03, 0.02, 0.01)), ((0.01, 0.01, 0.01), (0.02, 0.02, 0.0)))
 TOLD = ToldRecord((0.1, 0.3), (ONE, ONE[::-1]), (LEFT, LEFT[::-1]))
-GAINS = GainsRecord(
-    values=GainValues(*(GainRecord(0.1 * k, "1", 0.01) for k in range(6))),
-    load="moved",
-    gyro=True,
-    method="pso",
-    loss=Losses(2.0, 1.0),
-    better_than_hand=0.7,
-    stability_margin=0.02,
-    verdict="better than by hand",
-)
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -15,6 +16,9 @@ import pytest
 
 from slipid.control.export.c99.code import Code
 from slipid.control.export.fields import Struct
+from slipid.control.trajectory import rectangle
+from slipid.deploy.controllers import ROWS, pilot_of
+from tests.helpers import small_twin
 
 MANY = """
 void slipid_many(int32_t count, slipid_estimator *estimator, slipid_controller *controller,
@@ -34,6 +38,12 @@ void slipid_many(int32_t count, slipid_estimator *estimator, slipid_controller *
 """One step of many robots."""
 QUICK = ("-O2", "-fno-math-errno", "-fno-trapping-math")
 NEEDS_COMPILER = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+
+
+@cache
+def code(row: str) -> Code:
+    """Of a row of the trial for a small robot, with a rectangle to follow."""
+    return Code(pilot_of(small_twin.deployed(1.0, 1.0, 0.3), ROWS[row]), rectangle())
 
 
 @dataclass(frozen=True)

@@ -9,24 +9,13 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.model.geometry import Geometry, mecanum, omni
 from slipid.model.robot import build
-from tests.helpers.known_robot import deploy_known
+from tests.helpers.known_robot import GAINS, deploy_known
 
 ODD = ('wet | "sand" -->', "class", "Wet sand", "2nd")
 """Names of floors that no parameter can have, two of them alike in letters and digits but one."""
 LOADS = ("as built", "moved")
-GAINS = GainsRecord(
-    values=GainValues(*(GainRecord(0.1 * k, "1", 0.01) for k in range(6))),
-    load="moved",
-    gyro=True,
-    method="pso",
-    loss=Losses(2.0, 1.0),
-    better_than_hand=0.7,
-    stability_margin=0.02,
-    verdict="better than by hand",
-)
 AXES = ("along", "across", "yaw")
 
 

@@ -8,10 +8,29 @@ import jax
 import numpy as np
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.robot_file.record import Number, ToldRecord
+from slipid.control.robot_file.record import (
+    GainRecord,
+    GainsRecord,
+    GainValues,
+    Losses,
+    Number,
+    ToldRecord,
+)
 from slipid.deploy.record_of import plain, record_of
 from slipid.model.robot import Robot
 from slipid.parameter import entries
+
+GAINS = GainsRecord(
+    values=GainValues(*(GainRecord(0.1 * k, "1", 0.01) for k in range(6))),
+    load="moved",
+    gyro=True,
+    method="pso",
+    loss=Losses(2.0, 1.0),
+    better_than_hand=0.7,
+    stability_margin=0.02,
+    verdict="better than by hand",
+)
+"""Tuned for a load set-up named "moved"."""
 
 
 def deploy_known(

@@ -221,18 +221,17 @@ class FloorFilter(eqx.Module):
         size = jnp.sqrt(predicted**2 + 0.03**2)
         gap = jnp.where(told_of == 2, predicted - amps, size - jnp.abs(amps))
         var = std**2 + (currents.variance + self._stiction(w)) + self._of_friction(predicted)
-        worst = (s.unknown_std + 1.0) ** 2
-        score = jnp.minimum(gap**2 / var, worst)
-        told = jnp.sum(jnp.where(told_of > 0, -0.5 * (score + jnp.log(var)), 0.0), axis=1)
-        of_none = -0.5 * (s.unknown_std**2 + jnp.log(jnp.mean(var, axis=0)))
-        none = jnp.sum(jnp.where(told_of > 0, of_none, 0.0))
         yaw = jnp.mean(f.effect[:, 2]) * jnp.maximum(length(xi[:, :2]), 0.02)
-        gyro_var = s.gyro_std**2 + yaw**2
-        off = jnp.minimum((xi[:, 2] - turn) ** 2 / gyro_var, worst)
-        has = jnp.isfinite(turn)
-        told += jnp.where(has, -0.5 * (off + jnp.log(gyro_var)), 0.0)
-        none += jnp.where(has, -0.5 * (s.unknown_std**2 + jnp.log(jnp.mean(gyro_var))), 0.0)
-        return told, none
+        gyro_gap, gyro_var = xi[:, 2] - turn, s.gyro_std**2 + yaw**2
+        gap = jnp.concatenate([gap, gyro_gap[:, None]], axis=1)
+        var = jnp.concatenate([var, gyro_var[:, None]], axis=1)
+        heard = jnp.append(told_of > 0, jnp.isfinite(turn))
+        worst = (s.unknown_std + 1.0) ** 2
+        score = jnp.sum(jnp.where(heard, jnp.minimum(gap**2 / var, worst), 0.0), axis=1)
+        # a logarithm of a product costs a robot's computer less than several
+        told = -0.5 * (score + jnp.log(jnp.prod(jnp.where(heard, var, 1.0), axis=1)))
+        spread = jnp.log(jnp.prod(jnp.where(heard, jnp.mean(var, axis=0), 1.0)))
+        return told, -0.5 * (s.unknown_std**2 * jnp.sum(heard) + spread)
 
     def _of_friction(self, amps: Float[Array, "hypothesis wheel"]) -> Array:
         """Variance of currents as frictions of several floors under the wheels are unsure [A^2].

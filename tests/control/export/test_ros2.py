@@ -17,18 +17,8 @@ from slipid.control.export.header import header
 from slipid.control.export.ros.names import identifiers
 from slipid.control.export.ros.yaml_text import scalar
 from slipid.control.export.ros2 import ros2_files
-from tests.helpers.exported import LOADS, ODD, doubtful, mecanum_robot
+from tests.helpers.exported import LOADS, ODD, mecanum_robot
 from tests.helpers.ros_yaml import flat, parameters, read
-
-
-@pytest.fixture(scope="module")
-def robot() -> DeployedRobot:
-    return doubtful()
-
-
-@pytest.fixture(scope="module")
-def files(robot) -> dict[str, str]:
-    return ros2_files(robot)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.control.deployed import DeployedRobot
 from slipid.control.export.ros.names import identifiers
 from slipid.control.export.ros.noise import DISTANCE_M, PERIOD_S, Errs, errs_of, top_speed
 from slipid.control.export.ros2 import ros2_files
@@ -19,16 +18,6 @@ from tests.helpers.ros_yaml import parameters, read
 
 OMNI, MECANUM = "omni_wheel_drive_controller", "mecanum_drive_controller"
 EKF = "ekf_filter_node"
-
-
-@pytest.fixture(scope="module")
-def robot() -> DeployedRobot:
-    return doubtful()
-
-
-@pytest.fixture(scope="module")
-def files(robot) -> dict[str, str]:
-    return ros2_files(robot)
 
 
 # drive controllers ---------------------------------------------------------------------------

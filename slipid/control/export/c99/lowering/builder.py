@@ -1,7 +1,8 @@
 """Where every statement of a function stands.
 
 Every number is computed once, in the earliest block that has what it needs. A block is straight
-code, or one loop over lanes, so that what many operations do to the same lanes is one loop.
+code, or one loop over lanes, so that what many operations do to the same lanes is one loop. What
+stays the same in every turn of a repetition is computed in front of it.
 """
 
 from __future__ import annotations
@@ -50,12 +51,14 @@ class Builder:
     """Collects the statements of a function, or of the body of a condition or repetition.
 
     Attributes:
+        parent: of the code around it; turns: block that repeats this code, None if none does.
         blocks: in their order; source: line of Python that asks for what comes next.
         contiguous: arrays that lie in row-major order in memory as well, by their cells.
     """
 
     def __init__(self, names: Names, parent: Builder | None = None):
         self.names, self.parent = names, parent
+        self.turns: Block | None = None
         self.blocks: list[Block] = []
         self.source = ""
         self.contiguous: dict[int, tuple[Array, Memory]] = {}
@@ -73,6 +76,10 @@ class Builder:
 
         With `start` lanes are reduced to one number.
         """
+        around = self._around(cells)
+        if around is not self:
+            around.source = self.source
+            return around.compute(kind, template, cells, lanes, start)
         key = (kind, template, cells, lanes, start)
         if key not in self._known and self.parent is not None and key in self.parent._known:
             return self.parent._known[key]
@@ -90,7 +97,8 @@ class Builder:
 
     def array(self, kind: Kind, size: int, cells: tuple[Cell, ...], lanes: int = 0) -> Memory:
         """Memory for numbers that straight code, or a loop over lanes, fills from these cells."""
-        return Memory(f"m{self.names.number()}", kind, size, self._place(cells, lanes))
+        home = self._around(cells)._place(cells, lanes)
+        return Memory(f"m{self.names.number()}", kind, size, home)
 
     def fill(self, memory: Memory, template: str, cell: Cell, times: int = 0) -> None:
         """A statement of C that fills memory made by `array`, so many times if not 0."""
@@ -102,9 +110,27 @@ class Builder:
 
     def append(self, lanes: int = 0, nested: Nested | None = None, calls: bool = False) -> Block:
         """A new block behind all others."""
-        block = Block(self, len(self.blocks), lanes, calls, nested=nested)
+        return self.put(Block(self, 0, lanes, calls, nested=nested))
+
+    def put(self, block: Block) -> Block:
+        """A block behind all others."""
+        block.place = len(self.blocks)
         self.blocks.append(block)
         return block
+
+    def _around(self, cells: tuple[Cell, ...]) -> Builder:
+        """Code in which a statement with these cells can stand: around turns that change none."""
+        if self.parent is None or self.turns is None or any(map(self._changes, cells)):
+            return self
+        return self.parent._around(cells)
+
+    def _changes(self, cell: Cell) -> bool:
+        """Whether a cell may change from turn to turn."""
+        if isinstance(cell, At):
+            home = cell.memory.home
+            by_index = cell.index is not None and self._changes(cell.index)
+            return by_index or (home is not None and (home is self.turns or home.owner is self))
+        return isinstance(cell, Variable) and cell.home.owner is self
 
     def _place(self, cells: tuple[Cell, ...], lanes: int, calls: bool = False) -> Block:
         """The earliest block for a statement over so many lanes that uses these cells.

@@ -29,6 +29,7 @@ from slipid.control.export.c99.lowering.ir import (
     cells_of,
     in_memory,
     kind_of_value,
+    longest,
     varies,
 )
 from slipid.control.export.c99.lowering.moves import MOVES, SOURCES, moved
@@ -172,20 +173,18 @@ class _Lowering:
             raise NoFormError("a loop that goes through an array")
         builder = self._builder
         body = Builder(builder.names, builder)
-        block = builder.append(nested=Nested(None, params["length"], [body]))
+        body.turns = Block(builder, 0, nested=Nested(None, params["length"], [body]))
         begun = values[consts:]
-        memories = [self._memory(value, block) for value in begun]
-        before = builder.blocks.pop()  # what the loop begins with is stored in front of it
+        memories = [self._memory(value, body.turns) for value in begun]
         for value, memory in zip(begun, memories, strict=True):
             store(builder, value, memory)
-        before.place = len(builder.blocks)
-        builder.blocks.append(before)
         carry = [in_memory(m, v.shape) for m, v in zip(memories, begun, strict=True)]
         found = lowered(body, params["jaxpr"], [*values[:consts], *carry])
         names = frozenset(memory.name for memory in memories)
         kept = [apart(body, value, names) for value in found]
         for value, memory in zip(kept, memories, strict=True):
             store(body, value, memory)
+        builder.put(body.turns)
         return list(carry)
 
 
@@ -207,7 +206,7 @@ def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
 def store(builder: Builder, value: Value, memory: Memory) -> None:
     """Write an array, in row-major order, into memory at the end of a builder's code."""
     shape = value.shape
-    axis = value.axis if isinstance(value, Array) else None
+    axis = value.axis if isinstance(value, Array) else longest(shape)
     cells = along(builder, value, shape, axis)
     places = np.arange(prod(shape)).reshape(shape)
     lanes = 0 if axis is None else shape[axis]
