@@ -47,9 +47,9 @@ def test_a_step_is_that_of_jax(row, tmp_path):
     found = [differences(compiled, batch) for batch in batches(row)]
     every = {name: np.concatenate([f[name] for f in found]) for name in found[0]}
     for name, gaps in every.items():
-        # where the balance is flat, what the last bits make of it is not small
-        assert np.mean(gaps > 1e-12) < 0.005, name
-        assert np.max(gaps) < 1e-7, name
+        # where the balance is flat, the last bits count for more
+        assert np.mean(gaps > 1e-12) < 0.002, name
+        assert np.max(gaps) < 1e-10, name
 
 
 @pytest.mark.slow

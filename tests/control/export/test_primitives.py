@@ -70,7 +70,31 @@ def _swapped(x, y):
     return jax.lax.fori_loop(0, 5, turn, (x, y, x * y))
 
 
+def _made_in_turns(x):
+    def turn(k, c):
+        v = jnp.sin(c)
+        return v[0] * jnp.cos(v[1]) + 0.1 * v + x[k] * x
+
+    return jax.lax.fori_loop(0, 4, turn, x)
+
+
+def _read_late(x):
+    """Of two arrays alike the first is read once more after the second has been filled."""
+    first = jnp.stack([x[k] * x[k - 1] for k in range(N)])
+    k = jnp.argmin(x)
+    second = jnp.stack([x[j] * (k + j) for j in range(N)])
+    return second[k] - jnp.sin(first[k])
+
+
+def _across_rows(a, x):
+    rows, columns = np.arange(N) // 6, (6 + np.arange(N)) % N
+    return [a[rows, columns], jnp.concatenate([x[np.array([0, 1, 3, 7, 2, 9])], jnp.sin(x)])]
+
+
 FUNCTIONS = {
+    "made in turns": (_made_in_turns, LANES),
+    "read late": (_read_late, LANES),
+    "across rows": (_across_rows, SQUARE, LANES),
     "kept over turns": (_kept, LANES),
     "kept over branches": (_kept_in_branches, LANES),
     "swapped": (_swapped, LANES, LANES),

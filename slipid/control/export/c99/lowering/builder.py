@@ -85,10 +85,8 @@ class Builder:
             return self.parent._known[key]
         if key not in self._known:
             block = self._place(cells, lanes, bool(start) or any(f in template for f in CALLS))
-            one = start != ""
-            made = Variable(
-                kind, self.names.number(), 0 if one else lanes, block, one, (template, cells)
-            )
+            made_by = template, cells
+            made = Variable(kind, self.names.number(), 0 if start else lanes, block, made_by)
             block.statements.append(
                 Statement(made, template, cells, start=start, source=self.source)
             )
@@ -152,8 +150,7 @@ class Builder:
             return max(inner, self._behind(cell.memory.home, False))
         if not isinstance(cell, Variable):
             return 0
-        together = lanes == cell.lanes and not cell.summed
-        return self._behind(cell.home, together)
+        return self._behind(cell.home, lanes == cell.lanes)
 
     def _behind(self, home: Block | None, together: bool) -> int:
         if home is None or home.owner is not self:

@@ -87,7 +87,6 @@ class Variable:
 
     Attributes:
         kind: of it; number: of its name; home: block that computes it.
-        summed: whether lanes are summed up, or reduced in another way, to one number.
         made_by: template and cells of its statement.
     """
 
@@ -95,7 +94,6 @@ class Variable:
     number: int
     lanes: int
     home: Block
-    summed: bool = False
     made_by: tuple[str, tuple[Cell, ...]] = ("", ())
 
     @property
