@@ -40,6 +40,10 @@ HERE = Path(__file__).parent
 FAST = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 PLAIN = ("-O2",)
 KINDS = {"double": (), "float": ("-DSLIPID_FLOAT",)}
+SHARE = float(os.environ.get("SLIPID_BENCH_SHARE", "1"))
+"""Part of all steps and runs that is done, to try the benchmark."""
+NUDGE = 1e-14
+"""What states and inputs of a doubtful step are changed by, relatively."""
 THREE = omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0)
 
 
@@ -177,3 +181,14 @@ def driven(made: Code, robot: DeployedRobot, fleet: Fleet, steps: int = 1200) ->
         plant, read = plants.step(plant, command, number)
     dt = np.full(steps, PERIOD, fleet.kinds.real)
     return Drive(np.concatenate(rows), np.array(asked), dt)
+
+
+def nudged(given, rng, nudge=NUDGE):
+    """The same with every number off by a few roundings."""
+
+    def one(x):
+        if x.dtype != float:
+            return x
+        return x * (1 + nudge * rng.uniform(-1.0, 1.0, x.shape))
+
+    return jax.tree.map(one, given)
