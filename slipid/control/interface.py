@@ -195,8 +195,8 @@ class Estimate(eqx.Module):
     @property
     def finite(self) -> Bool[Array, ""]:
         """Whether every number is one."""
-        flat = [x.reshape(-1) for x in jax.tree.leaves(self) if x.dtype != bool]
-        return jnp.all(jnp.isfinite(jnp.concatenate(flat)))
+        parts = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(self) if x.dtype != bool]
+        return jnp.all(jnp.stack(parts))
 
 
 class AbstractEstimator(eqx.Module, Generic[State]):
