@@ -38,7 +38,7 @@ class Field:
 
     @property
     def size(self) -> int:
-        """How many numbers."""
+        """Count of its numbers."""
         return prod(self.shape)
 
 
@@ -61,7 +61,7 @@ class Struct:
 
 
 def kind_of(dtype: np.dtype) -> Kind:
-    """Of the numbers of a jax or numpy type."""
+    """Kind of the numbers of a type of jax or numpy."""
     if dtype == np.bool_:
         return "bool"
     return "int" if np.issubdtype(dtype, np.integer) else "real"

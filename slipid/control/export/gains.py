@@ -1,4 +1,4 @@
-"""What people must know of a controller's gains and limits."""
+"""Sentences on the origin of a controller's gains and limits."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""What stands at the head of every file that is made of a robot."""
+"""Head of every file that is made of a robot: its origin, floors, verdicts and warnings."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -32,7 +32,7 @@ def header(robot: DeployedRobot) -> list[str]:
 
 
 def in_markdown(robot: DeployedRobot) -> list[str]:
-    """The same as Markdown, warnings first, with the messages of the fit."""
+    """The head as Markdown, warnings first, with the messages of the fit."""
     notes = (f"Note of the fit: {message}" for message in robot.record.messages)
     warned = [line for text in warnings(robot) for line in (f"> **WARNING.** {text}", "")]
     return [*warned, *(f"- {one_line(part)}" for part in (*_facts(robot), *notes)), ""]

@@ -1,4 +1,4 @@
-"""What a folder for a robot is, for the person who opens it first."""
+"""README of an exported folder."""
 
 from collections.abc import Mapping, Sequence
 

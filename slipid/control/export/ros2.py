@@ -26,7 +26,7 @@ USES: Mapping[str, str] = {
     "slipid_parameters.yaml": "their declaration for generate_parameter_library: types, "
     "descriptions with verdicts, validators; the defaults are the numbers themselves",
 }
-"""What each file is for, but for those of single floors."""
+"""Use of each file that is not of a single floor."""
 _FLOOR = (
     "covariances of the drive controller and process noise of `robot_localization.yaml` on this "
     "floor: give it after those files, it overrides them"

@@ -30,7 +30,7 @@ SCHEMA = "slipid.stablehlo/1"
 CLOSE = 1e-9
 """Over its scale, by which a number may differ once the program is loaded."""
 PLATFORMS = ("cpu", "cuda", "tpu")
-"""That the programs are for."""
+"""Platforms that the programs run on."""
 FILES = ("step.stablehlo", "step_batch.stablehlo", "step.json", "golden.npz")
 
 

@@ -194,7 +194,7 @@ class Code:
 
 
 def about(pilot: Pilot[eqx.Module]) -> Iterator[str]:
-    """What a reader of the header must know of axes, wheels, sensors and floors."""
+    """Sentences on axes, wheels, sensors and floors for readers of the header."""
     robot = pilot.controller.robot
     yield (
         "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: those in "

@@ -33,19 +33,19 @@ class Recording:
 
     @property
     def readings(self) -> str:
-        """As lines for the example."""
+        """Text of readings.txt, which the example reads."""
         rows = [" ".join(repr(float(x)) for x in row) for row in self.given]
         return "\n".join([" ".join(map(repr, self.start)), *rows]) + "\n"
 
     @property
     def commands(self) -> str:
-        """As the example prints them."""
+        """Text of commands.txt, as the example prints it."""
         rows = zip(self.command, self.time, strict=True)
         return "".join(f"{' '.join(f'{x:.9f}' for x in c)} {t:.9f}\n" for c, t in rows)
 
 
 def _path(path: Path) -> str:
-    """Where a path leads, for people."""
+    """Description of a path for people."""
     corners = [f"({x:.2f}, {y:.2f})" for x, y in np.asarray(path.corners).tolist()]
     x, y, heading = np.asarray(path.rows)[0, :3].tolist()
     return (

@@ -116,7 +116,7 @@ def _shape(robot: DeployedRobot) -> Iterator[Parameter]:
 
 
 def _errors(robot: DeployedRobot) -> Iterator[Parameter]:
-    """What the model misses, and what the robot was seen with."""
+    """Parameters of the model's error, and of the conditions the robot was seen in."""
     three, two = (Check("fixed_size<>", (3,)), _ZEROS), (Check("fixed_size<>", (2,)),)
     for k, name in enumerate(identifiers(robot.labels, "floor")):
         yield _flat(f"errors.{name}.process", robot.process[k], _PROCESS, three)

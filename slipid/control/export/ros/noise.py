@@ -78,7 +78,7 @@ class Errs:
 
 
 def errs_of(robot: DeployedRobot) -> tuple[Errs, ...]:
-    """What odometry errs by, floor by floor in the robot's order."""
+    """Errors of odometry on each floor, in the robot's order."""
     slip = np.asarray(_slip(robot, jnp.asarray(top_speed(robot))))
     process, effect = np.asarray(robot.process), np.asarray(robot.effect)
     return tuple(
@@ -88,7 +88,7 @@ def errs_of(robot: DeployedRobot) -> tuple[Errs, ...]:
 
 
 def worst(errs: tuple[Errs, ...]) -> Errs:
-    """That on the floor on which the place is least known after `DISTANCE_M`."""
+    """Errors on the floor on which the place is least known after `DISTANCE_M`."""
     return max(errs, key=lambda e: e.pose(DISTANCE_M)[0])
 
 
@@ -125,5 +125,5 @@ def _axes(row: Float[np.ndarray, "3"]) -> Axes:
 
 
 def _level(row: Float[np.ndarray, "3"]) -> Axes:
-    """With the larger of along and across for both."""
+    """The same errors with the larger of along and across for both."""
     return _axes(np.array([row[:2].max(), row[:2].max(), row[2]]))

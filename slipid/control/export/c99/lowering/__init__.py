@@ -1,1 +1,1 @@
-"""From what JAX has traced to text of C99."""
+"""Lowering of functions that JAX has traced to text of C99."""

@@ -27,11 +27,11 @@ from slipid.control.export.c99.lowering.sources import UNROLLED
 from slipid.control.export.fields import Kind, kind_of
 
 Params = dict[str, Any]
-"""Of a primitive, as JAX has them."""
+"""Parameters of a primitive, as JAX has them."""
 Shaped = jax.ShapeDtypeStruct
 Rule = Callable[[Builder, list[Value], Params, Shaped], Value]
 Simpler = Callable[[tuple[Cell, ...]], Cell | None]
-"""What cells come to without a statement; None where it takes one."""
+"""Finds the cell that an operation on cells is equal to; None if it takes a statement."""
 
 
 UNARY = {
@@ -73,7 +73,7 @@ BINARY = {
     "sub": "{0} - {1}",
 }
 OF_INTS = {"max": "i_max({0}, {1})", "min": "i_min({0}, {1})", "rem": "{0} % {1}"}
-"""What is written otherwise for whole numbers."""
+"""Templates of operations that are written otherwise for whole numbers."""
 NEUTRAL = {"add": (0.0, 0.0), "sub": (None, 0.0), "mul": (1.0, 1.0), "div": (None, 1.0)}
 """Numbers that, in the first or second place, leave the other as it is."""
 
@@ -111,7 +111,7 @@ def _axis(values: Sequence[Value], shape: tuple[int, ...]) -> int | None:
 
 
 def lanes_of(values: Sequence[Value], shape: tuple[int, ...]) -> int:
-    """How many lanes there are then; 0 for none."""
+    """Number of lanes of what is computed from values, number by number; 0 for none."""
     axis = _axis(values, shape)
     return 0 if axis is None else shape[axis]
 

@@ -20,8 +20,8 @@ class Argument:
     """An argument of a function of C.
 
     Attributes:
-        name: of it; type: of what a pointer points to, empty for plain numbers.
-        fields: that it has; one alone for plain numbers.
+        name: its name; type: struct that the pointer points to, empty for plain numbers.
+        fields: fields of the struct; one alone for plain numbers.
         read, written: whether the function reads and fills it.
     """
 
@@ -45,7 +45,7 @@ class Argument:
 
     @property
     def memories(self) -> list[Memory]:
-        """Where its fields lie."""
+        """Memory of each of its fields."""
         if self.type:
             return [
                 Memory(f"{self.name}->{f.name}", f.kind, f.size, scalar=not f.shape)
@@ -57,7 +57,7 @@ class Argument:
 
     @property
     def declared(self) -> str:
-        """As the function declares it."""
+        """Text of its declaration in the function's head."""
         const = "" if self.written else "const "
         if self.type:
             return f"{const}{self.type} *{self.name}"
@@ -72,8 +72,8 @@ class Function:
     """A function of C.
 
     Attributes:
-        name: of it; about: comment of its declaration; arguments: in their order.
-        lines: of its body; reads: names of all memory it reads.
+        name: its name; about: comment of its declaration; arguments: its arguments in order.
+        lines: lines of its body; reads: names of all memory that it reads.
         scratch: numbers in arrays that it has on the stack.
     """
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from slipid.control.export.c99.lowering.builder import Builder
 
 Cells = np.ndarray
-"""Of objects, each a `Cell`."""
+"""Array of objects, each of them a `Cell`."""
 LANES = 7
 """Length from which an axis is a loop."""
 
@@ -48,9 +48,9 @@ class Memory:
     """Numbers side by side: a field of a struct, an array on the stack or a table of constants.
 
     Attributes:
-        name: in C; kind: of its numbers; size: how many.
+        name: name in C; kind: kind of its numbers; size: count of its numbers.
         home: block that fills it; None where it is filled before the function begins.
-        values: of a table of constants.
+        values: bytes of a table of constants, empty for other memory.
         scalar: whether it is a single number that C knows without an index.
         lanes: whether a loop fills it, truth values as 1 and 0: numbers of one size make a loop
             that compilers turn into instructions for several lanes at once.
@@ -77,7 +77,7 @@ class At:
 
     @property
     def kind(self) -> Kind:
-        """Of the memory."""
+        """Kind of the numbers in the memory."""
         return self.memory.kind
 
 
@@ -86,8 +86,8 @@ class Variable:
     """A number that a statement computes; one for every lane where `lanes` is not 0.
 
     Attributes:
-        kind: of it; number: of its name; home: block that computes it.
-        made_by: template and cells of its statement.
+        kind: kind of the number; number: number in its name; home: block that computes it.
+        made_by: template and cells of the statement that computes it.
     """
 
     kind: Kind
@@ -98,7 +98,7 @@ class Variable:
 
     @property
     def memory(self) -> Memory:
-        """Where its lanes are kept."""
+        """Array on the stack that keeps its lanes."""
         return Memory(f"m{self.number}", self.kind, self.lanes, self.home, lanes=True)
 
 
@@ -111,10 +111,11 @@ class Statement:
     """`target = template` with cells for {0}, {1} and so on.
 
     Attributes:
-        target: what it computes; None where the template is a whole statement of C.
-        writes: memory that the template fills; times: numbers of it, in a loop, if not 0.
+        target: variable that it computes; None where the template is a whole statement of C.
+        writes: memory that the template fills; times: how many numbers it fills in a loop of its
+            own, 0 for a statement without one.
         always: whether it stays though nothing reads that memory.
-        start: of a reduction; empty for what is none.
+        start: number that a reduction starts from; empty for a statement that is none.
         source: line of Python that asks for it.
     """
 
@@ -133,8 +134,8 @@ class Block:
     """Statements that run one after the other, for every lane if `lanes` is not 0.
 
     Attributes:
-        owner: what it is part of; place: among the blocks of its owner.
-        lanes: of the loop; calls: whether its statements call functions.
+        owner: builder that it is part of; place: its number among the blocks of the owner.
+        lanes: count of the loop's turns; calls: whether its statements call functions.
         nested: a condition or a repetition, which has blocks of its own.
     """
 
@@ -153,7 +154,7 @@ class Nested:
     Attributes:
         when: condition of the first of two bodies, or None.
         times: how often a single body runs.
-        bodies: what runs.
+        bodies: code that runs.
     """
 
     when: Cell | None
@@ -166,9 +167,9 @@ class Array:
     """An array of cells.
 
     Attributes:
-        shape: of the array; kind: of its numbers.
-        axis: that of the lanes, or None.
-        cells: without that axis.
+        shape: shape of the array; kind: kind of its numbers.
+        axis: axis of the lanes, or None.
+        cells: its cells, an array without that axis.
     """
 
     shape: tuple[int, ...]
@@ -178,11 +179,11 @@ class Array:
 
 
 Value = Array | np.ndarray
-"""What is computed at run time, or a constant."""
+"""An array that is computed at run time, or a constant."""
 
 
 def kind_of_value(value: Value) -> Kind:
-    """Of its numbers."""
+    """Kind of the numbers of a value."""
     return value.kind if isinstance(value, Array) else kind_of(value.dtype)
 
 
@@ -194,7 +195,7 @@ def cells_of(shape: Sequence[int], cells: Sequence[Cell]) -> Cells:
 
 
 def varies(cell: Cell) -> bool:
-    """Whether it differs from lane to lane."""
+    """Whether a cell differs from lane to lane."""
     if isinstance(cell, At):
         by_index = cell.index is not None and cell.index.lanes > 0
         return cell.stride != 0 or cell.table is not None or by_index

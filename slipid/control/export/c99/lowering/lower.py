@@ -57,10 +57,10 @@ Primitives that only move numbers need no rule of their own: they are asked, by 
 the numbers of their result come from.
 """
 INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
-"""Primitives that are functions called."""
+"""Primitives that call a function; its code is put in their place."""
 
 _TYPES = frozenset(map(np.dtype, ("float64", "float32", "int64", "int32", "bool")))
-"""Of numbers that have a type in C."""
+"""Types of numbers that have a counterpart in C."""
 
 
 class UnsupportedError(Exception):

@@ -33,7 +33,7 @@ class Sources:
 
     Attributes:
         constant: whether all are constants; numbers: then they themselves.
-        kind: of them.
+        kind: kind of the numbers.
     """
 
     def __init__(self, builder: Builder, sources: Sequence[Value]):
@@ -137,7 +137,7 @@ class Sources:
         return At(first.memory, 0, table=self._builder.names.table(places, "int"))
 
     def _laned_source(self, row: np.ndarray) -> bool:
-        """Whether a row is of one array with lanes, other than along them."""
+        """Whether all of a row comes from one array that has lanes."""
         source, _ = self._source(int(row[0]))
         same = all(self._source(int(place))[0] is source for place in row)
         return same and isinstance(source, Array) and source.axis is not None
@@ -204,7 +204,7 @@ def _values(table: Memory) -> np.ndarray:
 
 
 def _places(cells: Sequence[Cell]) -> np.ndarray | None:
-    """Where cells lie, if they lie in the same memory."""
+    """Offsets of cells that all lie in one memory; None if they do not."""
     first = cells[0]
     for cell in cells:
         if not isinstance(cell, At) or not isinstance(first, At):

@@ -75,7 +75,7 @@ def reduced(name: str) -> Rule:
 
 
 def _of_ints(start: str) -> str:
-    """What a reduction of whole numbers starts from."""
+    """Neutral element of a reduction of whole numbers, from that of reals."""
     known = {"R(0.0)": "0", "R(1.0)": "1", "R_INFINITY": "INT32_MAX", "-R_INFINITY": "INT32_MIN"}
     return known[start]
 

@@ -13,7 +13,7 @@ from slipid.control.export.c99.lowering.usage import Usage
 from slipid.control.export.fields import DTYPES, Kind
 
 TYPES: dict[Kind, str] = {"real": "real_t", "int": "int32_t", "bool": "bool"}
-"""Of numbers, in C."""
+"""Types of numbers in C."""
 WIDTH = 100
 FLOAT_MAX = float(np.finfo(np.float32).max)
 
@@ -160,7 +160,7 @@ class Body:
         return f"({text} != R(0.0))" if memory.lanes and memory.kind == "bool" else text
 
     def _name(self, memory: Memory) -> str:
-        """Of the array that memory shares with other memory, or its own."""
+        """Name in C: that of the array on the stack which it shares, or its own."""
         shared = self._usage.shared.get(memory.name)
         return memory.name if shared is None else shared[1]
 
