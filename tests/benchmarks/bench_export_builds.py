@@ -23,6 +23,8 @@ from slipid.control.trajectory import rectangle
 from tests.benchmarks.export_builds import HERE, KINDS, needs, pilot, ran
 
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
+FLAGS = ("-fno-math-errno", "-fno-trapping-math")
+"""Flags that the exported folder asks CMake and PlatformIO for."""
 FUZZ_S = float(os.environ.get("SLIPID_FUZZ_S", "600"))
 ROWS = ("slip_odometry", "contact")
 CHIPS = {
@@ -132,7 +134,8 @@ def sizes(row: str, chip: str, folder: Path) -> Sizes:
     texts = {"slipid.h": made.header(), "slipid.c": made.source()}
     for name, text in (texts | {"sizes.c": SIZES, "main.c": MAIN}).items():
         (folder / name).write_text(text)
-    words = [f"{tool}gcc", *WARNINGS, "-Wdouble-promotion", "-Os", *CHIPS[chip], "-DSLIPID_FLOAT"]
+    chosen = [*WARNINGS, "-Wdouble-promotion", "-Os", *FLAGS, *CHIPS[chip], "-DSLIPID_FLOAT"]
+    words = [f"{tool}gcc", *chosen]
     ran([*words, "-fstack-usage", "-c", "slipid.c", "sizes.c"], folder)
     code, tables = sections(ran([f"{tool}size", "-A", "slipid.o"], folder))
     linked = ["main.c", "slipid.o", "--specs=nano.specs", "--specs=nosys.specs", "-lm"]
