@@ -25,21 +25,21 @@ def design(
         list[str] | None,
         typer.Option(
             metavar="FLOOR[@LOAD][:SPEED[:HEADING]]",
-            help="Prediction to sharpen, as gray:0.3:45 [m/s, deg]; may be repeated.",
+            help="Prediction to sharpen, as gray:0.3:45 (m/s, deg); may be repeated.",
         ),
     ] = None,
     runs: Annotated[int, typer.Option(min=1, max=1000, help="How many to propose.")] = 12,
     headings: Annotated[
-        str | None, typer.Option(metavar="LIST", help="Of candidates, as 0,45,90 [deg].")
+        str | None, typer.Option(metavar="LIST", help="Of candidates, as 0,45,90, in deg.")
     ] = None,
     speeds: Annotated[
-        str | None, typer.Option(metavar="LIST", help="Of candidates, as 0.1,0.2 [m/s].")
+        str | None, typer.Option(metavar="LIST", help="Of candidates, as 0.1,0.2, in m/s.")
     ] = None,
     turns: Annotated[
-        str | None, typer.Option(metavar="LIST", help="Turning rates, as -40,0,40 [deg/s].")
+        str | None, typer.Option(metavar="LIST", help="Turning rates, as -40,0,40, in deg/s.")
     ] = None,
     distance: Annotated[
-        float | None, typer.Option(metavar="M", help="Of every run [m]; as driven by default.")
+        float | None, typer.Option(metavar="M", help="Of every run, in m; as driven by default.")
     ] = None,
     floor: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Floor that can be driven on.")

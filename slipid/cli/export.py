@@ -5,26 +5,32 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, Load, MaybeOut, Quiet, emit, guarded
+from slipid.cli.common import Json, Load, Quiet, emit, guarded
 from slipid.support.progress import Reporter
 
 
 @guarded
 def export(
     source: Annotated[
-        Path, typer.Argument(metavar="OUT|ROBOT.json", help="Folder identify wrote, or its robot.")
+        Path,
+        typer.Argument(
+            metavar="OUT|ROBOT.json|DIR",
+            help="Folder identify wrote, or its robot; with --check the exported folder.",
+        ),
     ],
     to: Annotated[
         str, typer.Option("--to", metavar="FORMS", help="By commas: c, ros2, stablehlo, table.")
     ] = "c,ros2,stablehlo,table",
-    out: MaybeOut = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write to.")
+    ] = None,
     controller: Annotated[
         str, typer.Option(metavar="NAME", help="Row of the trial: contact, slip_odometry, ...")
     ] = "contact",
     path: Annotated[
-        str, typer.Option(metavar="NAME", help="That the example in C follows.")
+        str, typer.Option(metavar="NAME", help="Path that the example in C follows.")
     ] = "rectangle",
-    speed: Annotated[float, typer.Option(metavar="M_S", help="Along the path [m/s].")] = 0.2,
+    speed: Annotated[float, typer.Option(metavar="M_S", help="Along the path, in m/s.")] = 0.2,
     load: Load = None,
     floors: Annotated[
         str, typer.Option(metavar="NAMES", help="Floors there are, by commas; all by default.")
@@ -53,7 +59,7 @@ def export(
     setup_jax(quiet=True)
     if check:
         names = check_folder(source)
-        if (source / "stablehlo").is_dir():
+        if any(name.startswith("stablehlo/") for name in names):
             from slipid.control.export.stablehlo import load_program
 
             load_program(source / "stablehlo")

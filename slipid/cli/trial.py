@@ -24,7 +24,7 @@ def trial(
     path: Annotated[
         str, typer.Option(metavar="NAME", help="rectangle, circle, eight, or turning: it turns.")
     ] = "rectangle",
-    speed: Annotated[float, typer.Option(metavar="M_S", help="Along the path [m/s].")] = 0.2,
+    speed: Annotated[float, typer.Option(metavar="M_S", help="Along the path, in m/s.")] = 0.2,
     starts: Annotated[int, typer.Option(min=1, max=99, help="Poses to start from.")] = 20,
     load: Load = None,
     tuned_gains: Annotated[

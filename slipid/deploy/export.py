@@ -16,7 +16,7 @@ from slipid.control.closed_loop import PERIOD, Pilot, Plant, drive
 from slipid.control.deployed import DeployedRobot
 from slipid.control.export.c99.folder import Recording, c_files
 from slipid.control.export.c99.lowering.lower import UnsupportedError
-from slipid.control.export.folder import check_folder, write_folder
+from slipid.control.export.folder import check_folder, check_writable, write_folder
 from slipid.control.export.header import warnings
 from slipid.control.export.readme import readme
 from slipid.control.export.ros2 import ros2_files
@@ -126,6 +126,7 @@ def export(robot: DeployedRobot, out: Path, wish: Wish, report: Reporter) -> Exp
         told = "the map of its floors; name one with --map"
         none = "no map; leave out --map, or take contact_map"
         raise DataError(f"controller {wish.controller} is told {told if row.mapped else none}")
+    check_writable(out)
     path = path_of(wish.path, wish.speed, robot)
     place = _place(robot, path, wish.map)
     pilot = pilot_of(robot, row, floor=floor_of(place.floor, robot.labels))
@@ -202,5 +203,5 @@ def recorded(
         np.concatenate([[PERIOD], *(np.ravel(x) for x in jax.tree.leaves(reading))])
         for reading in plant.readings[: len(course.command)]
     ]
-    about = f"the identified model as a plant, with delays and noise ({wish.path})"
+    about = f"the identified model as a plant, with delays and noise, along the path {wish.path}"
     return Recording(about, place.believed, np.array(given), course.command, course.own)

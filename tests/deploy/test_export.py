@@ -65,8 +65,8 @@ def test_its_example_drives_as_the_library_did(folder, tmp_path):
     here = tmp_path / "c"
     shutil.copytree(folder / "c", here)
     said = subprocess.run(
-        "cc -O2 -Isrc -o drive examples/drive/drive.c src/slipid.c -lm &&"
-        " ./drive < examples/drive/readings.txt | cmp - examples/drive/commands.txt",
+        "mkdir build && cc -O2 -Isrc -o build/drive examples/drive/drive.c src/slipid.c -lm &&"
+        " build/drive < examples/drive/readings.txt | cmp - examples/drive/commands.txt",
         shell=True,
         cwd=here,
         env={"PATH": "/usr/bin:/bin"},
@@ -184,3 +184,10 @@ def test_what_cannot_be_exported_is_said_before_anything_is_written(tmp_path, wi
     with pytest.raises(DataError, match=said):
         export(ROBOT, tmp_path / "out", wish, QUIET)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_with_other_files_is_refused_before_anything_is_made(tmp_path, monkeypatch):
+    (tmp_path / "mine.txt").write_text("kept")
+    monkeypatch.setattr("slipid.deploy.export._form", lambda *_: pytest.fail("made a form"))
+    with pytest.raises(DataError, match="files that no export wrote"):
+        export(ROBOT, tmp_path, Wish(), QUIET)

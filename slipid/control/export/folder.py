@@ -1,6 +1,7 @@
 """A folder that goes to a robot: robot.json, the forms made of it, and the checksum of every file.
 
-`sha256sum -c SHA256SUMS` checks it where there is no slipid.
+`sha256sum -c SHA256SUMS` checks it where there is no slipid. Folders named `build` hold what is
+built of it, and count as no part of it.
 """
 
 from __future__ import annotations
@@ -14,38 +15,52 @@ from slipid.support.errors import DataError
 from slipid.support.files import write_bytes
 
 SUMS = "SHA256SUMS"
+BUILD = "build"
 
 
 def write_folder(folder: Path, content: Mapping[str, bytes]) -> None:
-    """Write files and their checksums, which come last: without them no folder is whole.
+    """Write files and their checksums in place of an older export, of which nothing stays.
+
+    Checksums come first: a folder of which some files were not written any more is then known as
+    one that was cut short, and can be written again.
 
     Raises:
-        DataError: nothing can be written there, or a file lies there that is none of an export's.
+        DataError: as `check_writable`, or nothing can be written there.
     """
-    _cleared(folder)
-    for name, data in content.items():
-        write_bytes(folder / name, data)
+    check_writable(folder)
+    for name in sorted(_files(folder) - {SUMS}):
+        (folder / name).unlink()
+        for above in (folder / name).parents:
+            if above == folder or any(above.iterdir()):
+                break
+            above.rmdir()
     sums = "".join(f"{_sum(data)}  {name}\n" for name, data in sorted(content.items()))
     write_bytes(folder / SUMS, sums.encode())
+    for name, data in content.items():
+        write_bytes(folder / name, data)
 
 
-def _cleared(folder: Path) -> None:
-    """Remove an older export, so that nothing of it stays; refuse a folder that is none."""
+def check_writable(folder: Path) -> None:
+    """Refuse a folder whose content is not all an export's, as it was written.
+
+    Raises:
+        DataError: it is no folder, or a file in it was added or changed by hand.
+    """
     if not folder.exists():
         return
     if not folder.is_dir():
         raise DataError(f"{folder}: not a folder; name another one with --out")
-    here = _files(folder)
-    if not here:
-        return
-    known = set(_sums(folder)) | {SUMS} if (folder / SUMS).is_file() else set()
-    if here - known:
-        raise DataError(
-            f"{folder}: has files that no export wrote ({sorted(here - known)[0]}); name another "
-            "folder with --out"
-        )
-    for name in [SUMS, *sorted(here - {SUMS})]:
-        (folder / name).unlink()
+    sums = _sums(folder) if (folder / SUMS).is_file() else {}
+    for name in sorted(_files(folder) - {SUMS}):
+        if name not in sums:
+            raise DataError(
+                f"{folder}: has files that no export wrote ({name}); name another folder with --out"
+            )
+        if _sum((folder / name).read_bytes()) != sums[name]:
+            raise DataError(
+                f"{folder / name}: changed after it was written, and would be lost; move it "
+                "elsewhere, or name another folder with --out"
+            )
 
 
 def check_folder(folder: Path | str) -> tuple[str, ...]:
@@ -89,7 +104,9 @@ def _sums(folder: Path) -> dict[str, str]:
 
 
 def _files(folder: Path) -> set[str]:
-    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    """Files of a folder but for those in folders named `build`."""
+    paths = (p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
+    return {p.as_posix() for p in paths if BUILD not in p.parts}
 
 
 def _sum(data: bytes) -> str:

@@ -33,9 +33,18 @@ def header(robot: DeployedRobot) -> list[str]:
 
 def in_markdown(robot: DeployedRobot) -> list[str]:
     """The head as Markdown, warnings first, with the messages of the fit."""
+    return [*warned(robot), *facts(robot)]
+
+
+def warned(robot: DeployedRobot) -> list[str]:
+    """Warnings as Markdown."""
+    return [line for text in warnings(robot) for line in (f"> **WARNING.** {text}", "")]
+
+
+def facts(robot: DeployedRobot) -> list[str]:
+    """Origin, floors, loads, verdicts and messages of the fit as a list in Markdown."""
     notes = (f"Note of the fit: {message}" for message in robot.record.messages)
-    warned = [line for text in warnings(robot) for line in (f"> **WARNING.** {text}", "")]
-    return [*warned, *(f"- {one_line(part)}" for part in (*_facts(robot), *notes)), ""]
+    return [*(f"- {one_line(part)}" for part in (*_facts(robot), *notes)), ""]
 
 
 def warnings(robot: DeployedRobot) -> tuple[str, ...]:

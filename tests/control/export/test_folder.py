@@ -9,6 +9,7 @@ import pytest
 
 from slipid.control.export.folder import SUMS, check_folder, write_folder
 from slipid.support.errors import DataError
+from slipid.support.files import write_bytes
 
 CONTENT = {"README.md": b"# one\n", "c/src/slipid.c": b"int x;\n", "robot.json": b"{}\n"}
 
@@ -78,7 +79,43 @@ def test_it_is_checked_where_there_is_no_slipid(folder):
 def test_an_older_export_leaves_nothing_behind(folder):
     write_folder(folder, {"README.md": b"# two\n"})
     assert check_folder(folder) == ("README.md",)
-    assert not (folder / "c/src/slipid.c").exists()
+    assert not (folder / "c").exists()
+
+
+def test_what_is_built_of_it_is_no_part_of_it(folder):
+    (folder / "c/build").mkdir()
+    (folder / "c/build/check").write_text("a program")
+    assert sorted(check_folder(folder)) == sorted(CONTENT)
+    write_folder(folder, {"README.md": b"# two\n"})
+    assert check_folder(folder) == ("README.md",)
+    assert (folder / "c/build/check").read_text() == "a program"
+
+
+def test_a_file_that_was_changed_by_hand_is_never_lost(folder):
+    (folder / "c/src/slipid.c").write_text("int own;\n")
+    with pytest.raises(DataError, match=r"slipid\.c: changed after it was written"):
+        write_folder(folder, CONTENT)
+    assert (folder / "c/src/slipid.c").read_text() == "int own;\n"
+    assert (folder / "README.md").exists()
+
+
+def test_a_folder_that_was_cut_short_can_be_written_again(folder, monkeypatch):
+    """However many files were written before."""
+
+    def full(path, data):
+        if path.name == "slipid.c":
+            raise OSError("no space left")
+        write_bytes(path, data)
+
+    new = {**CONTENT, "c/src/more.c": b"int z;\n", "README.md": b"# two\n"}
+    with monkeypatch.context() as m:
+        m.setattr("slipid.control.export.folder.write_bytes", full)
+        with pytest.raises(OSError, match="no space"):
+            write_folder(folder, new)
+    with pytest.raises(DataError, match="No such file"):
+        check_folder(folder)
+    write_folder(folder, new)
+    assert sorted(check_folder(folder)) == sorted(new)
 
 
 def test_other_files_are_never_touched(folder):

@@ -86,6 +86,13 @@ def _read_late(x):
     return second[k] - jnp.sin(first[k])
 
 
+def _carried_places(x):
+    def turn(k, c):
+        return (c[0] + 1) % N, jnp.take(x, c[0], mode="clip") + 0.1 * c[1]
+
+    return jax.lax.fori_loop(0, 3, turn, (jnp.floor(jnp.abs(3 * x)).astype(int) % N, x))[1]
+
+
 def _across_rows(a, x):
     rows, columns = np.arange(N) // 6, (6 + np.arange(N)) % N
     return [a[rows, columns], jnp.concatenate([x[np.array([0, 1, 3, 7, 2, 9])], jnp.sin(x)])]
@@ -93,6 +100,7 @@ def _across_rows(a, x):
 
 FUNCTIONS = {
     "made in turns": (_made_in_turns, LANES),
+    "carried places": (_carried_places, LANES),
     "read late": (_read_late, LANES),
     "across rows": (_across_rows, SQUARE, LANES),
     "kept over turns": (_kept, LANES),
@@ -108,7 +116,13 @@ FUNCTIONS = {
         ],
         LANES,
     ),
-    "signs of 0": (lambda x: 1 / jnp.where(x > 0, 0.0, -0.0), LANES),
+    "signs of 0": (
+        lambda x: [
+            1 / jnp.where(x > 0, 0.0, -0.0),
+            1 / jnp.where(x > 9, x, jnp.array([0.0, -0.0] * (N // 2))),
+        ],
+        LANES,
+    ),
     "large": (lambda x: jnp.minimum(1e305, jnp.where(x > 0, 1e301, 2.0)), LANES),
     "arithmetic": (lambda x, y: x + y * x - x / (3 + y * y), SMALL, SMALL),
     "arithmetic of lanes": (lambda x, y: -(x + y * x - x / (3 + y * y)), LANES, LANES),
@@ -154,6 +168,11 @@ FUNCTIONS = {
         WIDE,
     ),
     "least": (lambda x: jnp.argmin(jnp.abs(x)) * 1.0, LANES),
+    "least of few": (
+        lambda x, y: [jnp.argmin(y) * 1.0, jnp.argmin(jnp.concatenate([x[:5], y])) * 1.0],
+        LANES,
+        SMALL,
+    ),
     "softmax": (jax.nn.softmax, LANES),
     "vectors": (lambda x, y: [x @ y, jnp.outer(x, y)], LANES, LANES),
     "matrices": (lambda a, b: [a @ b, b.T @ a, b.T @ b, a @ a], SQUARE, WIDE),
@@ -337,7 +356,10 @@ def test_a_primitive_without_a_form_in_c_is_refused_by_name_and_line():
         (lambda x: x.at[jnp.argmin(x)].set(1.0), "places that are not known before"),
         (lambda x: x.at[jnp.argmin(x)].get(mode="fill"), "places out of range that are filled"),
         (lambda x: ~jnp.floor(x).astype(int), "of whole numbers"),
+        (lambda x: jnp.abs(jnp.floor(x).astype(int)), "of whole numbers"),
+        (lambda x: jnp.bitwise_and.reduce(jnp.floor(x).astype(int)), "of whole numbers"),
         (lambda x: x.astype(jnp.uint8), "numbers of type uint8"),
+        (lambda x: x.astype(jnp.float32), "numbers of type float32"),
         (lambda x: jax.lax.integer_pow(x, 0), "a power of 0"),
         (lambda x: jax.lax.select_n(jnp.argmin(x) * jnp.ones(N, int), x, x, 2 * x), "two cases"),
         (lambda x: jax.lax.scan(lambda c, y: (c + y, c), 0.0, x)[1], "goes through an array"),

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from slipid.control.closed_loop import Pilot
 from slipid.control.export.c99.code import Code, filled, template
 from slipid.control.export.c99.golden_header import golden_header
-from slipid.control.export.header import in_markdown, made_with
+from slipid.control.export.header import facts, made_with, warned
 from slipid.control.trajectory import Path
 
 
@@ -54,6 +54,11 @@ def _path(path: Path) -> str:
     )
 
 
+def _kib(numbers: int) -> str:
+    """Size of so many numbers in `double`."""
+    return f"{numbers * 8 / 1024:.1f} KiB"
+
+
 def c_files(
     pilot: Pilot[eqx.Module], path: Path, recording: Recording | None = None
 ) -> dict[str, str]:
@@ -74,7 +79,7 @@ def c_files(
         "test/golden.h": golden_header(code),
         "test/check.c": template("check.c"),
         "examples/drive/drive.c": template("drive.c"),
-        "examples/Slipid/Slipid.ino": template("Slipid.ino"),
+        "examples/Slipid/Slipid.ino": filled("Slipid.ino", {"STACK": _kib(code.scratch)}),
         "CMakeLists.txt": template("CMakeLists.txt"),
         "library.json": filled("library.json", named),
         "library.properties": filled("library.properties", named),
@@ -86,12 +91,13 @@ def c_files(
         steps = filled("recording.md", {"PLANT": recording.plant})
     robot = pilot.controller.robot
     values = {
-        "HEAD": "\n".join(in_markdown(robot)),
+        "WARNINGS": "\n".join(warned(robot)),
+        "HEAD": "\n".join(facts(robot)),
         "RECORDING": steps,
         "FLOORS": ", ".join(f"`{name}` ({k})" for k, name in enumerate(robot.labels)),
         "WHEELS": str(robot.wheels),
-        "STATE": f"{code.kept * 8 / 1024:.1f} KiB",
-        "STACK": f"{code.scratch * 8 / 1024:.0f} KiB",
+        "STATE": _kib(code.kept),
+        "STACK": _kib(code.scratch),
         "PATH": _path(path),
     }
     files["README.md"] = filled("README.md", values)

@@ -16,6 +16,8 @@ def golden_header(code: Code) -> str:
     names = [f.name for f in code.estimate.fields for _ in range(f.size)]
     scale = np.maximum(np.abs(kept.said).max(axis=0), 1e-3)
     rows = [
+        "#include <math.h>",
+        "",
         f"#define GOLDEN_STEPS {len(kept.given)}",
         f"#define GOLDEN_GIVEN {kept.given.shape[1]}",
         f"#define GOLDEN_SAID {kept.said.shape[1]}",

@@ -65,6 +65,6 @@ def along(builder: Builder, value: Value, shape: tuple[int, ...], axis: int | No
 def _table(builder: Builder, row: np.ndarray) -> Cell:
     """A row of constants."""
     kind = kind_of(row.dtype)
-    if (row == row[0]).all():
+    if row.tobytes() == len(row) * row[:1].tobytes():
         return Number(row[0].item(), kind)
     return At(builder.names.table(row, kind), 0, 1)

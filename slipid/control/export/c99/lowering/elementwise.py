@@ -129,7 +129,7 @@ def unary(name: str) -> Rule:
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
         if UNARY[name] == "{0}":
             return values[0]
-        if name == "not" and kind_of_value(values[0]) != "bool":
+        if kind_of_value(values[0]) == "int" and name not in ("neg", "square"):
             raise NoFormError("of whole numbers")
         return applied(builder, UNARY[name], kind_of(out.dtype), values, out.shape)
 

@@ -59,7 +59,7 @@ the numbers of their result come from.
 INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
 """Primitives that call a function; its code is put in their place."""
 
-_TYPES = frozenset(map(np.dtype, ("float64", "float32", "int64", "int32", "bool")))
+_TYPES = frozenset(map(np.dtype, ("float64", "int64", "int32", "bool")))
 """Types of numbers that have a counterpart in C."""
 
 

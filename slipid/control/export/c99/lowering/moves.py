@@ -22,6 +22,7 @@ from slipid.control.export.c99.lowering.ir import (
     Variable,
     cells_of,
     longest,
+    varies,
 )
 from slipid.control.export.c99.lowering.sources import contiguous
 
@@ -106,17 +107,20 @@ def dynamic_slice(builder: Builder, values: list[Value], params: Params, out: Sh
 
 
 def _offset(
-    builder: Builder, starts: Sequence[Cell], whole: Value, sizes: Sequence[int]
+    builder: Builder, starts: Sequence[Cell], whole: Value, sizes: Sequence[int], lanes: int = 0
 ) -> Variable:
-    """Number of the first number from which a part of an array is taken, within its bounds."""
+    """Number of the first number from which a part of an array is taken, within its bounds.
+
+    There is one for every lane if any start differs from lane to lane.
+    """
     terms, cells = [], []
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
         most, stride = whole.shape[axis] - size, prod(whole.shape[axis + 1 :])
         if most:
             terms.append(f"i_min(i_max({{{len(cells)}}}, 0), {most}) * {stride}")
             cells.append(start)
-    lanes = max((c.lanes for c in cells if isinstance(c, Variable)), default=0)
-    return builder.compute("int", " + ".join(terms) or "0", tuple(cells), lanes)
+    count = lanes if any(map(varies, cells)) else 0
+    return builder.compute("int", " + ".join(terms) or "0", tuple(cells), count)
 
 
 def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
@@ -132,6 +136,7 @@ def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     kept = [d for d in range(len(whole.shape)) if d not in numbers.collapsed_slice_dims]
     own = where.axis if isinstance(where, Array) else None
     axis = None if own is None else batch[own]
+    lanes = 0 if own is None else where.shape[own]
     places = along(builder, where, where.shape, own)
     strides = [prod(whole.shape[d + 1 :]) for d in range(len(whole.shape))]
     shape = tuple(n for d, n in enumerate(out.shape) if d != axis)
@@ -143,7 +148,7 @@ def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -
         starts: list[Cell] = [Number(0, "int")] * len(whole.shape)
         for k, d in enumerate(numbers.start_index_map):
             starts[d] = row[k]
-        base = _offset(builder, starts, whole, sizes)
+        base = _offset(builder, starts, whole, sizes, lanes)
         inner = sum(place[o] * strides[d] for o, d in zip(numbers.offset_dims, kept, strict=True))
         read = At(memory, inner, index=base)
         cells.append(builder.compute(memory.kind, "{0}", (read,), base.lanes))

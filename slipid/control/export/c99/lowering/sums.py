@@ -24,6 +24,7 @@ from slipid.control.export.c99.lowering.ir import (
     Number,
     Value,
     cells_of,
+    kind_of_value,
     varies,
 )
 from slipid.control.export.fields import Kind, kind_of
@@ -55,6 +56,7 @@ def reduced(name: str) -> Rule:
         value, axes = values[0], params["axes"]
         assert isinstance(value, Array)
         kind, own = value.kind, template
+        first = _of_ints(start) if kind == "int" else start
         if kind == "int":
             own = template.replace("r_", "i_")
         lanes = 0 if value.axis is None else value.shape[value.axis]
@@ -65,7 +67,6 @@ def reduced(name: str) -> Rule:
         rows = moved.reshape(prod(kept), -1)
         cells = [chained(builder, own, kind, row, lanes) for row in rows]
         if value.axis in axes:
-            first = _of_ints(start) if kind == "int" else start
             cells = [over_lanes(builder, own, kind, cell, lanes, first) for cell in cells]
             return Array(out.shape, kind, None, cells_of(kept, cells))
         axis = None if value.axis is None else value.axis - sum(d < value.axis for d in axes)
@@ -77,6 +78,8 @@ def reduced(name: str) -> Rule:
 def _of_ints(start: str) -> str:
     """Neutral element of a reduction of whole numbers, from that of reals."""
     known = {"R(0.0)": "0", "R(1.0)": "1", "R_INFINITY": "INT32_MAX", "-R_INFINITY": "INT32_MIN"}
+    if start not in known:
+        raise NoFormError("of whole numbers")
     return known[start]
 
 
@@ -91,10 +94,9 @@ def over_lanes(
 def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
     """Number of the first lane with the least number, or with none."""
     value = values[0]
-    assert isinstance(value, Array)
-    if value.axis is None or len(value.shape) > 1:
-        raise NoFormError("an argmin of other than one long axis")
-    cell, lanes = value.cells.item(), value.shape[0]
+    if len(value.shape) > 1 or kind_of_value(value) != "real":
+        raise NoFormError("an argmin of other than one axis of reals")
+    cell, lanes = along(builder, value, value.shape, 0).item(), value.shape[0]
     least = builder.compute("real", "r_min({acc}, {0})", (cell,), lanes, "R_INFINITY")
     which = At(builder.names.table(np.arange(lanes), "int"), 0, 1)
     same = "({acc} < 0) & (({0} == {1}) | ({0} != {0})) ? {2} : {acc}"

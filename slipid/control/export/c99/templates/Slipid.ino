@@ -1,4 +1,5 @@
-/* One control period every 50 ms. Fill in how your robot reads its sensors and drives its wheels. */
+/* One control period every 50 ms. Fill in how your robot reads its sensors and drives its wheels.
+   A step keeps @STACK@ of intermediate numbers on the stack, half of that with SLIPID_FLOAT: see that the loop has it. */
 #include <slipid.h>
 
 static slipid_state state;
