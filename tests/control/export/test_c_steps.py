@@ -109,6 +109,7 @@ def test_a_clock_that_has_run_for_days_goes_on_in_float(tmp_path):
     np.testing.assert_allclose(ages, 0.05 * np.arange(len(ages)), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_every_field_has_a_unit():
     plain = {f.name for s in code("contact").structs for f in s.fields if f.comment.endswith("[1]")}
     assert plain == {
