@@ -238,6 +238,10 @@ def _library(folder: Path) -> ctypes.CDLL:
         arguments, _ = _arguments(_real(run), shapes)
         like = [jnp.ones(shape) for shape in shapes]
         functions.append(function(names, f"f{k}", "", arguments, traced(_real(run), *like)))
+    return _compiled(names, functions, folder)
+
+
+def _compiled(names: Names, functions, folder: Path) -> ctypes.CDLL:
     reads = frozenset().union(*(f.reads for f in functions))
     tables = [line for m in names.tables.values() if m.name in reads for line in table(m)]
     head = [
@@ -332,6 +336,18 @@ def test_what_only_a_branch_needs_is_computed_there():
 def test_long_constants_are_copied_in_a_loop():
     assert text_of(lambda: jnp.zeros((N, 2))).count("=") < N
     assert text_of(lambda: jnp.arange(1.0 * N)).count("=") < N
+
+
+def test_arguments_that_are_filled_in_place_are_read_first(tmp_path):
+    names = Names()
+    arguments = [Argument.plain(name, LANES, True, True) for name in ("x", "y")]
+    like = (jnp.ones(N), jnp.ones(N))
+    made = function(names, "f", "", arguments, traced(lambda x, y: [y[::-1], x], *like))
+    x, y = np.arange(1.0 * N), np.arange(1.0 * N) ** 2
+    pointers = [a.ctypes.data_as(ctypes.c_void_p) for a in (x, y)]
+    _compiled(names, [made], tmp_path).f(*pointers)
+    np.testing.assert_array_equal(x, np.arange(1.0 * N)[::-1] ** 2)
+    np.testing.assert_array_equal(y, np.arange(1.0 * N))
 
 
 def test_a_primitive_without_a_form_in_c_is_refused_by_name_and_line():
