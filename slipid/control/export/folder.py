@@ -52,6 +52,8 @@ def check_writable(folder: Path) -> None:
         raise DataError(f"{folder}: not a folder; name another one with --out")
     sums = _sums(folder) if (folder / SUMS).is_file() else {}
     for name in sorted(_files(folder) - {SUMS}):
+        if _whole(name) in {SUMS, *sums}:
+            continue  # a process was killed while it wrote this part of a file
         if name not in sums:
             raise DataError(
                 f"{folder}: has files that no export wrote ({name}); name another folder with --out"
@@ -78,7 +80,8 @@ def check_folder(folder: Path | str) -> tuple[str, ...]:
             raise DataError(f"{place / name}: {error.strerror}; export the robot again") from error
         if _sum(data) != expected:
             raise DataError(
-                f"{place / name}: changed or damaged after it was written; export the robot again"
+                f"{place / name}: changed or damaged after it was written; export the robot again, "
+                "to another folder"
             )
     if more := sorted(_files(place) - set(sums) - {SUMS}):
         raise DataError(
@@ -101,6 +104,12 @@ def _sums(folder: Path) -> dict[str, str]:
             f"{folder / SUMS}: cannot be read; expected a folder that `slipid export` wrote"
         )
     return named
+
+
+def _whole(name: str) -> str | None:
+    """Name of the file of which a file is a part that `write_bytes` left; None if it is none."""
+    match = re.fullmatch(r"((?:.*/)?)\.(.+)\.[0-9a-f]{8}", name)
+    return None if match is None else match[1] + match[2]
 
 
 def _files(folder: Path) -> set[str]:

@@ -27,7 +27,7 @@ def header(robot: DeployedRobot) -> list[str]:
 
     Each is plain printable text, of 96 characters at most where no word is longer.
     """
-    said = (*_facts(robot), *(f"WARNING: {text}" for text in warnings(robot)))
+    said = (*_sentences(robot), *(f"WARNING: {text}" for text in warnings(robot)))
     return [line for part in said for line in wrapped(part)]
 
 
@@ -44,7 +44,7 @@ def warned(robot: DeployedRobot) -> list[str]:
 def facts(robot: DeployedRobot) -> list[str]:
     """Origin, floors, loads, verdicts and messages of the fit as a list in Markdown."""
     notes = (f"Note of the fit: {message}" for message in robot.record.messages)
-    return [*(f"- {one_line(part)}" for part in (*_facts(robot), *notes)), ""]
+    return [*(f"- {one_line(part)}" for part in (*_sentences(robot), *notes)), ""]
 
 
 def warnings(robot: DeployedRobot) -> tuple[str, ...]:
@@ -53,7 +53,7 @@ def warnings(robot: DeployedRobot) -> tuple[str, ...]:
     return tuple(f"{WARNINGS[v]}: {listed(paths)}." for v, paths in found.items() if paths)
 
 
-def _facts(robot: DeployedRobot) -> Iterator[str]:
+def _sentences(robot: DeployedRobot) -> Iterator[str]:
     record = robot.record
     yield f"Made by slipid {made_with()} from robot.json; make it anew rather than change it."
     yield f"Numbers: {record.numbers} (`numbers` of robot.json)."

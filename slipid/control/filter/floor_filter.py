@@ -214,7 +214,11 @@ class FloorFilter(eqx.Module):
     def _evidence(
         self, xi: Array, predicted: Array, currents: Currents, w: Array, turn: Array
     ) -> tuple[Array, Array]:
-        """Log likelihood of what is measured under every hypothesis, and under none of them."""
+        """Log likelihood of what is measured under every hypothesis, and under none of them.
+
+        Variances count over their means: a constant in all, and no product that leaves the range
+        of single precision.
+        """
         f, s = self.robot, self.settings
         amps, told_of = currents.filtered, currents.told
         std = f.current_std[hypotheses_of(f).under]
@@ -229,9 +233,8 @@ class FloorFilter(eqx.Module):
         worst = (s.unknown_std + 1.0) ** 2
         score = jnp.sum(jnp.where(heard, jnp.minimum(gap**2 / var, worst), 0.0), axis=1)
         # a logarithm of a product costs a robot's computer less than several
-        told = -0.5 * (score + jnp.log(jnp.prod(jnp.where(heard, var, 1.0), axis=1)))
-        spread = jnp.log(jnp.prod(jnp.where(heard, jnp.mean(var, axis=0), 1.0)))
-        return told, -0.5 * (s.unknown_std**2 * jnp.sum(heard) + spread)
+        spread = jnp.prod(jnp.where(heard, var / jnp.mean(var, axis=0), 1.0), axis=1)
+        return -0.5 * (score + jnp.log(spread)), -0.5 * s.unknown_std**2 * jnp.sum(heard)
 
     def _of_friction(self, amps: Float[Array, "hypothesis wheel"]) -> Array:
         """Variance of currents as frictions of several floors under the wheels are unsure [A^2].

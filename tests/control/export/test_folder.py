@@ -118,6 +118,19 @@ def test_a_folder_that_was_cut_short_can_be_written_again(folder, monkeypatch):
     assert sorted(check_folder(folder)) == sorted(new)
 
 
+def test_what_a_killed_process_left_is_cleared(folder):
+    for name in ("c/src/.slipid.c.0123abcd", f".{SUMS}.89abcdef"):
+        (folder / name).write_text("a par")
+    with pytest.raises(DataError, match="not there when the folder was written"):
+        check_folder(folder)
+    write_folder(folder, CONTENT)
+    assert sorted(check_folder(folder)) == sorted(CONTENT)
+    (folder / ".mine.0123abcd").write_text("kept")
+    with pytest.raises(DataError, match="files that no export wrote"):
+        write_folder(folder, CONTENT)
+    assert (folder / ".mine.0123abcd").read_text() == "kept"
+
+
 def test_other_files_are_never_touched(folder):
     (folder / "mine.txt").write_text("kept")
     with pytest.raises(DataError, match=r"files that no export wrote \(mine.txt\)"):
