@@ -11,6 +11,7 @@ import pytest
 from slipid.control.estimator import Estimator
 from slipid.control.filter.floor_filter import FloorFilter
 from slipid.control.filter.hypotheses import hypotheses_of
+from slipid.control.filter.wheels import Currents
 from slipid.control.interface import Measurement, Settings
 from slipid.model.geometry import omni
 from slipid.model.robot import build, twist, wheel_current
@@ -61,3 +62,33 @@ def test_where_frictions_are_open_currents_rule_out_no_mixture_of_floors():
     assert unsure > 2 * sure
     alike = believed(jnp.full((2, 2), 0.5))  # what floors share tells nothing apart
     np.testing.assert_allclose(alike, sure, rtol=1e-6)
+
+
+@pytest.mark.parametrize("turn", [0.3, np.nan])
+def test_evidence_is_that_of_normal_errors_of_what_was_heard(turn):
+    """Up to what is the same under every hypothesis and under none of them."""
+    robot, s = deployed(1.0, 1.0, 0.3), Settings()
+    floors, rng = FloorFilter(robot, s), np.random.default_rng(0)
+    shape = hypotheses_of(robot).under.shape
+    xi = 0.2 * rng.normal(size=(shape[0], 3))
+    predicted = 0.5 + 0.3 * rng.normal(size=shape)
+    amps, heard = np.array([0.4, -0.7, 0.1]), np.array([2, 1, 0])
+    currents = Currents(jnp.asarray(amps), jnp.asarray(heard), jnp.full(3, 1e-3))
+    w = jnp.array([3.0, 0.1, -2.0])
+    told, none = floors._evidence(
+        jnp.asarray(xi), jnp.asarray(predicted), currents, w, jnp.asarray(turn)
+    )
+    std = np.asarray(robot.current_std)[hypotheses_of(robot).under]
+    var = std**2 + 1e-3 + np.asarray(floors._stiction(w))
+    var = var + np.asarray(floors._of_friction(jnp.asarray(predicted)))
+    size = np.hypot(predicted, 0.03)
+    gaps = {0: (predicted - amps)[:, 0], 1: (size - abs(amps))[:, 1]}
+    parts = [(gaps[k], var[:, k]) for k in gaps]
+    if np.isfinite(turn):
+        speed = np.maximum(np.linalg.norm(xi[:, :2], axis=1), 0.02)
+        yaw = np.mean(np.asarray(robot.effect)[:, 2]) * speed
+        parts.append((xi[:, 2] - turn, s.gyro_std**2 + yaw**2))
+    worst = (s.unknown_std + 1) ** 2
+    wanted = sum(-0.5 * (np.minimum(g**2 / v, worst) + np.log(v)) for g, v in parts)
+    of_none = sum(-0.5 * (s.unknown_std**2 + np.log(v.mean())) for _, v in parts)
+    np.testing.assert_allclose(told - none, wanted - of_none, rtol=1e-10)
