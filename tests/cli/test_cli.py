@@ -570,13 +570,19 @@ def test_export_writes_a_folder_and_tells_a_changed_byte(small, tmp_path):
     assert all((out / name).is_file() for name in found["files"])
     assert invoke("export", out, "--check").exit_code == 0
     path = out / "table/gains.csv"
-    path.write_bytes(path.read_bytes().replace(b"1", b"2", 1))
+    written = path.read_bytes()
+    path.write_bytes(written.replace(b"1", b"2", 1))
     told = invoke("export", out, "--check")
     assert told.exit_code == 2
     assert "gains.csv: changed or damaged" in told.output
-    again = invoke("export", out / "robot.json", "--to", "table", "--out", out, "--quiet")
+    words = ("export", out / "robot.json", "--to", "table", "--out", out, "--quiet")
+    refused = invoke(*words)
+    assert refused.exit_code == 2
+    assert "gains.csv: changed after it was written, and would be lost" in refused.output
+    path.write_bytes(written)
+    again = invoke(*words)
     assert again.exit_code == 0, again.output
-    assert not (out / "ros2").exists() or not list((out / "ros2").rglob("*.*"))
+    assert not (out / "ros2").exists()
 
 
 def test_export_says_what_is_missing(tmp_path):
