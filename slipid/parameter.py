@@ -38,6 +38,7 @@ class Declaration:
             of all of them together is found from the data, up to about `spread`.
         doc: one line for people.
         electric: it is read from currents and voltages given the motion, not from the motion.
+        of: what the numbers of a vector are of, one each: a wheel, a drive or an axis.
     """
 
     unit: str
@@ -51,6 +52,7 @@ class Declaration:
     deviation: bool = False
     doc: str = ""
     electric: bool = False
+    of: str = "wheel"
 
     @property
     def tied(self) -> bool:
@@ -165,9 +167,9 @@ class Entry:
         """Names of a vector's entries, none for a scalar."""
         if self.size == 1:
             return ()
-        if self.size == 2:
+        if self.declaration.of == "axis":
             return ("x", "y")
-        return tuple(f"wheel {k + 1}" for k in range(self.size))
+        return tuple(f"{self.declaration.of} {k + 1}" for k in range(self.size))
 
     @property
     def coordinates(self) -> int:

@@ -122,7 +122,7 @@ class Fit:
             DataError: a run on a floor or with a load set-up that was not identified.
         """
         fit = self.result
-        rungs = restored(dict(fit.baselines))
+        rungs = restored(fit.space.template.geometry, dict(fit.baselines))
         fitted = fit.contact
         return Validation(validation(fitted, rungs, runs), fit, runs)
 

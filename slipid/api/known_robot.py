@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.data.runs import Runs, collect
-from slipid.model.robot import Robot, twist, wheel_current, wheel_torque
+from slipid.model.robot import Robot, motor_current, twist, wheel_torque
 from slipid.selftest import known
 from slipid.selftest.logs import make_logs
 
@@ -83,7 +83,7 @@ class Motion:
     wheel_speed: Float[np.ndarray, "command wheel"]
     slip: Float[np.ndarray, "command wheel"]
     torque: Float[np.ndarray, "command wheel"]
-    current: Float[np.ndarray, "command wheel"]
+    current: Float[np.ndarray, "command drive"]
 
 
 def move(
@@ -114,12 +114,13 @@ def _moved(
     frame = robot.geometry.frame()
 
     def one(row: Float[Array, "3"]) -> tuple[Array, ...]:
-        speed = robot.geometry.forward() @ row / frame.radius
+        driven = robot.geometry.forward() @ row / frame.radius
+        speed = robot.geometry.at_wheels(driven)
         way, stands = jnp.sign(speed), jnp.abs(speed) < 1e-6
         xi = twist(robot, frame, speed, floor, load)
         torque = wheel_torque(robot, frame, xi, speed, floor, load)
         rim = jnp.where(stands, jnp.nan, frame.radius * frame.pull * speed)
-        current = wheel_current(robot, frame, xi, speed, floor, load)
-        return xi, speed, 1 - frame.hold @ xi / rim, torque * way, current * way
+        current = motor_current(robot, frame, xi, driven, floor, load) * jnp.sign(driven)
+        return xi, speed, 1 - frame.hold @ xi / rim, torque * way, current
 
     return jax.vmap(one)(command)

@@ -112,7 +112,6 @@ class Comparison:
 
 def compared(task: Task, problem: Problem, question: str, parts: int, quiet: bool) -> Comparison:
     """Every rung of the ladder judged fold by fold; arguments as of `Fit.compare`."""
-    task.robot.geometry.inverse()  # nothing to compare where motion does not tell the wheels' turns
     fold = folds_of(task.dataset, question, parts)
     if (fold < 0).all():
         raise DataError("no run can be left out; expected several headings or speeds")

@@ -30,11 +30,11 @@ from slipid.support.files import checksum, json_text, read_json, write_bytes
 
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
-SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/5"
+SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/6"
 _PLAIN = ("converged", "reason", "rounds", "remaining")
 _CURVE = ("torque_nm", "slip", "slip_lo", "slip_hi")
 _SHARED = ("std", "coefs", "by_number", "covariance")
-_SHAPE = ("place", "drive_angle", "roller_angle", "grips", "gear_ratio")
+_SHAPE = ("place", "drive_angle", "roller_angle", "grips", "drive_of", "gear_ratio")
 
 
 def save(fit: Fit, folder: Path) -> tuple[str, ...]:
@@ -255,7 +255,10 @@ def _robot_json(robot: Robot) -> Content:
 
 def _robot_of(kept: Content) -> Robot:
     shape = _tuples(kept["geometry"])
-    geometry = Geometry(drive_offset=jnp.zeros(len(shape["place"])), **shape)
+    wheels, drives = len(shape["place"]), len(set(shape["drive_of"]))
+    geometry = Geometry(
+        drive_offset=jnp.zeros(wheels), radius_deviation=jnp.zeros(drives or wheels), **shape
+    )
     names = kept["surfaces"], kept["loads"], kept["sessions"]
     robot = build(geometry, *names, centre=tuple(kept["centre"]))
     restored: Robot = put(robot, {e: kept["values"][e.path] for e in entries(robot)})

@@ -43,7 +43,7 @@ def seen(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
     it stays finite at a wheel that stands.
     """
     frame = robot.geometry.frame()
-    speed = lk.wheel_speed(robot, b)
+    speed = robot.geometry.at_wheels(lk.wheel_speed(robot, b))
 
     def one(w: Array, surface: Array, load: Array) -> tuple[Array, Array]:
         xi = model.twist(robot, frame, w, surface, load)
@@ -114,8 +114,9 @@ def slip_on(robot: Robot, floor: str, curve: SlipCurve) -> Float[np.ndarray, " t
 def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
     """What each floor was seen with."""
     speed, torque, slip = (np.asarray(x) for x in seen(robot, b))
-    back = np.linalg.pinv(np.asarray(robot.geometry.forward()))[2] * robot.geometry.wheel_radius
-    yaw = speed @ np.asarray(back)  # by the encoders: what was driven, not how it slipped
+    back = np.asarray(robot.geometry.least())[2] * float(robot.geometry.wheel_radius)
+    # by the encoders: what was driven, not how it slipped
+    yaw = np.asarray(lk.wheel_speed(robot, b)) @ back
     floor, far = np.asarray(b.surface), travel(b, robot)[0].sum(axis=1)
     out: dict[str, Validity] = {}
     for k, label in enumerate(robot.surfaces.labels):

@@ -41,10 +41,6 @@ def compare(
     config = read_config(config_path)
     job = read_job(config, data, report)
     asked = {name: folds_of(job.dataset, name) for name in dict.fromkeys(questions)}
-    try:
-        job.robot.geometry.inverse()
-    except ValueError as error:
-        raise DataError(f"{config.path}: nothing to compare: {error}") from error
     for name in [name for name, fold in asked.items() if (fold < 0).all()]:
         report.line(f"skipped: {name}: no floor has runs in two of them")
         del asked[name]

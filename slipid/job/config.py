@@ -21,11 +21,29 @@ Numbers = Number | list[Number]
 
 
 class Wheeled(Section):
-    """What every robot has."""
+    """What every robot has.
+
+    `drives` says which wheels, counted from 1, share a motor with its encoder and ammeter, in the
+    order of the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together.
+    """
 
     wheel_radius_m: Positive
     gear_ratio: Positive = 1.0
     mass_kg: Positive | None = None
+    drives: list[Annotated[list[int], Field(min_length=1)]] | None = None
+
+    def drive_of(self, wheels: int) -> tuple[int, ...]:
+        """Number of the drive that turns each wheel, from 0; empty where each has its own."""
+        if self.drives is None:
+            return ()
+        turned = [wheel for drive in self.drives for wheel in drive]
+        if sorted(turned) != list(range(1, wheels + 1)):
+            raise ValueError(
+                f"drives {self.drives}; expected each of the wheels 1 to {wheels} once"
+            )
+        return tuple(
+            k for wheel in range(1, wheels + 1) for k, d in enumerate(self.drives) if wheel in d
+        )
 
 
 class Omni(Wheeled):
@@ -43,6 +61,13 @@ class Box(Wheeled):
     drive: Literal["mecanum", "skid"]
     half_length_m: Positive
     half_width_m: Positive
+
+
+class Differential(Wheeled):
+    """Two ordinary wheels on an axle, left and right, and casters."""
+
+    drive: Literal["differential"]
+    track_m: Positive
 
 
 class General(Wheeled):
@@ -64,7 +89,7 @@ class General(Wheeled):
         return self
 
 
-Wheels = Omni | Box | General
+Wheels = Omni | Box | Differential | General
 
 
 class Logs(Section):
@@ -230,9 +255,14 @@ def geometry(robot: Wheels) -> Geometry:
     radius, gear = robot.wheel_radius_m, robot.gear_ratio
     if isinstance(robot, Omni):
         azimuths, base = robot.wheel_azimuths_deg, robot.base_radius_m
-        return g.omni(azimuths, base, radius, gear, robot.roller_angle_deg)
+        shared = robot.drive_of(len(azimuths))
+        return g.omni(azimuths, base, radius, gear, robot.roller_angle_deg, shared)
     if isinstance(robot, Box):
         make = g.mecanum if robot.drive == "mecanum" else g.skid_steer
-        return make(robot.half_length_m, robot.half_width_m, radius, gear)
+        return make(robot.half_length_m, robot.half_width_m, radius, gear, robot.drive_of(4))
+    if isinstance(robot, Differential):
+        robot.drive_of(2)
+        return g.differential(robot.track_m / 2, radius, gear)
     rollers = [None if a == "none" else float(a) for a in robot.roller_angles_deg]
-    return g.general(robot.wheel_places_m, robot.drive_directions_deg, rollers, radius, gear)
+    places, shared = robot.wheel_places_m, robot.drive_of(len(robot.wheel_places_m))
+    return g.general(places, robot.drive_directions_deg, rollers, radius, gear, shared)

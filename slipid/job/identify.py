@@ -210,11 +210,7 @@ def _judged(about: Mapping[str, Any]) -> str:
 
 def _with_baselines(fit: Fit, task: Task) -> Fit:
     """The fit, with every simpler model learnt from the same runs at the fitted camera and lag."""
-    try:
-        fit.robot.geometry.inverse()
-    except ValueError:  # wheels that do not fix the twist: none of them applies
-        return fit
-    cut = task.windows(fit.robot)
-    learnt = [rung.fit(cut, fit.robot) for rung in rungs(fit.channels.current)]
+    cut, shape = task.windows(fit.robot), fit.space.template.geometry
+    learnt = [rung.fit(cut, fit.robot) for rung in rungs(shape, fit.channels.current)]
     plain = {r.name: {floor: v.tolist() for floor, v in r.state.items()} for r in learnt}
     return replace(fit, baselines=plain)

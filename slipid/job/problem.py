@@ -134,10 +134,13 @@ def _go_together(job: Job, data: Runs) -> None:
 def job_of(config: Config, dataset: Runs, skipped: Sequence[str], report: Reporter) -> Job:
     """Job of runs that are there already."""
     shape = shape_of(config)
-    if shape.wheels != dataset.logs[0].wheels:
+    logged = dataset.logs[0]
+    if shape.drives != logged.wheels:
+        drives = f"{shape.drives} drives" if shape.drive_of else f"{shape.wheels} wheels"
+        shared = "; say which wheels share a motor by robot.drives = [[1, 3], [2, 4]]"
         raise DataError(
-            f"{config.path}: robot: {shape.wheels} wheels, but {dataset.logs[0].name} has "
-            f"{dataset.logs[0].wheels}; expected the same"
+            f"{config.path}: robot: {drives}, but {logged.name} has {logged.wheels}; expected the "
+            f"same{shared if shape.wheels == 2 * logged.wheels else ''}"
         )
     robot = on_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
     choices, left_out = _choices(config, robot)

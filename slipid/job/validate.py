@@ -34,7 +34,7 @@ def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Conten
         report.line(f"{again} of {len(dataset)} runs were fitted: they say little about new ones")
     report.stage("predicting")
     try:
-        rungs = restored(dict(fit.baselines))
+        rungs = restored(fit.space.template.geometry, dict(fit.baselines))
     except ValueError as error:
         raise DataError(f"{out / 'fit.json'}: {error}") from error
     fitted = fit.contact

@@ -11,6 +11,8 @@ from slipid.parameter import parameter
 
 known = partial(parameter, free=False)
 """Held where it is unless the user says otherwise."""
+plane = partial(known, of="axis")
+"""A vector in the plane, x and y."""
 
 
 class Camera(eqx.Module):
@@ -27,10 +29,10 @@ class Camera(eqx.Module):
     lag: Array = known("s", "t_c", "camera behind the encoders", start=0.0, spread=0.03)
     marker_yaw: Array = known("rad", "psi", "marker heading less body's", start=0.0, spread=0.03)
     session_yaw: Array = known("rad", "dpsi", "its change", start=0.0, spread=0.01, per="sessions")
-    marker_place: Array = known("m", "p_m", "marker from the body's centre", start=0.0, spread=0.02)
-    tilt: Array = known("1/m", "h", "perspective of a tilted camera", start=0.0, spread=0.03)
+    marker_place: Array = plane("m", "p_m", "marker from the body's centre", start=0.0, spread=0.02)
+    tilt: Array = plane("1/m", "h", "perspective of a tilted camera", start=0.0, spread=0.03)
     radial: Array = known("1/m^2", "k", "radial distortion", start=0.0, spread=0.02)
-    tangential: Array = known("1/m", "p", "decentred lens", start=0.0, spread=0.02)
+    tangential: Array = plane("1/m", "p", "decentred lens", start=0.0, spread=0.02)
     centre: tuple[float, float] = eqx.field(static=True, default=(0.0, 0.0))
     sessions: tuple[str, ...] = eqx.field(static=True, default=())
 

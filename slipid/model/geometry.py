@@ -20,15 +20,19 @@ class Geometry(eqx.Module):
 
     A wheel has a place, a drive direction, and rollers that run freely at `roller_angle` from it:
     90 deg for an omni wheel, 45 deg for mecanum; `grips` marks an ordinary wheel without rollers.
+    A drive is a motor with its encoder and ammeter; it turns one wheel, or several alike.
 
     Attributes:
         wheel_radius: r [m].
         base_radius: L [m], multiplies `place`.
         drive_offset: small rotation of each wheel's drive direction [rad].
+        radius_deviation: what the wheels of each drive are larger than r, over r (drive,).
         place: wheel centres (wheel, 2) in units of the base radius.
         drive_angle: direction of travel of a positive wheel speed (wheel,) [rad].
         roller_angle: from the free rolling direction to the drive direction (wheel,) [rad].
         grips: 1 for an ordinary wheel, 0 with rollers (wheel,).
+        drive_of: number of the drive that turns each wheel, from 0 (wheel,); empty where every
+            wheel has its own.
         gear_ratio: n, motor speed over wheel speed.
     """
 
@@ -41,14 +45,26 @@ class Geometry(eqx.Module):
     drive_offset: Array = parameter(
         "rad", "delta", "drive direction offset", start=0.0, spread=0.01, free=False
     )
+    radius_deviation: Array = parameter(
+        "1", "rho", "wheel radius over r, less 1", start=0.0, spread=0.005, free=False, of="drive"
+    )
     place: tuple[tuple[float, float], ...] = eqx.field(static=True, default=())
     drive_angle: tuple[float, ...] = eqx.field(static=True, default=())
     roller_angle: tuple[float, ...] = eqx.field(static=True, default=())
     grips: tuple[bool, ...] = eqx.field(static=True, default=())
+    drive_of: tuple[int, ...] = eqx.field(static=True, default=())
     gear_ratio: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self) -> None:
-        """Refuse roller angles that cannot drive."""
+        """Refuse roller angles that cannot drive, and drives that turn no wheel."""
+        if self.drive_of and (
+            len(self.drive_of) != self.wheels
+            or set(self.drive_of) != set(range(len(set(self.drive_of))))
+        ):
+            raise ValueError(
+                f"drives of the wheels {list(self.drive_of)}; expected one for each of the "
+                f"{self.wheels} wheels, counted from 0 without a gap"
+            )
         for k, (angle, grip) in enumerate(zip(self.roller_angle, self.grips, strict=True)):
             if not grip and abs(math.sin(angle)) < 0.05:
                 raise ValueError(
@@ -61,6 +77,26 @@ class Geometry(eqx.Module):
     def wheels(self) -> int:
         """Number of wheels."""
         return len(self.drive_angle)
+
+    @property
+    def drives(self) -> int:
+        """Number of drives: as many angles, currents and voltages are logged."""
+        return len(set(self.drive_of)) if self.drive_of else self.wheels
+
+    @property
+    def determines_twist(self) -> bool:
+        """Whether the turns of the wheels tell x, y and yaw, if nothing slips."""
+        return int(np.linalg.matrix_rank(np.asarray(self.forward()), tol=1e-6)) == 3
+
+    def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
+        """What every wheel has of its drive, such as its speed."""
+        return of_drives[..., jnp.asarray(self.drive_of)] if self.drive_of else of_drives
+
+    def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
+        """What every drive has of all its wheels together, such as their torque."""
+        if not self.drive_of:
+            return of_wheels
+        return of_wheels @ jnp.asarray(np.eye(self.drives)[list(self.drive_of)])
 
     def frame(self) -> "Frame":
         """The wheels as rows of matrices, at the current radius, base and offsets."""
@@ -84,25 +120,37 @@ class Geometry(eqx.Module):
                 return axis
         return None
 
-    def forward(self) -> Float[Array, "wheel 3"]:
-        """J: rim speed of each wheel without slip [m/s] from the body twist."""
-        frame = self.frame()
-        return frame.hold / frame.pull[:, None]
+    def forward(self) -> Float[Array, "drive 3"]:
+        """J: rim speed r w of each drive without slip [m/s] from the body twist.
 
-    def inverse(self) -> Float[Array, "3 wheel"]:
-        """J^+: body twist from rim speeds [m/s], least squares beyond three wheels.
+        That of a drive with several wheels is their mean.
+        """
+        frame = self.frame()
+        of_wheels = frame.hold / frame.pull[:, None]
+        if not self.drive_of:
+            return of_wheels
+        share = np.eye(self.drives)[list(self.drive_of)]
+        return jnp.asarray((share / share.sum(axis=0)).T) @ of_wheels
+
+    def least(self) -> Float[Array, "3 drive"]:
+        """J^+: the smallest body twist that comes nearest to rim speeds [m/s], of any drives.
+
+        Wheels that all point ahead do not tell motion sideways: it is taken for none.
+        """
+        return jnp.asarray(np.linalg.pinv(np.asarray(self.forward()), rcond=1e-6))
+
+    def inverse(self) -> Float[Array, "3 drive"]:
+        """J^+ of wheels that determine the twist, least squares beyond three of them.
 
         Raises:
-            ValueError: the wheels do not fix all three parts of the twist (rank below 3).
+            ValueError: they do not (rank below 3).
         """
-        j = np.asarray(self.forward())
-        if np.linalg.matrix_rank(j, tol=1e-6) < 3:
+        if not self.determines_twist:
             raise ValueError(
                 f"{self.wheels} wheels with these drive directions do not determine x, y and yaw: "
-                "the kinematics have rank below 3. Wheel-by-wheel inversion needs rank 3; "
-                "use model.slip = 'contact', which needs no inversion"
+                "the kinematics have rank below 3"
             )
-        return jnp.asarray(np.linalg.pinv(j))
+        return self.least()
 
 
 class Frame(eqx.Module):
@@ -112,8 +160,9 @@ class Frame(eqx.Module):
         hold: speed along the direction the rollers do not give way in (wheel, 3); for an omni wheel
             this is the drive direction.
         roll: speed along the free rolling direction (wheel, 3).
-        pull: share of the rim speed along `hold`, sin(roller angle).
-        slip_through: share along `roll`, cos(roller angle).
+        pull: share of the rim speed r w along `hold`, sin(roller angle), times the wheel's radius
+            over r.
+        slip_through: share along `roll`, cos(roller angle), times the same.
         grip: 1 where the wheel has no rollers.
         shift: change of load shares per contact displacement (wheel, 2) [1/m].
         radius: wheel radius [m].
@@ -144,11 +193,12 @@ def _frame(of: Geometry) -> Frame:
 
     # loads move when the contact patches do: N = N0 - shift @ (displacement), minimum change
     lever = jnp.concatenate([jnp.ones((1, of.wheels)), p.T], axis=0)
+    larger = 1.0 + of.at_wheels(jnp.broadcast_to(of.radius_deviation, (of.drives,)))
     return Frame(
         hold=row(hold),
         roll=row(free),
-        pull=jnp.sin(roller),
-        slip_through=jnp.cos(roller),
+        pull=larger * jnp.sin(roller),
+        slip_through=larger * jnp.cos(roller),
         grip=jnp.asarray(of.grips, dtype=float),
         shift=jnp.linalg.pinv(lever)[:, 1:],
         radius=of.wheel_radius,
@@ -162,27 +212,46 @@ def omni(
     wheel_radius: float,
     gear_ratio: float = 1.0,
     roller_deg: float = 90.0,
+    drive_of: Sequence[int] = (),
 ) -> Geometry:
     """Omni robot of any number of wheels, each driving 90 deg ahead of its azimuth."""
     d = np.radians(np.asarray(azimuth_deg, float))
     place, ways = np.stack([np.cos(d), np.sin(d)], -1) * base_radius, np.degrees(d) + 90.0
-    return general(place, ways, [roller_deg] * len(d), wheel_radius, gear_ratio)
+    return general(place, ways, [roller_deg] * len(d), wheel_radius, gear_ratio, drive_of)
 
 
 def mecanum(
-    half_length: float, half_width: float, wheel_radius: float, gear_ratio: float = 1.0
+    half_length: float,
+    half_width: float,
+    wheel_radius: float,
+    gear_ratio: float = 1.0,
+    drive_of: Sequence[int] = (),
 ) -> Geometry:
     """Four mecanum wheels in X: front left, front right, rear left, rear right."""
     corners = _corners(half_length, half_width)
-    return general(corners, [0.0] * 4, [135.0, 45.0, 45.0, 135.0], wheel_radius, gear_ratio)
+    rollers = [135.0, 45.0, 45.0, 135.0]
+    return general(corners, [0.0] * 4, rollers, wheel_radius, gear_ratio, drive_of)
 
 
 def skid_steer(
-    half_length: float, half_width: float, wheel_radius: float, gear_ratio: float = 1.0
+    half_length: float,
+    half_width: float,
+    wheel_radius: float,
+    gear_ratio: float = 1.0,
+    drive_of: Sequence[int] = (),
 ) -> Geometry:
-    """Four ordinary wheels that all point ahead: front left, front right, rear left, rear right."""
+    """Four ordinary wheels that all point ahead: front left, front right, rear left, rear right.
+
+    With `drive_of` (0, 1, 0, 1) a drive turns both wheels of a side.
+    """
     corners = _corners(half_length, half_width)
-    return general(corners, [0.0] * 4, [None] * 4, wheel_radius, gear_ratio)
+    return general(corners, [0.0] * 4, [None] * 4, wheel_radius, gear_ratio, drive_of)
+
+
+def differential(half_track: float, wheel_radius: float, gear_ratio: float = 1.0) -> Geometry:
+    """Two ordinary wheels on an axle, left and right, and casters that carry the rest."""
+    axle = [(0.0, half_track), (0.0, -half_track)]
+    return general(axle, [0.0] * 2, [None] * 2, wheel_radius, gear_ratio)
 
 
 def _corners(a: float, b: float) -> list[tuple[float, float]]:
@@ -195,8 +264,12 @@ def general(
     roller_deg: Sequence[float | None],
     wheel_radius: float,
     gear_ratio: float = 1.0,
+    drive_of: Sequence[int] = (),
 ) -> Geometry:
-    """Any wheels: centres [m], drive directions and roller angles [deg] (None: no rollers)."""
+    """Any wheels: centres [m], drive directions and roller angles [deg] (None: no rollers).
+
+    `drive_of` is the number of the drive that turns each wheel, from 0, where wheels share drives.
+    """
     p = np.asarray(place, float)
     base = float(np.sqrt((p**2).sum(axis=1).mean()))
     if base <= 0:
@@ -205,9 +278,11 @@ def general(
         wheel_radius=jnp.asarray(wheel_radius, dtype=float),
         base_radius=jnp.asarray(base, dtype=float),
         drive_offset=jnp.zeros(len(p)),
+        radius_deviation=jnp.zeros(len(set(drive_of)) or len(p)),
         place=tuple((float(x), float(y)) for x, y in p / base),
         drive_angle=tuple(float(a) for a in np.radians(np.asarray(drive_deg, float))),
         roller_angle=tuple(math.radians(90.0 if a is None else float(a)) for a in roller_deg),
         grips=tuple(a is None for a in roller_deg),
+        drive_of=tuple(int(k) for k in drive_of),
         gear_ratio=float(gear_ratio),
     )

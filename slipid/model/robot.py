@@ -174,7 +174,7 @@ def twist(
     load: Array,
     near: Float[Array, "3"] | None = None,
 ) -> Float[Array, "3"]:
-    """Body twist on floor `surface` (index) with load set-up `load` (index).
+    """Body twist on floor `surface` (index) with load set-up `load` (index), by wheel speeds.
 
     `surface` may have one index per wheel, here and below; `near` is as of `contact.equilibrium`.
     """
@@ -213,15 +213,19 @@ def wheel_torque(
     return frame.radius * force * felt(robot, frame, xi, wheel_speed, surface, load)[..., 0]
 
 
-def wheel_current(
+def motor_current(
     robot: Robot,
     frame: Frame,
     xi: Float[Array, "3"],
-    wheel_speed: Float[Array, " wheel"],
+    speed: Float[Array, " drive"],
     surface: Array,
     load: Array,
-) -> Float[Array, " wheel"]:
-    """Signed current of each motor [A]: traction, drag along the drive, friction."""
+) -> Float[Array, " drive"]:
+    """Signed current of each motor [A]: traction and drag of its wheels, and its own friction.
+
+    `speed` is that of the wheels of each drive [rad/s].
+    """
+    shape = robot.geometry
     force = jnp.mean(robot.surfaces.friction[surface]) * robot.body.mass * GRAVITY
-    borne = robot.motor.borne(felt(robot, frame, xi, wheel_speed, surface, load))
-    return robot.motor.current(frame.radius * force * borne, wheel_speed)
+    borne = robot.motor.borne(felt(robot, frame, xi, shape.at_wheels(speed), surface, load))
+    return robot.motor.current(frame.radius * force * shape.at_drives(borne), speed)

@@ -18,7 +18,8 @@ SHOWN = {
 }
 WORDS = {
     "identified": "identified (force balance)",
-    "encoder": "encoders alone",
+    "nominal": "encoders, sizes as in the config",
+    "encoder": "encoders, sizes as fitted",
     "constant": "one slip for all",
     "linear": "slip ~ torque",
     "affine": "slip ~ 1 + torque",
@@ -28,6 +29,9 @@ WORDS = {
     "monotone_spline": "slip ~ any rising curve of torque",
     "affine_current": "slip ~ 1 + current",
     "heading_lookup": "lookup by heading",
+    "effective_track": "effective radius and track",
+    "instantaneous_centres": "instantaneous centres",
+    "full_linear": "any linear kinematics",
     "paper": "form of 2021, refitted",
 }
 

@@ -27,6 +27,8 @@ TURNING = 0.5
 class Seen:
     """Pieces of a few seconds; angles in the body frame, everything a mean over the piece.
 
+    What is of a wheel is of all wheels of a drive: their mean, of loads and torques the sum.
+
     Attributes:
         group: index into `groups` of each piece.
         groups: (floor, load set-up), from the least slip to the most.
@@ -53,14 +55,14 @@ class Seen:
     slip: Float[np.ndarray, " piece"]
     drift: Float[np.ndarray, " piece"]
     yaw: Float[np.ndarray, " piece"]
-    wheel_speed: Float[np.ndarray, "piece wheel"]
-    wheel_slip: Float[np.ndarray, "piece wheel"]
-    sideways: Float[np.ndarray, "piece wheel"]
-    share: Float[np.ndarray, "piece wheel"]
-    amps: Float[np.ndarray, "piece wheel"] | None
-    amps_model: Float[np.ndarray, "piece wheel"]
-    torque: Float[np.ndarray, "piece wheel"]
-    dragged: Float[np.ndarray, "piece wheel"]
+    wheel_speed: Float[np.ndarray, "piece drive"]
+    wheel_slip: Float[np.ndarray, "piece drive"]
+    sideways: Float[np.ndarray, "piece drive"]
+    share: Float[np.ndarray, "piece drive"]
+    amps: Float[np.ndarray, "piece drive"] | None
+    amps_model: Float[np.ndarray, "piece drive"]
+    torque: Float[np.ndarray, "piece drive"]
+    dragged: Float[np.ndarray, "piece drive"]
     unsigned: bool
 
 
@@ -69,10 +71,10 @@ def seen(robot: Robot, data: Runs, per_piece: int) -> Seen:
     radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
     w = windows(data, radius, lag, per_piece=per_piece, longest=1.5)
     b, dt = lk.batch(w, robot), w.dt[..., None]
-    speed, torque = (np.asarray(x) for x in curves.seen(robot, b)[:2])
+    shape = robot.geometry
+    torque = np.asarray(shape.at_drives(curves.seen(robot, b)[1]))
     amps, dragged = (np.asarray(x) for x in _borne(robot, b))
-    inverse = np.linalg.pinv(np.asarray(robot.geometry.forward())) * radius
-    frame = robot.geometry.frame()
+    inverse, frame = np.asarray(shape.least()) * radius, shape.frame()
     free = (w.turn @ inverse.T).sum(axis=1)
     far = np.linalg.norm((w.turn @ inverse.T)[..., :2], axis=-1).sum(axis=1)
     true = (body_twist(w, robot) * dt).sum(axis=1)
@@ -85,7 +87,11 @@ def seen(robot: Robot, data: Runs, per_piece: int) -> Seen:
     def whole(x: np.ndarray | Array) -> np.ndarray:
         return np.asarray((np.asarray(x) * dt).sum(axis=1) / time[:, None])
 
-    rim = radius * w.turn.sum(axis=1) * np.asarray(frame.pull)
+    def mean(of_wheels: np.ndarray | Array) -> np.ndarray:
+        ones = jnp.ones(shape.wheels)
+        return np.asarray(shape.at_drives(jnp.asarray(of_wheels)) / shape.at_drives(ones))
+
+    rim = radius * w.turn.sum(axis=1)
     safe = np.where(np.abs(rim) > LEAST_WAY, rim, np.nan)
     pairs = list(zip(w.surface, w.load, strict=True))
     slip = 1.0 - along / np.maximum(ahead, 1e-9)
@@ -102,10 +108,10 @@ def seen(robot: Robot, data: Runs, per_piece: int) -> Seen:
         slip=slip,
         drift=np.degrees(np.arctan2(across, along)),
         yaw=np.degrees(true[:, 2] - free[:, 2]) / np.maximum(ahead, 1e-9),
-        wheel_speed=whole(speed),
-        wheel_slip=1.0 - (true @ np.asarray(frame.hold).T) / safe,
-        sideways=np.abs((true @ np.asarray(frame.roll).T) / safe),
-        share=np.asarray(robot.body.load_share)[np.asarray(b.load)],
+        wheel_speed=whole(lk.wheel_speed(robot, b)),
+        wheel_slip=1.0 - (true @ np.asarray(shape.forward()).T) / safe,
+        sideways=mean(np.abs(true @ (frame.roll / frame.pull[:, None]).T)) / np.abs(safe),
+        share=np.asarray(shape.at_drives(robot.body.load_share))[np.asarray(b.load)],
         amps=whole(w.current) if w.has_current else None,
         amps_model=whole(amps),
         torque=whole(torque),
@@ -148,4 +154,5 @@ def _borne(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
 @jax.jit
 def _twists(robot: Robot, wheel_speed: Array, surface: Array, load: Array) -> Array:
     frame = robot.geometry.frame()
-    return jax.vmap(lambda w: model.twist(robot, frame, w, surface, load))(wheel_speed)
+    wheels = robot.geometry.at_wheels(wheel_speed)
+    return jax.vmap(lambda w: model.twist(robot, frame, w, surface, load))(wheels)

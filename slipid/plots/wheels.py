@@ -62,13 +62,15 @@ def _cloud(ax: Axes, robot: Robot, seen: Seen, floor: str) -> PathCollection | N
 
 
 def driving_torque(robot: Robot, seen: Seen) -> np.ndarray:
-    """Torque along the wheel's turning [N m]: from the current, or predicted where none is logged.
+    """Torque along a wheel's turning [N m]: from the current, or predicted where none is logged.
+
+    Wheels that share a drive share its torque.
 
     A log of magnitudes hides the sign of a current; it is taken from the prediction.
     """
-    turning = np.sign(seen.wheel_speed)
+    turning, wheels = np.sign(seen.wheel_speed), robot.geometry.wheels / robot.geometry.drives
     if seen.amps is None:
-        return seen.torque * turning
+        return seen.torque * turning / wheels
     speed = np.abs(seen.wheel_speed)
     amps = seen.amps * turning
     if seen.unsigned:
@@ -78,7 +80,7 @@ def driving_torque(robot: Robot, seen: Seen) -> np.ndarray:
         ) >= 0
         amps = (seen.amps - float(robot.motor.current_offset)) * np.where(driven, 1.0, -1.0)
     torque = np.asarray(robot.motor.torque(jnp.asarray(amps), jnp.asarray(speed)))
-    return torque - seen.dragged * turning
+    return (torque - seen.dragged * turning) / wheels
 
 
 def _curve(ax: Axes, fit: Fit, floor: str) -> None:

@@ -106,7 +106,7 @@ def show_check(page: Page, found: Content) -> None:
 
 def show_validation(page: Page, found: Content) -> None:
     """Write the summary of a validation file: one row per floor and model."""
-    columns = ("surface", "model", "end-point error", "median", "length", "heading")
+    columns = ("surface", "model", "end / chord", "median", "end / path", "length", "heading")
     made = table((*columns, "in 90 %", "runs"))
     for surface, models in found["summary"].items():
         for model, s in models.items():
@@ -116,6 +116,7 @@ def show_validation(page: Page, found: Content) -> None:
                 model,
                 percent(s["endpoint_error_mean"]),
                 percent(s["endpoint_error_median"]),
+                percent(s["endpoint_error_over_path_mean"]),
                 percent(s["length_error_mean"]),
                 "" if heading is None else f"{heading:.2f} deg",
                 percent(s["coverage90"]),

@@ -20,7 +20,7 @@ from slipid.data.log import Log
 from slipid.data.wheel_signals import interpolate
 from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.shared import AXES
-from slipid.model.robot import Robot, twist, wheel_current
+from slipid.model.robot import Robot, motor_current, twist
 from slipid.model.se2 import compose, path
 from slipid.selftest.known import Sensors
 
@@ -102,7 +102,7 @@ class _Maker:
     ) -> Float[np.ndarray, "run row 3"]:
         """Body poses with process noise and run effects, centred on the origin of the camera."""
         s, shape, rng = self.sensors, self.robot.geometry, self.random
-        back = np.linalg.pinv(np.asarray(shape.forward()))
+        back = np.asarray(shape.least())
         step = speed * dt[..., None] * float(shape.wheel_radius) @ back.T
         far = np.linalg.norm(step[..., :2], axis=-1)[..., None]
         u = np.where(far > 0, step[..., :2] / np.maximum(far, 1e-12), [1.0, 0.0])
@@ -169,8 +169,8 @@ def _twists(robot: Robot, speed: Array, floor: Array, load: Array) -> tuple[Arra
     frame = robot.geometry.frame()
 
     def one(w: Array, f: Array, s: Array) -> tuple[Array, Array]:
-        xi = twist(robot, frame, w, f, s)
-        return xi, wheel_current(robot, frame, xi, w, f, s)
+        xi = twist(robot, frame, robot.geometry.at_wheels(w), f, s)
+        return xi, motor_current(robot, frame, xi, w, f, s)
 
     return jax.vmap(jax.vmap(one, (0, None, None)))(speed, floor, load)
 

@@ -229,7 +229,7 @@ def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, 
         return np.asarray(chain(start, jnp.asarray(increment)))[:, -1, :2]
 
     true = ends(contact_increments(truth, lk.batch(w, truth)))
-    back = np.linalg.pinv(np.asarray(truth.geometry.forward()))
+    back = np.asarray(truth.geometry.least())
     twist = (w.turn / w.dt[..., None]) @ (back * float(truth.geometry.wheel_radius)).T
     said = {
         "identified": ends(contact_increments(found, lk.batch(w, found))),

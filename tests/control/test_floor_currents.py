@@ -14,7 +14,7 @@ from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.filter.wheels import Currents
 from slipid.control.interface import Measurement, Settings
 from slipid.model.geometry import omni
-from slipid.model.robot import build, twist, wheel_current
+from slipid.model.robot import build, twist, motor_current
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.small_twin import deployed
 
@@ -36,7 +36,7 @@ def test_drag_along_the_drive_is_in_the_currents_that_tell_floors():
         xi = twist(robot, frame, w, *place)
         alike = int(np.flatnonzero((hypotheses_of(known).under == k).all(axis=1))[0])
         np.testing.assert_allclose(
-            amps[alike], wheel_current(robot, frame, xi, w, *place), rtol=1e-6
+            amps[alike], motor_current(robot, frame, xi, w, *place), rtol=1e-6
         )
 
 

@@ -144,7 +144,7 @@ def test_the_singular_wheel_is_named():
     ids=["skid steer", "two wheels", "drives through the centre"],
 )
 def test_rank_below_three_is_refused_for_inversion_only(g):
-    with pytest.raises(ValueError, match=r"rank below 3.*needs rank 3.*contact"):
+    with pytest.raises(ValueError, match="rank below 3"):
         g.inverse()
     assert np.isfinite(np.asarray(g.forward())).all()
     assert np.isfinite(np.asarray(g.frame().shift)).all()

@@ -20,7 +20,7 @@ from slipid.parameter import Declaration, Entry, entries
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_bytes
 
-SCHEMA = "slipid.robot/3"
+SCHEMA = "slipid.robot/4"
 ANEW = "copy it again, or write it anew with `slipid identify`"
 
 
@@ -143,7 +143,8 @@ def _told(where: str, told: ToldRecord, floors: int) -> None:
 
 def declared(record: RobotRecord, wheels: int) -> tuple[Entry, ...]:
     """Every number that a robot of this shape has, in order; the camera is no part of it."""
-    shape = Geometry(**vars(record.wheels), drive_offset=jnp.zeros(wheels))
+    level = jnp.zeros(wheels)
+    shape = Geometry(**vars(record.wheels), drive_offset=level, radius_deviation=level)
     robot = build(shape, record.labels, [load.name for load in record.loads])
     return tuple(e for e in entries(robot) if e.part != "camera")
 

@@ -164,7 +164,9 @@ def learn(
     contact = contact_of(problem, optimum.state, optimum.covariance, keep)
     models: list[Predictive] = [contact]
     seconds = {contact.name: time.perf_counter() - began}
-    for rung in rungs(problem.windows.has_current, nested(data, question, judged)):
+    for rung in rungs(
+        problem.robot.geometry, problem.windows.has_current, nested(data, question, judged)
+    ):
         began = time.perf_counter()
         models.append(with_noise(rung, contact, problem, keep))
         seconds[rung.name] = time.perf_counter() - began

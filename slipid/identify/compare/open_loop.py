@@ -50,6 +50,11 @@ class Tracks:
         """The camera's straight-line displacement [m]."""
         return np.linalg.norm((self.measured[:, -1] - self.measured[:, 0])[:, :2], axis=1)
 
+    @property
+    def path(self) -> Float[np.ndarray, " run"]:
+        """Length of the camera's path, step by step [m]."""
+        return np.linalg.norm(np.diff(self.measured[..., :2], axis=1), axis=2).sum(axis=1)
+
 
 def cuts(data: Runs, robot: Robot) -> list[Windows]:
     """The runs, each as one piece of short steps, `TOGETHER` at a time.

@@ -82,7 +82,7 @@ def body_twist(w: Windows, robot: Robot) -> np.ndarray:
 
 def rims(w: Windows, robot: Robot) -> tuple[Float[np.ndarray, "3 wheel"], np.ndarray]:
     """J^+ r, from wheel speeds to the twist without slip, and the wheel speeds [rad/s]."""
-    j = np.asarray(robot.geometry.inverse()) * float(robot.geometry.wheel_radius)
+    j = np.asarray(robot.geometry.least()) * float(robot.geometry.wheel_radius)
     return j, w.turn / w.dt[..., None]
 
 

@@ -50,9 +50,8 @@ def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
 
 def _left(w: Windows, robot: Robot) -> Float[np.ndarray, "piece window 3"]:
     """Motion along, across and in yaw that other runs do not predict [m, m, rad]."""
-    back = np.linalg.pinv(np.asarray(robot.geometry.forward())).T * float(
-        robot.geometry.wheel_radius
-    )
+    shape = robot.geometry
+    back = np.asarray(shape.least()).T * float(shape.wheel_radius)
     step, late = w.turn @ back, w.faster @ back
     moved = body_twist(w, robot) * w.dt[..., None]
     angle = np.arctan2(step[..., 1], step[..., 0])

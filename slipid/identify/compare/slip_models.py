@@ -1,4 +1,4 @@
-"""Rungs below the force balance: encoders, and slip curves wheel by wheel.
+"""Rungs below the force balance: encoders, slip curves wheel by wheel, corrected kinematics.
 
 Residuals are in displacement, so nothing is divided by a wheel speed.
 """
@@ -13,6 +13,7 @@ from scipy import sparse
 from scipy.optimize import least_squares, linprog, lsq_linear
 
 from slipid.data.windows import Windows
+from slipid.identify.compare.kinematics import Nominal, corrected
 from slipid.identify.compare.rung import (
     HeadingLookup,
     Rung,
@@ -21,6 +22,7 @@ from slipid.identify.compare.rung import (
     of_floor,
     rims,
 )
+from slipid.model.geometry import Geometry
 from slipid.model.motor import signed
 from slipid.model.robot import Robot
 
@@ -38,7 +40,7 @@ instead of whichever rounding prefers.
 
 @dataclass(frozen=True)
 class Encoder(Rung):
-    """No slip: xi = J^+ r w."""
+    """No slip: xi = J^+ r w, at the fitted radius, places and lag."""
 
     name: str = "encoder"
 
@@ -213,13 +215,22 @@ def _ramps(knots: Sequence[float]) -> Features:
     return phi
 
 
-def rungs(has_current: bool, together: Together | None = None) -> list[Rung]:
+def rungs(shape: Geometry, has_current: bool, together: Together | None = None) -> list[Rung]:
     """Every rung the logs allow, unfitted; `paper` is the form the authors ran on the robot.
 
-    Its threshold of 0.4 A and the spline's knots are for motors of that size. Runs that will be
-    left out `together` are so, too, where a rung tunes itself.
+    The shape is the robot's as its config has it: wheels that do not determine the twist have rungs
+    of their own. The threshold of `paper`, 0.4 A, and the spline's knots are for motors of that
+    size. Runs that will be left out `together` are so, too, where a rung tunes itself.
     """
-    out: list[Rung] = [Encoder(), Curve("constant", _powers(0))]
+    plain: list[Rung] = [Nominal("nominal", shape), Encoder()]
+    if not shape.determines_twist:
+        return plain + corrected(shape)
+    return plain + _of_wheels(has_current, together)
+
+
+def _of_wheels(has_current: bool, together: Together | None) -> list[Rung]:
+    """Slip wheel by wheel, and by the direction of travel."""
+    out: list[Rung] = [Curve("constant", _powers(0))]
     if has_current:
         out += [
             Curve("linear", _powers(1), torque=True),
@@ -234,9 +245,9 @@ def rungs(has_current: bool, together: Together | None = None) -> list[Rung]:
     return [*out, HeadingLookup(together=together)]
 
 
-def restored(states: Mapping[str, Mapping[str, Sequence]]) -> list[Rung]:
+def restored(shape: Geometry, states: Mapping[str, Mapping[str, Sequence]]) -> list[Rung]:
     """Rungs from their names and states, as `{rung.name: rung.state}` wrote them."""
-    known = {rung.name: rung for rung in rungs(has_current=True)}
+    known = {rung.name: rung for rung in rungs(shape, has_current=True)}
     if strange := sorted(set(states) - set(known)):
         raise ValueError(f"no model '{strange[0]}'; there are: {', '.join(known)}")
     return [

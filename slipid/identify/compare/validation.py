@@ -21,14 +21,16 @@ SCHEMA = "slipid.validation/1"
 class Score:
     """What a model's prediction of a run is worth.
 
-    The pose at the end is x, y [m] and yaw [rad]; the end-point error is over the chord, the length
-    error relative. `level` is the probability of the region whose edge the end lies on, `covered90`
-    whether that is at most 0.9, both None for a model without. The energy score is in m, the log
-    density of the logged poses in nats, None where it was not asked for.
+    The pose at the end is x, y [m] and yaw [rad]; the end-point error is over the chord, and over
+    the path, which means something on closed paths, too; the length error is relative. `level` is
+    the probability of the region whose edge the end lies on, `covered90` whether that is at most
+    0.9, both None for a model without. The energy score is in m, the log density of the logged
+    poses in nats, None where it was not asked for.
     """
 
     predicted_end: Sequence[float]
     endpoint_error: float
+    endpoint_error_over_path: float
     length_error: float
     heading_error_deg: float
     level: float | None
@@ -42,7 +44,8 @@ class Judged:
     """A run and the scores of every model on it.
 
     Heading and speed are as commanded [deg], [m/s], None where not known; the chord is the camera's
-    straight-line displacement [m], the measured end a pose (x, y [m], yaw [rad]).
+    straight-line displacement [m], the path its way [m], the measured end a pose (x, y [m],
+    yaw [rad]).
     """
 
     name: str
@@ -51,6 +54,7 @@ class Judged:
     heading_deg: float | None
     speed: float | None
     chord: float
+    path: float
     measured_end: Sequence[float]
     models: dict[str, Score]
     session: str | None = None
@@ -75,6 +79,8 @@ class Summary:
 
     endpoint_error_mean: float
     endpoint_error_median: float
+    endpoint_error_over_path_mean: float
+    endpoint_error_over_path_median: float
     length_error_mean: float
     heading_error_median_deg: float
     coverage90: float | None
@@ -164,6 +170,7 @@ def score(
     """
     gap = tracks.gap
     level, energy = replay.scores(gap[:, :2], cov)
+    path = tracks.path.tolist()
     ahead = np.linalg.norm((tracks.predicted[:, -1] - tracks.predicted[:, 0])[:, :2], axis=1)
     for n, k in enumerate(tracks.run.tolist()):
         log, chord = data.logs[k], float(tracks.chord[n])
@@ -175,12 +182,14 @@ def score(
                 heading_deg=finite(np.degrees(data.heading[k])),
                 speed=finite(data.speed[k]),
                 chord=chord,
+                path=path[n],
                 measured_end=tracks.measured[n, -1].tolist(),
                 models={},
             )
         runs[k].models[model] = Score(
             predicted_end=tracks.predicted[n, -1].tolist(),
             endpoint_error=float(np.hypot(*gap[n, :2])) / max(chord, 1e-9),
+            endpoint_error_over_path=float(np.hypot(*gap[n, :2])) / max(path[n], 1e-9),
             length_error=abs(float(ahead[n]) / max(chord, 1e-9) - 1.0),
             heading_error_deg=abs(float(np.degrees(gap[n, 2]))),
             level=None if level is None else float(level[n]),
@@ -220,6 +229,8 @@ def _mean(scores: Sequence[Score]) -> Summary:
     return Summary(
         endpoint_error_mean=float(np.mean(all_of("endpoint_error"))),
         endpoint_error_median=float(np.median(all_of("endpoint_error"))),
+        endpoint_error_over_path_mean=float(np.mean(all_of("endpoint_error_over_path"))),
+        endpoint_error_over_path_median=float(np.median(all_of("endpoint_error_over_path"))),
         length_error_mean=float(np.mean(all_of("length_error"))),
         heading_error_median_deg=float(np.median(all_of("heading_error_deg"))),
         coverage90=float(np.mean(covered)) if covered.size else None,

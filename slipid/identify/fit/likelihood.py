@@ -18,11 +18,11 @@ from slipid.model.robot import Robot
 
 Marker = Float[Array, "piece window 3"]
 """Increments of the marker [m, m, rad], or body twists [m/s, m/s, rad/s], of every window."""
-PerWheel = Float[Array, "piece window wheel"]
-Felt = Float[Array, "piece window wheel 2"]
-"""What `model.robot.felt` says of every wheel."""
+PerDrive = Float[Array, "piece window drive"]
+Felt = Float[Array, "piece window drive 2"]
+"""What `model.robot.felt` says of the wheels of every drive."""
 PerChannel = Float[Array, "piece m"]
-"""Window by window the wheels of every piece, as residuals are."""
+"""Window by window the drives of every piece, as residuals are."""
 Std = Float[Array, ""] | float
 SMOOTH = 0.03
 """Magnitude below which the mean of an unsigned current levels off [A]."""
@@ -49,12 +49,12 @@ class Batch(eqx.Module):
     load: Int[Array, " piece"]
     session: Int[Array, " piece"]
     dt: Float[Array, "piece window"]
-    turn: PerWheel
-    faster: PerWheel
+    turn: PerDrive
+    faster: PerDrive
     pose: Float[Array, "piece edge 3"]
-    current: PerWheel
-    voltage: PerWheel
-    current_var: PerWheel
+    current: PerDrive
+    voltage: PerDrive
+    current_var: PerDrive
     lag: Float[Array, ""]
     has_current: bool = eqx.field(static=True)
     has_voltage: bool = eqx.field(static=True)
@@ -98,7 +98,7 @@ class ElectricNoise(eqx.Module):
 class Predicted(eqx.Module):
     """What the robot says of each window: marker increments (x, y [m], yaw [rad]), body twists.
 
-    Felt is what each wheel's motor works against, in units of mu m g.
+    Felt is what each motor works against, in units of mu m g.
     """
 
     increment: Marker
@@ -106,18 +106,19 @@ class Predicted(eqx.Module):
     felt: Felt
 
 
-def wheel_speed(robot: Robot, b: Batch) -> PerWheel:
-    """Mean wheel speed of every window at the robot's camera lag [rad/s]."""
+def wheel_speed(robot: Robot, b: Batch) -> PerDrive:
+    """Mean wheel speed of every drive and window at the robot's camera lag [rad/s]."""
     return (b.turn - (robot.camera.lag - b.lag) * b.faster) / b.dt[..., None]
 
 
 def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
     """Contact equilibrium of every window, looked for near twists as `model.robot.twist` does."""
-    frame = robot.geometry.frame()
+    shape, frame = robot.geometry, robot.geometry.frame()
 
     def window(w: Array, near: Array | None, surface: Array, load: Array) -> tuple[Array, Array]:
+        w = shape.at_wheels(w)
         xi = model.twist(robot, frame, w, surface, load, near)
-        return xi, model.felt(robot, frame, xi, w, surface, load)
+        return xi, shape.at_drives(model.felt(robot, frame, xi, w, surface, load).T).T
 
     each, on = None if near is None else 0, 0 if b.surface.ndim > 1 else None
     pieces = jax.vmap(jax.vmap(window, (0, each, on, None)), (0, each, 0, 0))
@@ -136,7 +137,7 @@ def seen(
     return jax.vmap(jax.vmap(window, (0, 0, None)))(twist, dt, session)
 
 
-def predicted_current(robot: Robot, b: Batch, felt: Felt) -> PerWheel:
+def predicted_current(robot: Robot, b: Batch, felt: Felt) -> PerDrive:
     """Motor current of every window [A] given what motors work against, or its size."""
     friction = robot.surfaces.friction[b.surface]  # of the wheels on average, as `felt` has it
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
@@ -185,16 +186,16 @@ def electric_residuals(
     return out
 
 
-def _flat(x: PerWheel) -> PerChannel:
+def _flat(x: PerDrive) -> PerChannel:
     return x.reshape(x.shape[0], -1)
 
 
-def _direction(b: Batch) -> PerWheel:
+def _direction(b: Batch) -> PerDrive:
     """What a logged current counts for in the direction of the wheel: 1 if it is signed."""
     return jnp.ones_like(b.turn) if b.signed else jnp.tanh(b.turn / b.dt[..., None] / 0.2)
 
 
-def _flow(b: Batch, noise: ElectricNoise) -> tuple[PerWheel, PerWheel]:
+def _flow(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDrive]:
     """Share k of the gap of a measured current that is true current, and what stays unknown of it.
 
     The true current is N(predicted, s^2) before it is measured with the noise sigma^2. Afterwards

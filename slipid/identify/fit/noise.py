@@ -210,7 +210,7 @@ def _components(
 
 def steps(windows: Windows | Batch, robot: Robot) -> Float[np.ndarray, "piece window 3"]:
     """Movement of the body in each window by the encoders, in its own frame [m, m, rad]."""
-    j = np.linalg.pinv(np.asarray(robot.geometry.forward()))
+    j = np.asarray(robot.geometry.least())
     return np.asarray(windows.turn) * float(robot.geometry.wheel_radius) @ j.T
 
 

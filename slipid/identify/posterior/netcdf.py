@@ -50,6 +50,7 @@ def tree(
         "load": list(robot.body.loads),
         "session": list(robot.camera.sessions),
         "wheel": [f"wheel {k + 1}" for k in range(robot.geometry.wheels)],
+        "drive": [f"drive {k + 1}" for k in range(robot.geometry.drives)],
         "axis": list(_AXES[:2]),
         "direction": list(_AXES),
         "run": [runs[k] for k in run],
@@ -88,7 +89,7 @@ def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
         leaf = np.asarray(e.whole(robots))
         values[e.quantity] = leaf.reshape(*shape, *leaf.shape[1:])
         of = {"surface": e.surface, "load": e.load, "session": e.session}
-        of_vector = [] if e.size == 1 else ["axis"] if e.size == 2 else ["wheel"]
+        of_vector = [] if e.size == 1 else [e.declaration.of]
         dims[e.quantity] = [label for label, name in of.items() if name is not None] + of_vector
         units[e.quantity] = e.declaration.unit
     return values, dims, units
@@ -124,7 +125,7 @@ def _data(
     dims = {"increment": ["piece", "window", "direction"]}
     gaps = {"increment": new["motion"]}
     if w.has_current:
-        measured["current"], dims["current"] = np.asarray(w.current), ["piece", "window", "wheel"]
+        measured["current"], dims["current"] = np.asarray(w.current), ["piece", "window", "drive"]
         gaps["current"] = new["current"]
     predicted = {k: gaps[k].reshape(*gaps[k].shape[:2], *y.shape) + y for k, y in measured.items()}
     return measured, predicted, dims
