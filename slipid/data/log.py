@@ -9,28 +9,33 @@ from jaxtyping import Bool, Float
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Log:
-    """One run, every array sampled at `time`.
+    """One run, every array at `time`, at which some sensor was read.
+
+    What is of a wheel is of a drive, where several wheels share a motor.
 
     Attributes:
         name: path relative to the data root, with forward slashes; `#03` follows where one file
             holds several runs.
         path: the file.
         sha256: hash of the file's bytes.
-        time: [s], strictly increasing.
-        wheel_angle: [rad] at the wheel, cumulative from the first row; no columns where a log has
+        time: [s], strictly increasing; from the first row on where a clock counts from 1970.
+        wheel_angle: [rad] at the wheel, cumulative from the first row, and even between two
+            readings; no columns where a log has
             only poses.
         wheel_speed: [rad/s] at the wheel as the robot reported it, or None.
         wheel_speed_command: [rad/s] at the wheel, or None.
         twist_command: x [m/s], y [m/s], yaw rate [rad/s], or None.
         current: [A], or None.
+        current_fresh: False where a current repeats what was read before (or was not read); None
+            where it was read in every row.
         current_is_signed: False where the log has magnitudes only.
-        voltage: [V] across each motor, or None.
+        voltage: [V] across each motor, or None; `voltage_fresh` as of the current.
         duty: [1] of each motor's bridge, or None.
         bus_voltage: [V], or None.
         gyro: yaw rate [rad/s], or None.
         pose: x [m], y [m], heading [rad] without wrap-around, in the scale of the logged camera,
             or None.
-        pose_fresh: False where the row repeats the last camera frame (or was filled in).
+        pose_fresh: False where the row repeats the last pose.
         surface: name of the floor, None where it is unknown.
         load: name of the load set-up.
         notes: what the reader repaired, one sentence each.
@@ -45,8 +50,10 @@ class Log:
     wheel_speed_command: Float[np.ndarray, "time wheel"] | None = None
     twist_command: Float[np.ndarray, "time 3"] | None = None
     current: Float[np.ndarray, "time wheel"] | None = None
+    current_fresh: Bool[np.ndarray, "time wheel"] | None = None
     current_is_signed: bool
     voltage: Float[np.ndarray, "time wheel"] | None = None
+    voltage_fresh: Bool[np.ndarray, "time wheel"] | None = None
     duty: Float[np.ndarray, "time wheel"] | None = None
     bus_voltage: Float[np.ndarray, " time"] | None = None
     gyro: Float[np.ndarray, " time"] | None = None

@@ -8,7 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from slipid.data.log import Log
-from slipid.data.wheel_signals import MOVED, bridge_stalls, first_moved
+from slipid.data.wheel_signals import (
+    MOVED,
+    bridge_stalls,
+    first_moved,
+    read_anew,
+    refresh_period,
+)
 from slipid.support.errors import DataError
 
 
@@ -27,11 +33,14 @@ class Runs:
         live: False in the rows of a stall, whose currents are stale.
         current: motor currents [A], or None.
         voltage: motor voltages [V], or None.
+        current_fresh, voltage_fresh: False where a reading repeats what was read before (sample,
+            wheel); None where none does.
         current_is_signed: False where some log has magnitudes only.
         session: name of the time in which the marker stayed as it was, for each run.
         heading: direction of travel that was commanded, for each run [rad]; nan where it turns.
         speed: commanded speed of each run [m/s]; nan where no command was logged.
         turn: commanded yaw rate of each run [rad/s]; nan where no command was logged.
+        aside: a line for every run that was read and is not here, because its pose jumps.
     """
 
     logs: tuple[Log, ...]
@@ -43,11 +52,14 @@ class Runs:
     live: Bool[np.ndarray, " sample"]
     current: Float[np.ndarray, "sample wheel"] | None
     voltage: Float[np.ndarray, "sample wheel"] | None
+    current_fresh: Bool[np.ndarray, "sample wheel"] | None
+    voltage_fresh: Bool[np.ndarray, "sample wheel"] | None
     current_is_signed: bool
     session: tuple[str, ...]
     heading: Float[np.ndarray, " run"]
     speed: Float[np.ndarray, " run"]
     turn: Float[np.ndarray, " run"]
+    aside: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.logs)
@@ -65,15 +77,19 @@ class Runs:
         """Runs of both; DataError where a run is in both, or they do not go together."""
         if both := {log.name for log in self.logs} & {log.name for log in other.logs}:
             raise DataError(f"{min(both)}: in both sets of runs; expected it once")
-        return collect([*self.logs, *other.logs], [*self.session, *other.session])
+        aside = [*self.aside, *other.aside]
+        return collect([*self.logs, *other.logs], [*self.session, *other.session], aside)
 
 
-def collect(logs: Sequence[Log], session: Sequence[str] | None = None) -> Runs:
+def collect(
+    logs: Sequence[Log], session: Sequence[str] | None = None, aside: Sequence[str] = ()
+) -> Runs:
     """One set of runs that all have wheels and poses.
 
     Args:
         session: of each run, the time in which the marker stayed as it was; by default surface,
             load and commanded speed, which is how test grids are driven.
+        aside: a line for every run that is left out because its pose jumps.
 
     Raises:
         DataError: no run, different wheel counts, a run without pose.
@@ -121,12 +137,64 @@ def collect(logs: Sequence[Log], session: Sequence[str] | None = None) -> Runs:
         live=np.concatenate([~stalled for _, stalled in bridged]),
         current=flat.get("current"),
         voltage=flat.get("voltage"),
+        current_fresh=_fresh(logs, "current"),
+        voltage_fresh=_fresh(logs, "voltage"),
         current_is_signed=all(log.current_is_signed for log in logs),
         session=tuple(session or (default_session(log) for log in logs)),
         heading=heading,
         speed=speed,
         turn=turn,
+        aside=tuple(aside),
     )
+
+
+def _fresh(logs: Sequence[Log], channel: str) -> Bool[np.ndarray, "sample wheel"] | None:
+    """Where a channel was read anew, of all runs; None where it always was."""
+    each = [getattr(log, f"{channel}_fresh") for log in logs]
+    if all(fresh is None for fresh in each):
+        return None
+    shapes = [(log.samples, log.wheels) for log in logs]
+    return np.concatenate(
+        [np.ones(s, bool) if f is None else f for f, s in zip(each, shapes, strict=True)]
+    )
+
+
+def counted_once(logs: Sequence[Log]) -> list[Log]:
+    """The logs, with readings of currents and voltages marked that only repeat the one before.
+
+    How often a sensor is read is told by all runs of one file kind together: an ammeter that is
+    read once a second changes six times in six seconds.
+    """
+    out = list(logs)
+    for channel in ("current", "voltage"):
+        have = [k for k, log in enumerate(out) if getattr(log, channel) is not None]
+        periods: dict[int, float] = {}
+        for wheel in range(out[have[0]].wheels if have else 0):
+            series = [_read(out[k], channel, wheel) for k in have if out[k].wheels > wheel]
+            period = refresh_period((time, values) for time, values, _ in series)
+            if period is not None:
+                periods[wheel] = period
+        for k in have if periods else ():
+            fresh = np.ones((out[k].samples, out[k].wheels), dtype=bool)
+            before = getattr(out[k], f"{channel}_fresh")
+            fresh &= True if before is None else before
+            for wheel, period in periods.items():
+                time, values, rows = _read(out[k], channel, wheel)
+                fresh[rows, wheel] &= read_anew(time, values, period)
+            said = ", ".join(f"{p:.2g}" for p in sorted(set(periods.values())))
+            note = f"{channel} is read anew every {said} s: between, it repeats and is not counted"
+            changes: dict[str, Any] = {f"{channel}_fresh": fresh}
+            out[k] = replace(out[k], notes=(*out[k].notes, note), **changes)
+    return out
+
+
+def _read(
+    log: Log, channel: str, wheel: int
+) -> tuple[Float[np.ndarray, " read"], Float[np.ndarray, " read"], np.ndarray]:
+    """Times, values and rows of the readings of one wheel."""
+    fresh = getattr(log, f"{channel}_fresh")
+    rows = np.arange(log.samples) if fresh is None else np.flatnonzero(fresh[:, wheel])
+    return log.time[rows], getattr(log, channel)[rows, wheel], rows
 
 
 def default_session(log: Log) -> str:

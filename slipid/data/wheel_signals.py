@@ -1,5 +1,6 @@
 """Signals of one run: steps of motion, stalls of the telemetry, the start, swapped wheels."""
 
+from collections.abc import Iterable
 from itertools import permutations
 
 import numpy as np
@@ -11,6 +12,8 @@ STALLED = 3
 """Steps without change from which a stretch can be a stall."""
 DOUBT = 0.05
 """Relative misfit from which the declared order is doubted; speed loops keep below it."""
+LEAST_CHANGES = 8
+"""Changes of a value from which on its sensor's own period can be told."""
 BETTER = 0.25
 """Another order must have less than this share of the declared one's misfit to be believed."""
 
@@ -33,6 +36,59 @@ def integral(
     """Integral of each column from the first row on, by trapezoids; the first row is 0."""
     areas = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None]
     return np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(areas, axis=0)])
+
+
+def readings(
+    time: Float[np.ndarray, " time"], values: Float[np.ndarray, " time"]
+) -> Bool[np.ndarray, " time"]:
+    """Rows in which a sensor that may be slower than the rows was read anew.
+
+    All of them where the value also changes from row to row, or hardly ever.
+    """
+    period = refresh_period([(time, values)])
+    return np.ones(len(time), bool) if period is None else read_anew(time, values, period)
+
+
+def refresh_period(
+    runs: Iterable[tuple[Float[np.ndarray, " time"], Float[np.ndarray, " time"]]],
+) -> float | None:
+    """Period of a sensor that is slower than the rows it is logged in [s]; None of one that is not.
+
+    Its value never changes in two rows one after the other, but for one in twenty: a sensor that
+    is read in every row and happens to repeat itself changes in neighbouring rows, too.
+    """
+    rows: list[np.ndarray] = []
+    seconds: list[np.ndarray] = []
+    for time, values in runs:
+        changed = np.flatnonzero(np.diff(values) != 0) + 1
+        rows.append(np.diff(changed))
+        seconds.append(np.diff(time[changed]))
+    apart = np.concatenate(rows) if rows else np.zeros(0, int)
+    if len(apart) < LEAST_CHANGES or np.quantile(apart, 0.05) < 2:
+        return None
+    return float(np.median(np.concatenate(seconds)))
+
+
+def read_anew(
+    time: Float[np.ndarray, " time"], values: Float[np.ndarray, " time"], period: float
+) -> Bool[np.ndarray, " time"]:
+    """Rows in which a sensor of this period was read: where its value changes, or must have been.
+
+    A value that stays for several periods was read several times.
+    """
+    out = np.zeros(len(time), dtype=bool)
+    out[0] = True
+    last = 0
+    changed = np.append(np.flatnonzero(np.diff(values) != 0) + 1, len(time))
+    for row in changed.tolist():
+        end = time[min(row, len(time) - 1)]
+        count = int(np.round((end - time[last]) / period))
+        again = time[last] + (end - time[last]) / max(count, 1) * np.arange(1, count)
+        out[np.searchsorted(time, again - 1e-9).clip(0, len(time) - 1)] = True
+        if row < len(time):
+            out[row] = True
+            last = row
+    return out
 
 
 def body_steps(pose: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "step 3"]:

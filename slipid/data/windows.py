@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from slipid.data.runs import Runs, first_row
 from slipid.data.wheel_signals import interpolate
@@ -11,6 +11,8 @@ from slipid.support.errors import DataError
 
 NORMAL_STD = 0.6827
 """Part of a normal distribution that is within one std."""
+UNREAD = 1e6
+"""Variance of what was not read, so large that it tells nothing [A^2, V^2]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +28,9 @@ class Windows:
         pose: pose at the edges of the windows (piece, window + 1, 3), as logged.
         current: mean of the signed current or of its magnitude [A]; zeros where not logged.
         voltage: mean voltage [V]; zeros where not logged.
-        current_var: variance of the mean current by the ammeter's own noise [A^2].
+        current_var: variance of the mean current by the ammeter's own noise [A^2]; `UNREAD`, for
+            which it says nothing, where no current was read in the window.
+        voltage_var: zero, or `UNREAD` where no voltage was read in the window [V^2].
         has_current, has_voltage: whether they were logged.
         current_is_signed: False where `current` is a mean of magnitudes.
         lag: lag of the camera behind the encoders that was assumed [s].
@@ -43,6 +47,7 @@ class Windows:
     current: Float[np.ndarray, "piece window wheel"]
     voltage: Float[np.ndarray, "piece window wheel"]
     current_var: Float[np.ndarray, "piece window wheel"]
+    voltage_var: Float[np.ndarray, "piece window wheel"]
     has_current: bool
     has_voltage: bool
     current_is_signed: bool
@@ -118,14 +123,23 @@ def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
     amps = data.current if data.current_is_signed else np.abs(data.current)
     for k in range(len(data)):
         rows = data.rows(k)
-        live = data.live[rows]
-        bent = np.abs(np.diff(amps[rows], 2, axis=0))[live[:-2] & live[1:-1] & live[2:]]
-        if len(bent):
-            step = np.abs(np.diff(amps[rows], axis=0))
-            rounding = np.where(step > 0, step, np.inf).min(axis=0) ** 2 / 12
-            noise = np.quantile(bent, NORMAL_STD, axis=0) ** 2 / 6
-            out[k] = np.maximum(noise, np.where(np.isfinite(rounding), rounding, 0.0))
+        live, of_run = data.live[rows], amps[rows]
+        fresh = None if data.current_fresh is None else data.current_fresh[rows]
+        for wheel in range(out.shape[1]):
+            read = slice(None) if fresh is None else fresh[:, wheel]
+            out[k, wheel] = _ammeter(of_run[read, wheel], live[read])
     return out
+
+
+def _ammeter(amps: Float[np.ndarray, " reading"], live: Bool[np.ndarray, " reading"]) -> float:
+    """Variance of a reading of one ammeter in one run [A^2]."""
+    bent = np.abs(np.diff(amps, 2))[live[:-2] & live[1:-1] & live[2:]]
+    if not len(bent):
+        return 0.0
+    step = np.abs(np.diff(amps))
+    rounding = float((step[step > 0] ** 2).min(initial=np.inf)) / 12
+    noise = float(np.quantile(bent, NORMAL_STD)) ** 2 / 6
+    return max(noise, rounding if np.isfinite(rounding) else 0.0)
 
 
 def _edges(data: Runs, run: int, radius: float, per_piece: int, longest: float) -> list[np.ndarray]:
@@ -169,14 +183,17 @@ def _cut(
     end = np.maximum(np.searchsorted(t, at[1:]), first + 1)
     zero = np.zeros((len(edges) - 1, angle.shape[1]))
     live = data.live[rows].astype(float)[:, None]
-    mean_current = variance = mean_voltage = zero
+    mean_current = variance = mean_voltage = unread = zero
     if data.current is not None:
         amps = data.current[rows]
         amps = amps if data.current_is_signed else np.abs(amps)
-        mean_current, count = _mean(amps, live, first, end)
-        variance = noise / count
+        read = live if data.current_fresh is None else live * data.current_fresh[rows]
+        mean_current, count = _mean(amps, read, first, end)
+        variance = np.where(count > 0, noise / np.maximum(count, 1), UNREAD)
     if data.voltage is not None:
-        mean_voltage, _ = _mean(data.voltage[rows], live, first, end)
+        read = live if data.voltage_fresh is None else live * data.voltage_fresh[rows]
+        mean_voltage, count = _mean(data.voltage[rows], read, first, end)
+        unread = np.where(count > 0, 0.0, UNREAD)
     return {
         "dt": np.diff(t[edges]),
         "turn": np.diff(turned, axis=0),
@@ -185,13 +202,17 @@ def _cut(
         "current": mean_current,
         "voltage": mean_voltage,
         "current_var": variance,
+        "voltage_var": unread,
     }
 
 
 def _mean(
     x: np.ndarray, live: np.ndarray, lo: np.ndarray, hi: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over the live rows lo..hi of each window, and how many rows these are."""
+    """Mean over what was read in the rows lo..hi of each window, and how many readings these are.
+
+    Where there was none it is the mean over all rows.
+    """
 
     def total(values: np.ndarray) -> np.ndarray:
         summed = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
@@ -199,7 +220,8 @@ def _mean(
 
     lo, hi = np.minimum(lo, len(x) - 1), np.minimum(hi, len(x))
     hi = np.maximum(hi, lo + 1)
-    if (total(live) < 1).any():
-        live = np.ones_like(live)
+    live = np.broadcast_to(live, x.shape)
     n = total(live)
-    return total(x * live) / n, n
+    rows = (hi - lo)[:, None]
+    mean = np.where(n > 0, total(x * live) / np.maximum(n, 1), total(x) / rows)
+    return mean, n

@@ -7,7 +7,7 @@ from slipid.data.log import Log
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import PRESETS, declared_layout, preset
 from slipid.data.reading.reader import find_logs, read_logs, session_of
-from slipid.data.runs import Runs, collect
+from slipid.data.runs import Runs, collect, counted_once
 from slipid.job.config import Config, Logs
 from slipid.support.errors import DataError, near
 from slipid.support.progress import Reporter
@@ -24,13 +24,16 @@ def read_dataset(
         raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
     count = sum(len(paths) for _, paths in found)
     logs: list[Log] = []
+    aside: list[str] = []
     sessions: dict[str, str] = {}
     done = short = 0
     for section, paths in found:
         layout = layout_of(config, section)
         surface = None if section.map is not None else section.surface
         for path in paths:
-            for log in read_logs(path, layout, root, surface, section.load):
+            found_there = read_logs(path, layout, root, surface, section.load)
+            aside += found_there.aside
+            for log in found_there.logs:
                 if log.samples < section.min_rows:
                     short += 1
                     continue
@@ -45,7 +48,9 @@ def read_dataset(
             report.advance(done, count)
     if short:
         skipped.append(f"skipped: {short} runs shorter than their min_rows")
-    return collect(logs, list(sessions.values())), skipped
+    if not logs:
+        raise DataError("\n".join([*aside, *skipped]) or f"{root}: no run in any file")
+    return collect(counted_once(logs), list(sessions.values()), aside), [*skipped, *aside]
 
 
 def files_of(

@@ -80,7 +80,7 @@ def test_several_runs_in_one_file(root):
     lines = (root / GENERIC).read_text().splitlines()
     (root / GENERIC).write_text("\n".join([*lines, *lines[1:51]]) + "\n")
     layout = declared_layout({**GENERIC_LAYOUT, "new_run": "time_restarts"}, "layout")
-    logs = read_logs(root / GENERIC, layout, root, "oak", "as_built")
+    logs = read_logs(root / GENERIC, layout, root, "oak", "as_built").logs
     assert [(log.name, log.samples) for log in logs] == [
         ("generic/run.csv#1", 200),
         ("generic/run.csv#2", 50),

@@ -344,13 +344,13 @@ CASES: tuple[Case, ...] = (
     # values
     Case(
         "burst of missing values",
-        _cell(range(80, 90), "xpos", "NaN"),
-        ("exp07.csv rows 80-89", "column 'xpos'", "10 missing", "up to 3 rows"),
+        _cell(range(80, 130), "m2pos", "NaN"),
+        ("exp07.csv row 80", "column 'm2pos'", "no value for 1.58 s", "one about every 0.031 s"),
     ),
     Case(
-        "many missing values",
-        _cell(range(10, _END, 9), "m1cur", ""),
-        ("exp07.csv row", "column 'm1cur'", "22 of 200 values missing", "at most 2%"),
+        "no value at all",
+        _cell(range(4, _END), "m1cur", ""),
+        ("exp07.csv", "column 'm1cur'", "no value in any row", "numbers"),
     ),
     Case(
         "infinite value",

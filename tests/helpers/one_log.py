@@ -5,6 +5,7 @@ from pathlib import Path
 from slipid.data.log import Log
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.reader import read_logs
+from slipid.support.errors import DataError
 
 
 def read_log(
@@ -16,5 +17,8 @@ def read_log(
     load: str = "as_built",
 ) -> Log:
     """Arguments as of `read_logs`; the run is named after its file where there is no root."""
-    (log,) = read_logs(path, layout, root or path.parent, surface, load)
+    found = read_logs(path, layout, root or path.parent, surface, load)
+    if found.aside:
+        raise DataError(found.aside[0])
+    (log,) = found.logs
     return log

@@ -1,20 +1,19 @@
 """Checks every log passes once, at the door; each failure names file, row and what was expected."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.layout import Channel, Layout
+from slipid.data.reading.layout import Layout
+from slipid.data.reading.signal import Signal
 from slipid.data.reading.table import Table
-from slipid.data.wheel_signals import integral, interpolate, stretches, swapped_order
-from slipid.support.errors import bad_data
+from slipid.data.wheel_signals import integral, interpolate, swapped_order
+from slipid.support.errors import DataError, bad_data
 
 MIN_ROWS = 2
 """Rows below which there is no motion to speak of."""
-MAX_FILLED = 3
-"""Missing cells in a row that are filled by interpolation; more is a burst, and refused."""
-MAX_FILLED_SHARE = 0.02
-"""Share of a column's cells that may be missing."""
 
 # What no wheeled robot does, so that the unit or the sensor must be wrong.
 _LIMITS = {
@@ -59,49 +58,11 @@ def check_time(table: Table, layout: Layout, time: Float[np.ndarray, " row"]) ->
         fail(1, f"rows {usual:.3g} s apart", "10 us to 60 s; is the unit of time right?")
 
 
-def filled(
-    table: Table, channel: Channel, time: Float[np.ndarray, " row"], notes: list[str]
-) -> Float[np.ndarray, "row column"]:
-    """Cells of a channel, up to three missing in a row filled linearly in time; refuses bursts."""
-    cells = table.stacked(channel)
-    for j, column in enumerate(channel.columns):
-        values = cells[:, j]
-        infinite = np.flatnonzero(np.isinf(values))
-        if len(infinite):
-            row = int(table.lines[infinite[0]])
-            raise bad_data(table.path, "an infinite value", "a number", row=row, column=str(column))
-        missing = np.isnan(values)
-        if not missing.any():
-            continue
-        first, end = max(stretches(missing).tolist(), key=lambda ends: ends[1] - ends[0])
-        rows = (int(table.lines[first]), int(table.lines[end - 1]))
-        if end - first > MAX_FILLED:
-            found = f"{end - first} missing values in a row"
-            expected = f"numbers (gaps up to {MAX_FILLED} rows are filled in)"
-            raise bad_data(table.path, found, expected, row=rows, column=str(column))
-        if missing.mean() > MAX_FILLED_SHARE:
-            found = f"{missing.sum()} of {len(missing)} values missing"
-            expected = f"at most {MAX_FILLED_SHARE:.0%}"
-            raise bad_data(table.path, found, expected, row=rows, column=str(column))
-        cells[missing, j] = np.interp(time[missing], time[~missing], values[~missing])
-        notes.append(f"column '{column}': {missing.sum()} missing values filled by interpolation")
-    return cells
+class Unsteady(DataError):
+    """The pose of a run jumps: it is to be set aside, and the others can be read."""
 
 
-def unwrapped_ticks(
-    ticks: Float[np.ndarray, "row wheel"], bits: int, notes: list[str]
-) -> Float[np.ndarray, "row wheel"]:
-    """Ticks without the wrap-around of an integer counter of `bits` bits."""
-    period = 2.0**bits
-    steps = np.diff(ticks, axis=0)
-    if np.abs(steps).max(initial=0.0) <= 0.5 * period:
-        return ticks
-    turns = np.concatenate([np.zeros((1, ticks.shape[1])), np.cumsum(np.round(steps / period), 0)])
-    notes.append(f"tick counter wrapped around at {bits} bits and was continued")
-    return ticks - turns * period
-
-
-def check_log(log: Log, table: Table, layout: Layout) -> None:
+def check_log(log: Log, signals: Mapping[str, Signal], layout: Layout) -> None:
     """Refuse what no robot does: absurd magnitudes, signs, jumps, and channels that stand still."""
     for name, (limit, unit) in _LIMITS.items():
         values = getattr(log, name)
@@ -110,19 +71,19 @@ def check_log(log: Log, table: Table, layout: Layout) -> None:
             value = values[i, j] if values.ndim == 2 else values[i]
             found = f"{name} of {value:.4g} {unit}"
             expected = f"at most {limit:g}; is the unit of the column right?"
-            raise _at(table, layout, name, i, j, found, expected)
+            raise _at(log, signals, name, i, j, found, expected)
     if log.current is not None and not log.current_is_signed and log.current.min() < 0:
         i, j = _first(log.current < 0)
         found = f"a negative current ({log.current[i, j]:.4g} A)"
         expected = "magnitudes only, as the layout says (current_is_signed = false)"
-        raise _at(table, layout, "current", i, j, found, expected)
-    _check_wheels(log, table, layout)
-    _check_order(log, table, layout)
+        raise _at(log, signals, "current", i, j, found, expected)
+    _check_wheels(log, signals, layout)
+    _check_order(log, signals, layout)
     if log.pose is not None:
-        _check_pose(log, table, layout)
+        _check_pose(log, signals, layout)
 
 
-def _check_wheels(log: Log, table: Table, layout: Layout) -> None:
+def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: Layout) -> None:
     """Refuse angles no wheel can make, and a wheel that stands still when commanded."""
     if not log.wheels:
         return
@@ -136,7 +97,7 @@ def _check_wheels(log: Log, table: Table, layout: Layout) -> None:
         expected = (
             f"at most {limit:.3g}; does the counter restart, or wrap at {layout.tick_bits} bits?"
         )
-        raise _at(table, layout, "wheel", i + 1, j, found, expected)
+        raise _at(log, signals, "wheel", i + 1, j, found, expected)
     command = log.wheel_speed_command
     if command is None:
         return
@@ -147,10 +108,10 @@ def _check_wheels(log: Log, table: Table, layout: Layout) -> None:
     if len(dead):
         j = int(dead[0])
         found = f"constant, though the wheel was commanded {commanded[j]:.3g} rad"
-        raise _at(table, layout, "wheel", None, j, found, "a wheel that turns when commanded")
+        raise _at(log, signals, "wheel", None, j, found, "a wheel that turns when commanded")
 
 
-def _check_order(log: Log, table: Table, layout: Layout) -> None:
+def _check_order(log: Log, signals: Mapping[str, Signal], layout: Layout) -> None:
     """Refuse wheel columns in another order than those of the commanded or reported speeds."""
     # steps of half a second: delays and jitter do not matter
     edges = np.linspace(log.time[0], log.time[-1], max(2, int(log.duration / 0.5) + 1))
@@ -168,28 +129,31 @@ def _check_order(log: Log, table: Table, layout: Layout) -> None:
             found = f"the wheel does not move as its {name} says"
             listed = ", ".join(map(str, order))
             expected = f"wheels in the order {listed} (swapped or reversed columns?)"
-            raise _at(table, layout, "wheel", None, j, found, expected)
+            raise _at(log, signals, "wheel", None, j, found, expected)
 
 
-def _check_pose(log: Log, table: Table, layout: Layout) -> None:
-    pose = log.pose
-    assert pose is not None
+def _check_pose(log: Log, signals: Mapping[str, Signal], layout: Layout) -> None:
+    """Refuse a pose that stands still while wheels turn; set a run aside whose pose jumps."""
+    assert log.pose is not None
+    assert log.pose_fresh is not None
+    rows = np.flatnonzero(log.pose_fresh)
+    pose = log.pose[rows]
     steps = np.hypot(*np.diff(pose[:, :2], axis=0).T)
     turns, most = np.degrees(np.abs(np.diff(pose[:, 2]))), np.degrees(layout.max_heading_jump)
     for column, what, jumps, limit, unit in (
         ("pose_x", "pose", steps, layout.max_pose_jump, "m"),
         ("pose_heading", "heading", turns, most, "deg"),
     ):
-        if jumps.max() > limit:
+        if jumps.max(initial=0.0) > limit:
             i = int(np.argmax(jumps > limit))
             found = f"the {what} jumps by {jumps[i]:.3g} {unit}"
-            expected = f"at most {limit:.3g} {unit} between rows; another marker, or a wrong unit?"
-            raise _at(table, layout, column, i + 1, 0, found, expected)
+            expected = f"at most {limit:.3g} {unit} between poses; another marker, or a wrong unit?"
+            raise Unsteady(str(_at(log, signals, column, int(rows[i + 1]), 0, found, expected)))
     turned = np.ptp(log.wheel_angle, axis=0).max(initial=0.0)
     if turned > 2.0 and np.ptp(pose, axis=0).max() == 0:
         found = f"the pose is constant while a wheel turns {turned:.3g} rad"
         expected = "a pose that changes: was the marker seen?"
-        raise _at(table, layout, "pose_x", None, 0, found, expected)
+        raise _at(log, signals, "pose_x", None, 0, found, expected)
 
 
 def _first(mask: np.ndarray) -> tuple[int, int]:
@@ -197,16 +161,32 @@ def _first(mask: np.ndarray) -> tuple[int, int]:
     return int(at[0]), int(at[1]) if len(at) > 1 else 0
 
 
+_NAMES = {
+    "wheel": ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed"),
+    "wheel_speed": ("wheel_speed", "motor_speed"),
+    "wheel_speed_command": ("wheel_speed_command", "motor_speed_command"),
+    "current": ("current", "motor_torque", "wheel_torque"),
+    "voltage": ("voltage", "duty"),
+    "pose_heading": ("pose_heading", "pose_quaternion"),
+}
+"""Channels that what a log holds may come from."""
+
+
 def _at(
-    table: Table, layout: Layout, name: str, i: int | None, j: int, found: str, expected: str
-) -> Exception:
-    """The error at row i of the j-th column of the channel whose name begins with `name`."""
-    order = {
-        "wheel": ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed"),
-        "wheel_speed": ("wheel_speed", "motor_speed"),
-        "wheel_speed_command": ("wheel_speed_command", "motor_speed_command"),
-    }.get(name, (name,))
-    channel = next((layout.channels[n] for n in order if n in layout.channels), None)
-    column = str(channel.columns[j]) if channel else None
-    row = None if i is None else int(table.lines[i])
-    return bad_data(table.path, found, expected, row=row, column=column)
+    log: Log,
+    signals: Mapping[str, Signal],
+    name: str,
+    i: int | None,
+    j: int,
+    found: str,
+    expected: str,
+) -> DataError:
+    """The error at time i of the log, in the j-th column of the channel that `name` comes from."""
+    signal = next((signals[n] for n in _NAMES.get(name, (name,)) if n in signals), None)
+    if signal is None:
+        return bad_data(log.path, found, expected)
+    sample = None
+    if i is not None:
+        since = log.time[i] + (signal.time[0] - log.time[0] if signal.time[0] > 1e6 else 0.0)
+        sample = max(int(np.searchsorted(signal.time, since + 1e-9, side="right")) - 1, 0)
+    return signal.source.error(found, expected, sample=sample, column=j)

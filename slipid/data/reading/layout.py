@@ -1,6 +1,7 @@
 """What a log file's layout is: which column holds which channel, in which unit."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import field
 from typing import Annotated, Literal
 
 from pydantic import (
@@ -27,6 +28,8 @@ PER_WHEEL = {
     "wheel_speed_command": "rad/s",
     "motor_speed_command": "rad/s",
     "current": "A",
+    "motor_torque": "N*m",
+    "wheel_torque": "N*m",
     "voltage": "V",
     "duty": "1",
 }
@@ -41,7 +44,9 @@ SINGLE = {
     "pose_y": "m",
     "pose_heading": "rad",
 }
-CHANNELS: dict[str, str] = {**SINGLE, **PER_WHEEL}
+SEVERAL = {"pose_quaternion": "1"}
+"""Channels with a number of columns of their own: x, y, z and w of a quaternion."""
+CHANNELS: dict[str, str] = {**SINGLE, **SEVERAL, **PER_WHEEL}
 """Every channel a layout may name, with the unit it is turned into."""
 
 Count = Annotated[int, Field(ge=0, strict=True)]
@@ -104,13 +109,16 @@ class Layout:
         ticks_are_increments: whether the cells hold the ticks since the last row.
         tick_bits: width of the tick counter, at which it wraps around.
         current_is_signed: False where the cells are magnitudes.
+        torque_constant: torque per current of the *motor* [N m/A], where a driver reports torques.
         metres_per_pixel: scale of the camera along its x and its y [m].
         new_run: what tells that the next run starts inside the file.
         drop_repeated_time: whether to keep the last of rows with the same time; else such rows are
             refused.
         max_gap: longest time between rows [s]; a longer one is called a clock jump.
-        max_pose_jump: longest way between rows [m]; a longer one is called a marker swap.
-        max_heading_jump: largest turn between rows [rad]; a larger one is called a marker swap.
+        max_pose_jump: longest way between two poses [m]; a run with a longer one is set aside.
+        max_heading_jump: largest turn between two poses [rad]; the same.
+        beside: layouts of files that lie beside a run's own and hold more of its channels, by their
+            names; `{stem}` stands for that of the run's own file without its suffix.
     """
 
     name: str
@@ -125,12 +133,14 @@ class Layout:
     ticks_are_increments: StrictBool = False
     tick_bits: Count = 32
     current_is_signed: StrictBool = True
+    torque_constant: Positive | None = None
     metres_per_pixel: Annotated[tuple[Positive, Positive] | None, BeforeValidator(_pair)] = None
     new_run: Literal["never", "time_restarts", "ticks_restart"] = "never"
     drop_repeated_time: StrictBool = False
     max_gap: Positive = 1.0
     max_pose_jump: Positive = 0.5
     max_heading_jump: Positive = 1.6
+    beside: Mapping[str, "Layout"] = field(default_factory=dict)
 
     @property
     def columns(self) -> tuple[str | int, ...]:

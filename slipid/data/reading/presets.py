@@ -145,14 +145,14 @@ _LAYOUTS = (
     ),
 )
 PRESETS = {layout.name: layout for layout in _LAYOUTS}
-_SETTINGS = [f.name for f in fields(Layout) if f.name not in ("name", "channels")]
+_SETTINGS = [f.name for f in fields(Layout) if f.name not in ("name", "channels", "beside")]
 
 
 def declared_layout(table: Mapping[str, object], where: str) -> Layout:
     """Layout declared in a config: `format` names a preset, the rest overrides it.
 
     `columns` maps each channel to `{columns = [...] or column = ..., unit, scale, offset}`; `false`
-    takes a channel of the preset away.
+    takes a channel of the preset away. `beside` has a layout for each further file of a run.
 
     Messages call the section `where`, such as `robotino.toml [layout]`.
 
@@ -160,12 +160,29 @@ def declared_layout(table: Mapping[str, object], where: str) -> Layout:
         DataError: unknown key, channel, unit or format, wrong dimension, wrong type.
     """
     given = dict(table)
+    others = given.pop("beside", {})
+    if not isinstance(others, dict) or not all(isinstance(v, dict) for v in others.values()):
+        raise DataError(f"{where} beside: {others!r}; expected a table of layouts by file name")
+    layout = _declared_file(given, where)
+    beside = dict(layout.beside)
+    for name, one in others.items():
+        beside[name] = _declared_file(one, f"{where} beside.'{name}'")
+    layout = replace(layout, beside=beside)
+    if problem := _problem(layout):
+        raise DataError(f"{where}: {problem}")
+    return layout
+
+
+def _declared_file(table: Mapping[str, object], where: str) -> Layout:
+    """Layout of a single file."""
+    given = dict(table)
     name, columns = given.pop("format", None), given.pop("columns", {})
     if name is not None and name not in PRESETS:
         raise DataError(f"{where}: {unknown('format', name, PRESETS)}")
     for key in given:
         if key not in _SETTINGS:
-            raise DataError(f"{where}: {unknown('key', key, ['format', 'columns', *_SETTINGS])}")
+            known = ["format", "columns", "beside", *_SETTINGS]
+            raise DataError(f"{where}: {unknown('key', key, known)}")
     if not isinstance(columns, dict):
         raise DataError(f"{where} columns: {columns!r}; expected a table")
     base = Layout(where, {}) if name is None else PRESETS[str(name)]
@@ -177,7 +194,7 @@ def declared_layout(table: Mapping[str, object], where: str) -> Layout:
         if spec is not False:
             channels[channel] = checked(f"{where} columns.{channel}", spec, Channel)
     layout = replace(checked(where, {**vars(base), **given}, Layout), channels=channels)
-    if problem := _problem(layout):
+    if problem := _file_problem(layout):
         raise DataError(f"{where}: {problem}")
     for channel in channels:
         try:
@@ -187,25 +204,46 @@ def declared_layout(table: Mapping[str, object], where: str) -> Layout:
     return layout
 
 
-def _problem(layout: Layout) -> str | None:
-    """What does not belong together."""
+def _file_problem(layout: Layout) -> str | None:
+    """What does not belong together in a file."""
     have = layout.channels
-    counts = {name: len(c.columns) for name, c in have.items() if name in PER_WHEEL}
     single = {name: len(c.columns) for name, c in have.items() if name in SINGLE}
     if not have:
         return f"no columns; expected a table of channels ({', '.join(CHANNELS)})"
     if "time" not in have and layout.row_period is None:
         return "no time column; expected a channel 'time', or row_period in seconds"
-    if "wheel_ticks" in have and layout.ticks_per_revolution is None:
-        return "wheel_ticks without ticks_per_revolution; expected ticks per turn of the motor"
-    if len(set(counts.values())) > 1:
-        return f"channels disagree on the number of wheels: {counts}; expected the same of each"
     if many := [name for name, count in single.items() if count != 1]:
         return f"columns.{many[0]}: {single[many[0]]} columns; expected one column"
-    if 0 < len({"pose_x", "pose_y", "pose_heading"} & set(have)) < 3:
-        return "a pose in parts; expected pose_x, pose_y and pose_heading, or none of them"
+    if "pose_quaternion" in have and len(have["pose_quaternion"].columns) != 4:
+        count = len(have["pose_quaternion"].columns)
+        return f"columns.pose_quaternion: {count} columns; expected four: x, y, z and w"
     if layout.first_data_row <= max(layout.names_row, layout.units_row):
         return f"first_data_row {layout.first_data_row}; expected it below names and units"
     if not layout.names_row and any(isinstance(c, str) for c in layout.columns):
         return "columns by name, but names_row is 0; expected positions from 0"
+    return None
+
+
+def _problem(layout: Layout) -> str | None:
+    """What does not belong together in all files of a run."""
+    files = [layout, *layout.beside.values()]
+    names = [name for one in files for name in one.channels if name != "time"]
+    if twice := [name for name in names if names.count(name) > 1]:
+        return f"channel '{twice[0]}' in two files; expected it in one of them"
+    have = {name: c for one in files for name, c in one.channels.items()}
+    counts = {name: len(c.columns) for name, c in have.items() if name in PER_WHEEL}
+    if "wheel_ticks" in have and layout.ticks_per_revolution is None:
+        return "wheel_ticks without ticks_per_revolution; expected ticks per turn of the motor"
+    if len(set(counts.values())) > 1:
+        return f"channels disagree on the number of wheels: {counts}; expected the same of each"
+    if {"motor_torque", "wheel_torque"} & set(have) and layout.torque_constant is None:
+        return "a torque without torque_constant; expected the motor's torque per current [N m/A]"
+    turned = {"pose_heading", "pose_quaternion"} & set(have)
+    if 0 < len({"pose_x", "pose_y"} & set(have)) + len(turned) != 3:
+        return (
+            "a pose in parts; expected pose_x, pose_y and one of pose_heading and "
+            "pose_quaternion, or none of them"
+        )
+    if layout.beside and layout.new_run != "never":
+        return f"new_run = '{layout.new_run}' with files beside; expected one run for each file"
     return None

@@ -1,5 +1,6 @@
 """Read logs: from files and their layout to runs in SI units, checked once, here."""
 
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -8,12 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.checks import MIN_ROWS, check_log, check_time, filled, unwrapped_ticks
+from slipid.data.reading.assemble import Identity, assembled
+from slipid.data.reading.checks import MIN_ROWS, Unsteady, check_log, check_time
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import preset
+from slipid.data.reading.signal import Signal, Source
 from slipid.data.reading.table import Table, read_table
-from slipid.data.runs import Runs, collect, default_session
-from slipid.data.wheel_signals import integral
+from slipid.data.runs import Runs, collect, counted_once, default_session
 from slipid.support.errors import DataError
 
 Session = Literal["surface/load/speed", "folder", "file"]
@@ -47,12 +49,15 @@ def read_runs(
     """
     root = Path(folder)
     chosen = preset(layout) if isinstance(layout, str) else layout
-    logs = [
-        log
-        for path in find_logs(root, pattern)
-        for log in read_logs(path, chosen, root, surface, load)
-    ]
-    return collect(logs, [session_of(log, session) for log in logs])
+    logs: list[Log] = []
+    aside: list[str] = []
+    for path in find_logs(root, pattern):
+        found = read_logs(path, chosen, root, surface, load)
+        logs += found.logs
+        aside += found.aside
+    if not logs and aside:
+        raise DataError("\n".join(aside))
+    return collect(counted_once(logs), [session_of(log, session) for log in logs], aside)
 
 
 def session_of(log: Log, session: Session) -> str:
@@ -64,12 +69,22 @@ def session_of(log: Log, session: Session) -> str:
     return default_session(log)
 
 
+@dataclass(frozen=True)
+class FileRuns:
+    """The runs in a file, and a line for each that is set aside because its pose jumps."""
+
+    logs: tuple[Log, ...]
+    aside: tuple[str, ...]
+
+
 def read_logs(
     path: Path, layout: Layout, root: Path, surface: str | None, load: str
-) -> tuple[Log, ...]:
-    """Every run in a CSV or Parquet file, where `layout.new_run` tells them apart.
+) -> FileRuns:
+    """Every run in a CSV or Parquet file, and a line for each whose pose jumps.
 
-    Parts of a file of a single row hold no motion and are left out.
+    `layout.new_run` tells runs apart. Parts of a file of a single row hold no motion and are left
+    out. A run whose pose jumps is set aside by its name: the marker was taken for another, or the
+    matching of scans failed, and what lies between is not to be fitted.
 
     Args:
         root: data folder above the file, which the names of the runs are relative to.
@@ -81,15 +96,45 @@ def read_logs(
     if layout.drop_repeated_time:
         table = table.rows(np.append(np.diff(_time(table, layout)) != 0, True))
     name = path.relative_to(root).as_posix()
+    logs: list[Log] = []
+    aside: list[str] = []
+    for part, suffix in _parts(table, layout):
+        notes: list[str] = []
+        signals = signals_of(part, layout, notes)
+        for pattern, beside in layout.beside.items():
+            signals |= signals_of(_beside(path, pattern, beside), beside, notes)
+        identity = Identity(name + suffix, path, table.sha256, surface, load)
+        log = assembled(signals, layout, identity, tuple(dict.fromkeys(notes)))
+        try:
+            check_log(log, signals, layout)
+        except Unsteady as error:
+            aside.append(f"set aside: {error}")
+            continue
+        logs.append(log)
+    return FileRuns(tuple(logs), tuple(aside))
+
+
+def _parts(table: Table, layout: Layout) -> list[tuple[Table, str]]:
+    """The runs of a table, and what is appended to the name of each."""
     starts = _run_starts(table, layout)
     if len(starts) == 1:
-        return (_log(table, layout, name, surface, load),)
+        return [(table, "")]
     pairs = [(a, b) for a, b in pairwise([*starts, len(table.values)]) if b - a >= MIN_ROWS]
     width = len(str(len(pairs)))
-    return tuple(
-        _log(table.rows(slice(a, b)), layout, f"{name}#{k:0{width}d}", surface, load)
-        for k, (a, b) in enumerate(pairs, start=1)
-    )
+    return [(table.rows(slice(a, b)), f"#{k:0{width}d}") for k, (a, b) in enumerate(pairs, start=1)]
+
+
+def _beside(path: Path, pattern: str, layout: Layout) -> Table:
+    """The file that lies beside a run's own and has the rest of its channels."""
+    other = path.parent / pattern.replace("{stem}", path.stem)
+    if not other.is_file():
+        there = sorted(p.name for p in path.parent.iterdir() if p.is_file() and p != path)
+        listed = ", ".join(there[:8] + ["..."] * (len(there) > 8)) or "nothing else"
+        raise DataError(
+            f"{other}: not there; expected it beside {path.name}, as the layout says "
+            f"(there is {listed})"
+        )
+    return read_table(other, layout)
 
 
 def find_logs(root: Path, pattern: str) -> list[Path]:
@@ -123,40 +168,30 @@ def _run_starts(table: Table, layout: Layout) -> list[int]:
     return [0]
 
 
-def _log(table: Table, layout: Layout, name: str, surface: str | None, load: str) -> Log:
-    """Convert a table that holds one run."""
-    notes: list[str] = []
+def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Signal]:
+    """The channels of a table in SI units, each at the times at which it has a value.
+
+    Appends what is special of them to the notes.
+    """
     time = _time(table, layout)
     check_time(table, layout, time)
-    have = {
-        channel: _channel(table, layout, channel, time, notes)
-        for channel in layout.channels
-        if channel != "time"
-    }
-    pose, fresh = _pose(table, layout, have)
-    log = Log(
-        name=name,
-        path=table.path,
-        sha256=table.sha256,
-        time=time,
-        wheel_angle=_wheel_angle(layout, have, time, notes),
-        wheel_speed=_at_wheel(layout, have, "speed"),
-        wheel_speed_command=_at_wheel(layout, have, "speed_command"),
-        twist_command=_twist(have, len(time)),
-        current=have.get("current"),
-        current_is_signed=layout.current_is_signed,
-        voltage=_voltage(have),
-        duty=have.get("duty"),
-        bus_voltage=have["bus_voltage"][:, 0] if "bus_voltage" in have else None,
-        gyro=have["gyro"][:, 0] if "gyro" in have else None,
-        pose=pose,
-        pose_fresh=fresh,
-        surface=surface,
-        load=load,
-        notes=tuple(notes),
-    )
-    check_log(log, table, layout)
-    return log
+    out: dict[str, Signal] = {}
+    for name, channel in layout.channels.items():
+        if name == "time":
+            continue
+        columns = tuple(str(column) for column in channel.columns)
+        cells = table.stacked(channel)
+        source = Source(table.path, columns, table.lines)
+        for i, j in np.argwhere(np.isinf(cells))[:1].tolist():
+            raise source.error("an infinite value", "a number", sample=i, column=j)
+        missing = np.isnan(cells)
+        for j in np.flatnonzero(missing.any(axis=0)).tolist():
+            if missing[:, j].all():
+                raise source.error("no value in any row", "numbers", column=j)
+            notes.append(f"column '{columns[j]}' has empty cells: it is taken at its own times")
+        values = (cells * channel.scale + channel.offset) * layout.to_si(name)
+        out[name] = Signal(time, values, source).part(~missing.all(axis=1))
+    return out
 
 
 def _time(table: Table, layout: Layout) -> Float[np.ndarray, " row"]:
@@ -165,73 +200,3 @@ def _time(table: Table, layout: Layout) -> Float[np.ndarray, " row"]:
     channel = layout.channels["time"]
     cells = table.stacked(channel)
     return ((cells * channel.scale + channel.offset) * layout.to_si("time"))[:, 0]
-
-
-def _channel(
-    table: Table, layout: Layout, name: str, time: Float[np.ndarray, " row"], notes: list[str]
-) -> Float[np.ndarray, "row column"]:
-    """A channel in SI units, short gaps filled."""
-    channel = layout.channels[name]
-    cells = filled(table, channel, time, notes)
-    if name == "wheel_ticks" and not layout.ticks_are_increments:
-        cells = unwrapped_ticks(cells, layout.tick_bits, notes)
-    return (cells * channel.scale + channel.offset) * layout.to_si(name)
-
-
-def _wheel_angle(
-    layout: Layout, have: dict[str, np.ndarray], time: Float[np.ndarray, " row"], notes: list[str]
-) -> Float[np.ndarray, "row wheel"]:
-    """Cumulative angle at the wheel: from ticks, else angles, else the integral of the speed."""
-    if "wheel_ticks" in have:
-        ticks = have["wheel_ticks"]
-        ticks = np.cumsum(ticks, axis=0) if layout.ticks_are_increments else ticks
-        per_turn = float(layout.ticks_per_revolution or 1.0) * layout.gear_ratio
-        angle = ticks * (2.0 * np.pi / per_turn)
-    elif "wheel_angle" in have:
-        angle = have["wheel_angle"]
-    elif "motor_angle" in have:
-        angle = have["motor_angle"] / layout.gear_ratio
-    elif (speed := _at_wheel(layout, have, "speed")) is not None:
-        angle = integral(time, speed)
-        notes.append("wheel angle integrated from the reported speed")
-    else:
-        return np.zeros((len(time), 0))
-    return angle - angle[0]
-
-
-def _at_wheel(layout: Layout, have: dict[str, np.ndarray], what: str) -> np.ndarray | None:
-    if f"wheel_{what}" in have:
-        return have[f"wheel_{what}"]
-    if f"motor_{what}" in have:
-        return have[f"motor_{what}"] / layout.gear_ratio
-    return None
-
-
-def _voltage(have: dict[str, np.ndarray]) -> np.ndarray | None:
-    """As logged, else the duty cycle of the bus voltage where both were."""
-    if "voltage" not in have and {"duty", "bus_voltage"} <= have.keys():
-        return have["duty"] * have["bus_voltage"]
-    return have.get("voltage")
-
-
-def _twist(have: dict[str, np.ndarray], rows: int) -> np.ndarray | None:
-    names = [f"twist_command_{axis}" for axis in ("x", "y", "yaw")]
-    if not have.keys() & set(names):
-        return None
-    return np.concatenate([have.get(name, np.zeros((rows, 1))) for name in names], axis=1)
-
-
-def _pose(
-    table: Table, layout: Layout, have: dict[str, np.ndarray]
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Pose with the heading unwrapped, and which rows bring a new camera frame."""
-    if "pose_x" not in have:
-        return None, None
-    names = ("pose_x", "pose_y", "pose_heading")
-    cells = np.concatenate([table.stacked(layout.channels[name]) for name in names], axis=1)
-    fresh = np.ones(len(cells), dtype=bool)
-    fresh[1:] = np.any(np.diff(cells, axis=0) != 0, axis=1)
-    fresh &= ~np.isnan(cells).any(axis=1)
-    pose = np.concatenate([have[name] for name in names], axis=1)
-    pose[:, 2] = np.unwrap(pose[:, 2])
-    return pose, fresh

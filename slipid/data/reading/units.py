@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 # The registry is our own, and small, for one reason: here an angle is a dimension. With an angle as
 # a pure number, as SI has it, "Hz" would silently pass as rad/s and a duty cycle as an angle.
 _PREFIXES = (
+    "nano- = 1e-9 = n-",
     "micro- = 1e-6 = u- = µ-",
     "milli- = 1e-3 = m-",
     "centi- = 1e-2 = c-",
@@ -22,6 +23,7 @@ _UNITS = (
     "second = [time] = s = sec",
     "ampere = [current] = A = amp",
     "volt = [voltage] = V",
+    "newton = [force] = N",
     "radian = [angle] = rad",
     "tick = [tick] = _ = count = pulse",
     "pixel = [pixel] = px = pix",
@@ -37,8 +39,8 @@ _UNITS = (
 )
 _ALIASES = {"%": "percent", "°": "degree", "°/s": "degree/s", "1": "fraction", "": "fraction"}
 _KNOWN = (
-    *("s", "ms", "us", "min", "m", "mm", "cm", "inch", "rad", "deg", "rev", "rad/s", "deg/s"),
-    *("rpm", "rev/s", "m/s", "mm/s", "A", "mA", "V", "mV", "tick", "pixel", "percent", "1"),
+    *("s", "ms", "us", "ns", "min", "m", "mm", "cm", "inch", "rad", "deg", "rev", "rad/s", "deg/s"),
+    *("rpm", "rev/s", "m/s", "mm/s", "A", "mA", "V", "mV", "tick", "pixel", "percent", "1", "N*m"),
 )
 
 

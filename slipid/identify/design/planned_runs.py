@@ -157,6 +157,7 @@ def steady_windows(
         current=blank,
         voltage=blank,
         current_var=blank,
+        voltage_var=blank,
         has_current=channels.current,
         has_voltage=channels.voltage,
         current_is_signed=channels.signed,

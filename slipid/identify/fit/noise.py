@@ -139,7 +139,8 @@ def noise(windows: Windows, robot: Robot, crossing: Crossing | None = None) -> N
     if windows.has_current and windows.has_voltage:
         n, m = len(windows), windows.turn.shape[1] * windows.turn.shape[2]
         base = np.broadcast_to(np.eye(m), (n, 1, m, m)).copy()
-        blocks["voltage"] = _components("voltage", base, np.full((n, 1), len(table)))
+        unread = windows.voltage_var.reshape(n, -1)
+        blocks["voltage"] = _components("voltage", base, np.full((n, 1), len(table)), unread)
         table.append(Component("voltage", "window", None, "V", 0.05))
     return Noise(tuple(table), blocks)
 

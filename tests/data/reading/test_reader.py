@@ -258,7 +258,7 @@ def test_parquet_reads_as_csv_does(root):
         read_log(path, layout)
 
 
-def test_short_gaps_are_filled_and_noted(root):
+def test_empty_cells_leave_a_pose_stale_and_are_noted(root):
     good = generic(root)
     path = root / GENERIC
     lines = path.read_text().splitlines()
@@ -268,8 +268,10 @@ def test_short_gaps_are_filled_and_noted(root):
         lines[row] = ",".join(cells)
     path.write_text("\n".join(lines))
     log = generic(root)
-    np.testing.assert_allclose(log.pose, good.pose, atol=1e-12)
-    assert log.notes == ("column 'x': 2 missing values filled by interpolation",)
+    assert log.notes == ("column 'x' has empty cells: it is taken at its own times",)
+    there = np.delete(np.arange(len(good.pose)), [49, 50])
+    np.testing.assert_allclose(log.pose[there], good.pose[there], atol=1e-12)
+    np.testing.assert_array_equal(log.pose[49:51], good.pose[[48, 48]])
     assert not log.pose_fresh[49:51].any()
     assert log.pose_fresh[51]
 

@@ -159,7 +159,7 @@ def test_every_other_file_reads(real_data, pattern, name, runs, rows, wheels):
     logs = [
         log
         for path in find_logs(real_data, pattern)
-        for log in read_logs(path, layout, real_data, None, "as_built")
+        for log in read_logs(path, layout, real_data, None, "as_built").logs
     ]
     assert (len(logs), sum(log.samples for log in logs)) == (runs, rows)
     assert {log.wheels for log in logs} == {wheels}
@@ -179,7 +179,7 @@ def test_rows_of_2021_are_0_45_s_apart(real_data):
     """Ticks between rows over the reported speed, which reads 1.3 % high."""
     periods = []
     for path in find_logs(real_data, "robotino2021/experimental_data_[gbr]*[yed].csv"):
-        for log in read_logs(path, preset("robotino2021"), real_data, None, "as_built"):
+        for log in read_logs(path, preset("robotino2021"), real_data, None, "as_built").logs:
             turned, speed = np.diff(log.wheel_angle, axis=0), log.wheel_speed[1:]
             fast = np.abs(speed) > 0.5 * np.abs(speed).max() + 0.5
             periods += list(1.013 * turned[fast] / speed[fast])
@@ -190,7 +190,7 @@ def test_axes_of_2021_on_gray(real_data):
     """Translation with little slip: wheels and camera agree but for the same scale as in 2022."""
     path = real_data / "robotino2021" / "experimental_data_gray.csv"
     ratios, turns = [], []
-    for log in read_logs(path, preset("robotino2021"), real_data, None, "as_built"):
+    for log in read_logs(path, preset("robotino2021"), real_data, None, "as_built").logs:
         if np.any(log.twist_command[:, 2]) or log.samples < 4:
             continue
         steps = np.diff(log.wheel_angle, axis=0) @ TO_TWIST.T
@@ -208,7 +208,7 @@ def test_axes_of_2021_on_gray(real_data):
 def test_gyro_of_the_field_is_in_degrees_with_the_sign_of_the_heading(real_data):
     path = real_data / "robotino2021" / "experimental_data_on_whole_field.csv"
     gyro, rate = [], []
-    for log in read_logs(path, preset("robotino2021_field"), real_data, None, "as_built"):
+    for log in read_logs(path, preset("robotino2021_field"), real_data, None, "as_built").logs:
         gyro += list(log.gyro[1:])
         rate += list(np.diff(log.pose[:, 2]) / np.diff(log.time))
     gyro, rate = np.array(gyro), np.array(rate)
