@@ -85,7 +85,7 @@ def windows(
     Raises:
         DataError: a run whose wheels never move that far, or too short for its windows.
     """
-    each = [_edges(data, k, wheel_radius, per_piece, longest) for k in range(len(data))]
+    each = [_edges(data, k, wheel_radius, lag, per_piece, longest) for k in range(len(data))]
     run = [k for k, pieces in enumerate(each) for _ in pieces]
     noise = ammeter_variance(data)
     pieces = [_cut(data, k, edges, lag, noise[k]) for k, cuts in enumerate(each) for edges in cuts]
@@ -142,14 +142,20 @@ def _ammeter(amps: Float[np.ndarray, " reading"], live: Bool[np.ndarray, " readi
     return max(noise, rounding if np.isfinite(rounding) else 0.0)
 
 
-def _edges(data: Runs, run: int, radius: float, per_piece: int, longest: float) -> list[np.ndarray]:
-    """Rows at the window edges of each piece of a run; only rows with a new camera frame."""
-    first = first_row(data, run, radius)
+def _edges(
+    data: Runs, run: int, radius: float, lag: float, per_piece: int, longest: float
+) -> list[np.ndarray]:
+    """Rows at the window edges of each piece of a run.
+
+    Only rows with a new pose, and those whose pose shows a time at which the wheels were measured.
+    """
+    first, time = first_row(data, run, radius), data.time[data.rows(run)]
     fresh = np.flatnonzero(data.fresh[data.rows(run)])
-    fresh = fresh[fresh >= first]
+    shown = time[fresh] - lag
+    fresh = fresh[(fresh >= first) & (shown >= time[0] - 1e-9) & (shown <= time[-1] + 1e-9)]
     if len(fresh) < per_piece + 1:
         raise DataError(
-            f"{data.logs[run].name}: {len(fresh)} camera frames after the robot started; "
+            f"{data.logs[run].name}: {len(fresh)} poses after the robot started; "
             f"expected at least {per_piece + 1}"
         )
     t = data.time[data.rows(run)][fresh]

@@ -40,6 +40,7 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
     Raises:
         ValueError: the wheels' kinematics have rank below 3.
     """
+    fit.robot.geometry.inverse()  # what cannot be deployed is not computed
     source: Source = "laplace"
     numbers, messages = fit.parameters, fit.messages
     vectors, center = fit.draws(DRAWS), fit.z

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from slipid.data.floor_map import FloorMap, read_map
+from slipid.data.lag import pose_lag
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
@@ -20,6 +21,10 @@ from slipid.parameter import entries
 from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError, near
 from slipid.support.progress import Reporter
+
+
+LAG_STD = 0.1
+"""Std of the prior of a lag that was found from the motion [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,12 +149,29 @@ def job_of(config: Config, dataset: Runs, skipped: Sequence[str], report: Report
         )
     robot = on_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
     choices, left_out = _choices(config, robot)
-    choices = still_viscosities(dataset) + choices  # what the user says comes later and wins
+    # what the user says comes later and wins
+    choices = [*told_lag(dataset), *without_rollers(shape), *still_viscosities(dataset), *choices]
     skipped = (*skipped, *left_out)
     for sentence in skipped:
         report.line(sentence)
     settings = config.content.fit
     return Job(dataset, robot, tuple(choices), settings, config=config, skipped=skipped)
+
+
+def told_lag(dataset: Runs) -> list[Choice]:
+    """The camera's lag as the motion itself tells it, free around that."""
+    lag = pose_lag(dataset)
+    if lag is None:
+        return []
+    return [Choice("camera.lag", prior_mean=lag.seconds, prior_std=LAG_STD, free=True)]
+
+
+def without_rollers(shape: Geometry) -> list[Choice]:
+    """Numbers of rollers held, where no wheel has any."""
+    if not all(shape.grips):
+        return []
+    names = ("roller_drag", "roller_creep", "roller_viscosity")
+    return [Choice(f"surface.*.{name}", free=False) for name in names]
 
 
 def on_runs(robot: Robot, runs: Runs, centre: tuple[float, float]) -> Robot:
