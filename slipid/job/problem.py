@@ -22,7 +22,6 @@ from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError, near
 from slipid.support.progress import Reporter
 
-
 LAG_STD = 0.1
 """Std of the prior of a lag that was found from the motion [s]."""
 

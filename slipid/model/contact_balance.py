@@ -98,6 +98,10 @@ class Balance(eqx.Module):
         by_along = -w.traction.by_speed() - w.resistance.by_speed()
         across = (w.traction.by_activity() - w.resistance.by_activity()) * by_roll
         rolls = -w.drag.by_speed() - w.drag.by_activity() * by_roll
+        turned: Array | float = 0.0  # drag along the rollers by the speed along the drive
+        if rows.frame.ordinary:
+            across = across + rows.frame.grip * w.traction.by_beside()
+            turned = load * rows.frame.grip * w.drag.by_beside()
         by_along, across, rolls = load * by_along, load * across, load * rolls
         one = jnp.ones_like(xi.x)
         by_x = jax.jvp(lambda v: self.load(xi._replace(x=v)), (xi.x,), (one,))[1]
@@ -105,7 +109,8 @@ class Balance(eqx.Module):
 
         def column(k: int, pushed: Array | float, dragged: Array | float) -> Planar:
             along = by_along * rows.hold[k] + across * rows.roll[k] + pushed
-            return self._summed(along, rolls * rows.roll[k] + dragged)
+            back = rolls * rows.roll[k] + turned * rows.hold[k] + dragged
+            return self._summed(along, back)
 
         scrub = law.scrub_moment(xi.yaw, self.on.floor.scrub).by_speed()
         x, y = column(0, push * by_x, drag * by_x), column(1, push * by_y, drag * by_y)
@@ -164,7 +169,9 @@ class Balance(eqx.Module):
     def wheels(self, along: Array, roll: Array) -> WheelForces:
         """The law at speeds of the wheels."""
         f = self.on.frame
-        return law.wheel_forces(along, roll, self.rim, f.pull, self.on.drag_onset, self.on.floor)
+        grip = f.grip if f.ordinary else None
+        where = along, roll, self.rim, f.pull, self.on.drag_onset
+        return law.wheel_forces(*where, self.on.floor, grip)
 
     def _speeds(self, xi: Planar) -> tuple[Array, Array]:
         """Speeds of the wheels along their drive and along their rollers."""

@@ -17,7 +17,10 @@ share, v^ the direction of motion, and forces in units of mu m g:
 
 This is for omni wheels; where rollers stand at an angle g to the drive, vs_i is r w_i sin g less
 the speed along the direction in which the rollers do not give way, and r w_i cos g is taken off
-q_i. Ordinary wheels grip sideways as they do ahead.
+q_i. Ordinary wheels grip sideways as they do ahead, and friction is against their sliding as a
+whole: with m_i = sqrt(vs_i^2 + q_i^2) the first terms of T_i and D_i are
+
+    N_i tanh(m_i / (v0 + s0 c_i)) vs_i / m_i,     -N_i tanh(m_i / (v0 + s0 c_i)) q_i / m_i
 
 Wheels may stand on different floors. Forces are then in units of mean(mu) m g, each wheel's
 weighted by mu_i / mean(mu), and b and cz are means over the loads. Creep and rolling resistance are
@@ -55,6 +58,8 @@ W0 = 0.05
 """Yaw rate below which the scrub moment is viscous [rad/s]."""
 
 
+_STILL = 1e-6
+"""Sliding that is none [m/s]."""
 positive = partial(parameter, lower=0.0)
 
 
@@ -114,12 +119,16 @@ class ContactSurface(eqx.Module):
 
 
 class Friction(eqx.Module):
-    """A force against a speed that saturates: top tanh(speed / onset) + viscosity speed.
+    """A force against a speed that saturates: top tanh(m / onset) speed / m + viscosity speed.
+
+    m is the size of the speed, or of the whole sliding of which this is one part: friction is
+    against the sliding as a whole.
 
     Attributes:
         speed: [m/s].
         onset: speed at which it is nearly saturated [m/s], linear in the wheel's activity.
         ratio: onset per activity; top: where it saturates; viscosity: force per speed.
+        beside: the part of the sliding at right angles [m/s]; None where parts do not share.
     """
 
     speed: Array
@@ -127,26 +136,55 @@ class Friction(eqx.Module):
     ratio: Array | float
     top: Array | float
     viscosity: Array | float = 0.0
+    beside: Array | None = None
 
     def force(self) -> Array:
         """The force."""
-        return self.top * jnp.tanh(self.speed / self.onset) + self.viscosity * self.speed
+        if self.beside is None:
+            return self.top * jnp.tanh(self.speed / self.onset) + self.viscosity * self.speed
+        return (self.top * self._slope() + self.viscosity) * self.speed
 
     def chord(self) -> Array:
         """Force over speed, which is even in the speed and finite at rest."""
-        size = jnp.abs(self.speed) + 1e-12 * self.onset
-        return self.top * (jnp.tanh(size / self.onset) / size) + self.viscosity
+        if self.beside is None:
+            size = jnp.abs(self.speed) + 1e-12 * self.onset
+            return self.top * (jnp.tanh(size / self.onset) / size) + self.viscosity
+        return self.top * self._slope() + self.viscosity
 
     def by_speed(self) -> Array:
         """Derivative by the speed, at a constant activity."""
-        return self._steep() / self.onset + self.viscosity
+        if self.beside is None:
+            return self._steep() / self.onset + self.viscosity
+        return self.top * (self._slope() + self._bent() * self.speed**2) + self.viscosity
+
+    def by_beside(self) -> Array | float:
+        """Derivative by the part of the sliding at right angles."""
+        if self.beside is None:
+            return 0.0
+        return self.top * self._bent() * self.speed * self.beside
 
     def by_activity(self) -> Array:
         """Derivative by the wheel's activity, at a constant speed."""
         return -(self._steep() / self.onset) * (self.speed / self.onset) * self.ratio
 
     def _steep(self) -> Array:
-        return self.top * (1 - jnp.tanh(self.speed / self.onset) ** 2)
+        return self.top * (1 - jnp.tanh(self._size() / self.onset) ** 2)
+
+    def _size(self) -> Array:
+        """Size of the sliding, away from zero where it is of two parts."""
+        if self.beside is None:
+            return self.speed
+        return jnp.sqrt(self.speed**2 + self.beside**2 + _STILL**2)
+
+    def _slope(self) -> Array:
+        """tanh(m / onset) / m."""
+        return jnp.tanh(self._size() / self.onset) / self._size()
+
+    def _bent(self) -> Array:
+        """Derivative of `_slope` by m, over m."""
+        m = self._size()
+        steep = (1 - jnp.tanh(m / self.onset) ** 2) / self.onset
+        return (steep - self._slope()) / m**2
 
 
 class WheelForces(eqx.Module):
@@ -177,10 +215,12 @@ class WheelForces(eqx.Module):
         return self.traction.force() * pull - self.drag.force() * slip_through
 
 
-def wheel_traction(slide: Array, active: Array, floor: ContactSurface) -> Friction:
-    """Traction at a sliding speed."""
+def wheel_traction(
+    slide: Array, active: Array, floor: ContactSurface, beside: Array | None = None
+) -> Friction:
+    """Traction at a sliding speed, and at the sliding beside it of a wheel without rollers."""
     onset = V0 + floor.creep * active
-    return Friction(slide, onset, floor.creep, 1.0, floor.slide_viscosity)
+    return Friction(slide, onset, floor.creep, 1.0, floor.slide_viscosity, beside)
 
 
 def rolled(rim: Array, roll: Array, pull: Array) -> Array:
@@ -226,7 +266,13 @@ def sideways(floor: ContactSurface, grip: Array) -> tuple[ContactSurface, Array]
 
 
 def wheel_forces(
-    along: Array, roll: Array, rim: Array, pull: Array, at_rest: Array, floor: ContactSurface
+    along: Array,
+    roll: Array,
+    rim: Array,
+    pull: Array,
+    at_rest: Array,
+    floor: ContactSurface,
+    grip: Array | None = None,
 ) -> WheelForces:
     """The law at the speeds of a wheel [m/s].
 
@@ -234,14 +280,18 @@ def wheel_forces(
         along, roll, rim: J xi, q and r w of the head of this module.
         pull: `Frame.pull`.
         at_rest, floor: from `sideways`.
+        grip: `Frame.grip` of a robot with wheels without rollers, whose friction is against their
+            sliding as a whole; None of one without.
     """
     active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
-    onset = at_rest + floor.roller_creep * active
+    onset, slide = at_rest + floor.roller_creep * active, rim * pull - along
+    ahead, beside = (None, None) if grip is None else (grip * slide, grip * roll)
+    drag = floor.roller_creep, floor.roller_drag, floor.roller_viscosity
     return WheelForces(
         active=active,
-        traction=wheel_traction(rim * pull - along, active, floor),
+        traction=wheel_traction(slide, active, floor, beside),
         resistance=Friction(along, V0 + S1 * active, S1, floor.rolling_resistance),
-        drag=Friction(roll, onset, floor.roller_creep, floor.roller_drag, floor.roller_viscosity),
+        drag=Friction(roll, onset, *drag, ahead),
     )
 
 

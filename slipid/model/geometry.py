@@ -167,6 +167,7 @@ class Frame(eqx.Module):
         shift: change of load shares per contact displacement (wheel, 2) [1/m].
         radius: wheel radius [m].
         base: base radius [m], scales the moment.
+        ordinary: whether some wheel has no rollers.
     """
 
     hold: Float[Array, "wheel 3"]
@@ -177,6 +178,7 @@ class Frame(eqx.Module):
     shift: Float[Array, "wheel 2"]
     radius: Float[Array, ""]
     base: Float[Array, ""]
+    ordinary: bool = eqx.field(static=True, default=False)
 
 
 @jax.jit
@@ -203,6 +205,7 @@ def _frame(of: Geometry) -> Frame:
         shift=jnp.linalg.pinv(lever)[:, 1:],
         radius=of.wheel_radius,
         base=of.base_radius,
+        ordinary=any(of.grips),
     )
 
 

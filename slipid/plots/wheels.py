@@ -124,7 +124,9 @@ def wheel_curve(
     along, roll = rim * pull * (1 - jnp.asarray(slip)), rim * (pull * sideways - slip_through)
     relative = jnp.asarray(share * robot.geometry.wheels)
     surface, onset = law.sideways(law.at_load(surface, relative), frame.grip[0])
-    felt = law.wheel_forces(along, roll, rim, pull, onset, surface).felt(pull, slip_through)
+    grip = frame.grip[0] if frame.ordinary else None
+    forces = law.wheel_forces(along, roll, rim, pull, onset, surface, grip)
+    felt = forces.felt(pull, slip_through)
     weight = robot.body.mass * GRAVITY * law.load_force(jnp.asarray(share), surface)
     return np.asarray(frame.radius * weight * felt)
 

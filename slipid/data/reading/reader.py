@@ -77,9 +77,7 @@ class FileRuns:
     aside: tuple[str, ...]
 
 
-def read_logs(
-    path: Path, layout: Layout, root: Path, surface: str | None, load: str
-) -> FileRuns:
+def read_logs(path: Path, layout: Layout, root: Path, surface: str | None, load: str) -> FileRuns:
     """Every run in a CSV or Parquet file, and a line for each whose pose jumps.
 
     `layout.new_run` tells runs apart. Parts of a file of a single row hold no motion and are left
