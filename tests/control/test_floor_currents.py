@@ -14,7 +14,7 @@ from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.filter.wheels import Currents
 from slipid.control.interface import Measurement, Settings
 from slipid.model.geometry import omni
-from slipid.model.robot import build, twist, motor_current
+from slipid.model.robot import build, motor_current, twist
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.small_twin import deployed
 

@@ -73,6 +73,7 @@ def made(truth, runs=24, count=2, seed=0, std=None, signed=True, voltage=True):
         current=np.zeros((runs, count, 3)),
         voltage=np.zeros((runs, count, 3)),
         current_var=np.full((runs, count, 3), 1e-4 if std else 0.0),
+        voltage_var=np.zeros((runs, count, 3)),
         has_current=True,
         has_voltage=voltage,
         current_is_signed=signed,

@@ -102,7 +102,11 @@ def test_other_drives(tmp_path, section, wheels, grips):
         ("base_radius_m", "base_radius", ["robot.base_radius: no such key", "mean base_radius_m"]),
         ("base_radius_m = 0.125\n", "", ["robot.base_radius_m: missing"]),
         ('"omni"', '"omny"', ["robot.drive: 'omny'", "did you mean omni", "mecanum, skid"]),
-        ('drive = "omni"\n', "", ["robot.drive: missing", "omni, mecanum, skid, differential, general"]),
+        (
+            'drive = "omni"\n',
+            "",
+            ["robot.drive: missing", "omni, mecanum, skid, differential, general"],
+        ),
         ("gear_ratio = 16", "gear_ratio = -16", ["robot.gear_ratio: -16", "greater than 0"]),
         ("gear_ratio = 16", 'gear_ratio = "16:1"', ["robot.gear_ratio: '16:1'", "number"]),
         ("mass_kg = 12.0", "mass_kg = nan", ["robot.mass_kg: nan", "finite"]),

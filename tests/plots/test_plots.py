@@ -17,6 +17,7 @@ from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.result import Fit, summarise
+from slipid.model.geometry import differential, omni
 from slipid.plots import fit as plots
 from slipid.plots import load as plots_robot
 from slipid.plots.compare import WORDS, ladder_figure
@@ -166,7 +167,9 @@ def test_loads_are_written_at_their_wheels():
 
 
 def test_every_rung_has_words_in_the_picture():
-    assert set(WORDS) == {"identified", *(rung.name for rung in rungs(has_current=True))}
+    shapes = omni([60, 180, 300], 0.1, 0.04), differential(0.2, 0.04)
+    names = {rung.name for shape in shapes for rung in rungs(shape, has_current=True)}
+    assert set(WORDS) == {"identified", *names}
 
 
 def test_errors_are_drawn_to_scale():

@@ -39,7 +39,7 @@ from tests.helpers.made_windows import SCALE, made
 from tests.helpers.made_windows import robot as made_robot
 
 ROBOT = made_robot(sessions=("one",))
-ALL = {rung.name: rung for rung in rungs(has_current=True)}
+ALL = {rung.name: rung for rung in rungs(ROBOT.geometry, has_current=True)}
 STD = {
     "run.along": 0.02,
     "run.across": 0.02,
@@ -91,11 +91,13 @@ def rows(densities, seed=0):
             heading_deg=10.0 * k,
             speed=0.1,
             chord=0.5,
+            path=0.5,
             measured_end=(0.5, 0.0, 0.0),
             models={
                 name: Score(
                     predicted_end=(0.5, 0.0, 0.0),
                     endpoint_error=float(rng.uniform(0.01, 0.02)),
+                    endpoint_error_over_path=float(rng.uniform(0.01, 0.02)),
                     length_error=0.01,
                     heading_error_deg=1.0,
                     level=float(rng.uniform()),

@@ -12,7 +12,7 @@ from tests.helpers.made_windows import SCALE, made
 from tests.helpers.made_windows import robot as made_robot
 
 ROBOT = made_robot(sessions=("one",))
-ALL = {rung.name: rung for rung in rungs(has_current=True)}
+ALL = {rung.name: rung for rung in rungs(ROBOT.geometry, has_current=True)}
 SPLINE = np.array([0.02, 0.01, 0.05, 0.1, 0.0, 0.2, 0.1])
 TRUE = {
     "constant": ([0.1], [0.4]),
@@ -164,12 +164,13 @@ def test_rungs_come_back_from_their_names_and_numbers():
     fitted = [rung.fit(driven(windows(), with_truth("affine")), ROBOT) for rung in ALL.values()]
     states = {r.name: {f: v.tolist() for f, v in r.state.items()} for r in fitted}
     w = windows(seed=2)
-    for one, two in zip(fitted, restored(states), strict=True):
+    for one, two in zip(fitted, restored(ROBOT.geometry, states), strict=True):
         np.testing.assert_array_equal(one.increments(w, ROBOT), two.increments(w, ROBOT))
 
 
 def test_without_currents_only_rungs_that_need_none_are_there():
-    assert [r.name for r in rungs(has_current=False)] == ["encoder", "constant", "heading_lookup"]
+    names = [r.name for r in rungs(ROBOT.geometry, has_current=False)]
+    assert names == ["nominal", "encoder", "constant", "heading_lookup"]
 
 
 @pytest.mark.parametrize("name", ["affine", "saturating", "heading_lookup"])

@@ -72,6 +72,7 @@ def still(lag, runs, per_run):
         current=zero,
         voltage=zero,
         current_var=zero + 1e-4,
+        voltage_var=zero,
         has_current=True,
         has_voltage=False,
         current_is_signed=False,
