@@ -18,7 +18,7 @@ from slipid.job.logs import layout_of
 from slipid.job.problem import Job, job_of, read_job, shape_of
 from slipid.model.robot import build
 from slipid.selftest import replicates as test
-from slipid.selftest.known import Sensors, grid
+from slipid.selftest.known import Sensors, grid, turning_grid
 from slipid.selftest.logs import make_logs
 from slipid.selftest.replicates import Number, Replicate
 from slipid.support.checkpoint import Checkpoint, key_of
@@ -85,7 +85,11 @@ def planned(config: Config, report: Reporter) -> Job:
     sections = one_floor(config.content.logs)
     loads = list(dict.fromkeys(section.load for section in sections))
     setups = [(floor, load) for floor in wanted.surfaces for load in loads]
-    runs = grid(setups, wanted.headings, wanted.speeds_m_s, wanted.turns)
+    if shape.determines_twist:
+        runs = grid(setups, wanted.headings, wanted.speeds_m_s, wanted.turns)
+    else:
+        base = float(shape.base_radius)
+        runs = turning_grid(setups, wanted.headings, wanted.speeds_m_s, base)
     drives = [replace(d, distance=wanted.distance_m) for d in runs]
     robot = build(shape, wanted.surfaces, loads, sorted({d.session for d in drives}))
     layouts = [layout_of(config, section) for section in sections]
@@ -111,7 +115,9 @@ def wanted_of(config: Config, problem: Problem) -> tuple[str, ...]:
     ratios = derived(problem.space, z, np.eye(len(z)), w.has_voltage)
     paths = [e.path for e in problem.space.free] + [e.path for e in ratios]
     given = config.content.selftest.wanted
-    patterns = ["surface.*.creep", "surface.*.roller_drag", "robot.load_share@*"]
+    patterns = ["surface.*.creep"]
+    if problem.robot.geometry.determines_twist:  # else runs hardly tell where the weight is
+        patterns += ["surface.*.roller_drag", "robot.load_share@*"]
     patterns += ["surface.*.friction/motor.back_emf"] if w.has_current else []
     patterns += ["motor.resistance", "motor.back_emf"] if w.has_current and w.has_voltage else []
     for pattern in given or []:

@@ -88,6 +88,24 @@ def grid(
     return tuple(drives)
 
 
+def turning_grid(
+    setups: Sequence[tuple[str, str]], ways: int, speeds: Sequence[float], base_radius: float
+) -> tuple[Drive, ...]:
+    """Runs of wheels that do not drive sideways, on every (floor, load).
+
+    Between straight ahead and turning on the spot `ways` of each speed, evenly around the circle of
+    (ahead, turn times base radius [m]).
+    """
+    drives = []
+    for surface, load in setups:
+        for speed in speeds:
+            for way in 2 * np.pi * np.arange(ways) / ways:
+                ahead, turn = speed * np.cos(way), speed * np.sin(way) / base_radius
+                back = 0.0 if ahead >= 0 else np.pi
+                drives.append(Drive(surface, load, back, float(abs(ahead)), turn=float(turn)))
+    return tuple(drives)
+
+
 @dataclass(frozen=True)
 class Sensors:
     """How the logs are disturbed; stds by the names of `slipid.identify.fit.noise.noise`.

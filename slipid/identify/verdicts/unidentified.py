@@ -102,6 +102,7 @@ def flat_directions(
     std = space.prior_std
     given = np.linalg.inv(covariance) * (std[:, None] * std)
     told = _Told(given, space.electric if has_current else None)
+    sideways = space.template.geometry.determines_twist
     out = []
     for picked, u in _sparse(told, kept, scale, 1 / std):
         main = _named(told, [axes[k] for k in picked], picked, u, std[picked])
@@ -115,7 +116,7 @@ def flat_directions(
                 powers=tuple(round(float(p), 2) for p in power),
                 others=rest,
                 formula=formula(mine, power, step) + (SMALL if rest and len(mine) > 1 else ""),
-                remedy=remedy(moving, has_current, has_voltage, validity or {}),
+                remedy=remedy(moving, has_current, has_voltage, validity or {}, sideways),
             )
         )
     return tuple(out)

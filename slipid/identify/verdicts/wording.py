@@ -146,9 +146,16 @@ SPEEDS_DIFFER = 1.3
 
 
 def remedy(
-    found: Sequence[Entry], has_current: bool, has_voltage: bool, validity: Mapping[str, Validity]
+    found: Sequence[Entry],
+    has_current: bool,
+    has_voltage: bool,
+    validity: Mapping[str, Validity],
+    sideways: bool = True,
 ) -> str:
-    """What to log or to drive for numbers that are open, by what each floor was driven with."""
+    """What to log or to drive for numbers that are open, by what each floor was driven with.
+
+    `sideways` is whether the robot can drive in any direction.
+    """
     quantities = {e.quantity for e in found}
     electric = all(e.declaration.electric or e.quantity == "robot.mass" for e in found)
     if electric or quantities & {*_SCALE}:
@@ -158,7 +165,7 @@ def remedy(
     for needed, text in _CAMERA:
         if quantities.issuperset(needed):
             return text
-    return _runs(found, validity)
+    return _runs(found, validity, sideways)
 
 
 def _electric(
@@ -173,7 +180,7 @@ def _electric(
     return "drive with other loads and speeds, or weigh the robot"
 
 
-def _runs(found: Sequence[Entry], validity: Mapping[str, Validity]) -> str:
+def _runs(found: Sequence[Entry], validity: Mapping[str, Validity], sideways: bool) -> str:
     """What to drive for numbers of floors, loads and marker, by what was driven."""
     floors = {e.surface for e in found if e.surface is not None}
     loads = {e.load for e in found if e.load is not None}
@@ -185,13 +192,13 @@ def _runs(found: Sequence[Entry], validity: Mapping[str, Validity]) -> str:
     where = " there" if floors else " with that load" if loads else ""
     said = []
     headings = sorted({h for v in mine for h in v.headings_deg})
-    if len(headings) < FEW_HEADINGS:
+    if sideways and len(headings) < FEW_HEADINGS:
         seen = f" than {', '.join(f'{h:g}' for h in headings)} deg" if headings else ""
         said.append(f"in other directions{seen}")
     if any(_speeds(v) < 2 for v in mine) or not mine:
         said.append("at other speeds")
     if max((v.yaw_rate[1] for v in mine), default=0.0) < TURNING:
-        said.append("in curves")
+        said.append("in curves" if sideways else "in curves and on the spot")
     slip = max((v.slip[1] for v in mine), default=1.0)
     if floors and slip < LITTLE_SLIP:
         said.append(f"loaded unevenly (wheels slip by {slip:.1%} at most, so it hardly matters)")
