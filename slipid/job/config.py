@@ -171,8 +171,15 @@ class Weights(Section):
 
 
 class FitSection(Section):
-    """How finely runs are cut and how long to fit."""
+    """How finely runs are cut, how long to fit, and which lengths are trusted.
 
+    Motion tells the wheel radius over the scale of the poses and no more. `lengths_from` says which
+    of the two is known: "poses" that are in true metres, as those of motion capture, lidar and RTK
+    are, make the wheel radius free; "wheels" that were measured make the scale of the camera free.
+    Without it both are as `[parameters]` says.
+    """
+
+    lengths_from: Literal["poses", "wheels"] | None = None
     windows_per_piece: int = Field(default=4, ge=1, le=32)
     longest_window_s: Positive = 6.0
     rounds: int = Field(default=30, ge=1)

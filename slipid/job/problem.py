@@ -22,6 +22,10 @@ from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError, near
 from slipid.support.progress import Reporter
 
+LENGTHS = {"poses": "robot.wheel_radius", "wheels": "camera.scale"}
+"""What is free where these lengths are trusted."""
+SIZE_STD = 0.1
+"""Std of its prior, as a part of the nominal value: tyres give way, cameras are set up by eye."""
 LAG_STD = 0.1
 """Std of the prior of a lag that was found from the motion [s]."""
 
@@ -149,7 +153,15 @@ def job_of(config: Config, dataset: Runs, skipped: Sequence[str], report: Report
     robot = on_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
     choices, left_out = _choices(config, robot)
     # what the user says comes later and wins
-    choices = [*told_lag(dataset), *without_rollers(shape), *still_viscosities(dataset), *choices]
+    known = [*told_lag(dataset), *without_rollers(shape), *still_viscosities(dataset)]
+    trusted = config.content.fit.lengths_from
+    choices = [*known, *choices]
+    if trusted is not None and {*LENGTHS.values()} <= {e.path for e in Space(robot, choices).free}:
+        freed = LENGTHS["wheels" if trusted == "poses" else "poses"]
+        raise DataError(
+            f"{config.path}: fit.lengths_from = '{trusted}' with {freed} free in parameters; "
+            "expected one of the two: motion tells them apart by no means"
+        )
     skipped = (*skipped, *left_out)
     for sentence in skipped:
         report.line(sentence)
@@ -163,6 +175,18 @@ def told_lag(dataset: Runs) -> list[Choice]:
     if lag is None:
         return []
     return [Choice("camera.lag", prior_mean=lag.seconds, prior_std=LAG_STD, free=True)]
+
+
+def lengths(trusted: str | None, shape: Geometry) -> list[Choice]:
+    """The wheel radius free and the scale of the poses held, or the other way round."""
+    if trusted is None:
+        return []
+    radius = float(shape.wheel_radius)
+    nominal = {"robot.wheel_radius": radius, "camera.scale": 1.0}
+    return [
+        Choice(path, prior_mean=mean, prior_std=SIZE_STD * mean, free=path == LENGTHS[trusted])
+        for path, mean in nominal.items()
+    ]
 
 
 def without_rollers(shape: Geometry) -> list[Choice]:
@@ -206,6 +230,7 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
     """The config's parameter settings, checked, less those of floors and loads that are absent."""
     paths, skipped = [e.path for e in entries(robot)], []
     choices = said_of(robot, config.content.robot.mass_kg or float(robot.body.mass))
+    choices += lengths(config.content.fit.lengths_from, robot.geometry)
     try:
         known = share_priors(config.content.weights, robot.geometry)
     except ValueError as error:
