@@ -29,6 +29,8 @@ PER_WHEEL = {
     "current": "A",
     "voltage": "V",
     "duty": "1",
+    "motor_torque": "N*m",
+    "wheel_torque": "N*m",
 }
 SINGLE = {
     "time": "s",

@@ -22,6 +22,7 @@ _UNITS = (
     "second = [time] = s = sec",
     "ampere = [current] = A = amp",
     "volt = [voltage] = V",
+    "newton = [force] = N",
     "radian = [angle] = rad",
     "tick = [tick] = _ = count = pulse",
     "pixel = [pixel] = px = pix",
@@ -38,7 +39,7 @@ _UNITS = (
 _ALIASES = {"%": "percent", "°": "degree", "°/s": "degree/s", "1": "fraction", "": "fraction"}
 _KNOWN = (
     *("s", "ms", "us", "min", "m", "mm", "cm", "inch", "rad", "deg", "rev", "rad/s", "deg/s"),
-    *("rpm", "rev/s", "m/s", "mm/s", "A", "mA", "V", "mV", "tick", "pixel", "percent", "1"),
+    *("rpm", "rev/s", "m/s", "mm/s", "A", "mA", "V", "mV", "N*m", "tick", "pixel", "percent", "1"),
 )
 
 

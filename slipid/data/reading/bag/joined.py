@@ -1,0 +1,109 @@
+"""Rows of numbers from one or several topics as the samples of one channel."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.reading.bag.clock import clock, seconds, timed
+from slipid.data.reading.bag.layout import BagLayout
+from slipid.data.reading.bag.messages.streams import Stream
+from slipid.data.reading.signal import Source
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Numbers of a channel as they are in the messages, at their times [s]."""
+
+    time: Float[np.ndarray, " sample"]
+    values: Float[np.ndarray, "sample column"]
+    source: Source
+
+
+def samples_of(stream: Stream, layout: BagLayout, notes: list[str]) -> Samples:
+    """Rows of one stream that have every number, ordered in time.
+
+    Raises:
+        DataError: there are none, numbers are not finite, or the clock jumps.
+    """
+    stream = timed(finite(stream, layout, notes), layout, notes)
+    whole = np.all(~stream.absent, axis=1)
+    if not whole.all():
+        notes.append(
+            f"topic {stream.topic}: {(~whole).sum()} messages without all of "
+            f"{', '.join(stream.columns)} left out"
+        )
+    return _samples(stream.part(whole), layout)
+
+
+def side_by_side(streams: Sequence[Stream], layout: BagLayout, notes: list[str]) -> Samples:
+    """Columns that lie in several topics, or in messages that have some of them only.
+
+    Each is taken from the first topic that has it, at the times of the first column; the others are
+    interpolated linearly there, and times that they do not span are left out.
+
+    Raises:
+        DataError: as `samples_of`.
+    """
+    ordered = [timed(finite(stream, layout, notes), layout, notes) for stream in streams]
+    columns = []
+    for stream in ordered:
+        for j, name in enumerate(stream.columns):
+            have = ~stream.absent[:, j]
+            if have.any() and (
+                len(ordered) == 1 or name not in [c.source.columns[0] for c in columns]
+            ):
+                one = stream.part(have)
+                columns.append(
+                    Samples(
+                        seconds(clock(one, layout)),
+                        one.values[:, [j]],
+                        Source(one.path, (name,), one.number, one.topic),
+                    )
+                )
+    first = columns[0]
+    inside = np.ones(len(first.time), dtype=bool)
+    for other in columns[1:]:
+        inside &= (first.time >= other.time[0]) & (first.time <= other.time[-1])
+    time = first.time[inside]
+    values = [np.interp(time, one.time, one.values[:, 0]) for one in columns]
+    topics = ", ".join(dict.fromkeys(str(one.source.topic) for one in columns))
+    names = tuple(one.source.columns[0] for one in columns)
+    gap = max(float(np.diff(one.time).max(initial=0.0)) for one in columns)
+    notes.append(
+        f"topics {topics}: {', '.join(names[1:])} came at other times than {names[0]} and were "
+        f"interpolated to them (longest gap {gap:.3g} s)"
+    )
+    source = Source(first.source.path, names, first.source.lines[inside], topics)
+    return Samples(time, np.column_stack(values), source)
+
+
+def mostly_whole(stream: Stream) -> bool:
+    """Whether about all rows that have one of the numbers have all of them."""
+    whole = int((~stream.absent.any(axis=1)).sum())
+    return whole >= 0.5 * int((~stream.absent).sum(axis=0).max(initial=0))
+
+
+def finite(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
+    """Rows without NaN, where the layout lets them be left out; refuses them elsewhere."""
+    bad = ~np.isfinite(stream.values).all(axis=1)
+    if not bad.any():
+        return stream
+    rows = np.flatnonzero(bad)
+    column = stream.columns[int(np.argmin(np.isfinite(stream.values[rows[0]])))]
+    if np.isinf(stream.values[rows]).any() or not layout.drop_nan or bad.all():
+        found = f"{column} is no finite number, as in {len(rows)} of {len(bad)} messages"
+        expected = "numbers; to leave such messages out say: drop_nan = true"
+        if bad.all():
+            expected = "numbers; does the driver fill this field in?"
+        raise stream.error(found, expected, int(rows[0]))
+    notes.append(
+        f"topic {stream.topic}: {len(rows)} messages without a number in {column} left out"
+    )
+    return stream.part(~bad)
+
+
+def _samples(stream: Stream, layout: BagLayout) -> Samples:
+    source = Source(stream.path, stream.columns, stream.number, stream.topic)
+    return Samples(seconds(clock(stream, layout)), stream.values, source)
