@@ -58,6 +58,8 @@ def message(store, name: str, fields: Mapping[str, Any]):
         element, count = inner
         many = [None] * count if given is None and kind == Nodetype.ARRAY else given
         many = [] if many is None else many
+        if isinstance(many, np.ndarray) and many.dtype == np.uint8:
+            return many
         if element[0] == Nodetype.BASE and element[1][0] != "string":
             dtype = {"bool": "bool", "char": "uint8", "byte": "uint8"}.get(
                 element[1][0], element[1][0]

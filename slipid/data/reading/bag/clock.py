@@ -29,6 +29,9 @@ def timed(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
     if len(zero):
         expected = 'a stamp in every message; to use the time of receipt say: stamp = "received"'
         raise stream.error("the time stamp is zero", expected, int(zero[0]))
+    steps = np.diff(time)
+    if (steps > 0).all():
+        return stream
     late = np.maximum.accumulate(time) - time
     jumps = np.flatnonzero(late > layout.max_disorder * 1e9)
     if len(jumps):
@@ -38,18 +41,18 @@ def timed(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
             'set, or a recording added? To use the time of receipt say: stamp = "received"'
         )
         raise stream.error(found, expected, int(jumps[0]))
-    if late.any():
-        count = int((late > 0).sum())
+    if disordered := int((late > 0).sum()):
         notes.append(
-            f"topic {stream.topic}: {count} messages out of order by up to "
+            f"topic {stream.topic}: {disordered} messages out of order by up to "
             f"{late.max() / 1e9:.3g} s were sorted"
         )
     order = np.argsort(time, kind="stable")
     # of messages with one stamp the last one stands
     last = np.append(np.diff(time[order]) != 0, True)
-    if not last.all():
-        count = int((~last).sum())
-        notes.append(f"topic {stream.topic}: {count} messages with the stamp of another left out")
+    if repeated := int((~last).sum()):
+        notes.append(
+            f"topic {stream.topic}: {repeated} messages with the stamp of another left out"
+        )
     return stream.part(order[last])
 
 

@@ -12,9 +12,6 @@ from slipid.data.reading.bag.storage.opened import OpenBag
 from slipid.data.reading.bag.transforms import Link
 from slipid.support.errors import near
 
-_LOOK = 500
-"""Messages between two looks at whether the chain is known."""
-
 
 def chain_of(
     bag: OpenBag, messages: Mapping[str, Message], frame: str, child: str
@@ -36,17 +33,10 @@ def chain_of(
         for topic, message in messages.items()
     }
     frame, child = frame.lstrip("/"), child.lstrip("/")
-    for count, raw in enumerate(bag.messages(tuple(messages)), start=1):
-        streams[raw.topic].add(raw.received, raw.data)
-        if count % _LOOK == 0:
-            for stream in streams.values():
-                stream.flush()
-            if links := _links(seen.parent, frame, child):
-                return links
-    for stream in streams.values():
-        stream.flush()
-    if links := _links(seen.parent, frame, child):
-        return links
+    for batch in bag.batches(tuple(messages)):
+        streams[batch.topic].add(batch)
+        if links := _links(seen.parent, frame, child):
+            return links
     frames = sorted({*seen.parent.keys(), *seen.parent.values()})
     where = ", ".join(messages)
     for name in (frame, child):

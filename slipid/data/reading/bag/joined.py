@@ -34,7 +34,8 @@ def samples_of(stream: Stream, layout: BagLayout, notes: list[str]) -> Samples:
             f"topic {stream.topic}: {(~whole).sum()} messages without all of "
             f"{', '.join(stream.columns)} left out"
         )
-    return _samples(stream.part(whole), layout)
+        stream = stream.part(whole)
+    return _samples(stream, layout)
 
 
 def side_by_side(streams: Sequence[Stream], layout: BagLayout, notes: list[str]) -> Samples:

@@ -109,7 +109,6 @@ def _collected(bag: OpenBag, plans: Sequence[ChannelPlan]) -> list[list[Stream]]
         wanted = [w for one in plans for w in one.wanted if w.topic == name]
         picks = [one.pick for one in wanted]
         topics[name] = TopicStreams(bag.path, name, wanted[0].message, picks, cdr=bag.cdr)
-    add = {name: topic.add for name, topic in topics.items()}
-    for topic, received, data in bag.messages(tuple(topics)):
-        add[topic](received, data)
+    for batch in bag.batches(tuple(topics)):
+        topics[batch.topic].add(batch)
     return [[topics[w.topic].stream(w.pick) for w in one.wanted] for one in plans]

@@ -111,8 +111,7 @@ def _served(message: Message, shape: Shape) -> tuple[str, ...]:
 def _fields(message: Message, shape: Shape) -> tuple[TopicField, ...]:
     """Everything in a type of message, with how much of it one message has."""
     return tuple(
-        TopicField(path, what, len(shape.places(steps_of(path))) + len(shape.texts(steps_of(path))))
-        for path, what in message.paths.items()
+        TopicField(path, what, shape.count(steps_of(path))) for path, what in message.paths.items()
     )
 
 

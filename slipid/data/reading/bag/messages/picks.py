@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from slipid.data.reading.bag.messages.shape import Place, Shape, Step, steps_of
 
@@ -26,6 +26,7 @@ class Located:
     numbers: tuple[Place | None, ...]
 
 
+@runtime_checkable
 class Pick(Protocol):
     """What is wanted of the messages of a topic: one row of numbers a message, or none, or more."""
 

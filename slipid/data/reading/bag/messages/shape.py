@@ -98,6 +98,10 @@ class Shape:
         """Texts at a path."""
         return tuple(leaf.text for leaf, _ in self._at(path) if not leaf.dtype)
 
+    def count(self, path: Sequence[Step]) -> int:
+        """How many numbers or texts are at a path."""
+        return sum(1 if leaf.count is None else leaf.count for leaf, _ in self._at(path))
+
     def _at(self, path: Sequence[Step]) -> list[tuple[Leaf, int | None]]:
         """Leaves at a path, and which of its elements is meant."""
         found = []

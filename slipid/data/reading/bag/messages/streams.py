@@ -10,10 +10,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from slipid.data.reading.bag.messages.kinds import Message
 from slipid.data.reading.bag.messages.picks import Located, Pick
 from slipid.data.reading.bag.messages.shape import Shape, shape_of
+from slipid.data.reading.bag.storage.opened import Batch
 from slipid.support.errors import DataError, bad_data
 
-BATCH_BYTES = 1 << 20
-"""Of messages that wait until they are turned into numbers together."""
 MAX_SHAPES = 256
 """Shapes of a topic that are remembered; with more of them the oldest are found anew."""
 FEW_SHAPES = 16
@@ -71,6 +70,23 @@ class _Rows:
     absent: Bool[np.ndarray, "row column"]
 
 
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """A shape that was met, and where the numbers of each pick lie in it."""
+
+    shape: Shape
+    places: tuple[tuple[Located, ...], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Alike:
+    """Messages of one shape: which of a batch they are, their bytes, and as in `_Known`."""
+
+    which: Int[np.ndarray, " message"]
+    block: UInt8[np.ndarray, "message byte"]
+    places: tuple[tuple[Located, ...], ...]
+
+
 class TopicStreams:
     """Takes the messages of a topic and keeps the numbers that some picks want of them."""
 
@@ -80,33 +96,23 @@ class TopicStreams:
         self.path, self.topic, self.message, self.cdr = path, topic, message, cdr
         self.picks = tuple(picks)
         self.count = 0
-        self._raw: list[bytes] = []
-        self._received: list[int] = []
-        self._room = BATCH_BYTES
         self._rows: list[list[_Rows]] = [[] for _ in self.picks]
-        self._shapes: dict[int, list[tuple[Shape, list[tuple[Located, ...]]]]] = {}
+        self._shapes: dict[int, list[_Known]] = {}
 
-    def add(self, received: int, raw: bytes) -> None:
-        """Take one message, received at a time [ns]."""
-        self._raw.append(raw)
-        self._received.append(received)
-        self._room -= len(raw) + 64
-        if self._room < 0:
-            self.flush()
-
-    def flush(self) -> None:
-        """Turn the messages that wait into numbers."""
-        received = np.array(self._received, dtype=np.int64)
+    def add(self, batch: Batch) -> None:
+        """Take the messages that follow in the topic."""
+        if set(map(type, batch.data)) != {bytes}:
+            raise topic_error(self.path, self.topic, "a message that is no bytes", "a whole bag")
+        received = np.array(batch.received, dtype=np.int64)
         numbers = self.count + 1 + np.arange(len(received))
-        for which, block, places in self._blocks():
-            for rows, located in zip(self._rows, places, strict=True):
-                rows += [_taken(block, received[which], numbers[which], row) for row in located]
-        self.count += len(self._raw)
-        self._raw, self._received, self._room = [], [], BATCH_BYTES
+        for alike in self._alike(batch.data):
+            for rows, located in zip(self._rows, alike.places, strict=True):
+                which = alike.which
+                rows += [_taken(alike.block, received[which], numbers[which], x) for x in located]
+        self.count += len(received)
 
     def stream(self, pick: Pick) -> Stream:
         """Every row of one of the picks."""
-        self.flush()
         parts = self._rows[self.picks.index(pick)]
         widths = {part.values.shape[1] for part in parts}
         if len(widths) > 1:
@@ -115,69 +121,63 @@ class TopicStreams:
             found = f"{other.values.shape[1]} numbers, and {first.values.shape[1]} of them before"
             expected = "as many in every message; name one by its index, such as [0]?"
             raise topic_error(self.path, self.topic, found, expected, int(other.number[0]))
-        if not parts:
-            none = np.zeros(0, dtype=np.int64)
-            width = len(pick.columns)
-            empty = np.zeros((0, width))
-            return Stream(
-                self.path, self.topic, pick.columns, None, none, none, empty, empty.astype(bool)
-            )
-        number = np.concatenate([part.number for part in parts])
-        order = np.argsort(number, kind="stable")
+        number = _laid([part.number for part in parts], np.zeros(0, dtype=np.int64))
         stamps = [part.stamp for part in parts if part.stamp is not None]
-        return Stream(
+        empty = np.zeros((0, len(pick.columns)))
+        stream = Stream(
             path=self.path,
             topic=self.topic,
             columns=pick.columns,
-            stamp=np.concatenate(stamps)[order] if len(stamps) == len(parts) else None,
-            received=np.concatenate([part.received for part in parts])[order],
-            number=number[order],
-            values=np.concatenate([part.values for part in parts])[order],
-            absent=np.concatenate([part.absent for part in parts])[order],
+            stamp=np.concatenate(stamps) if stamps and len(stamps) == len(parts) else None,
+            received=_laid([part.received for part in parts], number),
+            number=number,
+            values=_laid([part.values for part in parts], empty),
+            absent=_laid([part.absent for part in parts], empty.astype(bool)),
         )
+        # messages of other shapes, and other transforms of a message, came one after the other
+        in_order = (np.diff(number) >= 0).all()
+        return stream if in_order else stream.part(np.argsort(number, kind="stable"))
 
-    def _blocks(
-        self,
-    ) -> Iterator[
-        tuple[
-            Int[np.ndarray, " message"],
-            UInt8[np.ndarray, "message byte"],
-            list[tuple[Located, ...]],
-        ]
-    ]:
-        """Messages of one shape: which they are, their bytes, and where each pick's numbers are."""
-        lengths = np.fromiter(map(len, self._raw), np.int64, len(self._raw))
-        for length in np.unique(lengths):
+    def _alike(self, data: Sequence[bytes]) -> Iterator[_Alike]:
+        """Messages by shape."""
+        lengths = np.fromiter(map(len, data), np.int64, len(data))
+        for length in np.unique(lengths).tolist():
             left = np.flatnonzero(lengths == length)
-            joined = b"".join([self._raw[k] for k in left])
-            block = np.frombuffer(joined, np.uint8).reshape(len(left), int(length))
-            seen = 0
-            for shape, places in self._shapes.get(int(length), []):
-                same = shape.fits(block)
-                if same.any():
-                    yield left[same], block[same], places
-                    left, block = left[~same], block[~same]
+            joined = b"".join(data if len(left) == len(data) else [data[int(k)] for k in left])
+            block = np.frombuffer(joined, np.uint8).reshape(len(left), length)
+            known, new = list(self._shapes.get(length, ())), 0
             while len(left):
-                shape, places = self._shape(int(left[0]))
-                seen += 1
-                same = shape.fits(block) if seen <= FEW_SHAPES else np.arange(len(left)) == 0
-                yield left[same], block[same], places
-                left, block = left[~same], block[~same]
+                if known:
+                    one = known.pop(0)
+                else:
+                    row = int(left[0])
+                    one, new = self._known(data[row], self.count + row + 1), new + 1
+                same = one.shape.fits(block) if new <= FEW_SHAPES else np.arange(len(left)) == 0
+                if same.all():
+                    yield _Alike(left, block, one.places)
+                    break
+                if same.any():
+                    yield _Alike(left[same], block[same], one.places)
+                    left, block = left[~same], block[~same]
 
-    def _shape(self, k: int) -> tuple[Shape, list[tuple[Located, ...]]]:
-        """Shape of the k-th message that waits, which is a new one."""
+    def _known(self, data: bytes, number: int) -> _Known:
+        """Shape of a message that has a new one, and where the wanted numbers lie in it."""
         try:
-            shape = shape_of(self._raw[k], self.message, cdr=self.cdr)
+            shape = shape_of(data, self.message, cdr=self.cdr)
         except ValueError as error:
             found = f"it is no {self.message.name}: {error}"
             expected = "messages as their definition says; is the bag damaged?"
-            number = self.count + k + 1
             raise topic_error(self.path, self.topic, found, expected, number) from error
         if sum(map(len, self._shapes.values())) >= MAX_SHAPES:
             self._shapes.clear()
-        known = shape, [pick.located(shape) for pick in self.picks]
+        known = _Known(shape, tuple(pick.located(shape) for pick in self.picks))
         self._shapes.setdefault(shape.size, []).append(known)
         return known
+
+
+def _laid(parts: Sequence[np.ndarray], none: np.ndarray) -> np.ndarray:
+    """Arrays end to end; another where there are none."""
+    return np.concatenate(parts) if parts else none
 
 
 def topic_error(

@@ -1,0 +1,163 @@
+"""Speed and memory of reading a big bag, beside bare rosbags on the same topics.
+
+    .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks/bench_bags.py
+
+The bag is made in a temporary folder: images that nobody wants, and beside them joint states at
+500 Hz, an IMU at 200 Hz, odometry at 50 Hz and commands at 20 Hz. SLIPID_BAG_GB sets its size.
+Bare iteration takes the wanted messages out of the bag and looks at none; the other number has
+rosbags turn each into its object as well, as whoever wants the numbers must.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+GB = float(os.environ.get("SLIPID_BAG_GB", "1"))
+IMAGE = 640 * 480 * 3
+RATES = {"/camera": 10, "/joint_states": 500, "/imu": 200, "/odom": 50, "/cmd_vel": 20}
+WANTED = [topic for topic in RATES if topic != "/camera"]
+JOINTS = ("left", "right")
+LAYOUT = {
+    "joints": list(JOINTS),
+    "topics": {
+        "wheel_angle": {"topic": "/joint_states"},
+        "wheel_speed": {"topic": "/joint_states"},
+        "current": {"topic": "/joint_states", "unit": "A"},
+        "gyro": {"topic": "/imu"},
+        "pose": {"topic": "/odom"},
+        "twist_command": {"topic": "/cmd_vel"},
+    },
+}
+ALONE = """
+import resource, sys, time
+from pathlib import Path
+from slipid.data.reading.bag.layout import declared_bag_layout
+from slipid.data.reading.bag.reader import read_bag
+from tests.benchmarks.bench_bags import LAYOUT, GB
+import rosbags.highlevel, slipid.data.reading.bag.messages.definitions as d
+d._standard()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+(run,) = read_bag(Path(sys.argv[1]), declared_bag_layout(LAYOUT, "layout"))
+after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+kept = sum(s.values.nbytes + s.time.nbytes + s.source.lines.nbytes for s in run.signals.values())
+print((after - before) / 1024, kept / 2**20)
+"""
+
+
+@pytest.fixture(scope="module", params=["rosbag1", "sqlite3", "mcap"])
+def bag(request, tmp_path_factory):
+    from tests.helpers.made_bags import SUFFIX
+
+    path = tmp_path_factory.mktemp("bags") / f"big{SUFFIX[request.param]}"
+    started = time.perf_counter()
+    counts = written(path, request.param)
+    size = sum(p.stat().st_size for p in ([path] if path.is_file() else path.iterdir()))
+    print(
+        f"\n{request.param}: {size / 1e9:.2f} GB with {counts} wanted messages, "
+        f"made in {time.perf_counter() - started:.0f} s"
+    )
+    return path
+
+
+def written(path: Path, storage: str) -> int:
+    """Write the bag and return how many messages in it are wanted."""
+    from tests.helpers.made_bags import message, types_of, writer_of
+
+    store = types_of(storage)
+    serialise = store.serialize_ros1 if storage == "rosbag1" else store.serialize_cdr
+    length = GB * 1e9 / (IMAGE * RATES["/camera"] + 400.0 * sum(RATES[t] for t in WANTED))
+    times = sorted(
+        (float(t), topic)
+        for topic, rate in RATES.items()
+        for t in 1.7e9 + np.arange(int(length * rate)) / rate
+    )
+    pixels = np.random.default_rng(0).integers(0, 255, IMAGE, dtype=np.uint8)
+    with writer_of(path, storage) as writer:
+        connections = {}
+        for t, topic in times:
+            name, fields = said(topic, t, pixels)
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, name, typestore=store)
+            raw = serialise(message(store, name, fields), name)
+            writer.write(connections[topic], round((t + 0.001) * 1e9), raw)
+    return sum(topic != "/camera" for _, topic in times)
+
+
+def said(topic: str, t: float, pixels: np.ndarray) -> tuple[str, dict]:
+    """Type and fields of a message."""
+    from tests.helpers.made_bags import JOINT_STATE, header, pose_fields, vector
+
+    turn = t % 1000.0
+    if topic == "/camera":
+        fields = {"header": header(t, "camera"), "height": 480, "width": 640, "step": 1920}
+        return "sensor_msgs/msg/Image", {**fields, "encoding": "rgb8", "data": pixels}
+    if topic == "/joint_states":
+        arrays = {name: [turn, -turn] for name in ("position", "velocity", "effort")}
+        return JOINT_STATE, {"header": header(t), "name": list(JOINTS), **arrays}
+    if topic == "/imu":
+        return "sensor_msgs/msg/Imu", {"header": header(t, "imu"), "angular_velocity": vector(z=1)}
+    if topic == "/odom":
+        name = "nav_msgs/msg/Odometry"
+        return name, pose_fields(name, t, turn, 0.0, 0.1)
+    return "geometry_msgs/msg/Twist", {"linear": vector(0.1), "angular": vector()}
+
+
+def bare(path: Path, *, objects: bool) -> int:
+    """What rosbags does by itself; how many messages it found."""
+    from rosbags.highlevel import AnyReader
+
+    count = 0
+    with AnyReader([path]) as reader:
+        wanted = [c for c in reader.connections if c.topic in WANTED]
+        for connection, _, raw in reader.messages(wanted):
+            count += 1
+            if objects:
+                reader.deserialize(raw, connection.msgtype)
+    return count
+
+
+def test_reading_is_as_fast_as_bare_iteration(bag):
+    from slipid.data.reading.bag.layout import declared_bag_layout
+    from slipid.data.reading.bag.reader import read_bag
+    from slipid.data.reading.bag.topics import topics_of
+
+    layout = declared_bag_layout(LAYOUT, "layout")
+    jobs = {
+        "bare rosbags": lambda: bare(bag, objects=False),
+        "rosbags with objects": lambda: bare(bag, objects=True),
+        "read_bag": lambda: read_bag(bag, layout),
+        "topics_of": lambda: topics_of(bag),
+    }
+    taken = {name: [] for name in jobs}
+    for _ in range(3):
+        for name, job in jobs.items():
+            started = time.perf_counter()
+            job()
+            taken[name].append(time.perf_counter() - started)
+    best = {name: min(times) for name, times in taken.items()}
+    for name, seconds in best.items():
+        ratio = best["bare rosbags"] / seconds
+        print(f"{name:22s} {seconds:7.2f} s, {ratio:5.2f} of the speed of bare rosbags")
+    assert best["bare rosbags"] / best["read_bag"] >= 0.7
+
+
+def test_memory_is_that_of_the_wanted_numbers(bag):
+    root = Path(__file__).resolve().parents[2]
+    said = subprocess.run(
+        [sys.executable, "-c", ALONE, str(bag)],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    )
+    grown, kept = map(float, said.stdout.split())
+    print(f"\nmemory grew by {grown:.0f} MiB at most; {kept:.0f} MiB of it are the signals")
+    assert grown < 10.0 * kept + 100.0
