@@ -13,6 +13,8 @@ import numpy as np
 STORAGES = ("rosbag1", "sqlite3", "mcap")
 SUFFIX = {"rosbag1": ".bag", "sqlite3": "", "mcap": ""}
 JOINT_STATE = "sensor_msgs/msg/JointState"
+MISSING = {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
+"""Standard types that rosbags does not know of ROS 1."""
 ROBOTINO = {
     "robotino_msgs/msg/MotorReadings": (
         "time stamp\nfloat32[] velocities # rpm\nint32[] positions # ticks\n"
@@ -38,7 +40,8 @@ def types_of(storage: str, definitions: Mapping[str, str] | None = None):
 
     store = get_typestore(Stores.ROS1_NOETIC if storage == "rosbag1" else Stores.ROS2_HUMBLE)
     types: dict[str, Any] = {}
-    for name, text in (definitions or {}).items():
+    missing = {name: text for name, text in MISSING.items() if name not in store.types}
+    for name, text in (missing | dict(definitions or {})).items():
         types.update(get_types_from_msg(text, name))
     if types:
         store.register(types)

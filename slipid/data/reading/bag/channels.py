@@ -54,7 +54,7 @@ def filled(stream: Stream) -> Stream:
     """The same stream; DataError where no message has the wanted numbers."""
     if len(stream.number):
         return stream
-    found = f"no numbers in {', '.join(stream.columns) or 'the wanted fields'} of any message"
+    found = f"no numbers in {', '.join(stream.columns)} of any message"
     raise stream.error(found, "an array that is filled in, and has the wanted index")
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Int
 
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.messages.streams import Stream
+from slipid.data.reading.bag.transforms import STATIC
 from slipid.support.errors import DataError
 
 APART_NOTED = 0.5
@@ -74,11 +75,16 @@ def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str])
     Raises:
         DataError: they are so far apart that their times cannot be compared.
     """
-    stamped = [s for s in streams if s.stamp is not None and layout.stamp == "header"]
-    bare = [s for s in streams if s.stamp is None]
-    if not stamped or not bare:
+    bare, delays = [], {}
+    for stream in streams:
+        if not len(stream.number) or stream.topic.endswith(STATIC):
+            continue
+        if stream.stamp is None:
+            bare.append(stream)
+        else:
+            delays[stream.topic] = float(np.median(stream.received - stream.stamp)) / 1e9
+    if not bare or not delays or layout.stamp == "received":
         return
-    delays = {s.topic: float(np.median(s.received - s.stamp)) / 1e9 for s in stamped}
     topic = max(delays, key=lambda name: abs(delays[name]))
     apart = delays[topic]
     others = ", ".join(sorted({s.topic for s in bare}))

@@ -21,7 +21,7 @@ from slipid.data.reading.bag.messages.picks import Pick, TransformPick, edges_of
 from slipid.data.reading.bag.messages.shape import Shape, shape_of, steps_of
 from slipid.data.reading.bag.messages.streams import topic_error
 from slipid.data.reading.bag.storage.opened import OpenBag, StoredTopic
-from slipid.data.reading.bag.transforms import Link
+from slipid.data.reading.bag.transforms import STATIC, Link
 from slipid.support.errors import DataError, bad_data, near
 
 
@@ -93,7 +93,7 @@ def _transformed(
 ) -> ChannelPlan:
     """Plan of a pose from transforms, with those of the static topic beside."""
     messages = {topic: message}
-    static = f"{topic}_static"
+    static = topic + STATIC
     if static in bag.topics and bag.topics[static].count:
         messages[static] = message_of(bag, layout, static, "pose")
     if spec.frame is None or spec.child is None:

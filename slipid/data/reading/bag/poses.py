@@ -12,7 +12,7 @@ from slipid.data.reading.bag.layout import GROUPS, BagLayout
 from slipid.data.reading.bag.messages.picks import Edge, TransformPick
 from slipid.data.reading.bag.messages.streams import Stream
 from slipid.data.reading.bag.plan import ChannelPlan
-from slipid.data.reading.bag.transforms import Moving, composed, heading, tilt
+from slipid.data.reading.bag.transforms import STATIC, Moving, composed, heading, tilt
 from slipid.data.reading.signal import Signal, Source
 
 TILT_NOTED = np.radians(20.0)
@@ -81,7 +81,7 @@ def _transformed(
         assert isinstance(wanted.pick, TransformPick)
         # topics that move come first in a plan, and the static one repeats what never changes
         if wanted.pick.edge not in moving and len(stream.number):
-            if stream.topic.endswith("_static"):
+            if stream.topic.endswith(STATIC):
                 stream = finite(stream.part(np.array([len(stream.number) - 1])), layout, notes)
             else:
                 stream = timed(finite(stream, layout, notes), layout, notes)

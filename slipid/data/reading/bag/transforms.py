@@ -8,6 +8,9 @@ from jaxtyping import Float
 
 from slipid.data.reading.bag.messages.picks import Edge
 
+STATIC = "_static"
+"""End of the topic's name beside `/tf` that holds transforms which never change."""
+
 
 @dataclass(frozen=True)
 class Link:

@@ -115,12 +115,12 @@ def channel_meaning(
         return _joint_meaning(channel, spec, joints)
     known = _known(message)
     paths = spec.fields or ((known[channel].path,) if channel in known else ())
-    if not paths and tuple(message.paths) == ("data",):
+    if not paths and message.name.startswith("std_msgs/") and "data" in message.paths:
         paths = ("data",)
     if not paths:
         fitting = f"{_FITTING[channel]}, or " if channel in _FITTING else ""
         expected = f"{fitting}field = one of its numbers ({_listed(message)}), with its unit"
-        raise Unfit(f"{message.name}, which does not tell of itself what is {channel}", expected)
+        raise Unfit(f"{message.name}, which does not tell where in it {channel} is", expected)
     for path in paths:
         _check_number(path, message)
     said = [one.unit for one in known.values() if one.path == paths[0].split("[")[0]]

@@ -44,11 +44,15 @@ class FieldPick:
 
     Attributes:
         paths: of the fields.
-        columns: names of the numbers, as the first message told them.
+        seen: name of each number, as the first message told them.
     """
 
     paths: tuple[str, ...]
-    columns: tuple[str, ...] = ()
+    seen: tuple[str, ...] = ()
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        return self.seen or self.paths
 
     def located(self, shape: Shape) -> tuple[Located, ...]:
         numbers: list[Place] = []
@@ -59,7 +63,7 @@ class FieldPick:
             names += [path] if len(places) == 1 else [f"{path}[{k}]" for k in range(len(places))]
         if not numbers:
             return ()
-        self.columns = self.columns or tuple(names)
+        self.seen = self.seen or tuple(names)
         return (_located(shape, (), numbers),)
 
 
