@@ -11,6 +11,9 @@ from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.messages.streams import Stream
 from slipid.data.reading.signal import Source
 
+ABSURD = 1e30
+"""No sensor gives a number as large, in whatever unit: the bag is damaged."""
+
 
 @dataclass(frozen=True, eq=False)
 class Samples:
@@ -87,18 +90,21 @@ def mostly_whole(stream: Stream) -> bool:
 
 
 def finite(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
-    """Rows without NaN, where the layout lets them be left out; refuses them elsewhere."""
-    bad = ~np.isfinite(stream.values).all(axis=1)
+    """Rows without NaN, where the layout lets these be left out; refuses all that is no number."""
+    bad = ~np.all(np.abs(stream.values) < ABSURD, axis=1)
     if not bad.any():
         return stream
     rows = np.flatnonzero(bad)
-    column = stream.columns[int(np.argmin(np.isfinite(stream.values[rows[0]])))]
-    if np.isinf(stream.values[rows]).any() or not layout.drop_nan or bad.all():
-        found = f"{column} is no finite number, as in {len(rows)} of {len(bad)} messages"
-        expected = "numbers; to leave such messages out say: drop_nan = true"
+    numbers = stream.values[rows[0]]
+    j = int(np.argmin(np.abs(numbers) < ABSURD))
+    if bad.all() or not layout.drop_nan or not np.isnan(stream.values[rows]).any(axis=1).all():
+        found = f"{stream.columns[j]} is {numbers[j]:.3g} here, the first of {len(rows)} such"
+        found += f" among {len(bad)} messages"
+        expected = "numbers; to leave out messages with nan say: drop_nan = true"
         if bad.all():
             expected = "numbers; does the driver fill this field in?"
         raise stream.error(found, expected, int(rows[0]))
+    column = stream.columns[j]
     notes.append(
         f"topic {stream.topic}: {len(rows)} messages without a number in {column} left out"
     )

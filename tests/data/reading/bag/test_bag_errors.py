@@ -193,9 +193,9 @@ def test_effort_without_a_meaning(tmp_path):
     choices = ('"A" (current)', '"N*m" (motor_torque', '"V" (voltage)', '"1" (duty)')
     topics = {"current": {"topic": "/joint_states"}}
     refused(tmp_path, wheels(), topics, "effort without a unit", *choices)
+    table = {"topics": {"voltage": {"topic": "/joint_states", "field": "effort"}}}
     with pytest.raises(DataError) as caught:
-        spec = {"topic": "/joint_states", "field": "effort"}
-        declared_bag_layout({"topics": {"voltage": spec}}, "layout")
+        declared_bag_layout(table, "layout")
     assert all(choice in str(caught.value) for choice in choices)
 
 
@@ -236,7 +236,7 @@ def test_poses_without_numbers(tmp_path):
     x = TIME - START
     x[40:60] = np.nan
     topics = {"pose": {"topic": "/pose"}}
-    words = ("message 41", "pose.position.x", "20 of 200", "drop_nan = true")
+    words = ("message 41", "pose.position.x is nan", "20 such among 200", "drop_nan = true")
     refused(tmp_path, poses(x=x), topics, *words)
     run = accepted(tmp_path / "kept", poses(x=x), topics, drop_nan=True)
     assert len(run.signals["pose_x"].time) == 180
@@ -245,7 +245,7 @@ def test_poses_without_numbers(tmp_path):
 
 def test_all_poses_without_numbers(tmp_path):
     topics = {"pose": {"topic": "/pose"}}
-    words = ("200 of 200", "does the driver fill")
+    words = ("200 such among 200", "does the driver fill")
     refused(tmp_path, poses(x=np.full(len(TIME), np.nan)), topics, *words, drop_nan=True)
 
 

@@ -53,7 +53,7 @@ def test_a_chain_is_composed(tmp_path, storage, parts):
     time, pose, run = pose_of(path, "map", "camera")
     s = time - 100.0
     # up to the last time at which all of the chain is known
-    np.testing.assert_allclose(time, TIME[TIME <= TIME[::5][-1] + 1e-9], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(time, TIME[: len(TIME) - 4], rtol=0, atol=1e-6)
     expected = np.column_stack(
         [
             1.0 + 0.1 * s + s + 0.2 * np.cos(s) - 0.1 * np.sin(s),
@@ -110,5 +110,5 @@ def test_frames_that_do_not_lead_there(tmp_path, parts, frame, child, words):
 def test_transforms_need_frames(tmp_path, parts):
     path = write_bag(tmp_path / "bag", "mcap", in_order(*parts))
     layout = declared_bag_layout({"topics": {"pose": {"topic": "/tf"}}}, "layout")
-    with pytest.raises(DataError, match="expected frame and child.*map -> odom"):
+    with pytest.raises(DataError, match=r"expected frame and child.*map -> odom"):
         read_bag(path, layout)

@@ -4,7 +4,6 @@ import io
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 MAGIC = b"\x89MCAP0\r\n"
 _DATA_END, _FOOTER = 0x0F, 0x02
@@ -42,7 +41,7 @@ class MendedMcap:
         """As of a path."""
         return False
 
-    def open(self, *_: object, **__: object) -> BinaryIO:
+    def open(self, *_: object, **__: object) -> io.BufferedReader:
         """The whole records, and an end."""
         return io.BufferedReader(_Mended(self.path, self.end), buffer_size=1 << 16)
 
@@ -88,7 +87,7 @@ class _Mended(io.RawIOBase):
         self._at = base + offset
         return self._at
 
-    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+    def readinto(self, buffer: memoryview | bytearray) -> int:  # type: ignore[override]
         if self._at < self._end:
             self._file.seek(self._at)
             data = self._file.read(min(len(buffer), self._end - self._at))

@@ -236,7 +236,7 @@ def _entered(path: Path | MendedMcap, files: BagFiles, stack: ExitStack) -> "Rea
 
 def _damaged(files: BagFiles, error: Exception) -> DataError:
     """The error about a bag that rosbags cannot read."""
-    said = str(error) or type(error).__name__
+    said = (str(error).splitlines() or [type(error).__name__])[0][:200]
     file = files.parts[0]
     if "not indexed" in said:
         expected = f"a whole bag; {_REMEDY['rosbag1'].format(file=file)}"
