@@ -30,14 +30,15 @@ def channel_signal(
     Raises:
         DataError: a joint or a number is missing, not finite, or out of time.
     """
-    if isinstance(plan.wanted[0].pick, JointPick):
+    by_name = isinstance(plan.wanted[0].pick, JointPick)
+    if by_name:
         _check_joints(plan, streams)
     else:
         streams = [filled(stream) for stream in streams]
     if len(streams) == 1 and mostly_whole(streams[0]):
         samples = samples_of(streams[0], layout, notes)
     else:
-        samples = side_by_side(streams, layout, notes)
+        samples = side_by_side(streams, layout, notes, by_name=by_name)
     columns = samples.values.shape[1]
     scale = np.array(plan.spec.scale)
     if len(scale) not in (1, columns):

@@ -41,31 +41,26 @@ def samples_of(stream: Stream, layout: BagLayout, notes: list[str]) -> Samples:
     return _samples(stream, layout)
 
 
-def side_by_side(streams: Sequence[Stream], layout: BagLayout, notes: list[str]) -> Samples:
+def side_by_side(
+    streams: Sequence[Stream], layout: BagLayout, notes: list[str], *, by_name: bool
+) -> Samples:
     """Columns that lie in several topics, or in messages that have some of them only.
 
-    Each is taken from the first topic that has it, at the times of the first column; the others are
-    interpolated linearly there, and times that they do not span are left out.
+    They are laid side by side at the times of the first column; the others are interpolated
+    linearly there, and times that they do not span are left out.
+
+    Args:
+        streams: which hold the columns.
+        layout: what the bag is read by.
+        notes: which more are added to.
+        by_name: whether the streams have the same columns, of which each is taken from the first
+            that fills it in; else all columns of all streams are wanted.
 
     Raises:
-        DataError: as `samples_of`.
+        DataError: as `samples_of`, or no time is common to the columns.
     """
-    ordered = [timed(finite(stream, layout, notes), layout, notes) for stream in streams]
-    columns = []
-    for stream in ordered:
-        for j, name in enumerate(stream.columns):
-            have = ~stream.absent[:, j]
-            if have.any() and (
-                len(ordered) == 1 or name not in [c.source.columns[0] for c in columns]
-            ):
-                one = stream.part(have)
-                columns.append(
-                    Samples(
-                        seconds(clock(one, layout)),
-                        one.values[:, [j]],
-                        Source(one.path, (name,), one.number, one.topic),
-                    )
-                )
+    ordered = [timed(finite(one, layout, notes), layout, notes) for one in streams]
+    columns = _columns(ordered, layout, by_name)
     first = columns[0]
     inside = np.ones(len(first.time), dtype=bool)
     for other in columns[1:]:
@@ -74,13 +69,31 @@ def side_by_side(streams: Sequence[Stream], layout: BagLayout, notes: list[str])
     values = [np.interp(time, one.time, one.values[:, 0]) for one in columns]
     topics = ", ".join(dict.fromkeys(str(one.source.topic) for one in columns))
     names = tuple(one.source.columns[0] for one in columns)
+    source = Source(first.source.path, names, first.source.lines[inside], topics)
+    if not len(time):
+        raise source.error("its columns share no time", "columns that were recorded together")
     gap = max(float(np.diff(one.time).max(initial=0.0)) for one in columns)
     notes.append(
         f"topics {topics}: {', '.join(names[1:])} came at other times than {names[0]} and were "
         f"interpolated to them (longest gap {gap:.3g} s)"
     )
-    source = Source(first.source.path, names, first.source.lines[inside], topics)
     return Samples(time, np.column_stack(values), source)
+
+
+def _columns(streams: Sequence[Stream], layout: BagLayout, by_name: bool) -> list[Samples]:
+    """Each column for itself."""
+    pairs = [(stream, j) for stream in streams for j in range(len(stream.columns))]
+    if by_name:
+        # every stream has a column for every joint, in which most of them are empty
+        having = [(stream, j) for stream, j in pairs if not stream.absent[:, j].all()]
+        owner = {j: stream for stream, j in reversed(having)}
+        pairs = [(owner[j], j) for j in sorted(owner)]
+    columns = []
+    for stream, j in pairs:
+        one = stream.part(~stream.absent[:, j])
+        source = Source(one.path, (one.columns[j],), one.number, one.topic)
+        columns.append(Samples(seconds(clock(one, layout)), one.values[:, [j]], source))
+    return columns
 
 
 def mostly_whole(stream: Stream) -> bool:

@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
+from slipid.data.reading.bag.storage.damage import damaged
 from slipid.data.reading.bag.storage.files import BagFiles, files_of
 from slipid.data.reading.bag.storage.mended import MendedMcap, mended
 from slipid.support.errors import DataError, bad_data
@@ -17,14 +18,6 @@ if TYPE_CHECKING:
     import rosbags.rosbag2
 
 Reader: TypeAlias = "rosbags.rosbag1.Reader | rosbags.rosbag2.Reader"
-_REMEDY = {
-    "rosbag1": "run: rosbag reindex {file}",
-    "sqlite3": "save what is left with: sqlite3 {file} .recover | sqlite3 whole.db3",
-    "mcap": "save what is left with: mcap recover {file} -o whole.mcap",
-}
-_METADATA = "copy the folder again, or run: ros2 bag reindex {file}"
-
-
 _BATCH_BYTES = 1 << 20
 
 
@@ -126,7 +119,7 @@ class OpenBag:
                         raise TypeError(f"a message of type {type(data).__name__}")
                     yield Raw(connection.topic, received, data)
             except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
-                raise _damaged(self.files, error) from error
+                raise damaged(self.files, error) from error
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """The same messages topic by topic, about a megabyte at a time.
@@ -153,7 +146,7 @@ class OpenBag:
                         yield batch
                         waiting[topic], room[topic] = Batch(topic, [], []), _BATCH_BYTES
             except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
-                raise _damaged(self.files, error) from error
+                raise damaged(self.files, error) from error
         yield from (batch for batch in waiting.values() if batch.data)
 
 
@@ -231,30 +224,7 @@ def _entered(path: Path | MendedMcap, files: BagFiles, stack: ExitStack) -> "Rea
         # a mended file has as much of a path as rosbags asks of one file
         return stack.enter_context(rosbag2.Reader(path))  # type: ignore[arg-type]
     except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
-        raise _damaged(files, error) from error
-
-
-def _damaged(files: BagFiles, error: Exception) -> DataError:
-    """The error about a bag that rosbags cannot read."""
-    said = (str(error).splitlines() or [type(error).__name__])[0][:200]
-    file = files.parts[0]
-    if "not indexed" in said:
-        expected = f"a whole bag; {_REMEDY['rosbag1'].format(file=file)}"
-        return bad_data(files.path, "the bag has no index: its recording was cut off", expected)
-    if isinstance(error, PermissionError):
-        return bad_data(files.path, f"cannot be read ({error.strerror})", "a readable bag")
-    if isinstance(error, KeyError) and error.args[0] in ("protobuf", "jsonschema", "flatbuffer"):
-        found = f"it holds messages encoded as {error.args[0]}, which are not read"
-        expected = "ROS messages only; filter them out with: mcap filter"
-        return bad_data(files.path, found, expected)
-    if "Profile is not ros2" in said:
-        expected = "one that ROS 2 recorded (profile ros2); write it again with: ros2 bag convert"
-        return bad_data(files.path, "an MCAP file of another profile", expected)
-    remedy = _REMEDY[files.storage].format(file=file)
-    if "metadata" in said.lower() or "files are missing" in said:
-        remedy = _METADATA.format(file=files.path)
-    found = f"the bag is damaged or was cut off ({said})"
-    return bad_data(files.path, found, f"a whole one; {remedy}")
+        raise damaged(files, error) from error
 
 
 def _topic(name: str, same: "list[rosbags.interfaces.Connection]") -> StoredTopic:
