@@ -23,7 +23,7 @@ from slipid.job.config import read_config
 from slipid.job.problem import Job, Task, read_job, with_mixed
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.errors import DataError
-from slipid.support.files import writable, write_bytes, write_json
+from slipid.support.files import read_json, writable, write_bytes, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -63,6 +63,8 @@ def identify(
         except ValueError as error:
             raise DataError(f"--profile: {error}") from error
     writable(out)
+    if said := _another(out, job):
+        report.line(said)
     key = key_of(config.hash, job.data_hash, problem.space.names, problem.noise.names)
     kept = Checkpoint(out, key)
     optimum = optimised(job, problem, kept, report)
@@ -86,6 +88,19 @@ def identify(
         written = (*written, "profile.json")
     kept.remove(f"{CHECKPOINT}.npz")
     return Identified(fit, job, tuple(found), written)
+
+
+def _another(out: Path, job: Job) -> str | None:
+    """A sentence where a folder holds the fit of another config or of other logs, else None."""
+    try:
+        before = read_json(out / "run.json", "what identify wrote")
+        config, data = before["config"], before["data"]
+    except (DataError, KeyError, TypeError):
+        return None
+    if config["sha256"] == job.config.hash and data["hash"] == job.data_hash:
+        return None
+    other = "other logs" if config["sha256"] == job.config.hash else f"another {config['name']}"
+    return f"{out} holds a fit of {other}; it is replaced when this one is done"
 
 
 def _keep_run(job: Job, data: Path, out: Path, seconds: float) -> None:
