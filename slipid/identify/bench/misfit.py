@@ -1,0 +1,84 @@
+"""What residuals still go with: speed, current or time, where they should go with nothing."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.identify.bench.fit import MotorFit
+from slipid.identify.bench.moments import Sums, cell_length, celled
+from slipid.identify.bench.windows import Windows
+
+BINS = 8
+"""Of about as many windows."""
+SURE = 5.0
+"""Stds by which the mean of a bin is not 0."""
+MATTERS = 0.01
+"""Part of the range of the voltage, or of the current, from which a mean matters to people."""
+LONG_S = 0.3
+"""Memory of residuals from which a reader is told [s]."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Where the model is off most: so much of a channel, at this value of another one."""
+
+    channel: str
+    unit: str
+    off: float
+    over: str
+    at: str
+    sure: float
+
+    @property
+    def text(self) -> str:
+        return (
+            f"the {self.channel} is {abs(self.off):.2g} {self.unit} "
+            f"{'above' if self.off > 0 else 'below'} the model's at {self.at} ({self.over}, "
+            f"{self.sure:.0f} stds): the motor has something that the model lacks, intervals are wider"
+        )
+
+
+def misfits(fit: MotorFit) -> tuple[Misfit, ...]:
+    """The worst of each equation, if it is sure and matters."""
+    pairs = [("current", "A", fit.amps, fit.amps_sums)]
+    if fit.volts is not None and fit.volts_sums is not None:
+        pairs.insert(0, ("voltage", "V", fit.volts, fit.volts_sums))
+    found = (_worst(fit, *pair) for pair in pairs)
+    return tuple(m for m in found if m is not None)
+
+
+def _worst(fit: MotorFit, channel: str, unit: str, w: Windows, s: Sums) -> Misfit | None:
+    """Largest mean of a bin, in its stds, over speed, current and time."""
+    size = MATTERS * float(np.ptp(w.both.left))
+    best: Misfit | None = None
+    for over, value, what in (
+        ("speed", w.speed, "rad/s"),
+        ("current", w.current, "A"),
+        ("time", w.time, "s"),
+    ):
+        for some in np.array_split(np.argsort(value, kind="stable"), BINS):
+            off, sure = _mean(fit, w, s, some)
+            if abs(off) > size and sure > max(SURE, 0.0 if best is None else best.sure):
+                at = f"{value[some].min():.3g} to {value[some].max():.3g} {what}"
+                best = Misfit(channel, unit, off, over, at, sure)
+    return best
+
+
+def _mean(
+    fit: MotorFit, w: Windows, s: Sums, some: np.ndarray
+) -> tuple[float, float]:
+    """Weighted mean of the residuals of some windows, and its size in stds.
+
+    Cells of the length of the residuals' memory count as independent.
+    """
+    chosen = np.zeros(len(w.time))
+    chosen[some] = s.weight[some]
+    total = float(chosen.sum())
+    if total <= 0:
+        return 0.0, 0.0
+    off = float((chosen * s.residual).sum() / total)
+    length = max(fit.remember, cell_length([w]))
+    away: Float[np.ndarray, "cell 1"] = celled((chosen * (s.residual - off))[:, None], w, length)
+    std = float(np.sqrt((away**2).sum())) / total
+    return off, abs(off) / max(std, 1e-300)
