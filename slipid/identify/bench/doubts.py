@@ -95,7 +95,7 @@ def _sure(w: Windows, column: int) -> float:
     found = start(w, signals, list(range(signals)))
     s = sums(w, found, signals)
     inverse = np.linalg.pinv(s.tangent[:, :signals], rcond=1e-10)
-    std = np.sqrt(np.diag(inverse @ scatter(s.each, 8) @ inverse.T))
+    std = np.sqrt(np.diag(inverse @ scatter(s.moments, 8) @ inverse.T))
     return float(found[column] / max(std[column], 1e-300))
 
 

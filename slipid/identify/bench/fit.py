@@ -219,12 +219,12 @@ def _scatter(
     """Scatter of all moments; time that residuals remember [s], and how many such times there are."""
     pairs = [(amps, a)] if volts is None or v is None else [(volts, v), (amps, a)]
     length = cell_length([w for w, _ in pairs])
-    parts = [celled(s.each, w, length) for w, s in pairs]
+    parts = [celled(s.moments, w, length) for w, s in pairs]
     count = max(len(p) for p in parts)
     g = np.concatenate([np.pad(p, ((0, count - len(p)), (0, 0))) for p in parts], axis=1)
-    left = [celled((s.weight * s.residual)[:, None], w, length)[:, 0] for w, s in pairs]
+    left = [celled(s.residual[:, None], w, length)[:, 0] for w, s in pairs]
     lags = 2 * max(memory(x) for x in left) + 2
-    groups = np.concatenate([grouped(s.each, w) for w, s in pairs], axis=1)
+    groups = np.concatenate([grouped(s, w) for w, s in pairs], axis=1)
     return widened(scatter(g, lags), groups), lags * length / 2, count / lags
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Int
 
 from slipid.identify.bench.fit import MotorFit
 from slipid.identify.bench.moments import Sums, cell_length, celled
@@ -52,33 +52,42 @@ def _worst(fit: MotorFit, channel: str, unit: str, w: Windows, s: Sums) -> Misfi
     """Largest mean of a bin, in its stds, over speed, current and time."""
     size = MATTERS * float(np.ptp(w.both.left))
     best: Misfit | None = None
-    for over, value, what in (
-        ("speed", w.speed, "rad/s"),
-        ("current", w.current, "A"),
-        ("time", w.time, "s"),
+    time = w.time, w.time
+    for over, (odd, even), what in (
+        ("speed", (w.odd.speed, w.even.speed), "rad/s"),
+        ("current", (w.odd.current, w.even.current), "A"),
+        ("time", time, "s"),
     ):
-        for some in np.array_split(np.argsort(value, kind="stable"), BINS):
-            off, sure = _mean(fit, w, s, some)
+        # a window is put by the rows that its residual is not of, or noise would sort residuals
+        bins = [np.array_split(np.argsort(v, kind="stable"), BINS) for v in (odd, even)]
+        for one, other in zip(*bins, strict=True):
+            off, sure = _mean(fit, w, s, one, other)
             if abs(off) > size and sure > max(SURE, 0.0 if best is None else best.sure):
-                at = f"{value[some].min():.3g} to {value[some].max():.3g} {what}"
+                at = f"{odd[one].min():.3g} to {odd[one].max():.3g} {what}"
                 best = Misfit(channel, unit, off, over, at, sure)
     return best
 
 
 def _mean(
-    fit: MotorFit, w: Windows, s: Sums, some: np.ndarray
+    fit: MotorFit,
+    w: Windows,
+    s: Sums,
+    even: Int[np.ndarray, " some"],
+    odd: Int[np.ndarray, " some"],
 ) -> tuple[float, float]:
-    """Weighted mean of the residuals of some windows, and its size in stds.
+    """Weighted mean of residuals of even and odd rows of some windows, and its size in stds.
 
     Cells of the length of the residuals' memory count as independent.
     """
-    chosen = np.zeros(len(w.time))
-    chosen[some] = s.weight[some]
-    total = float(chosen.sum())
+    weight, sum_ = np.zeros(len(w.time)), np.zeros(len(w.time))
+    for asked, some in ((s.even, even), (s.odd, odd)):
+        weight[some] += asked.weight[some]
+        sum_[some] += asked.weight[some] * asked.residual[some]
+    total = float(weight.sum())
     if total <= 0:
         return 0.0, 0.0
-    off = float((chosen * s.residual).sum() / total)
+    off = float(sum_.sum()) / total
     length = max(fit.remember, cell_length([w]))
-    away: Float[np.ndarray, "cell 1"] = celled((chosen * (s.residual - off))[:, None], w, length)
+    away = celled((sum_ - weight * off)[:, None], w, length)
     std = float(np.sqrt((away**2).sum())) / total
     return off, abs(off) / max(std, 1e-300)

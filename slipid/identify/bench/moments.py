@@ -43,30 +43,45 @@ Square = Float[np.ndarray, "moment moment"]
 
 
 @dataclass(frozen=True, eq=False)
+class Asked:
+    """Residuals of one half of the rows [V] or [A], their weights, and g of every window."""
+
+    residual: Float[np.ndarray, " window"]
+    weight: Float[np.ndarray, " window"]
+    moments: Float[np.ndarray, "window moment"]
+
+
+@dataclass(frozen=True, eq=False)
 class Sums:
-    """h, G of an equation, as means over the windows that count; its weights and residuals.
+    """h and G of an equation, and what they are made of.
 
     Attributes:
         constant: h. `slope`: G.
         tangent: G as weights change with the residuals: -dg / dk, which decides how sure k is.
-        each: g of every window at the coefficients that the weights are of.
-        residual: means of both halves [V] or [A].
-        weight: means of both halves, 0 where a window does not count.
+        even, odd: both halves; the moments of the two add up to g.
         scale: robust std of a residual of one half.
     """
 
     constant: Moments
     slope: Float[np.ndarray, "moment column"]
     tangent: Float[np.ndarray, "moment column"]
-    each: Float[np.ndarray, "window moment"]
-    residual: Float[np.ndarray, " window"]
-    weight: Float[np.ndarray, " window"]
+    even: Asked
+    odd: Asked
     scale: float
+
+    @property
+    def moments(self) -> Float[np.ndarray, "window moment"]:
+        return self.even.moments + self.odd.moments
+
+    @property
+    def residual(self) -> Float[np.ndarray, " window"]:
+        """Weighted mean of both halves."""
+        return (self.even.weight * self.even.residual + self.odd.weight * self.odd.residual) / 2
 
 
 def sums(w: Windows, coefficients: Float[np.ndarray, " column"], signals: int) -> Sums:
     """Sums at some coefficients; the first so many signals are asked."""
-    parts = []
+    totals, halves = [], []
     for mine, other in ((w.even, w.odd), (w.odd, w.even)):
         residual = mine.left - mine.signals @ coefficients
         scale = _scale(residual[w.usable])
@@ -74,9 +89,10 @@ def sums(w: Windows, coefficients: Float[np.ndarray, " column"], signals: int) -
         weight = w.usable * (DEGREES + 1) / (DEGREES + square)
         z = other.signals[:, :signals] * (weight / 2)[:, None]
         bent = z * ((DEGREES - square) / (DEGREES + square))[:, None]
-        known = z.T @ mine.left, z.T @ mine.signals, bent.T @ mine.signals, z * residual[:, None]
-        parts.append((*known, residual / 2, weight / 2, scale / 2))
-    return Sums(*(one + other for one, other in zip(*parts, strict=True)))
+        totals.append((z.T @ mine.left, z.T @ mine.signals, bent.T @ mine.signals, scale / 2))
+        halves.append(Asked(residual, weight, z * residual[:, None]))
+    constant, slope, tangent, scale = (a + b for a, b in zip(*totals, strict=True))
+    return Sums(constant, slope, tangent, *halves, scale)
 
 
 def start(w: Windows, signals: int, columns: list[int], rounds: int = 12) -> np.ndarray:
@@ -161,15 +177,18 @@ def widened(s: Square, groups: Float[np.ndarray, "group moment"]) -> Square:
     return np.asarray(stretch * np.maximum(value / chance, 1.0) @ stretch.T)
 
 
-def grouped(
-    each: Float[np.ndarray, "window moment"], w: Windows
-) -> Float[np.ndarray, "group moment"]:
-    """Sums over bins of about as many windows each, over speed and over current in each of them."""
-    group = np.zeros(len(w.time), int)
-    for k, some in enumerate(np.array_split(np.argsort(w.speed, kind="stable"), SPEEDS)):
-        within = some[np.argsort(w.current[some], kind="stable")]
-        for j, few in enumerate(np.array_split(within, CURRENTS)):
-            group[few] = k * CURRENTS + j
-    total = np.zeros((SPEEDS * CURRENTS, each.shape[1]))
-    np.add.at(total, group, each)
+def grouped(s: Sums, w: Windows) -> Float[np.ndarray, "group moment"]:
+    """Sums over windows alike in speed, and among these in current: about as many in each group.
+
+    A window is put where the half of its rows says that its residual is not of: its own noise would
+    put it where that noise is large.
+    """
+    total = np.zeros((SPEEDS * CURRENTS, s.even.moments.shape[1]))
+    for asked, other in ((s.even, w.odd), (s.odd, w.even)):
+        group = np.zeros(len(w.time), int)
+        for k, some in enumerate(np.array_split(np.argsort(other.speed, kind="stable"), SPEEDS)):
+            within = some[np.argsort(other.current[some], kind="stable")]
+            for j, few in enumerate(np.array_split(within, CURRENTS)):
+                group[few] = k * CURRENTS + j
+        np.add.at(total, group, asked.moments)
     return total

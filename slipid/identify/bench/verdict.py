@@ -1,6 +1,6 @@
 """What may be said of a motor on a bench: every number with its verdict, and what would tell more."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,11 +11,24 @@ from slipid.identify.fit_file import SCHEMA, number_json
 from slipid.identify.result import hash_of
 from slipid.identify.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, members, sentences
-from slipid.identify.verdicts.wording import VOLTAGE, listed
+from slipid.identify.verdicts.wording import VOLTAGE
 from slipid.support.content import Content
 
 ROWS_ELECTRICAL, ROWS_MECHANICAL = 2.0, 6.0
 """Rows in one time constant, L/R and J R / C_e^2, for inductance and inertia to be told."""
+_OF = {
+    "voltage": tuple(
+        f"motor.{name}"
+        for name in ("resistance", "back_emf", "brush_drop", "inductance", "voltage_offset")
+    ),
+    "current": tuple(
+        f"motor.{name}"
+        for name in ("coulomb_friction", "viscous_friction", "rotor_inertia", "current_offset")
+    ),
+}
+"""Numbers of the equation that is about each channel."""
+ONE_POINT = 0.05
+"""Range of the speed, over its largest, below which a log shows one point."""
 _CURES = (
     (("motor.inductance",), "log faster, several rows in L/R, with steps of the voltage"),
     (("motor.rotor_inertia",), "speed up and slow down, over some tenths of a second"),
@@ -94,9 +107,11 @@ def bench_fit(fits: Sequence[MotorFit]) -> BenchFit:
         slow = _too_slow(f)
         voltage = f.has_voltage
         numbers = estimates(f.space, f.choices, f.z, f.covariance, voltage, members(flat))
-        for e in (_judged(f, e, slow) for e in numbers):
+        doubted = {path for m in found[f.label] for path in _OF[m.channel]}
+        for e in (_judged(f, e, slow, doubted) for e in numbers):
             parameters[_labelled(e.path, f.label)] = replace(e, path=_labelled(e.path, f.label))
         for e in derived(f.space, f.z, f.covariance, voltage):
+            e = _judged(f, e, slow, doubted)
             path = "/".join(_labelled(p, f.label) for p in e.path.split("/"))
             ratios[path] = replace(e, path=path)
         own = [*slow.values(), *sentences(flat), *(m.text for m in found[f.label]), *_remarks(f)]
@@ -136,22 +151,30 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
         ("motor.rotor_inertia", mechanical, ROWS_MECHANICAL, "J R / C_e^2"),
     ):
         if path in f.space.place and constant < least * rows:
+            about = f"about {_time(constant)}" if constant > 0.05 * rows else "far shorter"
             slow[path] = (
-                f"{path} is not identified at this rate: its time constant {name} is about "
-                f"{_time(constant)}, and rows are {_time(rows)} apart: log {least:g} rows or more in it"
+                f"{path} is not identified at this rate: its time constant {name} is {about}, "
+                f"and rows are {_time(rows)} apart: log {least:g} rows or more in it"
             )
     return slow
+
+
+def _one_point(f: MotorFit) -> bool:
+    """Whether speed and voltage keep to one value each."""
+    used = f.amps.both.speed[f.amps.usable]
+    return float(np.ptp(np.quantile(used, (0.02, 0.98)))) < ONE_POINT * float(np.abs(used).max())
 
 
 def _time(seconds: float) -> str:
     return f"{1e3 * seconds:.2g} ms" if seconds < 1 else f"{seconds:.2g} s"
 
 
-def _judged(f: MotorFit, e: Estimate, slow: dict[str, str]) -> Estimate:
-    """The verdict, less what rows are too slow for and what may as well be 0."""
-    if e.path in slow and e.verdict != "not_identified":
+def _judged(f: MotorFit, e: Estimate, slow: Collection[str], doubted: Collection[str]) -> Estimate:
+    """The verdict, less what rows are too slow for, what may be 0, and what a misfit puts in doubt."""
+    if (e.path in slow or _one_point(f)) and e.verdict not in ("fixed", "not_identified"):
         return replace(e, verdict="not_identified", provenance="borrowed")
-    if e.path == "motor.inductance" and e.verdict == "identified" and e.value < FROM_ZERO * e.std:
+    small = e.path == "motor.inductance" and e.std is not None and e.value < FROM_ZERO * e.std
+    if e.verdict == "identified" and (small or {*e.path.split("/")} & {*doubted}):
         return replace(e, verdict="weak")
     return e
 
@@ -159,6 +182,11 @@ def _judged(f: MotorFit, e: Estimate, slow: dict[str, str]) -> Estimate:
 def _remarks(f: MotorFit) -> list[str]:
     """Further things that a reader must know."""
     said = []
+    if _one_point(f):
+        said.append(
+            "speed and voltage keep to one value: nothing can be told apart there: turn at several "
+            "speeds, both ways, and speed up and slow down"
+        )
     if not f.has_voltage:
         said.append(
             "without a voltage neither resistance nor back-EMF is known: friction and inertia are "
@@ -190,5 +218,5 @@ def _about(f: MotorFit) -> Content:
         "memory_s": f.remember,
         "windows": [len(w.time) for w in (f.volts, f.amps) if w is not None],
         "usable": [float(np.round(k, 3)) for k in kept],
-        "misfit": [listed([m.text]) for m in misfits(f)],
+        "misfit": [m.text for m in misfits(f)],
     }

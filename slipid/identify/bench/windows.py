@@ -44,10 +44,15 @@ BRAKES = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Half:
-    """What the even, or the odd, rows say of every window: signals of an equation, and its left."""
+    """What the even, or the odd, rows say of every window: signals of an equation, and its left.
+
+    With the means of speed [rad/s] and current [A].
+    """
 
     signals: Float[np.ndarray, "window column"]
     left: Float[np.ndarray, " window"]
+    speed: Float[np.ndarray, " window"]
+    current: Float[np.ndarray, " window"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +62,6 @@ class Windows:
     Attributes:
         even, odd: what both halves of the rows say.
         time: middle of each [s], from the first row of its record.
-        speed, current: means over each [rad/s], [A].
         record: number of the record that it is of.
         usable: False where the equation does not hold, at rest, or may not.
     """
@@ -65,16 +69,14 @@ class Windows:
     even: Half
     odd: Half
     time: Float[np.ndarray, " window"]
-    speed: Float[np.ndarray, " window"]
-    current: Float[np.ndarray, " window"]
     record: Int[np.ndarray, " window"]
     usable: Bool[np.ndarray, " window"]
 
     @property
     def both(self) -> Half:
         """Means of the two halves."""
-        signals = (self.even.signals + self.odd.signals) / 2
-        return Half(signals, (self.even.left + self.odd.left) / 2)
+        pairs = zip(vars(self.even).values(), vars(self.odd).values(), strict=True)
+        return Half(*((a + b) / 2 for a, b in pairs))
 
 
 def electrical(records: Sequence[Record], zero: float) -> Windows | None:
@@ -95,8 +97,9 @@ def electrical(records: Sequence[Record], zero: float) -> Windows | None:
         def half(
             row: "_Half", r: Record = r, sign: np.ndarray = sign, along: np.ndarray = along
         ) -> Half:
-            known = row.mean(r.current), row.mean(r.speed), sign, row.slope(r.current)
-            return Half(np.stack([*known, np.ones(len(sign)), along], 1), row.mean(r.voltage))
+            current, speed = row.mean(r.current), row.mean(r.speed)
+            known = current, speed, sign, row.slope(r.current), np.ones(len(sign)), along
+            return Half(np.stack(known, 1), row.mean(r.voltage), speed, current)
 
         parts.append(_cut(r, k, at, half))
     return _joined(parts)
@@ -112,11 +115,9 @@ def mechanical(records: Sequence[Record]) -> Windows:
         along = np.ones(len(rows)) if r.signed else np.sign(rows.mean(axis=1))
 
         def half(row: "_Half", r: Record = r, along: np.ndarray = along) -> Half:
-            speed = row.mean(r.speed)
-            return Half(
-                np.stack([row.slope(r.speed), np.tanh(speed / REST), speed, along], 1),
-                row.mean(r.current),
-            )
+            current, speed = row.mean(r.current), row.mean(r.speed)
+            known = row.slope(r.speed), np.tanh(speed / REST), speed, along
+            return Half(np.stack(known, 1), current, speed, current)
 
         parts.append(_cut(r, k, at, half, moving))
     return _joined(parts)
@@ -161,16 +162,16 @@ def _cut(
     usable: Bool[np.ndarray, " window"] | None = None,
 ) -> Windows:
     """Windows of one record."""
-    even, odd = _Half(r, at, 0), _Half(r, at, 1)
-    speed, current = ((even.mean(x) + odd.mean(x)) / 2 for x in (r.speed, r.current))
-    usable = np.ones(len(speed), bool) if usable is None else usable
+    halves = _Half(r, at, 0), _Half(r, at, 1)
+    usable = np.ones(len(at.middle), bool) if usable is None else usable
     if not r.signed:
         # a magnitude was given the sign of the speed: wrong where the motor brakes
-        faster = (even.slope(r.speed) + odd.slope(r.speed)) / 2 * np.sign(speed)
+        speed, slope = (sum(getattr(h, k)(r.speed) for h in halves) for k in ("mean", "slope"))
+        faster = slope * np.sign(speed)
         spread = 1.4826 * np.median(np.abs(faster)) if len(faster) else 0.0
         usable = usable & (faster > -BRAKES * spread)
-    time, count = r.time[at.middle] - r.time[0], np.full(len(speed), number)
-    return Windows(half(even), half(odd), time, speed, current, count, usable)
+    time, count = r.time[at.middle] - r.time[0], np.full(len(at.middle), number)
+    return Windows(*map(half, halves), time, count, usable)
 
 
 def _jumps(r: Record, half: int, middle: Int[np.ndarray, " window"]) -> Bool[np.ndarray, " window"]:
@@ -187,11 +188,11 @@ def _jumps(r: Record, half: int, middle: Int[np.ndarray, " window"]) -> Bool[np.
 
 
 def _joined(parts: Sequence[Windows]) -> Windows:
-    def halves(name: str) -> Half:
-        found = [getattr(p, name) for p in parts]
-        return Half(np.concatenate([h.signals for h in found]), np.concatenate([h.left for h in found]))
+    """Windows of several records, one after the other."""
 
-    names = ("time", "speed", "current", "record", "usable")
-    return Windows(
-        halves("even"), halves("odd"), *(np.concatenate([getattr(p, n) for p in parts]) for n in names)
-    )
+    def halves(found: Sequence[Half]) -> Half:
+        return Half(*map(np.concatenate, zip(*(vars(h).values() for h in found), strict=True)))
+
+    rest = ([getattr(p, name) for p in parts] for name in ("time", "record", "usable"))
+    even, odd = halves([p.even for p in parts]), halves([p.odd for p in parts])
+    return Windows(even, odd, *map(np.concatenate, rest))
