@@ -81,7 +81,9 @@ def bench(
     from slipid.report.bench import show_bench
 
     if profile:
-        raise DataError("--profile: not of drive = 'motor', whose intervals need none; leave it out")
+        raise DataError(
+            "--profile: not of drive = 'motor', whose intervals need none; leave it out"
+        )
     with Reporter(quiet=quiet) as report:
         fit, written = identify_bench(config, data, out, report)
         report.stage("drawing")

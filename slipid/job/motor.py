@@ -34,7 +34,8 @@ from slipid.support.progress import Reporter
 class BenchJob:
     """Records of every motor by its label ("" of a single one), and what is wanted of its numbers.
 
-    `skipped` and `taken` are lines for people; `units_said`: the current's unit was named.
+    `skipped` and `taken` are lines for people; `units_said`: the current's unit is not doubted, as it
+    was named, or something of the resistance was said.
     """
 
     records: Mapping[str, tuple[Record, ...]]
@@ -81,7 +82,10 @@ def read_bench_job(config: Config, root: Path, report: Reporter) -> BenchJob:
     lines = (*skipped, *left)
     for line in lines:
         report.line(line)
-    return BenchJob(records, choices, lines)
+    said = any(
+        fnmatch.fnmatch("motor.resistance", c.pattern) for cs in choices.values() for c in cs
+    )
+    return BenchJob(records, choices, lines, (), said)
 
 
 def read_one(
@@ -128,7 +132,9 @@ def records_of(log: Log, layout: Layout) -> list[Record]:
 
 def _labels(names: Sequence[str], motors: int, where: str) -> tuple[str, ...]:
     if names and len(names) != motors:
-        raise DataError(f"{where}: robot.names: {len(names)} names; expected {motors}, one per motor")
+        raise DataError(
+            f"{where}: robot.names: {len(names)} names; expected {motors}, one per motor"
+        )
     return tuple(names) or (("",) if motors == 1 else tuple(str(k + 1) for k in range(motors)))
 
 
@@ -203,7 +209,11 @@ def check_bench(
     content: Content = {
         "schema": "slipid.check/1",
         "drive": "motor",
-        "logs": [_seen(f"{r.name}@{label}" if label else r.name, r) for label, rs in job.records.items() for r in rs],
+        "logs": [
+            _seen(f"{r.name}@{label}" if label else r.name, r)
+            for label, rs in job.records.items()
+            for r in rs
+        ],
         "parameters": {
             path: {"unit": e.unit, "ratio": e.ratio, "verdict": e.verdict}
             for path, e in fit.parameters.items()
@@ -232,5 +242,3 @@ def _seen(name: str, r: Record) -> Content:
         "speed": span(r.speed),
         "current_is_signed": r.signed,
     }
-
-

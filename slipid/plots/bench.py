@@ -30,7 +30,11 @@ def bench_figure(fit: MotorFit) -> Figure:
     if fit.volts is not None and fit.volts_sums is not None:
         pairs.insert(0, ("voltage", "V", fit.volts, fit.volts_sums))
     which = f"motor {fit.label}: " if fit.label else ""
-    made = figure(13.0, 3.9 * len(pairs) + 0.8, f"{which}measured (gray) and what the fit makes of the rest (blue)")
+    made = figure(
+        13.0,
+        3.9 * len(pairs) + 0.8,
+        f"{which}measured (gray) and what the fit makes of the rest (blue)",
+    )
     grid = made.add_gridspec(2 * len(pairs), 3, height_ratios=[2.0, 1.2] * len(pairs))
     for k, (name, unit, w, s) in enumerate(pairs):
         top = made.add_subplot(grid[2 * k, :])

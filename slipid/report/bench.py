@@ -27,7 +27,15 @@ def show_bench(page: Page, fit: BenchFit, taken: Sequence[str] = ()) -> None:
 
 def show_bench_check(page: Page, found: Content) -> None:
     """Write the content of check.json of motors."""
-    columns = ("log", "rows", "seconds", "rows/s", r"voltage \[V]", r"current \[A]", r"speed \[rad/s]")
+    columns = (
+        "log",
+        "rows",
+        "seconds",
+        "rows/s",
+        r"voltage \[V]",
+        r"current \[A]",
+        r"speed \[rad/s]",
+    )
     made = table(columns)
     for row in found["logs"]:
         spans = [
@@ -37,7 +45,9 @@ def show_bench_check(page: Page, found: Content) -> None:
         rate = f"{1 / row['row_period_s']:.4g}"
         made.add_row(Text(row["name"]), str(row["rows"]), f"{row['seconds']:.1f}", rate, *spans)
     page.table(made)
-    before = table(("parameter", "unit", "std after / before", "verdict"), "\nwhat the logs can tell")
+    before = table(
+        ("parameter", "unit", "std after / before", "verdict"), "\nwhat the logs can tell"
+    )
     for path, e in found["parameters"].items():
         if e["ratio"] is not None:
             before.add_row(Text(path), e["unit"], f"{e['ratio']:.3f}", verdict(e["verdict"]))

@@ -118,6 +118,7 @@ def layout_of(path: Path, given: Mapping[str, Named], header: Header, signed: bo
         first_data_row=header.first_data_row,
         gear_ratio=SHAFT,
         current_is_signed=signed,
+        drop_repeated_time=True,
     )
 
 
@@ -143,10 +144,9 @@ def _guessed(channel: str, columns: list[str]) -> tuple[str, ...]:
     found = []
     for name in columns:
         words = _words(name)
-        bare = [re.sub(r"\d+$", "", w) for w in words]
-        hits = [w for w in bare if w in WORDS[channel] and (len(w) > 1 or w == bare[0])]
+        hits = [w for w in words if w in WORDS[channel] and (len(w) > 1 or w == words[0])]
         # a letter alone may be a unit: of a name with more words it counts in the first place only
-        if hits and not {*bare} & _NOT and not _meant_otherwise(channel, bare):
+        if hits and not {*words} & _NOT and not _meant_otherwise(channel, words):
             found.append(name)
     return tuple(found[:1] if channel in ("time", "bus_voltage") else found)
 
@@ -157,7 +157,8 @@ def _meant_otherwise(channel: str, words: list[str]) -> bool:
 
 
 def _words(name: str) -> list[str]:
-    return [w for w in re.split(r"[^a-z0-9%/]+", name.lower()) if w]
+    """Words of a name; numbers only count motors."""
+    return [w for w in re.split(r"[^a-z%/]+", name.lower()) if w]
 
 
 def _unit(name: str, channel: str) -> str:

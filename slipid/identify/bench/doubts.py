@@ -18,14 +18,12 @@ FAST = 3000.0
 """Shaft speed that no brushed motor has [rad/s]."""
 POWER = 2e4
 """U^2 / R above which a current is rather in milliamperes [W]."""
-MAGNITUDE = 0.02
-"""Part of the rows of a current with a sign that have the other one, at least."""
 
 
 def refuse(records: Sequence[Record], label: str, units_said: bool = False) -> None:
     """DataError where the records cannot be what they are said to be; what to do stands in it.
 
-    `units_said`: the user named the unit of the current, which is then not doubted.
+    `units_said`: the unit of the current is not doubted, whatever comes of it.
     """
     where = records[0].name + (f", motor {label}" if label else "")
     speed = np.concatenate([r.speed for r in records])
@@ -60,17 +58,20 @@ def _signed(where: str, speed: np.ndarray, current: np.ndarray) -> None:
     driven = back.mean() > 0.05 and float(np.median(current[back])) > 0
     if driven and negative == 0 and current.min() > -level:
         found = "the current is never negative, though the shaft turns both ways"
-        _fail(where, found, "a signed current, or --unsigned (current_is_signed = false) for magnitudes")
+        _fail(
+            where,
+            found,
+            "a signed current, or --unsigned (current_is_signed = false) for magnitudes",
+        )
 
 
-def _signs(
-    where: str, records: Sequence[Record], volts: Windows | None, amps: Windows
-) -> None:
+def _signs(where: str, records: Sequence[Record], volts: Windows | None, amps: Windows) -> None:
     """Refuse columns that are exchanged or reversed, by signs no motor has.
 
     Inertia makes the current rise with acceleration, and back-EMF the voltage with speed.
     """
-    inertia = _sure(amps, 0)
+    # magnitudes were given their sign by the speed, which proves nothing
+    inertia = _sure(amps, 0) if all(r.signed for r in records) else 0.0
     if volts is None:
         if inertia < -SURE:
             found = "the shaft speeds up against its current"
@@ -107,4 +108,8 @@ def _milliamperes(where: str, records: Sequence[Record], volts: Windows) -> None
             f"a resistance of {found[0]:.2g} ohm at {highest:.3g} V, {highest**2 / found[0] / 1e3:.0f} "
             "kW at standstill"
         )
-        _fail(where, found_text, "the current in amperes (I:mA if these are mA, I:A if they are not)")
+        _fail(
+            where,
+            found_text,
+            "the current in amperes (I:mA if these are mA, I:A or a prior of motor.resistance if not)",
+        )

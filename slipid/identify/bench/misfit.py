@@ -15,6 +15,8 @@ SURE = 5.0
 """Stds by which the mean of a bin is not 0."""
 MATTERS = 0.01
 """Part of the range of the voltage, or of the current, from which a mean matters to people."""
+FEWEST = 5
+"""Stretches of time in a bin by which its scatter is judged, at least."""
 LONG_S = 0.3
 """Memory of residuals from which a reader is told [s]."""
 
@@ -52,6 +54,7 @@ def _worst(fit: MotorFit, channel: str, unit: str, w: Windows, s: Sums) -> Misfi
     """Largest mean of a bin, in its stds, over speed, current and time."""
     size = MATTERS * float(np.ptp(w.both.left))
     best: Misfit | None = None
+    used = np.flatnonzero(w.usable)
     time = w.time, w.time
     for over, (odd, even), what in (
         ("speed", (w.odd.speed, w.even.speed), "rad/s"),
@@ -59,7 +62,7 @@ def _worst(fit: MotorFit, channel: str, unit: str, w: Windows, s: Sums) -> Misfi
         ("time", time, "s"),
     ):
         # a window is put by the rows that its residual is not of, or noise would sort residuals
-        bins = [np.array_split(np.argsort(v, kind="stable"), BINS) for v in (odd, even)]
+        bins = [np.array_split(used[np.argsort(v[used], kind="stable")], BINS) for v in (odd, even)]
         for one, other in zip(*bins, strict=True):
             off, sure = _mean(fit, w, s, one, other)
             if abs(off) > size and sure > max(SURE, 0.0 if best is None else best.sure):
@@ -89,5 +92,8 @@ def _mean(
     off = float(sum_.sum()) / total
     length = max(fit.remember, cell_length([w]))
     away = celled((sum_ - weight * off)[:, None], w, length)
-    std = float(np.sqrt((away**2).sum())) / total
-    return off, abs(off) / max(std, 1e-300)
+    square = away[:, 0] ** 2
+    # too few stretches of time to judge by, or one that outweighs the others
+    if np.count_nonzero(square) < FEWEST or square.max() > square.sum() / 2:
+        return 0.0, 0.0
+    return off, abs(off) * total / float(np.sqrt(square.sum()))

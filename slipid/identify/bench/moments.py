@@ -102,7 +102,9 @@ def start(w: Windows, signals: int, columns: list[int], rounds: int = 12) -> np.
     asked = [k for k in columns if k < signals]
     for _ in range(rounds):
         halves = ((w.even, w.odd, weight[0]), (w.odd, w.even, weight[1]))
-        slope = sum(o.signals[:, asked].T @ (k[:, None] * m.signals[:, asked]) for m, o, k in halves)
+        slope = sum(
+            o.signals[:, asked].T @ (k[:, None] * m.signals[:, asked]) for m, o, k in halves
+        )
         constant = sum(o.signals[:, asked].T @ (k * m.left) for m, o, k in halves)
         found[asked] = np.linalg.lstsq(slope, constant, rcond=1e-10)[0]
         weight = [_weights(m, found, w.usable) for m in (w.even, w.odd)]
