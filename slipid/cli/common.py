@@ -70,9 +70,9 @@ def on_wheels(command: Callable[Words, int]) -> Callable[Words, None]:
         paths = (value for value in (*args, *options.values()) if isinstance(value, Path))
         if (first := next(paths, None)) is not None and is_bench(first):
             raise DataError(
-                f"{first}: drive = 'motor' has no wheels on a floor: `slipid {command.__name__}` does "
-                "not apply; `slipid check`, `identify` and `motor` do, and a robot's config takes the "
-                "numbers by [robot] motor = 'FILE'"
+                f"{first}: drive = 'motor' has no wheels on a floor: `slipid {command.__name__}` "
+                "does not apply; `slipid check`, `identify` and `motor` do, and a robot's config "
+                "takes the numbers by [robot] motor = 'FILE'"
             )
         return command(*args, **options)
 

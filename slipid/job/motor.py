@@ -34,8 +34,8 @@ from slipid.support.progress import Reporter
 class BenchJob:
     """Records of every motor by its label ("" of a single one), and what is wanted of its numbers.
 
-    `skipped` and `taken` are lines for people; `units_said`: the current's unit is not doubted, as it
-    was named, or something of the resistance was said.
+    `skipped` and `taken` are lines for people; `units_said`: the unit of the current is not
+    doubted, as it was named, or something was said of the resistance.
     """
 
     records: Mapping[str, tuple[Record, ...]]
@@ -68,8 +68,8 @@ def read_bench_job(config: Config, root: Path, report: Reporter) -> BenchJob:
     for section, paths in found:
         layout = of_config.layout_of(config, section)
         for path in paths:
-            for log in read_logs(path, layout, root, None, section.load):
-                parts.append(records_of(log, layout))
+            logs = read_logs(path, layout, root, None, section.load)
+            parts += [records_of(log, layout) for log in logs]
     counts = {len(p) for p in parts}
     if len(counts) > 1:
         raise DataError(f"{config.path}: logs of {min(counts)} and of {max(counts)} motors")

@@ -25,7 +25,7 @@ def bench_plots(fit: BenchFit, out: Path) -> list[Path]:
 
 
 def bench_figure(fit: MotorFit) -> Figure:
-    """Voltage and current over time, measured and fitted; residuals over time, speed and current."""
+    """Voltage and current, measured and fitted; residuals over time, speed and current."""
     pairs = [("current", "A", fit.amps, fit.amps_sums)]
     if fit.volts is not None and fit.volts_sums is not None:
         pairs.insert(0, ("voltage", "V", fit.volts, fit.volts_sums))

@@ -1,4 +1,4 @@
-"""Logs of a motor on a bench, from the test site's motor, which shares no formula with the model."""
+"""Logs of a motor on a bench, from the test site's motor, which shares nothing with the model."""
 
 from __future__ import annotations
 

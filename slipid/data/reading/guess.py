@@ -1,4 +1,4 @@
-"""Columns of a log of a motor that nobody described: guessed by name, or named on a command line."""
+"""Columns of a log of a motor that nobody described: guessed by name, or named by a person."""
 
 import re
 from collections.abc import Mapping

@@ -104,12 +104,10 @@ def _milliamperes(where: str, records: Sequence[Record], volts: Windows) -> None
     found = start(volts, 5, list(range(5)))
     highest = max(float(np.abs(r.voltage).max()) for r in records if r.voltage is not None)
     if 0 < found[0] < highest**2 / POWER and _sure(volts, 0) > SURE:
-        found_text = (
-            f"a resistance of {found[0]:.2g} ohm at {highest:.3g} V, {highest**2 / found[0] / 1e3:.0f} "
-            "kW at standstill"
-        )
+        heat = highest**2 / found[0] / 1e3
+        said = f"a resistance of {found[0]:.2g} ohm at {highest:.3g} V, {heat:.0f} kW at standstill"
         _fail(
             where,
-            found_text,
-            "the current in amperes (I:mA if these are mA, I:A or a prior of motor.resistance if not)",
+            said,
+            "the current in amperes (I:mA for mA; else I:A, or a prior of motor.resistance)",
         )

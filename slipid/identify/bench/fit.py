@@ -5,8 +5,8 @@ With the moments g of both equations, their scatter S and Gaussian priors in the
     -2 log pi(z) = g(z)^T S^-1 g(z) + |(z - mean) / std|^2 + const
 
 (Chernozhukov and Hong 2003: as good as a likelihood where the mean of g is what is known). Weights,
-S and z are found in turn. Its curvature J^T J, of the residuals in that sum, is at once the sandwich
-of robust statistics: intervals hold although noise is neither white nor Gaussian nor known.
+S and z are found in turn. Its curvature J^T J, of the residuals in that sum, is the sandwich of
+robust statistics at once: intervals hold although noise is neither white nor Gaussian nor known.
 
 Why not least squares or a Kalman smoother? The current is a noisy input: least squares has R too
 small by the part of the noise in the current's variance, and a smoother that knows better needs the
@@ -183,15 +183,8 @@ def _first(volts: Windows | None, amps: Windows, signed: bool) -> BenchMotor:
     j, tau, b = (float(x) * c if x > 0 else float(y) for x, y in zip(k, torque, strict=False))
     zero = float(k[3])
     return BenchMotor(
-        resistance=r,
-        back_emf=c,
-        inductance=slow,
-        brush_drop=drop,
-        coulomb_friction=tau,
-        viscous_friction=b,
-        rotor_inertia=j,
-        current_offset=zero,
-        voltage_offset=one + r * zero,
+        # in order of declaration
+        *map(jnp.asarray, (r, c, slow, drop, tau, b, j, zero, one + r * zero))
     )
 
 
@@ -216,7 +209,7 @@ def _chosen(space: Space, choices: Sequence[Choice]) -> np.ndarray:
 def _scatter(
     volts: Windows | None, v: Sums | None, amps: Windows, a: Sums
 ) -> tuple[Float[np.ndarray, "moment moment"], float, float]:
-    """Scatter of all moments; time that residuals remember [s], and how many such times there are."""
+    """Scatter of all moments; time that residuals remember [s], and how many such there are."""
     pairs = [(amps, a)] if volts is None or v is None else [(volts, v), (amps, a)]
     length = cell_length([w for w, _ in pairs])
     parts = [celled(s.moments, w, length) for w, s in pairs]
@@ -237,9 +230,9 @@ def _solved(
     root = np.linalg.inv(np.linalg.cholesky(s / std / std[:, None] + 1e-9 * np.eye(len(s)))) / std
     if v is None:
         root = np.concatenate([np.zeros((len(root), ASKED[0])), root], axis=1)
-    blocks = [_Block.of(v, ASKED[0], len(VOLTS)), _Block.of(a, *a.slope.shape)]
-    found, jacobian = _searched(jnp.asarray(z), _Held(space, *blocks, jnp.asarray(root)))
-    jacobian = np.asarray(jacobian)
+    volts, amps = _Block.of(v, ASKED[0], len(VOLTS)), _Block.of(a, *a.slope.shape)
+    found, tangent = _searched(jnp.asarray(z), _Held(space, volts, amps, jnp.asarray(root)))
+    jacobian = np.asarray(tangent)
     return np.asarray(found), np.linalg.inv(jacobian.T @ jacobian)
 
 

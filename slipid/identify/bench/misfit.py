@@ -37,7 +37,8 @@ class Misfit:
         return (
             f"the {self.channel} is {abs(self.off):.2g} {self.unit} "
             f"{'above' if self.off > 0 else 'below'} the model's at {self.at} ({self.over}, "
-            f"{self.sure:.0f} stds): the motor has something that the model lacks, intervals are wider"
+            f"{self.sure:.0f} stds): the motor has something that the model lacks, and intervals "
+            "are wider for it"
         )
 
 

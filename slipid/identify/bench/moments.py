@@ -92,7 +92,8 @@ def sums(w: Windows, coefficients: Float[np.ndarray, " column"], signals: int) -
         totals.append((z.T @ mine.left, z.T @ mine.signals, bent.T @ mine.signals, scale / 2))
         halves.append(Asked(residual, weight, z * residual[:, None]))
     constant, slope, tangent, scale = (a + b for a, b in zip(*totals, strict=True))
-    return Sums(constant, slope, tangent, *halves, scale)
+    even, odd = halves
+    return Sums(constant, slope, tangent, even, odd, scale)
 
 
 def start(w: Windows, signals: int, columns: list[int], rounds: int = 12) -> np.ndarray:

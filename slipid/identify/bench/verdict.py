@@ -1,4 +1,4 @@
-"""What may be said of a motor on a bench: every number with its verdict, and what would tell more."""
+"""What may be said of a motor on a bench: numbers with verdicts, and what would tell more."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -51,7 +51,7 @@ class BenchFit:
 
     Attributes:
         fits: of each motor.
-        parameters, derived: numbers, and quotients of them, by path; `@label` where motors have one.
+        parameters, derived: numbers, and quotients of them, by path, with `@label` of a motor.
         messages: what a reader must know, one sentence each.
         misfits: what the models lack, by label.
     """
@@ -170,7 +170,7 @@ def _time(seconds: float) -> str:
 
 
 def _judged(f: MotorFit, e: Estimate, slow: Collection[str], doubted: Collection[str]) -> Estimate:
-    """The verdict, less what rows are too slow for, what may be 0, and what a misfit puts in doubt."""
+    """The verdict, less what rows are too slow for, what may be 0, and what a misfit disputes."""
     if (e.path in slow or _one_point(f)) and e.verdict not in ("fixed", "not_identified"):
         return replace(e, verdict="not_identified", provenance="borrowed")
     small = e.path == "motor.inductance" and e.std is not None and e.value < FROM_ZERO * e.std
@@ -194,13 +194,13 @@ def _remarks(f: MotorFit) -> list[str]:
         )
     if not all(r.signed for r in f.records):
         said.append(
-            "currents are magnitudes: they were given the sign of the speed, stretches in which the "
-            "motor may brake were left out, and the zero of the ammeter looks like friction"
+            "currents are magnitudes: they were given the sign of the speed, stretches in which "
+            "the motor may brake were left out, and the zero of the ammeter looks like friction"
         )
     if f.remember > LONG_S:
         said.append(
-            f"residuals remember {f.remember:.2g} s: the intervals count {f.stretches:.0f} stretches "
-            "of that length, not the rows"
+            f"residuals remember {f.remember:.2g} s: the intervals count {f.stretches:.0f} "
+            "stretches of that length, not the rows"
         )
     if "motor.rotor_inertia" in f.space.place:
         said.append("motor.rotor_inertia is that of the rotor with everything that turned with it")

@@ -23,10 +23,10 @@ from slipid.identify.bench.motor import BRUSH_CURRENT, REST
 from slipid.identify.bench.record import Record
 
 ELECTRICAL_S, MECHANICAL_S = 3e-3, 1e-2
-"""Half the length of a window, about the time constants of small motors: transients are seen [s]."""
+"""Half the length of a window, about a time constant of small motors: transients are seen [s]."""
 LEAST, ENOUGH = 2, 8
-"""Half the length in rows at least, for the odd rows to show a slope; from where it is not all noise:
-longer windows than the mechanical ones are not made for that."""
+"""Half the length in rows: at least, for the odd rows to show a slope; and where it is not all noise,
+for which no window is made longer than a mechanical one."""
 MOST = 20_000
 """Windows of one record, at most."""
 WIDE = 4
@@ -86,7 +86,7 @@ def electrical(records: Sequence[Record], zero: float) -> Windows | None:
     """
     parts = []
     for k, r in enumerate(records):
-        if r.voltage is None:
+        if (measured := r.voltage) is None:
             return None
         at = _Places(r, ELECTRICAL_S)
         wide = np.arange(-WIDE * at.half, WIDE * at.half + 1)
@@ -95,11 +95,15 @@ def electrical(records: Sequence[Record], zero: float) -> Windows | None:
         sign = np.tanh((r.current[near].mean(axis=1) - zero * along) / BRUSH_CURRENT)
 
         def half(
-            row: "_Half", r: Record = r, sign: np.ndarray = sign, along: np.ndarray = along
+            row: "_Half",
+            r: Record = r,
+            measured: np.ndarray = measured,
+            sign: np.ndarray = sign,
+            along: np.ndarray = along,
         ) -> Half:
             current, speed = row.mean(r.current), row.mean(r.speed)
             known = current, speed, sign, row.slope(r.current), np.ones(len(sign)), along
-            return Half(np.stack(known, 1), row.mean(r.voltage), speed, current)
+            return Half(np.stack(known, 1), row.mean(measured), speed, current)
 
         parts.append(_cut(r, k, at, half))
     return _joined(parts)
@@ -162,7 +166,7 @@ def _cut(
     usable: Bool[np.ndarray, " window"] | None = None,
 ) -> Windows:
     """Windows of one record."""
-    halves = _Half(r, at, 0), _Half(r, at, 1)
+    even, odd = halves = _Half(r, at, 0), _Half(r, at, 1)
     usable = np.ones(len(at.middle), bool) if usable is None else usable
     if not r.signed:
         # a magnitude was given the sign of the speed: wrong where the motor brakes
@@ -171,7 +175,7 @@ def _cut(
         spread = 1.4826 * np.median(np.abs(faster)) if len(faster) else 0.0
         usable = usable & (faster > -BRAKES * spread)
     time, count = r.time[at.middle] - r.time[0], np.full(len(at.middle), number)
-    return Windows(*map(half, halves), time, count, usable)
+    return Windows(half(even), half(odd), time, count, usable)
 
 
 def _jumps(r: Record, half: int, middle: Int[np.ndarray, " window"]) -> Bool[np.ndarray, " window"]:
