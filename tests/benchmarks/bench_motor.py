@@ -32,11 +32,12 @@ def test_intervals_hold_the_truth(inertia, rate, drop):
         value = np.array([e.value for e in found])
         inside = np.mean([e.interval90[0] <= true <= e.interval90[1] for e in found])
         claimed = np.mean([e.verdict == "identified" for e in found])
-        size = abs(true) or 1.0
+        percent = 100 / (abs(true) or 1.0)
+        said = np.mean([e.std for e in found])
         print(
-            f"  {path:24} bias {100 * (value.mean() - true) / size:7.2f} %, scatter "
-            f"{100 * value.std() / size:6.2f} %, said {100 * np.mean([e.std for e in found]) / size:6.2f} "
-            f"%, 90 % intervals hold {inside:.2f}, identified {claimed:.2f}"
+            f"  {path:24} bias {percent * (value.mean() - true):7.2f} %, "
+            f"scatter {percent * value.std():6.2f} %, said {percent * said:6.2f} %, "
+            f"90 % intervals hold {inside:.2f}, identified {claimed:.2f}"
         )
         # of what is called identified, intervals hold the truth
         assert claimed < 0.5 or inside >= low, path

@@ -38,9 +38,13 @@ class Named:
 
 @dataclass(frozen=True)
 class Header:
-    """Names of the columns, the character between them, and the line of each part from 1."""
+    """Names of the columns and their units ("" where none is written), and where both stand.
+
+    Lines are counted from 1; a line of units may be above the names or below them.
+    """
 
     columns: tuple[str, ...]
+    units: tuple[str, ...]
     delimiter: str
     names_row: int
     first_data_row: int
@@ -63,15 +67,23 @@ def header_of(path: Path, delimiter: str | None) -> Header:
     for k, line in enumerate(lines):
         between = delimiter or max(";\t|,", key=line.count)
         if line.count(between) and _numbers(cells := _cells(line, between)):
-            names = _cells(lines[k - 1], between) if k else []
-            row = k
-            if k > 1 and all(c.lower() in _UNITS for c in names if c):
-                names, row = _cells(lines[k - 2], between), k - 1
+            above = [_cells(lines[j], between) for j in (k - 1, k - 2) if j >= 0]
+            names, other = [*above, [], []][:2]
+            row, units = k, other if _are_units(other) else []
+            if _are_units(names):
+                names, units, row = other, names, k - 1
             if k == 0 or len(names) < len([c for c in cells if c]):
                 found = f"no names for {len(cells)} columns"
                 raise bad_data(path, found, "a line of column names above the numbers", row=k + 1)
-            return Header(tuple(n for n in names if n), between, row, k + 1)
+            known = tuple(n for n in names if n)
+            return Header(known, (*units, *[""] * len(known))[: len(known)], between, row, k + 1)
     raise bad_data(path, "no row of numbers", "a CSV file with column names and rows of numbers")
+
+
+def _are_units(cells: list[str]) -> bool:
+    """Whether most cells of a line are units."""
+    known = [c.lower() in _UNITS for c in cells if c]
+    return sum(known) > len(known) / 2
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
@@ -96,7 +108,7 @@ def layout_of(path: Path, given: Mapping[str, Named], header: Header, signed: bo
             if name not in header.columns:
                 found = f"no column '{name}'{near(name, header.columns)}"
                 raise bad_data(path, found, f"one of {', '.join(header.columns)}")
-        unit = wish.unit or _unit(wish.columns[0], channel)
+        unit = wish.unit or _unit(wish.columns[0], channel, header)
         channels[channel] = Channel(wish.columns, unit)
     taken = {c for channel in channels.values() for c in channel.columns}
     for channel in WORDS:
@@ -105,7 +117,7 @@ def layout_of(path: Path, given: Mapping[str, Named], header: Header, signed: bo
         found_columns = _guessed(channel, [c for c in header.columns if c not in taken])
         if channel in channels or other in channels or more or not found_columns:
             continue
-        channels[channel] = Channel(found_columns, _unit(found_columns[0], channel))
+        channels[channel] = Channel(found_columns, _unit(found_columns[0], channel, header))
         taken |= {*found_columns}
     if "voltage" not in channels and not {"duty", "bus_voltage"} <= channels.keys():
         channels = {k: v for k, v in channels.items() if k not in ("duty", "bus_voltage")}
@@ -161,9 +173,12 @@ def _words(name: str) -> list[str]:
     return [w for w in re.split(r"[^a-z%/]+", name.lower()) if w]
 
 
-def _unit(name: str, channel: str) -> str:
-    """Unit that stands in a name, else the usual one."""
+def _unit(name: str, channel: str, header: Header) -> str:
+    """Unit that is written for a column, or stands in its name, else the usual one."""
     usual = CHANNELS[channel]
+    written = header.units[header.columns.index(name)]
+    if written and converts(written, usual):
+        return written
     for word in reversed(_words(name)[1:] + [w for w in _words(name) if w == "rpm"]):
         unit = _UNITS.get(word)
         if unit is not None and converts(unit, usual):

@@ -13,6 +13,7 @@ small by the part of the noise in the current's variance, and a smoother that kn
 spectra of three noises and what the voltage did between rows. Here no noise has to be known.
 """
 
+import fnmatch
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -203,7 +204,7 @@ def _scaled(records: Sequence[Record], resistance: float) -> list[Choice]:
 def _chosen(space: Space, choices: Sequence[Choice]) -> np.ndarray:
     """Coordinates that the user gave a start."""
     wanted = [c.pattern for c in choices if c.start is not None]
-    return space.where(lambda e: e.path in wanted)
+    return space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in wanted))
 
 
 def _scatter(

@@ -29,6 +29,8 @@ _OF = {
 """Numbers of the equation that is about each channel."""
 ONE_POINT = 0.05
 """Range of the speed, over its largest, below which a log shows one point."""
+SLOW_S = 1.0
+"""Time between rows from which its unit is doubted [s]."""
 _CURES = (
     (("motor.inductance",), "log faster, several rows in L/R, with steps of the voltage"),
     (("motor.rotor_inertia",), "speed up and slow down, over some tenths of a second"),
@@ -196,6 +198,11 @@ def _remarks(f: MotorFit) -> list[str]:
         said.append(
             "currents are magnitudes: they were given the sign of the speed, stretches in which "
             "the motor may brake were left out, and the zero of the ammeter looks like friction"
+        )
+    if f.period > SLOW_S:
+        said.append(
+            f"rows are {f.period:.3g} s apart: if the time is in milliseconds, say so (t:ms); "
+            "inertia and inductance come from it"
         )
     if f.remember > LONG_S:
         said.append(

@@ -25,8 +25,8 @@ from slipid.identify.bench.record import Record
 ELECTRICAL_S, MECHANICAL_S = 3e-3, 1e-2
 """Half the length of a window, about a time constant of small motors: transients are seen [s]."""
 LEAST, ENOUGH = 2, 8
-"""Half the length in rows: at least, for the odd rows to show a slope; and where it is not all noise,
-for which no window is made longer than a mechanical one."""
+"""Half the length in rows: at least, for the odd rows to show a slope; and where it is not all
+noise, for which no window is made longer than a mechanical one."""
 MOST = 20_000
 """Windows of one record, at most."""
 WIDE = 4
