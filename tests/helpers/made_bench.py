@@ -53,15 +53,19 @@ def driven(
     drop: float = 0.0,
     profile: Callable[[float], float] = steps_and_ramps,
     dt: float = 1e-4,
+    turn: float = 0.05,
 ) -> np.ndarray:
-    """Time, voltage, current, speed, step by step; dry friction holds what it can hold."""
+    """Time, voltage, current, speed, step by step; dry friction holds what it can hold.
+
+    The drop of the brushes turns over the current `turn` [A].
+    """
     drive = OpenLoop(Motor(supply_v=48.0, supply_ohm=0.0, efficiency=1.0), SpeedLoop(), 1.0, 1, dt)
     held = TRUTH["coulomb_friction"] * dt / inertia
     rows, speed = np.empty((round(seconds / dt), 4)), 0.0
     for k in range(len(rows)):
         volts, amps = profile(k * dt), drive.current[0]
         rows[k] = k * dt, volts, amps, speed
-        (torque,) = drive.step([volts - drop * np.tanh(amps / 0.02)], [0.0], [speed])
+        (torque,) = drive.step([volts - drop * np.tanh(amps / turn)], [0.0], [speed])
         free = speed + dt * (torque - TRUTH["viscous_friction"] * speed) / inertia
         speed = 0.0 if abs(free) <= held else free - np.sign(free) * held
     return rows

@@ -30,7 +30,7 @@ noise, for which no window is made longer than a mechanical one."""
 MOST = 20_000
 """Windows of one record, at most."""
 WIDE = 4
-"""Length of the stretch that tells the sign of a current, over a window of the voltage."""
+"""Length of the stretch that tells the sign of a small current, over a window."""
 STRAY = 1.5
 """Times the usual length, above which a window spans a gap between rows."""
 JUMP = 6.0
@@ -89,19 +89,11 @@ def electrical(records: Sequence[Record], zero: float) -> Windows | None:
         if (measured := r.voltage) is None:
             return None
         at = _Places(r, ELECTRICAL_S)
-        wide = np.arange(-WIDE * at.half, WIDE * at.half + 1)
-        near = np.clip(at.middle[:, None] + wide, 0, len(r.time) - 1)
-        along = np.ones(len(near)) if r.signed else np.sign(r.speed[near].mean(axis=1))
-        sign = np.tanh((r.current[near].mean(axis=1) - zero * along) / BRUSH_CURRENT)
 
-        def half(
-            row: "_Half",
-            r: Record = r,
-            measured: np.ndarray = measured,
-            sign: np.ndarray = sign,
-            along: np.ndarray = along,
-        ) -> Half:
+        def half(row: "_Half", r: Record = r, measured: np.ndarray = measured) -> Half:
             current, speed = row.mean(r.current), row.mean(r.speed)
+            along = np.ones(len(speed)) if r.signed else np.sign(row.longer(r.speed))
+            sign = np.tanh((row.longer(r.current) - zero * along) / BRUSH_CURRENT)
             known = current, speed, sign, row.slope(r.current), np.ones(len(sign)), along
             return Half(np.stack(known, 1), row.mean(measured), speed, current)
 
@@ -144,6 +136,9 @@ class _Half:
 
     def __init__(self, r: Record, at: _Places, first: int):
         self.at = at.middle[:, None] + np.arange(first - at.half, at.half - first + 1, 2)
+        reach = WIDE * at.half
+        wide = at.middle[:, None] + np.arange(first - reach, reach - first + 1, 2)
+        self.wide = np.clip(wide, first, len(r.time) - 1)
         time = r.time[self.at]
         middle = (time[:, 1:] + time[:, :-1]) / 2 - r.time[at.middle][:, None]
         kernel = np.cos(0.5 * np.pi * middle / (time[:, -1:] - time[:, :1])) ** 2
@@ -153,6 +148,10 @@ class _Half:
     def mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, " window"]:
         x = signal[self.at]
         return np.asarray((self.kernel * self.step * (x[:, 1:] + x[:, :-1]) / 2).sum(axis=1))
+
+    def longer(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, " window"]:
+        """Mean over a longer stretch of the same half of the rows, which tells a sign."""
+        return np.asarray(signal[self.wide].mean(axis=1))
 
     def slope(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, " window"]:
         return np.asarray((self.kernel * np.diff(signal[self.at], axis=1)).sum(axis=1))
