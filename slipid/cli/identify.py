@@ -12,6 +12,7 @@ from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
+    from slipid.job.config import Config
     from slipid.job.identify import Identified
 
 
@@ -31,9 +32,13 @@ def identify(
 
     Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt.
     """
+    from slipid.job.config import Motor, read_config
     from slipid.report.estimates import show_fit
     from slipid.support.files import read_json
 
+    wanted = read_config(config)
+    if isinstance(wanted.content.robot, Motor):
+        return bench(wanted, data, out, profile or (), json, quiet)
     with Reporter(quiet=quiet) as report:
         done = run(config, data, out, report, profile or ())
     content = read_json(out / "identified.json", "what identify wrote")
@@ -65,3 +70,23 @@ def run(
     if done.profiles:
         drawn.append(save(profile_figure(done.profiles), out / "profile.png"))
     return replace(done, written=(*done.written, *(path.name for path in drawn)))
+
+
+def bench(
+    config: "Config", data: Path, out: Path, profile: Sequence[str], json: str | None, quiet: bool
+) -> int:
+    """The same for motors on a bench."""
+    from slipid.job.motor import identify_bench
+    from slipid.plots.bench import bench_plots
+    from slipid.report.bench import show_bench
+
+    if profile:
+        raise DataError(
+            "--profile: not of drive = 'motor', whose intervals need none; leave it out"
+        )
+    with Reporter(quiet=quiet) as report:
+        fit, written = identify_bench(config, data, out, report)
+        report.stage("drawing")
+        written = (*written, *(path.name for path in bench_plots(fit, out)))
+    emit(json, fit.to_json(), lambda page: show_bench(page, fit), out, written)
+    return 0 if fit.good else 1

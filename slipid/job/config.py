@@ -24,13 +24,16 @@ class Wheeled(Section):
     """What every robot has.
 
     `drives` says which wheels, counted from 1, share a motor with its encoder and ammeter, in the
-    order of the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together.
+    order of the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together. `motor`
+    is the file that `slipid identify` or `slipid motor` wrote of its motor on a bench, relative to
+    the config.
     """
 
     wheel_radius_m: Positive
     gear_ratio: Positive = 1.0
     mass_kg: Positive | None = None
     drives: list[Annotated[list[int], Field(min_length=1)]] | None = None
+    motor: str | None = None
 
     def drive_of(self, wheels: int) -> tuple[int, ...]:
         """Number of the drive that turns each wheel, from 0; empty where each has its own."""
@@ -87,6 +90,13 @@ class General(Wheeled):
             if (count := len(getattr(self, key))) != wheels:
                 raise ValueError(f"{count} {key}; expected {wheels}, one per wheel_places_m")
         return self
+
+
+class Motor(Section):
+    """No wheels: motors on a bench, logged at their shafts; names where there are several."""
+
+    drive: Literal["motor"]
+    names: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]] = Field(default_factory=list)
 
 
 Wheels = Omni | Box | Differential | General
@@ -208,7 +218,7 @@ class SelftestSection(Section):
 class Content(Section):
     """The whole file."""
 
-    robot: Annotated[Wheels, Field(discriminator="drive")]
+    robot: Annotated[Wheels | Motor, Field(discriminator="drive")]
     layouts: dict[str, dict[str, object]] = Field(default_factory=dict)
     logs: list[Logs] = Field(min_length=1)
     camera: Camera = Camera()
@@ -217,6 +227,17 @@ class Content(Section):
     fit: FitSection = FitSection()
     selftest: SelftestSection = SelftestSection()
     validate_: ValidateSection = Field(default_factory=ValidateSection, alias="validate")
+
+    @property
+    def wheels(self) -> Wheels:
+        """The robot, which has some.
+
+        Raises:
+            ValueError: it is a motor on a bench.
+        """
+        if isinstance(self.robot, Motor):
+            raise ValueError("drive = 'motor' has no wheels on a floor")
+        return self.robot
 
     @model_validator(mode="after")
     def _floors_one_by_one(self) -> "Content":

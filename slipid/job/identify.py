@@ -19,6 +19,7 @@ from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit_file import save
 from slipid.identify.result import Fit, summarise
 from slipid.identify.verdicts.profile import Profile, profile, profiled
+from slipid.job.bench_priors import KEPT
 from slipid.job.config import read_config
 from slipid.job.problem import Job, Task, read_job, with_mixed
 from slipid.support.checkpoint import Checkpoint, key_of, versions
@@ -107,6 +108,8 @@ def _keep_run(job: Job, data: Path, out: Path, seconds: float) -> None:
     """What later commands and readers need to know of this run."""
     config = job.config
     write_bytes(out / "config.toml", config.text.encode())
+    if (bench := config.content.wheels.motor) is not None:
+        write_json(out / KEPT, read_json(config.path.parent / bench, "the numbers of a motor"))
     logs = {log.name: log.sha256 for log in job.logs}
     run = {
         "schema": "slipid.run/1",

@@ -12,6 +12,7 @@ from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
 from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.identify.result import hash_of
+from slipid.job.bench_priors import bench_priors
 from slipid.job.config import Config, FitSection, Logs, geometry, one_floor
 from slipid.job.logs import files_of, read_dataset
 from slipid.job.weights import share_priors
@@ -207,7 +208,7 @@ def on_runs(robot: Robot, runs: Runs, centre: tuple[float, float]) -> Robot:
 def shape_of(config: Config) -> Geometry:
     """Geometry of the config's robot; DataError where it cannot drive."""
     try:
-        return geometry(config.content.robot)
+        return geometry(config.content.wheels)
     except ValueError as error:
         raise DataError(f"{config.path}: robot: {error}") from error
 
@@ -229,8 +230,11 @@ def said_of(robot: Robot, mass: float) -> list[Choice]:
 def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
     """The config's parameter settings, checked, less those of floors and loads that are absent."""
     paths, skipped = [e.path for e in entries(robot)], []
-    choices = said_of(robot, config.content.robot.mass_kg or float(robot.body.mass))
+    choices = said_of(robot, config.content.wheels.mass_kg or float(robot.body.mass))
     choices += lengths(config.content.fit.lengths_from, robot.geometry)
+    measured, told = bench_priors(config, robot.motor.gear_ratio)
+    choices += measured
+    skipped += told
     try:
         known = share_priors(config.content.weights, robot.geometry)
     except ValueError as error:
