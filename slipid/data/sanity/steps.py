@@ -1,0 +1,89 @@
+"""What wheels, commands and poses say of the same steps of motion, at a lag of the poses."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from slipid.data.sanity.recorded import Flat, Recorded
+
+STEP_S = 0.4
+"""Length of a step [s]: long beside jitter and rounding, short beside a turn of the robot."""
+MOST_STEPS = 20_000
+"""Steps beyond which they are made longer; that happens where time is in the wrong unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Times between which motion is compared, and where the poses were then.
+
+    Attributes:
+        before, after: begin and end of each step on the clock of `Recorded` (step,) [s].
+        run: that each step belongs to (step,).
+        pose_before, pose_after: poses then (step, 3), as logged.
+    """
+
+    before: Float[np.ndarray, " step"]
+    after: Float[np.ndarray, " step"]
+    run: Int[np.ndarray, " step"]
+    pose_before: Float[np.ndarray, "step 3"]
+    pose_after: Float[np.ndarray, "step 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Increments over the same steps.
+
+    Attributes:
+        lag: of the poses behind the encoders that was assumed [s].
+        inside: False where the encoders were not recorded for the whole step (step,).
+        wheels: rotation of each wheel [rad]; nan where it is not inside.
+        commanded: rotation of each wheel that was commanded [rad], or None.
+        twist: step of the body that was commanded, in its axes [m, m, rad], or None.
+        gyro: turn by the gyro [rad], or None.
+    """
+
+    lag: float
+    inside: Bool[np.ndarray, " step"]
+    wheels: Float[np.ndarray, "step wheel"]
+    commanded: Float[np.ndarray, "step wheel"] | None
+    twist: Float[np.ndarray, "step 3"] | None
+    gyro: Float[np.ndarray, "step 1"] | None
+
+
+def edges(data: Recorded) -> Edges:
+    """Steps of about `STEP_S` of every run, from its first pose to its last."""
+    length = data.end - data.begin
+    step = max(min(STEP_S, float(np.median(length)) / 8), float(np.median(data.row)))
+    step = max(step, float(length.sum()) / MOST_STEPS)
+    count = np.maximum(np.round(length / step).astype(int), 1)
+    run = np.repeat(np.arange(len(count)), count)
+    within = np.arange(len(run)) - np.repeat(np.cumsum(count) - count, count)
+    each = (length / count)[run]
+    before = data.begin[run] + within * each
+    after = before + each
+    return Edges(before, after, run, data.pose.at(before), data.pose.at(after))
+
+
+def steps(data: Recorded, at: Edges, lag: float) -> Steps:
+    """Increments of every channel on the robot's clock, `lag` before those of the poses."""
+    before, after = at.before - lag, at.after - lag
+    slack = data.row[at.run]
+    inside = (before >= data.begin[at.run] - slack) & (after <= data.end[at.run] + slack)
+
+    def moved(channel: Flat) -> np.ndarray:
+        change = channel.at(after) - channel.at(before)
+        change[~inside] = np.nan
+        return change
+
+    def maybe(channel: Flat | None) -> np.ndarray | None:
+        return None if channel is None else moved(channel)
+
+    return Steps(
+        lag,
+        inside,
+        moved(data.angle),
+        maybe(data.commanded),
+        maybe(data.twist),
+        maybe(data.gyro),
+    )
