@@ -46,7 +46,7 @@ class Raw:
         return replace(self, has=self.has - set(channels))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drive:
     """Turns of the wheels per twist (wheel, 3), what it is declared as, and how it scrubs."""
 
@@ -60,7 +60,7 @@ class Drive:
 def _omni() -> Drive:
     a = np.radians([60.0, 180.0, 300.0])
     rolling = np.stack([-np.sin(a), np.cos(a), np.full(3, BASE)], axis=1) / RADIUS
-    return Drive("omni", rolling, g.omni([60, 180, 300], BASE, RADIUS, GEAR), True, 1.0)
+    return Drive("omni", rolling, g.omni([60.0, 180.0, 300.0], BASE, RADIUS, GEAR), True, 1.0)
 
 
 def _mecanum() -> Drive:

@@ -9,7 +9,7 @@ ends of their ranges, a cause fits where one factor brings all of them into thei
 believed: 1000, 2 pi, 57.3, the gear ratio.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import exp, inf, log, pi
 
@@ -22,7 +22,8 @@ ROWS_S = (0.001, 1.5)
 
 _COMMON = {
     "time": (1000.0, 1e6, 1e9, 60.0),
-    "wheel_turns": (2.0, 4.0, 10.0, 2 * pi, 30 / pi, 180 / pi, 1000.0, 60.0),
+    "wheel_gear": (2.0, 4.0, 2 * pi, 180 / pi, 1000.0),
+    "wheel_turns": (2.0, 4.0, 10.0, 2 * pi, 180 / pi, 1000.0),
     "wheel_radius": (2.0, 10.0, 100.0, 1000.0, 25.4),
     "pose_length": (1000.0, 100.0, 10.0, 25.4),
     "heading": (180 / pi,),
@@ -33,6 +34,9 @@ _COMMON = {
     "report": (30 / pi, 180 / pi, 2 * pi, 1000.0, 10.0),
     "gyro": (180 / pi, 1000.0),
 }
+_BY_GEAR = ("wheel_gear", "wheel_turns", "command_wheels", "report")
+_OF_RATES = (30 / pi, 180 / pi, 2 * pi, 1000.0, 60.0)
+"""Of turns that are integrated from speeds."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,7 @@ def causes(speed_is_angle: bool) -> Iterator[Cause]:
     wheels = {"travel": -1.0, "turning": -1.0, "drive": -1.0, "steer": -1.0}
     yield Cause("pose_length", {"travel": 1.0})
     yield Cause("heading", {"turning": 1.0, "gyro": -1.0})
+    yield Cause("wheel_gear", wheels | {"command": -1.0})
     yield Cause("wheel_turns", wheels | {"command": -1.0, "report": -1.0})
     yield Cause("wheel_radius", wheels)
     yield Cause("base", {"turning": 1.0, "steer": 1.0})
@@ -96,17 +101,18 @@ def explained(seen: Ratios, row_s: float, gear_ratio: float) -> tuple[tuple[Expl
     if all(r.natural for r in seen.known.values()):
         return (), True
     open_ = [c for c in causes(seen.speed_is_angle) if c.name != "time" or not _natural(row_s)]
-    single = _singles(seen.known, open_, gear_ratio)
+    common = _common(gear_ratio, seen.speed_is_angle)
+    single = _singles(seen.known, open_, common)
     if single:
         return tuple(sorted(single, key=lambda e: not e.common)), True
     for first in open_:
-        for factor in _factors(first.name, gear_ratio):
+        for factor in common[first.name]:
             left = {
                 name: replace(r, value=r.value / factor ** first.power.get(name, 0.0))
                 for name, r in seen.known.items()
             }
             rest = [c for c in open_ if c.name != first.name]
-            second = [e for e in _singles(left, rest, gear_ratio) if e.common]
+            second = [e for e in _singles(left, rest, common) if e.common]
             if second:
                 return (Explained(first.name, factor, True, factor, factor), second[0]), False
     return (), False
@@ -117,7 +123,7 @@ def _natural(row_s: float) -> bool:
 
 
 def _singles(
-    known: Mapping[str, Ratio], open_: list[Cause], gear_ratio: float
+    known: Mapping[str, Ratio], open_: list[Cause], common: Mapping[str, Sequence[float]]
 ) -> list[Explained]:
     """Causes that fit alone."""
     found = []
@@ -125,11 +131,7 @@ def _singles(
         low, high = _range(known, cause)
         if low > high:
             continue
-        inside = [
-            f
-            for f in _factors(cause.name, gear_ratio)
-            if low - NEAR <= log(f) <= high + NEAR
-        ]
+        inside = [f for f in common[cause.name] if low - NEAR <= log(f) <= high + NEAR]
         middle = min(max(_middle(known, cause), low), high)
         best = min(inside, key=lambda f: abs(log(f) - middle), default=None)
         factor = exp(middle) if best is None else best
@@ -162,9 +164,11 @@ def _middle(known: Mapping[str, Ratio], cause: Cause) -> float:
     return total / weights if weights else 0.0
 
 
-def _factors(name: str, gear_ratio: float) -> tuple[float, ...]:
-    """Factors that people get wrong, and their inverses."""
-    common = _COMMON[name]
-    if name in ("wheel_turns", "command_wheels", "report") and gear_ratio > 1.5:
-        common = (gear_ratio, *common)
-    return tuple(f for factor in common for f in (factor, 1 / factor))
+def _common(gear_ratio: float, speed_is_angle: bool) -> Mapping[str, Sequence[float]]:
+    """Factors that people get wrong by name of the cause, with their inverses."""
+    named = dict(_COMMON)
+    if speed_is_angle:
+        named["wheel_gear"] = _OF_RATES
+    if gear_ratio > 1.5:
+        named |= {name: (gear_ratio, *named[name]) for name in _BY_GEAR}
+    return {name: [f for one in all_ for f in (one, 1 / one)] for name, all_ in named.items()}

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from slipid.data.sanity.finding import Finding
 from slipid.data.sanity.reading import Reading, columns
-from slipid.data.sanity.recorded import Flat, Recorded
+from slipid.data.sanity.recorded import Recorded
 
 BACKWARDS = -0.25
 """Work over the sum of its magnitudes below which a sign is wrong."""
@@ -29,7 +29,7 @@ GRAVITY = 9.81
 
 
 def electric(
-    data: Recorded, reading: Reading, radius: float, mass_kg: float | None
+    data: Recorded, reading: Reading, radius: float, mass_kg: float | None, by_power: bool
 ) -> Iterator[Finding]:
     """Findings about currents and voltages.
 
@@ -37,6 +37,7 @@ def electric(
         reading: order and signs of the wheels, as they were found.
         radius: of the wheels [m].
         mass_kg: of the robot, None where it is not known.
+        by_power: whether speeds can be trusted, so that power can be compared with them.
     """
     speed = _speeds(data) @ columns(reading, data.wheels).T
     driving = np.abs(speed).max(axis=1, initial=0.0) > 0.2 * np.nanquantile(np.abs(speed), 0.95)
@@ -48,7 +49,7 @@ def electric(
     volts = data.bus if data.voltage is None else data.voltage
     voltage = None if volts is None else np.abs(volts.value[driving])
     power = None
-    if current is not None and voltage is not None and mass_kg is not None:
+    if by_power and current is not None and voltage is not None and mass_kg is not None:
         watts = float(np.nanmean((current * voltage).sum(axis=1)))
         rim = float(np.nanmean(np.abs(speed[driving]).mean(axis=1))) * radius
         power = watts / max(mass_kg * GRAVITY * rim, 1e-9)
@@ -146,8 +147,3 @@ def _size_of_voltage(volts: np.ndarray | None) -> Iterator[Finding]:
         f"set unit = '{unit}' for the channel voltage or bus_voltage (scale = {scale})",
         "wrong",
     )
-
-
-def constant(channel: Flat | None) -> bool:
-    """Whether a channel never changes."""
-    return channel is not None and not np.nanmax(np.abs(np.diff(channel.value, axis=0))) > 0

@@ -39,7 +39,7 @@ class Products:
     weight: Float[np.ndarray, " step"]
 
 
-def usable(*parts: Float[np.ndarray, "step column"]) -> Bool[np.ndarray, " step"]:
+def usable(*parts: Float[np.ndarray, "step _"]) -> Bool[np.ndarray, " step"]:
     """Steps in which all parts are known."""
     return np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
 
@@ -84,6 +84,15 @@ def products(
         known,
         weight,
     )
+
+
+def left_by_linear(
+    turns: Float[np.ndarray, "step wheel"], body: Float[np.ndarray, "step 3"]
+) -> float:
+    """Share of the body's motion that no linear map of turns explains; no step counts less."""
+    total = float((body**2).sum())
+    left = body - turns @ _linear(turns, body, np.ones(len(turns)))
+    return float((left**2).sum()) / total if total > 0 else 1.0
 
 
 def _linear(turns: np.ndarray, body: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -7,13 +7,17 @@ is called the command changes later than what is called the measured speed, and 
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from slipid.data.sanity.finding import Finding
 from slipid.data.sanity.recorded import Flat, Recorded
 
 LONGEST_S = 1.0
 """Lags between command and motion that are looked at, either way [s]."""
+MOST_SHIFTS = 50
+"""The same in rows, for time in a wrong unit."""
+MOST_ROWS = 20_000
+"""Rows that are looked at."""
 ALIKE = 0.3
 """Correlation from which a lag is believed."""
 BUSIER = 1.5
@@ -25,13 +29,16 @@ def exchanged(data: Recorded) -> Iterator[Finding]:
     if data.commanded is None or data.reported is None:
         return
     row = float(np.median(data.row))
-    when = np.arange(data.begin[0], data.end[-1], row)
+    when = np.arange(data.begin[0], data.end[-1], row)[:MOST_ROWS]
     inside = when + row <= data.end[data.runs_of(when).clip(0)]
-    said, done = (_changes(channel, when, row, inside) for channel in (data.commanded, data.reported))
+    said, done = (
+        _changes(channel, when, row, inside) for channel in (data.commanded, data.reported)
+    )
     if not (said**2).sum() > 0 or not (done**2).sum() > 0:
         return
-    shifts = np.arange(-int(LONGEST_S / row), int(LONGEST_S / row) + 1)
-    alike = np.array([_correlation(said, done, k) for k in shifts])
+    most = min(int(LONGEST_S / row), MOST_SHIFTS)
+    shifts = np.arange(-most, most + 1)
+    alike = np.array([_correlation(said, done, int(k)) for k in shifts])
     best = int(np.argmax(alike))
     busy = [float((np.abs(x) > 1e-3 * np.abs(x).max()).mean()) for x in (said, done)]
     if alike[best] > ALIKE and shifts[best] < 0 and busy[0] > BUSIER * busy[1]:
@@ -47,8 +54,8 @@ def exchanged(data: Recorded) -> Iterator[Finding]:
 
 
 def _changes(
-    channel: Flat, when: Float[np.ndarray, " at"], row: float, inside: np.ndarray
-) -> Float[np.ndarray, "at wheel"]:
+    channel: Flat, when: Float[np.ndarray, " at"], row: float, inside: Bool[np.ndarray, " at"]
+) -> Float[np.ndarray, "change wheel"]:
     """Change of a speed from row to row [rad/s], zero across the ends of runs."""
     speed = (channel.at(when + row) - channel.at(when)) / row
     speed[~inside] = np.nan

@@ -1,12 +1,12 @@
 """How far different channels say the robot went, as ratios, and what of that is natural.
 
-    travel      body over wheels, along        pose / (r / J turns): less than 1 where wheels slip
-    turning     body over wheels, heading      the same in heading
-    drive       commanded over wheels, along
-    steer       commanded over wheels, heading
-    command     commanded over measured wheel speeds
-    report      reported speeds over encoders
-    gyro        gyro over heading of the poses
+travel      body over wheels, along        pose / (r / J turns): less than 1 where wheels slip
+turning     body over wheels, heading      the same in heading
+drive       commanded over wheels, along
+steer       commanded over wheels, heading
+command     commanded over measured wheel speeds
+report      reported speeds over encoders
+gyro        gyro over heading of the poses
 """
 
 from collections.abc import Mapping
@@ -44,7 +44,7 @@ _WIDE: Mapping[str, _Range] = {
 }
 _UNVOUCHED: _Range = (0.3, 0.8, 1.35)
 """Of `travel` where no command was logged."""
-_SCRUBBING: Mapping[str, _Range] = {"turning": (0.25, 0.55, 1.35), "steer": (0.4, 1.3, 3.2)}
+_SCRUBBING: Mapping[str, _Range] = {"turning": (0.25, 0.55, 1.15), "steer": (0.4, 1.3, 3.2)}
 """Robots whose wheels cannot roll sideways turn less than their track says, and command more."""
 
 
@@ -76,9 +76,7 @@ class Ratios:
     speed_is_angle: bool
 
 
-def ratios(
-    data: Recorded, at: Edges, moved: Steps, evidence: Evidence, reading: Reading
-) -> Ratios:
+def ratios(data: Recorded, at: Edges, moved: Steps, evidence: Evidence, reading: Reading) -> Ratios:
     """Ratios under a reading: order, signs and axes are put right before."""
     values: dict[str, float | None] = {}
     predict = to_body(evidence, reading)
@@ -108,7 +106,7 @@ def ratios(
         values["report"] = None
     vouched = values.get("drive") is not None or values.get("command") is not None
     wide = dict(_WIDE) if vouched else _WIDE | {"travel": _UNVOUCHED}
-    if np.linalg.matrix_rank(evidence.rolling, tol=1e-6) < 3:
+    if not evidence.free:
         wide |= _SCRUBBING
     known = {k: Ratio(v, *wide[k]) for k, v in values.items() if v is not None and v > 0}
     return Ratios(known, same)
@@ -140,7 +138,9 @@ def _gyro(at: Edges, moved: Steps, pose: Products, reading: Reading) -> float | 
     gyro = reading.gyro_sign * moved.gyro[pose.known, 0]
     known = np.isfinite(gyro)
     weight, body, gyro = pose.weight[known], body[known], gyro[known]
-    own, both, other = ((weight * a * b).sum() for a, b in ((gyro, gyro), (gyro, body), (body, body)))
+    own, both, other = (
+        (weight * a * b).sum() for a, b in ((gyro, gyro), (gyro, body), (body, body))
+    )
     if not own * other > 0 or both < 0.5 * np.sqrt(own * other):
         return None
     return float(np.sqrt(own / other))
@@ -150,9 +150,13 @@ def _reported(data: Recorded) -> tuple[float | None, bool]:
     """Ratio of reported speeds to encoders, whole runs; and whether they are the same thing."""
     if data.reported is None:
         return None, False
-    ends = [channel.at(data.end) - channel.at(data.begin) for channel in (data.reported, data.angle)]
+    ends = [
+        channel.at(data.end) - channel.at(data.begin) for channel in (data.reported, data.angle)
+    ]
     middle = 0.5 * (data.begin + data.end)
-    halves = [channel.at(middle) - channel.at(data.begin) for channel in (data.reported, data.angle)]
+    halves = [
+        channel.at(middle) - channel.at(data.begin) for channel in (data.reported, data.angle)
+    ]
     said, turned = (np.concatenate(pair) for pair in zip(ends, halves, strict=True))
     known = usable(said, turned)
     said, turned = said[known], turned[known]

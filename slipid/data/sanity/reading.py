@@ -73,6 +73,11 @@ class Evidence:
         """Number of wheels."""
         return len(self.rolling)
 
+    @property
+    def free(self) -> bool:
+        """Whether the wheels fix all three parts of the twist."""
+        return bool(np.linalg.matrix_rank(self.rolling, tol=1e-6) == 3)
+
 
 @dataclass(frozen=True, eq=False)
 class Commanded:
@@ -97,11 +102,11 @@ def misfits(evidence: Evidence, reading: Reading) -> dict[str, float]:
     predict = to_body(evidence, reading)
     out = {"pose": 1.0}
     if pose is not None:
-        out["pose"] = _unexplained(pose, predict, _turned(-frame.offset))
+        out["pose"] = _unexplained(pose, predict, _turned(-frame.offset), evidence.free)
         out["wheels"] = _beyond_rigid(pose, evidence.rolling, wheels)
     if evidence.twist is not None:
         signs = np.diag(np.array(reading.twist_sign, float))
-        out["twist"] = _unexplained(evidence.twist, predict, signs)
+        out["twist"] = _unexplained(evidence.twist, predict, signs, evidence.free)
     if evidence.command is not None:
         out["command"] = _uncommanded(evidence.command, reading)
     if evidence.gyro is not None:
@@ -124,19 +129,23 @@ def to_body(evidence: Evidence, reading: Reading) -> Float[np.ndarray, "3 wheel"
     return np.asarray(turned @ columns(reading, evidence.wheels))
 
 
-def _turned(degrees: float) -> Float[np.ndarray, "3 3"]:
+def _turned(degrees: int) -> Float[np.ndarray, "3 3"]:
     """Rotation of a body step."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _unexplained(
-    of: Products, predict: Float[np.ndarray, "3 wheel"], axes: Float[np.ndarray, "3 3"]
+    of: Products,
+    predict: Float[np.ndarray, "3 wheel"],
+    axes: Float[np.ndarray, "3 3"],
+    free: bool,
 ) -> float:
     """Share of the body's motion that the predicted one does not explain, at a factor per axis.
 
     Sideways and turning motion count by the mean of their shares in what is predicted and in what
-    was seen: lengths in a wrong unit must not hide either.
+    was seen: lengths in a wrong unit must not hide either. Wheels that do not fix the twist (not
+    `free`) tell of one direction, which has one factor.
     """
     predicted = np.einsum("aw,wv,av->a", predict, of.turns, predict)
     both = np.einsum("aw,wa->a", predict, of.across @ axes.T)
@@ -146,6 +155,8 @@ def _unexplained(
         return 1.0
     moves = predicted > STILL * total
     explained = np.where(moves, both.clip(0) ** 2 / np.where(moves, predicted, 1.0), 0.0)
+    if not free and moves[:2].any():  # wheels that roll one way only: no factor per axis
+        explained[:2] = 0.5 * max(both[:2].sum(), 0.0) ** 2 / predicted[:2].sum()
     along = 1.0 - explained[:2].sum() / max(seen[:2].sum(), 1e-300)
     about = 1.0 - explained[2] / max(seen[2], 1e-300)
     share = 0.5 * (predicted[2] / total + seen[2] / seen.sum())

@@ -10,9 +10,6 @@ from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import integral, interpolate
 
-LONGEST_LAG_S = 8.0
-"""Largest lag between poses and encoders that is looked for, either way [s]."""
-
 
 @dataclass(frozen=True, eq=False)
 class Flat:
@@ -78,7 +75,7 @@ class Recorded:
 
 
 def recorded(data: Runs) -> Recorded:
-    """Channels of runs on one clock; the pauses are longer than the lags that are looked for."""
+    """Channels of runs on one clock; with a second between them."""
     first = np.array([log.time[0] for log in data.logs])
     length = np.array([log.duration for log in data.logs])
     starts = np.concatenate([[0.0], np.cumsum(length + 1.0)])[:-1]

@@ -1,23 +1,35 @@
-"""Sanity before fitting: do encoders, commands, gyro and poses tell of the same robot?"""
+"""Sanity before fitting: do encoders, commands, gyro and poses tell of the same robot?
+
+Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_speed_unit`,
+`heading_sign`, `heading_unit`, `heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`,
+`pose_mirrored`, `pose_length`, `pose_constant`, `pose_of_another_run`, `pose_unexplained`, `lag`,
+`base_radius`, `time_unit`, `current_sign`, `current_unit`, `current_of_supply`, `voltage_sign`,
+`voltage_unit`, `gyro_sign`, `gyro_unit`, `command_sign`, `command_order`, `command_unit`,
+`command_exchanged`, `scales`, `travel`, `not_checked`.
+"""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from slipid.data.runs import Runs
 from slipid.data.sanity.causes import explained
-from slipid.data.sanity.electric import constant, electric
+from slipid.data.sanity.electric import electric
 from slipid.data.sanity.evidence import usable
 from slipid.data.sanity.exchanged import exchanged
 from slipid.data.sanity.finding import Finding, worst_first
-from slipid.data.sanity.gather import Lag, find_lag, gather
-from slipid.data.sanity.ratios import FORWARD, TURNS, Ratios, ratios
-from slipid.data.sanity.reading import Evidence, Reading, misfits, to_body
+from slipid.data.sanity.gather import gather
+from slipid.data.sanity.lag import Lag, find_lag
+from slipid.data.sanity.notes import not_checked, notes
+from slipid.data.sanity.ratios import Ratios, ratios
+from slipid.data.sanity.reading import Evidence, Reading, misfits
 from slipid.data.sanity.recorded import Recorded, recorded
 from slipid.data.sanity.shape import mistakes
 from slipid.data.sanity.single_runs import likeness, single_runs, standing
 from slipid.data.sanity.steps import Edges, Steps, edges, steps
-from slipid.data.sanity.wording import of_causes, of_mistake
+from slipid.data.sanity.wording import of_causes, of_mistake, of_ratios
 from slipid.model.geometry import Geometry
 
 FEW = 20
@@ -36,10 +48,34 @@ SHORT = 0.62
 """Body over wheels below which, without commands to vouch for the wheels, it is said."""
 
 
-def findings(
-    data: Runs, geometry: Geometry, mass_kg: float | None = None
-) -> tuple[Finding, ...]:
-    """What is wrong with runs or with what was declared, the worst first, then what was not checked.
+@dataclass(frozen=True, eq=False)
+class _Declared:
+    """Numbers of the declared robot; `rolling` is J / r with the heading at the base radius."""
+
+    rolling: Float[np.ndarray, "wheel 3"]
+    base: float
+    radius: float
+    gear_ratio: float
+    mass_kg: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """What poses and wheels say of each other.
+
+    `findings` are about lag, order, signs and axes, and about single runs; `reading` is how they
+    are right; `poses` says whether the poses can be compared any further.
+    """
+
+    findings: tuple[Finding, ...]
+    moved: Steps
+    evidence: Evidence
+    reading: Reading
+    poses: bool
+
+
+def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tuple[Finding, ...]:
+    """What is wrong with runs or with what was declared, the worst first, then what is not known.
 
     Args:
         data: runs.
@@ -48,118 +84,108 @@ def findings(
     """
     base, radius = float(geometry.base_radius), float(geometry.wheel_radius)
     rolling = np.asarray(geometry.forward()) / radius / np.array([1.0, 1.0, base])
+    robot = _Declared(rolling, base, radius, float(geometry.gear_ratio), mass_kg)
     channels = recorded(data)
-    at = edges(channels)
-    return worst_first(_all(channels, at, rolling, geometry.gear_ratio, base, radius, mass_kg))
+    return worst_first(_all(channels, edges(channels), robot))
 
 
-def _all(
-    data: Recorded,
-    at: Edges,
-    rolling: np.ndarray,
-    gear_ratio: float,
-    base: float,
-    radius: float,
-    mass_kg: float | None,
-) -> Iterator[Finding]:
-    lag = find_lag(data, at, base)
-    moved = steps(data, at, lag.seconds)
-    if usable(moved.wheels).sum() < FEW:
-        yield _not_checked(f"the runs are too short: {len(at.run)} steps, at least {FEW} needed")
+def _all(data: Recorded, at: Edges, robot: _Declared) -> Iterator[Finding]:
+    """Findings in no order."""
+    found = _compared(data, at, robot)
+    if found is None:
+        yield not_checked(f"the runs are too short: {len(at.run)} steps, {FEW} are needed")
         return
-    evidence = gather(rolling, at, moved, base)
-    alone = likeness(at, moved, evidence, Reading(), base, len(data.names))
-    still = standing(data, alone)
-    reading = Reading()
-    if not still.all():
-        yield from _of_lag(lag)
-        reading, found = mistakes(evidence)
-        for mistake in found:
-            yield of_mistake(mistake)
-        alone = likeness(at, moved, evidence, reading, base, len(data.names))
-        yield from _foreign(evidence, reading)
-    yield from single_runs(data, alone)
-    seen = ratios(data, at, moved, evidence, reading)
-    if still.all():
-        seen = Ratios({k: r for k, r in seen.known.items() if k not in ("travel", "turning")}, seen.speed_is_angle)
-    row = float(np.median(data.row))
-    fitting, single = explained(seen, row, gear_ratio)
-    factors = of_causes(fitting, single, _said(seen), gear_ratio)
+    yield from found.findings
+    seen = ratios(data, at, found.moved, found.evidence, found.reading)
+    if not found.poses:
+        known = {k: r for k, r in seen.known.items() if k not in ("travel", "turning", "gyro")}
+        seen = Ratios(known, seen.speed_is_angle)
+    factors = tuple(_factors(seen, data, robot)) or tuple(_of_time(data, found.moved, at, robot))
     yield from factors
-    if not fitting and not all(r.natural for r in seen.known.values()):
-        yield Finding(
-            "scales",
-            f"the channels disagree about how far the robot went, and no single number explains it: {_said(seen)}",
-            "check the units of all channels, gear_ratio, wheel_radius_m and base_radius_m",
-            "wrong",
-        )
-    if not any(f.kind == "time_unit" for f in factors):
-        yield from _of_time(data, moved, at, row, radius)
-    yield from electric(data, reading, radius, mass_kg)
+    yield from electric(data, found.reading, robot.radius, robot.mass_kg, not factors)
     yield from exchanged(data)
     yield from _suspicious(seen)
-    yield from _notes(data, evidence, reading, seen)
+    yield from notes(data, found.evidence, found.reading)
+
+
+def _compared(data: Recorded, at: Edges, robot: _Declared) -> _Compared | None:
+    """Comparison of poses and wheels; None where there are too few steps."""
+    lag = find_lag(data, at, robot.base)
+    moved = steps(data, at, lag.seconds)
+    if usable(moved.wheels).sum() < FEW:
+        return None
+    evidence = gather(robot.rolling, at, moved, robot.base)
+    declared = likeness(at, moved, evidence, Reading(), robot.base, len(data.names))
+    if standing(data, declared).all():
+        return _Compared(tuple(single_runs(data, declared)), moved, evidence, Reading(), False)
+    reading, found = mistakes(evidence)
+    left = misfits(evidence, reading)["pose"]
+    if left > FOREIGN:
+        return _Compared((_foreign(left),), moved, evidence, Reading(), False)
+    alike = likeness(at, moved, evidence, reading, robot.base, len(data.names))
+    # a half sine turns back at half a turn, which puts single runs out of step
+    alone = () if reading.frame.heading == "half_sine" else tuple(single_runs(data, alike))
+    said = (*_of_lag(lag), *map(of_mistake, found), *alone)
+    return _Compared(said, moved, evidence, reading, True)
 
 
 def _of_lag(lag: Lag) -> Iterator[Finding]:
+    """Poses that come much later or earlier than encoders."""
     if abs(lag.seconds) < LATE_S:
         return
-    late = lag.seconds > 0
+    late = "after" if lag.seconds > 0 else "before"
     yield Finding(
         "lag",
-        f"the poses come {abs(lag.seconds):.1f} s {'after' if late else 'before'} the encoders: so "
-        f"{lag.unexplained:.2f} of the motion is left unexplained, without {lag.without:.2f}",
-        f"set offset = {-lag.seconds:.1f} s on the poses' time when they are merged with the robot's "
-        f"log, or start 'camera.lag' there ({lag.seconds:.1f} s)",
+        f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: so {lag.unexplained:.2f} of "
+        f"the motion is left unexplained, without {lag.without:.2f}",
+        f"shift the poses' times by {-lag.seconds:+.1f} s, or start 'camera.lag' in [parameters] at "
+        f"{lag.seconds:.1f}",
         "wrong" if abs(lag.seconds) > TOO_LATE_S else "suspicious",
     )
 
 
-def _foreign(evidence: Evidence, reading: Reading) -> Iterator[Finding]:
-    left = misfits(evidence, reading)["pose"]
-    if left > FOREIGN:
+def _foreign(left: float) -> Finding:
+    return Finding(
+        "pose_unexplained",
+        f"the poses do not follow the wheels: {left:.2f} of their motion is left unexplained, in "
+        "any order, with any signs and axes",
+        "check whether poses and encoders are of the same runs and of the same time, and whether "
+        "the wheels were on the ground",
+        "wrong",
+    )
+
+
+def _factors(seen: Ratios, data: Recorded, robot: _Declared) -> Iterator[Finding]:
+    """Units and sizes that are wrong."""
+    fitting, single = explained(seen, float(np.median(data.row)), robot.gear_ratio)
+    yield from of_causes(fitting, single, of_ratios(seen), robot.gear_ratio)
+    if not fitting and not all(r.natural for r in seen.known.values()):
         yield Finding(
-            "pose_unexplained",
-            f"the poses do not follow the wheels: {left:.2f} of their motion is left unexplained, "
-            "in any order, with any signs and axes",
-            "check whether poses and encoders are of the same runs and of the same time, and "
-            "whether the wheels were on the ground",
+            "scales",
+            "the channels disagree about how far the robot went, and no single number explains "
+            f"it: {of_ratios(seen)}",
+            "check the units of all channels, gear_ratio, wheel_radius_m and base_radius_m",
             "wrong",
         )
 
 
-def _said(seen: Ratios) -> str:
-    """The ratios that are not natural."""
-    words = {
-        "travel": "the body moves {:.3g} times as far as the wheels say",
-        "turning": "the body turns {:.3g} times as far as the wheels say",
-        "drive": "the commanded motion is {:.3g} times what the wheels did",
-        "steer": "the commanded turn is {:.3g} times what the wheels did",
-        "command": "the commanded wheel speeds are {:.3g} times the measured ones",
-        "report": "the reported wheel speeds are {:.3g} times what the encoders say",
-        "gyro": "the gyro turns {:.3g} times as far as the poses",
-    }
-    return ", ".join(words[k].format(r.value) for k, r in seen.known.items() if not r.natural)
-
-
-def _of_time(
-    data: Recorded, moved: Steps, at: Edges, row: float, radius: float
-) -> Iterator[Finding]:
+def _of_time(data: Recorded, moved: Steps, at: Edges, robot: _Declared) -> Iterator[Finding]:
     """Time in another unit, where only its size tells it."""
-    speed = np.abs(moved.wheels) / (at.after - at.before)[:, None] * radius
+    row = float(np.median(data.row))
+    speed = np.abs(moved.wheels) / (at.after - at.before)[:, None] * robot.radius
     top = float(np.nanquantile(speed, 0.95))
     slow = row > SLOW_ROW_S and top < SLOW_M_S
     if slow or (row < FAST_ROW_S and top > FAST_M_S):
-        unit = "ms" if slow else "s"
         yield Finding(
             "time_unit",
             f"rows are {row:.3g} s apart and wheels reach {top:.2g} m/s",
-            f"set unit = '{unit}' for the channel time",
+            f"set unit = '{'ms' if slow else 's'}' for the channel time",
             "wrong",
         )
 
 
 def _suspicious(seen: Ratios) -> Iterator[Finding]:
+    """Wheels that go much further than the body, with nothing to vouch for them."""
     travel = seen.known.get("travel")
     if travel is None or "drive" in seen.known or "command" in seen.known:
         return
@@ -172,37 +198,3 @@ def _suspicious(seen: Ratios) -> Iterator[Finding]:
             "unless the wheels slip so much",
             "suspicious",
         )
-
-
-def _notes(
-    data: Recorded, evidence: Evidence, reading: Reading, seen: Ratios
-) -> Iterator[Finding]:
-    """What could not be checked."""
-    predict = to_body(evidence, reading)
-    pose = next(iter(evidence.pose.values()), None)
-    if pose is not None:
-        share = np.einsum("aw,wv,av->a", predict, pose.turns, predict)
-        share = share / max(float(share.sum()), 1e-300)
-        free = np.linalg.matrix_rank(evidence.rolling, tol=1e-6) == 3
-        if share[2] < TURNS:
-            yield _not_checked(
-                "no run turns: base radius, unit of the heading and gyro could not be checked"
-            )
-        if share[0] < FORWARD:
-            yield _not_checked("no run drives ahead: its lengths and signs could not be checked")
-        if free and share[1] < FORWARD:
-            yield _not_checked(
-                "no run drives sideways: order and signs of the wheels could only be checked in part"
-            )
-    if evidence.twist is None and evidence.command is None:
-        yield _not_checked(
-            "no command is logged: wheels that turn too far could not be told from wheels that slip"
-        )
-    if data.current is not None and not data.current_is_signed:
-        yield _not_checked("currents are magnitudes: their signs could not be checked")
-    if constant(data.gyro):
-        yield _not_checked("the gyro never changes: it could not be checked")
-
-
-def _not_checked(what: str) -> Finding:
-    return Finding("not_checked", what, None, "note")

@@ -16,8 +16,9 @@ MOVED_M = 0.2
 """Way of the wheels from which a run must move its poses [m]."""
 ROWS = 20
 """Rows below which a run says nothing alone."""
-STRANGE, USUAL = 0.3, 0.9
-"""Likeness below which a run is strange, where the middle one has more than the second."""
+STRANGE, TIMES, USUAL = 0.3, 10.0, 0.9
+"""Distance from full likeness from which a run is strange, and the part of the middle one's from
+which it is, where that one is at least so alike."""
 CLIPPED = 4.0
 """Steps of the body beyond so many usual ones are shortened to that."""
 ALL = 0.5
@@ -92,10 +93,11 @@ def single_runs(data: Recorded, of: Likeness) -> Iterator[Finding]:
         )
     # a robot that is held in place by the floor is not like another run
     moves = ~still & (_rows(data) >= ROWS) & (of.wheels_m > MOVED_M)
-    moves &= of.poses_m > 0.25 * np.median(of.poses_m / of.wheels_m) * of.wheels_m
-    if moves.sum() < 2 or np.median(of.alike[moves]) < USUAL:
+    if moves.any():
+        moves &= of.poses_m > 0.25 * np.median(of.poses_m[moves] / of.wheels_m[moves]) * of.wheels_m
+    if moves.sum() < 2 or (usual := float(np.median(of.alike[moves]))) < USUAL:
         return
-    strange = moves & (of.alike < STRANGE)
+    strange = moves & (1 - of.alike > max(STRANGE, TIMES * (1 - usual)))
     if strange.any():
         yield Finding(
             "pose_of_another_run",

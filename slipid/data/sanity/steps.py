@@ -36,15 +36,13 @@ class Steps:
 
     Attributes:
         lag: of the poses behind the encoders that was assumed [s].
-        inside: False where the encoders were not recorded for the whole step (step,).
-        wheels: rotation of each wheel [rad]; nan where it is not inside.
+        wheels: rotation of each wheel [rad]; nan where it was not recorded for the whole step.
         commanded: rotation of each wheel that was commanded [rad], or None.
         twist: step of the body that was commanded, in its axes [m, m, rad], or None.
         gyro: turn by the gyro [rad], or None.
     """
 
     lag: float
-    inside: Bool[np.ndarray, " step"]
     wheels: Float[np.ndarray, "step wheel"]
     commanded: Float[np.ndarray, "step wheel"] | None
     twist: Float[np.ndarray, "step 3"] | None
@@ -65,24 +63,35 @@ def edges(data: Recorded) -> Edges:
     return Edges(before, after, run, data.pose.at(before), data.pose.at(after))
 
 
+def turns(data: Recorded, at: Edges, lag: float) -> Float[np.ndarray, "step wheel"]:
+    """Rotation of each wheel [rad], `lag` before the poses; nan where it was not recorded."""
+    return _moved(data, data.angle, at, lag)
+
+
+def _moved(
+    data: Recorded, channel: Flat, at: Edges, lag: float
+) -> Float[np.ndarray, "step column"]:
+    """Change of a channel over each step; nan outside of its run."""
+    change = channel.at(at.after - lag) - channel.at(at.before - lag)
+    change[~_inside(data, at, lag)] = np.nan
+    return change
+
+
+def _inside(data: Recorded, at: Edges, lag: float) -> Bool[np.ndarray, " step"]:
+    slack = data.row[at.run]
+    begins = at.before - lag >= data.begin[at.run] - slack
+    return np.asarray(begins & (at.after - lag <= data.end[at.run] + slack))
+
+
 def steps(data: Recorded, at: Edges, lag: float) -> Steps:
     """Increments of every channel on the robot's clock, `lag` before those of the poses."""
-    before, after = at.before - lag, at.after - lag
-    slack = data.row[at.run]
-    inside = (before >= data.begin[at.run] - slack) & (after <= data.end[at.run] + slack)
-
-    def moved(channel: Flat) -> np.ndarray:
-        change = channel.at(after) - channel.at(before)
-        change[~inside] = np.nan
-        return change
 
     def maybe(channel: Flat | None) -> np.ndarray | None:
-        return None if channel is None else moved(channel)
+        return None if channel is None else _moved(data, channel, at, lag)
 
     return Steps(
         lag,
-        inside,
-        moved(data.angle),
+        turns(data, at, lag),
         maybe(data.commanded),
         maybe(data.twist),
         maybe(data.gyro),

@@ -1,6 +1,6 @@
 """Sentences about readings and factors: what was found, and which key of the config to change."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isclose, pi
 
@@ -8,6 +8,7 @@ from slipid.data.sanity.candidates import Candidate
 from slipid.data.sanity.causes import Explained
 from slipid.data.sanity.finding import Finding
 from slipid.data.sanity.headings import Frame
+from slipid.data.sanity.ratios import Ratios
 from slipid.data.sanity.reading import Reading
 from slipid.data.sanity.shape import Mistake
 
@@ -121,9 +122,7 @@ def _frame(kind: str, frame: Frame) -> Words:
             f"set unit = '{is_said[0]}' for the channel pose_heading",
         )
     if kind == "heading_quaternion":
-        remedy = (
-            "log the yaw, 2 atan2(qz, qw), and name its column in the channel pose_heading"
-        )
+        remedy = "log the yaw, 2 atan2(qz, qw), and name its column in the channel pose_heading"
     elif kind == "heading_sign":
         remedy = f"turn the sign of scale for the channel pose_heading{offset}"
     elif kind == "pose_axis":
@@ -143,6 +142,7 @@ _KIND = {
     "time": "time_unit",
     "pose_length": "pose_length",
     "heading": "heading_unit",
+    "wheel_gear": "wheel_scale",
     "wheel_turns": "wheel_scale",
     "wheel_radius": "wheel_scale",
     "base": "base_radius",
@@ -170,13 +170,27 @@ def of_causes(
     if not single:
         return tuple(_finding(one, (), why, gear_ratio) for one in fitting)
     first, *others = fitting
-    as_likely = [e for e in others if e.common == first.common and _KIND[e.name] != _KIND[first.name]]
+    as_likely = [
+        e for e in others if e.common == first.common and _KIND[e.name] != _KIND[first.name]
+    ]
     return (_finding(first, as_likely[:2], why, gear_ratio),)
 
 
-def _finding(
-    of: Explained, others: Sequence[Explained], why: str, gear_ratio: float
-) -> Finding:
+def of_ratios(seen: Ratios) -> str:
+    """The ratios that are not natural, as a sentence."""
+    words = {
+        "travel": "the body moves {:.3g} times as far as the wheels say",
+        "turning": "the body turns {:.3g} times as far as the wheels say",
+        "drive": "the commanded motion is {:.3g} times what the wheels did",
+        "steer": "the commanded turn is {:.3g} times what the wheels did",
+        "command": "the commanded wheel speeds are {:.3g} times the measured ones",
+        "report": "the reported wheel speeds are {:.3g} times what the encoders say",
+        "gyro": "the gyro turns {:.3g} times as far as the poses",
+    }
+    return ", ".join(words[k].format(r.value) for k, r in seen.known.items() if not r.natural)
+
+
+def _finding(of: Explained, others: Sequence[Explained], why: str, gear_ratio: float) -> Finding:
     said = _factor(of, gear_ratio)
     remedy = said.remedy
     for other in others:
@@ -190,22 +204,22 @@ def _factor(of: Explained, gear_ratio: float) -> Words:
     much = f"{size:.3g} times too " + ("large" if of.factor > 1 else "small")
     name = of.name
     if name == "time":
-        unit = {1000.0: "ms", 1e6: "us", 1e9: "ns", 60.0: "s"}.get(of.factor)
+        unit = _named(of.factor, {1e3: "ms", 1e6: "us", 1e9: "ns", 60.0: "s", 1e-3: "s"})
         to = f"set unit = '{unit}' for the channel time" if unit else "correct the unit of time"
         return Words(f"time is in another unit, {much}", to)
     if name == "pose_length":
-        unit = {1000.0: "mm", 100.0: "cm", 0.001: "m", 0.01: "m"}.get(of.factor)
-        set_unit = f"set unit = '{unit}' for the channels" if unit else "correct the unit or scale of"
+        unit = _named(of.factor, {1e3: "mm", 1e2: "cm", 1e-3: "m", 1e-2: "m"})
+        set_unit = (
+            f"set unit = '{unit}' for the channels" if unit else "correct the unit or scale of"
+        )
         return Words(
             f"the poses' lengths are {much}",
             f"{set_unit} pose_x and pose_y (scale = {1 / of.factor:.3g})",
         )
     if name == "heading":
         unit = "deg" if of.factor > 1 else "rad"
-        return Words(
-            f"the heading is {much}", f"set unit = '{unit}' for the channel pose_heading"
-        )
-    if name == "wheel_turns":
+        return Words(f"the heading is {much}", f"set unit = '{unit}' for the channel pose_heading")
+    if name in ("wheel_gear", "wheel_turns"):
         return Words(f"the wheels' turns are {much}", _turns(of.factor, gear_ratio))
     if name == "wheel_radius":
         return Words(
@@ -227,7 +241,8 @@ def _factor(of: Explained, gear_ratio: float) -> Words:
     }[name]
     return Words(
         f"the channel {channel} is {much}",
-        f"correct its unit or scale{_unit_of_rate(of.factor)} (scale = {1 / of.factor:.3g})",
+        f"correct unit or scale of the channel {channel}{_unit_of_rate(of.factor)} "
+        f"(scale = {1 / of.factor:.3g})",
     )
 
 
@@ -254,4 +269,9 @@ def _unit_of_rate(factor: float) -> str:
         2 * pi: ": radians were taken for revolutions",
         1000.0: ": thousandths were taken for the whole",
     }
+    return _named(factor, names)
+
+
+def _named(factor: float, names: Mapping[float, str]) -> str:
+    """The name of a factor, or nothing."""
     return next((said for f, said in names.items() if isclose(f, factor, rel_tol=1e-3)), "")
