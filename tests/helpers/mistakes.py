@@ -1,4 +1,4 @@
-"""Mistakes that people make in configs and logs, made on purpose, and what they are to be called."""
+"""Mistakes that people make in configs and logs, on purpose, and what they are to be called."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -6,6 +6,7 @@ poses, gyro and ammeters are rounded, late and noisy.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -88,7 +89,7 @@ def _run(of: Drive, rng: np.random.Generator, speed: float) -> Raw:
     rows = len(time)
     twist = np.zeros((rows, 3))
     edges = [8, *sorted(rng.choice(np.arange(25, rows - 25), 3, replace=False)), rows - 10]
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         way = rng.uniform(-np.pi, np.pi)
         v = speed * rng.uniform(0.5, 1.0)
         sideways = v * np.sin(way) if of.sideways else 0.0

@@ -3,7 +3,7 @@
 A cause multiplies each ratio by a power of its factor. With the logarithms of ratios and of the
 ends of their ranges, a cause fits where one factor brings all of them into their ranges:
 
-    max_i  (log ratio_i - log high_i) / e_i   <=   log factor   <=   min_i  (log ratio_i - log low_i) / e_i
+    max_i  log(ratio_i / high_i) / e_i   <=   log factor   <=   min_i  log(ratio_i / low_i) / e_i
 
 (ends exchanged where e_i < 0). Of causes that fit, one with a factor that people do get wrong is
 believed: 1000, 2 pi, 57.3, the gear ratio.

@@ -24,7 +24,7 @@ LEAST_A = 0.005
 MOST_V, LEAST_V = 200.0, 0.2
 """Voltages that motors of such robots see [V]."""
 POWER = (0.003, 60.0)
-"""Electrical power over mass, gravity and speed, which any rolling or climbing robot keeps within."""
+"""Electrical power over mass, gravity and speed, of any robot that rolls or climbs."""
 GRAVITY = 9.81
 
 
@@ -57,7 +57,7 @@ def electric(
     if not odd and power is not None and not POWER[0] <= power <= POWER[1]:
         yield Finding(
             "current_unit",
-            f"the motors take {power:.3g} times the power that lifting the robot at its speed would",
+            f"the motors take {power:.3g} times the power of lifting the robot at its speed",
             "correct the unit of current (mA?) or voltage (mV?), or mass_kg in [robot]",
             "wrong",
         )

@@ -104,10 +104,11 @@ def ratios(data: Recorded, at: Edges, moved: Steps, evidence: Evidence, reading:
     values["report"], same = _reported(data)
     if same:
         values["report"] = None
-    vouched = values.get("drive") is not None or values.get("command") is not None
-    wide = dict(_WIDE) if vouched else _WIDE | {"travel": _UNVOUCHED}
+    wide = dict(_WIDE)
+    if values.get("drive") is None and values.get("command") is None:
+        wide["travel"] = _UNVOUCHED
     if not evidence.free:
-        wide |= _SCRUBBING
+        wide.update(_SCRUBBING)
     known = {k: Ratio(v, *wide[k]) for k, v in values.items() if v is not None and v > 0}
     return Ratios(known, same)
 

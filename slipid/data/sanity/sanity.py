@@ -34,8 +34,8 @@ from slipid.model.geometry import Geometry
 
 FEW = 20
 """Steps below which nothing is compared."""
-FOREIGN = 0.5
-"""Share of the poses' motion that wheels leave unexplained in any reading, from which it is said."""
+FOREIGN = 0.4
+"""Share of the poses' motion, left unexplained in any reading, from which it is said."""
 LATE_S = 1.0
 """Lag of the poses from which it is said [s]."""
 TOO_LATE_S = 1.9
@@ -138,8 +138,8 @@ def _of_lag(lag: Lag) -> Iterator[Finding]:
         "lag",
         f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: so {lag.unexplained:.2f} of "
         f"the motion is left unexplained, without {lag.without:.2f}",
-        f"shift the poses' times by {-lag.seconds:+.1f} s, or start 'camera.lag' in [parameters] at "
-        f"{lag.seconds:.1f}",
+        f"shift the poses' times by {-lag.seconds:+.1f} s, or start 'camera.lag' in [parameters] "
+        f"at {lag.seconds:.1f}",
         "wrong" if abs(lag.seconds) > TOO_LATE_S else "suspicious",
     )
 

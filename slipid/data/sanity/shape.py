@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from slipid.data.sanity.candidates import Candidate, candidates
-from slipid.data.sanity.reading import Evidence, Reading, misfit
+from slipid.data.sanity.reading import Evidence, Reading, misfit, misfits
 
 MISTAKES = 3
 """That are looked for, one after the other."""
@@ -11,6 +11,8 @@ GAIN = 0.05
 """A mistake is believed where its reading leaves so much less unexplained,"""
 SHARE = 0.3
 """and this part of what it still leaves; no real log comes near it without a mistake."""
+EXPLAINED = 0.4
+"""Part of the poses' motion that another frame of theirs may leave unexplained."""
 ALIKE = 0.02
 """Readings that differ by less are told as other ways to see it."""
 
@@ -47,6 +49,7 @@ def _one(evidence: Evidence, of: Reading) -> Mistake | None:
     """The simplest mistake that explains decisively better, or None."""
     before = misfit(evidence, of)
     tried = [(misfit(evidence, c.reading), c) for c in candidates(evidence, of)]
+    tried = [t for t in tried if t[1].reading.frame == of.frame or _explains(evidence, t[1])]
     after, best = min(tried, key=lambda pair: pair[0] + pair[1].cost)
     if before - after < GAIN + SHARE * after:
         return None
@@ -55,3 +58,8 @@ def _one(evidence: Evidence, of: Reading) -> Mistake | None:
         if other.kind != best.kind and left < after + ALIKE:
             alike.setdefault(other.kind, other)
     return Mistake(best, before, after, tuple(alike.values()))
+
+
+def _explains(evidence: Evidence, candidate: Candidate) -> bool:
+    """Whether poses of another frame then follow the wheels."""
+    return misfits(evidence, candidate.reading)["pose"] < EXPLAINED

@@ -14,6 +14,8 @@ from slipid.data.sanity.steps import Edges, Steps
 
 MOVED_M = 0.2
 """Way of the wheels from which a run must move its poses [m]."""
+STILL_M = 1e-6
+"""Way of poses that do not change, but for rounding [m]."""
 ROWS = 20
 """Rows below which a run says nothing alone."""
 STRANGE, TIMES, USUAL = 0.3, 10.0, 0.9
@@ -73,7 +75,7 @@ def likeness(
 
 def standing(data: Recorded, of: Likeness) -> Bool[np.ndarray, " run"]:
     """Runs whose poses do not change while wheels turn."""
-    return (of.poses_m == 0) & (of.wheels_m > MOVED_M) & (_rows(data) >= ROWS)
+    return (of.poses_m < STILL_M) & (of.wheels_m > MOVED_M) & (_rows(data) >= ROWS)
 
 
 def single_runs(data: Recorded, of: Likeness) -> Iterator[Finding]:

@@ -16,7 +16,7 @@ _WHAT_OF_FRAME = {
     "heading_sign": "the heading of the poses turns the other way round than the body does",
     "pose_axis": "an axis of the poses has the wrong sign",
     "pose_swapped": "x and y of the poses are exchanged",
-    "pose_mirrored": "the poses are mirrored, as seen from below or in an image whose y points down",
+    "pose_mirrored": "the poses are mirrored, as from below or in an image whose y points down",
     "heading_quaternion": "the heading is the z of a quaternion, sin(yaw / 2), not an angle",
 }
 
@@ -224,13 +224,14 @@ def _factor(of: Explained, gear_ratio: float) -> Words:
     if name == "wheel_radius":
         return Words(
             f"wheel_radius_m is {much}, or the wheels' turns are",
-            f"divide wheel_radius_m in [robot] by {of.factor:.3g}, or {_turns(of.factor, gear_ratio)}",
+            f"divide wheel_radius_m in [robot] by {of.factor:.3g}, or "
+            + _turns(of.factor, gear_ratio),
         )
     if name == "base":
         return Words(
             f"the distance of the wheels from the middle is {'less' if of.factor < 1 else 'more'} "
             f"than declared, by a factor of {size:.3g}",
-            f"correct base_radius_m (or half_width_m, half_length_m, wheel_places_m) in [robot]",
+            "correct base_radius_m (or half_width_m, half_length_m, wheel_places_m) in [robot]",
         )
     channel = {
         "gyro": "gyro",
