@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
+from slipid.data.sanity.axes.reading import Reading, columns
 from slipid.data.sanity.finding import Finding
-from slipid.data.sanity.reading import Reading, columns
-from slipid.data.sanity.recorded import Recorded
+from slipid.data.sanity.motion.recorded import Recorded
 
 BACKWARDS = -0.25
 """Work over the sum of its magnitudes below which a sign is wrong."""

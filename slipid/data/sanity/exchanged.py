@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from slipid.data.sanity.finding import Finding
-from slipid.data.sanity.recorded import Flat, Recorded
+from slipid.data.sanity.motion.recorded import Flat, Recorded
 
 LONGEST_S = 1.0
 """Lags between command and motion that are looked at, either way [s]."""

@@ -46,6 +46,14 @@ class Finding:
         }
 
 
+@dataclass(frozen=True)
+class Words:
+    """What was found, and what to do."""
+
+    found: str
+    remedy: str
+
+
 def listed(names: Sequence[str]) -> str:
     """The first few names, and how many more there are."""
     more = len(names) - NAMED

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from slipid.data.sanity.axes.reading import Evidence, Reading, to_body
 from slipid.data.sanity.finding import Finding
-from slipid.data.sanity.ratios import FORWARD, TURNS
-from slipid.data.sanity.reading import Evidence, Reading, to_body
-from slipid.data.sanity.recorded import Flat, Recorded
+from slipid.data.sanity.motion.recorded import Flat, Recorded
+from slipid.data.sanity.scales.ratios import FORWARD, TURNS
 
 
 def notes(data: Recorded, evidence: Evidence, reading: Reading) -> Iterator[Finding]:

@@ -15,21 +15,22 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.runs import Runs
-from slipid.data.sanity.causes import explained
+from slipid.data.sanity.axes.gather import gather
+from slipid.data.sanity.axes.reading import Evidence, Reading, misfits
+from slipid.data.sanity.axes.shape import mistakes
+from slipid.data.sanity.axes.words import of_mistake
 from slipid.data.sanity.electric import electric
-from slipid.data.sanity.evidence import usable
 from slipid.data.sanity.exchanged import exchanged
 from slipid.data.sanity.finding import Finding, worst_first
-from slipid.data.sanity.gather import gather
-from slipid.data.sanity.lag import Lag, find_lag
+from slipid.data.sanity.motion.evidence import usable
+from slipid.data.sanity.motion.lag import Lag, find_lag
+from slipid.data.sanity.motion.recorded import Recorded, recorded
+from slipid.data.sanity.motion.steps import Edges, Steps, edges, steps
 from slipid.data.sanity.notes import not_checked, notes
-from slipid.data.sanity.ratios import Ratios, ratios
-from slipid.data.sanity.reading import Evidence, Reading, misfits
-from slipid.data.sanity.recorded import Recorded, recorded
-from slipid.data.sanity.shape import mistakes
+from slipid.data.sanity.scales.causes import explained
+from slipid.data.sanity.scales.ratios import Ratios, ratios
+from slipid.data.sanity.scales.words import of_causes, of_ratios
 from slipid.data.sanity.single_runs import likeness, single_runs, standing
-from slipid.data.sanity.steps import Edges, Steps, edges, steps
-from slipid.data.sanity.wording import of_causes, of_mistake, of_ratios
 from slipid.model.geometry import Geometry
 
 FEW = 20

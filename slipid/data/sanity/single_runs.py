@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from slipid.data.sanity.axes.reading import Evidence, Reading, to_body
 from slipid.data.sanity.finding import Finding
-from slipid.data.sanity.headings import Frame, body_motion
-from slipid.data.sanity.reading import Evidence, Reading, to_body
-from slipid.data.sanity.recorded import Recorded
-from slipid.data.sanity.steps import Edges, Steps
+from slipid.data.sanity.motion.headings import Frame, body_motion
+from slipid.data.sanity.motion.recorded import Recorded
+from slipid.data.sanity.motion.steps import Edges, Steps
 
 MOVED_M = 0.2
 """Way of the wheels from which a run must move its poses [m]."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.data.sanity.recorded import Flat, Recorded
+from slipid.data.sanity.motion.recorded import Flat, Recorded
 
 STEP_S = 0.4
 """Length of a step [s]: long beside jitter and rounding, short beside a turn of the robot."""

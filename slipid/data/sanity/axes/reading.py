@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.sanity.evidence import Products
-from slipid.data.sanity.headings import Frame
+from slipid.data.sanity.motion.evidence import Products
+from slipid.data.sanity.motion.headings import Frame
 
 STILL = 1e-3
 """Share of the wheels' predicted motion along an axis below which the axis is not looked at."""

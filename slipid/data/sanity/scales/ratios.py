@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.sanity.evidence import Products, usable
-from slipid.data.sanity.headings import Frame, body_motion
-from slipid.data.sanity.reading import Evidence, Reading, columns, to_body
-from slipid.data.sanity.recorded import Recorded
-from slipid.data.sanity.steps import Edges, Steps
+from slipid.data.sanity.axes.reading import Evidence, Reading, columns, to_body
+from slipid.data.sanity.motion.evidence import Products, usable
+from slipid.data.sanity.motion.headings import Frame, body_motion
+from slipid.data.sanity.motion.recorded import Recorded
+from slipid.data.sanity.motion.steps import Edges, Steps
 
 TURNS = 0.01
 """Share of the predicted motion that must be turning, for the heading to be compared."""

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import exp, inf, log, pi
 
-from slipid.data.sanity.ratios import Ratio, Ratios
+from slipid.data.sanity.scales.ratios import Ratio, Ratios
 
 NEAR = 0.02
 """A range that ends this near a factor (in its logarithm) still holds it."""

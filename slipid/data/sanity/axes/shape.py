@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from slipid.data.sanity.candidates import Candidate, candidates
-from slipid.data.sanity.reading import Evidence, Reading, misfit, misfits
+from slipid.data.sanity.axes.candidates import Candidate, candidates
+from slipid.data.sanity.axes.reading import Evidence, Reading, misfit, misfits
 
 MISTAKES = 3
 """That are looked for, one after the other."""

@@ -6,8 +6,8 @@ from itertools import combinations, permutations, product
 
 import numpy as np
 
-from slipid.data.sanity.headings import Frame
-from slipid.data.sanity.reading import Evidence, Reading
+from slipid.data.sanity.axes.reading import Evidence, Reading
+from slipid.data.sanity.motion.headings import Frame
 
 TURN_DEG = 15
 """Grid on which rotations of axes and azimuths are looked for [deg]."""

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.sanity.steps import Edges
+from slipid.data.sanity.motion.steps import Edges
 
 Heading = Literal["as_said", "turned_round", "degrees", "radians", "half_sine"]
 """What the logged heading is: the heading [rad]; its negative; degrees that were taken for radians;
@@ -27,6 +27,10 @@ class Frame:
     heading: Heading = "as_said"
     y_down: bool = False
     offset: int = 0
+
+
+FRAMES = tuple(Frame(heading, down) for heading in HEADINGS for down in (False, True))
+"""Every frame whose steps of the body differ by more than a rotation."""
 
 
 def body_motion(at: Edges, frame: Frame) -> Float[np.ndarray, "step 3"]:

@@ -3,13 +3,10 @@
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.sanity.evidence import Products, products, usable
-from slipid.data.sanity.headings import HEADINGS, Frame, body_motion
-from slipid.data.sanity.reading import Commanded, Evidence
-from slipid.data.sanity.steps import Edges, Steps
-
-FRAMES = tuple(Frame(heading, down) for heading in HEADINGS for down in (False, True))
-"""Every frame whose steps of the body differ by more than a rotation."""
+from slipid.data.sanity.axes.reading import Commanded, Evidence
+from slipid.data.sanity.motion.evidence import Products, products, usable
+from slipid.data.sanity.motion.headings import FRAMES, Frame, body_motion
+from slipid.data.sanity.motion.steps import Edges, Steps
 
 
 def gather(rolling: Float[np.ndarray, "wheel 3"], at: Edges, moved: Steps, base: float) -> Evidence:

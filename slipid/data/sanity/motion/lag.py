@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.sanity.evidence import left_by_linear, usable
-from slipid.data.sanity.gather import FRAMES
-from slipid.data.sanity.headings import Frame, body_motion
-from slipid.data.sanity.recorded import Recorded
-from slipid.data.sanity.steps import Edges, turns
+from slipid.data.sanity.motion.evidence import left_by_linear, usable
+from slipid.data.sanity.motion.headings import FRAMES, Frame, body_motion
+from slipid.data.sanity.motion.recorded import Recorded
+from slipid.data.sanity.motion.steps import Edges, turns
 
 LONGEST_S = 8.0
 """Largest lag that is looked for, either way [s]."""
