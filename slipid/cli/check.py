@@ -18,7 +18,10 @@ def check(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Read and validate logs; say what they can tell before anything is fitted."""
+    """Read and validate logs; say what is wrong and what they can tell before anything is fitted.
+
+    Exit code 1 where logs and config do not go together.
+    """
     from slipid.job import check as job
     from slipid.job.config import Motor, read_config
     from slipid.plots.raw import raw_plots
@@ -33,7 +36,7 @@ def check(
             report.stage("drawing")
             raw_plots(logs, out)
     emit(json, found, lambda page: show_check(page, found))
-    return 0
+    return 1 if any(f["severity"] == "wrong" for f in found["findings"]) else 0
 
 
 def bench(config: "Config", data: Path, out: Path | None, json: str | None, quiet: bool) -> int:

@@ -25,6 +25,9 @@ def identify(
         list[str] | None,
         typer.Option(metavar="PATH", help="Also profile a number's likelihood; may be repeated."),
     ] = None,
+    anyway: Annotated[
+        bool, typer.Option("--anyway", help="Fit logs and config that do not go together.")
+    ] = False,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
@@ -40,14 +43,19 @@ def identify(
     if isinstance(wanted.content.robot, Motor):
         return bench(wanted, data, out, profile or (), json, quiet)
     with Reporter(quiet=quiet) as report:
-        done = run(config, data, out, report, profile or ())
+        done = run(config, data, out, report, profile or (), anyway)
     content = read_json(out / "identified.json", "what identify wrote")
     emit(json, content, lambda page: show_fit(page, done.fit, done.profiles), out, done.written)
     return 0 if done.fit.converged else 1
 
 
 def run(
-    config: Path, data: Path, out: Path, report: Reporter, profiles: Sequence[str] = ()
+    config: Path,
+    data: Path,
+    out: Path,
+    report: Reporter,
+    profiles: Sequence[str] = (),
+    anyway: bool = False,
 ) -> "Identified":
     """The fit and its pictures; arguments as of `slipid.job.identify.identify`.
 
@@ -60,7 +68,7 @@ def run(
     from slipid.plots.fit import identify_plots
     from slipid.plots.posterior import profile_figure
 
-    done = identify(config, data, out, report, profiles)
+    done = identify(config, data, out, report, profiles, anyway)
     report.stage("drawing")
     drawn = [out / name for name in write_robot(out, done.fit)]
     try:

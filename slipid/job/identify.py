@@ -22,6 +22,7 @@ from slipid.identify.verdicts.profile import Profile, profile, profiled
 from slipid.job.bench_priors import KEPT
 from slipid.job.config import read_config
 from slipid.job.problem import Job, Task, read_job, with_mixed
+from slipid.job.sanity import refuse_if_wrong, sanity
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, writable, write_bytes, write_json
@@ -43,18 +44,25 @@ class Identified:
 
 
 def identify(
-    config_path: Path, data: Path, out: Path, report: Reporter, profiles: Sequence[str] = ()
+    config_path: Path,
+    data: Path,
+    out: Path,
+    report: Reporter,
+    profiles: Sequence[str] = (),
+    anyway: bool = False,
 ) -> Identified:
     """Fit the robot of a config to its logs and write everything to `out`.
 
     A fit that was interrupted there goes on. Profile likelihoods are made of the numbers named.
-    DataError where config or logs are wrong; nothing was written then.
+    DataError where config or logs are wrong; nothing was written then. Where they do not go
+    together, that is fitted `anyway` and said.
     """
     began = time.monotonic()
     setup_jax(quiet=True)
     config = read_config(config_path)
     job = read_job(config, data, report)
     report.line(f"{len(job.dataset)} runs on {', '.join(job.robot.surfaces.labels)}")
+    _sane(job, report, anyway)
     job = with_mixed(job, data, report)
     report.stage("cutting windows")
     problem = job.problem()
@@ -102,6 +110,17 @@ def _another(out: Path, job: Job) -> str | None:
         return None
     other = "other logs" if config["sha256"] == job.config.hash else f"another {config['name']}"
     return f"{out} holds a fit of {other}; it is replaced when this one is done"
+
+
+def _sane(job: Job, report: Reporter, anyway: bool) -> None:
+    """Refuse logs and config that do not go together, or say so."""
+    report.stage("do logs and config go together?")
+    found = sanity(job)
+    if not anyway:
+        refuse_if_wrong(found)
+    for finding in found:
+        if finding.severity != "note":
+            report.line(f"{finding.severity}: {finding}")
 
 
 def _keep_run(job: Job, data: Path, out: Path, seconds: float) -> None:

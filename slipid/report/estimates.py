@@ -77,7 +77,8 @@ def show_fit(page: Page, fit: Fit, profiles: Sequence[Profile] = ()) -> None:
 
 
 def show_check(page: Page, found: Content) -> None:
-    """Write the content of check.json."""
+    """Write the content of check.json; what is wrong comes first."""
+    page.findings(found["findings"])
     groups = table(("surface", "load", "session", "runs", "minutes", "headings", r"speeds \[m/s]"))
     for row in found["groups"]:
         groups.add_row(
