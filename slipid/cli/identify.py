@@ -14,6 +14,7 @@ from slipid.support.progress import Reporter
 if TYPE_CHECKING:
     from slipid.job.config import Config
     from slipid.job.identify import Identified
+    from slipid.report.page import Page
 
 
 @guarded
@@ -33,10 +34,11 @@ def identify(
 ) -> int:
     """Fit motors, floors, loads and camera to the logs, end to end.
 
-    Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt.
+    Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt. Exit code
+    1 where it did not converge, or predicts worse than the encoders.
     """
     from slipid.job.config import Motor, read_config
-    from slipid.report.estimates import show_fit
+    from slipid.report.estimates import show_fit, show_trust
     from slipid.support.files import read_json
 
     wanted = read_config(config)
@@ -45,8 +47,13 @@ def identify(
     with Reporter(quiet=quiet) as report:
         done = run(config, data, out, report, profile or (), anyway)
     content = read_json(out / "identified.json", "what identify wrote")
-    emit(json, content, lambda page: show_fit(page, done.fit, done.profiles), out, done.written)
-    return 0 if done.fit.converged else 1
+
+    def show(page: "Page") -> None:
+        show_fit(page, done.fit, done.profiles)
+        show_trust(page, done.judgement)
+
+    emit(json, content, show, out, done.written)
+    return 0 if done.fit.converged and not done.judgement.is_bad else 1
 
 
 def run(
@@ -72,7 +79,8 @@ def run(
     report.stage("drawing")
     drawn = [out / name for name in write_robot(out, done.fit)]
     try:
-        drawn += identify_plots(done.fit, done.job.dataset, out)
+        warning = done.judgement.warning
+        drawn += identify_plots(done.fit, done.job.dataset, out, warning)
     except DataError as error:  # the numbers are written; a run too short to draw spoils none
         report.line(f"no more pictures: {error}")
     if done.profiles:

@@ -23,6 +23,7 @@ from slipid.job.bench_priors import KEPT
 from slipid.job.config import read_config
 from slipid.job.problem import Job, Task, read_job, with_mixed
 from slipid.job.sanity import refuse_if_wrong, sanity
+from slipid.job.trust import Judgement, judgement
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, writable, write_bytes, write_json
@@ -35,10 +36,11 @@ CHECKPOINT = "checkpoint"
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """End of `identify`: the fit, the runs it saw, the profiles asked for, the files written."""
+    """End of `identify`: the fit, the runs it saw, how far it may be trusted, profiles, files."""
 
     fit: Fit
     job: Job
+    judgement: Judgement
     profiles: tuple[Profile, ...]
     written: tuple[str, ...]
 
@@ -78,9 +80,11 @@ def identify(
     kept = Checkpoint(out, key)
     optimum = optimised(job, problem, kept, report)
     fit = summarised(job, problem, optimum, report)
+    report.stage("predicting the fitted runs")
+    judged = judgement(fit, job.dataset)
     report.stage("writing")
     written = (*save(fit, out), "run.json", "config.toml")
-    _keep_run(job, data, out, time.monotonic() - began)
+    _keep_run(job, judged, data, out, time.monotonic() - began)
     if profiles and job.mixed:
         report.line("profiles are of the runs on one floor each")
 
@@ -96,7 +100,7 @@ def identify(
         write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
         written = (*written, "profile.json")
     kept.remove(f"{CHECKPOINT}.npz")
-    return Identified(fit, job, tuple(found), written)
+    return Identified(fit, job, judged, tuple(found), written)
 
 
 def _another(out: Path, job: Job) -> str | None:
@@ -123,7 +127,7 @@ def _sane(job: Job, report: Reporter, anyway: bool) -> None:
             report.line(f"{finding.severity}: {finding}")
 
 
-def _keep_run(job: Job, data: Path, out: Path, seconds: float) -> None:
+def _keep_run(job: Job, judged: Judgement, data: Path, out: Path, seconds: float) -> None:
     """What later commands and readers need to know of this run."""
     config = job.config
     write_bytes(out / "config.toml", config.text.encode())
@@ -136,6 +140,7 @@ def _keep_run(job: Job, data: Path, out: Path, seconds: float) -> None:
         "seconds": round(seconds, 1),
         "config": {"name": config.path.name, "sha256": config.hash},
         "data": {"folder": str(data), "hash": job.data_hash, "logs": logs, "skipped": job.skipped},
+        "trust": judged.to_json(),
         "seed": job.settings.seed,
         "versions": versions(),
     }

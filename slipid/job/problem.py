@@ -154,7 +154,9 @@ def job_of(config: Config, dataset: Runs, skipped: Sequence[str], report: Report
     robot = on_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
     choices, left_out = _choices(config, robot)
     # what the user says comes later and wins
-    known = [*told_lag(dataset), *without_rollers(shape), *still_viscosities(dataset)]
+    given = any(fnmatch.fnmatchcase("camera.lag", p) for p in config.content.parameters)
+    lag = [] if given else told_lag(dataset)
+    known = [*lag, *without_rollers(shape), *still_viscosities(dataset)]
     trusted = config.content.fit.lengths_from
     choices = [*known, *choices]
     if trusted is not None and {*LENGTHS.values()} <= {e.path for e in Space(robot, choices).free}:
