@@ -1,6 +1,6 @@
 """The controllers of a trial, each a row of its table, and the gains they have."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,13 @@ class Row:
     gyro: bool = False
     mapped: bool = False
 
+    def drives(self, robot: DeployedRobot) -> bool:
+        """Whether it applies: torque corrections have gains of the 2021 paper's three wheels."""
+        return self.correction == "none" or robot.wheels == PAPER_WHEELS
 
+
+PAPER_WHEELS = 3
+"""Of the 2021 paper's robot."""
 ROWS: Mapping[str, Row] = {
     "encoder": Row("encoder", "believes its encoders"),
     "slip_odometry": Row("curve", "odometry less slip over current (figure 5)"),
@@ -51,6 +57,22 @@ ROWS: Mapping[str, Row] = {
     "contact_map": Row("contact", "contact, told the map of its floors", tuned=True, mapped=True),
     "contact_gyro": Row("contact", "contact, with a gyro", tuned=True, gyro=True),
 }
+
+
+def applying(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
+    """The controllers among these that apply to a robot.
+
+    Raises:
+        DataError: none does.
+    """
+    kept = tuple(name for name in names if ROWS[name].drives(robot))
+    if not kept:
+        raise DataError(
+            f"{', '.join(names)}: for robots with {PAPER_WHEELS} wheels, as that of the 2021 paper; "
+            f"this one has {robot.wheels}, expected some of "
+            f"{', '.join(name for name, row in ROWS.items() if row.drives(robot))}"
+        )
+    return kept
 
 
 def check_gains(out: Path, robot: DeployedRobot, forced: bool) -> None:
@@ -98,7 +120,15 @@ def pilot_of(
 
     Those are taken where they are better than gains set by hand, or forced. A map of the floors is
     told to the rows that may know it.
+
+    Raises:
+        DataError: the row does not apply to the robot's wheels.
     """
+    if not row.drives(robot):
+        raise DataError(
+            f"the torque correction of the 2021 paper has gains for {PAPER_WHEELS} wheels; this "
+            f"robot has {robot.wheels}"
+        )
     own = Gains.of(robot, forced) if row.tuned else Gains()
     if row.ahead:
         own = replace(own, ahead=jnp.asarray(1.0))

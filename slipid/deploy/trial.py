@@ -16,7 +16,7 @@ from slipid.control.interface import Settings
 from slipid.control.robot_file.typed import typed
 from slipid.control.tuning.actuation import Habits
 from slipid.data.floor_map import FloorMap, read_map
-from slipid.deploy.controllers import ROWS, check_gains, pilot_of, unused_gains
+from slipid.deploy.controllers import ROWS, applying, check_gains, pilot_of, unused_gains
 from slipid.deploy.deploy import habits_of, read_robot
 from slipid.deploy.floors import floor_of
 from slipid.deploy.trial_site import (
@@ -117,6 +117,9 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
     """
     setup_jax(quiet=True)
     jobs = _jobs(out, wish)
+    rows = tuple(dict.fromkeys(job.row for job in jobs))
+    if left := [name for name in wish.controllers if name not in rows]:
+        report.line(f"left out, for robots with three wheels: {', '.join(left)}")
     if unused := unused_gains(jobs[0].robot, wish.tuned_gains):
         report.line(unused)
     todo = {job.name: job for job in jobs if _driven(job) is None}
@@ -135,7 +138,7 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
         "closes_best": None if len(able) > 1 else able[0],
         "not_told_apart": able,
         "summary": {name: row.to_json() for name, row in table.items()},
-        "controllers": {name: ROWS[name].about for name in wish.controllers},
+        "controllers": {name: ROWS[name].about for name in rows},
         "runs": [run.to_json() for run in runs],
     }
     write_json(out / "trial.json", content)
@@ -180,7 +183,7 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
     shared = wish.plant, floor, robot, settings, habits, wish.tuned_gains, kept
     return [
         Job(f"{row}/start{k:02d}", row, path, start, 1000 + k, *shared)
-        for row in wish.controllers
+        for row in applying(wish.controllers, robot)
         for k, start in enumerate(starts(wish.starts, floor, path))
     ]
 
