@@ -98,6 +98,14 @@ class LogsSketch:
 
 
 @dataclass(frozen=True)
+class Hint:
+    """What to ask of a key of `[robot]` that nobody answered, instead of the usual words."""
+
+    key: str
+    asks: str
+
+
+@dataclass(frozen=True)
 class Sketch:
     """A whole config.
 
@@ -107,6 +115,7 @@ class Sketch:
         carries: channels of the presets that are used.
         above: comments at its beginning.
         data: the data folder, as it is called on the command line.
+        hints: questions about the robot in words that fit its logs.
     """
 
     robot: Answers
@@ -115,6 +124,7 @@ class Sketch:
     carries: frozenset[str] = frozenset()
     above: tuple[str, ...] = ()
     data: str = "DIR"
+    hints: tuple[Hint, ...] = ()
 
     @property
     def channels(self) -> frozenset[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from slipid.job.config import Logs, Wheels, geometry, parsed
 from slipid.job.new.drawing import drawing
 from slipid.job.new.lines import Block, Line, all_asked, toml
-from slipid.job.new.questions import Answers, robot_of
+from slipid.job.new.questions import robot_of
 from slipid.job.new.sketch import BesideSketch, FileSketch, LayoutSketch, LogsSketch, Sketch
 from slipid.job.reference.meanings import in_short
 from slipid.support.errors import DataError
@@ -78,7 +78,7 @@ def new_config(sketch: Sketch, name: str) -> NewConfig:
     picture = drawing(geometry(robot))
     blocks = [
         Block("", above=_head(sketch, name)),
-        _robot_block(sketch.robot, robot, picture),
+        _robot_block(sketch, robot, picture),
         *(block for layout in sketch.layouts for block in _layout_blocks(layout)),
         *(_logs_block(logs, first=k == 0) for k, logs in enumerate(sketch.logs)),
         _weights_block(geometry(robot).wheels),
@@ -100,16 +100,16 @@ def _head(sketch: Sketch, name: str) -> tuple[str, ...]:
     )
 
 
-def _robot_block(known: Answers, robot: Wheels, picture: str) -> Block:
+def _robot_block(sketch: Sketch, robot: Wheels, picture: str) -> Block:
     """`[robot]` with the drawing in front of it."""
-    lines = [Line("drive", toml(robot.drive), _ORDER[robot.drive], _open(known, "drive"))]
+    lines = [Line("drive", toml(robot.drive), _ORDER[robot.drive], _open(sketch, "drive"))]
     given = robot.model_dump(exclude_none=True, exclude={"drive"}, exclude_defaults=False)
     own = {key: value for key, value in given.items() if _worth_saying(robot, key, value)}
     # what the drive is made of comes first, what all robots have after it
     common = ("wheel_radius_m", "gear_ratio", "mass_kg")
     for key in (*(k for k in own if k not in common), *common):
         comment = in_short(type(robot), key)
-        lines.append(Line(key, toml(own[key]), comment, _open(known, key)))
+        lines.append(Line(key, toml(own[key]), comment, _open(sketch, key)))
     return Block("[robot]", tuple(lines), above=(*picture.splitlines(), "", FRAME))
 
 
@@ -118,11 +118,12 @@ def _worth_saying(robot: Wheels, key: str, value: object) -> bool:
     return key not in ("roller_angle_deg",) or value != type(robot).model_fields[key].default
 
 
-def _open(known: Answers, key: str) -> str:
+def _open(sketch: Sketch, key: str) -> str:
     """The question about a key that nobody answered."""
-    if _ASKED.get(key, key) not in known.taken or key == "drives":
+    if _ASKED.get(key, key) not in sketch.robot.taken or key == "drives":
         return ""
-    return _PUT.get(key, _MEASURE)
+    hints = (hint.asks for hint in sketch.hints if hint.key == key and hint.asks)
+    return next(hints, _PUT.get(key, _MEASURE))
 
 
 _UNITS = (
