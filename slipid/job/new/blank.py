@@ -14,7 +14,7 @@ _LABELS = {
 
 def blank(known: Answers) -> Sketch:
     """Everything that this robot may log, in one file for each run."""
-    layout = LayoutSketch("mine", FileSketch(_channels(known), settings=_settings(known)))
+    layout = LayoutSketch("mine", FileSketch(_channels(known), settings=_settings(known)), examples=True)
     return Sketch(known, (layout,), (LogsSketch("*/*.csv", "mine"),))
 
 

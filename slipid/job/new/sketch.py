@@ -72,11 +72,12 @@ class BesideSketch:
 
 @dataclass(frozen=True)
 class LayoutSketch:
-    """A layout of the config's own."""
+    """A layout of the config's own; `examples`: whether other ways to log are shown below it."""
 
     name: str
     file: FileSketch
     beside: tuple[BesideSketch, ...] = ()
+    examples: bool = False
 
     @property
     def channels(self) -> Iterator[ChannelSketch]:

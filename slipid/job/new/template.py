@@ -149,11 +149,10 @@ _BESIDE = (
 def _layout_blocks(layout: LayoutSketch) -> list[Block]:
     """A layout with its columns, and those of the files beside."""
     where = f"layouts.{layout.name}"
-    blocks = _file_blocks(where, layout.file, _UNITS, _ELSE)
+    below = (*_ELSE, *_BESIDE) if layout.examples else ()
+    blocks = _file_blocks(where, layout.file, _UNITS, below)
     for one in layout.beside:
         blocks += _beside_blocks(where, one)
-    if not layout.beside:
-        blocks[-1] = Block(**{**vars(blocks[-1]), "below": (*_ELSE, *_BESIDE)})
     return blocks
 
 
@@ -175,20 +174,20 @@ def _file_blocks(
 def _logs_block(logs: LogsSketch, first: bool) -> Block:
     """A section of logs; the first one explains its keys."""
 
-    def line(key: str, value: str, off: bool = False, question: str = "") -> Line:
-        return Line(key, toml(value), in_short(Logs, key) if first else "", question, off)
+    def line(key: str, value: str, off: bool = False) -> Line:
+        return Line(key, toml(value), in_short(Logs, key) if first else "", off=off)
 
     surface = in_short(Logs, "surface") + '; "folder": the folder names it'
     lines = [
-        line("glob", logs.glob),
-        line("format", logs.format),
-        Line("surface", toml(logs.surface), surface if first else "", logs.question),
-        line("load", "as_built"),
+        line("glob", logs.glob, logs.off),
+        line("format", logs.format, logs.off),
+        Line("surface", toml(logs.surface), surface if first else "", logs.question, logs.off),
+        line("load", "as_built", logs.off),
     ]
     if first:
         lines.append(line("map", "maps/site.toml", off=True))
     above = logs.above or (("One section per set of logs.",) if first else ())
-    return Block("[[logs]]", tuple(lines), above=above)
+    return Block("# [[logs]]" if logs.off else "[[logs]]", tuple(lines), above=above)
 
 
 def _weights_block(wheels: int) -> Block:

@@ -241,8 +241,16 @@ def _parquet_numbers(head: Head) -> Numbers:
     return Numbers(head, values, frozenset(texts))
 
 
-def heads_below(folder: Path) -> tuple[list[Head], list[str]]:
-    """Every log in a folder and below, and a line for each file that is none.
+@dataclass(frozen=True)
+class NoLog:
+    """A file that might have been a log, and why it is none."""
+
+    path: Path
+    why: str
+
+
+def heads_below(folder: Path) -> tuple[list[Head], list[NoLog]]:
+    """Every log in a folder and below, and the files that are none.
 
     Raises:
         DataError: there is none.
@@ -253,11 +261,11 @@ def heads_below(folder: Path) -> tuple[list[Head], list[str]]:
         try:
             head = head_of(path)
         except DataError as error:
-            not_logs.append(str(error))
+            not_logs.append(NoLog(path, str(error)))
             continue
         found.append(head)
     if not found:
         there = f"no log in {len(paths)} files" if paths else "no CSV or Parquet file below it"
-        listed = "".join(f"\n{line}" for line in not_logs[:3])
+        listed = "".join(f"\n{one.why}" for one in not_logs[:3])
         raise DataError(f"{folder}: {there}; expected logs of a robot{listed}")
     return found, not_logs

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from os.path import commonprefix
 from pathlib import Path, PurePosixPath
+from re import sub
 
 from slipid.job.new.look.file import Head
 
@@ -68,9 +69,11 @@ def _part(names: tuple[str, ...]) -> str:
         return names[0]
     suffixes = {PurePosixPath(name).suffix for name in names}
     end = suffixes.pop() if len(suffixes) == 1 else ""
-    start = commonprefix(names)
+    counted = {sub(r"\d+", "*", name) for name in names}
+    if len(counted) == 1:
+        return counted.pop()
     # digits at its end are a number, of which others may begin otherwise
-    return f"{start.rstrip('0123456789')}*{end}"
+    return f"{commonprefix(names).rstrip('0123456789')}*{end}"
 
 
 def pattern_beside(main: Kind, other: Kind) -> str | None:

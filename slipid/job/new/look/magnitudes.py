@@ -64,15 +64,14 @@ def place_unit(
 def speed_of(
     time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]
 ) -> float:
-    """A high speed of a place, as 9 of 10 steps have less, over a tenth of a second or more."""
+    """A high speed of a place, as 9 of 10 steps have less, over a second, so that noise is little."""
     there = ~(np.isnan(x) | np.isnan(y) | np.isnan(time))
     time, x, y = time[there], x[there], y[there]
     if len(time) < 3:
         return 0.0
-    stride = max(1, int(0.1 / max(float(np.median(np.diff(time))), 1e-6)))
+    stride = max(1, int(1.0 / max(float(np.median(np.diff(time))), 1e-6)))
+    stride = min(stride, max(1, len(time) // 3))
     t, x, y = time[::stride], x[::stride], y[::stride]
-    if len(t) < 3:
-        return 0.0
     steps = np.diff(t)
     good = steps > 0
     speeds = np.hypot(np.diff(x), np.diff(y))[good] / steps[good]
@@ -95,38 +94,29 @@ def heading_unit(values: Float[np.ndarray, " row"]) -> Unit:
     return Unit("rad" if most < 30 else "deg", doubt=f"radians or degrees? It reaches {most:.4g}")
 
 
-def speed_unit(
-    rms: float, speed: float | None, radius: float | None, of_motor: bool
-) -> Unit:
-    """Unit of wheel speeds, from the speed of the pose, if there is one, and a radius, if it is said.
+def speed_unit(seen: float | None, radius: float | None) -> Unit:
+    """Unit of wheel speeds, from the way of the pose, if there is one, and a radius, if it is said.
 
     Args:
-        rms: usual size of the wheel speeds, in their unit.
-        speed: of the pose [m/s].
-        radius: of the wheels [m].
-        of_motor: whether a gear lies between.
+        seen: speed of the pose over that of the wheels, [m/s] over their unit.
+        radius: of the wheels [m], over the gear ratio for speeds of the motor.
     """
     options = "rad/s, rpm or deg/s; or m/s at the rim: then divide by the radius with scale"
-    if speed is None or speed < 0.02 or rms <= 0 or of_motor:
+    if seen is None:
         return Unit("rad/s", doubt=f"in which unit: {options}?")
-    seen = speed / rms
     if radius is not None:
         units = {unit: seen / factor(unit, "rad/s") for unit in ("rad/s", "rpm", "deg/s", "rev/s")}
         best = min(units, key=lambda unit: abs(np.log(units[unit] / radius)))
         if abs(np.log(units[best] / radius)) < 0.7:
             return Unit(best, "as fast as the pose")
     elif RADII[0] <= seen <= RADII[1]:
-        return Unit("rad/s", f"as fast as the pose with wheels of about {_rounded(seen)} m")
+        return Unit("rad/s", f"as fast as the pose with wheels of about {seen:.2g} m")
     if 0.7 < seen < 1.5:
         doubt = "as fast as the pose itself, hence m/s at the rim: put scale = 1 / wheel radius"
         return Unit("rad/s", doubt=doubt)
     if RADII[0] <= seen / factor("rpm", "rad/s") <= RADII[1]:
         return Unit("rpm", doubt="rpm, or deg/s? With rad/s wheels would be too small")
     return Unit("rad/s", doubt=f"in which unit: {options}?")
-
-
-def _rounded(value: float) -> str:
-    return f"{value:.2g}"
 
 
 def plain_unit(channel: str) -> Unit:

@@ -12,15 +12,17 @@ from slipid.job.new.look.file import SUFFIXES, head_of, heads_below
 from slipid.job.new.look.kinds import Kind, a_folder_each, globs_of, kinds_of, pattern_beside
 from slipid.job.new.look.known_formats import likely_presets
 from slipid.job.new.look.robot import robot_from
-from slipid.job.new.look.sketches import Known, file_sketch, pose_study, without
-from slipid.job.new.look.study import Study, motion, study
+from slipid.job.new.look.sketches import Known, file_sketch, radius_hint, without
+from slipid.job.new.look.study import Study, study
 from slipid.job.new.questions import Answers, Told, robot_of
 from slipid.job.new.sketch import BesideSketch, LayoutSketch, LogsSketch, Sketch
 from slipid.job.new.template import new_config
 from slipid.support.errors import DataError
 
+_RUNS = 4
+"""Runs beside the first that are looked into."""
 FLOOR = "floor"
-_FLOOR = "on which floor were these driven? Its name, or folder where folders are called after floors"
+_FLOOR = "on which floor was {} driven? Its name, or folder where folders are called after floors"
 
 
 @dataclass(frozen=True)
@@ -39,16 +41,25 @@ class Group:
         kind: the files with the wheels.
         main: the first of them, looked into.
         beside: name of each other file, as of `Layout.beside`, and the first of them looked into.
+        others: the same of further runs.
     """
 
     kind: Kind
     main: Study
     beside: tuple[tuple[str, Study], ...] = ()
+    others: tuple["Group", ...] = ()
 
     @property
     def all(self) -> tuple[Study, ...]:
         """Every file of the first run."""
         return (self.main, *(one for _, one in self.beside))
+
+    @property
+    def complete(self) -> bool:
+        """Whether it has wheels and a pose."""
+        return any(one.columns.wheels for one in self.all) and any(
+            one.columns.has_pose for one in self.all
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +72,10 @@ class Sorted:
     root: Path
     presets: tuple[tuple[Kind, str], ...]
     groups: tuple[Group, ...]
+    also: tuple[Kind, ...]
     hints: tuple[str, ...]
     told: tuple[str, ...]
+    no_logs: tuple[Path, ...]
 
 
 def propose(path: Path, told: Told) -> Proposal:
@@ -80,16 +93,20 @@ def propose(path: Path, told: Told) -> Proposal:
     files = tuple(one for group in found.groups for one in group.all)
     guessed = robot_from(told, wheels, files)
     robot = _as_presets_say(guessed.robot, found)
+    known = [_known(group, robot) for group in found.groups]
+    logs = _logs(found)
+    used = {one.format for one in logs if not one.off}
+    presets = [PRESETS[name] for _, name in found.presets if name in used]
     sketch = Sketch(
         robot,
-        tuple(_layout(group, robot, k) for k, group in enumerate(found.groups)),
-        tuple(_logs(found)),
-        carries=frozenset(c for _, name in found.presets for c in PRESETS[name].channels),
+        tuple(_layout(group, one, k) for k, (group, one) in enumerate(zip(found.groups, known, strict=True))),
+        tuple(logs),
+        carries=frozenset(channel for layout in presets for channel in layout.channels),
         above=(f"Proposed from {path}.", *found.hints),
         data=str(found.root),
-        hints=guessed.hints,
+        hints=(*guessed.hints, *(hint for one in known for hint in radius_hint(one))),
     )
-    return Proposal(_tried(sketch, found, wheels), found.told)
+    return Proposal(_tried(sketch, found, wheels), (*found.told, *found.hints))
 
 
 def _sorted(path: Path) -> Sorted:
@@ -117,9 +134,11 @@ def _sorted(path: Path) -> Sorted:
     groups, left_out = _groups(others)
     told = [f"{len(kind.paths)} of format {name}: {kind.paths[0]} ..." for kind, name in presets]
     told += [_found(group) for group in groups]
-    told += [f"left out: {line}" for line in (*left_out, *no_logs[:5])]
-    told += [f"left out: {len(no_logs) - 5} more that are no logs"] * (len(no_logs) > 5)
-    return Sorted(root, tuple(presets), tuple(groups), tuple(hints), tuple(told))
+    told += [f"left out: {line}" for line in (*left_out, *(one.why for one in no_logs[:3]))]
+    told += [f"left out: {len(no_logs) - 3} more that are no logs"] * (len(no_logs) > 3)
+    paths = tuple(one.path for one in no_logs)
+    also = tuple(kind for kind, _ in others)
+    return Sorted(root, tuple(presets), tuple(groups), also, tuple(hints), tuple(told), paths)
 
 
 def _siblings(path: Path, kind: Kind) -> list[tuple[Kind, Study]]:
@@ -163,10 +182,27 @@ def _groups(kinds: list[tuple[Kind, Study]]) -> tuple[list[Group], list[str]]:
             beside.append((pattern, one))
             have |= fresh
             used.append(other)
-        groups.append(Group(kind, main, tuple(beside)))
+        group = Group(kind, main, tuple(beside))
+        groups.append(replace(group, others=_further(group)))
     lost = [kind for kind, _ in rest if kind not in used]
     lines = [f"{k.paths[0]}: no wheels in it, and nothing of a run that it lies beside" for k in lost]
     return groups, lines
+
+
+def _further(group: Group) -> tuple[Group, ...]:
+    """Some more runs of a kind, spread over all of them."""
+    count = len(group.kind.heads)
+    chosen = sorted({k * count // (_RUNS + 1) for k in range(1, _RUNS + 1)} - {0})
+    out = []
+    for k in chosen:
+        head = group.kind.heads[k]
+        names = [(n, head.path.parent / n.replace("{stem}", head.path.stem)) for n, _ in group.beside]
+        try:
+            beside = tuple((name, study(head_of(path))) for name, path in names)
+            out.append(Group(group.kind, study(head), beside))
+        except DataError:
+            continue  # the reader will say it of this run; the first one tells enough
+    return tuple(out)
 
 
 def _together(one: Study, other: Study) -> bool:
@@ -194,8 +230,12 @@ def _as_presets_say(robot: Answers, found: Sorted) -> Answers:
     return replace(robot, gear_ratio=gears.pop(), taken=robot.taken - {"gear_ratio"})
 
 
-def _layout(group: Group, robot: Answers, number: int) -> LayoutSketch:
-    known = Known(robot, motion(pose_study(group.all)), group.main, group.all)
+def _known(group: Group, robot: Answers) -> Known:
+    others = tuple(Known(robot, other.main, other.all) for other in group.others)
+    return Known(robot, group.main, group.all, others)
+
+
+def _layout(group: Group, known: Known, number: int) -> LayoutSketch:
     file = file_sketch(group.main, known)
     if not any(one.columns.has_pose for one in group.all):
         ask = "no pose was found (x, y, and a heading or a quaternion): a fit needs one"
@@ -209,18 +249,25 @@ def _name(number: int) -> str:
 
 
 def _logs(found: Sorted) -> list[LogsSketch]:
-    """A section for each glob."""
+    """A section for each glob; those of files that lack wheels or a pose are commented out."""
     named = [(kind, name) for kind, name in found.presets]
     named += [(group.kind, _name(k)) for k, group in enumerate(found.groups)]
     every = {path for kind, _ in named for path in kind.paths}
-    every |= {one.head.path for group in found.groups for _, one in group.beside}
+    every |= {path for one in found.also for path in one.paths} | set(found.no_logs)
+    whole = {name for name in PRESETS if {"pose_x"} <= PRESETS[name].channels.keys()}
+    whole -= {name for name in PRESETS if not _wheels_of(PRESETS[name])}
+    whole |= {_name(k) for k, group in enumerate(found.groups) if group.complete}
     out = []
     for kind, name in named:
         for glob in globs_of(found.root, kind, sorted(every - set(kind.paths))):
             floors = glob.count("/") > 0 and not a_folder_each(kind)
-            surface, ask = ("folder", "") if floors else (FLOOR, _FLOOR)
-            out.append(LogsSketch(glob, name, surface, question=ask))
-    return out
+            off = name not in whole
+            surface, ask = ("folder", "") if floors else (FLOOR, _FLOOR.format(glob))
+            above = ("Without wheels or without a pose, so nothing to fit:",) if off else ()
+            out.append(LogsSketch(glob, name, surface, above, "" if off else ask, off))
+    if all(one.off for one in out):  # a config has one section at least; the layout asks for a pose
+        return [replace(one, off=False, above=()) for one in out]
+    return sorted(out, key=lambda one: one.off)
 
 
 def _tried(sketch: Sketch, found: Sorted, wheels: int) -> Sketch:
@@ -241,7 +288,9 @@ def _refused(sketch: Sketch, name: str, group: Group) -> str:
     """Why the first file of a layout cannot be read; nothing where it can."""
     try:
         config = parsed(Path("robot.toml"), new_config(sketch, "robot.toml").text)
-        section = next(one for one in config.content.logs if one.format == name)
+        section = next((one for one in config.content.logs if one.format == name), None)
+        if section is None:
+            return ""
         path = group.kind.paths[0]
         read_logs(path, layout_of(config, section), path.parent, FLOOR, "as_built")
     except DataError as error:

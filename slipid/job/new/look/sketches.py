@@ -1,6 +1,7 @@
 """From files that were looked into to the layout that a config proposes for them."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from slipid.data.reading.units import factor
 from slipid.job.new.lines import Line
 from slipid.job.new.look.columns import Columns, Found
 from slipid.job.new.look.magnitudes import (
+    RADII,
     Unit,
     current_unit,
     duty_unit,
@@ -19,12 +21,14 @@ from slipid.job.new.look.study import (
     Motion,
     Study,
     increments,
+    motion,
     of_battery,
+    over_wheels,
     rate,
     signed,
 )
 from slipid.job.new.questions import Answers
-from slipid.job.new.sketch import ChannelSketch, FileSketch, setting
+from slipid.job.new.sketch import ChannelSketch, FileSketch, Hint, setting
 
 EFFORT = (
     "what is it: a current (unit A), a torque (N*m, and torque_constant in the layout), a voltage "
@@ -42,20 +46,41 @@ class Known:
 
     Attributes:
         robot: its sizes, as far as they are known.
-        moved: motion by the pose.
         main: the file that has the wheels; `all`: every file of the run.
+        others: the same of further runs, for what a single run may not show.
     """
 
     robot: Answers
-    moved: Motion
     main: Study
     all: tuple[Study, ...]
+    others: tuple["Known", ...] = ()
+
+    @cached_property
+    def moved(self) -> Motion:
+        """Motion by the pose."""
+        return motion(pose_study(self.all))
 
     def find(self, *channels: str) -> Found | None:
         """The first of some channels, in any of the files."""
         return next(
             (f for name in channels for one in self.all if (f := one.columns.get(name))), None
         )
+
+    @property
+    def runs(self) -> tuple["Known", ...]:
+        """This run, and the others."""
+        return (self, *self.others)
+
+    @cached_property
+    def over_wheels(self) -> float | None:
+        """Speed of the pose over that of the wheels, the middle one of all runs."""
+        found = []
+        for run in self.runs:
+            if (speed := run.find("wheel_speed", "motor_speed")) is None:
+                continue
+            ratio = over_wheels(run.main, speed, run.moved)
+            found += [ratio] if ratio is not None else []
+        return float(np.median(found)) if found else None
 
     @property
     def radius(self) -> float | None:
@@ -135,7 +160,7 @@ def _settings(known: Known) -> list[Line]:
         lines.append(setting("ticks_are_increments", bool(step), ask))
     lines.append(setting("gear_ratio", robot.gear_ratio, comment="as above"))
     if (current := known.find("current", "motor_torque", "wheel_torque")) is not None:
-        sign = signed(current, known.find("wheel_speed", "motor_speed"))
+        sign = _signed(known)
         ask = "nothing drove backwards: do currents have a sign, or only magnitudes?"
         lines.append(
             setting(
@@ -146,6 +171,15 @@ def _settings(known: Known) -> list[Line]:
             )
         )
     return lines
+
+
+def _signed(known: Known) -> bool | None:
+    """Whether currents have a sign in any of the runs; None where none tells."""
+    said = []
+    for run in known.runs:
+        if (current := run.find("current", "motor_torque", "wheel_torque")) is not None:
+            said.append(signed(current, run.find("wheel_speed", "motor_speed")))
+    return True if True in said else False if False in said else None
 
 
 def _by_speeds(known: Known, ticks: Found) -> str:
@@ -205,8 +239,11 @@ def _unit(one: Study, found: Found, known: Known) -> Unit:
     if channel == "pose_heading":
         return heading_unit(found.values[:, 0])
     if channel in ("wheel_speed", "motor_speed"):
-        rms = float(np.sqrt(np.nanquantile(np.nanmean(found.values**2, axis=1), 0.9)))
-        return speed_unit(rms, known.moved.speed, known.radius, channel == "motor_speed")
+        gear = known.robot.gear_ratio if channel == "motor_speed" else 1.0
+        if channel == "motor_speed" and "gear_ratio" in known.robot.taken:
+            return speed_unit(None, None)
+        seen = known.over_wheels
+        return speed_unit(seen and seen * gear, known.radius)
     if channel.endswith("speed_command"):
         speed = known.find(channel.removesuffix("_command"))
         if speed is None:
@@ -223,6 +260,18 @@ def _unit(one: Study, found: Found, known: Known) -> Unit:
     if channel in ("twist_command_yaw", "gyro"):
         return Unit("rad/s") if most < 20 else Unit("deg/s", f"up to {most:.4g}")
     return plain_unit(channel)
+
+
+def radius_hint(known: Known) -> tuple[Hint, ...]:
+    """What the poses say of the wheel radius, of wheels that all point ahead."""
+    speed, seen = known.find("wheel_speed"), known.over_wheels
+    if seen is None or speed is None or len(speed.at) > 2:
+        return ()
+    unit = speed.unit or _unit(known.main, speed, known).unit
+    radius = seen / factor(unit, "rad/s")
+    if not RADII[0] <= radius <= RADII[1]:
+        return ()
+    return (Hint("wheel_radius_m", f"taken by default: measure it; the poses say about {radius:.2g}"),)
 
 
 def pose_study(studies: tuple[Study, ...]) -> Study | None:

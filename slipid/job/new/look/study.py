@@ -84,12 +84,15 @@ class Motion:
     Attributes:
         speed: a high speed [m/s], None where there is no pose.
         place: unit of x and y.
-        time, steps: times at which a pose came [s], and how far it moved since the last [m].
+        time, x, y: when poses came [s], and where they were [m].
+        steps: how far each is from the last [m].
     """
 
     speed: float | None = None
     place: Unit = Unit("m")
     time: Float[np.ndarray, " pose"] | None = None
+    x: Float[np.ndarray, " pose"] | None = None
+    y: Float[np.ndarray, " pose"] | None = None
     steps: Float[np.ndarray, " pose"] | None = None
 
 
@@ -113,7 +116,7 @@ def motion(one: Study | None) -> Motion:
     there = ~(np.isnan(px) | np.isnan(py) | np.isnan(one.time))
     time, px, py = one.time[there], px[there] * scale, py[there] * scale
     steps = np.append(0.0, np.hypot(np.diff(px), np.diff(py)))
-    return Motion(speed_of(time, px, py), place, time, steps)
+    return Motion(speed_of(time, px, py), place, time, px, py, steps)
 
 
 def increments(found: Found, one: Study, moved: Motion) -> bool | None:
@@ -144,6 +147,31 @@ def _in_parts(values: Float[np.ndarray, " row"], width: int) -> Float[np.ndarray
     return values[: count * width].reshape(count, width).sum(axis=1)
 
 
+def over_wheels(one: Study, speed: Found, moved: Motion) -> float | None:
+    """Speed of the pose over that of the wheels, of seconds in which they turn; None without both.
+
+    It is the radius of wheels that all point ahead, if their speeds are in rad/s, and near it
+    for others.
+    """
+    if moved.time is None or moved.x is None or moved.y is None or one.clock is None:
+        return None
+    rows = np.sqrt(np.nanmean(speed.values**2, axis=1))
+    there = ~(np.isnan(rows) | np.isnan(one.time))
+    time, rows = one.time[there], rows[there]
+    if len(time) < 3:
+        return None
+    turned = np.append(0.0, np.cumsum(0.5 * (rows[1:] + rows[:-1]) * np.diff(time)))
+    start, end = max(time[0], moved.time[0]), min(time[-1], moved.time[-1])
+    edges = np.linspace(start, end, max(2, int(end - start)))
+    by_wheels = np.diff(np.interp(edges, time, turned))
+    # chords and not the way along all poses, which noise makes longer
+    x, y = (np.interp(edges, moved.time, part) for part in (moved.x, moved.y))
+    way = np.hypot(np.diff(x), np.diff(y))
+    good = by_wheels > 0.3 * by_wheels.max(initial=0.0)
+    ratio = float(np.median(way[good] / by_wheels[good])) if good.any() else 0.0
+    return ratio if ratio > 0 else None
+
+
 def signed(current: Found, speed: Found | None) -> bool | None:
     """Whether currents have a sign; None where nothing drove backwards and nothing tells."""
     values = current.values[~np.isnan(current.values)]
@@ -160,5 +188,6 @@ def signed(current: Found, speed: Found | None) -> bool | None:
 def of_battery(voltage: Found, speed: Found | None) -> bool:
     """Whether a voltage stays up whatever the wheels do, as a battery's does."""
     values = voltage.values[~np.isnan(voltage.values)]
-    far = float(values.min(initial=0.0)) > 0.6 * float(values.max(initial=0.0)) > 0.0
+    low, high = np.quantile(values, (0.05, 0.95)).tolist() if values.size else (0.0, 0.0)
+    far = low > 0.6 * high > 0.0
     return far and (speed is None or float(np.nanstd(speed.values)) > 0.0)
