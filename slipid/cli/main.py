@@ -14,6 +14,7 @@ from slipid.cli.export import export
 from slipid.cli.identify import identify
 from slipid.cli.new import new
 from slipid.cli.paper import paper
+from slipid.cli.reference import reference
 from slipid.cli.sample import sample
 from slipid.cli.selftest import selftest
 from slipid.cli.simulate import simulate
@@ -29,7 +30,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    *(new, check, selftest, identify, sample, validate, compare),
+    *(new, reference, check, selftest, identify, sample, validate, compare),
     *(design, tune, trial, export, simulate, paper, demo),
 ):
     app.command()(command)

@@ -29,7 +29,7 @@ def new(
         typer.Option(
             "--from",
             metavar="LOG",
-            help="A log or a folder of logs (CSV, Parquet, rosbag): looks into it and asks nothing.",
+            help="A log (CSV, Parquet, bag) or a folder of logs to look into; asks nothing.",
         ),
     ] = None,
     drive: Annotated[Text, _text("omni, mecanum, skid, differential or general.")] = None,
@@ -47,21 +47,15 @@ def new(
         Text, _text("yes where one motor turns both wheels of a side, else no.", _BOX)
     ] = None,
     wheels: Annotated[Text, _text("Number of omni wheels.", _WHEELS)] = None,
-    azimuths_deg: Annotated[
-        Text, _text("Where omni wheels stand, as 60,180,300.", _WHEELS)
-    ] = None,
-    base_radius_m: Annotated[
-        Text, _text("Omni wheels' centres from the middle.", _WHEELS)
-    ] = None,
+    azimuths_deg: Annotated[Text, _text("Where omni wheels stand, as 60,180,300.", _WHEELS)] = None,
+    base_radius_m: Annotated[Text, _text("Omni wheels' centres from the middle.", _WHEELS)] = None,
     places_m: Annotated[
         Text, _text("General: x,y of the wheels, as '0.2,0.1; 0.2,-0.1'.", _WHEELS)
     ] = None,
     directions_deg: Annotated[
         Text, _text("General: ways that the wheels roll, as 0,0.", _WHEELS)
     ] = None,
-    rollers_deg: Annotated[
-        Text, _text("General: rollers to these, as 45,none.", _WHEELS)
-    ] = None,
+    rollers_deg: Annotated[Text, _text("General: rollers to these, as 45,none.", _WHEELS)] = None,
     yes: Annotated[
         bool, typer.Option("--yes", help="Ask nothing: take defaults, marked in the config.")
     ] = False,

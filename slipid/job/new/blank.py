@@ -2,7 +2,14 @@
 
 from slipid.job.new.lines import Line
 from slipid.job.new.questions import Answers
-from slipid.job.new.sketch import ChannelSketch, FileSketch, LayoutSketch, LogsSketch, Sketch, setting
+from slipid.job.new.sketch import (
+    ChannelSketch,
+    FileSketch,
+    LayoutSketch,
+    LogsSketch,
+    Sketch,
+    setting,
+)
 
 _NAMES = "the column names and units below are examples: write those of your files"
 _LABELS = {
@@ -14,7 +21,9 @@ _LABELS = {
 
 def blank(known: Answers) -> Sketch:
     """Everything that this robot may log, in one file for each run."""
-    layout = LayoutSketch("mine", FileSketch(_channels(known), settings=_settings(known)), examples=True)
+    layout = LayoutSketch(
+        "mine", FileSketch(_channels(known), settings=_settings(known)), examples=True
+    )
     return Sketch(known, (layout,), (LogsSketch("*/*.csv", "mine"),))
 
 

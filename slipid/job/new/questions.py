@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 from slipid.job.config import Box, Differential, General, Omni, Wheels, geometry
 from slipid.support.errors import DataError, near
@@ -71,7 +71,7 @@ class Question:
     about: str
     asks: str
     default: Callable[[Answers], str]
-    read: Callable[[str, Answers], object]
+    read: Callable[[str, Answers], Any]
 
     @property
     def option(self) -> str:
@@ -169,7 +169,9 @@ _AZIMUTHS = Question(
     _evenly,
     _angles,
 )
-_BASE = Question("base_radius_m", "from the middle to the wheel centres [m]", _always("0.15"), _positive)
+_BASE = Question(
+    "base_radius_m", "from the middle to the wheel centres [m]", _always("0.15"), _positive
+)
 _WHEELBASE = Question("wheelbase_m", "wheelbase, front to rear axle [m]", _always("0.3"), _positive)
 _TRACK = Question(
     "track_m", "track, between the middles of left and right wheels [m]", _always("0.3"), _positive
@@ -187,7 +189,10 @@ _DIRECTIONS = Question(
     "directions_deg", "directions in which the wheels roll, from ahead [deg]", _each("0"), _angles
 )
 _ROLLERS = Question(
-    "rollers_deg", "angles of the rollers to them [deg], none without rollers", _each("none"), _rollers
+    "rollers_deg",
+    "angles of the rollers to them [deg], none without rollers",
+    _each("none"),
+    _rollers,
 )
 COMMON = (
     Question("wheel_radius_m", "wheel radius [m]", _always("0.05"), _positive),
@@ -254,20 +259,26 @@ def _answered(known: Answers, question: Question, told: Told, asker: Asker | Non
     text = getattr(told, question.about)
     if text is not None:
         try:
-            return replace(known, **{question.about: question.read(text, known)})
+            return _with(known, question, text)
         except ValueError as error:
             raise DataError(f"{question.option} '{text}': {error}") from None
     default = question.default(known)
     if asker is None:
         known = replace(known, taken=known.taken | {question.about})
-        return replace(known, **{question.about: question.read(default, known)})
+        return _with(known, question, default)
     wrong = ""
     while True:
         text = asker(question.asks, default, wrong)
         try:
-            return replace(known, **{question.about: question.read(text, known)})
+            return _with(known, question, text)
         except ValueError as error:
             wrong = f"'{text}': {error}"
+
+
+def _with(known: Answers, question: Question, text: str) -> Answers:
+    """What is known with a text as the answer to a question; ValueError where it is none."""
+    more: dict[str, Any] = {question.about: question.read(text, known)}
+    return replace(known, **more)
 
 
 def robot_of(known: Answers) -> Wheels:

@@ -30,10 +30,11 @@ _ASKED = {
 }
 """Which answer a key of `[robot]` is made of, where it is not called the same."""
 _MEASURE = "taken by default: measure it, or look it up"
+_WHERE = "taken by default: where do the wheels stand, in the order of the columns?"
 _PUT = {
     "drive": "which drive is it: omni, mecanum, skid, differential or general?",
-    "wheel_azimuths_deg": "taken by default: where do the wheels stand, in the order of the columns?",
-    "wheel_places_m": "taken by default: where do the wheels stand, in the order of the columns?",
+    "wheel_azimuths_deg": _WHERE,
+    "wheel_places_m": _WHERE,
     "drive_directions_deg": "taken by default: which way does each wheel roll?",
     "roller_angles_deg": "taken by default: do the wheels have rollers, and how are they tilted?",
     "gear_ratio": "taken by default: is there a gear, and are speeds and ticks of the motor?",
@@ -94,9 +95,9 @@ def _head(sketch: Sketch, name: str) -> tuple[str, ...]:
         *sketch.above,
         f"  slipid check {name} --data {sketch.data}",
         f"  slipid identify {name} --data {sketch.data} --out OUT",
-        "Every number is SI or has its unit in the name of its key. `slipid reference` explains all",
-        'keys, channels, units and parameters. A line that begins with "# ?" is to be answered, and',
-        "then taken out.",
+        "Every number is SI or has its unit in the name of its key. `slipid reference` explains "
+        'all keys, channels, units and parameters. A line that begins with "# ?" is to be answered, '
+        "and then taken out.",
     )
 
 
@@ -133,7 +134,7 @@ _UNITS = (
     "pose; currents tell friction, voltages (or duty and bus_voltage) the motor's constants.",
 )
 _ELSE = (
-    'A pose with a quaternion: pose_quaternion = { columns = ["qx", "qy", "qz", "qw"], unit = "1" }',
+    'With a quaternion: pose_quaternion = { columns = ["qx", "qy", "qz", "qw"], unit = "1" }',
     'Effort of a JointState: current (unit "A"), or motor_torque or wheel_torque (unit "N*m"), for '
     "which the layout needs torque_constant [N m/A]. Sensors may be slower than the rows: leave "
     "cells empty, or repeat the last value.",
@@ -141,7 +142,7 @@ _ELSE = (
 _BESIDE = (
     "More files of the same run, each with its own rows, beside the first one:",
     '[layouts.mine.beside."mocap.csv"]    # or "{stem}_pose.csv"; keys as above',
-    "[layouts.mine.beside.\"mocap.csv\".columns]",
+    '[layouts.mine.beside."mocap.csv".columns]',
     'time = { column = "stamp", unit = "ns" }',
 )
 
@@ -158,7 +159,7 @@ def _layout_blocks(layout: LayoutSketch) -> list[Block]:
 
 def _beside_blocks(where: str, one: BesideSketch) -> list[Block]:
     said = (f"Of the same run, in {one.pattern}:",)
-    return _file_blocks(f'{where}.beside.{toml(one.pattern)}', one.file, said, ())
+    return _file_blocks(f"{where}.beside.{toml(one.pattern)}", one.file, said, ())
 
 
 def _file_blocks(
@@ -215,7 +216,9 @@ def _parameters_block(channels: frozenset[str]) -> Block:
         lines.append(Line('"motor.back_emf"', f"{{ prior = {emf} }}", "[V s/rad]"))
     else:
         lines.append(Line('"motor.*"', "{ free = false }", "no current: motors are not seen"))
-        lines.append(Line('"surface.*.friction"', "{ free = false }", "nor how much floors can hold"))
+        lines.append(
+            Line('"surface.*.friction"', "{ free = false }", "nor how much floors can hold")
+        )
     above = (
         "Patterns of parameter names. fixed = value; start = value; free = true or false; prior is "
         "Gaussian in the parameter's own unit. `slipid reference parameters` lists the names.",

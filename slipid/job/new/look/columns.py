@@ -100,9 +100,7 @@ def columns_of(numbers: Numbers) -> Columns:
     return Columns(tuple(kept), tuple(unused), tuple(notes + dropped))
 
 
-def _found(
-    numbers: Numbers, said: dict[int, Named], channel: str, places: dict[str, int]
-) -> Found:
+def _found(numbers: Numbers, said: dict[int, Named], channel: str, places: dict[str, int]) -> Found:
     """A channel with its columns in order."""
     labels = sorted(places, key=_rank)
     at = tuple(places[label] for label in labels)
@@ -133,8 +131,10 @@ def _told_apart(found: list[Found]) -> list[Found]:
             ticks = one.unit in ("tick", "ticks") or (not one.unit and _counted(one.values))
             one = replace(one, channel="wheel_ticks" if ticks else f"{kind}_angle")
         elif what == "v":
-            volts = one.unit in ("V", "mV") or one.labels in speeds or (
-                not one.unit and _always_far(one.values)
+            volts = (
+                one.unit in ("V", "mV")
+                or one.labels in speeds
+                or (not one.unit and _always_far(one.values))
             )
             one = replace(one, channel="voltage" if volts else f"{kind}_speed")
         out.append(one)

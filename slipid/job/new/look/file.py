@@ -77,8 +77,8 @@ def head_of(path: Path) -> Head:
         DataError: it cannot be read, is empty, or is no log of rows of numbers.
     """
     if path.suffix == ".parquet":
-        names = tuple(_parquet(path).column_names)
-        return Head(path, "", 1, 0, 2, names, ("",) * len(names))
+        header = tuple(_parquet(path).column_names)
+        return Head(path, "", 1, 0, 2, header, ("",) * len(header))
     lines = _lines(path, _BEGINNING)
     delimiter = _delimiter(lines)
     rows = [_cells(line, delimiter) for line in lines[:_HEAD]]
@@ -87,11 +87,11 @@ def head_of(path: Path) -> Head:
         raise bad_data(path, "no rows of numbers", "a log: a row of numbers for every time")
     _refuse_commas(path, rows[first:], delimiter, first)
     names_row, units_row = _header(rows[:first], len(rows[first]))
-    header = rows[names_row - 1] if names_row else []
-    if not header and any(_number(c) is None and c.lower() not in _EMPTY for c in rows[first]):
+    top = rows[names_row - 1] if names_row else []
+    if not top and any(_number(c) is None and c.lower() not in _EMPTY for c in rows[first]):
         raise bad_data(path, "texts among the numbers, and no names", "a log", row=first + 1)
-    width = len(header) or len(rows[first])
-    names = [*header, *[""] * width][:width]
+    width = len(top) or len(rows[first])
+    names = [*top, *[""] * width][:width]
     if names_row and width > 1 and not names[-1]:
         width -= 1  # a delimiter at the end of every line
     units = rows[units_row - 1] if units_row else []

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from os.path import commonprefix
 from pathlib import Path, PurePosixPath
 from re import sub
 
@@ -73,7 +72,9 @@ def _part(names: tuple[str, ...]) -> str:
     if len(counted) == 1:
         return counted.pop()
     # digits at its end are a number, of which others may begin otherwise
-    return f"{commonprefix(names).rstrip('0123456789')}*{end}"
+    first, last = min(names), max(names)
+    alike = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
+    return f"{first[:alike].rstrip('0123456789')}*{end}"
 
 
 def pattern_beside(main: Kind, other: Kind) -> str | None:
@@ -85,7 +86,9 @@ def pattern_beside(main: Kind, other: Kind) -> str | None:
     first = main.paths[0]
     near = [path for path in other.paths if path.parent == first.parent]
     patterns = [path.name for path in near]
-    patterns += [path.name.replace(first.stem, "{stem}") for path in near if first.stem in path.name]
+    patterns += [
+        path.name.replace(first.stem, "{stem}") for path in near if first.stem in path.name
+    ]
     for pattern in patterns:
         named = [path.parent / pattern.replace("{stem}", path.stem) for path in main.paths]
         # a name without the stem belongs to one main file a folder

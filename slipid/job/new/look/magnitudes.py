@@ -64,7 +64,7 @@ def place_unit(
 def speed_of(
     time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]
 ) -> float:
-    """A high speed of a place, as 9 of 10 steps have less, over a second, so that noise is little."""
+    """A high speed of a place: 9 of 10 seconds have less. Over shorter times it would be noise."""
     there = ~(np.isnan(x) | np.isnan(y) | np.isnan(time))
     time, x, y = time[there], x[there], y[there]
     if len(time) < 3:

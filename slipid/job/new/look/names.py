@@ -55,7 +55,9 @@ def named(name: str, unit: str = "") -> Named:
         if found := _channel(words, unit):
             channel, label = found
             unit = "rpm" if words.has("what", "rpm") else unit
-            return Named(channel, label, unit if _fits(channel, unit) else "", _doubt(words, channel))
+            return Named(
+                channel, label, unit if _fits(channel, unit) else "", _doubt(words, channel)
+            )
     return Named(unit=unit)
 
 
@@ -158,7 +160,7 @@ def _measured(words: Words, unit: str) -> str | None:
 
 def _single(words: Words, unit: str) -> tuple[str, str] | None:
     """Channel of the whole robot, and which part of a quaternion."""
-    what = {value for value in words.of("what")}
+    what = set(words.of("what"))
     axis = words.words("axis")
     if what and what <= {"time"}:
         return "time", ""

@@ -99,7 +99,10 @@ def propose(path: Path, told: Told) -> Proposal:
     presets = [PRESETS[name] for _, name in found.presets if name in used]
     sketch = Sketch(
         robot,
-        tuple(_layout(group, one, k) for k, (group, one) in enumerate(zip(found.groups, known, strict=True))),
+        tuple(
+            _layout(group, one, k)
+            for k, (group, one) in enumerate(zip(found.groups, known, strict=True))
+        ),
         tuple(logs),
         carries=frozenset(channel for layout in presets for channel in layout.channels),
         above=(f"Proposed from {path}.", *found.hints),
@@ -185,7 +188,9 @@ def _groups(kinds: list[tuple[Kind, Study]]) -> tuple[list[Group], list[str]]:
         group = Group(kind, main, tuple(beside))
         groups.append(replace(group, others=_further(group)))
     lost = [kind for kind, _ in rest if kind not in used]
-    lines = [f"{k.paths[0]}: no wheels in it, and nothing of a run that it lies beside" for k in lost]
+    lines = [
+        f"{k.paths[0]}: no wheels in it, and nothing of a run that it lies beside" for k in lost
+    ]
     return groups, lines
 
 
@@ -196,7 +201,9 @@ def _further(group: Group) -> tuple[Group, ...]:
     out = []
     for k in chosen:
         head = group.kind.heads[k]
-        names = [(n, head.path.parent / n.replace("{stem}", head.path.stem)) for n, _ in group.beside]
+        names = [
+            (n, head.path.parent / n.replace("{stem}", head.path.stem)) for n, _ in group.beside
+        ]
         try:
             beside = tuple((name, study(head_of(path))) for name, path in names)
             out.append(Group(group.kind, study(head), beside))
@@ -213,8 +220,12 @@ def _together(one: Study, other: Study) -> bool:
 def _found(group: Group) -> str:
     """What a group of files holds, in a sentence."""
     said = [", ".join(found.channel for found in one.columns.found) for one in group.all]
-    more = [f"; beside it {name}: {channels}" for (name, _), channels in zip(group.beside, said[1:], strict=True)]
-    return f"{len(group.kind.paths)} like {group.kind.paths[0]}: {said[0] or 'nothing known'}{''.join(more)}"
+    more = [
+        f"; beside it {name}: {channels}"
+        for (name, _), channels in zip(group.beside, said[1:], strict=True)
+    ]
+    like = f"{len(group.kind.paths)} like {group.kind.paths[0]}"
+    return f"{like}: {said[0] or 'nothing known'}{''.join(more)}"
 
 
 def _wheels_of(layout: Layout) -> int:

@@ -1,4 +1,4 @@
-"""Which robot logs can be of: its drive by the number of wheels, and by whether it goes sideways."""
+"""Which robot logs can be of: its drive by the number of wheels, and whether it goes sideways."""
 
 from dataclasses import dataclass, replace
 
@@ -64,10 +64,12 @@ def sideways(files: tuple[Study, ...]) -> bool | None:
         command = one.columns.get("twist_command_y")
         if command is not None and np.nanmax(np.abs(command.values)) > 0:
             return True
-    one = pose_study(files)
-    if one is None or (turned := one.columns.get("pose_heading")) is None or not turned.unit:
+    posed = pose_study(files)
+    if posed is None or (turned := posed.columns.get("pose_heading")) is None:
         return None
-    x, y = one.columns.get("pose_x"), one.columns.get("pose_y")
+    if not turned.unit:
+        return None
+    x, y = posed.columns.get("pose_x"), posed.columns.get("pose_y")
     assert x is not None
     assert y is not None
     heading = turned.values[:, 0] * factor(turned.unit, "rad")
@@ -88,6 +90,8 @@ def _in_rows(known: Answers, wheels: int) -> Answers:
         known,
         wheels=wheels,
         places_m=tuple(places),
-        directions_deg=(0.0,) * wheels if len(known.directions_deg) != wheels else known.directions_deg,
+        directions_deg=(0.0,) * wheels
+        if len(known.directions_deg) != wheels
+        else known.directions_deg,
         rollers_deg=(None,) * wheels if len(known.rollers_deg) != wheels else known.rollers_deg,
     )

@@ -30,6 +30,7 @@ from slipid.job.new.look.study import (
 from slipid.job.new.questions import Answers
 from slipid.job.new.sketch import ChannelSketch, FileSketch, Hint, setting
 
+_CURRENTS = ("current", "motor_torque", "wheel_torque")
 EFFORT = (
     "what is it: a current (unit A), a torque (N*m, and torque_constant in the layout), a voltage "
     "(V) or a duty (1)?"
@@ -159,7 +160,7 @@ def _settings(known: Known) -> list[Line]:
         ask = "do ticks add up, or does each row have those since the last?" if step is None else ""
         lines.append(setting("ticks_are_increments", bool(step), ask))
     lines.append(setting("gear_ratio", robot.gear_ratio, comment="as above"))
-    if (current := known.find("current", "motor_torque", "wheel_torque")) is not None:
+    if known.find(*_CURRENTS) is not None:
         sign = _signed(known)
         ask = "nothing drove backwards: do currents have a sign, or only magnitudes?"
         lines.append(
@@ -175,10 +176,11 @@ def _settings(known: Known) -> list[Line]:
 
 def _signed(known: Known) -> bool | None:
     """Whether currents have a sign in any of the runs; None where none tells."""
-    said = []
-    for run in known.runs:
-        if (current := run.find("current", "motor_torque", "wheel_torque")) is not None:
-            said.append(signed(current, run.find("wheel_speed", "motor_speed")))
+    said = [
+        signed(current, run.find("wheel_speed", "motor_speed"))
+        for run in known.runs
+        if (current := run.find(*_CURRENTS)) is not None
+    ]
     return True if True in said else False if False in said else None
 
 
@@ -193,7 +195,9 @@ def _by_speeds(known: Known, ticks: Found) -> str:
     turned = float((np.abs(rates[1:]) * np.diff(time)[:, None]).sum()) / (2 * np.pi)
     counted = float(np.abs(np.diff(np.nan_to_num(ticks.values), axis=0)).sum())
     of = "motor" if speed.channel == "motor_speed" else "wheel"
-    return f" By the reported speeds about {counted / turned:.4g} a turn of the {of}" if turned else ""
+    return (
+        f" By the reported speeds about {counted / turned:.4g} a turn of the {of}" if turned else ""
+    )
 
 
 def _channel(one: Study, found: Found, known: Known) -> ChannelSketch:
@@ -271,7 +275,9 @@ def radius_hint(known: Known) -> tuple[Hint, ...]:
     radius = seen / factor(unit, "rad/s")
     if not RADII[0] <= radius <= RADII[1]:
         return ()
-    return (Hint("wheel_radius_m", f"taken by default: measure it; the poses say about {radius:.2g}"),)
+    return (
+        Hint("wheel_radius_m", f"taken by default: measure it; the poses say about {radius:.2g}"),
+    )
 
 
 def pose_study(studies: tuple[Study, ...]) -> Study | None:

@@ -11,6 +11,7 @@ from slipid.job.new.look.columns import Columns, Found, columns_of, without_name
 from slipid.job.new.look.file import Head, Numbers, numbers_of
 from slipid.job.new.look.magnitudes import Unit, place_unit, speed_of, time_unit
 
+METRES = Unit("m")
 _SPARSE = 0.02
 """Share of empty cells from which a channel is said to be slower than the rows."""
 
@@ -89,7 +90,7 @@ class Motion:
     """
 
     speed: float | None = None
-    place: Unit = Unit("m")
+    place: Unit = METRES
     time: Float[np.ndarray, " pose"] | None = None
     x: Float[np.ndarray, " pose"] | None = None
     y: Float[np.ndarray, " pose"] | None = None
@@ -125,7 +126,10 @@ def increments(found: Found, one: Study, moved: Motion) -> bool | None:
     The way of the pose goes along with the ticks of each row, or with their changes.
     """
     values = np.nan_to_num(found.values)
-    of_rows, of_changes = np.abs(values).sum(axis=1)[1:], np.abs(np.diff(values, axis=0)).sum(axis=1)
+    of_rows, of_changes = (
+        np.abs(values).sum(axis=1)[1:],
+        np.abs(np.diff(values, axis=0)).sum(axis=1),
+    )
     if moved.time is not None and moved.steps is not None and len(moved.time) > 20:
         way = np.interp(one.time, moved.time, np.cumsum(moved.steps))
         width = max(1, len(way) // 60)

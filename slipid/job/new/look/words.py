@@ -47,8 +47,8 @@ _TABLE: dict[str, str] = {
     ),
     # says nothing
     "noise": (
-        "data field fields msg value values actual measured meas feedback fb state states link robot "
-        "base body global world map camera cam mocap vicon optitrack tag marker tracker lidar slam "
+        "data field fields msg value values actual measured meas feedback fb state states link "
+        "robot base body global world map camera cam mocap vicon optitrack tag marker tracker lidar slam "
         "imu header twist coordinate coordinates coord axis of the from to in at along log sensor "
         "drive shaft nsec sec secs ros"
     ),
@@ -60,7 +60,7 @@ def _roles() -> dict[str, tuple[str, str]]:
     found = {}
     for role, words in _TABLE.items():
         name, _, value = role.partition(" ")
-        found |= {word: (name, value) for word in words.split()}
+        found |= dict.fromkeys(words.split(), (name, value))
     return found
 
 
