@@ -96,8 +96,8 @@ def _head(sketch: Sketch, name: str) -> tuple[str, ...]:
         f"  slipid check {name} --data {sketch.data}",
         f"  slipid identify {name} --data {sketch.data} --out OUT",
         "Every number is SI or has its unit in the name of its key. `slipid reference` explains "
-        'all keys, channels, units and parameters. A line that begins with "# ?" is to be answered, '
-        "and then taken out.",
+        'all keys, channels, units and parameters. A line that begins with "# ?" is to be '
+        "answered, and then taken out.",
     )
 
 
