@@ -47,10 +47,9 @@ def parameter_rows(config: Config | None = None) -> list[ParameterRow]:
     content = config.content
     floors = [FLOOR if s.surface == "folder" else s.surface for s in content.logs if s.map is None]
     loads = tuple(dict.fromkeys(section.load for section in content.logs))
-    mass = content.robot.mass_kg or 10.0
-    whole = Robot.of(geometry(content.robot), mass).on(
-        tuple(dict.fromkeys(floors)), loads, (SESSION,)
-    )
+    shape, mass = geometry(content.robot), content.robot.mass_kg
+    robot = Robot.of(shape) if mass is None else Robot.of(shape, mass)
+    whole = robot.on(tuple(dict.fromkeys(floors)), loads, (SESSION,))
     return [_row(entry, whole, content.parameters) for entry in entries(whole)]
 
 

@@ -49,8 +49,8 @@ _TABLE: dict[str, str] = {
     "noise": (
         "data field fields msg value values actual measured meas feedback fb state states link "
         "robot base body global world map camera cam mocap vicon optitrack tag marker tracker "
-        "lidar slam imu header twist coordinate coordinates coord axis of the from to in at along log sensor "
-        "drive shaft nsec sec secs ros"
+        "lidar slam imu header twist coordinate coordinates coord axis of the from to in at along "
+        "log sensor drive shaft nsec sec secs ros"
     ),
 }
 """Roles, and the words that play them."""

@@ -1,0 +1,216 @@
+"""What a bag's layout is: which topic holds which channel, and what tells its runs apart."""
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import AliasChoices, BeforeValidator, Field, StrictBool, StrictFloat, StrictStr
+from pydantic.dataclasses import dataclass
+
+from slipid.data.reading.bag.messages.shape import steps_of
+from slipid.data.reading.layout import CHANNELS, PER_WHEEL, Count, unknown
+from slipid.data.reading.units import factor
+from slipid.support.errors import DataError
+from slipid.support.toml_file import CLOSED, NotNegative, Positive, checked
+
+GROUPS = {
+    "pose": ("pose_x", "pose_y", "pose_heading"),
+    "twist_command": ("twist_command_x", "twist_command_y", "twist_command_yaw"),
+}
+"""Channels that one message holds together, by the name that a layout gives them."""
+TURNS = ("wheel_angle", "wheel_ticks", "motor_angle", "wheel_speed", "motor_speed")
+"""Channels that tell whether a wheel moves, the best first."""
+EFFORT = '"A" (current), "N*m" (motor_torque or wheel_torque), "V" (voltage) or "1" (duty)'
+"""What drivers put into the effort of a JointState."""
+
+
+def _several(value: object) -> object:
+    """One, or a list of them."""
+    return tuple(value) if isinstance(value, list | tuple) else (value,)
+
+
+Texts = Annotated[tuple[StrictStr, ...], BeforeValidator(_several)]
+
+
+@dataclass(frozen=True, config=CLOSED)
+class TopicChannel:
+    """Where one channel lies in a bag: value = (scale x number + offset), in `unit`.
+
+    Attributes:
+        topics: the topic; several where each holds some of the wheels.
+        fields: paths of the numbers in a message, such as `motors[0].current`; an array without an
+            index counts with all its elements. Of a pose or a twist the field that holds it. Known
+            message types need none.
+        unit: of the numbers; known message types need none, but for the effort of joints.
+        scale: a sign or a correction, one number for all columns or one for each.
+        offset: added after the scale, in `unit`.
+        frame: in which a pose is looked up in transforms (`/tf`).
+        child: the frame whose pose that is.
+    """
+
+    topics: Annotated[Texts, Field(min_length=1, validation_alias=AliasChoices("topics", "topic"))]
+    fields: Annotated[Texts, Field(validation_alias=AliasChoices("fields", "field"))] = ()
+    unit: StrictStr | None = None
+    scale: Annotated[tuple[StrictFloat, ...], BeforeValidator(_several)] = (1.0,)
+    offset: StrictFloat = 0.0
+    frame: StrictStr | None = None
+    child: StrictStr | None = None
+
+    def __post_init__(self) -> None:
+        for path in self.fields:
+            steps_of(path)
+        if (self.frame is None) != (self.child is None):
+            raise ValueError("one frame only; expected both frame and child, or none of them")
+        if len(self.fields) > 1 and len(self.topics) > 1:
+            raise ValueError("several topics and several fields; expected one field for all topics")
+
+
+@dataclass(frozen=True, config=CLOSED)
+class RunRule:
+    """What tells the runs of a bag apart: a topic, pauses or a table.
+
+    Attributes:
+        topic: whose value marks a run: true, or one value as long as it stays.
+        field: path of that value.
+        between: values between runs.
+        surface: path of the field that names the floor, and `load` of the load set-up.
+        pause_s: runs are cut where no wheel moves for longer [s].
+        table: CSV file with columns start and end [s], perhaps surface, load, name and bag, named
+            from the folder of the bag.
+        from_start: whether its times count from the first sample of the bag; else as stamps do.
+    """
+
+    topic: StrictStr | None = None
+    field: StrictStr = "data"
+    between: tuple[str | int | float | bool, ...] = ("", 0, False)
+    surface: StrictStr | None = None
+    load: StrictStr | None = None
+    pause_s: Positive | None = None
+    table: StrictStr | None = None
+    from_start: StrictBool = False
+
+    def __post_init__(self) -> None:
+        if sum(rule is not None for rule in (self.topic, self.pause_s, self.table)) != 1:
+            raise ValueError("expected one of topic, pause_s and table")
+        for path in (self.field, self.surface, self.load):
+            if path is not None:
+                steps_of(path)
+
+
+@dataclass(frozen=True, config=CLOSED)
+class BagLayout:
+    """How the bags of one robot are laid out.
+
+    Attributes:
+        name: what messages call it.
+        topics: where each channel, or group of channels, lies.
+        joints: names of the drives' joints, in the order of the drives.
+        runs: what tells runs apart; without it a bag is one run.
+        stamp: which time counts: that in the messages (of those that have one), or when the
+            recorder received them.
+        max_disorder: messages of a topic that are late by no more are sorted [s].
+        drop_nan: whether messages with numbers that are none (NaN) are left out; else refused.
+        definitions: folder of .msg files, for message types whose definition the bag lacks.
+
+    The others are those of `slipid.data.reading.layout.Layout`.
+    """
+
+    name: str
+    topics: Mapping[str, TopicChannel]
+    joints: tuple[StrictStr, ...] = ()
+    runs: RunRule | None = None
+    stamp: Literal["header", "received"] = "header"
+    max_disorder: NotNegative = 0.1
+    drop_nan: StrictBool = False
+    definitions: Path | None = None
+    ticks_per_revolution: Positive | None = None
+    gear_ratio: Positive = 1.0
+    ticks_are_increments: StrictBool = False
+    tick_bits: Count = 32
+    current_is_signed: StrictBool = True
+    max_gap: Positive = 1.0
+    max_pose_jump: Positive = 0.5
+    max_heading_jump: Positive = 1.6
+
+
+_SETTINGS = [f.name for f in fields(BagLayout) if f.name not in ("name", "topics")]
+_NAMES = [*GROUPS, *(name for name in CHANNELS if name not in ("time", "pose_quaternion"))]
+
+
+def declared_bag_layout(
+    table: Mapping[str, object], where: str, folder: Path = Path()
+) -> BagLayout:
+    """Layout of bags declared in a config: the table of which `kind = "bag"`.
+
+    Args:
+        table: what the config says.
+        where: what messages call the section, such as `robot.toml [layouts.mine]`.
+        folder: which a relative `definitions` counts from.
+
+    Raises:
+        DataError: unknown key, channel or unit, wrong dimension, wrong type.
+    """
+    given = {key: value for key, value in table.items() if key != "kind"}
+    topics = given.pop("topics", {})
+    for key in given:
+        if key not in _SETTINGS:
+            raise DataError(f"{where}: {unknown('key', key, ['kind', 'topics', *_SETTINGS])}")
+    if not isinstance(topics, dict) or not topics:
+        raise DataError(f"{where} topics: {topics!r}; expected a table of channels")
+    channels = {}
+    for name, spec in topics.items():
+        if name not in _NAMES:
+            raise DataError(f"{where} topics.{name}: {unknown('channel', name, _NAMES)}")
+        channels[name] = checked(f"{where} topics.{name}", spec, TopicChannel)
+        if problem := _channel_problem(name, channels[name]):
+            raise DataError(f"{where} topics.{name}: {problem}")
+    if isinstance(given.get("runs"), dict):
+        given["runs"] = checked(f"{where} runs", given["runs"], RunRule)
+    layout = checked(where, {**given, "name": where, "topics": {}}, BagLayout)
+    definitions = layout.definitions and folder / layout.definitions
+    layout = replace(layout, topics=channels, definitions=definitions)
+    if problem := _problem(layout):
+        raise DataError(f"{where}: {problem}")
+    return layout
+
+
+def _channel_problem(name: str, channel: TopicChannel) -> str | None:
+    """What does not belong together in one channel."""
+    if channel.frame is not None and name != "pose":
+        return "frame and child, which belong to a pose; expected neither"
+    if name in GROUPS:
+        plain = channel.unit is None and channel.scale == (1.0,) and channel.offset == 0.0
+        if plain and len(channel.topics) == 1 and len(channel.fields) <= 1:
+            return None
+        inner = ", ".join(GROUPS[name])
+        return f"more than topic and field; expected these alone, or {inner} each with its own"
+    if name not in PER_WHEEL and len(channel.topics) > 1:
+        return f"{len(channel.topics)} topics; expected one"
+    if channel.unit is None and any(path.endswith("effort") for path in channel.fields):
+        return f"effort without a unit, and drivers disagree on it; expected unit = {EFFORT}"
+    if channel.unit is not None:
+        try:
+            factor(channel.unit, CHANNELS[name])
+        except ValueError as error:
+            return str(error)
+    return None
+
+
+def _problem(layout: BagLayout) -> str | None:
+    """What does not belong together."""
+    have = set(layout.topics)
+    for group, inner in GROUPS.items():
+        if group in have and (twice := have & set(inner)):
+            return f"{group} and {min(twice)}; expected one of them"
+    if 0 < len(have & set(GROUPS["pose"])) < 3:
+        return "a pose in parts; expected pose, or all of pose_x, pose_y and pose_heading"
+    if "wheel_ticks" in have and layout.ticks_per_revolution is None:
+        return "wheel_ticks without ticks_per_revolution; expected ticks per turn of the motor"
+    if len(set(layout.joints)) < len(layout.joints):
+        return f"joints {list(layout.joints)}; expected each once"
+    if layout.runs is not None and layout.runs.pause_s is not None and not have & set(TURNS):
+        return f"runs by pauses, but no wheels; expected one of the topics {', '.join(TURNS)}"
+    if layout.definitions is not None and not layout.definitions.is_dir():
+        return f"definitions: no folder {layout.definitions}; expected one with .msg files"
+    return None

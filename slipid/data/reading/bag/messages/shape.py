@@ -1,0 +1,225 @@
+"""Where the numbers of a serialised message lie in its bytes.
+
+Messages of one topic mostly have one shape: the same texts, and arrays of the same lengths. So one
+message is walked through field by field, and the numbers of all others that have its shape are
+taken from the same places, thousands at a time.
+"""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from slipid.data.reading.bag.messages.kinds import Kind, Many, Message, Number, Text
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a path: the name of a field, and which element of it, or None for all."""
+
+    name: str
+    index: int | None = None
+
+
+@dataclass(frozen=True)
+class Place:
+    """A number in a message: its first byte, and its numpy type with byte order."""
+
+    offset: int
+    dtype: str
+
+    def of(self, block: UInt8[np.ndarray, "message byte"]) -> Float[np.ndarray, " message"]:
+        """The number in each of some messages of one shape."""
+        size = int(self.dtype[2:])
+        cells = np.ascontiguousarray(block[:, self.offset : self.offset + size])
+        return cells.view(self.dtype)[:, 0].astype(float)
+
+    def whole(self, block: UInt8[np.ndarray, "message byte"]) -> Int[np.ndarray, " message"]:
+        """The same of a whole number, without rounding."""
+        cells = np.ascontiguousarray(block[:, self.offset : self.offset + int(self.dtype[2:])])
+        return cells.view(self.dtype)[:, 0].astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """What lies at one path of a message.
+
+    Attributes:
+        path: the steps from the message to it.
+        dtype: of its numbers, with byte order; empty for a text.
+        offset: first byte.
+        count: how many numbers, None where it is one and no array.
+        text: of a text.
+    """
+
+    path: tuple[Step, ...]
+    dtype: str
+    offset: int
+    count: int | None = None
+    text: str = ""
+
+    def places(self, index: int | None) -> tuple[Place, ...]:
+        """Places of its numbers, or of the one with an index."""
+        size = int(self.dtype[2:])
+        every = range(1 if self.count is None else self.count)
+        if index is not None:
+            every = every[index : index + 1]
+        return tuple(Place(self.offset + k * size, self.dtype) for k in every)
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """How the messages of a topic that look like one of them are laid out.
+
+    Attributes:
+        size: bytes of the message.
+        leaves: everything in it, in order.
+        fixed: bytes that are the same in all messages of this shape: texts and lengths of arrays.
+        values: what these bytes are.
+    """
+
+    size: int
+    leaves: tuple[Leaf, ...]
+    fixed: Int[np.ndarray, " fixed"]
+    values: UInt8[np.ndarray, " fixed"]
+
+    def fits(self, block: UInt8[np.ndarray, "message byte"]) -> Bool[np.ndarray, " message"]:
+        """Which of some messages of its size have this shape."""
+        return np.all(block[:, self.fixed] == self.values, axis=1)
+
+    def places(self, path: Sequence[Step]) -> tuple[Place, ...]:
+        """Places of the numbers at a path, none where there are none."""
+        return tuple(p for leaf, index in self._at(path) if leaf.dtype for p in leaf.places(index))
+
+    def texts(self, path: Sequence[Step]) -> tuple[str, ...]:
+        """Texts at a path."""
+        return tuple(leaf.text for leaf, _ in self._at(path) if not leaf.dtype)
+
+    def count(self, path: Sequence[Step]) -> int:
+        """How many numbers or texts are at a path."""
+        return sum(1 if leaf.count is None else leaf.count for leaf, _ in self._at(path))
+
+    def _at(self, path: Sequence[Step]) -> list[tuple[Leaf, int | None]]:
+        """Leaves at a path, and which of its elements is meant."""
+        found = []
+        for leaf in self._by_names.get(tuple(step.name for step in path), ()):
+            ends = zip(leaf.path[:-1], path[:-1], strict=True)
+            inner = all(want.index in (None, have.index) for have, want in ends)
+            own, want = leaf.path[-1].index, path[-1].index
+            if inner and leaf.count is not None:
+                found.append((leaf, want))
+            elif inner and want in (None, own):
+                found.append((leaf, None))
+        return found
+
+    @cached_property
+    def _by_names(self) -> dict[tuple[str, ...], list[Leaf]]:
+        leaves: dict[tuple[str, ...], list[Leaf]] = {}
+        for leaf in self.leaves:
+            leaves.setdefault(tuple(step.name for step in leaf.path), []).append(leaf)
+        return leaves
+
+
+def steps_of(path: str) -> tuple[Step, ...]:
+    """Steps of a path as people write it, such as `motors[0].current`; ValueError otherwise."""
+    steps = []
+    for part in path.split("."):
+        name, bracket, rest = part.partition("[")
+        index, end, after = rest.partition("]")
+        whole = not bracket or (bool(end) and not after and index.isdecimal())
+        if not (name.isidentifier() and whole):
+            raise ValueError(f"no path of a field: '{path}'; expected such as motors[0].current")
+        steps.append(Step(name, int(index) if bracket else None))
+    return tuple(steps)
+
+
+def shape_of(raw: bytes, message: Message, *, cdr: bool) -> Shape:
+    """Shape of one message.
+
+    Args:
+        raw: its bytes.
+        message: its type.
+        cdr: whether it is serialised as in ROS 2 (CDR), else as in ROS 1.
+
+    Raises:
+        ValueError: the bytes are no such message; the text says why.
+    """
+    walk = _Walk(raw, cdr)
+    walk.through(message, ())
+    over = len(raw) - walk.at
+    if not 0 <= over < (4 if cdr else 1):
+        raise ValueError(f"{over} bytes are left over after its last field")
+    fixed = np.concatenate([np.arange(0), *(np.arange(a, b) for a, b in walk.fixed)])
+    values = np.frombuffer(raw, np.uint8)[fixed]
+    return Shape(len(raw), tuple(walk.leaves), fixed, values)
+
+
+class _Walk:
+    """A walk through the bytes of one message, which notes what it passes."""
+
+    def __init__(self, raw: bytes, cdr: bool) -> None:
+        self.raw, self.cdr, self.order = raw, cdr, "<"
+        self.at = self.origin = 0
+        self.leaves: list[Leaf] = []
+        self.fixed: list[tuple[int, int]] = []
+        if cdr:
+            if raw[:2] not in (b"\x00\x00", b"\x00\x01") or len(raw) < 4:
+                raise ValueError(f"it is not serialised as CDR (it starts with {raw[:4].hex(' ')})")
+            self.order = "<" if raw[1] else ">"
+            self.at = self.origin = 4
+            self.fixed.append((0, 2))
+
+    def through(self, kind: Kind, path: tuple[Step, ...]) -> None:
+        """Note the leaves of a field."""
+        if isinstance(kind, Number):
+            dtype = self.order + kind.dtype
+            self.leaves.append(Leaf(path, dtype, self.numbers(kind.size, 1)))
+        elif isinstance(kind, Text):
+            self.leaves.append(Leaf(path, "", self.at, None, self.text()))
+        elif isinstance(kind, Message):
+            for field in kind.fields:
+                self.through(field.kind, (*path, Step(field.name)))
+        else:
+            self.several(kind, path)
+
+    def several(self, kind: Many, path: tuple[Step, ...]) -> None:
+        """Note the leaves of an array."""
+        count = self.length() if kind.count is None else kind.count
+        if isinstance(kind.element, Number):
+            dtype = self.order + kind.element.dtype
+            at = self.numbers(kind.element.size, count)
+            self.leaves.append(Leaf(path, dtype, at, count))
+            return
+        if count > len(self.raw) - self.at:
+            raise ValueError(f"it ends before the {count} elements of '{path[-1].name}'")
+        *before, last = path
+        for k in range(count):
+            self.through(kind.element, (*before, Step(last.name, k)))
+
+    def numbers(self, size: int, count: int) -> int:
+        """Pass some numbers and return their first byte."""
+        if count and self.cdr:
+            self.at += -(self.at - self.origin) % size
+        first = self.at
+        self.at += size * count
+        if self.at > len(self.raw):
+            raise ValueError(f"it ends after {len(self.raw)} bytes, within its fields")
+        return first
+
+    def length(self) -> int:
+        """Pass the length of an array or a text."""
+        at = self.numbers(4, 1)
+        self.fixed.append((at, at + 4))
+        return int(struct.unpack_from(self.order + "I", self.raw, at)[0])
+
+    def text(self) -> str:
+        """Pass a text."""
+        size = self.length()
+        at = self.numbers(1, size)
+        self.fixed.append((at, at + size))
+        text = self.raw[at : at + size]
+        # CDR counts the zero at the end
+        return (text[:-1] if self.cdr else text).decode(errors="replace")

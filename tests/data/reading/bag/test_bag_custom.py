@@ -1,0 +1,182 @@
+"""Messages of one's own: numbers by the paths of their fields."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slipid.data.reading.bag.layout import declared_bag_layout
+from slipid.data.reading.bag.reader import read_bag
+from tests.helpers.made_bags import (
+    STORAGES,
+    SUFFIX,
+    Said,
+    header,
+    in_order,
+    joint_states,
+    turned,
+    vector,
+    without_definitions,
+    write_bag,
+)
+
+TIME = 1.7e9 + np.arange(0.0, 4.0, 0.01)
+ANGLE = np.column_stack([3.0 * np.sin(TIME - TIME[0]), np.linspace(0.0, 9.0, len(TIME))])
+RESOLUTION = 3e-7
+"""Of a double that counts seconds from 1970."""
+
+
+def layout(joints=("left", "right"), **given):
+    return declared_bag_layout({"kind": "bag", "joints": list(joints), **given}, "layout")
+
+
+def read(path, **given):
+    (run,) = read_bag(path, layout(**given))
+    return run
+
+
+def bag(tmp_path, storage, *said, **options):
+    return write_bag(tmp_path / f"bag{SUFFIX[storage]}", storage, in_order(*said), **options)
+
+
+CUSTOM = {
+    "my_msgs/msg/Motor": "string name\nfloat32 current\nint16 duty\n",
+    "my_msgs/msg/State": (
+        "std_msgs/Header header\nbool on\nfloat64[3] spare\nmy_msgs/Motor[] motors\n"
+        "float32[] volts\nint64 ticks\n"
+    ),
+}
+
+
+def states(time):
+    return [
+        Said(
+            "/state",
+            "my_msgs/msg/State",
+            {
+                "header": header(t, f"frame{k % 3}"),
+                "on": True,
+                "motors": [
+                    {"name": "a" * (k % 5), "current": k + 0.5, "duty": -k},
+                    {"name": "b", "current": -k, "duty": 2 * k},
+                ],
+                "volts": [1.0 * k] * 2,
+                "ticks": -5 * k,
+            },
+            t,
+        )
+        for k, t in enumerate(time.tolist())
+    ]
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_custom_messages(tmp_path, storage):
+    path = bag(tmp_path, storage, states(TIME), definitions=CUSTOM)
+    topics = {
+        "current": {"topic": "/state", "field": "motors.current", "unit": "mA"},
+        "duty": {
+            "topic": "/state",
+            "field": ["motors[1].duty", "motors[0].duty"],
+            "unit": "%",
+            "scale": [1.0, -1.0],
+        },
+        "voltage": {"topic": "/state", "field": "volts", "unit": "V"},
+        "bus_voltage": {"topic": "/state", "field": "volts[1]", "unit": "V", "offset": 1.0},
+    }
+    run = read(path, topics=topics)
+    k = np.arange(len(TIME))
+    values = {name: signal.values for name, signal in run.signals.items()}
+    np.testing.assert_allclose(values["current"], np.column_stack([k + 0.5, -k]) * 1e-3)
+    np.testing.assert_allclose(values["duty"], np.column_stack([2 * k, k]) / 100)
+    np.testing.assert_allclose(values["voltage"], np.column_stack([k, k]))
+    np.testing.assert_allclose(values["bus_voltage"][:, 0], k + 1.0)
+    assert run.signals["duty"].source.columns == ("motors[1].duty", "motors[0].duty")
+
+
+@pytest.mark.parametrize("package", ["my_msgs/msg", "."])
+def test_definitions_in_a_folder(tmp_path, package):
+    path = without_definitions(bag(tmp_path, "sqlite3", states(TIME), definitions=CUSTOM))
+    folder = tmp_path / "definitions" / package
+    folder.mkdir(parents=True)
+    for name, text in CUSTOM.items():
+        (folder / f"{name.split('/')[-1]}.msg").write_text(text)
+    topics = {"bus_voltage": {"topic": "/state", "field": "volts[1]", "unit": "V"}}
+    run = read(path, topics=topics, definitions=str(tmp_path / "definitions"))
+    k = np.arange(len(TIME))
+    np.testing.assert_allclose(run.signals["bus_voltage"].values[:, 0], k)
+
+
+def test_plain_arrays_and_numbers(tmp_path):
+    arrays = [
+        Said("/amps", "std_msgs/msg/Float64MultiArray", {"data": [k, -k]}, t)
+        for k, t in enumerate(TIME.tolist())
+    ]
+    one = [
+        Said("/volts", "std_msgs/msg/Int32", {"data": 100 * k}, t)
+        for k, t in enumerate(TIME.tolist())
+    ]
+    topics = {
+        "current": {"topic": "/amps", "unit": "A"},
+        "bus_voltage": {"topic": "/volts", "unit": "mV"},
+    }
+    run = read(bag(tmp_path, "mcap", arrays, one), topics=topics)
+    k = np.arange(len(TIME))
+    np.testing.assert_array_equal(run.signals["current"].values, np.column_stack([k, -k]))
+    np.testing.assert_allclose(run.signals["bus_voltage"].values[:, 0], 0.1 * k)
+
+
+def test_a_pose_inside_a_message_of_ones_own(tmp_path):
+    text = {"my_msgs/msg/Seen": "std_msgs/Header header\ngeometry_msgs/Pose robot\nfloat32 x\n"}
+    said = [
+        Said(
+            "/seen",
+            "my_msgs/msg/Seen",
+            {
+                "header": header(t),
+                "robot": {"position": vector(t - TIME[0]), "orientation": turned(0.5)},
+            },
+            t,
+        )
+        for t in TIME.tolist()
+    ]
+    path = bag(tmp_path, "mcap", said, definitions=text)
+    run = read(path, topics={"pose": {"topic": "/seen", "field": "robot"}})
+    np.testing.assert_allclose(run.signals["pose_x"].values[:, 0], TIME - TIME[0], atol=1e-6)
+    np.testing.assert_allclose(run.signals["pose_heading"].values, 0.5)
+
+
+def test_standard_types_need_no_definition_in_the_bag(tmp_path):
+    said = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
+    path = without_definitions(bag(tmp_path, "sqlite3", said))
+    run = read(path, topics={"wheel_angle": {"topic": "/joint_states"}})
+    np.testing.assert_allclose(run.signals["wheel_angle"].values, ANGLE)
+
+
+def test_messages_with_ever_new_texts_are_read_too(tmp_path):
+    said = [
+        Said(
+            "/joint_states",
+            "sensor_msgs/msg/JointState",
+            {"header": header(t, f"frame{k:04d}"), "name": ["left"], "position": [1.0 * k]},
+            t,
+        )
+        for k, t in enumerate(TIME.tolist())
+    ]
+    topics = {"wheel_angle": {"topic": "/joint_states"}}
+    run = read(bag(tmp_path, "mcap", said), joints=("left",), topics=topics)
+    np.testing.assert_array_equal(run.signals["wheel_angle"].values[:, 0], np.arange(len(TIME)))
+
+
+def test_a_topic_for_each_motor(tmp_path):
+    straight = TIME - TIME[0]
+    said = [
+        Said(f"/amps{j}", "std_msgs/msg/Float64", {"data": j + k * float(s)}, float(TIME[0] + s))
+        for j, (k, times) in enumerate([(1.0, straight[::2]), (-3.0, straight)])
+        for s in times
+    ]
+    topics = {"current": {"topic": ["/amps0", "/amps1"], "unit": "A"}}
+    signal = read(bag(tmp_path, "mcap", said), topics=topics).signals["current"]
+    s = straight[::2]
+    np.testing.assert_allclose(signal.time, TIME[0] + s, rtol=0, atol=RESOLUTION)
+    np.testing.assert_allclose(signal.values, np.column_stack([s, 1.0 - 3.0 * s]), atol=1e-6)
+    assert signal.source.topic == "/amps0, /amps1"

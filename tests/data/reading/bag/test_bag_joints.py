@@ -1,0 +1,101 @@
+"""Joints by their names, in messages and topics of any order."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slipid.data.reading.bag.layout import declared_bag_layout
+from slipid.data.reading.bag.reader import read_bag
+from tests.helpers.made_bags import (
+    SUFFIX,
+    in_order,
+    joint_states,
+    write_bag,
+)
+
+TIME = 1.7e9 + np.arange(0.0, 4.0, 0.01)
+ANGLE = np.column_stack([3.0 * np.sin(TIME - TIME[0]), np.linspace(0.0, 9.0, len(TIME))])
+RESOLUTION = 3e-7
+"""Of a double that counts seconds from 1970."""
+
+
+def layout(joints=("left", "right"), **given):
+    return declared_bag_layout({"kind": "bag", "joints": list(joints), **given}, "layout")
+
+
+def read(path, **given):
+    (run,) = read_bag(path, layout(**given))
+    return run
+
+
+def bag(tmp_path, storage, *said, **options):
+    return write_bag(tmp_path / f"bag{SUFFIX[storage]}", storage, in_order(*said), **options)
+
+
+def test_joints_are_found_by_name_in_any_order(tmp_path):
+    ahead = joint_states("/joint_states", TIME[::2], ["left", "right"], position=ANGLE[::2])
+    back = joint_states(
+        "/joint_states", TIME[1::2], ["arm", "right", "left"], position=with_arm(ANGLE[1::2])
+    )
+    topics = {"wheel_angle": {"topic": "/joint_states"}}
+    run = read(bag(tmp_path, "mcap", ahead, back), joints=("right", "left"), topics=topics)
+    np.testing.assert_allclose(run.signals["wheel_angle"].values, ANGLE[:, ::-1])
+
+
+def with_arm(angle):
+    """Columns arm, right, left."""
+    return np.column_stack([np.full(len(angle), 99.0), angle[:, 1], angle[:, 0]])
+
+
+def test_messages_of_other_joints_are_left_out(tmp_path):
+    wheels = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
+    arm = joint_states("/joint_states", TIME + 0.005, ["arm"], position=ANGLE[:, :1])
+    topics = {"wheel_angle": {"topic": "/joint_states"}}
+    run = read(bag(tmp_path, "sqlite3", wheels, arm), topics=topics)
+    np.testing.assert_allclose(run.signals["wheel_angle"].values, ANGLE)
+    np.testing.assert_array_equal(
+        run.signals["wheel_angle"].source.lines, 1 + 2 * np.arange(len(TIME))
+    )
+
+
+def test_joints_in_messages_of_their_own_are_laid_side_by_side(tmp_path):
+    straight = np.column_stack([TIME - TIME[0], 2.0 * (TIME - TIME[0])])
+    left = joint_states("/left", TIME, ["left"], position=straight[:, :1])
+    later = TIME + 0.003
+    right = joint_states("/right", later, ["right"], position=straight[:, 1:] + 0.006)
+    topics = {"wheel_angle": {"topic": ["/left", "/right"]}}
+    run = read(bag(tmp_path, "mcap", left, right), topics=topics)
+    signal = run.signals["wheel_angle"]
+    np.testing.assert_allclose(signal.values, straight[1:], atol=1e-6)
+    np.testing.assert_allclose(signal.time, TIME[1:], rtol=0, atol=RESOLUTION)
+    assert "interpolated" in run.notes[0]
+    assert "right" in run.notes[0]
+
+
+def test_a_message_without_one_of_the_joints_is_left_out_with_a_note(tmp_path):
+    said = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
+    said[7] = joint_states("/joint_states", TIME[7:8], ["left"], position=ANGLE[7:8, :1])[0]
+    topics = {"wheel_angle": {"topic": "/joint_states"}}
+    run = read(bag(tmp_path, "mcap", said), topics=topics)
+    np.testing.assert_allclose(run.signals["wheel_angle"].values, np.delete(ANGLE, 7, axis=0))
+    assert "1 messages without all of left, right" in run.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("channel", "unit", "factor"),
+    [
+        ("current", "A", 1.0),
+        ("motor_torque", "N*m", 1.0),
+        ("wheel_torque", "N m", 1.0),
+        ("motor_torque", "N*mm", 1e-3),
+        ("voltage", "V", 1.0),
+        ("duty", "1", 1.0),
+        ("duty", "%", 0.01),
+    ],
+)
+def test_what_effort_may_mean(tmp_path, channel, unit, factor):
+    said = joint_states("/joint_states", TIME, ["left", "right"], effort=ANGLE)
+    topics = {channel: {"topic": "/joint_states", "field": "effort", "unit": unit}}
+    run = read(bag(tmp_path, "mcap", said), topics=topics)
+    np.testing.assert_allclose(run.signals[channel].values, ANGLE * factor)
