@@ -32,8 +32,6 @@ PER_WHEEL = {
     "wheel_torque": "N*m",
     "voltage": "V",
     "duty": "1",
-    "motor_torque": "N*m",
-    "wheel_torque": "N*m",
 }
 SINGLE = {
     "time": "s",

@@ -87,6 +87,17 @@ class LayoutSketch:
 
 
 @dataclass(frozen=True)
+class BagSketch:
+    """A layout of bags: its keys, a line for each topic that counts, and what they hold."""
+
+    name: str
+    settings: tuple[Line, ...]
+    topics: tuple[Line, ...]
+    above: tuple[str, ...] = ()
+    questions: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class LogsSketch:
     """A section of logs; attributes as of `Logs`, and what is said or asked of it."""
 
@@ -117,6 +128,7 @@ class Sketch:
         above: comments at its beginning.
         data: the data folder, as it is called on the command line.
         hints: questions about the robot in words that fit its logs.
+        bags: layouts of bags.
     """
 
     robot: Answers
@@ -126,6 +138,7 @@ class Sketch:
     above: tuple[str, ...] = ()
     data: str = "DIR"
     hints: tuple[Hint, ...] = ()
+    bags: tuple[BagSketch, ...] = ()
 
     @property
     def channels(self) -> frozenset[str]:

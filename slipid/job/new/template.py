@@ -7,7 +7,14 @@ from slipid.job.config import Logs, Wheels, geometry, parsed
 from slipid.job.new.drawing import drawing
 from slipid.job.new.lines import Block, Line, all_asked, toml
 from slipid.job.new.questions import robot_of
-from slipid.job.new.sketch import BesideSketch, FileSketch, LayoutSketch, LogsSketch, Sketch
+from slipid.job.new.sketch import (
+    BagSketch,
+    BesideSketch,
+    FileSketch,
+    LayoutSketch,
+    LogsSketch,
+    Sketch,
+)
 from slipid.job.reference.meanings import in_short
 from slipid.support.errors import DataError
 from slipid.support.files import write_bytes
@@ -81,6 +88,7 @@ def new_config(sketch: Sketch, name: str) -> NewConfig:
         Block("", above=_head(sketch, name)),
         _robot_block(sketch, robot, picture),
         *(block for layout in sketch.layouts for block in _layout_blocks(layout)),
+        *(block for bag in sketch.bags for block in _bag_blocks(bag)),
         *(_logs_block(logs, first=k == 0) for k, logs in enumerate(sketch.logs)),
         _weights_block(geometry(robot).wheels),
         _parameters_block(sketch.channels),
@@ -169,6 +177,18 @@ def _file_blocks(
     return [
         Block(f"[{where}]", file.lines(), above=above, questions=file.questions),
         Block(f"[{where}.columns]", columns, above=file.above, below=below),
+    ]
+
+
+def _bag_blocks(bag: BagSketch) -> list[Block]:
+    """A layout of bags with its topics."""
+    said = (
+        "Which topic holds what. Known types of messages need neither field nor unit; the frame of "
+        "a pose in /tf and what the effort of joints is must be said.",
+    )
+    return [
+        Block(f"[layouts.{bag.name}]", bag.settings, above=said, questions=bag.questions),
+        Block(f"[layouts.{bag.name}.topics]", bag.topics, above=bag.above),
     ]
 
 

@@ -102,7 +102,7 @@ def columns_of(numbers: Numbers) -> Columns:
 
 def _found(numbers: Numbers, said: dict[int, Named], channel: str, places: dict[str, int]) -> Found:
     """A channel with its columns in order."""
-    labels = sorted(places, key=_rank)
+    labels = sorted(places, key=rank)
     at = tuple(places[label] for label in labels)
     units = Counter(said[k].unit for k in at)
     doubts = [f"column '{numbers.head.names[k]}': {said[k].doubt}" for k in at if said[k].doubt]
@@ -112,7 +112,7 @@ def _found(numbers: Numbers, said: dict[int, Named], channel: str, places: dict[
     return Found(channel, at, tuple(labels), numbers.values[:, at], unit, tuple(doubts))
 
 
-def _rank(label: str) -> tuple[int, int, str]:
+def rank(label: str) -> tuple[int, int, str]:
     """Order of wheels: by the drives' convention, else by number."""
     if label in _QUATERNION:
         return (0, _QUATERNION.index(label), label)

@@ -45,7 +45,7 @@ def globs_of(root: Path, kind: Kind, others: Sequence[Path]) -> list[str]:
 
 def _narrow(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> list[str]:
     """A glob for some files, narrower ones where it finds others."""
-    glob = "/".join(_part(parts) for parts in zip(*(p.parts for p in paths), strict=True))
+    glob = common_glob(paths)
     if not any(_finds(glob, path) for path in theirs):
         return [glob]
     folders = {path.parent for path in paths}
@@ -53,6 +53,11 @@ def _narrow(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> list[str
         parts = [[p for p in paths if p.parent == folder] for folder in sorted(folders)]
         return [one for part in parts for one in _narrow(part, theirs)]
     return [path.as_posix() for path in paths]
+
+
+def common_glob(paths: Sequence[PurePosixPath]) -> str:
+    """A glob that finds paths of the same depth: what they have in common, around stars."""
+    return "/".join(_part(parts) for parts in zip(*(p.parts for p in paths), strict=True))
 
 
 def _finds(glob: str, path: PurePosixPath) -> bool:

@@ -8,6 +8,7 @@ from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.reader import read_logs
 from slipid.job.config import geometry, parsed
 from slipid.job.logs import layout_of
+from slipid.job.new.look.bags import bags_in, propose_bags
 from slipid.job.new.look.file import SUFFIXES, head_of, heads_below
 from slipid.job.new.look.kinds import Kind, a_folder_each, globs_of, kinds_of, pattern_beside
 from slipid.job.new.look.known_formats import likely_presets
@@ -86,6 +87,9 @@ def propose(path: Path, told: Told) -> Proposal:
     """
     if not path.exists():
         raise DataError(f"{path}: no such file or folder; expected a log, or a folder of logs")
+    if bags := bags_in(path):
+        proposed = propose_bags(bags, path, told)
+        return Proposal(proposed.sketch, proposed.said)
     found = _sorted(path)
     wheels = max((group.main.columns.wheels for group in found.groups), default=0)
     for _, name in found.presets:
