@@ -62,9 +62,10 @@ def new(
     force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False,
 ) -> int:
     """Write a commented config for your robot: asks for it, or looks into its logs (--from)."""
+    from slipid.job.new.answers import Told
     from slipid.job.new.blank import blank
     from slipid.job.new.look.propose import propose
-    from slipid.job.new.questions import Told, ask
+    from slipid.job.new.questions import ask
     from slipid.job.new.template import absent, new_config
 
     absent(out, force)

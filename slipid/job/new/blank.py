@@ -1,7 +1,7 @@
 """A config for logs that nobody has shown yet: columns with names to be replaced."""
 
+from slipid.job.new.answers import Answers
 from slipid.job.new.lines import Line
-from slipid.job.new.questions import Answers
 from slipid.job.new.sketch import (
     ChannelSketch,
     FileSketch,

@@ -1,53 +1,22 @@
 """What is asked about a robot: its drive first, then only what that drive needs."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
 from slipid.job.config import Box, Differential, General, Omni, Wheels, geometry
+from slipid.job.new.answers import (
+    Answers,
+    Told,
+    angles,
+    count,
+    not_negative,
+    places,
+    positive,
+    rollers,
+    yes,
+)
 from slipid.support.errors import DataError, near
-
-
-@dataclass(frozen=True, kw_only=True)
-class Told:
-    """What was said of a robot beforehand, as text; None where it was not."""
-
-    drive: str | None = None
-    wheels: str | None = None
-    azimuths_deg: str | None = None
-    base_radius_m: str | None = None
-    wheelbase_m: str | None = None
-    track_m: str | None = None
-    shared: str | None = None
-    places_m: str | None = None
-    directions_deg: str | None = None
-    rollers_deg: str | None = None
-    wheel_radius_m: str | None = None
-    gear_ratio: str | None = None
-    mass_kg: str | None = None
-    ticks_per_revolution: str | None = None
-
-
-@dataclass(frozen=True)
-class Answers:
-    """What is known of a robot, said or taken by default."""
-
-    drive: str = "omni"
-    wheels: int = 3
-    azimuths_deg: tuple[float, ...] = ()
-    base_radius_m: float = 0.15
-    wheelbase_m: float = 0.3
-    track_m: float = 0.3
-    shared: bool = False
-    places_m: tuple[tuple[float, ...], ...] = ()
-    directions_deg: tuple[float, ...] = ()
-    rollers_deg: tuple[float | None, ...] = ()
-    wheel_radius_m: float = 0.05
-    gear_ratio: float = 1.0
-    mass_kg: float = 10.0
-    ticks_per_revolution: float = 1000.0
-    taken: frozenset[str] = field(default_factory=frozenset)
-    """What nobody said: a default stands there."""
 
 
 class Asker(Protocol):
@@ -79,62 +48,6 @@ class Question:
         return "--" + self.about.replace("_", "-")
 
 
-def _positive(text: str, _: Answers) -> float:
-    value = _number(text)
-    if not 0 < value < float("inf"):
-        raise ValueError("expected a number above 0")
-    return value
-
-
-def _not_negative(text: str, _: Answers) -> float:
-    value = _number(text)
-    if not 0 <= value < float("inf"):
-        raise ValueError("expected a number above 0, or 0 where there is none")
-    return value
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text.strip().replace("_", "?"))
-    except ValueError:
-        comma = " with a decimal point" if "," in text else ""
-        raise ValueError(f"expected a number{comma}") from None
-
-
-def _count(text: str, _: Answers) -> int:
-    if not text.strip().isdecimal() or not 3 <= int(text) <= 12:
-        raise ValueError("expected a whole number from 3 to 12")
-    return int(text)
-
-
-def _yes(text: str, _: Answers) -> bool:
-    word = text.strip().lower()
-    if word not in ("y", "yes", "true", "n", "no", "false"):
-        raise ValueError("expected yes or no")
-    return word in ("y", "yes", "true")
-
-
-def _angles(text: str, known: Answers) -> tuple[float, ...]:
-    found = tuple(_number(part) for part in text.replace(";", ",").split(","))
-    if len(found) != known.wheels:
-        raise ValueError(f"{len(found)} angles; expected {known.wheels}, one per wheel")
-    return found
-
-
-def _places(text: str, _: Answers) -> tuple[tuple[float, ...], ...]:
-    found = tuple(tuple(_number(c) for c in part.split(",")) for part in text.split(";"))
-    if len(found) < 2 or any(len(place) != 2 for place in found):
-        raise ValueError("expected x, y of each wheel, as in: 0.2, 0.1; 0.2, -0.1; -0.2, 0")
-    return found
-
-
-def _rollers(text: str, known: Answers) -> tuple[float | None, ...]:
-    words = [part.strip().lower() for part in text.replace(";", ",").split(",")]
-    if len(words) != known.wheels:
-        raise ValueError(f"{len(words)} rollers; expected {known.wheels}, one per wheel")
-    return tuple(None if word == "none" else _number(word) for word in words)
-
-
 def _drive(text: str, _: Answers) -> str:
     word = text.strip().lower()
     if word not in DRIVES:
@@ -162,47 +75,47 @@ DRIVE = Question(
     _always("omni"),
     _drive,
 )
-_WHEELS = Question("wheels", "number of wheels", _always("3"), _count)
+_WHEELS = Question("wheels", "number of wheels", _always("3"), count)
 _AZIMUTHS = Question(
     "azimuths_deg",
     "where the wheels stand, counter-clockwise from ahead, in the order of your columns [deg]",
     _evenly,
-    _angles,
+    angles,
 )
 _BASE = Question(
-    "base_radius_m", "from the middle to the wheel centres [m]", _always("0.15"), _positive
+    "base_radius_m", "from the middle to the wheel centres [m]", _always("0.15"), positive
 )
-_WHEELBASE = Question("wheelbase_m", "wheelbase, front to rear axle [m]", _always("0.3"), _positive)
+_WHEELBASE = Question("wheelbase_m", "wheelbase, front to rear axle [m]", _always("0.3"), positive)
 _TRACK = Question(
-    "track_m", "track, between the middles of left and right wheels [m]", _always("0.3"), _positive
+    "track_m", "track, between the middles of left and right wheels [m]", _always("0.3"), positive
 )
 _SHARED = Question(
-    "shared", "does one motor turn both wheels of a side (yes or no)", _always("no"), _yes
+    "shared", "does one motor turn both wheels of a side (yes or no)", _always("no"), yes
 )
 _PLACES = Question(
     "places_m",
     "centres of the wheels, x ahead and y left: x, y; x, y; ... [m]",
     _always("0.2, 0.15; 0.2, -0.15; -0.2, 0"),
-    _places,
+    places,
 )
 _DIRECTIONS = Question(
-    "directions_deg", "directions in which the wheels roll, from ahead [deg]", _each("0"), _angles
+    "directions_deg", "directions in which the wheels roll, from ahead [deg]", _each("0"), angles
 )
 _ROLLERS = Question(
     "rollers_deg",
     "angles of the rollers to them [deg], none without rollers",
     _each("none"),
-    _rollers,
+    rollers,
 )
 COMMON = (
-    Question("wheel_radius_m", "wheel radius [m]", _always("0.05"), _positive),
-    Question("gear_ratio", "motor turns per wheel turn", _always("1"), _positive),
-    Question("mass_kg", "mass of the robot [kg]", _always("10"), _positive),
+    Question("wheel_radius_m", "wheel radius [m]", _always("0.05"), positive),
+    Question("gear_ratio", "motor turns per wheel turn", _always("1"), positive),
+    Question("mass_kg", "mass of the robot [kg]", _always("10"), positive),
     Question(
         "ticks_per_revolution",
         "encoder ticks per motor turn (0: no ticks are logged)",
         _always("1000"),
-        _not_negative,
+        not_negative,
     ),
 )
 DRIVES: dict[str, tuple[Question, ...]] = {

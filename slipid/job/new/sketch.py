@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from slipid.data.reading.layout import Layout
+from slipid.job.new.answers import Answers
 from slipid.job.new.lines import Line, toml
-from slipid.job.new.questions import Answers
 from slipid.job.reference.meanings import in_short
 
 

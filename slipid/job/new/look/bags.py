@@ -7,12 +7,12 @@ from pathlib import Path, PurePosixPath
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.topics import Topic, topics_of
 from slipid.data.reading.layout import PER_WHEEL
+from slipid.job.new.answers import Answers, Told
 from slipid.job.new.lines import Line, toml
-from slipid.job.new.look.columns import rank
-from slipid.job.new.look.kinds import common_glob
-from slipid.job.new.look.names import named
+from slipid.job.new.look.columns.found import rank
+from slipid.job.new.look.columns.names import named
+from slipid.job.new.look.files.kinds import common_glob
 from slipid.job.new.look.robot import robot_from
-from slipid.job.new.questions import Answers, Told
 from slipid.job.new.sketch import BagSketch, LogsSketch, Sketch
 from slipid.job.reference.meanings import in_short
 
@@ -22,8 +22,8 @@ _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _TURNS = ("wheel_ticks", "wheel_angle", "wheel_speed", "motor_speed")
 _EFFORT = (
-    "what is the effort: a current (A), a torque (motor_torque or wheel_torque, N*m), a voltage (V) "
-    "or a duty (1)?"
+    "what is the effort: a current (A), a torque (motor_torque or wheel_torque, N*m), a voltage "
+    "(V) or a duty (1)?"
 )
 
 

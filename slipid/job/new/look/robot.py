@@ -6,9 +6,9 @@ import numpy as np
 
 from slipid.data.reading.units import factor
 from slipid.data.wheel_signals import body_steps
-from slipid.job.new.look.sketches import pose_study
-from slipid.job.new.look.study import Study
-from slipid.job.new.questions import Answers, Told, ask
+from slipid.job.new.answers import Answers, Told
+from slipid.job.new.look.signals.study import Study, pose_study
+from slipid.job.new.questions import ask
 from slipid.job.new.sketch import Hint
 
 _SIDEWAYS = 0.3

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 from slipid.data.reading.layout import CHANNELS
 from slipid.data.reading.units import converts
-from slipid.job.new.look.words import Words, words_of
+from slipid.job.new.look.columns.words import Words, words_of
 
 SUFFIXES = {
     **{"s": "s", "sec": "s", "secs": "s", "ms": "ms", "msec": "ms", "us": "us", "ns": "ns"},

@@ -7,9 +7,9 @@ from jaxtyping import Float
 
 from slipid.data.reading.units import factor
 from slipid.data.wheel_signals import refresh_period
-from slipid.job.new.look.columns import Columns, Found, columns_of, without_names
-from slipid.job.new.look.file import Head, Numbers, numbers_of
-from slipid.job.new.look.magnitudes import Unit, place_unit, speed_of, time_unit
+from slipid.job.new.look.columns.found import Columns, Found, columns_of, without_names
+from slipid.job.new.look.files.file import Head, Numbers, numbers_of
+from slipid.job.new.look.signals.magnitudes import Unit, place_unit, speed_of, time_unit
 
 METRES = Unit("m")
 _SPARSE = 0.02
@@ -195,3 +195,8 @@ def of_battery(voltage: Found, speed: Found | None) -> bool:
     low, high = np.quantile(values, (0.05, 0.95)).tolist() if values.size else (0.0, 0.0)
     far = low > 0.6 * high > 0.0
     return far and (speed is None or float(np.nanstd(speed.values)) > 0.0)
+
+
+def pose_study(studies: tuple[Study, ...]) -> Study | None:
+    """The file that has the pose."""
+    return next((one for one in studies if one.columns.has_pose), None)

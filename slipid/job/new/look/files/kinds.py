@@ -6,7 +6,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from re import sub
 
-from slipid.job.new.look.file import Head
+from slipid.job.new.look.files.file import Head
 
 
 @dataclass(frozen=True)

@@ -119,6 +119,17 @@ def speed_unit(seen: float | None, radius: float | None) -> Unit:
     return Unit("rad/s", doubt=f"in which unit: {options}?")
 
 
+def angle_unit(seen: float | None, radius: float | None) -> Unit:
+    """Unit of wheel angles; arguments as of `speed_unit`."""
+    if seen is None:
+        return Unit("rad", doubt="radians, degrees, turns or ticks?")
+    low, high = RADII if radius is None else (radius / 2, radius * 2)
+    for unit in ("rad", "deg", "rev"):
+        if low <= seen / factor(unit, "rad") <= high:
+            return Unit(unit, "turns as far as the pose goes")
+    return Unit("rad", doubt="radians, degrees, turns or ticks? The pose goes another way")
+
+
 def plain_unit(channel: str) -> Unit:
     """Unit of what is logged in SI but for rare cases."""
     return Unit({"wheel_ticks": "tick"}.get(channel, CHANNELS[channel]))

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.reader import read_logs
-from slipid.job.new.look.file import Head
-from slipid.job.new.look.kinds import Kind
+from slipid.job.new.look.files.file import Head
+from slipid.job.new.look.files.kinds import Kind
 from slipid.support.errors import DataError
 
 _TELLING = 8

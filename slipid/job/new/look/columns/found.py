@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.reading.layout import PER_WHEEL
-from slipid.job.new.look.file import Numbers
-from slipid.job.new.look.names import Named, named
+from slipid.job.new.look.columns.names import Named, named
+from slipid.job.new.look.files.file import Numbers
 
 _ORDER = ("fl", "fr", "ml", "mr", "rl", "rr", "l", "r")
 """Wheels as the drives count them."""
@@ -58,10 +58,14 @@ class Columns:
         """A channel, if it is there."""
         return next((one for one in self.found if one.channel == channel), None)
 
+    def first(self, *channels: str) -> Found | None:
+        """The first of some channels that is there."""
+        return next((found for name in channels if (found := self.get(name))), None)
+
     @property
     def turns(self) -> Found | None:
         """The channel that tells how far the wheels turned."""
-        return next((found for name in TURNS if (found := self.get(name))), None)
+        return self.first(*TURNS)
 
     @property
     def wheels(self) -> int:
@@ -215,3 +219,11 @@ def without_names(numbers: Numbers) -> Columns:
     used = {at for one in found for at in one.at}
     unused = tuple(str(k) for k in range(values.shape[1]) if k not in used)
     return Columns(tuple(found), unused)
+
+
+def without(columns: Columns, names: frozenset[str]) -> Columns:
+    """Columns less some channels, which another file of the run has as well."""
+    kept = tuple(one for one in columns.found if one.channel not in names)
+    again = sorted(one.channel for one in columns.found if one.channel in names)
+    said = (f"Also here, but taken from the other file: {', '.join(again)}.",) if again else ()
+    return replace(columns, found=kept, notes=(*columns.notes, *said))

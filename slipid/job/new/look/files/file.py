@@ -1,6 +1,5 @@
 """What a log file looks like: where names, units and numbers stand, and the numbers themselves."""
 
-from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,15 +8,20 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.reading import csv_text
-from slipid.job.new.look.names import is_unit
+from slipid.job.new.look.files.sniff import (
+    EMPTY,
+    HEAD,
+    cells_of,
+    delimiter_of,
+    first_numbers,
+    header_rows,
+    number_in,
+)
 from slipid.support.errors import DataError, bad_data
 
 if TYPE_CHECKING:
     from pyarrow import Table
 
-_DELIMITERS = (",", ";", "\t", "|", " ")
-_HEAD = 60
-"""Lines that are looked at for the header."""
 ROWS = 50_000
 """Rows that are looked at for what the numbers are like."""
 _FEW = 10
@@ -80,15 +84,15 @@ def head_of(path: Path) -> Head:
         header = tuple(_parquet(path).column_names)
         return Head(path, "", 1, 0, 2, header, ("",) * len(header))
     lines = _lines(path, _BEGINNING)
-    delimiter = _delimiter(lines)
-    rows = [_cells(line, delimiter) for line in lines[:_HEAD]]
-    first = _first_numbers(rows)
-    if first is None or len(rows) - first < min(_FEW, _HEAD - first):
+    delimiter = delimiter_of(lines)
+    rows = [cells_of(line, delimiter) for line in lines[:HEAD]]
+    first = first_numbers(rows)
+    if first is None or len(rows) - first < min(_FEW, HEAD - first):
         raise bad_data(path, "no rows of numbers", "a log: a row of numbers for every time")
     _refuse_commas(path, rows[first:], delimiter, first)
-    names_row, units_row = _header(rows[:first], len(rows[first]))
+    names_row, units_row = header_rows(rows[:first], len(rows[first]))
     top = rows[names_row - 1] if names_row else []
-    if not top and any(_number(c) is None and c.lower() not in _EMPTY for c in rows[first]):
+    if not top and any(number_in(c) is None and c.lower() not in EMPTY for c in rows[first]):
         raise bad_data(path, "texts among the numbers, and no names", "a log", row=first + 1)
     width = len(top) or len(rows[first])
     names = [*top, *[""] * width][:width]
@@ -121,11 +125,11 @@ def _cell_by_cell(head: Head, body: list[str]) -> Numbers:
     values = np.full((len(body), width), np.nan)
     wrong = np.zeros(width, dtype=int)
     for i, line in enumerate(body):
-        for j, cell in enumerate(_cells(line, head.delimiter)[:width]):
-            number = _number(cell)
+        for j, cell in enumerate(cells_of(line, head.delimiter)[:width]):
+            number = number_in(cell)
             if number is not None:
                 values[i, j] = number
-            elif cell.lower() not in _EMPTY:
+            elif cell.lower() not in EMPTY:
                 wrong[j] += 1
     texts = np.flatnonzero(wrong > 0.02 * len(body)).tolist()
     return Numbers(head, values, frozenset(texts))
@@ -145,64 +149,11 @@ def _lines(path: Path, limit: int = -1) -> list[str]:
     return csv_text.text_lines(path, raw)
 
 
-_EMPTY = {"", "nan", "na", "n/a", "null", "none"}
-
-
-def _cells(line: str, delimiter: str) -> list[str]:
-    return [cell.strip().strip("\"'").strip() for cell in line.split(delimiter)]
-
-
-def _number(cell: str) -> float | None:
-    try:
-        return float(cell) if "_" not in cell else None
-    except ValueError:
-        return None
-
-
-def _delimiter(lines: list[str]) -> str:
-    """The character that is in most lines the same number of times; most times, if several are."""
-
-    def score(delimiter: str) -> tuple[float, int]:
-        counts = Counter(line.count(delimiter) for line in lines[:_HEAD] if line.strip())
-        count, times = counts.most_common(1)[0]
-        return (times / sum(counts.values()) if count else 0.0, count)
-
-    best = max(_DELIMITERS[:-1], key=score)
-    if score(best)[1]:
-        return best
-    return " " if score(" ")[1] and score(" ")[0] > 0.5 else ","
-
-
-def _first_numbers(rows: list[list[str]]) -> int | None:
-    """Place of the first row that holds numbers and nothing else, or nearly."""
-    usual = Counter(len(row) for row in rows).most_common(1)[0][0]
-    for k, row in enumerate(rows):
-        filled = [cell for cell in row if cell.lower() not in _EMPTY]
-        numbers = sum(_number(cell) is not None for cell in filled)
-        if len(row) >= usual - 1 and numbers > 0.5 * len(filled):
-            return k
-    return None
-
-
-def _header(rows: list[list[str]], width: int) -> tuple[int, int]:
-    """Rows of names and of units, counted from 1, 0 where there is none."""
-    names = units = 0
-    for k, row in enumerate(rows, start=1):
-        filled = [cell for cell in row if cell]
-        if len(row) < width - 1 or len(filled) < len(row) - 2:
-            continue
-        if sum(map(is_unit, filled)) > 0.5 * len(filled) and not all(len(c) == 1 for c in filled):
-            units = k
-        elif sum(_number(cell) is None for cell in filled) > 0.5 * len(filled):
-            names = k
-    return (names, units) if names else (0, 0)
-
-
 def _refuse_commas(path: Path, body: list[list[str]], delimiter: str, first: int) -> None:
     """Refuse decimal commas here already: no layout could read them."""
     if delimiter == ",":
         return
-    for k, cells in enumerate(body[:_HEAD]):
+    for k, cells in enumerate(body[:HEAD]):
         for cell in cells:
             whole, comma, part = cell.lstrip("+-").partition(",")
             if comma and whole.isdecimal() and part.isdecimal():
