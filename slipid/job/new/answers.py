@@ -46,6 +46,7 @@ class Answers:
 
 
 def positive(text: str, _: Answers) -> float:
+    """A number above 0; this and the others: ValueError where the text is something else."""
     value = number(text)
     if not 0 < value < float("inf"):
         raise ValueError("expected a number above 0")
@@ -53,6 +54,7 @@ def positive(text: str, _: Answers) -> float:
 
 
 def not_negative(text: str, _: Answers) -> float:
+    """A number above 0, or 0."""
     value = number(text)
     if not 0 <= value < float("inf"):
         raise ValueError("expected a number above 0, or 0 where there is none")
@@ -60,6 +62,7 @@ def not_negative(text: str, _: Answers) -> float:
 
 
 def number(text: str) -> float:
+    """Any number."""
     try:
         return float(text.strip().replace("_", "?"))
     except ValueError:
@@ -68,12 +71,14 @@ def number(text: str) -> float:
 
 
 def count(text: str, _: Answers) -> int:
+    """A number of wheels."""
     if not text.strip().isdecimal() or not 3 <= int(text) <= 12:
         raise ValueError("expected a whole number from 3 to 12")
     return int(text)
 
 
 def yes(text: str, _: Answers) -> bool:
+    """Yes or no."""
     word = text.strip().lower()
     if word not in ("y", "yes", "true", "n", "no", "false"):
         raise ValueError("expected yes or no")
@@ -81,6 +86,7 @@ def yes(text: str, _: Answers) -> bool:
 
 
 def angles(text: str, known: Answers) -> tuple[float, ...]:
+    """An angle for every wheel [deg]."""
     found = tuple(number(part) for part in text.replace(";", ",").split(","))
     if len(found) != known.wheels:
         raise ValueError(f"{len(found)} angles; expected {known.wheels}, one per wheel")
@@ -88,6 +94,7 @@ def angles(text: str, known: Answers) -> tuple[float, ...]:
 
 
 def places(text: str, _: Answers) -> tuple[tuple[float, ...], ...]:
+    """Places of at least two wheels [m]."""
     found = tuple(tuple(number(c) for c in part.split(",")) for part in text.split(";"))
     if len(found) < 2 or any(len(place) != 2 for place in found):
         raise ValueError("expected x, y of each wheel, as in: 0.2, 0.1; 0.2, -0.1; -0.2, 0")
@@ -95,6 +102,7 @@ def places(text: str, _: Answers) -> tuple[tuple[float, ...], ...]:
 
 
 def rollers(text: str, known: Answers) -> tuple[float | None, ...]:
+    """Angle of the rollers of every wheel [deg], None of those without."""
     words = [part.strip().lower() for part in text.replace(";", ",").split(",")]
     if len(words) != known.wheels:
         raise ValueError(f"{len(words)} rollers; expected {known.wheels}, one per wheel")

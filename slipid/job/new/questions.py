@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol
+from typing import Any
 
 from slipid.job.config import Box, Differential, General, Omni, Wheels, geometry
 from slipid.job.new.answers import (
@@ -19,11 +19,9 @@ from slipid.job.new.answers import (
 from slipid.support.errors import DataError, near
 
 
-class Asker(Protocol):
-    """Asks people: a text for a question, after it was said what was wrong with the last one."""
-
-    def __call__(self, asks: str, default: str, wrong: str) -> str:
-        """The answer, or the default."""
+Asker = Callable[[str, str, str], str]
+"""Asks people: what is asked, what stands there if they say nothing, and what was wrong with the
+last answer; returns their answer, or the default."""
 
 
 @dataclass(frozen=True)
