@@ -20,7 +20,12 @@ from slipid.job.new.template import new_config
 from slipid.model import geometry as g
 from slipid.support.errors import DataError
 
-SIZES = {"wheel_radius_m": "0.08", "gear_ratio": "12", "mass_kg": "20", "ticks_per_revolution": "512"}
+SIZES = {
+    "wheel_radius_m": "0.08",
+    "gear_ratio": "12",
+    "mass_kg": "20",
+    "ticks_per_revolution": "512",
+}
 BOX = {"wheelbase_m": "0.5", "track_m": "0.6"}
 CORNERS = [(0.25, 0.3), (0.25, -0.3), (-0.25, 0.3), (-0.25, -0.3)]
 FOUR = {
@@ -110,7 +115,9 @@ def test_what_nobody_said_is_a_question_in_the_file_and_in_the_list():
     assert "half_width_m" not in asked
     lines = config.text.splitlines()
     assert sum(line.startswith(ASKS) for line in lines) == len(config.questions)
-    assert lines[lines.index(next(x for x in lines if x.startswith("half_length_m"))) - 1].startswith(ASKS)
+    assert lines[
+        lines.index(next(x for x in lines if x.startswith("half_length_m"))) - 1
+    ].startswith(ASKS)
 
 
 def test_people_are_asked_only_what_the_drive_needs_and_again_where_they_are_wrong():

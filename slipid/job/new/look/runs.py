@@ -161,7 +161,7 @@ def _further(group: Group) -> tuple[Group, ...]:
 
 def _together(one: Study, other: Study) -> bool:
     """Whether two files cover the same time: then they are of one run."""
-    return max(one.time[0], other.time[0]) < min(one.time[-1], other.time[-1])
+    return bool(max(one.time[0], other.time[0]) < min(one.time[-1], other.time[-1]))
 
 
 def _found(group: Group) -> str:

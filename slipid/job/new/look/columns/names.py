@@ -72,9 +72,10 @@ def is_unit(text: str) -> bool:
 def without_unit(name: str) -> tuple[str, str]:
     """A name less the unit in it, and that unit: brackets, after a comma, or the end of it."""
     if inside := re.match(r"^(.*\S)\s*[\[(]([^\])]*)[\])]\s*$", name):
-        if is_unit(inside[2]) or inside[2].lower() in SUFFIXES:
-            return inside[1], _unit(inside[2])
-        return inside[1] if not inside[2].isdecimal() else name, ""
+        if inside[2].isdecimal():
+            return name, ""
+        known = is_unit(inside[2]) or inside[2].lower() in SUFFIXES
+        return inside[1], _unit(inside[2]) if known else ""
     if (comma := re.match(r"^(.+), *([^,]+)$", name)) and is_unit(comma[2]):
         return comma[1], comma[2].strip()
     for length in (2, 1):

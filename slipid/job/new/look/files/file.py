@@ -87,9 +87,9 @@ def head_of(path: Path) -> Head:
     delimiter = delimiter_of(lines)
     rows = [cells_of(line, delimiter) for line in lines[:HEAD]]
     first = first_numbers(rows)
+    _refuse_commas(path, rows[first or 0 :], delimiter, first or 0)
     if first is None or len(rows) - first < min(_FEW, HEAD - first):
         raise bad_data(path, "no rows of numbers", "a log: a row of numbers for every time")
-    _refuse_commas(path, rows[first:], delimiter, first)
     names_row, units_row = header_rows(rows[:first], len(rows[first]))
     top = rows[names_row - 1] if names_row else []
     if not top and any(number_in(c) is None and c.lower() not in EMPTY for c in rows[first]):

@@ -107,7 +107,8 @@ def speed_unit(seen: float | None, radius: float | None) -> Unit:
     if radius is not None:
         units = {unit: seen / factor(unit, "rad/s") for unit in ("rad/s", "rpm", "deg/s", "rev/s")}
         best = min(units, key=lambda unit: abs(np.log(units[unit] / radius)))
-        if abs(np.log(units[best] / radius)) < 0.7:
+        apart = abs(np.log(units[best] / radius))
+        if apart < 0.7 and apart < abs(np.log(seen)):
             return Unit(best, "as fast as the pose")
     elif RADII[0] <= seen <= RADII[1]:
         return Unit("rad/s", f"as fast as the pose with wheels of about {seen:.2g} m")
