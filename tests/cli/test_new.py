@@ -112,7 +112,7 @@ def test_help_of_new_loads_nothing_heavy():
     code = (
         "import sys; from slipid.cli.main import app; from typer.testing import CliRunner; "
         "r = CliRunner().invoke(app, ['new', '--help']); assert r.exit_code == 0; "
-        "print(sorted({'jax', 'numpy', 'pydantic'} & set(sys.modules)))"
+        "print(sorted({'jax', 'numpy', 'slipid.job'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -18,7 +18,6 @@ from slipid.job.new.answers import (
 )
 from slipid.support.errors import DataError, near
 
-
 Asker = Callable[[str, str, str], str]
 """Asks people: what is asked, what stands there if they say nothing, and what was wrong with the
 last answer; returns their answer, or the default."""

@@ -75,7 +75,8 @@ def propose_bags(bags: Sequence[Path], asked: Path, told: Told) -> BagProposal:
         questions.append("no topic with a pose was found: a fit needs one")
     if not wheels:
         questions.append("no topic tells how wheels turn: which one does, and in which field?")
-    root = asked if asked.is_dir() and asked != bag.parent else asked.parent
+    is_bag = asked.is_file() or bag == asked / _METADATA
+    root = asked.parent if is_bag else asked
     inside = [PurePosixPath(one.relative_to(root)) for one in bags]
     inside = [one for one in inside if len(one.parts) == len(inside[0].parts)]
     layout = BagSketch(

@@ -12,6 +12,8 @@ from slipid.job.new.look.files.file import Head, Numbers, numbers_of
 from slipid.job.new.look.signals.magnitudes import Unit, place_unit, speed_of, time_unit
 
 METRES = Unit("m")
+_AHEAD = 2
+"""Drives up to which all wheels point ahead."""
 _SPARSE = 0.02
 """Share of empty cells from which a channel is said to be slower than the rows."""
 
@@ -159,15 +161,19 @@ def over_wheels(one: Study, speed: Found, moved: Motion) -> float | None:
     """
     if moved.time is None or moved.x is None or moved.y is None or one.clock is None:
         return None
-    rows = np.sqrt(np.nanmean(speed.values**2, axis=1))
+    # two wheels point ahead: their mean has the sign of the way; of others the sizes are as good
+    ahead = speed.values.shape[1] <= _AHEAD
+    rows = speed.values.mean(axis=1) if ahead else np.sqrt((speed.values**2).mean(axis=1))
     there = ~(np.isnan(rows) | np.isnan(one.time))
     time, rows = one.time[there], rows[there]
     if len(time) < 3:
         return None
     turned = np.append(0.0, np.cumsum(0.5 * (rows[1:] + rows[:-1]) * np.diff(time)))
     start, end = max(time[0], moved.time[0]), min(time[-1], moved.time[-1])
+    if end <= start:
+        return None
     edges = np.linspace(start, end, max(2, int(end - start)))
-    by_wheels = np.diff(np.interp(edges, time, turned))
+    by_wheels = np.abs(np.diff(np.interp(edges, time, turned)))
     # chords and not the way along all poses, which noise makes longer
     x, y = (np.interp(edges, moved.time, part) for part in (moved.x, moved.y))
     way = np.hypot(np.diff(x), np.diff(y))
