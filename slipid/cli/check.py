@@ -1,7 +1,13 @@
 """`slipid check`: what logs can tell, before any fit."""
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from slipid.cli.common import ConfigFile, DataFolder, Json, MaybeOut, Quiet, emit, guarded
 from slipid.support.progress import Reporter
+
+if TYPE_CHECKING:
+    from slipid.job.config import Config
 
 
 @guarded
@@ -12,15 +18,37 @@ def check(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Read and validate logs; say what they can tell before anything is fitted."""
+    """Read and validate logs; say what is wrong and what they can tell before anything is fitted.
+
+    Exit code 1 where logs and config do not go together.
+    """
     from slipid.job import check as job
+    from slipid.job.config import Motor, read_config
     from slipid.plots.raw import raw_plots
     from slipid.report.estimates import show_check
 
+    wanted = read_config(config)
+    if isinstance(wanted.content.robot, Motor):
+        return bench(wanted, data, out, json, quiet)
     with Reporter(quiet=quiet) as report:
         logs, found = job.check(config, data, out, report)
         if out is not None:
             report.stage("drawing")
             raw_plots(logs, out)
     emit(json, found, lambda page: show_check(page, found))
+    return 1 if any(f["severity"] == "wrong" for f in found["findings"]) else 0
+
+
+def bench(config: "Config", data: Path, out: Path | None, json: str | None, quiet: bool) -> int:
+    """The same for motors on a bench."""
+    from slipid.job.motor import check_bench
+    from slipid.plots.bench import bench_plots
+    from slipid.report.bench import show_bench_check
+
+    with Reporter(quiet=quiet) as report:
+        fit, found = check_bench(config, data, out, report)
+        if out is not None:
+            report.stage("drawing")
+            bench_plots(fit, out)
+    emit(json, found, lambda page: show_bench_check(page, found))
     return 0

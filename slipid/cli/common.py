@@ -59,6 +59,41 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     return run
 
 
+def on_wheels(command: Callable[Words, int]) -> Callable[Words, None]:
+    """`guarded`, of a command that has nothing to say of a motor on a bench: it says so first.
+
+    The config, or the folder of a result, is the first path among the arguments of a command.
+    """
+
+    @functools.wraps(command)
+    def checked(*args: Words.args, **options: Words.kwargs) -> int:
+        paths = (value for value in (*args, *options.values()) if isinstance(value, Path))
+        if (first := next(paths, None)) is not None and is_bench(first):
+            raise DataError(
+                f"{first}: drive = 'motor' has no wheels on a floor: `slipid {command.__name__}` "
+                "does not apply; `slipid check`, `identify` and `motor` do, and a robot's config "
+                "takes the numbers by [robot] motor = 'FILE'"
+            )
+        return command(*args, **options)
+
+    return guarded(checked)
+
+
+def is_bench(path: Path) -> bool:
+    """Whether a config, or the folder of a result, is of a motor on a bench."""
+    import tomllib
+
+    if path.is_dir():
+        if (path / "motor.json").is_file() and not (path / "config.toml").is_file():
+            return True
+        path = path / "config.toml"
+    try:
+        robot = tomllib.loads(path.read_text(encoding="utf-8")).get("robot")
+    except (OSError, ValueError):  # the command itself says what is wrong with it
+        return False
+    return isinstance(robot, dict) and robot.get("drive") == "motor"
+
+
 def emit(
     json: str | None,
     content: object,

@@ -4,11 +4,11 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, guarded
+from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, on_wheels
 from slipid.support.progress import Reporter
 
 
-@guarded
+@on_wheels
 def compare(
     config: ConfigFile,
     data: DataFolder,

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, guarded
+from slipid.cli.common import Json, OutFolder, Quiet, emit, on_wheels
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.identify.design.proposal import Design
 
 
-@guarded
+@on_wheels
 def design(
     out: OutFolder,
     parameter: Annotated[

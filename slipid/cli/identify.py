@@ -12,7 +12,9 @@ from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
+    from slipid.job.config import Config
     from slipid.job.identify import Identified
+    from slipid.report.page import Page
 
 
 @guarded
@@ -24,25 +26,43 @@ def identify(
         list[str] | None,
         typer.Option(metavar="PATH", help="Also profile a number's likelihood; may be repeated."),
     ] = None,
+    anyway: Annotated[
+        bool, typer.Option("--anyway", help="Fit logs and config that do not go together.")
+    ] = False,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
     """Fit motors, floors, loads and camera to the logs, end to end.
 
-    Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt.
+    Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt. Exit code
+    1 where it did not converge, or predicts worse than the encoders.
     """
-    from slipid.report.estimates import show_fit
+    from slipid.job.config import Motor, read_config
+    from slipid.report.estimates import show_fit, show_trust
     from slipid.support.files import read_json
 
+    wanted = read_config(config)
+    if isinstance(wanted.content.robot, Motor):
+        return bench(wanted, data, out, profile or (), json, quiet)
     with Reporter(quiet=quiet) as report:
-        done = run(config, data, out, report, profile or ())
+        done = run(config, data, out, report, profile or (), anyway)
     content = read_json(out / "identified.json", "what identify wrote")
-    emit(json, content, lambda page: show_fit(page, done.fit, done.profiles), out, done.written)
-    return 0 if done.fit.converged else 1
+
+    def show(page: "Page") -> None:
+        show_fit(page, done.fit, done.profiles)
+        show_trust(page, done.judgement)
+
+    emit(json, content, show, out, done.written)
+    return 0 if done.fit.converged and not done.judgement.is_bad else 1
 
 
 def run(
-    config: Path, data: Path, out: Path, report: Reporter, profiles: Sequence[str] = ()
+    config: Path,
+    data: Path,
+    out: Path,
+    report: Reporter,
+    profiles: Sequence[str] = (),
+    anyway: bool = False,
 ) -> "Identified":
     """The fit and its pictures; arguments as of `slipid.job.identify.identify`.
 
@@ -55,13 +75,34 @@ def run(
     from slipid.plots.fit import identify_plots
     from slipid.plots.posterior import profile_figure
 
-    done = identify(config, data, out, report, profiles)
+    done = identify(config, data, out, report, profiles, anyway)
     report.stage("drawing")
     drawn = [out / name for name in write_robot(out, done.fit)]
     try:
-        drawn += identify_plots(done.fit, done.job.dataset, out)
+        warning = done.judgement.warning
+        drawn += identify_plots(done.fit, done.job.dataset, out, warning)
     except DataError as error:  # the numbers are written; a run too short to draw spoils none
         report.line(f"no more pictures: {error}")
     if done.profiles:
         drawn.append(save(profile_figure(done.profiles), out / "profile.png"))
     return replace(done, written=(*done.written, *(path.name for path in drawn)))
+
+
+def bench(
+    config: "Config", data: Path, out: Path, profile: Sequence[str], json: str | None, quiet: bool
+) -> int:
+    """The same for motors on a bench."""
+    from slipid.job.motor import identify_bench
+    from slipid.plots.bench import bench_plots
+    from slipid.report.bench import show_bench
+
+    if profile:
+        raise DataError(
+            "--profile: not of drive = 'motor', whose intervals need none; leave it out"
+        )
+    with Reporter(quiet=quiet) as report:
+        fit, written = identify_bench(config, data, out, report)
+        report.stage("drawing")
+        written = (*written, *(path.name for path in bench_plots(fit, out)))
+    emit(json, fit.to_json(), lambda page: show_bench(page, fit), out, written)
+    return 0 if fit.good else 1

@@ -12,6 +12,7 @@ from slipid.cli.demo import demo
 from slipid.cli.design import design
 from slipid.cli.export import export
 from slipid.cli.identify import identify
+from slipid.cli.motor import motor
 from slipid.cli.new import new
 from slipid.cli.paper import paper
 from slipid.cli.reference import reference
@@ -30,7 +31,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    *(new, reference, check, selftest, identify, sample, validate, compare),
+    *(new, reference, motor, check, selftest, identify, sample, validate, compare),
     *(design, tune, trial, export, simulate, paper, demo),
 ):
     app.command()(command)

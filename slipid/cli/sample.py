@@ -5,12 +5,12 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, guarded
+from slipid.cli.common import Json, OutFolder, Quiet, emit, on_wheels
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
 
-@guarded
+@on_wheels
 def sample(
     out: OutFolder,
     data: Annotated[

@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import ConfigFile, Json, Out, Quiet, emit, guarded
+from slipid.cli.common import ConfigFile, Json, Out, Quiet, emit, on_wheels
 from slipid.support.progress import Reporter
 
 
-@guarded
+@on_wheels
 def selftest(
     config: ConfigFile,
     data: Annotated[

@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Jobs, Json, Load, OutFolder, Quiet, emit, guarded, processes
+from slipid.cli.common import Jobs, Json, Load, OutFolder, Quiet, emit, on_wheels, processes
 from slipid.support.progress import Reporter
 
 
-@guarded
+@on_wheels
 def trial(
     out: OutFolder,
     plant: Annotated[

@@ -4,11 +4,11 @@ from typing import Annotated, cast
 
 import typer
 
-from slipid.cli.common import Json, Load, OutFolder, Quiet, emit, guarded
+from slipid.cli.common import Json, Load, OutFolder, Quiet, emit, on_wheels
 from slipid.support.progress import Reporter
 
 
-@guarded
+@on_wheels
 def tune(
     out: OutFolder,
     load: Load = None,

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from slipid.cli.common import DataFolder, Json, OutFolder, Quiet, emit, guarded
+from slipid.cli.common import DataFolder, Json, OutFolder, Quiet, emit, on_wheels
 from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
 
-@guarded
+@on_wheels
 def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet = False) -> int:
     """Predict runs open loop and compare with the camera, model by model."""
     from slipid.report.estimates import show_validation

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -160,41 +160,47 @@ def _fresh(logs: Sequence[Log], channel: str) -> Bool[np.ndarray, "sample wheel"
 
 
 def counted_once(logs: Sequence[Log]) -> list[Log]:
-    """The logs, with readings of currents and voltages marked that only repeat the one before.
+    """The logs, with readings of currents marked that only repeat the one before.
 
-    How often a sensor is read is told by all runs of one file kind together: an ammeter that is
-    read once a second changes six times in six seconds.
+    How often an ammeter is read is told by all runs together: one that is read once a second
+    changes six times in six seconds. Voltages are not looked at: those that a bench or a program
+    sets stay as they are until the next step.
     """
+    have = [k for k, log in enumerate(logs) if log.current is not None]
+    wheels = max((logs[k].wheels for k in have), default=0)
+    periods: dict[int, float] = {}
+    for wheel in range(wheels):
+        series = [_read(logs[k], wheel) for k in have if logs[k].wheels > wheel]
+        period = refresh_period((one.time, one.amps) for one in series)
+        if period is not None:
+            periods[wheel] = period
     out = list(logs)
-    for channel in ("current", "voltage"):
-        have = [k for k, log in enumerate(out) if getattr(log, channel) is not None]
-        periods: dict[int, float] = {}
-        for wheel in range(out[have[0]].wheels if have else 0):
-            series = [_read(out[k], channel, wheel) for k in have if out[k].wheels > wheel]
-            period = refresh_period((time, values) for time, values, _ in series)
-            if period is not None:
-                periods[wheel] = period
-        for k in have if periods else ():
-            fresh = np.ones((out[k].samples, out[k].wheels), dtype=bool)
-            before = getattr(out[k], f"{channel}_fresh")
-            fresh &= True if before is None else before
-            for wheel, period in periods.items():
-                time, values, rows = _read(out[k], channel, wheel)
-                fresh[rows, wheel] &= read_anew(time, values, period)
-            said = ", ".join(f"{p:.2g}" for p in sorted(set(periods.values())))
-            note = f"{channel} is read anew every {said} s: between, it repeats and is not counted"
-            changes: dict[str, Any] = {f"{channel}_fresh": fresh}
-            out[k] = replace(out[k], notes=(*out[k].notes, note), **changes)
+    for k in have if periods else ():
+        before = out[k].current_fresh
+        shape = (out[k].samples, out[k].wheels)
+        fresh = np.ones(shape, dtype=bool) if before is None else before.copy()
+        for wheel, period in periods.items():
+            one = _read(out[k], wheel)
+            fresh[one.rows, wheel] &= read_anew(one.time, one.amps, period)
+        said = ", ".join(sorted({f"{p:.2g}" for p in periods.values()}))
+        note = f"current is read anew every {said} s: between, it repeats and is not counted"
+        out[k] = replace(out[k], current_fresh=fresh, notes=(*out[k].notes, note))
     return out
 
 
-def _read(
-    log: Log, channel: str, wheel: int
-) -> tuple[Float[np.ndarray, " read"], Float[np.ndarray, " read"], np.ndarray]:
-    """Times, values and rows of the readings of one wheel."""
-    fresh = getattr(log, f"{channel}_fresh")
+class _Readings(NamedTuple):
+    """Readings of one ammeter in a run: time [s], current [A] and row of each."""
+
+    time: Float[np.ndarray, " read"]
+    amps: Float[np.ndarray, " read"]
+    rows: Int[np.ndarray, " read"]
+
+
+def _read(log: Log, wheel: int) -> _Readings:
+    assert log.current is not None
+    fresh = log.current_fresh
     rows = np.arange(log.samples) if fresh is None else np.flatnonzero(fresh[:, wheel])
-    return log.time[rows], getattr(log, channel)[rows, wheel], rows
+    return _Readings(log.time[rows], log.current[rows, wheel], rows)
 
 
 def default_session(log: Log) -> str:

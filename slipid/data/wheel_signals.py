@@ -14,6 +14,8 @@ DOUBT = 0.05
 """Relative misfit from which the declared order is doubted; speed loops keep below it."""
 LEAST_CHANGES = 8
 """Changes of a value from which on its sensor's own period can be told."""
+LEAST_IN_A_RUN = 3
+"""The same, of a run on average."""
 BETTER = 0.25
 """Another order must have less than this share of the declared one's misfit to be believed."""
 
@@ -55,16 +57,20 @@ def refresh_period(
     """Period of a sensor that is slower than the rows it is logged in [s]; None of one that is not.
 
     Its value never changes in two rows one after the other, but for one in twenty: a sensor that
-    is read in every row and happens to repeat itself changes in neighbouring rows, too.
+    is read in every row and happens to repeat itself changes in neighbouring rows, too. In a run
+    it changes several times: what changes once is a step of what is measured.
     """
     rows: list[np.ndarray] = []
     seconds: list[np.ndarray] = []
+    count = 0
     for time, values in runs:
+        count += 1
         changed = np.flatnonzero(np.diff(values) != 0) + 1
         rows.append(np.diff(changed))
         seconds.append(np.diff(time[changed]))
     apart = np.concatenate(rows) if rows else np.zeros(0, int)
-    if len(apart) < LEAST_CHANGES or np.quantile(apart, 0.05) < 2:
+    least = max(LEAST_CHANGES, LEAST_IN_A_RUN * count)
+    if len(apart) < least or np.quantile(apart, 0.05) < 2:
         return None
     return float(np.median(np.concatenate(seconds)))
 

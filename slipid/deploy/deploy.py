@@ -21,6 +21,8 @@ from slipid.deploy.told import told_by_load
 from slipid.identify.posterior.diagnosis import Posterior, estimates
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
+from slipid.job.config import read_config
+from slipid.job.problem import shape_of
 from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
@@ -97,9 +99,15 @@ def read_robot(out: Path, load: str | None = None) -> DeployedRobot:
     """The robot of a folder; DataError where there is none, or as of `DeployedRobot.load`."""
     path = out / ROBOT
     if not path.is_file():
+        config = out / "config.toml"
+        if config.is_file() and not shape_of(read_config(config)).determines_twist:
+            raise DataError(
+                f"{out}: the wheels of this robot do not determine x, y and yaw: it has no "
+                "estimator and no controller yet, so nothing to tune, to drive in a trial or to "
+                "export; identify, validate, compare, sample, selftest and design apply"
+            )
         raise DataError(
-            f"{path}: not there; `slipid identify` writes it (for wheels that determine x, y and "
-            "yaw), so run it again with --out " + str(out)
+            f"{path}: not there; `slipid identify` writes it, so run it with --out {out}"
         )
     return DeployedRobot.load(path, load)
 

@@ -18,7 +18,9 @@ from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, members, sentences
 from slipid.job.config import read_config
 from slipid.job.problem import Task, read_job
+from slipid.job.sanity import sanity
 from slipid.support.content import Content
+from slipid.support.errors import DataError
 from slipid.support.files import write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
@@ -58,15 +60,25 @@ def check(
     """
     setup_jax(quiet=True)
     job = read_job(read_config(config_path), data, report)
+    report.stage("do logs and config go together?")
+    content = overview(job, job.skipped)
     report.stage("expected information")
-    content = overview(job, job.skipped) | expected(job, job.problem()).to_json()
+    content |= _expected_if_any(job).to_json()
     if out is not None:
         write_json(out / "check.json", content)
     return job.dataset, content
 
 
+def _expected_if_any(job: Task) -> Expected:
+    """`expected`; nothing where what is wrong with the logs leaves no windows to fit."""
+    try:
+        return expected(job, job.problem())
+    except DataError as error:
+        return Expected({}, {}, (f"nothing can be expected of a fit: {error}",))
+
+
 def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
-    """Runs by floor, load and session, channels that every run has, repairs, what was left out."""
+    """Findings, runs by floor, load and session, channels, repairs, what was left out."""
     data = job.dataset
     groups: dict[tuple[str, str, str], list[int]] = {}
     for k, log in enumerate(data.logs):
@@ -75,6 +87,7 @@ def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
     notes = Counter(note for log in data.logs for note in log.notes)
     return {
         "schema": "slipid.check/1",
+        "findings": [finding.to_json() for finding in sanity(job)],
         "runs": len(data),
         "groups": [
             {

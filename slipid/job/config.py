@@ -31,12 +31,15 @@ class Wheeled(Section):
         drives: which wheels, counted from 1, share a motor with its encoder and ammeter, in the
             order of the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together.
             Without it each wheel has its own.
+        motor: file that `slipid identify` or `slipid motor` wrote of its motor on a bench, relative to
+            the config.
     """
 
     wheel_radius_m: Positive
     gear_ratio: Positive = 1.0
     mass_kg: Positive | None = None
     drives: list[Annotated[list[int], Field(min_length=1)]] | None = None
+    motor: str | None = None
 
     def drive_of(self, wheels: int) -> tuple[int, ...]:
         """Number of the drive that turns each wheel, from 0; empty where each has its own."""
@@ -117,6 +120,17 @@ class General(Wheeled):
             if (count := len(getattr(self, key))) != wheels:
                 raise ValueError(f"{count} {key}; expected {wheels}, one per wheel_places_m")
         return self
+
+
+class Motor(Section):
+    """No wheels: motors on a bench, logged at their shafts.
+
+    Attributes:
+        names: of the motors in the order of the columns, where there are several.
+    """
+
+    drive: Literal["motor"]
+    names: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]] = Field(default_factory=list)
 
 
 Wheels = Omni | Box | Differential | General
@@ -232,9 +246,14 @@ class Weights(Section):
 
 
 class FitSection(Section):
-    """How finely runs are cut and how long to fit.
+    """How finely runs are cut, how long to fit, and which lengths are trusted.
+
+    Motion tells the wheel radius over the scale of the poses and no more.
 
     Attributes:
+        lengths_from: which of the two is known: "poses" that are in true metres, as those of motion
+            capture, lidar and RTK are, make the wheel radius free; "wheels" that were measured make
+            the scale of the camera free. Without it both are as `[parameters]` says.
         windows_per_piece: a run is cut into pieces of so many windows.
         longest_window_s: longer windows become more pieces.
         rounds: at most.
@@ -242,6 +261,7 @@ class FitSection(Section):
         seed: of the draws behind the curves' bands.
     """
 
+    lengths_from: Literal["poses", "wheels"] | None = None
     windows_per_piece: int = Field(default=4, ge=1, le=32)
     longest_window_s: Positive = 6.0
     rounds: int = Field(default=30, ge=1)
@@ -296,7 +316,7 @@ class Content(Section):
         validate: runs to predict instead of those that were fitted.
     """
 
-    robot: Annotated[Wheels, Field(discriminator="drive")]
+    robot: Annotated[Wheels | Motor, Field(discriminator="drive")]
     layouts: dict[str, dict[str, object]] = Field(default_factory=dict)
     logs: list[Logs] = Field(min_length=1)
     camera: Camera = Camera()
@@ -305,6 +325,17 @@ class Content(Section):
     fit: FitSection = FitSection()
     selftest: SelftestSection = SelftestSection()
     validate_: ValidateSection = Field(default_factory=ValidateSection, alias="validate")
+
+    @property
+    def wheels(self) -> Wheels:
+        """The robot, which has some.
+
+        Raises:
+            ValueError: it is a motor on a bench.
+        """
+        if isinstance(self.robot, Motor):
+            raise ValueError("drive = 'motor' has no wheels on a floor")
+        return self.robot
 
     @model_validator(mode="after")
     def _floors_one_by_one(self) -> "Content":

@@ -19,11 +19,14 @@ from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit_file import save
 from slipid.identify.result import Fit, summarise
 from slipid.identify.verdicts.profile import Profile, profile, profiled
+from slipid.job.bench_priors import KEPT
 from slipid.job.config import read_config
 from slipid.job.problem import Job, Task, read_job, with_mixed
+from slipid.job.sanity import refuse_if_wrong, sanity
+from slipid.job.trust import Judgement, judgement
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.errors import DataError
-from slipid.support.files import writable, write_bytes, write_json
+from slipid.support.files import read_json, writable, write_bytes, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -33,27 +36,35 @@ CHECKPOINT = "checkpoint"
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """End of `identify`: the fit, the runs it saw, the profiles asked for, the files written."""
+    """End of `identify`: the fit, the runs it saw, how far it may be trusted, profiles, files."""
 
     fit: Fit
     job: Job
+    judgement: Judgement
     profiles: tuple[Profile, ...]
     written: tuple[str, ...]
 
 
 def identify(
-    config_path: Path, data: Path, out: Path, report: Reporter, profiles: Sequence[str] = ()
+    config_path: Path,
+    data: Path,
+    out: Path,
+    report: Reporter,
+    profiles: Sequence[str] = (),
+    anyway: bool = False,
 ) -> Identified:
     """Fit the robot of a config to its logs and write everything to `out`.
 
     A fit that was interrupted there goes on. Profile likelihoods are made of the numbers named.
-    DataError where config or logs are wrong; nothing was written then.
+    DataError where config or logs are wrong; nothing was written then. Where they do not go
+    together, that is fitted `anyway` and said.
     """
     began = time.monotonic()
     setup_jax(quiet=True)
     config = read_config(config_path)
     job = read_job(config, data, report)
     report.line(f"{len(job.dataset)} runs on {', '.join(job.robot.surfaces.labels)}")
+    _sane(job, report, anyway)
     job = with_mixed(job, data, report)
     report.stage("cutting windows")
     problem = job.problem()
@@ -63,13 +74,17 @@ def identify(
         except ValueError as error:
             raise DataError(f"--profile: {error}") from error
     writable(out)
+    if said := _another(out, job):
+        report.line(said)
     key = key_of(config.hash, job.data_hash, problem.space.names, problem.noise.names)
     kept = Checkpoint(out, key)
     optimum = optimised(job, problem, kept, report)
     fit = summarised(job, problem, optimum, report)
+    report.stage("predicting the fitted runs")
+    judged = judgement(fit, job.dataset)
     report.stage("writing")
     written = (*save(fit, out), "run.json", "config.toml")
-    _keep_run(job, data, out, time.monotonic() - began)
+    _keep_run(job, judged, data, out, time.monotonic() - began)
     if profiles and job.mixed:
         report.line("profiles are of the runs on one floor each")
 
@@ -85,13 +100,39 @@ def identify(
         write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
         written = (*written, "profile.json")
     kept.remove(f"{CHECKPOINT}.npz")
-    return Identified(fit, job, tuple(found), written)
+    return Identified(fit, job, judged, tuple(found), written)
 
 
-def _keep_run(job: Job, data: Path, out: Path, seconds: float) -> None:
+def _another(out: Path, job: Job) -> str | None:
+    """A sentence where a folder holds the fit of another config or of other logs, else None."""
+    try:
+        before = read_json(out / "run.json", "what identify wrote")
+        config, data = before["config"], before["data"]
+    except (DataError, KeyError, TypeError):
+        return None
+    if config["sha256"] == job.config.hash and data["hash"] == job.data_hash:
+        return None
+    other = "other logs" if config["sha256"] == job.config.hash else f"another {config['name']}"
+    return f"{out} holds a fit of {other}; it is replaced when this one is done"
+
+
+def _sane(job: Job, report: Reporter, anyway: bool) -> None:
+    """Refuse logs and config that do not go together, or say so."""
+    report.stage("do logs and config go together?")
+    found = sanity(job)
+    if not anyway:
+        refuse_if_wrong(found)
+    for finding in found:
+        if finding.severity != "note":
+            report.line(f"{finding.severity}: {finding}")
+
+
+def _keep_run(job: Job, judged: Judgement, data: Path, out: Path, seconds: float) -> None:
     """What later commands and readers need to know of this run."""
     config = job.config
     write_bytes(out / "config.toml", config.text.encode())
+    if (bench := config.content.wheels.motor) is not None:
+        write_json(out / KEPT, read_json(config.path.parent / bench, "the numbers of a motor"))
     logs = {log.name: log.sha256 for log in job.logs}
     run = {
         "schema": "slipid.run/1",
@@ -99,6 +140,7 @@ def _keep_run(job: Job, data: Path, out: Path, seconds: float) -> None:
         "seconds": round(seconds, 1),
         "config": {"name": config.path.name, "sha256": config.hash},
         "data": {"folder": str(data), "hash": job.data_hash, "logs": logs, "skipped": job.skipped},
+        "trust": judged.to_json(),
         "seed": job.settings.seed,
         "versions": versions(),
     }

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from slipid.data.log import Log
-from slipid.data.reading.layout import Layout
+from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.presets import PRESETS, declared_layout, preset
-from slipid.data.reading.reader import find_logs, read_logs, session_of
+from slipid.data.reading.reader import AnyLayout, find_logs, read_logs, session_of
 from slipid.data.runs import Runs, collect, counted_once
 from slipid.job.config import Config, Logs
 from slipid.support.errors import DataError, near
@@ -69,12 +69,17 @@ def files_of(
     return found, skipped
 
 
-def layout_of(config: Config, section: Logs) -> Layout:
+def layout_of(config: Config, section: Logs) -> AnyLayout:
     """Layout a log section names: one of the config's own, else a preset."""
     own = config.content.layouts
     if section.format in own:
-        where = f"{config.path} layouts.{section.format}"
-        return declared_layout(own[section.format], where)
+        where, declared = f"{config.path} layouts.{section.format}", own[section.format]
+        kind = declared.get("kind", "rows")
+        if kind == "bag":
+            return declared_bag_layout(declared, where, config.path.parent)
+        if kind != "rows":
+            raise DataError(f"{where}.kind: {kind!r}; expected 'rows' (CSV, Parquet) or 'bag'")
+        return declared_layout({k: v for k, v in declared.items() if k != "kind"}, where)
     if section.format not in PRESETS:
         names = [*own, *PRESETS]
         hint = near(section.format, names)

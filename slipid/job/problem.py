@@ -12,6 +12,7 @@ from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
 from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.identify.result import hash_of
+from slipid.job.bench_priors import bench_priors
 from slipid.job.config import Config, FitSection, Logs, geometry, one_floor
 from slipid.job.logs import files_of, read_dataset
 from slipid.job.weights import share_priors
@@ -22,6 +23,10 @@ from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError, near
 from slipid.support.progress import Reporter
 
+LENGTHS = {"poses": "robot.wheel_radius", "wheels": "camera.scale"}
+"""What is free where these lengths are trusted."""
+SIZE_STD = 0.1
+"""Std of its prior, as a part of the nominal value: tyres give way, cameras are set up by eye."""
 LAG_STD = 0.1
 """Std of the prior of a lag that was found from the motion [s]."""
 
@@ -149,7 +154,17 @@ def job_of(config: Config, dataset: Runs, skipped: Sequence[str], report: Report
     robot = on_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
     choices, left_out = _choices(config, robot)
     # what the user says comes later and wins
-    choices = [*told_lag(dataset), *without_rollers(shape), *still_viscosities(dataset), *choices]
+    given = any(fnmatch.fnmatchcase("camera.lag", p) for p in config.content.parameters)
+    lag = [] if given else told_lag(dataset)
+    known = [*lag, *without_rollers(shape), *still_viscosities(dataset)]
+    trusted = config.content.fit.lengths_from
+    choices = [*known, *choices]
+    if trusted is not None and {*LENGTHS.values()} <= {e.path for e in Space(robot, choices).free}:
+        freed = LENGTHS["wheels" if trusted == "poses" else "poses"]
+        raise DataError(
+            f"{config.path}: fit.lengths_from = '{trusted}' with {freed} free in parameters; "
+            "expected one of the two: motion tells them apart by no means"
+        )
     skipped = (*skipped, *left_out)
     for sentence in skipped:
         report.line(sentence)
@@ -163,6 +178,18 @@ def told_lag(dataset: Runs) -> list[Choice]:
     if lag is None:
         return []
     return [Choice("camera.lag", prior_mean=lag.seconds, prior_std=LAG_STD, free=True)]
+
+
+def lengths(trusted: str | None, shape: Geometry) -> list[Choice]:
+    """The wheel radius free and the scale of the poses held, or the other way round."""
+    if trusted is None:
+        return []
+    radius = float(shape.wheel_radius)
+    nominal = {"robot.wheel_radius": radius, "camera.scale": 1.0}
+    return [
+        Choice(path, prior_mean=mean, prior_std=SIZE_STD * mean, free=path == LENGTHS[trusted])
+        for path, mean in nominal.items()
+    ]
 
 
 def without_rollers(shape: Geometry) -> list[Choice]:
@@ -183,7 +210,7 @@ def on_runs(robot: Robot, runs: Runs, centre: tuple[float, float]) -> Robot:
 def shape_of(config: Config) -> Geometry:
     """Geometry of the config's robot; DataError where it cannot drive."""
     try:
-        return geometry(config.content.robot)
+        return geometry(config.content.wheels)
     except ValueError as error:
         raise DataError(f"{config.path}: robot: {error}") from error
 
@@ -205,7 +232,11 @@ def said_of(robot: Robot, mass: float) -> list[Choice]:
 def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
     """The config's parameter settings, checked, less those of floors and loads that are absent."""
     paths, skipped = [e.path for e in entries(robot)], []
-    choices = said_of(robot, config.content.robot.mass_kg or float(robot.body.mass))
+    choices = said_of(robot, config.content.wheels.mass_kg or float(robot.body.mass))
+    choices += lengths(config.content.fit.lengths_from, robot.geometry)
+    measured, told = bench_priors(config, robot.motor.gear_ratio)
+    choices += measured
+    skipped += told
     try:
         known = share_priors(config.content.weights, robot.geometry)
     except ValueError as error:

@@ -27,6 +27,12 @@ def figure(width: float, height: float, title: str) -> Figure:
     return made
 
 
+def warned(made: Figure, text: str) -> None:
+    """Put a warning above the title of a figure, in its colour."""
+    title = made.get_suptitle()
+    made.suptitle(f"{text}\n{title}", fontsize=13, x=0.01, ha="left", color=ORANGE)
+
+
 def panels(count: int, width: float, height: float, title: str) -> tuple[Figure, list[Axes]]:
     """Figure with `count` plain panels of one size [inch], in rows of at most four."""
     columns = min(count, 4 if count != 5 else 3)

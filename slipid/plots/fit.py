@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from slipid.data.runs import Runs
 from slipid.identify.result import Fit
 from slipid.plots.compare import ladder_figure
-from slipid.plots.drawing import save_all
+from slipid.plots.drawing import save_all, warned
 from slipid.plots.load import load_figure
 from slipid.plots.motion import heading_figure, path_figure
 from slipid.plots.seen import Seen, seen
@@ -33,10 +33,17 @@ PICTURES: dict[str, Callable[[Fit, Runs, Seen], Figure | None]] = {
 """Pictures of a fit by name."""
 
 
-def identify_plots(fit: Fit, data: Runs, out: Path) -> list[Path]:
-    """Files of all `PICTURES` that the runs, those of the fit, have something for."""
+def identify_plots(fit: Fit, data: Runs, out: Path, warning: str | None = None) -> list[Path]:
+    """Files of all `PICTURES` that the runs, those of the fit, have something for.
+
+    What is said of a fit that is not to be used stands in the title of each.
+    """
     pieces = seen(fit.robot, data, fit.channels.windows)
-    return save_all({name: draw(fit, data, pieces) for name, draw in PICTURES.items()}, out)
+    made = {name: draw(fit, data, pieces) for name, draw in PICTURES.items()}
+    if warning is not None:
+        for figure in filter(None, made.values()):
+            warned(figure, warning)
+    return save_all(made, out)
 
 
 def picture(fit: Fit, data: Runs, name: str) -> Figure:

@@ -9,6 +9,7 @@ from rich.text import Text
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.identify.verdicts.profile import Profile
+from slipid.job.trust import Judgement
 from slipid.report.page import Page, percent, table, verdict
 from slipid.support.content import Content
 
@@ -76,8 +77,20 @@ def show_fit(page: Page, fit: Fit, profiles: Sequence[Profile] = ()) -> None:
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
 
 
+def show_trust(page: Page, judged: Judgement) -> None:
+    """Write how the fit predicts its own runs, open loop, and how far it may be trusted."""
+    if judged.floors:
+        made = table(("surface", "end / path", "encoders alone"))
+        for name, e in judged.floors.items():
+            made.add_row(name, percent(e.model), percent(e.encoders))
+        page.line(f"open loop from their first pose on, {judged.runs} of the fitted runs:")
+        page.table(made)
+    page.line(f"verdict: {judged.trust}")
+
+
 def show_check(page: Page, found: Content) -> None:
-    """Write the content of check.json."""
+    """Write the content of check.json; what is wrong comes first."""
+    page.findings(found["findings"])
     groups = table(("surface", "load", "session", "runs", "minutes", "headings", r"speeds \[m/s]"))
     for row in found["groups"]:
         groups.add_row(

@@ -5,6 +5,10 @@ from io import StringIO
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
+
+from slipid.data.sanity.finding import listed
+from slipid.support.content import Content
 
 COLOUR = {
     "identified": "green",
@@ -14,6 +18,8 @@ COLOUR = {
     "at_bound": "magenta",
 }
 
+SEVERITY = {"wrong": "bold red", "suspicious": "yellow", "note": "dim"}
+"""Colours of what a check of logs and config says."""
 WIDTH = 140
 """Of text that no terminal shows [characters]."""
 
@@ -55,6 +61,14 @@ class Page:
         """Sentences a reader must know."""
         for sentence in sentences:
             self.line(f"note: {sentence}")
+
+    def findings(self, found: Iterable[Content]) -> None:
+        """What was found wrong, in colour, and what was not checked."""
+        for one in found:
+            remedy = f"\n    {one['remedy']}" if one["remedy"] else ""
+            where = f" (in {listed(one['runs'])})" if one["runs"] else ""
+            said = Text.assemble((f"{one['severity']}: ", SEVERITY[one["severity"]]))
+            self._console.print(said.append(f"{one['found']}{where}{remedy}"), soft_wrap=True)
 
 
 def table(columns: Sequence[str], title: str | None = None, right: Sequence[str] = ()) -> Table:

@@ -93,7 +93,7 @@ def planned(config: Config, report: Reporter) -> Job:
     drives = [replace(d, distance=wanted.distance_m) for d in runs]
     robot = build(shape, wanted.surfaces, loads, sorted({d.session for d in drives}))
     layouts = [layout_of(config, section) for section in sections]
-    channels = [layout.channels.keys() for layout in layouts]
+    channels = [layout.holds for layout in layouts]
     has_current = all("current" in c for c in channels)
     has_voltage = all("voltage" in c or {"duty", "bus_voltage"} <= c for c in channels)
     is_signed = all(layout.current_is_signed for layout in layouts)

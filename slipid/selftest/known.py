@@ -100,9 +100,10 @@ def turning_grid(
     for surface, load in setups:
         for speed in speeds:
             for way in 2 * np.pi * np.arange(ways) / ways:
-                ahead, turn = speed * np.cos(way), speed * np.sin(way) / base_radius
+                # rounded: the cosine of a right angle is not quite zero
+                ahead, turn = (round(speed * float(f(way)), 9) for f in (np.cos, np.sin))
                 back = 0.0 if ahead >= 0 else np.pi
-                drives.append(Drive(surface, load, back, float(abs(ahead)), turn=float(turn)))
+                drives.append(Drive(surface, load, back, abs(ahead), turn=turn / base_radius))
     return tuple(drives)
 
 

@@ -144,6 +144,7 @@ def test_people_are_asked_only_what_the_drive_needs_and_again_where_they_are_wro
     ("told", "message"),
     [
         ({"drive": "omny"}, "--drive 'omny': no such drive, did you mean omni?"),
+        ({"drive": "motor"}, "--drive 'motor': a motor on a bench needs no config"),
         ({"wheel_radius_m": "0,05"}, "--wheel-radius-m '0,05': expected a number with a decimal"),
         ({"mass_kg": "0"}, "--mass-kg '0': expected a number above 0"),
         ({"mass_kg": "nan"}, "--mass-kg 'nan': expected a number above 0"),

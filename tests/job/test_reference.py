@@ -25,7 +25,18 @@ from slipid.support.errors import DataError
 
 ROOT = Path(__file__).resolve().parents[2]
 MODELS = (
-    *(c.Content, c.Omni, c.Box, c.Differential, c.General, c.Logs, c.Camera, c.Prior, c.Setting),
+    *(
+        c.Content,
+        c.Omni,
+        c.Box,
+        c.Differential,
+        c.General,
+        c.Motor,
+        c.Logs,
+        c.Camera,
+        c.Prior,
+        c.Setting,
+    ),
     *(c.Weights, c.FitSection, c.ValidateSection, c.SelftestSection, Layout, Channel),
 )
 
@@ -106,7 +117,7 @@ def test_all_there_is_is_in_it():
     for entry in entries(robot):
         assert f"| `{entry.path}` |" in text
         assert entry.declaration.doc
-    for drive in ("omni", "mecanum", "skid", "differential", "general"):
+    for drive in ("omni", "mecanum", "skid", "differential", "general", "motor"):
         assert f'drive = "{drive}"' in text
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from slipid.data.log import Log
-from slipid.data.reading.layout import Layout
+from slipid.data.reading.layout import Recorded
 from slipid.data.reading.signal import Signal, clock_of
 from slipid.data.wheel_signals import integral, readings
 
@@ -36,7 +36,7 @@ class Identity:
 
 
 def assembled(
-    signals: Mapping[str, Signal], layout: Layout, identity: Identity, notes: tuple[str, ...] = ()
+    signals: Mapping[str, Signal], layout: Recorded, identity: Identity, notes: tuple[str, ...] = ()
 ) -> Log:
     """The log of one run from its signals, by the names of their channels.
 
@@ -75,7 +75,7 @@ def assembled(
     )
 
 
-def _check_gaps(signal: Signal, layout: Layout) -> None:
+def _check_gaps(signal: Signal, layout: Recorded) -> None:
     """Refuse wheels that were not measured for a while: nobody knows how they turned then."""
     for column in range(signal.values.shape[1]):
         there = np.flatnonzero(~np.isnan(signal.values[:, column]))
@@ -124,7 +124,7 @@ def _fresh(
 def _angle(
     name: str | None,
     signals: Mapping[str, Signal],
-    layout: Layout,
+    layout: Recorded,
     clock: Float[np.ndarray, " time"],
     notes: list[str],
 ) -> Float[np.ndarray, "time wheel"]:
@@ -151,7 +151,7 @@ def _angle(
     return angle - angle[0]
 
 
-def _per_wheel(name: str, layout: Layout) -> float:
+def _per_wheel(name: str, layout: Recorded) -> float:
     """Angle of a wheel per tick, or per angle of what was measured."""
     if name == "wheel_ticks":
         return 2.0 * np.pi / (float(layout.ticks_per_revolution or 1.0) * layout.gear_ratio)
@@ -159,7 +159,7 @@ def _per_wheel(name: str, layout: Layout) -> float:
 
 
 def _ticks(
-    ticks: Float[np.ndarray, " sample"], layout: Layout, notes: list[str]
+    ticks: Float[np.ndarray, " sample"], layout: Recorded, notes: list[str]
 ) -> Float[np.ndarray, " sample"]:
     """Cumulative ticks, without the wrap-around of a counter of `tick_bits` bits."""
     if layout.ticks_are_increments:
@@ -174,7 +174,7 @@ def _ticks(
     return ticks - period * np.concatenate([[0.0], np.cumsum(np.round(steps / period))])
 
 
-def _at_wheel(held: Mapping[str, np.ndarray], layout: Layout, what: str) -> np.ndarray | None:
+def _at_wheel(held: Mapping[str, np.ndarray], layout: Recorded, what: str) -> np.ndarray | None:
     if f"wheel_{what}" in held:
         return held[f"wheel_{what}"]
     if f"motor_{what}" in held:
@@ -182,7 +182,7 @@ def _at_wheel(held: Mapping[str, np.ndarray], layout: Layout, what: str) -> np.n
     return None
 
 
-def _current(held: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray | None:
+def _current(held: Mapping[str, np.ndarray], layout: Recorded) -> np.ndarray | None:
     """As logged, else the torque that a driver reports over its constant."""
     if "current" in held:
         return held["current"]

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.layout import Layout
+from slipid.data.reading.layout import Layout, Recorded
 from slipid.data.reading.signal import Signal
 from slipid.data.reading.table import Table
 from slipid.data.wheel_signals import integral, interpolate, swapped_order
@@ -62,7 +62,7 @@ class Unsteady(DataError):
     """The pose of a run jumps: it is to be set aside, and the others can be read."""
 
 
-def check_log(log: Log, signals: Mapping[str, Signal], layout: Layout) -> None:
+def check_log(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> None:
     """Refuse what no robot does: absurd magnitudes, signs, jumps, and channels that stand still."""
     for name, (limit, unit) in _LIMITS.items():
         values = getattr(log, name)
@@ -83,7 +83,7 @@ def check_log(log: Log, signals: Mapping[str, Signal], layout: Layout) -> None:
         _check_pose(log, signals, layout)
 
 
-def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: Layout) -> None:
+def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> None:
     """Refuse angles no wheel can make, and a wheel that stands still when commanded."""
     if not log.wheels:
         return
@@ -111,7 +111,7 @@ def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: Layout) -> No
         raise _at(log, signals, "wheel", None, j, found, "a wheel that turns when commanded")
 
 
-def _check_order(log: Log, signals: Mapping[str, Signal], layout: Layout) -> None:
+def _check_order(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> None:
     """Refuse wheel columns in another order than those of the commanded or reported speeds."""
     # steps of half a second: delays and jitter do not matter
     edges = np.linspace(log.time[0], log.time[-1], max(2, int(log.duration / 0.5) + 1))
@@ -132,7 +132,7 @@ def _check_order(log: Log, signals: Mapping[str, Signal], layout: Layout) -> Non
             raise _at(log, signals, "wheel", None, j, found, expected)
 
 
-def _check_pose(log: Log, signals: Mapping[str, Signal], layout: Layout) -> None:
+def _check_pose(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> None:
     """Refuse a pose that stands still while wheels turn; set a run aside whose pose jumps."""
     assert log.pose is not None
     assert log.pose_fresh is not None

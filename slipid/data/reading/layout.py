@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import field
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Protocol, runtime_checkable
 
 from pydantic import (
     AliasChoices,
@@ -85,6 +85,38 @@ class Channel:
             )
 
 
+@runtime_checkable
+class Recorded(Protocol):
+    """What a layout says of the robot's sensors, whatever the files are; see `Layout`."""
+
+    @property
+    def ticks_per_revolution(self) -> float | None: ...
+
+    @property
+    def gear_ratio(self) -> float: ...
+
+    @property
+    def ticks_are_increments(self) -> bool: ...
+
+    @property
+    def tick_bits(self) -> int: ...
+
+    @property
+    def current_is_signed(self) -> bool: ...
+
+    @property
+    def torque_constant(self) -> float | None: ...
+
+    @property
+    def max_gap(self) -> float: ...
+
+    @property
+    def max_pose_jump(self) -> float: ...
+
+    @property
+    def max_heading_jump(self) -> float: ...
+
+
 def _pair(value: object) -> object:
     """Scales along x and y; one number counts for both."""
     if isinstance(value, list | tuple):
@@ -147,6 +179,12 @@ class Layout:
         """Every column the layout uses, each once."""
         used = (column for channel in self.channels.values() for column in channel.columns)
         return tuple(dict.fromkeys(used))
+
+    @property
+    def holds(self) -> frozenset[str]:
+        """Every channel of a run, those in files beside its own included."""
+        beside = (name for other in self.beside.values() for name in other.channels)
+        return frozenset((*self.channels, *beside))
 
     def to_si(self, channel: str) -> float:
         """Factor from the channel's unit to that of `CHANNELS`, for pixels the camera's scale.

@@ -1,15 +1,19 @@
 """Read logs: from files and their layout to runs in SI units, checked once, here."""
 
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
 from slipid.data.reading.assemble import Identity, assembled
+from slipid.data.reading.bag.layout import BagLayout
+from slipid.data.reading.bag.reader import read_bag
 from slipid.data.reading.checks import MIN_ROWS, Unsteady, check_log, check_time
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import preset
@@ -18,6 +22,8 @@ from slipid.data.reading.table import Table, read_table
 from slipid.data.runs import Runs, collect, counted_once, default_session
 from slipid.support.errors import DataError
 
+AnyLayout = Layout | BagLayout
+"""How files of rows, or bags, are laid out."""
 Session = Literal["surface/load/speed", "folder", "file"]
 """What runs have in common between which the camera's marker stayed as it was."""
 
@@ -25,7 +31,7 @@ Session = Literal["surface/load/speed", "folder", "file"]
 def read_runs(
     folder: Path | str,
     pattern: str,
-    layout: Layout | str,
+    layout: AnyLayout | str,
     *,
     surface: str | None = "folder",
     load: str = "as_built",
@@ -77,32 +83,29 @@ class FileRuns:
     aside: tuple[str, ...]
 
 
-def read_logs(path: Path, layout: Layout, root: Path, surface: str | None, load: str) -> FileRuns:
-    """Every run in a CSV or Parquet file, and a line for each whose pose jumps.
+def read_logs(
+    path: Path, layout: AnyLayout, root: Path, surface: str | None, load: str
+) -> FileRuns:
+    """Every run in a CSV or Parquet file or in a bag, and a line for each whose pose jumps.
 
-    `layout.new_run` tells runs apart. Parts of a file of a single row hold no motion and are left
-    out. A run whose pose jumps is set aside by its name: the marker was taken for another, or the
-    matching of scans failed, and what lies between is not to be fitted.
+    `layout.new_run` tells the runs of a file of rows apart, `layout.runs` those of a bag. Parts of
+    a file of a single row hold no motion and are left out. A run whose pose jumps is set aside by
+    its name: the marker was taken for another, or the matching of scans failed, and what lies
+    between is not to be fitted.
 
     Args:
         root: data folder above the file, which the names of the runs are relative to.
         surface: name of the floor; `folder` stands for that of the file's folder less `_surface`.
-        load: name of the load set-up.
+            A bag, or the table of its runs, may name another.
+        load: name of the load set-up, likewise.
     """
     surface = path.parent.name.removesuffix("_surface") if surface == "folder" else surface
-    table = read_table(path, layout)
-    if layout.drop_repeated_time:
-        table = table.rows(np.append(np.diff(_time(table, layout)) != 0, True))
-    name = path.relative_to(root).as_posix()
+    known = Identity(path.relative_to(root).as_posix(), path, "", surface, load)
+    raw = _of_bag(known, layout) if isinstance(layout, BagLayout) else _of_rows(known, layout)
     logs: list[Log] = []
     aside: list[str] = []
-    for part, suffix in _parts(table, layout):
-        notes: list[str] = []
-        signals = signals_of(part, layout, notes)
-        for pattern, beside in layout.beside.items():
-            signals |= signals_of(_beside(path, pattern, beside), beside, notes)
-        identity = Identity(name + suffix, path, table.sha256, surface, load)
-        log = assembled(signals, layout, identity, tuple(dict.fromkeys(notes)))
+    for identity, signals, notes in raw:
+        log = assembled(signals, layout, identity, notes)
         try:
             check_log(log, signals, layout)
         except Unsteady as error:
@@ -110,6 +113,55 @@ def read_logs(path: Path, layout: Layout, root: Path, surface: str | None, load:
             continue
         logs.append(log)
     return FileRuns(tuple(logs), tuple(aside))
+
+
+class _RawRun(NamedTuple):
+    """A run that was read and not put together yet."""
+
+    identity: Identity
+    signals: dict[str, Signal]
+    notes: tuple[str, ...]
+
+
+def _of_bag(known: Identity, layout: BagLayout) -> list[_RawRun]:
+    return [
+        _RawRun(
+            Identity(
+                known.name + run.name_suffix,
+                known.path,
+                run.sha256,
+                run.surface or known.surface,
+                run.load or known.load,
+            ),
+            run.signals,
+            run.notes,
+        )
+        for run in read_bag(known.path, layout)
+    ]
+
+
+def _of_rows(known: Identity, layout: Layout) -> list[_RawRun]:
+    table = read_table(known.path, layout)
+    if layout.drop_repeated_time:
+        table = table.rows(np.append(np.diff(_time(table, layout)) != 0, True))
+    beside = {
+        pattern: _beside(known.path, pattern, other) for pattern, other in layout.beside.items()
+    }
+    sha256 = sha256_of([table.sha256, *(other.sha256 for other in beside.values())])
+    out = []
+    for part, suffix in _parts(table, layout):
+        notes: list[str] = []
+        signals = signals_of(part, layout, notes)
+        for pattern, other in beside.items():
+            signals |= signals_of(other, layout.beside[pattern], notes)
+        identity = replace(known, name=known.name + suffix, sha256=sha256)
+        out.append(_RawRun(identity, signals, tuple(dict.fromkeys(notes))))
+    return out
+
+
+def sha256_of(parts: Sequence[str]) -> str:
+    """Hash of one file, or of the hashes of several."""
+    return parts[0] if len(parts) == 1 else hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 def _parts(table: Table, layout: Layout) -> list[tuple[Table, str]]:
@@ -139,7 +191,7 @@ def find_logs(root: Path, pattern: str) -> list[Path]:
     """Files under `root` that match a glob, sorted by name; DataError where there are none."""
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; expected the folder of the logs")
-    found = sorted(p for p in root.glob(pattern) if p.is_file())
+    found = sorted(p for p in root.glob(pattern) if p.is_file() or (p / "metadata.yaml").is_file())
     if found:
         return found
     nearest = root

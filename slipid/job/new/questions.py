@@ -47,6 +47,8 @@ class Question:
 
 def _drive(text: str, _: Answers) -> str:
     word = text.strip().lower()
+    if word == "motor":
+        raise ValueError("a motor on a bench needs no config; expected its log: slipid motor FILE")
     if word not in DRIVES:
         raise ValueError(f"no such drive{near(word, DRIVES)}; expected one of {', '.join(DRIVES)}")
     return word
@@ -121,8 +123,6 @@ DRIVES: dict[str, tuple[Question, ...]] = {
     "skid": (_WHEELBASE, _TRACK, _SHARED),
     "differential": (_TRACK,),
     "general": (_PLACES, _DIRECTIONS, _ROLLERS),
-    # "motor", a bench, goes here with no question about wheels; then `robot_of` makes its model,
-    # and `ask` leaves out of COMMON what a motor without a robot does not have.
 }
 """What each drive needs to be asked, in this order; COMMON comes after it."""
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from slipid.job.config import Logs, Wheels, geometry, parsed
+from slipid.job.config import FitSection, Logs, Wheels, geometry, parsed
 from slipid.job.new.drawing import drawing
 from slipid.job.new.lines import Block, Line, all_asked, toml
 from slipid.job.new.questions import robot_of
@@ -90,6 +90,7 @@ def new_config(sketch: Sketch, name: str) -> NewConfig:
         *(block for layout in sketch.layouts for block in _layout_blocks(layout)),
         *(block for bag in sketch.bags for block in _bag_blocks(bag)),
         *(_logs_block(logs, first=k == 0) for k, logs in enumerate(sketch.logs)),
+        _fit_block(),
         _weights_block(geometry(robot).wheels),
         _parameters_block(sketch.channels),
     ]
@@ -135,6 +136,10 @@ def _open(sketch: Sketch, key: str) -> str:
     return next(hints, _PUT.get(key, _MEASURE))
 
 
+_LENGTHS = (
+    '"poses" of motion capture, lidar or RTK, which make the wheel radius free; or "wheels" that '
+    "were measured, which make the scale of the camera free:"
+)
 _UNITS = (
     "Which column of your files holds what, in which unit. Time: s, ms, us or ns, since the start "
     "or since 1970. Others: rad, deg, rev, rad/s, rpm, tick, m, mm, A, mA, V, percent and so on.",
@@ -209,6 +214,15 @@ def _logs_block(logs: LogsSketch, first: bool) -> Block:
         lines.append(line("map", "maps/site.toml", off=True))
     above = logs.above or (("One section per set of logs.",) if first else ())
     return Block("# [[logs]]" if logs.off else "[[logs]]", tuple(lines), above=above)
+
+
+def _fit_block() -> Block:
+    """Whether poses are in true metres, which logs do not tell."""
+    above = (
+        f"Of lengths, {in_short(FitSection, 'lengths_from')}? " + _LENGTHS,
+        "[fit]",
+    )
+    return Block("", (Line("lengths_from", toml("poses"), off=True),), above=above)
 
 
 def _weights_block(wheels: int) -> Block:

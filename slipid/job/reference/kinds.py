@@ -107,13 +107,13 @@ def _least(limits: tuple[object, ...]) -> str:
 
 def _limits(limits: tuple[object, ...]) -> str:
     signs = {Gt: (">", "gt"), Ge: (">=", "ge"), Lt: ("<", "lt"), Le: ("<=", "le")}
-    said = [
+    said = {
         f"{sign} {getattr(one, attribute):g}"
         for one in _unpacked(limits)
         for kind, (sign, attribute) in signs.items()
         if isinstance(one, kind)
-    ]
-    return f" {' and '.join(said)}" if said else ""
+    }
+    return f" {' and '.join(sorted(said, reverse=True))}" if said else ""
 
 
 def _unpacked(limits: tuple[object, ...]) -> list[object]:

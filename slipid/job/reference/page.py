@@ -23,7 +23,7 @@ _DRIVES: tuple[tuple[type[c.Wheels], str, dict[str, object]], ...] = (
     ),
     (c.Differential, "differential", {"track_m": 0.3}),
 )
-"""Drives with a robot to draw. A motor on a bench has no wheels: its keys go beside these."""
+"""Drives with a robot to draw."""
 _SECTIONS: tuple[tuple[str, type], ...] = (
     ("[[logs]]", c.Logs),
     ("[camera]", c.Camera),
@@ -93,6 +93,8 @@ def _drives(_: object) -> str:
         parts += [f'### `drive = "{name}"`', purpose(kind), _table_of_keys(own), picture]
     own = [key for key in keys_of(c.General) if key.name not in common and key.name != "drive"]
     parts += ['### `drive = "general"`', purpose(c.General), _table_of_keys(own)]
+    own = [key for key in keys_of(c.Motor) if key.name != "drive"]
+    parts += ['### `drive = "motor"`', purpose(c.Motor), _table_of_keys(own)]
     return "\n\n".join(parts)
 
 

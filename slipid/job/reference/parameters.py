@@ -6,7 +6,8 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 
-from slipid.job.config import Config, Setting, geometry
+from slipid.identify.bench.motor import Bench, BenchMotor
+from slipid.job.config import Config, Motor, Setting, geometry
 from slipid.model.geometry import omni
 from slipid.model.robot import Robot
 from slipid.parameter import Declaration, Entry, entries
@@ -45,6 +46,9 @@ def parameter_rows(config: Config | None = None) -> list[ParameterRow]:
         whole = Robot.of(omni([60.0, 180.0, 300.0], 0.125, 0.04)).on((FLOOR,), sessions=(SESSION,))
         return [_row(entry, whole, {}) for entry in entries(whole)]
     content = config.content
+    if isinstance(content.robot, Motor):
+        bench = Bench(BenchMotor())
+        return [_row(entry, bench, content.parameters) for entry in entries(bench)]
     floors = [FLOOR if s.surface == "folder" else s.surface for s in content.logs if s.map is None]
     loads = tuple(dict.fromkeys(section.load for section in content.logs))
     shape, mass = geometry(content.robot), content.robot.mass_kg
@@ -53,7 +57,7 @@ def parameter_rows(config: Config | None = None) -> list[ParameterRow]:
     return [_row(entry, whole, content.parameters) for entry in entries(whole)]
 
 
-def _row(entry: Entry, robot: Robot, settings: dict[str, Setting]) -> ParameterRow:
+def _row(entry: Entry, robot: Robot | Bench, settings: dict[str, Setting]) -> ParameterRow:
     one = entry.declaration
     value = np.atleast_1d(np.asarray(entry.get(robot), float))
     start = f"{value[0]:.4g}" if np.ptp(value) == 0 else ", ".join(f"{v:.4g}" for v in value)

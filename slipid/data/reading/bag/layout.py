@@ -129,9 +129,15 @@ class BagLayout:
     ticks_are_increments: StrictBool = False
     tick_bits: Count = 32
     current_is_signed: StrictBool = True
+    torque_constant: Positive | None = None
     max_gap: Positive = 1.0
     max_pose_jump: Positive = 0.5
     max_heading_jump: Positive = 1.6
+
+    @property
+    def holds(self) -> frozenset[str]:
+        """Every channel of a run."""
+        return frozenset(inner for name in self.topics for inner in GROUPS.get(name, (name,)))
 
 
 _SETTINGS = [f.name for f in fields(BagLayout) if f.name not in ("name", "topics")]
@@ -207,6 +213,8 @@ def _problem(layout: BagLayout) -> str | None:
         return "a pose in parts; expected pose, or all of pose_x, pose_y and pose_heading"
     if "wheel_ticks" in have and layout.ticks_per_revolution is None:
         return "wheel_ticks without ticks_per_revolution; expected ticks per turn of the motor"
+    if {"motor_torque", "wheel_torque"} & have and layout.torque_constant is None:
+        return "a torque without torque_constant; expected the motor's torque per current [N m/A]"
     if len(set(layout.joints)) < len(layout.joints):
         return f"joints {list(layout.joints)}; expected each once"
     if layout.runs is not None and layout.runs.pause_s is not None and not have & set(TURNS):

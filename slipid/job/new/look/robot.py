@@ -54,7 +54,7 @@ def _drive(wheels: int, aside: bool | None) -> tuple[str, str]:
     if wheels > 4:
         return "general", f"{wheels} wheels: where do they stand, in the order of the columns?"
     if wheels == 1:
-        return "omni", "one column of wheels only: is it a motor on a bench, or are columns missed?"
+        return "omni", "one column of wheels only: a motor on a bench (slipid motor FILE), or more?"
     return "omni", "no column tells how wheels turn: which drive is it, and how many wheels?"
 
 

@@ -1,0 +1,89 @@
+"""`slipid motor`: a motor on a bench, from a single file."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from slipid.cli.common import Json, MaybeOut, Quiet, emit, guarded
+from slipid.support.progress import Reporter
+
+if TYPE_CHECKING:
+    from slipid.data.reading.guess import Named
+
+
+@guarded
+def motor(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Log, a CSV file.")],
+    time: Annotated[
+        str | None, typer.Option(metavar="NAME[:UNIT]", help="Column of the time, in s.")
+    ] = None,
+    voltage: Annotated[
+        str | None, typer.Option(metavar="NAME[:UNIT]", help="Across the motor, in V.")
+    ] = None,
+    current: Annotated[
+        str | None, typer.Option(metavar="NAME[:UNIT]", help="In A; I:mA for others.")
+    ] = None,
+    speed: Annotated[
+        str | None,
+        typer.Option(metavar="NAME[:UNIT]", help="Of the motor shaft, in rad/s; w:rpm for others."),
+    ] = None,
+    angle: Annotated[
+        str | None,
+        typer.Option(metavar="NAME[:UNIT]", help="Of the motor shaft, in rad, for the speed."),
+    ] = None,
+    duty: Annotated[
+        str | None, typer.Option(metavar="NAME[:UNIT]", help="Share of the bus voltage; d:% too.")
+    ] = None,
+    bus: Annotated[
+        str | None, typer.Option(metavar="NAME[:UNIT]", help="Bus voltage, with --duty, in V.")
+    ] = None,
+    unsigned: Annotated[
+        bool, typer.Option("--unsigned", help="The current is a magnitude.")
+    ] = False,
+    delimiter: Annotated[
+        str | None, typer.Option(metavar="CHARACTER", help="Between cells; guessed by default.")
+    ] = None,
+    out: MaybeOut = None,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Resistance, back-EMF, friction, inertia and more of a motor, from voltage, current and speed.
+
+    Columns that are not named are guessed. Several motors: names by commas. The speed must be that
+    of the motor shaft: no log shows that it was taken behind a gear. With --out it writes
+    motor.json and a picture. Exit code 1 where the model does not explain the log.
+    """
+    from slipid.job.motor import read_one
+    from slipid.report.bench import show_bench
+    from slipid.support.files import write_json
+
+    columns = {
+        "time": time,
+        "voltage": voltage,
+        "current": current,
+        "motor_speed": speed,
+        "motor_angle": angle,
+        "duty": duty,
+        "bus_voltage": bus,
+    }
+    with Reporter(quiet=quiet) as report:
+        report.stage("reading the log")
+        job = read_one(file, _named(columns), delimiter, not unsigned)
+        fit = job.fit(report)
+        content, written = fit.to_json(), ["motor.json"]
+        if out is not None:
+            from slipid.plots.bench import bench_plots
+
+            report.stage("drawing")
+            write_json(out / "motor.json", content)
+            written += [path.name for path in bench_plots(fit, out)]
+    emit(json, content, lambda page: show_bench(page, fit, job.taken), out, written)
+    return 0 if fit.good else 1
+
+
+def _named(columns: dict[str, str | None]) -> "dict[str, Named]":
+    """What was named, by channel."""
+    from slipid.data.reading.guess import named
+
+    return {channel: named(text, channel) for channel, text in columns.items() if text is not None}

@@ -1,0 +1,1 @@
+"""Do encoders, commands, gyro and poses tell of the same robot? Asked before anything is fitted."""

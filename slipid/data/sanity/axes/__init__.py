@@ -1,0 +1,1 @@
+"""Which order, signs and axes explain the motion?"""

@@ -1,0 +1,174 @@
+"""Which single wrong factor explains ratios that are not natural.
+
+A cause multiplies each ratio by a power of its factor. With the logarithms of ratios and of the
+ends of their ranges, a cause fits where one factor brings all of them into their ranges:
+
+    max_i  log(ratio_i / high_i) / e_i   <=   log factor   <=   min_i  log(ratio_i / low_i) / e_i
+
+(ends exchanged where e_i < 0). Of causes that fit, one with a factor that people do get wrong is
+believed: 1000, 2 pi, 57.3, the gear ratio.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import exp, inf, log, pi
+
+from slipid.data.sanity.scales.ratios import Ratio, Ratios
+
+NEAR = 0.02
+"""A range that ends this near a factor (in its logarithm) still holds it."""
+ROWS_S = (0.001, 1.5)
+"""Times between rows that are natural [s]."""
+
+_COMMON = {
+    "time": (1000.0, 1e6, 1e9, 60.0),
+    "wheel_gear": (2.0, 4.0, 2 * pi, 180 / pi, 1000.0),
+    "wheel_turns": (2.0, 4.0, 10.0, 2 * pi, 180 / pi, 1000.0),
+    "wheel_radius": (2.0, 10.0, 100.0, 1000.0, 25.4),
+    "pose_length": (1000.0, 100.0, 10.0, 25.4),
+    "heading": (180 / pi,),
+    "base": (2.0, 10.0, 100.0, 1000.0),
+    "command_twist": (1000.0, 100.0, 10.0),
+    "command_yaw": (180 / pi, 1000.0, 2 * pi),
+    "command_wheels": (30 / pi, 180 / pi, 2 * pi, 1000.0, 10.0),
+    "report": (30 / pi, 180 / pi, 2 * pi, 1000.0, 10.0),
+    "gyro": (180 / pi, 1000.0),
+}
+_BY_GEAR = ("wheel_gear", "wheel_turns", "command_wheels", "report")
+_OF_RATES = (30 / pi, 180 / pi, 2 * pi, 1000.0, 60.0)
+"""Of turns that are integrated from speeds."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A wrong factor.
+
+    Attributes:
+        name: what is wrong.
+        power: of the factor in each ratio that it changes.
+    """
+
+    name: str
+    power: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Explained:
+    """A cause that fits.
+
+    Attributes:
+        name: of the cause.
+        factor: what the declared number must be divided by, or the readings multiplied with.
+        common: whether it is one that people do get wrong.
+        low, high: range of the factor.
+    """
+
+    name: str
+    factor: float
+    common: bool
+    low: float
+    high: float
+
+
+def causes(speed_is_angle: bool) -> Iterator[Cause]:
+    """Everything that may be wrong by a factor, the likeliest first.
+
+    A factor above 1 stands for channels that say too much: turns, lengths, angles, time.
+    """
+    rates = {"drive": 1.0, "steer": 1.0, "command": 1.0, "gyro": 1.0, "report": 1.0}
+    integrated = {"travel": -1.0, "turning": -1.0, "gyro": 1.0}
+    yield Cause("time", integrated if speed_is_angle else rates)
+    wheels = {"travel": -1.0, "turning": -1.0, "drive": -1.0, "steer": -1.0}
+    yield Cause("pose_length", {"travel": 1.0})
+    yield Cause("heading", {"turning": 1.0, "gyro": -1.0})
+    yield Cause("wheel_gear", wheels | {"command": -1.0})
+    yield Cause("wheel_turns", wheels | {"command": -1.0, "report": -1.0})
+    yield Cause("wheel_radius", wheels)
+    yield Cause("base", {"turning": 1.0, "steer": 1.0})
+    yield Cause("gyro", {"gyro": 1.0})
+    yield Cause("report", {"report": 1.0})
+    yield Cause("command_wheels", {"command": 1.0})
+    yield Cause("command_twist", {"drive": 1.0})
+    yield Cause("command_yaw", {"steer": 1.0})
+
+
+def explained(seen: Ratios, row_s: float, gear_ratio: float) -> tuple[tuple[Explained, ...], bool]:
+    """Causes that fit, the likeliest first, and whether single ones do.
+
+    Where no single cause fits, the first pair that does is returned. Nothing where every ratio is
+    natural, or no pair of causes fits.
+    """
+    if all(r.natural for r in seen.known.values()):
+        return (), True
+    open_ = [c for c in causes(seen.speed_is_angle) if c.name != "time" or not _natural(row_s)]
+    common = _common(gear_ratio, seen.speed_is_angle)
+    single = _singles(seen.known, open_, common)
+    if single:
+        return tuple(sorted(single, key=lambda e: not e.common)), True
+    for first in open_:
+        for factor in common[first.name]:
+            left = {
+                name: replace(r, value=r.value / factor ** first.power.get(name, 0.0))
+                for name, r in seen.known.items()
+            }
+            rest = [c for c in open_ if c.name != first.name]
+            second = [e for e in _singles(left, rest, common) if e.common]
+            if second:
+                return (Explained(first.name, factor, True, factor, factor), second[0]), False
+    return (), False
+
+
+def _natural(row_s: float) -> bool:
+    return ROWS_S[0] <= row_s <= ROWS_S[1]
+
+
+def _singles(
+    known: Mapping[str, Ratio], open_: list[Cause], common: Mapping[str, Sequence[float]]
+) -> list[Explained]:
+    """Causes that fit alone."""
+    found = []
+    for cause in open_:
+        low, high = _range(known, cause)
+        if low > high:
+            continue
+        inside = [f for f in common[cause.name] if low - NEAR <= log(f) <= high + NEAR]
+        middle = min(max(_middle(known, cause), low), high)
+        best = min(inside, key=lambda f: abs(log(f) - middle), default=None)
+        factor = exp(middle) if best is None else best
+        found.append(Explained(cause.name, factor, best is not None, exp(low), exp(min(high, 60))))
+    return found
+
+
+def _range(known: Mapping[str, Ratio], cause: Cause) -> tuple[float, float]:
+    """Logarithms of the factors that bring every ratio into its range; empty where none does."""
+    low, high = -inf, inf
+    for name, ratio in known.items():
+        power = cause.power.get(name, 0.0)
+        if power == 0.0:
+            if not ratio.natural:
+                return inf, -inf
+            continue
+        ends = sorted((log(ratio.value) - log(end)) / power for end in (ratio.low, ratio.high))
+        low, high = max(low, ends[0]), min(high, ends[1])
+    return low, high
+
+
+def _middle(known: Mapping[str, Ratio], cause: Cause) -> float:
+    """Logarithm of the factor that ratios say if they are as usual; narrow ranges count most."""
+    total = weights = 0.0
+    for name, ratio in known.items():
+        if power := cause.power.get(name, 0.0):
+            weight = log(ratio.high / ratio.low) ** -2
+            total += weight * log(ratio.value / ratio.usual) / power
+            weights += weight
+    return total / weights if weights else 0.0
+
+
+def _common(gear_ratio: float, speed_is_angle: bool) -> Mapping[str, Sequence[float]]:
+    """Factors that people get wrong by name of the cause, with their inverses."""
+    named = dict(_COMMON)
+    if speed_is_angle:
+        named["wheel_gear"] = _OF_RATES
+    if gear_ratio > 1.5:
+        named |= {name: (gear_ratio, *named[name]) for name in _BY_GEAR}
+    return {name: [f for one in all_ for f in (one, 1 / one)] for name, all_ in named.items()}

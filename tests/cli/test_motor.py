@@ -1,0 +1,222 @@
+"""`slipid motor`, drive = "motor", and a bench's numbers as priors of a robot."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slipid.data.reading.guess import header_of, layout_of, named
+from slipid.job.bench_priors import bench_priors
+from slipid.job.config import parsed
+from slipid.support.errors import DataError
+from tests.helpers import made_bench as made
+from tests.helpers.shared import invoke
+
+CONFIG = """
+[robot]
+drive = "motor"
+names = ["left", "right"]
+[[logs]]
+glob = "*.csv"
+format = "mine"
+[layouts.mine.columns]
+time = { column = "t", unit = "s" }
+voltage = { columns = ["U1", "U2"], unit = "V" }
+current = { columns = ["I1", "I2"], unit = "A" }
+motor_speed = { columns = ["w1", "w2"], unit = "rad/s" }
+[parameters]
+"motor.brush_drop@left" = { fixed = 0.0 }
+"""
+ROBOT = """
+[robot]
+drive = "omni"
+base_radius_m = 0.125
+wheel_azimuths_deg = [60, 180, 300]
+wheel_radius_m = 0.04
+gear_ratio = 16
+{motor}
+[[logs]]
+glob = "*.csv"
+format = "robotino2022"
+"""
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A folder with a log of one motor, and one of two motors with its config."""
+    folder = tmp_path_factory.mktemp("bench")
+    rows = made.driven(made.FLYWHEEL)
+    one, two = made.logged(rows, 200, 1), made.logged(rows, 200, 1, noise=(0.1, 0.02, 2.0))
+    made.write(one, folder / "one.csv")
+    (folder / "two").mkdir()
+    columns = [one.time, one.voltage, one.current, one.speed, two.voltage, two.current, two.speed]
+    names = "t,U1,I1,w1,U2,I2,w2"
+    path = folder / "two" / "both.csv"
+    np.savetxt(path, np.stack(columns, 1), delimiter=",", header=names, comments="", fmt="%.7g")
+    (folder / "bench.toml").write_text(CONFIG)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def identified(bench):
+    result = invoke(
+        "identify", bench / "bench.toml", "--data", bench / "two", "--out", bench / "out", "--quiet"
+    )
+    assert result.exit_code == 0, result.output
+    return bench / "out"
+
+
+def test_a_file_without_options(bench):
+    result = invoke("motor", bench / "one.csv", "--out", bench / "single", "--quiet")
+    assert result.exit_code == 0, result.output
+    assert "voltage: U [V]" in result.output
+    found = json.loads((bench / "single" / "motor.json").read_text())
+    assert found["schema"] == "slipid.identified/1"
+    assert found["parameters"]["motor.resistance"]["value"] == pytest.approx(5.5, rel=0.02)
+    assert (bench / "single" / "bench.png").stat().st_size > 10_000
+
+
+def test_json_on_stdout(bench):
+    result = invoke("motor", bench / "one.csv", "--json", "-", "--quiet")
+    assert json.loads(result.stdout)["drive"] == "motor"
+
+
+def test_units_and_delimiter(bench, tmp_path):
+    made_one = made.logged(made.driven(made.FLYWHEEL), 200, 1)
+    table = [
+        1e3 * made_one.time,
+        made_one.voltage,
+        1e3 * made_one.current,
+        made_one.speed * 30 / np.pi,
+    ]
+    path = tmp_path / "log.csv"
+    np.savetxt(path, np.stack(table, 1), delimiter=";", header="t_ms;volts;x;y", comments="")
+    result = invoke(
+        "motor", path, "--current", "x:mA", "--speed", "y:rpm", "--json", "-", "--quiet"
+    )
+    assert result.exit_code == 0, result.output
+    r = json.loads(result.stdout)["parameters"]["motor.resistance"]
+    assert r["value"] == pytest.approx(5.5, rel=0.02)
+
+
+def test_a_missing_column_lists_what_there_is(bench):
+    result = invoke("motor", bench / "one.csv", "--current", "J")
+    assert result.exit_code == 2
+    assert "no column 'J'" in result.output
+    assert "t, U, I, w" in result.output
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda r: replace(r, voltage=np.where(r.time > 3, np.nan, r.voltage)), "missing values"),
+        (lambda r: replace(r, time=r.time + 50.0 * (r.time > 3)), "clock jumps"),
+        (lambda r: replace(r, current=-r.current), "wrong sign"),
+    ],
+)
+def test_broken_logs_are_refused(tmp_path, spoil, said):
+    record = made.logged(made.driven(made.FLYWHEEL), 100, 1)
+    result = invoke("motor", made.write(spoil(record), tmp_path / "log.csv"), "--quiet")
+    assert result.exit_code == 2
+    assert said in result.output
+
+
+def test_an_angle_or_a_duty_will_do(tmp_path):
+    rows = made.driven(made.FLYWHEEL)
+    record = made.logged(rows, 1000, 1)
+    angle = np.cumsum(rows[:, 3]) * 1e-4
+    at = np.interp(record.time, rows[:, 0], angle)
+    path, bus = tmp_path / "log.csv", np.full(len(at), 24.0)
+    table = [record.time, record.voltage / 24.0 * 100, bus, record.current, at]
+    np.savetxt(path, np.stack(table, 1), delimiter=",", header="t,duty_%,bus,I,angle", comments="")
+    result = invoke("motor", path, "--json", "-", "--quiet")
+    found = json.loads(result.stdout)["parameters"]
+    assert found["motor.resistance"]["value"] == pytest.approx(5.5, rel=0.03)
+    assert found["motor.back_emf"]["value"] == pytest.approx(0.0514, rel=0.01)
+
+
+def test_guesses(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(
+        "time [ms];motor_current_mA;speed_set;speed (rpm);Vbat;voltage\n" + "1;2;3;4;5;6\n" * 9
+    )
+    layout = layout_of(path, {}, header_of(path, None), signed=True)
+    found = {k: (c.columns[0], c.unit) for k, c in layout.channels.items()}
+    assert found == {
+        "time": ("time [ms]", "ms"),
+        "current": ("motor_current_mA", "mA"),
+        "motor_speed": ("speed (rpm)", "rpm"),
+        "voltage": ("voltage", "V"),
+    }
+    assert named("a,b:mA", "current").columns == ("a", "b")
+    assert named("/motor:current", "current").unit is None
+
+
+def test_two_motors_of_a_config(identified):
+    found = json.loads((identified / "identified.json").read_text())
+    for label in ("left", "right"):
+        r = found["parameters"][f"motor.resistance@{label}"]
+        assert r["verdict"] == "identified"
+        assert r["value"] == pytest.approx(5.5, rel=0.03)
+    assert found["parameters"]["motor.brush_drop@left"]["verdict"] == "fixed"
+    assert (identified / "bench_left.png").is_file()
+
+
+def test_check_says_what_there_is(bench):
+    result = invoke("check", bench / "bench.toml", "--data", bench / "two", "--quiet")
+    assert result.exit_code == 0
+    assert "both.csv" in result.output
+    assert "motor.resistance@right" in result.output
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("validate", "OUT", "--data", "."),
+        *((name, "OUT") for name in ("tune", "trial", "sample", "design")),
+        ("export", "OUT", "--out", "x"),
+        ("compare", "CONFIG", "--data", ".", "--out", "x"),
+        ("selftest", "CONFIG"),
+    ],
+)
+def test_what_needs_wheels_says_so(identified, bench, words):
+    where = {"OUT": identified, "CONFIG": bench / "bench.toml"}
+    result = invoke(*(where.get(word, word) for word in words))
+    assert result.exit_code == 2
+    assert f"`slipid {words[0]}` does not apply" in result.output
+
+
+def test_a_bench_gives_a_robot_its_priors(identified):
+    key = 'motor = "out/identified.json"'
+    config = parsed(identified.parent / "robot.toml", ROBOT.format(motor=key))
+    choices, lines = bench_priors(config, 16.0)
+    priors = {c.pattern: c for c in choices}
+    assert priors["motor.back_emf"].prior_mean == pytest.approx(0.0514, rel=0.01)
+    assert priors["motor.coulomb_friction"].prior_mean == pytest.approx(16 * 0.004, rel=0.1)
+    assert priors["motor.viscous_friction"].prior_mean == pytest.approx(256 * 2e-5, rel=0.2)
+    assert "motor.rotor_inertia" not in priors
+    assert any("motor from" in line for line in lines)
+
+
+def test_a_bench_that_is_none_is_refused(tmp_path):
+    config = parsed(tmp_path / "robot.toml", ROBOT.format(motor='motor = "b.json"'))
+    with pytest.raises(DataError, match=r"b.json: No such file"):
+        bench_priors(config, 16.0)
+    (tmp_path / "b.json").write_text('{"schema": "slipid.identified/1", "parameters": {}}')
+    with pytest.raises(DataError, match="a robot's numbers"):
+        bench_priors(config, 16.0)
+
+
+def test_real_logs_without_voltage(real_data):
+    path = real_data / "robotino2021" / "motor_identification.csv"
+    speeds = ",".join(f"motor{k}_output" for k in (1, 2, 3))
+    result = invoke("motor", path, "--speed", speeds, "--unsigned", "--json", "-", "--quiet")
+    found = json.loads(result.stdout)
+    assert result.exit_code in (0, 1)
+    for label in "123":
+        assert found["parameters"][f"motor.resistance@{label}"]["verdict"] == "not_identified"
+        assert found["parameters"][f"motor.back_emf@{label}"]["verdict"] == "not_identified"
+    assert any("log the motor voltage" in text for text in found["messages"])

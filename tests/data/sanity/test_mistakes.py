@@ -1,0 +1,87 @@
+"""Every mistake that was made on purpose is named, with what to do, on three kinds of drive."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+
+from slipid.data.sanity.sanity import findings
+from tests.helpers.mistakes import MISTAKES
+from tests.helpers.plain_robot import DRIVES, Drive, as_runs, drive
+
+MASS_KG = 12.0
+ONLY_POSES = ("speed", "command", "twist", "current", "voltage", "gyro")
+
+
+@cache
+def driven(robot: Drive, seed: int = 0):
+    return drive(robot, seed=seed)
+
+
+def alarms(runs, geometry):
+    return [f for f in findings(runs, geometry, MASS_KG) if f.severity != "note"]
+
+
+FEW = [(m, DRIVES[k % 3]) for k, m in enumerate(MISTAKES[::5])]
+
+
+@pytest.mark.parametrize(("mistake", "robot"), FEW, ids=lambda x: x.name)
+def test_a_few_are_named(mistake, robot):
+    test_it_is_named(robot, mistake)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", DRIVES, ids=lambda d: d.name)
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda m: m.name)
+def test_it_is_named(robot, mistake):
+    found = alarms(*mistake.made(driven(robot), robot))
+    assert {f.kind for f in found} == set(mistake.kinds)
+    assert all(f.severity == "wrong" for f in found)
+    assert any(mistake.says in (f.remedy or "") for f in found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", DRIVES, ids=lambda d: d.name)
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("less", [(), ONLY_POSES, ("speed", "command"), ("twist", "gyro")])
+def test_sound_runs_raise_no_alarm(robot, seed, less):
+    runs = as_runs([raw.less(*less) for raw in driven(robot, seed)])
+    assert alarms(runs, robot.geometry) == []
+
+
+NAMED_BY_POSES = (
+    *("sign of the first wheel", "sign of all wheels", "sign of the heading", "mirrored frame"),
+    *("wheels 1 and 2 exchanged", "pose in mm as m", "pose in m as mm", "yaw in deg as rad"),
+    *("encoder at the wheel", "half the wheel radius", "time in ms as s", "pose constant"),
+    *("pose 2.5 s late", "poses of another run in all", "x and y swapped", "gear forgotten"),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", DRIVES, ids=lambda d: d.name)
+@pytest.mark.parametrize("name", NAMED_BY_POSES)
+def test_encoders_and_poses_alone_name_it(robot, name):
+    (mistake,) = (m for m in MISTAKES if m.name == name)
+    runs, geometry = mistake.made([raw.less(*ONLY_POSES) for raw in driven(robot)], robot)
+    found = alarms(runs, geometry)
+    assert found
+    assert found[0].severity == "wrong"
+    said = " ".join(str(f) for f in found)
+    assert {f.kind for f in found} & set(mistake.kinds) or mistake.says in said
+
+
+def test_what_is_not_driven_is_a_note():
+    (omni, *_) = DRIVES
+    raws = [raw.less(*ONLY_POSES) for raw in driven(omni)]
+    said = [f for f in findings(as_runs(raws), omni.geometry) if f.severity == "note"]
+    assert any("no command is logged" in f.found for f in said)
+
+
+def test_two_mistakes_are_both_named():
+    (omni, *_) = DRIVES
+    by_name = {m.name: m for m in MISTAKES}
+    raws = by_name["sign of the heading"].runs(
+        by_name["sign of the third wheel"].runs(driven(omni))
+    )
+    assert {f.kind for f in alarms(as_runs(raws), omni.geometry)} == {"wheel_sign", "heading_sign"}

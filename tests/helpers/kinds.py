@@ -1,0 +1,82 @@
+"""Robots of every kind of drive with known numbers, and what their logs are fitted to."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slipid.data.runs import Runs, collect
+from slipid.identify.design.planned_runs import Drive
+from slipid.model.geometry import Geometry, differential, mecanum, omni, skid_steer
+from slipid.model.robot import Robot, build
+from slipid.parameter import entries
+from slipid.search_space import Choice, Space
+from slipid.selftest.known import Sensors, grid, turning_grid
+from slipid.selftest.logs import make_logs
+
+SHAPES = {
+    "omni 4": omni([45, 135, 225, 315], 0.2, 0.05, 16.0),
+    "mecanum": mecanum(0.2, 0.15, 0.05, 16.0),
+    "skid": skid_steer(0.2, 0.25, 0.1, 16.0, drive_of=(0, 1, 0, 1)),
+    "differential": differential(0.2, 0.1, 16.0),
+}
+FLOORS = {"firm": 0.08, "soft": 0.3}
+"""Creep of the floors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """Runs that were made, the robot that made them, and what is fitted."""
+
+    truth: Robot
+    data: Runs
+    choices: tuple[Choice, ...]
+
+
+def experiment(kind: str, seed: int = 0, headings: int = 12) -> Experiment:
+    """Runs of a robot of some kind on two floors, with currents and voltages."""
+    shape = SHAPES[kind]
+    drives = plan(shape, headings)
+    robot = build(shape, list(FLOORS), ("as_built",), sorted({d.session for d in drives}))
+    choices = [Choice(path, fixed=value) for path, value in numbers(robot).items()]
+    truth = Space(robot, choices).template
+    logs = make_logs(truth, drives, seed, Sensors(has_voltage=True))
+    return Experiment(truth, collect(logs), wanted(truth))
+
+
+def plan(shape: Geometry, headings: int) -> tuple[Drive, ...]:
+    setups = [(floor, "as_built") for floor in FLOORS]
+    if shape.determines_twist:
+        return grid(setups, headings, (0.15, 0.3), turns=4)
+    return turning_grid(setups, headings, (0.15, 0.3), float(shape.base_radius))
+
+
+def numbers(robot: Robot) -> dict[str, float | list[float]]:
+    """The true numbers, where they are not the declared starts."""
+    wheels = robot.geometry.wheels
+    share = np.linspace(0.9, 1.1, wheels) if wheels > 2 else np.array([1.0, 1.0])
+    out: dict[str, float | list[float]] = {
+        "robot.mass": 20.0,
+        "robot.load_share@as_built": (share / share.sum()).tolist(),
+        "motor.resistance": 2.0,
+        "motor.back_emf": 0.05,
+        "motor.coulomb_friction": 0.05,
+        "camera.lag": 0.05,
+    }
+    for floor, creep in FLOORS.items():
+        out[f"surface.{floor}.creep"] = creep
+        out[f"surface.{floor}.friction"] = 0.6
+    return {path: value for path, value in out.items() if path in {e.path for e in entries(robot)}}
+
+
+def wanted(truth: Robot) -> tuple[Choice, ...]:
+    """What is free, and priors that a user could have; they do not know the truth."""
+    held = (
+        [] if not all(truth.geometry.grips) else ["roller_drag", "roller_creep", "roller_viscosity"]
+    )
+    return (
+        *(Choice(f"surface.*.{name}", free=False) for name in held),
+        Choice("robot.mass", fixed=20.0),
+        Choice("camera.lag", prior_mean=0.0, prior_std=0.1),
+        Choice("motor.resistance", start=3.0, prior_mean=2.5, prior_std=1.5),
+        Choice("motor.back_emf", start=0.03, prior_mean=0.04, prior_std=0.02),
+    )

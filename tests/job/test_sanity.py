@@ -1,0 +1,94 @@
+"""Logs and config that do not go together are named, and not fitted unless that is wanted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from slipid.data.write import own_columns, own_csv
+from slipid.job.config import read_config
+from slipid.job.identify import identify
+from slipid.job.problem import read_job
+from slipid.job.sanity import sanity
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
+from tests.helpers.plain_robot import BASE, GEAR, OMNI, RADIUS, TICKS, as_runs, drive
+from tests.helpers.shared import invoke
+
+ROBOT = f"""[robot]
+drive = "omni"
+wheel_azimuths_deg = [60, 180, 300]
+base_radius_m = {BASE}
+wheel_radius_m = {RADIUS}
+gear_ratio = {GEAR}
+mass_kg = 12.0
+"""
+
+
+def config(folder: Path, robot: str = ROBOT, gear: float = GEAR) -> Path:
+    """A folder with logs, and a config that reads them."""
+    runs = as_runs([raw.less("speed", "command") for raw in drive(OMNI)])
+    for log in runs.logs:
+        path = folder / "logs" / log.name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(own_csv(log, GEAR, int(TICKS)), encoding="utf-8")
+    columns = own_columns(3, ["voltage", "gyro"])
+    text = robot + '[[logs]]\nglob = "*.csv"\nformat = "mine"\nsurface = "floor"\n'
+    text += f"[layouts.mine]\nticks_per_revolution = {TICKS}\ngear_ratio = {gear}\n"
+    for name, of in columns.items():
+        keys = "\n".join(
+            f"{key} = {value}" if isinstance(value, list) else f'{key} = "{value}"'
+            for key, value in of.items()
+        )
+        text += f"[layouts.mine.columns.{name}]\n{keys}\n"
+    file = folder / "my.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def kinds(file: Path) -> list[str]:
+    job = read_job(read_config(file), file.parent / "logs", Reporter(quiet=True))
+    return [f.kind for f in sanity(job) if f.severity == "wrong"]
+
+
+def test_a_sound_config_is_not_held_back(tmp_path):
+    assert kinds(config(tmp_path)) == []
+
+
+@pytest.mark.parametrize(
+    ("said", "instead", "kind"),
+    [
+        ("mass_kg = 12.0\n", "", "forgotten"),
+        (f"gear_ratio = {GEAR}\n", "", "forgotten"),
+        (f"gear_ratio = {GEAR}\n", "gear_ratio = 20\n", "two_gear_ratios"),
+        ("[60, 180, 300]", "[180, 60, 300]", "wheel_order"),
+        (f"base_radius_m = {BASE}", f"base_radius_m = {10 * BASE}", "base_radius"),
+    ],
+)
+def test_what_is_wrong_in_the_config_is_named(tmp_path, said, instead, kind):
+    assert kinds(config(tmp_path, ROBOT.replace(said, instead))) == [kind]
+
+
+def test_a_gear_that_is_wrong_in_both_places_is_named(tmp_path):
+    robot = ROBOT.replace(f"gear_ratio = {GEAR}", "gear_ratio = 1")
+    assert kinds(config(tmp_path, robot, gear=1.0)) == ["wheel_scale"]
+
+
+def test_identify_refuses_and_says_how_to_go_on(tmp_path):
+    file = config(tmp_path, ROBOT.replace("mass_kg = 12.0\n", ""))
+    with pytest.raises(DataError, match=r"(?s)1\. mass_kg \(.*into \[robot\].*--anyway"):
+        identify(file, tmp_path / "logs", tmp_path / "out", Reporter(quiet=True))
+    assert not (tmp_path / "out").exists()
+    words = ("--data", tmp_path / "logs", "--out", tmp_path / "out", "--quiet")
+    assert invoke("identify", file, *words).exit_code == 2
+
+
+@pytest.mark.slow
+def test_check_says_it_first_and_ends_with_one(tmp_path):
+    file = config(tmp_path, ROBOT.replace("[60, 180, 300]", "[180, 60, 300]"))
+    words = ("--data", tmp_path / "logs", "--out", tmp_path / "out", "--quiet")
+    result = invoke("check", file, *words)
+    assert result.exit_code == 1
+    assert result.stdout.startswith("wrong: the wheels' columns are in another order")
+    assert '"kind": "wheel_order"' in (tmp_path / "out" / "check.json").read_text()
