@@ -31,8 +31,8 @@ class Wheeled(Section):
         drives: which wheels, counted from 1, share a motor with its encoder and ammeter, in the
             order of the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together.
             Without it each wheel has its own.
-        motor: file that `slipid identify` or `slipid motor` wrote of its motor on a bench, relative to
-            the config.
+        motor: file that `slipid identify` or `slipid motor` wrote of its motor on a bench,
+            relative to the config.
     """
 
     wheel_radius_m: Positive

@@ -14,6 +14,7 @@ from slipid.job.new.answers import Told
 from slipid.job.new.look.propose import propose
 from slipid.job.new.template import new_config
 from tests.helpers.made_bags import (
+    ROBOTINO,
     Said,
     in_order,
     joint_states,
@@ -89,6 +90,20 @@ def test_effort_odometry_and_other_joints_are_asked_for(tmp_path):
     assert "Odometry of wheels is of no use" in said
     assert "joints that are taken for no wheels: arm" in said
     assert "current" not in tomllib.loads(config.text)["layouts"]["mine"]["topics"]
+
+
+def test_motor_readings_have_ticks_and_currents(tmp_path):
+    fields = {"velocities": [1, 2, 3], "positions": [4, 5, 6], "currents": [0.1, 0.2, 0.3]}
+    kind = "robotino_msgs/msg/MotorReadings"
+    said = [Said("/motors", kind, {"stamp": float(t), **fields}, float(t)) for t in TIME]
+    write_bag(tmp_path / "run1", "mcap", said, ROBOTINO)
+    config = proposed(tmp_path)
+    there = tomllib.loads(config.text)
+    assert there["robot"]["drive"] == "omni"
+    assert set(there["layouts"]["mine"]["topics"]) == {"wheel_ticks", "motor_speed", "current"}
+    said = "\n".join(config.questions)
+    assert "ticks_per_revolution: how many, of the motor shaft" in said
+    assert "no topic with a pose was found" in said
 
 
 def test_frames_of_transforms_are_asked_for(tmp_path):

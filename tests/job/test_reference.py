@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import BaseModel, Field
 
+from slipid.data.reading.bag.layout import RunRule, TopicChannel
 from slipid.data.reading.layout import CHANNELS, Channel, Layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.units import KNOWN
@@ -37,7 +38,16 @@ MODELS = (
         c.Prior,
         c.Setting,
     ),
-    *(c.Weights, c.FitSection, c.ValidateSection, c.SelftestSection, Layout, Channel),
+    *(
+        c.Weights,
+        c.FitSection,
+        c.ValidateSection,
+        c.SelftestSection,
+        Layout,
+        Channel,
+        TopicChannel,
+        RunRule,
+    ),
 )
 
 

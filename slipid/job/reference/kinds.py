@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -14,6 +15,7 @@ from slipid.job.reference.meanings import keys, meaning
 
 _PLAIN = {
     str: "text",
+    Path: "text",
     bool: "true or false",
     int: "whole number",
     float: "number",
@@ -136,7 +138,7 @@ def _default(kind: type, name: str) -> str:
 
 def _said(value: object) -> str:
     """A value as a config has it."""
-    if value is None or value == {} or value == [] or isinstance(value, BaseModel):
+    if value is None or value in ({}, [], ()) or isinstance(value, BaseModel):
         return "none"
     if isinstance(value, bool):
         return "true" if value else "false"

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
+from slipid.data.reading.bag.layout import BagLayout, RunRule, TopicChannel
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, SEVERAL, Channel, Layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.units import KNOWN
@@ -107,13 +108,33 @@ line for each channel, `CHANNEL = { column = "name", unit = "deg" }`, or `false`
 preset away. `[layouts.NAME.beside."FILE"]` is a layout for a file beside a run's own."""
 
 
+_BAGS = """\
+### Bags
+
+`kind = "bag"` makes a layout one of ROS bags (rosbag1, rosbag2, MCAP). `[layouts.NAME.topics]` has
+a line for each channel, `CHANNEL = { topic = "/name" }`, where `pose` and `twist_command` stand for
+the three numbers that a message holds together. Keys about encoders, currents and jumps are as
+above."""
+
+
+def _bags() -> list[str]:
+    alike = tuple(key.name for key in keys_of(Layout))
+    return [
+        _BAGS,
+        _table_of_keys(keys_of(BagLayout, hidden=(*alike, "topics"))),
+        "#### A channel of `topics`",
+        purpose(TopicChannel),
+        _table_of_keys(keys_of(TopicChannel)),
+        "#### `runs`",
+        purpose(RunRule),
+        _table_of_keys(keys_of(RunRule)),
+    ]
+
+
 def _layouts(_: object) -> str:
     keys = keys_of(Layout, hidden=("name", "channels"))
-    channel = "### A channel of `columns`"
-    said = purpose(Channel)
-    return "\n\n".join(
-        [_LAYOUT, _table_of_keys(keys), channel, said, _table_of_keys(keys_of(Channel))]
-    )
+    parts = [_LAYOUT, _table_of_keys(keys), "### A channel of `columns`", purpose(Channel)]
+    return "\n\n".join([*parts, _table_of_keys(keys_of(Channel)), *_bags()])
 
 
 def _channels(_: object) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath
 
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.topics import Topic, topics_of
-from slipid.data.reading.layout import PER_WHEEL
+from slipid.data.reading.layout import PER_WHEEL, Layout
 from slipid.job.new.answers import Answers, Told
 from slipid.job.new.lines import Line, toml
 from slipid.job.new.look.columns.found import rank
@@ -14,7 +14,7 @@ from slipid.job.new.look.columns.names import named
 from slipid.job.new.look.files.kinds import common_glob
 from slipid.job.new.look.robot import robot_from
 from slipid.job.new.sketch import BagSketch, LogsSketch, Sketch
-from slipid.job.reference.meanings import in_short
+from slipid.job.reference.meanings import in_short, meanings
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 _METADATA = "metadata.yaml"
@@ -178,7 +178,8 @@ def _settings(
     """Keys of the layout but for its topics."""
 
     def line(key: str, value: object, question: str = "") -> Line:
-        return Line(key, toml(value), in_short(BagLayout, key), question)
+        kind = BagLayout if key in meanings(BagLayout) else Layout
+        return Line(key, toml(value), in_short(kind, key), question)
 
     lines = [Line("kind", toml("bag"))]
     have = {one.channel for one in served}

@@ -42,7 +42,7 @@ def propose(path: Path, told: Told) -> Proposal:
         raise DataError(f"{path}: no such file or folder; expected a log, or a folder of logs")
     if bags := bags_in(path):
         proposed = propose_bags(bags, path, told)
-        return Proposal(proposed.sketch, proposed.said)
+        return Proposal(_bags_tried(proposed.sketch, bags[0]), proposed.said)
     found = sorted_logs(path)
     wheels = max((group.main.columns.wheels for group in found.groups), default=0)
     for _, name in found.presets:
@@ -130,20 +130,28 @@ def _tried(sketch: Sketch, found: Sorted, wheels: int) -> Sketch:
         asked = list(layout.file.questions)
         if wheels and drives != wheels:
             asked.append(f"[robot] has {drives} drives, but {wheels} have columns here: which?")
-        if problem := _refused(sketch, layout.name, group):
+        if problem := _refused(sketch, layout.name, group.kind.paths[0]):
             asked.append(f"the reader says: {problem}")
         layouts.append(replace(layout, file=replace(layout.file, questions=tuple(asked))))
     return replace(sketch, layouts=tuple(layouts))
 
 
-def _refused(sketch: Sketch, name: str, group: Group) -> str:
+def _bags_tried(sketch: Sketch, first: Path) -> Sketch:
+    """The sketch with what the reader says of the first bag, if it refuses it."""
+    (bag,) = sketch.bags
+    if problem := _refused(sketch, bag.name, first):
+        asked = (*bag.questions, f"the reader says: {problem}")
+        return replace(sketch, bags=(replace(bag, questions=asked),))
+    return sketch
+
+
+def _refused(sketch: Sketch, name: str, path: Path) -> str:
     """Why the first file of a layout cannot be read; nothing where it can."""
     try:
         config = parsed(Path("robot.toml"), new_config(sketch, "robot.toml").text)
         section = next((one for one in config.content.logs if one.format == name), None)
         if section is None:
             return ""
-        path = group.kind.paths[0]
         read_logs(path, layout_of(config, section), path.parent, FLOOR, "as_built")
     except DataError as error:
         return str(error).splitlines()[0].replace("robot.toml ", "")
