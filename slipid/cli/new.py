@@ -8,7 +8,7 @@ import typer
 from slipid.cli.common import guarded
 
 if TYPE_CHECKING:
-    from slipid.job.new.template import NewConfig
+    from slipid.job.new.written import NewConfig
 
 _WHEELS = "For omni and general wheels"
 _BOX = "For mecanum and skid"
@@ -66,7 +66,7 @@ def new(
     from slipid.job.new.blank import blank
     from slipid.job.new.look.propose import propose
     from slipid.job.new.questions import ask
-    from slipid.job.new.template import absent, new_config
+    from slipid.job.new.written import absent, new_config
 
     absent(out, force)
     told = Told(

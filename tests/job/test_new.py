@@ -16,7 +16,7 @@ from slipid.job.new.blank import blank
 from slipid.job.new.drawing import drawing
 from slipid.job.new.lines import ASKS, Line
 from slipid.job.new.questions import DRIVES, ask
-from slipid.job.new.template import new_config
+from slipid.job.new.written import new_config
 from slipid.model import geometry as g
 from slipid.support.errors import DataError
 

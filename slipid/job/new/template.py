@@ -1,12 +1,7 @@
 """The text of a new config: only what this drive and these logs have, every key explained."""
 
-from dataclasses import dataclass
-from pathlib import Path
-
-from slipid.job.config import FitSection, Logs, Wheels, geometry, parsed
-from slipid.job.new.drawing import drawing
-from slipid.job.new.lines import Block, Line, all_asked, toml
-from slipid.job.new.questions import robot_of
+from slipid.job.config import FitSection, Logs, Wheels, geometry
+from slipid.job.new.lines import Block, Line, toml
 from slipid.job.new.sketch import (
     BagSketch,
     BesideSketch,
@@ -16,8 +11,6 @@ from slipid.job.new.sketch import (
     Sketch,
 )
 from slipid.job.reference.meanings import in_short
-from slipid.support.errors import DataError
-from slipid.support.files import write_bytes
 
 _ORDER = {
     "omni": "each wheel drives 90 deg further than it stands",
@@ -51,40 +44,15 @@ _PUT = {
 FRAME = "x ahead, y left, angles counter-clockwise from ahead; wheels in the order of the columns"
 
 
-@dataclass(frozen=True)
-class NewConfig:
-    """A config that reads: its text, the robot in it, its drawing and what is still open."""
-
-    text: str
-    robot: Wheels
-    drawing: str
-    questions: tuple[str, ...]
-
-    def write(self, out: Path, force: bool = False) -> None:
-        """Write it; DataError where the file exists and shall not be replaced."""
-        absent(out, force)
-        write_bytes(out, self.text.encode())
-
-
-def absent(out: Path, force: bool) -> None:
-    """DataError where a file exists and shall not be replaced; said before anything is asked."""
-    if out.exists() and not force:
-        raise DataError(f"{out}: exists already; expected a new file, or --force")
-
-
-def new_config(sketch: Sketch, name: str) -> NewConfig:
-    """The config of a sketch, checked as if it had been read.
+def blocks_of(sketch: Sketch, robot: Wheels, picture: str, name: str) -> list[Block]:
+    """Every part of a config.
 
     Args:
         sketch: what it shall say.
+        robot: made of its answers; picture: of that robot.
         name: what the file will be called.
-
-    Raises:
-        DataError: the answers make no robot.
     """
-    robot = robot_of(sketch.robot)
-    picture = drawing(geometry(robot))
-    blocks = [
+    return [
         Block("", above=_head(sketch, name)),
         _robot_block(sketch, robot, picture),
         *(block for layout in sketch.layouts for block in _layout_blocks(layout)),
@@ -94,9 +62,6 @@ def new_config(sketch: Sketch, name: str) -> NewConfig:
         _weights_block(geometry(robot).wheels),
         _parameters_block(sketch.channels),
     ]
-    text = "\n\n".join(block.text() for block in blocks) + "\n"
-    parsed(Path(name), text)
-    return NewConfig(text, robot, picture, all_asked(blocks))
 
 
 def _head(sketch: Sketch, name: str) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from slipid.job.new.look.signals.known import Known
 from slipid.job.new.look.sketches import file_sketch, radius_hint
 from slipid.job.new.questions import robot_of
 from slipid.job.new.sketch import BesideSketch, LayoutSketch, LogsSketch, Sketch
-from slipid.job.new.template import new_config
+from slipid.job.new.written import new_config
 from slipid.support.errors import DataError
 
 FLOOR = "floor"

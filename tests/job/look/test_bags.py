@@ -12,7 +12,7 @@ from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.bag.reader import read_bag
 from slipid.job.new.answers import Told
 from slipid.job.new.look.propose import propose
-from slipid.job.new.template import new_config
+from slipid.job.new.written import new_config
 from tests.helpers.made_bags import (
     ROBOTINO,
     Said,
