@@ -15,6 +15,7 @@ from slipid.cli.identify import identify
 from slipid.cli.motor import motor
 from slipid.cli.new import new
 from slipid.cli.paper import paper
+from slipid.cli.reference import reference
 from slipid.cli.sample import sample
 from slipid.cli.selftest import selftest
 from slipid.cli.simulate import simulate
@@ -30,7 +31,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    *(new, motor, check, selftest, identify, sample, validate, compare),
+    *(new, reference, motor, check, selftest, identify, sample, validate, compare),
     *(design, tune, trial, export, simulate, paper, demo),
 ):
     app.command()(command)

@@ -1,11 +1,22 @@
 """`slipid new`: a config for a robot that nobody has described yet."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from slipid.cli.common import guarded
+
+if TYPE_CHECKING:
+    from slipid.job.new.written import NewConfig
+
+_WHEELS = "For omni and general wheels"
+_BOX = "For mecanum and skid"
+Text = str | None
+
+
+def _text(words: str, panel: str | None = None) -> object:
+    return typer.Option(help=words, rich_help_panel=panel, show_default=False)
 
 
 @guarded
@@ -13,25 +24,107 @@ def new(
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Config to write.")] = Path(
         "robot.toml"
     ),
-    drive: Annotated[str, typer.Option(help="omni, mecanum or skid.")] = "omni",
-    wheel_radius_m: Annotated[float, typer.Option(prompt="wheel radius [m]")] = 0.05,
-    base_m: Annotated[
-        float, typer.Option(prompt="wheel centres from the middle [m] (omni: radius)")
-    ] = 0.15,
-    gear_ratio: Annotated[float, typer.Option(prompt="motor turns per wheel turn")] = 1.0,
-    mass_kg: Annotated[float, typer.Option(prompt="mass [kg]")] = 10.0,
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="LOG",
+            help="A log (CSV, Parquet, bag) or a folder of logs to look into; asks nothing.",
+        ),
+    ] = None,
+    drive: Annotated[Text, _text("omni, mecanum, skid, differential or general.")] = None,
+    wheel_radius_m: Annotated[Text, _text("Wheel radius.")] = None,
+    gear_ratio: Annotated[Text, _text("Motor turns per wheel turn.")] = None,
+    mass_kg: Annotated[Text, _text("Mass of the robot.")] = None,
     ticks_per_revolution: Annotated[
-        float, typer.Option(prompt="encoder ticks per motor turn")
-    ] = 1000.0,
+        Text, _text("Encoder ticks per motor turn; 0 where none are logged.")
+    ] = None,
+    wheelbase_m: Annotated[Text, _text("Front to rear axle.", _BOX)] = None,
+    track_m: Annotated[
+        Text, _text("Between left and right wheels; also of a differential drive.", _BOX)
+    ] = None,
+    shared: Annotated[
+        Text, _text("yes where one motor turns both wheels of a side, else no.", _BOX)
+    ] = None,
+    wheels: Annotated[Text, _text("Number of omni wheels.", _WHEELS)] = None,
+    azimuths_deg: Annotated[Text, _text("Where omni wheels stand, as 60,180,300.", _WHEELS)] = None,
+    base_radius_m: Annotated[Text, _text("Omni wheels' centres from the middle.", _WHEELS)] = None,
+    places_m: Annotated[
+        Text, _text("General: x,y of the wheels, as '0.2,0.1; 0.2,-0.1'.", _WHEELS)
+    ] = None,
+    directions_deg: Annotated[
+        Text, _text("General: ways that the wheels roll, as 0,0.", _WHEELS)
+    ] = None,
+    rollers_deg: Annotated[Text, _text("General: rollers to these, as 45,none.", _WHEELS)] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Ask nothing: take defaults, marked in the config.")
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False,
 ) -> int:
-    """Write a commented config for your robot; asks what it needs to know."""
-    from slipid.job.new import write_new
+    """Write a commented config for your robot: asks for it, or looks into its logs (--from)."""
+    from slipid.job.new.answers import Told
+    from slipid.job.new.blank import blank
+    from slipid.job.new.look.propose import propose
+    from slipid.job.new.questions import ask
+    from slipid.job.new.written import absent, new_config
 
-    robot = drive, wheel_radius_m, base_m, gear_ratio, mass_kg, ticks_per_revolution
-    write_new(out, *robot, force)
-    typer.echo(f"{out}: name your columns below [layouts.mine.columns], then run")
-    typer.echo(f"  slipid check {out} --data DIR")
+    absent(out, force)
+    told = Told(
+        drive=drive,
+        wheels=wheels,
+        azimuths_deg=azimuths_deg,
+        base_radius_m=base_radius_m,
+        wheelbase_m=wheelbase_m,
+        track_m=track_m,
+        shared=shared,
+        places_m=places_m,
+        directions_deg=directions_deg,
+        rollers_deg=rollers_deg,
+        wheel_radius_m=wheel_radius_m,
+        gear_ratio=gear_ratio,
+        mass_kg=mass_kg,
+        ticks_per_revolution=ticks_per_revolution,
+    )
+    data = "DIR"
+    if log is not None:
+        proposal = propose(log, told)
+        for sentence in proposal.said:
+            typer.echo(sentence)
+        config, data = new_config(proposal.sketch, out.name), proposal.sketch.data
+    else:
+        config = new_config(blank(ask(told, None if yes else _asked)), out.name)
+    config.write(out, force)
+    _show(config, out, data)
+    return 0
+
+
+def _asked(asks: str, default: str, wrong: str) -> str:
+    """A person's answer."""
+    from slipid.support.errors import DataError
+
+    if wrong:
+        typer.echo(wrong, err=True)
+    try:
+        return str(typer.prompt(asks, default=default))
+    except typer.Abort:
+        if wrong:
+            raise DataError(f"{asks}: {wrong}") from None
+        raise DataError(
+            f"{asks}: no answer; expected one, an option that says it (slipid new --help), "
+            "or --yes for the defaults"
+        ) from None
+
+
+def _show(config: "NewConfig", out: Path, data: str) -> None:
+    """The robot as it was understood, what is still open, and what comes next."""
+    typer.echo(f"\n{config.drawing}\n")
+    if config.questions:
+        typer.echo(f'{out} has open questions, lines that begin with "# ?":')
+        for question in config.questions:
+            typer.echo(f"  ? {question}")
+        typer.echo("answer them, then run")
+    else:
+        typer.echo(f"{out} is complete; run")
+    typer.echo(f"  slipid check {out} --data {data}")
     typer.echo("or, before anything is driven, see what a plan of runs would tell:")
     typer.echo(f"  slipid selftest {out}")
-    return 0

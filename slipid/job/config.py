@@ -1,6 +1,7 @@
 """The config of a job: what the TOML file may say, checked once, every mistake with its key.
 
-Units stand in the names of the keys; everything is optional that has a default here.
+Units stand in the names of the keys; everything is optional that has a default here. What a key
+means stands in the docstring of its section: `slipid reference` and `slipid new` print it.
 """
 
 import hashlib
@@ -23,10 +24,15 @@ Numbers = Number | list[Number]
 class Wheeled(Section):
     """What every robot has.
 
-    `drives` says which wheels, counted from 1, share a motor with its encoder and ammeter, in the
-    order of the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together. `motor`
-    is the file that `slipid identify` or `slipid motor` wrote of its motor on a bench, relative to
-    the config.
+    Attributes:
+        wheel_radius_m: of the wheels as they roll under the robot's weight.
+        gear_ratio: motor turns per wheel turn.
+        mass_kg: of the robot as it drives; friction scales with it.
+        drives: which wheels, counted from 1, share a motor with its encoder and ammeter, in the
+            order of the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together.
+            Without it each wheel has its own.
+        motor: file that `slipid identify` or `slipid motor` wrote of its motor on a bench,
+            relative to the config.
     """
 
     wheel_radius_m: Positive
@@ -50,7 +56,14 @@ class Wheeled(Section):
 
 
 class Omni(Wheeled):
-    """Wheels on a circle, each driving 90 deg ahead of its azimuth."""
+    """Wheels on a circle, each driving 90 deg ahead of its azimuth.
+
+    Attributes:
+        base_radius_m: from the middle to the wheel centres.
+        wheel_azimuths_deg: where the wheels stand, counter-clockwise from ahead, in the order of
+            the columns of the logs.
+        roller_angle_deg: of the rollers' free direction to the drive direction.
+    """
 
     drive: Literal["omni"]
     base_radius_m: Positive
@@ -59,7 +72,12 @@ class Omni(Wheeled):
 
 
 class Box(Wheeled):
-    """Four wheels, front left, front right, rear left, rear right: mecanum in X, or ordinary."""
+    """Four wheels, front left, front right, rear left, rear right: mecanum in X, or ordinary.
+
+    Attributes:
+        half_length_m: half the wheelbase, from the front axle to the rear one.
+        half_width_m: half the track, between the middles of left and right wheels.
+    """
 
     drive: Literal["mecanum", "skid"]
     half_length_m: Positive
@@ -67,14 +85,26 @@ class Box(Wheeled):
 
 
 class Differential(Wheeled):
-    """Two ordinary wheels on an axle, left and right, and casters."""
+    """Two ordinary wheels on an axle, left and right, and casters.
+
+    Attributes:
+        track_m: between the middles of the wheels.
+    """
 
     drive: Literal["differential"]
     track_m: Positive
 
 
 class General(Wheeled):
-    """Any wheels: centres, drive directions, roller angles ("none": an ordinary wheel)."""
+    """Any wheels: centres, drive directions, roller angles.
+
+    Attributes:
+        wheel_places_m: x (ahead) and y (left) of every wheel's centre, in the order of the columns.
+        drive_directions_deg: where each wheel rolls when its speed is positive, counter-clockwise
+            from ahead.
+        roller_angles_deg: of each wheel's rollers to its drive direction; "none" is an ordinary
+            wheel.
+    """
 
     drive: Literal["general"]
     wheel_places_m: list[Annotated[list[Number], Field(min_length=2, max_length=2)]] = Field(
@@ -93,7 +123,11 @@ class General(Wheeled):
 
 
 class Motor(Section):
-    """No wheels: motors on a bench, logged at their shafts; names where there are several."""
+    """No wheels: motors on a bench, logged at their shafts.
+
+    Attributes:
+        names: of the motors in the order of the columns, where there are several.
+    """
 
     drive: Literal["motor"]
     names: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]] = Field(default_factory=list)
@@ -105,9 +139,17 @@ Wheels = Omni | Box | Differential | General
 class Logs(Section):
     """Log files of one kind, found by a glob below the data folder.
 
-    Runs of a section with a `map` (its file, relative to the config) cross the floors it shows;
-    their poses are in its frame. `session_name` says which runs belong together, of this section
-    and of others with the same name: those of a day, or between two set-ups of the robot.
+    Attributes:
+        glob: which files, below the data folder.
+        format: one of the config's own layouts, or a preset.
+        surface: name of the floor; "folder" takes that of the folder that each file lies in.
+        map: file of a floor map, relative to the config, instead of a surface: runs cross the
+            floors it shows, and their poses are in its frame.
+        load: name of the load set-up; each has its own wheel loads.
+        session: what runs have in common between which the marker stayed as it was.
+        session_name: instead of session: which runs belong together, of this section and of others
+            with the same name, such as those of a day, or between two set-ups of the robot.
+        min_rows: shorter runs are left out.
     """
 
     glob: str
@@ -129,20 +171,37 @@ class Logs(Section):
 
 
 class Camera(Section):
-    """The camera that saw the pose."""
+    """The camera that saw the pose.
+
+    Attributes:
+        image_centre_m: middle of the picture in the frame of the poses, where tilt and distortion
+            are zero.
+    """
 
     image_centre_m: tuple[Number, Number] = (0.0, 0.0)
 
 
 class Prior(Section):
-    """Gaussian prior, in SI around its mean."""
+    """Gaussian prior, in SI around its mean.
+
+    Attributes:
+        mean: its centre, one number for all entries of a vector or one for each.
+        std: its standard deviation, likewise.
+    """
 
     mean: Numbers
     std: Positive | list[Positive]
 
 
 class Setting(Section):
-    """What is wanted of the parameters that match a pattern."""
+    """What is wanted of the parameters that match a pattern.
+
+    Attributes:
+        start: value to begin with [SI]; a number that is not fitted stays so.
+        fixed: value that it keeps [SI].
+        free: whether it is fitted.
+        prior: what is known of it beforehand.
+    """
 
     start: Numbers | None = None
     fixed: Numbers | None = None
@@ -160,8 +219,14 @@ class Weights(Section):
     """What is known of the weight on the wheels in a load set-up.
 
     Either what scales show under each wheel, `kg`; or that it is `like` another set-up, with
-    `mass_kg` more (or less) at `place_m` of the body's frame. `std_kg` is of each scale, or of the
-    weight that the mass adds to each wheel.
+    `mass_kg` more (or less) at `place_m`.
+
+    Attributes:
+        std_kg: standard deviation of each scale, or of the weight that the mass adds to each wheel.
+        kg: what scales show under each wheel, in the order of the wheels.
+        like: name of another load set-up.
+        mass_kg: what was added to that one; negative where it was taken away.
+        place_m: x (ahead) and y (left) of that mass, from the middle.
     """
 
     std_kg: Positive
@@ -183,10 +248,17 @@ class Weights(Section):
 class FitSection(Section):
     """How finely runs are cut, how long to fit, and which lengths are trusted.
 
-    Motion tells the wheel radius over the scale of the poses and no more. `lengths_from` says which
-    of the two is known: "poses" that are in true metres, as those of motion capture, lidar and RTK
-    are, make the wheel radius free; "wheels" that were measured make the scale of the camera free.
-    Without it both are as `[parameters]` says.
+    Motion tells the wheel radius over the scale of the poses and no more.
+
+    Attributes:
+        lengths_from: which of the two is known: "poses" that are in true metres, as those of motion
+            capture, lidar and RTK are, make the wheel radius free; "wheels" that were measured make
+            the scale of the camera free. Without it both are as `[parameters]` says.
+        windows_per_piece: a run is cut into pieces of so many windows.
+        longest_window_s: longer windows become more pieces.
+        rounds: at most.
+        tolerance: done when nothing moves more than this part of its standard deviation.
+        seed: of the draws behind the curves' bands.
     """
 
     lengths_from: Literal["poses", "wheels"] | None = None
@@ -198,13 +270,27 @@ class FitSection(Section):
 
 
 class ValidateSection(Section):
-    """Runs to predict where they differ from those that were fitted."""
+    """Runs to predict where they differ from those that were fitted.
+
+    Attributes:
+        logs: sections as `[[logs]]`, for `slipid validate`.
+    """
 
     logs: list[Logs] = Field(default_factory=list)
 
 
 class SelftestSection(Section):
-    """What `selftest` drives where no logs are given, what it takes for true and asks for."""
+    """What `selftest` drives where no logs are given, what it takes for true and asks for.
+
+    Attributes:
+        surfaces: names of the floors that are made up.
+        headings: directions in which runs are driven, evenly around.
+        speeds_m_s: speeds of the runs.
+        turns: curved runs on each floor with each load set-up.
+        distance_m: of a run.
+        truth: parameters by name, and the value that is true of them in the simulation.
+        wanted: patterns of the parameters that shall be recovered; otherwise all free ones.
+    """
 
     surfaces: list[str] = Field(default=["firm", "soft"], min_length=1)
     headings: int = Field(default=12, ge=1, le=360)
@@ -216,7 +302,19 @@ class SelftestSection(Section):
 
 
 class Content(Section):
-    """The whole file."""
+    """The whole file.
+
+    Attributes:
+        robot: its wheels.
+        layouts: which column of your files holds what, by names of your own.
+        logs: one section for each set of log files.
+        camera: what saw the poses.
+        parameters: what is wanted of them, by patterns of their names.
+        weights: what is known of the wheel loads, by load set-up.
+        fit: how finely runs are cut and how long to fit.
+        selftest: what `slipid selftest` drives where there are no logs.
+        validate: runs to predict instead of those that were fitted.
+    """
 
     robot: Annotated[Wheels | Motor, Field(discriminator="drive")]
     layouts: dict[str, dict[str, object]] = Field(default_factory=dict)

@@ -28,7 +28,9 @@ class Camera(eqx.Module):
     scale: Array = known("1", "s", "true over logged length", start=1.0, lower=0.0, spread=0.02)
     lag: Array = known("s", "t_c", "camera behind the encoders", start=0.0, spread=0.03)
     marker_yaw: Array = known("rad", "psi", "marker heading less body's", start=0.0, spread=0.03)
-    session_yaw: Array = known("rad", "dpsi", "its change", start=0.0, spread=0.01, per="sessions")
+    session_yaw: Array = known(
+        "rad", "dpsi", "its change in a session", start=0.0, spread=0.01, per="sessions"
+    )
     marker_place: Array = plane("m", "p_m", "marker from the body's centre", start=0.0, spread=0.02)
     tilt: Array = plane("1/m", "h", "perspective of a tilted camera", start=0.0, spread=0.03)
     radial: Array = known("1/m^2", "k", "radial distortion", start=0.0, spread=0.02)

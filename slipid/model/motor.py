@@ -31,7 +31,9 @@ class Motor(eqx.Module):
     )
     inductance: Array = held("H", "L_a", "inductance", start=0.005, lower=0.0, spread=1.0)
     brush_drop: Array = held("V", "U_b", "voltage drop of the brushes", start=0.0, spread=0.5)
-    efficiency: Array = held("1", "eta", "gear", start=0.9, lower=0.0, upper=1.001, spread=0.5)
+    efficiency: Array = held(
+        "1", "eta", "efficiency of the gear", start=0.9, lower=0.0, upper=1.001, spread=0.5
+    )
     coulomb_friction: Array = electric(
         "N*m", "tau_c", "friction at the wheel", start=0.02, lower=0.0, spread=1.5
     )
@@ -46,7 +48,9 @@ class Motor(eqx.Module):
         spread=1.0,
     )
     current_offset: Array = held("A", "I_0", "zero of the ammeter", start=0.0, spread=0.05)
-    rotor_inertia: Array = held("kg*m^2", "J_m", "rotor", start=1e-5, lower=0.0, spread=1.0)
+    rotor_inertia: Array = held(
+        "kg*m^2", "J_m", "inertia of the rotor", start=1e-5, lower=0.0, spread=1.0
+    )
     gear_ratio: float = eqx.field(static=True, default=1.0)
 
     def voltage(

@@ -24,7 +24,7 @@ class Body(eqx.Module):
 
     mass: Array = parameter("kg", "m", "mass", start=10.0, lower=0.0, spread=0.1, free=False)
     yaw_inertia: Array = parameter(
-        "kg*m^2", "I_z", "inertia", start=0.2, lower=0.0, spread=0.5, free=False
+        "kg*m^2", "I_z", "inertia about the vertical", start=0.2, lower=0.0, spread=0.5, free=False
     )
     load_share: Array = parameter(
         "1",

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from slipid.cli.demo import packaged_config
-from slipid.job.new import write_new
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
 from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
@@ -48,7 +47,7 @@ def test_help_names_every_command():
     result = invoke("--help")
     assert result.exit_code == 0
     for command in (
-        *("new", "check", "selftest", "identify", "sample", "validate"),
+        *("new", "reference", "check", "selftest", "identify", "sample", "validate"),
         *("compare", "paper", "demo", "simulate", "export"),
     ):
         assert command in result.stdout
@@ -593,36 +592,12 @@ def test_export_says_what_is_missing(tmp_path):
     assert invoke("export", tmp_path, "--check").exit_code == 2
 
 
-def test_new_writes_a_config_that_reads_and_never_overwrites(tmp_path):
-    path = tmp_path / "mine.toml"
-    flags = {"wheel-radius-m": 0.05, "base-m": 0.2, "gear-ratio": 12, "mass-kg": 9}
-    words = [w for k, v in flags.items() for w in (f"--{k}", v)]
-    result = invoke("new", "--out", path, *words, "--ticks-per-revolution", 500)
-    assert result.exit_code == 0, result.stderr
-    from slipid.job.config import read_config
-
-    assert read_config(path).content.robot.base_radius_m == 0.2
-    again = invoke("new", "--out", path, *words, "--ticks-per-revolution", 500)
-    assert again.exit_code == 2
-    assert "exists already" in again.stderr
-    for drive in ("mecanum", "skid"):
-        write_new(tmp_path / f"{drive}.toml", drive, 0.05, 0.2, 12.0, 9.0, 500.0)
-    with pytest.raises(DataError, match="greater than 0"):
-        write_new(tmp_path / "x.toml", "omni", -0.05, 0.2, 12.0, 9.0, 500.0)
-    assert not (tmp_path / "x.toml").exists()
-    before = path.read_bytes()
-    answers = [*words, "--ticks-per-revolution", 500, "--wheel-radius-m", -1]
-    bad = invoke("new", "--out", path, "--force", *answers)
-    assert bad.exit_code == 2
-    assert path.read_bytes() == before
-
-
 @pytest.mark.slow
 def test_a_place_that_cannot_be_written_to_is_said_before_the_work(tmp_path):
     (tmp_path / "file").write_text("")
     path = tmp_path / "file" / "x.toml"
     with pytest.raises(DataError, match=r"x\.toml: cannot be written"):
-        write_new(path, "omni", 0.05, 0.2, 12.0, 9.0, 500.0)
+        write_bytes(path, b"")
     with pytest.raises(DataError, match="cannot be written"):
         writable(tmp_path / "file" / "out")
     writable(tmp_path / "new")

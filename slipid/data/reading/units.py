@@ -38,7 +38,7 @@ _UNITS = (
     "percent = 0.01 * fraction = %",
 )
 _ALIASES = {"%": "percent", "°": "degree", "°/s": "degree/s", "1": "fraction", "": "fraction"}
-_KNOWN = (
+KNOWN = (
     *("s", "ms", "us", "ns", "min", "m", "mm", "cm", "inch", "rad", "deg", "rev", "rad/s", "deg/s"),
     *("rpm", "rev/s", "m/s", "mm/s", "A", "mA", "V", "mV", "tick", "pixel", "percent", "1", "N*m"),
 )
@@ -67,7 +67,7 @@ def factor(unit: str, target: str) -> float:
     try:
         given = registry.parse_units(_ALIASES.get(unit.strip(), unit.strip()))
     except Exception as error:  # pint raises a dozen types, one of them tokenize's
-        known = f"{near(unit, _KNOWN)} (known: {', '.join(_KNOWN)})"
+        known = f"{near(unit, KNOWN)} (known: {', '.join(KNOWN)})"
         raise ValueError(f"unknown unit '{unit}'{known}") from error
     if given.dimensionality != wanted.dimensionality:
         raise ValueError(f"unit '{unit}' cannot be converted to {target}")

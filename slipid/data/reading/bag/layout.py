@@ -74,7 +74,7 @@ class RunRule:
         topic: whose value marks a run: true, or one value as long as it stays.
         field: path of that value.
         between: values between runs.
-        surface: path of the field that names the floor, and `load` of the load set-up.
+        surface, load: path of the field that names the floor, or the load set-up.
         pause_s: runs are cut where no wheel moves for longer [s].
         table: CSV file with columns start and end [s], perhaps surface, load, name and bag, named
             from the folder of the bag.

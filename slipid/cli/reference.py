@@ -1,0 +1,32 @@
+"""`slipid reference`: what a config may say, from the models that check it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from slipid.cli.common import guarded
+
+
+@guarded
+def reference(
+    what: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[WHAT]",
+            help="config, drives, layouts, channels, units, presets or parameters; all by default.",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config", metavar="CONFIG", help="Parameters of this robot and its choices."
+        ),
+    ] = None,
+) -> int:
+    """Every key, channel, unit and parameter, with its default and what it means (Markdown)."""
+    from slipid.job.config import read_config
+    from slipid.job.reference.page import reference
+
+    typer.echo(reference(what, None if config is None else read_config(config)), nl=False)
+    return 0

@@ -1,0 +1,209 @@
+"""A bag looked into: which topics hold what, proposed as a layout."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from slipid.data.reading.bag.layout import BagLayout
+from slipid.data.reading.bag.topics import Topic, topics_of
+from slipid.data.reading.layout import PER_WHEEL, Layout
+from slipid.job.new.answers import Answers, Told
+from slipid.job.new.lines import Line, toml
+from slipid.job.new.look.columns.found import rank
+from slipid.job.new.look.columns.names import named
+from slipid.job.new.look.files.kinds import common_glob
+from slipid.job.new.look.robot import robot_from
+from slipid.job.new.sketch import BagSketch, LogsSketch, Sketch
+from slipid.job.reference.meanings import in_short, meanings
+
+SUFFIXES = (".bag", ".db3", ".mcap")
+_METADATA = "metadata.yaml"
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_TURNS = ("wheel_ticks", "wheel_angle", "wheel_speed", "motor_speed")
+_EFFORT = (
+    "what is the effort: a current (A), a torque (motor_torque or wheel_torque, N*m), a voltage "
+    "(V) or a duty (1)?"
+)
+
+
+@dataclass(frozen=True)
+class BagProposal:
+    """A config for bags, and what was found, in sentences."""
+
+    sketch: Sketch
+    said: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Served:
+    """A channel, or a group of them, that a topic holds; `wheels` where it has one per wheel."""
+
+    channel: str
+    topic: Topic
+    wheels: int = 0
+    question: str = ""
+
+
+def bags_in(path: Path) -> list[Path]:
+    """Files that a config names for bags: of a path itself, or below it.
+
+    That is the metadata.yaml of a rosbag2 folder, whose other files belong to it.
+    """
+    if path.is_file():
+        return [path] if path.suffix in SUFFIXES or path.name == _METADATA else []
+    folders = {p.parent for p in path.rglob(_METADATA)}
+    alone = (p for p in path.rglob("*") if p.suffix in SUFFIXES and p.parent not in folders)
+    return sorted([*(folder / _METADATA for folder in folders), *alone])
+
+
+def propose_bags(bags: Sequence[Path], asked: Path, told: Told) -> BagProposal:
+    """The config that bags are proposed to have, by the first; DataError where it is unreadable.
+
+    Args:
+        bags: as of `bags_in`; asked: what was named.
+        told: what is known of the robot.
+    """
+    bag = bags[0]
+    topics = topics_of(bag)
+    joints, doubt = _joints(topics)
+    served = list(_first_of_each(topics, len(joints)))
+    wheels = next((one.wheels for name in _TURNS for one in served if one.channel == name), 0)
+    guessed = robot_from(told, wheels, ())
+    questions = [doubt] if doubt else []
+    if not any(one.channel == "pose" for one in served):
+        questions.append("no topic with a pose was found: a fit needs one")
+    if not wheels:
+        questions.append("no topic tells how wheels turn: which one does, and in which field?")
+    is_bag = asked.is_file() or bag == asked / _METADATA
+    root = asked.parent if is_bag else asked
+    inside = [PurePosixPath(one.relative_to(root)) for one in bags]
+    inside = [one for one in inside if len(one.parts) == len(inside[0].parts)]
+    layout = BagSketch(
+        "mine",
+        _settings(guessed.robot, joints, served),
+        tuple(_lines(served)),
+        _unused(topics, served),
+        tuple(questions),
+    )
+    floor = "on which floor was it driven? Or a topic or table tells: runs, in the layout"
+    glob = common_glob(inside)
+    sketch = Sketch(
+        guessed.robot,
+        (),
+        (LogsSketch(glob, "mine", "floor", question=floor),),
+        carries=frozenset(one.channel for one in served if one.question != _EFFORT),
+        above=(f"Proposed from {bag}.",),
+        data=str(root),
+        hints=guessed.hints,
+        bags=(layout,),
+    )
+    said = [f"{bag}: {len(topics)} topics"]
+    said += [f"  {one.topic.name} ({one.topic.type}): {one.channel}" for one in served]
+    return BagProposal(sketch, tuple(said))
+
+
+def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
+    """Names of the wheels' joints in the order of the drives, and what is not sure of them."""
+    names = tuple(dict.fromkeys(name for topic in topics for name in topic.joints))
+    labels = {name: named(f"{name}_velocity") for name in names}
+    wheels = [
+        name for name in names if labels[name].channel == "wheel_speed" and labels[name].label
+    ]
+    if not names:
+        return (), ""
+    if not wheels:
+        return names, f"which of the joints are wheels, in which order? {', '.join(names)}"
+    ordered = tuple(sorted(wheels, key=lambda name: rank(labels[name].label)))
+    others = [name for name in names if name not in wheels]
+    doubt = f"joints that are taken for no wheels: {', '.join(others)}" if others else ""
+    return ordered, doubt
+
+
+def _first_of_each(topics: Sequence[Topic], joints: int) -> Iterator[_Served]:
+    """The best topic for every channel: poses that are no odometry come before those that are."""
+    order = sorted(topics, key=lambda t: (t.type == _ODOMETRY, t.type == _TRANSFORMS, t.name))
+    seen: set[str] = set()
+    for topic in order:
+        for channel in topic.serves:
+            if channel in seen or not topic.count:
+                continue
+            seen.add(channel)
+            wheels = joints if topic.joints else _count(topic) if channel in PER_WHEEL else 0
+            yield _Served(channel, topic, wheels, _doubt(channel, topic))
+        if any(f.path == "effort" and f.count for f in topic.fields) and "current" not in seen:
+            seen.add("current")
+            yield _Served("current", topic, joints, _EFFORT)
+
+
+def _count(topic: Topic) -> int:
+    """How many wheels a message has numbers of."""
+    return max((field.count for field in topic.fields if field.type.endswith("[]")), default=1)
+
+
+def _doubt(channel: str, topic: Topic) -> str:
+    if channel != "pose":
+        return ""
+    if topic.type == _ODOMETRY:
+        return (
+            "is this pose from a camera, lidar or motion capture? Odometry of wheels is of no use"
+        )
+    if topic.type == _TRANSFORMS:
+        return f"which frame and which child? There are: {'; '.join(topic.frames)}"
+    return ""
+
+
+def _lines(served: Sequence[_Served]) -> Iterator[Line]:
+    """A line for each channel."""
+    for one in served:
+        inside = f"topic = {toml(one.topic.name)}"
+        off = one.question == _EFFORT
+        if off:
+            inside += ', field = "effort", unit = "A"'
+        if one.topic.type == _TRANSFORMS and one.topic.frames:
+            frame, _, child = one.topic.frames[0].partition(" -> ")
+            inside += f", frame = {toml(frame)}, child = {toml(child)}"
+        yield Line(one.channel, f"{{ {inside} }}", _rate(one.topic), one.question, off)
+
+
+def _rate(topic: Topic) -> str:
+    if topic.first is None or topic.last is None or topic.count < 2 or topic.last <= topic.first:
+        return topic.type
+    return f"{topic.type}, {(topic.count - 1) / (topic.last - topic.first):.3g} Hz"
+
+
+def _settings(
+    robot: Answers, joints: tuple[str, ...], served: Sequence[_Served]
+) -> tuple[Line, ...]:
+    """Keys of the layout but for its topics."""
+
+    def line(key: str, value: object, question: str = "") -> Line:
+        kind = BagLayout if key in meanings(BagLayout) else Layout
+        return Line(key, toml(value), in_short(kind, key), question)
+
+    lines = [Line("kind", toml("bag"))]
+    have = {one.channel for one in served}
+    lines += [line("joints", list(joints))] if joints else []
+    if "wheel_ticks" in have:
+        asked = "ticks_per_revolution" in robot.taken
+        ask = "how many, of the motor shaft, all edges counted?" if asked else ""
+        lines.append(line("ticks_per_revolution", robot.ticks_per_revolution or 1000.0, ask))
+    lines.append(Line("gear_ratio", toml(robot.gear_ratio), "as above"))
+    if "current" in have:
+        ask = "do currents have a sign, or are they magnitudes?"
+        lines.append(Line("current_is_signed", "true", "false for magnitudes", ask))
+    return tuple(lines)
+
+
+def _unused(topics: Sequence[Topic], served: Sequence[_Served]) -> tuple[str, ...]:
+    """Other topics, with what their messages hold."""
+    used = {one.topic.name for one in served}
+    others = [topic for topic in topics if topic.name not in used and topic.count]
+    return tuple(f"Not used: {topic.name} ({topic.type}){_holds(topic)}" for topic in others)
+
+
+def _holds(topic: Topic) -> str:
+    if topic.problem:
+        return f": {topic.problem}"
+    paths = [field.path for field in topic.fields if not field.path.startswith("header")]
+    return f" has {', '.join(paths[:8])}" if paths else ""

@@ -1,0 +1,1 @@
+"""Columns of a log file: what their names say, and which channels they hold."""

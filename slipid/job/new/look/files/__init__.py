@@ -1,0 +1,1 @@
+"""Log files: how each is laid out, and which belong together."""

@@ -1,0 +1,108 @@
+"""Log files of a folder sorted by kind: globs that find each, and which lie beside which."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path, PurePosixPath
+from re import sub
+
+from slipid.job.new.look.files.file import Head
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Files that are laid out alike, sorted by path."""
+
+    heads: tuple[Head, ...]
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Where they are."""
+        return tuple(head.path for head in self.heads)
+
+
+def kinds_of(heads: Sequence[Head]) -> list[Kind]:
+    """Files by kind, the kind with most of them first."""
+    groups: dict[Head, list[Head]] = {}
+    for head in heads:
+        groups.setdefault(head.signature, []).append(head)
+    return [Kind(tuple(g)) for g in sorted(groups.values(), key=len, reverse=True)]
+
+
+def globs_of(root: Path, kind: Kind, others: Sequence[Path]) -> list[str]:
+    """Globs below a folder that find the files of a kind and none of the others.
+
+    Folders two levels deep have one each: they tell sets of logs apart.
+    """
+    mine = [path.relative_to(root) for path in kind.paths]
+    theirs = [PurePosixPath(path.relative_to(root)) for path in others]
+    buckets: dict[tuple[str, int], list[PurePosixPath]] = {}
+    for path in map(PurePosixPath, mine):
+        top = path.parts[0] if len(path.parts) > 2 else ""
+        buckets.setdefault((top, len(path.parts)), []).append(path)
+    return [glob for paths in buckets.values() for glob in _narrow(paths, theirs)]
+
+
+def _narrow(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> list[str]:
+    """A glob for some files, narrower ones where it finds others."""
+    glob = common_glob(paths)
+    if not any(_finds(glob, path) for path in theirs):
+        return [glob]
+    folders = {path.parent for path in paths}
+    if len(folders) > 1:
+        parts = [[p for p in paths if p.parent == folder] for folder in sorted(folders)]
+        return [one for part in parts for one in _narrow(part, theirs)]
+    return [path.as_posix() for path in paths]
+
+
+def common_glob(paths: Sequence[PurePosixPath]) -> str:
+    """A glob that finds paths of the same depth: what they have in common, around stars."""
+    return "/".join(_part(parts) for parts in zip(*(p.parts for p in paths), strict=True))
+
+
+def _finds(glob: str, path: PurePosixPath) -> bool:
+    parts = glob.split("/")
+    return len(parts) == len(path.parts) and all(
+        fnmatchcase(name, part) for name, part in zip(path.parts, parts, strict=True)
+    )
+
+
+def _part(names: tuple[str, ...]) -> str:
+    """One name, or what several have in common around a star."""
+    if len(set(names)) == 1:
+        return names[0]
+    suffixes = {PurePosixPath(name).suffix for name in names}
+    end = suffixes.pop() if len(suffixes) == 1 else ""
+    counted = {sub(r"\d+", "*", name) for name in names}
+    if len(counted) == 1:
+        return counted.pop()
+    # digits at its end are a number, of which others may begin otherwise
+    first, last = min(names), max(names)
+    alike = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
+    return f"{first[:alike].rstrip('0123456789')}*{end}"
+
+
+def pattern_beside(main: Kind, other: Kind) -> str | None:
+    """Name of the file beside each of the main ones, as of `Layout.beside`; None if they have none.
+
+    Either it is called the same in every folder, or after the main file.
+    """
+    there = set(other.paths)
+    first = main.paths[0]
+    near = [path for path in other.paths if path.parent == first.parent]
+    patterns = [path.name for path in near]
+    patterns += [
+        path.name.replace(first.stem, "{stem}") for path in near if first.stem in path.name
+    ]
+    for pattern in patterns:
+        named = [path.parent / pattern.replace("{stem}", path.stem) for path in main.paths]
+        # a name without the stem belongs to one main file a folder
+        alone = "{stem}" in pattern or len({path.parent for path in main.paths}) == len(named)
+        if alone and there.issuperset(named):
+            return pattern
+    return None
+
+
+def a_folder_each(kind: Kind) -> bool:
+    """Whether every file is alone of its kind in its folder: then the folder is a run."""
+    return len(kind.paths) > 1 and len({path.parent for path in kind.paths}) == len(kind.paths)

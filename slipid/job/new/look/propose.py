@@ -1,0 +1,158 @@
+"""From logs to the config that is proposed for them."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from slipid.data.reading.layout import Layout
+from slipid.data.reading.presets import PRESETS
+from slipid.data.reading.reader import read_logs
+from slipid.job.config import geometry, parsed
+from slipid.job.logs import layout_of
+from slipid.job.new.answers import Answers, Told
+from slipid.job.new.look.bags import bags_in, propose_bags
+from slipid.job.new.look.files.kinds import a_folder_each, globs_of
+from slipid.job.new.look.robot import robot_from
+from slipid.job.new.look.runs import Group, Sorted, sorted_logs
+from slipid.job.new.look.signals.known import Known
+from slipid.job.new.look.sketches import file_sketch, radius_hint
+from slipid.job.new.questions import robot_of
+from slipid.job.new.sketch import BesideSketch, LayoutSketch, LogsSketch, Sketch
+from slipid.job.new.written import new_config
+from slipid.support.errors import DataError
+
+FLOOR = "floor"
+_FLOOR = "on which floor was {} driven? Its name, or folder where folders are called after floors"
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A config to be, and what was found, in sentences."""
+
+    sketch: Sketch
+    said: tuple[str, ...]
+
+
+def propose(path: Path, told: Told) -> Proposal:
+    """The config that a log, or a folder of logs, is proposed to have.
+
+    Raises:
+        DataError: there is no log, or what was told is no answer.
+    """
+    if not path.exists():
+        raise DataError(f"{path}: no such file or folder; expected a log, or a folder of logs")
+    if bags := bags_in(path):
+        proposed = propose_bags(bags, path, told)
+        return Proposal(_bags_tried(proposed.sketch, bags[0]), proposed.said)
+    found = sorted_logs(path)
+    wheels = max((group.main.columns.wheels for group in found.groups), default=0)
+    for _, name in found.presets:
+        wheels = max(wheels, _wheels_of(PRESETS[name]))
+    files = tuple(one for group in found.groups for one in group.all)
+    guessed = robot_from(told, wheels, files)
+    robot = _as_presets_say(guessed.robot, found)
+    known = [_known(group, robot) for group in found.groups]
+    logs = _logs(found)
+    used = {one.format for one in logs if not one.off}
+    presets = [PRESETS[name] for _, name in found.presets if name in used]
+    sketch = Sketch(
+        robot,
+        tuple(
+            _layout(group, one, k)
+            for k, (group, one) in enumerate(zip(found.groups, known, strict=True))
+        ),
+        tuple(logs),
+        carries=frozenset(channel for layout in presets for channel in layout.channels),
+        above=(f"Proposed from {path}.", *found.hints),
+        data=str(found.root),
+        hints=(*guessed.hints, *(hint for one in known for hint in radius_hint(one))),
+    )
+    return Proposal(_tried(sketch, found, wheels), (*found.told, *found.hints))
+
+
+def _wheels_of(layout: Layout) -> int:
+    turns = ("wheel_ticks", "motor_speed", "wheel_speed")
+    return max((len(layout.channels[c].columns) for c in turns if c in layout.channels), default=0)
+
+
+def _as_presets_say(robot: Answers, found: Sorted) -> Answers:
+    """The gear ratio that a published format has, unless another was told."""
+    gears = {PRESETS[name].gear_ratio for _, name in found.presets}
+    if len(gears) != 1 or "gear_ratio" not in robot.taken:
+        return robot
+    return replace(robot, gear_ratio=gears.pop(), taken=robot.taken - {"gear_ratio"})
+
+
+def _known(group: Group, robot: Answers) -> Known:
+    others = tuple(Known(robot, other.main, other.all) for other in group.others)
+    return Known(robot, group.main, group.all, others)
+
+
+def _layout(group: Group, known: Known, number: int) -> LayoutSketch:
+    file = file_sketch(group.main, known)
+    if not any(one.columns.has_pose for one in group.all):
+        ask = "no pose was found (x, y, and a heading or a quaternion): a fit needs one"
+        file = replace(file, questions=(*file.questions, ask))
+    beside = tuple(BesideSketch(name, file_sketch(one, known)) for name, one in group.beside)
+    return LayoutSketch(_name(number), file, beside)
+
+
+def _name(number: int) -> str:
+    return "mine" if number == 0 else f"mine{number + 1}"
+
+
+def _logs(found: Sorted) -> list[LogsSketch]:
+    """A section for each glob; those of files that lack wheels or a pose are commented out."""
+    named = [(kind, name) for kind, name in found.presets]
+    named += [(group.kind, _name(k)) for k, group in enumerate(found.groups)]
+    every = {path for kind, _ in named for path in kind.paths}
+    every |= {path for one in found.also for path in one.paths} | set(found.no_logs)
+    whole = {name for name in PRESETS if {"pose_x"} <= PRESETS[name].channels.keys()}
+    whole -= {name for name in PRESETS if not _wheels_of(PRESETS[name])}
+    whole |= {_name(k) for k, group in enumerate(found.groups) if group.complete}
+    out = []
+    for kind, name in named:
+        for glob in globs_of(found.root, kind, sorted(every - set(kind.paths))):
+            floors = glob.count("/") > 0 and not a_folder_each(kind)
+            off = name not in whole
+            surface, ask = ("folder", "") if floors else (FLOOR, _FLOOR.format(glob))
+            above = ("Without wheels or without a pose, so nothing to fit:",) if off else ()
+            out.append(LogsSketch(glob, name, surface, above, "" if off else ask, off))
+    if all(one.off for one in out):  # a config has one section at least; the layout asks for a pose
+        return [replace(one, off=False, above=()) for one in out]
+    return sorted(out, key=lambda one: one.off)
+
+
+def _tried(sketch: Sketch, found: Sorted, wheels: int) -> Sketch:
+    """The sketch with what the reader says of the first file of each layout, if it refuses it."""
+    drives = geometry(robot_of(sketch.robot)).drives
+    layouts = []
+    for layout, group in zip(sketch.layouts, found.groups, strict=True):
+        asked = list(layout.file.questions)
+        if wheels and drives != wheels:
+            asked.append(f"[robot] has {drives} drives, but {wheels} have columns here: which?")
+        if problem := _refused(sketch, layout.name, group.kind.paths[0]):
+            asked.append(f"the reader says: {problem}")
+        layouts.append(replace(layout, file=replace(layout.file, questions=tuple(asked))))
+    return replace(sketch, layouts=tuple(layouts))
+
+
+def _bags_tried(sketch: Sketch, first: Path) -> Sketch:
+    """The sketch with what the reader says of the first bag, if it refuses it."""
+    (bag,) = sketch.bags
+    if problem := _refused(sketch, bag.name, first):
+        asked = (*bag.questions, f"the reader says: {problem}")
+        return replace(sketch, bags=(replace(bag, questions=asked),))
+    return sketch
+
+
+def _refused(sketch: Sketch, name: str, path: Path) -> str:
+    """Why the first file of a layout cannot be read; nothing where it can."""
+    try:
+        config = parsed(Path("robot.toml"), new_config(sketch, "robot.toml").text)
+        section = next((one for one in config.content.logs if one.format == name), None)
+        if section is None:
+            return ""
+        read_logs(path, layout_of(config, section), path.parent, FLOOR, "as_built")
+    except DataError as error:
+        return str(error).splitlines()[0].replace("robot.toml ", "")
+    return ""

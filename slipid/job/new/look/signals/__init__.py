@@ -1,0 +1,1 @@
+"""What the numbers themselves tell: units by magnitudes, rates, signs, sums."""

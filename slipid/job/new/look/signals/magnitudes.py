@@ -1,0 +1,152 @@
+"""Units that no name says, from what robots do: how often they log, how fast they are."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.reading.layout import CHANNELS
+from slipid.data.reading.units import factor
+
+_SECONDS = (1e9, 4e9)
+"""Seconds since 1970 that stamps of robots show."""
+_CLOCKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+_STEPS = (2e-4, 2.5)
+"""Time between rows of logs, within which a unit is believed [s]."""
+FAST = 12.0
+"""Speed that no such robot has [m/s]."""
+RADII = (0.012, 0.6)
+"""Wheels of robots [m]."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit, and what was assumed to tell it; `doubt` is for people to answer."""
+
+    unit: str
+    why: str = ""
+    doubt: str = ""
+
+
+def time_unit(values: Float[np.ndarray, " row"]) -> Unit:
+    """Unit of time, from stamps since 1970 or else from the steps."""
+    first = float(np.nanmin(np.abs(values)))
+    for unit, per in _CLOCKS.items():
+        if _SECONDS[0] < first / per < _SECONDS[1]:
+            return Unit(unit, f"counts from 1970, in {unit}")
+    steps = np.abs(np.diff(values[~np.isnan(values)]))
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    fits = [unit for unit, per in _CLOCKS.items() if _STEPS[0] <= usual / per <= _STEPS[1]]
+    if len(fits) == 1:
+        return Unit(fits[0], f"steps of {usual:.4g}")
+    if not fits:
+        return Unit("s", doubt=f"in which unit are steps of {usual:.4g}?")
+    if fits[0] == "s" and usual < 1.0 and (steps != np.round(steps)).any():
+        return Unit("s", f"steps of {usual:.4g}")
+    return Unit(fits[0], doubt=f"steps of {usual:.4g}: in {' or '.join(fits)}?")
+
+
+def place_unit(
+    time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]
+) -> Unit:
+    """Unit of a place, from the speed that it would be [time in s]."""
+    speed, size = speed_of(time, x, y), float(np.nanmax(np.abs([x, y])))
+    if speed < FAST and size < 200:
+        return Unit("m", f"at most {speed:.2g} m/s")
+    whole = x[~np.isnan(x)]
+    if float(np.nanmin([x, y])) >= 0 and size < 4100 and (whole == np.round(whole)).all():
+        return Unit("mm", doubt="millimetres, or pixels (then give metres_per_pixel)?")
+    if speed < 1e3 * FAST:
+        return Unit("mm", f"at most {speed:.4g} mm/s")
+    return Unit("m", doubt=f"in which unit? It moves by {speed:.3g} of them a second")
+
+
+def speed_of(
+    time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]
+) -> float:
+    """A high speed of a place: 9 of 10 seconds have less. Over shorter times it would be noise."""
+    there = ~(np.isnan(x) | np.isnan(y) | np.isnan(time))
+    time, x, y = time[there], x[there], y[there]
+    if len(time) < 3:
+        return 0.0
+    stride = max(1, int(1.0 / max(float(np.median(np.diff(time))), 1e-6)))
+    stride = min(stride, max(1, len(time) // 3))
+    t, x, y = time[::stride], x[::stride], y[::stride]
+    steps = np.diff(t)
+    good = steps > 0
+    speeds = np.hypot(np.diff(x), np.diff(y))[good] / steps[good]
+    return float(np.quantile(speeds, 0.9)) if len(speeds) else 0.0
+
+
+def heading_unit(values: Float[np.ndarray, " row"]) -> Unit:
+    """Unit of a heading, from its jumps at a full turn, else from its size."""
+    known = values[~np.isnan(values)]
+    jump, most = float(np.abs(np.diff(known)).max(initial=0.0)), float(np.abs(known).max(initial=0))
+    if 330 < jump <= 361:
+        return Unit("deg", "jumps by 360")
+    if 5.8 < jump <= 6.2832 + 1e-3:
+        return Unit("rad", "jumps by 2 pi")
+    if most <= 6.2832 + 1e-3:
+        doubt = "radians or degrees? It never turns far" if most < 0.5 else ""
+        return Unit("rad", f"up to {most:.3g}", doubt)
+    if most <= 361 and most > 50:
+        return Unit("deg", f"up to {most:.3g}")
+    return Unit("rad" if most < 30 else "deg", doubt=f"radians or degrees? It reaches {most:.4g}")
+
+
+def speed_unit(seen: float | None, radius: float | None) -> Unit:
+    """Unit of wheel speeds, from the way of the pose, if there is one, and a radius, if it is said.
+
+    Args:
+        seen: speed of the pose over that of the wheels, [m/s] over their unit.
+        radius: of the wheels [m], over the gear ratio for speeds of the motor.
+    """
+    options = "rad/s, rpm or deg/s; or m/s at the rim: then divide by the radius with scale"
+    if seen is None:
+        return Unit("rad/s", doubt=f"in which unit: {options}?")
+    if radius is not None:
+        units = {unit: seen / factor(unit, "rad/s") for unit in ("rad/s", "rpm", "deg/s", "rev/s")}
+        best = min(units, key=lambda unit: abs(np.log(units[unit] / radius)))
+        apart = abs(np.log(units[best] / radius))
+        if apart < 0.7 and apart < abs(np.log(seen)):
+            return Unit(best, "as fast as the pose")
+    elif RADII[0] <= seen <= RADII[1]:
+        return Unit("rad/s", f"as fast as the pose with wheels of about {seen:.2g} m")
+    if 0.7 < seen < 1.5:
+        doubt = "as fast as the pose itself, hence m/s at the rim: put scale = 1 / wheel radius"
+        return Unit("rad/s", doubt=doubt)
+    if RADII[0] <= seen / factor("rpm", "rad/s") <= RADII[1]:
+        return Unit("rpm", doubt="rpm, or deg/s? With rad/s wheels would be too small")
+    return Unit("rad/s", doubt=f"in which unit: {options}?")
+
+
+def angle_unit(seen: float | None, radius: float | None) -> Unit:
+    """Unit of wheel angles; arguments as of `speed_unit`."""
+    if seen is None:
+        return Unit("rad", doubt="radians, degrees, turns or ticks?")
+    low, high = RADII if radius is None else (radius / 2, radius * 2)
+    for unit in ("rad", "deg", "rev"):
+        if low <= seen / factor(unit, "rad") <= high:
+            return Unit(unit, "turns as far as the pose goes")
+    return Unit("rad", doubt="radians, degrees, turns or ticks? The pose goes another way")
+
+
+def plain_unit(channel: str) -> Unit:
+    """Unit of what is logged in SI but for rare cases."""
+    return Unit({"wheel_ticks": "tick"}.get(channel, CHANNELS[channel]))
+
+
+def current_unit(most: float) -> Unit:
+    """Unit of currents from their largest."""
+    if most > 120:
+        return Unit("mA", f"up to {most:.4g}")
+    return Unit("A", f"up to {most:.3g}")
+
+
+def duty_unit(most: float) -> Unit:
+    """Unit of duty cycles from their largest."""
+    if most <= 1.05:
+        return Unit("1", f"up to {most:.3g}")
+    if most <= 105:
+        return Unit("percent", f"up to {most:.3g}")
+    return Unit("1", doubt=f"it reaches {most:.4g}: give scale, 1 over what stands for full")

@@ -1,0 +1,39 @@
+"""Configs that are proposed for logs, and the runs that are read with them."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+from slipid.job.config import parsed
+from slipid.job.logs import read_dataset
+from slipid.job.new.answers import Told
+from slipid.job.new.look.propose import propose
+from slipid.job.new.written import new_config
+from tests.helpers.made_tables import RADIUS, TRACK
+from tests.helpers.said import Said
+
+ROBOT = {
+    "drive": "differential",
+    "track_m": str(TRACK),
+    "wheel_radius_m": str(RADIUS),
+    "gear_ratio": "1",
+    "mass_kg": "20",
+}
+
+
+def proposed(path: Path, **told: str):
+    proposal = propose(path, Told(**told))
+    return proposal, new_config(proposal.sketch, "mine.toml")
+
+
+def layout_in(config, name: str = "mine"):
+    return tomllib.loads(config.text)["layouts"][name]
+
+
+def read(config, root: Path):
+    """Runs as `slipid check` reads them."""
+    there = parsed(Path("mine.toml"), config.text)
+    data, skipped = read_dataset(there, there.content.logs, root, Said())
+    assert not skipped
+    return data
