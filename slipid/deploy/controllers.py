@@ -68,8 +68,8 @@ def applying(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
     kept = tuple(name for name in names if ROWS[name].drives(robot))
     if not kept:
         raise DataError(
-            f"{', '.join(names)}: for robots with {PAPER_WHEELS} wheels, as that of the 2021 paper; "
-            f"this one has {robot.wheels}, expected some of "
+            f"{', '.join(names)}: for robots with {PAPER_WHEELS} wheels, as that of the 2021 "
+            f"paper; this one has {robot.wheels}, expected some of "
             f"{', '.join(name for name, row in ROWS.items() if row.drives(robot))}"
         )
     return kept

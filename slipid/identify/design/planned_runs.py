@@ -139,12 +139,12 @@ def steady_windows(
     middle of the image, the marker's heading is zero at their start. The ammeter counts as exact:
     its noise is not known beforehand, and averages out over a window.
     """
-    n, per_piece, wheels = len(drives), channels.windows, robot.geometry.wheels
+    n, per_piece, motors = len(drives), channels.windows, robot.geometry.drives
     base, radius = float(robot.geometry.base_radius), float(robot.geometry.wheel_radius)
     command = np.stack([d.command for d in drives])
     rate = command @ np.asarray(robot.geometry.forward()).T / radius
     dt = np.array([d.seconds(base) for d in drives])[:, None] / per_piece * np.ones((n, per_piece))
-    blank = np.zeros((n, per_piece, wheels))
+    blank = np.zeros((n, per_piece, motors))
     w = Windows(
         run=np.arange(n),
         surface=tuple(d.surface for d in drives),
