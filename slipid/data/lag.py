@@ -102,5 +102,6 @@ def _left(steps: list[_Steps], lag: float) -> float:
     y = y / size
     rest = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
     # sideways motion that wheels cannot tell is the same at every lag, and noise
-    told = np.clip(1.0 - (rest**2).sum(axis=0) / (y**2).sum(axis=0), 0.0, None)
+    whole = np.maximum((y**2).sum(axis=0), 1e-12)
+    told = np.clip(1.0 - (rest**2).sum(axis=0) / whole, 0.0, None)
     return float(1.0 - told.mean())

@@ -40,9 +40,11 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
     fit's Laplace approximation. `DeployedRobot.record.source` says which.
 
     Raises:
-        ValueError: the wheels' kinematics have rank below 3.
+        ValueError: the wheels' kinematics have rank below 3, or wheels share a drive.
     """
     fit.robot.geometry.inverse()  # what cannot be deployed is not computed
+    if fit.robot.geometry.drive_of:
+        raise ValueError("wheels that share a drive are not deployed yet")
     source: Source = "laplace"
     numbers, messages = fit.parameters, fit.messages
     vectors, center = fit.draws(DRAWS), fit.z

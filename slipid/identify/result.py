@@ -135,7 +135,9 @@ class Fit:
     def flat(self) -> tuple[Flat, ...]:
         """Directions the likelihood leaves open; what sessions share blurs numbers, opens none."""
         has = self.channels
-        return flat_directions(self.space, self.laplace, has.current, has.voltage, self.validity)
+        sideways = self.robot.geometry.determines_twist
+        where = has.current, has.voltage, self.validity, sideways
+        return flat_directions(self.space, self.laplace, *where)
 
     @cached_property
     def derived(self) -> dict[str, Estimate]:

@@ -137,7 +137,8 @@ def expected(job: Task, problem: Problem) -> Expected:
     most = -np.inf
     for z in (space.start, *(np.where(creep, np.log(c), space.start) for c in CREEPS)):
         covariance = problem.laplace(z, log_v, keep)
-        flat = flat_directions(space, covariance, w.has_current, volt, validity)
+        where = w.has_current, volt, validity, robot.geometry.determines_twist
+        flat = flat_directions(space, covariance, *where)
         found = estimates(space, job.choices, space.start, covariance, volt, members(flat))
         _least(parameters, found)
         _least(ratios, derived(space, space.start, covariance, volt))

@@ -121,6 +121,7 @@ def config_of(case: Case, folder: Path) -> Path:
     path = folder / "my.toml"
     path.write_text(
         f"[robot]\n{three if case.file == ROBOTINO else two}\nwheel_radius_m = 0.04\n"
+        f"mass_kg = 12\ngear_ratio = {case.mapping().get('gear_ratio', 16)}\n"
         f"[layouts.mine]\n{layout}\n"
         f'[[logs]]\nglob = "{case.file}"\nformat = "mine"\nsurface = "gray"\n',
         encoding="utf-8",
@@ -383,7 +384,7 @@ def test_an_interrupt_that_python_must_ignore_where_it_arrives_stops_the_command
         cli.AGAIN_S = 3.0  # a busy machine may be slow to print
         cli.main()
     """
-    words = [sys.executable, "-c", code, "check", "my.toml", "--data", "."]
+    words = [sys.executable, "-c", code, "check", "configs/omni3.toml", "--data", "."]
     run = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert run.stdout == "went on\n"
     assert "interrupted" in run.stderr
@@ -585,7 +586,7 @@ def test_export_writes_a_folder_and_tells_a_changed_byte(small, tmp_path):
 
 
 def test_export_says_what_is_missing(tmp_path):
-    assert "robot.json: No such file" in invoke("export", tmp_path, "--out", tmp_path / "o").output
+    assert "robot.json: not there" in invoke("export", tmp_path, "--out", tmp_path / "o").output
     told = invoke("export", tmp_path)
     assert told.exit_code == 2
     assert "name one with --out" in told.output

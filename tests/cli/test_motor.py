@@ -112,7 +112,7 @@ def test_a_missing_column_lists_what_there_is(bench):
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda r: replace(r, voltage=np.where(r.time > 3, np.nan, r.voltage)), "missing values"),
+        (lambda r: replace(r, voltage=np.full_like(r.voltage, np.nan)), "no value in any row"),
         (lambda r: replace(r, time=r.time + 50.0 * (r.time > 3)), "clock jumps"),
         (lambda r: replace(r, current=-r.current), "wrong sign"),
     ],
@@ -122,6 +122,25 @@ def test_broken_logs_are_refused(tmp_path, spoil, said):
     result = invoke("motor", made.write(spoil(record), tmp_path / "log.csv"), "--quiet")
     assert result.exit_code == 2
     assert said in result.output
+
+
+def test_rows_without_a_voltage_are_left_out(tmp_path):
+    record = made.logged(made.driven(made.FLYWHEEL), 200, 1)
+    early = record.time < 3
+    cut = replace(
+        record,
+        time=record.time[early],
+        voltage=record.voltage[early],
+        current=record.current[early],
+        speed=record.speed[early],
+    )
+    hole = replace(record, voltage=np.where(early, record.voltage, np.nan))
+    found = []
+    for name, one in (("cut", cut), ("hole", hole)):
+        path = made.write(one, tmp_path / f"{name}.csv")
+        found.append(json.loads(invoke("motor", path, "--json", "-", "--quiet").stdout))
+    values = [f["parameters"]["motor.back_emf"]["value"] for f in found]
+    assert values[0] == pytest.approx(values[1], rel=1e-9)
 
 
 def test_an_angle_or_a_duty_will_do(tmp_path):

@@ -14,7 +14,7 @@ from slipid.selftest.known import Sensors, grid, turning_grid
 from slipid.selftest.logs import make_logs
 
 SHAPES = {
-    "omni 4": omni([45, 135, 225, 315], 0.2, 0.05, 16.0),
+    "omni 4": omni([45.0, 135.0, 225.0, 315.0], 0.2, 0.05, 16.0),
     "mecanum": mecanum(0.2, 0.15, 0.05, 16.0),
     "skid": skid_steer(0.2, 0.25, 0.1, 16.0, drive_of=(0, 1, 0, 1)),
     "differential": differential(0.2, 0.1, 16.0),

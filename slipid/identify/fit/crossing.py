@@ -84,7 +84,7 @@ def crossing(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Crossing:
     return Crossing(whole, floor[at, 0], counts[at, 0] & there, names)
 
 
-_PER_WINDOW = ("dt", "turn", "faster", "current", "voltage", "current_var")
+_PER_WINDOW = ("dt", "turn", "faster", "current", "voltage", "current_var", "voltage_var")
 
 
 def _windows_on(data: Runs, floor: FloorMap, robot: Robot) -> Crossing:

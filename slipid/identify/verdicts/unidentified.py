@@ -87,6 +87,7 @@ def flat_directions(
     has_current: bool,
     has_voltage: bool,
     validity: Mapping[str, Validity] | None = None,
+    sideways: bool = True,
 ) -> tuple[Flat, ...]:
     """Directions in which the data narrow the prior by less than a fifth.
 
@@ -94,7 +95,8 @@ def flat_directions(
     directions of others. The yaws of single sessions and what a floor's law lacks are deviations by
     declaration and are taken as known.
 
-    `validity`, what every floor was driven with, makes the remedies definite.
+    `validity`, what every floor was driven with, and whether the robot can drive in any direction,
+    `sideways`, make the remedies definite.
     """
     axes = [axis for e in space.free for axis in axes_of(e)]
     kept = [k for k, axis in enumerate(axes) if not _known(axis.entry)]
@@ -102,7 +104,6 @@ def flat_directions(
     std = space.prior_std
     given = np.linalg.inv(covariance) * (std[:, None] * std)
     told = _Told(given, space.electric if has_current else None)
-    sideways = space.template.geometry.determines_twist
     out = []
     for picked, u in _sparse(told, kept, scale, 1 / std):
         main = _named(told, [axes[k] for k in picked], picked, u, std[picked])

@@ -7,6 +7,7 @@ import pytest
 
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.bag.reader import read_bag
+from slipid.support.errors import DataError
 from tests.helpers.made_bags import (
     SUFFIX,
     in_order,
@@ -97,5 +98,11 @@ def test_a_message_without_one_of_the_joints_is_left_out_with_a_note(tmp_path):
 def test_what_effort_may_mean(tmp_path, channel, unit, factor):
     said = joint_states("/joint_states", TIME, ["left", "right"], effort=ANGLE)
     topics = {channel: {"topic": "/joint_states", "field": "effort", "unit": unit}}
-    run = read(bag(tmp_path, "mcap", said), topics=topics)
+    run = read(bag(tmp_path, "mcap", said), topics=topics, torque_constant=0.05)
     np.testing.assert_allclose(run.signals[channel].values, ANGLE * factor)
+
+
+def test_a_torque_needs_what_makes_a_current_of_it():
+    topics = {"motor_torque": {"topic": "/joint_states", "field": "effort", "unit": "N*m"}}
+    with pytest.raises(DataError, match="a torque without torque_constant"):
+        layout(topics=topics)
