@@ -100,7 +100,8 @@ def _factor(of: Explained, gear_ratio: float) -> Words:
         return Words(
             f"the distance of the wheels from the middle is {'less' if of.factor < 1 else 'more'} "
             f"than declared, by a factor of {size:.3g}",
-            "correct base_radius_m (or half_width_m, half_length_m, wheel_places_m) in [robot]",
+            "correct base_radius_m (or track_m, half_width_m, half_length_m, wheel_places_m) of "
+            "[robot]",
         )
     channel = {
         "gyro": "gyro",
