@@ -97,8 +97,7 @@ def planned(config: Config, report: Reporter) -> Job:
     has_current = all("current" in c for c in channels)
     has_voltage = all("voltage" in c or {"duty", "bus_voltage"} <= c for c in channels)
     is_signed = all(layout.current_is_signed for layout in layouts)
-    made = make_logs(robot, drives, 0, Sensors(has_voltage=has_voltage))
-    logs = [replace(log, current_is_signed=is_signed) for log in made]
+    logs = make_logs(robot, drives, 0, Sensors(has_voltage=has_voltage, signed=is_signed))
     if not has_current:
         logs = [replace(log, current=None) for log in logs]
     report.line(f"no logs given: {len(logs)} runs of [selftest] on {', '.join(wanted.surfaces)}")

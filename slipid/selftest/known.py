@@ -118,6 +118,7 @@ class Sensors:
         row_period, frame_period: of the log and the camera [s].
         delay, ramp: from command to motion, and to full speed [s].
         wobble: of the wheel's angle, as time [s]; a real speed loop is never quite still.
+        signed: whether currents have their sign.
     """
 
     std: Mapping[str, float] = field(
@@ -144,6 +145,7 @@ class Sensors:
     ramp: float = 0.2
     wobble: float = 0.002
     has_voltage: bool = True
+    signed: bool = False
 
     def of(self, name: str) -> float:
         """Std of a variance component, 0 for one that these logs are made without."""

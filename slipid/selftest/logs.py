@@ -70,7 +70,7 @@ class _Maker:
                     wheel_speed=reported,
                     twist_command=np.tile(d.command, (n, 1)),
                     current=current,
-                    current_is_signed=False,
+                    current_is_signed=s.signed,
                     voltage=voltage,
                     pose=pose[k, :n],
                     pose_fresh=fresh[k, :n],
@@ -149,12 +149,13 @@ class _Maker:
     def electric(
         self, speed: Float[np.ndarray, "run step wheel"], amps: Float[np.ndarray, "run step wheel"]
     ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-        """Logged current magnitudes [A], voltages [V] and reported speeds [rad/s]."""
+        """Logged currents or their magnitudes [A], voltages [V] and reported speeds [rad/s]."""
         s, motor, rng = self.sensors, self.robot.motor, self.random
         level = np.array([s.of(f"current.{d.surface}.run") for d in self.drives])[:, None, None]
         amps = amps + level * rng.normal(size=(len(amps), 1, amps.shape[2])) * (speed != 0)
         true, w = _at_rows(amps), _at_rows(speed)
-        measured = np.abs(true + s.ripple * rng.normal(size=true.shape))
+        measured = true + s.ripple * rng.normal(size=true.shape)
+        measured = measured if s.signed else np.abs(measured)
         current = np.round((measured + float(motor.current_offset)) / s.current_step)
         noise = s.voltage_noise * rng.normal(size=true.shape)
         held = np.asarray(motor.voltage(jnp.asarray(true), jnp.asarray(w))) + noise

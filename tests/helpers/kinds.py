@@ -6,6 +6,7 @@ import numpy as np
 
 from slipid.data.runs import Runs, collect
 from slipid.identify.design.planned_runs import Drive
+from slipid.job.problem import told_lag
 from slipid.model.geometry import Geometry, differential, mecanum, omni, skid_steer
 from slipid.model.robot import Robot, build
 from slipid.parameter import entries
@@ -39,8 +40,10 @@ def experiment(kind: str, seed: int = 0, headings: int = 12) -> Experiment:
     robot = build(shape, list(FLOORS), ("as_built",), sorted({d.session for d in drives}))
     choices = [Choice(path, fixed=value) for path, value in numbers(robot).items()]
     truth = Space(robot, choices).template
-    logs = make_logs(truth, drives, seed, Sensors(has_voltage=True))
-    return Experiment(truth, collect(logs), wanted(truth))
+    # wheels that are dragged along brake, which magnitudes of currents do not tell
+    fine = Sensors(ripple=0.005, current_step=0.002, voltage_step=0.005, signed=True)
+    data = collect(make_logs(truth, drives, seed, fine))
+    return Experiment(truth, data, wanted(truth, data))
 
 
 def plan(shape: Geometry, headings: int) -> tuple[Drive, ...]:
@@ -68,7 +71,7 @@ def numbers(robot: Robot) -> dict[str, float | list[float]]:
     return {path: value for path, value in out.items() if path in {e.path for e in entries(robot)}}
 
 
-def wanted(truth: Robot) -> tuple[Choice, ...]:
+def wanted(truth: Robot, data: Runs) -> tuple[Choice, ...]:
     """What is free, and priors that a user could have; they do not know the truth."""
     held = (
         [] if not all(truth.geometry.grips) else ["roller_drag", "roller_creep", "roller_viscosity"]
@@ -76,7 +79,7 @@ def wanted(truth: Robot) -> tuple[Choice, ...]:
     return (
         *(Choice(f"surface.*.{name}", free=False) for name in held),
         Choice("robot.mass", fixed=20.0),
-        Choice("camera.lag", prior_mean=0.0, prior_std=0.1),
+        *told_lag(data),
         Choice("motor.resistance", start=3.0, prior_mean=2.5, prior_std=1.5),
         Choice("motor.back_emf", start=0.03, prior_mean=0.04, prior_std=0.02),
     )

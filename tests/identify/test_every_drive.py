@@ -18,7 +18,8 @@ def fitted(kind):
     truth = made.truth
     labels = truth.surfaces.labels, truth.body.loads, truth.camera.sessions
     robot = build(truth.geometry, *labels)
-    w = windows(made.data, float(start.geometry.wheel_radius), longest=2.0)
+    lag = float(start.camera.lag)
+    w = windows(made.data, float(start.geometry.wheel_radius), lag, longest=2.0)
     problem = Problem(w, robot, list(made.choices))
     optimum = optimise(problem)
     return made, summarise(problem, optimum, made.data, made.choices)
