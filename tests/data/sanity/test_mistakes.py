@@ -32,6 +32,16 @@ def test_a_few_are_named(mistake, robot):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mistake", "robot"),
+    [(m, DRIVES[k % len(DRIVES)]) for k, m in enumerate(MISTAKES)],
+    ids=lambda x: x.name,
+)
+def test_every_mistake_is_named_on_one_of_the_drives(mistake, robot):
+    test_it_is_named(robot, mistake)
+
+
+@pytest.mark.nightly
 @pytest.mark.parametrize("robot", DRIVES, ids=lambda d: d.name)
 @pytest.mark.parametrize("mistake", MISTAKES, ids=lambda m: m.name)
 def test_it_is_named(robot, mistake):
@@ -43,9 +53,16 @@ def test_it_is_named(robot, mistake):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", DRIVES, ids=lambda d: d.name)
+@pytest.mark.parametrize("less", [(), ONLY_POSES])
+def test_sound_runs_raise_no_alarm(robot, less):
+    test_other_sound_runs_raise_none_either(robot, 0, less)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("robot", DRIVES, ids=lambda d: d.name)
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("less", [(), ONLY_POSES, ("speed", "command"), ("twist", "gyro")])
-def test_sound_runs_raise_no_alarm(robot, seed, less):
+def test_other_sound_runs_raise_none_either(robot, seed, less):
     runs = as_runs([raw.less(*less) for raw in driven(robot, seed)])
     assert alarms(runs, robot.geometry) == []
 
