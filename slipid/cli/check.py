@@ -41,7 +41,7 @@ def check(
 
 def bench(config: "Config", data: Path, out: Path | None, json: str | None, quiet: bool) -> int:
     """The same for motors on a bench."""
-    from slipid.job.motor import check_bench
+    from slipid.job.bench.motor import check_bench
     from slipid.plots.bench import bench_plots
     from slipid.report.bench import show_bench_check
 

@@ -92,7 +92,7 @@ def bench(
     config: "Config", data: Path, out: Path, profile: Sequence[str], json: str | None, quiet: bool
 ) -> int:
     """The same for motors on a bench."""
-    from slipid.job.motor import identify_bench
+    from slipid.job.bench.motor import identify_bench
     from slipid.plots.bench import bench_plots
     from slipid.report.bench import show_bench
 

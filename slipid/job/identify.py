@@ -19,7 +19,7 @@ from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit_file import save
 from slipid.identify.result import Fit, summarise
 from slipid.identify.verdicts.profile import Profile, profile, profiled
-from slipid.job.bench_priors import KEPT
+from slipid.job.bench.priors import KEPT
 from slipid.job.config import read_config
 from slipid.job.problem import Job, Task, read_job, with_mixed
 from slipid.job.sanity import refuse_if_wrong, sanity

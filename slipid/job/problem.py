@@ -12,7 +12,7 @@ from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
 from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.identify.result import hash_of
-from slipid.job.bench_priors import bench_priors
+from slipid.job.bench.priors import bench_priors
 from slipid.job.config import Config, FitSection, Logs, geometry, one_floor
 from slipid.job.logs import files_of, read_dataset
 from slipid.job.weights import share_priors

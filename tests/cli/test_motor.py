@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slipid.data.reading.guess import header_of, layout_of, named
-from slipid.job.bench_priors import bench_priors
+from slipid.job.bench.priors import bench_priors
 from slipid.job.config import parsed
 from slipid.support.errors import DataError
 from tests.helpers import made_bench as made

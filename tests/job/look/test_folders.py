@@ -105,8 +105,9 @@ def test_files_at_other_times_are_not_of_the_run(tmp_path):
 
 
 def test_parquet(tmp_path):
-    pyarrow = pytest.importorskip("pyarrow")
-    parquet = pytest.importorskip("pyarrow.parquet")
+    import pyarrow
+    from pyarrow import parquet
+
     (tmp_path / "grass").mkdir()
     parquet.write_table(pyarrow.table(plain()), tmp_path / "grass" / "run.parquet")
     _, config = proposed(tmp_path, **ROBOT)

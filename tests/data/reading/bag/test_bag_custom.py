@@ -5,39 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slipid.data.reading.bag.layout import declared_bag_layout
-from slipid.data.reading.bag.reader import read_bag
 from tests.helpers.made_bags import (
     STORAGES,
-    SUFFIX,
     Said,
     header,
-    in_order,
     joint_states,
     turned,
     vector,
     without_definitions,
-    write_bag,
 )
-
-TIME = 1.7e9 + np.arange(0.0, 4.0, 0.01)
-ANGLE = np.column_stack([3.0 * np.sin(TIME - TIME[0]), np.linspace(0.0, 9.0, len(TIME))])
-RESOLUTION = 3e-7
-"""Of a double that counts seconds from 1970."""
-
-
-def layout(joints=("left", "right"), **given):
-    return declared_bag_layout({"kind": "bag", "joints": list(joints), **given}, "layout")
-
-
-def read(path, **given):
-    (run,) = read_bag(path, layout(**given))
-    return run
-
-
-def bag(tmp_path, storage, *said, **options):
-    return write_bag(tmp_path / f"bag{SUFFIX[storage]}", storage, in_order(*said), **options)
-
+from tests.helpers.one_bag import ANGLE, RESOLUTION, TIME, bag, read
 
 CUSTOM = {
     "my_msgs/msg/Motor": "string name\nfloat32 current\nint16 duty\n",

@@ -4,6 +4,10 @@ import io
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from _typeshed import WriteableBuffer
 
 MAGIC = b"\x89MCAP0\r\n"
 _DATA_END, _FOOTER = 0x0F, 0x02
@@ -87,14 +91,15 @@ class _Mended(io.RawIOBase):
         self._at = base + offset
         return self._at
 
-    def readinto(self, buffer: memoryview | bytearray) -> int:  # type: ignore[override]
+    def readinto(self, buffer: "WriteableBuffer") -> int:
+        view = memoryview(buffer)
         if self._at < self._end:
             self._file.seek(self._at)
-            data = self._file.read(min(len(buffer), self._end - self._at))
+            data = self._file.read(min(len(view), self._end - self._at))
         else:
             first = self._at - self._end
-            data = _END[first : first + len(buffer)]
-        buffer[: len(data)] = data
+            data = _END[first : first + len(view)]
+        view[: len(data)] = data
         self._at += len(data)
         return len(data)
 

@@ -5,7 +5,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 from slipid.data.reading.bag.storage.damage import damaged
 from slipid.data.reading.bag.storage.files import BagFiles, files_of
@@ -222,7 +222,7 @@ def _entered(path: Path | MendedMcap, files: BagFiles, stack: ExitStack) -> "Rea
         if files.storage == "rosbag1":
             return stack.enter_context(rosbag1.Reader(files.path))
         # a mended file has as much of a path as rosbags asks of one file
-        return stack.enter_context(rosbag2.Reader(path))  # type: ignore[arg-type]
+        return stack.enter_context(rosbag2.Reader(cast(Path, path)))
     except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
         raise damaged(files, error) from error
 

@@ -1,0 +1,30 @@
+"""A bag of two wheels, and the one run that is read from it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slipid.data.reading.bag.layout import BagLayout, declared_bag_layout
+from slipid.data.reading.bag.reader import BagRun, read_bag
+from tests.helpers.made_bags import SUFFIX, Said, in_order, write_bag
+
+TIME = 1.7e9 + np.arange(0.0, 4.0, 0.01)
+ANGLE = np.column_stack([3.0 * np.sin(TIME - TIME[0]), np.linspace(0.0, 9.0, len(TIME))])
+RESOLUTION = 3e-7
+"""Of a double that counts seconds from 1970."""
+
+
+def layout(joints: tuple[str, ...] = ("left", "right"), **given: Any) -> BagLayout:
+    return declared_bag_layout({"kind": "bag", "joints": list(joints), **given}, "layout")
+
+
+def read(path: Path, **given: Any) -> BagRun:
+    (run,) = read_bag(path, layout(**given))
+    return run
+
+
+def bag(tmp_path: Path, storage: str, *said: list[Said], **options: Any) -> Path:
+    return write_bag(tmp_path / f"bag{SUFFIX[storage]}", storage, in_order(*said), **options)
