@@ -161,7 +161,7 @@ class Frame(eqx.Module):
             this is the drive direction.
         roll: speed along the free rolling direction (wheel, 3).
         pull: share of the rim speed r w along `hold`, sin(roller angle), times the wheel's radius
-            over r.
+            over r; how hard a wheel creeps counts with r.
         slip_through: share along `roll`, cos(roller angle), times the same.
         grip: 1 where the wheel has no rollers.
         shift: change of load shares per contact displacement (wheel, 2) [1/m].

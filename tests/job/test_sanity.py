@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 
 from slipid.data.write import own_columns, own_csv
-from slipid.job.config import read_config
+from slipid.job.config import FitSection, read_config
 from slipid.job.identify import identify
-from slipid.job.problem import read_job
+from slipid.job.problem import Task, read_job
 from slipid.job.sanity import sanity
+from slipid.model.robot import Robot
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.helpers.plain_robot import BASE, GEAR, OMNI, RADIUS, TICKS, as_runs, drive
@@ -92,3 +93,16 @@ def test_check_says_it_first_and_ends_with_one(tmp_path):
     assert result.exit_code == 1
     assert result.stdout.startswith("wrong: the wheels' columns are in another order")
     assert '"kind": "wheel_order"' in (tmp_path / "out" / "check.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("signed", "volts", "expected"), [(False, True, 1), (True, True, 0), (False, False, 0)]
+)
+def test_magnitudes_beside_voltages_are_refused_where_wheels_drag_each_other(
+    signed, volts, expected
+):
+    raws = [raw.less(*([] if volts else ["voltage"])) for raw in drive(SKID, runs=2)]
+    runs = as_runs(raws, signed)
+    robot = Robot.of(SKID.geometry, 50.0)
+    found = sanity(Task(runs, robot, (), FitSection()))
+    assert [f.kind for f in found].count("braking_unseen") == expected

@@ -582,6 +582,31 @@ def test_longer_skid_steers_turn_less():
     assert rate(0.05) > rate(0.1) > rate(0.2) > 0
 
 
+@pytest.mark.parametrize("creep", [0.02, 0.3, 2.0])
+@pytest.mark.parametrize("half_length", [0.05, 0.15, 0.3])
+def test_four_wheels_that_turn_on_the_spot_have_one_effective_track(creep, half_length):
+    """W = r w b / (a^2 + b^2), whatever the friction: it is against the sliding as a whole."""
+    frame = skid_steer(half_length, 0.15, 0.05).frame()
+    floor = surface(creep=creep, rolling_resistance=1e-9, scrub=1e-9, lead=0.0)
+    xi = np.asarray(equilibrium(jnp.array([-0.3, 0.3, -0.3, 0.3]), frame, floor, jnp.full(4, 0.25)))
+    np.testing.assert_allclose(xi[2], 0.3 * 0.15 / (half_length**2 + 0.15**2), rtol=1e-6)
+    np.testing.assert_allclose(xi[:2], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_friction_of_an_ordinary_wheel_is_no_larger_than_its_load(seed):
+    """Traction and drag together point against the sliding, and reach mu N at most."""
+    rng = np.random.default_rng(seed)
+    along, roll, rim = (jnp.asarray(rng.normal(0, 0.5, 50)) for _ in range(3))
+    floor, onset = law.sideways(surface(creep=0.1, slide_viscosity=1e-12), jnp.ones(()))
+    w = law.wheel_forces(along, roll, rim, jnp.ones(()), onset, floor, jnp.ones(()))
+    push, drag = np.asarray(w.traction.force()), -np.asarray(w.drag.force())
+    slide = np.asarray(rim - along)
+    assert (np.hypot(push, drag) <= 1 + 1e-9).all()
+    assert np.hypot(push, drag).max() > 0.9
+    np.testing.assert_allclose(push * -np.asarray(roll), drag * slide, atol=1e-9)
+
+
 def test_a_fourth_wheel_at_odds_is_overruled():
     """Three wheels ask for a translation, one stands still: the body moves, and turns."""
     rim = np.asarray(OMNI4.forward()) @ [0.3, 0.0, 0.0]
