@@ -71,6 +71,34 @@ def test_windows_are_cut_at_poses_and_turns_taken_there(tmp_path):
     np.testing.assert_allclose(w.turn, np.diff(angle(edges), axis=1), atol=5e-4)
 
 
+@pytest.mark.parametrize("lag", [0.9, -1.3])
+def test_windows_keep_to_poses_whose_time_the_wheels_were_measured_at(tmp_path, lag):
+    """A pose that is late shows what was before the log begins, one that is early what comes after.
+
+    Beyond the log's ends wheels would count as standing still.
+    """
+    fast = np.arange(0.0, 6.0, 0.02)
+    rows = [(t, *angle(t + 1.0), *pose(t + 1.0 - lag)) for t in fast.tolist()]
+    csv(tmp_path / "run.csv", ["t", "left", "right", "x", "y", "yaw"], rows)
+    w = windows(one(tmp_path, ONE_FILE), RADIUS, lag, longest=0.5)
+    edges = w.pose[:, :, 1] / 0.02  # the time that each pose shows, as y tells it
+    assert edges.min() >= 1.0 - 1e-6
+    assert edges.max() <= 1.0 + fast[-1] + 1e-6
+    np.testing.assert_allclose(w.turn, np.diff(angle(edges), axis=1), atol=5e-4)
+
+
+def test_what_was_not_read_again_is_what_was_read_last(tmp_path):
+    sparse(tmp_path / "run.csv")
+    path = tmp_path / "run.csv"
+    header, *lines = path.read_text().splitlines()
+    given = [f"{line},{k / 1000 if k % 5 == 0 else ''}" for k, line in enumerate(lines)]
+    path.write_text("\n".join([f"{header},gyro", *given]))
+    layout = {"columns": {**ONE_FILE["columns"], "gyro": {"column": "gyro", "unit": "rad/s"}}}
+    (log,) = one(tmp_path, layout).logs
+    rows = np.arange(log.samples)
+    np.testing.assert_allclose(log.gyro, (rows - rows % 5) / 1000, atol=1e-12)
+
+
 def test_a_camera_that_sees_nothing_for_a_while_leaves_a_long_window(tmp_path):
     fast = np.arange(0, 6, 0.02)
     rows = [

@@ -101,6 +101,19 @@ def test_without_slip_and_lag_the_sizes_of_the_config_are_right(kind):
     np.testing.assert_allclose(w.pose[:, -1, 2] - start[:, 2], turned.sum(axis=1), atol=1e-9)
 
 
+@pytest.mark.parametrize("name", TRUE)
+def test_corrections_are_what_their_equations_say(name):
+    shape = SHAPES["differential"]
+    w = replace(windows(shape), lag=LAG)
+    a, b, x, c, e, f = [*TRUE[name], 0.0, 0.0, 0.0][:6]
+    left, right = np.moveaxis(0.1 * w.turn / w.dt[..., None], -1, 0)
+    s, d = 0.5 * (left + right), (right - left) / 0.5
+    yaw = b * d + e * s
+    expected = np.stack([a * s + c * d, f * s - x * yaw, yaw], axis=-1)
+    found = with_truth(shape, name).twist(w, robot(shape))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
 def test_nominal_has_no_lag_and_keeps_its_sizes_when_the_fit_changes_them():
     shape = SHAPES["differential"]
     larger = replace(shape, wheel_radius=shape.wheel_radius * 1.2)
