@@ -185,8 +185,6 @@ def _cut(
     turned, ahead, behind = (interpolate(t, angle, when) for when in (at, at + half, at - half))
     span = np.clip(at + half, t[0], t[-1]) - np.clip(at - half, t[0], t[-1])
     speed = (ahead - behind) / np.maximum(span, 1e-3)[:, None]
-    first = np.searchsorted(t, at[:-1])
-    end = np.maximum(np.searchsorted(t, at[1:]), first + 1)
     zero = np.zeros((len(edges) - 1, angle.shape[1]))
     live = data.live[rows].astype(float)[:, None]
     mean_current = variance = mean_voltage = unread = zero
@@ -194,11 +192,11 @@ def _cut(
         amps = data.current[rows]
         amps = amps if data.current_is_signed else np.abs(amps)
         read = live if data.current_fresh is None else live * data.current_fresh[rows]
-        mean_current, count = _mean(amps, read, first, end)
+        mean_current, count = _mean(t, amps, read, at)
         variance = np.where(count > 0, noise / np.maximum(count, 1), UNREAD)
     if data.voltage is not None:
         read = live if data.voltage_fresh is None else live * data.voltage_fresh[rows]
-        mean_voltage, count = _mean(data.voltage[rows], read, first, end)
+        mean_voltage, count = _mean(t, data.voltage[rows], read, at)
         unread = np.where(count > 0, 0.0, UNREAD)
     return {
         "dt": np.diff(t[edges]),
@@ -213,21 +211,26 @@ def _cut(
 
 
 def _mean(
-    x: np.ndarray, live: np.ndarray, lo: np.ndarray, hi: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over what was read in the rows lo..hi of each window, and how many readings these are.
+    time: Float[np.ndarray, " row"],
+    x: Float[np.ndarray, "row wheel"],
+    live: Float[np.ndarray, "row #wheel"],
+    at: Float[np.ndarray, " edge"],
+) -> tuple[Float[np.ndarray, "window wheel"], Float[np.ndarray, "window wheel"]]:
+    """Mean over time of what was read between edges, and how many readings it is the mean of.
 
-    Where there was none it is the mean over all rows.
+    A reading stands for the time from halfway to the row before it to halfway to the next. A mean
+    over the rows in a window would be as late as its first row lies behind the edge: while a robot
+    speeds up, voltages would read high. Where nothing was read it is the mean over all rows.
     """
+    bounds = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), time[-1:]])
+    cell = np.diff(bounds)[:, None]
 
     def total(values: np.ndarray) -> np.ndarray:
         summed = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-        return np.asarray(summed[hi] - summed[lo])
+        return np.diff(interpolate(bounds, summed, at), axis=0)
 
-    lo, hi = np.minimum(lo, len(x) - 1), np.minimum(hi, len(x))
-    hi = np.maximum(hi, lo + 1)
     live = np.broadcast_to(live, x.shape)
-    n = total(live)
-    rows = (hi - lo)[:, None]
-    mean = np.where(n > 0, total(x * live) / np.maximum(n, 1), total(x) / rows)
-    return mean, n
+    seconds = total(cell * live)
+    read = seconds > 1e-9
+    mean = total(x * cell * live) / np.where(read, seconds, 1.0)
+    return np.where(read, mean, total(x * cell) / total(cell)), np.where(read, total(live), 0.0)

@@ -11,6 +11,7 @@ import pytest
 
 from slipid.data.log import Log
 from slipid.data.runs import MOVED, collect, first_row
+from slipid.data.wheel_signals import integral
 from slipid.data.windows import ammeter_variance, windows
 from slipid.support.errors import DataError
 
@@ -200,16 +201,31 @@ def test_lag_shifts_the_wheels_and_not_the_poses(logs):
     np.testing.assert_allclose(w.turn[0], np.diff(phi, axis=0), atol=1e-12)
 
 
-def test_means_are_those_of_the_rows_and_their_variance_the_ammeters_over_their_count():
+def test_means_are_over_time_and_their_variance_the_ammeters_over_their_count():
     data = collect([run(pose_fresh=None)])
     log = data.logs[0]
     w = windows(data, RADIUS, per_piece=2)
     edges = [np.flatnonzero((log.pose == p).all(axis=1))[0] for p in w.pose[0]]
     for k, (a, b) in enumerate(pairwise(edges)):
-        np.testing.assert_allclose(w.current[0, k], log.current[a:b].mean(axis=0), rtol=1e-9)
-        np.testing.assert_allclose(w.voltage[0, k], log.voltage[a:b].mean(axis=0), rtol=1e-9)
+        rows, seconds = slice(a, b + 1), log.time[b] - log.time[a]
+        for mean, of_rows in ((w.current, log.current), (w.voltage, log.voltage)):
+            expected = integral(log.time[rows], of_rows[rows])[-1] / seconds
+            np.testing.assert_allclose(mean[0, k], expected, rtol=1e-9)
         expected = ammeter_variance(data)[0] / (b - a)
-        np.testing.assert_allclose(w.current_var[0, k], expected, rtol=1e-12)
+        np.testing.assert_allclose(w.current_var[0, k], expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.011, 0.05])
+def test_means_of_what_grows_are_those_of_the_middle_of_the_window(lag):
+    """A voltage that rises with time: whichever rows lie in a window, its mean is not late."""
+    blank = run()
+    log = replace(blank, voltage=2.0 + 3.0 * blank.time[:, None] * np.ones(3))
+    data = collect([log])
+    w = windows(data, RADIUS, lag=lag, per_piece=2)
+    at = np.array([log.time[(log.pose == p).all(axis=1)][0] for p in w.pose[0]]) - lag
+    middle = 2.0 + 3.0 * 0.5 * (at[1:] + at[:-1])
+    step = np.diff(log.time).max()
+    np.testing.assert_allclose(w.voltage[0], middle[:, None] * np.ones(3), atol=step**2)
 
 
 @pytest.mark.parametrize("ripple", [0.0, 0.3])

@@ -167,7 +167,7 @@ def test_loads_are_written_at_their_wheels():
 
 
 def test_every_rung_has_words_in_the_picture():
-    shapes = omni([60, 180, 300], 0.1, 0.04), differential(0.2, 0.04)
+    shapes = omni([60.0, 180.0, 300.0], 0.1, 0.04), differential(0.2, 0.04)
     names = {rung.name for shape in shapes for rung in rungs(shape, has_current=True)}
     assert set(WORDS) == {"identified", *names}
 

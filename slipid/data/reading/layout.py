@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import field
-from typing import Annotated, Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal
 
 from pydantic import (
     AliasChoices,
@@ -85,36 +85,31 @@ class Channel:
             )
 
 
-@runtime_checkable
-class Recorded(Protocol):
-    """What a layout says of the robot's sensors, whatever the files are; see `Layout`."""
+@dataclass(frozen=True, config=CLOSED, kw_only=True)
+class Recorded:
+    """What a layout says of the robot's sensors, whatever the files are.
 
-    @property
-    def ticks_per_revolution(self) -> float | None: ...
+    Attributes:
+        ticks_per_revolution: ticks of the encoder in one turn of the *motor* shaft.
+        gear_ratio: turns of the motor per turn of the wheel.
+        ticks_are_increments: whether ticks count since the last sample.
+        tick_bits: width of the tick counter, at which it wraps around.
+        current_is_signed: False where currents are magnitudes.
+        torque_constant: torque per current of the *motor* [N m/A], where a driver reports torques.
+        max_gap: longest time between samples of a wheel [s]; a longer one is called a clock jump.
+        max_pose_jump: longest way between two poses [m]; a run with a longer one is set aside.
+        max_heading_jump: largest turn between two poses [rad]; the same.
+    """
 
-    @property
-    def gear_ratio(self) -> float: ...
-
-    @property
-    def ticks_are_increments(self) -> bool: ...
-
-    @property
-    def tick_bits(self) -> int: ...
-
-    @property
-    def current_is_signed(self) -> bool: ...
-
-    @property
-    def torque_constant(self) -> float | None: ...
-
-    @property
-    def max_gap(self) -> float: ...
-
-    @property
-    def max_pose_jump(self) -> float: ...
-
-    @property
-    def max_heading_jump(self) -> float: ...
+    ticks_per_revolution: Positive | None = None
+    gear_ratio: Positive = 1.0
+    ticks_are_increments: StrictBool = False
+    tick_bits: Count = 32
+    current_is_signed: StrictBool = True
+    torque_constant: Positive | None = None
+    max_gap: Positive = 1.0
+    max_pose_jump: Positive = 0.5
+    max_heading_jump: Positive = 1.6
 
 
 def _pair(value: object) -> object:
@@ -125,7 +120,7 @@ def _pair(value: object) -> object:
 
 
 @dataclass(frozen=True, config=CLOSED)
-class Layout:
+class Layout(Recorded):
     """How one kind of log file is laid out.
 
     Attributes:
@@ -136,19 +131,10 @@ class Layout:
         units_row: line that holds the units, which are then checked; 0 where there is none.
         first_data_row: line on which the numbers start.
         row_period: time between rows of a file without a time column [s].
-        ticks_per_revolution: ticks of the encoder in one turn of the *motor* shaft.
-        gear_ratio: turns of the motor per turn of the wheel.
-        ticks_are_increments: whether the cells hold the ticks since the last row.
-        tick_bits: width of the tick counter, at which it wraps around.
-        current_is_signed: False where the cells are magnitudes.
-        torque_constant: torque per current of the *motor* [N m/A], where a driver reports torques.
         metres_per_pixel: scale of the camera along its x and its y [m].
         new_run: what tells that the next run starts inside the file.
         drop_repeated_time: whether to keep the last of rows with the same time; else such rows are
             refused.
-        max_gap: longest time between rows [s]; a longer one is called a clock jump.
-        max_pose_jump: longest way between two poses [m]; a run with a longer one is set aside.
-        max_heading_jump: largest turn between two poses [rad]; the same.
         beside: layouts of files that lie beside a run's own and hold more of its channels, by their
             names; `{stem}` stands for that of the run's own file without its suffix.
     """
@@ -160,18 +146,9 @@ class Layout:
     units_row: Count = 0
     first_data_row: Count = 2
     row_period: Positive | None = None
-    ticks_per_revolution: Positive | None = None
-    gear_ratio: Positive = 1.0
-    ticks_are_increments: StrictBool = False
-    tick_bits: Count = 32
-    current_is_signed: StrictBool = True
-    torque_constant: Positive | None = None
     metres_per_pixel: Annotated[tuple[Positive, Positive] | None, BeforeValidator(_pair)] = None
     new_run: Literal["never", "time_restarts", "ticks_restart"] = "never"
     drop_repeated_time: StrictBool = False
-    max_gap: Positive = 1.0
-    max_pose_jump: Positive = 0.5
-    max_heading_jump: Positive = 1.6
     beside: Mapping[str, "Layout"] = field(default_factory=dict)
 
     @property

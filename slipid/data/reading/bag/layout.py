@@ -9,7 +9,7 @@ from pydantic import AliasChoices, BeforeValidator, Field, StrictBool, StrictFlo
 from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.bag.messages.shape import steps_of
-from slipid.data.reading.layout import CHANNELS, PER_WHEEL, Count, unknown
+from slipid.data.reading.layout import CHANNELS, PER_WHEEL, Recorded, unknown
 from slipid.data.reading.units import factor
 from slipid.support.errors import DataError
 from slipid.support.toml_file import CLOSED, NotNegative, Positive, checked
@@ -99,7 +99,7 @@ class RunRule:
 
 
 @dataclass(frozen=True, config=CLOSED)
-class BagLayout:
+class BagLayout(Recorded):
     """How the bags of one robot are laid out.
 
     Attributes:
@@ -112,8 +112,6 @@ class BagLayout:
         max_disorder: messages of a topic that are late by no more are sorted [s].
         drop_nan: whether messages with numbers that are none (NaN) are left out; else refused.
         definitions: folder of .msg files, for message types whose definition the bag lacks.
-
-    The others are those of `slipid.data.reading.layout.Layout`.
     """
 
     name: str
@@ -124,15 +122,6 @@ class BagLayout:
     max_disorder: NotNegative = 0.1
     drop_nan: StrictBool = False
     definitions: Path | None = None
-    ticks_per_revolution: Positive | None = None
-    gear_ratio: Positive = 1.0
-    ticks_are_increments: StrictBool = False
-    tick_bits: Count = 32
-    current_is_signed: StrictBool = True
-    torque_constant: Positive | None = None
-    max_gap: Positive = 1.0
-    max_pose_jump: Positive = 0.5
-    max_heading_jump: Positive = 1.6
 
     @property
     def holds(self) -> frozenset[str]:
