@@ -7,7 +7,7 @@ from slipid.control import closed_loop
 from slipid.control.deployed import DeployedRobot
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import ROWS, pilot_of
-from slipid.deploy.deploy import habits_of
+from slipid.deploy.deploy import NO_CONTROLLER, habits_of
 from slipid.deploy.floors import floor_of
 from slipid.deploy.trial import REST_S, path_of
 from slipid.deploy.trial_site import known_to_fit, site, starts, twin
@@ -59,10 +59,12 @@ def drive(
         seed: of the sensors' noise.
 
     Raises:
-        ValueError: no such controller or start.
+        ValueError: no such controller or start, or wheels that have no controller.
         DataError: no such path or map, a speed beyond what the fit has seen, or a floor that the
             robot does not know.
     """
+    if not robot.steers:
+        raise ValueError(NO_CONTROLLER)
     course = path_of(path, speed, robot)
     floor = site(robot) if map is None else read_map(Path(map))
     known_to_fit(floor, robot, str(map))

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.control.filter.effects import Told
-from slipid.control.robot_file.file import ANEW, check, read_robot, write_robot
+from slipid.control.robot_file.file import ANEW, check, read_robot, shape_of, write_robot
 from slipid.control.robot_file.record import LoadRecord, Numbers, RobotRecord
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Frame, Geometry
+from slipid.model.geometry import Frame, Geometry, at_drives, at_wheels
 from slipid.model.motor import Motor
 from slipid.support.errors import DataError
 
@@ -25,7 +25,8 @@ class DeployedRobot(eqx.Module):
 
     Attributes:
         frame: wheel directions; `places`: wheel centres in the body frame [m].
-        forward: J (wheel, 3); `inverse`: its pseudo-inverse.
+        forward: J (drive, 3); `inverse`: its pseudo-inverse. A drive is a motor with its encoder
+            and ammeter; all but robots with several wheels on a drive have one for every wheel.
         motor: of every wheel.
         floors: stacked, a row per floor in the order of `labels`.
         rest: load shares at rest.
@@ -40,15 +41,15 @@ class DeployedRobot(eqx.Module):
         current_trend: a + b v, measured currents over the model's at speed v [A, A s/m].
         highest: wheel speed up to which the fit has seen the robot [rad/s], and the model's largest
             current up to 0.8 of it [A].
-        wheel_curve: a + b |I|, the slip ratio of each wheel, of all floors together (wheel, 2).
+        wheel_curve: a + b |I|, the slip ratio of each drive, of all floors together (drive, 2).
         record: every number with its interval, verdict and provenance.
         load_setup: name of the load set-up.
     """
 
     frame: Frame
     places: Float[Array, "wheel 2"]
-    forward: Float[Array, "wheel 3"]
-    inverse: Float[Array, "3 wheel"]
+    forward: Float[Array, "drive 3"]
+    inverse: Float[Array, "3 drive"]
     motor: Motor
     floors: ContactSurface
     rest: Float[Array, " wheel"]
@@ -60,7 +61,7 @@ class DeployedRobot(eqx.Module):
     current_std: Float[Array, " floor"]
     current_trend: Float[Array, "2"]
     highest: Float[Array, "2"]
-    wheel_curve: Float[Array, "wheel 2"]
+    wheel_curve: Float[Array, "drive 2"]
     record: RobotRecord = eqx.field(static=True)
     load_setup: str = eqx.field(static=True)
 
@@ -68,6 +69,42 @@ class DeployedRobot(eqx.Module):
     def wheels(self) -> int:
         """Number of wheels."""
         return len(self.record.wheels.place)
+
+    @property
+    def drives(self) -> int:
+        """Number of drives: as many angles, currents and voltages are measured."""
+        return shape_of(self.record).drives
+
+    @property
+    def steers(self) -> bool:
+        """Whether its wheels can be asked for any twist, each of them alone.
+
+        Else it has an estimator, but no controller: `slipid.control.controller` asks for motion
+        sideways as well.
+        """
+        shape = shape_of(self.record)
+        return not shape.drive_of and shape.determines_twist
+
+    @property
+    def by_wheels(self) -> Float[Array, "3 wheel"]:
+        """Twist per rim speed of every wheel, where those of a drive turn alike."""
+        if not self.record.wheels.drive_of:
+            return self.inverse
+        return self.inverse @ self.on_average(jnp.eye(self.wheels)).T
+
+    def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
+        """What every wheel has of its drive, such as its speed."""
+        return at_wheels(self.record.wheels.drive_of, of_drives)
+
+    def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
+        """What every drive has of all its wheels together, such as their torque."""
+        return at_drives(self.record.wheels.drive_of, of_wheels)
+
+    def on_average(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
+        """Mean of what the wheels of every drive have."""
+        if not self.record.wheels.drive_of:
+            return of_wheels
+        return self.at_drives(of_wheels) / self.at_drives(jnp.ones(self.wheels))
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -79,8 +116,7 @@ class DeployedRobot(eqx.Module):
         """The robot of a record, as it drives with a load set-up, the first one by default.
 
         Raises:
-            ValueError: no such load set-up, a number that is missing or out of its bounds, or
-                wheels whose kinematics have rank below 3.
+            ValueError: no such load set-up, or a number that is missing or out of its bounds.
         """
         check(record)
         return _arrays(record, load, {path: n.value for path, n in record.parameters.items()})
@@ -174,7 +210,7 @@ def _arrays(
         frame=geometry.frame(),
         places=jnp.asarray(geometry.place) * geometry.base_radius,
         forward=geometry.forward(),
-        inverse=geometry.inverse(),
+        inverse=geometry.least(),
         motor=Motor(**of("motor", Motor), gear_ratio=wheels.gear_ratio),
         floors=ContactSurface(
             **{name: jnp.stack([row[name] for row in rows]) for name in rows[0]},

@@ -36,7 +36,7 @@ class EstimatorState(eqx.Module):
     """
 
     wheels: WheelState
-    current: Float[Array, " wheel"]
+    current: Float[Array, " drive"]
     floors: FloorState
     place: PoseState
     stuck: Float[Array, ""]
@@ -70,7 +70,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
         f, s = self.robot, self.settings
         return EstimatorState(
             wheels=WheelState.init(f, s),
-            current=jnp.zeros(f.wheels),
+            current=jnp.zeros(f.drives),
             floors=FloorFilter(f, s).init(),
             place=PoseFilter(f, s).init(jnp.asarray(pose, dtype=float), std),
             stuck=jnp.zeros(()),
@@ -125,7 +125,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
         )
 
     def _slip(self, w: Array, twist: Array) -> Array:
-        """Slip ratio of each wheel, 0 for one that stands."""
+        """Slip ratio of each drive, 0 for one that stands."""
         f, turns = self.robot, jnp.abs(w) > 1e-3
         rim = f.frame.radius * jnp.where(turns, w, 1.0)
         return jnp.where(turns, jnp.clip(1 - f.forward @ twist / rim, -2.0, 2.0), 0.0)
@@ -163,7 +163,7 @@ class OdometryState(eqx.Module):
 
     pose: Float[Array, "3"]
     wheels: WheelState
-    current: Float[Array, " wheel"]
+    current: Float[Array, " drive"]
 
 
 class Odometry(AbstractEstimator[OdometryState]):
@@ -189,7 +189,7 @@ class Odometry(AbstractEstimator[OdometryState]):
         return OdometryState(
             pose=jnp.asarray(pose, dtype=float),
             wheels=WheelState.init(self.robot, self.settings),
-            current=jnp.zeros(self.robot.wheels),
+            current=jnp.zeros(self.robot.drives),
         )
 
     def advance(

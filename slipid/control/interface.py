@@ -72,25 +72,25 @@ class Settings:
 class Readings(eqx.Module):
     """A measurement with NaN where there is nothing; attributes as of `Measurement`.
 
-    Those of all robots with so many wheels have one structure, whatever they measure.
+    Those of all robots with so many drives have one structure, whatever they measure.
     """
 
-    wheel_angle: Float[Array, "*batch wheel"]
-    wheel_speed: Float[Array, "*batch wheel"]
-    current: Float[Array, "*batch wheel"]
-    voltage: Float[Array, "*batch wheel"]
+    wheel_angle: Float[Array, "*batch drive"]
+    wheel_speed: Float[Array, "*batch drive"]
+    current: Float[Array, "*batch drive"]
+    voltage: Float[Array, "*batch drive"]
     gyro: Float[Array, "*batch"]
     fix: Float[Array, "*batch 3"]
     fix_std: Float[Array, "*batch 2"]
     fix_age: Float[Array, "*batch"]
 
     @classmethod
-    def nothing(cls, wheels: int) -> "Readings":
-        """Of a robot of so many wheels that measures nothing."""
-        shapes = [(wheels,)] * 4 + [(), (3,), (2,), ()]
+    def nothing(cls, drives: int) -> "Readings":
+        """Of a robot of so many drives that measures nothing."""
+        shapes = [(drives,)] * 4 + [(), (3,), (2,), ()]
         return cls(*(jnp.full(shape, jnp.nan, dtype=float) for shape in shapes))
 
-    def filled(self, wheels: int) -> "Readings":
+    def filled(self, drives: int) -> "Readings":
         """Themselves."""
         return self
 
@@ -101,8 +101,9 @@ class Measurement(eqx.Module):
     `Measurement(wheel_angle=angle, current=amps)` is a robot that measures these two.
 
     Attributes:
-        wheel_angle: of every wheel, cumulative [rad]; it counts before `wheel_speed`.
-        wheel_speed: of every wheel [rad/s].
+        wheel_angle: of every encoder, as the wheel turns, cumulative [rad]; it counts before
+            `wheel_speed`.
+        wheel_speed: the same, its rate [rad/s].
         current: of every motor [A], signed or not as the estimator's settings say.
         voltage: of every motor [V].
         gyro: yaw rate [rad/s].
@@ -121,18 +122,18 @@ class Measurement(eqx.Module):
     fix_std: Given = None
     fix_age: Given = None
 
-    def filled(self, wheels: int) -> Readings:
+    def filled(self, drives: int) -> Readings:
         """The same with NaN where there is nothing.
 
         Raises:
-            ValueError: a field has another shape than a robot of so many wheels gives.
+            ValueError: a field has another shape than a robot of so many drives gives.
         """
-        given = vars(Readings.nothing(wheels))
+        given = vars(Readings.nothing(drives))
         for name, value in vars(self).items():
             if value is not None:
                 found, shape = jnp.asarray(value, dtype=float), given[name].shape
                 if found.shape != shape:
-                    of = f"a robot with {wheels} wheels"
+                    of = f"a robot with {drives} encoders"
                     raise ValueError(f"{name} of shape {found.shape}; expected {shape} of {of}")
                 given = given | {name: found}
         return Readings(**given)
@@ -161,7 +162,7 @@ class Estimate(eqx.Module):
 
     Attributes:
         pose: x, y [m], heading [rad]; twist: of the body [m/s, m/s, rad/s].
-        slip: ratio of each wheel; wheel_speed: of each wheel [rad/s].
+        slip: ratio of the wheels of each drive; wheel_speed: of these [rad/s].
         current: of each motor, signed and filtered [A].
         surface_probability: of each floor in the order of `labels`, and of none of them in the last
             column, under each wheel.
@@ -175,9 +176,9 @@ class Estimate(eqx.Module):
 
     pose: Float[Array, "3"]
     twist: Float[Array, "3"]
-    slip: Float[Array, " wheel"]
-    wheel_speed: Float[Array, " wheel"]
-    current: Float[Array, " wheel"]
+    slip: Float[Array, " drive"]
+    wheel_speed: Float[Array, " drive"]
+    current: Float[Array, " drive"]
     surface_probability: Float[Array, "wheel floor_or_none"]
     covariance: Float[Array, "3 3"]
     believed: Believed
@@ -223,7 +224,7 @@ class AbstractEstimator(eqx.Module, Generic[State]):
         What is None, no number or what no sensor of this robot could read counts as not measured;
         where `dt` [s] is no positive number, no time has passed.
         """
-        z, dt = measurement.filled(self.robot.wheels), jnp.asarray(dt, dtype=float)
+        z, dt = measurement.filled(self.robot.drives), jnp.asarray(dt, dtype=float)
         given = jax.tree.leaves((self, state, z, dt))
         if any(isinstance(x, jax.core.Tracer) for x in given):
             return self.advance(state, z, dt)

@@ -21,14 +21,19 @@ from slipid.deploy.told import told_by_load
 from slipid.identify.posterior.diagnosis import Posterior, estimates
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
-from slipid.job.config import read_config
-from slipid.job.problem import shape_of
 from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
 from slipid.support.errors import DataError
 
 ROBOT = "robot.json"
+NO_CONTROLLER = (
+    "the wheels of this robot cannot be asked for any motion ahead, sideways and in yaw, each "
+    "wheel alone: it has an estimator (slipid.Estimator), but no controller, so nothing to tune, "
+    "to drive in a trial or to export; identify, validate, compare, sample, selftest and design "
+    "apply"
+)
+"""What is said of wheels that have no controller."""
 DRAWS = 64
 """Draws of the posterior that are kept."""
 
@@ -38,13 +43,7 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
 
     Its numbers are those of `identified.json`: of the posterior where there is one, else of the
     fit's Laplace approximation. `DeployedRobot.record.source` says which.
-
-    Raises:
-        ValueError: the wheels' kinematics have rank below 3, or wheels share a drive.
     """
-    fit.robot.geometry.inverse()  # what cannot be deployed is not computed
-    if fit.robot.geometry.drive_of:
-        raise ValueError("wheels that share a drive are not deployed yet")
     source: Source = "laplace"
     numbers, messages = fit.parameters, fit.messages
     vectors, center = fit.draws(DRAWS), fit.z
@@ -80,15 +79,8 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
 
 
 def write_robot(out: Path, fit: Fit, posterior: Posterior | None = None) -> tuple[str, ...]:
-    """Write robot.json beside a fit where its wheels allow a controller; names of files written."""
-    try:
-        robot = deploy(fit, posterior)
-    except ValueError as error:
-        if isinstance(error, DataError):
-            raise
-        (out / ROBOT).unlink(missing_ok=True)
-        return ()
-    kept = out / ROBOT
+    """Write robot.json beside a fit; names of files written."""
+    robot, kept = deploy(fit, posterior), out / ROBOT
     with suppress(DataError):  # gains outlive a fit that came to the same numbers
         before = DeployedRobot.load(kept).record if kept.is_file() else robot.record
         if before.numbers == robot.record.numbers:
@@ -98,20 +90,24 @@ def write_robot(out: Path, fit: Fit, posterior: Posterior | None = None) -> tupl
 
 
 def read_robot(out: Path, load: str | None = None) -> DeployedRobot:
-    """The robot of a folder; DataError where there is none, or as of `DeployedRobot.load`."""
+    """The robot of a folder that is to be driven.
+
+    Raises:
+        DataError: there is none, its wheels have no controller, or as of `DeployedRobot.load`.
+    """
     path = out / ROBOT
     if not path.is_file():
-        config = out / "config.toml"
-        if config.is_file() and not shape_of(read_config(config)).determines_twist:
-            raise DataError(
-                f"{out}: the wheels of this robot do not determine x, y and yaw: it has no "
-                "estimator and no controller yet, so nothing to tune, to drive in a trial or to "
-                "export; identify, validate, compare, sample, selftest and design apply"
-            )
         raise DataError(
             f"{path}: not there; `slipid identify` writes it, so run it with --out {out}"
         )
-    return DeployedRobot.load(path, load)
+    return steered(path, DeployedRobot.load(path, load))
+
+
+def steered(path: Path, robot: DeployedRobot) -> DeployedRobot:
+    """The robot of a file; DataError where its wheels have no controller."""
+    if not robot.steers:
+        raise DataError(f"{path}: {NO_CONTROLLER}")
+    return robot
 
 
 def habits_of(robot: DeployedRobot, gyro: bool) -> Habits:

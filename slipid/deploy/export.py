@@ -26,7 +26,7 @@ from slipid.control.interface import Measurement, Readings
 from slipid.control.robot_file.file import robot_bytes
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import ROWS, pilot_of
-from slipid.deploy.deploy import ROBOT, habits_of, read_robot
+from slipid.deploy.deploy import ROBOT, habits_of, read_robot, steered
 from slipid.deploy.floors import floor_of
 from slipid.deploy.trial import REST_S, path_of
 from slipid.deploy.trial_site import known_to_fit, site, starts, twin
@@ -99,7 +99,7 @@ def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedR
     """
     is_file = source.suffix == ".json"
     path = source if is_file else source / ROBOT
-    robot = DeployedRobot.load(path, load) if is_file else read_robot(source, load)
+    robot = steered(path, DeployedRobot.load(path, load)) if is_file else read_robot(source, load)
     try:
         return robot.on(*floors) if floors else robot
     except ValueError as error:

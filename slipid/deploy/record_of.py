@@ -104,40 +104,51 @@ def _load(
 ) -> record.LoadRecord:
     """What depends on how the robot is loaded."""
     frame, k = robot.geometry.frame(), jnp.asarray(robot.load_index(name))
-    speed, amps, slip = _circle(robot, frame, k, jnp.asarray(top))
+    ways = directions(36)
+    if not robot.geometry.determines_twist:
+        ways = jnp.concatenate([ways, _turns(frame)])
+    speed, amps, slip = _circle(robot, frame, k, jnp.asarray(top), ways)
     curve = np.asarray(_wheel_curve(speed, amps, slip))
     return record.LoadRecord(
         name=name,
-        spread=tuple(_axes(row) for row in _spread(draws, k)),
+        spread=tuple(_axes(row) for row in _spread(robot, frame, draws, k)),
         told=told,
         highest_current=float(jnp.max(jnp.abs(amps))),
         wheel_curve=tuple((float(a), float(b)) for a, b in curve),
     )
 
 
-def _ways(count: int) -> Array:
+def directions(count: int) -> Float[Array, "way 3"]:
     """Twists of 1 m/s in so many directions, without turning."""
     angle = jnp.linspace(0.0, 2 * jnp.pi, count, endpoint=False)
     return jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
 
 
+def _turns(frame: Frame) -> Float[Array, "way 3"]:
+    """Twists on the spot, to the left and to the right, with a rim speed of 1 m/s or so."""
+    return jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / frame.base
+
+
 @eqx.filter_jit
-def _circle(robot: Robot, frame: Frame, load: Array, top: Array) -> tuple[Array, Array, Array]:
-    """Wheel speeds, currents, slip ratios on every floor in all directions (.., wheel)."""
-    speed = _ways(36) @ robot.geometry.forward().T / frame.radius
+def _circle(
+    robot: Robot, frame: Frame, load: Array, top: Array, ways: Float[Array, "way 3"]
+) -> tuple[Array, Array, Array]:
+    """Wheel speeds, currents, slip ratios on every floor for all ways to move (.., drive)."""
+    shape = robot.geometry
+    speed = ways @ shape.forward().T / frame.radius
     speed = jnp.stack([0.4 * top, 0.8 * top])[:, None, None] * speed / jnp.max(jnp.abs(speed))
     rest = robot.body.load_share[load]
 
     def one(w: Array, floor: ContactSurface) -> tuple[Array, Array]:
-        rim = frame.radius * w
+        rim = frame.radius * shape.at_wheels(w)
         xi = contact.equilibrium(rim, frame, floor, rest)
         force = floor.friction * robot.body.mass * GRAVITY * frame.radius
         where = xi, rim, frame, floor, rest
         felt = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
-        lost = rim - robot.geometry.forward() @ xi
-        return robot.motor.current(force * robot.motor.borne(felt), w), lost / jnp.where(
-            jnp.abs(rim) < 1e-9, 1e-9, rim
-        )
+        amps = robot.motor.current(shape.at_drives(force * robot.motor.borne(felt)), w)
+        turned = frame.radius * w
+        lost = turned - shape.forward() @ xi
+        return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
 
     flat = speed.reshape(-1, speed.shape[-1])
     amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(robot.surfaces)
@@ -146,7 +157,7 @@ def _circle(robot: Robot, frame: Frame, load: Array, top: Array) -> tuple[Array,
 
 @eqx.filter_jit
 def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
-    """Least squares of the slip speed on a + b |I|, wheel by wheel, over all floors.
+    """Least squares of the slip speed on a + b |I|, drive by drive, over all floors.
 
     The 2021 paper's deployed form, its coefficients refitted; weighted by wheel speed, so that
     wheels that hardly turn do not decide.
@@ -160,10 +171,16 @@ def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
     return jax.vmap(wheel, 1)(*flat)
 
 
-def _spread(draws: Robot, load: Array) -> Float[np.ndarray, "floor 3"]:
-    """Std over posterior draws of the motion per metre, a row per floor (along, across, yaw)."""
-    moved = np.asarray(moved_per_metre(draws, load, jnp.asarray(0.2), 12))
-    return np.sqrt(np.mean(spread_of(moved) ** 2, axis=1))
+def _spread(robot: Robot, frame: Frame, draws: Robot, load: Array) -> Float[np.ndarray, "floor 3"]:
+    """Std over posterior draws of the motion per metre, a row per floor (along, across, yaw).
+
+    On average over all directions; of wheels that do not drive sideways the largest, turns on the
+    spot included.
+    """
+    free, speed = robot.geometry.determines_twist, jnp.asarray(0.2)
+    ways = directions(12) if free else jnp.concatenate([directions(2), _turns(frame)])
+    std = spread_of(np.asarray(moved_per_metre(draws, load, speed, ways)))
+    return np.sqrt(np.mean(std**2, axis=1)) if free else std.max(axis=1)
 
 
 def spread_of(draws: Float[np.ndarray, "draw *rest"]) -> Float[np.ndarray, "*rest"]:
@@ -174,22 +191,21 @@ def spread_of(draws: Float[np.ndarray, "draw *rest"]) -> Float[np.ndarray, "*res
 
 @eqx.filter_jit
 def moved_per_metre(
-    draws: Robot, load: Array, speed: Array, count: int
-) -> Float[Array, "draw floor direction 3"]:
+    draws: Robot, load: Array, speed: Array, way: Float[Array, "way 3"]
+) -> Float[Array, "draw floor way 3"]:
     """Motion along, across and in yaw per metre of wheels that would not slip, at a speed [m/s].
 
-    In so many directions, of robots that are stacked.
+    For ways to move at 1 m/s, of robots that are stacked.
     """
 
     def one(robot: Robot) -> Array:
         frame = robot.geometry.frame()
-        way = _ways(count)
-        rim = speed * way @ robot.geometry.forward().T
+        rim = robot.geometry.at_wheels(speed * way @ robot.geometry.forward().T)
         rest = robot.body.load_share[load]
         xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
             robot.surfaces
         )
-        along = jnp.einsum("fkc,kc->fk", xi, way)
+        along = jnp.einsum("fkc,kc->fk", xi[..., :2], way[:, :2])
         across = xi[..., 1] * way[:, 0] - xi[..., 0] * way[:, 1]
         return jnp.stack([along, across, xi[..., 2]], axis=-1) / speed
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.control.robot_file.record import Axes, ToldRecord
-from slipid.deploy.record_of import moved_per_metre, spread_of
+from slipid.deploy.record_of import directions, moved_per_metre, spread_of
 from slipid.identify.compare.predictive import Contact
 from slipid.identify.fit.shared import AXES, Directions, Pace
 
@@ -53,7 +53,7 @@ def _table(
     way = Directions(np.tile(angle, count), paces, contact.robot.geometry.mirror())
     robots = jax.vmap(contact.space.tree)(jnp.asarray(draws))
     k = jnp.asarray(contact.robot.load_index(load))
-    moved = [moved_per_metre(robots, k, jnp.exp(s), DIRECTIONS) for s in log_speed]
+    moved = [moved_per_metre(robots, k, jnp.exp(s), directions(DIRECTIONS)) for s in log_speed]
     predicted = np.concatenate([np.asarray(x) for x in moved], axis=2)  # speeds in turn
     shape = (len(labels), count, DIRECTIONS, len(AXES))
     mean, left = np.zeros(shape), np.zeros(shape)

@@ -90,13 +90,11 @@ class Geometry(eqx.Module):
 
     def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
         """What every wheel has of its drive, such as its speed."""
-        return of_drives[..., jnp.asarray(self.drive_of)] if self.drive_of else of_drives
+        return at_wheels(self.drive_of, of_drives)
 
     def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
         """What every drive has of all its wheels together, such as their torque."""
-        if not self.drive_of:
-            return of_wheels
-        return of_wheels @ jnp.asarray(np.eye(self.drives)[list(self.drive_of)])
+        return at_drives(self.drive_of, of_wheels)
 
     def frame(self) -> "Frame":
         """The wheels as rows of matrices, at the current radius, base and offsets."""
@@ -139,18 +137,21 @@ class Geometry(eqx.Module):
         """
         return jnp.asarray(np.linalg.pinv(np.asarray(self.forward()), rcond=1e-6))
 
-    def inverse(self) -> Float[Array, "3 drive"]:
-        """J^+ of wheels that determine the twist, least squares beyond three of them.
 
-        Raises:
-            ValueError: they do not (rank below 3).
-        """
-        if not self.determines_twist:
-            raise ValueError(
-                f"{self.wheels} wheels with these drive directions do not determine x, y and yaw: "
-                "the kinematics have rank below 3"
-            )
-        return self.least()
+def at_wheels(
+    drive_of: tuple[int, ...], of_drives: Float[Array, "*batch drive"]
+) -> Float[Array, "*batch wheel"]:
+    """What every wheel has of its drive; `drive_of` as of `Geometry`."""
+    return of_drives[..., jnp.asarray(drive_of)] if drive_of else of_drives
+
+
+def at_drives(
+    drive_of: tuple[int, ...], of_wheels: Float[Array, "*batch wheel"]
+) -> Float[Array, "*batch drive"]:
+    """What every drive has of all its wheels together; `drive_of` as of `Geometry`."""
+    if not drive_of:
+        return of_wheels
+    return of_wheels @ jnp.asarray(np.eye(len(set(drive_of)))[list(drive_of)])
 
 
 class Frame(eqx.Module):

@@ -61,7 +61,7 @@ def _sentences(robot: DeployedRobot) -> Iterator[str]:
     loads = listed([load.name for load in record.loads])
     yield f"Load set-up: {one_line(robot.load_setup)}, of those known: {loads}."
     yield f"Floors: {listed(robot.labels)}."
-    numbers = declared(record, robot.wheels)
+    numbers = declared(record)
     counts = Counter(record.parameters[e.path].verdict for e in numbers)
     said = ", ".join(f"{n} {v.replace('_', ' ')}" for v, n in counts.most_common())
     yield f"Verdicts: {said}."

@@ -74,14 +74,14 @@ def values_of(number: Number) -> tuple[float, ...]:
 def rows_of(robot: DeployedRobot) -> tuple[Row, ...]:
     """Every number of a robot, those per wheel one by one."""
     known = robot.record.parameters
-    numbers = declared(robot.record, robot.wheels)
+    numbers = declared(robot.record)
     return tuple(row for e in numbers for row in _of_entry(e, known[e.path]))
 
 
 def doubted(robot: DeployedRobot, verdict: Verdict) -> tuple[str, ...]:
     """Paths of the numbers with a verdict."""
     known = robot.record.parameters
-    numbers = declared(robot.record, robot.wheels)
+    numbers = declared(robot.record)
     return tuple(e.path for e in numbers if known[e.path].verdict == verdict)
 
 

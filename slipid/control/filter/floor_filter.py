@@ -128,7 +128,7 @@ class FloorFilter(eqx.Module):
 
         Args:
             old, tick: the beliefs before the step, and the step.
-            w: wheel speeds [rad/s]; currents: what is known of them.
+            w: wheel speed of every drive [rad/s]; currents: what is known of them.
             turn: yaw rate by the gyro, its bias taken off, NaN without one [rad/s].
             mapped: probability of every hypothesis by a floor map where the robot now is.
         """
@@ -174,18 +174,19 @@ class FloorFilter(eqx.Module):
         return jnp.sqrt(1 - share[:, None] * (1 - part**2))
 
     def solve(
-        self, near: Float[Array, "hypothesis 3"], w: Float[Array, " wheel"]
-    ) -> tuple[Float[Array, "hypothesis 3"], Float[Array, "hypothesis wheel"]]:
+        self, near: Float[Array, "hypothesis 3"], w: Float[Array, " drive"]
+    ) -> tuple[Float[Array, "hypothesis 3"], Float[Array, "hypothesis drive"]]:
         """Twist [m/s, m/s, rad/s] and currents [A] of every hypothesis, `near` a moment ago."""
         f = self.robot
         on = stand(f.frame, f.floors.at(hypotheses_of(f).under.T), f.rest)
-        rim = f.frame.radius * w
-        twist, pull = settle(near.T, rim, on, f.inverse)
+        rim = f.frame.radius * f.at_wheels(w)
+        twist, pull = settle(near.T, rim, on, f.by_wheels)
         drag = Balance(rim[:, None], on).rolled(Planar(*twist))
         borne = f.motor.borne(jnp.stack([pull, drag], axis=-1))
-        torque = on.friction * f.mass * GRAVITY * f.frame.radius * borne
-        amps = f.motor.current(torque.T, jnp.broadcast_to(w, torque.T.shape))
-        more = f.current_trend @ jnp.stack([1.0, length((f.inverse @ rim)[:2])])
+        force = on.friction * f.mass * GRAVITY * borne
+        torque = f.at_drives((force * f.frame.radius).T)
+        amps = f.motor.current(torque, jnp.broadcast_to(w, torque.shape))
+        more = f.current_trend @ jnp.stack([1.0, length((f.inverse @ (f.frame.radius * w))[:2])])
         return twist.T, amps + jnp.sign(amps) * more
 
     def _by_friction(self, twist: Array, w: Array, under: Array) -> Float[Array, "3 floor"]:
@@ -195,7 +196,7 @@ class FloorFilter(eqx.Module):
         leads too far where all wheels slide.
         """
         f = self.robot
-        rim = f.frame.radius * w
+        rim = f.frame.radius * f.at_wheels(w)
         shared = f.floors.mixed(under)
         on, xi = stand(f.frame, shared, f.rest), Planar(*twist)
         mu, each = on.floor.friction, under * f.floors.friction / jnp.mean(shared.friction)
@@ -221,10 +222,10 @@ class FloorFilter(eqx.Module):
         """
         f, s = self.robot, self.settings
         amps, told_of = currents.filtered, currents.told
-        std = f.current_std[hypotheses_of(f).under]
+        var = f.on_average(f.current_std[hypotheses_of(f).under] ** 2)
         size = jnp.sqrt(predicted**2 + 0.03**2)
         gap = jnp.where(told_of == 2, predicted - amps, size - jnp.abs(amps))
-        var = std**2 + (currents.variance + self._stiction(w)) + self._of_friction(predicted)
+        var = var + (currents.variance + self._stiction(w)) + self._of_friction(predicted)
         yaw = jnp.mean(f.effect[:, 2]) * jnp.maximum(length(xi[:, :2]), 0.02)
         gyro_gap, gyro_var = xi[:, 2] - turn, s.gyro_std**2 + yaw**2
         gap = jnp.concatenate([gap, gyro_gap[:, None]], axis=1)
@@ -236,7 +237,7 @@ class FloorFilter(eqx.Module):
         spread = jnp.prod(jnp.where(heard, var / jnp.mean(var, axis=0), 1.0), axis=1)
         return -0.5 * (score + jnp.log(spread)), -0.5 * s.unknown_std**2 * jnp.sum(heard)
 
-    def _of_friction(self, amps: Float[Array, "hypothesis wheel"]) -> Array:
+    def _of_friction(self, amps: Float[Array, "hypothesis drive"]) -> Array:
         """Variance of currents as frictions of several floors under the wheels are unsure [A^2].
 
         A wheel has so much of the whole drag as its friction is over their mean.
@@ -244,7 +245,7 @@ class FloorFilter(eqx.Module):
         on = hypotheses_of(self.robot).on.astype(float)
         over = (on - on.mean(axis=1, keepdims=True)).reshape(-1, on.shape[2])
         var = jnp.sum((over @ self.robot.friction_covariance) * over, axis=1)
-        return amps**2 * var.reshape(amps.shape)
+        return amps**2 * self.robot.on_average(var.reshape(on.shape[:2]))
 
     def _stiction(self, w: Array) -> Array:
         """Variance of the current that holds a standing wheel, between friction's bounds [A^2]."""

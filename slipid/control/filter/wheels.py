@@ -12,22 +12,22 @@ class WheelState(eqx.Module):
     """How the wheels turn.
 
     Attributes:
-        speed: of each wheel [rad/s]; age: of its last reading [s].
+        speed: of the wheels of each drive [rad/s]; age: of its last reading [s].
         angle: up to which motion is counted [rad]; NaN before the first reading.
     """
 
-    speed: Float[Array, " wheel"]
-    angle: Float[Array, " wheel"]
-    age: Float[Array, " wheel"]
+    speed: Float[Array, " drive"]
+    angle: Float[Array, " drive"]
+    age: Float[Array, " drive"]
 
     @classmethod
     def init(cls, robot: DeployedRobot, settings: Settings) -> "WheelState":
         """At rest, and not heard of yet."""
-        w = robot.wheels
+        n = robot.drives
         return cls(
-            speed=jnp.zeros(w),
-            angle=jnp.full(w, jnp.nan, dtype=float),
-            age=jnp.full(w, 10 * settings.stale_s, dtype=float),
+            speed=jnp.zeros(n),
+            angle=jnp.full(n, jnp.nan, dtype=float),
+            age=jnp.full(n, 10 * settings.stale_s, dtype=float),
         )
 
 
@@ -40,9 +40,9 @@ class Currents(eqx.Module):
         variance: of the sensors [A^2].
     """
 
-    filtered: Float[Array, " wheel"]
-    told: Int[Array, " wheel"]
-    variance: Float[Array, " wheel"]
+    filtered: Float[Array, " drive"]
+    told: Int[Array, " drive"]
+    variance: Float[Array, " drive"]
 
 
 def time_step(dt: Float[Array, ""] | float, settings: Settings) -> Float[Array, ""]:

@@ -5,7 +5,7 @@
 
 import json
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from slipid.parameter import Declaration, Entry, entries
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_bytes
 
-SCHEMA = "slipid.robot/4"
+SCHEMA = "slipid.robot/5"
 ANEW = "copy it again, or write it anew with `slipid identify`"
 
 
@@ -114,15 +114,24 @@ def check(record: RobotRecord) -> None:
         raise ValueError("wheels.place: no entries; expected one for every wheel")
     for name in ("drive_angle", "roller_angle", "grips"):
         _counted(f"wheels.{name}", getattr(record.wheels, name), wheels)
+    drives = shape_of(record).drives
     for kind, names in (("floors", record.labels), ("loads", [x.name for x in record.loads])):
         if not names or len(set(names)) < len(names):
             raise ValueError(f"{kind} {list(names)}; expected one or more, each once")
     for load in record.loads:
         _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
-        _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, wheels)
+        _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, drives)
         if load.told is not None:
             _told(f"loads, {load.name}: told", load.told, len(record.floors))
-    _numbers(record, wheels)
+    _numbers(record)
+
+
+def shape_of(record: RobotRecord) -> Geometry:
+    """The wheels, every number at its start."""
+    plain = Geometry(**vars(record.wheels))
+    return replace(
+        plain, drive_offset=jnp.zeros(plain.wheels), radius_deviation=jnp.zeros(plain.drives)
+    )
 
 
 def _told(where: str, told: ToldRecord, floors: int) -> None:
@@ -141,16 +150,14 @@ def _told(where: str, told: ToldRecord, floors: int) -> None:
         raise ValueError(f"{where}.left: a std below 0")
 
 
-def declared(record: RobotRecord, wheels: int) -> tuple[Entry, ...]:
+def declared(record: RobotRecord) -> tuple[Entry, ...]:
     """Every number that a robot of this shape has, in order; the camera is no part of it."""
-    level = jnp.zeros(wheels)
-    shape = Geometry(**vars(record.wheels), drive_offset=level, radius_deviation=level)
-    robot = build(shape, record.labels, [load.name for load in record.loads])
+    robot = build(shape_of(record), record.labels, [load.name for load in record.loads])
     return tuple(e for e in entries(robot) if e.part != "camera")
 
 
-def _numbers(record: RobotRecord, wheels: int) -> None:
-    known = {e.path: (e.declaration, e.size) for e in declared(record, wheels)}
+def _numbers(record: RobotRecord) -> None:
+    known = {e.path: (e.declaration, e.size) for e in declared(record)}
     for path in known:
         if path not in record.parameters:
             raise ValueError(f"parameters['{path}'] is missing")

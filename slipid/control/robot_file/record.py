@@ -12,7 +12,7 @@ from slipid.model.robot import Validity
 from slipid.support.files import checksum
 
 Numbers = float | tuple[float, ...]
-"""A number, or one per wheel."""
+"""A number, or one per wheel or drive."""
 Pair = tuple[float, float]
 Axes = tuple[float, float, float]
 """Along, across and in yaw."""
@@ -73,6 +73,7 @@ class Wheels:
     drive_angle: tuple[float, ...]
     roller_angle: tuple[float, ...]
     grips: tuple[bool, ...]
+    drive_of: tuple[int, ...]
     gear_ratio: float
 
 
@@ -119,7 +120,7 @@ class LoadRecord:
         spread: std of the motion per metre by the uncertainty of the numbers, on every floor.
         told: of the effects by the fitted runs; None where no runs are known.
         highest_current: of the model up to 0.8 of the highest wheel speed.
-        wheel_curve: a + b |I|, the slip ratio of each wheel, of all floors together.
+        wheel_curve: a + b |I|, the slip ratio of each drive, of all floors together.
     """
 
     name: str

@@ -40,7 +40,7 @@ def test_every_number_reads_back_to_the_last_bit(made):
     assert values(rows, "gains") == [float(x) for x in vars(gains).values()]
     assert values(rows, "limits") == list(vars(limits).values())
     assert values(rows, "motor")[0] == robot.record.wheels.gear_ratio
-    for e in declared(robot.record, robot.wheels):
+    for e in declared(robot.record):
         number = robot.record.parameters[e.path]
         found = [row for row in rows if row["name"] == e.path]
         assert [float(row["value"]) for row in found] == np.ravel(number.value).tolist()
@@ -57,7 +57,7 @@ def test_names_are_those_of_the_robot_and_stand_once(robot):
     rows = table(robot)
     names = [(row["name"], row["entry"]) for row in rows]
     assert len(set(names)) == len(names)
-    assert {e.path for e in declared(robot.record, robot.wheels)} < {name for name, _ in names}
+    assert {e.path for e in declared(robot.record)} < {name for name, _ in names}
 
 
 def test_rows_of_a_matrix_say_which_wheel_and_part_of_the_twist(robot):

@@ -63,7 +63,7 @@ def _numbers(robot: DeployedRobot) -> Iterator[Parameter]:
             return f"{part}.{floors[e.surface]}.{last}"
         return quantity if e.load is None else f"{quantity}.{loads[e.load]}"
 
-    found = [(name(e), e) for e in declared(robot.record, robot.wheels)]
+    found = [(name(e), e) for e in declared(robot.record)]
     order = {group: k for k, group in enumerate(dict.fromkeys(_group(n) for n, _ in found))}
     for called, e in sorted(found, key=lambda pair: order[_group(pair[0])]):
         number = robot.record.parameters[e.path]
