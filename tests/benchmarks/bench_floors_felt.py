@@ -3,8 +3,8 @@
     make bench
     .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks/bench_floors_felt.py
 
-(about two minutes of one processor). The runs of "borealtc": a Husky on five floors, 6.5 rows a second, currents
-without a sign. What a free wheel draws is from runs of another Husky with its wheels in the air.
+(about two minutes of one processor). The runs of "borealtc": a Husky on five floors, 6.5 rows a
+second, currents without a sign. What a free wheel draws is from runs of another Husky with its wheels in the air.
 Friction, creep and rolling resistance of every floor are fitted to every other run; the estimator
 then drives the others, told nothing but the wheels, the currents and the gyro. Prints what it
 believed, run by run and in all. Without a pose the numbers of a floor are only those that make its
@@ -168,7 +168,7 @@ def misfit(
     amps: np.ndarray,
     yaw: np.ndarray,
 ) -> np.ndarray:
-    """What the numbers of a floor leave of currents and yaw rates, and how far they are from usual."""
+    """What numbers of a floor leave of currents and yaw rates, and how unusual they are."""
     sizes, turn = said(on_floor(robot, number, logs), jnp.asarray(number), speed)
     gaps = [((np.asarray(sizes) - amps) / 1.5).ravel(), (np.asarray(turn) - yaw) / 0.1]
     return np.concatenate([*gaps, (logs - START) / [1.5, 1.5, 2.0]])
