@@ -4,12 +4,12 @@
     .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks/bench_floors_felt.py
 
 (about two minutes of one processor). The runs of "borealtc": a Husky on five floors, 6.5 rows a
-second, currents without a sign. What a free wheel draws is from runs of another Husky with its wheels in the air.
-Friction, creep and rolling resistance of every floor are fitted to every other run; the estimator
-then drives the others, told nothing but the wheels, the currents and the gyro. Prints what it
-believed, run by run and in all. Without a pose the numbers of a floor are only those that make its
-currents and its turning; they are no identification, and frictions count in units of the motors'
-unknown torque constant.
+second, currents without a sign. What a free wheel draws is from runs of another Husky with its
+wheels in the air. Friction, creep and rolling resistance of every floor are fitted to every other
+run; the estimator then drives the others, told nothing but the wheels, the currents and the gyro.
+Prints what it believed, run by run and in all. Without a pose the numbers of a floor are only those
+that make its currents and its turning; they are no identification, and frictions count in units of
+the motors' unknown torque constant.
 """
 
 from dataclasses import dataclass, replace
