@@ -1,0 +1,34 @@
+"""A fit to some runs of a config, and what it and the rungs predict of others."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from slipid.data.runs import Runs
+from slipid.identify.compare.slip_models import restored
+from slipid.identify.compare.validation import Validation, validation
+from slipid.job.config import read_config
+from slipid.job.identify import optimised, summarised
+from slipid.job.problem import Job, job_of, read_job
+from slipid.support.progress import Reporter
+
+
+def held_back(
+    config: Path, folder: Path, fitted: tuple[str, ...], judged: tuple[str, ...]
+) -> Validation:
+    """Fitted to runs that have one of some words in their names, judged on those with others."""
+    with Reporter(quiet=True) as report:
+        read = read_config(config)
+        whole: Job = read_job(read, folder, report)
+        job = job_of(read, part(whole.dataset, fitted), (), report)
+        problem = job.problem()
+        fit = summarised(job, problem, optimised(job, problem, None, report), report)
+    assert fit.converged, fit.reason
+    rungs = restored(fit.space.template.geometry, dict(fit.baselines))
+    other = part(whole.dataset, judged)
+    # a session that was not fitted has the marker where the robot has it
+    other = replace(other, session=tuple(fit.robot.camera.sessions[:1] * len(other)))
+    return validation(fit.contact, rungs, other)
+
+
+def part(data: Runs, names: tuple[str, ...]) -> Runs:
+    return data.subset([k for k, log in enumerate(data.logs) if any(n in log.name for n in names)])
