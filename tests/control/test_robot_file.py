@@ -215,9 +215,9 @@ def test_what_is_no_robot_is_refused(tmp_path):
 
 
 def test_a_newer_file_asks_for_an_update(path):
-    rewritten(path, lambda c: c.update(schema="slipid.robot/5", more=3))
+    rewritten(path, lambda c: c.update(schema="slipid.robot/6", more=3))
     said = refused(path)
-    assert "written by a newer slipid as slipid.robot/5" in said
+    assert "written by a newer slipid as slipid.robot/6" in said
     assert "update slipid" in said
 
 
@@ -281,7 +281,9 @@ def test_a_changed_digit_is_refused(path):
             "wheels.drive_angle: 1 entries; expected 3",
         ),
         (lambda c: c["wheels"].update(roller_angle=[0.0] * 3), "such a wheel cannot drive"),
-        (lambda c: c["wheels"].update(drive_angle=[0.0] * 3), "rank below 3"),
+        (lambda c: c["wheels"].update(drive_of=[0, 0, 2]), "counted from 0 without a gap"),
+        (lambda c: c["wheels"].update(drive_of=[0, 0]), "expected one for each of the 3 wheels"),
+        (lambda c: c["wheels"].update(drive_of=[0, 1, 0.5]), "drive_of"),
         (lambda c: c["parameters"]["robot.mass"].update(value=-1), "expected inside (0, inf)"),
         (lambda c: c["parameters"]["robot.mass"].update(value=[1, 2]), "expected one number"),
         (lambda c: c["parameters"]["robot.mass"].update(unit="g"), "unit: 'g'; expected 'kg'"),
