@@ -19,6 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+Numbers = Array | np.ndarray
+"""Numbers that are being traced or lie on a device, or numpy's, for which nothing is compiled."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Declaration:
@@ -71,16 +74,19 @@ class Declaration:
         p = (x - self.lower) / (self.upper - self.lower)
         return np.log(p) - np.log1p(-p)
 
-    def to_si(self, z: Float[Array, " n"]) -> Float[Array, " m"]:
-        """SI values of a search-space vector."""
+    def to_si(self, z: Float[Numbers, "*some n"]) -> Float[Numbers, "*some m"]:
+        """SI values of a search-space vector, or of many; numpy's for numpy's, uncompiled."""
+        plain = isinstance(z, np.ndarray)
         if self.tied:
-            x = jnp.asarray(share_basis(z.shape[-1] + 1)) @ z
-            return jax.nn.softmax(x) if self.shares else x
+            x = z @ share_basis(z.shape[-1] + 1).T
+            return (_softmax(x) if plain else jax.nn.softmax(x)) if self.shares else x
         if math.isinf(self.lower) and math.isinf(self.upper):
             return z
         if math.isinf(self.upper):
-            return self.lower + jnp.exp(z)
-        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(z)
+            return self.lower + (np.exp(z) if plain else jnp.exp(z))
+        return self.lower + (self.upper - self.lower) * (
+            _sigmoid(z) if plain else jax.nn.sigmoid(z)
+        )
 
     def slope(self, value: Any) -> Any:
         """Derivative d SI / d search at SI values, of numbers that are not tied."""
@@ -90,6 +96,16 @@ class Declaration:
             return value - self.lower
         p = (value - self.lower) / (self.upper - self.lower)
         return (self.upper - self.lower) * p * (1.0 - p)
+
+
+def _softmax(x: np.ndarray) -> np.ndarray:
+    part = np.exp(x - x.max(axis=-1, keepdims=True))
+    return np.asarray(part / part.sum(axis=-1, keepdims=True))
+
+
+def _sigmoid(z: np.ndarray) -> np.ndarray:
+    small = np.exp(-np.abs(z))
+    return np.where(z >= 0, 1.0, small) / (1.0 + small)
 
 
 def share_basis(n: int) -> np.ndarray:
@@ -160,7 +176,11 @@ class Entry:
 
     def get(self, tree: Any) -> Any:
         """Value in a tree [SI], scalar or vector."""
-        return self.whole(tree) if self.index is None else self.whole(tree)[self.index]
+        whole = self.whole(tree)
+        if self.index is None:
+            return whole
+        # numpy indexes without compiling anything
+        return (whole if isinstance(whole, jax.core.Tracer) else np.asarray(whole))[self.index]
 
     @property
     def labels(self) -> tuple[str, ...]:

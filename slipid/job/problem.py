@@ -11,7 +11,6 @@ from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
 from slipid.identify.fit.problem import Problem, still_viscosities
-from slipid.identify.result import hash_of
 from slipid.job.bench.priors import bench_priors
 from slipid.job.config import Config, FitSection, Logs, geometry, one_floor
 from slipid.job.logs import files_of, read_dataset
@@ -21,6 +20,7 @@ from slipid.model.robot import Robot
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError, near
+from slipid.support.files import hash_of
 from slipid.support.progress import Reporter
 
 LENGTHS = {"poses": "robot.wheel_radius", "wheels": "camera.scale"}
