@@ -9,6 +9,7 @@ from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.lag import pose_lag
 from slipid.data.log import Log
 from slipid.data.runs import Runs
+from slipid.data.sanity.columns import refuse_misordered
 from slipid.data.windows import Windows, windows
 from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.job.bench.priors import bench_priors
@@ -103,6 +104,7 @@ def with_mixed(job: Job, root: Path, report: Reporter) -> Job:
         floor = _map(job, section)
         data, short = read_dataset(job.config, [section], root, report)
         absent += short
+        refuse_misordered(data.logs)
         _go_together(job, data)
         job = replace(job, mixed=(*job.mixed, (data, floor)))
     for sentence in absent:
