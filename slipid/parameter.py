@@ -76,17 +76,14 @@ class Declaration:
 
     def to_si(self, z: Float[Numbers, "*some n"]) -> Float[Numbers, "*some m"]:
         """SI values of a search-space vector, or of many; numpy's for numpy's, uncompiled."""
-        plain = isinstance(z, np.ndarray)
         if self.tied:
-            x = z @ share_basis(z.shape[-1] + 1).T
-            return (_softmax(x) if plain else jax.nn.softmax(x)) if self.shares else x
+            x: Numbers = z @ share_basis(z.shape[-1] + 1).T
+            return _softmax(x) if self.shares else x
         if math.isinf(self.lower) and math.isinf(self.upper):
             return z
         if math.isinf(self.upper):
-            return self.lower + (np.exp(z) if plain else jnp.exp(z))
-        return self.lower + (self.upper - self.lower) * (
-            _sigmoid(z) if plain else jax.nn.sigmoid(z)
-        )
+            return self.lower + (np.exp(z) if isinstance(z, np.ndarray) else jnp.exp(z))
+        return self.lower + (self.upper - self.lower) * _sigmoid(z)
 
     def slope(self, value: Any) -> Any:
         """Derivative d SI / d search at SI values, of numbers that are not tied."""
@@ -98,12 +95,16 @@ class Declaration:
         return (self.upper - self.lower) * p * (1.0 - p)
 
 
-def _softmax(x: np.ndarray) -> np.ndarray:
+def _softmax(x: Numbers) -> Numbers:
+    if not isinstance(x, np.ndarray):
+        return jax.nn.softmax(x)
     part = np.exp(x - x.max(axis=-1, keepdims=True))
     return np.asarray(part / part.sum(axis=-1, keepdims=True))
 
 
-def _sigmoid(z: np.ndarray) -> np.ndarray:
+def _sigmoid(z: Numbers) -> Numbers:
+    if not isinstance(z, np.ndarray):
+        return jax.nn.sigmoid(z)
     small = np.exp(-np.abs(z))
     return np.where(z >= 0, 1.0, small) / (1.0 + small)
 

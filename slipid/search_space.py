@@ -152,8 +152,8 @@ def _placed(whole: Any, index: int | None, value: Any) -> Any:
     """An array with a value in one of its rows, or in place of all of it."""
     shape = whole.shape if index is None else whole.shape[1:]
     if isinstance(whole, jax.core.Tracer) or isinstance(value, jax.core.Tracer):
-        new = jnp.asarray(value, dtype=whole.dtype).reshape(shape)
-        return new if index is None else jnp.asarray(whole).at[index].set(new)
+        traced = jnp.asarray(value, dtype=whole.dtype).reshape(shape)
+        return traced if index is None else jnp.asarray(whole).at[index].set(traced)
     new = np.asarray(value, dtype=whole.dtype).reshape(shape)
     if index is None:
         return new

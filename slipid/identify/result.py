@@ -24,6 +24,7 @@ from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, members, sentences
 from slipid.model.robot import Robot, Validity
 from slipid.search_space import Choice, Space
+from slipid.support.files import hash_of
 
 CONFLICT = 4.0
 """Prior stds from the prior mean beyond which a reader is told."""

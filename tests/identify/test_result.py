@@ -30,6 +30,7 @@ from slipid.search_space import Choice
 from slipid.selftest.known import Sensors, blank, grid, truth
 from slipid.selftest.logs import make_logs
 from slipid.support.errors import DataError
+from slipid.support.files import hash_of
 
 pytestmark = pytest.mark.slow  # traces whole fits
 

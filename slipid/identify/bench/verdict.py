@@ -12,6 +12,7 @@ from slipid.identify.verdicts.estimates import FROM_ZERO, Estimate, derived, est
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, members, sentences
 from slipid.identify.verdicts.wording import VOLTAGE
 from slipid.support.content import Content
+from slipid.support.files import hash_of
 
 ROWS_ELECTRICAL, ROWS_MECHANICAL = 2.0, 6.0
 """Rows in one time constant, L/R and J R / C_e^2, for inductance and inertia to be told."""
