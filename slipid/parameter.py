@@ -19,6 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+Numbers = Array | np.ndarray
+"""Numbers that are being traced or lie on a device, or numpy's, for which nothing is compiled."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Declaration:
@@ -71,16 +74,16 @@ class Declaration:
         p = (x - self.lower) / (self.upper - self.lower)
         return np.log(p) - np.log1p(-p)
 
-    def to_si(self, z: Float[Array, " n"]) -> Float[Array, " m"]:
-        """SI values of a search-space vector."""
+    def to_si(self, z: Float[Numbers, "*some n"]) -> Float[Numbers, "*some m"]:
+        """SI values of a search-space vector, or of many; numpy's for numpy's, uncompiled."""
         if self.tied:
-            x = jnp.asarray(share_basis(z.shape[-1] + 1)) @ z
-            return jax.nn.softmax(x) if self.shares else x
+            x: Numbers = z @ share_basis(z.shape[-1] + 1).T
+            return _softmax(x) if self.shares else x
         if math.isinf(self.lower) and math.isinf(self.upper):
             return z
         if math.isinf(self.upper):
-            return self.lower + jnp.exp(z)
-        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(z)
+            return self.lower + (np.exp(z) if isinstance(z, np.ndarray) else jnp.exp(z))
+        return self.lower + (self.upper - self.lower) * _sigmoid(z)
 
     def slope(self, value: Any) -> Any:
         """Derivative d SI / d search at SI values, of numbers that are not tied."""
@@ -90,6 +93,20 @@ class Declaration:
             return value - self.lower
         p = (value - self.lower) / (self.upper - self.lower)
         return (self.upper - self.lower) * p * (1.0 - p)
+
+
+def _softmax(x: Numbers) -> Numbers:
+    if not isinstance(x, np.ndarray):
+        return jax.nn.softmax(x)
+    part = np.exp(x - x.max(axis=-1, keepdims=True))
+    return np.asarray(part / part.sum(axis=-1, keepdims=True))
+
+
+def _sigmoid(z: Numbers) -> Numbers:
+    if not isinstance(z, np.ndarray):
+        return jax.nn.sigmoid(z)
+    small = np.exp(-np.abs(z))
+    return np.where(z >= 0, 1.0, small) / (1.0 + small)
 
 
 def share_basis(n: int) -> np.ndarray:
@@ -160,7 +177,11 @@ class Entry:
 
     def get(self, tree: Any) -> Any:
         """Value in a tree [SI], scalar or vector."""
-        return self.whole(tree) if self.index is None else self.whole(tree)[self.index]
+        whole = self.whole(tree)
+        if self.index is None:
+            return whole
+        # numpy indexes without compiling anything
+        return (whole if isinstance(whole, jax.core.Tracer) else np.asarray(whole))[self.index]
 
     @property
     def labels(self) -> tuple[str, ...]:

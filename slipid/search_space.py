@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -124,7 +125,7 @@ class Space(eqx.Module):
 
     def tree(self, z: Float[Array, " free"] | Float[np.ndarray, " free"]) -> Any:
         """Tree of SI values at a search-space vector; jit-able."""
-        z, place = jnp.asarray(z), self.place
+        z, place = z if isinstance(z, jax.core.Tracer) else np.asarray(z, float), self.place
         return put(self.template, {e: e.declaration.to_si(z[place[e.path]]) for e in self.free})
 
     def vector(self, tree: Any) -> np.ndarray:
@@ -134,17 +135,31 @@ class Space(eqx.Module):
 
 
 def put(tree: Any, values: Mapping[Entry, Any]) -> Any:
-    """The tree with these values [SI] at their places."""
+    """The tree with these values [SI] at their places; compiles nothing where nothing is traced."""
     changed: dict[tuple[str, ...], tuple[Entry, Any]] = {}
     for entry, value in values.items():
         whole = changed[entry.leaf][1] if entry.leaf in changed else entry.whole(tree)
-        shape = whole.shape if entry.index is None else whole.shape[1:]
-        new = jnp.asarray(value, dtype=whole.dtype).reshape(shape)
-        changed[entry.leaf] = entry, new if entry.index is None else whole.at[entry.index].set(new)
+        changed[entry.leaf] = entry, _placed(whole, entry.index, value)
     if not changed:
         return tree
     places, arrays = zip(*changed.values(), strict=True)
-    return eqx.tree_at(lambda t: [e.whole(t) for e in places], tree, arrays)
+    return eqx.tree_at(
+        lambda t: [e.whole(t) for e in places], tree, [jnp.asarray(a) for a in arrays]
+    )
+
+
+def _placed(whole: Any, index: int | None, value: Any) -> Any:
+    """An array with a value in one of its rows, or in place of all of it."""
+    shape = whole.shape if index is None else whole.shape[1:]
+    if isinstance(whole, jax.core.Tracer) or isinstance(value, jax.core.Tracer):
+        traced = jnp.asarray(value, dtype=whole.dtype).reshape(shape)
+        return traced if index is None else jnp.asarray(whole).at[index].set(traced)
+    new = np.asarray(value, dtype=whole.dtype).reshape(shape)
+    if index is None:
+        return new
+    out = np.array(whole)
+    out[index] = new
+    return out
 
 
 def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, Any, bool]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from slipid.api.results import Comparison, Profile, Proposal, Validation, compared
 from slipid.data.runs import Runs
+from slipid.data.sanity.columns import refuse_misordered
 from slipid.identify import fit_file, result
 from slipid.identify.compare.slip_models import restored
 from slipid.identify.compare.validation import validation
@@ -220,11 +221,12 @@ def fit(
         quiet: show no progress.
 
     Raises:
-        DataError: the runs cannot be cut into windows.
+        DataError: the runs cannot be cut into windows, or columns of wheels are exchanged.
         ValueError: no such number, or a value outside its bounds.
 
     Source: the contact law of `slipid.model.contact_law`, the likelihood of `slipid.identify.fit`.
     """
+    refuse_misordered(runs.logs)
     wishes = priors or {}, fixed or {}, start or {}, free
     task = task_of(runs, robot, *wishes, image_centre, windows_per_piece, seed)
     with Reporter(quiet=quiet) as report:

@@ -24,7 +24,6 @@ def check(
     """
     from slipid.job import check as job
     from slipid.job.config import Motor, read_config
-    from slipid.plots.raw import raw_plots
     from slipid.report.estimates import show_check
 
     wanted = read_config(config)
@@ -33,6 +32,8 @@ def check(
     with Reporter(quiet=quiet) as report:
         logs, found = job.check(config, data, out, report)
         if out is not None:
+            from slipid.plots.raw import raw_plots
+
             report.stage("drawing")
             raw_plots(logs, out)
     emit(json, found, lambda page: show_check(page, found))
@@ -42,12 +43,13 @@ def check(
 def bench(config: "Config", data: Path, out: Path | None, json: str | None, quiet: bool) -> int:
     """The same for motors on a bench."""
     from slipid.job.bench.motor import check_bench
-    from slipid.plots.bench import bench_plots
     from slipid.report.bench import show_bench_check
 
     with Reporter(quiet=quiet) as report:
         fit, found = check_bench(config, data, out, report)
         if out is not None:
+            from slipid.plots.bench import bench_plots
+
             report.stage("drawing")
             bench_plots(fit, out)
     emit(json, found, lambda page: show_bench_check(page, found))

@@ -1,6 +1,5 @@
 """The result of a fit: a frozen value with intervals and verdicts, identifiability included."""
 
-import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -25,6 +24,7 @@ from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, members, sentences
 from slipid.model.robot import Robot, Validity
 from slipid.search_space import Choice, Space
+from slipid.support.files import hash_of
 
 CONFLICT = 4.0
 """Prior stds from the prior mean beyond which a reader is told."""
@@ -265,9 +265,3 @@ def draws(z: Search, covariance: Square, count: int, seed: int) -> Float[np.ndar
     rng = np.random.default_rng(seed)
     root = np.linalg.cholesky(covariance)
     return z + rng.standard_normal((count, len(root))) @ root.T
-
-
-def hash_of(runs: Iterable[tuple[str, str]]) -> str:
-    """Hash of a set of runs from their names and file hashes, whatever their order."""
-    lines = "".join(f"{name} {sha}\n" for name, sha in sorted(runs))
-    return hashlib.sha256(lines.encode()).hexdigest()

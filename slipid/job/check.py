@@ -5,15 +5,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.identify import slip_curves as curves_of
 from slipid.identify.compare.scatter import scatter
-from slipid.identify.fit.optimise import CREEPS
-from slipid.identify.fit.problem import Problem
+from slipid.identify.fit.problem import CREEPS, Problem
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, members, sentences
 from slipid.job.config import read_config
@@ -128,16 +126,18 @@ def expected(job: Task, problem: Problem) -> Expected:
     """
     space, w = problem.space, problem.windows
     log_v, keep, volt = scatter(problem), np.ones(len(w)), w.has_voltage
-    robot = space.tree(jnp.asarray(space.start))
-    validity = curves_of.validity(job.dataset, robot, problem.batch)
     creep = space.where(lambda e: e.quantity == "surface.creep")
     parameters: dict[str, Estimate] = {}
     ratios: dict[str, Estimate] = {}
     open_: tuple[Flat, ...] = ()
     most = -np.inf
-    for z in (space.start, *(np.where(creep, np.log(c), space.start) for c in CREEPS)):
-        covariance = problem.laplace(z, log_v, keep)
-        where = w.has_current, volt, validity, robot.geometry.determines_twist
+    starts = (space.start, *(np.where(creep, np.log(c), space.start) for c in CREEPS))
+    covariances = [problem.laplace(z, log_v, keep) for z in starts]
+    # after them: what it compiles they have traced
+    robot = space.tree(space.start)
+    validity = curves_of.validity(job.dataset, robot, problem.batch)
+    where = w.has_current, volt, validity, robot.geometry.determines_twist
+    for covariance in covariances:
         flat = flat_directions(space, covariance, *where)
         found = estimates(space, job.choices, space.start, covariance, volt, members(flat))
         _least(parameters, found)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slipid.data.sanity.columns import refuse_misordered
 from slipid.identify.compare.folds import Fold, folds_of, judge
 from slipid.identify.compare.ranking import ranking
 from slipid.identify.compare.transfer import transfer
@@ -40,6 +41,7 @@ def compare(
     setup_jax(quiet=True)
     config = read_config(config_path)
     job = read_job(config, data, report)
+    refuse_misordered(job.logs)
     asked = {name: folds_of(job.dataset, name) for name in dict.fromkeys(questions)}
     for name in [name for name, fold in asked.items() if (fold < 0).all()]:
         report.line(f"skipped: {name}: no floor has runs in two of them")

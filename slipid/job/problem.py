@@ -9,9 +9,9 @@ from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.lag import pose_lag
 from slipid.data.log import Log
 from slipid.data.runs import Runs
+from slipid.data.sanity.columns import refuse_misordered
 from slipid.data.windows import Windows, windows
 from slipid.identify.fit.problem import Problem, still_viscosities
-from slipid.identify.result import hash_of
 from slipid.job.bench.priors import bench_priors
 from slipid.job.config import Config, FitSection, Logs, geometry, one_floor
 from slipid.job.logs import files_of, read_dataset
@@ -21,6 +21,7 @@ from slipid.model.robot import Robot
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError, near
+from slipid.support.files import hash_of
 from slipid.support.progress import Reporter
 
 LENGTHS = {"poses": "robot.wheel_radius", "wheels": "camera.scale"}
@@ -103,6 +104,7 @@ def with_mixed(job: Job, root: Path, report: Reporter) -> Job:
         floor = _map(job, section)
         data, short = read_dataset(job.config, [section], root, report)
         absent += short
+        refuse_misordered(data.logs)
         _go_together(job, data)
         job = replace(job, mixed=(*job.mixed, (data, floor)))
     for sentence in absent:

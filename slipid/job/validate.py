@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from slipid.data.runs import Runs
+from slipid.data.sanity.columns import refuse_misordered
 from slipid.identify.compare.slip_models import restored
 from slipid.identify.compare.validation import validation
 from slipid.identify.fit_file import load
@@ -26,6 +27,7 @@ def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Conten
     sections = one_floor(config.content.validate_.logs or config.content.logs)
     report.stage("reading logs")
     dataset, skipped = read_dataset(config, sections, data, report)
+    refuse_misordered(dataset.logs)
     for sentence in skipped:
         report.line(sentence)
     seen = {sha for _, sha in fit.runs}

@@ -2,22 +2,25 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 from rich.text import Text
 
-from slipid.identify.result import Fit
-from slipid.identify.verdicts.estimates import Estimate
-from slipid.identify.verdicts.profile import Profile
-from slipid.job.trust import Judgement
 from slipid.report.page import Page, percent, table, verdict
 from slipid.support.content import Content
+
+if TYPE_CHECKING:  # the tables need none of what fits
+    from slipid.identify.result import Fit
+    from slipid.identify.verdicts.estimates import Estimate
+    from slipid.identify.verdicts.profile import Profile
+    from slipid.job.trust import Judgement
 
 RECOVERED = {"yes": "green", "roughly": "yellow", "no": "red", "wrong": "magenta"}
 """Colours of what a self-test says."""
 
 
-def estimates(items: Iterable[Estimate], title: str) -> Table:
+def estimates(items: "Iterable[Estimate]", title: str) -> Table:
     """Table of estimates; numbers of single sessions and defaults are left to the files."""
     columns = ("parameter", "value", "unit", "90 % interval", "verdict", "from")
     made = table(columns, title, right=("value",))
@@ -37,7 +40,7 @@ def estimates(items: Iterable[Estimate], title: str) -> Table:
     return made
 
 
-def rows_of(e: Estimate) -> list[tuple[str, float, tuple[float, float] | None]]:
+def rows_of(e: "Estimate") -> list[tuple[str, float, tuple[float, float] | None]]:
     """Label, value and interval of a scalar, or of each entry of a vector."""
     if not e.labels:
         return [("", e.value, e.interval90)]
@@ -46,7 +49,7 @@ def rows_of(e: Estimate) -> list[tuple[str, float, tuple[float, float] | None]]:
 
 
 def show_sample(
-    page: Page, numbers: Iterable[Estimate], about: Content, messages: Iterable[str]
+    page: Page, numbers: "Iterable[Estimate]", about: Content, messages: Iterable[str]
 ) -> None:
     """Write what the draws of a posterior say, and what sample.json says of how they were made."""
     worst = about["worst"]
@@ -66,7 +69,7 @@ def show_sample(
         )
 
 
-def show_fit(page: Page, fit: Fit, profiles: Sequence[Profile] = ()) -> None:
+def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None:
     """Write the numbers of a fit, what the logs leave open, and how the fit ended."""
     page.table(estimates(fit.parameters.values(), f"{len(fit.runs)} runs, {fit.rounds} rounds"))
     if fit.derived:
@@ -77,7 +80,7 @@ def show_fit(page: Page, fit: Fit, profiles: Sequence[Profile] = ()) -> None:
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
 
 
-def show_trust(page: Page, judged: Judgement) -> None:
+def show_trust(page: Page, judged: "Judgement") -> None:
     """Write how the fit predicts its own runs, open loop, and how far it may be trusted."""
     if judged.floors:
         made = table(("surface", "end / path", "encoders alone"))
@@ -156,7 +159,7 @@ class Row:
         return self.interval[0] <= self.truth <= self.interval[1]
 
 
-def compared(fit: Fit, truth: Content) -> list[Row]:
+def compared(fit: "Fit", truth: Content) -> list[Row]:
     """Every number that was fitted beside its truth, as far as truth.json has one."""
     rows = []
     for e in fit.parameters.values():
@@ -170,7 +173,7 @@ def compared(fit: Fit, truth: Content) -> list[Row]:
     return rows
 
 
-def show_truth(page: Page, fit: Fit, truth: Content) -> None:
+def show_truth(page: Page, fit: "Fit", truth: Content) -> None:
     """Write `compared`, and how many intervals hold the truth."""
     rows = compared(fit, truth)
     columns = ("parameter", "truth", "identified", "unit", "90 % interval", "truth in it", "")

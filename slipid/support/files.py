@@ -5,7 +5,7 @@ import io
 import json
 import os
 import secrets
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -78,3 +78,9 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray], compress: bool = Tru
     save = np.savez_compressed if compress else np.savez
     save(buffer, allow_pickle=False, **arrays)
     write_bytes(path, buffer.getvalue())
+
+
+def hash_of(runs: Iterable[tuple[str, str]]) -> str:
+    """Hash of a set of runs from their names and file hashes, whatever their order."""
+    lines = "".join(f"{name} {sha}\n" for name, sha in sorted(runs))
+    return hashlib.sha256(lines.encode()).hexdigest()

@@ -5,8 +5,20 @@ from __future__ import annotations
 import pytest
 
 from slipid.data.reading.presets import declared_layout
+from slipid.data.runs import collect
+from slipid.data.sanity.columns import refuse_misordered
+from slipid.data.sanity.sanity import findings
+from slipid.model.geometry import omni
 from slipid.support.errors import DataError
-from tests.helpers.broken_logs import CASES, GENERIC, GENERIC_LAYOUT, ROBOTINO, Case, write_good
+from tests.helpers.broken_logs import (
+    CASES,
+    EXCHANGED,
+    GENERIC,
+    GENERIC_LAYOUT,
+    ROBOTINO,
+    Case,
+    write_good,
+)
 from tests.helpers.one_log import read_log
 
 
@@ -38,3 +50,20 @@ def test_a_broken_log_is_refused_where_it_is_broken(root, case: Case):
     assert [fragment for fragment in case.expected if fragment not in message] == [], message
     assert "\n" not in message
     assert len(message) < 600
+
+
+@pytest.mark.parametrize("case", EXCHANGED, ids=lambda case: case.name)
+def test_exchanged_and_reversed_wheels_are_read_and_then_named(root, case: Case):
+    path = root / case.file
+    good = read_log(path, declared_layout(case.mapping(), "layout"), root=root)
+    refuse_misordered([good])
+    case.breaker(path)
+    log = read_log(path, declared_layout(case.mapping(), "layout"), root=root)
+    with pytest.raises(DataError) as caught:
+        refuse_misordered([good, log])
+    for said in case.expected:
+        assert said in str(caught.value)
+    robot = omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0)
+    wrong = [f for f in findings(collect([log]), robot) if f.severity == "wrong"]
+    kinds = {"wheel_columns", "wheel_order", "wheel_sign", "command_order", "command_sign"}
+    assert {f.kind for f in wrong} & kinds, [str(f) for f in wrong]

@@ -315,6 +315,18 @@ MISTAKES = (
         _wheels(_ordered([1, 0, 2, 3]), "command"),
     ),
     Mistake(
+        "reported speeds in another order",
+        ("wheel_columns",),
+        "those of wheel_speed",
+        _wheels(_ordered([1, 0, 2, 3]), "speed"),
+    ),
+    Mistake(
+        "sign of a reported speed",
+        ("wheel_columns",),
+        "scale = -1",
+        _wheels(_signed(1), "speed"),
+    ),
+    Mistake(
         "sign of a commanded wheel", ("command_sign",), "commanded", _wheels(_signed(1), "command")
     ),
 )

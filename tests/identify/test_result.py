@@ -23,13 +23,14 @@ from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit.variances import DEGREES
 from slipid.identify.fit_file import identified_json, load, save, to_json
 from slipid.identify.posterior import diagnosis
-from slipid.identify.result import Fit, hash_of, summarise
+from slipid.identify.result import Fit, summarise
 from slipid.identify.verdicts.estimates import estimates
 from slipid.identify.verdicts.unidentified import flat_directions, members
 from slipid.search_space import Choice
 from slipid.selftest.known import Sensors, blank, grid, truth
 from slipid.selftest.logs import make_logs
 from slipid.support.errors import DataError
+from slipid.support.files import hash_of
 
 pytestmark = pytest.mark.slow  # traces whole fits
 

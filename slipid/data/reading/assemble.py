@@ -47,7 +47,8 @@ def assembled(
     clock = clock_of(list(signals.values()))
     if turns is not None:
         first, last = signals[turns].time[[0, -1]]
-        clock = clock[(clock >= first) & (clock <= last)]
+        inside = (clock >= first) & (clock <= last)
+        clock = clock if inside.all() else clock[inside]
         _check_gaps(signals[turns], layout)
     said = list(notes)
     held = {name: _held(signal, clock) for name, signal in signals.items()}
@@ -96,6 +97,8 @@ def _check_gaps(signal: Signal, layout: Recorded) -> None:
 
 def _held(signal: Signal, clock: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time column"]:
     """What was measured last at every time; before the first reading that one."""
+    if signal.time is clock and not np.isnan(signal.values).any():
+        return signal.values.copy()
     out = np.empty((len(clock), signal.values.shape[1]))
     for k, column in enumerate(signal.values.T):
         there = ~np.isnan(column)
@@ -114,6 +117,8 @@ def _fresh(
     if name is None:
         return None
     signal = signals[name]
+    if signal.time is clock and not np.isnan(signal.values).any():
+        return None
     out = np.zeros((len(clock), signal.values.shape[1]), dtype=bool)
     inside = (signal.time >= clock[0]) & (signal.time <= clock[-1])
     rows = np.searchsorted(clock, signal.time[inside])

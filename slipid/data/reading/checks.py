@@ -9,7 +9,7 @@ from slipid.data.log import Log
 from slipid.data.reading.layout import Layout, Recorded
 from slipid.data.reading.signal import Signal
 from slipid.data.reading.table import Table
-from slipid.data.wheel_signals import integral, interpolate, swapped_order
+from slipid.data.wheel_signals import integral
 from slipid.support.errors import DataError, bad_data
 
 MIN_ROWS = 2
@@ -78,7 +78,6 @@ def check_log(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> None
         expected = "magnitudes only, as the layout says (current_is_signed = false)"
         raise _at(log, signals, "current", i, j, found, expected)
     _check_wheels(log, signals, layout)
-    _check_order(log, signals, layout)
     if log.pose is not None:
         _check_pose(log, signals, layout)
 
@@ -109,27 +108,6 @@ def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> 
         j = int(dead[0])
         found = f"constant, though the wheel was commanded {commanded[j]:.3g} rad"
         raise _at(log, signals, "wheel", None, j, found, "a wheel that turns when commanded")
-
-
-def _check_order(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> None:
-    """Refuse wheel columns in another order than those of the commanded or reported speeds."""
-    # steps of half a second: delays and jitter do not matter
-    edges = np.linspace(log.time[0], log.time[-1], max(2, int(log.duration / 0.5) + 1))
-    for name in ("wheel_speed_command", "wheel_speed"):
-        reference = getattr(log, name)
-        if reference is None:
-            continue
-        measured, said = (
-            np.diff(interpolate(log.time, angle, edges), axis=0)
-            for angle in (log.wheel_angle, integral(log.time, reference))
-        )
-        if order := swapped_order(measured, said):
-            elsewhere = [j for j, wheel in enumerate(order) if abs(wheel) != j + 1]
-            j, *_ = elsewhere or [j for j, wheel in enumerate(order) if wheel < 0]
-            found = f"the wheel does not move as its {name} says"
-            listed = ", ".join(map(str, order))
-            expected = f"wheels in the order {listed} (swapped or reversed columns?)"
-            raise _at(log, signals, "wheel", None, j, found, expected)
 
 
 def _check_pose(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> None:

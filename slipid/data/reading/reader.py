@@ -240,7 +240,8 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
                 raise source.error("no value in any row", "numbers", column=j)
             notes.append(f"column '{columns[j]}' has empty cells: it is taken at its own times")
         values = (cells * channel.scale + channel.offset) * layout.to_si(name)
-        out[name] = Signal(time, values, source).part(~missing.all(axis=1))
+        signal, there = Signal(time, values, source), ~missing.all(axis=1)
+        out[name] = signal if there.all() else signal.part(there)
     return out
 
 

@@ -5,7 +5,7 @@ Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`,
 `pose_mirrored`, `pose_length`, `pose_constant`, `pose_of_another_run`, `pose_unexplained`, `lag`,
 `base_radius`, `time_unit`, `current_sign`, `current_unit`, `current_of_supply`, `voltage_sign`,
 `voltage_unit`, `gyro_sign`, `gyro_unit`, `command_sign`, `command_order`, `command_unit`,
-`command_exchanged`, `scales`, `travel`, `not_checked`.
+`command_exchanged`, `wheel_columns`, `scales`, `travel`, `not_checked`.
 """
 
 from collections.abc import Iterator
@@ -19,6 +19,7 @@ from slipid.data.sanity.axes.gather import gather
 from slipid.data.sanity.axes.reading import Evidence, Reading, misfits
 from slipid.data.sanity.axes.shape import mistakes
 from slipid.data.sanity.axes.words import of_mistake
+from slipid.data.sanity.columns import SAME, misordered
 from slipid.data.sanity.electric import electric
 from slipid.data.sanity.exchanged import exchanged
 from slipid.data.sanity.finding import Finding, worst_first
@@ -87,7 +88,10 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
     rolling = np.asarray(geometry.forward()) / radius / np.array([1.0, 1.0, base])
     robot = _Declared(rolling, base, radius, float(geometry.gear_ratio), mass_kg)
     channels = recorded(data)
-    return worst_first(_all(channels, edges(channels), robot))
+    said = tuple(_all(channels, edges(channels), robot))
+    if not {finding.kind for finding in said} & {*SAME}:
+        said += tuple(misordered(data.logs))
+    return worst_first(said)
 
 
 def _all(data: Recorded, at: Edges, robot: _Declared) -> Iterator[Finding]:

@@ -8,11 +8,11 @@ import numpy as np
 from slipid.identify.bench.fit import MotorFit
 from slipid.identify.bench.misfit import LONG_S, Misfit, misfits
 from slipid.identify.fit_file import SCHEMA, number_json
-from slipid.identify.result import hash_of
 from slipid.identify.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, members, sentences
 from slipid.identify.verdicts.wording import VOLTAGE
 from slipid.support.content import Content
+from slipid.support.files import hash_of
 
 ROWS_ELECTRICAL, ROWS_MECHANICAL = 2.0, 6.0
 """Rows in one time constant, L/R and J R / C_e^2, for inductance and inertia to be told."""

@@ -71,7 +71,8 @@ def body_twist(w: Windows, robot: Robot) -> np.ndarray:
     """Measured body twist of every window: yaw and place of the marker taken out, over dt."""
     moved = np.asarray(_measured(robot, jnp.asarray(w.pose)))
     yaw = moved[..., 2]
-    psi = np.array([float(robot.camera.yaw(robot.session_index(s))) for s in w.session])[:, None]
+    yaws = {s: float(robot.camera.yaw(robot.session_index(s))) for s in set(w.session)}
+    psi = np.array([yaws[s] for s in w.session])[:, None]
     chord = turned(psi, moved[..., :2])
     place = np.broadcast_to(np.asarray(robot.camera.marker_place), chord.shape)
     chord -= turned(yaw, place) - place

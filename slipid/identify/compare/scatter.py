@@ -1,12 +1,20 @@
 """How far runs scatter, before any physics is fitted to them.
 
 The motion of the body is regressed on what is smooth in that of the wheels, floor by floor and load
-by load: a Fourier series in the direction of travel, yaw, and whatever a lag of the camera moves.
+by load: a Fourier series in the direction of travel, yaw, whatever a lag of the camera moves, and
+what turning moves in a marker whose place on the body is not known.
 Every run is predicted by the others. What is left in window k of run r, over the distance d_rk, is
 
     e_rk = a_r d_rk + s_rk,   var a = v_run,   var s_rk = v_process d_rk
 
-and the two variances follow from its mean squares within and between runs.
+and the two variances follow from its squares within and between runs, which with D_r = sum_k d_rk
+and a^_r = sum_k e_rk / D_r are expected to be
+
+    sum_rk (e_rk - a^_r d_rk)^2 = v_process sum_r (D_r - sum_k d_rk^2 / D_r)
+    sum_r (sum_k e_rk)^2        = v_run sum_r D_r^2 + v_process sum_r D_r
+
+Squares are summed before anything is divided by a distance: where a robot stands or nearly so, the
+poses' own noise over the little distance would count for all.
 """
 
 import numpy as np
@@ -32,15 +40,16 @@ def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
     """
     w, robot = problem.windows, problem.robot
     far, _ = travel(w, robot)
-    left = _left(w, robot)
+    left = _left(w, robot, "camera.marker_place" in problem.space.place)
     variance = dict(zip(problem.noise.names, problem.noise.typical**2, strict=True))
     for floor in dict.fromkeys(w.surface):
         mine = np.asarray(w.surface) == floor
-        e, d, whole = left[mine], far[mine][..., None], far[mine].sum(axis=1)[:, None]
-        level = e.sum(axis=1) / whole
-        within = ((e - level[:, None] * d) ** 2 / np.maximum(d, 1e-9)).sum(axis=(0, 1))
-        process = within / max(mine.sum() * (far.shape[1] - 1), 1)
-        run = (level**2).mean(axis=0) - process * (1 / whole).mean()
+        e, d, whole = left[mine], far[mine], far[mine].sum(axis=1)
+        total, most = e.sum(axis=1), np.maximum(whole, 1e-9)
+        level = total / most[:, None]
+        within = ((e - level[:, None] * d[..., None]) ** 2).sum(axis=(0, 1))
+        process = within / max(float((whole - (d**2).sum(axis=1) / most).sum()), 1e-9)
+        run = ((total**2).sum(axis=0) - process * whole.sum()) / max(float((whole**2).sum()), 1e-9)
         for k, axis in enumerate(AXES):
             for kind, found in (("process", process), ("run", run)):
                 name = f"{kind}.{floor}.{axis}"
@@ -48,7 +57,7 @@ def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
     return np.log(list(variance.values()))
 
 
-def _left(w: Windows, robot: Robot) -> Float[np.ndarray, "piece window 3"]:
+def _left(w: Windows, robot: Robot, place_is_free: bool) -> Float[np.ndarray, "piece window 3"]:
     """Motion along, across and in yaw that other runs do not predict [m, m, rad]."""
     shape = robot.geometry
     back = np.asarray(shape.least()).T * float(shape.wheel_radius)
@@ -59,7 +68,9 @@ def _left(w: Windows, robot: Robot) -> Float[np.ndarray, "piece window 3"]:
         vector[..., :2] = turned(-angle, vector[..., :2])
     waves = [f(k * angle) for k in range(1, HARMONICS + 1) for f in (np.cos, np.sin)]
     series = np.stack([np.ones_like(angle), *waves], -1) * step[..., :1]
-    x = np.concatenate([series, step[..., 2:], late], axis=-1)
+    turns = step[..., 2:]
+    swept = [turns * np.stack([np.cos(angle), np.sin(angle)], -1)] if place_is_free else []
+    x = np.concatenate([series, turns, late, *swept], axis=-1)
     gap = moved - step
     out = np.empty_like(gap)
     group = np.array([f"{a}@{b}" for a, b in zip(w.surface, w.load, strict=True)])

@@ -16,6 +16,7 @@ from slipid.identify.fit.crossing import MOTION, Several
 from slipid.identify.fit.hierarchy import effect_variances, pooled
 from slipid.identify.fit.noise import SHARED
 from slipid.identify.fit.problem import (
+    CREEPS,
     Problem,
     State,
     effects_of,
@@ -27,8 +28,6 @@ from slipid.identify.fit.shared import Tie, freed
 from slipid.identify.fit.variances import Blocks, Search, Square, Target, scored, spread_of
 from slipid.model.robot import Robot
 
-CREEPS = (0.05, 0.4, 1.0)
-"""Starts of the creep of every floor; others end in poor minima."""
 _REFUSED = 12
 """Steps of the solver that may be refused in a round."""
 

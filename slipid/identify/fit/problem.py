@@ -32,6 +32,9 @@ from slipid.identify.fit.variances import (
 from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
 
+CREEPS = (0.05, 0.4, 1.0)
+"""Starts of the creep of every floor; others end in poor minima."""
+
 
 @dataclass(frozen=True)
 class State:

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -103,7 +101,7 @@ def estimates(
 
     `flat` are the paths of the numbers that move along directions which the data leave open.
     """
-    tree = space.tree(jnp.asarray(z))
+    tree = space.tree(z)
     return tuple(
         _free(space, e, tree, z, covariance, has_voltage, e.path in flat)
         if e.path in space.place
@@ -148,16 +146,16 @@ def _free(
     prior_mean, prior_std = space.prior_mean[at], space.prior_std[at]
     value = np.atleast_1d(np.asarray(entry.get(tree), float))
     std_z = np.sqrt(np.diag(block))
-    center = np.asarray(d.to_si(jnp.asarray(prior_mean)))
+    center = np.asarray(d.to_si(prior_mean))
     if d.tied:
         rng = np.random.default_rng(0)
         spread = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
-        draws = np.asarray(jax.vmap(d.to_si)(jnp.asarray(spread)))
+        draws = np.asarray(d.to_si(spread))
         low, high = np.quantile(draws, [0.05, 0.95], axis=0)
         std = draws.std(axis=0)
         wide = np.full(entry.size, prior_std.mean() / entry.size)
     else:
-        low, high = (np.asarray(d.to_si(jnp.asarray(mean + k * std_z))) for k in (-Z95, Z95))
+        low, high = (np.asarray(d.to_si(mean + k * std_z)) for k in (-Z95, Z95))
         std = d.slope(value) * std_z
         wide = d.slope(center) * prior_std
     scaled = block / prior_std[:, None] / prior_std[None, :]

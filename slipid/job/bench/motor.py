@@ -16,6 +16,7 @@ from slipid.data.reading.guess import Named, header_of, layout_of
 from slipid.data.reading.layout import Recorded
 from slipid.data.reading.reader import read_logs
 from slipid.data.runs import counted_once
+from slipid.data.sanity.columns import refuse_misordered
 from slipid.identify.bench.doubts import refuse
 from slipid.identify.bench.fit import fit_motor
 from slipid.identify.bench.motor import Bench, BenchMotor
@@ -72,6 +73,7 @@ def read_bench_job(config: Config, root: Path, report: Reporter) -> BenchJob:
         layout = of_config.layout_of(config, section)
         for path in paths:
             logs = counted_once(read_logs(path, layout, root, None, section.load).logs)
+            refuse_misordered(logs)
             parts += [records_of(log, layout) for log in logs]
     counts = {len(p) for p in parts}
     if len(counts) > 1:
@@ -98,6 +100,7 @@ def read_one(
     header = header_of(path, delimiter)
     layout = layout_of(path, given, header, signed)
     logs = counted_once(read_logs(path, layout, path.parent, None, "bench").logs)
+    refuse_misordered(logs)
     parts = [records_of(log, layout) for log in logs]
     labels = _labels((), len(parts[0]), str(path))
     records = {label: tuple(p[k] for p in parts) for k, label in enumerate(labels)}

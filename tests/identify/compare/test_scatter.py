@@ -7,6 +7,7 @@ import pytest
 
 from slipid.identify.compare.scatter import scatter
 from slipid.identify.fit.problem import Problem
+from slipid.search_space import Choice
 from tests.helpers.made_windows import made
 from tests.helpers.made_windows import robot as made_robot
 
@@ -19,8 +20,8 @@ NOISY = {
 }
 
 
-def found(w):
-    problem = Problem(w, ROBOT, [])
+def found(w, choices=()):
+    problem = Problem(w, ROBOT, list(choices))
     std = np.exp(0.5 * scatter(problem))
     typical = dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True))
     return dict(zip(problem.noise.names, std.tolist(), strict=True)), typical
@@ -44,3 +45,32 @@ def test_runs_too_few_to_be_predicted_from_each_other_scatter_far():
     assert found(few)[0]["run.soft.along"] > 0.1
     alone = replace(few, surface=("firm",) * len(few)).pieces(np.array([0]))
     assert np.isfinite(list(found(alone)[0].values())).all()
+
+
+def test_where_a_robot_stands_the_noise_of_the_camera_is_no_scatter():
+    w = made(ROBOT, runs=96, count=4, seed=2, std=NOISY)
+    moving = found(w)[0]
+    rng, stands = np.random.default_rng(0), np.arange(0, len(w), 2)
+    turn, faster, pose = w.turn.copy(), w.faster.copy(), w.pose.copy()
+    turn[stands, 3], faster[stands, 3] = 1e-5, 0.0
+    pose[stands, 4] = pose[stands, 3] + rng.normal(0, [5e-4, 5e-4, 3e-3], (len(stands), 3))
+    standing = found(replace(w, turn=turn, faster=faster, pose=pose))[0]
+    for name in NOISY:
+        assert standing[name] < 1.4 * moving[name], name
+
+
+def test_a_marker_whose_place_is_unknown_is_no_scatter_of_turning_runs():
+    w = made(ROBOT, runs=96, count=4, seed=2, std=NOISY)
+    place = np.array([0.12, -0.09])
+    c, s = np.cos(w.pose[..., 2]), np.sin(w.pose[..., 2])
+    moved = np.stack([c * place[0] - s * place[1], s * place[0] + c * place[1]], -1)
+    pose = w.pose.copy()
+    pose[..., :2] += moved
+    off = replace(w, pose=pose)
+    free = (Choice("camera.marker_place", free=True),)
+    names = ("run.firm.along", "run.firm.across")
+    before, known = found(w, free)[0], found(off, free)[0]
+    held = found(off)[0]
+    for name in names:
+        assert known[name] < 1.2 * before[name], name
+        assert held[name] > 2.0 * known[name], name

@@ -6,6 +6,7 @@ from pathlib import Path
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.reader import read_logs
+from slipid.data.sanity.columns import refuse_misordered
 from slipid.job.config import geometry, parsed
 from slipid.job.logs import layout_of
 from slipid.job.new.answers import Answers, Told
@@ -152,7 +153,8 @@ def _refused(sketch: Sketch, name: str, path: Path) -> str:
         section = next((one for one in config.content.logs if one.format == name), None)
         if section is None:
             return ""
-        read_logs(path, layout_of(config, section), path.parent, FLOOR, "as_built")
+        found = read_logs(path, layout_of(config, section), path.parent, FLOOR, "as_built")
+        refuse_misordered(found.logs)
     except DataError as error:
         return str(error).splitlines()[0].replace("robot.toml ", "")
     return ""

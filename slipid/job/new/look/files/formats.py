@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.reader import read_logs
+from slipid.data.sanity.columns import refuse_misordered
 from slipid.job.new.look.files.file import Head
 from slipid.job.new.look.files.kinds import Kind
 from slipid.support.errors import DataError
@@ -55,7 +56,7 @@ def _matches(head: Head, layout: Layout) -> bool:
 def _reads(kind: Kind, layout: Layout) -> bool:
     for path in kind.paths[:_TRIED]:
         try:
-            read_logs(path, layout, path.parent, "floor", "as_built")
+            refuse_misordered(read_logs(path, layout, path.parent, "floor", "as_built").logs)
         except DataError:
             continue
         return True
