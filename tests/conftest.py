@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 from ctypes.util import find_library
 from pathlib import Path
 
@@ -29,15 +30,20 @@ os.environ["MPLBACKEND"] = "Agg"
 if find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 
+# Commands that tests start compile slipid anew, seconds each, where its bytecode is not kept.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 import jax  # noqa: E402
-from jaxtyping import install_import_hook  # noqa: E402
+
+from tests.helpers.checked import check_types_of  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 one_blas_thread()
 
 # Shapes and types of every annotated function of slipid are checked while tests run; under jit this
 # costs at tracing only. Must come before the first import of what computes.
-install_import_hook("slipid", "beartype.beartype")
+check_types_of("slipid")
 
 
 @pytest.fixture
