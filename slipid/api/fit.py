@@ -230,8 +230,7 @@ def fit(
     wishes = priors or {}, fixed or {}, start or {}, free
     task = task_of(runs, robot, *wishes, image_centre, windows_per_piece, seed)
     with Reporter(quiet=quiet) as report:
-        problem = task.problem()
-        optimum = optimised(task, problem, None, report)
+        problem, optimum = optimised(task, task.problem(), None, report)
         found = summarised(task, problem, optimum, report)
     return Fit(found, task, problem, optimum)
 

@@ -30,6 +30,8 @@ from slipid.support.files import read_json, writable, write_bytes, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
+LATE = 3
+"""Round from which a fit counts as near its optimum."""
 CHECKPOINT = "checkpoint"
 """Name of the file that a fit in progress keeps its state in."""
 
@@ -78,7 +80,7 @@ def identify(
         report.line(said)
     key = key_of(config.hash, job.data_hash, problem.space.names, problem.noise.names)
     kept = Checkpoint(out, key)
-    optimum = optimised(job, problem, kept, report)
+    problem, optimum = optimised(job, problem, kept, report)
     fit = summarised(job, problem, optimum, report)
     report.stage("predicting the fitted runs")
     judged = judgement(fit, job.dataset)
@@ -147,15 +149,34 @@ def _keep_run(job: Job, judged: Judgement, data: Path, out: Path, seconds: float
     write_json(out / "run.json", run)
 
 
-def optimised(task: Task, problem: Problem, kept: Checkpoint | None, report: Reporter) -> Optimum:
-    """Optimum of a task, whose problem is `task.problem()`.
+def optimised(
+    task: Task, problem: Problem, kept: Checkpoint | None, report: Reporter
+) -> tuple[Problem, Optimum]:
+    """Optimum of a task, whose problem is `task.problem()`, and the problem that it is one of.
 
-    It goes on from the state that was kept of this very task, and keeps every round.
+    That is another one where the lag found was not expected, see `Task.problem`. It goes on from
+    the state that was kept of this very task, and keeps every round.
     """
+    optimum = _optimised(task, problem, _restored(kept, report), kept, report)
+    cut = task.problem(problem.space.tree(optimum.state.z)).windows
+    if cut.lag == problem.windows.lag:
+        return problem, optimum
+    report.line(f"cut anew at a lag of {cut.lag:.2f} s; it was {problem.windows.lag:.2f} s before")
+    again = problem.of(cut)
+    start = replace(optimum.state, round=LATE, moved=np.inf, effect=None)
+    return again, _optimised(task, again, (start, list(optimum.history)), kept, report)
+
+
+def _optimised(
+    task: Task,
+    problem: Problem,
+    before: tuple[State | None, list[float]],
+    kept: Checkpoint | None,
+    report: Reporter,
+) -> Optimum:
+    """Optimum of one cut, from a state, with the losses on the way to it, if there is one."""
     wanted = task.settings
-    start, history = _restored(kept)
-    if start is not None and kept is not None:
-        report.line(f"going on from round {start.round} of {kept.folder / CHECKPOINT}.npz")
+    start, history = before
     first: list[float] = []
 
     def tell(state: State) -> None:
@@ -183,14 +204,16 @@ def optimised(task: Task, problem: Problem, kept: Checkpoint | None, report: Rep
     return replace(optimum, history=tuple(history))
 
 
-def _restored(kept: Checkpoint | None) -> tuple[State | None, list[float]]:
+def _restored(kept: Checkpoint | None, report: Reporter) -> tuple[State | None, list[float]]:
     """Where the fit stood when it was left, and its losses so far."""
     found = None if kept is None else kept.load(CHECKPOINT)
-    if found is None:
+    if found is None or kept is None:
         return None, []
     history = found.pop("history").tolist()
     plain: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in found.items()}
-    return State(**plain), history
+    start = State(**plain)
+    report.line(f"going on from round {start.round} of {kept.folder / CHECKPOINT}.npz")
+    return start, history
 
 
 def summarised(task: Task, problem: Problem, optimum: Optimum, report: Reporter) -> Fit:

@@ -28,6 +28,8 @@ LENGTHS = {"poses": "robot.wheel_radius", "wheels": "camera.scale"}
 """What is free where these lengths are trusted."""
 SIZE_STD = 0.1
 """Std of its prior, as a part of the nominal value: tyres give way, cameras are set up by eye."""
+ANEW_S = 0.02
+"""Gap between a fitted lag and that at which windows were cut, from which they are cut anew [s]."""
 LAG_STD = 0.1
 """Std of the prior of a lag that was found from the motion [s]."""
 
@@ -60,10 +62,17 @@ class Task:
         """Hash of the runs and their files."""
         return hash_of((log.name, log.sha256) for log in self.logs)
 
-    def problem(self) -> Problem:
-        """Likelihood of the runs, cut into windows as the settings say."""
-        start = Space(self.robot, self.choices).template
-        return Problem(self.windows(start), self.robot, list(self.choices))
+    def problem(self, near: Robot | None = None) -> Problem:
+        """Likelihood of the runs, cut into windows as the settings say.
+
+        They are cut at the camera's lag where a fit starts, or at that of a robot `near` its
+        optimum if this is `ANEW_S` away: what wheels turned in a window is linear in the lag only
+        near the one that it was cut at.
+        """
+        robot = Space(self.robot, self.choices).template
+        if near is not None and abs(float(near.camera.lag - robot.camera.lag)) > ANEW_S:
+            robot = replace(robot, camera=replace(robot.camera, lag=near.camera.lag))
+        return Problem(self.windows(robot), self.robot, list(self.choices))
 
     def windows(self, robot: Robot) -> Windows:
         """Windows of the runs at the wheel radius and the camera lag of a robot."""

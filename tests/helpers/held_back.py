@@ -20,8 +20,8 @@ def held_back(
         read = read_config(config)
         whole: Job = read_job(read, folder, report)
         job = job_of(read, part(whole.dataset, fitted), (), report)
-        problem = job.problem()
-        fit = summarised(job, problem, optimised(job, problem, None, report), report)
+        problem, optimum = optimised(job, job.problem(), None, report)
+        fit = summarised(job, problem, optimum, report)
     assert fit.converged, fit.reason
     rungs = restored(fit.space.template.geometry, dict(fit.baselines))
     other = part(whole.dataset, judged)
