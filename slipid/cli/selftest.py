@@ -22,9 +22,9 @@ def selftest(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Make this very experiment with known truth, fit it, and say what it recovers.
+    r"""Make this very experiment with known truth, fit it, and say what it recovers.
 
-    Without --data it is the plan of [selftest] in the config. Writes selftest.json; goes on from
+    Without --data it is the plan of \[selftest] in the config. Writes selftest.json; goes on from
     the replicates that are done. Exit code 1 where a number that is wanted is not recovered.
     """
     from slipid.report.estimates import show_selftest

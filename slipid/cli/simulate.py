@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def simulate(
     config: ConfigFile, out: Out, jobs: Jobs = None, json: Json = None, quiet: Quiet = False
 ) -> int:
-    """Logs from the virtual test site, whose physics is MuJoCo's; needs slipid[testsite].
+    r"""Logs from the virtual test site, whose physics is MuJoCo's; needs slipid\[testsite].
 
     Writes logs, a config that identifies them, floor maps, and the truth in a folder of its own.
     Runs that are done are kept and not driven again.

@@ -1,12 +1,14 @@
 """Slip against torque of every floor, with its band, and what range the data saw."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import travel
@@ -17,6 +19,10 @@ from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.search_space import Space
 
 POINTS = 41
+_STEADY, _MOVED = 0.1, 0.1
+"""Parts: of a command, by which rows may differ from it; of the fastest window, to have moved."""
+_SECTOR, _COMMON = 30.0, 0.02
+"""Directions that count as one [deg], and the part of all windows from which one counts."""
 _SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])
 
 
@@ -114,15 +120,24 @@ def slip_on(robot: Robot, floor: str, curve: SlipCurve) -> Float[np.ndarray, " t
 def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
     """What each floor was seen with."""
     speed, torque, slip = (np.asarray(x) for x in seen(robot, b))
-    back = np.asarray(robot.geometry.least())[2] * float(robot.geometry.wheel_radius)
+    back = np.asarray(robot.geometry.least()) * float(robot.geometry.wheel_radius)
     # by the encoders: what was driven, not how it slipped
-    yaw = np.asarray(lk.wheel_speed(robot, b)) @ back
+    twist = np.asarray(lk.wheel_speed(robot, b)) @ back.T
+    yaw = twist[..., 2]
     floor, far = np.asarray(b.surface), travel(b, robot)[0].sum(axis=1)
     out: dict[str, Validity] = {}
     for k, label in enumerate(robot.surfaces.labels):
         runs = [i for i, log in enumerate(data.logs) if (log.surface or "unknown") == label]
         mine = floor == k
         most = [float(np.abs(x[mine]).max()) for x in (speed, torque, slip, yaw)]
+        if 2 * sum(has_steady_command(data.logs[i]) for i in runs) > len(runs):
+            driven = Driven(
+                distinct(np.degrees(data.heading[runs]), 1),
+                distinct(data.speed[runs], 3),
+                distinct(data.turn[runs], 2),
+            )
+        else:
+            driven = by_encoders(twist[mine].reshape(-1, 3))
         out[label] = Validity(
             runs=len(runs),
             loads=tuple(sorted({data.logs[i].load for i in runs})),
@@ -130,12 +145,45 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
             torque_nm=(0.0, most[1]),
             slip=(0.0, most[2]),
             yaw_rate=(0.0, most[3]),
-            headings_deg=distinct(np.degrees(data.heading[runs]), 1),
-            speeds=distinct(data.speed[runs], 3),
-            turn_rates=distinct(data.turn[runs], 2),
+            headings_deg=driven.headings_deg,
+            speeds=driven.speeds,
+            turn_rates=driven.turn_rates,
             distance=round(float(far[mine].sum()) / max(len(runs), 1), 3),
         )
     return out
+
+
+class Driven(NamedTuple):
+    """Headings [deg], speeds [m/s] and turn rates [rad/s] that were driven, each once, rising."""
+
+    headings_deg: tuple[float, ...]
+    speeds: tuple[float, ...]
+    turn_rates: tuple[float, ...]
+
+
+def has_steady_command(log: Log) -> bool:
+    """Whether a run was asked for one motion most of the time, which then tells what it drove."""
+    if log.twist_command is None:
+        return False
+    gap = np.linalg.norm(log.twist_command - np.median(log.twist_command, axis=0), axis=1)
+    usual = float(np.linalg.norm(np.median(log.twist_command, axis=0)))
+    return usual > 0.0 and float((gap < _STEADY * usual).mean()) > 0.5
+
+
+def by_encoders(twist: Float[np.ndarray, "window 3"]) -> Driven:
+    """What windows drove by their wheels: roughly, of windows that moved, what is no exception."""
+    speed = np.linalg.norm(twist[:, :2], axis=1)
+    ahead = speed > _MOVED * speed.max(initial=0.0)
+    turned = np.abs(twist[:, 2])
+    on = turned > _MOVED * turned.max(initial=0.0)
+    way = np.degrees(np.arctan2(twist[ahead, 1], twist[ahead, 0]))
+    headings, count = np.unique((np.round(way / _SECTOR) * _SECTOR) % 360.0, return_counts=True)
+    common = headings[count >= _COMMON * count.sum()]
+    signed = np.where(common > 180.0, common - 360.0, common)  # as commands have them
+    parts = (0.1, 0.5, 0.9)
+    speeds = np.quantile(speed[ahead], parts) if ahead.any() else np.zeros(0)
+    rates = np.quantile(twist[on, 2], parts) if on.any() else np.zeros(0)
+    return Driven(distinct(signed, 1), distinct(speeds, 3), distinct(rates, 2))
 
 
 def distinct(x: np.ndarray, digits: int) -> tuple[float, ...]:

@@ -117,7 +117,8 @@ class Validity:
         runs: how many; loads: with which load set-ups.
         wheel_speed, torque_nm, slip, yaw_rate: smallest and largest [rad/s], [N m], 1, [rad/s];
             the yaw rate by the encoders.
-        headings_deg, speeds, turn_rates: of the body, each that was driven [deg], [m/s], [rad/s].
+        headings_deg, speeds, turn_rates: of the body, each that was driven [deg], [m/s], [rad/s];
+            by the encoders, and roughly, where no steady command was logged.
         distance: of a run, on average [m].
     """
 

@@ -91,10 +91,13 @@ def show_trust(page: Page, judged: "Judgement") -> None:
     page.line(f"verdict: {judged.trust}")
 
 
+_COMMANDED = ("commanded headings", r"and speeds \[m/s]")
+
+
 def show_check(page: Page, found: Content) -> None:
     """Write the content of check.json; what is wrong comes first."""
     page.findings(found["findings"])
-    groups = table(("surface", "load", "session", "runs", "minutes", "headings", r"speeds \[m/s]"))
+    groups = table((*("surface", "load", "session", "runs", "minutes"), *_COMMANDED))
     for row in found["groups"]:
         groups.add_row(
             row["surface"],
@@ -102,7 +105,7 @@ def show_check(page: Page, found: Content) -> None:
             Text(row["session"]),
             str(row["runs"]),
             f"{row['seconds'] / 60:.1f}",
-            str(row["headings"]),
+            str(row["headings"] or ""),  # nothing was commanded, or a turn on the spot
             " ".join(f"{v:g}" for v in row["speeds"]),
         )
     page.table(groups)
@@ -115,7 +118,9 @@ def show_check(page: Page, found: Content) -> None:
     )
     for path, e in (found["parameters"] | found["derived"]).items():
         if e["ratio"] is not None and "session_yaw" not in path:
-            before.add_row(Text(path), e["unit"], f"{e['ratio']:.3f}", verdict(e["verdict"]))
+            # more than 1: what motion leaves open is more than the prior of what currents tell
+            shown = f"{min(e['ratio'], 1.0):.3f}"
+            before.add_row(Text(path), e["unit"], shown, verdict(e["verdict"]))
     page.table(before)
     page.notes(found["messages"])
 

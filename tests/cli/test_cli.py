@@ -53,6 +53,11 @@ def test_help_names_every_command():
         assert command in result.stdout
 
 
+def test_help_keeps_words_in_brackets():
+    assert "plan of [selftest] in the config" in invoke("selftest", "--help").stdout
+    assert "slipid[testsite]" in invoke("simulate", "--help").stdout
+
+
 def test_help_loads_nothing_heavy():
     code = (
         "import sys; from slipid.cli.main import app; from typer.testing import CliRunner; "

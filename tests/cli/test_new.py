@@ -67,7 +67,8 @@ def test_yes_takes_defaults_and_lists_them(tmp_path, drive):
 
 
 def test_a_log_is_looked_into(tmp_path):
-    table(tmp_path / "logs" / "grass" / "run.csv", plain())
+    columns = {name: one for name, one in plain().items() if not name.startswith("cur")}
+    table(tmp_path / "logs" / "grass" / "run.csv", columns)
     out = tmp_path / "mine.toml"
     result = invoke("new", "--from", tmp_path / "logs", "--out", out, *DIFFERENTIAL)
     assert result.exit_code == 0, result.stderr

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import json
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
@@ -24,6 +25,7 @@ from slipid.identify.fit.variances import DEGREES
 from slipid.identify.fit_file import identified_json, load, save, to_json
 from slipid.identify.posterior import diagnosis
 from slipid.identify.result import Fit, summarise
+from slipid.identify.slip_curves import by_encoders, has_steady_command
 from slipid.identify.verdicts.estimates import estimates
 from slipid.identify.verdicts.unidentified import flat_directions, members
 from slipid.search_space import Choice
@@ -233,6 +235,30 @@ def test_curves_rise_hold_their_line_and_end_where_the_data_end():
     grip += float(floor.slide_viscosity[0]) * slip[k] * rim
     expected = 0.04 * float(floor.friction[0]) * 12.0 * 9.81 * share * grip
     assert torque[k] == pytest.approx(expected, rel=2e-3)
+
+
+def test_what_was_driven_is_told_by_the_wheels_where_no_steady_command_was_logged():
+    twist = np.zeros((400, 3))
+    way = np.radians(60.0 * (np.arange(400) % 6))
+    speed = np.where(np.arange(400) < 200, 0.1, 0.3)
+    twist[:, 0], twist[:, 1] = speed * np.cos(way), speed * np.sin(way)
+    twist[:40], twist[40:80, 2] = 0.0, 0.5
+    driven = by_encoders(twist)
+    assert driven.headings_deg == (-120.0, -60.0, 0.0, 60.0, 120.0, 180.0)
+    assert (min(driven.speeds), max(driven.speeds)) == (0.1, 0.3)
+    assert driven.turn_rates == (0.5,)
+    assert by_encoders(np.zeros((5, 3))) == ((), (), ())
+
+
+def test_a_command_that_changes_or_rests_tells_nothing_of_a_run():
+    data = made(True)[1]
+    log = replace(data.logs[0], twist_command=np.tile([0.2, 0.0, 0.0], (data.logs[0].samples, 1)))
+    assert has_steady_command(log)
+    assert not has_steady_command(replace(log, twist_command=None))
+    wandering = np.linspace(-1.0, 1.0, log.samples)[:, None] * [0.2, 0.1, 0.0]
+    assert not has_steady_command(replace(log, twist_command=wandering))
+    resting = np.where(np.arange(log.samples)[:, None] % 3 == 0, [0.2, 0.0, 0.0], 0.0)
+    assert not has_steady_command(replace(log, twist_command=resting))
 
 
 def test_a_solver_that_stopped_on_its_way_is_not_called_converged():

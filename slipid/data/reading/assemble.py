@@ -16,6 +16,7 @@ from slipid.data.log import Log
 from slipid.data.reading.layout import Recorded
 from slipid.data.reading.signal import Signal, clock_of
 from slipid.data.wheel_signals import integral, readings
+from slipid.support.errors import bad_data
 
 EPOCH = 1e6
 """Time from which on it is taken to count from 1970 and not from the start of the robot [s]."""
@@ -43,6 +44,9 @@ def assembled(
     Raises:
         DataError: the wheels were not measured for a while, or a channel has no value at all.
     """
+    if not signals:
+        found = "no column of anything but the time is known"
+        raise bad_data(identity.path, found, "columns of the wheels and of the pose")
     turns = next((name for name in TURNS if name in signals), None)
     clock = clock_of(list(signals.values()))
     if turns is not None:

@@ -80,13 +80,22 @@ def _signs(
     work = np.nan_to_num(values * speed)
     forth, back = (_share(work[way]) for way in (speed > 0, speed < 0))
     if name == "current" and forth > SIDED and back < -SIDED:
-        yield Finding(
-            "current_of_supply",
-            "currents are positive whichever way the wheels drive: they are what the battery "
-            "gives, with the sign of the power, not what the torque goes with",
-            "set current_is_signed = false in the layout, with magnitudes in the columns",
-            "note",
-        )
+        both = "currents are positive whichever way the wheels drive"
+        if np.nanmin(values) < 0.0:
+            yield Finding(
+                "current_of_supply",
+                f"{both}, and negative at times: they are what the battery gives, with the sign of "
+                "the power, not what the torque goes with",
+                "take the current out of the layout, or log that of each motor",
+                "note",
+            )
+        else:
+            yield Finding(
+                "current_of_supply",
+                f"{both}: they are magnitudes, which do not tell driving from braking",
+                "set current_is_signed = false in the layout",
+                "note",
+            )
         return
     share = np.array([_share(column) for column in work.T])
     turned = np.flatnonzero(share < BACKWARDS)

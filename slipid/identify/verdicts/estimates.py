@@ -26,6 +26,8 @@ below this part of it: a tight prior that the data contradict is something else.
 NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
 """Without a voltage nothing sets the scale of these; a prior elsewhere must not lend them one."""
 Z95 = 1.6448536269514722
+LARGEST = 600.0
+"""Largest exponent at an end of an interval: of what nothing is known it would be infinite."""
 
 
 class Ratio(NamedTuple):
@@ -155,7 +157,8 @@ def _free(
         std = draws.std(axis=0)
         wide = np.full(entry.size, prior_std.mean() / entry.size)
     else:
-        low, high = (np.asarray(d.to_si(mean + k * std_z)) for k in (-Z95, Z95))
+        ends = (np.minimum(mean + k * std_z, LARGEST) for k in (-Z95, Z95))
+        low, high = (np.asarray(d.to_si(end)) for end in ends)
         std = d.slope(value) * std_z
         wide = d.slope(center) * prior_std
     scaled = block / prior_std[:, None] / prior_std[None, :]
@@ -252,7 +255,7 @@ def _quotient(
     value, ratio = float(np.exp(log_value)), std / prior_std
     forced = "not_identified" if over == NEEDS_VOLTAGE[0] and not has_voltage else None
     verdict, provenance = said(ratio, 1 / std, forced, is_flat=False)
-    low, high = (float(np.exp(log_value + k * std)) for k in (-Z95, Z95))
+    low, high = (float(np.exp(min(log_value + k * std, LARGEST))) for k in (-Z95, Z95))
     return Estimate(
         path=f"{over}/{wanted.under}",
         unit=wanted.unit,

@@ -80,8 +80,11 @@ def _product(axes: list[Axis], power: np.ndarray) -> str:
             listed([n for n, k in zip(names, power, strict=True) if s * k > 0]) for s in (1, -1)
         )
         return f"unseen for any factor: {up} times it, {down} divided by it"
-    parts = [_power(p, k) for p, k in zip(names, power, strict=True)]
-    return f"{', '.join(parts)} (each times t to the power shown, any t)"
+    parts = [
+        f"{name} {'times' if k > 0 else 'divided by'} {_power('t', abs(k))}"
+        for name, k in zip(names, power, strict=True)
+    ]
+    return f"unseen for any factor t: {', '.join(parts)}"
 
 
 def _power(name: str, k: float) -> str:

@@ -99,7 +99,10 @@ class BagSketch:
 
 @dataclass(frozen=True)
 class LogsSketch:
-    """A section of logs; attributes as of `Logs`, and what is said or asked of it."""
+    """A section of logs; attributes as of `Logs`, and what is said or asked of it.
+
+    A session of "" is not written: the default holds.
+    """
 
     glob: str
     format: str
@@ -107,6 +110,7 @@ class LogsSketch:
     above: tuple[str, ...] = ()
     question: str = ""
     off: bool = False
+    session: str = ""
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,10 @@ _PUT = {
     "mass_kg": "taken by default: weigh the robot",
     "wheel_radius_m": _MEASURE,
 }
+_DATASHEET = (
+    "without the voltages of the motors this and the next stay what is written: what are they, by "
+    "the datasheet?"
+)
 FRAME = "x ahead, y left, angles counter-clockwise from ahead; wheels in the order of the columns"
 
 
@@ -175,6 +179,8 @@ def _logs_block(logs: LogsSketch, first: bool) -> Block:
         Line("surface", toml(logs.surface), surface if first else "", logs.question, logs.off),
         line("load", "as_built", logs.off),
     ]
+    if logs.session:
+        lines.append(line("session", logs.session, logs.off))
     if first:
         lines.append(line("map", "maps/site.toml", off=True))
     above = logs.above or (("One section per set of logs.",) if first else ())
@@ -209,9 +215,11 @@ def _parameters_block(channels: frozenset[str]) -> Block:
         Line(yaw, "{ free = true }", "marker's heading less the robot's [rad]"),
     ]
     if current:
-        said = "datasheet" if voltage else "datasheet: without voltages they stay what is written"
+        ask = "" if voltage else _DATASHEET
         resistance, emf = "{ mean = 1.0, std = 0.5 }", "{ mean = 0.05, std = 0.025 }"
-        lines.append(Line('"motor.resistance"', f"{{ prior = {resistance} }}", f"[ohm], {said}"))
+        lines.append(
+            Line('"motor.resistance"', f"{{ prior = {resistance} }}", "[ohm], datasheet", ask)
+        )
         lines.append(Line('"motor.back_emf"', f"{{ prior = {emf} }}", "[V s/rad]"))
     else:
         lines.append(Line('"motor.*"', "{ free = false }", "no current: motors are not seen"))

@@ -39,4 +39,5 @@ def test_currents_of_the_supply_are_told_from_those_of_torque(real_data):
     runs = skid_runs("warthog_grass_2024_7_29", True, real_data)
     found = findings(runs, two_sides(0.30, 1.08))
     (note,) = (f for f in found if f.kind == "current_of_supply")
-    assert "current_is_signed = false" in (note.remedy or "")
+    # some are below zero, so they cannot be read as magnitudes
+    assert "take the current out of the layout" in (note.remedy or "")

@@ -16,7 +16,7 @@ from slipid.identify.fit.optimise import optimise
 from slipid.identify.fit.problem import Problem
 from slipid.identify.verdicts import unidentified as flat_module
 from slipid.identify.verdicts import wording
-from slipid.identify.verdicts.estimates import RATIOS, derived
+from slipid.identify.verdicts.estimates import RATIOS, derived, estimates
 from slipid.identify.verdicts.profile import RISE, _Walk, profile, profiled
 from slipid.identify.verdicts.unidentified import NOTICED, flat_directions, sentences
 from slipid.identify.verdicts.wording import VOLTAGE, remedy
@@ -100,6 +100,10 @@ def test_powers_differ_by_formula():
     assert wording._product(both, np.array([1.0, -1.0])) == f"{a} and {b} only as {a} * {b}"
     assert wording._product(both, np.array([-0.5, 1.0])) == f"{a} and {b} only as {a}^2 * {b}"
     assert wording._product(both, np.array([1.0, 0.5])) == f"{a} and {b} only as {a} / {b}^2"
+    three = [*both, *wording.axes_of(numbers("surface.soft.creep")[0])]
+    open_ = wording._product(three, np.array([1.0, -0.5, 0.8]))
+    assert open_.startswith(f"unseen for any factor t: {a} times t, {b} divided by t^0.5, ")
+    assert open_.endswith(" times t^0.8")
     assert wording._sum([a, b], np.array([1.0, -1.0])) == f"{a} and {b} only as {b} + {a}"
     assert wording._sum([a, b], np.array([1.0, 0.5])) == f"{a} and {b} only as {a} - 2 {b}"
 
@@ -271,6 +275,16 @@ def test_what_currents_and_voltages_tell(voltage):
     low, high = both.interval90
     assert np.log(high / low) == pytest.approx(2 * 1.6448536 * std)
     assert both.ratio == pytest.approx(std / np.hypot(space.prior_std[r], space.prior_std[c]))
+
+
+def test_what_nothing_is_known_of_has_ends_that_files_can_hold():
+    space = space_of("motor.resistance", "motor.back_emf")
+    wide = np.diag((1e4 * space.prior_std) ** 2)
+    [e] = derived(space, space.start, wide, True)
+    every = estimates(space, (), space.start, wide, True, ())
+    ends = [e.interval90[1], *(one.interval90[1] for one in every if one.std is not None)]
+    assert len(ends) == 3
+    assert np.isfinite(ends).all()
 
 
 def test_no_prior_lends_the_ratio_a_verdict_without_voltage():

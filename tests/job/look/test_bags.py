@@ -130,3 +130,48 @@ def test_several_bags_have_one_glob(tmp_path, count):
         write_bag(tmp_path / f"run{k}.bag", "rosbag1", messages())
     glob = tomllib.loads(proposed(tmp_path, **SKID).text)["logs"][0]["glob"]
     assert glob == ("run0.bag" if count == 1 else "run*.bag")
+
+
+MOTOR_STATE = {"base_msgs/msg/MotorState": "float32[] currents # A\nfloat32[] voltages # V\n"}
+
+
+def _drive_with_pauses(fields_per_wheel: int = 4):
+    """Three drives of two seconds, two seconds apart, and the currents of every motor."""
+    moving = (TIME - TIME[0]) % 4.0 < 2.0
+    angle = np.cumsum(moving * 0.02)[:, None] * np.ones(len(JOINTS))
+    states = joint_states("/joint_states", TIME, JOINTS, position=angle)
+    pose = [
+        Said("/where", POSE, pose_fields(POSE, float(t), 0.1 * float(x), 0.0, 0.0), float(t))
+        for t, x in zip(TIME, angle[:, 0], strict=True)
+    ]
+    many = {"currents": [0.5] * fields_per_wheel, "voltages": [6.0] * fields_per_wheel}
+    motors = [Said("/motors", "base_msgs/msg/MotorState", many, float(t)) for t in TIME]
+    return in_order(states, pose, motors)
+
+
+def test_currents_in_messages_of_an_unknown_type_are_proposed_and_asked_for(tmp_path):
+    bag = write_bag(tmp_path / "run1", "mcap", _drive_with_pauses(), MOTOR_STATE)
+    config = proposed(tmp_path, **SKID)
+    layout = tomllib.loads(config.text)["layouts"]["mine"]
+    assert layout["topics"]["current"] == {"topic": "/motors", "field": "currents", "unit": "A"}
+    said = [q for q in config.questions if q.startswith(("current:", "voltage:"))]
+    assert len(said) == 2
+    assert all("by the name of the field" in q for q in said)
+    assert "motor.resistance" in tomllib.loads(config.text)["parameters"]
+    read = read_bag(bag, declared_bag_layout(layout, "mine"))
+    np.testing.assert_allclose(read[0].signals["voltage"].values, 6.0)
+
+
+def test_fields_for_another_number_of_wheels_are_not_proposed(tmp_path):
+    write_bag(tmp_path / "run1", "mcap", _drive_with_pauses(2), MOTOR_STATE)
+    topics = tomllib.loads(proposed(tmp_path, **SKID).text)["layouts"]["mine"]["topics"]
+    assert not {"current", "voltage"} & topics.keys()
+
+
+def test_a_long_drive_with_pauses_is_cut_at_them_in_one_session(tmp_path):
+    bag = write_bag(tmp_path / "run1", "mcap", _drive_with_pauses(), MOTOR_STATE)
+    there = tomllib.loads(proposed(tmp_path, **SKID).text)
+    layout = there["layouts"]["mine"]
+    assert layout["runs"] == {"pause_s": 1}
+    assert there["logs"][0]["session"] == "file"
+    assert len(read_bag(bag, declared_bag_layout(layout, "mine"))) == 3

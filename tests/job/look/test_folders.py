@@ -62,8 +62,8 @@ def test_three_files_of_a_run_at_three_rates(tmp_path):
     turned = layout["beside"]["mocap.csv"]["columns"]["pose_quaternion"]
     assert turned["columns"] == ["qx", "qy", "qz", "qw"]
     assert tomllib.loads(config.text)["logs"][0]["glob"] == "run*/joint_states.csv"
-    # folders are runs here and no floors: that is all that is left to say
-    assert [q.partition(":")[0] for q in config.questions] == ["surface"]
+    # folders are runs here and no floors, and no voltage was logged: that is all left to say
+    assert [q.partition(":")[0] for q in config.questions] == ["surface", '"motor.resistance"']
     data = read(config, tmp_path)
     assert len(data) == 3
     log = data.logs[0]
@@ -111,7 +111,7 @@ def test_parquet(tmp_path):
     (tmp_path / "grass").mkdir()
     parquet.write_table(pyarrow.table(plain()), tmp_path / "grass" / "run.parquet")
     _, config = proposed(tmp_path, **ROBOT)
-    assert config.questions == ()
+    assert [q for q in config.questions if "datasheet" not in q] == []
     assert "delimiter" not in layout_in(config)
     assert len(read(config, tmp_path)) == 1
 
@@ -143,3 +143,21 @@ def test_a_file_of_which_no_column_is_known_is_a_question_and_still_a_config(tmp
     lines = {name: np.arange(30.0) ** 2 + k for k, name in enumerate(("foo", "bar", "baz"))}
     _, config = proposed(table(tmp_path / "run.csv", lines))
     assert any("which column holds what? There are: foo, bar, baz" in q for q in config.questions)
+
+
+def test_magnitudes_of_currents_in_a_file_of_their_own_are_asked_for(tmp_path):
+    three_files(tmp_path / "run1")
+    path = tmp_path / "run1" / "drivers.csv"
+    path.write_text(path.read_text().replace("-", ""))
+    _, config = proposed(tmp_path, **ROBOT)
+    assert any("do currents have a sign" in q for q in config.questions)
+
+
+def test_a_folder_above_those_of_the_runs_is_proposed_as_the_floor_and_asked_for(tmp_path):
+    for floor in ("grass", "ice"):
+        for run in ("run1", "run2"):
+            three_files(tmp_path / floor / run)
+    _, config = proposed(tmp_path, **ROBOT)
+    floors = [one["surface"] for one in tomllib.loads(config.text)["logs"]]
+    assert sorted(floors) == ["grass", "ice"]
+    assert sum("on which floor was" in q for q in config.questions) == 2

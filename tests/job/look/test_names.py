@@ -45,6 +45,8 @@ from slipid.job.new.look.signals.magnitudes import heading_unit, place_unit, tim
         ("gyro_z", "gyro", "", ""),
         ("effort[1]", "wheel_torque", "1", ""),
         ("pwm_l", "duty", "l", ""),
+        ("w1_angle_rad", "wheel_position", "1", "rad"),
+        ("w1", "wheel_speed", "1", ""),
     ],
 )
 def test_names_as_people_use_them(name, channel, label, unit):

@@ -9,6 +9,7 @@ import pytest
 
 from slipid.job.new.lines import ASKS
 from slipid.job.new.look.files.file import head_of
+from slipid.support.errors import DataError
 from tests.helpers.made_tables import RADIUS, motion, plain, table
 from tests.helpers.proposals import ROBOT, layout_in, proposed, read
 
@@ -17,8 +18,9 @@ def test_a_plain_file_leaves_nothing_open_and_reads(tmp_path):
     table(tmp_path / "grass" / "run1.csv", plain())
     table(tmp_path / "grass" / "run2.csv", plain(9.0))
     proposal, config = proposed(tmp_path, **ROBOT)
-    assert config.questions == ()
-    assert ASKS not in config.text.replace('"# ?"', "")
+    (question,) = config.questions  # what no log without voltages tells
+    assert question.startswith('"motor.resistance": without the voltages')
+    assert config.text.replace('"# ?"', "").count(ASKS) == 1
     layout = layout_in(config)
     assert layout["columns"]["wheel_speed"] == {
         "columns": ["left_vel", "right_vel"],
@@ -60,7 +62,7 @@ def test_other_units_are_told_by_names_units_row_and_magnitude(tmp_path):
         "current": "mA",
     }
     assert layout["current_is_signed"] is False
-    assert [q for q in config.questions if "floor" not in q] == []
+    assert [q for q in config.questions if "floor" not in q and "datasheet" not in q] == []
 
 
 def test_a_row_of_units_above_the_names(tmp_path):
@@ -175,3 +177,44 @@ def test_what_the_reader_refuses_is_said(tmp_path):
     path.write_text("\n".join(rows) + "\n")
     _, config = proposed(path, **ROBOT)
     assert any("the reader says" in q and "row 101" in q for q in config.questions)
+
+
+def test_a_heading_beyond_a_turn_is_told_by_the_turn_rate(tmp_path):
+    columns = plain(60.0)
+    unwrapped = 1.5 * np.abs(columns["yaw"]).max() + columns["yaw"] + 7.0
+    for unit, heading in (("rad", unwrapped), ("deg", np.degrees(columns["yaw"]) / 3)):
+        _, config = proposed(
+            table(tmp_path / unit / "run.csv", columns | {"yaw": heading}), **ROBOT
+        )
+        assert layout_in(config)["columns"]["pose_heading"]["unit"] == unit
+        assert not any("radians or degrees" in q for q in config.questions)
+
+
+def test_currents_of_the_battery_are_left_out(tmp_path):
+    columns = plain()
+    for side in ("left", "right"):
+        current = np.abs(columns[f"cur_{side}"])
+        current[::40] = -0.1  # braking gives a little back
+        columns[f"cur_{side}"] = current
+    _, config = proposed(table(tmp_path / "run.csv", columns), **ROBOT)
+    layout = layout_in(config)
+    assert "current" not in layout["columns"]
+    assert "current_is_signed" not in layout
+    assert "what the battery gives" in config.text.replace("\n# ", " ")
+
+
+def test_currents_without_voltages_ask_for_the_datasheet(tmp_path):
+    with_voltage = plain()
+    for side in ("left", "right"):
+        with_voltage[f"motor_voltage_{side}"] = 2.0 * with_voltage[f"{side}_vel"]
+    for columns, asked in ((plain(), True), (with_voltage, False)):
+        _, config = proposed(table(tmp_path / "run.csv", columns), **ROBOT)
+        assert any("by the datasheet?" in q for q in config.questions) is asked
+
+
+def test_a_log_of_a_motor_on_a_bench_is_sent_to_the_command_for_it(tmp_path):
+    time = np.arange(0.0, 5.0, 0.01)
+    lines = {"t": time, "V": np.sin(time), "I": np.cos(time), "w": 20 * np.sin(time)}
+    path = table(tmp_path / "bench.csv", lines)
+    with pytest.raises(DataError, match=r"motor on a bench .*\nrun: slipid motor .*bench.csv"):
+        proposed(path)

@@ -6,12 +6,12 @@ from pathlib import Path, PurePosixPath
 
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.topics import Topic, topics_of
-from slipid.data.reading.layout import PER_WHEEL, Layout
+from slipid.data.reading.layout import CHANNELS, PER_WHEEL, Layout
 from slipid.job.new.answers import Answers, Told
 from slipid.job.new.lines import Line, toml
 from slipid.job.new.look.columns.found import rank
 from slipid.job.new.look.columns.names import named
-from slipid.job.new.look.files.kinds import common_glob
+from slipid.job.new.look.files.kinds import common_glob, floor_of
 from slipid.job.new.look.robot import robot_from
 from slipid.job.new.sketch import BagSketch, LogsSketch, Sketch
 from slipid.job.reference.meanings import in_short, meanings
@@ -35,14 +35,23 @@ class BagProposal:
     said: tuple[str, ...]
 
 
+_BY_NAME = ("current", "voltage", "duty")
+"""Channels that are looked for in messages of unknown types, by what their fields are called."""
+
+
 @dataclass(frozen=True)
 class _Served:
-    """A channel, or a group of them, that a topic holds; `wheels` where it has one per wheel."""
+    """A channel, or a group of them, that a topic holds; `wheels` where it has one per wheel.
+
+    `field` and `unit` where the type of the messages does not tell them.
+    """
 
     channel: str
     topic: Topic
     wheels: int = 0
     question: str = ""
+    field: str = ""
+    unit: str = ""
 
 
 def bags_in(path: Path) -> list[Path]:
@@ -69,6 +78,7 @@ def propose_bags(bags: Sequence[Path], asked: Path, told: Told) -> BagProposal:
     joints, doubt = _joints(topics)
     served = list(_first_of_each(topics, len(joints)))
     wheels = next((one.wheels for name in _TURNS for one in served if one.channel == name), 0)
+    served += _by_field_names(topics, served, wheels)
     guessed = robot_from(told, wheels, ())
     questions = [doubt] if doubt else []
     if not any(one.channel == "pose" for one in served):
@@ -91,7 +101,7 @@ def propose_bags(bags: Sequence[Path], asked: Path, told: Told) -> BagProposal:
     sketch = Sketch(
         guessed.robot,
         (),
-        (LogsSketch(glob, "mine", "floor", question=floor),),
+        (LogsSketch(glob, "mine", floor_of(glob), question=floor),),
         carries=frozenset(one.channel for one in served if one.question != _EFFORT),
         above=(f"Proposed from {bag}.",),
         data=str(root),
@@ -136,6 +146,24 @@ def _first_of_each(topics: Sequence[Topic], joints: int) -> Iterator[_Served]:
             yield _Served("current", topic, joints, _EFFORT)
 
 
+def _by_field_names(
+    topics: Sequence[Topic], served: Sequence[_Served], wheels: int
+) -> Iterator[_Served]:
+    """Channels in messages of unknown types: numbers of every wheel in a field of that name."""
+    seen = {one.channel for one in served}
+    for topic in (one for one in topics if one.count and not one.serves and not one.joints):
+        for field in topic.fields:
+            told = named(f"wheel {field.path.replace('.', ' ')}")
+            if told.channel not in _BY_NAME or told.channel in seen:
+                continue
+            if field.count != wheels or field.type.startswith("text"):
+                continue
+            seen.add(told.channel)
+            unit = told.unit or CHANNELS[told.channel]
+            ask = f"by the name of the field: is it that, of the motors in this order, in {unit}?"
+            yield _Served(told.channel, topic, wheels, ask, field.path, unit)
+
+
 def _count(topic: Topic) -> int:
     """How many wheels a message has numbers of."""
     return max((field.count for field in topic.fields if field.type.endswith("[]")), default=1)
@@ -160,6 +188,8 @@ def _lines(served: Sequence[_Served]) -> Iterator[Line]:
         off = one.question == _EFFORT
         if off:
             inside += ', field = "effort", unit = "A"'
+        elif one.field:
+            inside += f", field = {toml(one.field)}, unit = {toml(one.unit)}"
         if one.topic.type == _TRANSFORMS and one.topic.frames:
             frame, _, child = one.topic.frames[0].partition(" -> ")
             inside += f", frame = {toml(frame)}, child = {toml(child)}"

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from slipid.data.reading.units import factor
 from slipid.job.new.look.columns.found import Found
 from slipid.job.new.look.signals.known import ANGLES, SPEEDS, Known
 from slipid.job.new.look.signals.magnitudes import (
@@ -22,6 +23,10 @@ PIXELS = ("pixel", "pixels", "pix", "px")
 EFFORT = (
     "what is it: a current (unit A), a torque (N*m, and torque_constant in the layout), a voltage "
     "(V) or a duty (1)?"
+)
+_SUPPLY = (
+    "positive whichever way the wheels drive, and negative at times, so it is what the battery "
+    "gives: slipid wants the current of each motor"
 )
 _BATTERY = (
     "it stays up whatever the wheels do, so it is the battery's: slipid wants the voltage at the "
@@ -48,6 +53,8 @@ def _set_apart(sketch: ChannelSketch, found: Found, known: Known) -> ChannelSket
         return replace(sketch, off=True, question=EFFORT)
     if found.channel.endswith("torque"):
         return replace(sketch, off=True, question="give torque_constant [N m/A] in the layout")
+    if found.channel == "current" and known.of_supply:
+        return replace(sketch, off=True, comment=_SUPPLY)
     if found.channel == "voltage" and of_battery(found, speed):
         return replace(sketch, off=True, comment=_BATTERY)
     if found.channel == "bus_voltage" and known.find("duty") is None:
@@ -71,7 +78,9 @@ def unit_of(one: Study, found: Found, known: Known) -> Unit:
         place = known.moved.place
         return place if channel == "pose_x" else Unit(place.unit)
     if channel == "pose_heading":
-        return heading_unit(found.values[:, 0])
+        farthest = max(known.runs, key=_range_of_heading)
+        turning = farthest.find(channel) or found
+        return heading_unit(turning.values[:, 0], _turned(farthest))
     if channel in (*SPEEDS, *ANGLES):
         seen = known.over_wheels
         if channel.startswith("motor") and seen is not None:
@@ -91,5 +100,26 @@ def unit_of(one: Study, found: Found, known: Known) -> Unit:
     if channel.startswith("twist_command") and channel != "twist_command_yaw":
         return Unit("m/s") if most < 20 else Unit("mm/s", f"up to {most:.4g}")
     if channel in ("twist_command_yaw", "gyro"):
-        return Unit("rad/s") if most < 20 else Unit("deg/s", f"up to {most:.4g}")
+        return _turn_rate_unit(most)
     return plain_unit(channel)
+
+
+def _range_of_heading(run: Known) -> float:
+    found = run.find("pose_heading")
+    return 0.0 if found is None else float(np.nanmax(found.values) - np.nanmin(found.values))
+
+
+def _turned(run: Known) -> float:
+    """Range of the heading by the gyro or by the commands of a run [rad]; 0 without."""
+    for one in run.all:
+        rate = one.columns.first("gyro", "twist_command_yaw")
+        if rate is None or one.clock is None:
+            continue
+        unit = rate.unit or _turn_rate_unit(float(np.nanmax(np.abs(rate.values)))).unit
+        speeds = np.nan_to_num(rate.values[:-1, 0]) * factor(unit, "rad/s")
+        return float(np.ptp(np.cumsum(speeds * np.diff(one.time))))
+    return 0.0
+
+
+def _turn_rate_unit(most: float) -> Unit:
+    return Unit("rad/s") if most < 20 else Unit("deg/s", f"up to {most:.4g}")

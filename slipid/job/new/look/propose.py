@@ -1,8 +1,12 @@
 """From logs to the config that is proposed for them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from slipid.data.log import Log
+from slipid.data.reading import guess
+from slipid.data.reading.bag.runs.pauses import PAUSE_S, parts_between_pauses
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.reader import read_logs
@@ -10,11 +14,13 @@ from slipid.data.sanity.columns import refuse_misordered
 from slipid.job.config import geometry, parsed
 from slipid.job.logs import layout_of
 from slipid.job.new.answers import Answers, Told
+from slipid.job.new.lines import Line
 from slipid.job.new.look.bags import bags_in, propose_bags
-from slipid.job.new.look.files.kinds import a_folder_each, globs_of
+from slipid.job.new.look.files.kinds import a_folder_each, floor_of, globs_of
 from slipid.job.new.look.robot import robot_from
 from slipid.job.new.look.runs import Group, Sorted, sorted_logs
 from slipid.job.new.look.signals.known import Known
+from slipid.job.new.look.signals.study import Study
 from slipid.job.new.look.sketches import file_sketch, radius_hint
 from slipid.job.new.questions import robot_of
 from slipid.job.new.sketch import BesideSketch, LayoutSketch, LogsSketch, Sketch
@@ -49,6 +55,7 @@ def propose(path: Path, told: Told) -> Proposal:
     for _, name in found.presets:
         wheels = max(wheels, _wheels_of(PRESETS[name]))
     files = tuple(one for group in found.groups for one in group.all)
+    _no_bench(path, found, wheels, files)
     guessed = robot_from(told, wheels, files)
     robot = _as_presets_say(guessed.robot, found)
     known = [_known(group, robot) for group in found.groups]
@@ -68,6 +75,23 @@ def propose(path: Path, told: Told) -> Proposal:
         hints=(*guessed.hints, *(hint for one in known for hint in radius_hint(one))),
     )
     return Proposal(_tried(sketch, found, wheels), (*found.told, *found.hints))
+
+
+def _no_bench(path: Path, found: Sorted, wheels: int, files: Sequence[Study]) -> None:
+    """DataError where a log is of a motor on a bench, which another command is for."""
+    if found.presets or wheels > 1 or not files or any(one.columns.has_pose for one in files):
+        return
+    first = files[0].head.path
+    try:
+        guessed = guess.layout_of(first, {}, guess.header_of(first, None), signed=True)
+    except DataError:
+        return
+    seen = ", ".join(channel.removeprefix("motor_") for channel in guessed.channels)
+    also = 'several logs of it: drive = "motor" in [robot] of a config, see slipid reference'
+    raise DataError(
+        f"{path}: no wheels and no pose; {first.name} is like that of a motor on a bench ({seen})\n"
+        f"run: slipid motor {first} --out DIR\n{also}"
+    )
 
 
 def _wheels_of(layout: Layout) -> int:
@@ -115,7 +139,7 @@ def _logs(found: Sorted) -> list[LogsSketch]:
         for glob in globs_of(found.root, kind, sorted(every - set(kind.paths))):
             floors = glob.count("/") > 0 and not a_folder_each(kind)
             off = name not in whole
-            surface, ask = ("folder", "") if floors else (FLOOR, _FLOOR.format(glob))
+            surface, ask = ("folder", "") if floors else (floor_of(glob), _FLOOR.format(glob))
             above = ("Without wheels or without a pose, so nothing to fit:",) if off else ()
             out.append(LogsSketch(glob, name, surface, above, "" if off else ask, off))
     if all(one.off for one in out):  # a config has one section at least; the layout asks for a pose
@@ -131,30 +155,49 @@ def _tried(sketch: Sketch, found: Sorted, wheels: int) -> Sketch:
         asked = list(layout.file.questions)
         if wheels and drives != wheels:
             asked.append(f"[robot] has {drives} drives, but {wheels} have columns here: which?")
-        if problem := _refused(sketch, layout.name, group.kind.paths[0]):
+        if problem := _tried_on(sketch, layout.name, group.kind.paths[0]).problem:
             asked.append(f"the reader says: {problem}")
         layouts.append(replace(layout, file=replace(layout.file, questions=tuple(asked))))
     return replace(sketch, layouts=tuple(layouts))
 
 
 def _bags_tried(sketch: Sketch, first: Path) -> Sketch:
-    """The sketch with what the reader says of the first bag, if it refuses it."""
+    """The sketch with what the reader says of the first bag, if it refuses it.
+
+    A bag that is one long drive with pauses is cut at them: its runs share a session.
+    """
     (bag,) = sketch.bags
-    if problem := _refused(sketch, bag.name, first):
-        asked = (*bag.questions, f"the reader says: {problem}")
+    tried = _tried_on(sketch, bag.name, first)
+    if tried.problem:
+        asked = (*bag.questions, f"the reader says: {tried.problem}")
         return replace(sketch, bags=(replace(bag, questions=asked),))
-    return sketch
+    count = max((parts_between_pauses(log, PAUSE_S) for log in tried.logs), default=1)
+    if count < 2:
+        return sketch
+    said = f"cut where no wheel moves for longer: {count} runs in the first bag"
+    cut = Line("runs", f"{{ pause_s = {PAUSE_S:g} }}", said)
+    logs = tuple(replace(one, session="file") for one in sketch.logs)
+    return replace(sketch, bags=(replace(bag, settings=(*bag.settings, cut)),), logs=logs)
 
 
-def _refused(sketch: Sketch, name: str, path: Path) -> str:
-    """Why the first file of a layout cannot be read; nothing where it can."""
+@dataclass(frozen=True)
+class _Tried:
+    """What the reader made of a file: its runs, or why it refused it."""
+
+    logs: tuple[Log, ...] = ()
+    problem: str = ""
+
+
+def _tried_on(sketch: Sketch, name: str, path: Path) -> _Tried:
+    """The first file of a layout as the reader reads it by the sketch."""
     try:
         config = parsed(Path("robot.toml"), new_config(sketch, "robot.toml").text)
         section = next((one for one in config.content.logs if one.format == name), None)
         if section is None:
-            return ""
-        found = read_logs(path, layout_of(config, section), path.parent, FLOOR, "as_built")
-        refuse_misordered(found.logs)
+            return _Tried()
+        layout = layout_of(config, section)
+        logs = read_logs(path, layout, path.parent, FLOOR, "as_built").logs
+        refuse_misordered(logs)
+        return _Tried(tuple(logs))
     except DataError as error:
-        return str(error).splitlines()[0].replace("robot.toml ", "")
-    return ""
+        return _Tried(problem=str(error).splitlines()[0].replace("robot.toml ", ""))

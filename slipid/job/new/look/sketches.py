@@ -82,9 +82,9 @@ def _settings(known: Known) -> list[Line]:
         ask = "do ticks add up, or does each row have those since the last?" if step is None else ""
         lines.append(setting("ticks_are_increments", bool(step), ask))
     lines.append(setting("gear_ratio", robot.gear_ratio, comment="as above"))
-    if known.find(*CURRENTS) is not None:
+    if known.find(*CURRENTS) is not None and not known.of_supply:
         sign = known.signed
-        ask = "nothing drove backwards: do currents have a sign, or only magnitudes?"
+        ask = "the logs do not tell: do currents have a sign, or are they magnitudes?"
         lines.append(
             setting(
                 "current_is_signed",

@@ -6,12 +6,15 @@ from math import tau
 import numpy as np
 from jaxtyping import Float
 
+from slipid.data.log import Log
 from slipid.data.reading.bag.layout import TURNS, BagLayout
 from slipid.data.reading.bag.runs.stretch import Stretch
 from slipid.data.reading.signal import Signal
 
 STILL = 0.02
 """A wheel that turned by less [rad], or is turning slower [rad/s], stands still."""
+PAUSE_S = 1.0
+"""Pause at which a long drive is proposed to be cut [s]."""
 
 
 def by_pauses(layout: BagLayout, signals: Mapping[str, Signal], pause_s: float) -> list[Stretch]:
@@ -59,3 +62,10 @@ def _moved(angle: Float[np.ndarray, " sample"]) -> list[int]:
             held = value
             found.append(row)
     return found
+
+
+def parts_between_pauses(log: Log, pause_s: float) -> int:
+    """Into how many runs longer pauses of its wheels would cut a log."""
+    turned = np.abs(np.diff(log.wheel_angle, axis=0)) > STILL * np.diff(log.time)[:, None]
+    moves = log.time[1:][turned.any(axis=1)]
+    return int((np.diff(moves) > pause_s).sum()) + 1 if len(moves) else 0

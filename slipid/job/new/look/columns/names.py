@@ -149,10 +149,10 @@ def _measured(words: Words, unit: str) -> str | None:
     for what in ("ticks", "current", "torque", "voltage", "duty", "speed"):
         if words.has("what", what):
             return what
+    if words.has("what", "position", "angle", "yaw"):  # before w, which may be a wheel
+        return "position"
     if words.has("what", "angular", "w"):
         return "speed"
-    if words.has("what", "position", "angle", "yaw"):
-        return "position"
     if words.has("what", "v"):
         return "v"
     by_unit = (what for target, what in _BY_UNIT.items() if unit and converts(unit, target))

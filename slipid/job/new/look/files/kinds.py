@@ -60,6 +60,12 @@ def common_glob(paths: Sequence[PurePosixPath]) -> str:
     return "/".join(_part(parts) for parts in zip(*(p.parts for p in paths), strict=True))
 
 
+def floor_of(glob: str) -> str:
+    """Name of a floor by a glob: that of a folder above the runs', or only that it is a floor."""
+    first, *others = glob.split("/")
+    return first if len(others) > 1 and "*" not in first else "floor"
+
+
 def _finds(glob: str, path: PurePosixPath) -> bool:
     parts = glob.split("/")
     return len(parts) == len(path.parts) and all(

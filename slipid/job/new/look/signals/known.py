@@ -10,6 +10,7 @@ from slipid.job.new.look.columns.found import Found
 from slipid.job.new.look.signals.study import (
     Motion,
     Study,
+    driven_backwards,
     motion,
     over_wheels,
     pose_study,
@@ -74,6 +75,14 @@ class Known:
             if (current := run.find(*CURRENTS)) is not None
         ]
         return True if True in said else False if False in said else None
+
+    @property
+    def of_supply(self) -> bool:
+        """Whether currents are what the battery gives: positive both ways, negative at times."""
+        currents = [(run.find(*CURRENTS), run.find(*SPEEDS)) for run in self.runs]
+        known = [(current, speed) for current, speed in currents if current is not None]
+        both_ways = any(driven_backwards(current, speed) for current, speed in known)
+        return both_ways and any(np.nanmin(current.values) < 0.0 for current, _ in known)
 
     @property
     def radius(self) -> float | None:

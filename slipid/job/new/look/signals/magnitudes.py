@@ -17,6 +17,8 @@ FAST = 12.0
 """Speed that no such robot has [m/s]."""
 RADII = (0.012, 0.6)
 """Wheels of robots [m]."""
+_TURNED, _NEAR_TURN = 0.5, 5.0
+"""Turn by a turn rate that tells the unit of a heading [rad], and a factor by which it may err."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +80,23 @@ def speed_of(
     return float(np.quantile(speeds, 0.9)) if len(speeds) else 0.0
 
 
-def heading_unit(values: Float[np.ndarray, " row"]) -> Unit:
-    """Unit of a heading, from its jumps at a full turn, else from its size."""
+def heading_unit(values: Float[np.ndarray, " row"], turned: float = 0.0) -> Unit:
+    """Unit of a heading, from its jumps at a full turn, else from its size.
+
+    Args:
+        turned: range of the heading by a gyro or by commands [rad], 0 where there are none.
+    """
     known = values[~np.isnan(values)]
     jump, most = float(np.abs(np.diff(known)).max(initial=0.0)), float(np.abs(known).max(initial=0))
     if 330 < jump <= 361:
         return Unit("deg", "jumps by 360")
     if 5.8 < jump <= 6.2832 + 1e-3:
         return Unit("rad", "jumps by 2 pi")
+    if turned > _TURNED:
+        times = float(np.ptp(known)) / turned
+        for unit, expected in (("rad", 1.0), ("deg", 180.0 / np.pi)):
+            if expected / _NEAR_TURN < times < expected * _NEAR_TURN:
+                return Unit(unit, f"turns {times:.2g} times as far as the turn rate says")
     if most <= 6.2832 + 1e-3:
         doubt = "radians or degrees? It never turns far" if most < 0.5 else ""
         return Unit("rad", f"up to {most:.3g}", doubt)

@@ -188,11 +188,20 @@ def signed(current: Found, speed: Found | None) -> bool | None:
     most = float(np.abs(values).max(initial=0.0))
     if float(values.min(initial=0.0)) < -0.02 * most:
         return True
-    if speed is None or len(speed.at) != len(current.at):
-        return None
+    return False if driven_backwards(current, speed) else None
+
+
+def driven_backwards(current: Found, speed: Found | None) -> bool:
+    """Whether currents are positive where wheels drive backwards, as magnitudes are.
+
+    Two files with rows of their own do not tell.
+    """
+    if speed is None or speed.values.shape != current.values.shape:
+        return False
     backwards = np.nan_to_num(speed.values) < -0.1 * float(np.nanmax(np.abs(speed.values)))
-    strong = np.nan_to_num(current.values) > 0.1 * most
-    return False if float((backwards & strong).mean()) > 0.01 else None
+    known = np.nan_to_num(current.values)
+    strong, least = (backwards & (k * known > 0.1 * np.abs(known).max()) for k in (1, -1))
+    return float(strong.mean()) > max(0.01, 3 * float(least.mean()))
 
 
 def of_battery(voltage: Found, speed: Found | None) -> bool:
