@@ -16,6 +16,7 @@ from slipid.identify.fit.shared import AXES
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame
+from slipid.model.motor import Motor
 from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.parameter import entries
 
@@ -103,8 +104,12 @@ def _load(
     robot: Robot, name: str, top: float, draws: Robot, told: record.ToldRecord | None
 ) -> record.LoadRecord:
     """What depends on how the robot is loaded."""
-    frame, k = robot.geometry.frame(), jnp.asarray(robot.load_index(name))
-    speed, amps, slip = _circle(robot, frame, k, jnp.asarray(top))
+    k = jnp.asarray(robot.load_index(name))
+    wheels = robot.geometry.frame(), robot.geometry.forward()
+    rest = robot.body.load_share[k]
+    speed, amps, slip = _circle(
+        *wheels, robot.surfaces, rest, robot.motor, robot.body.mass, jnp.asarray(top)
+    )
     curve = np.asarray(_wheel_curve(speed, amps, slip))
     return record.LoadRecord(
         name=name,
@@ -122,25 +127,35 @@ def _ways(count: int) -> Array:
 
 
 @eqx.filter_jit
-def _circle(robot: Robot, frame: Frame, load: Array, top: Array) -> tuple[Array, Array, Array]:
-    """Wheel speeds, currents, slip ratios on every floor in all directions (.., wheel)."""
-    speed = _ways(36) @ robot.geometry.forward().T / frame.radius
+def _circle(
+    frame: Frame,
+    forward: Array,
+    surfaces: ContactSurface,
+    rest: Array,
+    motor: Motor,
+    mass: Array,
+    top: Array,
+) -> tuple[Array, Array, Array]:
+    """Wheel speeds, currents, slip ratios on every floor in all directions (.., wheel).
+
+    Compiled once for all robots with as many wheels and floors, wherever their wheels are.
+    """
+    speed = _ways(36) @ forward.T / frame.radius
     speed = jnp.stack([0.4 * top, 0.8 * top])[:, None, None] * speed / jnp.max(jnp.abs(speed))
-    rest = robot.body.load_share[load]
 
     def one(w: Array, floor: ContactSurface) -> tuple[Array, Array]:
         rim = frame.radius * w
         xi = contact.equilibrium(rim, frame, floor, rest)
-        force = floor.friction * robot.body.mass * GRAVITY * frame.radius
+        force = floor.friction * mass * GRAVITY * frame.radius
         where = xi, rim, frame, floor, rest
         felt = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
-        lost = rim - robot.geometry.forward() @ xi
-        return robot.motor.current(force * robot.motor.borne(felt), w), lost / jnp.where(
+        lost = rim - forward @ xi
+        return motor.current(force * motor.borne(felt), w), lost / jnp.where(
             jnp.abs(rim) < 1e-9, 1e-9, rim
         )
 
     flat = speed.reshape(-1, speed.shape[-1])
-    amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(robot.surfaces)
+    amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(surfaces)
     return jnp.broadcast_to(flat, amps.shape), amps, slip
 
 
@@ -172,7 +187,6 @@ def spread_of(draws: Float[np.ndarray, "draw *rest"]) -> Float[np.ndarray, "*res
     return np.asarray(high - low) / 2
 
 
-@eqx.filter_jit
 def moved_per_metre(
     draws: Robot, load: Array, speed: Array, count: int
 ) -> Float[Array, "draw floor direction 3"]:
@@ -180,17 +194,24 @@ def moved_per_metre(
 
     In so many directions, of robots that are stacked.
     """
+    wheels = jax.vmap(lambda robot: (robot.geometry.frame(), robot.geometry.forward()))(draws)
+    return _moved(*wheels, draws.surfaces, draws.body.load_share[:, load], speed, count)
 
-    def one(robot: Robot) -> Array:
-        frame = robot.geometry.frame()
+
+@eqx.filter_jit
+def _moved(
+    frames: Frame, forward: Array, surfaces: ContactSurface, rest: Array, speed: Array, count: int
+) -> Array:
+    """As `moved_per_metre`; compiled once for all robots with as many wheels and floors."""
+
+    def one(frame: Frame, forward: Array, surfaces: ContactSurface, rest: Array) -> Array:
         way = _ways(count)
-        rim = speed * way @ robot.geometry.forward().T
-        rest = robot.body.load_share[load]
+        rim = speed * way @ forward.T
         xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
-            robot.surfaces
+            surfaces
         )
         along = jnp.einsum("fkc,kc->fk", xi, way)
         across = xi[..., 1] * way[:, 0] - xi[..., 0] * way[:, 1]
         return jnp.stack([along, across, xi[..., 2]], axis=-1) / speed
 
-    return jax.vmap(one)(draws)
+    return jax.vmap(one)(frames, forward, surfaces, rest)
