@@ -15,7 +15,8 @@ from slipid.identify.fit.noise import SHARED
 from slipid.identify.fit.shared import AXES
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Frame
+from slipid.model.geometry import Frame, at_drives, at_wheels
+from slipid.model.motor import Motor
 from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.parameter import entries
 
@@ -103,11 +104,15 @@ def _load(
     robot: Robot, name: str, top: float, draws: Robot, told: record.ToldRecord | None
 ) -> record.LoadRecord:
     """What depends on how the robot is loaded."""
-    frame, k = robot.geometry.frame(), jnp.asarray(robot.load_index(name))
-    ways = directions(36)
-    if not robot.geometry.determines_twist:
+    shape, k = robot.geometry, jnp.asarray(robot.load_index(name))
+    frame, ways = shape.frame(), directions(36)
+    if not shape.determines_twist:
         ways = jnp.concatenate([ways, _turns(frame)])
-    speed, amps, slip = _circle(robot, frame, k, jnp.asarray(top), ways)
+    wheels = frame, shape.forward(), shape.drive_of
+    rest, mass = robot.body.load_share[k], robot.body.mass
+    speed, amps, slip = _circle(
+        *wheels, robot.surfaces, rest, robot.motor, mass, jnp.asarray(top), ways
+    )
     curve = np.asarray(_wheel_curve(speed, amps, slip))
     return record.LoadRecord(
         name=name,
@@ -131,27 +136,36 @@ def _turns(frame: Frame) -> Float[Array, "way 3"]:
 
 @eqx.filter_jit
 def _circle(
-    robot: Robot, frame: Frame, load: Array, top: Array, ways: Float[Array, "way 3"]
+    frame: Frame,
+    forward: Float[Array, "drive 3"],
+    drive_of: tuple[int, ...],
+    surfaces: ContactSurface,
+    rest: Float[Array, " wheel"],
+    motor: Motor,
+    mass: Array,
+    top: Array,
+    ways: Float[Array, "way 3"],
 ) -> tuple[Array, Array, Array]:
-    """Wheel speeds, currents, slip ratios on every floor for all ways to move (.., drive)."""
-    shape = robot.geometry
-    speed = ways @ shape.forward().T / frame.radius
+    """Wheel speeds, currents, slip ratios on every floor for all ways to move (.., drive).
+
+    Compiled once for all robots with as many wheels and floors, wherever their wheels are.
+    """
+    speed = ways @ forward.T / frame.radius
     speed = jnp.stack([0.4 * top, 0.8 * top])[:, None, None] * speed / jnp.max(jnp.abs(speed))
-    rest = robot.body.load_share[load]
 
     def one(w: Array, floor: ContactSurface) -> tuple[Array, Array]:
-        rim = frame.radius * shape.at_wheels(w)
+        rim = frame.radius * at_wheels(drive_of, w)
         xi = contact.equilibrium(rim, frame, floor, rest)
-        force = floor.friction * robot.body.mass * GRAVITY * frame.radius
+        force = floor.friction * mass * GRAVITY * frame.radius
         where = xi, rim, frame, floor, rest
         felt = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
-        amps = robot.motor.current(shape.at_drives(force * robot.motor.borne(felt)), w)
+        amps = motor.current(at_drives(drive_of, force * motor.borne(felt)), w)
         turned = frame.radius * w
-        lost = turned - shape.forward() @ xi
+        lost = turned - forward @ xi
         return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
 
     flat = speed.reshape(-1, speed.shape[-1])
-    amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(robot.surfaces)
+    amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(surfaces)
     return jnp.broadcast_to(flat, amps.shape), amps, slip
 
 
@@ -189,7 +203,6 @@ def spread_of(draws: Float[np.ndarray, "draw *rest"]) -> Float[np.ndarray, "*res
     return np.asarray(high - low) / 2
 
 
-@eqx.filter_jit
 def moved_per_metre(
     draws: Robot, load: Array, speed: Array, way: Float[Array, "way 3"]
 ) -> Float[Array, "draw floor way 3"]:
@@ -197,16 +210,30 @@ def moved_per_metre(
 
     For ways to move at 1 m/s, of robots that are stacked.
     """
+    wheels = jax.vmap(lambda robot: (robot.geometry.frame(), robot.geometry.forward()))(draws)
+    rest, drive_of = draws.body.load_share[:, load], draws.geometry.drive_of
+    return _moved(*wheels, drive_of, draws.surfaces, rest, speed, way)
 
-    def one(robot: Robot) -> Array:
-        frame = robot.geometry.frame()
-        rim = robot.geometry.at_wheels(speed * way @ robot.geometry.forward().T)
-        rest = robot.body.load_share[load]
+
+@eqx.filter_jit
+def _moved(
+    frames: Frame,
+    forward: Float[Array, "draw drive 3"],
+    drive_of: tuple[int, ...],
+    surfaces: ContactSurface,
+    rest: Float[Array, "draw wheel"],
+    speed: Array,
+    way: Float[Array, "way 3"],
+) -> Array:
+    """As `moved_per_metre`; compiled once for all robots with as many wheels and floors."""
+
+    def one(frame: Frame, forward: Array, surfaces: ContactSurface, rest: Array) -> Array:
+        rim = at_wheels(drive_of, speed * way @ forward.T)
         xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
-            robot.surfaces
+            surfaces
         )
         along = jnp.einsum("fkc,kc->fk", xi[..., :2], way[:, :2])
         across = xi[..., 1] * way[:, 0] - xi[..., 0] * way[:, 1]
         return jnp.stack([along, across, xi[..., 2]], axis=-1) / speed
 
-    return jax.vmap(one)(draws)
+    return jax.vmap(one)(frames, forward, surfaces, rest)
