@@ -1,6 +1,7 @@
 """Read logs: from files and their layout to runs in SI units, checked once, here."""
 
 import hashlib
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -67,9 +68,12 @@ def read_runs(
 
 
 def session_of(log: Log, session: Session) -> str:
-    """Name of the session of a run: its file, the folder of its file, or how it was driven."""
+    """Name of the session of a run: its file, the folder of its file, or how it was driven.
+
+    The runs that one file holds share it.
+    """
     if session == "file":
-        return log.name
+        return re.sub(r"#\d+$", "", log.name)
     if session == "folder":
         return log.name.rpartition("/")[0] or log.name
     return default_session(log)

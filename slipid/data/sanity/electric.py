@@ -1,6 +1,7 @@
 """Currents and voltages: their sign by the work that they do, their size by what robots draw."""
 
 from collections.abc import Iterator
+from itertools import permutations
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +12,10 @@ from slipid.data.sanity.motion.recorded import Recorded
 
 BACKWARDS = -0.25
 """Work over the sum of its magnitudes below which a sign is wrong."""
+ORDERED = 0.4
+"""The same of every wheel in another order of the columns, and what it is more than by signs."""
+MOST_ORDERED = 6
+"""Wheels up to which every order is tried."""
 SIDED = 0.1
 """The same, forwards and backwards apart, from which the sign is that of the power."""
 MOST_A_PER_KG = 2.5
@@ -39,12 +44,13 @@ def electric(
         mass_kg: of the robot, None where it is not known.
         by_power: whether speeds can be trusted, so that power can be compared with them.
     """
-    speed = _speeds(data) @ columns(reading, data.wheels).T
+    declared = _speeds(data)
+    speed = declared @ columns(reading, data.wheels).T
     driving = np.abs(speed).max(axis=1, initial=0.0) > 0.2 * np.nanquantile(np.abs(speed), 0.95)
     for channel, name in ((data.current, "current"), (data.voltage, "voltage")):
         if channel is None or (name == "current" and not data.current_is_signed):
             continue
-        yield from _signs(channel.value[driving], speed[driving], name)
+        yield from _signs(channel.value[driving], speed[driving], declared[driving], name)
     current = None if data.current is None else np.abs(data.current.value[driving])
     volts = data.bus if data.voltage is None else data.voltage
     voltage = None if volts is None else np.abs(volts.value[driving])
@@ -74,9 +80,15 @@ def _speeds(data: Recorded) -> Float[np.ndarray, "row wheel"]:
 
 
 def _signs(
-    values: Float[np.ndarray, "row wheel"], speed: Float[np.ndarray, "row wheel"], name: str
+    values: Float[np.ndarray, "row wheel"],
+    speed: Float[np.ndarray, "row wheel"],
+    declared: Float[np.ndarray, "row wheel"],
+    name: str,
 ) -> Iterator[Finding]:
-    """Motors must do work on the whole: sum of value x speed above zero, wheel by wheel."""
+    """Motors must do work on the whole: sum of value x speed above zero, wheel by wheel.
+
+    The speed is in the order and with the signs that were found, or as `declared`.
+    """
     work = np.nan_to_num(values * speed)
     forth, back = (_share(work[way]) for way in (speed > 0, speed < 0))
     if name == "current" and forth > SIDED and back < -SIDED:
@@ -97,6 +109,16 @@ def _signs(
                 "note",
             )
         return
+    if order := _other_order(values, speed, declared):
+        listed = ", ".join(str(k + 1) for k in order)
+        yield Finding(
+            f"{name}_order",
+            f"the columns of the {name} are in another order than the wheels: number {listed} "
+            f"go with wheels 1 to {len(order)}",
+            f"name the columns of the channel {name} in the order {listed}",
+            "wrong",
+        )
+        return
     share = np.array([_share(column) for column in work.T])
     turned = np.flatnonzero(share < BACKWARDS)
     if not len(turned):
@@ -111,6 +133,32 @@ def _signs(
         "if it is 1 (else turn its sign)",
         "wrong",
     )
+
+
+def _other_order(
+    values: Float[np.ndarray, "row wheel"],
+    speed: Float[np.ndarray, "row wheel"],
+    declared: Float[np.ndarray, "row wheel"],
+) -> tuple[int, ...] | None:
+    """Which column goes with each wheel, where another order explains more than turned signs do.
+
+    Columns that are in the order of the encoders' are right, even where that is not the wheels'.
+    """
+    wheels = range(speed.shape[1])
+    if len(wheels) > MOST_ORDERED:
+        return None
+    share, as_declared = (_shares(values, one) for one in (speed, declared))
+    best = max(permutations(wheels), key=lambda order: float(share[list(order), wheels].sum()))
+    told = share[list(best), wheels]
+    signs = max(float(np.abs(np.diagonal(one)).sum()) for one in (share, as_declared))
+    return best if told.min() > ORDERED and told.sum() > signs + ORDERED else None
+
+
+def _shares(
+    values: Float[np.ndarray, "row wheel"], speed: Float[np.ndarray, "row wheel"]
+) -> Float[np.ndarray, "wheel wheel"]:
+    """`_share` of every column with every wheel's speed."""
+    return np.array([[_share(np.nan_to_num(v * w)) for w in speed.T] for v in values.T])
 
 
 def _share(work: np.ndarray) -> float:

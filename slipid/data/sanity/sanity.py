@@ -3,9 +3,10 @@
 Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_speed_unit`,
 `heading_sign`, `heading_unit`, `heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`,
 `pose_mirrored`, `pose_length`, `pose_constant`, `pose_of_another_run`, `pose_unexplained`, `lag`,
-`base_radius`, `time_unit`, `current_sign`, `current_unit`, `current_of_supply`, `voltage_sign`,
-`voltage_unit`, `gyro_sign`, `gyro_unit`, `command_sign`, `command_order`, `command_unit`,
-`command_exchanged`, `wheel_columns`, `scales`, `travel`, `not_checked`.
+`base_radius`, `time_unit`, `current_sign`, `current_order`, `current_unit`, `current_of_supply`,
+`voltage_sign`, `voltage_order`, `voltage_unit`, `gyro_sign`, `gyro_unit`, `command_sign`,
+`command_order`, `command_unit`, `command_exchanged`, `wheel_columns`, `scales`, `travel`,
+`not_checked`.
 """
 
 from collections.abc import Iterator

@@ -46,6 +46,7 @@ def test_sessions(root):
     assert read(root, session="folder").session == (ROBOTINO.rpartition("/")[0],)
     (log,) = read(root).logs
     assert session_of(replace(log, name="alone.csv"), "folder") == "alone.csv"
+    assert session_of(replace(log, name="a/rec.bag#03"), "file") == "a/rec.bag"
 
 
 def test_runs_are_added_with_the_sessions_they_had(root):

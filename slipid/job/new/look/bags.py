@@ -160,7 +160,7 @@ def _by_field_names(
                 continue
             seen.add(told.channel)
             unit = told.unit or CHANNELS[told.channel]
-            ask = f"by the name of the field: is it that, of the motors in this order, in {unit}?"
+            ask = f"by the name of the field: is it that, in {unit}, in the order of the joints?"
             yield _Served(told.channel, topic, wheels, ask, field.path, unit)
 
 
