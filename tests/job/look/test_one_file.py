@@ -117,6 +117,17 @@ def test_a_voltage_of_the_battery_is_left_out_and_effort_is_asked_for(tmp_path):
     assert any(q.startswith("wheel_torque: what is it") for q in config.questions)
 
 
+def test_a_motor_that_drives_one_way_in_the_first_run_is_no_battery(tmp_path):
+    for name, way in (("run1", 1.0), ("run2", 1.0), ("run3", -1.0)):
+        columns = plain()
+        for side in ("left", "right"):
+            columns[f"{side}_vel"] = way * (5.0 + 0.1 * columns[f"{side}_vel"])
+            columns[f"{side}_voltage_V"] = 0.5 * columns[f"{side}_vel"]
+        table(tmp_path / "floor" / f"{name}.csv", columns)
+    _, config = proposed(tmp_path, **ROBOT)
+    assert "voltage" in layout_in(config)["columns"]
+
+
 def test_rates_and_repeats_are_said(tmp_path):
     si = plain()
     every = np.arange(len(si["t"])) % 5 == 0

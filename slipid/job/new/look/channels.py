@@ -55,7 +55,8 @@ def _set_apart(sketch: ChannelSketch, found: Found, known: Known) -> ChannelSket
         return replace(sketch, off=True, question="give torque_constant [N m/A] in the layout")
     if found.channel == "current" and known.of_supply:
         return replace(sketch, off=True, comment=_SUPPLY)
-    if found.channel == "voltage" and of_battery(found, speed):
+    runs = (run.find(found.channel) for run in known.runs)
+    if found.channel == "voltage" and of_battery([one for one in runs if one], speed):
         return replace(sketch, off=True, comment=_BATTERY)
     if found.channel == "bus_voltage" and known.find("duty") is None:
         return replace(sketch, off=True, comment="of use beside a duty cycle alone")

@@ -1,5 +1,6 @@
 """A file looked into: its columns, its clock in seconds, and what its signals are like."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -204,9 +205,10 @@ def driven_backwards(current: Found, speed: Found | None) -> bool:
     return float(strong.mean()) > max(0.01, 3 * float(least.mean()))
 
 
-def of_battery(voltage: Found, speed: Found | None) -> bool:
-    """Whether a voltage stays up whatever the wheels do, as a battery's does."""
-    values = voltage.values[~np.isnan(voltage.values)]
+def of_battery(voltages: Sequence[Found], speed: Found | None) -> bool:
+    """Whether the voltage of some runs stays up whatever the wheels do, as a battery's does."""
+    values = np.concatenate([one.values.ravel() for one in voltages])
+    values = values[~np.isnan(values)]
     low, high = np.quantile(values, (0.05, 0.95)).tolist() if values.size else (0.0, 0.0)
     far = low > 0.6 * high > 0.0
     return far and (speed is None or float(np.nanstd(speed.values)) > 0.0)
