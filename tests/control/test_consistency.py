@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -24,6 +24,7 @@ from slipid.control.tuning.twin import Twin
 from slipid.model import contact
 from slipid.model.se2 import advance, compose
 from tests.helpers.small_twin import deployed, floor
+from tests.helpers.stepped import stepped
 
 DT = 0.05
 FIRM = floor([[0]])
@@ -58,10 +59,11 @@ def sure_of(state, hypothesis, count, of_others=1e-9):
 # belief changes are handed over once -----------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_news_that_comes_late_corrects_the_pose_by_the_difference_of_the_ways_once():
     robot = deployed()
     est = Estimator(robot, Settings(patch_m=1e9))  # floors do not change on the way
-    run = jax.jit(lambda s, z: est.step(s, z, DT))
+    run = partial(stepped(est), dt=DT)
     w = rolling(robot, (0.2, 0.05, 0.1))
     state = est.init()
     for _ in range(5):  # hypotheses settle; this way is not counted
@@ -80,13 +82,14 @@ def test_news_that_comes_late_corrects_the_pose_by_the_difference_of_the_ways_on
     assert np.hypot(*(there - ended((twists[0], (steps + more) * DT)))[:2]) > 0.02
 
 
+@pytest.mark.slow
 def test_a_floor_that_changes_within_a_step_moves_the_pose_by_what_was_travelled():
     robot = eqx.tree_at(lambda r: r.current_std, deployed(), jnp.full(2, 0.003))
     sure = Settings(
         current_is_signed=True, ammeter_std_a=0.003, forget_s=DT, filter_s=1e-3, patch_m=0.05
     )
     est = Estimator(robot, sure)
-    run = jax.jit(lambda s, z: est.step(s, z, DT))
+    run = partial(stepped(est), dt=DT)
     w = rolling(robot, (0.2, 0.05, 0.1))
     near, amps = FloorFilter(robot, sure).solve(jnp.zeros((8, 3)), w)
     for _ in range(5):
@@ -108,6 +111,7 @@ def test_a_floor_that_changes_within_a_step_moves_the_pose_by_what_was_travelled
     np.testing.assert_allclose(said.pose, there, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own", [1.0, 1e-2, 1e-4])
 def test_what_a_late_fix_sets_aside_leaves_a_covariance(own):
     """Most of the noise that came in since then is known by what it has in common with the rest."""
@@ -134,6 +138,7 @@ def test_what_a_late_fix_sets_aside_leaves_a_covariance(own):
         assert values[0] > -1e-9 * values[-1]
 
 
+@pytest.mark.slow
 def test_a_late_fix_after_news_of_the_floors_does_not_count_the_hand_over_twice():
     """News, then a fix of a moment before it that says the same: the pose is where the robot is."""
     robot = eqx.tree_at(lambda r: r.current_std, deployed(1.0, 1.0, 1.0), jnp.full(2, 0.003))
@@ -142,7 +147,7 @@ def test_a_late_fix_after_news_of_the_floors_does_not_count_the_hand_over_twice(
         current_is_signed=True, ammeter_std_a=0.003, forget_s=DT, filter_s=1e-3, patch_m=1e9
     )
     est = Estimator(robot, sure)
-    run = jax.jit(lambda s, z, dt: est.step(s, z, dt))
+    run = stepped(est)
     w, near = rolling(robot, (0.2, 0.05, 0.1)), jnp.zeros((8, 3))
     for _ in range(8):  # hypotheses settle
         near, amps = FloorFilter(robot, sure).solve(near, w)
@@ -189,12 +194,13 @@ def test_a_direction_that_trembles_keeps_its_effect_and_a_floor_left_does_not():
     assert keep[1] < 0.01
 
 
+@pytest.mark.slow
 def test_a_way_back_errs_anew():
     """Errors of a way on add up, those of a way back are independent of the way out."""
     robot = deployed(run=1.0).on("firm")
     robot = eqx.tree_at(lambda r: r.effect, robot, robot.effect.at[:, 2].set(0.0))
     est = Estimator(robot)
-    run = jax.jit(lambda s, z: est.step(s, z, DT))
+    run = partial(stepped(est), dt=DT)
 
     def along(*speeds):
         state = est.init()
@@ -209,6 +215,7 @@ def test_a_way_back_errs_anew():
     assert along(0.1, -0.1) == pytest.approx(2 * once, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("under", [(0, 0, 0), (1, 0, 0), (0, 1, 1)])
 def test_motion_by_friction_is_that_of_finite_differences(under):
     bias = jnp.asarray([[0.1, -0.15, 0.05], [-0.2, 0.05, 0.15]])
@@ -249,11 +256,13 @@ def test_a_reading_moves_what_learns_and_leaves_the_rest_with_the_right_covarian
     np.testing.assert_allclose(now.covariance, exact, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_gyro_leaves_what_pushes_the_body_as_it_is():
     """The belief about the floors has heard the same gyro."""
     robot = deployed(process=1.0, run=1.0, current=1.0)
     state, speed = Estimator(robot).init(), rolling(robot, (0.2, 0.0, 0.0))
-    run = jax.jit(lambda s, z: Estimator(robot).step(s, z, DT))
+    est = Estimator(robot)
+    run = partial(stepped(est), dt=DT)
     for k in range(40):
         reading = Measurement(wheel_angle=k * DT * speed, current=jnp.full(3, 0.4), gyro=0.1)
         state, _ = run(state, reading)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from slipid.control.interface import Measurement, Settings
 from slipid.identify.fit import shared
 from tests.control.test_consistency import DT, rolling, settled
 from tests.helpers.small_twin import deployed
+from tests.helpers.stepped import stepped
 
 BASE = jnp.asarray(0.125)
 SPEEDS = (0.1, 0.2, 0.4)
@@ -69,7 +71,7 @@ def driven(told, hypothesis):
         rows = jnp.concatenate([MISSED, PARTS], axis=1)[:, None, None]
         robot = eqx.tree_at(lambda r: r.told, robot, Told(jnp.log(jnp.asarray([0.2])), rows))
     watched = Estimator(robot, Settings(patch_m=1e9))
-    run = jax.jit(lambda s, z: watched.step(s, z, DT))
+    run = partial(stepped(watched), dt=DT)
     belief, state = jnp.full(9, 1e-12).at[hypothesis].set(1.0), watched.init()
     for _ in range(20):
         state = eqx.tree_at(lambda s: s.floors.belief, state, belief)
@@ -77,6 +79,7 @@ def driven(told, hypothesis):
     return robot, said, state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("under", [0, 1])
 def test_the_twist_is_that_of_the_contact_and_what_is_told_of_its_floor(under):
     """Along, across and in yaw, per metre of wheels that do not slip; what is left is the std."""
@@ -91,6 +94,7 @@ def test_the_twist_is_that_of_the_contact_and_what_is_told_of_its_floor(under):
     np.testing.assert_allclose(left, np.sort(PARTS[under] * robot.effect[under]), rtol=0.01)
 
 
+@pytest.mark.slow
 def test_of_wheels_on_several_floors_nothing_is_told():
     """Twist and std are those of a robot that is told nothing: what is told is of one floor."""
     (_, said, state), (_, alone, bare) = (driven(told, hypothesis=1) for told in (True, False))

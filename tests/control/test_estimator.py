@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -30,6 +30,7 @@ from slipid.model.robot import build
 from tests.helpers import small_twin
 from tests.helpers.compiled_pilot import CompiledPilot, Flat
 from tests.helpers.known_robot import deploy_known
+from tests.helpers.stepped import stepped
 
 PATH = rectangle()
 LIMITS = Limits()
@@ -244,7 +245,7 @@ def test_saturation_keeps_the_direction():
 @cache
 def watch(s=None):
     est = Estimator(robot(), s)
-    return est, jax.jit(lambda state, z, dt: est.step(state, z, dt))
+    return est, stepped(est)
 
 
 def drive(state, count, speed=(0.0, 0.0, 0.0), angle=None, **known):
@@ -265,7 +266,7 @@ def test_without_slip_it_is_the_encoders():
     f = robot()
     sticky = replace_floor(f)
     est = Estimator(sticky)
-    run = jax.jit(lambda state, z: est.step(state, z, DT))
+    run = partial(stepped(est), dt=DT)
     state = est.init()
     for _ in range(40):
         state, e = run(state, reading(wheel_speed=wheels([0.2, 0.1, 0.3])))
@@ -277,7 +278,7 @@ def replace_floor(f):
     """The robot on floors that neither drag nor let slip."""
     names = ("creep", "roller_drag", "roller_viscosity", "rolling_resistance", "scrub", "lead")
     return eqx.tree_at(
-        lambda r: [getattr(r.floors, n) for n in names], f, [jnp.full(3, 1e-6)] * len(names)
+        lambda r: [getattr(r.floors, n) for n in names], f, [jnp.full(3, 1e-6, float)] * len(names)
     )
 
 
@@ -378,7 +379,7 @@ def test_fixes_that_all_come_late_count_for_what_they_say():
 @pytest.mark.parametrize("lost", [(), (20,), (20, 21, 22), tuple(range(3, 60, 4))])
 def test_readings_that_are_lost_do_not_make_the_way_longer(kind, lost):
     est = pilot(kind).estimator
-    run = jax.jit(lambda s, z, dt: est.step(s, z, dt))
+    run = stepped(est)
 
     def way(lost, twice=()):
         state, angle, speed = est.init(), np.zeros(3), wheels([0.2, 0.0, 0.0])
@@ -432,13 +433,14 @@ def test_heading_is_the_integral_of_a_gyro_without_bias_whatever_is_believed_of_
     assert float(pose[2]) == pytest.approx(rates.sum() * DT, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bias", [0.012, -0.008])
 def test_a_robot_that_starts_at_once_learns_its_gyro_bias_from_the_contact_model(bias):
     one = robot().on("b")
     est, there = Estimator(one), FloorFilter(one, Settings())
     state, true, twist = est.init(), 0.0, jnp.zeros((1, 3))
     turns = jax.jit(lambda near, w: there.solve(near, w))
-    run = jax.jit(lambda state, z, dt: est.step(state, z, dt))
+    run = stepped(est)
     for k in range(500):
         speed = wheels([0.2 * np.cos(0.01 * k), 0.2 * np.sin(0.01 * k), 0.0])
         twist, amps = turns(twist, speed)
@@ -452,6 +454,7 @@ def test_a_robot_that_starts_at_once_learns_its_gyro_bias_from_the_contact_model
     assert off < 3 * float(jnp.sqrt(said.covariance[2, 2])) + 1e-3
 
 
+@pytest.mark.slow
 def test_a_late_gyro_is_taken_for_its_own_time():
     late = 3
     est, run = watch(Settings(gyro_delay_s=late * DT))
@@ -473,6 +476,7 @@ def test_a_robot_at_rest_turns_as_its_gyro_says_less_the_bias():
     assert float(said[-1].pose[2]) == pytest.approx(0.2 * 20 * DT, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_observer_takes_a_constant_disturbance_out():
     """A body that does what it is asked to but for a constant: what is wanted comes about."""
     f = robot()
@@ -581,6 +585,7 @@ def test_gains_that_are_known_when_compiled_command_the_same():
         assert np.abs(commands).max() > 1.0
 
 
+@pytest.mark.slow
 def test_mecanum_wheels_miss_less_of_a_twist_by_the_contact_model():
     f = deploy_known(build(mecanum(0.2, 0.15, 0.05), ("a",)), highest_speed=10.0)
     con = Controller(f, Gains.at((1.0, 1.0, 0.0, 1.0, 0.0, 0.0)))
@@ -612,11 +617,12 @@ def test_what_is_believed_of_the_body_is_at_the_wheels_speeds_of_the_estimate():
     np.testing.assert_allclose(e.believed.twist, each, atol=3e-3)
 
 
+@pytest.mark.slow
 def test_wheels_that_creep_count_as_those_that_go():
     """Slower than counts as moving; the same way then moves and doubts as much."""
     f = small_twin.deployed(process=1.0, run=1.0)
     est, found = Estimator(f), []
-    run = jax.jit(lambda state, z: est.step(state, z, DT))
+    run = partial(stepped(est), dt=DT)
     for speed, steps in ((0.02, 1200), (0.2, 120)):
         turning = f.forward @ jnp.array([0.0, 0.0, speed]) / f.frame.radius
         state = est.init()
@@ -633,6 +639,7 @@ def test_wheels_that_creep_count_as_those_that_go():
     assert np.all(np.abs(np.log(slow_variance[known] / fast_variance[known])) < np.log(1.6))
 
 
+@pytest.mark.slow
 def test_a_robot_that_stands_stays_as_sure_as_it_is():
     state, _ = drive(watch()[0].init(), 20, wheels([0.2, 0.1, 0.3]))
     _, later = drive(state, 1200)
@@ -653,10 +660,11 @@ def test_flags_come_on_and_go_off():
     assert float(drive(state, 1, fast)[1][-1].out_of_range) == 1
 
 
+@pytest.mark.slow
 def test_currents_that_no_floor_explains_are_out_of_range():
-    sure = eqx.tree_at(lambda f: f.current_std, robot(), jnp.full(3, 0.03))
+    sure = eqx.tree_at(lambda f: f.current_std, robot(), jnp.full(3, 0.03, float))
     est = Estimator(sure, Settings(ammeter_std_a=0.02))
-    run = jax.jit(lambda state, z: est.step(state, z, DT))
+    run = partial(stepped(est), dt=DT)
     state, speed = est.init(), wheels([0.2, 0.0, 0.0])
     for amps, beyond in ((0.3, 0.0), (1.25 * float(sure.highest[1]), 1.0)):
         for _ in range(60):
@@ -666,14 +674,15 @@ def test_currents_that_no_floor_explains_are_out_of_range():
     assert np.asarray(said.surface_probability)[0, -1] > 0.5
 
 
+@pytest.mark.slow
 def test_a_robot_that_spins_its_wheels_in_place_is_immobilised():
     slick = eqx.tree_at(
         lambda r: (r.floors.roller_drag, r.floors.creep),
         robot(),
-        (jnp.full(3, 4.0), jnp.full(3, 0.2)),
+        (jnp.full(3, 4.0, float), jnp.full(3, 0.2, float)),
     )
     est = Estimator(slick, Settings())
-    run = jax.jit(lambda state, z: est.step(state, z, DT))
+    run = partial(stepped(est), dt=DT)
     state = est.init()
     for _ in range(30):
         state, e = run(state, reading(wheel_speed=wheels([0.2, 0.0, 0.0])))
