@@ -20,6 +20,7 @@ from slipid.cli.demo import packaged_config
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
 from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
+from tests.helpers.kept import kept
 from tests.helpers.shared import FEW, invoke
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -151,7 +152,10 @@ def test_a_broken_log_is_one_message_and_2(tmp_path, case: Case):
     assert not out.exists()
 
 
-@pytest.mark.parametrize("name", ["empty file", "binary file", "missing column"])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", kept(["empty file", "binary file", "missing column"], ["binary file"])
+)
 def test_a_broken_log_in_a_real_process(tmp_path, name):
     [case] = [c for c in CASES if c.name == name]
     data = tmp_path / "data"
@@ -362,6 +366,7 @@ def test_a_killed_fit_goes_on_and_ends_where_it_would_have(small, tmp_path):
     assert one["rounds"] == other["rounds"] == len(one["history"]) > 10
 
 
+@pytest.mark.slow
 def test_an_interrupt_that_python_must_ignore_where_it_arrives_stops_the_command():
     code = """if True:
         import gc, signal, time

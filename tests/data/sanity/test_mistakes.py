@@ -76,8 +76,15 @@ NAMED_BY_POSES = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", DRIVES, ids=lambda d: d.name)
-@pytest.mark.parametrize("name", NAMED_BY_POSES)
+@pytest.mark.parametrize(
+    ("robot", "name"),
+    [
+        pytest.param(robot, name, marks=[] if k % len(DRIVES) == n else pytest.mark.nightly)
+        for k, name in enumerate(NAMED_BY_POSES)
+        for n, robot in enumerate(DRIVES)
+    ],
+    ids=lambda x: x if isinstance(x, str) else x.name,
+)
 def test_encoders_and_poses_alone_name_it(robot, name):
     (mistake,) = (m for m in MISTAKES if m.name == name)
     runs, geometry = mistake.made([raw.less(*ONLY_POSES) for raw in driven(robot)], robot)
