@@ -15,7 +15,11 @@ from slipid.support.jax_setup import one_blas_thread, plain_loops
 
 ROOT = Path(__file__).resolve().parents[1]
 GOLDENS = Path(__file__).with_name("goldens")
-LONG = ("test_cli", "test_calibration", "test_notebooks", "test_folds", "test_public")
+LONG = (
+    *("test_cli", "test_calibration", "test_notebooks", "test_folds", "test_public"),
+    *("test_every_drive", "test_recovery", "test_result", "test_estimator", "test_consistency"),
+    "test_trial",
+)
 """Files that take longest."""
 
 # Set in the environment, so that commands and notebooks started by a test share them. The cache is

@@ -5,6 +5,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 HEAVY = ["jax", "equinox", "optimistix", "scipy", "matplotlib", "pydantic", "pint", "typer", "rich"]
 
 
@@ -23,6 +25,7 @@ def test_import_is_light_and_silent():
     assert json.loads(done.stdout) == []
 
 
+@pytest.mark.slow
 def test_all_but_extras_runs_without_their_libraries():
     """What `pip install slipid` brings is enough to identify, deploy, tune and run the demo."""
     rooms = (

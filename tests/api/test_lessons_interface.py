@@ -19,6 +19,7 @@ def test_made_runs_have_the_channels_and_the_truth_that_were_asked_for():
         sl.made_runs(["gray"], truth={"surface.grey.creep": 0.4})
 
 
+@pytest.mark.slow
 def test_a_move_has_the_slip_of_its_own_twist():
     robot = sl.made_runs(["soft"], headings=1, speeds=[0.2], turns=0).robot
     commands = np.array([[0.2, 0.0, 0.0], [0.1, 0.1, 0.4]])

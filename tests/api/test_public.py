@@ -100,6 +100,7 @@ def test_what_is_deployed_has_the_numbers_that_are_shown(world):
     )
 
 
+@pytest.mark.slow
 def test_a_wrong_name_is_refused_with_the_choices(tmp_path):
     write_runs(tmp_path)
     runs = sl.read_runs(tmp_path, "one_surface/gray/*.csv", layout="robotino2022")

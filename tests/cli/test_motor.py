@@ -174,6 +174,7 @@ def test_guesses(tmp_path):
     assert named("/motor:current", "current").unit is None
 
 
+@pytest.mark.slow
 def test_two_motors_of_a_config(identified):
     found = json.loads((identified / "identified.json").read_text())
     for label in ("left", "right"):

@@ -87,6 +87,7 @@ def met(after, before):
     return state, *placed(state, root, supports, motion)
 
 
+@pytest.mark.slow
 def test_a_floor_met_on_one_side_of_an_edge_puts_the_pose_there():
     state, now, left = met({0: 0.01, 1: 0.99}, {0: 0.5, 1: 0.5})
     assert float(now.pose[0]) > 0.05
@@ -162,6 +163,7 @@ def test_a_map_brings_the_believed_pose_nearer_and_a_wrong_one_takes_it_little_f
     assert np.median(wrong) < 1.25 * np.median(without)
 
 
+@pytest.mark.slow
 def test_what_is_no_number_leaves_a_robot_with_a_map_sound():
     robot = deployed()
     estimator = Estimator(robot, SETTINGS, floor(CHESS))

@@ -55,6 +55,7 @@ def driven(asked, probability, periods=8):
     return turning
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [0, 3, 7])
 def test_known_floors_leave_little_of_what_wheels_without_slip_miss(k):
     rng, scale = np.random.default_rng(k), np.array([1.0, 1.0, 0.125])

@@ -155,6 +155,7 @@ def test_what_is_known_of_the_floors_is_saved_with_them(robot, tmp_path):
     np.testing.assert_array_equal(only.told.table[0, ..., :3], ONE[::-1])
 
 
+@pytest.mark.slow
 def test_the_schema_tells_what_is_written_and_names_every_gain(path, robot):
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     jsonschema.validate(json.loads(path.read_text()), SCHEMA)
@@ -374,6 +375,7 @@ def places(content, at=()):
             yield from places(value, (*at, key))
 
 
+@pytest.mark.slow
 def test_any_content_gives_a_robot_or_a_sentence_and_the_schema_agrees(path):
     """With a checksum that is right: what loads is by the schema, what is not by it never loads."""
     good = json.loads(path.read_text())
@@ -437,6 +439,7 @@ print(said.estimate.pose, said.estimate.surface, said.command)
 """
 
 
+@pytest.mark.slow
 def test_it_runs_where_there_is_jax_and_nothing_else(path):
     """Whatever JAX and equinox do not import themselves is absent."""
     words = [sys.executable, "-c", ALONE, str(path)]

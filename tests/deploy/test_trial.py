@@ -207,6 +207,7 @@ def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(deployed):
     np.testing.assert_allclose(found.sides_mm, [900, 400, 900, 400], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
     start, path = (0.0, 0.0, 0.0), reference.waypoints([(0.0, 0.0), (0.9, 0.0)])
     far = []
@@ -286,6 +287,7 @@ def test_starts_are_spread_and_the_same_for_everyone():
         assert np.abs(start[:2]).max() <= 1.2 + 1e-3
 
 
+@pytest.mark.slow
 def test_a_robot_can_be_told_which_floors_there_are(deployed):
     a, b = deployed.labels
     only = deployed.on(b)
@@ -315,6 +317,7 @@ polygon = [[0, -1], [1, -1], [1, 1], [0, 1]]
 """
 
 
+@pytest.mark.slow
 def test_a_map_file_reaches_an_estimator_and_a_robot_that_has_numpy_alone(tmp_path, deployed):
     (tmp_path / "lab.toml").write_text(LAB)
     made = floor_map(tmp_path / "lab.toml", deployed)
@@ -383,6 +386,7 @@ def test_a_map_may_show_a_floor_that_the_fit_does_not_know(deployed):
     np.testing.assert_allclose(supports, supports[0, 0])  # it says nothing of any hypothesis
 
 
+@pytest.mark.slow
 def test_the_twin_is_another_robot_of_the_posterior_for_every_start():
     robot = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"])
     eight = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 8), robot)
@@ -554,6 +558,7 @@ def test_live_readings_are_as_the_sensors_log_them():
     assert live.pose[0] > 0.1  # a delay and a slew, then 0.2 m/s
 
 
+@pytest.mark.slow
 def test_a_plant_that_is_reset_starts_anew():
     plant = SitePlant(uniform("firm"), "as_built", (0.2, 0.1, 0.3), 1, gyro=True)
     first = jax.tree.leaves(plant.reset())

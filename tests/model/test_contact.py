@@ -250,6 +250,7 @@ forward = jax.jit(jax.jacfwd(twist))
 reverse = jax.jit(jax.jacrev(twist))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("floor", FLOORS)
 @pytest.mark.parametrize(
     "rim",
@@ -374,6 +375,7 @@ def test_slip_is_a_ratio_once_speeds_are_above_the_regularisation():
     assert left[-1] < V0 / 20.0
 
 
+@pytest.mark.slow
 def test_wheels_at_rest_hold_the_robot():
     for g in GEOMETRIES.values():
         rim = jnp.zeros(g.wheels)

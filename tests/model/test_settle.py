@@ -61,6 +61,7 @@ def one_by_one(kind, rim):
     return xi.T, pull.T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_is_the_equilibrium_with_its_tractions(kind):
     *_, floors = robot(kind)
@@ -77,6 +78,7 @@ def test_it_is_the_equilibrium_with_its_tractions(kind):
         np.testing.assert_allclose(pull, want_pull, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_it_keeps_up_with_wheels_that_change_speed():
     frame, *_, floors = robot("omni 3")
     rng = np.random.default_rng(1)
@@ -99,6 +101,7 @@ def test_it_keeps_up_with_wheels_that_change_speed():
     assert np.quantile(off, 0.99) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [np.nan, np.inf, 1e300, 1e-300])
 def test_nothing_is_lost_to_a_bad_start_or_a_standing_robot(start):
     *_, floors = robot("omni 3")

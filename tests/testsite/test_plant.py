@@ -103,6 +103,7 @@ def test_a_coasting_robot_only_loses_energy(surface):
     assert np.max(total[50:] - total[:-50]) < 0.01
 
 
+@pytest.mark.slow
 def test_the_floor_carries_the_weight_as_statics_say():
     plant = standing("firm", Machine())
     rim = Machine().wheel_from_twist @ np.array([0.1, 0.05, 0.0])
@@ -174,6 +175,7 @@ def test_slip_grows_with_softness_and_depends_on_the_direction():
     assert np.ptp(level) < 0.6 * np.ptp(found["soft"])
 
 
+@pytest.mark.slow
 def test_ribs_shake_a_robot_and_do_not_hold_it():
     site = Site()
     smooth = {**GROUNDS, "ribbed": replace(GROUNDS["ribbed"], rib_height_m=0.0)}
@@ -234,6 +236,7 @@ def test_a_command_arrives_after_its_delay():
         assert first == pytest.approx(delay, abs=0.0015)
 
 
+@pytest.mark.slow
 def test_compaction_and_body_drag_slow_a_robot():
     run = straight("soft", "as_built", 1.0, 0.2, 0.5)
     free = replace(EVEN["soft"], compaction=0.0, body_drag_n=0.0)

@@ -129,6 +129,7 @@ def declared(files) -> dict[str, dict]:
     return flat(tree["slipid"], leaf="type")
 
 
+@pytest.mark.slow
 def test_parameters_are_as_they_are_declared(node, declared, four):
     assert faults(node, declared) == []
     other = ros2_files(four)

@@ -32,6 +32,7 @@ def folder(tmp_path, content):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_program_that_was_read_back_says_what_the_pilot_says(folder):
     program, count = load_program(folder), 5
     begin, rng = PILOT.init(), np.random.default_rng(0)
@@ -85,6 +86,7 @@ def test_a_newer_file_is_refused(folder):
         load_program(folder)
 
 
+@pytest.mark.slow
 def test_a_program_that_says_other_numbers_is_refused(folder):
     kept = dict(np.load(folder / "golden.npz"))
     kept["command"][3, 1] += 1e-6

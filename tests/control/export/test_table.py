@@ -29,6 +29,7 @@ def values(rows: list[dict[str, str]], group: str) -> list[float]:
     return [float(row["value"]) for row in rows if row["group"] == group]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [doubtful, mecanum_robot])
 def test_every_number_reads_back_to_the_last_bit(made):
     robot = made()

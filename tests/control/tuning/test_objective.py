@@ -134,6 +134,7 @@ def test_a_search_betters_gains_by_hand_and_can_be_left(
         np.testing.assert_array_equal(resumed[name], state[name])
 
 
+@pytest.mark.slow
 def test_gains_that_are_handed_over_are_stable(robots, cases):
     search = searched(robots, cases, "gradient")
 

@@ -50,6 +50,7 @@ def test_a_delay_beyond_the_ring_is_refused():
         Twin(deployed(), FIRM, Habits(delay_s=0.4))
 
 
+@pytest.mark.slow
 def test_wheels_wait_then_slew_then_hold():
     state, _ = driven(Twin(deployed(), FIRM, SILENT), jnp.full((40, 3), 4.0))
     w = np.asarray(state.speed)
@@ -59,6 +60,7 @@ def test_wheels_wait_then_slew_then_hold():
     np.testing.assert_allclose(w[-1], 4.0, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_body_at_constant_speed_moves_as_the_contact_says():
     robot = deployed()
     command = jnp.asarray([3.0, -2.0, 0.5])
@@ -72,6 +74,7 @@ def test_a_body_at_constant_speed_moves_as_the_contact_says():
         assert gone == pytest.approx(float(jnp.hypot(xi[0], xi[1])), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_runs_differ_by_what_the_fit_says():
     robot = deployed(run=1.0)
     twin = Twin(robot, FIRM, SILENT)
@@ -89,6 +92,7 @@ def test_runs_differ_by_what_the_fit_says():
     assert along.std() == pytest.approx(0.01, rel=0.15)
 
 
+@pytest.mark.slow
 def test_sensors_read_ticks_and_magnitudes_and_nothing_that_is_not_there():
     habits = Habits(ticks=320.0, voltage=False)
     _, z = driven(Twin(deployed(current=1.0), FIRM, habits), jnp.full((30, 3), -3.0))
@@ -104,6 +108,7 @@ def test_sensors_read_ticks_and_magnitudes_and_nothing_that_is_not_there():
     assert np.mean(z.gyro[-10:]) == pytest.approx(float(state.twist[-1, 2]), abs=0.03)
 
 
+@pytest.mark.slow
 def test_a_rollout_is_the_run_of_a_plant():
     robot, path = deployed(1.0, 1.0, 1.0), waypoints([(0.0, 0.0), (0.15, 0.0)], pause=0.2)
     path = path.moved(START)

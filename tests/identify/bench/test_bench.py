@@ -82,6 +82,7 @@ def test_a_bare_rotor_is_too_quick_for_slow_rows():
     assert found.parameters["motor.rotor_inertia"].verdict == "not_identified"
 
 
+@pytest.mark.slow
 def test_a_brush_drop_does_not_pass_for_resistance():
     record = made.logged(made.driven(made.FLYWHEEL, drop=0.6), 200, 1, noise=(0.05, 0.1, 1.0))
     plain = np.stack([record.current, record.speed], axis=1)
@@ -93,6 +94,7 @@ def test_a_brush_drop_does_not_pass_for_resistance():
     assert found["motor.brush_drop"].value == pytest.approx(0.6, abs=0.12)
 
 
+@pytest.mark.slow
 def test_a_noisy_ammeter_does_not_make_the_resistance_small():
     quick = made.driven(made.FLYWHEEL, 25.0)
     found = [fitted(made.logged(quick, 500, k, noise=(0.05, 0.3, 1.0))) for k in range(4)]

@@ -245,6 +245,7 @@ def test_models_that_say_the_same_can_hardly_be_told_apart():
     assert others.count("worse") <= 4  # of twelve
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["affine", "paper", "heading_lookup"])
 def test_slopes_by_a_rungs_numbers_are_those_of_a_step_in_them(name):
     w = made(ROBOT, runs=24, count=2, seed=5, voltage=False)
@@ -260,6 +261,7 @@ def test_slopes_by_a_rungs_numbers_are_those_of_a_step_in_them(name):
 # transfer ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", [0.1, 0.4])
 def test_a_curve_carries_over_where_floors_share_it_and_nowhere_else(other):
     w = driven("affine_current", ([0.05, 0.1], [0.05 + other - 0.1, other]), 7)
@@ -393,6 +395,7 @@ def with_sessions(std, seed, session):
     return model, replace(w, session=tuple(f"s{k}" for k in session))
 
 
+@pytest.mark.slow
 def test_what_sessions_share_is_found_and_widens_what_was_fitted():
     std = np.array([0.03, 0.02, 0.08])
     found = []

@@ -171,6 +171,7 @@ def test_a_bag_cut_anywhere_is_read_or_refused(tmp_path, whole, storage):
     assert outcomes.count("refused") > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("storage", ["rosbag1", "sqlite3", "mcap", "chunks"])
 def test_a_bag_with_other_bytes_is_read_or_refused(tmp_path, whole, storage):
     rng = np.random.default_rng(2)
