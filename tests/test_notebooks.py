@@ -12,6 +12,7 @@ import pytest
 from tests.helpers.kept import kept
 
 import slipid
+from tests.helpers.kept import kept
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 FIGURES = {

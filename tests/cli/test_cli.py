@@ -21,6 +21,7 @@ from slipid.cli.demo import packaged_config
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
 from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
+from tests.helpers.kept import kept
 from tests.helpers.shared import FEW, invoke
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -25,6 +25,7 @@ from slipid.control.tuning.twin import Twin
 from slipid.model import contact
 from slipid.model.se2 import advance, compose
 from tests.helpers.small_twin import deployed, floor
+from tests.helpers.stepped import stepped
 
 DT = 0.05
 FIRM = floor([[0]])

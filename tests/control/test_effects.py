@@ -16,6 +16,7 @@ from slipid.control.interface import Measurement, Settings
 from slipid.identify.fit import shared
 from tests.control.test_consistency import DT, rolling, settled
 from tests.helpers.small_twin import deployed
+from tests.helpers.stepped import stepped
 
 BASE = jnp.asarray(0.125)
 SPEEDS = (0.1, 0.2, 0.4)

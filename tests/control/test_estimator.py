@@ -31,6 +31,7 @@ from slipid.model.robot import build
 from tests.helpers import small_twin
 from tests.helpers.compiled_pilot import CompiledPilot, Flat
 from tests.helpers.known_robot import deploy_known
+from tests.helpers.stepped import stepped
 
 PATH = rectangle()
 LIMITS = Limits()

@@ -10,6 +10,7 @@ from slipid.identify.fit.problem import Problem
 from slipid.identify.result import summarise
 from slipid.model.robot import build
 from slipid.search_space import Space
+from tests.helpers.kept import kept
 from tests.helpers.kinds import SHAPES, experiment
 
 
