@@ -9,7 +9,6 @@ from pathlib import Path
 
 import nbformat
 import pytest
-from tests.helpers.kept import kept
 
 import slipid
 from tests.helpers.kept import kept

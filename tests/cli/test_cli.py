@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.helpers.kept import kept
 
 from slipid.cli.demo import packaged_config
 from slipid.support.errors import DataError

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from tests.helpers.stepped import stepped
 
 from slipid.control.estimator import Estimator
 from slipid.control.filter.effects import SETTLES, TURN, stays

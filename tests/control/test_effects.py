@@ -8,7 +8,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.helpers.stepped import stepped
 
 from slipid.control.estimator import Estimator
 from slipid.control.filter.effects import FORGETS, Course, Told

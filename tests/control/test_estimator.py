@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.helpers.stepped import stepped
 
 from slipid.control import closed_loop
 from slipid.control.closed_loop import Pilot

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from tests.helpers.kept import kept
 
 from slipid.data.windows import windows
 from slipid.identify.fit.optimise import optimise
