@@ -16,6 +16,8 @@ from slipid.support.errors import DataError
 
 SAME = ("wheel_sign", "wheel_order", "command_sign", "command_order")
 """Findings from the poses of all runs together, which say it better."""
+BROUGHT = ("wheel_scale", "wheel_speed_unit")
+"""Findings that columns in another order may bring about; with the right order they are told."""
 STEP_S = 0.5
 """Length of a step [s]: delays and jitter do not matter."""
 CHANNELS = ("wheel_speed_command", "wheel_speed")

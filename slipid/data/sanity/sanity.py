@@ -20,7 +20,7 @@ from slipid.data.sanity.axes.gather import gather
 from slipid.data.sanity.axes.reading import Evidence, Reading, misfits
 from slipid.data.sanity.axes.shape import mistakes
 from slipid.data.sanity.axes.words import of_mistake
-from slipid.data.sanity.columns import SAME, misordered
+from slipid.data.sanity.columns import BROUGHT, SAME, misordered
 from slipid.data.sanity.electric import electric
 from slipid.data.sanity.exchanged import exchanged
 from slipid.data.sanity.finding import Finding, worst_first
@@ -91,7 +91,8 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
     channels = recorded(data)
     said = tuple(_all(channels, edges(channels), robot))
     if not {finding.kind for finding in said} & {*SAME}:
-        said += tuple(misordered(data.logs))
+        columns = tuple(misordered(data.logs))
+        said = tuple(f for f in said if not columns or f.kind not in BROUGHT) + columns
     return worst_first(said)
 
 
