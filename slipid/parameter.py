@@ -58,6 +58,11 @@ class Declaration:
     of: str = "wheel"
 
     @property
+    def logarithmic(self) -> bool:
+        """Whether the search space is that of a logarithm."""
+        return math.isinf(self.upper) and not math.isinf(self.lower)
+
+    @property
     def tied(self) -> bool:
         """Whether its numbers have one coordinate less than there are of them."""
         return self.shares or self.deviation

@@ -38,9 +38,9 @@ if find_library("EGL"):
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-import jax  # noqa: E402
+import jax
 
-from tests.helpers.checked import check_types_of  # noqa: E402
+from tests.helpers.checked import check_types_of
 
 jax.config.update("jax_enable_x64", True)
 one_blas_thread()

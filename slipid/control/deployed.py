@@ -73,7 +73,7 @@ class DeployedRobot(eqx.Module):
     @property
     def drives(self) -> int:
         """Number of drives: as many angles, currents and voltages are measured."""
-        return shape_of(self.record).drives
+        return self.record.wheels.drives
 
     @property
     def steers(self) -> bool:

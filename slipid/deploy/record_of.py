@@ -108,11 +108,9 @@ def _load(
     frame, ways = shape.frame(), directions(36)
     if not shape.determines_twist:
         ways = jnp.concatenate([ways, _turns(frame)])
-    wheels = frame, shape.forward(), shape.drive_of
-    rest, mass = robot.body.load_share[k], robot.body.mass
-    speed, amps, slip = _circle(
-        *wheels, robot.surfaces, rest, robot.motor, mass, jnp.asarray(top), ways
-    )
+    wheels, rest = _Wheels.of(robot), robot.body.load_share[k]
+    floors, motor, mass = robot.surfaces, robot.motor, robot.body.mass
+    speed, amps, slip = _circle(wheels, floors, rest, motor, mass, jnp.asarray(top), ways)
     curve = np.asarray(_wheel_curve(speed, amps, slip))
     return record.LoadRecord(
         name=name,
@@ -134,11 +132,26 @@ def _turns(frame: Frame) -> Float[Array, "way 3"]:
     return jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / frame.base
 
 
+class _Wheels(eqx.Module):
+    """The wheels as arrays, wherever they are: what is compiled for some serves all as many."""
+
+    frame: Frame
+    forward: Float[Array, "*draw drive 3"]
+    drive_of: tuple[int, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, robot: Robot) -> "_Wheels":
+        shape = robot.geometry
+        return cls(shape.frame(), shape.forward(), shape.drive_of)
+
+    def rim(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
+        """Rim speeds of the wheels by those of their drives [m/s]."""
+        return at_wheels(self.drive_of, of_drives)
+
+
 @eqx.filter_jit
 def _circle(
-    frame: Frame,
-    forward: Float[Array, "drive 3"],
-    drive_of: tuple[int, ...],
+    wheels: _Wheels,
     surfaces: ContactSurface,
     rest: Float[Array, " wheel"],
     motor: Motor,
@@ -146,22 +159,20 @@ def _circle(
     top: Array,
     ways: Float[Array, "way 3"],
 ) -> tuple[Array, Array, Array]:
-    """Wheel speeds, currents, slip ratios on every floor for all ways to move (.., drive).
-
-    Compiled once for all robots with as many wheels and floors, wherever their wheels are.
-    """
-    speed = ways @ forward.T / frame.radius
+    """Wheel speeds, currents, slip ratios on every floor for all ways to move (.., drive)."""
+    frame = wheels.frame
+    speed = ways @ wheels.forward.T / frame.radius
     speed = jnp.stack([0.4 * top, 0.8 * top])[:, None, None] * speed / jnp.max(jnp.abs(speed))
 
     def one(w: Array, floor: ContactSurface) -> tuple[Array, Array]:
-        rim = frame.radius * at_wheels(drive_of, w)
+        turned = frame.radius * w
+        rim = wheels.rim(turned)
         xi = contact.equilibrium(rim, frame, floor, rest)
         force = floor.friction * mass * GRAVITY * frame.radius
         where = xi, rim, frame, floor, rest
         felt = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
-        amps = motor.current(at_drives(drive_of, force * motor.borne(felt)), w)
-        turned = frame.radius * w
-        lost = turned - forward @ xi
+        amps = motor.current(at_drives(wheels.drive_of, force * motor.borne(felt)), w)
+        lost = turned - wheels.forward @ xi
         return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
 
     flat = speed.reshape(-1, speed.shape[-1])
@@ -210,25 +221,22 @@ def moved_per_metre(
 
     For ways to move at 1 m/s, of robots that are stacked.
     """
-    wheels = jax.vmap(lambda robot: (robot.geometry.frame(), robot.geometry.forward()))(draws)
-    rest, drive_of = draws.body.load_share[:, load], draws.geometry.drive_of
-    return _moved(*wheels, drive_of, draws.surfaces, rest, speed, way)
+    rest = draws.body.load_share[:, load]
+    return _moved(jax.vmap(_Wheels.of)(draws), draws.surfaces, rest, speed, way)
 
 
 @eqx.filter_jit
 def _moved(
-    frames: Frame,
-    forward: Float[Array, "draw drive 3"],
-    drive_of: tuple[int, ...],
+    wheels: _Wheels,
     surfaces: ContactSurface,
     rest: Float[Array, "draw wheel"],
     speed: Array,
     way: Float[Array, "way 3"],
 ) -> Array:
-    """As `moved_per_metre`; compiled once for all robots with as many wheels and floors."""
+    """As `moved_per_metre`."""
 
-    def one(frame: Frame, forward: Array, surfaces: ContactSurface, rest: Array) -> Array:
-        rim = at_wheels(drive_of, speed * way @ forward.T)
+    def one(wheels: _Wheels, surfaces: ContactSurface, rest: Array) -> Array:
+        rim, frame = wheels.rim(speed * way @ wheels.forward.T), wheels.frame
         xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
             surfaces
         )
@@ -236,4 +244,4 @@ def _moved(
         across = xi[..., 1] * way[:, 0] - xi[..., 0] * way[:, 1]
         return jnp.stack([along, across, xi[..., 2]], axis=-1) / speed
 
-    return jax.vmap(one)(frames, forward, surfaces, rest)
+    return jax.vmap(one)(wheels, surfaces, rest)

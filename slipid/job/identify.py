@@ -154,15 +154,16 @@ def optimised(
 ) -> tuple[Problem, Optimum]:
     """Optimum of a task, whose problem is `task.problem()`, and the problem that it is one of.
 
-    That is another one where the lag found was not expected, see `Task.problem`. It goes on from
+    That is another one where the lag found was not expected, see `Task.cut_as`. It goes on from
     the state that was kept of this very task, and keeps every round.
     """
     optimum = _optimised(task, problem, _restored(kept, report), kept, report)
-    cut = task.problem(problem.space.tree(optimum.state.z)).windows
-    if cut.lag == problem.windows.lag:
+    robot = task.cut_as(problem.space.tree(optimum.state.z))
+    lag, before = float(robot.camera.lag), problem.windows.lag
+    if lag == before:
         return problem, optimum
-    report.line(f"cut anew at a lag of {cut.lag:.2f} s; it was {problem.windows.lag:.2f} s before")
-    again = problem.of(cut)
+    report.line(f"cut anew at a lag of {lag:.2f} s; it was {before:.2f} s before")
+    again = problem.of(task.windows(robot))
     start = replace(optimum.state, round=LATE, moved=np.inf, effect=None)
     return again, _optimised(task, again, (start, list(optimum.history)), kept, report)
 

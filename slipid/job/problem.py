@@ -63,16 +63,19 @@ class Task:
         return hash_of((log.name, log.sha256) for log in self.logs)
 
     def problem(self, near: Robot | None = None) -> Problem:
-        """Likelihood of the runs, cut into windows as the settings say.
+        """Likelihood of the runs, cut into windows as the settings say, `near` an optimum."""
+        return Problem(self.windows(self.cut_as(near)), self.robot, list(self.choices))
 
-        They are cut at the camera's lag where a fit starts, or at that of a robot `near` its
-        optimum if this is `ANEW_S` away: what wheels turned in a window is linear in the lag only
-        near the one that it was cut at.
+    def cut_as(self, near: Robot | None) -> Robot:
+        """The robot at whose radius and lag windows are cut: as a fit starts, but for the lag.
+
+        That is the one of a robot `near` an optimum where it is `ANEW_S` away: what wheels turned
+        in a window is linear in the lag only near the one that it was cut at.
         """
         robot = Space(self.robot, self.choices).template
-        if near is not None and abs(float(near.camera.lag - robot.camera.lag)) > ANEW_S:
-            robot = replace(robot, camera=replace(robot.camera, lag=near.camera.lag))
-        return Problem(self.windows(robot), self.robot, list(self.choices))
+        if near is None or abs(float(near.camera.lag - robot.camera.lag)) <= ANEW_S:
+            return robot
+        return replace(robot, camera=replace(robot.camera, lag=near.camera.lag))
 
     def windows(self, robot: Robot) -> Windows:
         """Windows of the runs at the wheel radius and the camera lag of a robot."""

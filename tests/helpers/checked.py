@@ -98,5 +98,5 @@ def _jaxtyped(fn: Any = None, *, typechecker: Callable) -> Any:
 
 def check_types_of(package: str) -> None:
     """Check what functions and dataclasses of a package are given and return; before its import."""
-    jaxtyping.jaxtyped = _jaxtyped  # type: ignore[assignment]
+    jaxtyping.jaxtyped = _jaxtyped
     jaxtyping.install_import_hook(package, "beartype.beartype")

@@ -27,7 +27,7 @@ def fitted(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", kept(SHAPES, ["skid"]))  # each compiles a fit of its own
+@pytest.mark.parametrize("kind", kept(SHAPES, ["skid", "mecanum"]))  # each compiles a fit
 def test_a_robot_of_every_drive_is_recovered_within_its_intervals(kind):
     made, fit = fitted(kind)
     assert fit.converged, fit.reason

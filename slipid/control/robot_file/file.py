@@ -114,13 +114,13 @@ def check(record: RobotRecord) -> None:
         raise ValueError("wheels.place: no entries; expected one for every wheel")
     for name in ("drive_angle", "roller_angle", "grips"):
         _counted(f"wheels.{name}", getattr(record.wheels, name), wheels)
-    drives = shape_of(record).drives
+    shape_of(record)  # which refuses wheels that cannot drive, and drives that turn none
     for kind, names in (("floors", record.labels), ("loads", [x.name for x in record.loads])):
         if not names or len(set(names)) < len(names):
             raise ValueError(f"{kind} {list(names)}; expected one or more, each once")
     for load in record.loads:
         _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
-        _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, drives)
+        _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, record.wheels.drives)
         if load.told is not None:
             _told(f"loads, {load.name}: told", load.told, len(record.floors))
     _numbers(record)

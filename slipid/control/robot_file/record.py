@@ -76,6 +76,11 @@ class Wheels:
     drive_of: tuple[int, ...]
     gear_ratio: float
 
+    @property
+    def drives(self) -> int:
+        """Number of drives; `Geometry.drives` without the arrays of one."""
+        return len(set(self.drive_of)) or len(self.place)
+
 
 @dataclass(frozen=True)
 class FloorRecord:

@@ -157,7 +157,8 @@ def _free(
         std = draws.std(axis=0)
         wide = np.full(entry.size, prior_std.mean() / entry.size)
     else:
-        ends = (np.minimum(mean + k * std_z, LARGEST) for k in (-Z95, Z95))
+        most = LARGEST if d.logarithmic else np.inf
+        ends = (np.minimum(mean + k * std_z, most) for k in (-Z95, Z95))
         low, high = (np.asarray(d.to_si(end)) for end in ends)
         std = d.slope(value) * std_z
         wide = d.slope(center) * prior_std
