@@ -33,6 +33,17 @@ def test_si_to_search_and_back_is_the_identity(name):
     )
 
 
+@pytest.mark.parametrize("name", [*BIJECTIONS, "shares", "deviation"])
+def test_numpy_and_jax_say_the_same_of_one_and_of_many(name):
+    tied = {n: declaration(**{n: True}) for n in ("shares", "deviation")}
+    d = tied[name] if name in tied else BIJECTIONS[name][0]
+    z = np.random.default_rng(0).normal(scale=3.0, size=(50, 2))
+    many = d.to_si(z)
+    assert isinstance(many, np.ndarray)
+    np.testing.assert_allclose(many, d.to_si(jnp.asarray(z)), rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(many[7], d.to_si(z[7]), rtol=1e-12, atol=1e-14)
+
+
 @pytest.mark.parametrize("name", BIJECTIONS)
 def test_search_to_si_stays_inside_the_bounds(name):
     d, _ = BIJECTIONS[name]

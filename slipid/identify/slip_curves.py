@@ -188,7 +188,7 @@ def by_encoders(twist: Float[np.ndarray, "window 3"]) -> Driven:
 
 def distinct(x: np.ndarray, digits: int) -> tuple[float, ...]:
     """Values that are known, rounded, each once, rising."""
-    return tuple(sorted({round(float(v), digits) for v in x[np.isfinite(x)]}))
+    return tuple(sorted({round(float(v), digits) + 0.0 for v in x[np.isfinite(x)]}))
 
 
 def current_trend(robot: Robot, b: lk.Batch) -> tuple[float, float]:

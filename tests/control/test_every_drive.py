@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from slipid.api.driving import drive
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator, Odometry
 from slipid.control.interface import Readings, Settings
 from slipid.deploy.deploy import steered
+from slipid.deploy.record_of import moved_per_metre, spread_of
 from slipid.model.robot import build
 from slipid.search_space import Choice, Space
 from slipid.selftest.known import Sensors
@@ -94,6 +96,25 @@ def test_the_estimator_ends_nearer_than_encoders(driven):
     assert np.mean(ours) < (0.25 * np.mean(encoders) if slips else 1e-4), (ours, encoders)
 
 
+def test_wheels_of_a_drive_that_turn_alike_move_the_body_as_it_says(driven):
+    robot, _ = driven
+    rim = jnp.arange(1.0, robot.drives + 1)
+    np.testing.assert_allclose(robot.by_wheels @ robot.at_wheels(rim), robot.inverse @ rim)
+
+
+@pytest.mark.slow
+def test_what_is_unsure_of_turns_on_the_spot_counts_in_full():
+    """Two draws that differ in scrub: turns of a skid-steer robot differ, its straights do not."""
+    robot = build(SHAPES["skid"], ["floor"])
+    both = [replace(robot.surfaces, scrub=jnp.asarray([cz])) for cz in (0.002, 0.1)]
+    draws = jax.tree.map(lambda *x: jnp.stack(x), *(replace(robot, surfaces=s) for s in both))
+    turn = jnp.array([[0.0, 0.0, 1.0 / float(robot.geometry.base_radius)]])
+    moved = moved_per_metre(draws, jnp.asarray(0), jnp.asarray(0.2), turn)
+    ((_, _, yaw),) = deploy_known(robot, draws=draws).record.loads[0].spread
+    assert yaw == pytest.approx(float(spread_of(np.asarray(moved))[0, 0, 2]), rel=1e-6)
+    assert yaw > 0.01
+
+
 def test_the_robot_survives_its_file(driven, tmp_path):
     robot, _ = driven
     robot.save(tmp_path / "robot.json")
@@ -108,3 +129,5 @@ def test_it_has_no_controller(driven, tmp_path):
     assert not robot.steers
     with pytest.raises(DataError, match=r"it has an estimator .* but no controller"):
         steered(tmp_path, robot)
+    with pytest.raises(ValueError, match=r"it has an estimator .* but no controller"):
+        drive(robot)

@@ -25,7 +25,7 @@ from slipid.identify.fit.variances import DEGREES
 from slipid.identify.fit_file import identified_json, load, save, to_json
 from slipid.identify.posterior import diagnosis
 from slipid.identify.result import Fit, summarise
-from slipid.identify.slip_curves import by_encoders, has_steady_command
+from slipid.identify.slip_curves import by_encoders, has_steady_command, validity
 from slipid.identify.verdicts.estimates import estimates
 from slipid.identify.verdicts.unidentified import flat_directions, members
 from slipid.search_space import Choice
@@ -243,11 +243,24 @@ def test_what_was_driven_is_told_by_the_wheels_where_no_steady_command_was_logge
     speed = np.where(np.arange(400) < 200, 0.1, 0.3)
     twist[:, 0], twist[:, 1] = speed * np.cos(way), speed * np.sin(way)
     twist[:40], twist[40:80, 2] = 0.0, 0.5
+    twist[80] = 0.3 * np.array([0.0, 1.0, 0.0])  # one window is no direction that was driven
     driven = by_encoders(twist)
     assert driven.headings_deg == (-120.0, -60.0, 0.0, 60.0, 120.0, 180.0)
     assert (min(driven.speeds), max(driven.speeds)) == (0.1, 0.3)
     assert driven.turn_rates == (0.5,)
     assert by_encoders(np.zeros((5, 3))) == ((), (), ())
+
+
+def test_a_floor_whose_runs_have_no_steady_command_was_seen_as_the_wheels_say():
+    problem, data, _ = made(True)
+    robot = problem.space.tree(problem.space.start)
+    blind = tuple(replace(log, twist_command=None) for log in data.logs)
+    lies = replace(data, heading=data.heading + 0.1)
+    asked, seen = (
+        validity(runs, robot, problem.batch)["soft"] for runs in (lies, replace(lies, logs=blind))
+    )
+    assert set(np.mod(asked.headings_deg, 30.0)) != {0.0}
+    assert set(np.mod(seen.headings_deg, 30.0)) == {0.0}
 
 
 def test_a_command_that_changes_or_rests_tells_nothing_of_a_run():

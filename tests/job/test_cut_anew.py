@@ -1,6 +1,7 @@
 """Windows are cut anew where a fit finds another lag than they were cut at."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import State
-from slipid.job import identify
+from slipid.job import identify, sample
 from slipid.job.config import FitSection
 from slipid.job.problem import ANEW_S, Task
 from slipid.model.robot import build
@@ -48,7 +49,8 @@ def test_a_fit_goes_on_with_windows_at_the_lag_it_found(task, monkeypatch):
         fitted.append((problem.windows.lag, before[0]))
         z = np.array(problem.space.start)
         z[problem.space.place["camera.lag"]] += 0.12 - EXPECTED
-        state = State(z, np.zeros(len(problem.noise.names)), 9, 1.0, 0.001, "joint")
+        shared = np.ones((len(problem.windows), 3))
+        state = State(z, np.zeros(len(problem.noise.names)), 9, 1.0, 0.001, "joint", shared)
         return Optimum(state, np.eye(len(z)), True, "settled", (1.0,))
 
     monkeypatch.setattr(identify, "_optimised", fit)
@@ -59,4 +61,23 @@ def test_a_fit_goes_on_with_windows_at_the_lag_it_found(task, monkeypatch):
     assert starts[0] is None
     assert (starts[1].z == optimum.state.z).all()
     assert starts[1].round < optimum.state.round
+    assert starts[1].effect is None  # other windows may be other pieces
     assert again.windows.lag == pytest.approx(0.12)
+
+
+def test_chains_are_of_windows_as_the_fit_has_cut_them(monkeypatch, tmp_path):
+    class Asked(Exception):
+        """What the problem was to be near."""
+
+    class Job:
+        def problem(self, near):
+            raise Asked(near)
+
+    fit = SimpleNamespace(robot="the robot of the fit")
+    nothing = ("_on_one_floor", "_where_the_logs_are", "_same_logs", "read_config")
+    for name in nothing:
+        monkeypatch.setattr(sample, name, lambda *_: None)
+    monkeypatch.setattr(sample, "load", lambda _: fit)
+    monkeypatch.setattr(sample, "read_job", lambda *_: Job())
+    with Reporter(quiet=True) as report, pytest.raises(Asked, match="the robot of the fit"):
+        sample.sample(tmp_path, None, sample.Plan(), 1, report)

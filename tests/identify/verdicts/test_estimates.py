@@ -277,6 +277,15 @@ def test_what_currents_and_voltages_tell(voltage):
     assert both.ratio == pytest.approx(std / np.hypot(space.prior_std[r], space.prior_std[c]))
 
 
+def test_a_number_without_bounds_may_be_larger_than_any_exponent():
+    space = space_of("surface.soft.lead")
+    at = space.place["surface.soft.lead"]
+    z = np.array(space.start)
+    z[at] = 1e4
+    [e] = [one for one in estimates(space, (), z, np.eye(len(z)), True, ()) if one.std is not None]
+    assert e.interval90 == pytest.approx((1e4 - 1.6448536, 1e4 + 1.6448536))
+
+
 def test_what_nothing_is_known_of_has_ends_that_files_can_hold():
     space = space_of("motor.resistance", "motor.back_emf")
     wide = np.diag((1e4 * space.prior_std) ** 2)
