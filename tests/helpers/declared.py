@@ -11,8 +11,8 @@ from jaxtyping import Array
 from slipid.parameter import Declaration, parameter
 
 
-def declaration(lower=-math.inf, upper=math.inf, shares=False):
-    return Declaration(unit="1", symbol="x", start=1.0, lower=lower, upper=upper, shares=shares)
+def declaration(lower=-math.inf, upper=math.inf, **ties):
+    return Declaration(unit="1", symbol="x", start=1.0, lower=lower, upper=upper, **ties)
 
 
 class Inner(eqx.Module):

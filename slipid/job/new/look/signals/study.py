@@ -206,12 +206,15 @@ def driven_backwards(current: Found, speed: Found | None) -> bool:
 
 
 def of_battery(voltages: Sequence[Found], speed: Found | None) -> bool:
-    """Whether the voltage of some runs stays up whatever the wheels do, as a battery's does."""
-    values = np.concatenate([one.values.ravel() for one in voltages])
-    values = values[~np.isnan(values)]
-    low, high = np.quantile(values, (0.05, 0.95)).tolist() if values.size else (0.0, 0.0)
-    far = low > 0.6 * high > 0.0
-    return far and (speed is None or float(np.nanstd(speed.values)) > 0.0)
+    """Whether the voltage of some runs stays up whatever the wheels do, as a battery's does.
+
+    Every run is measured by its own largest voltage: batteries of other robots, or other charges,
+    are no sign of a motor.
+    """
+    runs = [one.values[~np.isnan(one.values)] for one in voltages]
+    values = np.concatenate([run / max(float(np.abs(run).max(initial=0.0)), 1e-9) for run in runs])
+    low = float(np.quantile(values, 0.05)) if values.size else 0.0
+    return low > 0.6 and (speed is None or float(np.nanstd(speed.values)) > 0.0)
 
 
 def pose_study(studies: tuple[Study, ...]) -> Study | None:
