@@ -15,6 +15,9 @@ UNREAD = 1e6
 """Variance of what was not read, so large that it tells nothing [A^2, V^2]."""
 
 
+PerWindow = Float[np.ndarray, "window wheel"]
+
+
 @dataclass(frozen=True, eq=False)
 class Windows:
     """Pieces of K neighbouring windows; a short run is one piece, a long one is cut.
@@ -186,18 +189,18 @@ def _cut(
     span = np.clip(at + half, t[0], t[-1]) - np.clip(at - half, t[0], t[-1])
     speed = (ahead - behind) / np.maximum(span, 1e-3)[:, None]
     zero = np.zeros((len(edges) - 1, angle.shape[1]))
-    live = data.live[rows].astype(float)[:, None]
+    live = data.live[rows]
     mean_current = variance = mean_voltage = unread = zero
     if data.current is not None:
         amps = data.current[rows]
         amps = amps if data.current_is_signed else np.abs(amps)
-        read = live if data.current_fresh is None else live * data.current_fresh[rows]
-        mean_current, count = _mean(t, amps, read, at)
-        variance = np.where(count > 0, noise / np.maximum(count, 1), UNREAD)
+        fresh = None if data.current_fresh is None else data.current_fresh[rows]
+        mean_current, count, missed = _mean(t, amps, live, fresh, at)
+        variance = np.where(count > 0, noise / np.maximum(count, 1) + missed, UNREAD)
     if data.voltage is not None:
-        read = live if data.voltage_fresh is None else live * data.voltage_fresh[rows]
-        mean_voltage, count = _mean(t, data.voltage[rows], read, at)
-        unread = np.where(count > 0, 0.0, UNREAD)
+        fresh = None if data.voltage_fresh is None else data.voltage_fresh[rows]
+        mean_voltage, count, missed = _mean(t, data.voltage[rows], live, fresh, at)
+        unread = np.where(count > 0, missed, UNREAD)
     return {
         "dt": np.diff(t[edges]),
         "turn": np.diff(turned, axis=0),
@@ -213,14 +216,18 @@ def _cut(
 def _mean(
     time: Float[np.ndarray, " row"],
     x: Float[np.ndarray, "row wheel"],
-    live: Float[np.ndarray, "row #wheel"],
+    live: Bool[np.ndarray, " row"],
+    fresh: Bool[np.ndarray, "row wheel"] | None,
     at: Float[np.ndarray, " edge"],
-) -> tuple[Float[np.ndarray, "window wheel"], Float[np.ndarray, "window wheel"]]:
-    """Mean over time of what was read between edges, and how many readings it is the mean of.
+) -> tuple[PerWindow, PerWindow, PerWindow]:
+    """Mean over time between edges, of how many readings it is, and the variance of what it missed.
 
-    A reading stands for the time from halfway to the row before it to halfway to the next. A mean
+    A row stands for the time from halfway to the row before it to halfway to the next. A mean
     over the rows in a window would be as late as its first row lies behind the edge: while a robot
-    speeds up, voltages would read high. Where nothing was read it is the mean over all rows.
+    speeds up, voltages would read high. What a slower meter did not read in a row is taken to be
+    even between its readings; had it jumped from one reading's value to the next one's at any time
+    in between, the mean over that time would be off by their difference over sqrt(12). Rows that
+    are not live are left out, but where a window has no others.
     """
     bounds = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), time[-1:]])
     cell = np.diff(bounds)[:, None]
@@ -229,8 +236,33 @@ def _mean(
         summed = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
         return np.diff(interpolate(bounds, summed, at), axis=0)
 
-    live = np.broadcast_to(live, x.shape)
-    seconds = total(cell * live)
-    read = seconds > 1e-9
-    mean = total(x * cell * live) / np.where(read, seconds, 1.0)
-    return np.where(read, mean, total(x * cell) / total(cell)), np.where(read, total(live), 0.0)
+    read = np.broadcast_to(live[:, None], x.shape)
+    jump = np.zeros(x.shape)
+    if fresh is not None:
+        read = read & fresh
+        each = [_between(time, x[:, k], read[:, k]) for k in range(x.shape[1])]
+        x, jump = (np.stack(column, axis=-1) for column in zip(*each, strict=True))
+    told = cell * live[:, None]
+    seconds = total(told)
+    moving = seconds > 1e-9
+    safe = np.where(moving, seconds, 1.0)
+    mean = np.where(moving, total(x * told) / safe, total(x * cell) / total(cell))
+    count = np.where(moving, total(read.astype(float)), 0.0)
+    return mean, count, total(jump * told) / safe**2
+
+
+def _between(
+    time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], read: Bool[np.ndarray, " row"]
+) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " row"]]:
+    """What was read, even between two readings, and in rows between them (jump)^2 seconds / 12.
+
+    Summed over the time of such rows, the latter is the variance of the integral of what a meter
+    did not see; it is zero where it was read in neighbouring rows.
+    """
+    if not read.any():
+        return x, np.zeros_like(x)
+    at = np.flatnonzero(read)
+    rows, seconds = np.diff(at), np.diff(time[at])
+    jump = np.zeros_like(x)
+    jump[at[0] : at[-1]] = np.repeat(np.diff(x[at]) ** 2 * seconds / 12 * (rows > 1), rows)
+    return np.interp(time, time[read], x[read]), jump

@@ -15,7 +15,7 @@ from slipid.identify import slip_curves as curves_of
 from slipid.identify.compare.predictive import Contact, contact_of
 from slipid.identify.fit.noise import POOLED
 from slipid.identify.fit.optimise import Optimum
-from slipid.identify.fit.problem import Problem, State, log_jacobian
+from slipid.identify.fit.problem import Problem, log_jacobian
 from slipid.identify.fit.shared import FoundShared, Tie, freed, freed_slopes
 from slipid.identify.fit.variances import MOTIONS, Search, Square
 from slipid.identify.slip_curves import SlipCurve
@@ -184,7 +184,7 @@ def summarise(
     """
     z, log_v = optimum.state.z, optimum.state.log_variance
     contact = contact_of(problem, optimum.state, optimum.covariance, problem.every)
-    left, name = _remaining(problem, optimum.state)
+    left, name = _remaining(problem, optimum)
     settled = left < REMAINING
     stuck = f"the solver stopped {left:.2g} stds of {name} away from where its own step leads"
     windows, robot = problem.windows, contact.robot
@@ -224,14 +224,18 @@ def summarise(
     )
 
 
-def _remaining(problem: Problem, state: State) -> tuple[float, str]:
+def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
     """Largest step of a full Gauss-Newton step in posterior stds, and the number that takes it.
+
+    The stds are those of the Laplace covariance, as the rounds are stopped by: the rows that the
+    solver sees hold what is felt as exact, and so tell friction far better than the logs do.
 
     delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), W with the weights of outliers, g
     the slope of log |d residuals / d data|; where currents were logged, their rows move the
     electric numbers only.
     """
-    z, log_v, every = state.z, state.log_variance, problem.every
+    state, every = optimum.state, problem.every
+    z, log_v = state.z, state.log_variance
     electric = problem.electric(z, log_v)
     residual, jacobian = problem.linear(z, electric)
     seen = problem.seen(residual, log_v, every, state.shared(len(problem.windows)))
@@ -249,7 +253,7 @@ def _remaining(problem: Problem, state: State) -> tuple[float, str]:
         flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k in MOTIONS else own)
         gradient = gradient + flat.T @ np.asarray(white).ravel()
         info = info + flat.T @ flat
-    std = np.sqrt(np.diag(np.linalg.inv(info)))
+    std = np.sqrt(np.diag(optimum.covariance))
     steps = np.abs(np.linalg.solve(info, gradient)) / std
     worst = int(np.argmax(steps))
     return float(steps[worst]), problem.space.names[worst]

@@ -229,6 +229,48 @@ def test_means_of_what_grows_are_those_of_the_middle_of_the_window(lag):
     np.testing.assert_allclose(w.voltage[0], middle[:, None] * np.ones(3), atol=step**2)
 
 
+def every(log, n, at=0):
+    """The log, had its meters been read in every n-th row and held until they were read again."""
+    number = np.arange(log.samples)
+    read = number % n == at
+    read[0] = True
+    last = np.maximum.accumulate(np.where(read, number, 0))
+    fresh = np.repeat(read[:, None], 3, axis=1)
+    held = {"current": log.current[last], "voltage": log.voltage[last]}
+    return replace(log, **held, current_fresh=fresh, voltage_fresh=fresh)
+
+
+@pytest.mark.parametrize("n", [3, 5])
+def test_a_slow_meter_is_even_between_its_readings(n):
+    """What grows evenly has the same mean, however seldom it is read; readings count once."""
+    blank = run()
+    grows = 2.0 + 3.0 * blank.time[:, None] * np.ones(3)
+    log = replace(blank, current=grows, voltage=grows, current_is_signed=True)
+    often, seldom = (windows(collect([one]), RADIUS, per_piece=2) for one in (log, every(log, n)))
+    held = log.time[n] - log.time[0]  # the last reading of a log has no next one
+    np.testing.assert_allclose(seldom.voltage, often.voltage, atol=3.0 * held**2)
+    np.testing.assert_allclose(seldom.current, often.current, atol=3.0 * held**2)
+    assert (often.voltage_var == 0.0).all()
+    # T / held gaps, and a jump of 3 held anywhere in each
+    expected = (3.0 * held) ** 2 / 12 * held / seldom.dt[..., None]
+    np.testing.assert_allclose(seldom.voltage_var / expected, 1.0, atol=0.5)
+
+
+def test_what_a_slow_meter_missed_is_covered_by_its_variance():
+    """A voltage that jumps once, at any time between two readings: errors are as large as told."""
+    off = []
+    for k in range(60):
+        blank = run(seconds=6.0)
+        jumps = blank.time[:, None] > 7.0 + 0.05 * k
+        log = replace(blank, voltage=np.where(jumps, 5.0, 1.0) * np.ones(3))
+        often, seldom = (windows(collect([x]), RADIUS, per_piece=2) for x in (log, every(log, 15)))
+        told = seldom.voltage_var > 1e-9
+        gap = seldom.voltage - often.voltage
+        np.testing.assert_allclose(gap[~told], 0.0, atol=1e-9)
+        off += (gap[told] / np.sqrt(seldom.voltage_var[told])).tolist()
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.2)
+
+
 @pytest.mark.parametrize("ripple", [0.0, 0.3])
 def test_ripple_is_no_noise_of_the_ammeter(ripple):
     """White noise of 0.1 A under a ripple of ten readings a period, in four runs of 30 s."""
