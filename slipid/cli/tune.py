@@ -14,7 +14,12 @@ def tune(
     load: Load = None,
     method: Annotated[str, typer.Option("--method", help="gradient or pso.")] = "gradient",
     rollouts: Annotated[
-        int, typer.Option("--rollouts", min=1, help="Rehearsals it may spend.")
+        int,
+        typer.Option(
+            "--rollouts",
+            min=1,
+            help="Rehearsals it may spend; a step of gradient takes 112, of pso 480.",
+        ),
     ] = 3360,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of draws, floors and search.")] = 0,
     gyro: Annotated[bool, typer.Option("--gyro/--no-gyro", help="The robot has a gyro.")] = False,

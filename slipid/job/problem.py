@@ -102,7 +102,11 @@ class Job(Task):
 
 
 def read_job(config: Config, root: Path, report: Reporter) -> Job:
-    """Read every log of runs on one floor that the config names, and set up its robot."""
+    """Read every log of runs on one floor that the config names, and set up its robot.
+
+    What the bench told of its motor comes first: a file that is missing costs no reading of logs.
+    """
+    bench_priors(config, gear_ratio=1.0)
     report.stage("reading logs")
     dataset, skipped = read_dataset(config, one_floor(config.content.logs), root, report)
     return job_of(config, dataset, skipped, report)

@@ -230,6 +230,13 @@ def test_a_bench_that_is_none_is_refused(tmp_path):
         bench_priors(config, 16.0)
 
 
+def test_a_missing_bench_is_told_before_logs_are_read(tmp_path):
+    (tmp_path / "robot.toml").write_text(ROBOT.format(motor='motor = "b.json"'))
+    result = invoke("check", str(tmp_path / "robot.toml"), "--data", str(tmp_path))
+    assert result.exit_code == 2
+    assert "b.json: No such file" in result.output
+
+
 def test_real_logs_without_voltage(real_data):
     path = real_data / "robotino2021" / "motor_identification.csv"
     speeds = ",".join(f"motor{k}_output" for k in (1, 2, 3))
