@@ -114,8 +114,8 @@ def show_check(page: Page, found: Content) -> None:
         page.line(f"repaired in {count} runs: {note}")
     before = table(
         ("parameter", "unit", "std after / before", "verdict"),
-        "before any fit: what the logs can be expected to tell, at the floors that a fit starts from "
-        "and by the one of them that tells least",
+        "before any fit: what the logs can be expected to tell, by the least telling of the floors "
+        "that a fit starts from",
     )
     for path, e in (found["parameters"] | found["derived"]).items():
         if e["ratio"] is not None and "session_yaw" not in path:
