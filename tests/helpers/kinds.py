@@ -1,5 +1,6 @@
 """Robots of every kind of drive with known numbers, and what their logs are fitted to."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,13 +38,18 @@ def experiment(kind: str, seed: int = 0, headings: int = 12) -> Experiment:
     """Runs of a robot of some kind on two floors, with currents and voltages."""
     shape = SHAPES[kind]
     drives = plan(shape, headings)
-    robot = build(shape, list(FLOORS), ("as_built",), sorted({d.session for d in drives}))
-    choices = [Choice(path, fixed=value) for path, value in numbers(robot).items()]
-    truth = Space(robot, choices).template
+    truth = known(shape, drives)
     # wheels that are dragged along brake, which magnitudes of currents do not tell
     fine = Sensors(ripple=0.005, current_step=0.002, voltage_step=0.005, signed=True)
     data = collect(make_logs(truth, drives, seed, fine))
     return Experiment(truth, data, wanted(truth, data))
+
+
+def known(shape: Geometry, drives: Sequence[Drive]) -> Robot:
+    """A robot of this shape whose every number is known, in the sessions that are driven."""
+    robot = build(shape, list(FLOORS), ("as_built",), sorted({d.session for d in drives}))
+    choices = [Choice(path, fixed=value) for path, value in numbers(robot).items()]
+    return Space(robot, choices).template
 
 
 def plan(shape: Geometry, headings: int) -> tuple[Drive, ...]:
