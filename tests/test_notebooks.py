@@ -65,7 +65,7 @@ def test_lessons_import_the_public_interface_alone(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", kept(FIGURES, list(FIGURES)[:3]))
+@pytest.mark.parametrize("name", kept(FIGURES, list(FIGURES)[:2]))
 def test_lesson_runs_without_real_logs(name, tmp_path, monkeypatch):
     monkeypatch.setenv("SLIPID_DATA", str(tmp_path))
     pictures = run(name, tmp_path)

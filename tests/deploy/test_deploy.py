@@ -12,8 +12,9 @@ import pytest
 
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot
+from slipid.control.estimator import Odometry
 from slipid.control.interface import MIXED, Settings
-from slipid.control.tuning import optimisers
+from slipid.control.tuning import objective, optimisers
 from slipid.deploy import tune
 from slipid.deploy.deploy import DRAWS, deploy, read_robot, write_robot
 from slipid.deploy.told import DIRECTIONS
@@ -102,6 +103,8 @@ def test_after_sampling_no_two_files_disagree(fitted, sampled):
 def test_gains_outlive_the_same_numbers_and_no_others(fitted, tmp_path, monkeypatch):
     monkeypatch.setattr(optimisers, "PARTICLES", 6)
     monkeypatch.setattr(tune, "JUDGED", 4)
+    # in the filter's place, which takes a minute to compile: gains are searched as with it
+    monkeypatch.setattr(objective, "Estimator", Odometry)
     out, fit = tmp_path / "out", load(fitted)
     shutil.copytree(fitted, out)
     done = invoke("tune", out, "--method", "pso", "--rollouts", "96", "--quiet")

@@ -117,7 +117,7 @@ class Program:
         self._process.stdin.flush()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # the loop of a twin in C is compared in the suite
 @NEEDS_COMPILER
 def test_the_program_drives_the_test_site_to_the_last_printed_digit(tmp_path):
     """One process is the robot, in C; the other is the world, in MuJoCo."""

@@ -40,7 +40,7 @@ print(seen.surface.tolist(), bool(seen.finite), command.shape)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # installs packages
 def test_a_robot_is_loaded_and_driven_with_jax_and_equinox_alone(tmp_path):
     made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"])
     deploy_known(made, highest_speed=8.0).save(tmp_path / "robot.json")

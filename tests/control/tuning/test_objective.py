@@ -27,6 +27,7 @@ from slipid.control.tuning.stability import Loop, linearised, spectral_radius
 from slipid.deploy import tune as app
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.progress import Reporter
+from tests.helpers.kept import kept
 from tests.helpers.small_twin import deployed, stacked
 
 HABITS = Habits(smooth=True)
@@ -104,7 +105,7 @@ def test_the_same_budget_is_the_same_number_of_rollouts(robots, cases):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("method", ["gradient", "pso"])
+@pytest.mark.parametrize("method", kept(["gradient", "pso"], ["pso"]))
 def test_a_search_betters_gains_by_hand_and_can_be_left(
     robots, cases, method, tmp_path, monkeypatch
 ):
