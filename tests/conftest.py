@@ -21,6 +21,8 @@ LONG = (
     "test_trial",
 )
 """Files that take longest."""
+MANY = 1_000_000
+"""Objects that were made since garbage was collected, from which on it is again."""
 
 # Set in the environment, so that commands and notebooks started by a test share them. The cache is
 # what keeps the second run of the suite short: most of the first is compilation.
@@ -117,15 +119,17 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="module", autouse=True)
 def _room_for_compiled_code():
-    """After each file garbage is collected, and compiled code forgotten before it is too much.
+    """After a file garbage is collected, and compiled code forgotten, before it is too much.
 
     Tracing makes many objects that live long, and looking through them all again and again took a
-    sixth of the suite: garbage is collected between files alone. Compiled functions hold memory
+    sixth of the suite: garbage is collected between files alone, and only after files that made
+    many objects, for a look takes a second. Compiled functions hold memory
     maps; at vm.max_map_count (65 530 by default) the next compilation is a segmentation fault.
     """
     gc.disable()
     yield
-    gc.collect()
+    if gc.get_count()[0] > MANY:
+        gc.collect()
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > 15_000:
         jax.clear_caches()

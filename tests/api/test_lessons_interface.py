@@ -8,6 +8,7 @@ import pytest
 import slipid as sl
 
 
+@pytest.mark.slow
 def test_made_runs_have_the_channels_and_the_truth_that_were_asked_for():
     slippery = {"surface.gray.creep": 0.4}
     made = sl.made_runs(["gray"], headings=3, speeds=[0.2], turns=0, truth=slippery, current=False)

@@ -119,6 +119,7 @@ def test_every_public_name_is_there():
         _ = sl.nonsense
 
 
+@pytest.mark.slow
 def test_setting_up_jax_says_what_it_did():
     code = "import slipid, jax; slipid.setup_jax(); print(jax.config.jax_enable_x64)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -332,6 +332,7 @@ def made_data(tmp_path, rng):
     return tmp_path / "data"
 
 
+@pytest.mark.slow
 def test_run_writes_report_and_figures(made_data, tmp_path):
     out = tmp_path / "out"
     files = paper_plots.run(made_data, out)

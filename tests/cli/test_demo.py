@@ -69,6 +69,7 @@ def test_a_seed_for_what_is_recorded_is_refused(tmp_path):
         demo.run(tmp_path, "recorded", 3, 1, Reporter(quiet=True))
 
 
+@pytest.mark.slow
 def test_the_recording_needs_neither_mujoco_nor_opencv(tmp_path):
     code = (
         "import sys\n"

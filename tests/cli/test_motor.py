@@ -69,6 +69,7 @@ def identified(bench):
     return bench / "out"
 
 
+@pytest.mark.slow
 def test_a_file_without_options(bench):
     result = invoke("motor", bench / "one.csv", "--out", bench / "single", "--quiet")
     assert result.exit_code == 0, result.output
@@ -79,6 +80,7 @@ def test_a_file_without_options(bench):
     assert (bench / "single" / "bench.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_json_on_stdout(bench):
     result = invoke("motor", bench / "one.csv", "--json", "-", "--quiet")
     assert json.loads(result.stdout)["drive"] == "motor"
@@ -185,6 +187,7 @@ def test_two_motors_of_a_config(identified):
     assert (identified / "bench_left.png").is_file()
 
 
+@pytest.mark.slow
 def test_check_says_what_there_is(bench):
     result = invoke("check", bench / "bench.toml", "--data", bench / "two", "--quiet")
     assert result.exit_code == 0
@@ -192,6 +195,7 @@ def test_check_says_what_there_is(bench):
     assert "motor.resistance@right" in result.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [
@@ -209,6 +213,7 @@ def test_what_needs_wheels_says_so(identified, bench, words):
     assert f"`slipid {words[0]}` does not apply" in result.output
 
 
+@pytest.mark.slow
 def test_a_bench_gives_a_robot_its_priors(identified):
     key = 'motor = "out/identified.json"'
     config = parsed(identified.parent / "robot.toml", ROBOT.format(motor=key))
@@ -237,6 +242,7 @@ def test_a_missing_bench_is_told_before_logs_are_read(tmp_path):
     assert "b.json: No such file" in result.output
 
 
+@pytest.mark.slow
 def test_real_logs_without_voltage(real_data):
     path = real_data / "robotino2021" / "motor_identification.csv"
     speeds = ",".join(f"motor{k}_output" for k in (1, 2, 3))

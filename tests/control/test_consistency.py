@@ -170,6 +170,7 @@ def test_a_late_fix_after_news_of_the_floors_does_not_count_the_hand_over_twice(
 # effects ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [1, 7, 200])
 def test_an_effect_correlates_over_a_turn_as_the_kernel_says_in_however_many_steps(steps):
     for turn in (0.0, 0.1, 0.3, np.pi):

@@ -34,6 +34,7 @@ def at(angle, speed, turn=0.0):
     return [np.asarray(x) for x in table().at(Course.of(way, BASE))]
 
 
+@pytest.mark.slow
 def test_the_table_is_met_at_its_rows_and_is_linear_between_them():
     for k in range(8):
         for speed, left in zip(SPEEDS, (0.3, 0.5, 0.7), strict=True):

@@ -174,6 +174,7 @@ def test_adversarial_steps(kind, steps):
     np.testing.assert_array_equal(np.asarray(ok).all(0), True, err_msg=str(names))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
@@ -191,6 +192,7 @@ def test_any_reading_leaves_a_sound_state(kind, data):
 # a wheel that is not heard -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_stops_where_a_wheel_falls_silent_and_goes_on_without_a_bump(kind):
     state, angle, command, rows = pilot(kind).init(), np.zeros(3), np.zeros(3), []
@@ -219,6 +221,7 @@ def test_a_pilot_that_wakes_on_a_moving_robot_starts_from_its_wheels():
     assert np.abs(np.asarray(said.command) - speed).max() <= LIMITS.acceleration * DT + 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_state_is_of_one_kind_from_the_start(kind):
     """Else a step is compiled twice."""
@@ -231,6 +234,7 @@ def test_a_state_is_of_one_kind_from_the_start(kind):
 # the parts -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_saturation_keeps_the_direction():
     rng = np.random.default_rng(0)
     for _ in range(50):
@@ -262,6 +266,7 @@ def wheels(twist):
     return np.asarray(robot().forward @ np.asarray(twist) / robot().frame.radius)
 
 
+@pytest.mark.slow
 def test_without_slip_it_is_the_encoders():
     f = robot()
     sticky = replace_floor(f)
@@ -282,6 +287,7 @@ def replace_floor(f):
     )
 
 
+@pytest.mark.slow
 def test_the_covariance_grows_and_a_fix_shrinks_it():
     est, _ = watch()
     state, said = drive(est.init(), 60, wheels([0.2, 0.0, 0.0]))
@@ -294,6 +300,7 @@ def test_the_covariance_grows_and_a_fix_shrinks_it():
     assert eigen.min() > -1e-12
 
 
+@pytest.mark.slow
 def test_a_late_fix_corrects_as_a_prompt_one_does():
     est, _ = watch()
     off, speed = np.array([0.05, -0.03, 0.1]), wheels([0.2, 0.05, 0.2])
@@ -352,6 +359,7 @@ def test_of_a_covariance_only_what_another_can_hold_is_set_aside():
             assert held[0, 0] >= part[0, 0] / max(1.16 * most, 1.0)
 
 
+@pytest.mark.slow
 def test_fixes_that_all_come_late_count_for_what_they_say():
     est, run = watch()
     speed, std = wheels([0.2, 0.05, 0.3]), np.array([0.001, 0.002])
@@ -375,6 +383,7 @@ def test_fixes_that_all_come_late_count_for_what_they_say():
         assert 0.6 * known < now < 2.0 * known
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("lost", [(), (20,), (20, 21, 22), tuple(range(3, 60, 4))])
 def test_readings_that_are_lost_do_not_make_the_way_longer(kind, lost):
@@ -420,6 +429,7 @@ def test_the_gyro_bias_is_learnt_at_rest_and_not_while_it_creeps():
     assert abs(float(state.place.nuisance[-1])) < 1e-9
 
 
+@pytest.mark.slow
 def test_heading_is_the_integral_of_a_gyro_without_bias_whatever_is_believed_of_the_floors():
     est, run = watch(Settings(gyro_bias_std=0.0))
     rng = np.random.default_rng(0)
@@ -605,6 +615,7 @@ def test_mecanum_wheels_miss_less_of_a_twist_by_the_contact_model():
     assert missed(speeds) < 0.5 * missed(plain)
 
 
+@pytest.mark.slow
 def test_what_is_believed_of_the_body_is_at_the_wheels_speeds_of_the_estimate():
     f, speed = robot(), wheels([0.15, -0.1, 0.4])
     _, said = drive(watch()[0].init(), 30, speed, current=np.full(3, 0.4))

@@ -96,6 +96,7 @@ def test_the_estimator_ends_nearer_than_encoders(driven):
     assert np.mean(ours) < (0.25 * np.mean(encoders) if slips else 1e-4), (ours, encoders)
 
 
+@pytest.mark.slow
 def test_wheels_of_a_drive_that_turn_alike_move_the_body_as_it_says(driven):
     robot, _ = driven
     rim = jnp.arange(1.0, robot.drives + 1)
@@ -115,6 +116,7 @@ def test_what_is_unsure_of_turns_on_the_spot_counts_in_full():
     assert yaw > 0.01
 
 
+@pytest.mark.slow
 def test_the_robot_survives_its_file(driven, tmp_path):
     robot, _ = driven
     robot.save(tmp_path / "robot.json")

@@ -37,6 +37,7 @@ def test_poses_drawn_have_the_mean_and_covariance_they_are_drawn_from():
     np.testing.assert_allclose(SPREAD.T @ SPREAD / len(SPREAD), np.eye(3), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_pose_that_is_known_has_the_floors_of_the_map():
     robot, there = deployed(), floor(CHESS)
     hypotheses = hypotheses_of(robot).under
@@ -104,6 +105,7 @@ def test_a_floor_met_on_one_side_of_an_edge_puts_the_pose_there():
     assert float(left[1, 1]) > 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("belief", [{0: 0.5, 1: 0.5}, {0: 0.99, 1: 0.01}, {1: 1.0}])
 def test_beliefs_that_nothing_has_changed_move_no_pose(belief):
     """However far from the map they are: their evidence has counted when it came."""

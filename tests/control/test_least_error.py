@@ -68,6 +68,7 @@ def test_known_floors_leave_little_of_what_wheels_without_slip_miss(k):
     assert np.max(left) < np.max(missed)
 
 
+@pytest.mark.slow
 def test_periods_lead_to_the_minimum():
     asked, p = jnp.array([0.05, -0.02, 0.1]), np.zeros(len(HYPOTHESES) + 1)
     p[[0, 3]] = 0.6, 0.4
@@ -82,6 +83,7 @@ def test_periods_lead_to_the_minimum():
     assert np.linalg.norm(slope(found)) < 1e-3 * np.linalg.norm(slope(plain(asked)))
 
 
+@pytest.mark.slow
 def test_what_runs_told_of_a_floor_is_made_up_for():
     """Runs told that the robot goes a tenth of its way to the left: it is sent to the right."""
     left = jnp.array([0.0, 0.1, 0.0, 1.0, 1.0, 1.0])
@@ -97,6 +99,7 @@ def test_what_runs_told_of_a_floor_is_made_up_for():
     assert abs(change[0]) < 0.3 * abs(change[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", range(len(HYPOTHESES)))
 def test_wheels_that_follow_late_come_to_rest_too(k):
     rng = np.random.default_rng(k)
@@ -157,6 +160,7 @@ def test_the_last_command_holds_the_next_one_back():
     assert (held > near).all()
 
 
+@pytest.mark.slow
 def test_the_derivative_of_the_equilibrium_is_that_of_differences():
     f, under = ROBOT, jnp.asarray([0, 1, 0])
     rim, most = jnp.array([0.1, -0.22, 0.05]), jnp.full(3, 1e3)
@@ -171,6 +175,7 @@ def test_the_derivative_of_the_equilibrium_is_that_of_differences():
         np.testing.assert_allclose(found[wheel], (ends[0] - ends[1]) / (2 * h), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_no_number_comes_out_of_a_belief_that_is_none():
     asked = jnp.array([0.2, 0.0, 0.0])
     seen = Believed(jnp.full(len(HYPOTHESES) + 1, jnp.nan), jnp.full((len(HYPOTHESES), 3), jnp.nan))

@@ -91,6 +91,7 @@ def same(a: DeployedRobot, b: DeployedRobot) -> None:
         np.testing.assert_array_equal(x, y, strict=True)
 
 
+@pytest.mark.slow
 def test_every_number_survives_to_the_last_bit(robot, path):
     again = DeployedRobot.load(path, load="moved")
     assert again.record == robot.record
@@ -110,6 +111,7 @@ def test_every_number_survives_to_the_last_bit(robot, path):
     assert len(text) < 20_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verdict", ["no better than by hand", "worse than by hand"])
 def test_gains_that_are_not_known_to_be_better_are_read_and_not_used(tmp_path, robot, verdict):
     gains = replace(GAINS, verdict=verdict)
@@ -238,6 +240,7 @@ def test_a_changed_digit_is_refused(path):
     assert "does not match its checksum" in refused(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -347,6 +350,7 @@ def loads(path: Path) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_damaged_bytes_give_a_robot_or_a_sentence(path):
     rng, good = random.Random(0), path.read_bytes()
     survived = 0

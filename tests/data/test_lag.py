@@ -75,6 +75,7 @@ def test_steady_motion_tells_no_lag():
     assert pose_lag(collect([run(0.4, seed, steady=True) for seed in range(3)])) is None
 
 
+@pytest.mark.slow
 def test_real_robots_have_the_lag_that_each_day_tells(real_data):
     from slipid.job.config import read_config
     from slipid.job.logs import read_dataset

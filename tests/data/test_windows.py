@@ -256,6 +256,7 @@ def test_a_slow_meter_is_even_between_its_readings(n):
     np.testing.assert_allclose(seldom.voltage_var / expected, 1.0, atol=0.5)
 
 
+@pytest.mark.slow
 def test_what_a_slow_meter_missed_is_covered_by_its_variance():
     """A voltage that jumps once, at any time between two readings: errors are as large as told."""
     off = []

@@ -180,6 +180,7 @@ def pilot(deployed, preview=0.0):
     return Pilot(Odometry(deployed), Controller(deployed, gains))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", reference.PATHS)
 def test_encoders_close_every_path_without_slip(deployed, name):
     start = (0.2, 0.1, -1.0)
@@ -192,6 +193,7 @@ def test_encoders_close_every_path_without_slip(deployed, name):
     assert abs(found.heading_error_deg) < 0.5
 
 
+@pytest.mark.slow
 def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(deployed):
     start = (0.2, 0.1, -1.0)
     path = reference.rectangle().moved(start)
@@ -218,6 +220,7 @@ def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
     assert far[1] < 0.905
 
 
+@pytest.mark.slow
 def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
     start = (0.0, 0.0, 0.0)
     path = reference.rectangle()
@@ -229,6 +232,7 @@ def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
     assert found.cross_track_rmse_mm > 30
 
 
+@pytest.mark.slow
 def test_of_a_curve_the_first_quarter_is_judged(deployed):
     start = (0.0, 0.0, 0.0)
     path = reference.circle(0.35)
@@ -239,6 +243,7 @@ def test_of_a_curve_the_first_quarter_is_judged(deployed):
     assert float(columns([run])["first_side_travelled"][0]) == pytest.approx(0.8, abs=0.03)
 
 
+@pytest.mark.slow
 def test_a_robot_that_does_not_move_has_its_whole_way_left(deployed):
     path = reference.rectangle()
     plant = Perfect(deployed, (0.0, 0.0, 0.0), 0.0)
@@ -424,6 +429,7 @@ def test_what_a_trial_cannot_do_is_said(tmp_path, deployed):
         tr._jobs(tmp_path, tr.Wish())
 
 
+@pytest.mark.slow
 def test_runs_of_another_path_or_speed_are_driven_anew(tmp_path, deployed):
     deployed.save(tmp_path / "robot.json")
 

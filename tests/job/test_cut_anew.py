@@ -33,6 +33,7 @@ def at_lag(task, lag):
     return replace(task.robot, camera=replace(task.robot.camera, lag=jnp.asarray(lag)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("off", "moves"), [(0.9 * ANEW_S, False), (1.1 * ANEW_S, True)])
 def test_windows_are_cut_at_the_expected_lag_unless_another_is_farther_off(task, off, moves):
     found = task.problem(at_lag(task, EXPECTED + off)).windows
@@ -41,6 +42,7 @@ def test_windows_are_cut_at_the_expected_lag_unless_another_is_farther_off(task,
     assert (found.turn == task.windows(at_lag(task, lag)).turn).all()
 
 
+@pytest.mark.slow
 def test_a_fit_goes_on_with_windows_at_the_lag_it_found(task, monkeypatch):
     problem, fitted = task.problem(), []
 

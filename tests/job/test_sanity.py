@@ -27,6 +27,7 @@ def test_a_sound_config_is_not_held_back(tmp_path):
     assert kinds(config(tmp_path)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("said", "instead", "kind"),
     [
@@ -46,6 +47,7 @@ def test_a_gear_that_is_wrong_in_both_places_is_named(tmp_path):
     assert kinds(config(tmp_path, robot, gear=1.0)) == ["wheel_scale"]
 
 
+@pytest.mark.slow
 def test_identify_refuses_and_says_how_to_go_on(tmp_path):
     file = config(tmp_path, ROBOT.replace("mass_kg = 12.0\n", ""))
     with pytest.raises(DataError, match=r"(?s)1\. mass_kg \(.*into \[robot\].*--anyway"):

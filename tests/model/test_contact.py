@@ -479,6 +479,7 @@ def test_energy_is_lost_at_every_wheel_and_the_motors_pay_for_it(name):
     np.testing.assert_allclose(paid[solved], lost[solved], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_no_wheel_pushes_harder_than_friction_allows():
     floors, rim, rest = cases("hard", 2000, seed=8)
     floors = eqx.tree_at(lambda f: f.slide_viscosity, floors, jnp.zeros(2000))

@@ -30,6 +30,7 @@ def test_a_drive_turns_all_its_wheels():
     np.testing.assert_allclose(SHARED.forward(), expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_motor_bears_all_wheels_of_its_drive_and_its_own_friction_once():
     drives, at = jnp.array([3.0, 6.0]), jnp.asarray(0)
     shared, own = robot(SHARED), robot(OWN)

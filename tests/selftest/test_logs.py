@@ -75,6 +75,7 @@ def test_logs_have_the_traps_of_real_ones(logs):
     assert 0.12 < start < 0.35
 
 
+@pytest.mark.slow
 def test_sessions_are_those_a_dataset_finds(logs):
     assert [default_session(log) for log in logs] == [d.session for d in PLAN]
     assert set(ROBOT.camera.sessions) == {d.session for d in PLAN}
@@ -127,6 +128,7 @@ def of_motion(name):
     return name.startswith(("camera", "process", "run"))
 
 
+@pytest.mark.slow
 def test_files_read_back_as_they_were_made(logs, tmp_path):
     paths = write_logs(logs, ROBOT, tmp_path / "data", tmp_path / "apart")
     assert paths == [tmp_path / "data" / log.name for log in logs]

@@ -277,6 +277,7 @@ def test_a_replicate_depends_on_seed_and_number_alone(tmp_path, monkeypatch):
     assert 0.2 < (spread / np.minimum(problem.space.prior_std, 0.5)).std() < 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("more", "said"),
     [

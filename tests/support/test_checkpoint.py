@@ -108,6 +108,7 @@ for k in range(100_000):
 """
 
 
+@pytest.mark.slow
 def test_a_kill_leaves_every_part_whole(tmp_path):
     rng = np.random.default_rng(0)
     kept, path = Checkpoint(tmp_path, "mine"), tmp_path / "part.json"

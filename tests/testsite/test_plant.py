@@ -68,6 +68,7 @@ def slip(trace: Trace, machine: Machine) -> float:
 # the engine
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", ["firm", "soft", "ribbed"])
 def test_a_robot_at_rest_gains_no_energy(surface):
     plant = standing(surface)
@@ -229,6 +230,7 @@ def test_the_centre_of_mass_is_where_it_is_put_also_with_uneven_wheels():
     np.testing.assert_allclose(centre, [0.01, 0.01], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_command_arrives_after_its_delay():
     for delay in (0.02, 0.12):
         trace = drive(straight("firm", "as_built", 0.0, 0.2, 0.1), Site(command_delay_s=delay), 0)
@@ -312,6 +314,7 @@ def test_a_gear_takes_its_part_of_what_drives_only():
     assert torque[0] == pytest.approx(0.8 * torque[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pi", "feed_forward", "cascade"])
 def test_every_speed_loop_drives_the_robot(kind):
     gains = {"pi": {}, "feed_forward": {"gain": 0.4}, "cascade": {"gain": 0.05, "integral": 1.0}}
@@ -363,6 +366,7 @@ def test_the_rectangle_is_driven_by_encoders_and_better_by_camera():
     assert closure["camera"] < 0.05 < closure["encoders"]
 
 
+@pytest.mark.slow
 def test_way_points_by_camera_are_reached():
     floor = uniform("medium")
     run = Wander(map="site", count=1, points=1).runs(floor, 5)[0]
@@ -373,6 +377,7 @@ def test_way_points_by_camera_are_reached():
     assert far < 0.06
 
 
+@pytest.mark.slow
 def test_the_same_seed_drives_the_same_run():
     run = straight("soft", "as_built", 1.0, 0.2, 0.2)
     one, same, other = (drive(run, Site(), seed) for seed in (1, 1, 2))

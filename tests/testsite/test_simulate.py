@@ -367,6 +367,7 @@ def corners(pose, machine, camera):
     return pixels(camera, np.c_[flat + pose[:2], np.full(4, machine.marker_height_m)])
 
 
+@pytest.mark.slow
 def test_the_marker_is_seen_where_the_camera_says(studio):
     book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     detector = cv2.aruco.ArucoDetector(book)
@@ -380,6 +381,7 @@ def test_the_marker_is_seen_where_the_camera_says(studio):
         np.testing.assert_allclose(found[0][0], corners(pose, Machine(), HALF), atol=1.2)
 
 
+@pytest.mark.slow
 def test_the_floor_has_its_colours_where_its_patches_are(studio):
     image = studio.frame(np.array([0.45, -0.2, 0.0]), np.zeros(3)).astype(float)
     for place, name in (((-0.3, 0.3), "firm"), ((0.9, 0.3), "medium"), ((0.0, -0.6), "short")):
@@ -390,6 +392,7 @@ def test_the_floor_has_its_colours_where_its_patches_are(studio):
         np.testing.assert_allclose(seen / seen.sum(), wanted / wanted.sum(), atol=0.03)
 
 
+@pytest.mark.slow
 def test_light_changes_and_motion_smears(studio):
     def still(t):
         return np.array([0.3, 0.2, 0.4])

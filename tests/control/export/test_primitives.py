@@ -290,11 +290,13 @@ def same(library, name, given):
             np.testing.assert_allclose(got, want, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_c_has_the_numbers_of_jax(library, name):
     same(library, name, lambda rng, shape: rng.normal(size=shape))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two numbers", "least", "truth", "functions", "reductions"])
 def test_c_has_the_numbers_of_jax_where_some_are_none(library, name):
     def broken(rng, shape):

@@ -29,6 +29,7 @@ def four() -> DeployedRobot:
 # files ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_file_says_of_which_robot_it_is(robot, files):
     head = [f"# {line}" for line in header(robot)]
     for name, text in files.items():
@@ -43,6 +44,7 @@ def test_every_file_says_of_which_robot_it_is(robot, files):
     assert all(line.isprintable() for line in header(robot))
 
 
+@pytest.mark.slow
 def test_every_file_is_in_the_readme(files):
     assert all(f"| `{name}` |" in files["README.md"] for name in files if name != "README.md")
 
@@ -194,6 +196,7 @@ def test_every_number_of_the_record_is_there(robot, node):
     assert count == sum(np.size(x) for name, x in node.items() if name.startswith(groups))
 
 
+@pytest.mark.slow
 def test_gains_and_limits_are_those_of_the_controller(robot):
     for load in LOADS:
         made = DeployedRobot.of(robot.record, load)
@@ -209,6 +212,7 @@ def test_gains_and_limits_are_those_of_the_controller(robot):
 # README --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_numbers_that_were_not_identified_are_warned_of(robot, files, four):
     text = files["README.md"]
     assert "> **WARNING.** NOT IDENTIFIED" in text

@@ -77,6 +77,7 @@ LAYOUTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_controllers_turn_wheels_as_the_robot_has_them(name):
     robot = known(LAYOUTS[name])
@@ -95,6 +96,7 @@ def test_controllers_turn_wheels_as_the_robot_has_them(name):
     assert "Its kinematics are the identified ones." in files["README.md"]
 
 
+@pytest.mark.slow
 def test_identified_sizes_stand_in_exactly(robot, files):
     p = parameters(files, "drive_controller.yaml", OMNI)
     assert p["robot_radius"] == float(robot.frame.base)
@@ -106,6 +108,7 @@ def test_identified_sizes_stand_in_exactly(robot, files):
     assert reach == pytest.approx(0.35, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_drives_that_are_off_are_met_on_average_and_told(robot, files):
     p = parameters(files, "drive_controller.yaml", OMNI)
     mean = np.mean(robot.record.parameters["robot.drive_offset"].value)
@@ -113,6 +116,7 @@ def test_drives_that_are_off_are_met_on_average_and_told(robot, files):
     assert "Its kinematics differ from the identified ones by 0.1778 %" in files["README.md"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shape",
     [
@@ -168,6 +172,7 @@ def test_variances_are_those_of_errors_that_are_drawn(errs):
     np.testing.assert_allclose(walked, [wide, wide, after[2]], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_slip_is_what_wheels_go_beyond_the_body(robot):
     speed, ways, forward = top_speed(robot), np.arange(24) * np.pi / 12, np.asarray(robot.forward)
     for k, errs in enumerate(errs_of(robot)):
@@ -185,6 +190,7 @@ def test_slip_is_what_wheels_go_beyond_the_body(robot):
         assert errs.effect == tuple(robot.effect[k].tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [doubtful, mecanum_robot])
 def test_covariances_are_those_of_the_floor_and_by_default_of_the_worst(made):
     robot = made()

@@ -55,6 +55,7 @@ def test_a_program_that_was_read_back_says_what_the_pilot_says(folder):
         kept, many = list(found[: len(kept)]), list(both[: len(kept)])
 
 
+@pytest.mark.slow
 def test_it_says_what_its_arrays_are(folder):
     program = load_program(folder)
     s = program.signature
@@ -66,6 +67,7 @@ def test_it_says_what_its_arrays_are(folder):
     assert next(x.about for x in s.given if x.name == "reading.gyro") == "yaw rate [rad/s]"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_a_lost_or_damaged_file_is_one_sentence(folder, name):
     data = (folder / name).read_bytes()

@@ -67,6 +67,7 @@ def test_rows_of_a_matrix_say_which_wheel_and_part_of_the_twist(robot):
     assert by_name["inverse[W]", "wheel 3"] == float(robot.inverse[2, 2])
 
 
+@pytest.mark.slow
 def test_verdicts_warn(robot):
     sure = {row["name"]: row["verdict"] for row in table(robot)}
     assert sure["motor.resistance"] == "NOT IDENTIFIED"

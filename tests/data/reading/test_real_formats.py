@@ -61,12 +61,14 @@ def test_every_run_of_2022_reads(robotino2022):
         assert swapped_order(turned, asked) is None
 
 
+@pytest.mark.slow
 def test_frames_repeat_as_a_29_hz_camera_does(robotino2022):
     logs = [log for logs in robotino2022.values() for log in logs]
     repeated = np.concatenate([~log.pose_fresh[1:] for log in logs])
     assert repeated.mean() == pytest.approx(0.086, abs=0.005)
 
 
+@pytest.mark.slow
 def test_axes_and_scale_of_the_camera_on_the_table(robotino2022):
     """Where wheels grip, pose and wheels must agree but for the scale: this fixes every sign."""
     ratios, turns = [], []

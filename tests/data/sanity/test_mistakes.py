@@ -26,6 +26,7 @@ def alarms(runs, geometry):
 FEW = [(m, DRIVES[k % 3]) for k, m in enumerate(MISTAKES[::5])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mistake", "robot"), FEW, ids=lambda x: x.name)
 def test_a_few_are_named(mistake, robot):
     test_it_is_named(robot, mistake)

@@ -45,6 +45,7 @@ def off(found: BenchFit, path: str, true: float) -> float:
 # recovery ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [100, 200, 1000])
 def test_a_motor_is_recovered(rows, rate):
     found = fitted(made.logged(rows, rate, seed=2))
@@ -59,6 +60,7 @@ def test_a_motor_is_recovered(rows, rate):
         assert found.parameters[f"motor.{name}"].verdict == "identified"
 
 
+@pytest.mark.slow
 def test_without_noise_it_is_exact(rows):
     found = fitted(made.logged(rows, 1000, 0, SILENT, SILENT))
     for path, true in made.truth(made.FLYWHEEL).items():
@@ -66,6 +68,7 @@ def test_without_noise_it_is_exact(rows):
             assert found.parameters[path].value == pytest.approx(true, rel=1e-5, abs=1e-6), path
 
 
+@pytest.mark.slow
 def test_inductance_needs_rows_in_its_time_constant():
     quick = made.driven(made.FLYWHEEL, 3.0, 0.0, made.quick_steps)
     fast = fitted(made.logged(quick, 10_000))
@@ -77,6 +80,7 @@ def test_inductance_needs_rows_in_its_time_constant():
     assert any("not identified at this rate" in text for text in slow.messages)
 
 
+@pytest.mark.slow
 def test_a_bare_rotor_is_too_quick_for_slow_rows():
     found = fitted(made.logged(made.driven(made.ROTOR), 100))
     assert found.parameters["motor.rotor_inertia"].verdict == "not_identified"
@@ -201,6 +205,7 @@ def test_at_one_speed_nothing_is_identified(record):
     assert any("keep to one value" in text for text in found.messages)
 
 
+@pytest.mark.slow
 def test_a_misfit_is_named_and_lowers_verdicts(record):
     """Friction that falls with speed is none of the model's."""
     odd = 0.15 * np.sin(record.speed / 60.0)
@@ -211,6 +216,7 @@ def test_a_misfit_is_named_and_lowers_verdicts(record):
     assert found.parameters["motor.coulomb_friction"].verdict != "identified"
 
 
+@pytest.mark.slow
 def test_what_is_fixed_stays(record):
     found = fitted(record, choices=[Choice("motor.brush_drop", fixed=0.1)])
     e = found.parameters["motor.brush_drop"]

@@ -280,6 +280,7 @@ def logs():
     return make_logs(truth(PLAN), PLAN, 1, Sensors())
 
 
+@pytest.mark.slow
 def test_a_turn_on_the_spot_has_no_speed_to_leave_out(logs):
     spin = make_logs(truth(PLAN), [Drive("soft", "as_built", 0.0, 0.0, 0.5)], 1, Sensors())
     fold = folds_of(collect([*logs, *spin]), "speeds")
@@ -287,6 +288,7 @@ def test_a_turn_on_the_spot_has_no_speed_to_leave_out(logs):
     assert fold[-1] == -1
 
 
+@pytest.mark.slow
 def test_runs_that_nothing_could_be_fitted_for_are_never_left_out(logs):
     slow = [log for log in logs if np.hypot(*np.median(log.twist_command, axis=0)[:2]) < 0.2]
     assert sorted(set(folds_of(collect(logs), "speeds"))) == [0, 1]

@@ -27,6 +27,7 @@ def found(w, choices=()):
     return dict(zip(problem.noise.names, std.tolist(), strict=True)), typical
 
 
+@pytest.mark.slow
 def test_noise_is_found_where_it_is_and_what_is_typical_elsewhere():
     std, typical = found(made(ROBOT, runs=192, count=4, seed=1, std=NOISY))
     for name, true in NOISY.items():
@@ -39,6 +40,7 @@ def test_noise_is_found_where_it_is_and_what_is_typical_elsewhere():
             assert std[name] == pytest.approx(typical[name])
 
 
+@pytest.mark.slow
 def test_runs_too_few_to_be_predicted_from_each_other_scatter_far():
     w = made(ROBOT, runs=192, count=4, seed=1, std=NOISY)
     few = w.pieces(np.flatnonzero(np.asarray(w.surface) == "soft")[:3])
@@ -47,6 +49,7 @@ def test_runs_too_few_to_be_predicted_from_each_other_scatter_far():
     assert np.isfinite(list(found(alone)[0].values())).all()
 
 
+@pytest.mark.slow
 def test_where_a_robot_stands_the_noise_of_the_camera_is_no_scatter():
     w = made(ROBOT, runs=96, count=4, seed=2, std=NOISY)
     moving = found(w)[0]
@@ -59,6 +62,7 @@ def test_where_a_robot_stands_the_noise_of_the_camera_is_no_scatter():
         assert standing[name] < 1.4 * moving[name], name
 
 
+@pytest.mark.slow
 def test_a_marker_whose_place_is_unknown_is_no_scatter_of_turning_runs():
     w = made(ROBOT, runs=96, count=4, seed=2, std=NOISY)
     place = np.array([0.12, -0.09])

@@ -47,6 +47,7 @@ def with_truth(name):
     return replace(ALL[name], state=state)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TRUE)
 def test_a_curve_finds_the_curve_that_made_the_data(name):
     truth = with_truth(name)
@@ -55,6 +56,7 @@ def test_a_curve_finds_the_curve_that_made_the_data(name):
         np.testing.assert_allclose(found.state[floor], beta, atol=2e-5, err_msg=floor)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TRUE)
 def test_a_curve_predicts_runs_it_has_not_seen(name):
     truth = with_truth(name)
@@ -126,6 +128,7 @@ def test_the_lookup_learns_a_smooth_series_of_each_floor_and_load():
     assert np.abs(gap).mean() < 0.05 * np.abs(plain).mean()
 
 
+@pytest.mark.slow
 def test_the_lookup_is_tuned_on_runs_left_out_as_they_will_be():
     """Where a sector is left out it has to be held down harder than where it interpolates."""
     w = made(ROBOT, runs=96, count=2, seed=4)
@@ -144,6 +147,7 @@ def test_the_lookup_is_tuned_on_runs_left_out_as_they_will_be():
     assert size["sectors"] < 0.6 * size["at random"]
 
 
+@pytest.mark.slow
 def test_a_lookup_that_has_nothing_to_leave_out_is_tuned_on_random_runs():
     w = made(ROBOT, runs=48, count=2, seed=4)
     one = replace(ALL["heading_lookup"], together=np.where(w.run < 20, 3, -1))
@@ -160,6 +164,7 @@ def test_the_lookup_lends_a_load_it_never_saw_the_series_of_another():
     np.testing.assert_array_equal(rung.increments(w, ROBOT), rung.increments(as_built, ROBOT))
 
 
+@pytest.mark.slow
 def test_rungs_come_back_from_their_names_and_numbers():
     fitted = [rung.fit(driven(windows(), with_truth("affine")), ROBOT) for rung in ALL.values()]
     states = {r.name: {f: v.tolist() for f, v in r.state.items()} for r in fitted}

@@ -133,6 +133,7 @@ def test_runs_of_a_session_cannot_average_away_what_they_share():
     assert (np.diag(found) > 1.05 * np.diag(apart)).any()
 
 
+@pytest.mark.slow
 def test_known_undoes_covariance():
     now = start(False, False).plus(rows(False, False))
     again = info.known(now.covariance, now.is_electric)
@@ -196,6 +197,7 @@ def test_greedy_stops_at_its_target():
 # physics ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_long_run_is_worth_less_than_two_and_a_second_one_its_share():
     this, prior = planner(False, False), start(False, False)
     one, long = this.rows([DRIVES[0], replace(DRIVES[0], distance=1.4)]).motion

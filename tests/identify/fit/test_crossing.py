@@ -264,6 +264,7 @@ def test_electric_numbers_that_move_motion_are_marginalised_first():
 # where wheels stand -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_wheels_stand_where_the_camera_says_less_the_marker():
     true = made_robot()
     true = eqx.tree_at(lambda r: r.camera.marker_yaw, true, jnp.asarray(0.1))
@@ -290,6 +291,7 @@ def driven():
 RIGHT = [[0.0, -9.0], [9.0, -9.0], [9.0, 9.0], [0.0, 9.0]]
 
 
+@pytest.mark.slow
 def test_windows_in_which_no_wheel_changes_floors(driven):
     true, data = driven
     half = from_polygons("soft", [("firm", RIGHT)], (-3.0, -3.0, 3.0, 3.0))
@@ -309,6 +311,7 @@ def test_windows_in_which_no_wheel_changes_floors(driven):
     assert rim.max(axis=2)[whole.counts].min() >= cut.LEAST_SPEED
 
 
+@pytest.mark.slow
 def test_windows_of_a_run_stand_in_a_row_and_two_maps_go_together(driven):
     true, data = driven
     floor = uniform("soft", 3.0)
@@ -329,6 +332,7 @@ def test_windows_of_a_run_stand_in_a_row_and_two_maps_go_together(driven):
     np.testing.assert_array_equal(both.windows.turn[-1], one.windows.turn[0])
 
 
+@pytest.mark.slow
 def test_runs_without_a_window_are_refused(driven, monkeypatch):
     true, data = driven
     monkeypatch.setattr(cut, "LEAST_SPEED", 9.0)

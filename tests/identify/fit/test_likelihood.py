@@ -110,6 +110,7 @@ def test_every_number_but_the_known_silent_ones_moves_the_residuals(everything):
     assert silent == {"motor.inductance", "motor.rotor_inertia", "robot.yaw_inertia"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signed", [True, False])
 def test_voltages_are_predicted_from_what_is_expected_of_the_true_current(truth, signed):
     """A normal around the predicted current, seen with the ammeter's noise."""
@@ -241,6 +242,7 @@ def test_inverse_root_is_numpy_s(size):
 # weights and information
 
 
+@pytest.mark.slow
 def test_the_loss_is_a_student_t_per_run(everything):
     """Up to a constant, against scipy's multivariate t."""
     z = everything.space.start
@@ -264,6 +266,7 @@ def test_the_loss_is_a_student_t_per_run(everything):
     assert ours(typical) - ours(other) == pytest.approx(theirs(typical) - theirs(other), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_whitened_residuals_are_weighted_mahalanobis_distances(everything):
     blocks = everything.linear(everything.space.start, electric_noise(everything.batch, 0.05))[0]
     log_v = 2 * np.log(everything.noise.typical)
@@ -489,6 +492,7 @@ def fitted(problem, jacobian, y, std):
 # electric noise: voltages tell of the scatter of currents, too
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ammeter", [2e-4, 5e-3])
 def test_scoring_steps_end_where_the_loss_is_level_in_electric_noise(truth, ammeter):
     w = made(truth, runs=48, std=NOISE)
@@ -517,6 +521,7 @@ def test_scoring_steps_end_where_the_loss_is_level_in_electric_noise(truth, amme
             assert (loss(step) - loss(-step)) / 2e-4 == pytest.approx(0.0, abs=0.01), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signed", [True, False])
 def test_the_trend_of_currents_is_of_their_sizes_over_the_encoders_speed(signed):
     truth = robot()

@@ -124,6 +124,7 @@ def test_new_paces_keep_the_variance_of_the_process(mirror):
 # marginalised -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_loss_is_the_marginal_likelihood_of_all_runs(problem):
     """With weights and roots held, against one Gaussian of all residuals."""
     keep, none = np.ones(RUNS), np.zeros((RUNS, 3))
@@ -146,6 +147,7 @@ def test_the_loss_is_the_marginal_likelihood_of_all_runs(problem):
     assert found[0] != pytest.approx(found[1], rel=0.01)
 
 
+@pytest.mark.slow
 def test_effects_found_are_their_conditional_mean(problem):
     log_v, keep = log_variance(problem), np.ones(RUNS)
     blocks, _ = motion(problem, log_v)
@@ -159,6 +161,7 @@ def test_effects_found_are_their_conditional_mean(problem):
     np.testing.assert_allclose(flat - np.asarray(left).ravel(), expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_spread_of_residuals_is_that_of_numbers_and_effects_together(problem):
     """Posterior covariance of J z + E e, with the whole information of both written out."""
     log_v, keep = log_variance(problem), np.ones(RUNS)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from slipid.data.windows import UNREAD
 from slipid.identify.fit.problem import Problem
@@ -21,6 +22,7 @@ def weights(w):
     return {k: np.asarray(jnp.einsum("nij,nj->ni", root[k], residual[k])) for k in root}
 
 
+@pytest.mark.slow
 def test_what_was_not_read_weighs_nothing():
     w = made(ROBOT, runs=6, count=4, voltage=True)
     hidden = np.zeros_like(w.current)

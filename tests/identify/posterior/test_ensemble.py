@@ -166,6 +166,7 @@ def test_moments_are_within_three_monte_carlo_errors_or_it_says_so(case, seed):
     np.testing.assert_array_less(np.abs(flat.std(axis=0) - std) / of_std, 3.5)
 
 
+@pytest.mark.slow
 def test_ensembles_in_different_modes_are_not_reported():
     """Modes so far apart that nothing leads from one to the other."""
 
@@ -181,6 +182,7 @@ def test_ensembles_in_different_modes_are_not_reported():
         assert not found.converged
 
 
+@pytest.mark.slow
 def test_an_interrupted_chain_goes_on_as_if_it_had_not_been():
     target, _, _ = gaussian()
     plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=6)
@@ -194,6 +196,7 @@ def test_an_interrupted_chain_goes_on_as_if_it_had_not_been():
             np.testing.assert_array_equal(one.log_prob, other.log_prob)
 
 
+@pytest.mark.slow
 def test_the_seed_decides():
     target, _, _ = banana()
     plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1,), most=3)
@@ -257,6 +260,7 @@ def state_of(target, u):
     return model, State(u, log_prob=log_prob, blobs=terms, copy=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [0, 1])
 def test_a_hamiltonian_move_is_exact_and_independent_for_a_gaussian(exact, which):
     target, u = exact
@@ -286,6 +290,7 @@ def two_widths():
     return target.seen_by(target.laplace()), precision
 
 
+@pytest.mark.slow
 def test_each_group_goes_its_own_hamiltonian_way():
     """With steps that are long for one group only that one is thrown back, and both stay exact."""
     target, precision = two_widths()
@@ -314,6 +319,7 @@ def test_a_walker_whose_slope_is_lost_stays_with_all_its_groups():
     assert moved[:100].mean() == 0  # they are refused, wherever the way led
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("groups", [(0, 1), None])
 def test_walking_along_a_coordinate_keeps_the_distribution(bent, groups):
     """Exact draws of what a bent map makes of a Gaussian stay that."""

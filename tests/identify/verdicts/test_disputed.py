@@ -41,6 +41,7 @@ def problem():
     return problem_of(robot(), runs=24)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1.0, 4.0])
 def test_sigma_is_that_of_the_likelihood_alone(problem, size):
     """What floors say is put together with the prior by Bayes' theorem, and taken apart again."""
@@ -77,6 +78,7 @@ def test_a_floor_with_another_law_is_named(bias):
     assert [d.floors for d in found] == [("firm", "soft")] * (bias > 0)
 
 
+@pytest.mark.slow
 def test_only_loads_that_were_identified_are_disputed(problem):
     space = problem.space
     tight = np.diag(np.full(space.size, 1e-4))

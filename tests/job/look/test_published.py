@@ -25,6 +25,7 @@ def test_robotino_2022(real_data):
     assert "layouts" not in tomllib.loads(config.text)
 
 
+@pytest.mark.slow
 def test_robotino_2021(real_data):
     _, config = proposed(real_data / "robotino2021")
     assert set(formats(config)) == {"robotino2021", "robotino2021_field"}

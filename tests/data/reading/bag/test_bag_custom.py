@@ -129,6 +129,7 @@ def test_standard_types_need_no_definition_in_the_bag(tmp_path):
     np.testing.assert_allclose(run.signals["wheel_angle"].values, ANGLE)
 
 
+@pytest.mark.slow
 def test_messages_with_ever_new_texts_are_read_too(tmp_path):
     said = [
         Said(

@@ -165,6 +165,7 @@ def test_messages_that_wait_in_a_log_beside_the_bag(tmp_path, whole):
 # damaged anywhere
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("storage", ["rosbag1", "sqlite3", "mcap", "chunks"])
 def test_a_bag_cut_anywhere_is_read_or_refused(tmp_path, whole, storage):
     ends = np.random.default_rng(1).uniform(0.0, 1.0, 40)
