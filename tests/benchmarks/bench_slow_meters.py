@@ -3,7 +3,7 @@
     make bench
     .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks/bench_slow_meters.py
 
-(about four minutes). Rows are 31 ms apart; a meter that is read in every 16th is read twice a
+(about seven minutes). Rows are 31 ms apart; a meter that is read in every 16th is read twice a
 second. Prints how far R and C_e are from the truth, the std that was told, and their ratio. Asserts
 that no number is more than 3.5 of its stds off.
 """
