@@ -13,8 +13,6 @@ NORMAL_STD = 0.6827
 """Part of a normal distribution that is within one std."""
 UNREAD = 1e6
 """Variance of what was not read, so large that it tells nothing [A^2, V^2]."""
-
-
 PerWindow = Float[np.ndarray, "window wheel"]
 
 
@@ -237,32 +235,33 @@ def _mean(
         return np.diff(interpolate(bounds, summed, at), axis=0)
 
     read = np.broadcast_to(live[:, None], x.shape)
-    jump = np.zeros(x.shape)
+    unseen = np.zeros(x.shape)
     if fresh is not None:
         read = read & fresh
         each = [_between(time, x[:, k], read[:, k]) for k in range(x.shape[1])]
-        x, jump = (np.stack(column, axis=-1) for column in zip(*each, strict=True))
+        x, unseen = (np.stack(column, axis=-1) for column in zip(*each, strict=True))
     told = cell * live[:, None]
     seconds = total(told)
     moving = seconds > 1e-9
     safe = np.where(moving, seconds, 1.0)
     mean = np.where(moving, total(x * told) / safe, total(x * cell) / total(cell))
     count = np.where(moving, total(read.astype(float)), 0.0)
-    return mean, count, total(jump * told) / safe**2
+    return mean, count, total(unseen * told) / safe**2
 
 
 def _between(
     time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], read: Bool[np.ndarray, " row"]
 ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " row"]]:
-    """What was read, even between two readings, and in rows between them (jump)^2 seconds / 12.
+    """What was read, even between two readings; and what a jump there would do, by the second.
 
-    Summed over the time of such rows, the latter is the variance of the integral of what a meter
-    did not see; it is zero where it was read in neighbouring rows.
+    The latter is step^2 seconds / 12 in rows from a reading to the next: summed over their time,
+    the variance of the integral of what a meter did not see. It is zero where neighbouring rows
+    were read.
     """
     if not read.any():
         return x, np.zeros_like(x)
     at = np.flatnonzero(read)
     rows, seconds = np.diff(at), np.diff(time[at])
-    jump = np.zeros_like(x)
-    jump[at[0] : at[-1]] = np.repeat(np.diff(x[at]) ** 2 * seconds / 12 * (rows > 1), rows)
-    return np.interp(time, time[read], x[read]), jump
+    unseen = np.zeros_like(x)
+    unseen[at[0] : at[-1]] = np.repeat(np.diff(x[at]) ** 2 * seconds / 12 * (rows > 1), rows)
+    return np.interp(time, time[read], x[read]), unseen

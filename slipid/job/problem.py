@@ -12,7 +12,7 @@ from slipid.data.runs import Runs
 from slipid.data.sanity.columns import refuse_misordered
 from slipid.data.windows import Windows, windows
 from slipid.identify.fit.problem import Problem, still_viscosities
-from slipid.job.bench.priors import bench_priors
+from slipid.job.bench.priors import bench_of, bench_priors
 from slipid.job.config import Config, FitSection, Logs, geometry, one_floor
 from slipid.job.logs import files_of, read_dataset
 from slipid.job.weights import share_priors
@@ -104,9 +104,9 @@ class Job(Task):
 def read_job(config: Config, root: Path, report: Reporter) -> Job:
     """Read every log of runs on one floor that the config names, and set up its robot.
 
-    What the bench told of its motor comes first: a file that is missing costs no reading of logs.
+    The bench's file of its motor is looked at first: one that is missing costs no reading of logs.
     """
-    bench_priors(config, gear_ratio=1.0)
+    bench_of(config)
     report.stage("reading logs")
     dataset, skipped = read_dataset(config, one_floor(config.content.logs), root, report)
     return job_of(config, dataset, skipped, report)

@@ -8,47 +8,18 @@ second. Prints how far R and C_e are from the truth, the std that was told, and 
 that no number is more than 3.5 of its stds off.
 """
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 
-from slipid.data.log import Log
 from slipid.data.runs import collect
-from slipid.data.windows import windows
-from slipid.identify.fit.optimise import optimise
-from slipid.identify.fit.problem import Problem
-from slipid.identify.result import summarise
-from slipid.model.robot import Robot, build
 from slipid.selftest.known import Sensors
 from slipid.selftest.logs import make_logs
-from tests.helpers.kinds import SHAPES, known, plan, wanted
+from tests.helpers.kinds import SHAPES, fitted, known, plan, wanted
+from tests.helpers.slow_meters import held
 
 EVERY = (1, 4, 16)
 """Rows from one reading of the meters to the next."""
 SEEDS = (0, 1, 2)
 FINE = Sensors(ripple=0.005, current_step=0.002, voltage_step=0.005, signed=True)
-
-
-def held(log: Log, rows: int, first: int) -> Log:
-    """The log, had its meters been read once in so many rows and held in between."""
-    number = np.arange(log.samples)
-    read = number % rows == first % rows
-    read[0] = True
-    last = np.maximum.accumulate(np.where(read, number, 0))
-    fresh = np.repeat(read[:, None], log.wheel_angle.shape[1], axis=1)
-    kept = {"current": log.current[last], "voltage": log.voltage[last]}
-    return replace(log, **kept, current_fresh=fresh, voltage_fresh=fresh)
-
-
-def fitted(truth: Robot, logs: list[Log]):
-    data = collect(logs)
-    choices = wanted(truth, data)
-    labels = truth.surfaces.labels, truth.body.loads, truth.camera.sessions
-    radius, lag = float(truth.geometry.wheel_radius), float(truth.camera.lag)
-    w = windows(data, radius, lag, longest=2.0)
-    problem = Problem(w, build(truth.geometry, *labels), list(choices))
-    return summarise(problem, optimise(problem), data, choices)
 
 
 @pytest.mark.parametrize("kind", ["differential", "skid"])
@@ -60,7 +31,8 @@ def test_what_slow_meters_tell(kind):
         truth = known(SHAPES[kind], drives)
         logs = make_logs(truth, drives, seed, FINE)
         for rows in EVERY:
-            fit = fitted(truth, [held(log, rows, 7 * k) for k, log in enumerate(logs)])
+            data = collect([held(log, rows, 7 * k) for k, log in enumerate(logs)])
+            fit = fitted(truth, data, wanted(truth, data))
             assert fit.converged, fit.reason
             for name in ("motor.back_emf", "motor.resistance"):
                 (entry,) = (e for e in fit.space.free if e.path == name)

@@ -14,6 +14,7 @@ from slipid.data.runs import MOVED, collect, first_row
 from slipid.data.wheel_signals import integral
 from slipid.data.windows import ammeter_variance, windows
 from slipid.support.errors import DataError
+from tests.helpers.slow_meters import held
 
 RADIUS = 0.04
 
@@ -229,34 +230,31 @@ def test_means_of_what_grows_are_those_of_the_middle_of_the_window(lag):
     np.testing.assert_allclose(w.voltage[0], middle[:, None] * np.ones(3), atol=step**2)
 
 
-def every(log, n, at=0):
-    """The log, had its meters been read in every n-th row and held until they were read again."""
-    number = np.arange(log.samples)
-    read = number % n == at
-    read[0] = True
-    last = np.maximum.accumulate(np.where(read, number, 0))
-    fresh = np.repeat(read[:, None], 3, axis=1)
-    held = {"current": log.current[last], "voltage": log.voltage[last]}
-    return replace(log, **held, current_fresh=fresh, voltage_fresh=fresh)
-
-
 @pytest.mark.parametrize("n", [3, 5])
 def test_a_slow_meter_is_even_between_its_readings(n):
     """What grows evenly has the same mean, however seldom it is read; readings count once."""
     blank = run()
     grows = 2.0 + 3.0 * blank.time[:, None] * np.ones(3)
     log = replace(blank, current=grows, voltage=grows, current_is_signed=True)
-    often, seldom = (windows(collect([one]), RADIUS, per_piece=2) for one in (log, every(log, n)))
-    held = log.time[n] - log.time[0]  # the last reading of a log has no next one
-    np.testing.assert_allclose(seldom.voltage, often.voltage, atol=3.0 * held**2)
-    np.testing.assert_allclose(seldom.current, often.current, atol=3.0 * held**2)
+    often, seldom = (windows(collect([one]), RADIUS, per_piece=2) for one in (log, held(log, n)))
+    gap = log.time[n] - log.time[0]  # the last reading of a log has no next one
+    np.testing.assert_allclose(seldom.voltage, often.voltage, atol=3.0 * gap**2)
+    np.testing.assert_allclose(seldom.current, often.current, atol=3.0 * gap**2)
     assert (often.voltage_var == 0.0).all()
-    # T / held gaps, and a jump of 3 held anywhere in each
-    expected = (3.0 * held) ** 2 / 12 * held / seldom.dt[..., None]
+    # T / gap gaps, and a jump of 3 gap anywhere in each
+    expected = (3.0 * gap) ** 2 / 12 * gap / seldom.dt[..., None]
     np.testing.assert_allclose(seldom.voltage_var / expected, 1.0, atol=0.5)
 
 
 @pytest.mark.slow
+def test_a_meter_that_is_read_in_every_row_misses_nothing():
+    """Whether a log says so, or says nothing of it."""
+    log = run(pose_fresh=None)
+    often, said = (windows(collect([one]), RADIUS, per_piece=2) for one in (log, held(log, 1)))
+    for name in ("current", "voltage", "current_var", "voltage_var"):
+        np.testing.assert_array_equal(getattr(said, name), getattr(often, name))
+
+
 def test_what_a_slow_meter_missed_is_covered_by_its_variance():
     """A voltage that jumps once, at any time between two readings: errors are as large as told."""
     off = []
@@ -264,7 +262,7 @@ def test_what_a_slow_meter_missed_is_covered_by_its_variance():
         blank = run(seconds=6.0)
         jumps = blank.time[:, None] > 7.0 + 0.05 * k
         log = replace(blank, voltage=np.where(jumps, 5.0, 1.0) * np.ones(3))
-        often, seldom = (windows(collect([x]), RADIUS, per_piece=2) for x in (log, every(log, 15)))
+        often, seldom = (windows(collect([x]), RADIUS, per_piece=2) for x in (log, held(log, 15)))
         told = seldom.voltage_var > 1e-9
         gap = seldom.voltage - often.voltage
         np.testing.assert_allclose(gap[~told], 0.0, atol=1e-9)

@@ -6,7 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from slipid.data.runs import Runs, collect
+from slipid.data.windows import windows
 from slipid.identify.design.planned_runs import Drive
+from slipid.identify.fit.optimise import optimise
+from slipid.identify.fit.problem import Problem
+from slipid.identify.result import Fit, summarise
 from slipid.job.problem import told_lag
 from slipid.model.geometry import Geometry, differential, mecanum, omni, skid_steer
 from slipid.model.robot import Robot, build
@@ -50,6 +54,15 @@ def known(shape: Geometry, drives: Sequence[Drive]) -> Robot:
     robot = build(shape, list(FLOORS), ("as_built",), sorted({d.session for d in drives}))
     choices = [Choice(path, fixed=value) for path, value in numbers(robot).items()]
     return Space(robot, choices).template
+
+
+def fitted(truth: Robot, data: Runs, choices: Sequence[Choice]) -> Fit:
+    """Windows at the lag that a fit starts from, a problem on them, its optimum and its summary."""
+    start = Space(truth, choices).template
+    labels = truth.surfaces.labels, truth.body.loads, truth.camera.sessions
+    w = windows(data, float(start.geometry.wheel_radius), float(start.camera.lag), longest=2.0)
+    problem = Problem(w, build(truth.geometry, *labels), list(choices))
+    return summarise(problem, optimise(problem), data, choices)
 
 
 def plan(shape: Geometry, headings: int) -> tuple[Drive, ...]:

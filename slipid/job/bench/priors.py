@@ -30,21 +30,41 @@ class Told:
     verdict: str
 
 
+@dataclass(frozen=True)
+class Bench:
+    """A bench's file, and its numbers by name, one for each of its motors."""
+
+    path: Path
+    numbers: Mapping[str, list[Told]]
+
+
+def bench_of(config: Config) -> Bench | None:
+    """The bench that the config names, None where it names none.
+
+    Raises:
+        DataError: the file is missing, damaged, or of no bench.
+    """
+    named = config.content.wheels.motor
+    if named is None:
+        return None
+    # a result keeps a copy, so that later commands need no other folder
+    kept = config.path.parent / KEPT
+    path = kept if kept.is_file() else config.path.parent / named
+    return Bench(path, _read(path, f"{config.path}: robot.motor"))
+
+
 def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[str]]:
     """Priors of `motor.*` from the file that the config names, and lines about what was not taken.
 
     At the wheel a friction of the shaft is n times, per wheel speed n^2 times as large.
 
     Raises:
-        DataError: the file is missing, or no motor was identified in it.
+        DataError: as of `bench_of`.
     """
-    named = config.content.wheels.motor
-    if named is None:
+    bench = bench_of(config)
+    if bench is None:
         return [], []
-    # a result keeps a copy, so that later commands need no other folder
-    kept = config.path.parent / KEPT
-    path = kept if kept.is_file() else config.path.parent / named
-    told = read_bench(path, f"{config.path}: robot.motor")
+    path, told = bench.path, bench.numbers
     choices, left = [], []
     for name in TAKEN:
         sure = [t for t in told.get(name, []) if t.verdict == "identified"]
@@ -70,7 +90,7 @@ def _pooled(sure: list[Told]) -> tuple[float, float]:
     return float(np.mean(values)), float(np.hypot(spread, np.mean([t.std for t in sure])))
 
 
-def read_bench(path: Path, where: str) -> Mapping[str, list[Told]]:
+def _read(path: Path, where: str) -> Mapping[str, list[Told]]:
     """Numbers of a bench by name, one for each of its motors."""
     content = read_json(path, _WHAT)
     schema = content.get("schema") if isinstance(content, dict) else None

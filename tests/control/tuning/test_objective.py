@@ -28,6 +28,7 @@ from slipid.deploy import tune as app
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.progress import Reporter
 from tests.helpers.kept import kept
+from tests.helpers.shared import invoke
 from tests.helpers.small_twin import deployed, stacked
 
 HABITS = Habits(smooth=True)
@@ -55,6 +56,12 @@ def cases(robots):
 def searched(robots, cases, method, rollouts=100, seed=0):
     task = Task(deployed(1.0, 1.0, 1.0), habits=HABITS, steps=40)
     return Search(task, cases, robots, method, rollouts, seed)
+
+
+def test_help_tells_what_a_step_takes():
+    said = " ".join(invoke("tune", "--help").output.replace("│", " ").split())
+    cost = [tuning.BATCH * n for n in (searching.GRADIENT, searching.PARTICLES)]
+    assert f"a step of gradient takes {cost[0]}, of pso {cost[1]}" in said
 
 
 def test_the_box_holds_the_gains_and_nothing_else():

@@ -117,6 +117,16 @@ def test_a_voltage_of_the_battery_is_left_out_and_effort_is_asked_for(tmp_path):
     assert any(q.startswith("wheel_torque: what is it") for q in config.questions)
 
 
+def test_batteries_of_several_robots_are_batteries(tmp_path):
+    for name, volts in (("run1", 24.0), ("run2", 50.0), ("run3", 24.0)):
+        si = plain()
+        lines = {**si, "vl": volts - 0.1 * np.abs(si["cur_left"]), "vr": volts + 0 * si["t"]}
+        lines["vr"][0] = 3 * volts  # a glitch makes a motor of none
+        table(tmp_path / "floor" / f"{name}.csv", lines)
+    _, config = proposed(tmp_path, **ROBOT)
+    assert "voltage" not in layout_in(config)["columns"]
+
+
 def test_a_motor_that_drives_one_way_in_the_first_run_is_no_battery(tmp_path):
     for name, way in (("run1", 1.0), ("run2", 1.0), ("run3", -1.0)):
         columns = plain()

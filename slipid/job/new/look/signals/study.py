@@ -208,13 +208,14 @@ def driven_backwards(current: Found, speed: Found | None) -> bool:
 def of_battery(voltages: Sequence[Found], speed: Found | None) -> bool:
     """Whether the voltage of some runs stays up whatever the wheels do, as a battery's does.
 
-    Every run is measured by its own largest voltage: batteries of other robots, or other charges,
-    are no sign of a motor.
+    Every run is measured by what is high in it: batteries of other robots, or other charges, are
+    no sign of a motor.
     """
     runs = [one.values[~np.isnan(one.values)] for one in voltages]
-    values = np.concatenate([run / max(float(np.abs(run).max(initial=0.0)), 1e-9) for run in runs])
-    low = float(np.quantile(values, 0.05)) if values.size else 0.0
-    return low > 0.6 and (speed is None or float(np.nanstd(speed.values)) > 0.0)
+    high = [float(np.quantile(np.abs(run), 0.95)) if run.size else 0.0 for run in runs]
+    values = np.concatenate([run / h for run, h in zip(runs, high, strict=True) if h] or [[0.0]])
+    stays_up = float(np.quantile(values, 0.05)) > 0.6
+    return stays_up and (speed is None or float(np.nanstd(speed.values)) > 0.0)
 
 
 def pose_study(studies: tuple[Study, ...]) -> Study | None:
