@@ -1,0 +1,1 @@
+"""From pictures to poses and maps of floors: the room that knows OpenCV."""

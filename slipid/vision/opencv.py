@@ -1,0 +1,92 @@
+"""OpenCV, imported late, and what its versions 4 and 5 call the same."""
+
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.support.errors import DataError, near
+
+
+@cache
+def opencv() -> ModuleType:
+    """The module cv2, whose readers of pictures and videos keep quiet about what they cannot read.
+
+    Raises:
+        DataError: it is absent, too old, or built without its ArUco module.
+    """
+    try:
+        import cv2
+    except ImportError as error:
+        raise DataError(
+            f"pictures need OpenCV ({error}); expected: pip install 'slipid[camera]'"
+        ) from error
+    if not hasattr(getattr(cv2, "aruco", None), "CharucoDetector"):
+        raise DataError(
+            f"OpenCV {cv2.__version__} has no marker detector; expected version 4.8 or newer of "
+            "opencv-contrib-python-headless, and no other build of OpenCV beside it"
+        )
+    log = getattr(getattr(cv2, "utils", None), "logging", None)
+    if log is not None:  # we say ourselves what is wrong with a file
+        log.setLogLevel(log.LOG_LEVEL_SILENT)
+    return cv2
+
+
+def dictionary_names() -> list[str]:
+    """Marker dictionaries that OpenCV knows, such as `4X4_50`."""
+    prefix = "DICT_"
+    aruco = opencv().aruco
+    return sorted(name.removeprefix(prefix) for name in dir(aruco) if name.startswith(prefix))
+
+
+def marker_dictionary(name: str) -> object:
+    """OpenCV's dictionary of a name such as `4X4_50`, with `DICT_` before it or not.
+
+    Raises:
+        DataError: there is none of that name.
+    """
+    short = name.upper().removeprefix("DICT_")
+    names = dictionary_names()
+    if short not in names:
+        hint = near(short, names)
+        raise DataError(f"no marker dictionary '{name}'{hint}; expected one of {', '.join(names)}")
+    aruco = opencv().aruco
+    return aruco.getPredefinedDictionary(getattr(aruco, f"DICT_{short}"))
+
+
+def read_picture(path: Path) -> np.ndarray:
+    """A picture as rows, columns, and blue, green, red from 0 to 255.
+
+    Raises:
+        DataError: the file is absent, empty or no picture.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; expected a picture") from error
+    if not data:
+        raise DataError(f"{path}: the file is empty; expected a picture (PNG, JPEG, ...)")
+    cv2 = opencv()
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:  # a size beyond what it reads
+        picture = None
+    if picture is None:
+        raise DataError(f"{path}: no picture that OpenCV reads; expected PNG, JPEG or the like")
+    return np.asarray(picture)
+
+
+def ideal_points(
+    pixels: Float[np.ndarray, "point 1 2"],
+    matrix: Float[np.ndarray, "3 3"],
+    distortion: Float[np.ndarray, " coefficient"],
+) -> Float[np.ndarray, "point 1 2"]:
+    """Pixels as a pinhole with focal length 1 sees them, iterated until they stand still."""
+    cv2 = opencv()
+    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
+    iterated = getattr(cv2, "undistortPointsIter", None)
+    if iterated is not None:  # OpenCV 4
+        return np.asarray(iterated(pixels, matrix, distortion, None, None, until))
+    return np.asarray(cv2.undistortPoints(pixels, matrix, distortion, None, None, None, until))
