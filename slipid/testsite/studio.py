@@ -216,9 +216,10 @@ def _carpet(
 
 
 def _marker(cv2: ModuleType) -> np.ndarray:
-    """Picture of the marker."""
+    """Picture of the marker, its top edge ahead: the texture's right is the body's front."""
     book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    return np.repeat(cv2.aruco.generateImageMarker(book, MARKER, 480)[..., None], 3, axis=2)
+    drawn = np.rot90(cv2.aruco.generateImageMarker(book, MARKER, 480), -1)
+    return np.repeat(drawn[..., None], 3, axis=2)
 
 
 def _png(cv2: ModuleType, picture: np.ndarray) -> bytes:

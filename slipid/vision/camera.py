@@ -70,7 +70,11 @@ class OverheadCamera:
 
     @classmethod
     def straight_down(
-        cls, image_px: tuple[int, int], metres_per_pixel: float, height_m: float
+        cls,
+        image_px: tuple[int, int],
+        metres_per_pixel: float,
+        height_m: float,
+        turn_deg: float = 0.0,
     ) -> "OverheadCamera":
         """A camera without distortion that looks straight down on the middle of its picture.
 
@@ -79,11 +83,15 @@ class OverheadCamera:
         Args:
             metres_per_pixel: on the floor.
             height_m: of the lens above the floor.
+            turn_deg: by which the world's x and y are turned to the left in the picture, about z;
+                at 180, x is the picture's left and y its down.
         """
         focal, (width, height) = height_m / metres_per_pixel, image_px
         matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
-        down = np.diag([1.0, -1.0, -1.0])
-        return cls(Lens(image_px, matrix, np.zeros(4)), down, np.array([0.0, 0.0, height_m]))
+        cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+        # columns are the world's x, y, z in the axes right, down, away
+        rotation = np.array([[cosine, -sine, 0], [-sine, -cosine, 0], [0, 0, -1]])
+        return cls(Lens(image_px, matrix, np.zeros(4)), rotation, np.array([0.0, 0.0, height_m]))
 
     @property
     def height(self) -> float:

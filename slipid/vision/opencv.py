@@ -1,8 +1,10 @@
 """OpenCV, imported late, and what its versions 4 and 5 call the same."""
 
+import os
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +19,7 @@ def opencv() -> ModuleType:
     Raises:
         DataError: it is absent, too old, or built without its ArUco module.
     """
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet, before it is loaded
     try:
         import cv2
     except ImportError as error:
@@ -41,7 +44,7 @@ def dictionary_names() -> list[str]:
     return sorted(name.removeprefix(prefix) for name in dir(aruco) if name.startswith(prefix))
 
 
-def marker_dictionary(name: str) -> object:
+def marker_dictionary(name: str) -> Any:
     """OpenCV's dictionary of a name such as `4X4_50`, with `DICT_` before it or not.
 
     Raises:

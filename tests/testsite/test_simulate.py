@@ -360,10 +360,10 @@ def pixels(camera, points):
 
 
 def corners(pose, machine, camera):
-    """Where the marker's corners should be seen, in ArUco's order."""
+    """Where the marker's corners should be seen, in ArUco's order; its top edge is ahead."""
     yaw, half = pose[2] + np.radians(machine.marker_yaw_deg), 0.5 * machine.marker_size_m
     c, s = np.cos(yaw), np.sin(yaw)
-    flat = half * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) @ np.array([[c, s], [-s, c]])
+    flat = half * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) @ np.array([[c, s], [-s, c]])
     return pixels(camera, np.c_[flat + pose[:2], np.full(4, machine.marker_height_m)])
 
 

@@ -1,0 +1,123 @@
+"""`slipid track`: poses from a video."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from slipid.cli.common import Json, Quiet, emit, guarded
+from slipid.support.progress import Reporter
+
+if TYPE_CHECKING:
+    from slipid.report.page import Page
+    from slipid.vision.tracking.finder import Region
+
+
+@guarded
+def track(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="VIDEO|FOLDER|DEVICE", help="Video, pictures, or a camera's number."
+        ),
+    ],
+    camera: Annotated[
+        Path, typer.Option(metavar="FILE", help="Camera that slipid calibrate wrote.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Poses: .csv or .parquet.")],
+    marker_size: Annotated[
+        float | None, typer.Option(metavar="M", help="Edge of the marker's black square, in m.")
+    ] = None,
+    marker_height: Annotated[
+        float | None, typer.Option(metavar="M", help="Of the marker above the floor, in m.")
+    ] = None,
+    marker_yaw: Annotated[
+        float, typer.Option(metavar="DEG", help="Of its top edge, counter-clockwise from ahead.")
+    ] = 0.0,
+    dictionary: Annotated[
+        str, typer.Option(metavar="NAME", help="Dictionary of the marker.")
+    ] = "4X4_50",
+    id: Annotated[
+        int | None, typer.Option(min=0, help="Number of the marker; the only one by default.")
+    ] = None,
+    targets: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Several markers, boards or robots, instead of these."),
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Frame rate; by default the video's times.")
+    ] = None,
+    times: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Times of the frames: CSV of frame, time.")
+    ] = None,
+    region: Annotated[
+        str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="Only this part, in pixels.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", help="How long to watch a device.")
+    ] = None,
+    preview: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Also draw one frame, to check by eye.")
+    ] = None,
+    preview_frame: Annotated[
+        int | None, typer.Option(metavar="N", min=0, help="Which; by default the first seen.")
+    ] = None,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Poses of a robot with a marker, from the video of a calibrated camera above it.
+
+    Every frame has a row with pose and covariance, or with the reason why it has none; nothing is
+    filled. Exit code 1 where the poses should not be used as they are.
+    """
+    from slipid.support.errors import DataError
+    from slipid.vision.camera import OverheadCamera
+    from slipid.vision.tracking import tracking
+    from slipid.vision.tracking.frames.source import open_source
+    from slipid.vision.tracking.target import read_targets
+
+    above = OverheadCamera.load(camera)
+    with Reporter(quiet=quiet) as report:
+        frames = open_source(source, fps, times, seconds)
+        above.of_size(frames.image_px, frames.name)
+        if targets is not None:
+            bodies = read_targets(targets)
+        elif marker_size is None or marker_height is None:
+            raise DataError(
+                "no size or no height of the marker; expected --marker-size and --marker-height in "
+                "metres, or --targets FILE"
+            )
+        else:
+            report.stage("looking for the marker")
+            yaw = marker_yaw * 3.141592653589793 / 180
+            bodies = (
+                tracking.lone_target(frames, dictionary, id, marker_size, marker_height, yaw),
+            )
+        unfinished = out.with_name(f".{out.name}.unfinished")
+        done = tracking.track(frames, above, bodies, unfinished, report, _region(region))
+        written = [path.name for path in done.write(out)]
+        if preview is not None:
+            number = tracking.preview(preview, done, above, preview_frame)
+            report.line(f"frame {number} is drawn in {preview}")
+
+    def show(page: "Page") -> None:
+        page.notes(done.notes)
+        for doubt in done.doubts:
+            page.line(f"DOUBTFUL: {doubt}")
+
+    emit(json, done.to_json(), show, out.parent, written)
+    return 1 if done.doubts else 0
+
+
+def _region(text: str | None) -> "Region | None":
+    """A part of the picture from four numbers; DataError where they are none."""
+    from slipid.support.errors import DataError
+    from slipid.vision.tracking.finder import Region
+
+    if text is None:
+        return None
+    try:
+        left, top, right, bottom = (int(part) for part in text.split(","))
+    except ValueError:
+        raise DataError(f"--region {text}; expected four whole numbers X0,Y0,X1,Y1") from None
+    return Region(left, top, right, bottom)

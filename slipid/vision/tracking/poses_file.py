@@ -1,0 +1,91 @@
+"""A track as a file of poses that logs may have beside them: CSV or Parquet, a row per frame.
+
+Columns: frame; time [s]; x, y [m], heading [rad], empty where the frame has no pose; the
+covariance of these (var_x, var_y, var_heading, cov_xy, cov_x_heading, cov_y_heading) [m, rad];
+size, how large the markers look over what they are; flag, a word; and rejected_x, rejected_y,
+rejected_heading, a pose that was found and not believed.
+"""
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from slipid.support.errors import DataError
+from slipid.support.files import write_bytes
+from slipid.vision.tracking.track import Flag, Track
+
+_NUMBERS = {
+    "time": "%.6f",
+    "x": "%.6f",
+    "y": "%.6f",
+    "heading": "%.6f",
+    "var_x": "%.4g",
+    "var_y": "%.4g",
+    "var_heading": "%.4g",
+    "cov_xy": "%.4g",
+    "cov_x_heading": "%.4g",
+    "cov_y_heading": "%.4g",
+    "size": "%.5f",
+    "rejected_x": "%.6f",
+    "rejected_y": "%.6f",
+    "rejected_heading": "%.6f",
+}
+"""Columns of numbers, and how CSV writes them."""
+
+
+def write_poses(path: Path, track: Track) -> None:
+    """Write a track; the suffix .parquet makes it Parquet, everything else CSV.
+
+    Raises:
+        DataError: nothing can be written there, or Parquet without pyarrow.
+    """
+    data = _parquet(track) if path.suffix.lower() == ".parquet" else _csv(track).encode()
+    write_bytes(path, data)
+
+
+def _columns(track: Track) -> dict[str, np.ndarray]:
+    """Columns of numbers, NaN where a cell is empty."""
+    p, c, r = track.pose, track.covariance, track.rejected
+    values = (
+        *(track.time, p[:, 0], p[:, 1], p[:, 2]),
+        *(c[:, 0, 0], c[:, 1, 1], c[:, 2, 2], c[:, 0, 1], c[:, 0, 2], c[:, 1, 2]),
+        *(track.size, r[:, 0], r[:, 1], r[:, 2]),
+    )
+    return dict(zip(_NUMBERS, values, strict=True))
+
+
+def _words(track: Track) -> list[str]:
+    return [Flag(flag).word for flag in track.flag.tolist()]
+
+
+def _csv(track: Track) -> str:
+    columns, out = _columns(track), io.StringIO()
+    out.write(",".join(["frame", *_NUMBERS, "flag"]) + "\n")
+    words = _words(track)
+    for k, number in enumerate(track.frame.tolist()):
+        cells = [
+            _NUMBERS[name] % values[k] if np.isfinite(values[k]) else ""
+            for name, values in columns.items()
+        ]
+        out.write(",".join([str(number), *cells, words[k]]) + "\n")
+    return out.getvalue()
+
+
+def _parquet(track: Track) -> bytes:
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError as error:
+        raise DataError(
+            f"Parquet needs {error.name}; expected: pip install 'slipid[parquet]', or a name that "
+            "ends in .csv"
+        ) from error
+    columns = {
+        name: pa.array(values, mask=~np.isfinite(values))
+        for name, values in _columns(track).items()
+    }
+    table = pa.table({"frame": track.frame, **columns, "flag": _words(track)})
+    out = io.BytesIO()
+    parquet.write_table(table, out)
+    return out.getvalue()

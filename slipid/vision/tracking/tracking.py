@@ -1,0 +1,155 @@
+"""`slipid track`: poses of marked bodies from a video, a folder of pictures or a camera."""
+
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slipid.support.checkpoint import Checkpoint, key_of, source_hash
+from slipid.support.content import Content
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
+from slipid.vision.camera import OverheadCamera
+from slipid.vision.tracking.finder import Finder, MarkerDetector, Region
+from slipid.vision.tracking.frames.frame import Source, cut_off
+from slipid.vision.tracking.frames.times import uneven
+from slipid.vision.tracking.poses_file import write_poses
+from slipid.vision.tracking.preview import write_preview
+from slipid.vision.tracking.sightings import look_through, only_marker
+from slipid.vision.tracking.target import Marker, Target
+from slipid.vision.tracking.track import Flag, Track, summary, track_of
+
+SCHEMA = "slipid.track/1"
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What a video told.
+
+    Attributes:
+        source: what was looked at.
+        tracks: of every body.
+        notes: what a person should know, a sentence each.
+        doubts: why the poses should not be used as they are; empty where nothing speaks against.
+    """
+
+    source: Source
+    tracks: tuple[Track, ...]
+    notes: tuple[str, ...]
+    doubts: tuple[str, ...]
+
+    def write(self, path: Path) -> list[Path]:
+        """Write the poses: one body to this file, of several each to one with its name added."""
+        names = [path]
+        if len(self.tracks) > 1:
+            names = [path.with_stem(f"{path.stem}_{t.target.name}") for t in self.tracks]
+        for name, track in zip(names, self.tracks, strict=True):
+            write_poses(name, track)
+        return names
+
+    def to_json(self) -> Content:
+        """What programs read of it; the poses themselves are in files of their own."""
+        return {
+            "schema": SCHEMA,
+            "source": self.source.name,
+            "frames": len(self.tracks[0].frame),
+            "targets": {track.target.name: _content(track) for track in self.tracks},
+            "notes": list(self.notes),
+            "doubts": list(self.doubts),
+        }
+
+
+def _content(track: Track) -> Content:
+    good = track.good.any()
+    return {
+        "poses": int(track.good.sum()),
+        "flags": {flag.word: track.count(flag) for flag in Flag},
+        "corner_std_px": track.corner_std,
+        "size": track.usual_size if good else None,
+        "height_m": track.target.height,
+        "height_told_m": track.height_told if good else None,
+    }
+
+
+def track(
+    source: Source,
+    camera: OverheadCamera,
+    targets: tuple[Target, ...],
+    checkpoint: Path,
+    report: Reporter,
+    region: Region | None = None,
+) -> Tracked:
+    """Poses of marked bodies in every frame of a source.
+
+    Args:
+        source: where the frames come from, see `open_source`.
+        camera: calibrated, with its place above the floor.
+        targets: the bodies and their markers, all of one dictionary.
+        checkpoint: folder for what is done, from which it goes on after an interrupt; it is taken
+            away at the end.
+        report: is told how far it is.
+        region: the part of the picture that counts.
+
+    Raises:
+        DataError: frames of another size than the camera was calibrated at, no marker in any frame,
+            times that do not increase.
+    """
+    camera.of_size(source.image_px, source.name)
+    ids = frozenset(number for target in targets for number in target.ids)
+    if region is not None and region.within(Region(0, 0, *camera.lens.image_px)).empty:
+        width, height = camera.lens.image_px
+        raise DataError(f"--region lies outside; expected a part of 0,0,{width},{height}")
+    finder = Finder(MarkerDetector(targets[0].dictionary), ids, region)
+    kept = Checkpoint(
+        checkpoint,
+        key_of(source.identity, targets[0].dictionary, sorted(ids), region, source_hash("vision")),
+    )
+    seen = look_through(source, finder, kept, report)
+    tracks = tuple(track_of(camera, target, seen) for target in targets)
+    kept.remove()
+    notes = [sentence for sentence in (uneven(seen.time),) if sentence]
+    short = cut_off(source, len(seen.frame))
+    doubts = [*([short] if short else []), *(d for t in tracks for d in t.doubts())]
+    return Tracked(source, tracks, (*notes, *summary(tracks)), tuple(doubts))
+
+
+def lone_target(
+    source: Source, dictionary: str, id: int | None, size_m: float, height_m: float, yaw: float
+) -> Target:
+    """A body with one marker in its middle; the only one that is in view where no number is given.
+
+    Args:
+        size_m: edge of the marker's black square [m].
+        height_m: of the marker above the floor [m].
+        yaw: of the marker's top edge, counter-clockwise from ahead [rad].
+
+    Raises:
+        DataError: no marker in view, or several.
+    """
+    number = only_marker(source, MarkerDetector(dictionary)) if id is None else id
+    return Target("robot", dictionary, (Marker.at(number, size_m, height_m, yaw=yaw),))
+
+
+def preview(path: Path, tracked: Tracked, camera: OverheadCamera, number: int | None) -> int:
+    """Draw what was found in one frame; the number of that frame.
+
+    Args:
+        number: of the frame; by default the first one in which every body has a pose.
+
+    Raises:
+        DataError: there is no frame of that number, or nothing can be written there.
+    """
+    tracks = tracked.tracks
+    if number is None:
+        all_seen = np.logical_and.reduce([track.good for track in tracks])
+        number = int(tracks[0].frame[int(np.argmax(all_seen))])
+    rows = np.flatnonzero(tracks[0].frame == number)
+    if not len(rows):
+        raise DataError(
+            f"{tracked.source.name}: no frame {number}; expected 0 to {tracks[0].frame[-1]}"
+        )
+    frames = tracked.source.frames(number)
+    with closing(frames) if hasattr(frames, "close") else frames:
+        write_preview(path, next(frames).grey, camera, tracks, int(rows[0]))
+    return number
