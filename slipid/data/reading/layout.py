@@ -135,6 +135,8 @@ class Layout(Recorded):
         new_run: what tells that the next run starts inside the file.
         drop_repeated_time: whether to keep the last of rows with the same time; else such rows are
             refused.
+        clock: "own" of a file of poses beside a run's own whose times are not the robot's: how far
+            they are apart, and drift, is then found from the motion.
         beside: layouts of files that lie beside a run's own and hold more of its channels, by their
             names; `{stem}` stands for that of the run's own file without its suffix.
     """
@@ -149,6 +151,7 @@ class Layout(Recorded):
     metres_per_pixel: Annotated[tuple[Positive, Positive] | None, BeforeValidator(_pair)] = None
     new_run: Literal["never", "time_restarts", "ticks_restart"] = "never"
     drop_repeated_time: StrictBool = False
+    clock: Literal["robot", "own"] = "robot"
     beside: Mapping[str, "Layout"] = field(default_factory=dict)
 
     @property

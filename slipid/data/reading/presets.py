@@ -143,7 +143,20 @@ _LAYOUTS = (
             "wheel_ticks": Channel((4, 5, 6), "tick", scale=(-1.0,)),
         },
     ),
+    # What `slipid track` writes of a video that somebody started by hand.
+    Layout(
+        name="tracked",
+        clock="own",
+        channels={
+            "time": _one("time", "s"),
+            "pose_x": _one("x", "m"),
+            "pose_y": _one("y", "m"),
+            "pose_heading": _one("heading", "rad"),
+        },
+    ),
 )
+POSES = ("pose_x", "pose_y", "pose_heading", "pose_quaternion")
+"""Channels of a camera, whose clock may be its own."""
 PRESETS = {layout.name: layout for layout in _LAYOUTS}
 _SETTINGS = [f.name for f in fields(Layout) if f.name not in ("name", "channels", "beside")]
 
@@ -244,6 +257,11 @@ def _problem(layout: Layout) -> str | None:
             "a pose in parts; expected pose_x, pose_y and one of pose_heading and "
             "pose_quaternion, or none of them"
         )
+    if layout.clock == "own":
+        return "clock = 'own' of the robot's own file; expected it of a file of poses beside it"
+    for name, one in layout.beside.items():
+        if one.clock == "own" and not set(one.channels) <= {"time", *POSES}:
+            return f"beside '{name}': clock = 'own' of a file that holds more than poses"
     if layout.beside and layout.new_run != "never":
         return f"new_run = '{layout.new_run}' with files beside; expected one run for each file"
     return None

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
+from slipid.data.reading.aligned import on_robot_clock
 from slipid.data.reading.assemble import Identity, assembled
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.reader import read_bag
@@ -156,9 +157,12 @@ def _of_rows(known: Identity, layout: Layout) -> list[_RawRun]:
     for part, suffix in _parts(table, layout):
         notes: list[str] = []
         signals = signals_of(part, layout, notes)
-        for pattern, other in beside.items():
-            signals |= signals_of(other, layout.beside[pattern], notes)
         identity = replace(known, name=known.name + suffix, sha256=sha256)
+        for pattern, other in beside.items():
+            more = signals_of(other, layout.beside[pattern], notes)
+            if layout.beside[pattern].clock == "own":
+                more = on_robot_clock(more, assembled(signals, layout, identity), notes)
+            signals |= more
         out.append(_RawRun(identity, signals, tuple(dict.fromkeys(notes))))
     return out
 

@@ -12,6 +12,7 @@ from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from slipid.vision.camera import OverheadCamera
 from slipid.vision.tracking.finder import Finder, MarkerDetector, Region
+from slipid.vision.tracking.frames.ahead import ahead
 from slipid.vision.tracking.frames.frame import Source, cut_off
 from slipid.vision.tracking.frames.times import uneven
 from slipid.vision.tracking.poses_file import write_poses
@@ -149,7 +150,6 @@ def preview(path: Path, tracked: Tracked, camera: OverheadCamera, number: int | 
         raise DataError(
             f"{tracked.source.name}: no frame {number}; expected 0 to {tracks[0].frame[-1]}"
         )
-    frames = tracked.source.frames(number)
-    with closing(frames) if hasattr(frames, "close") else frames:
+    with closing(ahead(tracked.source.frames(number))) as frames:
         write_preview(path, next(frames).grey, camera, tracks, int(rows[0]))
     return number
