@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
+from slipid.data.clocks.clock import Clock
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Log:
@@ -36,6 +38,7 @@ class Log:
         pose: x [m], y [m], heading [rad] without wrap-around, in the scale of the logged camera,
             or None.
         pose_fresh: False where the row repeats the last pose.
+        pose_clock: the clock of poses that had one of their own, as it was found from the motion.
         surface: name of the floor, None where it is unknown.
         load: name of the load set-up.
         notes: what the reader repaired, one sentence each.
@@ -59,6 +62,7 @@ class Log:
     gyro: Float[np.ndarray, " time"] | None = None
     pose: Float[np.ndarray, "time 3"] | None = None
     pose_fresh: Bool[np.ndarray, " time"] | None = None
+    pose_clock: Clock | None = None
     surface: str | None
     load: str
     notes: tuple[str, ...] = ()

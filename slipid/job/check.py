@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slipid.data.clocks.clock import Clock
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.identify import slip_curves as curves_of
@@ -100,9 +101,21 @@ def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
             for (surface, load, session), runs in sorted(groups.items())
         ],
         "channels": _channels(data.logs),
+        "clocks": {log.name: _clock(log.pose_clock) for log in data.logs if log.pose_clock},
         "notes": dict(notes.most_common()),
         "skipped": list(skipped),
         "data": {"hash": job.data_hash, "logs": {log.name: log.sha256 for log in data.logs}},
+    }
+
+
+def _clock(clock: Clock) -> Content:
+    """The clock of a run's poses against the robot's; intervals of 90 %."""
+    return {
+        "offset_s": clock.offset,
+        "offset_interval90_s": clock.offset_interval90,
+        "drift": clock.drift,
+        "drift_std": clock.drift_std,
+        "told_by": clock.told_by,
     }
 
 

@@ -1,6 +1,6 @@
 """Numbers as tables: before a fit, after it, and beside the truth or the camera."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -94,6 +94,18 @@ def show_trust(page: Page, judged: "Judgement") -> None:
 _COMMANDED = ("commanded headings", r"and speeds \[m/s]")
 
 
+def _clocks(clocks: Mapping[str, Content]) -> str:
+    """Of the clocks of poses that had their own, how far off they were and how sure that is."""
+    offsets = [clock["offset_s"] for clock in clocks.values()]
+    wide = [0.5 * (high - low) for low, high in (c["offset_interval90_s"] for c in clocks.values())]
+    by = ", ".join(sorted({clock["told_by"] for clock in clocks.values()}))
+    return (
+        f"clock of the poses, from the motion ({by}): {min(offsets):+.3f} to {max(offsets):+.3f} s "
+        f"from the robot's in {len(clocks)} runs; 90 % intervals +- {1e3 * min(wide):.1f} to "
+        f"{1e3 * max(wide):.1f} ms"
+    )
+
+
 def show_check(page: Page, found: Content) -> None:
     """Write the content of check.json; what is wrong comes first."""
     page.findings(found["findings"])
@@ -110,6 +122,8 @@ def show_check(page: Page, found: Content) -> None:
         )
     page.table(groups)
     page.line("channels: " + ", ".join(found["channels"]))
+    if found["clocks"]:
+        page.line(_clocks(found["clocks"]))
     for note, count in found["notes"].items():
         page.line(f"repaired in {count} runs: {note}")
     before = table(

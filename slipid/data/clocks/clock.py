@@ -12,7 +12,7 @@ errs and, of each step of its own, what slip does; their sizes are told from wha
 interval is told by how far parts of the run disagree.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +21,8 @@ from jaxtyping import Float
 from slipid.data.clocks.motion import Motion, Steps
 from slipid.data.clocks.noise import StepNoise
 
-COARSE = 0.05
-"""Step of the search for the offset [s]."""
+COARSE, SEARCHED = 0.05, 0.1
+"""Step of the search for the offset, and least length of the steps that are compared in it [s]."""
 FINE, REACH = 0.01, 0.2
 """Step and half the width of the search around that [s], in which noise is told from slip."""
 LEAST_SHARED = 1.0
@@ -36,8 +36,12 @@ ROUNDS, SETTLED = 20, 6
 ELSEWHERE, BETTER = 0.5, 0.02
 """Other offsets, further away than this [s], must leave more of the motion unexplained, by so much
 of it [1]: steady motion, or the same again and again, tells no offset."""
+MOST_LEFT = 0.5
+"""Part of the motion that the best offset may leave unexplained [1]."""
 GOOD_STD = 0.03
 """Std of an offset that is told [s]."""
+SURE_STD = 0.005
+"""Std of one that needs no other view of the run [s]."""
 LEAST_STEPS = 20
 
 
@@ -50,6 +54,7 @@ class Clock:
         drift: of the robot's clock against the poses' [1]; `drift_std` its std.
         middle: time on the poses' clock to which the offset belongs [s].
         left: part of the motion that is not explained [1].
+        told_by: "gyro" or "wheels".
     """
 
     offset: float
@@ -58,6 +63,13 @@ class Clock:
     drift_std: float
     middle: float
     left: float
+    told_by: str
+
+    @property
+    def offset_interval90(self) -> tuple[float, float]:
+        """Interval that holds the offset with 90 % [s]."""
+        wide = 1.645 * self.offset_std
+        return self.offset - wide, self.offset + wide
 
     def robot_time(self, time: Float[np.ndarray, " pose"]) -> Float[np.ndarray, " pose"]:
         """Times of poses on the robot's clock [s]."""
@@ -71,9 +83,17 @@ class Clock:
         )
 
 
-def best_clock(motions: Sequence[Motion]) -> Clock | None:
-    """The surest clock that one of several views of a run tells; None where none does."""
-    found = [clock for motion in motions if (clock := clock_of_poses(motion)) is not None]
+def best_clock(motions: Iterable[Motion]) -> Clock | None:
+    """The first clock that is sure, of several views of a run, else the surest; None without any.
+
+    Views behind the first that is sure are not asked for.
+    """
+    found = []
+    for motion in motions:
+        clock = clock_of_poses(motion)
+        if clock is not None and clock.offset_std <= SURE_STD:
+            return clock
+        found += [] if clock is None else [clock]
     return min(found, key=lambda clock: clock.offset_std, default=None)
 
 
@@ -81,34 +101,37 @@ def clock_of_poses(motion: Motion) -> Clock | None:
     """The clock of a run's poses; None where its motion does not tell it."""
     if len(motion.pose_time) < LEAST_STEPS or len(motion.time) < LEAST_STEPS:
         return None
-    steps = motion.steps()
+    steps = motion.steps(motion.step)
     if len(steps.moved) < LEAST_STEPS:
         return None
-    guess = _searched(motion, steps)
+    guess = _searched(motion)
     return None if guess is None else _refined(motion, steps, guess)
 
 
-def _searched(motion: Motion, steps: Steps) -> float | None:
+def _searched(motion: Motion) -> float | None:
     """Offset at which least of the motion is unexplained, if no other one does about as well."""
+    steps = motion.steps(SEARCHED)
+    moved = motion.scaled(steps.moved)
     low = motion.time[0] + LEAST_SHARED - steps.last[-1]
     high = motion.time[-1] - LEAST_SHARED - steps.first[0]
     if not high > low:
         return None
     offsets = np.arange(low, high + COARSE, COARSE)
-    left = np.array([_unexplained(motion, steps, offset) for offset in offsets])
+    left = np.array([_unexplained(motion, steps, moved, offset) for offset in offsets])
     best = int(np.argmin(left))
     others = left[np.abs(offsets - offsets[best]) > ELSEWHERE]
-    if len(others) and not others.min() > left[best] + BETTER:
+    if (len(others) and not others.min() > left[best] + BETTER) or not left[best] < MOST_LEFT:
         return None
     return float(offsets[best])
 
 
-def _unexplained(motion: Motion, steps: Steps, offset: float) -> float:
+def _unexplained(
+    motion: Motion, steps: Steps, moved: Float[np.ndarray, "step 3"], offset: float
+) -> float:
     """Part of the motion that what turned does not explain at an offset."""
     x = motion.turned_at(steps.last + offset) - motion.turned_at(steps.first + offset)
-    y = motion.scaled(steps.moved)
-    rest = y - x @ np.linalg.lstsq(x, y, rcond=motion.collinear)[0]
-    return float((rest**2).sum() / max((y**2).sum(), 1e-12))
+    rest = moved - x @ np.linalg.lstsq(x, moved, rcond=motion.collinear)[0]
+    return float((rest**2).sum() / max((moved**2).sum(), 1e-12))
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +197,15 @@ def _told(
     std[0] = np.hypot(std[0], motion.body_std)
     if not std[0] < GOOD_STD:
         return None
-    return Clock(float(at[0]), float(std[0]), float(at[1]), float(std[1]), middle, near.share)
+    return Clock(
+        offset=float(at[0]),
+        offset_std=float(std[0]),
+        drift=float(at[1]),
+        drift_std=float(std[1]),
+        middle=middle,
+        left=near.share,
+        told_by=motion.told_by,
+    )
 
 
 def _spread(near: _Near, inverse: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2"]:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import cholesky_banded, solve_banded
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +31,6 @@ class StepNoise:
         self, rows: Float[np.ndarray, "step column"], joined: Bool[np.ndarray, " step"]
     ) -> Float[np.ndarray, "step column"]:
         """Columns times the inverse root of the covariance: 2 seen + own, and -seen beside it."""
-        out = np.empty_like(rows)
-        root, before = 1.0, np.zeros(rows.shape[1])
-        for k, row in enumerate(rows):
-            beside = -self.seen / root if k and joined[k] else 0.0
-            root = float(np.sqrt(2.0 * self.seen + self.own - beside**2))
-            before = (row - beside * before) / root
-            out[k] = before
-        return out
+        beside = np.where(joined[1:], -self.seen, 0.0)
+        band = np.stack([np.full(len(rows), 2.0 * self.seen + self.own), np.append(beside, 0.0)])
+        return np.asarray(solve_banded((1, 0), cholesky_banded(band, lower=True), rows))

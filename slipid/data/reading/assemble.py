@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
+from slipid.data.clocks.clock import Clock
 from slipid.data.log import Log
 from slipid.data.reading.layout import Recorded
 from slipid.data.reading.signal import Signal, clock_of
@@ -34,6 +35,7 @@ class Identity:
     sha256: str
     surface: str | None
     load: str
+    pose_clock: Clock | None = None
 
 
 def assembled(

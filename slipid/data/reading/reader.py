@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.aligned import on_robot_clock
+from slipid.data.reading.aligned import clock_against
 from slipid.data.reading.assemble import Identity, assembled
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.reader import read_bag
@@ -161,7 +161,9 @@ def _of_rows(known: Identity, layout: Layout) -> list[_RawRun]:
         for pattern, other in beside.items():
             more = signals_of(other, layout.beside[pattern], notes)
             if layout.beside[pattern].clock == "own":
-                more = on_robot_clock(more, assembled(signals, layout, identity), notes)
+                clock = clock_against(assembled(signals, layout, identity), more)
+                identity = replace(identity, pose_clock=clock)
+                more = {n: replace(s, time=clock.robot_time(s.time)) for n, s in more.items()}
             signals |= more
         out.append(_RawRun(identity, signals, tuple(dict.fromkeys(notes))))
     return out
