@@ -1,6 +1,13 @@
-"""From a map of floors, as a file or as cells, to what an estimator looks up."""
+"""From a map of floors, as a file or as cells, to what an estimator or a user looks up."""
 
 from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.ndimage import distance_transform_edt
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.filter.floor import Floor
@@ -29,3 +36,63 @@ def floor_map(path: Path | str, robot: DeployedRobot) -> Floor:
             f"{', '.join(robot.labels)}"
         )
     return floor_of(read, robot.labels)
+
+
+class WheelFloors(eqx.Module):
+    """What is under each wheel.
+
+    Attributes:
+        surface: number of the surface, in the order of the map's.
+        border: distance from the middle of the wheel to the nearest other surface [m], to within
+            half a cell of the map; infinite on a map of a single surface.
+    """
+
+    surface: Int[Array, "*batch wheel"]
+    border: Float[Array, "*batch wheel"]
+
+
+class FloorLookup(eqx.Module):
+    """A floor map that jitted functions ask for the floor under each wheel, and for its border.
+
+    Attributes:
+        floor: surfaces by cell, counted as in `surfaces`.
+        border: distance from the middle of every cell to the nearest other surface [m].
+        surfaces: their names.
+    """
+
+    floor: Floor
+    border: Float[Array, "row column"]
+    surfaces: tuple[str, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, floor: FloorMap) -> "FloorLookup":
+        """Of a floor map."""
+        border = np.full(floor.cells.shape, np.inf)
+        for number in np.unique(floor.cells):
+            own = floor.cells == number
+            if not own.all():
+                border[own] = (distance_transform_edt(own)[own] - 0.5) * floor.cell
+        found = floor_of(floor, floor.surfaces)
+        return cls(found, jnp.asarray(border), floor.surfaces)
+
+    @classmethod
+    def read(cls, path: Path | str) -> "FloorLookup":
+        """Of a map file; DataError where it is none."""
+        return cls.of(read_map(Path(path)))
+
+    @eqx.filter_jit
+    def under(self, pose: Float[Array, "*batch 3"], wheels: Float[Array, "wheel 2"]) -> WheelFloors:
+        """Floor and border under the wheels of bodies at some poses.
+
+        Beyond the edge of the map both are those of the nearest cell.
+
+        Args:
+            pose: x, y [m], heading [rad].
+            wheels: where the wheels are on the body, x ahead, y left [m].
+        """
+        flat = pose.reshape(-1, 3)
+        row, column = jax.vmap(self.floor.cell_under, (0, None))(flat, wheels)
+        shape = (*pose.shape[:-1], len(wheels))
+        return WheelFloors(
+            self.floor.cells[row, column].reshape(shape), self.border[row, column].reshape(shape)
+        )

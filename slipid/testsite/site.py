@@ -126,6 +126,8 @@ class Camera:
         flicker: how much the light changes within some seconds, as a part of it.
         exposure_s: how long a frame is exposed; what moves is seen twice, at both ends.
         frame_s: between frames.
+        early_s: how long before the robot's log somebody starts it: its clock is then ahead by
+            that.
     """
 
     height_m: Positive = 2.2
@@ -145,6 +147,7 @@ class Camera:
     flicker: NotNegative = 0.06
     exposure_s: NotNegative = 0.012
     frame_s: Positive = 1 / 29
+    early_s: NotNegative = 0.0
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:

@@ -115,13 +115,20 @@ class Floor(eqx.Module):
 
         Beyond the edge it is that of the nearest cell.
         """
+        row, column = self.cell_under(pose, wheels)
+        return self.cells[row, column]
+
+    def cell_under(
+        self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
+    ) -> tuple[Int[Array, " wheel"], Int[Array, " wheel"]]:
+        """Row and column of the cell under each wheel; beyond the edge those of the nearest."""
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         turned = jnp.stack(
             [c * wheels[:, 0] - s * wheels[:, 1], s * wheels[:, 0] + c * wheels[:, 1]], axis=-1
         )
         steps = jnp.floor((pose[:2] + turned - self.corner) / self.cell).astype(jnp.int32)
         rows, columns = self.cells.shape
-        return self.cells[steps[:, 1].clip(0, rows - 1), steps[:, 0].clip(0, columns - 1)]
+        return steps[:, 1].clip(0, rows - 1), steps[:, 0].clip(0, columns - 1)
 
     def supports(
         self,

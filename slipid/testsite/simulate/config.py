@@ -43,13 +43,20 @@ current_is_signed = {signed}
 
 [layouts.testsite.columns]
 {columns}
-{sets}
+{beside}{sets}
 [parameters]
 "camera.scale" = {{ prior = {{ mean = {scale}, std = 0.002 }} }}      # measured, with an error
-"camera.lag" = {{ prior = {{ mean = 0.05, std = 0.02 }} }}
+"camera.lag" = {{ prior = {{ mean = {lag}, std = 0.02 }} }}
 "camera.marker_yaw" = {{ free = true }}
 "motor.resistance" = {{ start = 11.0, prior = {{ mean = 8.0, std = 4.0 }} }}
 "motor.back_emf" = {{ start = 0.0257, prior = {{ mean = 0.04, std = 0.02 }} }}
+"""
+_TRACKED = """
+# what `slipid track` makes of the video of each run:
+#   slipid track video/as_built/firm/run000.avi --camera video/camera.json \\
+#     --marker-size {size} --marker-height {height} --out logs/as_built/firm/run000.poses.csv
+[layouts.testsite.beside."{{stem}}.poses.csv"]
+format = "tracked"
 """
 
 
@@ -176,17 +183,26 @@ def _said_of(what: str) -> Iterator[None]:
         raise DataError(f"{what}: {error}") from error
 
 
-def identify_config(plan: Plan) -> str:
-    """Text of a config for `slipid identify` that fits the logs in slipid's own columns."""
+def identify_config(plan: Plan, by_video: bool = False) -> str:
+    """Text of a config for `slipid identify` that fits the logs in slipid's own columns.
+
+    With `by_video` the poses in the logs are passed over, for those that are tracked in videos.
+    """
     machine, sensors = plan.site.machine, plan.site.sensors
     measured = 0.0015 * float(np.random.default_rng([plan.content.seed, 2]).normal())
     more = [channel for channel in OPTIONAL if getattr(sensors, channel)]
     columns = own_columns(len(machine.wheel_azimuths_deg), more)
+    beside, scale, lag = "", sensors.camera_scale, 0.05
+    if by_video:
+        columns = {name: c for name, c in columns.items() if not name.startswith("pose_")}
+        beside = _TRACKED.format(size=machine.marker_size_m, height=machine.marker_height_m)
+        scale, lag = 1.0, 0.0
     one = {(run.load, run.surface) for _, run in plan.runs if run.surface is not None}
     where = [(load, surface, 'surface = "folder"') for load, surface in sorted(one)]
     where += [(load, name, f'map = "maps/{name}.toml"') for load, name in _mapped(plan)]
     sets = "".join(
-        f'\n[[logs]]\nglob = "{load}/{name}/*.csv"\nformat = "testsite"\n{floor}\nload = "{load}"\n'
+        f'\n[[logs]]\nglob = "{load}/{name}/run*[0-9].csv"\nformat = "testsite"\n'
+        f'{floor}\nload = "{load}"\n'
         for load, name, floor in where
     )
     return _IDENTIFY.format(
@@ -199,7 +215,9 @@ def identify_config(plan: Plan) -> str:
         signed=str(sensors.current_is_signed).lower(),
         columns="\n".join(f"{name} = {_inline(c)}" for name, c in columns.items()),
         sets=sets,
-        scale=round(sensors.camera_scale * (1 + measured), 4),
+        beside=beside,
+        scale=round(scale * (1 + measured), 4),
+        lag=lag,
     )
 
 
@@ -216,6 +234,15 @@ def _mapped(plan: Plan) -> list[tuple[str, str]]:
         for load, name in pairs
         if load in loads and set(plan.maps[name].surfaces) <= floors
     )
+
+
+def all_filmed(plan: Plan) -> bool:
+    """Whether every run that a config for `slipid identify` reads has a video."""
+    mapped = {f"{load}/{name}/" for load, name in _mapped(plan)}
+    read = [
+        n for n, r in plan.runs if r.surface is not None or n.rpartition("/")[0] + "/" in mapped
+    ]
+    return set(read) <= set(plan.filmed)
 
 
 def _inline(value: object) -> str:

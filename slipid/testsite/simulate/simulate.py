@@ -17,7 +17,7 @@ from slipid.support.progress import Reporter
 from slipid.support.workers import spread
 from slipid.testsite.driving import Run, Trace, drive
 from slipid.testsite.plant import engine
-from slipid.testsite.simulate.config import Plan, can_identify, identify_config
+from slipid.testsite.simulate.config import Plan, all_filmed, can_identify, identify_config
 from slipid.testsite.simulate.observe import observe
 from slipid.testsite.site import Camera, Site
 from slipid.testsite.studio import Studio, film
@@ -97,7 +97,7 @@ def film_and_write(what: tuple[Job, Camera]) -> None:
     with np.load(_truth(job)) as true:
         studio = Studio(job.site, job.run.load, job.run.map, camera, job.seed)
         path = _video(job)
-        frames = np.arange(true["time"][0], true["time"][-1], camera.frame_s)
+        frames = np.arange(true["time"][0] - camera.early_s, true["time"][-1], camera.frame_s)
         rows = "".join(f"{k},{t:.4f}\n" for k, t in enumerate(frames))
         write_bytes(path.with_suffix(".csv"), f"frame,time\n{rows}".encode())
         with closing(studio):
@@ -166,8 +166,13 @@ def _describe(plan: Plan, out: Path) -> None:
     known = {"schema": "slipid.truth/1", "parameters": truth(site), "site": asdict(site)}
     write_json(out / "truth" / "truth.json", known)
     robot = out / "robot.toml"
-    if can_identify(plan) and not robot.is_file():  # it may have been edited since
-        write_bytes(robot, identify_config(plan).encode())
+    if can_identify(plan):
+        texts = {robot: identify_config(plan)}
+        if all_filmed(plan):
+            texts[out / "robot_video.toml"] = identify_config(plan, by_video=True)
+        for path, text in texts.items():
+            if not path.is_file():  # it may have been edited since
+                write_bytes(path, text.encode())
 
 
 def truth(site: Site) -> dict[str, Content]:

@@ -1,0 +1,54 @@
+"""`slipid floors`: which floor was under each wheel."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from slipid.cli.common import DataFolder, Json, Out, OutFolder, Quiet, emit, on_wheels
+from slipid.support.content import Content
+from slipid.support.progress import Reporter
+
+if TYPE_CHECKING:
+    from slipid.report.page import Page
+
+
+@on_wheels
+def floors(
+    fitted: OutFolder,
+    map: Annotated[
+        Path, typer.Option("--map", metavar="FILE", help="Floor map, as slipid map writes.")
+    ],
+    data: DataFolder,
+    out: Out,
+    logs: Annotated[
+        str | None,
+        typer.Option(metavar="GLOB", help="Which logs; those with a map in the config by default."),
+    ] = None,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Which floor was under each wheel in logged runs, and how far its border was.
+
+    Poses are corrected by the camera of the fit. Writes a CSV file for each run.
+    """
+    from slipid.deploy.floors_under import floors_under, summary, write_floors
+    from slipid.support.jax_setup import setup_jax
+
+    setup_jax(quiet=True)
+    with Reporter(quiet=quiet) as report:
+        lookup, runs = floors_under(fitted, map, data, logs, report)
+        written = write_floors(out, lookup, runs)
+    content = summary(lookup, runs)
+    emit(json, content, lambda page: show(page, content), out, [f"{len(written)} CSV files"])
+    return 0
+
+
+def show(page: "Page", content: Content) -> None:
+    """Print how much of each run every floor was under every wheel."""
+    from slipid.report.page import table
+
+    shares = table(("run", *content["surfaces"]), "percent of the time under wheel 1, 2, ...")
+    for name, run in content["runs"].items():
+        shares.add_row(name, *(" ".join(f"{100 * v:3.0f}" for v in row) for row in run.values()))
+    page.table(shares)
