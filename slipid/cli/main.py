@@ -6,12 +6,15 @@ import threading
 
 import typer
 
+from slipid.cli.calibrate import calibrate
 from slipid.cli.check import check
 from slipid.cli.compare import compare
 from slipid.cli.demo import demo
 from slipid.cli.design import design
 from slipid.cli.export import export
+from slipid.cli.floors import floors
 from slipid.cli.identify import identify
+from slipid.cli.map import map_
 from slipid.cli.motor import motor
 from slipid.cli.new import new
 from slipid.cli.paper import paper
@@ -19,6 +22,7 @@ from slipid.cli.reference import reference
 from slipid.cli.sample import sample
 from slipid.cli.selftest import selftest
 from slipid.cli.simulate import simulate
+from slipid.cli.track import track
 from slipid.cli.trial import trial
 from slipid.cli.tune import tune
 from slipid.cli.validate import validate
@@ -32,9 +36,9 @@ app = typer.Typer(
 )
 for command in (
     *(new, reference, motor, check, selftest, identify, sample, validate, compare),
-    *(design, tune, trial, export, simulate, paper, demo),
+    *(design, tune, trial, export, simulate, calibrate, track, map_, floors, paper, demo),
 ):
-    app.command()(command)
+    app.command(command.__name__.rstrip("_"))(command)  # map is a word of Python
 
 AGAIN_S = 0.05
 """After which an interrupt is sent again that Python had to ignore."""

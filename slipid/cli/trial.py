@@ -18,6 +18,14 @@ def trial(
     map: Annotated[
         Path | None, typer.Option("--map", metavar="FILE", help="Floor map; else made of patches.")
     ] = None,
+    told_map: Annotated[
+        Path | None,
+        typer.Option(
+            "--told-map",
+            metavar="FILE",
+            help="Map that controllers with one are told; the true one by default.",
+        ),
+    ] = None,
     controllers: Annotated[
         str | None, typer.Option(metavar="NAMES", help="By commas; all by default.")
     ] = None,
@@ -48,6 +56,7 @@ def trial(
     wish = Wish(
         plant=plant,
         map=map,
+        told_map=told_map,
         controllers=names_of(controllers),
         path=path,
         speed=speed,

@@ -168,11 +168,17 @@ class Pictured(Section):
 
 
 def read_map(path: Path) -> FloorMap:
-    """Map from a TOML file: `base`, `extent_m` and `[[patch]]`, or `picture` and `[colours]`.
+    """Map from a file: TOML or, by its suffix `.geojson`, what `slipid map` wrote.
+
+    TOML has `base`, `extent_m` and `[[patch]]`, or `picture` and `[colours]`.
 
     Raises:
         DataError: unreadable, unknown or missing keys, wrong values.
     """
+    if path.suffix.lower() == ".geojson":
+        from slipid.data.geojson_map import in_cells, read_vector_map
+
+        return in_cells(path, read_vector_map(path))
     mapping = mapping_of(path, text_of(path, "a floor map"))
     try:
         if "picture" in mapping:

@@ -46,7 +46,7 @@ PLANTS = ("testsite", "twin")
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """One run of one controller from one start."""
+    """One run of one controller from one start; `told` is the floor map that it may be told."""
 
     name: str
     row: str
@@ -55,6 +55,7 @@ class Job:
     seed: int
     plant: str
     floor: FloorMap
+    told: FloorMap
     robot: DeployedRobot
     settings: Settings
     habits: Habits
@@ -70,6 +71,7 @@ class Wish:
         plant: `testsite` (MuJoCo) or `twin` (the identified model itself, another draw of its
             numbers for every start).
         map: file of a floor map; None for patches of the identified floors.
+        told_map: file of the map that controllers with a map are told; None for the true one.
         controllers: names of `ROWS`.
         load: name of the load set-up; None for the first.
         path: name of `trajectory.PATHS`; speed: along it [m/s].
@@ -79,6 +81,7 @@ class Wish:
 
     plant: str = "testsite"
     map: Path | None = None
+    told_map: Path | None = None
     controllers: tuple[str, ...] = tuple(ROWS)
     path: str = "rectangle"
     speed: float = 0.2
@@ -132,6 +135,7 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
         "schema": SCHEMA,
         "plant": wish.plant,
         "map": "patches" if wish.map is None else str(wish.map),
+        "told_map": None if wish.told_map is None else str(wish.told_map),
         "path": wish.path,
         "speed_m_s": wish.speed,
         "gains": _named(jobs[0].robot, wish.tuned_gains),
@@ -156,12 +160,15 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
     robot = jax.tree.map(np.asarray, read_robot(out, wish.load))
     path = path_of(wish.path, wish.speed, robot)
     floor = site(robot) if wish.map is None else read_map(wish.map)
+    told = floor if wish.told_map is None else read_map(wish.told_map)
     settings, habits = Settings.of(robot), habits_of(robot, gyro=False)
     if wish.plant == "testsite":  # it has the sensors it has, whatever the logs had
         known_to_site(floor, robot.load_setup, robot.wheels)
         settings, habits = replace(settings, current_is_signed=False), Habits()
     else:
         known_to_fit(floor, robot, str(wish.map))
+    if wish.told_map is not None:
+        known_to_fit(told, robot, str(wish.told_map))
     check_gains(out, robot, wish.tuned_gains)
     key = key_of(
         *(
@@ -174,13 +181,13 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
             habits,
             *jax.tree.leaves(robot),
         ),
-        *(floor.surfaces, floor.corner, floor.cell, floor.cells),
+        *(part for m in (floor, told) for part in (m.surfaces, m.corner, m.cell, m.cells)),
         # runs of other code are not taken for this one's
         source_hash("control", "model", "testsite", "data", "deploy"),
     )
     # trials of other gains or floors lie beside this one, so that going back to them costs nothing
     kept = Checkpoint(out / FOLDER / key[:12] / f"of{wish.starts}", key)
-    shared = wish.plant, floor, robot, settings, habits, wish.tuned_gains, kept
+    shared = wish.plant, floor, told, robot, settings, habits, wish.tuned_gains, kept
     return [
         Job(f"{row}/start{k:02d}", row, path, start, 1000 + k, *shared)
         for row in applying(wish.controllers, robot)
@@ -228,7 +235,7 @@ def drive(job: Job) -> None:
         plant = twin(truth, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro))
     else:
         plant = SitePlant(job.floor, robot.load_setup, job.start, job.seed, row.gyro)
-    there = floor_of(job.floor, robot.labels)
+    there = floor_of(job.told, robot.labels)
     pilot = pilot_of(robot, row, job.settings, job.forced, there)
     course = closed_loop.drive(pilot, path, plant, job.start)
     off = course.pose[-1] - course.believed[-1]

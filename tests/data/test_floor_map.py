@@ -1,5 +1,7 @@
 """Floor maps: polygons, pictures, files, and what is wrong with some of them."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from slipid.data.floor_map import (
     uniform,
     write_map,
 )
+from slipid.data.geojson_map import Patch, VectorMap, covered
 from slipid.support.errors import DataError
 from tests.helpers.floors import surface_at
 
@@ -168,3 +171,99 @@ def test_a_map_whose_colours_cannot_be_told_apart_is_not_written(tmp_path):
     with pytest.raises(ValueError, match="same colour"):
         write_map(tmp_path / "site.toml", floor, {"a": "#102030", "b": "#102030"})
     assert not any(tmp_path.iterdir())
+
+
+def vector_map(*patches: Patch) -> VectorMap:
+    colours = {"table": "#ffffff", "gray": "#808080"}
+    return VectorMap(patches, colours, *UNIT, 0.1, "table", "", 0.0, ("a note",))
+
+
+def ringed(surface: str, *rings: list) -> Patch:
+    return Patch(surface, tuple(np.array(ring, float) for ring in rings), 1.0, 2.5)
+
+
+WHOLE = [[0, 0], [1, 0], [1, 1], [0, 1]]
+HOLE = SQUARE[::-1]
+
+
+def test_polygons_with_holes_come_back_from_geojson(tmp_path):
+    path = tmp_path / "map.geojson"
+    vector_map(ringed("table", WHOLE, HOLE), ringed("gray", SQUARE)).save(path)
+    floor = read_map(path)
+    assert floor.surfaces == ("table", "gray")
+    assert floor.cells.shape == (10, 10)
+    wanted = np.zeros((10, 10), int)
+    wanted[2:6, 2:6] = 1
+    np.testing.assert_array_equal(floor.cells, wanted)
+    assert floor.extent == pytest.approx(UNIT)
+    content = json.loads(path.read_text())
+    assert content["features"][0]["geometry"]["coordinates"][0] == [*WHOLE, WHOLE[0]]
+    assert content["features"][1]["properties"] == {
+        "surface": "gray",
+        "area_m2": 1.0,
+        "colour": "#808080",
+        "confidence": 2.5,
+    }
+
+
+def test_what_no_polygon_covers_has_the_nearest_surface(tmp_path):
+    path = tmp_path / "map.geojson"
+    left = [[0, 0], [0.3, 0], [0.3, 1], [0, 1]]
+    right = [[0.7, 0], [1, 0], [1, 1], [0.7, 1]]
+    vector_map(ringed("table", left), ringed("gray", right)).save(path)
+    np.testing.assert_array_equal(read_map(path).cells[4], [0] * 5 + [1] * 5)
+
+
+def test_cells_are_covered_by_their_middles():
+    ring = np.array([[0.4, 0.6], [2.6, 0.6], [2.6, 2.5], [0.4, 2.5]])
+    wanted = np.zeros((4, 4), bool)
+    wanted[1, 0:3] = True
+    np.testing.assert_array_equal(covered([ring], 4, 4), wanted)
+    np.testing.assert_array_equal(covered([ring[::-1]], 4, 4), wanted)
+    triangle = np.array([[0.0, 0.0], [8.0, 0.0], [0.0, 8.0]])
+    np.testing.assert_array_equal(covered([triangle - 0.01], 8, 8).sum(axis=1), range(7, -1, -1))
+    assert covered([np.array([[-9.0, -9.0], [9.0, -9.0], [9.0, 9.0], [-9.0, 9.0]])], 3, 2).all()
+    assert not covered([triangle + np.array([9.0, 0.0])], 8, 8).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (('"slipid.map/2"', '"slipid.map/3"'), r"slipid\.schema: 'slipid.map/3'; expected one of"),
+        (('"FeatureCollection"', '"Feature"'), "type: 'Feature'; expected one of 'FeatureColl"),
+        (('"Polygon"', '"Point"'), r"features\[1\]\.geometry\.type: 'Point'; expected one of"),
+        (('"cell_m": 0.1', '"cell_m": 0'), r"slipid\.cell_m: 0; expected: input should be gr"),
+        (('"cell_m": 0.1', '"cell_m": 0.0001'), "100000000 cells; expected at most"),
+        (('"cell_m": 0.1', '"cell": 0.1'), r"slipid\.cell: no such key, did you mean cell_m"),
+        (('"surface": "gray"', '"surface": "sand"'), "no colour of sand; expected it in slipid"),
+        (('"confidence": 2.5', '"confidence": NaN'), r"confidence: nan; expected"),
+        (('"colour": "#808080"', '"colour": "gray"'), r"properties\.colour: 'gray'; expected"),
+        (('"type": "Feature"', '"type" "Feature"'), "no valid JSON"),
+    ],
+)
+def test_what_is_wrong_with_a_geojson_map_is_said(tmp_path, change, match):
+    path = tmp_path / "map.geojson"
+    vector_map(ringed("table", WHOLE, HOLE), ringed("gray", SQUARE)).save(path)
+    text = path.read_text()
+    assert change[0] in text
+    path.write_text(text.replace(*change))
+    with pytest.raises(DataError, match=match) as error:
+        read_map(path)
+    assert str(path) in str(error.value)
+
+
+def test_geojson_without_a_map_is_refused(tmp_path):
+    path = tmp_path / "map.geojson"
+    with pytest.raises(DataError, match=r"expected a floor map \(slipid\.map/2\) that"):
+        read_map(path)
+    vector_map().save(path)
+    with pytest.raises(DataError, match=r"features: .* at least 1 item"):
+        read_map(path)
+    vector_map(ringed("table", (np.array(WHOLE) + 30).tolist())).save(path)
+    with pytest.raises(DataError, match="no polygon lies within extent_m; expected coord"):
+        read_map(path)
+    low = vector_map(ringed("table", WHOLE)).to_json()
+    low["slipid"]["extent_m"] = [1.0, 0.0, 0.0, 1.0]
+    path.write_text(json.dumps(low))
+    with pytest.raises(DataError, match="expected lowest x, y, then highest x, y"):
+        read_map(path)

@@ -18,7 +18,8 @@ CELL = 0.005
 def halves() -> FloorLookup:
     """Carpet where x is above 0.2 m, table elsewhere."""
     carpet = [(0.2, -1.0), (1.0, -1.0), (1.0, 1.0), (0.2, 1.0)]
-    return FloorLookup.of(from_polygons("table", [("carpet", carpet)], (-1.0, -1.0, 1.0, 1.0), CELL))
+    patches = [("carpet", carpet)]
+    return FloorLookup.of(from_polygons("table", patches, (-1.0, -1.0, 1.0, 1.0), CELL))
 
 
 def test_floor_and_border_of_every_wheel(halves):

@@ -1,0 +1,146 @@
+"""`slipid map`: which surface lies where, from a picture from above."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from slipid.cli.common import Json, Out, Quiet, emit, guarded
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
+
+if TYPE_CHECKING:
+    from slipid.report.page import Page
+    from slipid.vision.camera import OverheadCamera
+    from slipid.vision.floor.found import FoundMap
+
+PROPOSAL = "palette.toml"
+
+
+@guarded
+def map_(
+    image: Annotated[Path, typer.Argument(metavar="IMAGE", help="Picture of the floor, or video.")],
+    out: Out,
+    camera: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Camera that `slipid calibrate` wrote.")
+    ] = None,
+    metres_per_pixel: Annotated[
+        float | None,
+        typer.Option(metavar="M", min=1e-6, max=1, help="Instead of --camera: straight down."),
+    ] = None,
+    camera_height: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M",
+            min=0.1,
+            max=100,
+            help="With --metres-per-pixel; by default the width of the view.",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Surfaces by colour or by points, region, masks."),
+    ] = None,
+    surfaces: Annotated[
+        int | None, typer.Option(metavar="N", min=1, max=40, help="How many to propose.")
+    ] = None,
+    cell: Annotated[
+        float | None,
+        typer.Option(metavar="M", min=1e-4, max=1, help="Edge of a cell; a pixel's by default."),
+    ] = None,
+    dictionary: Annotated[
+        str, typer.Option(metavar="NAME", help="ArUco dictionary of the robot's marker.")
+    ] = "4X4_50",
+    robot_radius: Annotated[
+        float, typer.Option(metavar="M", min=0, max=10, help="Around the marker; is masked.")
+    ] = 0.2,
+    robot_height: Annotated[
+        float, typer.Option(metavar="M", min=0, max=10, help="Of the marker above the floor.")
+    ] = 0.25,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    r"""Map of the floor from one picture from above: patches of surfaces; needs slipid\[camera].
+
+    Without a config it proposes surfaces and writes a palette.toml to rename them in and to run
+    again with. Writes map.geojson, which every option for a map takes, and a picture to check it.
+    Exit code 1 where the map is poor.
+    """
+    from slipid.plots.floor import floor_plot
+    from slipid.support.files import write_bytes
+    from slipid.support.jax_setup import one_blas_thread
+    from slipid.vision.floor.picture import Wish, map_of
+    from slipid.vision.floor.robot_mask import Robot
+
+    one_blas_thread()  # many small matrices
+    robot = Robot(dictionary, robot_radius, robot_height)
+    with Reporter(quiet=quiet) as report:
+        above = _camera(image, camera, metres_per_pixel, camera_height)
+        found = map_of(image, above, Wish(config, surfaces, robot, cell), report)
+        if found.proposal is not None and (out / PROPOSAL).exists():
+            raise DataError(
+                f"{out / PROPOSAL}: it is there already and may have been edited, and surfaces are "
+                f"to be proposed; expected --config {out / PROPOSAL} with surfaces in it, or "
+                "another folder"
+            )
+        found.vector.save(out / "map.geojson")
+        floor_plot(found.vector, found.floor.colour, found.floor.seen, out / "map.png")
+        written = ["map.geojson", "map.png"]
+        if found.proposal is not None:
+            write_bytes(out / PROPOSAL, found.proposal.encode())
+            written.append(PROPOSAL)
+    emit(json, found.to_json(), lambda page: show(page, found, out), out, written)
+    return 1 if found.poor else 0
+
+
+def _camera(
+    image: Path, camera: Path | None, metres_per_pixel: float | None, height: float | None
+) -> "OverheadCamera":
+    """The camera that is told, one way or the other."""
+    from slipid.vision.camera import OverheadCamera
+    from slipid.vision.still import still
+
+    if (camera is None) == (metres_per_pixel is None):
+        raise DataError(
+            f"{image}: no scale; expected either --camera FILE or --metres-per-pixel M"
+            if camera is None
+            else f"{camera}: a camera and --metres-per-pixel; expected one of them"
+        )
+    if camera is not None:
+        if height is not None:
+            raise DataError(f"{camera}: it says how high it is; expected no --camera-height")
+        return OverheadCamera.load(camera)
+    assert metres_per_pixel is not None
+    tall, wide = still(image).shape[:2]
+    return OverheadCamera.straight_down(
+        (wide, tall), metres_per_pixel, height or metres_per_pixel * max(wide, tall)
+    )
+
+
+def show(page: "Page", found: "FoundMap", out: Path) -> None:
+    """Print the surfaces, what is doubtful, and what to do next."""
+    from slipid.report.page import table
+
+    content = found.to_json()
+    columns = ("surface", "colour", "patches", "area [m^2]", "share", "confidence")
+    rows = table(columns, right=columns[2:])
+    for one in content["surfaces"]:
+        sure = "" if one["confidence"] is None else f"{one['confidence']:.1f}"
+        share, area = f"{100 * one['share']:.1f} %", f"{one['area_m2']:.3f}"
+        rows.add_row(one["surface"], one["colour"], str(one["patches"]), area, share, sure)
+    page.table(rows)
+    page.line(
+        "confidence: by how many spreads the next best surface explains the least sure patch worse"
+    )
+    for robot in found.robots:
+        page.line(
+            f"robot with marker {robot.marker} masked at x {robot.x:.2f} m, y {robot.y:.2f} m"
+        )
+    page.notes(content["notes"])
+    for sentence in found.warnings:
+        page.line(f"warning: {sentence}")
+    for sentence in found.poor:
+        page.line(f"poor: {sentence}")
+    if found.proposal is not None:
+        page.line(f"surfaces are proposed: rename or join them in {out / PROPOSAL}, then add")
+        page.line(f"  --config {out / PROPOSAL}")

@@ -1,0 +1,199 @@
+"""The map that was found: outlines in metres, colours, and how far it can be trusted."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from slipid.data.geojson_map import Patch, VectorMap
+from slipid.support.content import Content
+from slipid.support.errors import DataError
+from slipid.vision.floor.asked import Asked, Source
+from slipid.vision.floor.grid import Rectified
+from slipid.vision.floor.judge import Pair, alike, margin, unknown_share, verdict
+from slipid.vision.floor.outline import Outlined, area, outlined
+from slipid.vision.floor.palette import Palette, ProposedSurface, palette_text
+from slipid.vision.floor.robot_mask import Seen
+from slipid.vision.floor.segmentation.colour import Features, code_of_light
+from slipid.vision.floor.segmentation.proposal import Proposal
+from slipid.vision.floor.segmentation.segment import UNKNOWN
+from slipid.vision.floor.segmentation.surfaces import Surfaces
+
+MOST_NAMED = 3
+"""Of weak patches, the largest."""
+WEAK = 1.0
+"""Confidence below which a patch is named [spreads]."""
+TOLERANCE = 0.6
+"""How far an outline may be from the edges of cells [cells]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """Which surface each cell has, and how well each explains it."""
+
+    labels: Int[np.ndarray, "row column"]
+    costs: Float32[np.ndarray, "surface row column"]
+    surfaces: Surfaces
+
+
+@dataclass(frozen=True, eq=False)
+class FoundMap:
+    """A map, and what it was made of.
+
+    Attributes:
+        vector: polygons.
+        floor: the picture laid onto the floor.
+        labels: surface of each cell, in the order of the colours of `vector`; -1 is unknown.
+        robots: that hid a part of it.
+        warnings: what makes it less certain; poor: what makes it bad.
+        proposal: a config that finds the same surfaces; None where one was given.
+    """
+
+    vector: VectorMap
+    floor: Rectified
+    labels: Int[np.ndarray, "row column"]
+    robots: tuple[Seen, ...]
+    warnings: tuple[str, ...]
+    poor: tuple[str, ...]
+    proposal: str | None
+
+    def to_json(self) -> Content:
+        """What programs want to know, without the polygons."""
+        total = max(1, int((self.labels >= 0).sum()))
+        return {
+            "surfaces": [
+                {
+                    "surface": name,
+                    "colour": colour,
+                    "share": float((self.labels == k).sum() / total),
+                    "area_m2": sum(p.area for p in self.vector.patches if p.surface == name),
+                    "patches": sum(p.surface == name for p in self.vector.patches),
+                    "confidence": _least(self.vector, name),
+                }
+                for k, (name, colour) in enumerate(self.vector.colours.items())
+            ],
+            "filled_share": self.vector.unknown,
+            "robots": [{"marker": r.marker, "place_m": [r.x, r.y]} for r in self.robots],
+            "notes": list(self.vector.notes),
+            "warnings": list(self.warnings),
+            "poor": list(self.poor),
+        }
+
+
+def _least(vector: VectorMap, name: str) -> float | None:
+    """Confidence of the least certain patch of a surface."""
+    given = [p.confidence for p in vector.patches if p.surface == name and p.confidence is not None]
+    return min(given, default=None)
+
+
+def made(
+    source: Source,
+    ask: Asked,
+    found: Features,
+    names: tuple[str, ...],
+    palette: Palette,
+    told: Told,
+) -> FoundMap:
+    """Outlines, colours and how far they can be trusted."""
+    there = [k for k in range(len(names)) if (told.labels == k).any()]
+    number = np.full(len(names) + 1, UNKNOWN)
+    number[there] = np.arange(len(there))
+    labels = number[told.labels]  # UNKNOWN is the last
+    kept = tuple(names[k] for k in there)
+    if not kept:
+        raise DataError(f"{source.path}: no cell looks like a surface; expected a floor")
+    colours = {
+        name: palette.palette.get(name, code_of_light(np.median(found.light[labels == k], axis=0)))
+        for k, name in enumerate(kept)
+    }
+    patches = tuple(
+        _patch(one, ask, kept, told.costs[there]) for one in outlined(labels, TOLERANCE)
+    )
+    pairs = tuple(
+        pair for pair in alike(told.surfaces, names) if {pair.one, pair.other} <= set(kept)
+    )
+    poor = verdict(pairs, labels, ask.wanted)
+    vector = _vector(source, ask, labels, patches, colours)
+    warnings = _warnings(ask, pairs, vector)
+    return FoundMap(vector, ask.floor, labels, ask.robots, warnings, poor, None)
+
+
+def _patch(
+    one: Outlined,
+    ask: Asked,
+    names: tuple[str, ...],
+    costs: Float32[np.ndarray, "surface row column"],
+) -> Patch:
+    """A patch in metres, the outer ring anticlockwise and holes clockwise."""
+    rings = []
+    for k, ring in enumerate(one.rings):
+        way = ring if (area(ring) > 0) == (k == 0) else ring[::-1]
+        rings.append(ask.floor.grid.places(way))
+    size = sum(area(ring) for ring in rings)
+    return Patch(names[one.label], tuple(rings), size, margin(costs, one.cells, one.label))
+
+
+def _vector(
+    source: Source,
+    ask: Asked,
+    labels: Int[np.ndarray, "row column"],
+    patches: tuple[Patch, ...],
+    colours: dict[str, str],
+) -> VectorMap:
+    """The map as a file has it."""
+    grid = ask.floor.grid
+    extent = grid.extent
+    most = int(np.argmax(np.bincount(labels[labels >= 0])))
+    unknown = float((labels < 0).mean())
+    wanted = unknown_share(labels, ask.wanted)
+    notes = []
+    if unknown > 0:
+        notes.append(
+            f"{100 * unknown:.1f} % of the map's rectangle is unknown ({100 * wanted:.1f} % of the "
+            "floor that was asked for): read as a floor map it has the nearest surface there"
+        )
+    return VectorMap(
+        patches,
+        colours,
+        *(extent.low_x, extent.low_y, extent.high_x, extent.high_y),
+        grid.cell,
+        list(colours)[most],
+        hashlib.sha256(source.path.read_bytes()).hexdigest(),
+        unknown,
+        tuple(notes),
+    )
+
+
+def _warnings(ask: Asked, pairs: tuple[Pair, ...], vector: VectorMap) -> tuple[str, ...]:
+    """What a reader must know of a map that is not poor for it."""
+    said = [pair.said() for pair in pairs if pair.separable]
+    if not ask.robots:
+        said.append(
+            "no marker of a robot was found, so none is masked; where one stands, mask it in the "
+            "config, or name the --dictionary of its marker"
+        )
+    weak = [p for p in vector.patches if p.confidence is not None and p.confidence < WEAK]
+    for patch in weak[:MOST_NAMED]:
+        x, y = patch.rings[0].mean(axis=0)
+        said.append(
+            f"the patch of {patch.surface} around x {x:.2f} m, y {y:.2f} m ({patch.area:.3g} m^2) "
+            f"looks almost as much like another surface ({patch.confidence:.1f} spreads)"
+        )
+    if len(weak) > MOST_NAMED:
+        area = sum(patch.area for patch in weak[MOST_NAMED:])
+        said.append(f"so do {len(weak) - MOST_NAMED} smaller patches ({area:.3g} m^2)")
+    return tuple(said)
+
+
+def text_of_proposal(path: Path, palette: Palette, made: FoundMap, points: Proposal) -> str:
+    """The config of a proposal, by points in pixels."""
+    shares = {one["surface"]: one["share"] for one in made.to_json()["surfaces"]}
+    pixels = made.floor.pixels[points.row, points.column]
+    surfaces = []
+    for name, colour in made.vector.colours.items():
+        mine = points.surface == int(name.removeprefix("surface_")) - 1
+        places = tuple((float(x), float(y)) for x, y in pixels[mine])
+        surfaces.append(ProposedSurface(name, colour, shares[name], places))
+    return palette_text(surfaces, path.name, palette)

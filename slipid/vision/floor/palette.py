@@ -1,0 +1,137 @@
+"""The config of a map: surfaces by colour or by marked points, the region, and what lies on it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from slipid.data.floor_map import Colour, Point
+from slipid.support.errors import DataError
+from slipid.support.toml_file import Section, checked, mapping_of, text_of
+
+SCHEMA: Literal["slipid.palette/1"] = "slipid.palette/1"
+Points = Annotated[list[Point], Field(min_length=1)]
+Name = Annotated[str, Field(min_length=1, max_length=60)]
+
+
+class Places(Section):
+    """Places in pixels of the picture or in metres of the floor."""
+
+    at_px: Points | None = None
+    at_m: Points | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> "Places":
+        if (self.at_px is None) == (self.at_m is None):
+            raise ValueError("expected either at_px or at_m: [[x, y], ...]")
+        return self
+
+    @property
+    def count(self) -> int:
+        return len(self.at_px or self.at_m or [])
+
+
+class Polygon(Places):
+    """A polygon."""
+
+    @model_validator(mode="after")
+    def _corners(self) -> "Polygon":
+        if self.count < 3:
+            raise ValueError(f"{self.count} corners; expected a polygon of 3 or more")
+        return self
+
+
+class Marked(Places):
+    """Points on a surface."""
+
+    surface: Name
+
+
+class Palette(Section):
+    """What is told of a floor before its picture is looked at."""
+
+    schema_: Literal["slipid.palette/1"] = Field(alias="schema")
+    palette: dict[Name, Colour] = Field(default_factory=dict)
+    points: list[Marked] = Field(default_factory=list)
+    region: Polygon | None = None
+    mask: list[Polygon] = Field(default_factory=list)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Surfaces, in the order of the config."""
+        return tuple(dict.fromkeys([*self.palette, *(one.surface for one in self.points)]))
+
+
+def read_palette(path: Path) -> Palette:
+    """A config of surfaces, checked.
+
+    Raises:
+        DataError: unreadable, unknown or missing keys, wrong values, two surfaces of one colour.
+    """
+    found = checked(path, mapping_of(path, text_of(path, "a palette of surfaces")), Palette)
+    first: dict[str, str] = {}
+    for name, colour in found.palette.items():
+        same = first.setdefault(colour.lower(), name)
+        if same != name:
+            raise DataError(
+                f"{path}: palette.{name}: '{colour}', the colour of {same}; expected another: "
+                "surfaces are told apart by it"
+            )
+    return found
+
+
+@dataclass(frozen=True)
+class ProposedSurface:
+    """A surface that was found, by points on it.
+
+    Attributes:
+        colour: `#rrggbb`.
+        share: of the floor that was looked at.
+        points: pixels.
+    """
+
+    name: str
+    colour: str
+    share: float
+    points: tuple[tuple[float, float], ...]
+
+
+def palette_text(found: Sequence[ProposedSurface], image: str, before: Palette) -> str:
+    """A config that finds the same surfaces again, to be edited."""
+    lines = [
+        f"# Surfaces that `slipid map` found by itself in {image}.",
+        "# Rename them. Two with the same name become one surface: where the light differs much,",
+        "# one surface is often proposed as two. A surface that is missing: add points on it.",
+        "# Then: slipid map IMAGE --config this file, with the other options as before.",
+        f'schema = "{SCHEMA}"',
+        "",
+    ]
+    lines += _polygon("[region]", before.region) if before.region else _EXAMPLE
+    for one in before.mask:
+        lines += _polygon("[[mask]]", one)
+    for surface in found:
+        points = ", ".join(f"[{x:.0f}, {y:.0f}]" for x, y in surface.points)
+        lines += [
+            f"[[points]]  # {surface.colour}, {100 * surface.share:.1f} % of what was looked at",
+            f'surface = "{surface.name}"',
+            f"at_px = [{points}]",
+            "",
+        ]
+    return "\n".join(lines)
+
+
+_EXAMPLE = [
+    "# Only what lies in a region is mapped; objects on the floor can be masked:",
+    "# [region]",
+    "# at_px = [[100, 100], [900, 100], [900, 700], [100, 700]]",
+    "# [[mask]]",
+    "# at_px = [[10, 10], [60, 10], [60, 80]]",
+    "",
+]
+
+
+def _polygon(head: str, polygon: Polygon) -> list[str]:
+    key, corners = ("at_px", polygon.at_px) if polygon.at_px else ("at_m", polygon.at_m)
+    return [head, f"{key} = {[list(corner) for corner in corners or []]}", ""]

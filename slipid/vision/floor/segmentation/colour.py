@@ -1,0 +1,82 @@
+"""Colours as people see differences of them, as light adds up, and how rough a surface looks."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from slipid.vision.opencv import opencv
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """What surfaces are told apart by, in every cell.
+
+    Attributes:
+        look: lightness L, a, b of CIELAB, and texture, each with a spread of its own.
+        light: red, green, blue as light adds up, 0 to 1.
+    """
+
+    look: Float[np.ndarray, "row column 4"]
+    light: Float[np.ndarray, "row column 3"]
+
+
+def features(colour: UInt8[np.ndarray, "row column 3"], smooth: float = 1.0) -> Features:
+    """What a picture in blue, green, red shows.
+
+    Args:
+        smooth: of the noise [cells].
+    """
+    cv2 = opencv()
+    fine = colour.astype(np.float32) / 255
+    soft = cv2.GaussianBlur(fine, (0, 0), smooth)
+    lab = cv2.cvtColor(soft, cv2.COLOR_BGR2LAB)
+    rough = texture(cv2.cvtColor(fine, cv2.COLOR_BGR2LAB)[..., 0])
+    look = np.concatenate([lab, rough[..., None]], axis=-1)
+    return Features(look, as_light(soft[..., ::-1]))
+
+
+def texture(lightness: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
+    """How much the lightness changes within a few cells, as the logarithm of 1 and that.
+
+    The median over a window leaves out edges between surfaces, which are lines in it.
+    """
+    cv2 = opencv()
+    change = np.abs(lightness - cv2.GaussianBlur(lightness, (0, 0), 2.5))
+    coarse = np.clip(change * 16, 0, 255).astype(np.uint8)
+    usual = cv2.medianBlur(coarse, 13).astype(np.float32) / 16
+    return np.log1p(cv2.GaussianBlur(usual, (0, 0), 3.0))
+
+
+def as_light(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """Amounts of light that add up, of sRGB values from 0 to 1."""
+    low = rgb / np.asarray(12.92, rgb.dtype)
+    high = ((np.maximum(rgb, 0) + 0.055) / 1.055) ** 2.4
+    return np.where(rgb <= 0.04045, low, high).astype(rgb.dtype)
+
+
+def as_shown(light: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """SRGB values from 0 to 1 of amounts of light."""
+    inside = np.clip(light, 0, 1)
+    low, high = 12.92 * inside, 1.055 * inside ** (1 / 2.4) - 0.055
+    return np.where(inside <= 0.0031308, low, high)
+
+
+def lab_of(light: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """CIELAB of amounts of red, green, blue light."""
+    cv2 = opencv()
+    shown = as_shown(light)[..., ::-1].astype(np.float32).reshape(-1, 1, 3)
+    if not len(shown):
+        return np.zeros(light.shape)
+    found = cv2.cvtColor(np.ascontiguousarray(shown), cv2.COLOR_BGR2LAB)
+    return np.asarray(found, float).reshape(light.shape)
+
+
+def light_of_code(code: str) -> Float[np.ndarray, "3"]:
+    """Amounts of light of a colour `#rrggbb`."""
+    return as_light(np.array([int(code[k : k + 2], 16) for k in (1, 3, 5)]) / 255)
+
+
+def code_of_light(light: Float[np.ndarray, "3"]) -> str:
+    """`#rrggbb` of amounts of light."""
+    return "#" + "".join(f"{round(255 * float(v)):02x}" for v in as_shown(light))
