@@ -7,6 +7,7 @@ from importlib import import_module
 
 TYPE_CHECKING = False  # known to type checkers by its name, without loading `typing`
 if TYPE_CHECKING:
+    from slipid.api.camera import track as track
     from slipid.api.check import check as check
     from slipid.api.driving import drive as drive
     from slipid.api.export import export as export
@@ -22,7 +23,9 @@ if TYPE_CHECKING:
     from slipid.control.deployed import DeployedRobot as DeployedRobot
     from slipid.control.estimator import Estimator as Estimator
     from slipid.control.interface import Measurement as Measurement
+    from slipid.data.reading.presets import layout as layout
     from slipid.data.reading.reader import read_runs as read_runs
+    from slipid.deploy.floors import FloorLookup as FloorLookup
     from slipid.deploy.floors import floor_map as floor_map
     from slipid.identify.posterior.blocks import Plan as Plan
     from slipid.model.robot import Robot as Robot
@@ -30,6 +33,8 @@ if TYPE_CHECKING:
     from slipid.plots.wheels import wheel_curve as wheel_curve
     from slipid.support.errors import DataError as DataError
     from slipid.support.jax_setup import setup_jax as setup_jax
+    from slipid.vision.camera import OverheadCamera as OverheadCamera
+    from slipid.vision.tracking.tracking import LoneMarker as LoneMarker
 
 __version__ = "0.1.0"
 _ROOMS = {
@@ -38,7 +43,10 @@ _ROOMS = {
     "DeployedRobot": "slipid.control.deployed",
     "Estimator": "slipid.control.estimator",
     "Fit": "slipid.api.fit",
+    "FloorLookup": "slipid.deploy.floors",
+    "LoneMarker": "slipid.vision.tracking.tracking",
     "Measurement": "slipid.control.interface",
+    "OverheadCamera": "slipid.vision.camera",
     "Plan": "slipid.identify.posterior.blocks",
     "Posterior": "slipid.api.posterior",
     "Prior": "slipid.api.fit",
@@ -50,11 +58,13 @@ _ROOMS = {
     "export": "slipid.api.export",
     "fit": "slipid.api.fit",
     "floor_map": "slipid.deploy.floors",
+    "layout": "slipid.data.reading.presets",
     "made_runs": "slipid.api.known_robot",
     "move": "slipid.api.known_robot",
     "plot_runs": "slipid.plots.raw",
     "read_runs": "slipid.data.reading.reader",
     "setup_jax": "slipid.support.jax_setup",
+    "track": "slipid.api.camera",
     "wheel_curve": "slipid.plots.wheels",
 }
 __all__ = sorted(_ROOMS)

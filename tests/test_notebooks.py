@@ -21,6 +21,7 @@ FIGURES = {
     "04_posterior": 4,
     "05_linear_or_nonlinear": 4,
     "06_compensation": 3,
+    "07_from_a_video": 3,
 }
 
 

@@ -161,6 +161,15 @@ PRESETS = {layout.name: layout for layout in _LAYOUTS}
 _SETTINGS = [f.name for f in fields(Layout) if f.name not in ("name", "channels", "beside")]
 
 
+def layout(table: Mapping[str, object]) -> Layout:
+    """How log files are laid out, as `[layouts.NAME]` of a config says it, for `read_runs`.
+
+    Raises:
+        DataError: unknown key, channel, unit or format, wrong dimension, wrong type.
+    """
+    return declared_layout(table, "layout")
+
+
 def declared_layout(table: Mapping[str, object], where: str) -> Layout:
     """Layout declared in a config: `format` names a preset, the rest overrides it.
 

@@ -1,0 +1,48 @@
+"""What an overhead camera saw: poses from a video."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from slipid.support.progress import Reporter
+from slipid.vision.camera import OverheadCamera
+from slipid.vision.tracking.frames.source import open_source
+from slipid.vision.tracking.target import Target, read_targets
+from slipid.vision.tracking.tracking import LoneMarker, Tracked
+from slipid.vision.tracking.tracking import track as run
+
+
+def track(
+    video: Path | str,
+    camera: OverheadCamera | Path | str,
+    marker: LoneMarker | Path | str,
+    *,
+    fps: float | None = None,
+    times: Path | str | None = None,
+    quiet: bool = False,
+) -> Tracked:
+    """Poses of a robot with a marker, in every frame of a video or of a folder of pictures.
+
+    `tracked.tracks[0].pose` has x, y [m] and heading [rad], NaN where the flag says why there is
+    none; `tracked.write(path)` writes the file that the layout `tracked` reads beside a log.
+
+    Args:
+        camera: calibrated and with its place above the floor, or its file.
+        marker: in the middle of the robot; or the file that places several, boards or robots.
+        fps: frames per second where the video has no times.
+        times: CSV file of frame and time, instead.
+        quiet: no progress.
+
+    Raises:
+        DataError: what cannot be read, no marker, or frames of another size than calibrated.
+    """
+    above = camera if isinstance(camera, OverheadCamera) else OverheadCamera.load(camera)
+    source = open_source(str(video), fps, None if times is None else Path(times))
+    above.of_size(source.image_px, source.name)
+    # what is found is in memory: nobody goes on from this folder
+    with TemporaryDirectory() as folder, Reporter(quiet=quiet) as report:
+        bodies: tuple[Target, ...]
+        if isinstance(marker, LoneMarker):
+            bodies = (marker.target(source),)
+        else:
+            bodies = read_targets(Path(marker))
+        return run(source, above, bodies, Path(folder) / "unfinished", report)
