@@ -1,5 +1,6 @@
 """`slipid track`: poses from a video."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -54,7 +55,7 @@ def track(
         str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="Only this part, in pixels.")
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(metavar="S", help="How long to watch a device.")
+        float | None, typer.Option(metavar="S", help="How long to watch a device; it needs this.")
     ] = None,
     preview: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also draw one frame, to check by eye.")
@@ -78,7 +79,9 @@ def track(
 
     above = OverheadCamera.load(camera)
     with Reporter(quiet=quiet) as report:
+        part = _region(region)
         frames = open_source(source, fps, times, seconds)
+        tracking.before_long_work(frames, out, preview)
         above.of_size(frames.image_px, frames.name)
         if targets is not None:
             bodies = read_targets(targets)
@@ -89,12 +92,11 @@ def track(
             )
         else:
             report.stage("looking for the marker")
-            yaw = marker_yaw * 3.141592653589793 / 180
-            bodies = (
-                tracking.lone_target(frames, dictionary, id, marker_size, marker_height, yaw),
-            )
+            yaw = math.radians(marker_yaw)
+            lone = tracking.LoneMarker(marker_size, marker_height, id, dictionary, yaw)
+            bodies = (lone.target(frames, part),)
         unfinished = out.with_name(f".{out.name}.unfinished")
-        done = tracking.track(frames, above, bodies, unfinished, report, _region(region))
+        done = tracking.track(frames, above, bodies, unfinished, report, part)
         written = [path.name for path in done.write(out)]
         if preview is not None:
             number = tracking.preview(preview, done, above, preview_frame)

@@ -1,24 +1,26 @@
 """Find markers in a frame: near where they were, and in all of it now and then.
 
 OpenCV looks through a whole frame in tens of milliseconds and through the surroundings of a marker
-in one. Where every marker that was seen last is found again near its expected place, nothing else
-is looked at, except in every `WHOLE`-th frame, in which a second marker of the same number shows.
+in one. Where every wanted marker was seen last and is found again near its expected place, nothing
+else is looked at, except in every `WHOLE`-th frame, in which a second marker of the same number
+shows.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from slipid.vision.opencv import marker_dictionary, opencv
+from slipid.vision.tracking.edges import refined
 
 WHOLE = 30
 """Every so many frames all of the frame is looked at."""
 AROUND = 0.7
 """Margin around the expected place, as a part of the marker's size in the picture."""
 LEAST_AROUND = 12.0
-"""Least margin [pixel]: corners are refined in windows of some pixels."""
+"""Least margin [pixel]: the detector passes over what touches the border."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,35 +70,27 @@ class MarkerDetector:
     """
 
     def __init__(self, dictionary: str):
-        aruco = opencv().aruco
-        parameters = aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
-        # windows of 5 pixels; corners of markers that are small in the picture have smaller ones
-        parameters.cornerRefinementWinSize = 5
-        parameters.cornerRefinementMinAccuracy = 0.01
-        self._detector = aruco.ArucoDetector(marker_dictionary(dictionary), parameters)
+        book = marker_dictionary(dictionary)
+        self._squares = int(book.markerSize) + 2
+        self._detector = opencv().aruco.ArucoDetector(book)
 
     def find(
         self, grey: UInt8[np.ndarray, "row column"], region: Region | None = None
     ) -> list[Sighting]:
         """Every marker in a frame, or in a part of it."""
-        shift = np.zeros(2)
-        if region is not None:
-            region = region.within(Region(0, 0, grey.shape[1], grey.shape[0]))
-            if region.empty:
-                return []
-            grey = np.ascontiguousarray(
-                grey[region.top : region.bottom, region.left : region.right]
-            )
-            shift = np.array([region.left, region.top], float)
-        corners, ids, _ = self._detector.detectMarkers(grey)
-        if ids is None:
+        whole = Region(0, 0, grey.shape[1], grey.shape[0])
+        part = whole if region is None else region.within(whole)
+        if part.empty:
             return []
+        looked = np.ascontiguousarray(grey[part.top : part.bottom, part.left : part.right])
+        corners, ids, _ = self._detector.detectMarkers(looked)
+        if ids is None or not len(ids):
+            return []
+        shift = np.array([part.left, part.top])
+        rough = np.asarray(corners, float).reshape(-1, 4, 2) + shift
         numbers = np.asarray(ids).ravel().tolist()
-        return [
-            Sighting(number, np.asarray(found, float).reshape(4, 2) + shift)
-            for number, found in zip(numbers, corners, strict=True)
-        ]
+        fine = refined(grey, rough, self._squares)
+        return [Sighting(number, fine[k]) for k, number in enumerate(numbers)]
 
 
 @dataclass(eq=False)
@@ -110,8 +104,8 @@ class Finder:
         last: where each wanted marker was seen last.
         speed: how far its middle moved in the frame before [pixel].
         whole: frames that were looked at as a whole.
-        twice: whether a marker was seen twice in the last of them; then all of the next is looked
-            at, too, lest the wrong one is followed.
+        twice: whether a marker was seen twice in the frame before; then all of the next is looked
+            at, lest the wrong one is followed.
     """
 
     detector: MarkerDetector
@@ -124,14 +118,13 @@ class Finder:
 
     def find(self, grey: UInt8[np.ndarray, "row column"], number: int) -> list[Sighting]:
         """The wanted markers in the frame of this number; each as often as it is seen."""
-        if self.last and not self.twice and number % WHOLE:
+        if self.ids == self.last.keys() and not self.twice and number % WHOLE:
             near = [s for s in self.detector.find(grey, self._around()) if s.id in self.ids]
-            if {s.id for s in near} >= set(self.last):
+            if self.ids == {s.id for s in near}:
                 self._follow(near)
                 return near
         found = [s for s in self.detector.find(grey, self.region) if s.id in self.ids]
         self.whole += 1
-        self.twice = len({s.id for s in found}) < len(found)
         self._follow(found)
         return found
 
@@ -150,24 +143,12 @@ class Finder:
         return around if self.region is None else around.within(self.region)
 
     def _follow(self, found: Sequence[Sighting]) -> None:
-        """Remember where each marker is; of several of one number the nearest to the last place."""
-        chosen = _nearest(found, self.last)
+        """Remember where each marker is."""
+        seen = {one.id: one for one in found}
+        self.twice = len(seen) < len(found)
         self.speed = {
-            number: seen.middle - self.last[number].middle
-            for number, seen in chosen.items()
+            number: one.middle - self.last[number].middle
+            for number, one in seen.items()
             if number in self.last
         }
-        self.last = chosen
-
-
-def _nearest(found: Iterable[Sighting], last: Mapping[int, Sighting]) -> dict[int, Sighting]:
-    out: dict[int, Sighting] = {}
-    for seen in found:
-        other = out.get(seen.id)
-        if other is None:
-            out[seen.id] = seen
-        elif seen.id in last:
-            middle = last[seen.id].middle
-            if np.linalg.norm(seen.middle - middle) < np.linalg.norm(other.middle - middle):
-                out[seen.id] = seen
-    return out
+        self.last = seen

@@ -1,38 +1,39 @@
-"""Which poses of a track are not to be believed: frames that do not fit to their neighbours.
+"""Which poses of a track are not to be believed: those that no body drives through.
 
-A body has inertia. From the frames around it the pose in a frame is known to about half the largest
-acceleration times the product of the times to two of them; what is further off, beyond its noise,
-was not measured but mistaken: a reflection, a torn frame, a frame out of order.
+A body has inertia: from where it was and how fast, it gets in a short time only so far. A track is
+cut wherever it turns more sharply than that allows, and of the pieces those are believed that can
+be driven one after the other and have most frames together. What is left out was not measured but
+mistaken: a reflection, a torn frame, a frame out of order, for one frame or for many.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 ACCELERATION = np.array([3.0, 3.0, 30.0])
 """Beyond what a wheeled robot does: x, y [m/s^2], heading [rad/s^2]."""
+SUDDEN = np.array([0.1, 0.1, 2.0])
+"""By which its speed may change at once, where it hits something: x, y [m/s], heading [rad/s]."""
+SPEED = np.array([5.0, 5.0, 15.0])
+"""Beyond what it drives: x, y [m/s], heading [rad/s]."""
 STDS = 6.0
 """Of the noise, below which nothing is an outlier."""
-WIDE, NARROW = 4, 2
-"""Neighbours on each side: at first many, among which some may be wrong; then the nearest."""
-LONGEST = 1.0
-"""Neighbours further away in time do not count [s]."""
-SPEED = 5.0
-"""Beyond what a body drives from one frame to the next [m/s]."""
+BEHIND = 2
+"""Frames over which the speed at the end of a piece is taken."""
+PIECES = 60
+"""Pieces before one after which it may come."""
+FEWEST = 5
+"""Poses, below which nothing can be said."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Around:
-    """What the neighbours of every frame say of it, medians over pairs of them.
+class _Seen:
+    """Poses that were found: time [s], x, y [m], heading [rad], and the std of their noise."""
 
-    Attributes:
-        expected: the pose.
-        reach: half the product of the times to two neighbours [s^2].
-    """
-
-    expected: Float[np.ndarray, "frame 3"]
-    reach: Float[np.ndarray, " frame"]
+    time: Float[np.ndarray, " pose"]
+    pose: Float[np.ndarray, "pose 3"]
+    std: Float[np.ndarray, "pose 3"]
 
 
 def jumps(
@@ -40,7 +41,7 @@ def jumps(
     pose: Float[np.ndarray, "frame 3"],
     std: Float[np.ndarray, "frame 3"],
 ) -> Bool[np.ndarray, " frame"]:
-    """Frames whose pose does not fit to those around; False where there is no pose.
+    """Frames whose pose no body drives through; False where there is no pose.
 
     Args:
         time: increasing [s].
@@ -49,74 +50,87 @@ def jumps(
     """
     there = np.isfinite(pose).all(axis=1)
     bad = np.zeros(len(time), bool)
-    if there.sum() < 5:
+    if there.sum() < FEWEST:
         return bad
-    known = pose.copy()
-    known[there, 2] = np.unwrap(pose[there, 2])
-    for neighbours in (WIDE, NARROW, NARROW):
-        around = _around(time, known, there & ~bad, neighbours)
-        gap = known - around.expected
-        gap[:, 2] = np.angle(
-            np.exp(1j * gap[:, 2])
-        )  # a wrong heading may have unwrapped what follows
-        allowed = STDS * std + around.reach[:, None] * ACCELERATION
-        with np.errstate(invalid="ignore"):
-            bad = there & (np.abs(gap) > allowed).any(axis=1)
-    good = np.flatnonzero(there & ~bad)
-    bad[good[~_of_one_way(time[good], known[good, :2])]] = True
+    seen = _Seen(time[there], pose[there], std[there])
+    first = _pieces(seen)
+    last = np.append(first[1:], len(seen.time)) - 1
+    believed = np.zeros(len(seen.time), bool)
+    for piece in _longest_way(seen, first, last):
+        believed[first[piece] : last[piece] + 1] = True
+    bad[np.flatnonzero(there)[~believed]] = True
     return bad
 
 
-def _of_one_way(
-    time: Float[np.ndarray, " frame"], place: Float[np.ndarray, "frame 2"]
-) -> Bool[np.ndarray, " frame"]:
-    """Frames of the longest stretch without an impossible step, and of what is reached from it.
+def _pieces(seen: _Seen) -> Int[np.ndarray, " piece"]:
+    """First poses of the pieces: a pose that does not fit between its neighbours is one alone."""
+    t, p, s = seen.time, seen.pose, seen.std
+    since, until = (t[1:-1] - t[:-2])[:, None], (t[2:] - t[1:-1])[:, None]
+    part = since / (since + until)
+    gap = _turned_least(p[1:-1] - p[:-2]) - part * _turned_least(p[2:] - p[:-2])
+    noise = np.sqrt(s[1:-1] ** 2 + ((1 - part) * s[:-2]) ** 2 + (part * s[2:]) ** 2)
+    reach = since * until * (0.5 * ACCELERATION + SUDDEN / (since + until))
+    sharp = np.abs(gap) > reach + STDS * noise
+    odd = np.flatnonzero(sharp.any(axis=1)) + 1
+    fast = np.abs(_turned_least(np.diff(p, axis=0))) > SPEED * np.diff(t)[:, None] + STDS * s[1:]
+    steps = np.flatnonzero(fast.any(axis=1)) + 1
+    return np.unique(np.concatenate([[0], odd, odd + 1, steps]))
 
-    A marker that is mistaken for a while makes a stretch of its own, smooth in itself.
+
+def _longest_way(
+    seen: _Seen, first: Int[np.ndarray, " piece"], last: Int[np.ndarray, " piece"]
+) -> list[int]:
+    """Pieces that can be driven one after the other, with most poses together."""
+    poses = last - first + 1
+    before = np.full(len(first), -1)
+    base = np.where(last > first, np.maximum(first, last - BEHIND), -1)
+    for piece in range(1, len(first)):
+        candidates = np.arange(max(0, piece - PIECES), piece)
+        start = np.full(len(candidates), first[piece])
+        onward = min(first[piece] + BEHIND, last[piece])
+        after = np.full(len(candidates), onward if onward > first[piece] else -1)
+        turn = np.maximum(
+            _turn(seen, last[candidates], base[candidates], start),
+            _turn(seen, start, after, last[candidates]),
+        )
+        if (near := candidates[turn <= 1]).size:
+            best = near[np.argmax(poses[near])]
+            poses[piece] += poses[best]
+            before[piece] = best
+            if base[piece] < 0:
+                base[piece] = last[best]
+    way = [int(np.argmax(poses))]
+    while before[way[-1]] >= 0:
+        way.append(int(before[way[-1]]))
+    return way
+
+
+def _turn(
+    seen: _Seen,
+    at: Int[np.ndarray, " way"],
+    base: Int[np.ndarray, " way"],
+    to: Int[np.ndarray, " way"],
+) -> Float[np.ndarray, " way"]:
+    """How sharply ways turn from a pose to another, as a part of what a body can.
+
+    Args:
+        seen: all poses.
+        at: the pose each way has come to.
+        base: one it has come from, which tells the speed; negative where there is none.
+        to: where it goes; before `at` in time where the way is followed backwards.
     """
-    if len(time) < 2:
-        return np.ones(len(time), bool)
-    far = np.linalg.norm(np.diff(place, axis=0), axis=1) > SPEED * np.diff(time)
-    edges = np.concatenate([[0], np.flatnonzero(far) + 1, [len(time)]])
-    keep = np.zeros(len(time), bool)
-    longest = int(np.argmax(np.diff(edges)))
-    keep[edges[longest] : edges[longest + 1]] = True
-    for k in [*range(longest + 1, len(edges) - 1), *range(longest - 1, -1, -1)]:
-        part = np.arange(edges[k], edges[k + 1])
-        kept = np.flatnonzero(keep)
-        own, other = (part[0], kept[-1]) if k > longest else (part[-1], kept[0])
-        within = SPEED * abs(time[own] - time[other])
-        keep[part] = np.linalg.norm(place[own] - place[other]) <= within
-    return keep
-
-
-def _around(
-    time: Float[np.ndarray, " frame"],
-    pose: Float[np.ndarray, "frame 3"],
-    good: Bool[np.ndarray, " frame"],
-    neighbours: int,
-) -> _Around:
-    """Expected poses from good frames before and after, by a straight line through every pair."""
-    at = np.flatnonzero(good)
-    before = np.searchsorted(at, np.arange(len(time)), side="left")
-    after = np.searchsorted(at, np.arange(len(time)), side="right")
-    steps = np.arange(neighbours)
-    ranks = np.concatenate([before[:, None] - 1 - steps, after[:, None] + steps], axis=1)
-    inside = (ranks >= 0) & (ranks < len(at))
-    near = at[ranks.clip(0, len(at) - 1)]
-    inside &= np.abs(time[near] - time[:, None]) <= LONGEST
-    first, second = np.triu_indices(2 * neighbours, 1)
-    j, k = near[:, first], near[:, second]
-    since, until = time[:, None] - time[j], time[k] - time[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        part = since / (since + until)
-        line = pose[j] + part[..., None] * _turned_least(pose[k] - pose[j])
-    both = inside[:, first] & inside[:, second] & (j != k)
-    line = np.where(both[..., None], line, np.nan)
-    reach = np.where(both, 0.5 * np.abs(since * until), np.nan)
-    empty = ~both.any(axis=1)
-    line[empty], reach[empty] = pose[empty, None], 0.0
-    return _Around(np.nanmedian(line, axis=1), np.nanmedian(reach, axis=1))
+    t, p, s = seen.time, seen.pose, seen.std
+    after = np.abs(t[to] - t[at])[:, None]
+    way = _turned_least(p[to] - p[at])
+    fast = (np.abs(way) / (SPEED * after + STDS * (s[to] + s[at]))).max(axis=1)
+    moving = base >= 0
+    span = np.where(moving, np.abs(t[at] - t[base]), 1.0)[:, None]
+    times = after / span
+    gone = times * _turned_least(p[at] - p[base])
+    noise = np.sqrt(s[to] ** 2 + ((1 + times) * s[at]) ** 2 + (times * s[base]) ** 2)
+    allowed = after * (0.5 * (after + span) * ACCELERATION + SUDDEN) + STDS * noise
+    sharp = (np.abs(_turned_least(way - gone)) / allowed).max(axis=1)
+    return np.asarray(np.where(moving, np.maximum(fast, sharp), fast))
 
 
 def _turned_least(change: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:

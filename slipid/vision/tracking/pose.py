@@ -3,11 +3,13 @@
 Every corner is a ray, met by the plane at the corner's height. There the corners of a body at x, y
 with heading theta, whose markers look s times as large as they are, lie at
 
-    place_i = (x, y) + s R(theta) corner_i                                                   (1)
+    place_i = (x, y) + R(theta) (middle_i + s own_i)                                         (1)
 
-and what is left over, turned into pixels by the local derivative of the ray's place, is least.
-The factor s is fitted because the edge between black and white is found a little within or beside
-where it is, in all corners alike: it takes that up, and a wrong height of the markers as well.
+with the middle of the corner's marker on the body and, from there, the corner's own place. What is
+left over, turned into pixels by the local derivative of the ray's place, is least. The factor s is
+fitted because the edge between black and white is found a little within or beside where it is, in
+all corners alike: it takes that up, and tells a wrong height of the markers. It does not stretch
+the way from the body's origin to a marker: that was measured with a ruler.
 With corners that err by sigma pixels each, independently, the covariance of (x, y, theta) is that
 part of sigma^2 (J^T J)^-1.
 """
@@ -45,6 +47,28 @@ class Poses:
     free: Float[np.ndarray, " frame"]
 
 
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """All corners of a target.
+
+    Attributes:
+        middle: of the corner's marker, ahead and left on the body [m].
+        own: from there to the corner [m].
+        height: above the floor [m].
+    """
+
+    middle: Float[np.ndarray, "corner 2"]
+    own: Float[np.ndarray, "corner 2"]
+    height: Float[np.ndarray, " corner"]
+
+    @classmethod
+    def of(cls, target: Target) -> "_Body":
+        corners = np.stack([marker.corners for marker in target.markers])
+        middle = np.repeat(corners[..., :2].mean(axis=1), 4, axis=0)
+        flat = corners.reshape(-1, 3)
+        return cls(middle, flat[:, :2] - middle, flat[:, 2])
+
+
 def poses_of(
     camera: OverheadCamera, target: Target, corners: Float[np.ndarray, "frame marker 4 2"]
 ) -> Poses:
@@ -56,22 +80,22 @@ def poses_of(
         corners: x, y [pixel], NaN where a marker is not seen.
     """
     frames = len(corners)
-    body = np.concatenate([marker.corners for marker in target.markers])
-    pixels = corners.reshape(frames, len(body), 2)
-    place, per_pixel = _on_planes(camera, pixels, body[:, 2])
+    body = _Body.of(target)
+    pixels = corners.reshape(frames, len(body.height), 2)
+    place, per_pixel = _on_planes(camera, pixels, body.height)
     seen = np.isfinite(place).all(axis=-1) & np.isfinite(per_pixel).all(axis=(-1, -2))
     seen &= seen.sum(axis=1, keepdims=True) >= 3
     some = seen.any(axis=1)
     place, per_pixel, used = place[some], per_pixel[some], seen[some]
     place = np.where(used[..., None], place, 0.0)
     into_pixels = np.linalg.inv(np.where(used[..., None, None], per_pixel, np.eye(2)))
-    fitted = _similarity(place, body[:, :2], used)
+    fitted = _similarity(place, body.middle + body.own, used)
     for _ in range(ROUNDS):
-        left, slope = _left_over(fitted, place, into_pixels, body[:, :2], used)
+        left, slope = _left_over(fitted, place, into_pixels, body, used)
         normal = np.swapaxes(slope, 1, 2) @ slope
         step = np.linalg.solve(normal, np.swapaxes(slope, 1, 2) @ left[..., None])
         fitted = fitted - step[..., 0]
-    left, slope = _left_over(fitted, place, into_pixels, body[:, :2], used)
+    left, slope = _left_over(fitted, place, into_pixels, body, used)
     unit = np.linalg.inv(np.swapaxes(slope, 1, 2) @ slope)[:, :3, :3]
     out = Poses(*(np.full((frames, *shape), np.nan) for shape in ((3,), (3, 3), (), (), ())))
     turned = np.angle(np.exp(1j * fitted[:, 2]))
@@ -125,17 +149,24 @@ def _left_over(
     fitted: Float[np.ndarray, "frame 4"],
     place: Float[np.ndarray, "frame corner 2"],
     into_pixels: Float[np.ndarray, "frame corner 2 2"],
-    body: Float[np.ndarray, "corner 2"],
+    body: _Body,
     used: Bool[np.ndarray, "frame corner"],
 ) -> tuple[Float[np.ndarray, "frame number"], Float[np.ndarray, "frame number 4"]]:
     """Equation (1) less what was seen [pixel], and its derivative by x, y, heading and size."""
-    c, s = np.cos(fitted[:, 2])[:, None], np.sin(fitted[:, 2])[:, None]
-    turned = np.stack([c * body[:, 0] - s * body[:, 1], s * body[:, 0] + c * body[:, 1]], axis=-1)
-    size = fitted[:, 3, None, None]
+    own, size = _turned(body.own, fitted[:, 2]), fitted[:, 3, None, None]
+    turned = _turned(body.middle, fitted[:, 2]) + size * own
     across = np.stack([-turned[..., 1], turned[..., 0]], axis=-1)
-    gap = fitted[:, None, :2] + size * turned - place
+    gap = fitted[:, None, :2] + turned - place
     moved = np.broadcast_to(np.eye(2), (*place.shape[:2], 2, 2))
-    slope = np.concatenate([moved, (size * across)[..., None], turned[..., None]], axis=-1)
+    slope = np.concatenate([moved, across[..., None], own[..., None]], axis=-1)
     left = np.where(used[..., None], np.einsum("fcij,fcj->fci", into_pixels, gap), 0.0)
     bent = np.where(used[..., None, None], into_pixels @ slope, 0.0)
     return left.reshape(len(left), -1), bent.reshape(len(bent), -1, 4)
+
+
+def _turned(
+    points: Float[np.ndarray, "corner 2"], heading: Float[np.ndarray, " frame"]
+) -> Float[np.ndarray, "frame corner 2"]:
+    c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    x, y = points[:, 0], points[:, 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)

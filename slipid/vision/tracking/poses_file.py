@@ -8,11 +8,12 @@ rejected_heading, a pose that was found and not believed.
 
 import io
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
 from slipid.support.errors import DataError
-from slipid.support.files import write_bytes
+from slipid.support.files import writable, write_bytes
 from slipid.vision.tracking.track import Flag, Track
 
 _NUMBERS = {
@@ -34,14 +35,30 @@ _NUMBERS = {
 """Columns of numbers, and how CSV writes them."""
 
 
+def can_write(path: Path) -> None:
+    """Try whether poses can be written there.
+
+    Raises:
+        DataError: not so, or Parquet without pyarrow.
+    """
+    if path.is_dir():
+        raise DataError(f"{path}: a folder; expected the name of a file, .csv or .parquet")
+    if _is_parquet(path):
+        _pyarrow()
+    writable(path.parent)
+
+
 def write_poses(path: Path, track: Track) -> None:
     """Write a track; the suffix .parquet makes it Parquet, everything else CSV.
 
     Raises:
         DataError: nothing can be written there, or Parquet without pyarrow.
     """
-    data = _parquet(track) if path.suffix.lower() == ".parquet" else _csv(track).encode()
-    write_bytes(path, data)
+    write_bytes(path, _parquet(track) if _is_parquet(path) else _csv(track).encode())
+
+
+def _is_parquet(path: Path) -> bool:
+    return path.suffix.lower() == ".parquet"
 
 
 def _columns(track: Track) -> dict[str, np.ndarray]:
@@ -72,20 +89,24 @@ def _csv(track: Track) -> str:
     return out.getvalue()
 
 
-def _parquet(track: Track) -> bytes:
+def _pyarrow() -> ModuleType:
     try:
-        import pyarrow as pa
-        from pyarrow import parquet
+        import pyarrow.parquet
     except ImportError as error:
         raise DataError(
             f"Parquet needs {error.name}; expected: pip install 'slipid[parquet]', or a name that "
             "ends in .csv"
         ) from error
+    return pyarrow
+
+
+def _parquet(track: Track) -> bytes:
+    pa = _pyarrow()
     columns = {
         name: pa.array(values, mask=~np.isfinite(values))
         for name, values in _columns(track).items()
     }
     table = pa.table({"frame": track.frame, **columns, "flag": _words(track)})
     out = io.BytesIO()
-    parquet.write_table(table, out)
+    pa.parquet.write_table(table, out)
     return out.getvalue()

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from slipid.support.errors import DataError
-from slipid.support.files import write_bytes
+from slipid.support.files import writable, write_bytes
 from slipid.vision.camera import OverheadCamera
 from slipid.vision.opencv import opencv
 from slipid.vision.tracking.track import Track
@@ -41,13 +41,28 @@ def write_preview(
     for track in tracks:
         if track.good[row]:
             _body(drawn, camera, track, track.pose[row])
+    write_bytes(path, _encoded(path, drawn))
+
+
+def can_draw(path: Path) -> None:
+    """Try whether a picture can be written there.
+
+    Raises:
+        DataError: not so, or its suffix is of no picture.
+    """
+    _encoded(path, np.zeros((8, 8, 3), np.uint8))
+    writable(path.parent)
+
+
+def _encoded(path: Path, drawn: UInt8[np.ndarray, "row column 3"]) -> bytes:
+    cv2 = opencv()
     try:
         there, data = cv2.imencode(path.suffix or ".", drawn)
     except cv2.error:
         there = False
     if not there:
         raise DataError(f"{path}: no picture that OpenCV writes; expected .png or .jpg")
-    write_bytes(path, bytes(data))
+    return bytes(data)
 
 
 def _line(

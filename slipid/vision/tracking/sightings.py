@@ -13,15 +13,15 @@ from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from slipid.vision.opencv import dictionary_names
-from slipid.vision.tracking.finder import Finder, MarkerDetector
+from slipid.vision.tracking.finder import Finder, MarkerDetector, Region
 from slipid.vision.tracking.frames.ahead import ahead
-from slipid.vision.tracking.frames.frame import Source
+from slipid.vision.tracking.frames.frame import Frame, Source
 
 KEPT_S = 10.0
 """Time between two checkpoints [s]."""
 PART = "sightings"
 LOOKED = 100
-"""Frames without any marker after which it is said what else is in the picture."""
+"""Frames without any marker after which it is said what is in the picture instead."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +69,16 @@ class _Notebook:
     id: list[int] = field(default_factory=list)
     corners: list[Float[np.ndarray, "4 2"]] = field(default_factory=list)
 
+    def add(self, frame: Frame, repeated: bool, finder: Finder) -> None:
+        """Note a frame and the markers in it; in a repeated one nothing is looked for."""
+        for found in [] if repeated else finder.find(frame.grey, frame.index):
+            self.row.append(len(self.frame))
+            self.id.append(found.id)
+            self.corners.append(found.corners)
+        self.frame.append(frame.index)
+        self.time.append(frame.time)
+        self.repeated.append(repeated)
+
     def sightings(self) -> Sightings:
         return Sightings(
             np.array(self.frame, int),
@@ -81,7 +91,8 @@ class _Notebook:
 
     @classmethod
     def again(cls, kept: dict[str, np.ndarray]) -> "_Notebook":
-        return cls(**{name: list(kept[name]) for name in vars(cls())})
+        plain = {name: kept[name].tolist() for name in vars(cls()) if name != "corners"}
+        return cls(**plain, corners=list(kept["corners"]))
 
 
 def look_through(
@@ -98,27 +109,27 @@ def look_through(
         report.line(f"going on from frame {len(seen.frame)}")
     report.stage("tracking")
     before: UInt8[np.ndarray, "row column"] | None = None
-    saved = clock.monotonic()
-    with closing(ahead(source.frames(len(seen.frame)))) as frames:
-        for frame in frames:
-            repeated = before is not None and np.array_equal(before, frame.grey)
-            before = frame.grey
-            for found in [] if repeated else finder.find(frame.grey, frame.index):
-                seen.row.append(len(seen.frame))
-                seen.id.append(found.id)
-                seen.corners.append(found.corners)
-            seen.frame.append(frame.index)
-            seen.time.append(frame.time)
-            seen.repeated.append(repeated)
-            if len(seen.frame) == LOOKED and not seen.row:
-                _refuse_others(frame.grey, finder)
-            if clock.monotonic() > saved + KEPT_S:
-                checkpoint.save(PART, vars(seen.sightings()))
-                saved = clock.monotonic()
-            report.advance(len(seen.frame), max(source.count or 0, len(seen.frame)))
+    known, saved = len(seen.frame), clock.monotonic()
+    # the last known frame again: whether the next one repeats it
+    with closing(ahead(source.frames(max(0, known - 1)))) as frames:
+        try:
+            for frame in frames:
+                if frame.index >= known:
+                    repeated = before is not None and np.array_equal(before, frame.grey)
+                    seen.add(frame, repeated, finder)
+                    if len(seen.frame) == LOOKED and not seen.row:
+                        report.line(_others(frame.grey, finder) or "no marker in sight so far")
+                before = frame.grey
+                if clock.monotonic() > saved + KEPT_S:
+                    checkpoint.save(PART, vars(seen.sightings()))
+                    saved = clock.monotonic()
+                report.advance(len(seen.frame), max(source.count or 0, len(seen.frame)))
+        except KeyboardInterrupt:
+            checkpoint.save(PART, vars(seen.sightings()))
+            raise
     if not seen.row:
-        if before is not None:
-            _refuse_others(before, finder)
+        if before is not None and (words := _others(before, finder)):
+            raise DataError(f"{source.name}: {words}")
         wanted = ", ".join(map(str, sorted(finder.ids)))
         raise DataError(
             f"{source.name}: marker {wanted} in none of {len(seen.frame)} frames; expected it in "
@@ -127,34 +138,39 @@ def look_through(
     return seen.sightings()
 
 
-def _refuse_others(grey: UInt8[np.ndarray, "row column"], finder: Finder) -> None:
-    """DataError where a picture shows markers, but none that is wanted."""
+def _others(grey: UInt8[np.ndarray, "row column"], finder: Finder) -> str | None:
+    """What to do where a picture shows markers, but none that is wanted."""
     wanted = ", ".join(map(str, sorted(finder.ids)))
-    if others := sorted({s.id for s in finder.detector.find(grey)} - finder.ids):
-        raise DataError(
+    if others := sorted({s.id for s in finder.detector.find(grey, finder.region)} - finder.ids):
+        return (
             f"marker {wanted} is in no frame so far, but {_numbers(others)}; expected --id "
             f"{others[0]}, or a file of targets"
         )
-    for name, ids in markers_in(grey):
-        raise DataError(
+    for name, ids in markers_in(grey, finder.region):
+        return (
             f"marker {wanted} is in no frame so far, but {_numbers(ids)} of the dictionary {name}; "
             f"expected --dictionary {name}"
         )
+    return None
 
 
 def _numbers(ids: Sequence[int]) -> str:
     return f"marker{'s' if len(ids) > 1 else ''} {', '.join(map(str, ids))}"
 
 
-def markers_in(grey: UInt8[np.ndarray, "row column"]) -> list[tuple[str, list[int]]]:
+def markers_in(
+    grey: UInt8[np.ndarray, "row column"], region: Region | None = None
+) -> list[tuple[str, list[int]]]:
     """Dictionaries that know markers in a picture, most markers first, of those the smallest."""
-    found = {name: {s.id for s in MarkerDetector(name).find(grey)} for name in dictionary_names()}
+    found = {
+        name: {s.id for s in MarkerDetector(name).find(grey, region)} for name in dictionary_names()
+    }
     names = sorted((n for n in found if found[n]), key=lambda n: (-len(found[n]), len(n), n))
     return [(name, sorted(found[name])) for name in names]
 
 
-def only_marker(source: Source, detector: MarkerDetector) -> int:
-    """Number of the one marker that a video shows in its first frames.
+def only_marker(source: Source, detector: MarkerDetector, region: Region | None = None) -> int:
+    """Number of the one marker that a video, or a part of its picture, shows in its first frames.
 
     Raises:
         DataError: it shows none, or several.
@@ -164,7 +180,7 @@ def only_marker(source: Source, detector: MarkerDetector) -> int:
     with closing(ahead(source.frames())) as frames:
         for frame in frames:
             last = frame.grey
-            counts.update({s.id for s in detector.find(frame.grey)})
+            counts.update({s.id for s in detector.find(frame.grey, region)})
             if frame.index >= LOOKED or sum(counts.values()) >= LOOKED // 4:
                 break
     often = sorted(number for number, n in counts.items() if 5 * n >= max(counts.values()))
@@ -176,12 +192,12 @@ def only_marker(source: Source, detector: MarkerDetector) -> int:
             "of targets"
         )
     if last is not None:
-        for name, ids in markers_in(last):
+        for name, ids in markers_in(last, region):
             raise DataError(
                 f"{source.name}: no marker of this dictionary, but {_numbers(ids)} of {name}; "
                 f"expected --dictionary {name}"
             )
     raise DataError(
         f"{source.name}: no marker of any dictionary in the first frames; expected one in view, "
-        "sharp, flat, with a white margin around"
+        "sharp, flat, with a white margin around, or --id where it comes later"
     )

@@ -89,6 +89,15 @@ class Target:
         """Mean height of its markers above the floor [m]."""
         return float(np.mean([marker.corners[:, 2] for marker in self.markers]))
 
+    def below(self, camera_m: float) -> None:
+        """DataError where a marker is as high as the camera [m], which does not see it then."""
+        for marker in self.markers:
+            if (height := float(marker.corners[:, 2].max())) >= camera_m:
+                raise DataError(
+                    f"{self.name}: marker {marker.id} at {height:g} m above the floor, but the "
+                    f"camera at {camera_m:g} m; expected heights in metres, below the camera"
+                )
+
 
 class _Placed(Section):
     """Where something lies on the body."""

@@ -41,13 +41,16 @@ class Flag(IntEnum):
 
 LEAST_NOISE = 0.05
 """Least std of a corner that is believed [pixel]."""
-SHARED = 0.07
+SHARED = 0.05
 """What all corners of a frame err in common [pixel]: nothing that is left over shows it."""
 ODD_SQUARES = 25.0
 """Mean square left over, in units of the usual one, from which on corners are no marker's."""
+ODD_LEAST = 1.0
+"""Root mean square left over [pixel] below which corners are a marker's whatever is usual: an edge
+along the pixels' rows is found better than one aslant, and a heading that changes is no mistake."""
 ODD_SIZE = 0.05
 """Part by which a marker's size in a frame may differ from its usual one."""
-WRONG_SIZE = 0.03
+WRONG_SIZE = 0.02
 """Part by which the usual size may differ from the stated one: more is a wrong height or size."""
 LEAST_SEEN = 0.5
 """Part of the frames that should have a pose."""
@@ -163,7 +166,7 @@ def _odd(
     odd = np.zeros(len(size), bool)
     if there.any():
         usual = max(float(np.median(mean_square[there])), LEAST_NOISE**2)
-        odd[there] = mean_square[there] > ODD_SQUARES * usual
+        odd[there] = mean_square[there] > max(ODD_SQUARES * usual, ODD_LEAST**2)
         odd[there] |= np.abs(size[there] / np.median(size[there]) - 1) > ODD_SIZE
     return odd
 

@@ -11,12 +11,14 @@ from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from slipid.vision.camera import OverheadCamera
+from slipid.vision.opencv import marker_dictionary, opencv
 from slipid.vision.tracking.finder import Finder, MarkerDetector, Region
 from slipid.vision.tracking.frames.ahead import ahead
 from slipid.vision.tracking.frames.frame import Source, cut_off
 from slipid.vision.tracking.frames.times import uneven
-from slipid.vision.tracking.poses_file import write_poses
-from slipid.vision.tracking.preview import write_preview
+from slipid.vision.tracking.frames.video import Device
+from slipid.vision.tracking.poses_file import can_write, write_poses
+from slipid.vision.tracking.preview import can_draw, write_preview
 from slipid.vision.tracking.sightings import look_through, only_marker
 from slipid.vision.tracking.target import Marker, Target
 from slipid.vision.tracking.track import Flag, Track, summary, track_of
@@ -33,12 +35,14 @@ class Tracked:
         tracks: of every body.
         notes: what a person should know, a sentence each.
         doubts: why the poses should not be used as they are; empty where nothing speaks against.
+        kept: what was found, to be found again should the poses not be written.
     """
 
     source: Source
     tracks: tuple[Track, ...]
     notes: tuple[str, ...]
     doubts: tuple[str, ...]
+    kept: Checkpoint
 
     def write(self, path: Path) -> list[Path]:
         """Write the poses: one body to this file, of several each to one with its name added."""
@@ -47,6 +51,7 @@ class Tracked:
             names = [path.with_stem(f"{path.stem}_{t.target.name}") for t in self.tracks]
         for name, track in zip(names, self.tracks, strict=True):
             write_poses(name, track)
+        self.kept.remove()
         return names
 
     def to_json(self) -> Content:
@@ -88,7 +93,7 @@ def track(
         camera: calibrated, with its place above the floor.
         targets: the bodies and their markers, all of one dictionary.
         checkpoint: folder for what is done, from which it goes on after an interrupt; it is taken
-            away at the end.
+            away once the poses are written.
         report: is told how far it is.
         region: the part of the picture that counts.
 
@@ -97,6 +102,8 @@ def track(
             times that do not increase.
     """
     camera.of_size(source.image_px, source.name)
+    for target in targets:
+        target.below(camera.height)
     ids = frozenset(number for target in targets for number in target.ids)
     if region is not None and region.within(Region(0, 0, *camera.lens.image_px)).empty:
         width, height = camera.lens.image_px
@@ -104,32 +111,75 @@ def track(
     finder = Finder(MarkerDetector(targets[0].dictionary), ids, region)
     kept = Checkpoint(
         checkpoint,
-        key_of(source.identity, targets[0].dictionary, sorted(ids), region, source_hash("vision")),
+        key_of(
+            *(source.identity, targets[0].dictionary, sorted(ids), region),
+            *(source_hash("vision"), opencv().__version__),
+        ),
     )
     seen = look_through(source, finder, kept, report)
     tracks = tuple(track_of(camera, target, seen) for target in targets)
-    kept.remove()
     notes = [sentence for sentence in (uneven(seen.time),) if sentence]
     short = cut_off(source, len(seen.frame))
     doubts = [*([short] if short else []), *(d for t in tracks for d in t.doubts())]
-    return Tracked(source, tracks, (*notes, *summary(tracks)), tuple(doubts))
+    return Tracked(source, tracks, (*notes, *summary(tracks)), tuple(doubts), kept)
 
 
-def lone_target(
-    source: Source, dictionary: str, id: int | None, size_m: float, height_m: float, yaw: float
-) -> Target:
-    """A body with one marker in its middle; the only one that is in view where no number is given.
-
-    Args:
-        size_m: edge of the marker's black square [m].
-        height_m: of the marker above the floor [m].
-        yaw: of the marker's top edge, counter-clockwise from ahead [rad].
+def before_long_work(source: Source, out: Path, drawn: Path | None) -> None:
+    """Try what comes after it.
 
     Raises:
-        DataError: no marker in view, or several.
+        DataError: nothing can be written there, or a device should be drawn: what it showed is
+            gone by then.
     """
-    number = only_marker(source, MarkerDetector(dictionary)) if id is None else id
-    return Target("robot", dictionary, (Marker.at(number, size_m, height_m, yaw=yaw),))
+    can_write(out)
+    if drawn is not None:
+        if isinstance(source, Device):
+            raise DataError(
+                f"{source.name}: --preview of a device, whose frames are not kept; expected a "
+                "video or a folder of pictures"
+            )
+        can_draw(drawn)
+
+
+@dataclass(frozen=True)
+class LoneMarker:
+    """One marker in the middle of a body.
+
+    Attributes:
+        size: edge of its black square [m].
+        height: above the floor [m].
+        id: its number; None for the only one that is in view.
+        yaw: of its top edge, counter-clockwise from ahead [rad].
+    """
+
+    size: float
+    height: float
+    id: int | None = None
+    dictionary: str = "4X4_50"
+    yaw: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.size < np.inf:
+            raise DataError(f"--marker-size {self.size:g}; expected the edge in metres")
+        if not np.isfinite(self.height):
+            raise DataError(f"--marker-height {self.height:g}; expected it in metres")
+        if not np.isfinite(self.yaw):
+            raise DataError(f"--marker-yaw {np.degrees(self.yaw):g}; expected an angle in degrees")
+        most = len(marker_dictionary(self.dictionary).bytesList) - 1
+        if self.id is not None and self.id > most:
+            raise DataError(f"--id {self.id}; expected 0 to {most} in {self.dictionary}")
+
+    def target(self, source: Source, region: Region | None = None) -> Target:
+        """The body; its marker is looked for, in a part of the picture, where it has no number.
+
+        Raises:
+            DataError: no marker in view, or several.
+        """
+        number = self.id
+        if number is None:
+            number = only_marker(source, MarkerDetector(self.dictionary), region)
+        marker = Marker.at(number, self.size, self.height, yaw=self.yaw)
+        return Target("robot", self.dictionary, (marker,))
 
 
 def preview(path: Path, tracked: Tracked, camera: OverheadCamera, number: int | None) -> int:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -29,6 +29,7 @@ class Frame:
     grey: UInt8[np.ndarray, "row column"]
 
 
+@runtime_checkable
 class Source(Protocol):
     """Where frames come from."""
 
@@ -45,6 +46,10 @@ class Source(Protocol):
         """How many frames there should be; None where nobody knows."""
 
     @property
+    def exact(self) -> bool:
+        """Whether there are just so many, as where each has a time of its own."""
+
+    @property
     def identity(self) -> str:
         """What tells it from others: name, size and date."""
 
@@ -54,7 +59,11 @@ class Source(Protocol):
 
 def cut_off(source: Source, found: int) -> str | None:
     """A sentence where a source ended before it should have."""
-    if source.count is None or found >= (1 - LOST) * source.count - 1:
+    if source.count is None or found == source.count:
+        return None
+    if source.exact:
+        return f"{source.name}: {found} frames, but {source.count} times; expected a time for each"
+    if found >= (1 - LOST) * source.count - 1:
         return None
     return (
         f"{source.name}: ends after frame {found} of {source.count}; the file was cut off or is "
@@ -71,6 +80,6 @@ def stamp(path: Path) -> tuple[str, int, int]:
 def grey_of(picture: np.ndarray) -> UInt8[np.ndarray, "row column"]:
     """Grey levels of a picture in blue, green and red, or of one that is grey already."""
     cv2 = opencv()
-    if picture.ndim == 2:
-        return np.asarray(picture)
+    if picture.ndim == 2 or picture.shape[2] == 1:
+        return np.asarray(picture).reshape(picture.shape[:2])
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))

@@ -1,6 +1,6 @@
 """A folder of pictures as frames."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,12 +21,18 @@ class PictureFolder:
 
     paths: tuple[Path, ...]
     times: Float[np.ndarray, " frame"]
+    image_px: tuple[int, int]
+    exact: bool = True
 
     @classmethod
     def at(
         cls, folder: Path, fps: float | None, times: Float[np.ndarray, " frame"] | None
     ) -> "PictureFolder":
-        """Every picture in a folder; DataError where there is none, or no time for each."""
+        """Every picture in a folder, which have the size of the first.
+
+        Raises:
+            DataError: there is none, or no time for each.
+        """
         found = sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURES)
         if not found:
             raise DataError(f"{folder}: no picture; expected {', '.join(PICTURES)}")
@@ -38,18 +44,18 @@ class PictureFolder:
             raise DataError(
                 f"{folder}: {len(found)} pictures and {len(times)} times; expected one each"
             )
-        return cls(tuple(found), times)
+        return cls.of(found, times)
+
+    @classmethod
+    def of(cls, paths: Sequence[Path], times: Float[np.ndarray, " frame"]) -> "PictureFolder":
+        """Some pictures; DataError where the first is none."""
+        rows, columns = read_picture(paths[0]).shape[:2]
+        return cls(tuple(paths), times, (columns, rows))
 
     @property
     def name(self) -> str:
         """The folder, or the picture where there is one alone."""
         return str(self.paths[0] if len(self.paths) == 1 else self.paths[0].parent)
-
-    @property
-    def image_px(self) -> tuple[int, int]:
-        """Size of the first picture."""
-        rows, columns = read_picture(self.paths[0]).shape[:2]
-        return columns, rows
 
     @property
     def count(self) -> int:
@@ -63,12 +69,11 @@ class PictureFolder:
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
         """Pictures from a number on."""
-        size = self.image_px
         for k in range(first, len(self.paths)):
             picture = read_picture(self.paths[k])
-            if (picture.shape[1], picture.shape[0]) != size:
+            if (picture.shape[1], picture.shape[0]) != self.image_px:
                 raise DataError(
                     f"{self.paths[k]}: {picture.shape[1]} x {picture.shape[0]} pixels; expected "
-                    f"{size[0]} x {size[1]} as {self.paths[0].name}"
+                    f"{self.image_px[0]} x {self.image_px[1]} as {self.paths[0].name}"
                 )
             yield Frame(k, float(self.times[k]), grey_of(picture))

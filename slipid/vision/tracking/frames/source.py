@@ -21,7 +21,7 @@ def open_source(
         place: a file, a folder, or a device: its number, or its path such as /dev/video0.
         fps: frames per second where times are not to be taken from the source.
         times: CSV file with the columns frame and time [s], instead.
-        seconds: how long to watch a device.
+        seconds: how long to watch a device, which has no end.
 
     Raises:
         DataError: nothing there that can be read, or no times.
@@ -30,14 +30,23 @@ def open_source(
         raise DataError("--fps and --times at once; expected one of them")
     path = Path(place)
     if place.isdigit() or place.startswith("/dev/video"):
-        return Device(place, seconds)
-    if not path.exists():
-        raise DataError(f"{path}: no such file or folder; expected a video or a folder of pictures")
+        if seconds is None or not 0 < seconds < float("inf"):
+            raise DataError(f"device {place}: it has no end; expected --seconds")
+        if fps is not None or times is not None:
+            raise DataError(f"device {place}: its times are this computer's; no --fps, no --times")
+        return Device.at(place, seconds)
+    if seconds is not None:
+        raise DataError(f"--seconds is for devices, not for {place}; a video is read to its end")
+    try:
+        size = path.stat().st_size
+    except (OSError, ValueError):
+        what = "a video or a folder of pictures"
+        raise DataError(f"{path}: no such file or folder; expected {what}") from None
     known = None if times is None else read_times(times)
     if path.is_dir():
         return PictureFolder.at(path, fps, known)
-    if not path.stat().st_size:
+    if not size:
         raise DataError(f"{path}: the file is empty; expected a video")
     if path.suffix.lower() in PICTURES:
-        return PictureFolder((path,), even_times(1, fps or 1.0) if known is None else known)
+        return PictureFolder.of((path,), even_times(1, fps or 1.0) if known is None else known)
     return Video.at(path, fps, known)

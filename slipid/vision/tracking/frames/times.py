@@ -44,7 +44,7 @@ def read_times(path: Path) -> Float[np.ndarray, " frame"]:
 
 def even_times(count: int, fps: float) -> Float[np.ndarray, " frame"]:
     """Times [s] of frames that come evenly from 0 on; DataError where the rate is none."""
-    if not fps > 0:
+    if not 0 < fps < np.inf:
         raise DataError(f"--fps {fps:g}; expected frames per second")
     return np.arange(count) / fps
 

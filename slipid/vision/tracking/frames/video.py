@@ -45,12 +45,19 @@ class Video:
                 )
             announced = capture.value(cv2.CAP_PROP_FRAME_COUNT)
         count = int(announced) if 0 < announced < 1e9 else None
+        if times is not None:
+            count = len(times)
         return cls(path, (first.shape[1], first.shape[0]), count, times, fps)
 
     @property
     def name(self) -> str:
         """The file."""
         return str(self.path)
+
+    @property
+    def exact(self) -> bool:
+        """Where every frame has a given time."""
+        return self.times is not None
 
     @property
     def identity(self) -> str:
@@ -99,8 +106,21 @@ class Device:
     """A camera that is plugged in; times are of this computer's clock, from the first frame on."""
 
     place: str
-    seconds: float | None = None
+    seconds: float
+    image_px: tuple[int, int]
     count: None = None
+    exact: bool = False
+
+    @classmethod
+    def at(cls, place: str, seconds: float) -> "Device":
+        """A camera that shows something; DataError where there is none."""
+        with closing(Capture(place)) as capture:
+            first = capture.next_picture()
+        if first is None:
+            raise DataError(
+                f"device {place}: it shows nothing; expected a camera that is not in use"
+            )
+        return cls(place, seconds, (first.shape[1], first.shape[0]))
 
     @property
     def name(self) -> str:
@@ -108,27 +128,19 @@ class Device:
         return f"device {self.place}"
 
     @property
-    def image_px(self) -> tuple[int, int]:
-        """Size of what it shows now."""
-        first = next(self.frames(), None)
-        if first is None:
-            raise DataError(f"{self.name}: it shows nothing; expected a camera that is not in use")
-        return first.grey.shape[1], first.grey.shape[0]
-
-    @property
     def identity(self) -> str:
         """Never the same: what it shows is gone."""
         return f"{self.place} {time.time_ns()}"
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """What it shows from now on, until it ends or the time is over."""
+        """What it shows from now on, until the time is over."""
         began: float | None = None
         with closing(Capture(self.place)) as capture:
             for k in range(10**9):
                 picture = capture.next_picture()
                 now = time.monotonic()
                 began = now if began is None else began
-                if picture is None or (self.seconds is not None and now - began > self.seconds):
+                if picture is None or now - began > self.seconds:
                     return
                 yield Frame(k, now - began, grey_of(picture))
 
