@@ -3,9 +3,10 @@
     SLIPID_FIT=demo_out/result .venv/bin/python -m pytest -s -o python_files='bench_*.py' \
         tests/benchmarks/bench_floor_map.py
 
-(twenty minutes on two cores). A rectangle over patches of the test site is filmed; the map of the
-site is made from that video, and the trial is driven from 16 starts with the true map and with the
-made one. Needs a folder that `slipid identify` wrote for the test site's firm and soft floors.
+(twenty minutes on two cores). A rectangle over patches of the test site is filmed by a camera that
+sees all of them; the map of the site is made from that video, and the trial is driven from 16
+starts with the true map and with the made one. Needs a folder that `slipid identify` wrote for the
+test site's firm and soft floors.
 Asserts that the median closures differ by less than 5 points of what encoders close at, and that a
 million poses are looked up in a second.
 """
@@ -40,6 +41,7 @@ half_m = 1.2
 kind = "rectangle"
 map = "site"
 [camera]
+height_m = 3.0
 frame_s = 0.5
 """
 PALETTE = """

@@ -214,8 +214,17 @@ def test_poses_of_another_run_are_refused_with_what_to_do(tmp_path):
         read(tmp_path, layout())
 
 
+def test_poses_alone_are_read_as_well(tmp_path):
+    write(tmp_path, Drive(6, seconds=4.0))
+    known = declared_layout({"format": "tracked"}, "test")
+    log = read_logs(tmp_path / "run.poses.csv", known, tmp_path, None, "as_built").logs[0]
+    assert log.pose is not None
+    assert log.wheels == 0
+    assert log.pose_clock is None
+
+
 def test_the_clock_of_the_robots_own_file_is_the_robots():
-    with pytest.raises(DataError, match="clock = 'own' of the robot's own file"):
+    with pytest.raises(DataError, match="the robot's own file: clock = 'own'"):
         declared_layout(layout(clock="own"), "test")
 
 
@@ -223,5 +232,5 @@ def test_only_poses_may_have_a_clock_of_their_own():
     table = layout()
     columns = {"current": {"columns": ["i", "j", "k"], "unit": "A"}}
     table["beside"] = {"{stem}.poses.csv": {"format": "tracked", "columns": columns}}
-    with pytest.raises(DataError, match="holds more than poses"):
+    with pytest.raises(DataError, match=r"poses\.csv: clock = 'own'; expected .* poses alone"):
         declared_layout(table, "test")

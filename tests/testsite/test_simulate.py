@@ -316,9 +316,9 @@ def test_runs_on_a_map_of_floors_that_were_driven_are_fitted_with_it(tmp_path):
     found = parsed(tmp_path / "robot.toml", identify_config(plan(tmp_path / "x", MIXED))).content
     said = [(logs.glob, logs.map) for logs in found.logs]
     assert said == [
-        ("as_built/firm/*.csv", None),
-        ("as_built/soft/*.csv", None),
-        ("as_built/site/*.csv", "maps/site.toml"),
+        ("as_built/firm/run*[0-9].csv", None),
+        ("as_built/soft/run*[0-9].csv", None),
+        ("as_built/site/run*[0-9].csv", "maps/site.toml"),
     ]
     # a load that no run on one floor had
     text = MIXED.replace('map = "site"', 'map = "site"\nload = "moved"')

@@ -266,11 +266,9 @@ def _problem(layout: Layout) -> str | None:
             "a pose in parts; expected pose_x, pose_y and one of pose_heading and "
             "pose_quaternion, or none of them"
         )
-    if layout.clock == "own":
-        return "clock = 'own' of the robot's own file; expected it of a file of poses beside it"
-    for name, one in layout.beside.items():
+    for name, one in [("the robot's own file", layout), *layout.beside.items()]:
         if one.clock == "own" and not set(one.channels) <= {"time", *POSES}:
-            return f"beside '{name}': clock = 'own' of a file that holds more than poses"
+            return f"{name}: clock = 'own'; expected it of a file that holds poses alone"
     if layout.beside and layout.new_run != "never":
         return f"new_run = '{layout.new_run}' with files beside; expected one run for each file"
     return None

@@ -94,7 +94,7 @@ def test_presets_are_layouts():
     for name, layout in PRESETS.items():  # the checks of a declared layout, on the preset itself
         assert declared_layout({"format": name}, "layout") == preset(name) == layout
         columns = {len(layout.channels[c].columns) for c in layout.channels if c in PER_WHEEL}
-        assert columns == (set() if name == "robotino2021_camera" else {3})
+        assert columns == (set() if name in ("robotino2021_camera", "tracked") else {3})
 
 
 def test_a_config_starts_from_a_preset_and_overrides_it(root):
