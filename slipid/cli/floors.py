@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from slipid.report.page import Page
 
 
+MOST_BEYOND = 0.05
+"""Part of the rows in which wheels may be beyond the map."""
+
+
 @on_wheels
 def floors(
     fitted: OutFolder,
@@ -30,7 +34,8 @@ def floors(
 ) -> int:
     """Which floor was under each wheel in logged runs, and how far its border was.
 
-    Poses are corrected by the camera of the fit. Writes a CSV file for each run.
+    Poses are corrected by the camera of the fit. Writes a CSV file for each run. Exit code 1 where
+    wheels are often beyond the map.
     """
     from slipid.deploy.floors_under import floors_under, summary, write_floors
     from slipid.support.jax_setup import setup_jax
@@ -41,7 +46,7 @@ def floors(
         written = write_floors(out, lookup, runs)
     content = summary(lookup, runs)
     emit(json, content, lambda page: show(page, content), out, [f"{len(written)} CSV files"])
-    return 0
+    return 0 if content["beyond_the_map"] <= MOST_BEYOND else 1
 
 
 def show(page: "Page", content: Content) -> None:
@@ -52,3 +57,5 @@ def show(page: "Page", content: Content) -> None:
     for name, run in content["runs"].items():
         shares.add_row(name, *(" ".join(f"{100 * v:3.0f}" for v in row) for row in run.values()))
     page.table(shares)
+    if beyond := content["beyond_the_map"]:
+        page.line(f"note: {100 * beyond:.1f} % of the wheels' places are beyond the map")

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
 from slipid.control.deployed import DeployedRobot
@@ -45,10 +45,13 @@ class WheelFloors(eqx.Module):
         surface: number of the surface, in the order of the map's.
         border: distance from the middle of the wheel to the nearest other surface [m], to within
             half a cell of the map; infinite on a map of a single surface.
+        inside: whether the wheel is on the map; beyond its edge, surface and border are those of
+            the nearest cell.
     """
 
     surface: Int[Array, "*batch wheel"]
     border: Float[Array, "*batch wheel"]
+    inside: Bool[Array, "*batch wheel"]
 
 
 class FloorLookup(eqx.Module):
@@ -84,15 +87,15 @@ class FloorLookup(eqx.Module):
     def under(self, pose: Float[Array, "*batch 3"], wheels: Float[Array, "wheel 2"]) -> WheelFloors:
         """Floor and border under the wheels of bodies at some poses.
 
-        Beyond the edge of the map both are those of the nearest cell.
-
         Args:
             pose: x, y [m], heading [rad].
             wheels: where the wheels are on the body, x ahead, y left [m].
         """
         flat = pose.reshape(-1, 3)
-        row, column = jax.vmap(self.floor.cell_under, (0, None))(flat, wheels)
+        row, column = jax.vmap(self.floor.steps_to, (0, None))(flat, wheels)
+        rows, columns = self.floor.cells.shape
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        row, column = row.clip(0, rows - 1), column.clip(0, columns - 1)
         shape = (*pose.shape[:-1], len(wheels))
-        return WheelFloors(
-            self.floor.cells[row, column].reshape(shape), self.border[row, column].reshape(shape)
-        )
+        found = self.floor.cells[row, column], self.border[row, column], inside
+        return WheelFloors(*(part.reshape(shape) for part in found))

@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from slipid.data.log import Log
 from slipid.data.reading.reader import find_logs
@@ -33,6 +33,7 @@ class FloorsOfRun:
         time: [s]; pose: of the body in the frame of the map, x, y [m], heading [rad].
         surface: number of the surface under each wheel.
         border: distance of each wheel from the nearest other surface [m].
+        inside: whether each wheel is on the map; nothing is known of its floor where it is not.
     """
 
     name: str
@@ -40,6 +41,7 @@ class FloorsOfRun:
     pose: Float[np.ndarray, "row 3"]
     surface: Int[np.ndarray, "row wheel"]
     border: Float[np.ndarray, "row wheel"]
+    inside: Bool[np.ndarray, "row wheel"]
 
 
 def floors_under(
@@ -74,7 +76,14 @@ def floors_under(
         report.line(sentence)
     report.stage("looking up floors")
     sessions = zip(runs.logs, runs.session, strict=True)
-    return lookup, [_of_run(fit.robot, lookup, log, session) for log, session in sessions]
+    found = [_of_run(fit.robot, lookup, log, session) for log, session in sessions]
+    if not any(run.inside.any() for run in found):
+        x, y = np.concatenate([run.pose for run in found])[0, :2]
+        raise DataError(
+            f"{map_file}: no wheel of any run is on this map (the first stands at x {x:.2f} m, "
+            f"y {y:.2f} m); expected a map in the frame of the poses"
+        )
+    return lookup, found
 
 
 def _of_run(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> FloorsOfRun:
@@ -93,6 +102,7 @@ def _of_run(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> Floors
         np.asarray(pose),
         np.asarray(found.surface),
         np.asarray(found.border),
+        np.asarray(found.inside),
     )
 
 
@@ -108,8 +118,12 @@ def write_floors(folder: Path, lookup: FloorLookup, runs: list[FloorsOfRun]) -> 
         text.write(",".join(["time", "x", "y", "heading", *names]) + "\n")
         for k in range(len(run.time)):
             numbers = [f"{v:.5f}" for v in (run.time[k], *run.pose[k])]
-            floors = [lookup.surfaces[s] for s in run.surface[k]]
-            borders = [f"{v:.4f}" if np.isfinite(v) else "" for v in run.border[k]]
+            there = run.inside[k]
+            floors = [
+                lookup.surfaces[s] if i else "" for s, i in zip(run.surface[k], there, strict=True)
+            ]
+            known = np.isfinite(run.border[k]) & there
+            borders = [f"{v:.4f}" if i else "" for v, i in zip(run.border[k], known, strict=True)]
             text.write(",".join([*numbers, *floors, *borders]) + "\n")
         path = folder / Path(run.name.replace("#", "_")).with_suffix(".csv")
         write_bytes(path, text.getvalue().encode())
@@ -122,9 +136,10 @@ def summary(lookup: FloorLookup, runs: list[FloorsOfRun]) -> Content:
     return {
         "schema": SCHEMA,
         "surfaces": list(lookup.surfaces),
+        "beyond_the_map": float(np.mean([1.0 - run.inside.mean() for run in runs])),
         "runs": {
             run.name: {
-                name: np.round((run.surface == number).mean(axis=0), 4).tolist()
+                name: np.round(((run.surface == number) & run.inside).mean(axis=0), 4).tolist()
                 for number, name in enumerate(lookup.surfaces)
             }
             for run in runs

@@ -94,15 +94,21 @@ def show_trust(page: Page, judged: "Judgement") -> None:
 _COMMANDED = ("commanded headings", r"and speeds \[m/s]")
 
 
+STRANGE_RATE = 3e-4
+"""Difference of the rates of two clocks that no quartz has [1]."""
+
+
 def _clocks(clocks: Mapping[str, Content]) -> str:
     """Of the clocks of poses that had their own, how far off they were and how sure that is."""
     offsets = [clock["offset_s"] for clock in clocks.values()]
     wide = [0.5 * (high - low) for low, high in (c["offset_interval90_s"] for c in clocks.values())]
+    rate = max((clock["drift"] for clock in clocks.values()), key=abs)
+    strange = f"; rates differ by up to {1e6 * rate:+.0f} ppm: is the video's frame rate right?"
     by = ", ".join(sorted({clock["told_by"] for clock in clocks.values()}))
     return (
         f"clock of the poses, from the motion ({by}): {min(offsets):+.3f} to {max(offsets):+.3f} s "
         f"from the robot's in {len(clocks)} runs; 90 % intervals +- {1e3 * min(wide):.1f} to "
-        f"{1e3 * max(wide):.1f} ms"
+        f"{1e3 * max(wide):.1f} ms{strange if abs(rate) > STRANGE_RATE else ''}"
     )
 
 

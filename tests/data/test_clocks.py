@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -103,6 +105,9 @@ def test_a_long_run_tells_the_drift():
     assert clock is not None
     assert clock.drift == pytest.approx(drift, abs=5e-5)
     assert clock.drift_std < 3e-5
+    wrong = clock_of_poses(Drive(5, seconds=120.0, drift=1e-3).by_gyro())
+    assert wrong is not None
+    assert wrong.drift == pytest.approx(1e-3, abs=5e-5)  # 29.97 frames a second taken for 30
     short = clock_of_poses(Drive(5).by_gyro())
     assert short is not None
     assert short.drift_std > 8e-5  # what quartz does: a short run tells no more
@@ -210,8 +215,27 @@ def test_poses_of_another_run_are_refused_with_what_to_do(tmp_path):
     (tmp_path / "other").mkdir()
     write(tmp_path / "other", still)
     (tmp_path / "other" / "run.poses.csv").replace(tmp_path / "run.poses.csv")
-    with pytest.raises(DataError, match=r"run.poses.csv.*does not tell the clock.*starts, stops"):
-        read(tmp_path, layout())
+    found = read_logs(
+        tmp_path / "run.csv", declared_layout(layout(), "test"), tmp_path, "f", "as_built"
+    )
+    assert found.logs == ()
+    (said,) = found.aside
+    assert re.search(r"set aside: .*run.poses.csv: .*does not tell its clock.*starts, stops", said)
+
+
+def test_a_log_that_counts_from_1970_has_its_poses_where_they_belong(tmp_path):
+    drive = Drive(6)
+    shift = 1.7e9
+    drive.time = drive.time + shift
+    write(tmp_path, drive)
+    log = read(tmp_path, layout())
+    assert log.pose_clock is not None
+    assert log.pose_clock.offset == pytest.approx(OFFSET + shift, abs=0.003)
+    assert log.pose is not None
+    assert log.pose_fresh is not None
+    fresh = log.pose_fresh & (log.time > 1.0)
+    inside = np.interp(log.time[fresh], drive.pose_time + OFFSET, drive.pose[:, 0])
+    np.testing.assert_allclose(log.pose[fresh, 0], inside, atol=2e-3)
 
 
 def test_poses_alone_are_read_as_well(tmp_path):

@@ -66,6 +66,10 @@ def test_beyond_the_edge_it_is_the_nearest_cell():
     lookup = FloorLookup.of(FloorMap(("a", "b"), cells, (0.0, 0.0), 0.1))
     found = lookup.under(jnp.array([[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]]), jnp.zeros((1, 2)))
     assert [lookup.surfaces[k] for k in found.surface[:, 0]] == ["b", "a"]
+    assert not np.asarray(found.inside).any()
+    edges = jnp.array([[0.01, 0.01, 0.0], [0.19, 0.19, 0.0], [0.21, 0.1, 0.0], [0.1, -0.01, 0.0]])
+    within = lookup.under(edges, jnp.zeros((1, 2))).inside
+    assert np.asarray(within[:, 0]).tolist() == [True, True, False, False]
 
 
 def test_the_command_refuses_what_is_no_fit_and_no_map(tmp_path):

@@ -81,6 +81,16 @@ SIZES = {
 }
 
 
+def test_no_file_of_another_kind_is_lost(made, tmp_path):
+    log = tmp_path / "run07.csv"
+    log.write_text("time,ticks_1\n0.0,1\n")
+    video = made.video("robot", ROBOT)
+    assert "would be lost" in refusal(made, video, *LONE, out=log)
+    assert log.read_text() == "time,ticks_1\n0.0,1\n"
+    assert ".csv or .parquet" in refusal(made, video, *LONE, out=tmp_path / "a.xlsx")
+    assert not (tmp_path / "a.xlsx").exists()
+
+
 @pytest.mark.parametrize("words", SIZES)
 def test_options_that_cannot_be(made, words, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)

@@ -122,13 +122,20 @@ class Floor(eqx.Module):
         self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
     ) -> tuple[Int[Array, " wheel"], Int[Array, " wheel"]]:
         """Row and column of the cell under each wheel; beyond the edge those of the nearest."""
+        row, column = self.steps_to(pose, wheels)
+        rows, columns = self.cells.shape
+        return row.clip(0, rows - 1), column.clip(0, columns - 1)
+
+    def steps_to(
+        self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
+    ) -> tuple[Int[Array, " wheel"], Int[Array, " wheel"]]:
+        """Rows and columns from the corner to each wheel, also where there is no cell."""
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         turned = jnp.stack(
             [c * wheels[:, 0] - s * wheels[:, 1], s * wheels[:, 0] + c * wheels[:, 1]], axis=-1
         )
         steps = jnp.floor((pose[:2] + turned - self.corner) / self.cell).astype(jnp.int32)
-        rows, columns = self.cells.shape
-        return steps[:, 1].clip(0, rows - 1), steps[:, 0].clip(0, columns - 1)
+        return steps[:, 1], steps[:, 0]
 
     def supports(
         self,

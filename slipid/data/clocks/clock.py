@@ -27,8 +27,9 @@ FINE, REACH = 0.01, 0.2
 """Step and half the width of the search around that [s], in which noise is told from slip."""
 LEAST_SHARED = 1.0
 """Time that both clocks must share [s]."""
-DRIFT_STD = 1e-4
-"""Of the rates of two clocks, before the motion is looked at [1]: quartz errs less."""
+DRIFT_STD, OTHER_RATE = 1e-4, 1e-2
+"""Of the rates of two clocks, before the motion is looked at [1]: quartz errs less; and where the
+motion contradicts that, as a frame rate does that is not what it is said to be."""
 BLOCKS = 10
 """Parts of a run that are compared for the interval."""
 ROUNDS, SETTLED = 20, 6
@@ -168,15 +169,19 @@ def _refined(motion: Motion, steps: Steps, offset: float) -> Clock | None:
             return None
         _, k, noise = min(told)
         at[0] = grid[k]
-    prior, change = np.diag([0.0, DRIFT_STD**-2]), np.full(2, np.inf)
+    quartz, change = True, np.full(2, np.inf)
     for k in range(ROUNDS):
         now = _near(motion, steps, at, middle, noise)
         if now is None or abs(at[0] - offset) > REACH:
             return None
+        prior = np.diag([0.0, (DRIFT_STD if quartz else OTHER_RATE) ** -2])
         normal = np.einsum("kci,kcj->ij", now.slope, now.slope) + prior
         if not normal[0, 0] > 0.0:
             return None
-        if abs(change[0]) < 1e-5:
+        settled = abs(change[0]) < 1e-5
+        if settled and quartz and abs(at[1]) > 3 * DRIFT_STD:
+            quartz, settled = False, False
+        if settled:
             return _told(motion, now, at, np.linalg.inv(normal), middle)
         pull = np.einsum("kci,kc->i", now.slope, now.left) + prior @ at
         change = np.linalg.solve(normal, pull)

@@ -93,6 +93,7 @@ def read_logs(
 ) -> FileRuns:
     """Every run in a CSV or Parquet file or in a bag, and a line for each whose pose jumps.
 
+    So is a run whose poses have a clock of their own that its motion does not tell.
     `layout.new_run` tells the runs of a file of rows apart, `layout.runs` those of a bag. Parts of
     a file of a single row hold no motion and are left out. A run whose pose jumps is set aside by
     its name: the marker was taken for another, or the matching of scans failed, and what lies
@@ -106,7 +107,10 @@ def read_logs(
     """
     surface = path.parent.name.removesuffix("_surface") if surface == "folder" else surface
     known = Identity(path.relative_to(root).as_posix(), path, "", surface, load)
-    raw = _of_bag(known, layout) if isinstance(layout, BagLayout) else _of_rows(known, layout)
+    try:
+        raw = _of_bag(known, layout) if isinstance(layout, BagLayout) else _of_rows(known, layout)
+    except Unsteady as error:
+        return FileRuns((), (f"set aside: {error}",))
     logs: list[Log] = []
     aside: list[str] = []
     for identity, signals, notes in raw:
@@ -161,7 +165,7 @@ def _of_rows(known: Identity, layout: Layout) -> list[_RawRun]:
         for pattern, other in beside.items():
             more = signals_of(other, layout.beside[pattern], notes)
             if layout.beside[pattern].clock == "own":
-                clock = clock_against(assembled(signals, layout, identity), more)
+                clock = clock_against(signals, layout, identity, more)
                 identity = replace(identity, pose_clock=clock)
                 more = {n: replace(s, time=clock.robot_time(s.time)) for n, s in more.items()}
             signals |= more

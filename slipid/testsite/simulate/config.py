@@ -25,7 +25,7 @@ RESERVED = ("one_surface", "two_surfaces", "wheel_load")
 """Folders of the 2022 layout."""
 _IDENTIFY = """\
 # Identifies the robot of these logs:
-#   slipid identify robot.toml --data logs --out result
+#   slipid identify {name} --data logs --out result
 # They were made by slipid simulate; the truth lies in truth/, which nothing reads that fits.
 
 [robot]
@@ -52,7 +52,7 @@ current_is_signed = {signed}
 "motor.back_emf" = {{ start = 0.0257, prior = {{ mean = 0.04, std = 0.02 }} }}
 """
 _TRACKED = """
-# what `slipid track` makes of the video of each run:
+# what `slipid track` makes of the video of each run, such as:
 #   slipid track video/as_built/firm/run000.avi --camera video/camera.json \\
 #     --marker-size {size} --marker-height {height} --out logs/as_built/firm/run000.poses.csv
 [layouts.testsite.beside."{{stem}}.poses.csv"]
@@ -215,6 +215,7 @@ def identify_config(plan: Plan, by_video: bool = False) -> str:
         signed=str(sensors.current_is_signed).lower(),
         columns="\n".join(f"{name} = {_inline(c)}" for name, c in columns.items()),
         sets=sets,
+        name="robot_video.toml" if by_video else "robot.toml",
         beside=beside,
         scale=round(scale * (1 + measured), 4),
         lag=lag,

@@ -160,10 +160,15 @@ def _vector(
         *(extent.low_x, extent.low_y, extent.high_x, extent.high_y),
         grid.cell,
         list(colours)[most],
-        hashlib.sha256(source.path.read_bytes()).hexdigest(),
+        _sha256(source.path),
         unknown,
         tuple(notes),
     )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:  # a video may be larger than memory
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _warnings(ask: Asked, pairs: tuple[Pair, ...], vector: VectorMap) -> tuple[str, ...]:

@@ -35,6 +35,9 @@ _NUMBERS = {
 """Columns of numbers, and how CSV writes them."""
 
 
+_HEAD = ",".join(["frame", *_NUMBERS, "flag"])
+
+
 def can_write(path: Path) -> None:
     """Try whether poses can be written there.
 
@@ -43,6 +46,12 @@ def can_write(path: Path) -> None:
     """
     if path.is_dir():
         raise DataError(f"{path}: a folder; expected the name of a file, .csv or .parquet")
+    if path.suffix.lower() not in (".csv", ".parquet"):
+        raise DataError(f"{path}: expected a name that ends in .csv or .parquet")
+    if path.suffix.lower() == ".csv" and path.is_file() and not _is_ours(path):
+        raise DataError(
+            f"{path}: there is a file of another kind, which would be lost; expected another name"
+        )
     if _is_parquet(path):
         _pyarrow()
     writable(path.parent)
@@ -55,6 +64,13 @@ def write_poses(path: Path, track: Track) -> None:
         DataError: nothing can be written there, or Parquet without pyarrow.
     """
     write_bytes(path, _parquet(track) if _is_parquet(path) else _csv(track).encode())
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a file is one of tracked poses, or empty."""
+    with path.open("rb") as file:
+        begin = file.read(len(_HEAD))
+    return begin in (b"", _HEAD.encode())
 
 
 def _is_parquet(path: Path) -> bool:

@@ -161,8 +161,10 @@ class LoneMarker:
     def __post_init__(self) -> None:
         if not 0 < self.size < np.inf:
             raise DataError(f"--marker-size {self.size:g}; expected the edge in metres")
-        if not np.isfinite(self.height):
-            raise DataError(f"--marker-height {self.height:g}; expected it in metres")
+        if not 0 <= self.height < np.inf:
+            raise DataError(
+                f"--marker-height {self.height:g}; expected it in metres above the floor"
+            )
         if not np.isfinite(self.yaw):
             raise DataError(f"--marker-yaw {np.degrees(self.yaw):g}; expected an angle in degrees")
         most = len(marker_dictionary(self.dictionary).bytesList) - 1
