@@ -11,7 +11,6 @@ from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.report.page import Page
-    from slipid.vision.camera import OverheadCamera
     from slipid.vision.floor.found import FoundMap
 
 PROPOSAL = "palette.toml"
@@ -22,21 +21,8 @@ def map_(
     image: Annotated[Path, typer.Argument(metavar="IMAGE", help="Picture of the floor, or video.")],
     out: Out,
     camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Camera that `slipid calibrate` wrote.")
-    ] = None,
-    metres_per_pixel: Annotated[
-        float | None,
-        typer.Option(metavar="M", min=1e-6, max=1, help="Instead of --camera: straight down."),
-    ] = None,
-    camera_height: Annotated[
-        float | None,
-        typer.Option(
-            metavar="M",
-            min=0.1,
-            max=100,
-            help="With --metres-per-pixel; by default the width of the view.",
-        ),
-    ] = None,
+        Path, typer.Option(metavar="FILE", help="Camera that `slipid calibrate` wrote.")
+    ],
     config: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Surfaces by colour or by points, region, masks."),
@@ -54,7 +40,7 @@ def map_(
     robot_radius: Annotated[
         float, typer.Option(metavar="M", min=0, max=10, help="Around the marker; is masked.")
     ] = 0.2,
-    robot_height: Annotated[
+    marker_height: Annotated[
         float, typer.Option(metavar="M", min=0, max=10, help="Of the marker above the floor.")
     ] = 0.25,
     json: Json = None,
@@ -69,14 +55,16 @@ def map_(
     from slipid.plots.floor import floor_plot
     from slipid.support.files import write_bytes
     from slipid.support.jax_setup import one_blas_thread
+    from slipid.vision.camera import OverheadCamera
     from slipid.vision.floor.picture import Wish, map_of
     from slipid.vision.floor.robot_mask import Robot
 
     one_blas_thread()  # many small matrices
-    robot = Robot(dictionary, robot_radius, robot_height)
+    robot = Robot(dictionary, robot_radius, marker_height)
     with Reporter(quiet=quiet) as report:
-        above = _camera(image, camera, metres_per_pixel, camera_height)
-        found = map_of(image, above, Wish(config, surfaces, robot, cell), report)
+        found = map_of(
+            image, OverheadCamera.load(camera), Wish(config, surfaces, robot, cell), report
+        )
         if found.proposal is not None and (out / PROPOSAL).exists():
             raise DataError(
                 f"{out / PROPOSAL}: it is there already and may have been edited, and surfaces are "
@@ -91,30 +79,6 @@ def map_(
             written.append(PROPOSAL)
     emit(json, found.to_json(), lambda page: show(page, found, out), out, written)
     return 1 if found.poor else 0
-
-
-def _camera(
-    image: Path, camera: Path | None, metres_per_pixel: float | None, height: float | None
-) -> "OverheadCamera":
-    """The camera that is told, one way or the other."""
-    from slipid.vision.camera import OverheadCamera
-    from slipid.vision.still import still
-
-    if (camera is None) == (metres_per_pixel is None):
-        raise DataError(
-            f"{image}: no scale; expected either --camera FILE or --metres-per-pixel M"
-            if camera is None
-            else f"{camera}: a camera and --metres-per-pixel; expected one of them"
-        )
-    if camera is not None:
-        if height is not None:
-            raise DataError(f"{camera}: it says how high it is; expected no --camera-height")
-        return OverheadCamera.load(camera)
-    assert metres_per_pixel is not None
-    tall, wide = still(image).shape[:2]
-    return OverheadCamera.straight_down(
-        (wide, tall), metres_per_pixel, height or metres_per_pixel * max(wide, tall)
-    )
 
 
 def show(page: "Page", found: "FoundMap", out: Path) -> None:

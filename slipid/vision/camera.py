@@ -41,6 +41,15 @@ class Lens:
     matrix: Float[np.ndarray, "3 3"]
     distortion: Float[np.ndarray, " coefficient"]
 
+    def to_json(self) -> Content:
+        """What a camera file says of it."""
+        return {
+            "schema": SCHEMA,
+            "image_px": list(self.image_px),
+            "matrix": self.matrix.tolist(),
+            "distortion": self.distortion.tolist(),
+        }
+
     def ideal(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Where a pinhole with focal length 1 sees what the lens shows at some pixels."""
         flat = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
@@ -140,11 +149,7 @@ class OverheadCamera:
 
     def to_json(self) -> Content:
         """What `load` reads."""
-        return {
-            "schema": SCHEMA,
-            "image_px": list(self.lens.image_px),
-            "matrix": self.lens.matrix.tolist(),
-            "distortion": self.lens.distortion.tolist(),
+        return self.lens.to_json() | {
             "rotation_from_world": self.rotation.tolist(),
             "place_m": self.place.tolist(),
             "scale_std": self.scale_std,

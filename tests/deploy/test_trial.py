@@ -21,7 +21,7 @@ from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.interface import Measurement, Settings
 from slipid.control.robot_file.record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.control.robot_file.typed import typed
-from slipid.data.floor_map import four_zones, uniform
+from slipid.data.floor_map import four_zones, uniform, write_map
 from slipid.deploy import trial as tr
 from slipid.deploy.controllers import ROWS, check_gains, pilot_of, unused_gains
 from slipid.deploy.floors import floor_map, floor_of
@@ -445,6 +445,46 @@ def test_runs_of_another_path_or_speed_are_driven_anew(tmp_path, deployed):
         job.kept.save_json("mark", {})
         assert plain.kept.load_json("mark") is None
         assert jobs(**other)[0].kept.load_json("mark") == {}
+
+
+def test_a_controller_is_told_another_map_than_the_true_one(tmp_path, deployed, monkeypatch):
+    deployed.save(tmp_path / "robot.json")
+    labels = list(deployed.labels)
+    maps = {"true": labels[:2], "told": labels[1::-1], "strange": [labels[0], "moss"]}
+    for name, (a, b) in maps.items():
+        colours = {a: "#101010", b: "#f0f0f0"}
+        write_map(tmp_path / f"{name}.toml", four_zones([a, b, a, b]), colours)
+
+    def jobs(**more):
+        wish = {"plant": "twin", "controllers": ("contact_map",), "map": tmp_path / "true.toml"}
+        return tr._jobs(tmp_path, tr.Wish(**wish, **more))
+
+    plain, other = jobs()[0], jobs(told_map=tmp_path / "told.toml")[0]
+    assert plain.told is plain.floor
+    assert other.kept.folder != plain.kept.folder
+    middle = np.array([[0.0, 0.5], [0.9, 0.5]])
+
+    def named(floor):
+        return [floor.surfaces[int(k)] for k in floor.at(middle)]
+
+    assert named(other.floor) == named(plain.floor) == labels[:2]
+    assert named(other.told) == labels[1::-1]
+
+    class Told(Exception):
+        pass
+
+    def caught(robot, row, settings, forced, floor):
+        raise Told(floor)
+
+    monkeypatch.setattr(tr, "pilot_of", caught)
+    with pytest.raises(Told) as told:
+        tr.drive(other)
+    (floor,) = told.value.args
+    for k, place in enumerate(middle):
+        under = floor.under(jnp.array([*place, 0.0]), jnp.zeros((1, 2)))
+        assert labels[int(under[0])] == labels[1 - k]
+    with pytest.raises(DataError, match=r"strange\.toml: no surface 'moss'"):
+        jobs(told_map=tmp_path / "strange.toml")
 
 
 def values(gains):

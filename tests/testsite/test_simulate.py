@@ -16,13 +16,13 @@ from typer.testing import CliRunner
 
 from slipid.cli.main import app
 from slipid.data.floor_map import four_zones, read_map
-from slipid.data.reading.presets import preset
+from slipid.data.reading.presets import declared_layout, preset
 from slipid.job.config import parsed
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.machine import Machine
-from slipid.testsite.simulate.config import can_identify, identify_config, plan
+from slipid.testsite.simulate.config import all_filmed, can_identify, identify_config, plan
 from slipid.testsite.simulate.simulate import Job, _place, simulate, truth
 from slipid.testsite.site import Camera, Site
 from slipid.testsite.studio import MARKER, Studio, film
@@ -324,6 +324,61 @@ def test_runs_on_a_map_of_floors_that_were_driven_are_fitted_with_it(tmp_path):
     text = MIXED.replace('map = "site"', 'map = "site"\nload = "moved"')
     found = parsed(tmp_path / "robot.toml", identify_config(plan(tmp_path / "x", text))).content
     assert len(found.logs) == 2
+
+
+def test_where_all_runs_are_filmed_a_config_takes_the_poses_of_their_videos(tmp_path):
+    filmed = plan(tmp_path / "x", f'video = ["*"]\n{MIXED}')
+    assert all_filmed(filmed)
+    assert not all_filmed(plan(tmp_path / "x", f'video = ["*/firm/*"]\n{MIXED}'))
+    # a map with a floor that no run keeps to is not read by the fit either
+    assert all_filmed(
+        plan(tmp_path / "x", f'video = ["*/firm/*", "*/soft/*", "*/site/*"]\n{MIXED}')
+    )
+    found = parsed(tmp_path / "r.toml", identify_config(filmed, by_video=True)).content
+    known = declared_layout(found.layouts["testsite"], "testsite")
+    assert not [name for name in known.channels if name.startswith("pose")]
+    assert known.beside["{stem}.poses.csv"] == preset("tracked")
+    assert found.parameters["camera.scale"].prior.mean == pytest.approx(1.0, abs=0.01)
+    plain = parsed(tmp_path / "r.toml", identify_config(filmed)).content
+    assert "beside" not in plain.layouts["testsite"]
+    assert plain.parameters["camera.scale"].prior.mean == pytest.approx(1.117, abs=0.01)
+
+
+@pytest.mark.slow
+def test_a_camera_that_is_started_early_films_a_robot_that_stands(tmp_path):
+    text = """
+video = ["*"]
+[camera]
+width_px = 320
+height_px = 180
+focal_px = 200
+frame_s = 0.2
+early_s = 0.5
+noise = 0
+flicker = 0
+[[runs]]
+kind = "headings"
+surface = "firm"
+step_deg = 360
+speeds_m_s = [0.2]
+distance_m = 0.1
+"""
+    path = tmp_path / "x.toml"
+    path.write_text(text)
+    try:
+        with Reporter(quiet=True) as report:
+            simulate(plan(path, text), tmp_path, 1, report)
+    except DataError as error:
+        pytest.skip(f"frames cannot be drawn here: {error}")
+    times = np.loadtxt(tmp_path / "video/as_built/firm/run000.csv", delimiter=",", skiprows=1)
+    assert times[0].tolist() == [0.0, -0.5]
+    video = cv2.VideoCapture(str(tmp_path / "video/as_built/firm/run000.avi"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == len(times)
+    first, second = (video.read()[1].astype(float) for _ in range(2))
+    *_, last = (video.read()[1].astype(float) for _ in range(len(times) - 2))
+    assert np.abs(second - first).max() == 0.0
+    assert np.abs(last - first).max() > 20.0
+    assert (tmp_path / "robot_video.toml").is_file()
 
 
 def test_the_truth_has_the_names_of_a_fit():

@@ -21,7 +21,7 @@ from slipid.vision.calibration.place.floor import FloorFit, placed, placed_robus
 from slipid.vision.calibration.place.points import FloorPoints, read_points
 from slipid.vision.calibration.place.spread import spread
 from slipid.vision.calibration.report import floor_report, lens_report, scale_std, straight_report
-from slipid.vision.camera import SCHEMA, Lens, OverheadCamera, read_camera
+from slipid.vision.camera import Lens, OverheadCamera, read_camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,14 +146,7 @@ def save_lens(lens: LensFound, path: Path) -> None:
     Raises:
         DataError: nothing can be written there.
     """
-    content = {
-        "schema": SCHEMA,
-        "image_px": list(lens.lens.image_px),
-        "matrix": lens.lens.matrix.tolist(),
-        "distortion": lens.lens.distortion.tolist(),
-        "report": lens.report,
-    }
-    write_json(path, content)
+    write_json(path, lens.lens.to_json() | {"report": lens.report})
 
 
 def _above(lens: LensFound, fit: FloorFit, source: str, size_std: float) -> FloorFound:

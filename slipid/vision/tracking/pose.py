@@ -86,6 +86,9 @@ def poses_of(
     seen = np.isfinite(place).all(axis=-1) & np.isfinite(per_pixel).all(axis=(-1, -2))
     seen &= seen.sum(axis=1, keepdims=True) >= 3
     some = seen.any(axis=1)
+    out = Poses(*(np.full((frames, *shape), np.nan) for shape in ((3,), (3, 3), (), (), ())))
+    if not some.any():  # another body than those in view
+        return out
     place, per_pixel, used = place[some], per_pixel[some], seen[some]
     place = np.where(used[..., None], place, 0.0)
     into_pixels = np.linalg.inv(np.where(used[..., None, None], per_pixel, np.eye(2)))
@@ -97,7 +100,6 @@ def poses_of(
         fitted = fitted - step[..., 0]
     left, slope = _left_over(fitted, place, into_pixels, body, used)
     unit = np.linalg.inv(np.swapaxes(slope, 1, 2) @ slope)[:, :3, :3]
-    out = Poses(*(np.full((frames, *shape), np.nan) for shape in ((3,), (3, 3), (), (), ())))
     turned = np.angle(np.exp(1j * fitted[:, 2]))
     out.pose[some] = np.column_stack([fitted[:, :2], turned])
     out.unit_covariance[some], out.size[some] = unit, fitted[:, 3]

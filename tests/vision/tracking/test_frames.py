@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from fractions import Fraction
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -36,7 +37,6 @@ def write_times(path, rows):
 
 def write_uneven(path, ticks):
     """A video whose frames have times of their own, in milliseconds."""
-    av = pytest.importorskip("av")
     with av.open(str(path), "w") as file:
         stream = file.add_stream("mpeg4", rate=30)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
