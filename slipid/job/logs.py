@@ -6,7 +6,7 @@ from pathlib import Path
 from slipid.data.log import Log
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.presets import PRESETS, declared_layout, preset
-from slipid.data.reading.reader import AnyLayout, find_logs, read_logs, session_of
+from slipid.data.reading.reader import AnyLayout, find_logs, read_logs, session_of, without_beside
 from slipid.data.runs import Runs, collect, counted_once
 from slipid.job.config import Config, Logs
 from slipid.support.errors import DataError, near
@@ -66,7 +66,8 @@ def files_of(
             skipped.append(f"skipped: {error}")
         except (ValueError, NotImplementedError) as error:
             raise DataError(f"{config.path}: logs.glob '{section.glob}': {error}") from error
-    return found, skipped
+    own = [(one, without_beside(paths, layout_of(config, one))) for one, paths in found]
+    return own, skipped
 
 
 def layout_of(config: Config, section: Logs) -> AnyLayout:

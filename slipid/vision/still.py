@@ -14,6 +14,11 @@ FRAMES = 25
 """Frames of a video whose median is taken."""
 
 
+def is_picture(path: Path) -> bool:
+    """Whether a file is taken for a picture, by its name."""
+    return path.suffix.lower() in PICTURES
+
+
 def still(path: Path) -> np.ndarray:
     """Rows, columns, and blue, green, red of a picture, or of the median of a video's frames.
 
@@ -22,7 +27,7 @@ def still(path: Path) -> np.ndarray:
     Raises:
         DataError: neither a picture nor a video.
     """
-    if path.suffix.lower() in PICTURES or not path.is_file() or not path.stat().st_size:
+    if is_picture(path) or not path.is_file() or not path.stat().st_size:
         return read_picture(path)
     with closing(Capture(str(path))) as capture:
         count = int(capture.value(opencv().CAP_PROP_FRAME_COUNT))

@@ -11,7 +11,7 @@ from slipid.data.clocks.clock import SURE_STD, best_clock, clock_of_poses
 from slipid.data.clocks.motion import Motion
 from slipid.data.clocks.noise import StepNoise
 from slipid.data.reading.presets import declared_layout
-from slipid.data.reading.reader import read_logs
+from slipid.data.reading.reader import read_logs, read_runs
 from slipid.support.errors import DataError
 
 OFFSET = 1.2345
@@ -108,6 +108,9 @@ def test_a_long_run_tells_the_drift():
     wrong = clock_of_poses(Drive(5, seconds=120.0, drift=1e-3).by_gyro())
     assert wrong is not None
     assert wrong.drift == pytest.approx(1e-3, abs=5e-5)  # 29.97 frames a second taken for 30
+    other = clock_of_poses(Drive(5, seconds=40.0, drift=3e-3).by_gyro())
+    assert other is not None
+    assert abs(other.drift - 3e-3) < 3 * other.drift_std < 6e-4
     short = clock_of_poses(Drive(5).by_gyro())
     assert short is not None
     assert short.drift_std > 8e-5  # what quartz does: a short run tells no more
@@ -135,6 +138,34 @@ def test_the_same_again_and_again_tells_nothing():
     turned = 0.05 * np.sin(2 * np.pi * drive.pose_time / period)
     drive.pose = np.stack([turned, 0 * turned, 0 * turned], axis=1)
     assert clock_of_poses(drive.by_wheels()) is None
+
+
+def test_a_gyro_tells_nothing_of_a_robot_that_does_not_turn():
+    drive = Drive(2)
+    rng = np.random.default_rng(0)
+    drive.gyro = 0.01 + rng.normal(0.0, 0.004, len(drive.time))
+    drive.pose[:, 2] = rng.normal(0.0, 0.0015, len(drive.pose))
+    assert clock_of_poses(drive.by_gyro()) is None
+
+
+def test_parts_of_a_run_that_disagree_make_the_interval_wider():
+    one = clock_of_poses(Drive(0, seconds=30.0).by_gyro())
+    drive = Drive(0, seconds=30.0)
+    middle = slice(len(drive.pose_time) // 3, 2 * len(drive.pose_time) // 3)
+    drive.pose_time[middle] += 0.03
+    two = clock_of_poses(drive.by_gyro())
+    assert one is not None
+    assert two is not None
+    assert two.offset_std > 2.0 * one.offset_std
+
+
+def test_no_step_goes_across_a_gap_of_the_poses():
+    drive = Drive(2)
+    there = np.abs(drive.pose_time - 4.0) > 0.7
+    motion = Motion.of_gyro(drive.time, drive.gyro, drive.pose_time[there], drive.pose[there])
+    steps = motion.steps(0.1)
+    assert (steps.last - steps.first).max() < 0.25
+    assert len(steps.first) > 90
 
 
 def test_a_short_record_tells_nothing():
@@ -236,6 +267,27 @@ def test_a_log_that_counts_from_1970_has_its_poses_where_they_belong(tmp_path):
     fresh = log.pose_fresh & (log.time > 1.0)
     inside = np.interp(log.time[fresh], drive.pose_time + OFFSET, drive.pose[:, 0])
     np.testing.assert_allclose(log.pose[fresh, 0], inside, atol=2e-3)
+
+
+def test_headings_that_wrap_around_are_as_good(tmp_path):
+    drive = Drive(6)
+    turned = drive.pose[:, 2] + 3.0
+    c, s = np.cos(3.0), np.sin(3.0)
+    x, y = drive.pose[:, :2].T
+    drive.pose = np.column_stack([c * x - s * y, s * x + c * y, np.angle(np.exp(1j * turned))])
+    assert np.abs(np.diff(drive.pose[:, 2])).max() > 6.0
+    write(tmp_path, drive)
+    log = read(tmp_path, layout())
+    assert log.pose_clock is not None
+    assert log.pose_clock.offset == pytest.approx(OFFSET, abs=0.003)
+
+
+def test_a_glob_that_finds_the_poses_too_reads_the_logs_alone(tmp_path):
+    write(tmp_path, Drive(6))
+    runs = read_runs(tmp_path, "*.csv", declared_layout(layout(), "test"), surface=None)
+    assert [log.name for log in runs.logs] == ["run.csv"]
+    alone = read_runs(tmp_path, "*.poses.csv", "tracked", surface=None)
+    assert [log.name for log in alone.logs] == ["run.poses.csv"]
 
 
 def test_poses_alone_are_read_as_well(tmp_path):

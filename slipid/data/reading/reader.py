@@ -59,7 +59,7 @@ def read_runs(
     chosen = preset(layout) if isinstance(layout, str) else layout
     logs: list[Log] = []
     aside: list[str] = []
-    for path in find_logs(root, pattern):
+    for path in without_beside(find_logs(root, pattern), chosen):
         found = read_logs(path, chosen, root, surface, load)
         logs += found.logs
         aside += found.aside
@@ -219,6 +219,21 @@ def find_logs(root: Path, pattern: str) -> list[Path]:
         f"{root}: no file matches '{pattern}'; expected at least one "
         f"({nearest} has {listed or 'nothing in it'})"
     )
+
+
+def without_beside(paths: Sequence[Path], layout: AnyLayout) -> list[Path]:
+    """Files without those that lie beside another of them and hold more of its channels.
+
+    A glob such as `*.csv` finds both; where the layout puts nothing beside, all are kept.
+    """
+    if isinstance(layout, BagLayout):
+        return list(paths)
+    further = {
+        path.parent / pattern.replace("{stem}", path.stem)
+        for path in paths
+        for pattern in layout.beside
+    }
+    return [path for path in paths if path not in further]
 
 
 def _run_starts(table: Table, layout: Layout) -> list[int]:

@@ -20,6 +20,7 @@ from slipid.vision.floor.segmentation.colour import Features, code_of_light
 from slipid.vision.floor.segmentation.proposal import Proposal
 from slipid.vision.floor.segmentation.segment import UNKNOWN
 from slipid.vision.floor.segmentation.surfaces import Surfaces
+from slipid.vision.still import is_picture
 
 MOST_NAMED = 3
 """Of weak patches, the largest."""
@@ -116,7 +117,7 @@ def made(
     )
     poor = verdict(pairs, labels, ask.wanted)
     vector = _vector(source, ask, labels, patches, colours)
-    warnings = _warnings(ask, pairs, vector)
+    warnings = _warnings(ask, source.path, pairs, vector)
     return FoundMap(vector, ask.floor, labels, ask.robots, warnings, poor, None)
 
 
@@ -171,10 +172,12 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _warnings(ask: Asked, pairs: tuple[Pair, ...], vector: VectorMap) -> tuple[str, ...]:
+def _warnings(
+    ask: Asked, path: Path, pairs: tuple[Pair, ...], vector: VectorMap
+) -> tuple[str, ...]:
     """What a reader must know of a map that is not poor for it."""
     said = [pair.said() for pair in pairs if pair.separable]
-    if not ask.robots:
+    if not ask.robots and is_picture(path):  # in a video's median it is gone
         said.append(
             "no marker of a robot was found, so none is masked; where one stands, mask it in the "
             "config, or name the --dictionary of its marker"
