@@ -53,6 +53,7 @@ class Drive:
         return Motion.of_gyro(self.time, self.gyro, self.pose_time, self.pose)
 
 
+@pytest.mark.slow
 def test_a_gyro_tells_the_offset_to_milliseconds_and_how_sure_it_is():
     clocks = [clock_of_poses(Drive(seed).by_gyro()) for seed in range(8)]
     assert all(clock is not None for clock in clocks)
@@ -99,6 +100,7 @@ def test_times_of_poses_come_out_on_the_clock_of_the_robot():
     assert moved[1] - moved[0] == pytest.approx(10.0 * (1.0 + clock.drift))
 
 
+@pytest.mark.slow
 def test_a_long_run_tells_the_drift():
     drift = 2e-4
     clock = clock_of_poses(Drive(5, seconds=120.0, drift=drift).by_gyro())
