@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
 
 from slipid.data.floor_map import from_polygons, write_map
+from slipid.data.log import Log
+from slipid.deploy.floors import FloorLookup
+from slipid.deploy.floors_under import _of_run, summary
+from slipid.model.geometry import omni
+from slipid.model.robot import build
 from tests.helpers.shared import invoke
 
 EDGE = 0.1
@@ -22,6 +29,47 @@ def half_carpet(path, low=-3.0, high=3.0):
     extent = (low, low, high, high)
     write_map(path, from_polygons("table", [("carpet", corners)], extent), COLOURS)
     return path
+
+
+def test_a_marker_that_sits_aside_and_is_turned_is_taken_into_account(tmp_path):
+    robot = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["soft"], sessions=["day"])
+    yaw, aside = 0.4, np.array([0.06, -0.03])
+    camera = replace(
+        robot.camera,
+        scale=jnp.asarray(1.1),
+        marker_yaw=jnp.asarray(0.3),
+        session_yaw=jnp.array([yaw - 0.3]),
+        marker_place=jnp.asarray(aside),
+    )
+    lookup = FloorLookup.read(half_carpet(tmp_path / "map.toml"))
+    heading = np.linspace(-3.0, 3.0, 40)
+    logged = np.column_stack([0.05 * np.cos(3 * heading), 0.1 * heading, heading])
+    log = Log(
+        name="run.csv",
+        path=tmp_path / "run.csv",
+        sha256="",
+        time=np.arange(40.0),
+        wheel_angle=np.zeros((40, 3)),
+        current_is_signed=True,
+        pose=logged,
+        pose_fresh=np.arange(40) % 2 == 0,
+        surface=None,
+        load="as_built",
+    )
+    found = _of_run(replace(robot, camera=camera), lookup, log, "day")
+    body = heading[::2] - yaw
+    c, s = np.cos(body), np.sin(body)
+    centre = 1.1 * logged[::2, 0] - (c * aside[0] - s * aside[1])
+    wheel = centre[:, None] + 0.125 * np.cos(np.radians([60, 180, 300]) + body[:, None])
+    np.testing.assert_array_equal(found.time, np.arange(0.0, 40.0, 2.0))
+    np.testing.assert_allclose(found.border, np.abs(wheel - EDGE), atol=0.0045)
+    clear = np.abs(wheel - EDGE) > 0.005
+    np.testing.assert_array_equal((found.surface == 1)[clear], (wheel > EDGE)[clear])
+    beyond = replace(found, inside=np.arange(20)[:, None] < [20, 10, 0])
+    shares = summary(lookup, [beyond])
+    assert shares["beyond_the_map"] == pytest.approx(0.5)
+    on_map = [sum(part) for part in zip(*shares["runs"]["run.csv"].values(), strict=True)]
+    assert on_map == pytest.approx([1.0, 0.5, 0.0])
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import pytest
 
 from slipid.support.errors import DataError
 from slipid.vision.still import FRAMES, still
+from slipid.vision.tracking.frames.video import Capture
 
 FLOOR = np.full((80, 120, 3), (40, 120, 200), np.uint8)
 
@@ -35,6 +36,13 @@ def test_what_stands_most_of_the_time_stays(tmp_path):
     shown = still(film(tmp_path / "video.avi", 60, stands=45)).astype(int)
     assert shown[25:45, 10:25].min() > 240
     assert np.abs(shown[60:] - FLOOR[60:]).max() < 12
+
+
+def test_frames_are_spread_over_a_video_that_does_not_know_its_length(tmp_path, monkeypatch):
+    path = film(tmp_path / "video.avi", 300, stands=70)
+    monkeypatch.setattr(Capture, "value", lambda self, what: 0.0)
+    shown = still(path).astype(int)
+    assert np.abs(shown - FLOOR).max() < 12
 
 
 def test_a_picture_is_itself(tmp_path):
