@@ -39,7 +39,7 @@ def test_what_stands_most_of_the_time_stays(tmp_path):
 
 
 def test_frames_are_spread_over_a_video_that_does_not_know_its_length(tmp_path, monkeypatch):
-    path = film(tmp_path / "video.avi", 300, stands=70)
+    path = film(tmp_path / "video.avi", 300, stands=20)
     monkeypatch.setattr(Capture, "value", lambda self, what: 0.0)
     shown = still(path).astype(int)
     assert np.abs(shown - FLOOR).max() < 12
