@@ -72,6 +72,7 @@ def test_wheels_tell_it_too_and_claim_less():
     assert 0.015 <= clock.offset_std < 0.02
 
 
+@pytest.mark.slow
 def test_the_gyro_is_asked_first_and_wheels_only_where_it_does_not_tell():
     drive = Drive(1)
 
@@ -150,6 +151,7 @@ def test_a_gyro_tells_nothing_of_a_robot_that_does_not_turn():
     assert clock_of_poses(drive.by_gyro()) is None
 
 
+@pytest.mark.slow
 def test_parts_of_a_run_that_disagree_make_the_interval_wider():
     one = clock_of_poses(Drive(0, seconds=30.0).by_gyro())
     drive = Drive(0, seconds=30.0)

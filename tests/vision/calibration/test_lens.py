@@ -143,6 +143,7 @@ def test_each_reason_to_refuse_a_lens_is_one():
         refuse(fit, coverage(np.full((9, 2), 200.0), SIZE), tilts)
 
 
+@pytest.mark.slow
 def test_a_poor_lens_says_why():
     poor = " ".join(lens_of_views(seen_views(made.places(7), noise=0.4))[1].poor)
     assert "7 views; expected 10" in poor

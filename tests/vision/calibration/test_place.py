@@ -67,6 +67,7 @@ def test_uncertainty_of_the_lens_reaches_the_floor(found, folder):
     assert stds[1] > 0.6 * focal["std"] / focal["value"] * CAMERA[2]
 
 
+@pytest.mark.slow
 def test_stated_place_is_that_of_repetitions():
     off, lengths, stated = [], [], []
     for seed in range(24):

@@ -13,6 +13,8 @@ from slipid.vision.floor.outline import area
 from tests.helpers.made_floors import COLOURS, POINTS, Flaws, made_floor
 from tests.helpers.mapped_floors import HEAD, REGION, border_error, mapped, marked, truth_of
 
+pytestmark = pytest.mark.slow
+
 
 def test_points_on_surfaces_are_enough_under_uneven_light(made, by_points):
     true = truth_of(by_points, made)
@@ -26,7 +28,6 @@ def test_points_on_surfaces_are_enough_under_uneven_light(made, by_points):
         assert np.mean(by_points.labels[known & (true == k)] == k) > 0.95
 
 
-@pytest.mark.slow
 def test_one_point_on_each_surface_is_enough_as_the_light_is_learnt(tmp_path):
     floor = made_floor(flaws=Flaws(shade=0.6, glare=0.25))
     points = {name: places[1:] for name, places in POINTS.items()}
@@ -109,7 +110,6 @@ def test_neighbouring_patches_leave_no_gap_and_do_not_overlap(by_points):
     assert (count > 1).sum() < 20
 
 
-@pytest.mark.slow
 def test_colours_alone_are_enough_where_light_is_not_too_uneven(tmp_path):
     palette = "[palette]\n" + "".join(f'{name} = "{code}"\n' for name, code in COLOURS.items())
     floor = made_floor(flaws=Flaws(shade=0.2, glare=0.05))
@@ -120,7 +120,6 @@ def test_colours_alone_are_enough_where_light_is_not_too_uneven(tmp_path):
     assert found.vector.colours == COLOURS
 
 
-@pytest.mark.slow
 def test_surfaces_are_proposed_and_their_config_finds_them_again(made, tmp_path):
     found = mapped(made, tmp_path, REGION)
     names = list(found.vector.colours)

@@ -12,6 +12,8 @@ from slipid.vision.floor.picture import Wish, map_of
 from slipid.vision.floor.robot_mask import Robot
 from tests.helpers.mapped_floors import HEAD, REFERENCE, SITE_POINTS, marked
 
+pytestmark = pytest.mark.slow
+
 
 def reference(names: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Surface of each pixel of the test site as drawn by hand, and whether it is sure."""
@@ -27,7 +29,6 @@ def reference(names: list[str]) -> tuple[np.ndarray, np.ndarray]:
     return true, true >= 0
 
 
-@pytest.mark.slow
 def test_the_test_site_agrees_with_what_was_drawn_by_hand(real_data, tmp_path):
     image = real_data / "robotino2021" / "test_site.jpg"
     config = tmp_path / "site.toml"
@@ -46,7 +47,6 @@ def test_the_test_site_agrees_with_what_was_drawn_by_hand(real_data, tmp_path):
     assert not found.poor
 
 
-@pytest.mark.slow
 def test_the_edge_of_the_carpet_lies_where_it_was_measured(real_data, tmp_path):
     image = real_data / "robotino2022" / "two_surfaces" / "green_table" / "top_view.jpg"
     region = "[region]\nat_px = [[385, 60], [1440, 130], [1440, 995], [390, 995]]\n"

@@ -13,6 +13,8 @@ from tests.helpers.made_drives import round_trip, starts_and_stops
 from tests.helpers.made_videos import Body
 from tests.helpers.tracked import STAGE, errors, tracked
 
+pytestmark = pytest.mark.slow
+
 COUNT = 100
 BAD = (11, 22, 34, 57, 80)
 AT = 45

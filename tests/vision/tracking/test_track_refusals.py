@@ -39,6 +39,7 @@ def refusal(made, source, *words, out=None) -> str:
     return done.stderr
 
 
+@pytest.mark.slow
 def test_markers_that_are_not_those_asked_for(made):
     assert "no marker of any dictionary" in refusal(made, made.video("empty", count=3), *LONE)
     words = refusal(made, made.video("empty", count=3), *LONE, "--id", 4)

@@ -64,6 +64,7 @@ CONDITIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_poses_are_accurate_and_their_covariance_holds(name, tmp_path):
     """At 640 pixels, where the marker is 19 to 30 pixels large; more pixels do better."""
@@ -80,6 +81,7 @@ def test_poses_are_accurate_and_their_covariance_holds(name, tmp_path):
     assert abs(track.usual_size - 1) < 2e-3
 
 
+@pytest.mark.slow
 def test_covariance_is_not_much_too_large(tmp_path):
     """Errors of single frames are about what noise makes of them, not a hundredth of it."""
     stage = Stage(light=replace(PLAIN, noise=12.0, bright=0.5, flicker=0.0))
@@ -135,6 +137,7 @@ def test_wrong_height_is_told(tmp_path):
 # several markers --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_markers_of_a_body_at_several_heights_give_one_pose(tmp_path):
     markers = (
         Printed(id=1, size=0.1, height=0.25, ahead=0.2, left=0.0, yaw=0.7),
