@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
 PARTS = ("fit", "unseen")
 """What is fitted, and what is predicted: folders, and configs `testsite_<part>.toml`."""
-RECORDED = Path(__file__).with_name("recorded.zip")
-"""Logs of the test site that ship with slipid."""
 
 
 @guarded
@@ -57,6 +55,7 @@ def run(
     """
     from slipid.cli.identify import run as identify
     from slipid.cli.validate import run as validate
+    from slipid.job.packaged import packaged_config, unpack
     from slipid.support.files import read_json, write_bytes, write_json
 
     if plant not in ("recorded", "mujoco"):
@@ -78,35 +77,9 @@ def run(
     return done, found, truth["parameters"]
 
 
-def packaged_config(name: str) -> str:
-    """Text of a config that ships with slipid."""
-    import slipid
-
-    package = Path(slipid.__file__).parent
-    # beside the package in a clone, inside it in an installation
-    for folder in (package / "configs", package.parent / "configs"):
-        if (folder / name).is_file():
-            return (folder / name).read_text(encoding="utf-8")
-    raise FileNotFoundError(f"{name} is missing from this installation of slipid")
-
-
-def unpack(out: Path) -> None:
-    """Write the recorded logs, their truth and nothing else below a folder."""
-    from zipfile import ZipFile
-
-    from slipid.support.files import write_bytes
-
-    try:
-        archive = ZipFile(RECORDED)
-    except OSError as error:
-        raise DataError(f"{RECORDED}: {error.strerror}; expected the recorded logs") from error
-    with archive:
-        for name in archive.namelist():
-            write_bytes(out / name, archive.read(name))
-
-
 def drive_anew(out: Path, seed: int, jobs: int, report: Reporter) -> None:
     """Drive the runs that ship recorded, and those to be predicted, on the test site."""
+    from slipid.job.packaged import packaged_config
     from slipid.testsite.simulate.config import plan
     from slipid.testsite.simulate.simulate import simulate
 

@@ -6,6 +6,7 @@ import threading
 
 import typer
 
+from slipid.cli.benchmark import benchmark
 from slipid.cli.calibrate import calibrate
 from slipid.cli.check import check
 from slipid.cli.compare import compare
@@ -36,7 +37,8 @@ app = typer.Typer(
 )
 for command in (
     *(new, reference, motor, check, selftest, identify, sample, validate, compare),
-    *(design, tune, trial, export, simulate, calibrate, track, map_, floors, paper, demo),
+    *(design, tune, trial, export, simulate, calibrate, track, map_, floors, paper),
+    *(benchmark, demo),
 ):
     app.command(command.__name__.rstrip("_"))(command)  # map is a word of Python
 

@@ -6,13 +6,15 @@ what they do beyond the pose loop
 
     v = R(-heading) (v_ref + k (p_ref - p)),   W = W_ref + k_yaw sin(heading_ref - heading)
 
+or in the law that stands in its place.
+
 A robot whose wheels turn and which does not move turns and goes by turns, ever harder: demands to
 go and to turn that cancel at the wheels that have grip, so that only a wheel without any spins, are
 a rest of the loop far from its path. It goes on as usual once it has moved for a while; if that
 does not come about it stops and says so.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal
 
@@ -28,6 +30,8 @@ from slipid.control.least_error import wheel_speeds
 from slipid.parameter import parameter
 
 Correction = Literal["none", "torque", "paper_print", "paper_code"]
+Law = Callable[[Float[Array, "6"], Float[Array, "3"]], Float[Array, "3"]]
+"""Twist of the body to ask for [m/s, m/s, rad/s], of a reference as of `Path.at` and a pose."""
 PAPER_GAIN = {"x": (3000.0, 500.0, 3000.0), "y": (2000.0, 2000.0, 2000.0)}
 """Of the 2021 paper's torque correction, motor rpm per N m at the motor shaft, by leg."""
 OBSERVE_S = 0.4
@@ -170,12 +174,15 @@ class Controller(eqx.Module):
         gains: by default those tuned for the robot where they are better, else those set by hand.
         correction: torque correction of the 2021 paper, in the form it prints, the form its authors
             ran, or corrected.
+        law: in place of the pose loop and its integral; a module, so that numbers of another law of
+            its kind need no other compilation.
     """
 
     robot: DeployedRobot
     gains: Gains
     limits: Limits = eqx.field(static=True)
     correction: Correction = eqx.field(static=True)
+    law: Law | None = None
 
     def __init__(
         self,
@@ -183,8 +190,9 @@ class Controller(eqx.Module):
         gains: Gains | None = None,
         limits: Limits = Limits(),
         correction: Correction = "none",
+        law: Law | None = None,
     ):
-        self.robot, self.limits, self.correction = robot, limits, correction
+        self.robot, self.limits, self.correction, self.law = robot, limits, correction, law
         self.gains = Gains.of(robot) if gains is None else gains
 
     def init(self) -> ControllerState:
@@ -257,14 +265,18 @@ class Controller(eqx.Module):
         return still, jnp.where(tries, old.tried + dt, 0.0)
 
     def _wanted(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
-        """Twist that the pose loop asks for, its speed limited [m/s, m/s, rad/s]."""
-        v = ref[3:5] + self.gains.place * gap + old.integral
-        c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
-        turn = ref[5] + self.gains.yaw * jnp.sin(ref[2] - pose[2])
-        wanted = jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0], turn])
+        """Twist that the pose loop or the law asks for, its speed limited [m/s, m/s, rad/s]."""
+        wanted = self._pose_loop(old, ref, pose, gap) if self.law is None else self.law(ref, pose)
         wanted = wanted * _freeing(old.tried)
         fast = jnp.sqrt(wanted[:2] @ wanted[:2] + 1e-12) / self.limits.twist
         return wanted.at[:2].divide(jnp.maximum(fast, 1.0))
+
+    def _pose_loop(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
+        """Twist that the pose loop asks for [m/s, m/s, rad/s]."""
+        v = ref[3:5] + self.gains.place * gap + old.integral
+        c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+        turn = ref[5] + self.gains.yaw * jnp.sin(ref[2] - pose[2])
+        return jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0], turn])
 
     def _wheels(self, old: ControllerState, asked: Array, e: Estimate) -> Array:
         """Wheel speeds for a twist: a share of those by the contact model, the rest kinematics."""

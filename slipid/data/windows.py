@@ -23,6 +23,7 @@ class Windows:
     Attributes:
         run: number of the run that each piece is cut from (piece,).
         surface, load, session: their names for each piece.
+        began: time in its run at which each piece begins [s] (piece,).
         dt: length of each window [s] (piece, window).
         turn: rotation of each wheel in the window [rad] (piece, window, wheel), at lag `lag`.
         faster: wheel speed at its end less that at its start [rad/s]; d turn / d lag = -faster.
@@ -41,6 +42,7 @@ class Windows:
     surface: tuple[str, ...]
     load: tuple[str, ...]
     session: tuple[str, ...]
+    began: Float[np.ndarray, " piece"]
     dt: Float[np.ndarray, "piece window"]
     turn: Float[np.ndarray, "piece window wheel"]
     faster: Float[np.ndarray, "piece window wheel"]
@@ -200,6 +202,7 @@ def _cut(
         mean_voltage, count, missed = _mean(t, data.voltage[rows], live, fresh, at)
         unread = np.where(count > 0, missed, UNREAD)
     return {
+        "began": t[edges[0]],
         "dt": np.diff(t[edges]),
         "turn": np.diff(turned, axis=0),
         "faster": np.diff(speed, axis=0),

@@ -1,19 +1,31 @@
 """The controllers of a trial, each a row of its table, and the gains they have."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 
-from slipid.control.closed_loop import Pilot
-from slipid.control.controller import Controller, Correction, Gains
+from slipid.baselines.steering.goswami_padhy import (
+    GoswamiPadhy,
+    Rehearsal,
+    by_gradient,
+    by_swarm,
+)
+from slipid.baselines.steering.indiveri import Indiveri, inverse_kinematics
+from slipid.control.closed_loop import PERIOD, Pilot
+from slipid.control.controller import Controller, Correction, Gains, Law, Limits
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator, Odometry
 from slipid.control.filter.floor import Floor
 from slipid.control.interface import AbstractEstimator, Settings
+from slipid.control.trajectory import rectangle
+from slipid.control.tuning.actuation import Habits
 from slipid.support.errors import DataError
 
 
@@ -25,6 +37,7 @@ class Row:
         observer: `encoder`, `curve` (slip over current, wheel by wheel) or `contact`.
         about: one sentence for people.
         correction: of the 2021 paper.
+        law: a published one in place of the pose loop, made for a robot.
         tuned: whether it has the gains of `slipid tune`, where they are better than by hand.
         ahead: whether wheel speeds come from the contact model, whatever the gains say.
         gyro: whether the robot has one.
@@ -34,6 +47,7 @@ class Row:
     observer: str
     about: str
     correction: Correction = "none"
+    law: Callable[[DeployedRobot], Law] | None = None
     tuned: bool = False
     ahead: bool = False
     gyro: bool = False
@@ -44,6 +58,44 @@ class Row:
         return self.correction == "none" or robot.wheels == PAPER_WHEELS
 
 
+BESIDE = ((0.05, 0.0, 0.2), (0.0, 0.05, -0.2), (-0.05, 0.0, 0.2), (0.0, -0.05, -0.2))
+"""From where gains of published laws are rehearsed: beside the path's start [m, m, rad]."""
+
+
+def _indiveri(robot: DeployedRobot) -> Law:
+    """The wheels as they were identified, and the gains that the pose loop has by hand."""
+    numbers, wheels, gains = robot.record.parameters, robot.record.wheels, Gains()
+    matrix = inverse_kinematics(
+        np.asarray(robot.places),
+        np.asarray(wheels.drive_angle) + np.asarray(numbers["robot.drive_offset"].value),
+        np.asarray(wheels.roller_angle),
+        float(robot.frame.radius) * (1 + np.asarray(numbers["robot.radius_deviation"].value)),
+    )
+    both = jnp.stack([gains.place, gains.yaw])
+    return Indiveri(jnp.asarray(matrix), both, jnp.asarray(Limits().wheel_speed))
+
+
+def _goswami_padhy(robot: DeployedRobot) -> Law:
+    return GoswamiPadhy(jnp.asarray(_rehearsed("swarm")))
+
+
+def _goswami_padhy_gradient(robot: DeployedRobot) -> Law:
+    return GoswamiPadhy(jnp.asarray(_rehearsed("gradient")))
+
+
+@cache
+def _rehearsed(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
+    """Gains [1/s] on the first two sides of the rectangle; the others mirror them.
+
+    The ideal robot is late as every robot's twin is, so that gains are the same for all of them.
+    """
+    path, habits = rectangle(), Habits()
+    times = jnp.arange(0.0, float(path.marks[1]), PERIOD)
+    reference = np.asarray(jax.vmap(path.at)(times))
+    task = Rehearsal(reference, np.array(BESIDE), habits.held(), habits.follow, PERIOD)
+    return tuple((by_swarm(task) if by == "swarm" else by_gradient(task)).tolist())
+
+
 PAPER_WHEELS = 3
 """Of the 2021 paper's robot."""
 ROWS: Mapping[str, Row] = {
@@ -52,6 +104,13 @@ ROWS: Mapping[str, Row] = {
     "paper_print": Row("curve", "and torque correction as printed", "paper_print"),
     "paper_code": Row("curve", "and torque correction as its authors ran it", "paper_code"),
     "torque": Row("curve", "and torque correction, corrected", "torque"),
+    "goswami_padhy": Row(
+        "encoder", "law of Goswami and Padhy, gains by a swarm", law=_goswami_padhy
+    ),
+    "goswami_padhy_gradient": Row(
+        "encoder", "and gains by the gradient", law=_goswami_padhy_gradient
+    ),
+    "indiveri": Row("encoder", "law of Indiveri, its limit keeps the direction", law=_indiveri),
     "contact": Row("contact", "contact estimator, tuned gains where they are better", tuned=True),
     "contact_ahead": Row("contact", "and wheel speeds by the contact model", ahead=True),
     "contact_map": Row("contact", "contact, told the map of its floors", tuned=True, mapped=True),
@@ -136,4 +195,5 @@ def pilot_of(
     if row.observer != "contact":
         estimator = Odometry(robot, settings, curve=row.observer == "curve")
         own = replace(own, preview=jnp.asarray(0.0))  # the paper's loop has none
-    return Pilot(estimator, Controller(robot, own, correction=row.correction))
+    law = None if row.law is None else row.law(robot)
+    return Pilot(estimator, Controller(robot, own, correction=row.correction, law=law))

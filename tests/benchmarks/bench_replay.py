@@ -28,6 +28,7 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.interface import MIXED, Settings
 from slipid.deploy.floors import floor_of
+from slipid.deploy.forecaster import robot_of
 from slipid.identify.compare.folds import sectors
 from slipid.identify.compare.predictive import Contact, contact_of
 from slipid.identify.fit.likelihood import batch
@@ -98,7 +99,7 @@ def deployed(job: Job, contact: Contact, runs: np.ndarray) -> DeployedRobot:
     windows = job.problem().windows
     seen = windows.pieces(np.flatnonzero(np.isin(windows.run, runs)))
     trend = current_trend(contact.robot, batch(seen, contact.robot))
-    return replayed.deployed(contact, "as_built", TOP, trend)
+    return robot_of(contact, TOP, trend, load="as_built")
 
 
 def show(rows: list[Judged]) -> None:

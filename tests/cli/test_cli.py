@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slipid.cli.demo import packaged_config
+from slipid.job.packaged import packaged_config
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
 from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good

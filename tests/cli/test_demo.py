@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from slipid.cli import demo
-from slipid.cli.demo import PARTS, RECORDED, drive_anew, packaged_config, unpack
+from slipid.cli.demo import PARTS, drive_anew
+from slipid.job import packaged
 from slipid.job.config import read_config
+from slipid.job.packaged import RECORDED, packaged_config, unpack
 from slipid.job.problem import read_job
 from slipid.plots.motion import path_figure
 from slipid.report.estimates import compared
@@ -79,7 +81,7 @@ def test_the_recording_needs_neither_mujoco_nor_opencv(tmp_path):
         "            raise ImportError(name)\n"
         "sys.meta_path.insert(0, Absent())\n"
         "from pathlib import Path\n"
-        "from slipid.cli.demo import packaged_config, unpack\n"
+        "from slipid.job.packaged import packaged_config, unpack\n"
         "from slipid.support.progress import Reporter\n"
         "from slipid.testsite.simulate.simulate import simulate\n"
         "from slipid.testsite.simulate.config import plan\n"
@@ -97,7 +99,7 @@ def test_the_recording_needs_neither_mujoco_nor_opencv(tmp_path):
 
 
 def test_a_missing_recording_is_said(tmp_path, monkeypatch):
-    monkeypatch.setattr(demo, "RECORDED", tmp_path / "gone.zip")
+    monkeypatch.setattr(packaged, "RECORDED", tmp_path / "gone.zip")
     with pytest.raises(DataError, match=r"gone\.zip: .*expected the recorded logs"):
         unpack(tmp_path)
 

@@ -23,13 +23,14 @@ from slipid.control.robot_file.record import (
     GainValues,
     ToldRecord,
 )
+from slipid.deploy.forecaster import given
 from slipid.deploy.record_of import record_of
 from slipid.model.geometry import omni
 from slipid.model.robot import Validity, build
 from slipid.parameter import entries
 from slipid.support.errors import DataError
 from slipid.support.files import checksum
-from tests.helpers.known_robot import GAINS, deploy_known, given
+from tests.helpers.known_robot import GAINS, deploy_known
 
 SCHEMA = json.loads(resources.files("slipid.control").joinpath("robot.schema.json").read_text())
 SEEN = Validity(

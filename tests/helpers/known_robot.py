@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import jax
-import numpy as np
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.robot_file.record import (
@@ -13,12 +12,11 @@ from slipid.control.robot_file.record import (
     GainsRecord,
     GainValues,
     Losses,
-    Number,
     ToldRecord,
 )
-from slipid.deploy.record_of import plain, record_of
+from slipid.deploy.forecaster import given
+from slipid.deploy.record_of import record_of
 from slipid.model.robot import Robot
-from slipid.parameter import entries
 
 GAINS = GainsRecord(
     values=GainValues(*(GainRecord(0.1 * k, "1", 0.01) for k in range(6))),
@@ -51,19 +49,3 @@ def deploy_known(
         robot, given(robot), std or {}, several, highest_speed, current_trend, {}, told
     )
     return DeployedRobot.of(record, load)
-
-
-def given(robot: Robot) -> dict[str, Number]:
-    """The numbers of a robot as they were given, by path."""
-    return {
-        e.path: Number(
-            value=plain(np.asarray(e.get(robot))),
-            unit=e.declaration.unit,
-            std=None,
-            interval90=None,
-            verdict="fixed",
-            provenance="override",
-            source="given",
-        )
-        for e in entries(robot)
-    }

@@ -66,6 +66,7 @@ def made(truth, runs=24, count=2, seed=0, std=None, signed=True, voltage=True):
         surface=tuple(labels[k % len(labels)] for k in range(runs)),
         load=tuple(loads[k // 2 % len(loads)] for k in range(runs)),
         session=tuple(sessions[k // 3 % len(sessions)] for k in range(runs)),
+        began=np.zeros(runs),
         dt=dt,
         turn=dt[..., None] * rate * rng.normal(1.0, 0.02, (runs, count, 3)),
         faster=rng.normal(0.0, 0.05, (runs, count, 3)),

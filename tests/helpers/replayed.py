@@ -16,18 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2
 
-from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import AbstractEstimator, Estimate, Readings
 from slipid.data.floor_map import FloorMap
 from slipid.data.log import Log
 from slipid.data.runs import Runs, first_row
-from slipid.deploy.deploy import DRAWS
-from slipid.deploy.told import told_by_load
-from slipid.identify.compare.predictive import Contact
-from slipid.identify.result import draws
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
-from tests.helpers.known_robot import deploy_known
 
 TOGETHER = 32
 """Runs replayed in one call."""
@@ -35,22 +29,6 @@ ROWS = 128
 """Rows are filled up to a multiple of it, so that few shapes are compiled."""
 STARTS = 0.001
 """A robot moves from where the rim of a wheel has moved this far [m]."""
-
-
-def deployed(contact: Contact, load: str, top: float, trend: tuple[float, float]) -> DeployedRobot:
-    """The robot of a fit, as `slipid.deploy.deploy` has it.
-
-    Args:
-        contact: the fit.
-        load: set-up it drives with.
-        top: highest wheel speed in the fitted runs [rad/s].
-        trend: of the currents in the fitted runs, see `slipid.identify.slip_curves.current_trend`.
-    """
-    several = draws(contact.z, contact.covariance, DRAWS, seed=0)
-    robots = jax.vmap(contact.space.tree)(jnp.asarray(several))
-    std = {name: float(np.sqrt(v)) for name, v in contact.forecast.items()}
-    told = told_by_load(contact, contact.z, several)
-    return deploy_known(contact.robot, load, std, robots, top, trend, told)
 
 
 def heard(estimator: AbstractEstimator, angle: Any, current: Any) -> Readings:

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from slipid.cli.demo import packaged_config
 from slipid.cli.main import app
+from slipid.job.packaged import packaged_config
 from slipid.selftest.known import Sensors, grid, truth
 from slipid.selftest.logs import make_logs
 from tests.helpers.made_logs import write_logs

@@ -15,7 +15,6 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from slipid.cli.demo import packaged_config
 from slipid.cli.main import app
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit import noise as of_noise
@@ -23,6 +22,7 @@ from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.shared import AXES
 from slipid.job.config import parsed
+from slipid.job.packaged import packaged_config
 from slipid.job.problem import Job
 from slipid.selftest import replicates as selftest
 from slipid.selftest.experiment import judged, summary

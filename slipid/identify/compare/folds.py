@@ -155,9 +155,7 @@ def learn(
     Of the runs left out nothing is used but which they are.
     """
     fitted = np.setdiff1d(np.arange(len(data)), judged)
-    held = [*still_viscosities(data, fitted), *choices]
-    if Space(problem.robot, held).names != problem.space.names:  # they saw a floor at one speed
-        problem = Problem(problem.windows, problem.robot, held)
+    problem = of_some(problem, choices, data, fitted)
     keep = np.isin(problem.windows.run, fitted).astype(float)
     began = time.perf_counter()
     optimum = fit(problem, keep=keep)
@@ -171,6 +169,14 @@ def learn(
         models.append(with_noise(rung, contact, problem, keep))
         seconds[rung.name] = time.perf_counter() - began
     return Learnt(problem, optimum, tuple(models), seconds)
+
+
+def of_some(problem: Problem, choices: Sequence[Choice], data: Runs, fitted: np.ndarray) -> Problem:
+    """The problem of a fit to some of its runs: what those cannot tell is held."""
+    held = [*still_viscosities(data, fitted), *choices]
+    if Space(problem.robot, held).names == problem.space.names:
+        return problem
+    return Problem(problem.windows, problem.robot, held)  # they saw a floor at one speed
 
 
 def judge(

@@ -150,6 +150,7 @@ def steady_windows(
         surface=tuple(d.surface for d in drives),
         load=tuple(d.load for d in drives),
         session=(session,) * n,
+        began=np.zeros(n),
         dt=dt,
         turn=dt[..., None] * rate[:, None],
         faster=blank,

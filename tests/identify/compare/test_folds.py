@@ -13,7 +13,6 @@ from scipy.optimize import brentq
 from scipy.stats import binom, chi2, multivariate_t
 from typer.testing import CliRunner
 
-from slipid.cli.demo import packaged_config
 from slipid.cli.main import app
 from slipid.data.runs import collect
 from slipid.identify.compare import open_loop as replay
@@ -29,6 +28,7 @@ from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import Linear, shared
 from slipid.identify.fit.variances import DEGREES
 from slipid.job.compare import finished
+from slipid.job.packaged import packaged_config
 from slipid.search_space import Choice
 from slipid.selftest.known import Sensors, grid, truth
 from slipid.selftest.logs import make_logs

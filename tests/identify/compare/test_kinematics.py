@@ -40,6 +40,7 @@ def windows(shape, seed=0, runs=24, count=4):
         surface=("grass",) * runs,
         load=("as_built",) * runs,
         session=("one",) * runs,
+        began=np.zeros(runs),
         dt=np.full((runs, count), 0.5),
         turn=0.5 * turn,
         faster=rng.normal(size=turn.shape),

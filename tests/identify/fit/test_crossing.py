@@ -14,7 +14,6 @@ import pytest
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from slipid.cli.demo import packaged_config
 from slipid.cli.main import app
 from slipid.control.interface import MIXED, Settings
 from slipid.data.floor_map import from_polygons, uniform
@@ -29,6 +28,7 @@ from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.variances import _cut, whitened
 from slipid.identify.fit_file import load
 from slipid.job.config import read_config
+from slipid.job.packaged import packaged_config
 from slipid.job.problem import read_job, with_mixed
 from slipid.model import se2
 from slipid.search_space import Choice
@@ -65,6 +65,7 @@ def still(lag, runs, per_run):
         surface=("unknown",) * runs,
         load=("as_built",) * runs,
         session=("elsewhere",) * runs,
+        began=np.zeros(runs),
         dt=np.full((runs, per_run), 0.25),
         turn=zero,
         faster=zero,

@@ -1,0 +1,318 @@
+"""The one interface of every published system: what it hears of a run, and what it says of it.
+
+A method is fitted to runs with poses, and then predicts runs from what the robot itself measures:
+wheels, currents, commands, perhaps a gyro. All methods are given the same steps of the same runs.
+"""
+
+import abc
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.model.robot import Robot
+
+Channel = Literal["current", "gyro", "command", "twist"]
+"""What a method may need beside the encoders. `twist`: wheels that determine the body's twist."""
+Numbers = Float[np.ndarray, " step"]
+Twists = Float[np.ndarray, "step 3"]
+"""Body twist of each step: ahead [m/s], to the left [m/s], yaw [rad/s]."""
+TRIES = 4
+"""Settings that a method may try in its inner cross-validation, the same for all of them."""
+WINDOW_S = 0.5
+"""Length of the windows that methods are trained on and that twists are judged on [s]."""
+SHAFT_W0 = 3.0
+"""Shaft speed below which the torque of a current is not told by its power [rad/s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """What is known of a robot before anything is fitted.
+
+    A drive is a motor with all the wheels that it turns: one wheel, or a side of a skid steer.
+
+    Attributes:
+        forward: rim speed of each drive [m/s] from the body twist.
+        back: body twist from the drives' rim speeds, by least squares, if nothing slips.
+        wheel_radius, base_radius: [m].
+        gear_ratio: motor turns per wheel turn.
+        resistance, back_emf: of the motor by its datasheet [ohm], [V s/rad].
+        mass: of the robot [kg].
+        determines_twist: whether the drives determine the body's twist; a skid steer's do not.
+    """
+
+    forward: Float[np.ndarray, "drive 3"]
+    back: Float[np.ndarray, "3 drive"]
+    wheel_radius: float
+    base_radius: float
+    gear_ratio: float
+    resistance: float
+    back_emf: float
+    mass: float
+    determines_twist: bool
+
+    @classmethod
+    def of(cls, robot: Robot) -> "Machine":
+        """Of a robot as its config has it."""
+        shape, motor = robot.geometry, robot.motor
+        back = np.asarray(shape.least())
+        return cls(
+            forward=np.linalg.pinv(back),
+            back=back,
+            wheel_radius=float(shape.wheel_radius),
+            base_radius=float(shape.base_radius),
+            gear_ratio=float(motor.gear_ratio),
+            resistance=float(motor.resistance),
+            back_emf=float(motor.back_emf),
+            mass=float(robot.body.mass),
+            determines_twist=bool(shape.determines_twist),
+        )
+
+    @property
+    def size(self) -> Float[np.ndarray, "3"]:
+        """Weights that make a yaw rate comparable with a speed: one, one, base radius [m]."""
+        return np.array([1.0, 1.0, self.base_radius])
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """What the robot's computer hears of a run, in steps of a tenth to half a second.
+
+    Attributes:
+        name: of the run.
+        dt: length of each step [s].
+        turn: rotation of each drive's wheels in the step [rad].
+        current: mean current of each motor [A], signed along its wheel's forward direction where
+            `current_is_signed`, else its magnitude; None where it was not logged.
+        gyro: mean yaw rate [rad/s], or None.
+        command: twist that was commanded, or None.
+        floor: name of the floor if the method is told; None where it has to find out.
+    """
+
+    name: str
+    dt: Float[np.ndarray, " step"]
+    turn: Float[np.ndarray, "step drive"]
+    current: Float[np.ndarray, "step drive"] | None = None
+    current_is_signed: bool = False
+    gyro: Float[np.ndarray, " step"] | None = None
+    command: Float[np.ndarray, "step 3"] | None = None
+    floor: str | None = None
+
+    def __len__(self) -> int:
+        return len(self.dt)
+
+    @property
+    def speed(self) -> Float[np.ndarray, "step drive"]:
+        """Wheel speed of each drive [rad/s]."""
+        return self.turn / self.dt[:, None]
+
+    def rolling(self, machine: Machine) -> Twists:
+        """Body twist if nothing slips: what encoders alone say."""
+        return np.asarray(self.speed * machine.wheel_radius @ machine.back.T)
+
+    def along(self, machine: Machine) -> Float[np.ndarray, "step drive"]:
+        """Current along the wheel's motion [A]: positive where the motor drives.
+
+        Of an unsigned ammeter it is the magnitude, as if the motor always drove.
+
+        Raises:
+            ValueError: no current was logged.
+        """
+        if self.current is None:
+            raise ValueError(f"{self.name}: no current; this method needs one")
+        way = np.sign(self.speed)
+        return np.asarray(self.current * way if self.current_is_signed else self.current)
+
+    def torque(self, machine: Machine) -> Float[np.ndarray, "step drive"]:
+        """M = C_e I + R I^2 w / (w^2 + w0^2) [N m], w the shaft's speed and w0 = `SHAFT_W0`.
+
+        The 2021 paper's torque characterising variable M = U I / w, with U = C_e w + R I, regular
+        at rest. Positive where the motor drives.
+        """
+        amps, shaft = self.along(machine), np.abs(machine.gear_ratio * self.speed)
+        heat = machine.resistance * amps**2 * shaft / (shaft**2 + SHAFT_W0**2)
+        return np.asarray(machine.back_emf * amps + heat)
+
+    def power(self, machine: Machine) -> Numbers:
+        """Electric power of all motors [W], by the currents and the motor's datasheet.
+
+        P = sum_i (R I_i + C_e |w_i|) I_i
+        """
+        amps, shaft = self.along(machine), np.abs(machine.gear_ratio * self.speed)
+        return np.asarray(((machine.resistance * amps + machine.back_emf * shaft) * amps).sum(1))
+
+    def windowed(self, seconds: float = WINDOW_S) -> "Heard":
+        """The same run in longer steps: neighbours joined until they are about so long."""
+        first = groups(self.dt, seconds)
+        dt = np.add.reduceat(self.dt, first)
+
+        def mean(x: np.ndarray | None) -> np.ndarray | None:
+            if x is None:
+                return None
+            weight = self.dt.reshape(-1, *[1] * (x.ndim - 1))
+            return np.asarray(np.add.reduceat(x * weight, first) / dt.reshape(weight[first].shape))
+
+        return replace(
+            self,
+            dt=dt,
+            turn=np.add.reduceat(self.turn, first),
+            current=mean(self.current),
+            gyro=mean(self.gyro),
+            command=mean(self.command),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run with the pose of its body, for training and for the judge.
+
+    Attributes:
+        heard: what the robot measured; its `floor` is None where methods are not told.
+        pose: x, y [m] and heading [rad] of the body at the edges of the steps, in true metres.
+        floor: name of the floor it was driven on.
+        load: name of the load set-up.
+        heading: direction of travel commanded [rad], nan where there is none.
+        speed: commanded [m/s], nan where none was logged.
+    """
+
+    heard: Heard
+    pose: Float[np.ndarray, "edge 3"]
+    floor: str
+    load: str = "as_built"
+    heading: float = float("nan")
+    speed: float = float("nan")
+
+    @property
+    def twist(self) -> Twists:
+        """Body twist of every step by the pose: constant over a step, exact on SE(2)."""
+        return body_increments(self.pose) / self.heard.dt[:, None]
+
+    def windowed(self, seconds: float = WINDOW_S) -> "Run":
+        """The same run in longer steps."""
+        edges = np.append(groups(self.heard.dt, seconds), len(self.heard))
+        return replace(self, heard=self.heard.windowed(seconds), pose=self.pose[edges])
+
+    def told(self, floor: bool) -> "Run":
+        """The same run, its floor told to methods or not."""
+        return replace(self, heard=replace(self.heard, floor=self.floor if floor else None))
+
+
+@dataclass(frozen=True, eq=False)
+class Said:
+    """What a method says of a run.
+
+    Attributes:
+        path: pose at every edge of the steps, seen from the pose at the start [m, m, rad].
+        end_covariance: of the place at the end, seen from the start [m^2]; None of a method that
+            knows no uncertainty.
+        slipping: how sure it is that the robot slips in a step; any rising scale. None where that
+            is to be taken from how far its twist is from that of the encoders.
+        floors: probability of each floor in every step, by name; None of a method that does not
+            tell floors.
+        power: electric power of all motors in every step [W], predicted without the currents; None
+            of a method that does not predict it.
+    """
+
+    path: Float[np.ndarray, "edge 3"]
+    end_covariance: Float[np.ndarray, "2 2"] | None = None
+    slipping: Float[np.ndarray, " step"] | None = None
+    floors: Mapping[str, Numbers] | None = None
+    power: Numbers | None = None
+
+
+@dataclass(frozen=True)
+class Method(abc.ABC):
+    """A system as published, before or after it is fitted.
+
+    Attributes:
+        name: of its row.
+        needs: channels without which it does not run.
+    """
+
+    name: str
+    needs: frozenset[Channel] = field(default=frozenset(), kw_only=True)
+
+    def candidates(self) -> Sequence[Self]:
+        """Itself with other settings, at most `TRIES`, from which cross-validation picks one."""
+        return (self,)
+
+    @abc.abstractmethod
+    def fit(self, runs: Sequence[Run], machine: Machine) -> Self:
+        """The method fitted to runs."""
+
+    @abc.abstractmethod
+    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+        """What it says of runs it has not seen, from what was heard alone."""
+
+    @property
+    @abc.abstractmethod
+    def numbers(self) -> int:
+        """How many numbers were fitted."""
+
+
+@dataclass(frozen=True)
+class ByFloor(Method):
+    """A method fitted floor by floor, and once to all floors together for runs of unknown floors.
+
+    A floor that was not seen counts as unknown.
+    """
+
+    method: Method
+    fitted: Mapping[str | None, Method] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, method: Method) -> "ByFloor":
+        return cls(method.name, method, needs=method.needs)
+
+    def candidates(self) -> Sequence["ByFloor"]:
+        return [replace(self, method=method) for method in self.method.candidates()]
+
+    def fit(self, runs: Sequence[Run], machine: Machine) -> "ByFloor":
+        fitted: dict[str | None, Method] = {}
+        for floor in dict.fromkeys(run.floor for run in runs):
+            fitted[floor] = self.method.fit([run for run in runs if run.floor == floor], machine)
+        fitted[None] = self.method.fit(runs, machine) if len(fitted) > 1 else fitted[runs[0].floor]
+        return replace(self, fitted=fitted)
+
+    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+        key = [run.floor if run.floor in self.fitted else None for run in runs]
+        said: dict[int, Said] = {}
+        for floor in dict.fromkeys(key):
+            mine = [k for k, name in enumerate(key) if name == floor]
+            of_floor = self.fitted[floor].predict([runs[k] for k in mine], machine)
+            said.update(zip(mine, of_floor, strict=True))
+        return [said[k] for k in range(len(runs))]
+
+    @property
+    def numbers(self) -> int:
+        return sum(method.numbers for method in {id(m): m for m in self.fitted.values()}.values())
+
+
+def groups(dt: Float[np.ndarray, " step"], seconds: float) -> np.ndarray:
+    """First step of every group of neighbours that together are about so long [s]."""
+    count = max(1, round(float(dt.sum()) / seconds))
+    number = np.minimum((np.cumsum(dt) - 0.5 * dt) / dt.sum() * count, count - 1).astype(int)
+    return np.flatnonzero(np.diff(number, prepend=-1))
+
+
+def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, "edge 3"]:
+    """Poses from the origin on, of a body that keeps its twist over each step; exact on SE(2)."""
+    heading = np.concatenate([[0.0], np.cumsum(twist[:, 2] * dt)])
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    # a chord is the arc times sinc, and points half the turn away from its start
+    chord = np.sinc(np.diff(heading) / (2 * np.pi)) * dt
+    c, s = np.cos(middle), np.sin(middle)
+    step = np.stack([c * twist[:, 0] - s * twist[:, 1], s * twist[:, 0] + c * twist[:, 1]], axis=1)
+    place = np.concatenate([np.zeros((1, 2)), np.cumsum(step * chord[:, None], axis=0)])
+    return np.column_stack([place, heading])
+
+
+def body_increments(pose: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "step 3"]:
+    """Logarithm on SE(2) of each step of a path: twist times time [m, m, rad]."""
+    turn = np.diff(pose[:, 2])
+    middle = 0.5 * (pose[1:, 2] + pose[:-1, 2])
+    dx, dy = np.diff(pose[:, 0]), np.diff(pose[:, 1])
+    c, s, arc = np.cos(middle), np.sin(middle), np.sinc(turn / (2 * np.pi))
+    return np.stack([(c * dx + s * dy) / arc, (c * dy - s * dx) / arc, turn], axis=1)

@@ -1,0 +1,1 @@
+"""Slip from the encoders and the currents alone: no slip at all, corrections, and slip curves."""

@@ -1,0 +1,49 @@
+"""The rows of the benchmark's tables: every published system, in the order of its year or so."""
+
+from slipid.baselines.interface import ByFloor, Machine, Method
+from slipid.baselines.motion.boosted_trees import BoostedTrees
+from slipid.baselines.motion.effective_track import EffectiveTrack, InstantaneousCentres
+from slipid.baselines.motion.encoder import Encoder
+from slipid.baselines.motion.gmdh import GmdhClass, GmdhOne
+from slipid.baselines.motion.heading_lookup import HeadingLookup
+from slipid.baselines.motion.neural_network import NeuralNetwork
+from slipid.baselines.motion.ojeda import ojeda_rows
+from slipid.baselines.motion.paper import paper_rows
+from slipid.baselines.motion.quann import QuannEnergy, QuannSlip
+from slipid.baselines.motion.reina import ReinaDeterministic, ReinaFuzzy
+from slipid.baselines.motion.ward_iagnemma import WardIagnemma
+
+KINEMATIC = ("effective_track", "instantaneous_centres")
+"""Rows for wheels that do not determine the twist."""
+
+
+def _every() -> list[Method]:
+    """All methods, unfitted; those that handle floors themselves as they are."""
+    of_one_floor: list[Method] = [
+        EffectiveTrack(),
+        InstantaneousCentres(),
+        *ojeda_rows(),
+        ReinaDeterministic(),
+        ReinaFuzzy(),
+        WardIagnemma(),
+        WardIagnemma.with_current(),
+        QuannSlip(),
+        QuannEnergy(),
+        *paper_rows(),
+        HeadingLookup(),
+        BoostedTrees(),
+        NeuralNetwork(),
+    ]
+    return [Encoder(), *map(ByFloor.of, of_one_floor), GmdhOne(), GmdhClass()]
+
+
+ROWS = tuple(method.name for method in _every())
+"""Their names."""
+
+
+def rows(machine: Machine) -> list[Method]:
+    """Methods for a robot, unfitted; those that lack a channel they need are among them."""
+    every = _every()
+    if machine.determines_twist:
+        every = [method for method in every if method.name not in KINEMATIC]
+    return every

@@ -1,0 +1,117 @@
+"""Indiveri 2009: any Swedish wheels, a proportional pose loop, and limits that keep the direction.
+
+A wheel at b drives along the unit vector u; its rollers run freely along a line at the angle gamma
+from u, and n is across that line. Its speed follows from the speed of its centre along n,
+
+    r w (n . u) = n . (v + W z x b),   n . u = sin gamma
+
+a row of w = A xi for every wheel, of any number of wheels (the same as Gfrerrer 2008 derives by
+geometry). The loop asks for
+
+    v = R(th)^T (p_d' + k_p (p_d - p)),   W = W_d + k_th (th_d - th),   the turn in (-pi, pi]
+    xi <- xi / max(1, max_i |A xi|_i / w_max)
+
+so that a robot whose wheels cannot be fast enough moves as it was asked to, only slower: while the
+path rests, errors fall along the same straight line whatever the limit is.
+
+Nothing is tuned: gains are those of the robot's own pose loop set by hand.
+
+Liberties:
+
+- Gains are not those of the paper, which are of another robot; with the same ones as the row of the
+  encoders the two differ by the limit, and by the turn itself in place of its sine.
+- One factor for place and heading together, as slipid's notes on methods have it; whatever else the
+  paper gives first when not all can be had is left out.
+- The path waits for a robot that lags, as for all rows: it is what the paper's tracking of a path
+  too fast for the wheels has no need for.
+- Beyond three wheels nothing is chosen: speeds that no twist explains are never asked for.
+- Beside w_max the limits of all rows hold: body speed, acceleration of wheels, voltage.
+
+Source: Indiveri 2009, "Swedish wheeled omnidirectional mobile robots: kinematics analysis and
+control", IEEE T-RO 25(1), and Gfrerrer 2008, as slipid's notes on methods have them (1 and 8).
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+LEAST = 0.05
+"""Sine of a roller's angle to the drive direction below which a wheel hardly drives."""
+
+
+def inverse_kinematics(
+    place: Float[np.ndarray, "wheel 2"],
+    drive_angle: Float[np.ndarray, " wheel"],
+    roller_angle: Float[np.ndarray, " wheel"],
+    radius: Float[np.ndarray, " wheel"],
+) -> Float[np.ndarray, "wheel 3"]:
+    """A: speed of each wheel without slip [rad/s] from the body's twist [m/s, m/s, rad/s].
+
+    Args:
+        place: of the wheels' centres [m].
+        drive_angle: direction of travel of a positive speed [rad].
+        roller_angle: from the line along which rollers run freely to the drive direction [rad].
+        radius: [m].
+
+    Raises:
+        ValueError: rollers that run freely along the drive direction, or wheels that leave a motion
+            of the body free.
+    """
+    across = np.sin(roller_angle)
+    if np.abs(across).min() < LEAST:
+        wheel = int(np.abs(across).argmin())
+        raise ValueError(
+            f"wheel {wheel + 1}: rollers at {np.degrees(roller_angle[wheel]):g} deg to the drive "
+            "direction, such a wheel cannot drive; expected anything away from 0 and 180"
+        )
+    normal = drive_angle - roller_angle + 0.5 * np.pi
+    n = np.stack([np.cos(normal), np.sin(normal)], axis=1)
+    lever = place[:, 0] * n[:, 1] - place[:, 1] * n[:, 0]
+    matrix = np.column_stack([n, lever]) / (radius * across)[:, None]
+    if np.linalg.matrix_rank(matrix, tol=1e-6 * np.abs(matrix).max()) < 3:
+        raise ValueError("wheels that leave a motion of the body free; expected any three it needs")
+    return matrix
+
+
+def loop(
+    gains: Float[Array, "2"], reference: Float[Array, "6"], pose: Float[Array, "3"]
+) -> Float[Array, "3"]:
+    """Twist that the pose loop asks for [m/s, m/s, rad/s].
+
+    Args:
+        gains: of place and heading [1/s].
+        reference: pose and rates of the path in the world [m, m, rad, m/s, m/s, rad/s].
+        pose: that is believed [m, m, rad].
+    """
+    vx, vy = reference[3:5] + gains[0] * (reference[:2] - pose[:2])
+    off = reference[2] - pose[2]
+    turn = reference[5] + gains[1] * jnp.arctan2(jnp.sin(off), jnp.cos(off))
+    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+    return jnp.stack([c * vx + s * vy, c * vy - s * vx, turn])
+
+
+def slowed(
+    asked: Float[Array, "3"], matrix: Float[Array, "wheel 3"], limit: Float[Array, ""]
+) -> Float[Array, "3"]:
+    """A twist, or as much of it as leaves no wheel faster than a limit [rad/s]."""
+    over = jnp.max(jnp.abs(matrix @ asked)) / limit
+    return asked / jnp.maximum(over, 1.0)
+
+
+class Indiveri(eqx.Module):
+    """The law with its numbers.
+
+    Attributes:
+        matrix: of `inverse_kinematics`.
+        gains: of place and heading [1/s].
+        limit: of the wheels [rad/s].
+    """
+
+    matrix: Float[Array, "wheel 3"]
+    gains: Float[Array, "2"]
+    limit: Float[Array, ""]
+
+    def __call__(self, reference: Float[Array, "6"], pose: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Twist to ask for; arguments as of `loop`."""
+        return slowed(loop(self.gains, reference, pose), self.matrix, self.limit)

@@ -1,0 +1,1 @@
+"""Every published system on the same logs: what `slipid benchmark` does."""

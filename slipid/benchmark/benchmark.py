@@ -1,0 +1,135 @@
+"""`slipid benchmark`: every published system on the same logs, beside slipid itself."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Protocol
+
+from slipid.baselines.rows import ROWS
+from slipid.benchmark.own import NAME
+from slipid.benchmark.protocols import PROTOCOLS, splits
+from slipid.benchmark.reading import reading
+from slipid.benchmark.row import Row
+from slipid.benchmark.sets import SOURCES, there
+from slipid.benchmark.summary import Summary, summary
+from slipid.benchmark.work import OWN_MAP, Piece, Wish, data_of
+from slipid.support.checkpoint import versions
+from slipid.support.content import Content
+from slipid.support.errors import DataError, near
+from slipid.support.files import writable, write_json
+from slipid.support.jax_setup import setup_jax
+from slipid.support.progress import Reporter
+from slipid.support.workers import spread
+
+SCHEMA = "slipid.benchmark/1"
+Tables = dict[str, dict[str, dict[str, Summary]]]
+"""Summaries by data set, protocol and row."""
+
+
+class Part(Protocol):
+    """A part of the work, which keeps what it finds."""
+
+    @property
+    def name(self) -> str:
+        """Of the part."""
+        ...
+
+    def run(self) -> str:
+        """Do what is not kept yet; the name of the part."""
+        ...
+
+
+def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
+    """Run every row on every data set that is there, and write benchmark.json.
+
+    What is done is kept, and not done again; a row that fails is said, and stops no other.
+
+    Raises:
+        DataError: no such folder, no data set in it, or no such row.
+    """
+    began = time.monotonic()
+    setup_jax(quiet=True)
+    _known(wish)
+    sources = [source for source in SOURCES if there(source, wish.data)]
+    for source in SOURCES:
+        if source not in sources:
+            report.line(f"skipped: {source.name}: no folder {wish.data / source.folder}")
+    writable(wish.out)
+    report.stage("reading logs")
+    pieces: list[Piece] = []
+    for source in sources:
+        data = data_of(wish, source.name)
+        for kind in source.kinds:
+            if kind == "all" and data.crossing is None:
+                continue
+            asked = [
+                p for p in PROTOCOLS.values() if p.split == kind and (p.told or not wish.quick)
+            ]
+            folds = splits(data.facts, kind) if asked else []
+            pieces += [
+                Piece(wish, source.name, kind, f.fold) for f in folds[: 1 if wish.quick else None]
+            ]
+    report.stage(f"{len(pieces)} parts")
+    spread(work, {piece.name: piece for piece in pieces}, jobs, report)
+    report.stage("comparing")
+    tables = tables_of(pieces)
+    content = {
+        "schema": SCHEMA,
+        "quick": wish.quick,
+        "sets": {name: _set(wish, name, protocols) for name, protocols in tables.items()},
+        "protocols": {name: p.about for name, p in PROTOCOLS.items()},
+        "reading": reading(tables),
+        "seconds": round(time.monotonic() - began, 1),
+        "versions": versions(),
+    }
+    report.stage("writing")
+    write_json(wish.out / "benchmark.json", content)
+    return content
+
+
+def work(part: Part) -> str:
+    """Do a part."""
+    return part.run()
+
+
+def _known(wish: Wish) -> None:
+    if not wish.data.is_dir():
+        raise DataError(
+            f"{wish.data}: no such folder; expected the folder of the data sets (--data)"
+        )
+    every = [NAME, OWN_MAP, *ROWS]
+    for name in wish.only:
+        if name not in every:
+            raise DataError(
+                f"no row '{name}'{near(name, every)}; expected some of {', '.join(every)}"
+            )
+
+
+def tables_of(pieces: Sequence[Piece]) -> Tables:
+    """Summaries of what was kept of all pieces."""
+    folds: dict[tuple[str, str], dict[str, list[Row]]] = {}
+    for piece in pieces:
+        for (protocol, name), row in piece.rows().items():
+            folds.setdefault((piece.source, protocol), {}).setdefault(name, []).append(row)
+    tables: Tables = {}
+    for source in dict.fromkeys(piece.source for piece in pieces):
+        tables[source] = {
+            protocol: summary(folds[source, protocol], NAME)
+            for protocol in PROTOCOLS
+            if (source, protocol) in folds
+        }
+    return tables
+
+
+def _set(wish: Wish, name: str, protocols: Mapping[str, Mapping[str, Summary]]) -> Content:
+    data = data_of(wish, name)
+    return {
+        "about": data.source.about,
+        "over": data.source.over,
+        "runs": len(data.heard) + (0 if data.crossing is None else len(data.crossing)),
+        "hash": data.job.data_hash,
+        "protocols": {
+            protocol: {row: asdict(one) for row, one in found.items()}
+            for protocol, found in protocols.items()
+        },
+    }

@@ -1,0 +1,276 @@
+"""slipid's own rows: the force balance where the floor is told, its estimator where it is not."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.baselines.interface import Machine, Said
+from slipid.benchmark.sets import DataSet
+from slipid.benchmark.steps import Cut, body_poses
+from slipid.control.deployed import DeployedRobot
+from slipid.control.estimator import Estimator
+from slipid.control.interface import MIXED, Readings, Settings
+from slipid.control.robot_file.record import FloorRecord, RobotRecord, Sensors
+from slipid.data.floor_map import FloorMap
+from slipid.data.runs import Runs
+from slipid.deploy.floors import floor_of
+from slipid.deploy.forecaster import robot_of
+from slipid.identify.compare.folds import of_some
+from slipid.identify.compare.predictive import Contact, contact_of
+from slipid.identify.fit import likelihood as lk
+from slipid.identify.fit.optimise import optimise
+from slipid.identify.fit.problem import Problem, State
+from slipid.identify.slip_curves import current_trend
+from slipid.job.problem import Job
+from slipid.support.checkpoint import Checkpoint
+from slipid.support.progress import Reporter
+
+NAME = "slipid"
+STEPS = 16
+"""Estimators drive a number of steps that is a multiple of it, so that few shapes are compiled."""
+TOGETHER = 32
+"""Runs that an estimator drives in one call."""
+
+
+@dataclass(frozen=True, eq=False)
+class Own:
+    """slipid fitted to some runs of a data set.
+
+    Attributes:
+        contact: the force balance as it forecasts.
+        job: of all runs of the data set.
+        seen: which of its floors were fitted, by number.
+        highest_speed: of the wheels in these runs [rad/s].
+        trend: of their currents, see `slipid.identify.slip_curves.current_trend`.
+        seconds: that the fit took; converged: whether it did.
+    """
+
+    contact: Contact
+    job: Job
+    seen: tuple[int, ...]
+    highest_speed: float
+    trend: tuple[float, float]
+    seconds: float
+    converged: bool
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers were fitted."""
+        return self.contact.space.size
+
+
+def fit_own(data: DataSet, fitted: np.ndarray, kept: Checkpoint, report: Reporter) -> Own:
+    """The force balance fitted to some runs; what was kept of this very fit is not done again."""
+    job = data.job
+    problem = of_some(job.problem(), job.choices, job.dataset, fitted)
+    keep = np.isin(problem.windows.run, fitted).astype(float)
+    found = kept.load("fit")
+    if found is None:
+        began = time.perf_counter()
+
+        def tell(state: State) -> None:
+            report.note(f"round {state.round}")
+
+        limits = job.settings
+        optimum = optimise(
+            problem, keep=keep, most_rounds=limits.rounds, tolerance=limits.tolerance, tell=tell
+        )
+        kept.save(
+            "fit",
+            {k: v for k, v in vars(optimum.state).items() if v is not None}
+            | {
+                "covariance": optimum.covariance,
+                "seconds": time.perf_counter() - began,
+                "converged": bool(optimum.converged),
+            },
+        )
+        found = kept.load("fit")
+        assert found is not None
+    covariance, seconds, converged = (found.pop(k) for k in ("covariance", "seconds", "converged"))
+    plain: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in found.items()}
+    contact = contact_of(problem, State(**plain), covariance, keep)
+    speed, trend = _seen(problem, contact, keep)
+    seen = {job.dataset.logs[k].surface for k in fitted.tolist()}
+    rows = tuple(k for k, name in enumerate(contact.robot.surfaces.labels) if name in seen)
+    return Own(contact, job, rows, speed, trend, float(seconds), bool(converged))
+
+
+def _seen(
+    problem: Problem, contact: Contact, keep: Float[np.ndarray, " piece"]
+) -> tuple[float, tuple[float, float]]:
+    """Highest wheel speed [rad/s] and trend of currents in the pieces that count."""
+    w = problem.windows.pieces(np.flatnonzero(keep > 0))
+    speed = float(np.abs(w.turn / w.dt[..., None]).max())
+    if not w.has_current:
+        return speed, (0.0, 0.0)
+    return speed, current_trend(contact.robot, lk.batch(w, contact.robot))
+
+
+def told(own: Own, cut: Cut, machine: Machine) -> list[Said]:
+    """What the force balance says of runs whose floors it is told, with the electric power."""
+    w = cut.windows
+    tracks, cov = own.contact.ends(w)
+    robot = own.contact.robot
+    paths = body_poses(robot, w, tracks.predicted)
+    power = _power(own, w, machine) if own.job.dataset.current is not None else None
+    return [
+        Said(
+            path=seen_from_start(paths[k]),
+            end_covariance=turned_covariance(cov[k], -float(paths[k, 0, 2])),
+            power=None if power is None else power[k],
+        )
+        for k in range(len(cut.runs))
+    ]
+
+
+def _power(own: Own, w: Any, machine: Machine) -> np.ndarray:
+    """Electric power of all motors by the currents that the force balance predicts [W]."""
+    robot = own.contact.robot
+    b = lk.batch(w, robot)
+    amps = np.abs(np.asarray(_currents(robot, b)))
+    shaft = np.abs(machine.gear_ratio * w.turn / w.dt[..., None])
+    return np.asarray(((machine.resistance * amps + machine.back_emf * shaft) * amps).sum(-1))
+
+
+@jax.jit
+def _currents(robot: Any, b: lk.Batch) -> Array:
+    return lk.predicted_current(robot, b, lk.predict(robot, b).felt)
+
+
+def untold(own: Own, cuts: Sequence[Cut], data: Runs, floor: FloorMap | None = None) -> list[Said]:
+    """What the estimator says of runs whose floors it is not told, in the order of the cuts.
+
+    With a map it starts at the first pose of the body, in the frame of the map.
+    """
+    runs = [(run, cut.numbers[k]) for cut in cuts for k, run in enumerate(cut.runs)]
+    several = floor is not None or any(run.floor == "unknown" for run, _ in runs)
+    signed = own.job.dataset.current_is_signed
+    out: dict[int, Said] = {}
+    for load in dict.fromkeys(data.logs[number].load for _, number in runs):
+        mine = [n for n, (_, number) in enumerate(runs) if data.logs[number].load == load]
+        whole = robot_of(own.contact, own.highest_speed, own.trend, Sensors(signed), load)
+        # a floor that nobody has seen has no numbers
+        robot = DeployedRobot.of(whole.record.on(own.seen), load)
+        settings = Settings.of(robot)
+        if several:
+            settings = replace(settings, alike=MIXED)
+        known = None if floor is None else floor_of(floor, robot.labels)
+        estimator = Estimator(_same_structure(robot), settings, known)
+        said = replay(estimator, [runs[n][0].heard for n in mine], _starts(runs, mine, floor))
+        out.update(zip(mine, said, strict=True))
+    return [out[n] for n in range(len(runs))]
+
+
+def _starts(runs: Sequence[Any], mine: Sequence[int], floor: FloorMap | None) -> np.ndarray:
+    if floor is None:
+        return np.zeros((len(mine), 3))
+    return np.stack([runs[n][0].pose[0] for n in mine])
+
+
+def _same_structure(robot: DeployedRobot) -> DeployedRobot:
+    """The robot with a record that says no more than what compiled code depends on.
+
+    Robots of several fits then share it.
+    """
+    record = robot.record
+    blank = RobotRecord(
+        wheels=record.wheels,
+        parameters={},
+        floors=tuple(
+            FloorRecord(floor.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, None)
+            for floor in record.floors
+        ),
+        loads=(),
+        current_trend=(0.0, 0.0),
+        highest_speed=0.0,
+        draws={},
+    )
+    return replace(robot, record=blank, load_setup="")
+
+
+class _Rows(eqx.Module):
+    """What an estimator hears, row by row of every run; NaN where there is nothing."""
+
+    angle: Float[Array, "run row drive"]
+    current: Float[Array, "run row drive"]
+    gyro: Float[Array, "run row"]
+    dt: Float[Array, "run row"]
+
+
+@eqx.filter_jit
+def _driven(
+    estimator: Estimator, start: Float[Array, "run 3"], rows: _Rows
+) -> tuple[Array, Array, Array]:
+    """Poses, covariances of the place and probabilities of floors under the robot, row by row."""
+    nothing = Readings.nothing(estimator.robot.drives)
+
+    def step(state: Any, row: _Rows) -> Any:
+        z = replace(nothing, wheel_angle=row.angle, current=row.current, gyro=row.gyro)
+        state, seen = estimator.step(state, z, row.dt)
+        floors = jnp.mean(seen.surface_probability, axis=0)
+        return state, (seen.pose, seen.covariance[:2, :2], floors)
+
+    def one(pose: Array, of_run: _Rows) -> Any:
+        return jax.lax.scan(step, estimator.init(pose), of_run)[1]
+
+    return jax.vmap(one)(start, rows)
+
+
+def replay(estimator: Estimator, runs: Sequence[Any], start: np.ndarray) -> list[Said]:
+    """Estimates of runs from what was heard of them, from poses (run, 3) on.
+
+    The first row is the wheels' first angle, in which no time passes.
+    """
+    longest = max(len(run) for run in runs)
+    longest = -(-longest // STEPS) * STEPS + 1
+    drives = estimator.robot.drives
+    out: list[Said] = []
+    for first in range(0, len(runs), TOGETHER):
+        some = runs[first : first + TOGETHER]
+        angle = np.full((TOGETHER, longest, drives), np.nan)
+        current = np.full((TOGETHER, longest, drives), np.nan)
+        gyro, dt = np.full((TOGETHER, longest), np.nan), np.zeros((TOGETHER, longest))
+        begin = np.zeros((TOGETHER, 3))
+        begin[: len(some)] = start[first : first + TOGETHER]
+        for n, run in enumerate(some):
+            rows = slice(1, len(run) + 1)
+            angle[n, 0], angle[n, rows] = 0.0, np.cumsum(run.turn, axis=0)
+            dt[n, rows] = run.dt
+            if run.current is not None:
+                current[n, rows] = run.current
+            if run.gyro is not None:
+                gyro[n, rows] = run.gyro
+        heard = _Rows(*(jnp.asarray(x) for x in (angle, current, gyro, dt)))
+        pose, cov, floors = (np.asarray(x) for x in _driven(estimator, jnp.asarray(begin), heard))
+        for n, run in enumerate(some):
+            rows = slice(0, len(run) + 1)
+            path = np.concatenate([begin[n][None], pose[n, 1 : len(run) + 1]])
+            names = (*estimator.robot.labels, "unknown")
+            out.append(
+                Said(
+                    path=seen_from_start(path),
+                    end_covariance=turned_covariance(cov[n, len(run)], -float(begin[n, 2])),
+                    floors={name: floors[n, 1 : len(run) + 1, k] for k, name in enumerate(names)},
+                )
+            )
+    return out
+
+
+def seen_from_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "edge 3"]:
+    """Poses as they are seen from the first of them."""
+    x, y, yaw = (path - path[0]).T
+    c, s = np.cos(path[0, 2]), np.sin(path[0, 2])
+    return np.stack([c * x + s * y, c * y - s * x, yaw], axis=1)
+
+
+def turned_covariance(cov: Float[np.ndarray, "2 2"], angle: float) -> Float[np.ndarray, "2 2"]:
+    """Covariance of a plane vector that was turned by an angle [rad]."""
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return turn @ cov @ turn.T

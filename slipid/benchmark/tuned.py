@@ -1,0 +1,71 @@
+"""The same chance for every method: its settings by inner cross-validation on training runs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from slipid.baselines.interface import TRIES, ByFloor, Machine, Method, Run
+from slipid.benchmark.judge import judged
+from slipid.benchmark.protocols import INNER, inner
+
+MOST_RUNS = 60
+"""Runs that the inner cross-validation uses, evenly taken: settings need no more."""
+WORST = 2.0
+"""End-point error beyond which it does not matter how far a setting is off."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tuned:
+    """A method with its settings, and in words which these are and how many were tried."""
+
+    method: Method
+    settings: str
+    tried: int
+
+
+def tuned(method: Method, runs: Sequence[Run], machine: Machine, kind: str) -> Tuned:
+    """The method with the best of its settings, unfitted.
+
+    Each is fitted without a part of the runs, of the kind that the method will be judged by, and
+    judged on that part by its mean end-point error over the path. A setting with which the method
+    cannot be fitted counts as the worst.
+    """
+    candidates = list(method.candidates())[:TRIES]
+    if len(candidates) == 1:
+        return Tuned(method, "", 1)
+    some = np.linspace(0, len(runs) - 1, min(len(runs), MOST_RUNS)).round().astype(int)
+    few = [runs[k] for k in some]
+    part = inner(few, kind)
+    losses = [_loss(candidate, few, part, machine) for candidate in candidates]
+    best = candidates[int(np.argmin(losses))]
+    return Tuned(best, settings_of(best, candidates), len(candidates))
+
+
+def _loss(method: Method, runs: Sequence[Run], part: np.ndarray, machine: Machine) -> float:
+    """Mean end-point error over the parts that are left out in turn."""
+    errors: list[float] = []
+    for k in range(INNER):
+        fitted = [run for run, p in zip(runs, part, strict=True) if p != k]
+        left_out = [run for run, p in zip(runs, part, strict=True) if p == k]
+        if not fitted or not left_out:
+            continue
+        try:
+            said = method.fit(fitted, machine).predict([run.heard for run in left_out], machine)
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+            return np.inf
+        for run, one in zip(left_out, said, strict=True):
+            error = judged(run, one, machine, "path").endpoint_error
+            errors.append(min(error, WORST) if np.isfinite(error) else WORST)
+    return float(np.mean(errors)) if errors else 0.0
+
+
+def settings_of(best: Method, candidates: Sequence[Method]) -> str:
+    """The fields in which candidates differ, as the best one has them: `ridge = 0.01`."""
+    inside = [c.method if isinstance(c, ByFloor) else c for c in (best, *candidates)]
+    said = []
+    for f in fields(inside[0]):
+        values = [getattr(c, f.name) for c in inside]
+        if any(repr(v) != repr(values[0]) for v in values):
+            said.append(f"{f.name} = {values[0]!r}")
+    return ", ".join(said)

@@ -1,0 +1,51 @@
+"""`slipid benchmark`: every published system on the same logs, beside slipid."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from slipid.cli.common import DataFolder, Jobs, Json, Out, Quiet, emit, guarded, processes
+from slipid.support.progress import Reporter
+
+
+@guarded
+def benchmark(
+    data: DataFolder,
+    out: Out = Path("out/benchmark"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Some of the runs, one fold, floors that are told.")
+    ] = False,
+    rows: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="Rows, by commas; all by default.")
+    ] = None,
+    jobs: Jobs = None,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Every published slip system on the same logs, beside slipid: one table, with intervals.
+
+    The folder of --data has those of the public data sets: robotino2022, robotino2021, drive_skid,
+    borealtc; what is absent is left out. Recorded runs of the virtual test site are always there.
+    Writes benchmark.json and benchmark.html. What is done is kept: called again after an interrupt
+    it goes on from there. The exit code is 1 where a row failed.
+    """
+    from slipid.benchmark.benchmark import benchmark as run
+    from slipid.benchmark.work import Wish
+    from slipid.report.benchmark import show_benchmark
+    from slipid.report.benchmark_page import write_page
+
+    only = () if rows is None else tuple(name.strip() for name in rows.split(",") if name.strip())
+    with Reporter(quiet=quiet) as report:
+        found = run(Wish(data, out, only, quick), processes(jobs), report)
+        written = write_page(found, out)
+        report.line(f"in {out}: benchmark.json, {written.name}")
+    emit(json, found, lambda page: show_benchmark(page, found))
+    failed = [
+        row
+        for one in found["sets"].values()
+        for protocol in one["protocols"].values()
+        for row in protocol.values()
+        if row["failed"]
+    ]
+    return 1 if failed else 0

@@ -1,0 +1,57 @@
+"""End-point errors of every row, protocol by protocol."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from slipid.plots import drawing
+from slipid.support.content import Content
+
+OWN = "slipid"
+"""Rows whose names begin with it are drawn in colour."""
+
+
+def benchmark_figure(one: Content, about: Content, name: str) -> Figure | None:
+    """A panel per protocol of one data set: mean end-point error with its 90 % interval.
+
+    Args:
+        one: of a data set in benchmark.json.
+        about: protocols in words.
+        name: of the data set.
+    """
+    protocols = {
+        protocol: ends
+        for protocol, rows in one["protocols"].items()
+        if (ends := {n: row["endpoint_error"] for n, row in rows.items() if row["endpoint_error"]})
+    }
+    if not protocols:
+        return None
+    rows = max(len(ends) for ends in protocols.values())
+    made, axes = drawing.panels(
+        len(protocols),
+        4.6,
+        1.4 + 0.24 * rows,
+        f"{name}: {one['about']}\nmean end-point error over the {one['over']}, 90 % intervals",
+    )
+    for ax, (protocol, ends) in zip(axes, protocols.items(), strict=True):
+        _panel(ax, ends)
+        ax.set_title(about[protocol], fontsize=9, loc="left", wrap=True)
+    return made
+
+
+def _panel(ax: Axes, ends: dict[str, list[float]]) -> None:
+    order = sorted(ends, key=lambda row: -ends[row][0])
+    for k, row in enumerate(order):
+        middle, low, high = (100 * x for x in ends[row])
+        colour = drawing.ORANGE if row.startswith(OWN) else drawing.BLUE
+        ax.plot([low, high], [k, k], color=colour, lw=1.5)
+        ax.plot(middle, k, "o", color=colour, ms=4)
+    ax.set_yticks(np.arange(len(order)), order, fontsize=7)
+    for label in ax.get_yticklabels():
+        if label.get_text().startswith(OWN):
+            label.set_color(drawing.ORANGE)
+            label.set_fontweight("bold")
+    ax.set_xscale("log")
+    ax.set_xlabel("end-point error, %")
+    ax.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
+    ax.set_ylim(-0.7, len(order) - 0.3)

@@ -1,0 +1,87 @@
+"""The tables of the benchmark on a terminal."""
+
+from collections.abc import Mapping
+
+from rich.text import Text
+
+from slipid.report.page import Page, table
+from slipid.support.content import Content
+
+COLUMNS: Mapping[str, tuple[str, float, int]] = {
+    "endpoint_error": ("end point, %", 100.0, 1),
+    "behind": ("less slipid", 100.0, 1),
+    "length_error": ("length, %", 100.0, 1),
+    "heading_error_deg": ("heading, deg", 1.0, 1),
+    "twist_error": ("twist, mm/s", 1000.0, 0),
+    "coverage90": ("in 90 %", 100.0, 0),
+    "slip_auc": ("slip AUC", 1.0, 2),
+    "floor_accuracy": ("floor, %", 100.0, 0),
+    "energy_error": ("energy, %", 100.0, 0),
+}
+"""Heading, factor and places of each number of a row."""
+ENDS = ("endpoint_error", "behind")
+"""Numbers that are shown with their 90 % interval."""
+
+
+def show_benchmark(page: Page, found: Content) -> None:
+    """Write every table, best rows first, and what they say."""
+    for name, one in found["sets"].items():
+        for protocol, rows in one["protocols"].items():
+            about = found["protocols"][protocol]
+            title = f"\n{name}: {about}; end points over the {one['over']}"
+            made = table(("row", *headings(rows), *COSTS), title, right=COSTS)
+            for row, content in ranked(rows):
+                made.add_row(Text(row), *cells(content, rows), *costs(content))
+            page.table(made)
+            page.notes(absent(rows))
+    page.line()
+    for sentence in found["reading"]:
+        page.line(sentence)
+
+
+COSTS = ("numbers", "fit, s", "step, us")
+
+
+def ranked(rows: Content) -> list[tuple[str, Content]]:
+    """Rows that are there, the least end-point error first."""
+    there = [(name, one) for name, one in rows.items() if one["endpoint_error"] is not None]
+    return sorted(there, key=lambda item: item[1]["endpoint_error"][0])
+
+
+def shown(rows: Content) -> list[str]:
+    """Numbers that some row has."""
+    return [name for name in COLUMNS if any(row[name] is not None for row in rows.values())]
+
+
+def headings(rows: Content) -> list[str]:
+    """Of the numbers that some row has."""
+    return [COLUMNS[name][0] for name in shown(rows)]
+
+
+def cells(row: Content, rows: Content) -> list[str]:
+    """The numbers of a row in words."""
+    return [in_words(name, row[name]) for name in shown(rows)]
+
+
+def in_words(name: str, value: list[float] | None) -> str:
+    """A number, with its interval where it is one of `ENDS`; nothing where it is not known."""
+    if value is None:
+        return ""
+    _, factor, places = COLUMNS[name]
+    sign = "+" if name == "behind" else ""
+    middle, low, high = (f"{factor * x:{sign}.{places}f}" for x in value)
+    return f"{middle} [{low}, {high}]" if name in ENDS else middle
+
+
+def costs(row: Content) -> list[str]:
+    """Fitted numbers, seconds to fit, microseconds a step."""
+    return [str(row["numbers"]), f"{row['fit_s']:.2g}", f"{row['step_us']:.2g}"]
+
+
+def absent(rows: Content) -> list[str]:
+    """Why rows are not in a table, rows of one reason together."""
+    why: dict[str, list[str]] = {}
+    for name, row in rows.items():
+        if row["absent"]:
+            why.setdefault(("failed: " if row["failed"] else "") + row["absent"], []).append(name)
+    return [f"{', '.join(names)}: {reason}" for reason, names in why.items()]

@@ -1,0 +1,93 @@
+"""The benchmark as one page of HTML, with its pictures inside."""
+
+from base64 import b64encode
+from html import escape
+from io import BytesIO
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from slipid.plots.benchmark import benchmark_figure
+from slipid.report.benchmark import COSTS, absent, cells, costs, headings, ranked
+from slipid.support.content import Content
+from slipid.support.files import write_bytes
+
+PAGE = "benchmark.html"
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 76rem; margin: 2rem auto }
+body { padding: 0 1rem }
+h2 { margin-top: 2.5rem; border-bottom: 1px solid #ccc } h3 { margin-bottom: .3rem }
+.wide { overflow-x: auto } img { max-width: 100% }
+table { border-collapse: collapse; font-size: 13px; white-space: nowrap }
+th, td { text-align: right; padding: .15rem .6rem; border-bottom: 1px solid #eee }
+th:first-child, td:first-child { text-align: left; font-family: monospace }
+tr.own { background: #fdeee3; font-weight: 600 } .note { color: #666; font-size: 13px }
+"""
+
+
+def write_page(found: Content, out: Path) -> Path:
+    """Write the page of a benchmark's content below a folder."""
+    path = out / PAGE
+    write_bytes(path, page(found).encode())
+    return path
+
+
+def page(found: Content) -> str:
+    """The whole page: what it says, then a picture and the tables of every data set."""
+    parts = [
+        "<!doctype html><html lang='en'><meta charset='utf-8'>",
+        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
+        f"<title>Slip methods compared</title><style>{STYLE}</style>",
+        "<h1>Slip methods compared</h1>",
+        "<p>Every row was fitted to the same runs and predicts others, from what the robot itself "
+        "measures; the pose is used once, at the start. Numbers in brackets are 90 % intervals by "
+        "resampling runs.</p>",
+        "<h2>What the tables say</h2><ul>",
+        *(f"<li>{escape(sentence)}</li>" for sentence in found["reading"]),
+        "</ul>",
+    ]
+    for name, one in found["sets"].items():
+        parts += _set(found, name, one)
+    parts.append(f"<p class='note'>{_versions(found)}</p></html>")
+    return "\n".join(parts)
+
+
+def _set(found: Content, name: str, one: Content) -> list[str]:
+    parts = [f"<h2>{escape(name)}</h2><p>{escape(one['about'])}; {one['runs']} runs</p>"]
+    drawn = benchmark_figure(one, found["protocols"], name)
+    if drawn is not None:
+        parts.append(picture(drawn, f"End-point errors on {name}"))
+    for protocol, rows in one["protocols"].items():
+        title = f"{protocol.replace('_', ' ')}: {found['protocols'][protocol]}"
+        parts.append(f"<h3>{escape(title)}</h3>")
+        head = ("row", *headings(rows), *COSTS)
+        body = [(row, *cells(content, rows), *costs(content)) for row, content in ranked(rows)]
+        parts.append(html_table(head, body))
+        parts += [f"<p class='note'>{escape(line)}</p>" for line in absent(rows)]
+    return parts
+
+
+def html_table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
+    """A table whose first column names the row; slipid's own rows stand out."""
+    lines = [
+        "<div class='wide'><table><tr>",
+        *(f"<th>{escape(cell)}</th>" for cell in head),
+        "</tr>",
+    ]
+    for row in body:
+        own = " class='own'" if row[0].startswith("slipid") else ""
+        lines.append(f"<tr{own}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
+    return "".join([*lines, "</table></div>"])
+
+
+def picture(drawn: Figure, said: str) -> str:
+    """A figure inside the page, with what it shows in words."""
+    buffer = BytesIO()
+    drawn.savefig(buffer, format="png", dpi=110)
+    data = b64encode(buffer.getvalue()).decode()
+    return f"<img alt='{escape(said)}' src='data:image/png;base64,{data}'>"
+
+
+def _versions(found: Content) -> str:
+    said = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+    return escape(f"{said}; {found['seconds']:.0f} s")
