@@ -234,7 +234,7 @@ class Method(abc.ABC):
     name: str
     needs: frozenset[Channel] = field(default=frozenset(), kw_only=True)
 
-    def candidates(self) -> Sequence[Self]:
+    def candidates(self) -> Sequence["Method"]:
         """Itself with other settings, at most `TRIES`, from which cross-validation picks one."""
         return (self,)
 

@@ -22,7 +22,6 @@ def _every() -> list[Method]:
     of_one_floor: list[Method] = [
         EffectiveTrack(),
         InstantaneousCentres(),
-        *ojeda_rows(),
         ReinaDeterministic(),
         ReinaFuzzy(),
         WardIagnemma(),
@@ -34,7 +33,8 @@ def _every() -> list[Method]:
         BoostedTrees(),
         NeuralNetwork(),
     ]
-    return [Encoder(), *map(ByFloor.of, of_one_floor), GmdhOne(), GmdhClass()]
+    by_floor = [ByFloor.of(method) for method in of_one_floor]
+    return [Encoder(), *ojeda_rows(), *by_floor, GmdhOne(), GmdhClass()]
 
 
 ROWS = tuple(method.name for method in _every())

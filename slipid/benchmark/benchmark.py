@@ -9,6 +9,7 @@ from slipid.baselines.rows import ROWS
 from slipid.benchmark.own import NAME
 from slipid.benchmark.protocols import PROTOCOLS, splits
 from slipid.benchmark.reading import reading
+from slipid.benchmark.rectangle import CONTROLLERS, Rectangle
 from slipid.benchmark.row import Row
 from slipid.benchmark.sets import SOURCES, there
 from slipid.benchmark.summary import Summary, summary
@@ -69,8 +70,17 @@ def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
             pieces += [
                 Piece(wish, source.name, kind, f.fold) for f in folds[: 1 if wish.quick else None]
             ]
-    report.stage(f"{len(pieces)} parts")
-    spread(work, {piece.name: piece for piece in pieces}, jobs, report)
+    parts: list[Part] = [*pieces]
+    rectangle = (
+        None
+        if wish.quick or not set(CONTROLLERS) & set(wish.only or CONTROLLERS)
+        else Rectangle(wish)
+    )
+    if rectangle is not None:
+        parts.insert(0, rectangle)
+    report.stage(f"{len(parts)} parts")
+    spread(work, {part.name: part for part in parts}, jobs, report)
+    driven = None if rectangle is None else rectangle.drive(jobs, report)
     report.stage("comparing")
     tables = tables_of(pieces)
     content = {
@@ -78,6 +88,7 @@ def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
         "quick": wish.quick,
         "sets": {name: _set(wish, name, protocols) for name, protocols in tables.items()},
         "protocols": {name: p.about for name, p in PROTOCOLS.items()},
+        "rectangle": driven,
         "reading": reading(tables),
         "seconds": round(time.monotonic() - began, 1),
         "versions": versions(),
@@ -97,7 +108,8 @@ def _known(wish: Wish) -> None:
         raise DataError(
             f"{wish.data}: no such folder; expected the folder of the data sets (--data)"
         )
-    every = [NAME, OWN_MAP, *ROWS]
+    every = [NAME, OWN_MAP, *ROWS, *CONTROLLERS]
+    every = list(dict.fromkeys(every))
     for name in wish.only:
         if name not in every:
             raise DataError(

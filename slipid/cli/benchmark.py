@@ -32,13 +32,15 @@ def benchmark(
     """
     from slipid.benchmark.benchmark import benchmark as run
     from slipid.benchmark.work import Wish
+    from slipid.plots.benchmark import benchmark_pictures
     from slipid.report.benchmark import show_benchmark
     from slipid.report.benchmark_page import write_page
 
     only = () if rows is None else tuple(name.strip() for name in rows.split(",") if name.strip())
     with Reporter(quiet=quiet) as report:
         found = run(Wish(data, out, only, quick), processes(jobs), report)
-        written = write_page(found, out)
+        report.stage("drawing")
+        written = write_page(found, benchmark_pictures(found), out)
         report.line(f"in {out}: benchmark.json, {written.name}")
     emit(json, found, lambda page: show_benchmark(page, found))
     failed = [

@@ -11,6 +11,12 @@ OWN = "slipid"
 """Rows whose names begin with it are drawn in colour."""
 
 
+def benchmark_pictures(found: Content) -> dict[str, bytes]:
+    """A picture in the bytes of a PNG file for every data set of benchmark.json, by its name."""
+    made = {n: benchmark_figure(one, found["protocols"], n) for n, one in found["sets"].items()}
+    return {name: drawing.png(figure) for name, figure in made.items() if figure is not None}
+
+
 def benchmark_figure(one: Content, about: Content, name: str) -> Figure | None:
     """A panel per protocol of one data set: mean end-point error with its 90 % interval.
 

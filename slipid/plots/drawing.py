@@ -55,11 +55,16 @@ def plain(axes: Axes) -> None:
         axes.spines[side].set_visible(False)
 
 
-def save(made: Figure, path: Path) -> Path:
-    """Write the figure as PNG, whole or not at all."""
+def png(made: Figure) -> bytes:
+    """The figure as a PNG file."""
     buffer = io.BytesIO()
     made.savefig(buffer, format="png", dpi=110)
-    write_bytes(path, buffer.getvalue())
+    return buffer.getvalue()
+
+
+def save(made: Figure, path: Path) -> Path:
+    """Write the figure as PNG, whole or not at all."""
+    write_bytes(path, png(made))
     return path
 
 

@@ -1,13 +1,10 @@
 """The benchmark as one page of HTML, with its pictures inside."""
 
 from base64 import b64encode
+from collections.abc import Mapping
 from html import escape
-from io import BytesIO
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
-from slipid.plots.benchmark import benchmark_figure
 from slipid.report.benchmark import COSTS, absent, cells, costs, headings, ranked
 from slipid.support.content import Content
 from slipid.support.files import write_bytes
@@ -25,15 +22,20 @@ tr.own { background: #fdeee3; font-weight: 600 } .note { color: #666; font-size:
 """
 
 
-def write_page(found: Content, out: Path) -> Path:
-    """Write the page of a benchmark's content below a folder."""
+def write_page(found: Content, pictures: Mapping[str, bytes], out: Path) -> Path:
+    """Write the page of a benchmark's content below a folder; arguments as of `page`."""
     path = out / PAGE
-    write_bytes(path, page(found).encode())
+    write_bytes(path, page(found, pictures).encode())
     return path
 
 
-def page(found: Content) -> str:
-    """The whole page: what it says, then a picture and the tables of every data set."""
+def page(found: Content, pictures: Mapping[str, bytes]) -> str:
+    """The whole page: what it says, then a picture and the tables of every data set.
+
+    Args:
+        found: content of benchmark.json.
+        pictures: PNG files by the name of the data set they show.
+    """
     parts = [
         "<!doctype html><html lang='en'><meta charset='utf-8'>",
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",
@@ -47,14 +49,13 @@ def page(found: Content) -> str:
         "</ul>",
     ]
     for name, one in found["sets"].items():
-        parts += _set(found, name, one)
+        parts += _set(found, name, one, pictures.get(name))
     parts.append(f"<p class='note'>{_versions(found)}</p></html>")
     return "\n".join(parts)
 
 
-def _set(found: Content, name: str, one: Content) -> list[str]:
+def _set(found: Content, name: str, one: Content, drawn: bytes | None) -> list[str]:
     parts = [f"<h2>{escape(name)}</h2><p>{escape(one['about'])}; {one['runs']} runs</p>"]
-    drawn = benchmark_figure(one, found["protocols"], name)
     if drawn is not None:
         parts.append(picture(drawn, f"End-point errors on {name}"))
     for protocol, rows in one["protocols"].items():
@@ -80,11 +81,9 @@ def html_table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
     return "".join([*lines, "</table></div>"])
 
 
-def picture(drawn: Figure, said: str) -> str:
-    """A figure inside the page, with what it shows in words."""
-    buffer = BytesIO()
-    drawn.savefig(buffer, format="png", dpi=110)
-    data = b64encode(buffer.getvalue()).decode()
+def picture(png: bytes, said: str) -> str:
+    """A picture inside the page, with what it shows in words."""
+    data = b64encode(png).decode()
     return f"<img alt='{escape(said)}' src='data:image/png;base64,{data}'>"
 
 

@@ -333,3 +333,14 @@ def test_windows_that_slip_are_those_of_more_than_a_fifth_with_turning_in_metres
         assert said.slipping is not None
         assert (np.median(said.slipping) > 0.5) == slips
         assert len(groups(run.heard.dt, 0.5)) == 8
+
+
+@pytest.mark.parametrize(("answer", "kept"), [(0.55, 0.7), (0.45, 1.0)])
+def test_fuzzy_answers_flag_slip_from_one_half_on(answer, kept):
+    method = ReinaFuzzy(
+        rules=Sugeno(2, np.full(4, answer)), slip=0.3, limits=Limits(turning=np.inf)
+    )
+    run = patchy(3)
+    said = method.predict([run.heard], ROBOTINO)[0]
+    path = path_of(kept * run.heard.rolling(ROBOTINO), run.heard.dt)
+    assert said.path == pytest.approx(path)

@@ -34,7 +34,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.baselines.interface import Heard, Machine, Method, Run, Said, Twists
-from slipid.baselines.motion.encoder import Steps, Windows, least
+from slipid.baselines.motion.steps import Steps, Windows, least
 
 
 @dataclass(frozen=True)

@@ -54,8 +54,8 @@ MEMORY = 0.9
 CANDIDATES = (
     Growth(1e-3, KEPT, 5),
     Growth(1e-1, KEPT, 5),
-    Growth(1e-3, KEPT, 2),
     Growth(1e-2, KEPT, 1),
+    Growth(1.0, KEPT, 1),
 )
 SEED = 0
 

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.baselines.interface import Channel, Heard, Machine, Method, Run, Said, Twists
-from slipid.baselines.motion.encoder import Steps, Windows
+from slipid.baselines.motion.steps import Steps, Windows
 
 HARMONICS = 6
 RIDGES = (1e-5, 1e-3, 1e-1, 10.0)

@@ -17,10 +17,8 @@ are known to all floors, as if they had been measured once before. If all traini
 floor, which says nothing about a harder one, it is the quarter of the runs in which encoders err
 least: then little is flagged.
 
-So it tells floors apart itself: two numbers for each floor that it was trained on, and two from all
-runs together for floors that are not told or not known.
-
-Tuned: the low pass's time constant.
+So it treats floors itself: two numbers for each floor that it was trained on, and two from all runs
+together where the floor is not told or not known. Tuned: the low pass's time constant.
 
 Liberties:
     - The equations are restated, not copied: length of a window, variance before learning, order of
@@ -28,8 +26,8 @@ Liberties:
       to do here and is left out.
     - The original corrects rovers along their direction of motion; here every drive is corrected
       along its own, so that omni robots are too. A wheel is never turned backwards.
-    - Statistics of the hard floor are over all steps in which the robot moves, whatever the
-      direction of travel. Which floor is hard is told by training poses, also to `ojeda_gyro`.
+    - Statistics of the hard floor are over all steps in which the robot moves, in any direction.
+      Which floor is hard is told by training poses, also to `ojeda_gyro`.
     - `ojeda_continuous` learns online in the order in which runs come, as published, and stops
       learning after the last: 0.995 per window remembers the last 100 s that were flagged.
     - `ojeda_sporadic` solves for the place after integration, which is not linear, by a trust
@@ -50,13 +48,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from slipid.baselines.interface import Channel, Heard, Machine, Method, Run, Said, Twists
-from slipid.baselines.motion.encoder import Steps, Windows, least
+from slipid.baselines.motion.steps import Steps, Windows, least
 
 Line = Float[np.ndarray, "2"]
 """k0 [m/s] and k1 [m/s/A]."""
 Tuning = Literal["continuous", "sporadic", "gyro"]
 FORGETTING = 0.995
 SIGMAS = 3.0
+"""Above the hard floor's mean, where slip is flagged."""
 MOVING = 0.02
 """Mean rim speed above which the robot moves [m/s]."""
 PRIOR = 1e6
@@ -147,14 +146,13 @@ class Ojeda(Method):
         steps = Steps.of([run.heard for run in runs])
         current = steps.smoothed(steps.heard.along(machine), self.time_constant).mean(axis=1)
         moves = np.abs(steps.heard.speed).mean(axis=1) * machine.wheel_radius > MOVING
-        # a robot that never moved says at least what it takes at rest
         seen = current[moves] if moves.any() else current
         return Hard(float(seen.mean()), max(float(seen.std()), 1e-6))
 
     def _scene(self, runs: Sequence[Heard], hard: Hard, machine: Machine) -> Scene:
         steps = Steps.of(runs)
-        current = steps.smoothed(steps.heard.along(machine), self.time_constant)
         rim = steps.heard.speed * machine.wheel_radius
+        current = steps.smoothed(steps.heard.along(machine), self.time_constant)
         return Scene(steps, rim, current, hard.sigmas(current) > SIGMAS)
 
     def _line(self, runs: Sequence[Run], hard: Hard, machine: Machine) -> Line:
@@ -196,7 +194,7 @@ def true_ends(runs: Sequence[Run]) -> Float[np.ndarray, "run 3"]:
 
 
 def continuous(scene: Scene, w: Windows, machine: Machine) -> Line:
-    """By the pose at all times."""
+    """By the pose at all times; only windows with slip flagged count."""
     rows = w.rows(machine.back @ scene.features(), machine)
     told = rows.parts.any(axis=(1, 2))
     return forgetful(rows.parts[told], rows.gap[told], FORGETTING, PRIOR)

@@ -44,17 +44,12 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.baselines.interface import Channel, Heard, Machine, Method, Run, Said
-from slipid.baselines.motion.encoder import Steps, Windows
+from slipid.baselines.motion.steps import Steps, Windows
+from slipid.baselines.paper2021 import table as tables
 from slipid.baselines.paper2021.samples import FIGURES_3_AND_4, Samples
-from slipid.baselines.paper2021.table import (
-    DEPLOYED_MEMORY,
-    DEPLOYED_THRESHOLD,
-    TORQUE_SVR,
-    deployed_slip,
-)
 
 Slips = Float[np.ndarray, "step drive"]
-TIME_CONSTANT = -0.031 / float(np.log(DEPLOYED_MEMORY))
+TIME_CONSTANT = -0.031 / float(np.log(tables.DEPLOYED_MEMORY))
 """Of the authors' smoothing [s]: their computer sampled about every 31 ms."""
 MOST = 3000
 """Samples that a support vector regression is fitted to."""
@@ -94,7 +89,7 @@ class PaperPrint(Wheelwise):
         recipe = FIGURES_3_AND_4
         motor = replace(machine, resistance=recipe.resistance, back_emf=recipe.back_emf)
         torque = steps.heard.torque(motor)
-        return np.clip(np.polynomial.polynomial.polyval(torque, TORQUE_SVR), 0.0, 1.0)
+        return np.clip(np.polynomial.polynomial.polyval(torque, tables.TORQUE_SVR), 0.0, 1.0)
 
 
 @final
@@ -107,8 +102,8 @@ class PaperCode(Wheelwise):
     def slip(self, steps: Steps, machine: Machine) -> Slips:
         current = steps.smoothed(steps.heard.along(machine), TIME_CONSTANT)
         if current.shape[1] == 3:
-            return deployed_slip(current)
-        of_each = deployed_slip(np.repeat(current.reshape(-1, 1), 3, axis=1))
+            return tables.deployed_slip(current)
+        of_each = tables.deployed_slip(np.repeat(current.reshape(-1, 1), 3, axis=1))
         return np.asarray(of_each.mean(axis=1).reshape(current.shape))
 
 
@@ -164,7 +159,7 @@ class PaperCodeRefit(Refitted):
     def features(self, steps: Steps, machine: Machine) -> Float[np.ndarray, "step drive k"]:
         current = steps.smoothed(steps.heard.along(machine), TIME_CONSTANT)
         line = np.stack([current, np.ones_like(current)], axis=-1)
-        line[current <= DEPLOYED_THRESHOLD] = 0.0
+        line[current <= tables.DEPLOYED_THRESHOLD] = 0.0
         own = np.eye(current.shape[1])
         return np.einsum("sdk,de->sdek", line, own).reshape(*current.shape, -1)
 
@@ -232,8 +227,9 @@ class PaperSvr(Wheelwise):
     def fit(self, runs: Sequence[Run], machine: Machine) -> "PaperSvr":
         seen = recipe_samples(runs, machine)
         if len(np.unique(seen.torque.round(9))) <= self.degree:
-            # the recipe left nothing to fit a curve to: no slip was seen
-            return replace(self, curve=(0.0,) * (self.degree + 1))
+            # nothing to fit a curve to: the slip that was seen, if any was
+            level = float(seen.slip.mean()) if len(seen) else 0.0
+            return replace(self, curve=(level,) + (0.0,) * self.degree)
         curve = insensitive_curve(seen.torque, seen.slip, self.degree, self.c, self.tube)
         return replace(self, curve=tuple(curve.tolist()))
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from slipid.baselines.interface import TRIES, ByFloor
-from slipid.baselines.motion.encoder import Steps
 from slipid.baselines.motion.ojeda import Hard, Ojeda, forgetful, hard_runs, ojeda_rows
+from slipid.baselines.motion.steps import Steps
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
 CONTINUOUS, SPORADIC, GYRO = ojeda_rows()
@@ -113,12 +113,15 @@ def test_the_recursion_is_weighted_least_squares(rng):
 
 
 def test_the_pose_known_all_the_time_is_forgotten_and_that_known_now_and_then_is_not(rng):
-    hard, old = two_floors(rng, (0.01, 0.02), count=50)
-    _, new = two_floors(rng, (0.02, 0.05), count=50)
+    hard, _ = two_floors(rng, (0.0, 0.0), count=4)
+    old, new = (
+        [corrected_run(rng, line, floor="soft", level=1.2) for _ in range(45)]
+        for line in ((0.01, 0.02), (0.02, 0.05))
+    )
     continuous, sporadic = (m.fit(hard + old + new, ROBOTINO) for m in (CONTINUOUS, SPORADIC))
     run = new[0]
     middle = corrected_run(rng, (0.015, 0.035), floor="soft", level=1.2)
-    assert path_error(continuous, [run]) < 0.1 * path_error(sporadic, [run])
+    assert path_error(continuous, [run]) < 0.25 * path_error(sporadic, [run])
     assert path_error(sporadic, [middle]) < 0.3 * path_error(sporadic, [run])
 
 

@@ -9,8 +9,9 @@ from scipy.signal import lfilter
 
 from slipid.baselines.interface import TRIES, ByFloor, path_of
 from slipid.baselines.motion.effective_track import EffectiveTrack, InstantaneousCentres
-from slipid.baselines.motion.encoder import Encoder, Steps, Windows, least
+from slipid.baselines.motion.encoder import Encoder
 from slipid.baselines.motion.heading_lookup import HeadingLookup
+from slipid.baselines.motion.steps import Steps, Windows, least
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
 

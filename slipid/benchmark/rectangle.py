@@ -1,0 +1,73 @@
+"""The rectangle of the 2021 paper, driven by the published controllers and slipid's."""
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from slipid.benchmark import own as slipid_rows
+from slipid.benchmark.work import Wish, data_of
+from slipid.control.robot_file.record import Sensors
+from slipid.deploy import trial
+from slipid.deploy.deploy import ROBOT
+from slipid.deploy.forecaster import robot_of
+from slipid.support.checkpoint import Checkpoint, key_of, source_hash
+from slipid.support.content import Content
+from slipid.support.errors import DataError
+from slipid.support.jax_setup import setup_jax
+from slipid.support.progress import Reporter
+
+SOURCE = "testsite"
+"""Data set whose robot drives."""
+CONTROLLERS = (
+    "encoder",
+    "goswami_padhy",
+    "indiveri",
+    "paper_print",
+    "paper_code",
+    "torque",
+    "contact",
+    "contact_gyro",
+)
+STARTS = 8
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """The part of the work that identifies the robot which is then driven."""
+
+    wish: Wish
+    name: str = "rectangle"
+
+    @property
+    def folder(self) -> Path:
+        """Where the robot and its trial lie."""
+        return self.wish.out / self.name
+
+    def run(self) -> str:
+        """Identify the robot of the test site from all its runs; the name of the part."""
+        setup_jax(quiet=True)
+        data = data_of(self.wish, SOURCE)
+        code = source_hash("model", "data", "identify", "job")
+        key = key_of(data.job.config.hash, data.job.data_hash, code)
+        everybody = np.arange(len(data.heard))
+        kept = Checkpoint(self.folder, key)
+        own = slipid_rows.fit_own(data, everybody, kept, Reporter(quiet=True))
+        sensors = Sensors(current_is_signed=data.heard.current_is_signed, voltage=True)
+        robot_of(own.contact, own.highest_speed, own.trend, sensors).save(self.folder / ROBOT)
+        return self.name
+
+    def drive(self, jobs: int, report: Reporter) -> Content:
+        """Drive all controllers on the virtual test site, or where MuJoCo is missing on the twin.
+
+        Returns:
+            What `slipid trial` writes, or why there is nothing.
+        """
+        plant = "testsite" if find_spec("mujoco") is not None else "twin"
+        asked = [name for name in CONTROLLERS if not self.wish.only or name in self.wish.only]
+        try:
+            wish = trial.Wish(plant, controllers=tuple(asked), starts=STARTS, jobs=jobs)
+            return trial.trial(self.folder, wish, report).content
+        except DataError as error:
+            return {"failed": str(error)}

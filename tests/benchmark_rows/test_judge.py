@@ -1,0 +1,183 @@
+"""What a prediction is worth, and how folds are put together, against plain formulas."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sklearn.metrics import roc_auc_score
+
+from slipid.baselines.interface import Said, path_of
+from slipid.benchmark.judge import judged
+from slipid.benchmark.reading import sentence
+from slipid.benchmark.row import Row
+from slipid.benchmark.summary import Number, Resampled, Summary, area, summary
+from tests.helpers.made_runs import ROBOTINO, made_run, straight
+
+
+def slipping_run(**more):
+    """Drives 0.8 m by its wheels and 0.6 m in truth."""
+    rolling = straight(0.0)
+    return made_run(rolling, 0.75 * rolling, current=np.full((40, 3), 0.5), **more)
+
+
+def said(run, twist, **more):
+    return Said(path_of(twist, run.heard.dt), **more)
+
+
+def test_the_end_is_judged_over_the_chord():
+    run = slipping_run()
+    one = judged(run, said(run, run.heard.rolling(ROBOTINO)), ROBOTINO, "chord")
+    assert one.endpoint_error == pytest.approx(1 / 3)
+    assert one.length_error == pytest.approx(1 / 3)
+    assert one.heading_error_deg == pytest.approx(0.0, abs=1e-9)
+    assert one.twist_error == pytest.approx(0.05)
+
+
+def test_over_the_path_a_circle_counts_its_way():
+    rolling = np.tile([0.2, 0.0, np.pi / 2], (40, 1))
+    run = made_run(rolling)
+    one = judged(run, said(run, 0.5 * rolling), ROBOTINO, "path")
+    assert one.heading_error_deg == pytest.approx(180.0)
+    ahead = np.hypot(*path_of(0.5 * rolling, run.heard.dt)[-1, :2])
+    assert one.endpoint_error == pytest.approx(ahead / 0.8, rel=2e-3)
+
+
+def test_the_start_may_lie_anywhere():
+    run = slipping_run()
+    c, s = np.cos(2.0), np.sin(2.0)
+    moved = run.pose @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [1.0, -3.0, 2.0]
+    one, other = (
+        judged(r, said(run, run.twist), ROBOTINO, "chord") for r in (run, replace(run, pose=moved))
+    )
+    assert other.endpoint_error == pytest.approx(one.endpoint_error, abs=1e-12)
+    assert other.endpoint_error < 1e-9
+
+
+def test_slip_is_told_from_the_twist_unless_a_method_says_it():
+    run = slipping_run()
+    right = judged(run, said(run, run.twist), ROBOTINO, "chord")
+    assert all(right.slips)
+    assert right.scores == pytest.approx([0.25] * 8)
+    own = judged(run, said(run, run.twist, slipping=np.full(40, 7.0)), ROBOTINO, "chord")
+    assert own.scores == pytest.approx([7.0] * 8)
+    steady = made_run(straight(0.0), 0.85 * straight(0.0))
+    assert not any(judged(steady, said(steady, steady.twist), ROBOTINO, "chord").slips)
+
+
+def test_a_region_covers_what_lies_inside_it():
+    run = slipping_run()
+    gap = 0.2  # of encoders, ahead
+    for std, inside in ((gap / 2.1, True), (gap / 2.2, False)):
+        cov = np.diag([std**2, 1e-6])
+        told = said(run, run.heard.rolling(ROBOTINO), end_covariance=cov)
+        assert judged(run, told, ROBOTINO, "chord").covered90 is inside
+
+
+def test_floors_are_right_for_a_part_of_the_time():
+    run = slipping_run(floor="gray@moved")
+    gray = np.where(np.arange(40) < 10, 0.2, 0.9)
+    told = said(run, run.twist, floors={"gray": gray, "green": 1 - gray})
+    assert judged(run.told(False), told, ROBOTINO, "chord").floor_right == pytest.approx(0.75)
+    assert judged(run.told(True), told, ROBOTINO, "chord").floor_right is None
+
+
+def test_energy_is_judged_as_a_whole():
+    run = slipping_run()
+    power = run.heard.power(ROBOTINO)
+    swung = power * np.where(np.arange(40) % 2, 1.4, 1.0)
+    told = said(run, run.twist, power=swung)
+    assert judged(run, told, ROBOTINO, "chord").energy_error == pytest.approx(0.2)
+
+
+def test_the_area_is_that_of_scikit_learn():
+    rng = np.random.default_rng(0)
+    score, slips = rng.integers(0, 9, 300).astype(float), rng.random(300) < 0.4
+    weight = rng.integers(0, 4, 300).astype(float)
+    expected = roc_auc_score(slips, score, sample_weight=weight)
+    assert area(score, slips, weight) == pytest.approx(expected)
+
+
+def rows(errors, floor="gray"):
+    """A fold whose runs err by so much."""
+    base = judged(slipping_run(), said(slipping_run(), straight(0.0)), ROBOTINO, "chord")
+    runs = [
+        replace(base, name=f"{floor}{k}", floor=floor, cluster=k, endpoint_error=e)
+        for k, e in enumerate(errors)
+    ]
+    return Row(runs=tuple(runs), numbers=3, fit_s=1.0)
+
+
+def test_means_are_over_runs_and_then_over_floors():
+    own = [rows([0.1, 0.1, 0.1, 0.1]), rows([0.3, 0.5], "green")]
+    found = summary({"slipid": own}, "slipid")["slipid"]
+    assert found.endpoint_error is not None
+    assert found.endpoint_error.value == pytest.approx(0.25)
+    assert found.floors is not None
+    assert found.floors["green"].value == pytest.approx(0.4)
+    assert found.runs == 6
+    assert found.numbers == 3
+
+
+def test_a_difference_is_paired():
+    rng = np.random.default_rng(0)
+    errors = rng.uniform(0.1, 0.9, 40)
+    own, other = [rows(errors)], [rows(errors + 0.01)]
+    found = summary({"slipid": own, "other": other}, "slipid")
+    behind = found["other"].behind
+    assert behind is not None
+    assert behind == pytest.approx(Number(0.01, 0.01, 0.01))  # runs that scatter do not hide it
+    assert found["slipid"].behind is None
+
+
+def test_intervals_hold_the_true_mean_as_often_as_they_say():
+    rng = np.random.default_rng(1)
+    hits = 0
+    for _ in range(100):
+        found = summary({"slipid": [rows(rng.normal(0.5, 0.1, 30))]}, "slipid")["slipid"]
+        assert found.endpoint_error is not None
+        hits += found.endpoint_error.low <= 0.5 <= found.endpoint_error.high
+    assert 80 <= hits <= 97
+
+
+def test_runs_of_a_cluster_are_drawn_together():
+    runs = [replace(run, cluster=k // 5) for k, run in enumerate(rows(np.zeros(20)).runs)]
+    drawn = Resampled.of(runs).draws
+    assert (drawn[:, ::5] == drawn[:, 4::5]).all()
+    assert (drawn.sum(axis=1) == 20).all()
+    assert len({tuple(row) for row in drawn.tolist()}) > 20
+
+
+def test_a_row_that_is_absent_in_one_fold_is_absent():
+    folds = {
+        "slipid": [rows([0.1, 0.2]), rows([0.3, 0.4], "green")],
+        "broken": [rows([0.1, 0.2]), Row.of_error(ValueError("no rank\nmore"))],
+        "ojeda_gyro": [Row.lacking(["gyro"]), Row.lacking(["gyro"])],
+    }
+    found = summary(folds, "slipid")
+    assert found["broken"].failed
+    assert found["broken"].absent == "ValueError: no rank"
+    assert found["broken"].endpoint_error is None
+    assert not found["ojeda_gyro"].failed
+    assert found["ojeda_gyro"].absent == "needs a gyro"
+
+
+def test_rows_outlive_their_files():
+    row = rows([0.1, 0.2])
+    assert Row.of_json(row.to_json()) == row
+
+
+def ends(value, low=None, high=None, behind=None):
+    error = Number(value, value - 0.01, value + 0.01)
+    return Summary(endpoint_error=error, behind=behind, runs=9)
+
+
+def test_the_reading_says_who_is_ahead():
+    ahead = {"slipid": ends(0.1), "rival": ends(0.05, behind=Number(-0.05, -0.07, -0.03))}
+    assert sentence("carpet", "new_floor", ahead) == (
+        "carpet, new floor: rival is ahead of slipid: 5.0 % against 10.0 %, "
+        "-5.0 points [-7.0, -3.0]"
+    )
+    tied = {"slipid": ends(0.1), "rival": ends(0.09, behind=Number(-0.01, -0.03, 0.01))}
+    assert sentence("x", "sectors", tied).endswith("by 9.0 %; not told apart from rival")
+    behind = {"slipid": ends(0.1), "rival": ends(0.2, behind=Number(0.1, 0.08, 0.12))}
+    assert sentence("x", "sectors", behind).endswith("by 20.0 %, +10.0 points [+8.0, +12.0]")

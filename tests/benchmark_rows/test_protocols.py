@@ -1,0 +1,162 @@
+"""What is left out together, and that methods are tuned on training runs of the same kind alone."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from slipid.baselines.interface import ByFloor, Machine, Method, Said, path_of
+from slipid.benchmark.protocols import PROTOCOLS, Facts, base_of, inner, splits
+from slipid.benchmark.tuned import tuned
+from tests.helpers.made_runs import ROBOTINO, made_run, straight
+
+
+def facts(floors=("gray", "green"), speeds=(0.1, 0.2)):
+    return [Facts(f, 10.0 * k, v) for f in floors for v in speeds for k in range(36)]
+
+
+def test_every_protocol_has_splits_of_its_kind():
+    kinds = {p.split for p in PROTOCOLS.values()}
+    assert kinds == {"headings", "sectors", "speeds", "floors", "all"}
+    assert splits(facts(), "headings")[0].protocols == ("known_floor", "unknown_floor")
+
+
+@pytest.mark.parametrize("kind", ["headings", "sectors", "speeds", "floors"])
+def test_runs_are_judged_once_and_never_fitted_then(kind):
+    every = facts()
+    found = splits(every, kind)
+    judged = np.concatenate([split.judged for split in found])
+    assert sorted(judged.tolist()) == list(range(len(every)))
+    for split in found:
+        assert not set(split.judged.tolist()) & set(split.fitted.tolist())
+        assert len(split.judged) + len(split.fitted) == len(every)
+
+
+def test_a_heading_that_is_left_out_is_seen_on_no_floor():
+    every = facts()
+    for split in splits(every, "headings"):
+        left_out = {every[k].heading_deg for k in split.judged}
+        assert not left_out & {every[k].heading_deg for k in split.fitted}
+
+
+def test_sectors_of_sixty_degrees_are_left_out_whole():
+    every = facts()
+    for split in splits(every, "sectors"):
+        ways = {int(every[k].heading_deg // 60) for k in split.judged}
+        assert len(ways) == 2
+        assert not ways & {int(every[k].heading_deg // 60) for k in split.fitted}
+
+
+def test_a_floor_driven_at_one_speed_keeps_it():
+    every = [*facts(), *facts(("table",), (0.1,))]
+    for split in splits(every, "speeds"):
+        assert "table" not in {every[k].floor for k in split.judged}
+
+
+def test_many_speeds_are_three_parts():
+    rng = np.random.default_rng(0)
+    every = [Facts("grass", 0.0, float(v)) for v in rng.uniform(0.5, 3.0, 60)]
+    found = splits(every, "speeds")
+    assert len(found) == 3
+    fastest = [max(every[k].speed for k in split.judged) for split in found]
+    assert fastest == sorted(fastest)
+
+
+def test_a_floor_nobody_else_has_is_not_judged_by_heading():
+    lone = [Facts("ice", 0.0, 0.1)] * 3
+    for split in splits([*facts(), *lone], "headings"):
+        assert not [k for k in split.judged if k >= len(facts())]
+
+
+def test_too_few_runs_are_no_split():
+    assert splits(facts()[:6], "headings") == []
+
+
+def test_the_load_is_no_part_of_the_floors_name():
+    assert base_of("gray@moved") == base_of("gray") == "gray"
+
+
+def runs(floors=("gray", "green"), slip=0.3):
+    out = []
+    for k, floor in enumerate(floors):
+        for n, way in enumerate(np.radians(np.arange(0, 360, 20))):
+            rolling = straight(way, 0.1 if n % 2 else 0.2)
+            out.append(made_run(rolling, (1 - slip * k) * rolling, floor=floor, name=f"{floor}{n}"))
+    return out
+
+
+def test_inner_folds_are_of_the_kind_that_is_judged_by():
+    training = runs()
+    by_floor = inner(training, "floors")
+    assert {(r.floor, k) for r, k in zip(training, by_floor, strict=True)} == {
+        ("gray", 0),
+        ("green", 1),
+    }
+    by_speed = inner(training, "speeds")
+    assert len({(round(r.speed, 2), k) for r, k in zip(training, by_speed, strict=True)}) == 2
+    one_speed = [run for run in training if run.speed < 0.15]
+    assert set(inner(one_speed, "speeds").tolist()) == {-1, 0, 1}  # headings instead
+
+
+@dataclass(frozen=True)
+class Scaled(Method):
+    """Encoders, times a number that is a setting."""
+
+    name: str = "scaled"
+    factor: float = 1.0
+    seen: tuple[str, ...] = ()
+
+    def candidates(self):
+        return [replace(self, factor=f) for f in (1.0, 0.85, 0.5)]
+
+    def fit(self, runs, machine: Machine):
+        return replace(self, seen=tuple(run.heard.name for run in runs))
+
+    def predict(self, runs, machine: Machine):
+        assert not {run.name for run in runs} & set(self.seen)
+        return [Said(path_of(self.factor * r.rolling(machine), r.dt)) for r in runs]
+
+    @property
+    def numbers(self):
+        return 0
+
+
+def test_the_best_setting_of_training_runs_is_picked():
+    found = tuned(ByFloor.of(Scaled()), runs(slip=0.5)[18:], ROBOTINO, "headings")
+    assert found.settings == "factor = 0.5"
+    assert found.tried == 3
+    pooled = tuned(Scaled(), runs(slip=0.3), ROBOTINO, "headings")
+    assert pooled.settings == "factor = 0.85"
+
+
+class Stubborn(Scaled):
+    """One setting cannot be fitted."""
+
+    def fit(self, runs, machine: Machine):
+        if self.factor == 0.5:
+            raise ValueError("no")
+        return super().fit(runs, machine)
+
+
+def test_a_setting_that_fails_is_not_picked():
+    assert tuned(Stubborn(), runs(slip=0.5)[18:], ROBOTINO, "headings").settings == "factor = 0.85"
+
+
+def test_a_method_by_floor_takes_the_pooled_one_where_nothing_is_told():
+    @dataclass(frozen=True)
+    class Mean(Scaled):
+        def fit(self, runs, machine: Machine):
+            slip = np.mean([r.twist[0, :2] @ r.heard.rolling(machine)[0, :2] for r in runs])
+            size = np.mean([(r.heard.rolling(machine)[0, :2] ** 2).sum() for r in runs])
+            return replace(self, factor=float(slip / size))
+
+    method = ByFloor.of(Mean()).fit(runs(slip=0.5), ROBOTINO)
+    way = made_run(straight(0.1), name="new")
+
+    def far(floor):
+        heard = replace(way.heard, floor=floor)
+        return method.predict([heard], ROBOTINO)[0].path[-1, 0] / way.pose[-1, 0]
+
+    assert far("gray") == pytest.approx(1.0)
+    assert far("green") == pytest.approx(0.5)
+    assert far(None) == far("ice") == pytest.approx(0.75)
