@@ -33,6 +33,8 @@ from slipid.support.checkpoint import Checkpoint
 from slipid.support.progress import Reporter
 
 NAME = "slipid"
+TOLERANCE = 0.1
+"""A fit is done when nothing moves by more than this part of its std: runs scatter far more."""
 STEPS = 16
 """Estimators drive a number of steps that is a multiple of it, so that few shapes are compiled."""
 TOGETHER = 32
@@ -78,10 +80,8 @@ def fit_own(data: DataSet, fitted: np.ndarray, kept: Checkpoint, report: Reporte
         def tell(state: State) -> None:
             report.note(f"round {state.round}")
 
-        limits = job.settings
-        optimum = optimise(
-            problem, keep=keep, most_rounds=limits.rounds, tolerance=limits.tolerance, tell=tell
-        )
+        most = job.settings.rounds
+        optimum = optimise(problem, keep=keep, most_rounds=most, tolerance=TOLERANCE, tell=tell)
         kept.save(
             "fit",
             {k: v for k, v in vars(optimum.state).items() if v is not None}

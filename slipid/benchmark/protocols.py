@@ -10,8 +10,10 @@ from jaxtyping import Int
 from slipid.baselines.interface import Run
 from slipid.data.runs import Runs
 
-FOLDS = 3
-"""Parts into which headings and sectors are dealt."""
+FOLDS = 2
+"""Parts into which headings and sectors are dealt; every other sector is left out together."""
+SPEEDS = 3
+"""Parts of speeds, where there are many."""
 INNER = 2
 """Folds of the inner cross-validation by which a method picks its settings."""
 SECTOR_DEG = 60.0
@@ -108,7 +110,7 @@ def headings(facts: Sequence[Facts]) -> Labels:
 
 
 def sectors(facts: Sequence[Facts]) -> Labels:
-    """Parts of two opposite sectors of directions each; -1 of runs without a direction."""
+    """Parts of every other sector of directions; -1 of runs without a direction."""
     way = np.array([f.heading_deg for f in facts])
     known = np.isfinite(way)
     turn = np.where(known, way, 0.0) % 360.0
@@ -123,7 +125,8 @@ def speeds(facts: Sequence[Facts]) -> Labels:
     speed = np.round([f.speed for f in facts], 3)
     where = np.array([f.floor for f in facts])
     every = np.unique(speed[np.isfinite(speed) & (speed > 0)])
-    edges = every[1:] if len(every) <= 2 * FOLDS else np.quantile(every, (1 / 3, 2 / 3))
+    many = len(every) > 2 * SPEEDS
+    edges = np.quantile(every, np.arange(1, SPEEDS) / SPEEDS) if many else every[1:]
     part = np.where(np.isfinite(speed) & (speed > 0), np.searchsorted(edges, speed, "right"), -1)
     for floor in np.unique(where):
         if len(np.unique(part[(where == floor) & (part >= 0)])) < 2:

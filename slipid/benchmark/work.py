@@ -239,15 +239,18 @@ def _own(scene: Scene, asked: Protocol, runs: list[Run], name: str) -> Row:
     if name == OWN_MAP and scene.data.map is None:
         return Row.lacking(["map"])
 
-    def predict() -> list[Said]:
+    def predict(cuts: Sequence[Cut]) -> list[Said]:
         if asked.told:
             machine = scene.data.machine
-            return [said for one in scene.cuts for said in slipid_rows.told(own, one, machine)]
+            return [said for one in cuts for said in slipid_rows.told(own, one, machine)]
         floor = scene.data.map if name == OWN_MAP else None
-        return slipid_rows.untold(own, scene.cuts, scene.judged, floor)
+        return slipid_rows.untold(own, cuts, scene.judged, floor)
 
-    predict()  # compiles
-    said, each = _timed(predict, runs)
+    for one in scene.cuts:  # compiles
+        predict([replace(one, numbers=one.numbers[:1], runs=one.runs[:1])])
+        if not asked.told:
+            break
+    said, each = _timed(lambda: predict(scene.cuts), runs)
     return Row(
         runs=_judged(scene, runs, said),
         numbers=own.numbers,

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import check_grad
 from scipy.stats import chi2
 
-from slipid.baselines.interface import TRIES, ByFloor, Run, path_of
+from slipid.baselines.interface import TRIES, ByFloor, Run, body_increments
 from slipid.baselines.motion.ward_iagnemma import (
     GRAVITY,
     REST,
@@ -95,13 +95,13 @@ def test_small_steps_follow_the_differential_equation(machine):
     start = np.array([0.05, -0.1, 0.2])
     exact = solve_ivp(rate, (0.0, 0.2), start, method="Radau", rtol=1e-9, atol=1e-11).y[:, -1]
     ends = []
-    for count in (200, 400):
+    for count in (40, 80):
         q = start[None]
         for _ in range(count):
             q = dynamics.step(q, rho, rim, np.array([0.2 / count])).speeds
         ends.append(q[0])
     # of first order: what is left halves with the step
-    assert 2 * ends[1] - ends[0] == pytest.approx(exact, abs=2e-5)
+    assert 2 * ends[1] - ends[0] == pytest.approx(exact, abs=2e-4)
 
 
 @MACHINES
@@ -125,7 +125,7 @@ def test_a_step_solves_its_equation_however_stiff(machine):
 @MACHINES
 def test_the_derivatives_of_a_step(machine):
     rng = np.random.default_rng(1)
-    for _ in range(5):
+    for _ in range(2):
         q, rolling = rng.normal(size=(2, 1, 3)) * 0.2
         dynamics = Dynamics.of(machine, FLOOR)
         rim, dt = rolling @ dynamics.rims.T, np.array([0.15])
@@ -195,12 +195,19 @@ def test_a_measurement_is_that_of_the_textbook_but_for_the_pose():
     assert after.mean[0] == pytest.approx(mean + 0.7 * gain[:5])
     assert after.spread[0, :5, :5] == pytest.approx((spread - np.outer(gain, row @ spread))[:5, :5])
     assert after.spread[0, 5:, 5:] == pytest.approx(spread[5:, 5:])
-    left = np.eye(8) - np.outer(np.append(gain[:5], np.zeros(3)), row)
-    assert after.spread[0, 5:, :5] == pytest.approx((left @ spread)[5:, :5], abs=1e-9)
+    own = np.append(gain[:5], np.zeros(3))
+    left = np.eye(8) - np.outer(own, row)
+    joseph = left @ spread @ left.T + 0.3 * np.outer(own, own)
+    assert after.spread[0] == pytest.approx(joseph)
     one = state.corrected(row[None], np.array([0.7]), np.array([0.3]), slice(3, 4))
     assert one.mean[0] == pytest.approx(mean + 0.7 * gain[:5] * [0, 0, 0, 1, 0])
-    unheard = state.corrected(row[None], np.array([np.nan]), np.array([0.3]))
-    assert unheard.mean[0] == pytest.approx(mean)
+    two = State(np.tile(mean, (2, 1)), np.tile(spread, (2, 1, 1)))
+    for news, variance in ((np.nan, 0.3), (0.7, np.nan)):
+        heard = two.corrected(
+            np.tile(row, (2, 1)), np.array([0.7, news]), np.array([0.3, variance])
+        )
+        assert heard.mean == pytest.approx(np.stack([after.mean[0], mean]))
+        assert heard.spread == pytest.approx(np.stack([after.spread[0], spread]))
 
 
 def test_resistance_that_pushes_or_exceeds_traction_is_pulled_back():
@@ -214,59 +221,64 @@ def test_resistance_that_pushes_or_exceeds_traction_is_pulled_back():
 
 
 def test_wheels_that_spin_on_the_spot_are_told():
-    run = made_run(straight(0.4), current=np.ones((40, 3)))
+    run = made_run(straight(0.0), current=np.ones((40, 3)))
     stuck = WardIagnemma(law=Law(rolling=2.0), noise=Noise(rolling=1e-6))
     rolls = WardIagnemma(law=Law(rise=200.0, rolling=1e-3), noise=Noise(rolling=1e-6))
     assert (stuck.predict([run.heard], ROBOTINO)[0].slipping[3:] > 0.8).all()
     assert (rolls.predict([run.heard], ROBOTINO)[0].slipping < 0.05).all()
 
 
+@pytest.mark.slow
 @MACHINES
 def test_what_was_driven_by_the_law_is_foretold(machine):
-    runs = [driven(FLOOR, k, machine) for k in range(24)]
-    fitted = WardIagnemma().fit(runs[:20], machine)
-    for run, said in zip(
-        runs[20:], fitted.predict([r.heard for r in runs[20:]], machine), strict=True
-    ):
-        rolled = path_of(run.heard.rolling(machine), run.heard.dt)[-1]
-        off, before = np.abs(said.path[-1] - run.pose[-1]), np.abs(rolled - run.pose[-1])
-        assert np.hypot(*off[:2]) < 0.1 * np.hypot(*before[:2])
+    runs = [driven(FLOOR, k, machine) for k in range(14)]
+    fitted = WardIagnemma().fit(runs[:10], machine)
+    foretold = fitted.predict([run.heard for run in runs[10:]], machine)
+    # after the wheels change, the robot's mass needs some steps to follow
+    settled = np.r_[10:20, 30:40]
+    for run, said in zip(runs[10:], foretold, strict=True):
+        twist = body_increments(said.path) / run.heard.dt[:, None]
+        off = np.abs((twist - run.twist) * machine.size)[settled]
+        slip = np.abs((run.heard.rolling(machine) - run.twist) * machine.size)[settled]
+        assert off.max() < 0.05 * slip.max()
 
 
+@pytest.mark.slow
 def test_the_law_is_found_again():
-    fitted = WardIagnemma().fit([driven(FLOOR, k) for k in range(30)], ROBOTINO)
+    fitted = WardIagnemma().fit([driven(FLOOR, k) for k in range(20)], ROBOTINO)
     assert fitted.law.rise == pytest.approx(FLOOR.rise, rel=0.1)
     assert fitted.law.rolling == pytest.approx(FLOOR.rolling, rel=0.1)
     assert fitted.law.turning == pytest.approx(FLOOR.turning, rel=0.15)
     assert fitted.law.drag == pytest.approx(FLOOR.drag, rel=0.2)
     plain = replace(FLOOR, drag=0.0)
-    runs = [driven(plain, k) for k in range(30)]
+    runs = [driven(plain, k) for k in range(5)]
     assert WardIagnemma(with_drag=False).fit(runs, ROBOTINO).law.drag == 0.0
 
 
-def scattered(seed: int, gyro: bool = False, law: Law = FLOOR, noise: Noise | None = None) -> Run:
-    """A run as the filter believes in: rho, bias and twists scatter as its noise says."""
-    rng = np.random.default_rng(seed)
-    noise = noise or Noise(0.03, (0.003, 0.004, 0.002), 0.02, 0.03)
-    own = replace(law, rolling=law.rolling + noise.rolling * rng.normal())
-    rolling = straight(rng.uniform(-3, 3), 0.25, 60)
-    dynamics, dt = Dynamics.of(ROBOTINO, own), np.array([0.1])
-    q, twist = rolling[:1], np.zeros((60, 3))
+TRUE = Noise(0.03, (0.003, 0.004, 0.002), 0.02, 0.03)
+
+
+def scattered(count: int, gyro: bool, noise: Noise = TRUE) -> list[Run]:
+    """Runs as the filter believes in: rho, bias and twists scatter as its noise says."""
+    rng = np.random.default_rng(0)
+    dynamics, dt = Dynamics.of(ROBOTINO, FLOOR), np.full(count, 0.1)
+    rolling = np.stack([straight(angle, 0.25, 60) for angle in rng.uniform(-3, 3, count)])
+    rho = FLOOR.rolling + noise.rolling * rng.normal(size=count)
+    q, twist = rolling[:, 0], np.zeros((count, 60, 3))
     for k in range(60):
-        rim = rolling[k : k + 1] @ dynamics.rims.T
-        q = dynamics.step(q, np.array([own.rolling]), rim, dt).speeds
-        q = q + noise.drift * rng.normal(size=3) / np.sqrt(0.1)
-        twist[k] = q[0] / ROBOTINO.size
-    yaw = twist[:, 2] + noise.bias * rng.normal() + noise.gyro * 5**0.5 * rng.normal(size=60)
-    return made_run(rolling, twist, gyro=yaw if gyro else None)
+        q = dynamics.step(q, rho, rolling[:, k] @ dynamics.rims.T, dt).speeds
+        q = q + noise.drift * rng.normal(size=(count, 3)) / np.sqrt(0.1)
+        twist[:, k] = q / ROBOTINO.size
+    yaw = twist[:, :, 2] + noise.bias * rng.normal(size=(count, 1))
+    yaw = yaw + noise.gyro * np.sqrt(5) * rng.normal(size=(count, 60))
+    return [made_run(rolling[k], twist[k], gyro=yaw[k] if gyro else None) for k in range(count)]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gyro", [False, True])
 def test_nine_ends_of_ten_lie_in_their_regions(gyro):
-    noise = Noise(0.03, (0.003, 0.004, 0.002), 0.02, 0.03)
-    runs = [scattered(k, gyro) for k in range(400)]
-    method = WardIagnemma(law=FLOOR, noise=noise)
+    runs = scattered(400, gyro)
+    method = WardIagnemma(law=FLOOR, noise=TRUE)
     said = method.predict([run.heard for run in runs], ROBOTINO)
     off = np.array(
         [one.path[-1, :2] - run.pose[-1, :2] for one, run in zip(said, runs, strict=True)]
@@ -279,18 +291,16 @@ def test_nine_ends_of_ten_lie_in_their_regions(gyro):
 
 @pytest.mark.slow
 def test_the_gyro_makes_the_end_surer():
-    pairs = [(scattered(k, True).heard, scattered(k).heard) for k in range(3)]
     noise = Noise(0.03, (0.003, 0.004, 0.02), 0.001, 0.001)
     method = WardIagnemma(law=FLOOR, noise=noise)
-    for with_gyro, without in pairs:
-        sure, unsure = method.predict([with_gyro, without], ROBOTINO)
+    for run in scattered(3, True):
+        sure, unsure = method.predict([run.heard, replace(run.heard, gyro=None)], ROBOTINO)
         assert np.linalg.det(sure.end_covariance) < 0.2 * np.linalg.det(unsure.end_covariance)
 
 
 @pytest.mark.slow
 def test_noise_is_found_again():
-    true = Noise(0.03, (0.003, 0.004, 0.002), 0.02, 0.03)
-    fitted = WardIagnemma().fit([scattered(k, True) for k in range(40)], ROBOTINO).noise
+    true, fitted = TRUE, WardIagnemma().fit(scattered(40, True), ROBOTINO).noise
     assert fitted.bias == pytest.approx(true.bias, rel=0.3)
     assert fitted.gyro == pytest.approx(true.gyro, rel=0.15)
     # what of the drift goes along the motion is partly taken for resistance
@@ -329,7 +339,7 @@ def test_gain_and_offset_of_the_currents_are_found_again():
 
 def test_currents_tell_runs_that_resist_more():
     heavier = replace(FLOOR, rolling=0.25)
-    noise = Noise(rolling=0.05, force=0.5)
+    noise = Noise(rolling=0.05, drift=(1e-3, 1e-3, 1e-3), force=0.5)
     run = pulling(driven(heavier, 5), FLOOR, 1.0, 0.0)
     method = replace(WardIagnemma.with_current(), law=FLOOR, noise=noise)
     deaf = replace(method, needs=frozenset())
@@ -338,8 +348,9 @@ def test_currents_tell_runs_that_resist_more():
     assert off[0] < 0.3 * off[1]
 
 
+@pytest.mark.slow
 def test_the_noise_of_currents_is_that_of_the_means_of_runs():
-    """What is the same all along a run counts as much as it moves the run's mean."""
+    """What is the same all along a run counts as much as it moves the mean of a run's wheel."""
     rng = np.random.default_rng(1)
     runs = []
     for k in range(30):
@@ -347,7 +358,7 @@ def test_the_noise_of_currents_is_that_of_the_means_of_runs():
         runs.append(run)
     noise = WardIagnemma.with_current().fit(runs, ROBOTINO).noise
     counts = [np.isfinite(pulls(run.heard.windowed(), ROBOTINO)).sum() for run in runs]
-    assert noise.force == pytest.approx(np.sqrt(np.mean(counts)), rel=0.35)
+    assert noise.force == pytest.approx(np.sqrt(np.mean(counts) / 3), rel=0.35)
 
 
 def test_runs_do_not_tell_on_those_beside_them():
@@ -400,4 +411,7 @@ def test_settings_to_try_and_numbers_fitted():
         tried = one.candidates()
         assert len({repr(m) for m in tried}) == len(tried) <= TRIES
         assert {(m.name, m.needs) for m in tried} == {(one.name, one.needs)}
-    assert (method.numbers, replace(method, with_drag=False).numbers, heard.numbers) == (10, 9, 13)
+    assert (method.numbers, replace(method, with_drag=False).numbers, heard.numbers) == (8, 7, 11)
+    run = driven(FLOOR, 0)
+    run = replace(run, heard=replace(run.heard, gyro=run.twist[:, 2]))
+    assert method.fit([run], ROBOTINO).numbers == 10

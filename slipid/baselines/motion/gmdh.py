@@ -18,8 +18,9 @@ Liberties:
     - Halves A and B are runs drawn at random, of every floor alike; windows of one run are as good
       as copies of each other.
     - Ridge instead of plain least squares, inputs clipped to what was seen, outputs likewise.
-    - Windows count by size squared in the networks of slip; floors count alike in those of floors.
-    - Evidence on the floor is added up along the run and fades, since a run may cross floors.
+    - Slow windows count less in the networks of slip; floors count alike in those of floors.
+    - Evidence on the floor is added up along the run and fades, since a run may cross floors. What
+      is said of floors is from what is heard, also where the floor is told.
     - Twenty neurons of a layer are kept and inputs of earlier layers are not offered again.
 
 Source: Andrakhanov, Belyaev 2017, Navigation learning system for mobile robot in heterogeneous

@@ -21,7 +21,8 @@ Liberties:
       the robot measures, and the map of energy is relative to where and how a run starts, since no
       absolute place is given.
     - A direction is a unit vector with a turning part instead of a heading, and slip is a ratio.
-    - A few hundred windows drawn at random instead of all.
+    - A few hundred windows drawn at random instead of all, slow ones less often; inputs of the slip
+      are clipped to what was seen.
     - The covariance of the end, and its inflation, are ours; a millimetre is added each way.
     - Linear law by least squares weighted by max(|v|, 0.02)^2, which is least squares of power;
       then the process of what is left, with the length given, variances by marginal likelihood.

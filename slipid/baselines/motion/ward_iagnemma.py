@@ -132,18 +132,19 @@ class Noise:
     Attributes:
         rolling: standard deviation of rho between runs.
         drift: standard deviation of place and turn after a second [m], (ahead, left, turn times L).
-        gyro, bias: standard deviation of the gyro over a window, and between runs [rad/s].
+        gyro, bias: standard deviation of the gyro over a window, and between runs [rad/s]; the
+            former is nan where training had no gyro, and then none is heard.
         gain, offset: k, and f [N].
-        force: standard deviation of the force by a current over a window [N].
+        force: standard deviation of the force by a current over a window [N]; nan like that.
     """
 
     rolling: float = 0.01
     drift: tuple[float, float, float] = (0.01, 0.01, 0.01)
-    gyro: float = 0.01
-    bias: float = 0.01
+    gyro: float = np.nan
+    bias: float = 0.0
     gain: float = 1.0
     offset: float = 0.0
-    force: float = 1.0
+    force: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +170,7 @@ class Nearer:
     """Speeds nearer to the solution of a step, and whether they solve it."""
 
     speeds: Speeds
-    solved: Bool[np.ndarray, " run"]
+    done: Bool[np.ndarray, " run"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +246,7 @@ class Dynamics:
         solution, todo = speeds.copy(), np.arange(len(speeds))
         for _ in range(_MOST_STEPS):
             nearer = self._nearer(solution[todo], speeds[todo], rolling[todo], rim[todo], dt[todo])
-            solution[todo], todo = nearer.speeds, todo[~nearer.solved]
+            solution[todo], todo = nearer.speeds, todo[~nearer.done]
             if len(todo) == 0:
                 break
         at, wait = self.push(solution, rolling, rim), dt[:, None]
@@ -259,24 +260,24 @@ class Dynamics:
         nearer, that of the secants is taken instead: but for the turning axes, the forces have a
         potential that is concave in squares of speeds, on which the secants' step descends.
         """
-        wait = dt[:, None]
-
-        def towards(at: Push) -> Speeds:
-            matrix = np.eye(3) - wait[..., None] * at.slope
-            return q - np.linalg.solve(matrix, (q - start - wait * at.rate)[..., None])[..., 0]
-
-        def miss(of: Speeds, at: Push) -> Each:
-            return np.sqrt(((of - start - wait * at.rate) ** 2 / _OVER_MASS).sum(axis=1))
-
-        here = self.push(q, rolling, rim)
-        trial = towards(here)
-        missed = miss(trial, self.push(trial, rolling, rim))
-        solved = missed < _SOLVED
-        worse = ~solved & ~(missed < miss(q, here))
+        here, wait = self.push(q, rolling, rim), dt[:, None]
+        left = q - start - wait * here.rate
+        trial = q - solved(wait, here.slope, left)
+        left_there = trial - start - wait * self.push(trial, rolling, rim).rate
+        before, after = ((x**2 / _OVER_MASS).sum(axis=1) for x in (left, left_there))
+        done = after < _SOLVED**2
+        worse = ~done & ~(after < before)
         if worse.any():
-            safe = towards(self.push(q, rolling, rim, secant=True))
-            trial = np.where(worse[:, None], safe, trial)
-        return Nearer(trial, solved)
+            secants = self.push(q, rolling, rim, secant=True).slope
+            trial = np.where(worse[:, None], q - solved(wait, secants, left), trial)
+        return Nearer(trial, done)
+
+
+def solved(
+    wait: Float[np.ndarray, "run 1"], slope: Float[np.ndarray, "run 3 3"], right: Speeds
+) -> Speeds:
+    """What I - dt slope makes the right-hand side."""
+    return np.linalg.solve(np.eye(3) - wait[..., None] * slope, right[..., None])[..., 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,11 +339,11 @@ class State:
 
         Joseph's form, right for any gain: P - K h P - P h' K' + K s K' with s = h P h' + variance.
         """
-        heard = np.isfinite(news)
+        heard = np.isfinite(news + variance)
         if not heard.any():
             return self
         shared = (self.spread @ row[..., None])[..., 0]
-        size = ((shared * row).sum(axis=1) + variance)[:, None]
+        size = ((shared * row).sum(axis=1) + np.where(heard, variance, 1.0))[:, None]
         gain = shared / size * heard[:, None]
         gain[:, : of.start or 0] = 0.0
         gain[:, of.stop :] = 0.0
@@ -532,7 +533,7 @@ def fitted_law(windows: Windows, machine: Machine, with_drag: bool) -> Law:
         loss="soft_l1",
         f_scale=0.1,
         diff_step=1e-3,
-        max_nfev=8,
+        max_nfev=20,
     )
     return law(found.x)
 
@@ -645,5 +646,5 @@ class WardIagnemma(Method):
 
     @property
     def numbers(self) -> int:
-        law, left = 3 + self.with_drag, 4
-        return law + left + 3 * ("current" in self.needs)
+        heard = 2 * np.isfinite(self.noise.gyro) + 3 * ("current" in self.needs)
+        return 3 + self.with_drag + 4 + int(heard)

@@ -18,14 +18,15 @@ Nothing is tuned: gains are those of the robot's own pose loop set by hand.
 
 Liberties:
 
-- Gains are not those of the paper, which are of another robot; with the same ones as the row of the
-  encoders the two differ by the limit, and by the turn itself in place of its sine.
-- One factor for place and heading together, as slipid's notes on methods have it; whatever else the
-  paper gives first when not all can be had is left out.
-- The path waits for a robot that lags, as for all rows: it is what the paper's tracking of a path
-  too fast for the wheels has no need for.
-- Beyond three wheels nothing is chosen: speeds that no twist explains are never asked for.
-- Beside w_max the limits of all rows hold: body speed, acceleration of wheels, voltage.
+- Made from slipid's notes on methods; the paper's own text was not compared, and what else it has
+  for wheels at their limit, beside one factor for place and heading together, is left out.
+- Gains are not those of a paper. With the same ones the row of the encoders differs by the limit,
+  which all rows have once more after it, and by the sine of the turn: where no wheel is at its
+  limit the two are nearly the same.
+- w_max is the limit of all rows, whatever the robot's own is.
+- The path waits for a robot that lags, and limits of body speed, acceleration of wheels and voltage
+  hold beside w_max, as for all rows.
+- It is steered from the pose that the encoders believe in.
 
 Source: Indiveri 2009, "Swedish wheeled omnidirectional mobile robots: kinematics analysis and
 control", IEEE T-RO 25(1), and Gfrerrer 2008, as slipid's notes on methods have them (1 and 8).

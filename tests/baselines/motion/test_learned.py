@@ -31,12 +31,17 @@ def slipping(angle, ratio, speed=0.2, steps=40, **heard) -> Run:
 
 def test_inputs_of_a_window_are_those_of_its_motion():
     amps = np.tile([-1.0, 2.0, 3.0], (40, 1))
-    run = made_run(straight(0.4), current=amps, gyro=np.full(40, 0.3))
+    rolling = straight(0.4) * [0.8, 0.8, 1.0] + np.array([0.0, 0.0, 0.96])
+    run = made_run(rolling, current=amps, gyro=np.full(40, 0.3))
     windows = Windows.of([run.heard], ROBOTINO)
     inputs = windows.inputs(ROBOTINO, common([run]))
-    vx, vy = 0.2 * np.cos(0.4), 0.2 * np.sin(0.4)
-    expected = [vx, vy, 0.0, *run.heard.speed[0], np.cos(0.4), np.sin(0.4), 0.0]
-    expected += [np.cos(0.8), np.sin(0.8), 1.0, 2.0, 3.0, vx, vy, 0.0, 0.3, 0.3 * 0.125 / 0.2]
+    # 0.16 m/s ahead and 0.12 m/s of turning make a size of 0.2 m/s
+    twist = [0.16 * np.cos(0.4), 0.16 * np.sin(0.4), 0.96]
+    direction = [0.8 * np.cos(0.4), 0.8 * np.sin(0.4), 0.6]
+    harmonic = [0.64 * np.cos(0.8), 0.64 * np.sin(0.8)]
+    gyro = [0.3, (0.3 - 0.96) * 0.125 / 0.2]
+    parts = (twist, run.heard.speed[0], direction, harmonic, [1.0, 2.0, 3.0], twist, gyro)
+    expected = np.concatenate(parts)
     assert inputs.shape == (8, len(expected))
     assert np.allclose(inputs, expected)
 
@@ -118,12 +123,17 @@ def test_boosted_trees_come_as_near_to_two_levels_as_their_rate_lets_them():
     for of_run, run, ratio in zip(said, (there, back), (-0.2, 0.4), strict=True):
         speed = run.heard.rolling(ROBOTINO)[0, 0] + 0.2 * (ratio * (1 - left) + 0.1 * left)
         assert of_run.path[-1, 0] == pytest.approx(speed * 4.0, rel=1e-6)
+    # four leaves and three thresholds of twenty trees for each component
+    assert method.numbers == 3 * 20 * 7
+    few = method.fit([there], ROBOTINO)
+    assert few.windows == 8
+    assert few.numbers == 3 * 20
 
 
 def test_trees_heed_windows_in_proportion_to_their_weight():
     # at a tenth of the usual speed slip is another; it counts 0.05 as much
     fast, slow = slipping(0.0, [-0.1, 0.0, 0.0]), slipping(0.0, [0.5, 0.0, 0.0], 0.025)
-    stump = BoostedTrees(boosting=Boosting(0.1, 2, 0 + 1))
+    stump = BoostedTrees(boosting=Boosting(0.1, 2, 1))
     method = stump.fit([fast] * 30 + [slow] * 20, ROBOTINO)
     assert 0.6 * 50 * 8 < method.windows < 0.65 * 50 * 8
 

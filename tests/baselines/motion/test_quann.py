@@ -13,7 +13,9 @@ from slipid.baselines.motion.quann import (
     QuannEnergy,
     QuannSlip,
     end_spread,
+    end_squares,
     parts,
+    places,
     slip_inputs,
 )
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
@@ -144,6 +146,25 @@ def test_covariances_of_ends_are_as_large_as_errors_of_new_runs():
     assert np.mean(np.array(square) < 4.605) == pytest.approx(0.9, abs=0.07)
 
 
+def test_a_covariance_is_that_of_the_slip_in_metres_and_radians():
+    runs = [slipping(angle, k, scatter=0.1) for k, angle in enumerate(np.linspace(0, 6.2, 16))]
+    method = QuannSlip().fit(runs, ROBOTINO)
+    new = slipping(1.0, 77).heard
+    (said,) = method.predict([new], ROBOTINO)
+    inputs = slip_inputs(Windows.of([new], ROBOTINO), ROBOTINO)
+    std = method.process.predict(method.scale.scaled(inputs)).std[0] * 0.2 / SIZES
+    spread = end_spread(said.path, np.tile(std, (40, 1)), new.dt)
+    assert np.allclose(said.end_covariance, method.inflation * spread + 1e-6 * np.eye(2))
+
+
+def test_inflation_is_from_runs_that_the_process_does_not_know():
+    # every run is alone in its direction, so that the process learns its own slip by heart
+    runs = [slipping(angle, k, scatter=0.1) for k, angle in enumerate(np.linspace(0, 6.2, 16))]
+    method = QuannSlip().fit(runs, ROBOTINO)
+    by_heart = end_squares(replace(method, inflation=1.0), runs, ROBOTINO).mean()
+    assert method.inflation > 5 * by_heart
+
+
 def test_every_run_is_in_one_part():
     numbers = np.array([3, 5, 8, 9, 11, 12])
     dealt = parts(numbers)
@@ -199,6 +220,25 @@ def test_a_law_of_energy_is_found_and_predicts_power_without_currents():
         assert np.allclose(said.path, path_of(new.rolling(ROBOTINO), new.dt))
     (rest,) = method.predict([made_run(np.zeros((40, 3))).heard], ROBOTINO)
     assert rest.power == pytest.approx(np.full(40, 20.0 * 0.02), rel=0.05)
+
+
+def test_a_law_leaves_the_least_squares_of_power():
+    factors = np.random.default_rng(6).uniform(0.5, 1.5, 40)
+    runs = [drawing(moving(seed), factor) for seed, factor in enumerate(factors)]
+    method = QuannEnergy().fit(runs, ROBOTINO)
+    windows = Windows.of([run.heard for run in runs], ROBOTINO)
+    power = np.concatenate([run.power(ROBOTINO) for run in windows.heard])
+    speed = np.hypot(windows.rolling[:, 0], windows.rolling[:, 1])
+    terms = np.stack([speed**0, speed, speed**2, np.abs(windows.rolling[:, 2])], axis=1)
+    terms = terms * np.maximum(speed, 0.02)[:, None]
+    assert np.allclose(terms.T @ (power - terms @ method.law), 0.0, atol=1e-6)
+
+
+def test_places_are_in_the_middle_of_windows_and_seen_from_the_start():
+    runs = [made_run(straight(0.0)).heard, made_run(straight(np.pi / 2)).heard]
+    found = places(Windows.of(runs, ROBOTINO), ROBOTINO)
+    assert np.allclose(found[:2], [[0.05, 0.0], [0.15, 0.0]])
+    assert np.allclose(found[8:10], [[0.0, 0.05], [0.0, 0.15]])
 
 
 def test_beyond_the_speeds_seen_energy_is_that_of_the_fastest():

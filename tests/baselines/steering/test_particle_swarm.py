@@ -32,7 +32,7 @@ def test_the_minimum_of_rosenbrocks_valley_is_found(seed):
 
 
 def test_a_minimum_on_the_edge_is_found_there():
-    found = minimise(lambda x: x[:, 0] - x[:, 1] + x[:, 2], LOW, HIGH, Swarm())
+    found = minimise(slope, LOW, HIGH, Swarm())
     np.testing.assert_array_equal(found.place, [-2.0, 3.0, 0.0])
 
 
@@ -66,19 +66,24 @@ def test_the_same_seed_finds_the_same_and_another_one_another():
     assert not np.array_equal(one, other)
 
 
-def test_particles_move_as_the_formula_says():
+def slope(x):
+    return x[:, 0] - x[:, 1] + x[:, 2]
+
+
+@pytest.mark.parametrize("cost_of", [sphere, slope])  # inside, and along the edges of the box
+def test_particles_move_as_the_formula_says(cost_of):
     """Written out particle by particle and coordinate by coordinate, with the same draws."""
     swarm = Swarm(particles=4, iterations=6, inertia=0.6, own=1.2, others=1.7)
     seen = []
 
     def cost(x):
         seen.append(x.copy())
-        return sphere(x)
+        return cost_of(x)
 
     minimise(cost, LOW, HIGH, swarm, 11)
     rng = np.random.default_rng(11)
     x, v = rng.uniform(LOW, HIGH, (4, 3)), np.zeros((4, 3))
-    best = [(float(c), tuple(p)) for c, p in zip(sphere(x), x, strict=True)]
+    best = [(float(c), tuple(p)) for c, p in zip(cost_of(x), x, strict=True)]
     np.testing.assert_array_equal(seen[0], x)
     for step in range(6):
         one, two = rng.uniform(size=(2, 4, 3))
@@ -93,5 +98,5 @@ def test_particles_move_as_the_formula_says():
                 v[k, j] = speed if place == x[k, j] + speed else 0.0
                 x[k, j] = place
         np.testing.assert_allclose(seen[step + 1], x, rtol=1e-12)
-        for k, c in enumerate(sphere(x)):
+        for k, c in enumerate(cost_of(x)):
             best[k] = min(best[k], (float(c), tuple(x[k])))
