@@ -101,7 +101,7 @@ def _one(
     closes, off = row["closure_error_median"], row["heading_error_deg"]
     done = f"{100 * row['finished_share']:.0f} % finish"
     title = f"{name}: {closes:.0f} mm, {off:.0f} deg off, {done}"
-    about = "\n".join(wrap(content["controllers"][name], 60))
+    about = "\n".join(wrap(content["controllers"][name], 44))
     axes.set_title(f"{title}\n{about}", fontsize=8, loc="left")
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
     axes.tick_params(labelsize=7)

@@ -84,7 +84,7 @@ _OVER_MASS = np.array([1.0, 1.0, 2.0])
 """m / M: what a force over the mass accelerates; the inertia is m L^2 / 2."""
 _STEADY = 10.0
 """Time after which speeds are taken for steady [s]."""
-_MOST_STEPS = 40
+_MOST_STEPS = 25
 """Newton steps after which an equation that is still not solved is left as it is."""
 _SOLVED = 1e-7
 """Residual at which an equation counts as solved [m/s]."""
@@ -534,6 +534,8 @@ def fitted_law(windows: Windows, machine: Machine, with_drag: bool) -> Law:
         f_scale=0.1,
         diff_step=1e-3,
         max_nfev=20,
+        ftol=1e-4,
+        xtol=1e-3,
     )
     return law(found.x)
 

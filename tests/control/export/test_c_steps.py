@@ -41,7 +41,7 @@ def batches(row: str) -> list[Batch]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("row", ["contact_ahead", "torque"])
+@pytest.mark.parametrize("row", ["contact_ahead", "torque", "indiveri"])
 def test_a_step_is_that_of_jax(row, tmp_path):
     compiled = CompiledC(code(row), tmp_path)
     found = [differences(compiled, batch) for batch in batches(row)]
