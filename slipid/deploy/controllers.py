@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,7 +23,7 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator, Odometry
 from slipid.control.filter.floor import Floor
 from slipid.control.interface import AbstractEstimator, Settings
-from slipid.control.trajectory import rectangle
+from slipid.control.trajectory import STEP, rectangle
 from slipid.control.tuning.actuation import Habits
 from slipid.support.errors import DataError
 
@@ -90,8 +89,9 @@ def _rehearsed(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
     The ideal robot is late as every robot's twin is, so that gains are the same for all of them.
     """
     path, habits = rectangle(), Habits()
-    times = jnp.arange(0.0, float(path.marks[1]), PERIOD)
-    reference = np.asarray(jax.vmap(path.at)(times))
+    times, rows = np.arange(0.0, float(path.marks[1]), PERIOD), np.asarray(path.rows)
+    own = STEP * np.arange(len(rows))
+    reference = np.stack([np.interp(times, own, column) for column in rows.T], axis=1)
     task = Rehearsal(reference, np.array(BESIDE), habits.held(), habits.follow, PERIOD)
     return tuple((by_swarm(task) if by == "swarm" else by_gradient(task)).tolist())
 

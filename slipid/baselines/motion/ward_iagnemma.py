@@ -450,7 +450,7 @@ class Filter:
 
 
 def pulls(run: Heard, machine: Machine) -> Float[np.ndarray, "step drive"]:
-    """N C_e I / r of each drive along its wheels' motion [N]; nan where it tells nothing."""
+    """Force n C_e I / r along each drive's motion [N]; nan where it tells nothing."""
     rim = np.abs(run.speed * machine.wheel_radius)
     if run.current is None:
         return np.full(rim.shape, np.nan)

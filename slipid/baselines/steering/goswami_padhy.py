@@ -133,7 +133,8 @@ class Rehearsal:
             total += lyapunov(e)
             ring[1:] = ring[:-1]
             ring[0] = twist(k, e, Plane(*row[3:]), here.yaw)
-            for arrived in np.tensordot(self.shares, ring, 1):
+            arrives = self.shares @ ring.reshape(len(ring), -1)
+            for arrived in arrives.reshape(-1, *pose.shape):
                 goes = goes + self.follow * (arrived - goes)
                 pose = _moved(pose, goes, h)
         return self.period * total.mean(axis=1)
