@@ -254,9 +254,11 @@ class Method(abc.ABC):
 
 @dataclass(frozen=True)
 class ByFloor(Method):
-    """A method fitted floor by floor, and once to all floors together for runs of unknown floors.
+    """A method fitted floor by floor where floors are told, else once to all runs together.
 
-    A floor that was not seen counts as unknown.
+    Attributes:
+        method: unfitted.
+        fitted: to the runs on each floor, by its name; under None to runs whose floor was not told.
     """
 
     method: Method
@@ -270,24 +272,26 @@ class ByFloor(Method):
         return [replace(self, method=method) for method in self.method.candidates()]
 
     def fit(self, runs: Sequence[Run], machine: Machine) -> "ByFloor":
-        fitted: dict[str | None, Method] = {}
-        for floor in dict.fromkeys(run.floor for run in runs):
-            fitted[floor] = self.method.fit([run for run in runs if run.floor == floor], machine)
-        fitted[None] = self.method.fit(runs, machine) if len(fitted) > 1 else fitted[runs[0].floor]
+        floors: dict[str | None, list[Run]] = {}
+        for run in runs:
+            floors.setdefault(run.heard.floor, []).append(run)
+        fitted = {name: self.method.fit(mine, machine) for name, mine in floors.items()}
         return replace(self, fitted=fitted)
 
     def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
-        key = [run.floor if run.floor in self.fitted else None for run in runs]
         said: dict[int, Said] = {}
-        for floor in dict.fromkeys(key):
-            mine = [k for k, name in enumerate(key) if name == floor]
+        for floor in dict.fromkeys(run.floor for run in runs):
+            mine = [k for k, run in enumerate(runs) if run.floor == floor]
+            if floor not in self.fitted:
+                known = ", ".join(map(str, self.fitted))
+                raise ValueError(f"{self.name}: no floor '{floor}'; fitted: {known}")
             of_floor = self.fitted[floor].predict([runs[k] for k in mine], machine)
             said.update(zip(mine, of_floor, strict=True))
         return [said[k] for k in range(len(runs))]
 
     @property
     def numbers(self) -> int:
-        return sum(method.numbers for method in {id(m): m for m in self.fitted.values()}.values())
+        return sum(method.numbers for method in self.fitted.values())
 
 
 def groups(dt: Float[np.ndarray, " step"], seconds: float) -> np.ndarray:

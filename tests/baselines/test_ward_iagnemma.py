@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import check_grad
 from scipy.stats import chi2
 
-from slipid.baselines.interface import TRIES, ByFloor, Run, body_increments
+from slipid.baselines.interface import TRIES, ByFloor, Run, body_increments, path_of
 from slipid.baselines.motion.ward_iagnemma import (
     GRAVITY,
     REST,
@@ -370,6 +370,34 @@ def test_runs_do_not_tell_on_those_beside_them():
     assert both.end_covariance == pytest.approx(alone.end_covariance, rel=1e-4)
 
 
+def test_the_spread_of_the_end_is_that_of_paths_with_other_twists():
+    """Turning fast: by differences of the end with noise in the twist of each of two steps."""
+    noise = Noise(rolling=0.0, drift=(0.01, 0.02, 0.03))
+    heard = made_run(np.tile([0.3, -0.2, 2.0], (2, 1)), dt=0.2).heard
+    dynamics = Dynamics.of(ROBOTINO, FLOOR)
+    own = Filter(dynamics, noise, 10.0, hears_current=False, wander=0.0)
+    runs = Padded.of([heard], ROBOTINO)
+
+    def end(shaken):
+        q, twist = runs.rolling[:, 0], np.zeros((2, 3))
+        for k in range(2):
+            rho = np.array([FLOOR.rolling])
+            q = dynamics.step(q, rho, runs.rim[:, k], heard.dt[:1]).speeds + shaken[k]
+            twist[k] = q[0] / ROBOTINO.size
+        return path_of(twist, heard.dt)[-1]
+
+    spread = np.zeros((3, 3))
+    for k in range(2):
+        for axis in range(3):
+            shaken = np.zeros((2, 3))
+            shaken[k, axis] = 1e-4
+            by = (end(shaken) - end(-shaken)) / 2e-4
+            spread += np.outer(by, by) * noise.drift[axis] ** 2 / 0.2
+    told = own.track(runs).covariance[0]
+    scale = np.sqrt(np.outer(spread.diagonal(), spread.diagonal()))
+    assert told / scale == pytest.approx(spread / scale, abs=0.002)
+
+
 def test_rho_that_wanders_makes_the_end_less_sure():
     heard = made_run(straight(0.2)).heard
     noise = Noise(0.02, (1e-4, 1e-4, 1e-4))
@@ -388,7 +416,7 @@ def test_rho_that_wanders_makes_the_end_less_sure():
 def test_a_skid_steer_that_turns_with_a_gyro_and_by_floor():
     runs = [driven(FLOOR, k, HUSKY) for k in range(8)]
     heard = [replace(r.heard, gyro=r.twist[:, 2]) for r in runs]
-    runs = [replace(r, heard=h, floor="grass") for r, h in zip(runs, heard, strict=True)]
+    runs = [replace(r, heard=h) for r, h in zip(runs, heard, strict=True)]
     fitted = ByFloor.of(WardIagnemma()).fit(runs, HUSKY)
     for run, said in zip(runs, fitted.predict(heard, HUSKY), strict=True):
         assert said.path[-1, 2] == pytest.approx(run.pose[-1, 2], abs=0.02)

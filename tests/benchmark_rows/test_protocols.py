@@ -142,7 +142,7 @@ def test_a_setting_that_fails_is_not_picked():
     assert tuned(Stubborn(), runs(slip=0.5)[18:], ROBOTINO, "headings").settings == "factor = 0.85"
 
 
-def test_a_method_by_floor_takes_the_pooled_one_where_nothing_is_told():
+def test_a_method_by_floor_has_one_fit_for_all_where_nothing_is_told():
     @dataclass(frozen=True)
     class Mean(Scaled):
         def fit(self, runs, machine: Machine):
@@ -150,13 +150,16 @@ def test_a_method_by_floor_takes_the_pooled_one_where_nothing_is_told():
             size = np.mean([(r.heard.rolling(machine)[0, :2] ** 2).sum() for r in runs])
             return replace(self, factor=float(slip / size))
 
-    method = ByFloor.of(Mean()).fit(runs(slip=0.5), ROBOTINO)
+    told = ByFloor.of(Mean()).fit(runs(slip=0.5), ROBOTINO)
+    untold = ByFloor.of(Mean()).fit([run.told(False) for run in runs(slip=0.5)], ROBOTINO)
     way = made_run(straight(0.1), name="new")
 
-    def far(floor):
+    def far(method, floor):
         heard = replace(way.heard, floor=floor)
         return method.predict([heard], ROBOTINO)[0].path[-1, 0] / way.pose[-1, 0]
 
-    assert far("gray") == pytest.approx(1.0)
-    assert far("green") == pytest.approx(0.5)
-    assert far(None) == far("ice") == pytest.approx(0.75)
+    assert far(told, "gray") == pytest.approx(1.0)
+    assert far(told, "green") == pytest.approx(0.5)
+    assert far(untold, None) == pytest.approx(0.75)
+    with pytest.raises(ValueError, match="scaled: no floor 'ice'; fitted: gray, green"):
+        far(told, "ice")

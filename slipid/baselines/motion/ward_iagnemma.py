@@ -439,13 +439,19 @@ class Filter:
 
     def _travelled(self, state: State, heading: Each, dt: Each) -> State:
         """A step added to the error of the pose; the heading is that in its middle."""
-        c, s, x, y = np.cos(heading), np.sin(heading), state.mean[:, 0], state.mean[:, 1]
-        across = np.stack([-s * x - c * y, c * x - s * y], axis=1)
+        radius = self.dynamics.base_radius
+        turning = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        aside = turning[:, ::-1] * [-1.0, 1.0]
+        x, y, yaw = state.mean[:, 0:1], state.mean[:, 1:2], state.mean[:, 2:3] / radius
+        along, across = x * turning + y * aside, x * aside - y * turning
+        # the chord of the step's arc, as of `path_of`, and how it shortens with the turn
+        wait = dt[:, None]
+        reach, less = np.sinc(yaw * wait / (2 * np.pi)) * wait, yaw * wait**3 / 12
         by = np.tile(np.eye(8), (len(dt), 1, 1))
-        by[:, 5, 0], by[:, 5, 1], by[:, 6, 0], by[:, 6, 1] = c * dt, -s * dt, s * dt, c * dt
-        by[:, 5:7, 2] = across * (0.5 * dt**2 / self.dynamics.base_radius)[:, None]
-        by[:, 7, 2] = dt / self.dynamics.base_radius
-        by[:, 5:7, 7] = across * dt[:, None]
+        by[:, 5:7, 0], by[:, 5:7, 1] = turning * reach, aside * reach
+        by[:, 5:7, 2] = (0.5 * wait * reach * across - less * along) / radius
+        by[:, 7, 2] = dt / radius
+        by[:, 5:7, 7] = across * reach
         return state.moved(state.mean, by)
 
 

@@ -176,10 +176,12 @@ def test_instantaneous_centres_come_back_where_sides_differ(rng):
 
 def test_kinematics_are_counted_by_floor(rng):
     grass = skid_runs(rng, one_track)
-    ice = [replace(run, floor="ice") for run in grass]
+    ice = [replace(run, floor="ice").told(True) for run in grass]
     for method, numbers in ((EffectiveTrack(), 3), (InstantaneousCentres(), 5)):
         assert method.fit(grass, HUSKY).numbers == numbers
-        assert ByFloor.of(method).fit(grass + ice, HUSKY).numbers == 3 * numbers
+        assert ByFloor.of(method).fit(grass + ice, HUSKY).numbers == 2 * numbers
+        untold = [run.told(False) for run in grass + ice]
+        assert ByFloor.of(method).fit(untold, HUSKY).numbers == numbers
         assert method.needs == frozenset()
         with pytest.raises(ValueError, match="not fitted"):
             method.predict([grass[0].heard], HUSKY)

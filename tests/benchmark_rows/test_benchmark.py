@@ -1,0 +1,88 @@
+"""The command on the recorded runs of the test site: one table, kept work, rows that fail."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from slipid.benchmark import work as benchmark_work
+from slipid.benchmark.benchmark import benchmark
+from slipid.benchmark.row import Row
+from slipid.benchmark.work import Piece, Wish, split_of
+from slipid.cli.main import app
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
+
+
+def kept(folder: Path) -> dict[str, int]:
+    return {p.name: p.stat().st_mtime_ns for p in folder.rglob("known_floor_*.json")}
+
+
+@pytest.mark.slow  # compiles a fit
+def test_one_command_makes_a_table_and_goes_on_from_what_was_kept(tmp_path, monkeypatch):
+    data, out = tmp_path / "data", tmp_path / "out"
+    data.mkdir()
+    asked = ["benchmark", "--data", str(data), "--out", str(out), "--quick", "--quiet"]
+    rows = ["--rows", "slipid,encoder,ojeda_gyro"]
+    done = CliRunner().invoke(app, [*asked, *rows, "--json", str(tmp_path / "x.json")])
+    assert done.exit_code == 0, done.output
+    found = json.loads((tmp_path / "x.json").read_text())
+    assert found == json.loads((out / "benchmark.json").read_text())
+    table = found["sets"]["testsite"]["protocols"]["known_floor"]
+    assert list(table) == ["slipid", "encoder", "ojeda_gyro"]
+    assert table["slipid"]["endpoint_error"][0] < 0.3 * table["encoder"]["endpoint_error"][0]
+    assert table["encoder"]["behind"][1] > 0
+    assert table["slipid"]["coverage90"][0] > 0.7
+    assert table["slipid"]["slip_auc"][0] > 0.9
+    assert table["ojeda_gyro"]["absent"] == "needs a gyro"
+    assert "needs a gyro" in done.output
+    page = (out / "benchmark.html").read_text()
+    assert "ojeda_gyro: needs a gyro" in page
+    assert "data:image/png;base64," in page
+
+    before = kept(out)
+    next(out.rglob("known_floor_encoder.json")).unlink()
+    again = CliRunner().invoke(app, [*asked, *rows])
+    assert again.exit_code == 0
+    after = kept(out)
+    assert {name for name in after if after[name] != before[name]} == {"known_floor_encoder.json"}
+
+    # in this process, where a row can be broken; the fit is kept
+    piece = Piece(Wish(data, out, ("encoder", "paper_code"), quick=True), "testsite", "headings", 0)
+    next(out.rglob("known_floor_encoder.json")).unlink()
+
+    def broken(*_: object) -> list:
+        raise ZeroDivisionError("a wheel of size 0")
+
+    monkeypatch.setattr("slipid.baselines.motion.encoder.Encoder.predict", broken)
+    assert piece.run() == "testsite/headings_0"
+    left = {name: row for (_, name), row in piece.rows().items()}
+    assert left["encoder"] == Row(absent="ZeroDivisionError: a wheel of size 0", failed=True)
+    assert len(left["paper_code"].runs) == len(split_of(piece).judged)
+
+
+def test_an_unknown_row_is_named_with_the_choices(tmp_path):
+    with pytest.raises(DataError, match=r"no row 'encodr'.*did you mean.*encoder"):
+        benchmark(Wish(tmp_path, tmp_path / "out", ("encodr",)), 1, Reporter(quiet=True))
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    asked = ["benchmark", "--data", str(tmp_path / "gone"), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, asked)
+    assert done.exit_code == 2
+    assert "gone: no such folder" in done.output
+
+
+def test_a_split_that_cannot_be_read_fails_alone(tmp_path, monkeypatch):
+    (tmp_path / "x").mkdir()
+    piece = Piece(Wish(tmp_path / "x", tmp_path / "out", ("encoder",)), "testsite", "headings", 0)
+
+    def broken(_: object) -> None:
+        raise OSError("disk on fire")
+
+    monkeypatch.setattr(benchmark_work, "_scene", broken)
+    piece.run()
+    rows = piece.rows()
+    assert {protocol for protocol, _ in rows} == {"known_floor", "unknown_floor"}
+    assert all(row.failed and "disk on fire" in row.absent for row in rows.values())
