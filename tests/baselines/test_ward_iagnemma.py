@@ -329,6 +329,7 @@ def test_the_force_of_a_current_is_that_of_gear_motor_and_wheel():
     assert np.isnan(pulls(replace(heard, current=None), ROBOTINO)).all()
 
 
+@pytest.mark.slow
 def test_gain_and_offset_of_the_currents_are_found_again():
     runs = [pulling(driven(FLOOR, k), FLOOR, 1.3, 2.0) for k in range(20)]
     fitted = WardIagnemma.with_current().fit(runs, ROBOTINO)

@@ -5,7 +5,7 @@ says after each row how probable every floor is. It may use what came before, an
 """
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Self
 
@@ -115,6 +115,27 @@ class FloorMethod(abc.ABC):
 def floors_of(felts: Sequence[Felt]) -> tuple[str, ...]:
     """Names of the floors that runs were driven on, sorted."""
     return tuple(sorted({felt.floor for felt in felts}))
+
+
+def rows_of(
+    felts: Sequence[Felt],
+    piece_s: float,
+    features: Callable[[Felt], Float[np.ndarray, "row feature"]],
+    every_s: float = 0.0,
+) -> tuple[Float[np.ndarray, "row feature"], np.ndarray]:
+    """Features to train on and the floor of each row, of rows in which the robot moves.
+
+    Runs are cut into pieces of `piece_s` [s], each of them heard anew; rows that are taken are
+    about `every_s` [s] apart.
+    """
+    found, floors = [], []
+    for felt in felts:
+        every = max(1, round(every_s / max(float(np.median(felt.dt)), 1e-3)))
+        for piece in felt.pieces(piece_s):
+            take = np.flatnonzero(piece.moves)[::every]
+            found.append(features(piece)[take])
+            floors += [felt.floor] * len(take)
+    return np.concatenate(found), np.array(floors)
 
 
 def accumulated(

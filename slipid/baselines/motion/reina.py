@@ -19,10 +19,10 @@ smoothed; of the fuzzy row the number of fuzzy sets instead of the quantile.
 Liberties:
 - The original only detects. Here the path is that of the encoders, its twist scaled by 1 - s where
   slip is flagged, s the mean slip of what was flagged in training windows (least squares).
-- The original sets thresholds by hand from runs on hard ground. Here they are quantiles over the
-  training windows without slip (I_lo: the median); where all slip, the smallest value seen.
+- Thresholds are quantiles over the training windows without slip (I_lo: the median); where all
+  slip, the smallest value seen.
 - Where there is no gyro, EI >= 1 takes the place of GI >= 1.
-- The original compares a rover's six wheels with each other. An omni robot's wheels turn at
+- The original compares the wheels of a rover with each other. An omni robot's wheels turn at
   different speeds, so they are compared with the shape of the commanded twist; what a slow wheel
   is off is divided by 0.3 of the fastest reference instead of its own. Three omni wheels fit any
   twist exactly: then EI tells how wheels follow their command, not whether they slip, and without
@@ -30,7 +30,7 @@ Liberties:
 - The smallest current is taken over wheels that turn with at least 0.3 of the fastest rim speed;
   the others carry no load that could tell of slip.
 - Fuzzy sets are triangles, every combination of sets has a rule, and consequents are constants
-  that are trained; the original's rules and sets were set by hand.
+  that are trained on poses; the original's own sets and rules are not taken over.
 - The score is the larger of the uncut indicators that flag, or the fuzzy answer; 0 at rest.
 - The original also sees by a camera how deep its wheels have sunk; that is left out.
 

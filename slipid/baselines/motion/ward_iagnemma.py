@@ -29,8 +29,8 @@ whether rho wanders within a run, by half its scatter between runs in a second.
 Liberties:
 - The original measures acceleration and, where there is one, GPS; neither is logged here. It has
   one axis of travel and pitch; here the body moves in a plane, and the ground is level.
-- The original's resistive force is a state with a fitted prior that rises with speed; here its
-  coefficient is the state. It fades out within v_s = 2 cm/s of rest.
+- The state is the coefficient of the resistive force, not the force. The force fades out within
+  v_s = 2 cm/s of rest, and may grow with speed (c); turning has a coefficient of its own.
 - The original takes parameters from experiments and shows that their values matter little; here
   they are fitted. At steady speed motion tells forces only in ratio to C1, so C1 = 0.6 throughout;
   C2 = 0.1 s/m, which windows cannot tell from the end of the exponential. A weak prior holds the

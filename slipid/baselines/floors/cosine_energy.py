@@ -1,0 +1,148 @@
+"""Belyaev and Kushnarev 2025: the floor by what driving costs in the direction of travel.
+
+Over the last half second let P be the electric power, (v_x, v_y, W) the twist that the encoders
+tell, and
+
+    u = sqrt(v_x^2 + v_y^2 + (L W)^2),     phi = direction of (v_x, v_y)
+    e = P / (m g u)                                       energy coefficient (cost of transport)
+    e ~ a_0 + sum_k a_k cos(k phi) + b_k sin(k phi)       of each floor, k = 1, 2, 3, ..
+    log p_t = exp(-dt / memory) log p_{t-1} + (dt / apart) log N(e_t; series(phi_t), s^2) + const
+
+s is the std that a floor's series leaves. Wheels that do not drive sideways have no direction of
+travel; phi is then the angle of (v_x, L W): 0 is straight ahead, a right angle turning on the spot.
+Tuned by cross-validation: how many harmonics there are, and whether e counts as it is or by its
+logarithm.
+
+Liberties
+- The paper was known here by its abstract and headings: an energy coefficient of motor current and
+  velocity, its dependency on the direction of motion by a discrete cosine transform, a filter of
+  the data, a probabilistic classifier with memory. The equations above are this file's.
+- A transform of evenly spread directions needs such runs; here the same series is fitted by least
+  squares with a ridge, so that any directions do. Sines are among its terms, for a robot that is
+  no mirror image of itself.
+- The filter of the data is a mean over half a second.
+- Memory is that of `accumulated`: what was heard fades.
+- Its detector of floors that nobody has seen, a neural network, and their identification while
+  driving have no part in this comparison.
+- Currents without a sign, and resistance and back-EMF as the robot's config has them.
+
+Source: Belyaev and Kushnarev 2025, Robotics 14(9), 130, sections 2.1 to 2.3.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.baselines.floors.features import Window
+from slipid.baselines.floors.interface import (
+    Beliefs,
+    Felt,
+    FloorMethod,
+    accumulated,
+    floors_of,
+    rows_of,
+)
+from slipid.baselines.interface import Machine
+
+GRAVITY = 9.81
+"""[m/s^2]"""
+SLOW = 0.02
+"""Speed below which no direction is told [m/s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """A cosine series of each floor.
+
+    Attributes:
+        weight: of the constant, and of cosine and sine of each harmonic in turn.
+        std: that is left.
+    """
+
+    weight: Float[np.ndarray, "floor term"]
+    std: Float[np.ndarray, " floor"]
+
+
+@dataclass(frozen=True)
+class CosineEnergy(FloorMethod):
+    """Energy coefficient as a cosine series in the direction of travel, and a Gaussian about it.
+
+    Attributes:
+        harmonics: how many.
+        logarithm: whether the coefficient's logarithm is modelled.
+        ridge: on all but the constant, as so many rows that say zero.
+        window_s: length of the mean; apart_s, memory_s: as of `accumulated` [s].
+        fitted: the series; None before.
+    """
+
+    name: str = "belyaev_kushnarev"
+    harmonics: int = 3
+    logarithm: bool = False
+    ridge: float = 10.0
+    window_s: float = 0.5
+    apart_s: float = 0.5
+    memory_s: float = 20.0
+    fitted: Series | None = field(default=None, repr=False)
+
+    def candidates(self) -> Sequence["CosineEnergy"]:
+        pairs = [(3, False), (6, False), (3, True), (6, True)]
+        return [replace(self, harmonics=count, logarithm=log) for count, log in pairs]
+
+    def fit(self, felts: Sequence[Felt], machine: Machine) -> "CosineEnergy":
+        labels, pieces = floors_of(felts), 8.0
+        rows, floor = rows_of(felts, pieces, lambda felt: self._seen(felt, machine))
+        known = np.isfinite(rows).all(axis=1)
+        fitted = [self._series(rows[known & (floor == name)]) for name in labels]
+        weight = np.stack([one.weight[0] for one in fitted])
+        return replace(
+            self,
+            labels=labels,
+            fitted=Series(weight, np.concatenate([one.std for one in fitted])),
+        )
+
+    def probability(self, felts: Sequence[Felt], machine: Machine) -> list[Beliefs]:
+        if self.fitted is None:
+            raise ValueError(f"{self.name} was not fitted")
+        out = []
+        for felt in felts:
+            angle, energy = self._seen(felt, machine).T
+            expected = terms(angle, self.harmonics) @ self.fitted.weight.T
+            z = (energy[:, None] - expected) / self.fitted.std
+            log = -0.5 * z**2 - np.log(self.fitted.std)
+            out.append(accumulated(log, felt, self.apart_s, self.memory_s))
+        return out
+
+    @property
+    def numbers(self) -> int:
+        return 0 if self.fitted is None else self.fitted.weight.size + self.fitted.std.size
+
+    def _series(self, rows: Float[np.ndarray, "row 2"]) -> Series:
+        """The series of one floor by its directions and coefficients."""
+        a = terms(rows[:, 0], self.harmonics)
+        ridge = self.ridge * np.eye(a.shape[1])
+        ridge[0, 0] = 0.0
+        weight = np.linalg.solve(a.T @ a + ridge + 1e-9 * np.eye(len(ridge)), a.T @ rows[:, 1])
+        left = rows[:, 1] - a @ weight
+        return Series(weight[None], np.array([max(float(left.std()), 1e-6)]))
+
+    def _seen(self, felt: Felt, machine: Machine) -> Float[np.ndarray, "row 2"]:
+        """Direction of travel [rad] and energy coefficient of every row, NaN where it is slow."""
+        window = Window.of(felt.time, self.window_s)
+        x, y, yaw = (window.mean(column) for column in felt.rolling(machine).T)
+        turn = machine.base_radius * yaw
+        across = y if machine.determines_twist else turn
+        speed = np.sqrt(x**2 + y**2 + turn**2)
+        amps, shaft = np.abs(felt.current), np.abs(machine.gear_ratio * felt.speed)
+        power = ((machine.resistance * amps + machine.back_emf * shaft) * amps).sum(axis=1)
+        moving = speed > SLOW
+        energy = window.mean(power) / (machine.mass * GRAVITY * np.where(moving, speed, np.nan))
+        energy = np.log(np.maximum(energy, 1e-9)) if self.logarithm else energy
+        return np.stack([np.arctan2(across, x), energy], axis=1)
+
+
+def terms(angle: Float[np.ndarray, " row"], harmonics: int) -> Float[np.ndarray, "row term"]:
+    """One, and cosine and sine of each multiple of an angle in turn."""
+    waves = [f(k * angle) for k in range(1, harmonics + 1) for f in (np.cos, np.sin)]
+    return np.stack([np.ones_like(angle), *waves], axis=1)
