@@ -4,14 +4,15 @@ from slipid.baselines.interface import ByFloor, Machine, Method
 from slipid.baselines.motion.boosted_trees import BoostedTrees
 from slipid.baselines.motion.effective_track import EffectiveTrack, InstantaneousCentres
 from slipid.baselines.motion.encoder import Encoder
-from slipid.baselines.motion.gmdh import GmdhClass, GmdhOne
+from slipid.baselines.motion.gmdh.method import GmdhClass, GmdhOne
 from slipid.baselines.motion.heading_lookup import HeadingLookup
 from slipid.baselines.motion.neural_network import NeuralNetwork
 from slipid.baselines.motion.ojeda import ojeda_rows
 from slipid.baselines.motion.paper import paper_rows
-from slipid.baselines.motion.quann import QuannEnergy, QuannSlip
-from slipid.baselines.motion.reina import ReinaDeterministic, ReinaFuzzy
-from slipid.baselines.motion.ward_iagnemma import WardIagnemma
+from slipid.baselines.motion.quann.energy import QuannEnergy
+from slipid.baselines.motion.quann.slip import QuannSlip
+from slipid.baselines.motion.reina.method import ReinaDeterministic, ReinaFuzzy
+from slipid.baselines.motion.ward_iagnemma.method import WardIagnemma
 
 KINEMATIC = ("effective_track", "instantaneous_centres")
 """Rows for wheels that do not determine the twist."""

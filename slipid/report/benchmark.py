@@ -34,6 +34,15 @@ def show_benchmark(page: Page, found: Content) -> None:
                 made.add_row(Text(row), *cells(content, rows), *costs(content))
             page.table(made)
             page.notes(absent(rows))
+    if (driven := found["rectangle"]) is not None:
+        if "failed" in driven:
+            page.line(f"\nrectangle: failed: {driven['failed']}")
+        else:
+            head, body = rectangle(driven)
+            made = table(head, f"\n{rectangle_title(driven)}", right=head[1:])
+            for cells_of_row in body:
+                made.add_row(*cells_of_row)
+            page.table(made)
     page.line()
     for sentence in found["reading"]:
         page.line(sentence)
@@ -85,3 +94,27 @@ def absent(rows: Content) -> list[str]:
         if row["absent"]:
             why.setdefault(("failed: " if row["failed"] else "") + row["absent"], []).append(name)
     return [f"{', '.join(names)}: {reason}" for reason, names in why.items()]
+
+
+def rectangle_title(driven: Content) -> str:
+    """What was driven, on what."""
+    plant = {"testsite": "the virtual test site", "twin": "the identified model itself"}
+    runs = min(row["runs"] for row in driven["summary"].values())
+    return f"rectangle on {plant[driven['plant']]}, {runs} starts, medians with 90 % intervals"
+
+
+def rectangle(driven: Content) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Head and rows of the table of controllers, the least closure error first."""
+    head = ("controller", "closure, mm", "of encoders', %", "finished, %", "cross-track, mm")
+    rows = sorted(driven["summary"].items(), key=lambda item: item[1]["closure_error_median"])
+    body: list[tuple[str, ...]] = []
+    for name, row in rows:
+        low, high = row["interval90"]["closure_error_median"]
+        ratio = row.get("to_encoder", {}).get("closure_error_median")
+        said = "" if ratio is None else f"{100 * ratio['value']:.0f}"
+        if ratio is not None and name != "encoder":
+            said += " [{:.0f}, {:.0f}]".format(*(100 * x for x in ratio["interval90"]))
+        closure = f"{row['closure_error_median']:.0f} [{low:.0f}, {high:.0f}]"
+        finished, cross = f"{100 * row['finished_share']:.0f}", f"{row['cross_track_rmse']:.0f}"
+        body.append((name, closure, said, finished, cross))
+    return head, body

@@ -5,7 +5,16 @@ from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 
-from slipid.report.benchmark import COSTS, absent, cells, costs, headings, ranked
+from slipid.report.benchmark import (
+    COSTS,
+    absent,
+    cells,
+    costs,
+    headings,
+    ranked,
+    rectangle,
+    rectangle_title,
+)
 from slipid.support.content import Content
 from slipid.support.files import write_bytes
 
@@ -50,6 +59,12 @@ def page(found: Content, pictures: Mapping[str, bytes]) -> str:
     ]
     for name, one in found["sets"].items():
         parts += _set(found, name, one, pictures.get(name))
+    if (driven := found["rectangle"]) is not None:
+        parts.append("<h2>Rectangle</h2>")
+        if "failed" in driven:
+            parts.append(f"<p>failed: {escape(driven['failed'])}</p>")
+        else:
+            parts += [f"<p>{escape(rectangle_title(driven))}</p>", html_table(*rectangle(driven))]
     parts.append(f"<p class='note'>{_versions(found)}</p></html>")
     return "\n".join(parts)
 
@@ -76,7 +91,7 @@ def html_table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
         "</tr>",
     ]
     for row in body:
-        own = " class='own'" if row[0].startswith("slipid") else ""
+        own = " class='own'" if row[0].startswith(("slipid", "contact")) else ""
         lines.append(f"<tr{own}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
     return "".join([*lines, "</table></div>"])
 

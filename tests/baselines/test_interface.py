@@ -35,7 +35,7 @@ def test_groups_of_a_run_shorter_than_a_window():
 
 
 def test_encoders_without_slip_say_the_twist():
-    run = made_run(straight(0.3) + [0.0, 0.0, 0.2])
+    run = made_run(straight(0.3) + np.array([0.0, 0.0, 0.2]))
     assert np.allclose(run.heard.rolling(ROBOTINO), run.twist)
 
 

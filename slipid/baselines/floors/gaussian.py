@@ -49,7 +49,9 @@ class Cloud:
     root: Float[np.ndarray, "floor feature feature"]
     log_volume: Float[np.ndarray, " floor"]
 
-    def comparable(self, rows: Float[np.ndarray, "row feature"]) -> Float[np.ndarray, "row feature"]:
+    def comparable(
+        self, rows: Float[np.ndarray, "row feature"]
+    ) -> Float[np.ndarray, "row feature"]:
         """Features less their mean over their std; 0 where nothing was heard."""
         return np.asarray(np.nan_to_num((rows - self.middle) / self.scale, nan=0.0))
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slipid.baselines.interface import Run, path_of
-from slipid.baselines.motion.gmdh import (
+from slipid.baselines.motion.gmdh.method import (
     CANDIDATES,
     MEMORY,
     GmdhClass,
@@ -16,7 +16,7 @@ from slipid.baselines.motion.gmdh import (
     first_half,
     remembered,
 )
-from slipid.baselines.motion.polynomial_network import (
+from slipid.baselines.motion.gmdh.polynomial_network import (
     GAIN,
     Growth,
     Layer,

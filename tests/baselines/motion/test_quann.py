@@ -7,15 +7,14 @@ import pytest
 
 from slipid.baselines.interface import Heard, Run, path_of
 from slipid.baselines.motion.features import Windows
-from slipid.baselines.motion.gaussian_process import KEPT, Kernel, Process, Rows
-from slipid.baselines.motion.quann import (
+from slipid.baselines.motion.quann.energy import QuannEnergy, places
+from slipid.baselines.motion.quann.gaussian_process import KEPT, Kernel, Process, Rows
+from slipid.baselines.motion.quann.slip import (
     PARTS,
-    QuannEnergy,
     QuannSlip,
     end_spread,
     end_squares,
     parts,
-    places,
     slip_inputs,
 )
 from tests.helpers.made_runs import ROBOTINO, made_run, straight

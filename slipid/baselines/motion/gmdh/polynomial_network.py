@@ -1,4 +1,4 @@
-"""GMDH network: layers of quadratic neurons of two inputs each, grown while unseen data gain.
+"""A GMDH network grows layers of quadratic neurons of two inputs each while unseen data gain.
 
 A neuron says  z = w . (1, x1, x2, x1 x2, x1^2, x2^2),  with
 

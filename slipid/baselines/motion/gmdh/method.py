@@ -1,23 +1,23 @@
-"""Andrakhanov and Belyaev's GMDH networks: slip from wheels and currents, one for all or by floor.
+"""Andrakhanov and Belyaev predict slip by GMDH networks, one set for all floors or one for each.
 
-A network of quadratic neurons (see `polynomial_network`) for each component of the body's slip in
-half a second, over the inputs of `features`. `gmdh_one` has one set of networks whatever the floor.
-`gmdh_class` first tells the floor and then uses the networks of that floor. It tells it by one
-network g_k per floor, taught one on its own floor and zero on others:
+There is a network of quadratic neurons (see `polynomial_network`) for each component of the body's
+slip in half a second, over the inputs of `features`. `gmdh_one` has one set of networks whatever
+the floor. `gmdh_class` first tells the floor and then uses the networks of that floor. It tells it
+by one network g_k per floor, which is taught one on its own floor and zero on others:
 
     p_k = max(g_k, 0.05) / sum_j max(g_j, 0.05)              of one window
     e_k <- 0.9 e_k + log p_k,   P_k = exp(e_k) / sum_j exp(e_j)    of the run so far
 
 and takes the floor of the largest P_k. A floor that is told and was seen is used instead.
 
-Tuned: ridge and number of layers.
+Two settings are tuned: the ridge and the number of layers.
 
 Liberties:
     - The papers predict displacement by a robot with other sensors; here it is slip as a ratio, of
       the same half second, from the inputs that all learned methods get.
-    - Halves A and B are runs drawn at random, of every floor alike; windows of one run are as good
-      as copies of each other.
-    - Ridge instead of plain least squares, inputs clipped to what was seen, outputs likewise.
+    - Halves A and B are runs drawn at random, of every floor alike, since windows of one run are as
+      good as copies of each other.
+    - Ridge replaces plain least squares; inputs and outputs are clipped to what was seen.
     - Slow windows count less in the networks of slip; floors count alike in those of floors.
     - Evidence on the floor is added up along the run and fades, since a run may cross floors. What
       is said of floors is from what is heard, also where the floor is told.
@@ -45,7 +45,7 @@ from slipid.baselines.motion.features import (
     at_steps,
     with_slip,
 )
-from slipid.baselines.motion.polynomial_network import Growth, PolynomialNetwork, grown
+from slipid.baselines.motion.gmdh.polynomial_network import Growth, PolynomialNetwork, grown
 
 KEPT = 20
 LEAST = 0.05

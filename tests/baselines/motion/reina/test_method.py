@@ -1,172 +1,19 @@
-"""Indicators of slip: fuzzy rules by hand and by scikit-learn, thresholds, flags and paths."""
+"""Thresholds and fuzzy rules flag slip where made runs slip, and correct their paths."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from sklearn.linear_model import Ridge
 from sklearn.metrics import roc_auc_score
 
-from slipid.baselines.interface import TRIES, ByFloor, Run, groups, path_of
-from slipid.baselines.motion.fuzzy import Sugeno
-from slipid.baselines.motion.reina import (
-    Indicators,
-    Limits,
-    ReinaDeterministic,
-    ReinaFuzzy,
-    Signals,
-    smoothing,
-)
+from slipid.baselines.interface import TRIES, ByFloor, groups, path_of
+from slipid.baselines.motion.reina.fuzzy import Sugeno
+from slipid.baselines.motion.reina.indicators import Indicators, Limits, Signals
+from slipid.baselines.motion.reina.method import ReinaDeterministic, ReinaFuzzy
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
+from tests.helpers.patchy_runs import LOST, patchy, slipping
 
 BOTH = [ReinaDeterministic(), ReinaFuzzy()]
-LOST = 0.4
-"""What the made runs lose of their twist where they slip."""
-
-
-def patchy(seed: int, gyro: bool = False, overlap: float = 0.02, lost: float = LOST) -> Run:
-    """A run that slips in some windows of half a second; there its currents are higher."""
-    rng = np.random.default_rng(seed)
-    slips = np.repeat(rng.random(20) < 0.4, 5)
-    rolling = straight(rng.uniform(-np.pi, np.pi), 0.2, 100)
-    rolling[:, 2] = 0.3
-    rolling *= rng.uniform(0.99, 1.01, (100, 1))
-    twist = rolling * np.where(slips, 1.0 - lost, 1.0)[:, None]
-    current = np.where(slips, 0.9, 0.5)[:, None] + overlap * rng.normal(size=(100, 3))
-    yaw = twist[:, 2] + 0.001 * rng.normal(size=100) if gyro else None
-    return made_run(rolling, twist, current=np.abs(current), gyro=yaw, name=f"made{seed}")
-
-
-def slipping(run: Run) -> np.ndarray:
-    """Which steps of a run of 0.1 s slip."""
-    rolling = run.heard.rolling(ROBOTINO)
-    return np.linalg.norm(rolling - run.twist, axis=1) > 0.2 * np.linalg.norm(rolling, axis=1)
-
-
-def test_two_rules_by_hand():
-    rules = Sugeno(2, np.array([0.1, 0.9]))
-    assert rules.infer(np.array([[0.3]]))[0] == pytest.approx(0.7 * 0.1 + 0.3 * 0.9)
-    assert rules.infer(np.array([[-1.0], [2.0]])) == pytest.approx([0.1, 0.9])
-
-
-def test_two_inputs_with_two_sets_are_bilinear_and_the_last_changes_fastest():
-    rng = np.random.default_rng(0)
-    a, b, c, d = rng.normal(size=4)
-    x, y = rng.random((2, 30))
-    told = Sugeno(2, np.array([a, b, c, d])).infer(np.stack([x, y], axis=1))
-    assert told == pytest.approx((1 - x) * ((1 - y) * a + y * b) + x * ((1 - y) * c + y * d))
-
-
-def test_three_sets_are_linear_from_peak_to_peak():
-    rules = Sugeno(3, np.array([0.2, 1.0, -0.4]))
-    x = np.linspace(0.0, 1.0, 41)
-    assert rules.infer(x[:, None]) == pytest.approx(np.interp(x, [0.0, 0.5, 1.0], [0.2, 1.0, -0.4]))
-    strengths = Sugeno.logical_or(2, 3).strengths(np.random.default_rng(1).random((20, 2)))
-    assert strengths.shape == (20, 9)
-    assert strengths.sum(axis=1) == pytest.approx(np.ones(20))
-
-
-def test_untrained_rules_are_a_logical_or():
-    corners = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
-    assert Sugeno.logical_or(2, 2).infer(corners) == pytest.approx([0.0, 1.0, 1.0, 1.0])
-
-
-def test_trained_consequents_are_those_of_ridge_regression_around_the_untrained():
-    rng = np.random.default_rng(2)
-    x, wanted = rng.random((50, 2)), (rng.random(50) < 0.5).astype(float)
-    start = Sugeno.logical_or(2, 3)
-    fires = start.strengths(x)
-    ridge = Ridge(alpha=1.0, fit_intercept=False).fit(fires, wanted - fires @ start.consequents)
-    assert start.trained(x, wanted).consequents == pytest.approx(start.consequents + ridge.coef_)
-
-
-def test_a_rule_that_never_fires_keeps_its_answer():
-    start = Sugeno.logical_or(2, 2)
-    trained = start.trained(np.tile([1.0, 0.0], (500, 1)), np.zeros(500))
-    assert trained.consequents[[0, 1, 3]] == pytest.approx(start.consequents[[0, 1, 3]])
-    assert trained.consequents[2] == pytest.approx(0.0, abs=0.01)
-
-
-def test_smoothing_is_the_recursive_filter_that_starts_with_the_first_value():
-    x = np.random.default_rng(3).normal(size=40)
-    kept = np.exp(-0.1 / 0.3)
-    above = weight = 0.0
-    recursive = []
-    for value in x:
-        above, weight = kept * above + value, kept * weight + 1.0
-        recursive.append(above / weight)
-    assert smoothing(np.full(40, 0.1), 0.3) @ x == pytest.approx(np.array(recursive))
-
-
-def test_smoothing_of_uneven_steps_weighs_them_by_their_length():
-    mean = smoothing(np.array([0.1, 0.3, 0.1]), 0.5)
-    weights = np.array([0.1 * np.exp(-0.2 / 0.5), 0.3])
-    assert mean[1] == pytest.approx([*(weights / weights.sum()), 0.0])
-
-
-def test_a_wheel_off_the_commanded_shape_is_told_by_the_encoder_indicator():
-    run = made_run(np.tile([1.0, 0.0, 0.0], (20, 1)), current=np.ones((20, 2)), machine=HUSKY)
-    heard = replace(run.heard, turn=run.heard.turn * [1.0, 1.4])
-    signals = Signals.of(heard, HUSKY, 0.3)
-    # of two wheels, the median ratio is in their middle
-    assert signals.deviation == pytest.approx(np.full(20, 0.2 / 1.2), rel=1e-5)
-    uncommanded = Signals.of(replace(heard, command=None), HUSKY, 0.3)
-    assert uncommanded.deviation == pytest.approx(np.zeros(20), abs=1e-6)
-
-
-def test_a_slow_wheel_counts_in_units_of_the_fastest():
-    run = made_run(straight(0.0, 0.2, 20), current=np.ones((20, 3)))
-    rim = run.heard.speed * ROBOTINO.wheel_radius + [0.0, 0.01, 0.0]
-    heard = replace(run.heard, turn=rim / ROBOTINO.wheel_radius * 0.1)
-    fastest = 0.2 * np.cos(np.pi / 6)
-    deviation = Signals.of(heard, ROBOTINO, 0.3).deviation
-    assert deviation == pytest.approx(np.full(20, 0.01 / (0.3 * fastest)), rel=1e-4)
-
-
-def test_accelerations_are_those_of_the_fastest_changing_wheel():
-    rolling = np.outer(np.linspace(0.0, 1.9, 20), [0.1, 0.0, 0.0])
-    change = Signals.of(made_run(rolling, current=np.ones((20, 3))).heard, ROBOTINO, 1e-3).change
-    assert change[1:] == pytest.approx(np.full(19, np.cos(np.pi / 6) / 0.04 * 0.1), rel=1e-4)
-
-
-def test_the_smallest_current_is_that_of_the_wheels_that_drive():
-    current = np.tile([0.6, 0.1, 0.7], (20, 1))
-    ahead = Signals.of(made_run(straight(0.0, 0.2, 20), current=current).heard, ROBOTINO, 0.3)
-    assert ahead.amps == pytest.approx(np.full(20, 0.6))
-    turning = np.tile([0.0, 0.0, 1.0], (20, 1))
-    around = Signals.of(made_run(turning, current=current).heard, ROBOTINO, 0.3)
-    assert around.amps == pytest.approx(np.full(20, 0.1))
-
-
-def test_indicators_are_signals_over_their_limits():
-    run = patchy(0, gyro=True)
-    signals = Signals.of(run.heard, ROBOTINO, 1e-3)
-    limits = Limits(change=2.0, turning=0.06, usual=0.4, highest=0.8)
-    told = Indicators.of(signals, limits)
-    assert run.heard.current is not None
-    fastest = np.abs(run.heard.speed).max(axis=1, keepdims=True)
-    amps = np.where(np.abs(run.heard.speed) > 0.3 * fastest, run.heard.current, np.inf).min(axis=1)
-    assert told.current == pytest.approx((amps - 0.4) / 0.4)
-    assert run.heard.gyro is not None
-    assert told.gyro == pytest.approx(
-        np.abs(run.heard.rolling(ROBOTINO)[:, 2] - run.heard.gyro) / 0.06, rel=1e-3
-    )
-    assert (told.encoder >= signals.change / 2.0).all()
-    assert Indicators.of(signals, replace(limits, turning=np.inf)).gyro is None
-
-
-def test_limits_are_quantiles_of_the_steps_that_do_not_slip():
-    runs = [patchy(k, gyro=True) for k in range(6)]
-    limits = ReinaDeterministic(quantile=0.9).fit(runs, ROBOTINO).limits
-    firm = ~np.concatenate([slipping(run) for run in runs])
-    signals = [Signals.of(run.heard, ROBOTINO, 0.3) for run in runs]
-    amps = np.concatenate([s.amps for s in signals])[firm]
-    assert limits.usual == pytest.approx(np.median(amps))
-    assert limits.highest == pytest.approx(np.quantile(amps, 0.9))
-    turning = np.concatenate([s.turning for s in signals if s.turning is not None])[firm]
-    assert limits.turning == pytest.approx(np.quantile(turning, 0.9))
-    change = np.concatenate([s.change for s in signals])[firm]
-    assert limits.change == pytest.approx(np.quantile(change, 0.9))
 
 
 def test_slip_is_flagged_by_the_gyro_or_by_all_currents_but_not_by_the_encoders():

@@ -1,4 +1,4 @@
-"""Gaussian process with a Matern-3/2 kernel on a few hundred windows, by scikit-learn.
+"""A Gaussian process with a Matern-3/2 kernel learns from a few hundred windows (scikit-learn).
 
     k(x, x') = variance (1 + sqrt(3) d) exp(-sqrt(3) d),    d^2 = sum_i ((x_i - x'_i) / length_i)^2
     mean(x) = k(x, X) (K + noise I)^-1 y

@@ -1,4 +1,4 @@
-"""Sugeno's fuzzy inference with constant consequents, trained by least squares.
+"""Sugeno's fuzzy inference answers by rules with constants that least squares trains.
 
 Every input lies in 0..1 and belongs to `sets` triangular sets, whose peaks are evenly spaced and
 whose memberships sum to one: for two sets, low is 1 - x and high is x. There is one rule for every

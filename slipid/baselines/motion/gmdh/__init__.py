@@ -1,0 +1,1 @@
+"""Andrakhanov and Belyaev's GMDH networks: slip from wheels and currents."""

@@ -1,0 +1,1 @@
+"""Quann and others' Gaussian processes: slip from what is measured, energy from places."""

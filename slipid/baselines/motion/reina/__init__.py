@@ -1,0 +1,1 @@
+"""Reina and others' slip detectors: indicators from encoders, gyro and currents."""

@@ -1,0 +1,62 @@
+"""Robots drive these runs as the law of traction of Ward and Iagnemma says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slipid.baselines.interface import Run
+from slipid.baselines.motion.ward_iagnemma.dynamics import Dynamics, Law
+from slipid.baselines.motion.ward_iagnemma.filter import Noise
+from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
+
+MACHINES = pytest.mark.parametrize("machine", [ROBOTINO, HUSKY], ids=["omni", "skid"])
+FLOOR = Law(rise=15.0, rolling=0.15, turning=0.1, drag=3.0)
+TRUE = Noise(0.03, (0.003, 0.004, 0.002), 0.02, 0.03)
+
+
+def held(rolling: np.ndarray, law: Law, machine=ROBOTINO, seconds: float = 20.0) -> np.ndarray:
+    """Twist of a robot whose wheels have long turned as the rolling twist says."""
+    dynamics = Dynamics.of(machine, law)
+    q = np.atleast_2d(rolling) * machine.size
+    each = np.ones(len(q))
+    step = dynamics.step(q, law.rolling * each, q @ dynamics.rims.T, seconds * each)
+    return step.speeds / machine.size
+
+
+def driven(law: Law, seed: int, machine=ROBOTINO, **more) -> Run:
+    """A run of 4 s with two twists that the wheels keep, the body moving by the law."""
+    rng = np.random.default_rng(seed)
+    rolling = rng.uniform([-0.3, -0.3, -0.5], [0.3, 0.3, 0.5], (2, 3)) * [1, machine is ROBOTINO, 1]
+    twice = np.repeat(rolling, 20, axis=0)
+    true = np.repeat(held(rolling, law, machine), 20, axis=0)
+    return made_run(twice, true, machine=machine, name=f"made{seed}", **more)
+
+
+def scattered(count: int, gyro: bool, noise: Noise = TRUE) -> list[Run]:
+    """Runs as the filter believes in: rho, bias and twists scatter as its noise says."""
+    rng = np.random.default_rng(0)
+    dynamics, dt = Dynamics.of(ROBOTINO, FLOOR), np.full(count, 0.1)
+    rolling = np.stack([straight(angle, 0.25, 60) for angle in rng.uniform(-3, 3, count)])
+    rho = FLOOR.rolling + noise.rolling * rng.normal(size=count)
+    q, twist = rolling[:, 0], np.zeros((count, 60, 3))
+    for k in range(60):
+        q = dynamics.step(q, rho, rolling[:, k] @ dynamics.rims.T, dt).speeds
+        q = q + noise.drift * rng.normal(size=(count, 3)) / np.sqrt(0.1)
+        twist[:, k] = q / ROBOTINO.size
+    yaw = twist[:, :, 2] + noise.bias * rng.normal(size=(count, 1))
+    yaw = yaw + noise.gyro * np.sqrt(5) * rng.normal(size=(count, 60))
+    return [made_run(rolling[k], twist[k], gyro=yaw[k] if gyro else None) for k in range(count)]
+
+
+def pulling(run: Run, law: Law, gain: float, offset: float, noise: float = 0.0) -> Run:
+    """The run with currents of the traction, as a motor's constant and friction make of it."""
+    dynamics = Dynamics.of(ROBOTINO, law)
+    rim = run.heard.speed * ROBOTINO.wheel_radius
+    slide = rim - (run.twist * ROBOTINO.size) @ dynamics.rims.T
+    force = gain * ROBOTINO.mass * np.sign(rim) * dynamics.traction(slide) + offset
+    force = force + noise * np.random.default_rng(0).normal(size=force.shape)
+    scale = ROBOTINO.gear_ratio * ROBOTINO.back_emf / ROBOTINO.wheel_radius
+    # a meter with signs: along the wheel's forward direction
+    current = force / scale * np.sign(rim)
+    return replace(run, heard=replace(run.heard, current=current, current_is_signed=True))
