@@ -14,8 +14,8 @@ FOLDS = 2
 """Parts into which headings and sectors are dealt; every other sector is left out together."""
 SPEEDS = 3
 """Parts of speeds, where there are many."""
-INNER = 2
-"""Folds of the inner cross-validation by which a method picks its settings."""
+INNER = 1
+"""Parts of the training runs that are left out in turn while a method picks its settings."""
 SECTOR_DEG = 60.0
 LEAST_FITTED, LEAST_JUDGED = 8, 3
 """Runs without which nothing is fitted, and nothing judged."""
@@ -170,8 +170,8 @@ def splits(facts: Sequence[Facts], kind: str) -> list[Split]:
 def inner(runs: Sequence[Run], kind: str) -> Labels:
     """Part of every training run for the inner cross-validation, of the kind that is judged by.
 
-    At most `INNER` parts, the largest ones; headings where the training runs have fewer than two of
-    the kind asked for. Parts from `INNER` on, and -1, are never left out.
+    The `INNER` largest parts are counted from 0; other runs have -1 or `INNER` and are never left
+    out. Headings are dealt where the training runs have fewer than two parts of the kind asked for.
     """
     facts = [Facts.of(run) for run in runs]
     for name in dict.fromkeys((kind if kind in KINDS else "headings", "headings")):
@@ -180,4 +180,4 @@ def inner(runs: Sequence[Run], kind: str) -> Labels:
         if len(names) > 1:
             order = names[np.argsort(-count, kind="stable")][:INNER]
             return np.select([part == name for name in order], range(len(order)), -1)
-    return np.random.default_rng(0).permutation(len(runs)) % INNER
+    return np.random.default_rng(0).permutation(len(runs)) % (INNER + 1)

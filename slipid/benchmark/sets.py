@@ -100,7 +100,7 @@ SOURCES = (
         about="Robotino on the virtual test site (MuJoCo), two floors, two loads",
         folder="",
         config="robotino.toml",
-        kinds=("headings", "sectors", "speeds", "floors"),
+        kinds=("headings", "speeds", "floors"),
     ),
 )
 

@@ -1,6 +1,6 @@
 """The tables of the benchmark on a terminal."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from rich.text import Text
 
@@ -21,6 +21,8 @@ COLUMNS: Mapping[str, tuple[str, float, int]] = {
 """Heading, factor and places of each number of a row."""
 ENDS = ("endpoint_error", "behind")
 """Numbers that are shown with their 90 % interval."""
+ON_THE_PAGE = ("length_error", "twist_error")
+"""Numbers for which a terminal is too narrow."""
 
 
 def show_benchmark(page: Page, found: Content) -> None:
@@ -29,9 +31,13 @@ def show_benchmark(page: Page, found: Content) -> None:
         for protocol, rows in one["protocols"].items():
             about = found["protocols"][protocol]
             title = f"\n{name}: {about}; end points over the {one['over']}"
-            made = table(("row", *headings(rows), *COSTS), title, right=COSTS)
+            brief = [number for number in shown(rows) if number not in ON_THE_PAGE]
+            head = ("row", *headings(brief), *COSTS[1:])
+            made = table(head, title, right=head[1:])
             for row, content in ranked(rows):
-                made.add_row(Text(row), *cells(content, rows), *costs(content))
+                made.add_row(Text(row), *cells(content, brief), *costs(content)[1:])
+            for column in made.columns:
+                column.no_wrap = True
             page.table(made)
             page.notes(absent(rows))
     if (driven := found["rectangle"]) is not None:
@@ -62,14 +68,14 @@ def shown(rows: Content) -> list[str]:
     return [name for name in COLUMNS if any(row[name] is not None for row in rows.values())]
 
 
-def headings(rows: Content) -> list[str]:
-    """Of the numbers that some row has."""
-    return [COLUMNS[name][0] for name in shown(rows)]
+def headings(numbers: Sequence[str]) -> list[str]:
+    """Of numbers by their names."""
+    return [COLUMNS[name][0] for name in numbers]
 
 
-def cells(row: Content, rows: Content) -> list[str]:
-    """The numbers of a row in words."""
-    return [in_words(name, row[name]) for name in shown(rows)]
+def cells(row: Content, numbers: Sequence[str]) -> list[str]:
+    """Numbers of a row in words."""
+    return [in_words(name, row[name]) for name in numbers]
 
 
 def in_words(name: str, value: list[float] | None) -> str:

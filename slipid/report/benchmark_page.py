@@ -14,6 +14,7 @@ from slipid.report.benchmark import (
     ranked,
     rectangle,
     rectangle_title,
+    shown,
 )
 from slipid.support.content import Content
 from slipid.support.files import write_bytes
@@ -76,8 +77,9 @@ def _set(found: Content, name: str, one: Content, drawn: bytes | None) -> list[s
     for protocol, rows in one["protocols"].items():
         title = f"{protocol.replace('_', ' ')}: {found['protocols'][protocol]}"
         parts.append(f"<h3>{escape(title)}</h3>")
-        head = ("row", *headings(rows), *COSTS)
-        body = [(row, *cells(content, rows), *costs(content)) for row, content in ranked(rows)]
+        numbers = shown(rows)
+        head = ("row", *headings(numbers), *COSTS)
+        body = [(row, *cells(content, numbers), *costs(content)) for row, content in ranked(rows)]
         parts.append(html_table(head, body))
         parts += [f"<p class='note'>{escape(line)}</p>" for line in absent(rows)]
     return parts

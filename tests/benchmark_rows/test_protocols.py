@@ -85,17 +85,18 @@ def runs(floors=("gray", "green"), slip=0.3):
     return out
 
 
-def test_inner_folds_are_of_the_kind_that_is_judged_by():
+def test_inner_parts_are_of_the_kind_that_is_judged_by():
     training = runs()
     by_floor = inner(training, "floors")
-    assert {(r.floor, k) for r, k in zip(training, by_floor, strict=True)} == {
-        ("gray", 0),
-        ("green", 1),
-    }
+    left_out = {run.floor for run, k in zip(training, by_floor, strict=True) if k == 0}
+    seen = {run.floor for run, k in zip(training, by_floor, strict=True) if k != 0}
+    assert len(left_out) == len(seen) == 1
     by_speed = inner(training, "speeds")
     assert len({(round(r.speed, 2), k) for r, k in zip(training, by_speed, strict=True)}) == 2
     one_speed = [run for run in training if run.speed < 0.15]
-    assert set(inner(one_speed, "speeds").tolist()) == {0, 1}  # headings instead
+    headings = inner(one_speed, "speeds")
+    assert 0 < np.mean(headings == 0) < 1
+    assert headings.tolist() == inner(one_speed, "headings").tolist()
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,9 @@ def scatter_of(felts: Sequence[Felt]) -> float:
     cells = Cells.joined(felts)
     several = cells.rows >= 5
     weight = cells.rows[several, None]
-    return float(np.sqrt((weight * cells.std[several] ** 2).sum() / weight.sum() / cells.std.shape[1]))
+    return float(
+        np.sqrt((weight * cells.std[several] ** 2).sum() / weight.sum() / cells.std.shape[1])
+    )
 
 
 def stiffness_of(felts: Sequence[Felt]) -> Float[np.ndarray, " drive"]:
@@ -129,13 +131,8 @@ def fitted_floors(robot: Robot, felts: Sequence[Felt]) -> Robot:
     """The robot with numbers of all its floors, each by the runs on it."""
     for number, floor in enumerate(robot.surfaces.labels):
         cells = Cells.joined([felt for felt in felts if felt.floor == floor]).thinned(CELLS)
-        logs = least_squares(
-            lambda logs, cells=cells, k=number: np.asarray(_misfit(logs, robot, k, cells)),
-            START,
-            jac=lambda logs, cells=cells, k=number: np.nan_to_num(_slope(logs, robot, k, cells)),
-            loss="soft_l1",
-            max_nfev=30,
-        ).x
+        left = _Left(robot, number, cells)
+        logs = least_squares(left.gaps, START, left.slope, loss="soft_l1", max_nfev=30).x
         robot = on_floor(robot, jnp.asarray(number), jnp.asarray(logs))
     return robot
 
@@ -162,31 +159,43 @@ def shown(
     return jax.vmap(one)(speed)
 
 
-def _misfit(logs: np.ndarray, robot: Robot, number: int, cells: Cells) -> Array:
-    """What numbers of a floor leave of currents and turning, and how unusual they are."""
-    return _left(jnp.asarray(logs), robot, jnp.asarray(number), *_arrays(cells))
+class _Left:
+    """What numbers of a floor leave of currents and turning, with its derivative."""
+
+    def __init__(self, robot: Robot, number: int, cells: Cells):
+        self.robot, self.number = robot, jnp.asarray(number)
+        every = (cells.speed, cells.current, cells.gyro, cells.weight)
+        self.cells = tuple(jnp.asarray(x) for x in every)
+        self.kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+
+    def gaps(self, logs: np.ndarray) -> np.ndarray:
+        return self._at(logs)[0]
+
+    def slope(self, logs: np.ndarray) -> np.ndarray:
+        return self._at(logs)[1]
+
+    def _at(self, logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Both at once: the solver asks for them one after the other."""
+        key = logs.tobytes()
+        if key not in self.kept:
+            slope, gaps = _both(jnp.asarray(logs), self.robot, self.number, *self.cells)
+            self.kept = {key: (np.asarray(gaps), np.nan_to_num(np.asarray(slope)))}
+        return self.kept[key]
 
 
-def _slope(logs: np.ndarray, robot: Robot, number: int, cells: Cells) -> Array:
-    return _left_slope(jnp.asarray(logs), robot, jnp.asarray(number), *_arrays(cells))
-
-
-def _arrays(cells: Cells) -> tuple[Array, ...]:
-    every = (cells.speed, cells.current, cells.gyro, cells.weight)
-    return tuple(jnp.asarray(x) for x in every)
-
-
-@eqx.filter_jit
-def _left(
+def _gaps(
     logs: Array, robot: Robot, number: Array, w: Array, amps: Array, gyro: Array, weight: Array
-) -> Array:
+) -> tuple[Array, Array]:
+    """Misfits of currents and turning, and how unusual the numbers are; twice."""
     said, turn = shown(on_floor(robot, number, logs), number, w)
-    gaps = [
-        ((said - amps) / CURRENT_A * weight[:, :1]).ravel(),
-        (turn - gyro) / YAW_RATE * weight[:, 1],
-        (logs - START) / SPREAD,
-    ]
-    return jnp.concatenate(gaps)
+    gaps = jnp.concatenate(
+        [
+            ((said - amps) / CURRENT_A * weight[:, :1]).ravel(),
+            (turn - gyro) / YAW_RATE * weight[:, 1],
+            (logs - START) / SPREAD,
+        ]
+    )
+    return gaps, gaps
 
 
-_left_slope = eqx.filter_jit(jax.jacfwd(_left))
+_both = eqx.filter_jit(jax.jacfwd(_gaps, has_aux=True))

@@ -12,7 +12,7 @@ At its first row it takes the wheels to turn as measured, and not to have stood 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 
 import equinox as eqx
@@ -33,8 +33,8 @@ from slipid.benchmark.felt.meters import MeteredMotor
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.interface import Readings, Settings
+from slipid.control.robot_file.record import FloorRecord, LoadRecord, RobotRecord, Wheels
 from slipid.deploy.forecaster import given
-from slipid.deploy.record_of import record_of
 from slipid.model.contact_law import ContactSurface
 from slipid.model.robot import Robot
 
@@ -46,16 +46,20 @@ SHARED_ROWS = 20.0
 """Rows that the scatter on a floor as a whole counts as, for that in each kind of motion."""
 MOST_ROWS = 150
 """Of a run at most, for the scatter."""
+HIGHEST_A, HIGHEST_SPEED = 100.0, 20.0
+"""Of what is measured; what is far above it is no reading [A], [rad/s]."""
 SETTINGS = Settings(
     current_is_signed=False,
-    forget_s=1.0,
+    forget_s=4.0,
     filter_s=0.02,
     patch_m=50.0,
-    alike=20.0,
+    alike=27.0,
     unknown_std=4.0,
     ammeter_std_a=0.1,
-    gyro_std=0.05,
+    gyro_std=0.08,
 )
+"""Currents of neighbouring rows are alike for seconds (`forget_s`), and one row alone is no mean of
+others (`filter_s`); `gyro_std` is about what the fits leave of the yaw rate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,9 +184,33 @@ def _shown(robot: Robot, number: Array, speed: Array) -> Array:
 
 
 def deployed(robot: Robot) -> DeployedRobot:
-    """The robot as it drives, its numbers as they are and without a spread."""
-    several = jax.tree.map(lambda x: x[None], robot)
-    return DeployedRobot.of(record_of(robot, given(robot), {}, several, 20.0, (0.0, 0.0), {}))
+    """The robot as it drives, its numbers as they are.
+
+    What the floor filter does not use, a robot's uncertainty and what a fit has seen, is left at
+    values that limit nothing.
+    """
+    shape = robot.geometry
+    none = (0.0, 0.0, 0.0)
+    load = LoadRecord(
+        name=robot.body.loads[0],
+        spread=(none,) * len(robot.surfaces.labels),
+        told=None,
+        highest_current=HIGHEST_A,
+        wheel_curve=((0.0, 0.0),) * shape.drives,
+    )
+    record = RobotRecord(
+        wheels=Wheels(**{f.name: getattr(shape, f.name) for f in fields(Wheels)}),
+        parameters={path: n for path, n in given(robot).items() if not path.startswith("camera.")},
+        floors=tuple(
+            FloorRecord(name=name, process=none, effect=none, current_std=1.0, seen=None)
+            for name in robot.surfaces.labels
+        ),
+        loads=(load,),
+        current_trend=(0.0, 0.0),
+        highest_speed=HIGHEST_SPEED,
+        draws={},
+    )
+    return DeployedRobot.of(record)
 
 
 class _Rows(eqx.Module):

@@ -26,7 +26,7 @@ from slipid.baselines.motion.ward_iagnemma.padded import Padded
 
 _STEADY = 10.0
 """Time after which speeds are taken for steady [s]."""
-_FIT_RUNS, _FIT_WINDOWS = 40, 300
+_FIT_RUNS, _FIT_WINDOWS = 40, 100
 """Largest numbers of runs, and of windows for the law, that are fitted to."""
 _BOUNDS = {
     "rise": (0.5, 500.0),
@@ -116,7 +116,7 @@ def fitted_law(windows: Windows, machine: Machine, with_drag: bool) -> Law:
         loss="soft_l1",
         f_scale=0.1,
         diff_step=1e-3,
-        max_nfev=20,
+        max_nfev=12,
         ftol=1e-4,
         xtol=1e-3,
     )
