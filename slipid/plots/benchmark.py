@@ -7,6 +7,8 @@ from matplotlib.figure import Figure
 from slipid.plots import drawing
 from slipid.support.content import Content
 
+TICKS = [m * 10.0**k for k in range(-2, 4) for m in (1, 2, 5)]
+"""Of a logarithmic axis of errors [%]."""
 OWN = "slipid"
 """Rows whose names begin with it are drawn in colour."""
 
@@ -59,5 +61,8 @@ def _panel(ax: Axes, ends: dict[str, list[float]]) -> None:
             label.set_fontweight("bold")
     ax.set_xscale("log")
     ax.set_xlabel("end-point error, %")
-    ax.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
+    low, high = ax.get_xlim()
+    ticks = [t for t in TICKS if low <= t <= high]
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    ax.minorticks_off()
     ax.set_ylim(-0.7, len(order) - 0.3)

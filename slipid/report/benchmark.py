@@ -90,7 +90,9 @@ def in_words(name: str, value: list[float] | None) -> str:
 
 def costs(row: Content) -> list[str]:
     """Fitted numbers, seconds to fit, microseconds a step."""
-    return [str(row["numbers"]), f"{row['fit_s']:.2g}", f"{row['step_us']:.2g}"]
+    fit, step = row["fit_s"], row["step_us"]
+    seconds = "< 0.1" if fit < 0.1 else f"{fit:.1f}" if fit < 10 else f"{fit:.0f}"
+    return [str(row["numbers"]), seconds, f"{step:.1f}" if step < 10 else f"{step:.0f}"]
 
 
 def absent(rows: Content) -> list[str]:

@@ -21,7 +21,7 @@ from slipid.support.files import write_bytes
 
 PAGE = "benchmark.html"
 STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 76rem; margin: 2rem auto }
+body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 92rem; margin: 2rem auto }
 body { padding: 0 1rem }
 h2 { margin-top: 2.5rem; border-bottom: 1px solid #ccc } h3 { margin-bottom: .3rem }
 .wide { overflow-x: auto } img { max-width: 100% }
@@ -52,8 +52,8 @@ def page(found: Content, pictures: Mapping[str, bytes]) -> str:
         f"<title>Slip methods compared</title><style>{STYLE}</style>",
         "<h1>Slip methods compared</h1>",
         "<p>Every row was fitted to the same runs and predicts others, from what the robot itself "
-        "measures; the pose is used once, at the start. Numbers in brackets are 90 % intervals by "
-        "resampling runs.</p>",
+        "measures; the pose is used once, at the start. Numbers in brackets are 90&nbsp;% "
+        "intervals by resampling runs; settings were picked on training runs alone.</p>",
         "<h2>What the tables say</h2><ul>",
         *(f"<li>{escape(sentence)}</li>" for sentence in found["reading"]),
         "</ul>",
