@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.baselines.interface import Machine, Said
-from slipid.benchmark.sets import DataSet
 from slipid.benchmark.steps import Cut, body_poses
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
@@ -30,7 +29,6 @@ from slipid.identify.fit.problem import Problem, State
 from slipid.identify.slip_curves import current_trend
 from slipid.job.problem import Job
 from slipid.support.checkpoint import Checkpoint
-from slipid.support.progress import Reporter
 
 NAME = "slipid"
 TOLERANCE = 0.1
@@ -68,20 +66,19 @@ class Own:
         return self.contact.space.size
 
 
-def fit_own(data: DataSet, fitted: np.ndarray, kept: Checkpoint, report: Reporter) -> Own:
-    """The force balance fitted to some runs; what was kept of this very fit is not done again."""
-    job = data.job
-    problem = of_some(job.problem(), job.choices, job.dataset, fitted)
+def fit_own(job: Job, problem: Problem, fitted: np.ndarray, kept: Checkpoint) -> Own:
+    """The force balance fitted to some runs of a job.
+
+    What was kept of this very fit is not done again. Fits of one `job.problem()` share what was
+    compiled for it.
+    """
+    problem = of_some(problem, job.choices, job.dataset, fitted)
     keep = np.isin(problem.windows.run, fitted).astype(float)
     found = kept.load("fit")
     if found is None:
         began = time.perf_counter()
-
-        def tell(state: State) -> None:
-            report.note(f"round {state.round}")
-
         most = job.settings.rounds
-        optimum = optimise(problem, keep=keep, most_rounds=most, tolerance=TOLERANCE, tell=tell)
+        optimum = optimise(problem, keep=keep, most_rounds=most, tolerance=TOLERANCE)
         kept.save(
             "fit",
             {k: v for k, v in vars(optimum.state).items() if v is not None}

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slipid.benchmark import own as slipid_rows
-from slipid.benchmark.work import Wish, data_of
+from slipid.benchmark.work import Wish, data_of, problem_of
 from slipid.control.robot_file.record import Sensors
 from slipid.deploy import trial
 from slipid.deploy.deploy import ROBOT
@@ -53,7 +53,7 @@ class Rectangle:
         key = key_of(data.job.config.hash, data.job.data_hash, code)
         everybody = np.arange(len(data.heard))
         kept = Checkpoint(self.folder, key)
-        own = slipid_rows.fit_own(data, everybody, kept, Reporter(quiet=True))
+        own = slipid_rows.fit_own(data.job, problem_of(self.wish, SOURCE), everybody, kept)
         sensors = Sensors(current_is_signed=data.heard.current_is_signed, voltage=True)
         robot_of(own.contact, own.highest_speed, own.trend, sensors).save(self.folder / ROBOT)
         return self.name

@@ -19,6 +19,7 @@ from slipid.benchmark.sets import SOURCES, DataSet, Source, read_set
 from slipid.benchmark.steps import Cut, cut
 from slipid.benchmark.tuned import tuned
 from slipid.data.runs import Runs
+from slipid.identify.fit.problem import Problem
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.jax_setup import setup_jax
@@ -96,6 +97,12 @@ def data_of(wish: Wish, source: str) -> DataSet:
     return found.thinned(QUICK_RUNS) if wish.quick else found
 
 
+@lru_cache(maxsize=2)
+def problem_of(wish: Wish, source: str) -> Problem:
+    """Fitting problem of all runs of a source, made and compiled once in every process."""
+    return data_of(wish, source).job.problem()
+
+
 def split_of(piece: Piece) -> Split:
     """The fold of a piece."""
     found = splits(data_of(piece.wish, piece.source).facts, piece.kind)
@@ -153,9 +160,8 @@ def _scene(piece: Piece) -> Scene:
     data, split = data_of(piece.wish, piece.source), split_of(piece)
     own: slipid_rows.Own | Row
     try:
-        own = slipid_rows.fit_own(
-            data, split.fitted, kept_of(piece, fit=True), Reporter(quiet=True)
-        )
+        problem = problem_of(piece.wish, piece.source)
+        own = slipid_rows.fit_own(data.job, problem, split.fitted, kept_of(piece, fit=True))
         robot = own.contact.robot
     except Exception as error:  # other rows are judged all the same
         own = Row.of_error(error)

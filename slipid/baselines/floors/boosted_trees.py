@@ -50,6 +50,8 @@ if TYPE_CHECKING:
 
 LEAST = 1e-4
 """Probability that no floor goes below after one row."""
+EVERYTHING = Hearing()
+"""What slipid hears too."""
 DRIVING = Hearing(current=False, gyro=False)
 """Wheel speeds alone."""
 
@@ -96,7 +98,7 @@ class BoostedTrees(FloorMethod):
     """
 
     name: str = "boosted_trees"
-    hearing: Hearing = Hearing()
+    hearing: Hearing = EVERYTHING
     driving_off: bool = False
     leaves: int = 4
     trees: int = 60
@@ -111,7 +113,7 @@ class BoostedTrees(FloorMethod):
     def candidates(self) -> Sequence["BoostedTrees"]:
         if not self.tuned:
             return (self,)
-        pairs = [(4, 20.0), (12, 20.0), (4, 4.0)]
+        pairs = [(4, 20.0), (12, 20.0)]
         return [replace(self, leaves=leaves, memory_s=memory) for leaves, memory in pairs]
 
     def fit(self, felts: Sequence[Felt], machine: Machine) -> "BoostedTrees":

@@ -6,7 +6,8 @@ says after each row how probable every floor is. It may use what came before, an
 
 import abc
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -60,19 +61,22 @@ class Felt:
 
     def part(self, first: int, last: int) -> "Felt":
         """The rows from `first` up to, and without, `last`."""
-        rows = {
-            f.name: value[first:last]
-            for f in fields(self)
-            if isinstance(value := getattr(self, f.name), np.ndarray)
-        }
-        return replace(self, **rows)
+        rows = slice(first, last)
+        return replace(
+            self,
+            time=self.time[rows],
+            speed=self.speed[rows],
+            current=self.current[rows],
+            gyro=None if self.gyro is None else self.gyro[rows],
+            vibration=None if self.vibration is None else self.vibration[rows],
+        )
 
     def pieces(self, seconds: float) -> list["Felt"]:
         """The run cut into parts of this length one after another, the last of them shorter."""
         start = np.cumsum(self.dt) - self.dt
         number = np.floor(start / seconds + 1e-6).astype(int)
         edges = [*np.flatnonzero(np.diff(number, prepend=-1)), len(self)]
-        return [self.part(int(a), int(b)) for a, b in zip(edges, edges[1:], strict=False)]
+        return [self.part(int(a), int(b)) for a, b in pairwise(edges)]
 
     def rolling(self, machine: Machine) -> Float[np.ndarray, "row 3"]:
         """Body twist if nothing slips [m/s, m/s, rad/s]."""

@@ -14,7 +14,6 @@ a run of many rows as one of `LONG`.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -137,6 +136,31 @@ def fitted_floors(robot: Robot, felts: Sequence[Felt]) -> Robot:
     return robot
 
 
+def currents_off(
+    robot: Robot,
+    number: int,
+    speed: Float[np.ndarray, "row drive"],
+    current: Float[np.ndarray, "row drive"],
+) -> Float[np.ndarray, "row drive"]:
+    """How much more motors should draw on a floor, by its numbers, than they do in each row [A].
+
+    By what the fit has compiled.
+    """
+    logs = np.log([float(getattr(robot.surfaces, name)[number]) for name in FITTED])
+    count, drives = speed.shape
+    found = []
+    for first in range(0, count, CELLS):
+        w, amps = np.zeros((2, CELLS, drives))
+        rows = min(CELLS, count - first)
+        w[:rows], amps[:rows] = speed[first : first + rows], current[first : first + rows]
+        every = Cells(
+            w, amps, np.zeros(CELLS), np.ones((CELLS, 2)), np.ones_like(w), np.ones(CELLS)
+        )
+        gaps = _Left(robot, number, every).gaps(logs)[: CELLS * drives]
+        found.append(CURRENT_A * gaps.reshape(CELLS, drives)[:rows])
+    return np.concatenate(found)
+
+
 def on_floor(robot: Robot, number: Array, logs: Float[Array, "3"]) -> Robot:
     """The robot with other numbers of a floor, given as logarithms."""
     stacks = {
@@ -198,4 +222,4 @@ def _gaps(
     return gaps, gaps
 
 
-_both = eqx.filter_jit(jax.jacfwd(_gaps, has_aux=True))
+_both = jax.jit(jax.jacfwd(_gaps, has_aux=True))

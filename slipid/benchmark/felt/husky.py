@@ -18,7 +18,7 @@ RADIUS = 0.165
 MASS = 60.0
 """[kg]"""
 ZERO_A = 0.59
-"""What the ammeters show of wheels that stand; what is measured is this and more, or nothing [A]."""
+"""What the ammeters show of wheels that stand [A]; of wheels that brake they show nothing."""
 FREE_A, FREE_AS = 0.54, 0.032
 """Friction of a wheel in the air, and its growth with the wheel's speed [A], [A s/rad]."""
 

@@ -1,5 +1,6 @@
 """Runs without poses: a folder per floor, a CSV file per run."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,7 @@ def _runs(path: Path, wheel_radius: float) -> list[Felt]:
         vibration=column["accel_std"],
     )
     edges = [0, *(np.flatnonzero(np.diff(whole.time) > LONGEST_S) + 1), len(whole)]
-    parts = [whole.part(int(a), int(b)) for a, b in zip(edges, edges[1:], strict=False)]
+    parts = [whole.part(int(a), int(b)) for a, b in pairwise(edges)]
     return [part for part in parts if len(part) >= FEWEST]
 
 

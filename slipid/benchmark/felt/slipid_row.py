@@ -13,7 +13,6 @@ At its first row it takes the wheels to turn as measured, and not to have stood 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
 
 import equinox as eqx
 import jax
@@ -24,14 +23,14 @@ from jaxtyping import Array, Float, Int
 from slipid.baselines.floors.interface import Beliefs, Felt, FloorMethod, floors_of
 from slipid.baselines.interface import Machine
 from slipid.benchmark.felt.fitting import (
+    currents_off,
     fitted_floors,
     scatter_of,
-    shown,
     stiffness_of,
 )
 from slipid.benchmark.felt.meters import MeteredMotor
 from slipid.control.deployed import DeployedRobot
-from slipid.control.estimator import Estimator
+from slipid.control.estimator import Estimator, EstimatorState
 from slipid.control.interface import Readings, Settings
 from slipid.control.robot_file.record import FloorRecord, LoadRecord, RobotRecord, Wheels
 from slipid.deploy.forecaster import given
@@ -154,33 +153,20 @@ def _scatter(
     count = len(BENDS) + 1
     std = np.ones((count, len(robot.surfaces.labels)))
     for k, floor in enumerate(robot.surfaces.labels):
-        square, kind = [], []
+        speed, current, kind = [], [], []
         for felt in (felt for felt in felts if felt.floor == floor):
             take = np.flatnonzero(felt.moves)
             take = take[:: max(1, len(take) // MOST_ROWS)]
-            off = _currents(robot, k, felt.speed[take]) - felt.current[take]
-            square.append((off**2).mean(axis=1))
+            speed.append(felt.speed[take])
+            current.append(felt.current[take])
             kind.append(kinds(felt, machine)[take])
-        squares, of_kind = np.concatenate(square), np.concatenate(kind)
-        whole = squares.mean()
+        off = currents_off(robot, k, np.concatenate(speed), np.concatenate(current))
+        squares, of_kind = (off**2).mean(axis=1), np.concatenate(kind)
         for n in range(count):
             mine = squares[of_kind == n]
-            std[n, k] = np.sqrt((mine.sum() + SHARED_ROWS * whole) / (len(mine) + SHARED_ROWS))
+            shared = SHARED_ROWS * squares.mean()
+            std[n, k] = np.sqrt((mine.sum() + shared) / (len(mine) + SHARED_ROWS))
     return std
-
-
-def _currents(
-    robot: Robot, number: int, speed: Float[np.ndarray, "row drive"]
-) -> Float[np.ndarray, "row drive"]:
-    """Currents that are shown on a floor [A]; filled up, so that one shape is compiled."""
-    room = 2 * MOST_ROWS
-    filled = np.concatenate([speed, np.zeros((room - len(speed), speed.shape[1]))])
-    return np.asarray(_shown(robot, jnp.asarray(number), jnp.asarray(filled)))[: len(speed)]
-
-
-@eqx.filter_jit
-def _shown(robot: Robot, number: Array, speed: Array) -> Array:
-    return shown(robot, number, speed)[0]
 
 
 def deployed(robot: Robot) -> DeployedRobot:
@@ -252,7 +238,7 @@ def _driven(
     """Probability of every floor, and of none, under the robot after every row."""
     nothing = Readings.nothing(estimator.robot.drives)
 
-    def step(state: eqx.Module, row: _Rows) -> tuple[eqx.Module, Array]:
+    def step(state: EstimatorState, row: _Rows) -> tuple[EstimatorState, Array]:
         now = Estimator(replace(estimator.robot, current_std=std[row.kind]), estimator.settings)
         z = replace(nothing, wheel_speed=row.speed, current=row.current, gyro=row.gyro)
         state, seen = now.advance(state, z, row.dt)

@@ -1,0 +1,45 @@
+"""Runs without poses of which everything is known, as classifiers of floors hear them."""
+
+import numpy as np
+
+from slipid.baselines.floors.interface import Felt
+
+HZ = 6.5
+
+
+def made_felt(
+    floor: str,
+    speed: np.ndarray,
+    level: float,
+    *,
+    name: str | None = None,
+    noise: float = 0.3,
+    seed: int = 0,
+    gyro: bool = True,
+) -> Felt:
+    """A run whose motors draw `level` [A] and a little noise at wheel speeds (row, drive)."""
+    rng = np.random.default_rng(seed)
+    rows = len(speed)
+    return Felt(
+        name=name or f"{floor}/{seed}",
+        floor=floor,
+        time=np.arange(rows) / HZ,
+        speed=speed,
+        current=np.abs(level + noise * rng.normal(size=speed.shape)),
+        gyro=0.02 * rng.normal(size=rows) if gyro else None,
+        vibration=np.abs(rng.normal(size=rows)),
+    )
+
+
+def ahead(rows: int = 60, rate: float = 1.5, drives: int = 2) -> np.ndarray:
+    """Wheel speeds of going straight ahead (row, drive) [rad/s]."""
+    return np.full((rows, drives), rate)
+
+
+def made_felts(levels: dict[str, float], runs: int = 4, rows: int = 60, **kw: float) -> list[Felt]:
+    """Runs straight ahead on floors that differ in what motors draw there [A]."""
+    return [
+        made_felt(floor, ahead(rows), level, seed=100 * n + k, name=f"{floor}/{k}", **kw)
+        for n, (floor, level) in enumerate(levels.items())
+        for k in range(runs)
+    ]
