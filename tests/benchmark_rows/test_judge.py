@@ -129,6 +129,7 @@ def test_a_difference_is_paired():
     assert found["slipid"].behind is None
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_true_mean_as_often_as_they_say():
     rng = np.random.default_rng(1)
     hits = 0

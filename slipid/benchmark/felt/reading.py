@@ -78,7 +78,8 @@ def _rows(path: Path) -> Float[np.ndarray, "row 7"]:
             raise bad_data(path, "no number", "one", row=int(missing[0]) + 2, column=name)
     back = np.flatnonzero(np.diff(rows[:, 0]) <= 0)
     if len(back):
-        raise bad_data(path, "time does not increase", "growing times", row=int(back[0]) + 3)
+        row = int(back[0]) + 3
+        raise bad_data(path, "does not increase", "growing times", row=row, column="time")
     return np.asarray(rows)
 
 

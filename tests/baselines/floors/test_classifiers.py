@@ -31,8 +31,10 @@ def mixed_felts(seed: int = 0):
 
 
 def training(method, felts, hearing=None, every=0.0):
-    take = (lambda f: features(f, HUSKY, hearing)) if hearing else (
-        lambda f: features(f, HUSKY, Hearing(), (method.window_s,))[:, 1:]
+    take = (
+        (lambda f: features(f, HUSKY, hearing))
+        if hearing
+        else (lambda f: features(f, HUSKY, Hearing(), (method.window_s,))[:, 1:])
     )
     return rows_of(felts, method.piece_s, take, every)
 

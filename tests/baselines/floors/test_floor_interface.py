@@ -95,9 +95,7 @@ def test_features_are_of_the_channels_that_are_asked_for():
 
 
 def test_the_gyro_counts_as_what_it_falls_short_whichever_way_it_turns():
-    left = replace(
-        made_felt("grass", np.tile([-1.0, 2.0], (20, 1)), 2.0), gyro=np.full(20, 0.3)
-    )
+    left = replace(made_felt("grass", np.tile([-1.0, 2.0], (20, 1)), 2.0), gyro=np.full(20, 0.3))
     right = replace(left, speed=left.speed[:, ::-1], gyro=np.full(20, -0.3))
     assert np.allclose(features(left, HUSKY)[:, -3:], features(right, HUSKY)[:, -3:])
     turn = left.rolling(HUSKY)[0, 2]
@@ -139,7 +137,9 @@ def test_floors_that_differ_in_what_motors_draw_are_told(method):
     levels = {"grass": 2.0, "ice": 1.0, "snow": 4.0}
     done = method.fit(made_felts(levels), HUSKY)
     assert done.labels == ("grass", "ice", "snow")
-    others = [made_felt(f, ahead(13), level, seed=50 + k) for k, (f, level) in enumerate(levels.items())]
+    others = [
+        made_felt(f, ahead(13), level, seed=50 + k) for k, (f, level) in enumerate(levels.items())
+    ]
     for felt, beliefs in zip(others, done.probability(others, HUSKY), strict=True):
         assert done.labels[int(beliefs[-1].argmax())] == felt.floor
     assert done.numbers > 0
