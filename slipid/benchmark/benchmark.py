@@ -6,6 +6,8 @@ from dataclasses import asdict
 from typing import Protocol
 
 from slipid.baselines.rows import ROWS
+from slipid.benchmark.felt.benchmark import felt_rows
+from slipid.benchmark.felt.part import FloorsFelt
 from slipid.benchmark.own import NAME
 from slipid.benchmark.protocols import PROTOCOLS, splits
 from slipid.benchmark.reading import reading
@@ -70,17 +72,15 @@ def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
             pieces += [
                 Piece(wish, source.name, kind, f.fold) for f in folds[: 1 if wish.quick else None]
             ]
+    felt, rectangle = FloorsFelt(wish), Rectangle(wish)
     parts: list[Part] = [*pieces]
-    rectangle = (
-        None
-        if wish.quick or not set(CONTROLLERS) & set(wish.only or CONTROLLERS)
-        else Rectangle(wish)
-    )
-    if rectangle is not None:
+    if felt.is_there:
+        parts.append(felt)
+    if not wish.quick and set(CONTROLLERS) & set(wish.only or CONTROLLERS):
         parts.insert(0, rectangle)
     report.stage(f"{len(parts)} parts")
     spread(work, {part.name: part for part in parts}, jobs, report)
-    driven = None if rectangle is None else rectangle.drive(jobs, report)
+    driven = rectangle.drive(jobs, report) if rectangle in parts else None
     report.stage("comparing")
     tables = tables_of(pieces)
     content = {
@@ -88,6 +88,7 @@ def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
         "quick": wish.quick,
         "sets": {name: _set(wish, name, protocols) for name, protocols in tables.items()},
         "protocols": {name: p.about for name, p in PROTOCOLS.items()},
+        "floors_felt": felt.table() if felt.is_there else None,
         "rectangle": driven,
         "reading": reading(tables),
         "seconds": round(time.monotonic() - began, 1),
@@ -108,8 +109,8 @@ def _known(wish: Wish) -> None:
         raise DataError(
             f"{wish.data}: no such folder; expected the folder of the data sets (--data)"
         )
-    every = [NAME, OWN_MAP, *ROWS, *CONTROLLERS]
-    every = list(dict.fromkeys(every))
+    classifiers = [method.name for method in felt_rows()]
+    every = list(dict.fromkeys([NAME, OWN_MAP, *ROWS, *classifiers, *CONTROLLERS]))
     for name in wish.only:
         if name not in every:
             raise DataError(

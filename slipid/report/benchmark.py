@@ -40,15 +40,17 @@ def show_benchmark(page: Page, found: Content) -> None:
                 column.no_wrap = True
             page.table(made)
             page.notes(absent(rows))
-    if (driven := found["rectangle"]) is not None:
-        if "failed" in driven:
-            page.line(f"\nrectangle: failed: {driven['failed']}")
-        else:
-            head, body = rectangle(driven)
-            made = table(head, f"\n{rectangle_title(driven)}", right=head[1:])
-            for cells_of_row in body:
-                made.add_row(*cells_of_row)
-            page.table(made)
+    for name, titled, rows_of in OTHERS:
+        if (one := found[name]) is None:
+            continue
+        if "failed" in one:
+            page.line(f"\n{name}: failed: {one['failed']}")
+            continue
+        head, body = rows_of(one)
+        made = table(head, f"\n{titled(one)}", right=head[1:])
+        for of_row in body:
+            made.add_row(*of_row)
+        page.table(made)
     page.line()
     for sentence in found["reading"]:
         page.line(sentence)
@@ -126,3 +128,33 @@ def rectangle(driven: Content) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         finished, cross = f"{100 * row['finished_share']:.0f}", f"{row['cross_track_rmse']:.0f}"
         body.append((name, closure, said, finished, cross))
     return head, body
+
+
+def felt_title(felt: Content) -> str:
+    """What was heard, and how often a guess is right."""
+    chance = f"always naming the commonest floor is right in {100 * felt['chance']:.0f} %"
+    return f"{felt['about']}; {felt['runs']} runs; {chance}"
+
+
+def felt(found: Content) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Head and rows of the table of classifiers: how often they are right, by the time heard."""
+    rows = [row for row in found["rows"] if row["after"]]
+    seconds = [after["seconds"] for after in rows[0]["after"]] if rows else []
+    head = ("right, %, after", *(f"{x:g} s" for x in seconds), "points over slipid", "numbers")
+    body: list[tuple[str, ...]] = []
+    for row in sorted(rows, key=lambda row: -row["after"][-1]["accuracy"][0]):
+        right = [
+            "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * x for x in after["accuracy"]))
+            for after in row["after"]
+        ]
+        behind = row["after"][-1]["behind"]
+        less = "" if behind is None else in_words("behind", behind)
+        body.append((row["name"], *right, less, str(row["numbers"])))
+    return head, body
+
+
+OTHERS = (
+    ("floors_felt", felt_title, felt),
+    ("rectangle", rectangle_title, rectangle),
+)
+"""Parts of benchmark.json that are one table each: their titles and rows."""

@@ -7,13 +7,12 @@ from pathlib import Path
 
 from slipid.report.benchmark import (
     COSTS,
+    OTHERS,
     absent,
     cells,
     costs,
     headings,
     ranked,
-    rectangle,
-    rectangle_title,
     shown,
 )
 from slipid.support.content import Content
@@ -60,12 +59,14 @@ def page(found: Content, pictures: Mapping[str, bytes]) -> str:
     ]
     for name, one in found["sets"].items():
         parts += _set(found, name, one, pictures.get(name))
-    if (driven := found["rectangle"]) is not None:
-        parts.append("<h2>Rectangle</h2>")
-        if "failed" in driven:
-            parts.append(f"<p>failed: {escape(driven['failed'])}</p>")
+    for name, title, rows in OTHERS:
+        if (one := found[name]) is None:
+            continue
+        parts.append(f"<h2>{escape(name.replace('_', ' '))}</h2>")
+        if "failed" in one:
+            parts.append(f"<p>failed: {escape(one['failed'])}</p>")
         else:
-            parts += [f"<p>{escape(rectangle_title(driven))}</p>", html_table(*rectangle(driven))]
+            parts += [f"<p>{escape(title(one))}</p>", html_table(*rows(one))]
     parts.append(f"<p class='note'>{_versions(found)}</p></html>")
     return "\n".join(parts)
 

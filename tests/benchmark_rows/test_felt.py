@@ -68,7 +68,10 @@ class Meter(FloorMethod):
         return len(self.level)
 
 
-def written(path, rows, header=",".join(COLUMNS)):
+HEADER = ",".join(COLUMNS)
+
+
+def written(path, rows, header=HEADER):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join([header, *rows]) + "\n")
 
@@ -104,13 +107,13 @@ def test_a_file_is_a_run_and_a_gap_makes_two(tmp_path):
 )
 def test_a_bad_file_is_named_with_its_row(tmp_path, rows, said):
     written(tmp_path / "ICE" / "00.csv", rows)
-    with pytest.raises(DataError, match="00.csv") as error:
+    with pytest.raises(DataError, match=r"00\.csv") as error:
         read_felt(tmp_path, 0.165)
     assert said in str(error.value)
 
 
 def test_a_missing_column_and_a_missing_folder_are_named(tmp_path):
-    with pytest.raises(DataError, match="no file FLOOR/RUN.csv"):
+    with pytest.raises(DataError, match=r"no file FLOOR/RUN\.csv"):
         read_felt(tmp_path, 0.165)
     written(tmp_path / "ICE" / "00.csv", ["0,1"], "time,curL")
     with pytest.raises(DataError, match="column 'curR': no such column"):

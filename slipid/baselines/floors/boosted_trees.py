@@ -19,8 +19,8 @@ which slipid does not.
 
 Liberties
 - No published system is copied; the features are those of `slipid.baselines.floors.features`.
-- Training runs are cut into pieces of `piece_s`, each heard anew, so that trees also see windows
-  that have just begun, as they are at the start of what they are judged on.
+- Training runs are heard in pieces of `piece_s`, each anew, so that trees also see windows that
+  have just begun, as they are at the start of what they are judged on.
 - Of every few rows one is used for training: neighbours say nearly the same.
 
 Source: Friedman 2001, Annals of Statistics 29(5), for boosting; Ke et al. 2017, NeurIPS, for trees
@@ -92,7 +92,8 @@ class BoostedTrees(FloorMethod):
         leaves: of a tree at most.
         trees: boosting steps, a tree per floor each; rate: of learning.
         apart_s, memory_s: of `accumulated` [s].
-        rows_s: rows for training are so far apart [s]; piece_s: lengths they are cut from [s].
+        rows_s: how far apart rows for training are; piece_s: after which these runs are heard
+            anew [s].
         tuned: whether cross-validation picks settings.
         fitted: the ensemble, and the one whose likelihood is taken off.
     """
@@ -143,7 +144,9 @@ class BoostedTrees(FloorMethod):
         from threadpoolctl import threadpool_limits
 
         rows, floor = rows_of(
-            felts, self.piece_s, lambda felt: features(felt, machine, hearing), self.rows_s
+            felts,
+            lambda felt: features(felt, machine, hearing, piece_s=self.piece_s),
+            self.rows_s,
         )
         trees = HistGradientBoostingClassifier(
             max_iter=self.trees,

@@ -91,8 +91,8 @@ class CosineEnergy(FloorMethod):
         return [replace(self, harmonics=count, logarithm=log) for count, log in pairs]
 
     def fit(self, felts: Sequence[Felt], machine: Machine) -> "CosineEnergy":
-        labels, pieces = floors_of(felts), 8.0
-        rows, floor = rows_of(felts, pieces, lambda felt: self._seen(felt, machine))
+        labels = floors_of(felts)
+        rows, floor = rows_of(felts, lambda felt: self._seen(felt, machine))
         known = np.isfinite(rows).all(axis=1)
         fitted = [self._series(rows[known & (floor == name)]) for name in labels]
         weight = np.stack([one.weight[0] for one in fitted])

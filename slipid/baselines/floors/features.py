@@ -41,11 +41,16 @@ def features(
     machine: Machine,
     hearing: Hearing = Hearing(),
     windows_s: Sequence[float] = WINDOWS_S,
+    piece_s: float = np.inf,
 ) -> Float[np.ndarray, "row feature"]:
-    """Features of every row, by the rows up to it; NaN where nothing was heard of a channel."""
-    columns = [np.minimum(felt.time - felt.time[0], max(windows_s))]
+    """Features of every row, by the rows up to it; NaN where nothing was heard of a channel.
+
+    After every `piece_s` [s] what came before is forgotten, as if the run began anew.
+    """
+    began = felt.began(piece_s)
+    columns = [np.minimum(felt.time - felt.time[began], max(windows_s))]
     for seconds in windows_s:
-        window = Window.of(felt.time, seconds)
+        window = Window.of(felt.time, seconds, began)
         columns += [column for x in _moving(felt, hearing) for column in window.both(x)]
         if hearing.current:
             amps, turned = np.abs(felt.current).sum(axis=1), np.abs(felt.speed).sum(axis=1)
@@ -84,9 +89,15 @@ class Window:
     first: Int[np.ndarray, " row"]
 
     @classmethod
-    def of(cls, time: Float[np.ndarray, " row"], seconds: float) -> "Window":
-        """Windows of a length at rows of these times [s]."""
-        return cls(np.searchsorted(time, time - seconds + 1e-6))
+    def of(
+        cls,
+        time: Float[np.ndarray, " row"],
+        seconds: float,
+        began: Int[np.ndarray, " row"] | None = None,
+    ) -> "Window":
+        """Windows of a length at rows of these times [s], none of them from before `began`."""
+        first = np.searchsorted(time, time - seconds + 1e-6)
+        return cls(first if began is None else np.maximum(first, began))
 
     def mean(self, x: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
         """Mean over each window of what is a number; NaN where nothing is."""

@@ -71,8 +71,8 @@ class Gaussian(FloorMethod):
     Attributes:
         shared: part of the covariance that floors have in common.
         ridge: added to every covariance of comparable features.
-        window_s: length of the windows; apart_s: as of `accumulated`; piece_s: lengths that
-            training runs are cut into, each heard anew [s].
+        window_s: length of the windows; apart_s: as of `accumulated`; piece_s: after which
+            training runs are heard anew [s].
         fitted: the Gaussians; None before.
     """
 
@@ -89,7 +89,7 @@ class Gaussian(FloorMethod):
 
     def fit(self, felts: Sequence[Felt], machine: Machine) -> "Gaussian":
         labels = floors_of(felts)
-        rows, floor = rows_of(felts, self.piece_s, lambda felt: self._features(felt, machine))
+        rows, floor = rows_of(felts, lambda felt: self._features(felt, machine, self.piece_s))
         middle, scale = np.nanmean(rows, axis=0), np.nanstd(rows, axis=0)
         comparable = np.nan_to_num((rows - middle) / np.maximum(scale, 1e-9), nan=0.0)
         groups = [comparable[floor == name] for name in labels]
@@ -123,6 +123,8 @@ class Gaussian(FloorMethod):
         floors, count = self.fitted.mean.shape
         return floors * (count + count * (count + 1) // 2)
 
-    def _features(self, felt: Felt, machine: Machine) -> Float[np.ndarray, "row feature"]:
+    def _features(
+        self, felt: Felt, machine: Machine, piece_s: float = np.inf
+    ) -> Float[np.ndarray, "row feature"]:
         """Those of one window, without the time heard."""
-        return features(felt, machine, Hearing(), (self.window_s,))[:, 1:]
+        return features(felt, machine, Hearing(), (self.window_s,), piece_s)[:, 1:]

@@ -11,7 +11,7 @@ from itertools import pairwise
 from typing import Self
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from slipid.baselines.interface import Machine
 
@@ -71,11 +71,15 @@ class Felt:
             vibration=None if self.vibration is None else self.vibration[rows],
         )
 
+    def began(self, seconds: float) -> Int[np.ndarray, " row"]:
+        """First row of the piece that each row is in, of pieces of this length [s]."""
+        start = np.cumsum(self.dt) - self.dt
+        number = np.floor(start / seconds + 1e-6)
+        return np.searchsorted(number, number)
+
     def pieces(self, seconds: float) -> list["Felt"]:
         """The run cut into parts of this length one after another, the last of them shorter."""
-        start = np.cumsum(self.dt) - self.dt
-        number = np.floor(start / seconds + 1e-6).astype(int)
-        edges = [*np.flatnonzero(np.diff(number, prepend=-1)), len(self)]
+        edges = [*np.unique(self.began(seconds)), len(self)]
         return [self.part(int(a), int(b)) for a, b in pairwise(edges)]
 
     def rolling(self, machine: Machine) -> Float[np.ndarray, "row 3"]:
@@ -123,22 +127,19 @@ def floors_of(felts: Sequence[Felt]) -> tuple[str, ...]:
 
 def rows_of(
     felts: Sequence[Felt],
-    piece_s: float,
     features: Callable[[Felt], Float[np.ndarray, "row feature"]],
     every_s: float = 0.0,
 ) -> tuple[Float[np.ndarray, "row feature"], np.ndarray]:
     """Features to train on and the floor of each row, of rows in which the robot moves.
 
-    Runs are cut into pieces of `piece_s` [s], each of them heard anew; rows that are taken are
-    about `every_s` [s] apart.
+    Rows that are taken are about `every_s` apart [s].
     """
     found, floors = [], []
     for felt in felts:
         every = max(1, round(every_s / max(float(np.median(felt.dt)), 1e-3)))
-        for piece in felt.pieces(piece_s):
-            take = np.flatnonzero(piece.moves)[::every]
-            found.append(features(piece)[take])
-            floors += [felt.floor] * len(take)
+        take = np.flatnonzero(felt.moves)[::every]
+        found.append(features(felt)[take])
+        floors += [felt.floor] * len(take)
     return np.concatenate(found), np.array(floors)
 
 

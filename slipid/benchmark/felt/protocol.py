@@ -72,13 +72,14 @@ def answers_of(
     return [
         answer
         for stretch, beliefs in zip(stretches, said, strict=True)
-        for answer in _answers(stretch, beliefs, method.labels, seconds)
+        for answer in asked_after(stretch, beliefs, method.labels, seconds)
     ]
 
 
-def _answers(
+def asked_after(
     stretch: Felt, beliefs: Beliefs, labels: Sequence[str], seconds: Sequence[float]
 ) -> list[Answer]:
+    """What beliefs say after each of the times that count, see the head of this file."""
     heard, step = np.cumsum(stretch.dt), float(np.median(stretch.dt))
     out = []
     for long in seconds:

@@ -30,13 +30,12 @@ def mixed_felts(seed: int = 0):
     return felts
 
 
-def training(method, felts, hearing=None, every=0.0):
-    take = (
-        (lambda f: features(f, HUSKY, hearing))
-        if hearing
-        else (lambda f: features(f, HUSKY, Hearing(), (method.window_s,))[:, 1:])
-    )
-    return rows_of(felts, method.piece_s, take, every)
+def training(method, felts):
+    """Features and floors as a method trains on them."""
+    if isinstance(method, Gaussian):
+        return rows_of(felts, lambda f: method._features(f, HUSKY, method.piece_s))
+    take = lambda f: features(f, HUSKY, method.hearing, piece_s=method.piece_s)  # noqa: E731
+    return rows_of(felts, take, method.rows_s)
 
 
 @pytest.mark.parametrize("shared", [0.0, 1.0])
@@ -60,11 +59,9 @@ def test_a_gaussian_is_discriminant_analysis(shared):
 
 
 def test_a_shared_part_lies_between():
-    felts, rows = mixed_felts(), None
-    found = []
+    felts, found = mixed_felts(), []
     for shared in (0.0, 0.5, 1.0):
         method = Gaussian(shared=shared)
-        rows, _ = training(method, felts)
         root = method.fit(felts, HUSKY).fitted.root
         found.append(np.linalg.inv(root) @ np.linalg.inv(root).transpose(0, 2, 1))
     assert np.allclose(found[1], 0.5 * (found[0] + found[2]))
@@ -74,7 +71,7 @@ def test_trees_are_those_of_the_library():
     felts = mixed_felts()
     method = BoostedTrees(trees=15, apart_s=1 / HZ, memory_s=np.inf)
     done = method.fit(felts, HUSKY)
-    rows, floor = training(method, felts, Hearing(), method.rows_s)
+    rows, floor = training(method, felts)
     oracle = HistGradientBoostingClassifier(
         max_iter=15,
         learning_rate=method.rate,

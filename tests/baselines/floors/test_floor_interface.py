@@ -102,13 +102,21 @@ def test_the_gyro_counts_as_what_it_falls_short_whichever_way_it_turns():
     assert features(left, HUSKY)[-1, -2] == pytest.approx(turn - 0.3)
 
 
+def test_features_of_a_run_heard_anew_are_those_of_its_pieces():
+    felt = made_felt("grass", ahead(61), 2.0)
+    each = [features(piece, HUSKY) for piece in felt.pieces(2.0)]
+    assert np.allclose(features(felt, HUSKY, piece_s=2.0), np.concatenate(each), atol=1e-6)
+    assert not np.allclose(features(felt, HUSKY), np.concatenate(each), atol=1e-3)
+
+
 def test_rows_to_train_on_are_apart_and_move():
     felt = made_felt("grass", ahead(52), 2.0)
     still = replace(felt, speed=np.where(np.arange(52)[:, None] < 26, 0.0, felt.speed))
-    rows, floor = rows_of([felt, still], 4.0, lambda f: f.time[:, None], every_s=0.3)
+    rows, floor = rows_of([felt, still], lambda f: f.time[:, None], every_s=0.3)
     assert (floor == "grass").all()
     assert len(rows) == 26 + 13
     assert np.diff(rows[:26, 0]) == pytest.approx(2 / HZ)
+    assert rows[26:].min() >= 26 / HZ
 
 
 @pytest.mark.parametrize(

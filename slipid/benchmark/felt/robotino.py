@@ -1,0 +1,155 @@
+"""The floors of the Robotino runs of 2022, by wheels and sizes of currents alone.
+
+Runs are split by headings, as elsewhere in the benchmark, and are heard from where the wheels have
+moved a centimetre; none of them stands or starts anew in between. slipid is its fit to the training
+runs with their poses, and the estimator as it is deployed; the other rows never see a pose.
+"""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from slipid.baselines.floors.boosted_trees import tree_rows
+from slipid.baselines.floors.cosine_energy import CosineEnergy
+from slipid.baselines.floors.gaussian import Gaussian
+from slipid.baselines.floors.interface import Felt, FloorMethod
+from slipid.baselines.interface import Machine, Run, Said
+from slipid.benchmark.felt.protocol import Asked, Judged, answers_of, asked_after, table_of, tuned
+from slipid.benchmark.felt.result import Answer, FeltRow, FeltTable
+from slipid.benchmark.own import NAME, Own, fit_own, untold
+from slipid.benchmark.protocols import Split, base_of, splits
+from slipid.benchmark.sets import DataSet
+from slipid.benchmark.steps import Cut, cut
+from slipid.benchmark.work import Piece, Wish, data_of, kept_of, problem_of
+
+SOURCE, KIND = "robotino2022", "headings"
+SECONDS = (0.25, 0.5, 1.0, 2.0)
+"""After which classifiers are asked; runs last two to six [s]."""
+ABOUT = "Robotino on four floors, straight runs: wheel speeds and sizes of currents"
+
+
+def robotino_rows() -> list[FloorMethod]:
+    """Classifiers beside slipid; without a gyro and an accelerometer there is no vibration row."""
+    trees = [row for row in tree_rows() if not row.hearing.vibration]
+    return [CosineEnergy(), Gaussian(), *trees]
+
+
+def robotino_felt(wish: Wish) -> FeltTable:
+    """The table of all classifiers on the Robotino's runs, or of those that are wished for.
+
+    A fit of slipid that is kept of the same runs is not done again.
+    """
+    data = data_of(wish, SOURCE)
+    found = splits(data.facts, KIND)[: 1 if wish.quick else None]
+    asked = Asked(seconds=SECONDS, inner=1 if wish.quick else 2)
+    parts: dict[str, list[Judged]] = {}
+    judged: list[Felt] = []
+    for split in found:
+        own = fit_own(
+            data.job,
+            problem_of(wish, SOURCE),
+            split.fitted,
+            kept_of(Piece(wish, SOURCE, KIND, split.fold), fit=True),
+        )
+        fitted, cuts = _fitted(data, split, own), _judged(data, split, own)
+        felts = [felt_of(run) for one in cuts for run in one.runs]
+        judged += felts
+        if not wish.only or NAME in wish.only:
+            parts.setdefault(NAME, []).append(_own(own, cuts, data, split, felts))
+        for method in robotino_rows():
+            if not wish.only or method.name in wish.only:
+                done = _published(method, fitted, felts, data.machine, asked)
+                parts.setdefault(method.name, []).append(done)
+    return table_of(
+        {name: _joined(each) for name, each in parts.items()}, judged, ABOUT, asked, NAME
+    )
+
+
+def felt_of(run: Run) -> Felt:
+    """A run as classifiers hear it, without its pose.
+
+    Raises:
+        ValueError: it has no currents.
+    """
+    heard = run.heard
+    if heard.current is None:
+        raise ValueError(f"{heard.name}: no current; floors are felt by it")
+    return Felt(
+        name=heard.name,
+        floor=base_of(run.floor),
+        time=np.cumsum(heard.dt),
+        speed=heard.speed,
+        current=np.abs(heard.current),
+        gyro=heard.gyro,
+    )
+
+
+def _fitted(data: DataSet, split: Split, own: Own) -> list[Felt]:
+    cuts = cut(data.heard.subset(split.fitted), own.contact.robot, data.source.poses_per_step)
+    runs = {k: run for one in cuts for k, run in zip(one.numbers, one.runs, strict=True)}
+    return [felt_of(runs[k]) for k in sorted(runs)]
+
+
+def _judged(data: DataSet, split: Split, own: Own) -> list[Cut]:
+    return cut(data.heard.subset(split.judged), own.contact.robot, data.source.poses_per_step)
+
+
+def _own(own: Own, cuts: list[Cut], data: DataSet, split: Split, felts: list[Felt]) -> Judged:
+    """slipid's estimator on the runs that were left out."""
+    began = time.perf_counter()
+    said = untold(own, cuts, data.heard.subset(split.judged))
+    took = time.perf_counter() - began
+    answers: list[Answer] = []
+    for felt, one in zip(felts, said, strict=True):
+        labels, beliefs = _beliefs(one)
+        answers += asked_after(felt, beliefs, labels, SECONDS)
+    rows = sum(len(felt) for felt in felts)
+    row = FeltRow(NAME, numbers=own.numbers, fit_s=own.seconds, row_us=1e6 * took / rows)
+    return Judged(row, tuple(answers))
+
+
+def _beliefs(said: Said) -> tuple[tuple[str, ...], np.ndarray]:
+    """Floors, and their probabilities given that it is one of them."""
+    assert said.floors is not None
+    labels = tuple(name for name in said.floors if name != "unknown")
+    each = np.stack([said.floors[name] for name in labels], axis=1)
+    return labels, each / each.sum(axis=1, keepdims=True)
+
+
+def _published(
+    method: FloorMethod, fitted: list[Felt], felts: list[Felt], machine: Machine, asked: Asked
+) -> Judged:
+    """A classifier fitted to some runs and asked of others, from their starts on."""
+    starts = [felt.pieces(max(SECONDS))[0] for felt in felts]
+    found = tuned(method, fitted, machine, asked)
+    began = time.perf_counter()
+    done = found.method.fit(fitted, machine)
+    ended = time.perf_counter()
+    answers = answers_of(done, starts, machine, SECONDS)
+    row = FeltRow(
+        method.name,
+        settings=(found.settings,),
+        numbers=done.numbers,
+        fit_s=ended - began,
+        tune_s=found.seconds,
+        row_us=1e6 * (time.perf_counter() - ended) / sum(len(felt) for felt in starts),
+    )
+    return Judged(row, tuple(answers))
+
+
+def _joined(parts: list[Judged]) -> Judged:
+    """All folds of a classifier."""
+
+    def median(name: str) -> float:
+        return float(np.median([getattr(part.row, name) for part in parts]))
+
+    row = replace(
+        parts[0].row,
+        settings=tuple(word for part in parts for word in part.row.settings),
+        numbers=int(median("numbers")),
+        fit_s=median("fit_s"),
+        tune_s=median("tune_s"),
+        row_us=median("row_us"),
+    )
+    return Judged(row, tuple(answer for part in parts for answer in part.answers))
