@@ -123,7 +123,10 @@ def _floor_right(run: Run, said: Said) -> float | None:
         return None
     names = list(said.floors)
     best = np.argmax(np.stack([said.floors[name] for name in names]), axis=0)
-    right = np.array([base_of(names[k]) == base_of(run.floor) for k in best])
+    known = {base_of(name) for name in names}
+    # a floor that nobody has seen is rightly called unknown
+    true = base_of(run.floor) if base_of(run.floor) in known else "unknown"
+    right = np.array([base_of(names[k]) == true for k in best])
     return float((right * run.heard.dt).sum() / run.heard.dt.sum())
 
 

@@ -44,7 +44,10 @@ PROTOCOLS: dict[str, Protocol] = {
 
 @dataclass(frozen=True)
 class Facts:
-    """What splits go by: floor, direction commanded [deg] and speed [m/s] of a run."""
+    """What splits go by: floor, direction commanded [deg] and speed [m/s] of a run.
+
+    The floor has the name of the load set-up after it where that is not the usual one.
+    """
 
     floor: str
     heading_deg: float
@@ -52,7 +55,7 @@ class Facts:
 
     @classmethod
     def of(cls, run: Run) -> "Facts":
-        return cls(base_of(run.floor), float(np.degrees(run.heading)), run.speed)
+        return cls(run.floor, float(np.degrees(run.heading)), run.speed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +86,20 @@ def base_of(floor: str) -> str:
     return floor.partition("@")[0]
 
 
+def setups_of(data: Runs) -> list[str]:
+    """Floor of each run, and its load set-up where that is not the one most runs have."""
+    loads = [log.load for log in data.logs]
+    main = max(dict.fromkeys(loads), key=loads.count)
+    return [
+        f"{log.surface or 'unknown'}" + ("" if log.load == main else f"@{log.load}")
+        for log in data.logs
+    ]
+
+
 def facts_of(data: Runs, base_radius: float) -> list[Facts]:
     """Of all runs; a robot that does not drive sideways has the direction of (speed, turning)."""
     out = []
+    floors = setups_of(data)
     for k, log in enumerate(data.logs):
         speed, turn = float(data.speed[k]), float(data.turn[k])
         heading = float(np.degrees(data.heading[k]))
@@ -93,7 +107,7 @@ def facts_of(data: Runs, base_radius: float) -> list[Facts]:
             ahead = float(np.median(log.twist_command[:, 0]))
             heading = float(np.degrees(np.arctan2(base_radius * turn, ahead)))
             speed = float(np.hypot(ahead, base_radius * turn))
-        out.append(Facts(log.surface or "unknown", heading, speed))
+        out.append(Facts(floors[k], heading, speed))
     return out
 
 
@@ -136,7 +150,7 @@ def speeds(facts: Sequence[Facts]) -> Labels:
 
 def floors(facts: Sequence[Facts]) -> Labels:
     """Parts of one floor each."""
-    return np.unique([f.floor for f in facts], return_inverse=True)[1]
+    return np.unique([base_of(f.floor) for f in facts], return_inverse=True)[1]
 
 
 KINDS: dict[str, Callable[[Sequence[Facts]], Labels]] = {

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from slipid.baselines.interface import Machine
-from slipid.benchmark.protocols import Facts, facts_of
+from slipid.benchmark.protocols import Facts, facts_of, setups_of
 from slipid.benchmark.steps import POSES_PER_STEP
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.runs import Runs, collect
@@ -144,12 +144,7 @@ class DataSet:
     @property
     def setups(self) -> list[str]:
         """Floor of each run, and its load set-up where that is not the one most runs have."""
-        loads = [log.load for log in self.heard.logs]
-        main = max(dict.fromkeys(loads), key=loads.count)
-        return [
-            f"{log.surface}" if log.load == main else f"{log.surface}@{log.load}"
-            for log in self.heard.logs
-        ]
+        return setups_of(self.heard)
 
 
 def there(source: Source, data: Path) -> bool:

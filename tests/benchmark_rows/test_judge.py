@@ -79,6 +79,8 @@ def test_floors_are_right_for_a_part_of_the_time():
     told = said(run, run.twist, floors={"gray": gray, "green": 1 - gray})
     assert judged(run.told(False), told, ROBOTINO, "chord").floor_right == pytest.approx(0.75)
     assert judged(run.told(True), told, ROBOTINO, "chord").floor_right is None
+    new = replace(told, floors={"green": 1 - gray, "unknown": gray})
+    assert judged(run.told(False), new, ROBOTINO, "chord").floor_right == pytest.approx(0.75)
 
 
 def test_energy_is_judged_as_a_whole():

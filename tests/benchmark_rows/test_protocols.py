@@ -53,6 +53,14 @@ def test_a_floor_driven_at_one_speed_keeps_it():
         assert "table" not in {every[k].floor for k in split.judged}
 
 
+def test_a_load_driven_at_one_speed_keeps_it_and_a_floor_is_left_out_with_all_loads():
+    every = [*facts(), *facts(("gray@moved",), (0.1,))]
+    for split in splits(every, "speeds"):
+        assert "gray@moved" not in {every[k].floor for k in split.judged}
+    left_out = [{every[k].floor for k in split.judged} for split in splits(every, "floors")]
+    assert left_out == [{"gray", "gray@moved"}, {"green"}]
+
+
 def test_many_speeds_are_three_parts():
     rng = np.random.default_rng(0)
     every = [Facts("grass", 0.0, float(v)) for v in rng.uniform(0.5, 3.0, 60)]

@@ -41,7 +41,7 @@ def test_recorded_runs_need_no_data_folder(testsite):
     assert len(testsite.heard) == len(testsite.job.dataset) == 120
     assert set(testsite.setups) == {"firm", "soft", "soft@moved"}
     assert testsite.machine.determines_twist
-    assert {fact.floor for fact in testsite.facts} == {"firm", "soft"}
+    assert {fact.floor for fact in testsite.facts} == {"firm", "soft", "soft@moved"}
 
 
 def test_a_part_of_the_runs_has_every_floor_and_speed(testsite):

@@ -4,9 +4,9 @@
     .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks/bench_floors_felt.py
 
 (about three minutes of one processor). The runs of "borealtc": a Husky on five floors, 6.5 rows a
-second, currents without a sign. Prints how often slipid's floor filter and the classifiers beside it
-name the right floor of runs that none of them was fitted to, by the seconds heard, and how often
-slipid named which. Without a pose the numbers of a floor are only those that make its currents and
+second, currents without a sign. Prints how often slipid's floor filter and the classifiers beside
+it name the right floor of runs that none of them was fitted to, by the seconds heard, and which
+floors slipid named. Without a pose the numbers of a floor are only those that make its currents and
 its turning; they are no identification, and frictions count in units of the motors' unknown torque
 constant.
 """
