@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from itertools import zip_longest
 from typing import Protocol
 
 from slipid.baselines.rows import ROWS
@@ -59,19 +60,7 @@ def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
             report.line(f"skipped: {source.name}: no folder {wish.data / source.folder}")
     writable(wish.out)
     report.stage("reading logs")
-    pieces: list[Piece] = []
-    for source in sources:
-        data = data_of(wish, source.name)
-        for kind in source.kinds:
-            if kind == "all" and data.crossing is None:
-                continue
-            asked = [
-                p for p in PROTOCOLS.values() if p.split == kind and (p.told or not wish.quick)
-            ]
-            folds = splits(data.facts, kind) if asked else []
-            pieces += [
-                Piece(wish, source.name, kind, f.fold) for f in folds[: 1 if wish.quick else None]
-            ]
+    pieces = in_turn([pieces_of(wish, source.name) for source in sources])
     felt, rectangle = FloorsFelt(wish), Rectangle(wish)
     parts: list[Part] = [*pieces]
     if felt.is_there:
@@ -97,6 +86,27 @@ def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
     report.stage("writing")
     write_json(wish.out / "benchmark.json", content)
     return content
+
+
+def pieces_of(wish: Wish, name: str) -> list[Piece]:
+    """All folds that a source is split into."""
+    data = data_of(wish, name)
+    found = []
+    for kind in data.source.kinds:
+        asked = [p for p in PROTOCOLS.values() if p.split == kind and (p.told or not wish.quick)]
+        if not asked or (kind == "all" and data.crossing is None):
+            continue
+        folds = splits(data.facts, kind)
+        found += [Piece(wish, name, kind, f.fold) for f in folds[: 1 if wish.quick else None]]
+    return found
+
+
+def in_turn(each: Sequence[Sequence[Piece]]) -> list[Piece]:
+    """Pieces of all sources by turns.
+
+    What one process has compiled for a source lies in the cache when another comes to it.
+    """
+    return [piece for row in zip_longest(*each) for piece in row if piece is not None]
 
 
 def work(part: Part) -> str:

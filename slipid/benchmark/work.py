@@ -97,7 +97,7 @@ def data_of(wish: Wish, source: str) -> DataSet:
     return found.thinned(QUICK_RUNS) if wish.quick else found
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=8)
 def problem_of(wish: Wish, source: str) -> Problem:
     """Fitting problem of all runs of a source, made and compiled once in every process."""
     return data_of(wish, source).job.problem()

@@ -122,7 +122,9 @@ def test_a_missing_column_and_a_missing_folder_are_named(tmp_path):
 
 def test_every_run_is_left_out_once_and_floors_are_in_every_fold():
     felts = made_felts({"grass": 2.0, "snow": 4.0}, runs=7)
+    felts = [*felts[:1], *felts[7:9], *felts[1:7], *felts[9:]]
     fold = folds_of(felts, 3)
+    assert fold.tolist() == [0, 0, 1, 1, 2, 0, 1, 2, 0, 2, 0, 1, 2, 0]
     assert sorted(set(fold.tolist())) == [0, 1, 2]
     for k in range(3):
         assert {f.floor for f, n in zip(felts, fold, strict=True) if n == k} == {"grass", "snow"}
@@ -160,6 +162,34 @@ def test_settings_are_picked_by_runs_that_the_candidate_was_not_fitted_to():
     assert found.method.off == 0.0
     assert found.settings == "off 0.0"
     assert tuned(Meter(tries=(9.0, 0.0)), felts, HUSKY, Asked(inner=1)).method.tries == (9.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Memory(Meter):
+    """Takes the first floor in runs that it was fitted to, and the last in all others."""
+
+    name: str = "memory"
+    known: frozenset[str] = frozenset()
+    right: bool = False
+
+    def candidates(self):
+        return [self, replace(self, right=True)]
+
+    def fit(self, felts, machine):
+        return replace(self, labels=floors_of(felts), known=frozenset(f.name for f in felts))
+
+    def probability(self, felts, machine):
+        seen = [f.name in self.known for f in felts]
+        each = [np.array([0.9, 0.1]) if s else np.array([0.1, 0.9]) for s in seen]
+        return [np.tile(p, (len(f), 1)) for p, f in zip(each, felts, strict=True)]
+
+
+@pytest.mark.parametrize("judged", [1, 3])
+def test_nobody_is_asked_of_runs_that_it_was_fitted_to(judged):
+    felts = made_felts({"grass": 2.0, "snow": 4.0}, runs=6)
+    table = felt_table([Memory()], felts, HUSKY, "made", Asked((1.0,), 3, judged), "memory")
+    assert table.rows[0].said["grass"] == {"grass": 0.0, "snow": 100.0}
+    assert len(table.rows[0].settings) == judged
 
 
 def answer(run, right, probability=0.5, floor="grass"):

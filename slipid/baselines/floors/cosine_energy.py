@@ -1,8 +1,9 @@
 """Belyaev and Kushnarev 2025: the floor by what driving costs in the direction of travel.
 
-Over the last half second let P be the electric power, (v_x, v_y, W) the twist that the encoders
-tell, and
+Over the last half second let (v_x, v_y, W) be the twist that the encoders tell, w and I speed and
+current of each motor, and
 
+    P = sum_i (R |I_i| + C_e |w_i|) |I_i|                 electric power, or without R I^2
     u = sqrt(v_x^2 + v_y^2 + (L W)^2),     phi = direction of (v_x, v_y)
     e = P / (m g u)                                       energy coefficient (cost of transport)
     e ~ a_0 + sum_k a_k cos(k phi) + b_k sin(k phi)       of each floor, k = 1, 2, 3, ..
@@ -10,8 +11,8 @@ tell, and
 
 s is the std that a floor's series leaves. Wheels that do not drive sideways have no direction of
 travel; phi is then the angle of (v_x, L W): 0 is straight ahead, a right angle turning on the spot.
-Tuned by cross-validation: how many harmonics there are, and whether e counts as it is or by its
-logarithm.
+Tuned by cross-validation: whether the heat R I^2 is part of P, without which e depends on currents
+and the ratio of speeds alone, and whether e counts as it is or by its logarithm.
 
 Liberties
 - The paper was known here by its abstract and headings: an energy coefficient of motor current and
@@ -70,7 +71,7 @@ class CosineEnergy(FloorMethod):
     """Energy coefficient as a cosine series in the direction of travel, and a Gaussian about it.
 
     Attributes:
-        harmonics: how many.
+        harmonics: how many; losses: whether the heat of the windings is part of the power.
         logarithm: whether the coefficient's logarithm is modelled.
         ridge: on all but the constant, as so many rows that say zero.
         window_s: length of the mean; apart_s, memory_s: as of `accumulated` [s].
@@ -78,7 +79,8 @@ class CosineEnergy(FloorMethod):
     """
 
     name: str = "belyaev_kushnarev"
-    harmonics: int = 3
+    harmonics: int = 6
+    losses: bool = True
     logarithm: bool = False
     ridge: float = 10.0
     window_s: float = 0.5
@@ -87,8 +89,8 @@ class CosineEnergy(FloorMethod):
     fitted: Series | None = field(default=None, repr=False)
 
     def candidates(self) -> Sequence["CosineEnergy"]:
-        pairs = [(3, False), (6, False), (3, True), (6, True)]
-        return [replace(self, harmonics=count, logarithm=log) for count, log in pairs]
+        both = (True, False)
+        return [replace(self, losses=heat, logarithm=log) for heat in both for log in both]
 
     def fit(self, felts: Sequence[Felt], machine: Machine) -> "CosineEnergy":
         labels = floors_of(felts)
@@ -135,7 +137,8 @@ class CosineEnergy(FloorMethod):
         across = y if machine.determines_twist else turn
         speed = np.sqrt(x**2 + y**2 + turn**2)
         amps, shaft = np.abs(felt.current), np.abs(machine.gear_ratio * felt.speed)
-        power = ((machine.resistance * amps + machine.back_emf * shaft) * amps).sum(axis=1)
+        heat = machine.resistance * self.losses * amps
+        power = ((heat + machine.back_emf * shaft) * amps).sum(axis=1)
         moving = speed > SLOW
         energy = window.mean(power) / (machine.mass * GRAVITY * np.where(moving, speed, np.nan))
         energy = np.log(np.maximum(energy, 1e-9)) if self.logarithm else energy

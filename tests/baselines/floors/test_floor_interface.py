@@ -73,6 +73,10 @@ def test_windows_hold_the_last_seconds_and_nothing_else():
         assert std[t] == pytest.approx(mine.std(), abs=1e-6)
 
 
+def test_a_window_of_half_a_second_holds_two_rows_a_quarter_apart():
+    assert Window.of(0.25 * np.arange(5), 0.5).first.tolist() == [0, 0, 1, 2, 3]
+
+
 def test_windows_leave_out_what_was_not_heard():
     x = np.array([np.nan, 1.0, np.nan, 3.0])
     mean, std = Window.of(np.arange(4.0), 10.0).both(x)
