@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.baselines.interface import Machine, Said
+from slipid.baselines.interface import Heard, Machine, Said
 from slipid.benchmark.steps import Cut, body_poses
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
@@ -37,6 +37,8 @@ STEPS = 16
 """Estimators drive a number of steps that is a multiple of it, so that few shapes are compiled."""
 TOGETHER = 32
 """Runs that an estimator drives in one call."""
+LONGEST_S = 0.25
+"""Longer steps are driven in several: what lasts more than half a second is no step to it [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,28 +143,43 @@ def _currents(robot: Any, b: lk.Batch) -> Array:
     return lk.predicted_current(robot, b, lk.predict(robot, b).felt)
 
 
-def untold(own: Own, cuts: Sequence[Cut], data: Runs, floor: FloorMap | None = None) -> list[Said]:
-    """What the estimator says of runs whose floors it is not told, in the order of the cuts.
+def estimated(
+    own: Own, cuts: Sequence[Cut], data: Runs, told: bool = False, floor: FloorMap | None = None
+) -> list[Said]:
+    """What the estimator says of runs, in the order of the cuts.
 
-    With a map it starts at the first pose of the body, in the frame of the map.
+    Args:
+        own: the fit; data: the runs that the cuts are of.
+        told: whether the floor of each run is told: then it is the only one there is.
+        floor: map of the floors; the estimator then starts at the first pose of the body, in the
+            frame of the map.
     """
     runs = [(run, cut.numbers[k]) for cut in cuts for k, run in enumerate(cut.runs)]
-    several = floor is not None or any(run.floor == "unknown" for run, _ in runs)
-    signed = own.job.dataset.current_is_signed
     out: dict[int, Said] = {}
-    for load in dict.fromkeys(data.logs[number].load for _, number in runs):
-        mine = [n for n, (_, number) in enumerate(runs) if data.logs[number].load == load]
-        whole = robot_of(own.contact, own.highest_speed, own.trend, Sensors(signed), load)
-        # a floor that nobody has seen has no numbers
-        robot = DeployedRobot.of(whole.record.on(own.seen), load)
-        settings = Settings.of(robot)
-        if several:
-            settings = replace(settings, alike=MIXED)
-        known = None if floor is None else floor_of(floor, robot.labels)
-        estimator = Estimator(_same_structure(robot), settings, known)
+    alone = {n: data.logs[number].surface if told else None for n, (_, number) in enumerate(runs)}
+    kinds = [(data.logs[number].load, alone[n]) for n, (_, number) in enumerate(runs)]
+    for load, only in dict.fromkeys(kinds):
+        mine = [n for n, kind in enumerate(kinds) if kind == (load, only)]
+        estimator = _estimator(own, load, only, floor, runs[mine[0]][0].floor == "unknown")
         said = replay(estimator, [runs[n][0].heard for n in mine], _starts(runs, mine, floor))
         out.update(zip(mine, said, strict=True))
     return [out[n] for n in range(len(runs))]
+
+
+def _estimator(
+    own: Own, load: str, only: str | None, floor: FloorMap | None, several: bool
+) -> Estimator:
+    """The estimator of a fit, for all floors that were fitted, or only one."""
+    signed = own.job.dataset.current_is_signed
+    whole = robot_of(own.contact, own.highest_speed, own.trend, Sensors(signed), load)
+    # a floor that nobody has seen has no numbers
+    rows = own.seen if only is None else (whole.labels.index(only),)
+    robot = DeployedRobot.of(whole.record.on(rows), load)
+    settings = Settings.of(robot)
+    if several or floor is not None:
+        settings = replace(settings, alike=MIXED)
+    known = None if floor is None else floor_of(floor, robot.labels)
+    return Estimator(_same_structure(robot), settings, known)
 
 
 def _starts(runs: Sequence[Any], mine: Sequence[int], floor: FloorMap | None) -> np.ndarray:
@@ -220,43 +237,46 @@ def _driven(
     return jax.vmap(one)(start, rows)
 
 
-def replay(estimator: Estimator, runs: Sequence[Any], start: np.ndarray) -> list[Said]:
+def replay(estimator: Estimator, runs: Sequence[Heard], start: np.ndarray) -> list[Said]:
     """Estimates of runs from what was heard of them, from poses (run, 3) on.
 
-    The first row is the wheels' first angle, in which no time passes.
+    The first row is the wheels' first angle, in which no time passes. Steps longer than `LONGEST_S`
+    are driven in equal parts.
     """
-    longest = max(len(run) for run in runs)
+    parts = [np.ceil(run.dt / LONGEST_S - 1e-9).astype(int).clip(1) for run in runs]
+    longest = max(int(part.sum()) for part in parts)
     longest = -(-longest // STEPS) * STEPS + 1
     drives = estimator.robot.drives
+    names = (*estimator.robot.labels, "unknown")
     out: list[Said] = []
     for first in range(0, len(runs), TOGETHER):
-        some = runs[first : first + TOGETHER]
+        some = range(first, min(first + TOGETHER, len(runs)))
         angle = np.full((TOGETHER, longest, drives), np.nan)
         current = np.full((TOGETHER, longest, drives), np.nan)
         gyro, dt = np.full((TOGETHER, longest), np.nan), np.zeros((TOGETHER, longest))
         begin = np.zeros((TOGETHER, 3))
         begin[: len(some)] = start[first : first + TOGETHER]
-        for n, run in enumerate(some):
-            rows = slice(1, len(run) + 1)
-            angle[n, 0], angle[n, rows] = 0.0, np.cumsum(run.turn, axis=0)
-            dt[n, rows] = run.dt
+        for n, k in enumerate(some):
+            run, part = runs[k], parts[k]
+            rows = slice(1, int(part.sum()) + 1)
+            turn = np.repeat(run.turn / part[:, None], part, axis=0)
+            angle[n, 0], angle[n, rows] = 0.0, np.cumsum(turn, axis=0)
+            dt[n, rows] = np.repeat(run.dt / part, part)
             if run.current is not None:
-                current[n, rows] = run.current
+                current[n, rows] = np.repeat(run.current, part, axis=0)
             if run.gyro is not None:
-                gyro[n, rows] = run.gyro
+                gyro[n, rows] = np.repeat(run.gyro, part)
         heard = _Rows(*(jnp.asarray(x) for x in (angle, current, gyro, dt)))
         pose, cov, floors = (np.asarray(x) for x in _driven(estimator, jnp.asarray(begin), heard))
-        for n, run in enumerate(some):
-            rows = slice(0, len(run) + 1)
-            path = np.concatenate([begin[n][None], pose[n, 1 : len(run) + 1]])
-            names = (*estimator.robot.labels, "unknown")
-            out.append(
-                Said(
-                    path=seen_from_start(path),
-                    end_covariance=turned_covariance(cov[n, len(run)], -float(begin[n, 2])),
-                    floors={name: floors[n, 1 : len(run) + 1, k] for k, name in enumerate(names)},
-                )
+        for n, k in enumerate(some):
+            ends = np.cumsum(parts[k])
+            path = np.concatenate([begin[n][None], pose[n, ends]])
+            said = Said(
+                path=seen_from_start(path),
+                end_covariance=turned_covariance(cov[n, ends[-1]], -float(begin[n, 2])),
+                floors={name: floors[n, ends, row] for row, name in enumerate(names)},
             )
+            out.append(said)
     return out
 
 

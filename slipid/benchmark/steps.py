@@ -45,7 +45,7 @@ def cut(data: Runs, robot: Robot, poses_per_step: int = POSES_PER_STEP) -> list[
     usual = _steps(float(np.quantile(poses, 0.1)), poses_per_step)
     groups: dict[int, list[int]] = {}
     for k, count in enumerate(poses):
-        groups.setdefault(min(usual, _steps(count, poses_per_step)), []).append(k)
+        groups.setdefault(min(usual, _steps(float(count), poses_per_step)), []).append(k)
     out = []
     for steps, runs in sorted(groups.items()):
         for first in range(0, len(runs), replay.TOGETHER):

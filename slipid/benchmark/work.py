@@ -245,16 +245,18 @@ def _own(scene: Scene, asked: Protocol, runs: list[Run], name: str) -> Row:
     if name == OWN_MAP and scene.data.map is None:
         return Row.lacking(["map"])
 
+    has_gyro = all(run.heard.gyro is not None for run in runs)
+
     def predict(cuts: Sequence[Cut]) -> list[Said]:
-        if asked.told:
+        if asked.told and not has_gyro:
             machine = scene.data.machine
             return [said for one in cuts for said in slipid_rows.told(own, one, machine)]
         floor = scene.data.map if name == OWN_MAP else None
-        return slipid_rows.untold(own, cuts, scene.judged, floor)
+        return slipid_rows.estimated(own, cuts, scene.judged, asked.told, floor)
 
     for one in scene.cuts:  # compiles
         predict([replace(one, numbers=one.numbers[:1], runs=one.runs[:1])])
-        if not asked.told:
+        if not asked.told or has_gyro:
             break
     said, each = _timed(lambda: predict(scene.cuts), runs)
     return Row(

@@ -202,7 +202,7 @@ def _cut(
         mean_voltage, count, missed = _mean(t, data.voltage[rows], live, fresh, at)
         unread = np.where(count > 0, missed, UNREAD)
     return {
-        "began": t[edges[0]],
+        "began": np.asarray(t[edges[0]]),
         "dt": np.diff(t[edges]),
         "turn": np.diff(turned, axis=0),
         "faster": np.diff(speed, axis=0),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from slipid.baselines.floors.interface import FloorMethod, floors_of
+from slipid.baselines.interface import Said
 from slipid.benchmark.felt.benchmark import felt_rows
 from slipid.benchmark.felt.fitting import (
     Cells,
@@ -28,11 +29,13 @@ from slipid.benchmark.felt.protocol import (
 )
 from slipid.benchmark.felt.reading import COLUMNS, read_felt
 from slipid.benchmark.felt.result import Answer, after_seconds, confused
+from slipid.benchmark.felt.robotino import RobotinoFelt, beliefs_of, felt_of, robotino_rows
 from slipid.benchmark.felt.slipid_row import SlipidFloors, kinds
+from slipid.benchmark.work import Wish
 from slipid.support.errors import DataError
 from slipid.support.files import json_text
 from tests.helpers.made_felt import HZ, ahead, made_felt, made_felts
-from tests.helpers.made_runs import HUSKY
+from tests.helpers.made_runs import HUSKY, made_run, straight
 
 
 @dataclass(frozen=True)
@@ -251,6 +254,14 @@ def test_a_table_compares_all_rows_with_the_reference():
     assert '"accuracy"' in json_text(table.to_json())
 
 
+def test_a_quick_table_is_of_one_fold_and_of_the_first_minute():
+    felts = made_felts({"grass": 2.0, "snow": 4.0}, runs=5, rows=600)
+    after = felt_table([Meter()], felts, HUSKY, "made", Asked.quick(), "meter").rows[0].after
+    assert [a.seconds for a in after] == [0.5, 1.0, 2.0]
+    # of each floor one run, of which a minute is 30 stretches
+    assert [a.stretches for a in after] == [60, 60, 60]
+
+
 def test_rows_have_names_of_their_own_and_slipid_is_first():
     names = [method.name for method in felt_rows()]
     assert names[0] == "slipid"
@@ -404,6 +415,43 @@ def test_a_free_wheel_draws_what_was_measured(real_data):
     if not folder.is_dir():
         pytest.skip(f"no logs of wheels in the air: {folder} is no folder")
     assert in_the_air(folder) == pytest.approx((ZERO_A, FREE_A, FREE_AS), rel=0.05)
+
+
+def test_a_robotino_run_is_heard_without_its_pose():
+    amps = np.tile([-0.5, 1.0, 2.0], (40, 1))
+    run = made_run(straight(0.3), current=amps, signed=True, floor="gray@moved")
+    felt = felt_of(run)
+    assert (felt.floor, felt.name) == ("gray", run.heard.name)
+    assert felt.dt.sum() == pytest.approx(4.0)
+    assert np.array_equal(felt.speed, run.heard.speed)
+    assert felt.current[0].tolist() == [0.5, 1.0, 2.0]
+    with pytest.raises(ValueError, match="no current"):
+        felt_of(made_run(straight(0.3)))
+
+
+def test_what_the_estimator_calls_unknown_is_left_out_of_the_comparison():
+    floors = {"gray": np.array([0.3]), "green": np.array([0.1]), "unknown": np.array([0.6])}
+    labels, beliefs = beliefs_of(Said(np.zeros((2, 3)), floors=floors))
+    assert labels == ("gray", "green")
+    assert beliefs == pytest.approx(np.array([[0.75, 0.25]]))
+
+
+def test_rows_on_the_robotino_hear_no_vibration():
+    names = [method.name for method in robotino_rows()]
+    assert "boosted_trees_vibration" not in names
+    assert {"belyaev_kushnarev", "gaussian", "boosted_trees"} <= set(names)
+
+
+@pytest.mark.nightly
+def test_slipid_is_ahead_of_all_classifiers_on_the_robotino(real_data, tmp_path):
+    part = RobotinoFelt(Wish(real_data, tmp_path, quick=True))
+    if not part.is_there:
+        pytest.skip(f"no logs of the Robotino in {real_data}")
+    assert part.run() == "robotino_felt"
+    table = part.table()
+    after = {row["name"]: row["after"][2]["accuracy"][0] for row in table["rows"]}
+    assert after["slipid"] == max(after.values())
+    assert after["slipid"] > 0.85
 
 
 def test_seconds_are_of_rows_that_come_as_often_as_they_do():

@@ -39,17 +39,19 @@ class Asked:
         seconds: after which they are asked [s].
         folds: into which runs are dealt; judged: how many of these are left out in turn.
         inner: folds by which settings are picked; one takes settings as they are.
+        first_s: of runs that are left out, as much from the start is judged [s].
     """
 
     seconds: tuple[float, ...] = SECONDS
     folds: int = FOLDS
     judged: int = FOLDS
     inner: int = INNER
+    first_s: float = np.inf
 
     @classmethod
     def quick(cls) -> "Asked":
-        """One fold and short times, settings as they are."""
-        return cls(seconds=QUICK_SECONDS, judged=1, inner=1)
+        """One fold, the first minute of its runs and short times, settings as they are."""
+        return cls(seconds=QUICK_SECONDS, judged=1, inner=1, first_s=60.0)
 
 
 def folds_of(felts: Sequence[Felt], count: int) -> Numbers:
@@ -152,7 +154,8 @@ def judged(method: FloorMethod, felts: Sequence[Felt], machine: Machine, asked: 
     answers: list[Answer] = []
     settings, numbers, fit_s, tune_s, heard_s, rows = [], [], [], [], 0.0, 0
     for k in range(asked.judged):
-        fitted, left_out = _some(felts, fold != k), _some(felts, fold == k)
+        fitted = _some(felts, fold != k)
+        left_out = [felt.pieces(asked.first_s)[0] for felt in _some(felts, fold == k)]
         found = tuned(method, fitted, machine, asked)
         began = time.perf_counter()
         done = found.method.fit(fitted, machine)

@@ -2,7 +2,9 @@
 
 Runs are split by headings, as elsewhere in the benchmark, and are heard from where the wheels have
 moved a centimetre; none of them stands or starts anew in between. slipid is its fit to the training
-runs with their poses, and the estimator as it is deployed; the other rows never see a pose.
+runs with their poses, and the estimator as it is deployed, with its own settings. It knows how the
+robot is loaded, as a robot in service does; the other rows see neither poses nor loads, and are
+fitted to runs with all loads together.
 """
 
 import time
@@ -17,7 +19,7 @@ from slipid.baselines.floors.interface import Felt, FloorMethod
 from slipid.baselines.interface import Machine, Run, Said
 from slipid.benchmark.felt.protocol import Asked, Judged, answers_of, asked_after, table_of, tuned
 from slipid.benchmark.felt.result import Answer, FeltRow, FeltTable
-from slipid.benchmark.own import NAME, Own, fit_own, untold
+from slipid.benchmark.own import NAME, Own, estimated, fit_own
 from slipid.benchmark.protocols import Split, base_of, splits
 from slipid.benchmark.row import Row
 from slipid.benchmark.sets import DataSet
@@ -139,18 +141,18 @@ def _judged(data: DataSet, split: Split, own: Own) -> list[Cut]:
 def _own(own: Own, cuts: list[Cut], data: DataSet, split: Split, felts: list[Felt]) -> Judged:
     """What the estimator says of the runs that were left out."""
     began = time.perf_counter()
-    said = untold(own, cuts, data.heard.subset(split.judged))
+    said = estimated(own, cuts, data.heard.subset(split.judged))
     took = time.perf_counter() - began
     answers: list[Answer] = []
     for felt, one in zip(felts, said, strict=True):
-        labels, beliefs = _beliefs(one)
+        labels, beliefs = beliefs_of(one)
         answers += asked_after(felt, beliefs, labels, SECONDS)
     rows = sum(len(felt) for felt in felts)
     row = FeltRow(NAME, numbers=own.numbers, fit_s=own.seconds, row_us=1e6 * took / rows)
     return Judged(row, tuple(answers))
 
 
-def _beliefs(said: Said) -> tuple[tuple[str, ...], np.ndarray]:
+def beliefs_of(said: Said) -> tuple[tuple[str, ...], np.ndarray]:
     """Floors, and their probabilities given that it is one of them."""
     assert said.floors is not None
     labels = tuple(name for name in said.floors if name != "unknown")
