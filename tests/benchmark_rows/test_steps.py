@@ -51,7 +51,7 @@ def test_gyro_and_command_are_means_over_each_step(made):
     lag = float(made.robot.camera.lag)
     middle = one.windows.began[0] + np.cumsum(heard.dt) - 0.5 * heard.dt - lag
     assert heard.gyro is not None
-    assert heard.gyro[1:] == pytest.approx(3.0 * middle[1:], abs=1e-6)
+    assert heard.gyro[1:] == pytest.approx(3.0 * middle[1:], abs=0.01)
 
 
 def test_a_start_anywhere_is_the_origin():
