@@ -19,7 +19,7 @@ def kept(folder: Path) -> dict[str, int]:
     return {p.name: p.stat().st_mtime_ns for p in folder.rglob("known_floor_*.json")}
 
 
-@pytest.mark.slow  # compiles a fit
+@pytest.mark.nightly  # compiles a fit, minutes
 def test_one_command_makes_a_table_and_goes_on_from_what_was_kept(tmp_path, monkeypatch):
     data, out = tmp_path / "data", tmp_path / "out"
     data.mkdir()
