@@ -313,6 +313,13 @@ def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, 
     return np.column_stack([place, heading])
 
 
+def seen_from_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "edge 3"]:
+    """Poses as they are seen from the first of them."""
+    x, y, yaw = (path - path[0]).T
+    c, s = np.cos(path[0, 2]), np.sin(path[0, 2])
+    return np.stack([c * x + s * y, c * y - s * x, yaw], axis=1)
+
+
 def body_increments(pose: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "step 3"]:
     """Logarithm on SE(2) of each step of a path: twist times time [m, m, rad]."""
     turn = np.diff(pose[:, 2])

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from slipid.baselines.rows import ROWS
 from slipid.benchmark.felt.benchmark import felt_rows
-from slipid.benchmark.felt.part import FloorsFelt
+from slipid.benchmark.felt.part import HuskyFloors, RobotinoFloors
 from slipid.benchmark.own import NAME
 from slipid.benchmark.protocols import PROTOCOLS, splits
 from slipid.benchmark.reading import reading
@@ -49,7 +49,7 @@ def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
     What is done is kept, and not done again; a row that fails is said, and stops no other.
 
     Raises:
-        DataError: no such folder, no data set in it, or no such row.
+        DataError: no such folder or row.
     """
     began = time.monotonic()
     setup_jax(quiet=True)
@@ -61,10 +61,10 @@ def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
     writable(wish.out)
     report.stage("reading logs")
     pieces = in_turn([pieces_of(wish, source.name) for source in sources])
-    felt, rectangle = FloorsFelt(wish), Rectangle(wish)
-    parts: list[Part] = [*pieces]
-    if felt.is_there:
-        parts.append(felt)
+    felt = [part for part in (HuskyFloors(wish), RobotinoFloors(wish)) if part.is_asked]
+    rectangle = Rectangle(wish)
+    # the Robotino's floors come last: they take the fits that were made for its headings
+    parts: list[Part] = [*pieces, *felt]
     if not wish.quick and set(CONTROLLERS) & set(wish.only or CONTROLLERS):
         parts.insert(0, rectangle)
     report.stage(f"{len(parts)} parts")
@@ -77,7 +77,7 @@ def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
         "quick": wish.quick,
         "sets": {name: _set(wish, name, protocols) for name, protocols in tables.items()},
         "protocols": {name: p.about for name, p in PROTOCOLS.items()},
-        "floors_felt": felt.table() if felt.is_there else None,
+        "floors": {part.name: part.table() for part in felt},
         "rectangle": driven,
         "reading": reading(tables),
         "seconds": round(time.monotonic() - began, 1),

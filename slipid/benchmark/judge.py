@@ -6,7 +6,15 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.baselines.interface import WINDOW_S, Machine, Run, Said, body_increments, groups
+from slipid.baselines.interface import (
+    WINDOW_S,
+    Machine,
+    Run,
+    Said,
+    body_increments,
+    groups,
+    seen_from_start,
+)
 from slipid.benchmark.protocols import base_of
 from slipid.benchmark.sets import Over
 from slipid.identify.compare.ranking import CLUSTER_DEG
@@ -57,7 +65,7 @@ class Judged:
 
 def judged(run: Run, said: Said, machine: Machine, over: Over) -> Judged:
     """A run against what was said of it."""
-    true = _from_start(run.pose)
+    true = seen_from_start(run.pose)
     gap = said.path[-1] - true[-1]
     chord = float(np.hypot(*true[-1, :2]))
     path = float(np.hypot(*np.diff(true[:, :2], axis=0).T).sum())
@@ -78,12 +86,6 @@ def judged(run: Run, said: Said, machine: Machine, over: Over) -> Judged:
         floor_right=_floor_right(run, said),
         energy_error=_energy_error(run, said, machine),
     )
-
-
-def _from_start(pose: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "edge 3"]:
-    x, y, yaw = (pose - pose[0]).T
-    c, s = np.cos(pose[0, 2]), np.sin(pose[0, 2])
-    return np.stack([c * x + s * y, c * y - s * x, yaw], axis=1)
 
 
 def _cluster(run: Run) -> int:

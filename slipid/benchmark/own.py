@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.baselines.interface import Heard, Machine, Said
+from slipid.baselines.interface import Heard, Machine, Said, seen_from_start
 from slipid.benchmark.steps import Cut, body_poses
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
@@ -278,13 +278,6 @@ def replay(estimator: Estimator, runs: Sequence[Heard], start: np.ndarray) -> li
             )
             out.append(said)
     return out
-
-
-def seen_from_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "edge 3"]:
-    """Poses as they are seen from the first of them."""
-    x, y, yaw = (path - path[0]).T
-    c, s = np.cos(path[0, 2]), np.sin(path[0, 2])
-    return np.stack([c * x + s * y, c * y - s * x, yaw], axis=1)
 
 
 def turned_covariance(cov: Float[np.ndarray, "2 2"], angle: float) -> Float[np.ndarray, "2 2"]:

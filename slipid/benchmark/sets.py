@@ -43,7 +43,6 @@ class Source:
         kinds: of splits it is for, see `slipid.benchmark.protocols`.
         over: what end-point errors are divided by.
         poses_per_step: see `slipid.benchmark.steps.cut`.
-
         currents: columns that methods hear beside what the config reads.
         crossing: runs from one floor to another: their glob and the file of their map.
     """

@@ -100,13 +100,18 @@ class Resampled:
 
     @classmethod
     def of(cls, runs: Sequence[Judged]) -> "Resampled":
-        names = tuple(dict.fromkeys(run.floor for run in runs))
-        floor = np.array([names.index(run.floor) for run in runs])
+        """Runs by their clusters; a run whose cluster is negative is one by itself."""
         sector = np.array([run.cluster for run in runs])
         alone = -1 - np.arange(len(runs))
-        cluster = np.where(sector < 0, alone, sector)
+        return cls.by([run.floor for run in runs], np.where(sector < 0, alone, sector))
+
+    @classmethod
+    def by(cls, floors: Sequence[str], cluster: np.ndarray) -> "Resampled":
+        """Whatever is on these floors and in these clusters, one of each."""
+        names = tuple(dict.fromkeys(floors))
+        floor = np.array([names.index(name) for name in floors])
         rng = np.random.default_rng(0)
-        draws = np.ones((DRAWS + 1, len(runs)))
+        draws = np.ones((DRAWS + 1, len(floors)))
         for k in range(len(names)):
             mine = np.flatnonzero(floor == k)
             kinds, of = np.unique(cluster[mine], return_inverse=True)
@@ -117,6 +122,10 @@ class Resampled:
     def mean(self, x: Float[np.ndarray, " run"]) -> Float[np.ndarray, " draw"]:
         """Mean over floors of means over runs, in every draw; runs that are nan do not count."""
         return np.nanmean([self.on(x, k) for k in range(len(self.names))], axis=0)
+
+    def over_all(self, x: Float[np.ndarray, " run"]) -> Float[np.ndarray, " draw"]:
+        """Mean over all runs, whatever their floor, in every draw."""
+        return np.asarray(self.draws @ x / np.maximum(self.draws.sum(axis=1), 1e-12))
 
     def on(self, x: Float[np.ndarray, " run"], floor: int) -> Float[np.ndarray, " draw"]:
         """Mean over the runs on a floor, in every draw."""
@@ -143,9 +152,10 @@ def _summary(
     behind = None
     if rival is not None:
         behind = number(by.mean(error - np.array([run.endpoint_error for run in rival])))
-    median: Callable[[str], float] = lambda name: float(  # noqa: E731
-        np.median([getattr(row, name) for row in rows])
-    )
+
+    def median(name: str) -> float:
+        return float(np.median([getattr(row, name) for row in rows]))
+
     return Summary(
         endpoint_error=number(by.mean(error)),
         floors={name: number(by.on(error, k)) for k, name in enumerate(by.names)},

@@ -1,7 +1,7 @@
 """The same chance for every method: its settings by inner cross-validation on training runs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -60,12 +60,8 @@ def _loss(method: Method, runs: Sequence[Run], part: np.ndarray, machine: Machin
     return float(np.mean(errors)) if errors else 0.0
 
 
-def settings_of(best: Method, candidates: Sequence[Method]) -> str:
+def settings_of(best: object, candidates: Sequence[object]) -> str:
     """The fields in which candidates differ, as the best one has them: `ridge = 0.01`."""
-    inside = [c.method if isinstance(c, ByFloor) else c for c in (best, *candidates)]
-    said = []
-    for f in fields(inside[0]):
-        values = [getattr(c, f.name) for c in inside]
-        if any(repr(v) != repr(values[0]) for v in values):
-            said.append(f"{f.name} = {values[0]!r}")
-    return ", ".join(said)
+    inside = [vars(c.method if isinstance(c, ByFloor) else c) for c in (best, *candidates)]
+    names = [name for name in inside[0] if len({repr(one[name]) for one in inside}) > 1]
+    return ", ".join(f"{name} = {inside[0][name]!r}" for name in names)

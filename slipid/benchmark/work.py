@@ -177,9 +177,12 @@ def _scene(piece: Piece) -> Scene:
 
 
 def _named(one: Cut, data: DataSet, numbers: np.ndarray) -> Cut:
-    """The cut with floors named as of the load set-up, too."""
-    setups = [data.setups[numbers[k]] for k in one.numbers]
-    runs = [replace(run, floor=name) for run, name in zip(one.runs, setups, strict=True)]
+    """The cut with what splits go by: floors with loads, commanded directions and speeds."""
+    facts = [data.facts[numbers[k]] for k in one.numbers]
+    runs = [
+        replace(run, floor=f.floor, heading=float(np.radians(f.heading_deg)), speed=f.speed)
+        for run, f in zip(one.runs, facts, strict=True)
+    ]
     return replace(one, runs=tuple(runs))
 
 

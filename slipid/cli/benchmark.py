@@ -28,7 +28,7 @@ def benchmark(
     The folder of --data has those of the public data sets: robotino2022, robotino2021, drive_skid,
     borealtc; what is absent is left out. Recorded runs of the virtual test site are always there.
     Writes benchmark.json and benchmark.html. What is done is kept: called again after an interrupt
-    it goes on from there. The exit code is 1 where a row failed.
+    it goes on from there. The exit code is 1 where anything failed.
     """
     from slipid.benchmark.benchmark import benchmark as run
     from slipid.benchmark.work import Wish
@@ -43,11 +43,12 @@ def benchmark(
         written = write_page(found, benchmark_pictures(found), out)
         report.line(f"in {out}: benchmark.json, {written.name}")
     emit(json, found, lambda page: show_benchmark(page, found))
-    failed = [
+    rows_of_all = (
         row
         for one in found["sets"].values()
         for protocol in one["protocols"].values()
         for row in protocol.values()
-        if row["failed"]
-    ]
+    )
+    others = (*found["floors"].values(), found["rectangle"] or {})
+    failed = any(row["failed"] for row in rows_of_all) or any("failed" in one for one in others)
     return 1 if failed else 0

@@ -1,6 +1,7 @@
 """The tables of the benchmark on a terminal."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 from rich.text import Text
 
@@ -40,15 +41,12 @@ def show_benchmark(page: Page, found: Content) -> None:
                 column.no_wrap = True
             page.table(made)
             page.notes(absent(rows))
-    for name, titled, rows_of in OTHERS:
-        if (one := found[name]) is None:
+    for name, one in others(found):
+        if one.said:
+            page.line(f"\n{name}: {one.said}")
             continue
-        if "failed" in one:
-            page.line(f"\n{name}: failed: {one['failed']}")
-            continue
-        head, body = rows_of(one)
-        made = table(head, f"\n{titled(one)}", right=head[1:])
-        for of_row in body:
+        made = table(one.head, f"\n{one.title}", right=one.head[1:])
+        for of_row in one.body:
             made.add_row(*of_row)
         page.table(made)
     page.line()
@@ -106,15 +104,32 @@ def absent(rows: Content) -> list[str]:
     return [f"{', '.join(names)}: {reason}" for reason, names in why.items()]
 
 
-def rectangle_title(driven: Content) -> str:
-    """What was driven, on what."""
+class Other(NamedTuple):
+    """A part of benchmark.json that is one table, or why there is none."""
+
+    title: str
+    head: tuple[str, ...]
+    body: list[tuple[str, ...]]
+    said: str = ""
+
+
+def others(found: Content) -> list[tuple[str, Other]]:
+    """Tables beside those of the data sets, by their names."""
+    parts: list[tuple[str, Content, Callable[[Content], Other]]]
+    parts = [(name, one, felt) for name, one in found["floors"].items()]
+    if found["rectangle"] is not None:
+        parts.append(("rectangle", found["rectangle"], rectangle))
+    return [
+        (name, Other("", (), [], f"failed: {one['failed']}") if "failed" in one else made(one))
+        for name, one, made in parts
+    ]
+
+
+def rectangle(driven: Content) -> Other:
+    """Controllers of the trial, the least closure error first."""
     plant = {"testsite": "the virtual test site", "twin": "the identified model itself"}
     runs = min(row["runs"] for row in driven["summary"].values())
-    return f"rectangle on {plant[driven['plant']]}, {runs} starts, medians with 90 % intervals"
-
-
-def rectangle(driven: Content) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Head and rows of the table of controllers, the least closure error first."""
+    title = f"rectangle on {plant[driven['plant']]}, {runs} starts, medians with 90 % intervals"
     head = ("controller", "closure, mm", "of encoders', %", "finished, %", "cross-track, mm")
     rows = sorted(driven["summary"].items(), key=lambda item: item[1]["closure_error_median"])
     body: list[tuple[str, ...]] = []
@@ -127,17 +142,13 @@ def rectangle(driven: Content) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         closure = f"{row['closure_error_median']:.0f} [{low:.0f}, {high:.0f}]"
         finished, cross = f"{100 * row['finished_share']:.0f}", f"{row['cross_track_rmse']:.0f}"
         body.append((name, closure, said, finished, cross))
-    return head, body
+    return Other(title, head, body)
 
 
-def felt_title(felt: Content) -> str:
-    """What was heard, and how often a guess is right."""
-    chance = f"always naming the commonest floor is right in {100 * felt['chance']:.0f} %"
-    return f"{felt['about']}; {felt['runs']} runs; {chance}"
-
-
-def felt(found: Content) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Head and rows of the table of classifiers: how often they are right, by the time heard."""
+def felt(found: Content) -> Other:
+    """Classifiers: how often they are right, by the time heard; the best at the end first."""
+    chance = f"always naming the commonest floor is right in {100 * found['chance']:.0f} %"
+    title = f"{found['about']}; {found['runs']} runs; {chance}"
     rows = [row for row in found["rows"] if row["after"]]
     seconds = [after["seconds"] for after in rows[0]["after"]] if rows else []
     head = ("right, %, after", *(f"{x:g} s" for x in seconds), "points over slipid", "numbers")
@@ -147,14 +158,15 @@ def felt(found: Content) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
             "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * x for x in after["accuracy"]))
             for after in row["after"]
         ]
-        behind = row["after"][-1]["behind"]
-        less = "" if behind is None else in_words("behind", behind)
-        body.append((row["name"], *right, less, str(row["numbers"])))
-    return head, body
+        over = in_words("behind", row["after"][-1]["behind"])
+        body.append((row["name"], *right, over, str(row["numbers"])))
+    return Other(title, head, body)
 
 
-OTHERS = (
-    ("floors_felt", felt_title, felt),
-    ("rectangle", rectangle_title, rectangle),
-)
-"""Parts of benchmark.json that are one table each: their titles and rows."""
+def picked(rows: Content) -> list[str]:
+    """Settings that cross-validation picked in each fold, of the rows that have some."""
+    return [
+        f"{name}: {'; '.join(dict.fromkeys(row['settings']))}"
+        for name, row in rows.items()
+        if any(row["settings"])
+    ]

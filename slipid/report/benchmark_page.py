@@ -7,11 +7,12 @@ from pathlib import Path
 
 from slipid.report.benchmark import (
     COSTS,
-    OTHERS,
     absent,
     cells,
     costs,
     headings,
+    others,
+    picked,
     ranked,
     shown,
 )
@@ -59,14 +60,11 @@ def page(found: Content, pictures: Mapping[str, bytes]) -> str:
     ]
     for name, one in found["sets"].items():
         parts += _set(found, name, one, pictures.get(name))
-    for name, title, rows in OTHERS:
-        if (one := found[name]) is None:
-            continue
+    for name, other in others(found):
         parts.append(f"<h2>{escape(name.replace('_', ' '))}</h2>")
-        if "failed" in one:
-            parts.append(f"<p>failed: {escape(one['failed'])}</p>")
-        else:
-            parts += [f"<p>{escape(title(one))}</p>", html_table(*rows(one))]
+        parts.append(f"<p>{escape(other.said or other.title)}</p>")
+        if not other.said:
+            parts.append(html_table(other.head, other.body))
     parts.append(f"<p class='note'>{_versions(found)}</p></html>")
     return "\n".join(parts)
 
@@ -83,6 +81,9 @@ def _set(found: Content, name: str, one: Content, drawn: bytes | None) -> list[s
         body = [(row, *cells(content, numbers), *costs(content)) for row, content in ranked(rows)]
         parts.append(html_table(head, body))
         parts += [f"<p class='note'>{escape(line)}</p>" for line in absent(rows)]
+        if lines := picked(rows):
+            parts.append("<details class='note'><summary>settings picked, fold by fold</summary>")
+            parts += [*(f"<div>{escape(line)}</div>" for line in lines), "</details>"]
     return parts
 
 

@@ -1,6 +1,7 @@
 """Telling the floor without a pose: reading, folds, answers, intervals, and slipid's own row."""
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,8 +19,9 @@ from slipid.benchmark.felt.fitting import (
     shown,
     stiffness_of,
 )
-from slipid.benchmark.felt.husky import FREE_A, FREE_AS, ZERO_A, husky, in_the_air
+from slipid.benchmark.felt.husky import FREE_A, FREE_AS, ZERO_A, husky
 from slipid.benchmark.felt.meters import MeteredMotor, clipped
+from slipid.benchmark.felt.part import HuskyFloors, RobotinoFloors
 from slipid.benchmark.felt.protocol import (
     Asked,
     answers_of,
@@ -29,7 +31,7 @@ from slipid.benchmark.felt.protocol import (
 )
 from slipid.benchmark.felt.reading import COLUMNS, read_felt
 from slipid.benchmark.felt.result import Answer, after_seconds, confused
-from slipid.benchmark.felt.robotino import RobotinoFelt, beliefs_of, felt_of, robotino_rows
+from slipid.benchmark.felt.robotino import beliefs_of, felt_of, robotino_rows
 from slipid.benchmark.felt.slipid_row import SlipidFloors, kinds
 from slipid.benchmark.work import Wish
 from slipid.support.errors import DataError
@@ -163,7 +165,7 @@ def test_settings_are_picked_by_runs_that_the_candidate_was_not_fitted_to():
     felts = made_felts({"grass": 2.0, "snow": 4.0})
     found = tuned(Meter(tries=(9.0, 0.0, 5.0)), felts, HUSKY, Asked(seconds=(1.0,)))
     assert found.method.off == 0.0
-    assert found.settings == "off 0.0"
+    assert found.settings == "off = 0.0"
     assert tuned(Meter(tries=(9.0, 0.0)), felts, HUSKY, Asked(inner=1)).method.tries == (9.0, 0.0)
 
 
@@ -410,6 +412,28 @@ def test_slipid_says_what_it_lacks():
         SlipidFloors().fit(made_felts({"grass": 2.0}), HUSKY)
 
 
+def in_the_air(root: Path) -> tuple[float, float, float]:
+    """`ZERO_A`, `FREE_A` and `FREE_AS` by runs of a Husky with its wheels in the air.
+
+    Rows count in which a wheel keeps its speed.
+    """
+    speed, amps = [], []
+    for path in sorted(root.glob("*.csv")):
+        rows = np.genfromtxt(path, delimiter=",", names=True)
+        for side in "lr":
+            w, i = rows[f"w{side}"], rows[f"i{side}"]
+            steady = np.isfinite(w) & np.isfinite(i)
+            steady &= np.abs(np.gradient(np.nan_to_num(w))) < 0.05
+            speed.append(np.abs(w[steady]))
+            amps.append(i[steady])
+    w, i = np.concatenate(speed), np.concatenate(amps)
+    zero = float(np.median(i[w < 0.02]))
+    moving = w > 0.5
+    # above three amperes a wheel is no longer free
+    slope, level = np.polyfit(w[moving], np.minimum(i[moving] - zero, 3.0), 1)
+    return zero, float(level), float(slope)
+
+
 def test_a_free_wheel_draws_what_was_measured(real_data):
     folder = real_data / "drive_skid" / "husky_in_the_air"
     if not folder.is_dir():
@@ -444,14 +468,34 @@ def test_rows_on_the_robotino_hear_no_vibration():
 
 @pytest.mark.nightly
 def test_slipid_is_ahead_of_all_classifiers_on_the_robotino(real_data, tmp_path):
-    part = RobotinoFelt(Wish(real_data, tmp_path, quick=True))
-    if not part.is_there:
+    part = RobotinoFloors(Wish(real_data, tmp_path, quick=True))
+    if not part.is_asked:
         pytest.skip(f"no logs of the Robotino in {real_data}")
-    assert part.run() == "robotino_felt"
+    assert part.run() == "robotino_floors"
     table = part.table()
     after = {row["name"]: row["after"][2]["accuracy"][0] for row in table["rows"]}
     assert after["slipid"] == max(after.values())
     assert after["slipid"] > 0.85
+
+
+def test_a_table_is_made_where_its_logs_are_and_a_row_is_wished_for(tmp_path):
+    assert not HuskyFloors(Wish(tmp_path, tmp_path)).is_asked
+    (tmp_path / "borealtc").mkdir()
+    assert HuskyFloors(Wish(tmp_path, tmp_path)).is_asked
+    assert HuskyFloors(Wish(tmp_path, tmp_path, ("gaussian",))).is_asked
+    assert not HuskyFloors(Wish(tmp_path, tmp_path, ("encoder",))).is_asked
+    assert not RobotinoFloors(Wish(tmp_path, tmp_path)).is_asked
+
+
+def test_a_table_that_fails_is_kept_with_its_reason_until_the_logs_change(tmp_path):
+    (tmp_path / "borealtc").mkdir()
+    part = HuskyFloors(Wish(tmp_path, tmp_path / "out"))
+    assert part.run() == "husky_floors"
+    assert "no file FLOOR/RUN.csv" in part.table()["failed"]
+    written(tmp_path / "borealtc" / "ICE" / "00.csv", ["0,1,1,1,1,0,0"])
+    assert part.table() == {"failed": "it was not kept"}
+    part.run()
+    assert "1 rows" in part.table()["failed"]
 
 
 def test_seconds_are_of_rows_that_come_as_often_as_they_do():

@@ -36,7 +36,7 @@ CONTENT = {
         }
     },
     "protocols": {"known_floor": "new headings on a floor that is told"},
-    "floors_felt": None,
+    "floors": {},
     "rectangle": None,
     "reading": ["carpets, known floor: slipid errs by 5.0 %"],
     "seconds": 12.0,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from slipid.api.known_robot import made_runs, move
-from slipid.benchmark.own import seen_from_start, turned_covariance
+from slipid.baselines.interface import seen_from_start
+from slipid.benchmark.own import turned_covariance
 from slipid.benchmark.steps import cut
 from slipid.data.runs import collect
 

@@ -99,7 +99,7 @@ class FloorMethod(abc.ABC):
     name: str
     labels: tuple[str, ...] = ()
 
-    def candidates(self) -> Sequence[Self]:
+    def candidates(self) -> Sequence["FloorMethod"]:
         """Itself with other settings, at most `TRIES`, from which cross-validation picks one."""
         return (self,)
 

@@ -5,10 +5,8 @@ assumed torque constant, and only their ratios mean something.
 """
 
 from dataclasses import replace
-from pathlib import Path
 
 import jax.numpy as jnp
-import numpy as np
 
 from slipid.model.geometry import skid_steer
 from slipid.model.robot import Robot, build
@@ -33,25 +31,3 @@ def husky() -> Robot:
         viscous_friction=jnp.asarray(gain * FREE_AS),
     )
     return replace(robot, motor=motor, body=replace(robot.body, mass=jnp.asarray(MASS)))
-
-
-def in_the_air(root: Path) -> tuple[float, float, float]:
-    """`ZERO_A`, `FREE_A` and `FREE_AS` by runs of a Husky with its wheels in the air.
-
-    Rows count in which a wheel keeps its speed.
-    """
-    speed, amps = [], []
-    for path in sorted(root.glob("*.csv")):
-        rows = np.genfromtxt(path, delimiter=",", names=True)
-        for side in "lr":
-            w, i = rows[f"w{side}"], rows[f"i{side}"]
-            steady = np.isfinite(w) & np.isfinite(i)
-            steady &= np.abs(np.gradient(np.nan_to_num(w))) < 0.05
-            speed.append(np.abs(w[steady]))
-            amps.append(i[steady])
-    w, i = np.concatenate(speed), np.concatenate(amps)
-    zero = float(np.median(i[w < 0.02]))
-    moving = w > 0.5
-    # above three amperes a wheel is no longer free
-    slope, level = np.polyfit(w[moving], np.minimum(i[moving] - zero, 3.0), 1)
-    return zero, float(level), float(slope)

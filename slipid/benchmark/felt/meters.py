@@ -13,6 +13,7 @@ mean of all counts as its own friction.
 
 from dataclasses import fields
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
@@ -33,8 +34,8 @@ class MeteredMotor(Motor):
         scatter: std of a current about its mean [A].
     """
 
-    stiffness: Float[Array, " drive"] = 0.0  # type: ignore[assignment]
-    scatter: Float[Array, ""] = 1.0  # type: ignore[assignment]
+    stiffness: Float[Array, " drive"] = eqx.field(kw_only=True)
+    scatter: Float[Array, ""] = eqx.field(kw_only=True)
 
     @classmethod
     def of(cls, motor: Motor, stiffness: Array, scatter: Array) -> "MeteredMotor":

@@ -1,10 +1,15 @@
-"""Telling floors from currents and a gyro, as a part of the whole benchmark."""
+"""Telling floors from currents, as parts of the whole benchmark."""
 
+import abc
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from slipid.benchmark.felt.benchmark import FOLDER, felt_benchmark
+from slipid.benchmark.felt.benchmark import FOLDER, felt_benchmark, felt_rows
+from slipid.benchmark.felt.result import FeltTable
+from slipid.benchmark.felt.robotino import SOURCE, robotino_felt, robotino_rows
+from slipid.benchmark.own import NAME
 from slipid.benchmark.row import Row
-from slipid.benchmark.work import Wish
+from slipid.benchmark.work import Wish, data_of
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.content import Content
 from slipid.support.files import hash_of
@@ -12,34 +17,54 @@ from slipid.support.jax_setup import setup_jax
 
 
 @dataclass(frozen=True)
-class FloorsFelt:
-    """The part of the work that tells floors without a pose."""
+class FeltPart(abc.ABC):
+    """A table of classifiers that is made once, and kept."""
 
     wish: Wish
-    name: str = "floors_felt"
 
     @property
-    def is_there(self) -> bool:
-        """Whether its logs are."""
-        return (self.wish.data / FOLDER).is_dir()
+    @abc.abstractmethod
+    def name(self) -> str:
+        """Of the part, and of its table in benchmark.json."""
+
+    @property
+    @abc.abstractmethod
+    def folder(self) -> str:
+        """Of its logs, below the data folder."""
+
+    @property
+    @abc.abstractmethod
+    def rows(self) -> Sequence[str]:
+        """Names of its classifiers."""
+
+    @abc.abstractmethod
+    def logs(self) -> str:
+        """Hash of its logs."""
+
+    @abc.abstractmethod
+    def make(self) -> FeltTable:
+        """Fit and judge the classifiers that are wished for."""
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether its logs are there, and any of its rows is wished for."""
+        asked = not self.wish.only or bool(set(self.wish.only) & set(self.rows))
+        return asked and (self.wish.data / self.folder).is_dir()
 
     @property
     def kept(self) -> Checkpoint:
         """Where its table is kept."""
-        files = sorted((self.wish.data / FOLDER).glob("*/*.csv"))
-        content = hash_of((path.name, str(path.stat().st_size)) for path in files)
-        code = source_hash("model", "control", "baselines", "benchmark")
-        key = key_of(content, self.wish.quick, self.wish.only, code)
+        rooms = ("model", "data", "identify", "job", "control", "baselines", "benchmark")
+        key = key_of(self.logs(), self.wish.quick, self.wish.only, source_hash(*rooms))
         return Checkpoint(self.wish.out / "kept", key)
 
     def run(self) -> str:
-        """Fit and judge all classifiers, if that is not kept yet; the name of the part."""
+        """Make the table, if it is not kept yet; the name of the part."""
         setup_jax(quiet=True)
         kept = self.kept
         if kept.load_json(self.name) is None:
             try:
-                table = felt_benchmark(self.wish.data, self.wish.quick, self.wish.only)
-                kept.save_json(self.name, table.to_json())
+                kept.save_json(self.name, self.make().to_json())
             except Exception as error:  # other parts are done all the same
                 kept.save_json(self.name, {"failed": Row.of_error(error).absent})
         return self.name
@@ -48,3 +73,39 @@ class FloorsFelt:
         """What was found, as in benchmark.json."""
         found: Content = self.kept.load_json(self.name) or {"failed": "it was not kept"}
         return found
+
+
+class HuskyFloors(FeltPart):
+    """Five floors that a Husky felt, without a pose."""
+
+    name = "husky_floors"
+    folder = FOLDER
+
+    @property
+    def rows(self) -> Sequence[str]:
+        return [method.name for method in felt_rows()]
+
+    def logs(self) -> str:
+        root = self.wish.data / FOLDER
+        files = sorted(root.glob("*/*.csv"))
+        return hash_of((str(f.relative_to(root)), f.read_text(errors="replace")) for f in files)
+
+    def make(self) -> FeltTable:
+        return felt_benchmark(self.wish.data, self.wish.quick, self.wish.only)
+
+
+class RobotinoFloors(FeltPart):
+    """Four floors that a Robotino felt; slipid is its fit to the runs with poses."""
+
+    name = "robotino_floors"
+    folder = SOURCE
+
+    @property
+    def rows(self) -> Sequence[str]:
+        return [NAME, *(method.name for method in robotino_rows())]
+
+    def logs(self) -> str:
+        return data_of(self.wish, SOURCE).job.data_hash
+
+    def make(self) -> FeltTable:
+        return robotino_felt(self.wish)

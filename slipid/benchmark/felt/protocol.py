@@ -23,6 +23,7 @@ from slipid.benchmark.felt.result import (
     after_seconds,
     confused,
 )
+from slipid.benchmark.tuned import settings_of
 
 SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """After which classifiers are asked [s]."""
@@ -126,14 +127,8 @@ def tuned(method: FloorMethod, felts: Sequence[Felt], machine: Machine, asked: A
         ]
         right.append(float(np.mean(each)))
     best = candidates[int(np.argmax(right))]
-    words = _differing(best, candidates)
+    words = settings_of(best, candidates)
     return Tuned(best, words, time.perf_counter() - began)
-
-
-def _differing(best: FloorMethod, candidates: Sequence[FloorMethod]) -> str:
-    """Settings of a candidate in which candidates differ."""
-    names = [name for name in vars(best) if len({repr(vars(c)[name]) for c in candidates}) > 1]
-    return ", ".join(f"{name} {vars(best)[name]}" for name in names)
 
 
 def _some(felts: Sequence[Felt], take: np.ndarray) -> list[Felt]:

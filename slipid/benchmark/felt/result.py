@@ -5,12 +5,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from slipid.benchmark.summary import INTERVAL, Number
-
-DRAWS = 1000
-"""Of the bootstrap."""
+from slipid.benchmark.summary import Number, Resampled, number
 
 
 @dataclass(frozen=True)
@@ -119,54 +115,23 @@ def _after(
     seconds: float, answers: Sequence[Answer], rival: Sequence[Answer] | None
 ) -> AfterSeconds:
     right = np.array([a.said == a.floor for a in answers], dtype=float)
-    floor = np.array([a.floor for a in answers])
-    draws = _draws(answers)
-    names = sorted(set(floor.tolist()))
-
-    def balanced(weight: Float[np.ndarray, "draw stretch"]) -> np.ndarray:
-        each = [_mean(right[floor == name], weight[:, floor == name]) for name in names]
-        return np.asarray(np.mean(each, axis=0))
-
+    # whole runs are drawn anew, floor by floor
+    run = np.unique([a.run for a in answers], return_inverse=True)[1]
+    by = Resampled.by([a.floor for a in answers], run)
     behind = None
     if rival is not None:
         assert [(a.run, a.floor) for a in rival] == [(a.run, a.floor) for a in answers]
         theirs = np.array([a.said == a.floor for a in rival], dtype=float)
-        behind = _number(_mean(right - theirs, draws))
+        behind = number(by.over_all(right - theirs))
     return AfterSeconds(
         seconds=seconds,
         stretches=len(answers),
-        accuracy=_number(_mean(right, draws)),
-        balanced=_number(balanced(draws)),
+        accuracy=number(by.over_all(right)),
+        balanced=number(by.mean(right)),
         behind=behind,
-        by_floor={name: float(right[floor == name].mean()) for name in names},
+        by_floor={name: float(by.on(right, k)[0]) for k, name in enumerate(by.names)},
         log_score=float(np.mean(np.log(np.maximum([a.probability for a in answers], 1e-6)))),
     )
-
-
-def _draws(answers: Sequence[Answer]) -> Float[np.ndarray, "draw stretch"]:
-    """How often each stretch counts: whole runs are drawn anew, floor by floor; first as it is."""
-    rng = np.random.default_rng(0)
-    run = np.array([a.run for a in answers])
-    names, number = np.unique(run, return_inverse=True)
-    floor_of = {a.run: a.floor for a in answers}
-    count = np.ones((DRAWS + 1, len(names)))
-    for floor in sorted(set(floor_of.values())):
-        mine = np.array([k for k, name in enumerate(names) if floor_of[name] == floor])
-        drawn = rng.multinomial(len(mine), np.full(len(mine), 1 / len(mine)), size=DRAWS)
-        count[1:, mine] = drawn
-    return count[:, number.ravel()]
-
-
-def _mean(
-    x: Float[np.ndarray, " stretch"], weight: Float[np.ndarray, "draw stretch"]
-) -> Float[np.ndarray, " draw"]:
-    return np.asarray((weight @ x) / np.maximum(weight.sum(axis=1), 1e-12))
-
-
-def _number(draws: Float[np.ndarray, " draw"]) -> Number:
-    """The value as it is, and the interval of the draws after it."""
-    low, high = np.quantile(draws[1:], INTERVAL)
-    return Number(float(draws[0]), float(low), float(high))
 
 
 def confused(answers: Sequence[Answer], seconds: float) -> dict[str, dict[str, float]]:

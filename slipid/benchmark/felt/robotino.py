@@ -8,7 +8,7 @@ fitted to runs with all loads together.
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,13 +21,9 @@ from slipid.benchmark.felt.protocol import Asked, Judged, answers_of, asked_afte
 from slipid.benchmark.felt.result import Answer, FeltRow, FeltTable
 from slipid.benchmark.own import NAME, Own, estimated, fit_own
 from slipid.benchmark.protocols import Split, base_of, splits
-from slipid.benchmark.row import Row
 from slipid.benchmark.sets import DataSet
 from slipid.benchmark.steps import Cut, cut
 from slipid.benchmark.work import Piece, Wish, data_of, kept_of, problem_of
-from slipid.support.checkpoint import Checkpoint, key_of, source_hash
-from slipid.support.content import Content
-from slipid.support.jax_setup import setup_jax
 
 SOURCE, KIND = "robotino2022", "headings"
 SECONDS = (0.25, 0.5, 1.0, 2.0)
@@ -70,43 +66,6 @@ def robotino_felt(wish: Wish) -> FeltTable:
     return table_of(
         {name: _joined(each) for name, each in parts.items()}, judged, ABOUT, asked, NAME
     )
-
-
-@dataclass(frozen=True)
-class RobotinoFelt:
-    """The same as a part of the benchmark's work, which keeps its table."""
-
-    wish: Wish
-    name: str = "robotino_felt"
-
-    @property
-    def is_there(self) -> bool:
-        """Whether its logs are."""
-        return (self.wish.data / SOURCE).is_dir()
-
-    @property
-    def kept(self) -> Checkpoint:
-        """Where its table is kept."""
-        code = source_hash("model", "data", "identify", "job", "control", "baselines", "benchmark")
-        data = data_of(self.wish, SOURCE).job.data_hash
-        key = key_of(data, self.wish.quick, self.wish.only, code)
-        return Checkpoint(self.wish.out / "kept", key)
-
-    def run(self) -> str:
-        """Fit and judge all classifiers, if that is not kept yet; the name of the part."""
-        setup_jax(quiet=True)
-        kept = self.kept
-        if kept.load_json(self.name) is None:
-            try:
-                kept.save_json(self.name, robotino_felt(self.wish).to_json())
-            except Exception as error:  # other parts are done all the same
-                kept.save_json(self.name, {"failed": Row.of_error(error).absent})
-        return self.name
-
-    def table(self) -> Content:
-        """What was found, as in benchmark.json."""
-        found: Content = self.kept.load_json(self.name) or {"failed": "it was not kept"}
-        return found
 
 
 def felt_of(run: Run) -> Felt:

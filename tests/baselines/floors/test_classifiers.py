@@ -34,7 +34,10 @@ def training(method, felts):
     """Features and floors as a method trains on them."""
     if isinstance(method, Gaussian):
         return rows_of(felts, lambda f: method._features(f, HUSKY, method.piece_s))
-    take = lambda f: features(f, HUSKY, method.hearing, piece_s=method.piece_s)  # noqa: E731
+
+    def take(f):
+        return features(f, HUSKY, method.hearing, piece_s=method.piece_s)
+
     return rows_of(felts, take, method.rows_s)
 
 
