@@ -258,10 +258,12 @@ class ByFloor(Method):
 
     Attributes:
         method: unfitted.
+        pooled: whether it takes no notice of floors that are told, and is fitted once all the same.
         fitted: to the runs on each floor, by its name; under None to runs whose floor was not told.
     """
 
     method: Method
+    pooled: bool = False
     fitted: Mapping[str | None, Method] = field(default_factory=dict)
 
     @classmethod
@@ -274,20 +276,24 @@ class ByFloor(Method):
     def fit(self, runs: Sequence[Run], machine: Machine) -> "ByFloor":
         floors: dict[str | None, list[Run]] = {}
         for run in runs:
-            floors.setdefault(run.heard.floor, []).append(run)
+            floors.setdefault(self._noticed(run.heard), []).append(run)
         fitted = {name: self.method.fit(mine, machine) for name, mine in floors.items()}
         return replace(self, fitted=fitted)
 
     def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
         said: dict[int, Said] = {}
-        for floor in dict.fromkeys(run.floor for run in runs):
-            mine = [k for k, run in enumerate(runs) if run.floor == floor]
+        noticed = [self._noticed(run) for run in runs]
+        for floor in dict.fromkeys(noticed):
+            mine = [k for k, name in enumerate(noticed) if name == floor]
             if floor not in self.fitted:
                 known = ", ".join(map(str, self.fitted))
                 raise ValueError(f"{self.name}: no floor '{floor}'; fitted: {known}")
             of_floor = self.fitted[floor].predict([runs[k] for k in mine], machine)
             said.update(zip(mine, of_floor, strict=True))
         return [said[k] for k in range(len(runs))]
+
+    def _noticed(self, heard: Heard) -> str | None:
+        return None if self.pooled else heard.floor
 
     @property
     def numbers(self) -> int:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from slipid.baselines.interface import Heard, Machine, Said, seen_from_start
 from slipid.benchmark.steps import Cut, body_poses
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
-from slipid.control.interface import MIXED, Readings, Settings
+from slipid.control.interface import MIXED, NO_FLOOR, Readings, Settings
 from slipid.control.robot_file.record import FloorRecord, RobotRecord, Sensors
 from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
@@ -66,6 +67,12 @@ class Own:
     def numbers(self) -> int:
         """How many numbers were fitted."""
         return self.contact.space.size
+
+    @cached_property
+    def deployed(self) -> DeployedRobot:
+        """The robot as it is deployed, on all floors of the data set."""
+        signed = self.job.dataset.current_is_signed
+        return robot_of(self.contact, self.highest_speed, self.trend, Sensors(signed))
 
 
 def fit_own(job: Job, problem: Problem, fitted: np.ndarray, kept: Checkpoint) -> Own:
@@ -143,42 +150,55 @@ def _currents(robot: Any, b: lk.Batch) -> Array:
     return lk.predicted_current(robot, b, lk.predict(robot, b).felt)
 
 
-def estimated(
-    own: Own, cuts: Sequence[Cut], data: Runs, told: bool = False, floor: FloorMap | None = None
-) -> list[Said]:
-    """What the estimator says of runs, in the order of the cuts.
+@dataclass(frozen=True, eq=False)
+class Place:
+    """What an estimator knows of where it drives.
 
-    Args:
-        own: the fit; data: the runs that the cuts are of.
+    Attributes:
         told: whether the floor of each run is told: then it is the only one there is.
-        floor: map of the floors; the estimator then starts at the first pose of the body, in the
-            frame of the map.
+        strange: whether there may be floors on which nobody drove.
+        map: of the floors; the estimator then starts at the first pose of the body, in its frame.
+    """
+
+    told: bool = False
+    strange: bool = False
+    map: FloorMap | None = None
+
+
+def estimated(own: Own, cuts: Sequence[Cut], data: Runs, place: Place) -> list[Said]:
+    """What the estimator says of runs, in the order of the cuts, which are of these data.
+
+    It hears currents only if it was fitted to some.
     """
     runs = [(run, cut.numbers[k]) for cut in cuts for k, run in enumerate(cut.runs)]
     out: dict[int, Said] = {}
-    alone = {n: data.logs[number].surface if told else None for n, (_, number) in enumerate(runs)}
+    alone = {
+        n: data.logs[number].surface if place.told else None for n, (_, number) in enumerate(runs)
+    }
     kinds = [(data.logs[number].load, alone[n]) for n, (_, number) in enumerate(runs)]
     for load, only in dict.fromkeys(kinds):
         mine = [n for n, kind in enumerate(kinds) if kind == (load, only)]
-        estimator = _estimator(own, load, only, floor, runs[mine[0]][0].floor == "unknown")
-        said = replay(estimator, [runs[n][0].heard for n in mine], _starts(runs, mine, floor))
+        estimator = _estimator(own, load, only, place, runs[mine[0]][0].floor == "unknown")
+        heard = [runs[n][0].heard for n in mine]
+        if own.job.dataset.current is None:
+            heard = [replace(one, current=None) for one in heard]
+        said = replay(estimator, heard, _starts(runs, mine, place.map))
         out.update(zip(mine, said, strict=True))
     return [out[n] for n in range(len(runs))]
 
 
-def _estimator(
-    own: Own, load: str, only: str | None, floor: FloorMap | None, several: bool
-) -> Estimator:
+def _estimator(own: Own, load: str, only: str | None, place: Place, several: bool) -> Estimator:
     """The estimator of a fit, for all floors that were fitted, or only one."""
-    signed = own.job.dataset.current_is_signed
-    whole = robot_of(own.contact, own.highest_speed, own.trend, Sensors(signed), load)
+    whole = own.deployed
     # a floor that nobody has seen has no numbers
     rows = own.seen if only is None else (whole.labels.index(only),)
     robot = DeployedRobot.of(whole.record.on(rows), load)
+    if place.strange:
+        robot = robot.with_unseen()
     settings = Settings.of(robot)
-    if several or floor is not None:
+    if several or place.map is not None:
         settings = replace(settings, alike=MIXED)
-    known = None if floor is None else floor_of(floor, robot.labels)
+    known = None if place.map is None else floor_of(place.map, robot.labels)
     return Estimator(_same_structure(robot), settings, known)
 
 
@@ -198,7 +218,7 @@ def _same_structure(robot: DeployedRobot) -> DeployedRobot:
         wheels=record.wheels,
         parameters={},
         floors=tuple(
-            FloorRecord(floor.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, None)
+            FloorRecord(floor.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, None, floor.unseen)
             for floor in record.floors
         ),
         loads=(),
@@ -247,7 +267,7 @@ def replay(estimator: Estimator, runs: Sequence[Heard], start: np.ndarray) -> li
     longest = max(int(part.sum()) for part in parts)
     longest = -(-longest // STEPS) * STEPS + 1
     drives = estimator.robot.drives
-    names = (*estimator.robot.labels, "unknown")
+    known = [k for k, floor in enumerate(estimator.robot.record.floors) if not floor.unseen]
     out: list[Said] = []
     for first in range(0, len(runs), TOGETHER):
         some = range(first, min(first + TOGETHER, len(runs)))
@@ -271,10 +291,11 @@ def replay(estimator: Estimator, runs: Sequence[Heard], start: np.ndarray) -> li
         for n, k in enumerate(some):
             ends = np.cumsum(parts[k])
             path = np.concatenate([begin[n][None], pose[n, ends]])
+            under = {estimator.robot.labels[row]: floors[n, ends, row] for row in known}
             said = Said(
                 path=seen_from_start(path),
                 end_covariance=turned_covariance(cov[n, ends[-1]], -float(begin[n, 2])),
-                floors={name: floors[n, ends, row] for row, name in enumerate(names)},
+                floors=under | {NO_FLOOR: 1.0 - sum(under.values())},
             )
             out.append(said)
     return out

@@ -12,7 +12,7 @@ from slipid.data.runs import Runs
 
 FOLDS = 2
 """Parts into which headings and sectors are dealt; every other sector is left out together."""
-SPEEDS = 3
+SPEEDS = 2
 """Parts of speeds, where there are many."""
 INNER = 1
 """Parts of the training runs that are left out in turn while a method picks its settings."""
@@ -25,11 +25,19 @@ Labels = Int[np.ndarray, " run"]
 
 
 class Protocol(NamedTuple):
-    """A question: how runs are split for it, whether floors are told, and in a sentence."""
+    """A question.
+
+    Attributes:
+        split: how runs are split for it.
+        told: whether floors are told.
+        about: the question in a sentence.
+        strange: whether methods are told that floors may be others than those that they have seen.
+    """
 
     split: str
     told: bool
     about: str
+    strange: bool = False
 
 
 PROTOCOLS: dict[str, Protocol] = {
@@ -37,7 +45,7 @@ PROTOCOLS: dict[str, Protocol] = {
     "unknown_floor": Protocol("headings", False, "new headings, the floor is not told"),
     "sectors": Protocol("sectors", True, "left-out sectors of 60 degrees, the floor is told"),
     "speeds": Protocol("speeds", True, "a left-out speed, the floor is told"),
-    "new_floor": Protocol("floors", False, "a floor that no method has seen"),
+    "new_floor": Protocol("floors", False, "a floor that no method has seen", True),
     "two_floors": Protocol("all", False, "runs from one floor to another, not told where"),
 }
 
@@ -132,7 +140,7 @@ def sectors(facts: Sequence[Facts]) -> Labels:
 
 
 def speeds(facts: Sequence[Facts]) -> Labels:
-    """Parts of one commanded speed, or thirds where there are many.
+    """Parts of one commanded speed, or halves where there are many.
 
     Runs on a floor that saw one part only are of none, -1.
     """

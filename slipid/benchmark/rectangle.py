@@ -30,7 +30,7 @@ CONTROLLERS = (
     "contact",
     "contact_gyro",
 )
-STARTS = 8
+STARTS = 6
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ SOURCES = (
         about="Robotino on the virtual test site (MuJoCo), two floors, two loads",
         folder="",
         config="robotino.toml",
-        kinds=("headings", "speeds", "floors"),
+        kinds=("headings", "floors"),
     ),
 )
 

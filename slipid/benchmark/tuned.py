@@ -1,7 +1,7 @@
 """The same chance for every method: its settings by inner cross-validation on training runs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,17 +29,26 @@ def tuned(method: Method, runs: Sequence[Run], machine: Machine, kind: str) -> T
 
     Each is fitted without a part of the runs, of the kind that the method will be judged by, and
     judged on that part by its mean end-point error over the path. A setting with which the method
-    cannot be fitted counts as the worst.
+    cannot be fitted counts as the worst. A method that is fitted floor by floor may also do better
+    with one fit to the runs of all floors: with the best settings both are tried.
     """
     candidates = list(method.candidates())[:TRIES]
-    if len(candidates) == 1:
-        return Tuned(method, "", 1)
     some = np.linspace(0, len(runs) - 1, min(len(runs), MOST_RUNS)).round().astype(int)
     few = [runs[k] for k in some]
     part = inner(few, kind)
+    pools = isinstance(method, ByFloor) and len({run.heard.floor for run in few}) > 1
+    if len(candidates) == 1 and not pools:
+        return Tuned(method, "", 1)
     losses = [_loss(candidate, few, part, machine) for candidate in candidates]
     best = candidates[int(np.argmin(losses))]
-    return Tuned(best, settings_of(best, candidates), len(candidates))
+    settings = [settings_of(best, candidates)]
+    if pools and isinstance(best, ByFloor):
+        pooled = replace(best, pooled=True)
+        if _loss(pooled, few, part, machine) < min(losses):
+            best = pooled
+            settings.append("one fit for all floors")
+    words = ", ".join(word for word in settings if word)
+    return Tuned(best, words, len(candidates) + pools)
 
 
 def _loss(method: Method, runs: Sequence[Run], part: np.ndarray, machine: Machine) -> float:

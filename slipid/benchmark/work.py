@@ -13,7 +13,7 @@ from slipid.baselines.interface import Channel, Machine, Method, Run, Said
 from slipid.baselines.rows import rows
 from slipid.benchmark import own as slipid_rows
 from slipid.benchmark.judge import Judged, judged
-from slipid.benchmark.protocols import PROTOCOLS, Protocol, Split, splits
+from slipid.benchmark.protocols import PROTOCOLS, Protocol, Split, base_of, splits
 from slipid.benchmark.row import Row
 from slipid.benchmark.sets import SOURCES, DataSet, Source, read_set
 from slipid.benchmark.steps import Cut, cut
@@ -120,12 +120,16 @@ def kept_of(piece: Piece, fit: bool) -> Checkpoint:
 
 
 def keys_of(piece: Piece) -> list[tuple[str, str]]:
-    """Protocols and rows that a piece is asked for, slipid's own rows first."""
+    """Protocols and rows that a piece is asked for, slipid's own rows first.
+
+    Where there is one floor only, there is nothing to be found out about it.
+    """
     wish, data, split = piece.wish, data_of(piece.wish, piece.source), split_of(piece)
     own = [slipid_rows.NAME] + ([OWN_MAP] if split.kind == "all" else [])
     every = own + [method.name for method in rows(data.machine)]
     wanted = [name for name in every if not wish.only or name in wish.only]
-    asked = [name for name in split.protocols if not wish.quick or PROTOCOLS[name].told]
+    several = len({base_of(f.floor) for f in data.facts}) > 1
+    asked = [p for p in split.protocols if PROTOCOLS[p].told or (several and not wish.quick)]
     return [(protocol, name) for protocol in asked for name in wanted]
 
 
@@ -249,18 +253,18 @@ def _own(scene: Scene, asked: Protocol, runs: list[Run], name: str) -> Row:
         return Row.lacking(["map"])
 
     has_gyro = all(run.heard.gyro is not None for run in runs)
+    place = slipid_rows.Place(
+        asked.told, asked.strange, scene.data.map if name == OWN_MAP else None
+    )
 
     def predict(cuts: Sequence[Cut]) -> list[Said]:
-        if asked.told and not has_gyro:
-            machine = scene.data.machine
-            return [said for one in cuts for said in slipid_rows.told(own, one, machine)]
-        floor = scene.data.map if name == OWN_MAP else None
-        return slipid_rows.estimated(own, cuts, scene.judged, asked.told, floor)
+        if drives:
+            return slipid_rows.estimated(own, cuts, scene.judged, place)
+        return [said for one in cuts for said in slipid_rows.told(own, one, scene.data.machine)]
 
-    for one in scene.cuts:  # compiles
+    drives = not asked.told or has_gyro
+    for one in scene.cuts[-1:] if drives else scene.cuts:  # compiles; the last have most steps
         predict([replace(one, numbers=one.numbers[:1], runs=one.runs[:1])])
-        if not asked.told or has_gyro:
-            break
     said, each = _timed(lambda: predict(scene.cuts), runs)
     return Row(
         runs=_judged(scene, runs, said),

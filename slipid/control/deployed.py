@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from slipid.control.filter.effects import Told
 from slipid.control.robot_file.file import ANEW, check, read_robot, shape_of, write_robot
 from slipid.control.robot_file.record import LoadRecord, Numbers, RobotRecord
+from slipid.control.robot_file.unseen import with_unseen
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame, Geometry, at_drives, at_wheels
 from slipid.model.motor import Motor
@@ -170,6 +171,15 @@ class DeployedRobot(eqx.Module):
             raise ValueError(f"floors {list(floors)}; expected each once of {known}")
         rows = tuple(self.labels.index(name) for name in floors)
         return DeployedRobot.of(self.record.on(rows), self.load_setup)
+
+    def with_unseen(self) -> "DeployedRobot":
+        """For a place that may have floors on which nobody drove, `unseen_1` and on.
+
+        An estimator of it takes a strange floor for the one of them that fits the currents best,
+        and says how unsure that is; without them it is taken for a floor that is known. See
+        `slipid.control.robot_file.unseen`.
+        """
+        return DeployedRobot.of(with_unseen(self.record), self.load_setup)
 
 
 def drawn(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:

@@ -1,6 +1,7 @@
 """The command on the recorded runs of the test site: one table, kept work, rows that fail."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from typer.testing import CliRunner
 from slipid.benchmark import work as benchmark_work
 from slipid.benchmark.benchmark import benchmark
 from slipid.benchmark.row import Row
-from slipid.benchmark.work import Piece, Wish, split_of
+from slipid.benchmark.work import Piece, Wish, data_of, keys_of, split_of
 from slipid.cli.main import app
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -60,6 +61,16 @@ def test_one_command_makes_a_table_and_goes_on_from_what_was_kept(tmp_path, monk
     left = {name: row for (_, name), row in piece.rows().items()}
     assert left["encoder"] == Row(absent="ZeroDivisionError: a wheel of size 0", failed=True)
     assert len(left["paper_code"].runs) == len(split_of(piece).judged)
+
+
+def test_where_there_is_one_floor_nobody_is_asked_which_it_is(tmp_path, monkeypatch):
+    (tmp_path / "x").mkdir()
+    piece = Piece(Wish(tmp_path / "x", tmp_path / "out", ("encoder",)), "testsite", "headings", 0)
+    assert keys_of(piece) == [("known_floor", "encoder"), ("unknown_floor", "encoder")]
+    data = data_of(piece.wish, "testsite")
+    alone = replace(data, facts=tuple(replace(f, floor="firm") for f in data.facts))
+    monkeypatch.setattr(benchmark_work, "data_of", lambda wish, source: alone)
+    assert keys_of(piece) == [("known_floor", "encoder")]
 
 
 def test_an_unknown_row_is_named_with_the_choices(tmp_path):

@@ -61,11 +61,11 @@ def test_a_load_driven_at_one_speed_keeps_it_and_a_floor_is_left_out_with_all_lo
     assert left_out == [{"gray", "gray@moved"}, {"green"}]
 
 
-def test_many_speeds_are_three_parts():
+def test_many_speeds_are_two_halves():
     rng = np.random.default_rng(0)
     every = [Facts("grass", 0.0, float(v)) for v in rng.uniform(0.5, 3.0, 60)]
     found = splits(every, "speeds")
-    assert len(found) == 3
+    assert [len(split.judged) for split in found] == [30, 30]
     fastest = [max(every[k].speed for k in split.judged) for split in found]
     assert fastest == sorted(fastest)
 
@@ -136,6 +136,34 @@ def test_the_best_setting_of_training_runs_is_picked():
     assert found.tried == 3
     pooled = tuned(Scaled(), runs(slip=0.3), ROBOTINO, "headings")
     assert pooled.settings == "factor = 0.85"
+
+
+@dataclass(frozen=True)
+class Hungry(Scaled):
+    """Encoders that are right if they were fitted to runs on several floors."""
+
+    factor: float = 1.0
+
+    def candidates(self):
+        return [self]
+
+    def fit(self, runs, machine: Machine):
+        several = len({run.floor for run in runs}) > 1
+        return replace(super().fit(runs, machine), factor=0.5 if several else 1.0)
+
+
+def test_a_method_by_floor_may_do_better_with_one_fit_for_all():
+    training = [run.told(True) for run in runs(slip=0.5)]
+    assert len({run.floor for run in training}) > 1
+    found = tuned(ByFloor.of(Hungry()), training, ROBOTINO, "headings")
+    assert (found.settings, found.tried) == ("one fit for all floors", 2)
+    done = found.method.fit(training, ROBOTINO)
+    assert isinstance(done, ByFloor)
+    assert list(done.fitted) == [None]
+    untold = [run.told(False) for run in training]
+    assert tuned(ByFloor.of(Hungry()), untold, ROBOTINO, "headings").tried == 1
+    # what is as good with floors apart keeps them apart
+    assert tuned(ByFloor.of(Scaled()), training, ROBOTINO, "headings").settings == "factor = 0.5"
 
 
 class Stubborn(Scaled):

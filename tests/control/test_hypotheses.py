@@ -8,8 +8,9 @@ import pytest
 from slipid.control.filter.hypotheses import CHANGES, _hypotheses
 
 
-def ways(place, floors, changes=CHANGES):
-    return _hypotheses(tuple(place), floors, changes)
+def ways(place, floors, changes=CHANGES, unseen=0):
+    """So many floors that were driven on, and after them so many that were not."""
+    return _hypotheses(tuple(place), (False,) * floors + (True,) * unseen, changes)
 
 
 THREE = [(0.5, 0.9), (-1.0, 0.0), (0.5, -0.9)]
@@ -58,3 +59,14 @@ def test_all_wheels_on_a_floor_and_floors_under_wheels():
 
 def test_all_ways_are_there_if_any_edge_may_be():
     assert len(ways(FOUR, 5, changes=4)) == 625
+
+
+def test_a_floor_that_nobody_drove_on_is_under_all_wheels_or_none():
+    found = ways(THREE, 2, unseen=3)
+    assert len(found) == 8 + 3
+    assert found.under[8:].tolist() == [[2] * 3, [3] * 3, [4] * 3]
+    assert found.uniform.tolist()[2:] == [8, 9, 10]
+    # no wheel alone comes to it or leaves it
+    for floor in range(2):
+        assert (found.beside[:, 8:, floor] == len(found)).all()
+        assert (found.beside[:, :8, 2 + floor] == len(found)).all()

@@ -158,6 +158,17 @@ def test_what_is_known_of_the_floors_is_saved_with_them(robot, tmp_path):
     np.testing.assert_array_equal(only.told.table[0, ..., :3], ONE[::-1])
 
 
+def test_floors_that_nobody_drove_on_are_saved_with_the_others(robot, tmp_path):
+    wider = robot.with_unseen()
+    wider.save(tmp_path / "wider.json")
+    again = DeployedRobot.load(tmp_path / "wider.json", "moved")
+    same(again, wider)
+    assert again.record == wider.record
+    assert again.with_unseen().record == wider.record
+    jsonschema.validate(json.loads((tmp_path / "wider.json").read_text()), SCHEMA)
+    same(wider.on(*robot.labels), robot)
+
+
 @pytest.mark.slow
 def test_the_schema_tells_what_is_written_and_names_every_gain(path, robot):
     jsonschema.Draft202012Validator.check_schema(SCHEMA)

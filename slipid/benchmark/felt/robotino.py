@@ -19,7 +19,7 @@ from slipid.baselines.floors.interface import Felt, FloorMethod
 from slipid.baselines.interface import Machine, Run, Said
 from slipid.benchmark.felt.protocol import Asked, Judged, answers_of, asked_after, table_of, tuned
 from slipid.benchmark.felt.result import Answer, FeltRow, FeltTable
-from slipid.benchmark.own import NAME, Own, estimated, fit_own
+from slipid.benchmark.own import NAME, Own, Place, estimated, fit_own
 from slipid.benchmark.protocols import Split, base_of, splits
 from slipid.benchmark.sets import DataSet
 from slipid.benchmark.steps import Cut, cut
@@ -100,7 +100,7 @@ def _judged(data: DataSet, split: Split, own: Own) -> list[Cut]:
 def _own(own: Own, cuts: list[Cut], data: DataSet, split: Split, felts: list[Felt]) -> Judged:
     """What the estimator says of the runs that were left out."""
     began = time.perf_counter()
-    said = estimated(own, cuts, data.heard.subset(split.judged))
+    said = estimated(own, cuts, data.heard.subset(split.judged), Place())
     took = time.perf_counter() - began
     answers: list[Answer] = []
     for felt, one in zip(felts, said, strict=True):

@@ -110,9 +110,15 @@ class FloorFilter(eqx.Module):
         )
 
     def prior(self) -> Float[Array, " hypothesis"]:
-        """Probability of every hypothesis before anything is measured."""
-        kinds = np.array([len(set(row)) for row in hypotheses_of(self.robot).under.tolist()])
-        weight = np.exp(-self.settings.alike * (kinds - 1))
+        """Probability of every hypothesis before anything is measured.
+
+        All floors together that nobody drove on are as rare as one further floor under the robot.
+        """
+        under = hypotheses_of(self.robot).under
+        kinds = np.array([len(set(row)) for row in under.tolist()])
+        unseen = np.array([floor.unseen for floor in self.robot.record.floors])[under[:, 0]]
+        further = kinds - 1 + unseen
+        weight = np.exp(-self.settings.alike * further) / np.where(unseen, unseen.sum(), 1)
         return jnp.asarray(weight / weight.sum())
 
     def step(

@@ -4,7 +4,8 @@ Floors to the power of wheels grows fast: 625 ways for four wheels on five floor
 floor is nearly straight on the scale of a robot, so going around the robot from wheel to wheel the
 floor changes at most twice: every way has one floor, or two with neighbouring wheels on each side.
 That leaves 125 of the 625 and 21 of three wheels' 27. Three floors at once, where patches meet at a
-corner, are taken for the nearest of these or for "unknown".
+corner, are taken for the nearest of these or for "unknown". A floor that nobody drove on is under
+all wheels or under none.
 """
 
 import itertools
@@ -43,13 +44,18 @@ class Hypotheses:
 
 def hypotheses_of(robot: DeployedRobot) -> Hypotheses:
     """Ways in which the wheels of a robot may stand on the floors it knows."""
-    return _hypotheses(robot.record.wheels.place, len(robot.labels), CHANGES)
+    unseen = tuple(floor.unseen for floor in robot.record.floors)
+    return _hypotheses(robot.record.wheels.place, unseen, CHANGES)
 
 
 @lru_cache(maxsize=32)
-def _hypotheses(place: tuple[tuple[float, float], ...], floors: int, changes: int) -> Hypotheses:
-    around = _around(np.asarray(place))
-    ways = itertools.product(range(floors), repeat=len(place))
+def _hypotheses(
+    place: tuple[tuple[float, float], ...], unseen: tuple[bool, ...], changes: int
+) -> Hypotheses:
+    around, floors = _around(np.asarray(place)), len(unseen)
+    driven = [k for k in range(floors) if not unseen[k]]
+    ways = list(itertools.product(driven, repeat=len(place)))
+    ways += [(k,) * len(place) for k in range(floors) if unseen[k]]
     under = np.array([way for way in ways if _changes(way, around) <= changes])
     number = {tuple(way): k for k, way in enumerate(under.tolist())}
 

@@ -20,7 +20,7 @@ from slipid.parameter import Declaration, Entry, entries
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_bytes
 
-SCHEMA = "slipid.robot/5"
+SCHEMA = "slipid.robot/6"
 ANEW = "copy it again, or write it anew with `slipid identify`"
 
 

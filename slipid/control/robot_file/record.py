@@ -90,6 +90,7 @@ class FloorRecord:
         process: growing with the root of the distance; effect: all the way.
         current_std: of the current that flows from the model's, the ammeter's noise aside.
         seen: None where the numbers were given, not fitted.
+        unseen: whether nobody drove on it: see `slipid.control.robot_file.unseen`.
     """
 
     name: str
@@ -97,6 +98,7 @@ class FloorRecord:
     effect: Axes
     current_std: float
     seen: Validity | None
+    unseen: bool = False
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,117 @@
+"""Floors that nobody drove on: what they are made of, and what they are good for."""
+
+from dataclasses import replace
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from slipid.control.deployed import DeployedRobot
+from slipid.control.estimator import Estimator
+from slipid.control.filter.floor_filter import FloorFilter
+from slipid.control.filter.hypotheses import hypotheses_of
+from slipid.control.interface import Readings, Settings
+from slipid.control.robot_file.unseen import GRIP, SOFTNESS, with_unseen
+from slipid.model.geometry import omni
+from slipid.model.robot import build
+from slipid.model.se2 import advance
+from tests.helpers.known_robot import deploy_known
+from tests.helpers.small_twin import deployed
+
+COUNT = len(SOFTNESS) * len(GRIP)
+SOFT = {"friction": 0.5, "creep": 0.6, "roller_drag": 0.95}
+"""Softer than the floors of the robot as floors are, between two of the unseen ones."""
+OTHER = {"friction": 0.5, "creep": 0.9, "roller_drag": 0.5}
+"""Softer still, with far less drag than floors so soft have."""
+
+
+def value(robot: DeployedRobot, path: str) -> float:
+    number = robot.record.parameters[f"surface.{path}"].value
+    assert isinstance(number, float)
+    return number
+
+
+def test_they_lie_about_the_middle_of_the_floors_that_were_driven_on():
+    known, wider = deployed(process=1.0), deployed(process=1.0).with_unseen()
+    names = wider.labels[2:]
+    assert names == tuple(f"unseen_{k + 1}" for k in range(COUNT))
+    assert wider.labels[:2] == known.labels
+    for quantity in ("creep", "friction", "roller_drag", "scrub"):
+        own = [value(known, f"{name}.{quantity}") for name in known.labels]
+        made = [value(wider, f"{name}.{quantity}") for name in names]
+        assert np.log(made).mean() == pytest.approx(np.log(own).mean())
+    creep = [value(wider, f"{name}.creep") for name in names]
+    drag = [value(wider, f"{name}.roller_drag") for name in names]
+    assert np.argsort(creep, kind="stable").tolist() == np.argsort(drag, kind="stable").tolist()
+    assert max(creep) / min(creep) == pytest.approx(np.exp(4.0))
+    # their motion is surely no better known than that of a floor that was driven on
+    assert (np.asarray(wider.effect[2:]) > np.asarray(wider.effect[:2]).max(axis=0)).all()
+    assert {n.verdict for p, n in wider.record.parameters.items() if "unseen" in p} == {
+        "not_identified"
+    }
+
+
+def test_together_they_are_as_rare_as_a_second_floor_under_the_robot():
+    known, wider = deployed(), deployed().with_unseen()
+    settings = Settings(alike=2.0)
+    prior = np.asarray(FloorFilter(wider, settings).prior())
+    ways = hypotheses_of(wider)
+    before = np.asarray(FloorFilter(known, settings).prior())
+    # the driven floors keep their odds
+    np.testing.assert_allclose(prior[: len(before)] / prior[0], before / before[0])
+    assert prior[ways.uniform[2:]].sum() == pytest.approx(np.exp(-2.0) * prior[ways.uniform[0]])
+
+
+def test_a_robot_has_them_once():
+    record = with_unseen(deployed().record)
+    assert with_unseen(record) is record
+
+
+@cache
+def strange(numbers: tuple[tuple[str, float], ...]) -> DeployedRobot:
+    """The robot on a floor that it does not know."""
+    made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["strange"])
+    surfaces = replace(made.surfaces, **{k: jnp.asarray([v]) for k, v in numbers})
+    return deploy_known(eqx.tree_at(lambda r: r.surfaces, made, surfaces), highest_speed=8.0)
+
+
+def end_after(
+    robot: DeployedRobot, numbers: dict[str, float], way: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the strange floor leads in 4 s, where the robot believes to be, and how sure it is."""
+    truth, settings = strange(tuple(numbers.items())), Settings(current_is_signed=True)
+    w = truth.forward @ jnp.asarray([0.2 * np.cos(way), 0.2 * np.sin(way), 0.0]) / 0.04
+    xi = jnp.zeros((1, 3))
+    for _ in range(4):
+        xi, amps = FloorFilter(truth, settings).solve(xi, w)
+    assert np.isfinite(amps).all()
+    estimator, dt = Estimator(robot, settings), 0.1
+    nothing = Readings.nothing(3)
+
+    @eqx.filter_jit
+    def drive(estimator: Estimator) -> tuple[jax.Array, jax.Array]:
+        def step(state, k):  # type: ignore[no-untyped-def]
+            z = replace(nothing, wheel_angle=k * dt * w, current=amps[0])
+            state, seen = estimator.step(state, z, dt)
+            return state, (seen.pose, seen.covariance)
+
+        poses, cov = jax.lax.scan(step, estimator.init(), jnp.arange(41.0))[1]
+        return poses[-1], cov[-1]
+
+    pose, cov = drive(estimator)
+    return np.asarray(advance(xi[0], 4.0)), np.asarray(pose), np.asarray(cov)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", [0.3, 1.2, 2.5])
+@pytest.mark.parametrize(("numbers", "part"), [(SOFT, 0.7), (OTHER, 0.9)])
+def test_a_strange_floor_is_taken_for_what_its_currents_are_like(numbers, part, way):
+    true, pose, _ = end_after(deployed(), numbers, way)
+    _, wider, cov = end_after(deployed().with_unseen(), numbers, way)
+    before, after = (float(np.hypot(*(p - true)[:2])) for p in (pose, wider))
+    assert after < part * before
+    gap = (wider - true)[:2]
+    assert gap @ np.linalg.solve(cov[:2, :2], gap) < 9.2  # 99 % of a Gaussian
