@@ -89,6 +89,7 @@ class Heard:
         gyro: mean yaw rate [rad/s], or None.
         command: twist that was commanded, or None.
         floor: name of the floor if the method is told; None where it has to find out.
+        load: name of the load set-up, which a robot knows; None where there is only one.
     """
 
     name: str
@@ -99,6 +100,7 @@ class Heard:
     gyro: Float[np.ndarray, " step"] | None = None
     command: Float[np.ndarray, "step 3"] | None = None
     floor: str | None = None
+    load: str | None = None
 
     def __len__(self) -> int:
         return len(self.dt)
@@ -254,12 +256,13 @@ class Method(abc.ABC):
 
 @dataclass(frozen=True)
 class ByFloor(Method):
-    """A method fitted floor by floor where floors are told, else once to all runs together.
+    """A method fitted floor by floor where floors are told, else load set-up by load set-up.
 
     Attributes:
         method: unfitted.
-        pooled: whether it takes no notice of floors that are told, and is fitted once all the same.
-        fitted: to the runs on each floor, by its name; under None to runs whose floor was not told.
+        pooled: whether it takes no notice of floors and loads, and is fitted once to all runs.
+        fitted: to the runs of each group, by its name; under None to all runs, for runs with a load
+            set-up that no training run had.
     """
 
     method: Method
@@ -276,15 +279,19 @@ class ByFloor(Method):
     def fit(self, runs: Sequence[Run], machine: Machine) -> "ByFloor":
         floors: dict[str | None, list[Run]] = {}
         for run in runs:
-            floors.setdefault(self._noticed(run.heard), []).append(run)
+            floors.setdefault(self.group_of(run.heard), []).append(run)
+        if all(run.heard.floor is None for run in runs):
+            floors[None] = list(runs)
         fitted = {name: self.method.fit(mine, machine) for name, mine in floors.items()}
         return replace(self, fitted=fitted)
 
     def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
         said: dict[int, Said] = {}
-        noticed = [self._noticed(run) for run in runs]
-        for floor in dict.fromkeys(noticed):
-            mine = [k for k, name in enumerate(noticed) if name == floor]
+        groups = [self.group_of(run) for run in runs]
+        if None in self.fitted:
+            groups = [name if name in self.fitted else None for name in groups]
+        for floor in dict.fromkeys(groups):
+            mine = [k for k, name in enumerate(groups) if name == floor]
             if floor not in self.fitted:
                 known = ", ".join(map(str, self.fitted))
                 raise ValueError(f"{self.name}: no floor '{floor}'; fitted: {known}")
@@ -292,8 +299,11 @@ class ByFloor(Method):
             said.update(zip(mine, of_floor, strict=True))
         return [said[k] for k in range(len(runs))]
 
-    def _noticed(self, heard: Heard) -> str | None:
-        return None if self.pooled else heard.floor
+    def group_of(self, heard: Heard) -> str | None:
+        """Name of the runs that this one is fitted with: its floor if that is told, or its load."""
+        if self.pooled:
+            return None
+        return heard.load if heard.floor is None else heard.floor
 
     @property
     def numbers(self) -> int:

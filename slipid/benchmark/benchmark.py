@@ -60,7 +60,15 @@ def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
             report.line(f"skipped: {source.name}: no folder {wish.data / source.folder}")
     writable(wish.out)
     report.stage("reading logs")
-    pieces = in_turn([pieces_of(wish, source.name) for source in sources])
+    unread: dict[str, str] = {}
+    each = []
+    for source in sources:
+        try:
+            each.append(pieces_of(wish, source.name))
+        except Exception as error:  # other data sets are there all the same
+            unread[source.name] = Row.of_error(error).absent
+            report.line(f"skipped: {source.name}: {unread[source.name]}")
+    pieces = in_turn(each)
     felt = [part for part in (HuskyFloors(wish), RobotinoFloors(wish)) if part.is_asked]
     rectangle = Rectangle(wish)
     # the Robotino's floors come last: they take the fits that were made for its headings
@@ -75,6 +83,7 @@ def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
     content = {
         "schema": SCHEMA,
         "quick": wish.quick,
+        "unread": unread,
         "sets": {name: _set(wish, name, protocols) for name, protocols in tables.items()},
         "protocols": {name: p.about for name, p in PROTOCOLS.items()},
         "floors": {part.name: part.table() for part in felt},

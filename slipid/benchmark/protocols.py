@@ -31,7 +31,8 @@ class Protocol(NamedTuple):
         split: how runs are split for it.
         told: whether floors are told.
         about: the question in a sentence.
-        strange: whether methods are told that floors may be others than those that they have seen.
+        strange: whether slipid's estimator is told that there may be floors that it has not seen;
+            other rows cannot make use of that.
     """
 
     split: str
@@ -131,12 +132,18 @@ def headings(facts: Sequence[Facts]) -> Labels:
     return np.random.default_rng(0).permutation(number.max() + 1)[number] % FOLDS
 
 
-def sectors(facts: Sequence[Facts]) -> Labels:
-    """Parts of every other sector of directions; -1 of runs without a direction."""
+def each_sector(facts: Sequence[Facts]) -> Labels:
+    """Sector of every run by itself; -1 of runs without a direction."""
     way = np.array([f.heading_deg for f in facts])
     known = np.isfinite(way)
     turn = np.where(known, way, 0.0) % 360.0
-    return np.where(known, np.floor((turn + 1e-6) / SECTOR_DEG).astype(int) % FOLDS, -1)
+    return np.where(known, np.floor((turn + 1e-6) / SECTOR_DEG).astype(int), -1)
+
+
+def sectors(facts: Sequence[Facts]) -> Labels:
+    """Parts of every other sector of directions; -1 of runs without a direction."""
+    each = each_sector(facts)
+    return np.where(each < 0, each, each % FOLDS)
 
 
 def speeds(facts: Sequence[Facts]) -> Labels:
@@ -190,14 +197,17 @@ def splits(facts: Sequence[Facts], kind: str) -> list[Split]:
 
 
 def inner(runs: Sequence[Run], kind: str) -> Labels:
-    """Part of every training run for the inner cross-validation, of the kind that is judged by.
+    """Part of every training run for picking settings, of the kind that methods are judged by.
 
-    The `INNER` largest parts are counted from 0; other runs have -1 or `INNER` and are never left
-    out. Headings are dealt where the training runs have fewer than two parts of the kind asked for.
+    The `INNER` largest parts of the training runs are held back in turn and numbered from 0; all
+    other runs have -1, or after random dealing `INNER`, and stay. For sectors a part is one sector,
+    since every other sector is missing already. Headings are dealt where the training runs have
+    fewer than two parts of the kind.
     """
     facts = [Facts.of(run) for run in runs]
+    inside: dict[str, Callable[[Sequence[Facts]], Labels]] = {**KINDS, "sectors": each_sector}
     for name in dict.fromkeys((kind if kind in KINDS else "headings", "headings")):
-        part = KINDS[name](facts)
+        part = inside[name](facts)
         names, count = np.unique(part[part >= 0], return_counts=True)
         if len(names) > 1:
             order = names[np.argsort(-count, kind="stable")][:INNER]

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slipid.benchmark import own as slipid_rows
+from slipid.benchmark.row import Row
 from slipid.benchmark.work import Wish, data_of, problem_of
 from slipid.control.robot_file.record import Sensors
 from slipid.deploy import trial
@@ -14,7 +15,6 @@ from slipid.deploy.deploy import ROBOT
 from slipid.deploy.forecaster import robot_of
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.content import Content
-from slipid.support.errors import DataError
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -48,6 +48,13 @@ class Rectangle:
     def run(self) -> str:
         """Identify the robot of the test site from all its runs; the name of the part."""
         setup_jax(quiet=True)
+        try:
+            self._identify()
+        except Exception:  # other parts are done all the same; `drive` then says that none is there
+            (self.folder / ROBOT).unlink(missing_ok=True)
+        return self.name
+
+    def _identify(self) -> None:
         data = data_of(self.wish, SOURCE)
         code = source_hash("model", "data", "identify", "job")
         key = key_of(data.job.config.hash, data.job.data_hash, code)
@@ -56,7 +63,6 @@ class Rectangle:
         own = slipid_rows.fit_own(data.job, problem_of(self.wish, SOURCE), everybody, kept)
         sensors = Sensors(current_is_signed=data.heard.current_is_signed, voltage=True)
         robot_of(own.contact, own.highest_speed, own.trend, sensors).save(self.folder / ROBOT)
-        return self.name
 
     def drive(self, jobs: int, report: Reporter) -> Content:
         """Drive all controllers on the virtual test site, or where MuJoCo is missing on the twin.
@@ -69,5 +75,5 @@ class Rectangle:
         try:
             wish = trial.Wish(plant, controllers=tuple(asked), starts=STARTS, jobs=jobs)
             return trial.trial(self.folder, wish, report).content
-        except DataError as error:
-            return {"failed": str(error)}
+        except Exception as error:  # all else is written all the same
+            return {"failed": Row.of_error(error).absent}

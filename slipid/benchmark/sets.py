@@ -17,6 +17,7 @@ from slipid.job.logs import read_dataset
 from slipid.job.packaged import packaged_path, unpack
 from slipid.job.problem import Job, job_of
 from slipid.search_space import Space
+from slipid.support.files import hash_of
 from slipid.support.progress import Reporter
 from slipid.support.toml_file import text_of
 
@@ -139,6 +140,12 @@ class DataSet:
         return replace(
             self, job=_job(self.job.config, heard, self.source), heard=heard, facts=facts
         )
+
+    @property
+    def crossing_hash(self) -> str:
+        """Of the runs over several floors and their map."""
+        logs = [] if self.crossing is None else [(x.name, x.sha256) for x in self.crossing.logs]
+        return hash_of([*logs, ("map", repr(self.map))])
 
     @property
     def setups(self) -> list[str]:

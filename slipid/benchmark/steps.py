@@ -74,6 +74,7 @@ def _cut(data: Runs, robot: Robot, w: Windows) -> Cut:
             turn=w.turn[piece],
             current=w.current[piece] if w.has_current else None,
             current_is_signed=w.current_is_signed,
+            load=log.load,
             gyro=None if log.gyro is None else _mean(log, log.gyro[:, None], edges)[:, 0],
             command=None if log.twist_command is None else _mean(log, log.twist_command, edges),
         )

@@ -13,6 +13,8 @@ from slipid.benchmark.row import Row
 DRAWS = 1000
 """Of the bootstrap."""
 INTERVAL = (0.05, 0.95)
+FEW = 2
+"""Clusters on a floor below which its runs are resampled one by one."""
 Weights = Float[np.ndarray, "draw run"]
 
 
@@ -39,6 +41,7 @@ class Summary:
         runs: how many.
         numbers, tune_s, fit_s, step_us: median over folds.
         settings: that were picked in each fold.
+        unconverged: folds in which a fit in rounds did not come to rest.
         absent: why there are no runs, see `Row`.
     """
 
@@ -58,6 +61,7 @@ class Summary:
     fit_s: float = 0.0
     step_us: float = 0.0
     settings: tuple[str, ...] = ()
+    unconverged: int = 0
     absent: str = ""
     failed: bool = False
 
@@ -87,7 +91,7 @@ def summary(folds: Mapping[str, Sequence[Row]], reference: str) -> dict[str, Sum
 
 @dataclass(frozen=True, eq=False)
 class Resampled:
-    """Runs resampled with replacement, whole clusters of a floor at a time.
+    """Runs resampled with replacement, whole clusters of a floor at a time if there are enough.
 
     Attributes:
         floor: number of the floor of each run; names: of the floors.
@@ -115,6 +119,8 @@ class Resampled:
         for k in range(len(names)):
             mine = np.flatnonzero(floor == k)
             kinds, of = np.unique(cluster[mine], return_inverse=True)
+            if len(kinds) < FEW:  # clusters too few to say how they scatter
+                kinds, of = mine, np.arange(len(mine))
             picked = rng.multinomial(len(kinds), np.full(len(kinds), 1 / len(kinds)), DRAWS)
             draws[1:, mine] = picked[:, of]
         return cls(floor, names, draws)
@@ -173,6 +179,7 @@ def _summary(
         fit_s=median("fit_s"),
         step_us=median("step_us"),
         settings=tuple(row.settings for row in rows),
+        unconverged=sum(not row.converged for row in rows),
     )
 
 

@@ -1,4 +1,4 @@
-"""The same chance for every method: its settings by inner cross-validation on training runs."""
+"""The same chance for every method: its settings by held-back training runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from slipid.benchmark.judge import judged
 from slipid.benchmark.protocols import INNER, inner
 
 MOST_RUNS = 60
-"""Runs that the inner cross-validation uses, evenly taken: settings need no more."""
+"""Runs by which settings are picked, evenly taken: picking them must not take long."""
 WORST = 2.0
 """End-point error beyond which it does not matter how far a setting is off."""
 
@@ -27,16 +27,17 @@ class Tuned:
 def tuned(method: Method, runs: Sequence[Run], machine: Machine, kind: str) -> Tuned:
     """The method with the best of its settings, unfitted.
 
-    Each is fitted without a part of the runs, of the kind that the method will be judged by, and
-    judged on that part by its mean end-point error over the path. A setting with which the method
-    cannot be fitted counts as the worst. A method that is fitted floor by floor may also do better
-    with one fit to the runs of all floors: with the best settings both are tried.
+    Each is fitted without a part of the runs, of the kind that the method will be judged by as far
+    as the training runs have such parts, and judged on that part by its mean end-point error over
+    the path. A setting with which the method cannot be fitted counts as the worst. A method that is
+    fitted floor by floor may also do better with one fit to all runs: with the best settings both
+    are tried.
     """
     candidates = list(method.candidates())[:TRIES]
     some = np.linspace(0, len(runs) - 1, min(len(runs), MOST_RUNS)).round().astype(int)
     few = [runs[k] for k in some]
     part = inner(few, kind)
-    pools = isinstance(method, ByFloor) and len({run.heard.floor for run in few}) > 1
+    pools = isinstance(method, ByFloor) and len({method.group_of(run.heard) for run in few}) > 1
     if len(candidates) == 1 and not pools:
         return Tuned(method, "", 1)
     losses = [_loss(candidate, few, part, machine) for candidate in candidates]
@@ -46,7 +47,7 @@ def tuned(method: Method, runs: Sequence[Run], machine: Machine, kind: str) -> T
         pooled = replace(best, pooled=True)
         if _loss(pooled, few, part, machine) < min(losses):
             best = pooled
-            settings.append("one fit for all floors")
+            settings.append("one fit to all runs")
     words = ", ".join(word for word in settings if word)
     return Tuned(best, words, len(candidates) + pools)
 
@@ -56,7 +57,10 @@ def _loss(method: Method, runs: Sequence[Run], part: np.ndarray, machine: Machin
     errors: list[float] = []
     for k in range(INNER):
         fitted = [run for run, p in zip(runs, part, strict=True) if p != k]
-        left_out = [run for run, p in zip(runs, part, strict=True) if p == k]
+        floors = {run.heard.floor for run in fitted}
+        left_out = [
+            run for run, p in zip(runs, part, strict=True) if p == k and run.heard.floor in floors
+        ]
         if not fitted or not left_out:
             continue
         try:

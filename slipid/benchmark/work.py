@@ -22,6 +22,7 @@ from slipid.data.runs import Runs
 from slipid.identify.fit.problem import Problem
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
+from slipid.support.content import Content
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -67,7 +68,7 @@ class Piece:
         """Fit and judge whatever is not kept yet; its name."""
         setup_jax(quiet=True)
         kept = kept_of(self, fit=False)
-        missing = [key for key in keys_of(self) if kept.load_json(f"{key[0]}_{key[1]}") is None]
+        missing = [key for key in keys_of(self) if not _is_done(kept.load_json("_".join(key)))]
         if missing:
             try:
                 scene: Scene | Row = _scene(self)
@@ -75,14 +76,19 @@ class Piece:
                 scene = Row.of_error(error)
             for protocol, name in missing:
                 row = scene if isinstance(scene, Row) else _row(scene, protocol, name)
-                kept.save_json(f"{protocol}_{name}", row.to_json())
+                kept.save_json("_".join((protocol, name)), row.to_json())
         return self.name
 
     def rows(self) -> dict[tuple[str, str], Row]:
         """What is kept of it, by protocol and row."""
         kept = kept_of(self, fit=False)
-        found = {key: kept.load_json(f"{key[0]}_{key[1]}") for key in keys_of(self)}
+        found = {key: kept.load_json("_".join(key)) for key in keys_of(self)}
         return {key: Row.of_json(content) for key, content in found.items() if content is not None}
+
+
+def _is_done(content: Content | None) -> bool:
+    """Whether a row is kept; one that failed is tried again."""
+    return content is not None and not content["failed"]
 
 
 def source_of(name: str) -> Source:
@@ -113,9 +119,10 @@ def kept_of(piece: Piece, fit: bool) -> Checkpoint:
     """Where the parts of a piece are kept: its fit, or what rows say."""
     data = data_of(piece.wish, piece.source)
     rooms = ("model", "data", "identify", "job")
-    code = source_hash(*rooms) if fit else source_hash(*rooms, "baselines", "benchmark", "control")
+    more = () if fit else ("baselines", "benchmark", "control", "deploy")
     split = split_of(piece)
-    key = key_of(data.job.config.hash, data.job.data_hash, split.fitted, split.judged, code)
+    marks = data.job.config.hash, data.job.data_hash, "" if fit else data.crossing_hash
+    key = key_of(*marks, split.fitted, split.judged, source_hash(*rooms, *more))
     return Checkpoint(piece.wish.out / "kept" / piece.name, key)
 
 

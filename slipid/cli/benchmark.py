@@ -43,12 +43,18 @@ def benchmark(
         written = write_page(found, benchmark_pictures(found), out)
         report.line(f"in {out}: benchmark.json, {written.name}")
     emit(json, found, lambda page: show_benchmark(page, found))
-    rows_of_all = (
+    every = [
         row
         for one in found["sets"].values()
         for protocol in one["protocols"].values()
         for row in protocol.values()
-    )
-    others = (*found["floors"].values(), found["rectangle"] or {})
-    failed = any(row["failed"] for row in rows_of_all) or any("failed" in one for one in others)
+    ]
+    others = [*found["floors"].values(), found["rectangle"] or {}]
+    felt = [row for one in others for row in one.get("rows", [])]
+    failed = [
+        *found["unread"],
+        *(row for row in every if row["failed"]),
+        *(one for one in others if "failed" in one),
+        *(row for row in felt if row["absent"]),
+    ]
     return 1 if failed else 0

@@ -96,9 +96,11 @@ def costs(row: Content) -> list[str]:
 
 
 def absent(rows: Content) -> list[str]:
-    """Why rows are not in a table, rows of one reason together."""
+    """Why rows are not in a table or not to be trusted, rows of one reason together."""
     why: dict[str, list[str]] = {}
     for name, row in rows.items():
+        if row["unconverged"]:
+            why.setdefault(f"fits did not come to rest: {row['unconverged']}", []).append(name)
         if row["absent"]:
             why.setdefault(("failed: " if row["failed"] else "") + row["absent"], []).append(name)
     return [f"{', '.join(names)}: {reason}" for reason, names in why.items()]
@@ -149,6 +151,8 @@ def felt(found: Content) -> Other:
     """Classifiers: how often they are right, by the time heard; the best at the end first."""
     chance = f"always naming the commonest floor is right in {100 * found['chance']:.0f} %"
     title = f"{found['about']}; {found['runs']} runs; {chance}"
+    if lost := [f"{row['name']}: {row['absent']}" for row in found["rows"] if row["absent"]]:
+        title = f"{title}; failed: {'; '.join(lost)}"
     rows = [row for row in found["rows"] if row["after"]]
     seconds = [after["seconds"] for after in rows[0]["after"]] if rows else []
     head = ("right, %, after", *(f"{x:g} s" for x in seconds), "points over slipid", "numbers")

@@ -15,7 +15,17 @@ from slipid.support.errors import DataError
 from slipid.support.files import read_json, write_arrays, write_json
 
 SCHEMA = "slipid.checkpoint/1"
-LIBRARIES = ("slipid", "jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy", "emcee")
+LIBRARIES = (
+    "slipid",
+    "jax",
+    "jaxlib",
+    "equinox",
+    "optimistix",
+    "numpy",
+    "scipy",
+    "emcee",
+    "scikit-learn",
+)
 
 
 def versions() -> dict[str, str]:

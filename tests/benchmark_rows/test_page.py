@@ -15,7 +15,7 @@ def row(error=None, absent="", failed=False, **more):
     names = "behind length_error heading_error_deg twist_error coverage90 slip_auc "
     blank = dict.fromkeys((names + "floor_accuracy energy_error floors").split())
     costs = {"runs": 9, "numbers": 3, "tune_s": 1.0, "fit_s": 0.02, "step_us": 12.3}
-    about = {"settings": [], "absent": absent, "failed": failed}
+    about = {"settings": [], "unconverged": 0, "absent": absent, "failed": failed}
     return {"endpoint_error": ends, **blank, **costs, **about, **more}
 
 

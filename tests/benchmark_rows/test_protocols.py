@@ -156,7 +156,7 @@ def test_a_method_by_floor_may_do_better_with_one_fit_for_all():
     training = [run.told(True) for run in runs(slip=0.5)]
     assert len({run.floor for run in training}) > 1
     found = tuned(ByFloor.of(Hungry()), training, ROBOTINO, "headings")
-    assert (found.settings, found.tried) == ("one fit for all floors", 2)
+    assert (found.settings, found.tried) == ("one fit to all runs", 2)
     done = found.method.fit(training, ROBOTINO)
     assert isinstance(done, ByFloor)
     assert list(done.fitted) == [None]

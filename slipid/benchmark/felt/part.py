@@ -54,7 +54,7 @@ class FeltPart(abc.ABC):
     @property
     def kept(self) -> Checkpoint:
         """Where its table is kept."""
-        rooms = ("model", "data", "identify", "job", "control", "baselines", "benchmark")
+        rooms = ("model", "data", "identify", "job", "control", "deploy", "baselines", "benchmark")
         key = key_of(self.logs(), self.wish.quick, self.wish.only, source_hash(*rooms))
         return Checkpoint(self.wish.out / "kept", key)
 
@@ -62,7 +62,8 @@ class FeltPart(abc.ABC):
         """Make the table, if it is not kept yet; the name of the part."""
         setup_jax(quiet=True)
         kept = self.kept
-        if kept.load_json(self.name) is None:
+        found = kept.load_json(self.name)
+        if found is None or "failed" in found:
             try:
                 kept.save_json(self.name, self.make().to_json())
             except Exception as error:  # other parts are done all the same

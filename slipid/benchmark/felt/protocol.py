@@ -8,8 +8,9 @@ is that long and the robot moves in at least half of its rows up to it.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Int
@@ -23,6 +24,7 @@ from slipid.benchmark.felt.result import (
     after_seconds,
     confused,
 )
+from slipid.benchmark.row import Row
 from slipid.benchmark.tuned import settings_of
 
 SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
@@ -173,6 +175,14 @@ def judged(method: FloorMethod, felts: Sequence[Felt], machine: Machine, asked: 
     return Judged(row, tuple(answers))
 
 
+def attempted(name: str, work: Callable[[], Judged]) -> Judged:
+    """What a classifier came to; if it fails, an empty row that says why."""
+    try:
+        return work()
+    except Exception as error:  # other rows are judged all the same
+        return Judged(FeltRow(name, absent=Row.of_error(error).absent), ())
+
+
 def felt_table(
     methods: Sequence[FloorMethod],
     felts: Sequence[Felt],
@@ -182,7 +192,10 @@ def felt_table(
     reference: str = "slipid",
 ) -> FeltTable:
     """All classifiers on the same runs; `reference` is the one that others are compared with."""
-    done = {method.name: judged(method, felts, machine, asked) for method in methods}
+    done = {
+        method.name: attempted(method.name, partial(judged, method, felts, machine, asked))
+        for method in methods
+    }
     return table_of(done, felts, about, asked, reference)
 
 
@@ -190,13 +203,18 @@ def table_of(
     done: dict[str, Judged], felts: Sequence[Felt], about: str, asked: Asked, reference: str
 ) -> FeltTable:
     """Rows put together."""
-    rival = done[reference].answers if reference in done else None
+    rival = (done[reference].answers or None) if reference in done else None
     longest, rows = max(asked.seconds), []
     for name, one in done.items():
+        if one.row.absent:
+            rows.append(one.row)
+            continue
         other = None if name == reference else rival
         after = after_seconds(one.answers, other)
         rows.append(replace(one.row, after=after, said=confused(one.answers, longest)))
-    first = next(iter(done.values())).answers
+    first = next((one.answers for one in done.values() if one.answers), ())
+    if not first:
+        raise ValueError("; ".join(f"{name}: {one.row.absent}" for name, one in done.items()))
     floor = [a.floor for a in first if a.seconds == min(asked.seconds)]
     chance = max(floor.count(name) for name in set(floor)) / len(floor)
     names = tuple(sorted({felt.floor for felt in felts}))

@@ -55,7 +55,7 @@ class FeltRow:
     """A classifier.
 
     Attributes:
-        name: of the row; hears: its channels, in words.
+        name: of the row.
         settings: that cross-validation picked in each fold, in words.
         numbers: how many were fitted, median over folds.
         after: by the time heard.

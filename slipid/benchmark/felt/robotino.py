@@ -9,6 +9,7 @@ fitted to runs with all loads together.
 
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -17,7 +18,15 @@ from slipid.baselines.floors.cosine_energy import CosineEnergy
 from slipid.baselines.floors.gaussian import Gaussian
 from slipid.baselines.floors.interface import Felt, FloorMethod
 from slipid.baselines.interface import Machine, Run, Said
-from slipid.benchmark.felt.protocol import Asked, Judged, answers_of, asked_after, table_of, tuned
+from slipid.benchmark.felt.protocol import (
+    Asked,
+    Judged,
+    answers_of,
+    asked_after,
+    attempted,
+    table_of,
+    tuned,
+)
 from slipid.benchmark.felt.result import Answer, FeltRow, FeltTable
 from slipid.benchmark.own import NAME, Own, Place, estimated, fit_own
 from slipid.benchmark.protocols import Split, base_of, splits
@@ -58,10 +67,12 @@ def robotino_felt(wish: Wish) -> FeltTable:
         felts = [felt_of(run) for one in cuts for run in one.runs]
         judged += felts
         if not wish.only or NAME in wish.only:
-            parts.setdefault(NAME, []).append(_own(own, cuts, data, split, felts))
+            done = attempted(NAME, partial(_own, own, cuts, data, split, felts))
+            parts.setdefault(NAME, []).append(done)
         for method in robotino_rows():
             if not wish.only or method.name in wish.only:
-                done = _published(method, fitted, felts, data.machine, asked)
+                work = partial(_published, method, fitted, felts, data.machine, asked)
+                done = attempted(method.name, work)
                 parts.setdefault(method.name, []).append(done)
     return table_of(
         {name: _joined(each) for name, each in parts.items()}, judged, ABOUT, asked, NAME
@@ -141,7 +152,9 @@ def _published(
 
 
 def _joined(parts: list[Judged]) -> Judged:
-    """All folds of a classifier."""
+    """All folds of a classifier; an empty row if it failed in one."""
+    if failed := [part for part in parts if part.row.absent]:
+        return failed[0]
 
     def median(name: str) -> float:
         return float(np.median([getattr(part.row, name) for part in parts]))

@@ -117,7 +117,7 @@ class FloorFilter(eqx.Module):
         under = hypotheses_of(self.robot).under
         kinds = np.array([len(set(row)) for row in under.tolist()])
         unseen = np.array([floor.unseen for floor in self.robot.record.floors])[under[:, 0]]
-        further = kinds - 1 + unseen
+        further = kinds - 1 + unseen  # floors beside the one that is under the robot for sure
         weight = np.exp(-self.settings.alike * further) / np.where(unseen, unseen.sum(), 1)
         return jnp.asarray(weight / weight.sum())
 
@@ -285,7 +285,23 @@ class FloorFilter(eqx.Module):
             given = prior / jnp.sum(jnp.append(prior, 0.0)[beside], axis=1)
             others = jnp.sum(jnp.concatenate([p, none])[beside], axis=1)
             p = (1 - change) * p + change * given[:, None] * others
-        return p
+        return self._estranged(p, change)
+
+    def _estranged(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
+        """The whole robot may come to a floor that nobody drove on, from one to another, or back.
+
+        That is as rare as a floor that none of the hypotheses knows.
+        """
+        unseen = np.array([floor.unseen for floor in self.robot.record.floors])
+        if not unseen.any():
+            return p
+        whole = hypotheses_of(self.robot).uniform
+        fresh = self.prior()[whole] / jnp.sum(self.prior()[whole])
+        strange = unseen[:, None] | unseen[None, :]
+        to = 0.05 * change * jnp.where(strange, fresh, 0.0)
+        leaves = jnp.sum(to, axis=1, keepdims=True)
+        mine = p[whole]
+        return p.at[whole].set((1 - leaves) * mine + to.T @ mine)
 
     def _moved(
         self, apart: Array, known: Array, xi: Array, turn: Array, tick: Tick

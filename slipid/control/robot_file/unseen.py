@@ -3,8 +3,9 @@
 Floors differ most by how soft they are. From one to another of the floors in the public logs of
 2022 and on the virtual test site, the logs of creep and of what rollers drag rise together, with a
 slope of 0.8. So a floor that nobody drove on is taken for the middle of those that were driven on,
-made softer or harder, with more friction or less. The currents then tell which of these fits.
-Nothing in it is identified: its motion counts as unsure as floors differ.
+made softer or harder, with more friction or less. Currents, and a gyro, tell which of them a
+strange floor is like; without either they count for little, being rare. Their numbers are not
+identified, and the motion on them is unsure by a tenth of the way and 0.3 rad per metre.
 """
 
 from collections.abc import Sequence
@@ -40,12 +41,17 @@ def with_unseen(record: RobotRecord) -> RobotRecord:
     """The robot with floors that nobody drove on, `unseen_1` and on, after its own.
 
     A robot that has them already is returned as it is.
+
+    Raises:
+        ValueError: a floor that was driven on has the name of one of them.
     """
     if any(floor.unseen for floor in record.floors):
         return record
     middle = _middle(record)
     cells = tuple(product(SOFTNESS, GRIP))
     names = [_NAME.format(k + 1) for k in range(len(cells))]
+    if taken := set(names) & set(record.labels):
+        raise ValueError(f"floor '{min(taken)}': the name of one that nobody drove on")
     parameters = dict(record.parameters)
     for name, (soft, grip) in zip(names, cells, strict=True):
         factor = {"creep": soft, "roller_drag": DRAG * soft, "friction": grip}
@@ -55,8 +61,9 @@ def with_unseen(record: RobotRecord) -> RobotRecord:
                 number, value=_scaled(number.value, value)
             )
     process = np.mean([floor.process for floor in record.floors], axis=0)
-    loud = LOUDER * float(np.mean([floor.current_std for floor in record.floors]))
-    floors = tuple(FloorRecord(name, _axes(process), EFFECT, loud, None, True) for name in names)
+    current_std = LOUDER * float(np.mean([floor.current_std for floor in record.floors]))
+    one = FloorRecord("", _axes(process), EFFECT, current_std, seen=None, unseen=True)
+    floors = tuple(replace(one, name=name) for name in names)
     return replace(
         record,
         parameters=parameters,
@@ -67,7 +74,8 @@ def with_unseen(record: RobotRecord) -> RobotRecord:
 
 def _middle(record: RobotRecord) -> dict[str, Number]:
     """Numbers of a floor in the middle of those that were driven on, geometric where positive."""
-    first, several = f"surface.{record.labels[0]}.", {}
+    first = f"surface.{record.labels[0]}."
+    middle_floor: dict[str, Number] = {}
     for path, number in record.parameters.items():
         if not path.startswith(first):
             continue
@@ -76,7 +84,7 @@ def _middle(record: RobotRecord) -> dict[str, Number]:
         signed = quantity in _SIGNED
         middle = each.mean(axis=0) if signed else np.exp(np.log(each).mean(axis=0))
         value: Numbers = tuple(middle.tolist()) if middle.ndim else float(middle)
-        several[quantity] = Number(
+        middle_floor[quantity] = Number(
             value=value,
             unit=number.unit,
             std=None,
@@ -85,7 +93,7 @@ def _middle(record: RobotRecord) -> dict[str, Number]:
             provenance="borrowed",
             source="given",
         )
-    return several
+    return middle_floor
 
 
 def _scaled(value: Numbers, factor: float) -> Numbers:
