@@ -9,8 +9,9 @@ from typer.testing import CliRunner
 
 from slipid.benchmark import work as benchmark_work
 from slipid.benchmark.benchmark import benchmark
+from slipid.benchmark.rectangle import Rectangle
 from slipid.benchmark.row import Row
-from slipid.benchmark.work import Piece, Wish, data_of, keys_of, split_of
+from slipid.benchmark.work import Piece, Wish, data_of, keys_of, source_of, split_of
 from slipid.cli.main import app
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -92,8 +93,40 @@ def test_a_split_that_cannot_be_read_fails_alone(tmp_path, monkeypatch):
     def broken(_: object) -> None:
         raise OSError("disk on fire")
 
-    monkeypatch.setattr(benchmark_work, "_scene", broken)
-    piece.run()
+    with monkeypatch.context() as patch:
+        patch.setattr(benchmark_work, "_scene", broken)
+        piece.run()
     rows = piece.rows()
     assert {protocol for protocol, _ in rows} == {"known_floor", "unknown_floor"}
     assert all(row.failed and "disk on fire" in row.absent for row in rows.values())
+
+    # what failed is tried again
+    monkeypatch.setattr(benchmark_work, "_scene", lambda piece: None)
+    monkeypatch.setattr(benchmark_work, "_row", lambda scene, protocol, name: Row.lacking(["gyro"]))
+    piece.run()
+    assert {row.absent for row in piece.rows().values()} == {"needs a gyro"}
+
+
+def test_a_data_set_that_cannot_be_read_stops_no_other(tmp_path, monkeypatch):
+    folder = tmp_path / "data" / "robotino2022" / "one_surface" / "gray"
+    folder.mkdir(parents=True)
+    (folder / "run.csv").write_text("this is no log")
+    monkeypatch.setattr("slipid.benchmark.benchmark.SOURCES", [source_of("robotino2022")])
+    found = benchmark(
+        Wish(tmp_path / "data", tmp_path / "out", ("quann_slip",)), 1, Reporter(quiet=True)
+    )
+    assert list(found["unread"]) == ["robotino2022"]
+    assert found["sets"] == {}
+    assert (tmp_path / "out" / "benchmark.json").is_file()
+
+
+def test_a_robot_that_cannot_be_identified_drives_no_rectangle(tmp_path, monkeypatch):
+    (tmp_path / "x").mkdir()
+    rectangle = Rectangle(Wish(tmp_path / "x", tmp_path / "out"))
+
+    def broken(*_: object) -> None:
+        raise OSError("disk on fire")
+
+    monkeypatch.setattr("slipid.benchmark.rectangle.data_of", broken)
+    assert rectangle.run() == "rectangle"
+    assert "failed" in rectangle.drive(1, Reporter(quiet=True))

@@ -412,6 +412,26 @@ def test_slipid_says_what_it_lacks():
         SlipidFloors().fit(made_felts({"grass": 2.0}), HUSKY)
 
 
+class Broken(Meter):
+    """Cannot be fitted."""
+
+    def fit(self, felts, machine):
+        raise ZeroDivisionError("no wheel")
+
+
+def test_a_classifier_that_fails_has_an_empty_row_beside_the_others():
+    felts = made_felts({"grass": 2.0, "snow": 4.0})
+    methods = [Broken(name="broken"), Meter()]
+    table = felt_table(methods, felts, HUSKY, "made", Asked(seconds=(1.0,)), "broken")
+    lost, there = table.rows
+    assert (lost.name, lost.absent) == ("broken", "ZeroDivisionError: no wheel")
+    assert lost.after == ()
+    assert there.after[0].accuracy.value > 0.5
+    assert there.after[0].behind is None
+    with pytest.raises(ValueError, match="no wheel"):
+        felt_table(methods[:1], felts, HUSKY, "made", Asked(seconds=(1.0,)), "broken")
+
+
 def in_the_air(root: Path) -> tuple[float, float, float]:
     """`ZERO_A`, `FREE_A` and `FREE_AS` by runs of a Husky with its wheels in the air.
 

@@ -7,10 +7,12 @@ import pytest
 from sklearn.metrics import roc_auc_score
 
 from slipid.baselines.interface import Said, path_of
-from slipid.benchmark.judge import judged
+from slipid.benchmark.judge import CHI2_90, judged
+from slipid.benchmark.own import WIDER
 from slipid.benchmark.reading import sentence
 from slipid.benchmark.row import Row
 from slipid.benchmark.summary import Number, Resampled, Summary, area, summary
+from slipid.identify.fit.variances import DEGREES
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 
@@ -148,6 +150,22 @@ def test_runs_of_a_cluster_are_drawn_together():
     assert (drawn[:, ::5] == drawn[:, 4::5]).all()
     assert (drawn.sum(axis=1) == 20).all()
     assert len({tuple(row) for row in drawn.tolist()}) > 20
+
+
+def test_runs_of_a_floor_with_one_cluster_are_drawn_one_by_one():
+    runs = [replace(run, cluster=7) for run in rows((0.1, 0.3, 0.2, 0.9)).runs]
+    draws = Resampled.of(runs).mean(np.array([run.endpoint_error for run in runs]))
+    assert draws[0] == pytest.approx(0.375)
+    assert np.std(draws) > 0.05
+
+
+def test_the_force_balances_region_holds_nine_tenths_of_a_student_t():
+    rng = np.random.default_rng(0)
+    scale = np.array([[2.0, 0.5], [0.5, 1.0]])
+    gaussian = rng.multivariate_normal((0.0, 0.0), scale, 20000)
+    ends = gaussian / np.sqrt(rng.chisquare(DEGREES, 20000) / DEGREES)[:, None]
+    inside = np.einsum("ni,ij,nj->n", ends, np.linalg.inv(WIDER * scale), ends) <= CHI2_90
+    assert inside.mean() == pytest.approx(0.9, abs=0.01)
 
 
 def test_a_row_that_is_absent_in_one_fold_is_absent():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from slipid.baselines.interface import ByFloor, Machine, Method, Said, path_of
-from slipid.benchmark.protocols import PROTOCOLS, Facts, base_of, inner, splits
-from slipid.benchmark.tuned import tuned
+from slipid.benchmark.protocols import PROTOCOLS, Facts, base_of, each_sector, inner, splits
+from slipid.benchmark.tuned import _loss, tuned
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 
@@ -107,6 +107,18 @@ def test_inner_parts_are_of_the_kind_that_is_judged_by():
     assert headings.tolist() == inner(one_speed, "headings").tolist()
 
 
+def test_a_sector_is_held_back_where_every_other_is_missing_already():
+    every = runs()
+    split = splits([Facts.of(run) for run in every], "sectors")[0]
+    training = [every[k] for k in split.fitted]
+    part = inner(training, "sectors")
+    sector = each_sector([Facts.of(run) for run in training])
+    held, kept = set(sector[part == 0].tolist()), set(sector[part != 0].tolist())
+    assert len(held) == 1
+    assert len(kept) == 2
+    assert not held & kept
+
+
 @dataclass(frozen=True)
 class Scaled(Method):
     """Encoders, times a number that is a setting."""
@@ -166,6 +178,17 @@ def test_a_method_by_floor_may_do_better_with_one_fit_for_all():
     assert tuned(ByFloor.of(Scaled()), training, ROBOTINO, "headings").settings == "factor = 0.5"
 
 
+def test_runs_whose_floor_was_left_out_altogether_do_not_count():
+    few = [run.told(True) for run in runs(slip=0.5)[:20]]
+    held = np.array([0] * 6 + [-1] * 12 + [0] * 2)  # both runs on the second floor
+    method = ByFloor.of(Scaled())
+    assert few[-1].floor not in {run.floor for run in few[:18]}
+    assert _loss(method, few, held, ROBOTINO) == pytest.approx(0.0)
+    # told of no floor, it is judged by them
+    untold = [run.told(False) for run in few]
+    assert _loss(method, untold, held, ROBOTINO) > 0.05
+
+
 class Stubborn(Scaled):
     """One setting cannot be fitted."""
 
@@ -179,14 +202,17 @@ def test_a_setting_that_fails_is_not_picked():
     assert tuned(Stubborn(), runs(slip=0.5)[18:], ROBOTINO, "headings").settings == "factor = 0.85"
 
 
-def test_a_method_by_floor_has_one_fit_for_all_where_nothing_is_told():
-    @dataclass(frozen=True)
-    class Mean(Scaled):
-        def fit(self, runs, machine: Machine):
-            slip = np.mean([r.twist[0, :2] @ r.heard.rolling(machine)[0, :2] for r in runs])
-            size = np.mean([(r.heard.rolling(machine)[0, :2] ** 2).sum() for r in runs])
-            return replace(self, factor=float(slip / size))
+@dataclass(frozen=True)
+class Mean(Scaled):
+    """Encoders, times what they are off by in the mean."""
 
+    def fit(self, runs, machine: Machine):
+        slip = np.mean([r.twist[0, :2] @ r.heard.rolling(machine)[0, :2] for r in runs])
+        size = np.mean([(r.heard.rolling(machine)[0, :2] ** 2).sum() for r in runs])
+        return replace(self, factor=float(slip / size))
+
+
+def test_a_method_by_floor_has_one_fit_for_all_where_nothing_is_told():
     told = ByFloor.of(Mean()).fit(runs(slip=0.5), ROBOTINO)
     untold = ByFloor.of(Mean()).fit([run.told(False) for run in runs(slip=0.5)], ROBOTINO)
     way = made_run(straight(0.1), name="new")
@@ -200,3 +226,23 @@ def test_a_method_by_floor_has_one_fit_for_all_where_nothing_is_told():
     assert far(untold, None) == pytest.approx(0.75)
     with pytest.raises(ValueError, match="scaled: no floor 'ice'; fitted: gray, green"):
         far(told, "ice")
+
+
+def test_where_floors_are_not_told_each_load_has_a_fit_and_a_strange_one_that_of_all():
+    every = [run.told(False) for run in runs(slip=0.5)]
+
+    def loaded(run, load):
+        return replace(run, heard=replace(run.heard, load=load))
+
+    training = [loaded(run, "own" if run.floor == "gray" else "moved") for run in every]
+    done = ByFloor.of(Mean()).fit(training, ROBOTINO)
+    assert set(done.fitted) == {"own", "moved", None}
+    run = training[0]
+
+    def end(load):
+        return done.predict([loaded(run, load).heard], ROBOTINO)[0].path[-1]
+
+    assert not np.allclose(end("own"), end("moved"))
+    assert np.allclose(
+        end("never seen"), done.fitted[None].predict([run.heard], ROBOTINO)[0].path[-1]
+    )

@@ -70,6 +70,26 @@ def test_a_robot_has_them_once():
     assert with_unseen(record) is record
 
 
+def test_a_floor_that_has_their_name_already_is_refused():
+    made = deploy_known(build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["unseen_3"]))
+    with pytest.raises(ValueError, match="floor 'unseen_3'"):
+        made.with_unseen()
+
+
+def test_a_robot_comes_to_them_and_from_them_as_a_whole():
+    wider = deployed().with_unseen()
+    by_floor, ways = FloorFilter(wider, Settings()), hypotheses_of(wider)
+    for start in (0, 5):
+        alone = jnp.zeros((len(ways), 1)).at[ways.uniform[start]].set(1.0)
+        now = np.asarray(by_floor._estranged(alone, jnp.asarray(0.5)))[:, 0]
+        assert now.sum() == pytest.approx(1.0)
+        assert (now[ways.uniform[2:]] > 0).all()
+        assert now[ways.uniform[start]] > 0.97
+    # from one floor that was driven on to another it comes wheel by wheel
+    alone = jnp.zeros((len(ways), 1)).at[ways.uniform[0]].set(1.0)
+    assert float(by_floor._estranged(alone, jnp.asarray(0.5))[ways.uniform[1], 0]) == 0.0
+
+
 @cache
 def strange(numbers: tuple[tuple[str, float], ...]) -> DeployedRobot:
     """The robot on a floor that it does not know."""
