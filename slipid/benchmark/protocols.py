@@ -132,18 +132,12 @@ def headings(facts: Sequence[Facts]) -> Labels:
     return np.random.default_rng(0).permutation(number.max() + 1)[number] % FOLDS
 
 
-def each_sector(facts: Sequence[Facts]) -> Labels:
-    """Sector of every run by itself; -1 of runs without a direction."""
+def sectors(facts: Sequence[Facts]) -> Labels:
+    """Parts of every other sector of directions; -1 of runs without a direction."""
     way = np.array([f.heading_deg for f in facts])
     known = np.isfinite(way)
     turn = np.where(known, way, 0.0) % 360.0
-    return np.where(known, np.floor((turn + 1e-6) / SECTOR_DEG).astype(int), -1)
-
-
-def sectors(facts: Sequence[Facts]) -> Labels:
-    """Parts of every other sector of directions; -1 of runs without a direction."""
-    each = each_sector(facts)
-    return np.where(each < 0, each, each % FOLDS)
+    return np.where(known, np.floor((turn + 1e-6) / SECTOR_DEG).astype(int) % FOLDS, -1)
 
 
 def speeds(facts: Sequence[Facts]) -> Labels:
@@ -200,14 +194,13 @@ def inner(runs: Sequence[Run], kind: str) -> Labels:
     """Part of every training run for picking settings, of the kind that methods are judged by.
 
     The `INNER` largest parts of the training runs are held back in turn and numbered from 0; all
-    other runs have -1, or after random dealing `INNER`, and stay. For sectors a part is one sector,
-    since every other sector is missing already. Headings are dealt where the training runs have
-    fewer than two parts of the kind.
+    other runs have -1, or after random dealing `INNER`, and stay. Headings are dealt where the
+    training runs have fewer than two parts of the kind, and so always for sectors: every other one
+    is missing already, and without one more the gap would be three times as wide as is asked about.
     """
     facts = [Facts.of(run) for run in runs]
-    inside: dict[str, Callable[[Sequence[Facts]], Labels]] = {**KINDS, "sectors": each_sector}
     for name in dict.fromkeys((kind if kind in KINDS else "headings", "headings")):
-        part = inside[name](facts)
+        part = KINDS[name](facts)
         names, count = np.unique(part[part >= 0], return_counts=True)
         if len(names) > 1:
             order = names[np.argsort(-count, kind="stable")][:INNER]

@@ -29,9 +29,9 @@ def tuned(method: Method, runs: Sequence[Run], machine: Machine, kind: str) -> T
 
     Each is fitted without a part of the runs, of the kind that the method will be judged by as far
     as the training runs have such parts, and judged on that part by its mean end-point error over
-    the path. A setting with which the method cannot be fitted counts as the worst. A method that is
-    fitted floor by floor may also do better with one fit to all runs: with the best settings both
-    are tried.
+    the path, floors counting alike. A setting with which the method cannot be fitted counts as the
+    worst. A method that is fitted floor by floor may also do better with one fit to all runs: with
+    the best settings both are tried, on all training runs, since few runs would favour one fit.
     """
     candidates = list(method.candidates())[:TRIES]
     some = np.linspace(0, len(runs) - 1, min(len(runs), MOST_RUNS)).round().astype(int)
@@ -44,8 +44,8 @@ def tuned(method: Method, runs: Sequence[Run], machine: Machine, kind: str) -> T
     best = candidates[int(np.argmin(losses))]
     settings = [settings_of(best, candidates)]
     if pools and isinstance(best, ByFloor):
-        pooled = replace(best, pooled=True)
-        if _loss(pooled, few, part, machine) < min(losses):
+        pooled, part = replace(best, pooled=True), inner(runs, kind)
+        if _loss(pooled, runs, part, machine) < _loss(best, runs, part, machine):
             best = pooled
             settings.append("one fit to all runs")
     words = ", ".join(word for word in settings if word)
@@ -53,8 +53,8 @@ def tuned(method: Method, runs: Sequence[Run], machine: Machine, kind: str) -> T
 
 
 def _loss(method: Method, runs: Sequence[Run], part: np.ndarray, machine: Machine) -> float:
-    """Mean end-point error over the parts that are left out in turn."""
-    errors: list[float] = []
+    """Mean end-point error over parts left out in turn, over runs and then over floors."""
+    errors: dict[str, list[float]] = {}
     for k in range(INNER):
         fitted = [run for run, p in zip(runs, part, strict=True) if p != k]
         floors = {run.heard.floor for run in fitted}
@@ -69,8 +69,9 @@ def _loss(method: Method, runs: Sequence[Run], part: np.ndarray, machine: Machin
             return np.inf
         for run, one in zip(left_out, said, strict=True):
             error = judged(run, one, machine, "path").endpoint_error
-            errors.append(min(error, WORST) if np.isfinite(error) else WORST)
-    return float(np.mean(errors)) if errors else 0.0
+            mine = errors.setdefault(run.floor, [])
+            mine.append(min(error, WORST) if np.isfinite(error) else WORST)
+    return float(np.mean([np.mean(mine) for mine in errors.values()])) if errors else 0.0
 
 
 def settings_of(best: object, candidates: Sequence[object]) -> str:

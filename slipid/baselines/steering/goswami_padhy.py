@@ -17,8 +17,8 @@ end at the edge, 5, and k3 at 4.67.
 
 Liberties:
 
-- The law is the form for robots that drive sideways, as slipid's notes on methods have it; the
-  paper's own text was not compared.
+- The law is the form for robots that drive sideways, as it is quoted; the paper's own text was not
+  at hand.
 - What is integrated is V, over the path of the trial begun from several places beside it, on a
   robot without slip whose twist follows commands by the twin's delay and lag. The paper's own
   robot, path and cost are not made anew.
@@ -28,7 +28,8 @@ Liberties:
   it asks for is held to the limits of all rows.
 - The swarm's start and edges: `slipid.baselines.steering.particle_swarm`.
 
-Source: Goswami and Padhy 2018, as slipid's notes on methods have it (section 8).
+Source: Goswami and Padhy 2018, a trajectory tracking law for a mobile robot with slip, its gains by
+particle swarm; known here by quotation only.
 """
 
 from dataclasses import dataclass

@@ -18,8 +18,8 @@ Nothing is tuned: gains are those of the robot's own pose loop set by hand.
 
 Liberties:
 
-- Made from slipid's notes on methods; the paper's own text was not compared, and what else it has
-  for wheels at their limit, beside one factor for place and heading together, is left out.
+- Made from its equations as they are quoted; the paper's own text was not at hand, and what else it
+  has for wheels at their limit, beside one factor for place and heading together, is left out.
 - Gains are not those of a paper. With the same ones the row of the encoders differs by the limit,
   which all rows have once more after it, and by the sine of the turn: where no wheel is at its
   limit the two are nearly the same.
@@ -29,7 +29,7 @@ Liberties:
 - It is steered from the pose that the encoders believe in.
 
 Source: Indiveri 2009, "Swedish wheeled omnidirectional mobile robots: kinematics analysis and
-control", IEEE T-RO 25(1), and Gfrerrer 2008, as slipid's notes on methods have them (1 and 8).
+control", IEEE T-RO 25(1), and Gfrerrer 2008, both as they are quoted.
 """
 
 import equinox as eqx
