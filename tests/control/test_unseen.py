@@ -100,8 +100,8 @@ def strange(numbers: tuple[tuple[str, float], ...]) -> DeployedRobot:
 
 def end_after(
     robot: DeployedRobot, numbers: dict[str, float], way: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the strange floor leads in 4 s, where the robot believes to be, and how sure it is."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the strange floor leads in 4 s, and where the robot believes to be."""
     truth, settings = strange(tuple(numbers.items())), Settings(current_is_signed=True)
     w = truth.forward @ jnp.asarray([0.2 * np.cos(way), 0.2 * np.sin(way), 0.0]) / 0.04
     xi = jnp.zeros((1, 3))
@@ -112,26 +112,22 @@ def end_after(
     nothing = Readings.nothing(3)
 
     @eqx.filter_jit
-    def drive(estimator: Estimator) -> tuple[jax.Array, jax.Array]:
+    def drive(estimator: Estimator) -> jax.Array:
         def step(state, k):  # type: ignore[no-untyped-def]
             z = replace(nothing, wheel_angle=k * dt * w, current=amps[0])
             state, seen = estimator.step(state, z, dt)
-            return state, (seen.pose, seen.covariance)
+            return state, seen.pose
 
-        poses, cov = jax.lax.scan(step, estimator.init(), jnp.arange(41.0))[1]
-        return poses[-1], cov[-1]
+        return jax.lax.scan(step, estimator.init(), jnp.arange(41.0))[1][-1]
 
-    pose, cov = drive(estimator)
-    return np.asarray(advance(xi[0], 4.0)), np.asarray(pose), np.asarray(cov)
+    return np.asarray(advance(xi[0], 4.0)), np.asarray(drive(estimator))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", [0.3, 1.2, 2.5])
 @pytest.mark.parametrize(("numbers", "part"), [(SOFT, 0.7), (OTHER, 0.9)])
 def test_a_strange_floor_is_taken_for_what_its_currents_are_like(numbers, part, way):
-    true, pose, _ = end_after(deployed(), numbers, way)
-    _, wider, cov = end_after(deployed().with_unseen(), numbers, way)
+    true, pose = end_after(deployed(), numbers, way)
+    _, wider = end_after(deployed().with_unseen(), numbers, way)
     before, after = (float(np.hypot(*(p - true)[:2])) for p in (pose, wider))
     assert after < part * before
-    gap = (wider - true)[:2]
-    assert gap @ np.linalg.solve(cov[:2, :2], gap) < 9.2  # 99 % of a Gaussian
