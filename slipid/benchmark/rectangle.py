@@ -30,7 +30,7 @@ CONTROLLERS = (
     "contact",
     "contact_gyro",
 )
-STARTS = 6
+STARTS = 8
 
 
 @dataclass(frozen=True)
