@@ -89,7 +89,7 @@ class Heard:
         gyro: mean yaw rate [rad/s], or None.
         command: twist that was commanded, or None.
         floor: name of the floor if the method is told; None where it has to find out.
-        load: name of the load set-up, which a robot knows; None where there is only one.
+        load: name of the load set-up, which a robot knows.
     """
 
     name: str
@@ -261,8 +261,8 @@ class ByFloor(Method):
     Attributes:
         method: unfitted.
         pooled: whether it takes no notice of floors and loads, and is fitted once to all runs.
-        fitted: to the runs of each group, by its name; under None to all runs, for runs with a load
-            set-up that no training run had.
+        fitted: to the runs of each group, by its name, the largest group first; under None to all
+            runs.
     """
 
     method: Method
@@ -277,27 +277,31 @@ class ByFloor(Method):
         return [replace(self, method=method) for method in self.method.candidates()]
 
     def fit(self, runs: Sequence[Run], machine: Machine) -> "ByFloor":
-        floors: dict[str | None, list[Run]] = {}
+        groups: dict[str | None, list[Run]] = {}
         for run in runs:
-            floors.setdefault(self.group_of(run.heard), []).append(run)
-        if all(run.heard.floor is None for run in runs):
-            floors[None] = list(runs)
-        fitted = {name: self.method.fit(mine, machine) for name, mine in floors.items()}
+            groups.setdefault(self.group_of(run.heard), []).append(run)
+        order = sorted(groups, key=lambda name: -len(groups[name]))
+        fitted = {name: self.method.fit(groups[name], machine) for name in order}
         return replace(self, fitted=fitted)
 
     def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
         said: dict[int, Said] = {}
-        groups = [self.group_of(run) for run in runs]
-        if None in self.fitted:
-            groups = [name if name in self.fitted else None for name in groups]
-        for floor in dict.fromkeys(groups):
-            mine = [k for k, name in enumerate(groups) if name == floor]
-            if floor not in self.fitted:
-                known = ", ".join(map(str, self.fitted))
-                raise ValueError(f"{self.name}: no floor '{floor}'; fitted: {known}")
-            of_floor = self.fitted[floor].predict([runs[k] for k in mine], machine)
-            said.update(zip(mine, of_floor, strict=True))
+        groups = [self._fitted_group(run) for run in runs]
+        for group in dict.fromkeys(groups):
+            mine = [k for k, name in enumerate(groups) if name == group]
+            of_group = self.fitted[group].predict([runs[k] for k in mine], machine)
+            said.update(zip(mine, of_group, strict=True))
         return [said[k] for k in range(len(runs))]
+
+    def _fitted_group(self, heard: Heard) -> str | None:
+        """The group of a run; a load set-up that no training run had is taken for the usual one."""
+        group = self.group_of(heard)
+        if group not in self.fitted:
+            if heard.floor is not None:
+                known = ", ".join(map(str, self.fitted))
+                raise ValueError(f"{self.name}: no floor '{heard.floor}'; fitted: {known}")
+            return next(iter(self.fitted))
+        return group
 
     def group_of(self, heard: Heard) -> str | None:
         """Name of the runs that this one is fitted with: its floor if that is told, or its load."""

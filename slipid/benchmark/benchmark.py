@@ -119,15 +119,7 @@ def in_turn(each: Sequence[Sequence[Piece]]) -> list[Piece]:
 
 
 def work(part: Part) -> str:
-    """Do a part, in one thread: there is a process for every core.
-
-    The threads of boosted trees wait for each other by spinning: two processes with two threads
-    each on two cores take six times as long.
-    """
-    import sklearn.ensemble  # noqa: F401  # loads the threads that are to be limited
-    from threadpoolctl import threadpool_limits
-
-    threadpool_limits(1)
+    """Do a part."""
     return part.run()
 
 

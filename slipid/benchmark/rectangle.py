@@ -15,6 +15,7 @@ from slipid.deploy.deploy import ROBOT
 from slipid.deploy.forecaster import robot_of
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.content import Content
+from slipid.support.files import read_json, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -48,11 +49,17 @@ class Rectangle:
     def run(self) -> str:
         """Identify the robot of the test site from all its runs; the name of the part."""
         setup_jax(quiet=True)
+        self._failure.unlink(missing_ok=True)
         try:
             self._identify()
-        except Exception:  # other parts are done all the same; `drive` then says that none is there
-            (self.folder / ROBOT).unlink(missing_ok=True)
+        except Exception as error:  # other parts are done all the same
+            write_json(self._failure, {"failed": Row.of_error(error).absent})
         return self.name
+
+    @property
+    def _failure(self) -> Path:
+        """Where it is kept why there is no robot."""
+        return self.folder / "failed.json"
 
     def _identify(self) -> None:
         data = data_of(self.wish, SOURCE)
@@ -70,6 +77,8 @@ class Rectangle:
         Returns:
             What `slipid trial` writes, or why there is nothing.
         """
+        if self._failure.is_file():
+            return read_json(self._failure, "why there is no robot")
         plant = "testsite" if find_spec("mujoco") is not None else "twin"
         asked = [name for name in CONTROLLERS if not self.wish.only or name in self.wish.only]
         try:

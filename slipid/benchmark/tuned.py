@@ -9,8 +9,6 @@ from slipid.baselines.interface import TRIES, ByFloor, Machine, Method, Run
 from slipid.benchmark.judge import judged
 from slipid.benchmark.protocols import INNER, inner
 
-MOST_RUNS = 60
-"""Runs by which settings are picked, evenly taken: picking them must not take long."""
 WORST = 2.0
 """End-point error beyond which it does not matter how far a setting is off."""
 
@@ -30,22 +28,21 @@ def tuned(method: Method, runs: Sequence[Run], machine: Machine, kind: str) -> T
     Each is fitted without a part of the runs, of the kind that the method will be judged by as far
     as the training runs have such parts, and judged on that part by its mean end-point error over
     the path, floors counting alike. A setting with which the method cannot be fitted counts as the
-    worst. A method that is fitted floor by floor may also do better with one fit to all runs: with
-    the best settings both are tried, on all training runs, since few runs would favour one fit.
+    worst. All training runs are used, since settings that are best for fewer are too cautious. A
+    method that is fitted floor by floor may also do better with one fit to all runs: with the best
+    settings both are tried.
     """
     candidates = list(method.candidates())[:TRIES]
-    some = np.linspace(0, len(runs) - 1, min(len(runs), MOST_RUNS)).round().astype(int)
-    few = [runs[k] for k in some]
-    part = inner(few, kind)
-    pools = isinstance(method, ByFloor) and len({method.group_of(run.heard) for run in few}) > 1
+    part = inner(runs, kind)
+    pools = isinstance(method, ByFloor) and len({method.group_of(run.heard) for run in runs}) > 1
     if len(candidates) == 1 and not pools:
         return Tuned(method, "", 1)
-    losses = [_loss(candidate, few, part, machine) for candidate in candidates]
+    losses = [_loss(candidate, runs, part, machine) for candidate in candidates]
     best = candidates[int(np.argmin(losses))]
     settings = [settings_of(best, candidates)]
     if pools and isinstance(best, ByFloor):
-        pooled, part = replace(best, pooled=True), inner(runs, kind)
-        if _loss(pooled, runs, part, machine) < _loss(best, runs, part, machine):
+        pooled = replace(best, pooled=True)
+        if _loss(pooled, runs, part, machine) < min(losses):
             best = pooled
             settings.append("one fit to all runs")
     words = ", ".join(word for word in settings if word)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slipid.control.deployed import DeployedRobot
-from slipid.control.estimator import Estimator
+from slipid.control.estimator import Estimator, EstimatorState
 from slipid.control.filter.floor_filter import FloorFilter
 from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.interface import Readings, Settings
@@ -113,7 +113,7 @@ def end_after(
 
     @eqx.filter_jit
     def drive(estimator: Estimator) -> jax.Array:
-        def step(state, k):  # type: ignore[no-untyped-def]
+        def step(state: EstimatorState, k: jax.Array) -> tuple[EstimatorState, jax.Array]:
             z = replace(nothing, wheel_angle=k * dt * w, current=amps[0])
             state, seen = estimator.step(state, z, dt)
             return state, seen.pose
