@@ -16,7 +16,7 @@ from slipid.benchmark.rectangle import CONTROLLERS, Rectangle
 from slipid.benchmark.row import Row
 from slipid.benchmark.sets import SOURCES, there
 from slipid.benchmark.summary import Summary, summary
-from slipid.benchmark.work import OWN_MAP, Piece, Wish, data_of
+from slipid.benchmark.work import OWN_MAP, QUICK_KIND, Piece, Wish, data_of
 from slipid.support.checkpoint import versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError, near
@@ -102,8 +102,7 @@ def pieces_of(wish: Wish, name: str) -> list[Piece]:
     data = data_of(wish, name)
     found = []
     for kind in data.source.kinds:
-        asked = [p for p in PROTOCOLS.values() if p.split == kind and (p.told or not wish.quick)]
-        if not asked or (kind == "all" and data.crossing is None):
+        if (wish.quick and kind != QUICK_KIND) or (kind == "all" and data.crossing is None):
             continue
         folds = splits(data.facts, kind)
         found += [Piece(wish, name, kind, f.fold) for f in folds[: 1 if wish.quick else None]]

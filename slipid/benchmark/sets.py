@@ -100,7 +100,7 @@ SOURCES = (
         about="Robotino on the virtual test site (MuJoCo), two floors, two loads",
         folder="",
         config="robotino.toml",
-        kinds=("headings", "floors"),
+        kinds=("headings", "sectors", "speeds", "floors"),
     ),
 )
 

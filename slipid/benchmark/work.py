@@ -30,8 +30,10 @@ OWN_MAP = "slipid_map"
 """slipid's estimator, told the map of the floors."""
 
 
-QUICK_RUNS = 100
-"""Of each data set, where a part is enough."""
+QUICK_RUNS = 60
+"""Runs of each data set, where a part is enough."""
+QUICK_KIND = "headings"
+"""The kind of split that is asked for then."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class Wish:
         data: folder of the data sets.
         out: folder to write to.
         only: names of rows; all where there are none.
-        quick: whether a part is enough: some runs, one fold, floors that are told.
+        quick: whether a part is enough: some runs, one fold of headings, floors that are told.
     """
 
     data: Path

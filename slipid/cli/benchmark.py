@@ -14,7 +14,10 @@ def benchmark(
     data: DataFolder,
     out: Out = Path("out/benchmark"),
     quick: Annotated[
-        bool, typer.Option("--quick", help="Some of the runs, one fold, floors that are told.")
+        bool,
+        typer.Option(
+            "--quick", help="Some of the runs, one fold of headings, floors that are told."
+        ),
     ] = False,
     rows: Annotated[
         str | None, typer.Option(metavar="NAMES", help="Rows, by commas; all by default.")

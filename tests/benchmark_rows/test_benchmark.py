@@ -74,6 +74,17 @@ def test_where_there_is_one_floor_nobody_is_asked_which_it_is(tmp_path, monkeypa
     assert keys_of(piece) == [("known_floor", "encoder")]
 
 
+def test_other_runs_over_several_floors_are_other_work_but_no_other_fit(tmp_path, monkeypatch):
+    (tmp_path / "x").mkdir()
+    piece = Piece(Wish(tmp_path / "x", tmp_path / "out"), "testsite", "headings", 0)
+    data = data_of(piece.wish, "testsite")
+    rows, fit = (benchmark_work.kept_of(piece, fit=fit).key for fit in (False, True))
+    more = replace(data, crossing=data.heard.subset([0]))
+    monkeypatch.setattr(benchmark_work, "data_of", lambda wish, source: more)
+    assert benchmark_work.kept_of(piece, fit=False).key != rows
+    assert benchmark_work.kept_of(piece, fit=True).key == fit
+
+
 def test_an_unknown_row_is_named_with_the_choices(tmp_path):
     with pytest.raises(DataError, match=r"no row 'encodr'.*did you mean.*encoder"):
         benchmark(Wish(tmp_path, tmp_path / "out", ("encodr",)), 1, Reporter(quiet=True))

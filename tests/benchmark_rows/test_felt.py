@@ -24,14 +24,15 @@ from slipid.benchmark.felt.meters import MeteredMotor, clipped
 from slipid.benchmark.felt.part import HuskyFloors, RobotinoFloors
 from slipid.benchmark.felt.protocol import (
     Asked,
+    Judged,
     answers_of,
     felt_table,
     folds_of,
     tuned,
 )
 from slipid.benchmark.felt.reading import COLUMNS, read_felt
-from slipid.benchmark.felt.result import Answer, after_seconds, confused
-from slipid.benchmark.felt.robotino import beliefs_of, felt_of, robotino_rows
+from slipid.benchmark.felt.result import Answer, FeltRow, after_seconds, confused
+from slipid.benchmark.felt.robotino import _joined, beliefs_of, felt_of, robotino_rows
 from slipid.benchmark.felt.slipid_row import SlipidFloors, kinds
 from slipid.benchmark.work import Wish
 from slipid.support.errors import DataError
@@ -478,6 +479,13 @@ def test_what_the_estimator_calls_unknown_is_left_out_of_the_comparison():
     labels, beliefs = beliefs_of(Said(np.zeros((2, 3)), floors=floors))
     assert labels == ("gray", "green")
     assert beliefs == pytest.approx(np.array([[0.75, 0.25]]))
+
+
+def test_a_classifier_that_fails_in_one_fold_has_an_empty_row():
+    lost = Judged(FeltRow("trees", absent="ValueError: no leaf"), ())
+    there = Judged(FeltRow("trees", numbers=4), (answer("a", 1),))
+    assert _joined([there, lost]) == lost
+    assert _joined([there, there]) == Judged(there.row, there.answers * 2)
 
 
 def test_rows_on_the_robotino_hear_no_vibration():

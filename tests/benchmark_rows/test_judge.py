@@ -122,6 +122,11 @@ def test_means_are_over_runs_and_then_over_floors():
     assert found.numbers == 3
 
 
+def test_folds_whose_fit_did_not_come_to_rest_are_counted():
+    folds = [rows([0.1, 0.2]), replace(rows([0.3]), converged=False)]
+    assert summary({"slipid": folds}, "slipid")["slipid"].unconverged == 1
+
+
 def test_a_difference_is_paired():
     rng = np.random.default_rng(0)
     errors = rng.uniform(0.1, 0.9, 40)

@@ -3,7 +3,9 @@
 import copy
 
 import pytest
+from typer.testing import CliRunner
 
+from slipid.cli.main import app
 from slipid.plots.benchmark import benchmark_pictures
 from slipid.report.benchmark import show_benchmark
 from slipid.report.benchmark_page import page
@@ -77,6 +79,57 @@ def test_a_data_set_in_which_nothing_ran_has_no_picture():
     content["sets"]["carpets"]["protocols"]["known_floor"] = failed
     assert benchmark_pictures(content) == {}
     assert "<img" not in page(content, {})
+
+
+def test_fits_that_did_not_come_to_rest_are_said():
+    content = copy.deepcopy(CONTENT)
+    content["sets"]["carpets"]["protocols"]["known_floor"]["slipid"]["unconverged"] = 2
+    assert "slipid: fits did not come to rest: 2" in text(content)
+    assert "slipid: fits did not come to rest: 2" in page(content, {})
+
+
+def heard(name, absent=""):
+    after = {"seconds": 1.0, "accuracy": [0.7, 0.6, 0.8], "behind": None}
+    return {"name": name, "numbers": 3, "after": [] if absent else [after], "absent": absent}
+
+
+def test_a_classifier_that_failed_is_said_above_the_others():
+    content = copy.deepcopy(CONTENT)
+    rows = [heard("gaussian"), heard("trees", "ValueError: no leaf")]
+    content["floors"] = {"husky": {"about": "a Husky", "runs": 9, "chance": 0.3, "rows": rows}}
+    for said in (text(content), page(content, {})):
+        flat = " ".join(said.split())
+        assert "failed: trees: ValueError: no leaf" in flat
+        assert "70 [60, 80]" in flat
+
+
+def clean():
+    content = copy.deepcopy(CONTENT)
+    del content["sets"]["carpets"]["protocols"]["known_floor"]["quann_slip"]
+    felt = {"about": "a Husky", "runs": 9, "chance": 0.3, "rows": [heard("gaussian")]}
+    return {**content, "unread": {}, "floors": {"husky": felt}}
+
+
+BROKEN = {
+    "data set": {"unread": {"carpets": "OSError: disk on fire"}},
+    "row": {"sets": CONTENT["sets"]},
+    "classifier": {
+        "floors": {"husky": {**clean()["floors"]["husky"], "rows": [heard("trees", "no leaf")]}}
+    },
+    "floors": {"floors": {"husky": {"failed": "no logs"}}},
+    "rectangle": {"rectangle": {"failed": "no MuJoCo"}},
+}
+
+
+@pytest.mark.parametrize("broken", [None, *BROKEN])
+def test_the_exit_code_says_whether_anything_failed(broken, tmp_path, monkeypatch):
+    content = clean() | (BROKEN[broken] if broken else {})
+    monkeypatch.setattr("slipid.benchmark.benchmark.benchmark", lambda *_: content)
+    monkeypatch.setattr("slipid.plots.benchmark.benchmark_pictures", lambda _: {})
+    asked = ["benchmark", "--data", str(tmp_path), "--out", str(tmp_path / "out"), "--quiet"]
+    done = CliRunner().invoke(app, asked)
+    assert done.exit_code == (1 if broken else 0), done.output
+    assert (tmp_path / "out" / "benchmark.html").is_file()
 
 
 @pytest.mark.parametrize("where", ["terminal", "page"])

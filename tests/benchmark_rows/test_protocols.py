@@ -173,6 +173,13 @@ def test_a_method_by_floor_may_do_better_with_one_fit_for_all():
     assert tuned(ByFloor.of(Scaled()), training, ROBOTINO, "headings").settings == "factor = 0.5"
 
 
+def test_floors_count_alike_whatever_number_of_runs_they_have():
+    few = runs(slip=0.5)[:24]  # 18 on the first floor, six on the second
+    held = np.array([0] * 9 + [-1] * 9 + [0] * 3 + [-1] * 3)
+    # encoders are right on the first and twice as far as the robot on the second
+    assert _loss(Scaled(), few, held, ROBOTINO) == pytest.approx(0.5)
+
+
 def test_runs_whose_floor_was_left_out_altogether_do_not_count():
     few = [run.told(True) for run in runs(slip=0.5)[:20]]
     held = np.array([0] * 6 + [-1] * 12 + [0] * 2)  # both runs on the second floor

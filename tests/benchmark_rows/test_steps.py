@@ -39,13 +39,19 @@ def test_it_moves_as_the_robot_that_drove_it(made):
             assert found[:2] == pytest.approx(expected[:2], abs=0.015)
 
 
-def test_gyro_and_command_are_means_over_each_step(made):
+def test_the_load_is_heard_and_gyro_and_command_are_means_over_each_step(made):
     logs = [
-        replace(log, gyro=3.0 * log.time, twist_command=np.tile([0.1, 0.2, 0.3], (log.samples, 1)))
+        replace(
+            log,
+            load="heavy",
+            gyro=3.0 * log.time,
+            twist_command=np.tile([0.1, 0.2, 0.3], (log.samples, 1)),
+        )
         for log in made.runs.logs
     ]
     one = cut(collect(logs), made.robot)[0]
     heard = one.runs[0].heard
+    assert heard.load == one.runs[0].load == "heavy"
     assert heard.command is not None
     assert heard.command == pytest.approx(np.tile([0.1, 0.2, 0.3], (len(heard), 1)))
     # in the time of the wheels, which the camera lags

@@ -14,6 +14,7 @@ from slipid.control.estimator import Estimator, EstimatorState
 from slipid.control.filter.floor_filter import FloorFilter
 from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.interface import Readings, Settings
+from slipid.control.robot_file.record import ToldRecord
 from slipid.control.robot_file.unseen import GRIP, SOFTNESS, with_unseen
 from slipid.model.geometry import omni
 from slipid.model.robot import build
@@ -47,11 +48,37 @@ def test_they_lie_about_the_middle_of_the_floors_that_were_driven_on():
     drag = [value(wider, f"{name}.roller_drag") for name in names]
     assert np.argsort(creep, kind="stable").tolist() == np.argsort(drag, kind="stable").tolist()
     assert max(creep) / min(creep) == pytest.approx(np.exp(4.0))
+    assert max(drag) / min(drag) == pytest.approx(np.exp(0.8 * 4.0))
     # their motion is surely no better known than that of a floor that was driven on
     assert (np.asarray(wider.effect[2:]) > np.asarray(wider.effect[:2]).max(axis=0)).all()
     assert {n.verdict for p, n in wider.record.parameters.items() if "unseen" in p} == {
         "not_identified"
     }
+
+
+def test_currents_on_them_are_less_sure_than_on_any_floor_of_the_robot():
+    wider = deployed(current=1.0).with_unseen()
+    known, made = np.asarray(wider.current_std[:2]), np.asarray(wider.current_std[2:])
+    assert made == pytest.approx(1.5 * known.mean())
+    assert made.min() > known.max()
+
+
+def test_nothing_is_told_of_them_but_how_far_off_they_are():
+    made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"])
+    cell = ((0.01, -0.02, 0.3), (0.0, 0.1, 0.0))
+    left = ((0.01, 0.02, 0.3), (0.0, 0.1, 0.0))
+    told = ToldRecord((0.1,), ((cell,), (cell,)), ((left,), (left,)))
+    known = deploy_known(made, told={made.body.loads[0]: told}).record
+    spread = tuple(replace(load, spread=((0.2, 0.4, 0.1),) * 2) for load in known.loads)
+    record = with_unseen(replace(known, loads=spread))
+    (load,) = record.loads
+    assert load.told is not None
+    assert load.told.mean[:2] == told.mean
+    assert load.told.left[:2] == told.left
+    assert load.spread[2:] == pytest.approx(np.tile([0.2, 0.4, 0.1], (COUNT, 1)))
+    assert np.asarray(load.told.mean[2:]) == pytest.approx(np.zeros((COUNT, 1, 2, 3)))
+    both = np.hypot([0.1, 0.1, 0.3], [0.2, 0.4, 0.1])
+    assert np.asarray(load.told.left[2:]) == pytest.approx(np.tile(both, (COUNT, 1, 2, 1)))
 
 
 def test_together_they_are_as_rare_as_a_second_floor_under_the_robot():
@@ -85,6 +112,9 @@ def test_a_robot_comes_to_them_and_from_them_as_a_whole():
         assert now.sum() == pytest.approx(1.0)
         assert (now[ways.uniform[2:]] > 0).all()
         assert now[ways.uniform[start]] > 0.97
+        # also when wheels come to other floors one by one
+        all_told = np.asarray(by_floor._changed(alone, jnp.asarray(0.5)))[:, 0]
+        assert (all_told[ways.uniform[2:]] > 0).all()
     # from one floor that was driven on to another it comes wheel by wheel
     alone = jnp.zeros((len(ways), 1)).at[ways.uniform[0]].set(1.0)
     assert float(by_floor._estranged(alone, jnp.asarray(0.5))[ways.uniform[1], 0]) == 0.0
