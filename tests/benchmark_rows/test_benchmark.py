@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from slipid.benchmark import work as benchmark_work
-from slipid.benchmark.benchmark import benchmark
+from slipid.benchmark.benchmark import benchmark, pieces_of
 from slipid.benchmark.rectangle import Rectangle
 from slipid.benchmark.row import Row
 from slipid.benchmark.work import Piece, Wish, data_of, keys_of, source_of, split_of
@@ -62,6 +62,17 @@ def test_one_command_makes_a_table_and_goes_on_from_what_was_kept(tmp_path, monk
     left = {name: row for (_, name), row in piece.rows().items()}
     assert left["encoder"] == Row(absent="ZeroDivisionError: a wheel of size 0", failed=True)
     assert len(left["paper_code"].runs) == len(split_of(piece).judged)
+
+
+def test_every_part_of_every_kind_is_asked_or_one_of_headings_if_it_has_to_be_quick(tmp_path):
+    (tmp_path / "x").mkdir()
+    wish = Wish(tmp_path / "x", tmp_path / "out")
+    kinds = ("headings", "sectors", "speeds", "floors")
+    every = [f"testsite/{kind}_{fold}" for kind in kinds for fold in (0, 1)]
+    assert [piece.name for piece in pieces_of(wish, "testsite")] == every
+    quick = pieces_of(replace(wish, quick=True), "testsite")
+    assert [piece.name for piece in quick] == ["testsite/headings_0"]
+    assert {protocol for protocol, _ in keys_of(quick[0])} == {"known_floor"}
 
 
 def test_where_there_is_one_floor_nobody_is_asked_which_it_is(tmp_path, monkeypatch):
