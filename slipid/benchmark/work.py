@@ -266,15 +266,16 @@ def _own(scene: Scene, asked: Protocol, runs: list[Run], name: str) -> Row:
         asked.told, asked.strange, scene.data.map if name == OWN_MAP else None
     )
 
-    def predict(cuts: Sequence[Cut]) -> list[Said]:
-        if drives:
-            return slipid_rows.estimated(own, cuts, scene.judged, place)
-        return [said for one in cuts for said in slipid_rows.told(own, one, scene.data.machine)]
-
     drives = not asked.told or has_gyro
-    for one in scene.cuts[-1:] if drives else scene.cuts:  # compiles; the last have most steps
-        predict([replace(one, numbers=one.numbers[:1], runs=one.runs[:1])])
-    said, each = _timed(lambda: predict(scene.cuts), runs)
+
+    def predict() -> list[Said]:
+        if drives:
+            return slipid_rows.estimated(own, scene.cuts, scene.judged, place)
+        machine = scene.data.machine
+        return [said for one in scene.cuts for said in slipid_rows.told(own, one, machine)]
+
+    predict()  # compiles
+    said, each = _timed(predict, runs)
     return Row(
         runs=_judged(scene, runs, said),
         numbers=own.numbers,
