@@ -16,6 +16,7 @@ from slipid.model.robot import Robot
 
 Channel = Literal["current", "gyro", "command", "twist"]
 """What a method may need beside the encoders. `twist`: wheels that determine the body's twist."""
+Aim = Literal["end", "energy"]
 Numbers = Float[np.ndarray, " step"]
 Twists = Float[np.ndarray, "step 3"]
 """Body twist of each step: ahead [m/s], to the left [m/s], yaw [rad/s]."""
@@ -23,6 +24,8 @@ TRIES = 4
 """Settings that a method may try in its inner cross-validation, the same for all of them."""
 WINDOW_S = 0.5
 """Length of the windows that methods are trained on and that twists are judged on [s]."""
+FEWEST = 5
+"""Runs on a floor, or with a load, below which a method takes its fit to all runs for them."""
 SHAFT_W0 = 3.0
 """Shaft speed below which the torque of a current is not told by its power [rad/s]."""
 
@@ -231,10 +234,12 @@ class Method(abc.ABC):
     Attributes:
         name: of its row.
         needs: channels without which it does not run.
+        aim: what it predicts, by which its settings are picked: where a run ends, or its energy.
     """
 
     name: str
     needs: frozenset[Channel] = field(default=frozenset(), kw_only=True)
+    aim: Aim = field(default="end", kw_only=True)
 
     def candidates(self) -> Sequence["Method"]:
         """Itself with other settings, at most `TRIES`, from which cross-validation picks one."""
@@ -258,6 +263,8 @@ class Method(abc.ABC):
 class ByFloor(Method):
     """A method fitted floor by floor where floors are told, else load set-up by load set-up.
 
+    Groups of fewer than `FEWEST` runs have the fit to all runs.
+
     Attributes:
         method: unfitted.
         pooled: whether it takes no notice of floors and loads, and is fitted once to all runs.
@@ -271,7 +278,7 @@ class ByFloor(Method):
 
     @classmethod
     def of(cls, method: Method) -> "ByFloor":
-        return cls(method.name, method, needs=method.needs)
+        return cls(method.name, method, needs=method.needs, aim=method.aim)
 
     def candidates(self) -> Sequence["ByFloor"]:
         return [replace(self, method=method) for method in self.method.candidates()]
@@ -281,7 +288,10 @@ class ByFloor(Method):
         for run in runs:
             groups.setdefault(self.group_of(run.heard), []).append(run)
         order = sorted(groups, key=lambda name: -len(groups[name]))
-        fitted = {name: self.method.fit(groups[name], machine) for name in order}
+        few = [name for name in order if len(groups[name]) < FEWEST] if len(order) > 1 else []
+        fitted = {n: self.method.fit(groups[n], machine) for n in order if n not in few}
+        if few:
+            fitted |= dict.fromkeys(few, self.method.fit(runs, machine))
         return replace(self, fitted=fitted)
 
     def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
@@ -311,7 +321,7 @@ class ByFloor(Method):
 
     @property
     def numbers(self) -> int:
-        return sum(method.numbers for method in self.fitted.values())
+        return sum(method.numbers for method in {id(m): m for m in self.fitted.values()}.values())
 
 
 def groups(dt: Float[np.ndarray, " step"], seconds: float) -> np.ndarray:

@@ -13,6 +13,7 @@ from slipid.baselines.interface import (
     Said,
     body_increments,
     groups,
+    path_of,
     seen_from_start,
 )
 from slipid.benchmark.protocols import base_of
@@ -36,8 +37,8 @@ class Judged:
         name, floor: of the run; the floor with the load set-up.
         cluster: runs of one cluster share their errors.
         endpoint_error: distance of predicted and true end over the chord, or over the path.
-        length_error: of the chord, relative.
-        heading_error_deg: at the end.
+        length_error: relative, of the chord, or of the path driven.
+        heading_error_deg: at the end, at most 180.
         twist_error: rms of the windows' twist errors, a yaw rate times the base radius [m/s].
         covered90: whether the end lies in the 90 % region; None without one.
         scores, slips: of each window, how sure the method is of slip, and whether there was any.
@@ -67,18 +68,16 @@ def judged(run: Run, said: Said, machine: Machine, over: Over) -> Judged:
     """A run against what was said of it."""
     true = seen_from_start(run.pose)
     gap = said.path[-1] - true[-1]
-    chord = float(np.hypot(*true[-1, :2]))
-    path = float(np.hypot(*np.diff(true[:, :2], axis=0).T).sum())
-    ahead = float(np.hypot(*said.path[-1, :2]))
+    most = max(_length(true, over), 1e-9)
     first = groups(run.heard.dt, WINDOW_S)
     off, slip, slips = _windows(run, said, machine, first)
     return Judged(
         name=run.heard.name,
         floor=run.floor,
         cluster=_cluster(run),
-        endpoint_error=float(np.hypot(*gap[:2])) / max(chord if over == "chord" else path, 1e-9),
-        length_error=abs(ahead / max(chord, 1e-9) - 1),
-        heading_error_deg=abs(float(np.degrees(gap[2]))),
+        endpoint_error=float(np.hypot(*gap[:2])) / most,
+        length_error=abs(_length(said.path, over) / most - 1),
+        heading_error_deg=abs(float(np.degrees(np.angle(np.exp(1j * gap[2]))))),
         twist_error=off,
         covered90=_covered(gap[:2], said.end_covariance),
         scores=[float(f"{x:.4g}") for x in slip.tolist()],
@@ -86,6 +85,13 @@ def judged(run: Run, said: Said, machine: Machine, over: Over) -> Judged:
         floor_right=_floor_right(run, said),
         energy_error=_energy_error(run, said, machine),
     )
+
+
+def _length(path: Float[np.ndarray, "edge 3"], over: Over) -> float:
+    """Of the straight way from the origin to the end, or of the way driven [m]."""
+    if over == "chord":
+        return float(np.hypot(*path[-1, :2]))
+    return float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum())
 
 
 def _cluster(run: Run) -> int:
@@ -103,13 +109,15 @@ def _windows(
     dt = np.diff(np.concatenate([[0.0], np.cumsum(run.heard.dt)])[edges])[:, None]
     true = body_increments(run.pose[edges]) / dt * machine.size
     told = body_increments(said.path[edges]) / dt * machine.size
-    rolling = run.heard.windowed().rolling(machine) * machine.size
+    # joined as the paths are, so that a method that says what encoders say sees no slip at all
+    by_wheels = path_of(run.heard.rolling(machine), run.heard.dt)
+    rolling = body_increments(by_wheels[edges]) / dt * machine.size
     size = np.linalg.norm(rolling, axis=1)
     moves = size > STANDS
     most = np.maximum(size, STANDS)
     slips = np.linalg.norm(true - rolling, axis=1) > SLIPS * most
     if said.slipping is None:
-        score = np.linalg.norm(told - rolling, axis=1) / most
+        score = np.round(np.linalg.norm(told - rolling, axis=1) / most, 6)
     else:
         score = np.add.reduceat(said.slipping * run.heard.dt, first) / dt[:, 0]
     off = float(np.sqrt(np.mean(np.sum((told - true) ** 2, axis=1))))

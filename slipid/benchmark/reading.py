@@ -5,6 +5,9 @@ from collections.abc import Mapping
 from slipid.benchmark.own import NAME
 from slipid.benchmark.summary import Number, Summary
 
+NAMED = 4
+"""Rows that a sentence names."""
+
 
 def reading(tables: Mapping[str, Mapping[str, Mapping[str, Summary]]]) -> list[str]:
     """A sentence for each protocol of each data set."""
@@ -31,17 +34,17 @@ def sentence(name: str, protocol: str, found: Mapping[str, Summary]) -> str:
     tied = [row for row in others if (b := found[row].behind) is not None and b.low <= 0 <= b.high]
     if ahead:
         best = min(ahead, key=lambda row: others[row].value)
-        also = f", as {len(ahead) - 1} more" if len(ahead) > 1 else ""
+        also = f" (and {len(ahead) - 1} more)" if len(ahead) > 1 else ""
         return (
-            f"{head}{best} is ahead of slipid{also}: {_percent(others[best])} against {mine}, "
+            f"{head}{best}{also} is ahead of slipid: {_percent(others[best])} against {mine}, "
             f"{_points(ahead[best])}"
         )
     best = min(others, key=lambda row: others[row].value)
     said = f"{head}slipid errs by {mine}, the best other row, {best}, by {_percent(others[best])}"
     if tied:
-        more = [row for row in tied if row != best][:3]
-        named = f"; not told apart from {', '.join([best, *more] if best in tied else more)}"
-        return said + named
+        tied.sort(key=lambda row: others[row].value)
+        more = f" and {len(tied) - NAMED} more" if len(tied) > NAMED else ""
+        return f"{said}; not told apart from {', '.join(tied[:NAMED])}{more}"
     behind = found[best].behind
     return f"{said}, {_points(behind)}" if behind is not None else said
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from slipid.benchmark import own as slipid_rows
 from slipid.benchmark.row import Row
-from slipid.benchmark.work import Wish, data_of, problem_of
+from slipid.benchmark.work import OF_FITS, Wish, data_of, problem_of
 from slipid.control.robot_file.record import Sensors
 from slipid.deploy import trial
 from slipid.deploy.deploy import ROBOT
@@ -63,8 +63,8 @@ class Rectangle:
 
     def _identify(self) -> None:
         data = data_of(self.wish, SOURCE)
-        code = source_hash("model", "data", "identify", "job")
-        key = key_of(data.job.config.hash, data.job.data_hash, code)
+        code = source_hash(*OF_FITS)
+        key = key_of(data.job.config.hash, data.job.data_hash, slipid_rows.TOLERANCE, code)
         everybody = np.arange(len(data.heard))
         kept = Checkpoint(self.folder, key)
         own = slipid_rows.fit_own(data.job, problem_of(self.wish, SOURCE), everybody, kept)

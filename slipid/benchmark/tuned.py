@@ -10,7 +10,7 @@ from slipid.benchmark.judge import judged
 from slipid.benchmark.protocols import INNER, inner
 
 WORST = 2.0
-"""End-point error beyond which it does not matter how far a setting is off."""
+"""Relative error beyond which it does not matter how far a setting is off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,11 +26,11 @@ def tuned(method: Method, runs: Sequence[Run], machine: Machine, kind: str) -> T
     """The method with the best of its settings, unfitted.
 
     Each is fitted without a part of the runs, of the kind that the method will be judged by as far
-    as the training runs have such parts, and judged on that part by its mean end-point error over
-    the path, floors counting alike. A setting with which the method cannot be fitted counts as the
-    worst. All training runs are used, since settings that are best for fewer are too cautious. A
-    method that is fitted floor by floor may also do better with one fit to all runs: with the best
-    settings both are tried.
+    as the training runs have such parts, and judged on that part by its mean error, of the end over
+    the path or of the energy (`Method.aim`), floors counting alike. A setting with which the method
+    cannot be fitted counts as the worst. All training runs are used, since settings that are best
+    for fewer are too cautious. A method that is fitted floor by floor may also do better with one
+    fit to all runs: with the best settings both are tried.
     """
     candidates = list(method.candidates())[:TRIES]
     part = inner(runs, kind)
@@ -50,7 +50,7 @@ def tuned(method: Method, runs: Sequence[Run], machine: Machine, kind: str) -> T
 
 
 def _loss(method: Method, runs: Sequence[Run], part: np.ndarray, machine: Machine) -> float:
-    """Mean end-point error over parts left out in turn, over runs and then over floors."""
+    """Mean error over parts left out in turn, over runs and then over floors."""
     errors: dict[str, list[float]] = {}
     for k in range(INNER):
         fitted = [run for run, p in zip(runs, part, strict=True) if p != k]
@@ -65,7 +65,9 @@ def _loss(method: Method, runs: Sequence[Run], part: np.ndarray, machine: Machin
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             return np.inf
         for run, one in zip(left_out, said, strict=True):
-            error = judged(run, one, machine, "path").endpoint_error
+            found = judged(run, one, machine, "path")
+            error = found.energy_error if method.aim == "energy" else found.endpoint_error
+            error = np.inf if error is None else error
             mine = errors.setdefault(run.floor, [])
             mine.append(min(error, WORST) if np.isfinite(error) else WORST)
     return float(np.mean([np.mean(mine) for mine in errors.values()])) if errors else 0.0

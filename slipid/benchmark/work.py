@@ -30,6 +30,10 @@ OWN_MAP = "slipid_map"
 """slipid's estimator, told the map of the floors."""
 
 
+OF_FITS = ("model", "data", "identify", "job", "parameter", "search_space")
+"""Packages and modules that slipid's fits depend on."""
+OF_ROWS = ("baselines", "benchmark", "control", "deploy")
+"""Packages that all rows depend on beside these."""
 QUICK_RUNS = 60
 """Runs of each data set, where a part is enough."""
 QUICK_KIND = "headings"
@@ -120,12 +124,12 @@ def split_of(piece: Piece) -> Split:
 def kept_of(piece: Piece, fit: bool) -> Checkpoint:
     """Where the parts of a piece are kept: its fit, or what rows say."""
     data = data_of(piece.wish, piece.source)
-    rooms = ("model", "data", "identify", "job")
-    more = () if fit else ("baselines", "benchmark", "control", "deploy")
+    more = ("fit",) if fit else (data.crossing_hash, source_hash(*OF_ROWS))
     split = split_of(piece)
-    marks = data.job.config.hash, data.job.data_hash, "" if fit else data.crossing_hash
-    key = key_of(*marks, split.fitted, split.judged, source_hash(*rooms, *more))
-    return Checkpoint(piece.wish.out / "kept" / piece.name, key)
+    marks = data.job.config.hash, data.job.data_hash, slipid_rows.TOLERANCE, source_hash(*OF_FITS)
+    key = key_of(*marks, split.fitted, split.judged, *more)
+    # in a folder of its own: what was kept of other work stays
+    return Checkpoint(piece.wish.out / "kept" / piece.name / key[:12], key)
 
 
 def keys_of(piece: Piece) -> list[tuple[str, str]]:

@@ -1,5 +1,7 @@
 """End-point errors of every row, protocol by protocol."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -47,7 +49,7 @@ def benchmark_figure(one: Content, about: Content, name: str) -> Figure | None:
     return made
 
 
-def _panel(ax: Axes, ends: dict[str, list[float]]) -> None:
+def _panel(ax: Axes, ends: Mapping[str, Sequence[float]]) -> None:
     order = sorted(ends, key=lambda row: -ends[row][0])
     for k, row in enumerate(order):
         middle, low, high = (100 * x for x in ends[row])

@@ -10,7 +10,7 @@ from slipid.support.content import Content
 
 COLUMNS: Mapping[str, tuple[str, float, int]] = {
     "endpoint_error": ("end point, %", 100.0, 1),
-    "behind": ("less slipid", 100.0, 1),
+    "behind": ("minus slipid's", 100.0, 1),
     "length_error": ("length, %", 100.0, 1),
     "heading_error_deg": ("heading, deg", 1.0, 1),
     "twist_error": ("twist, mm/s", 1000.0, 0),

@@ -108,4 +108,4 @@ def picture(png: bytes, said: str) -> str:
 
 def _versions(found: Content) -> str:
     said = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
-    return escape(f"{said}; {found['seconds']:.0f} s")
+    return escape(f"{said}; this call took {found['seconds']:.0f} s")

@@ -40,9 +40,10 @@ def versions() -> dict[str, str]:
 
 
 def source_hash(*rooms: str) -> bytes:
-    """Hash of the sources of some of slipid's packages, by name."""
+    """Hash of the sources of some of slipid's packages and modules, by name."""
     root = Path(__file__).resolve().parents[1]
-    found = sorted(path for room in rooms for path in (root / room).rglob("*.py"))
+    files = [path for room in rooms for path in (root / room).rglob("*.py")]
+    found = sorted(files + [root / f"{room}.py" for room in rooms if not (root / room).is_dir()])
     return hashlib.sha256(b"".join(path.read_bytes() for path in found)).digest()
 
 

@@ -11,7 +11,7 @@ from slipid.benchmark import work as benchmark_work
 from slipid.benchmark.benchmark import benchmark, pieces_of
 from slipid.benchmark.rectangle import Rectangle
 from slipid.benchmark.row import Row
-from slipid.benchmark.work import Piece, Wish, data_of, keys_of, source_of, split_of
+from slipid.benchmark.work import QUICK_RUNS, Piece, Wish, data_of, keys_of, source_of, split_of
 from slipid.cli.main import app
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -94,6 +94,21 @@ def test_other_runs_over_several_floors_are_other_work_but_no_other_fit(tmp_path
     monkeypatch.setattr(benchmark_work, "data_of", lambda wish, source: more)
     assert benchmark_work.kept_of(piece, fit=False).key != rows
     assert benchmark_work.kept_of(piece, fit=True).key == fit
+
+
+def test_quick_work_does_not_overwrite_what_was_kept(tmp_path):
+    (tmp_path / "x").mkdir()
+    wish = Wish(tmp_path / "x", tmp_path / "out", ("encoder",))
+    few = data_of(wish, "testsite").thinned(QUICK_RUNS)
+    assert len(few.heard) < len(data_of(wish, "testsite").heard)
+    whole, quick = (
+        Piece(replace(wish, quick=quick), "testsite", "headings", 0) for quick in (False, True)
+    )
+    assert whole.name == quick.name
+    folders = {
+        benchmark_work.kept_of(p, fit=f).folder for p in (whole, quick) for f in (False, True)
+    }
+    assert len(folders) == 4
 
 
 def test_an_unknown_row_is_named_with_the_choices(tmp_path):

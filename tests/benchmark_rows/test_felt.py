@@ -526,5 +526,26 @@ def test_a_table_that_fails_is_kept_with_its_reason_until_the_logs_change(tmp_pa
     assert "1 rows" in part.table()["failed"]
 
 
+def test_a_table_in_which_a_classifier_failed_is_made_again(tmp_path, monkeypatch):
+    (tmp_path / "borealtc").mkdir()
+    part = HuskyFloors(Wish(tmp_path, tmp_path / "out"))
+    felts = made_felts({"grass": 2.0, "snow": 4.0})
+    methods = [Broken(name="trees"), Meter()]
+    made = []
+
+    def make(_):
+        made.append(len(made))
+        return felt_table(methods, felts, HUSKY, "made", Asked(seconds=(1.0,)), "meter")
+
+    monkeypatch.setattr(HuskyFloors, "make", make)
+    part.run()
+    assert part.table()["rows"][0]["absent"] == "ZeroDivisionError: no wheel"
+    methods[0] = Meter(name="trees")
+    part.run()
+    assert part.table()["rows"][0]["absent"] == ""
+    part.run()
+    assert made == [0, 1]
+
+
 def test_seconds_are_of_rows_that_come_as_often_as_they_do():
     assert made_felt("grass", ahead(13), 1.0).dt.sum() == pytest.approx(13 / HZ)

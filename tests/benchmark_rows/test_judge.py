@@ -44,6 +44,25 @@ def test_over_the_path_a_circle_counts_its_way():
     assert one.endpoint_error == pytest.approx(ahead / 0.8, rel=2e-3)
 
 
+def test_lengths_are_of_what_ends_are_judged_over_and_headings_do_not_wind_up():
+    rolling = np.tile([0.2, 0.0, np.pi / 2], (80, 1))  # two whole turns
+    run = made_run(rolling)
+    one = judged(run, said(run, 0.5 * rolling), ROBOTINO, "path")
+    assert one.length_error == pytest.approx(0.5, rel=1e-3)
+    assert one.heading_error_deg == pytest.approx(0.0, abs=1e-6)
+    turned = said(run, rolling - [0.0, 0.0, np.pi / 3])
+    assert judged(run, turned, ROBOTINO, "path").heading_error_deg == pytest.approx(120.0)
+
+
+def test_who_says_what_encoders_say_sees_no_slip():
+    rng = np.random.default_rng(0)
+    rolling = rng.normal(0.2, 0.1, (40, 3))
+    run = made_run(rolling, 0.5 * rolling)
+    one = judged(run, said(run, run.heard.rolling(ROBOTINO)), ROBOTINO, "chord")
+    assert set(one.scores) == {0.0}
+    assert all(one.slips)
+
+
 def test_the_start_may_lie_anywhere():
     run = slipping_run()
     c, s = np.cos(2.0), np.sin(2.0)
@@ -203,7 +222,13 @@ def test_the_reading_says_who_is_ahead():
         "carpet, new floor: rival is ahead of slipid: 5.0 % against 10.0 %, "
         "-5.0 points [-7.0, -3.0]"
     )
+    both = {**ahead, "third": ends(0.06, behind=Number(-0.04, -0.06, -0.02))}
+    assert "new floor: rival (and 1 more) is ahead of slipid:" in sentence("x", "new_floor", both)
     tied = {"slipid": ends(0.1), "rival": ends(0.09, behind=Number(-0.01, -0.03, 0.01))}
     assert sentence("x", "sectors", tied).endswith("by 9.0 %; not told apart from rival")
+    many = {f"row{k}": ends(0.1 + 0.01 * k, behind=Number(0.0, -0.1, 0.1)) for k in range(6)}
+    assert sentence("x", "sectors", {"slipid": ends(0.1), **many}).endswith(
+        "not told apart from row0, row1, row2, row3 and 2 more"
+    )
     behind = {"slipid": ends(0.1), "rival": ends(0.2, behind=Number(0.1, 0.08, 0.12))}
     assert sentence("x", "sectors", behind).endswith("by 20.0 %, +10.0 points [+8.0, +12.0]")

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from slipid.baselines.interface import ByFloor, Machine, Method, Said, path_of
+from slipid.baselines.interface import FEWEST, ByFloor, Machine, Method, Said, path_of
+from slipid.baselines.motion.quann.energy import QuannEnergy
 from slipid.benchmark.protocols import PROTOCOLS, Facts, base_of, inner, splits
 from slipid.benchmark.tuned import _loss, tuned
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
@@ -228,6 +229,46 @@ def test_a_method_by_floor_has_one_fit_for_all_where_nothing_is_told():
     assert far(untold, None) == pytest.approx(0.75)
     with pytest.raises(ValueError, match="scaled: no floor 'ice'; fitted: gray, green"):
         far(told, "ice")
+
+
+def test_a_floor_of_few_runs_has_the_fit_to_all():
+    few = runs(slip=0.5)[: 18 + FEWEST - 1]
+    done = ByFloor.of(Mean()).fit(few, ROBOTINO)
+    assert list(done.fitted) == ["gray", "green"]
+    everything = Mean().fit(few, ROBOTINO)
+    assert done.fitted["green"] == everything
+    assert done.fitted["gray"] == Mean().fit(few[:18], ROBOTINO)
+    enough = ByFloor.of(Mean()).fit(runs(slip=0.5)[: 18 + FEWEST], ROBOTINO)
+    assert enough.fitted["green"] != everything
+
+
+@dataclass(frozen=True)
+class Powered(Scaled):
+    """Encoders, and a power that is a setting."""
+
+    watts: float = 1.0
+
+    def candidates(self):
+        return [replace(self, watts=w) for w in (90.0, 10.0, 3.0)]
+
+    def predict(self, runs, machine: Machine):
+        said = super().predict(runs, machine)
+        return [
+            replace(s, power=np.full(len(r), self.watts)) for s, r in zip(said, runs, strict=True)
+        ]
+
+
+def test_what_predicts_energy_is_tuned_by_it():
+    way = straight(0.1)
+    training = [
+        made_run(way, 0.5 * way, current=np.full((40, 3), 1.0), name=f"run{k}") for k in range(9)
+    ]
+    watts = float(training[0].heard.power(ROBOTINO).mean())
+    assert watts == pytest.approx(10.0, rel=0.1)
+    assert tuned(Powered(), training, ROBOTINO, "headings").settings == "watts = 90.0"
+    found = tuned(Powered(aim="energy"), training, ROBOTINO, "headings")
+    assert found.settings == "watts = 10.0"
+    assert ByFloor.of(QuannEnergy()).aim == "energy"
 
 
 def test_where_floors_are_not_told_each_load_has_a_fit_and_a_strange_one_that_of_the_usual():

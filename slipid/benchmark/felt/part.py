@@ -9,7 +9,7 @@ from slipid.benchmark.felt.result import FeltTable
 from slipid.benchmark.felt.robotino import SOURCE, robotino_felt, robotino_rows
 from slipid.benchmark.own import NAME
 from slipid.benchmark.row import Row
-from slipid.benchmark.work import Wish, data_of
+from slipid.benchmark.work import OF_FITS, OF_ROWS, Wish, data_of
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.content import Content
 from slipid.support.files import hash_of
@@ -54,16 +54,16 @@ class FeltPart(abc.ABC):
     @property
     def kept(self) -> Checkpoint:
         """Where its table is kept."""
-        rooms = ("model", "data", "identify", "job", "control", "deploy", "baselines", "benchmark")
-        key = key_of(self.logs(), self.wish.quick, self.wish.only, source_hash(*rooms))
-        return Checkpoint(self.wish.out / "kept", key)
+        code = source_hash(*OF_FITS, *OF_ROWS)
+        key = key_of(self.logs(), self.wish.quick, self.wish.only, code)
+        return Checkpoint(self.wish.out / "kept" / self.name / key[:12], key)
 
     def run(self) -> str:
         """Make the table, if it is not kept yet; the name of the part."""
         setup_jax(quiet=True)
         kept = self.kept
         found = kept.load_json(self.name)
-        if found is None or "failed" in found:
+        if found is None or "failed" in found or any(row["absent"] for row in found["rows"]):
             try:
                 kept.save_json(self.name, self.make().to_json())
             except Exception as error:  # other parts are done all the same

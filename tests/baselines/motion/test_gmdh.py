@@ -219,6 +219,17 @@ def test_floors_are_told_without_what_comes_later(classes):
     assert second.floors["ice"][-1] > 0.5 > first.floors["ice"][-1]
 
 
+def test_a_floor_that_was_never_seen_with_this_load_is_left_out():
+    loads = {"gray": "moved", "ice": "as_built"}
+    runs = [replace(run, heard=replace(run.heard, load=loads[run.floor])) for run in RUNS]
+    method = GmdhClass().fit(runs, ROBOTINO)
+    # by its currents it is on ice
+    new = slipping(1.1, "ice", seed=7).told(False).heard
+    moved, other = method.predict([replace(new, load="moved"), replace(new, load="new")], ROBOTINO)
+    assert np.array_equal(moved.floors["gray"], np.ones(40))
+    assert other.floors["ice"][-1] > 0.95
+
+
 def test_a_robot_at_rest_learns_nothing_of_its_floor(classes):
     rest = made_run(np.zeros((40, 3)), current=np.full((40, 3), 0.3)).told(False).heard
     (said,) = classes.predict([rest], ROBOTINO)

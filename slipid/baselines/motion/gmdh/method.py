@@ -21,6 +21,7 @@ Liberties:
     - Slow windows count less in the networks of slip; floors count alike in those of floors.
     - Evidence on the floor is added up along the run and fades, since a run may cross floors. What
       is said of floors is from what is heard, also where the floor is told.
+    - Floors that were never seen with the load at hand, which a robot knows, are left out.
     - Twenty neurons of a layer are kept and inputs of earlier layers are not offered again.
 
 Source: Andrakhanov, Belyaev 2017, Navigation learning system for mobile robot in heterogeneous
@@ -139,6 +140,7 @@ class GmdhClass(Method):
         growth: how networks are grown.
         channels: beside the encoders, that inputs are of.
         floors: networks of the slip ratio's three components on each floor.
+        loads: load set-ups with which each floor was seen, in the same order.
         telling: networks of the floors, in the same order; None where only one floor was seen.
     """
 
@@ -146,6 +148,7 @@ class GmdhClass(Method):
     growth: Growth = CANDIDATES[0]
     channels: frozenset[Channel] = frozenset()
     floors: Mapping[str, Networks] = field(default_factory=dict)
+    loads: Sequence[frozenset[str | None]] = ()
     telling: Networks | None = None
 
     def candidates(self) -> Sequence["GmdhClass"]:
@@ -169,14 +172,15 @@ class GmdhClass(Method):
         if len(names) > 1:
             alike = (on / on.sum(axis=0)).sum(axis=1)
             telling = Networks.grown(seen.inputs, on.astype(float), alike, in_a, self.growth)
-        return replace(self, channels=seen.channels, floors=floors, telling=telling)
+        loads = [frozenset(run.heard.load for run in runs if run.floor == name) for name in names]
+        return replace(self, channels=seen.channels, floors=floors, loads=loads, telling=telling)
 
     def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
         if not self.floors:
             raise ValueError(f"{self.name}: predict before fit")
         windows, names = Windows.of(runs, machine), list(self.floors)
         inputs = windows.inputs(machine, self.channels)
-        belief = self._belief(windows, inputs)
+        belief = self._belief(windows, inputs, runs)
         told = np.array([names.index(run.floor) if run.floor in names else -1 for run in runs])
         floor = np.where(told[windows.run] < 0, belief.argmax(axis=1), told[windows.run])
         ratio = np.zeros((len(inputs), 3))
@@ -188,15 +192,23 @@ class GmdhClass(Method):
             for of_run, belief_of_run in zip(said, at_steps(belief, windows, runs), strict=True)
         ]
 
-    def _belief(self, windows: Windows, inputs: Inputs) -> Float[np.ndarray, "window floor"]:
-        """Probability of each floor by all of a run that was heard up to each window."""
+    def _belief(
+        self, windows: Windows, inputs: Inputs, runs: Sequence[Heard]
+    ) -> Float[np.ndarray, "window floor"]:
+        """Probability of each floor by all of a run that was heard up to each window.
+
+        A floor that was never seen with the run's load is none that it may be on.
+        """
         if self.telling is None:
             return np.ones((len(inputs), 1))
         share = self.telling.say(inputs).clip(min=LEAST)
         evidence = np.log(share / share.sum(axis=1, keepdims=True))
         # a robot at rest tells nothing
         evidence[~windows.moves] = 0.0
-        return _softmax(remembered(evidence, windows.run))
+        seen = np.array([[run.load in loads for loads in self.loads] for run in runs])
+        seen |= ~seen.any(axis=1, keepdims=True)
+        total = remembered(evidence, windows.run)
+        return _softmax(np.where(seen[windows.run], total, -np.inf))
 
     @property
     def numbers(self) -> int:

@@ -3,7 +3,7 @@
 In `quann_energy` the energy per metre  y = P / max(|v|, 0.02)  is linear in (1, |v|, |v|^2, |W|),
 plus a Gaussian process of the place. Power is predicted from encoders alone as  y max(|v|, 0.02).
 
-One setting is tuned: the length of the map.
+One setting is tuned, by the energy of whole runs: the length of the map.
 
 Liberties:
     - The papers map energy over places that a robot team shares; here the map is relative to where
@@ -31,6 +31,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.baselines.interface import (
+    Aim,
     Channel,
     Heard,
     Machine,
@@ -61,6 +62,7 @@ class QuannEnergy(Method):
 
     name: str = "quann_energy"
     needs: frozenset[Channel] = field(default=frozenset({"current"}), kw_only=True)
+    aim: Aim = field(default="energy", kw_only=True)
     length: float = 0.2
     law: Float[np.ndarray, "4"] | None = None
     fastest: Float[np.ndarray, "2"] | None = None
