@@ -78,7 +78,7 @@ def cells(row: Content, numbers: Sequence[str]) -> list[str]:
     return [in_words(name, row[name]) for name in numbers]
 
 
-def in_words(name: str, value: list[float] | None) -> str:
+def in_words(name: str, value: Sequence[float] | None) -> str:
     """A number, with its interval where it is one of `ENDS`; nothing where it is not known."""
     if value is None:
         return ""
