@@ -7,8 +7,8 @@ from typer.testing import CliRunner
 
 from slipid.cli.main import app
 from slipid.plots.benchmark import benchmark_pictures
-from slipid.report.benchmark import show_benchmark
-from slipid.report.benchmark_page import page
+from slipid.report.benchmark import COLUMNS, show_benchmark
+from slipid.report.benchmark_page import LEGEND, page
 from slipid.report.page import Page
 
 
@@ -68,6 +68,8 @@ def test_the_page_has_every_table_and_picture_and_escapes_what_it_is_told():
     assert pictures["carpets"].startswith(b"\x89PNG")
     said = page(CONTENT, pictures)
     assert said.count("<img") == 1
+    for number, *_ in COLUMNS.values():
+        assert number.partition(",")[0].lower() in LEGEND.lower()
     assert "quann_slip: failed: ValueError: &lt;no&gt; rank" in said
     assert "<tr class='own'><td>slipid</td>" in said
     assert said.index("<td>slipid</td>") < said.index("<td>encoder</td>")
