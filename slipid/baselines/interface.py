@@ -17,6 +17,7 @@ from slipid.model.robot import Robot
 Channel = Literal["current", "gyro", "command", "twist"]
 """What a method may need beside the encoders. `twist`: wheels that determine the body's twist."""
 Aim = Literal["end", "energy"]
+"""What a method predicts of a run: where it ends, or how much electric energy it takes."""
 Numbers = Float[np.ndarray, " step"]
 Twists = Float[np.ndarray, "step 3"]
 """Body twist of each step: ahead [m/s], to the left [m/s], yaw [rad/s]."""
@@ -234,7 +235,7 @@ class Method(abc.ABC):
     Attributes:
         name: of its row.
         needs: channels without which it does not run.
-        aim: what it predicts, by which its settings are picked: where a run ends, or its energy.
+        aim: what it predicts, by which its settings are picked.
     """
 
     name: str

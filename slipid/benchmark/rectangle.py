@@ -64,7 +64,7 @@ class Rectangle:
     def _identify(self) -> None:
         data = data_of(self.wish, SOURCE)
         code = source_hash(*OF_FITS)
-        key = key_of(data.job.config.hash, data.job.data_hash, slipid_rows.TOLERANCE, code)
+        key = key_of(data.job.config.hash, data.job.data_hash, code)
         everybody = np.arange(len(data.heard))
         kept = Checkpoint(self.folder, key)
         own = slipid_rows.fit_own(data.job, problem_of(self.wish, SOURCE), everybody, kept)

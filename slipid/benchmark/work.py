@@ -30,7 +30,7 @@ OWN_MAP = "slipid_map"
 """slipid's estimator, told the map of the floors."""
 
 
-OF_FITS = ("model", "data", "identify", "job", "parameter", "search_space")
+OF_FITS = ("model", "data", "identify", "job", "parameter", "search_space", "benchmark/own")
 """Packages and modules that slipid's fits depend on."""
 OF_ROWS = ("baselines", "benchmark", "control", "deploy")
 """Packages that all rows depend on beside these."""
@@ -124,9 +124,9 @@ def split_of(piece: Piece) -> Split:
 def kept_of(piece: Piece, fit: bool) -> Checkpoint:
     """Where the parts of a piece are kept: its fit, or what rows say."""
     data = data_of(piece.wish, piece.source)
-    more = ("fit",) if fit else (data.crossing_hash, source_hash(*OF_ROWS))
+    more = () if fit else (data.crossing_hash, source_hash(*OF_ROWS))
     split = split_of(piece)
-    marks = data.job.config.hash, data.job.data_hash, slipid_rows.TOLERANCE, source_hash(*OF_FITS)
+    marks = data.job.config.hash, data.job.data_hash, source_hash(*OF_FITS)
     key = key_of(*marks, split.fitted, split.judged, *more)
     # in a folder of its own: what was kept of other work stays
     return Checkpoint(piece.wish.out / "kept" / piece.name / key[:12], key)

@@ -32,8 +32,8 @@ def benchmark(
 
     The folder of --data has those of the public data sets: robotino2022, robotino2021, drive_skid,
     borealtc; what is absent is left out. Recorded runs of the virtual test site are always there.
-    It takes about 17 minutes on two cores, --quick about two. Rows are published systems by name,
-    such as ojeda_gyro, quann_slip or effective_track; a wrong name is answered by all of them.
+    It takes about 17 minutes on two cores, --quick about two, and three the first time. Rows are
+    published systems by name, such as ojeda_gyro or quann_slip; a wrong name is answered by all.
     Writes benchmark.json and benchmark.html. What is done is kept: called again after an interrupt
     it goes on from there. The exit code is 1 where anything failed.
     """

@@ -40,7 +40,7 @@ def versions() -> dict[str, str]:
 
 
 def source_hash(*rooms: str) -> bytes:
-    """Hash of the sources of some of slipid's packages and modules, by name."""
+    """Hash of the sources of some of slipid's packages and modules, by their paths inside it."""
     root = Path(__file__).resolve().parents[1]
     files = [path for room in rooms for path in (root / room).rglob("*.py")]
     found = sorted(files + [root / f"{room}.py" for room in rooms if not (root / room).is_dir()])

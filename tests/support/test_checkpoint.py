@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pytest
 
-from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 
 ARRAYS = {"z": np.arange(3.0), "stage": "joint", "round": 4}
 PLAIN = {"x": np.pi, "rows": [1.0 / 3.0, None, "a"]}
@@ -128,3 +128,13 @@ def test_a_kill_leaves_every_part_whole(tmp_path):
         assert arrays is not None
         assert plain is not None
         assert len(set(arrays["value"].tolist())) == len(set(plain)) == 1
+
+
+def test_sources_are_of_packages_and_of_single_modules():
+    one, other, both = (
+        source_hash(*rooms)
+        for rooms in (("parameter",), ("benchmark/own",), ("parameter", "benchmark/own"))
+    )
+    assert len({one, other, both, source_hash("benchmark")}) == 4
+    with pytest.raises(FileNotFoundError):
+        source_hash("no_such_package")
