@@ -116,7 +116,7 @@ def test_slip_is_learned_from_currents_and_direction():
         (said,) = method.predict([new.heard], ROBOTINO)
         error = said.path[-1] - path_of(new.twist, new.heard.dt)[-1]
         assert np.hypot(*error[:2]) < 0.02 * 0.8
-    assert method.numbers == 1 + (2 + 9) + 3 * KEPT
+    assert method.numbers == 1 + (2 + 9) + 3 * 40 * 8  # runs of eight windows
     assert [each.anisotropic for each in method.candidates()] == [True, False]
     assert method.needs == {"current"}
     assert method.inflation < 1.0
@@ -211,7 +211,7 @@ def test_a_law_of_energy_is_found_and_predicts_power_without_currents():
     runs = [drawing(moving(seed)) for seed in range(60)]
     method = QuannEnergy().fit(runs, ROBOTINO)
     assert method.law == pytest.approx(LAW, rel=1e-3)
-    assert method.numbers == 4 + 2 + KEPT
+    assert method.numbers == 4 + 2 + 60 * 8  # runs of eight windows
     for seed in (100, 101, 102):
         new = drawing(moving(seed)).heard
         (said,) = method.predict([replace(new, current=None)], ROBOTINO)

@@ -8,7 +8,7 @@ One setting is tuned, by the energy of whole runs: the length of the map.
 Liberties:
     - The papers map energy over places that a robot team shares; here the map is relative to where
       and how a run starts, since no absolute place is given.
-    - A few hundred windows are drawn at random instead of taking all, slow ones less often.
+    - A thousand windows are drawn at random instead of taking all, slow ones less often.
     - The linear law is found by least squares weighted by max(|v|, 0.02)^2, which is least squares
       of power. The process of what is left follows, with the length given and its variances by
       marginal likelihood.

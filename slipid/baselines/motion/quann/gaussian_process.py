@@ -1,4 +1,4 @@
-"""A Gaussian process with a Matern-3/2 kernel learns from a few hundred windows (scikit-learn).
+"""A Gaussian process with a Matern-3/2 kernel learns from a thousand windows (scikit-learn).
 
     k(x, x') = variance (1 + sqrt(3) d) exp(-sqrt(3) d),    d^2 = sum_i ((x_i - x'_i) / length_i)^2
     mean(x) = k(x, X) (K + noise I)^-1 y
@@ -20,7 +20,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-KEPT = 300
+KEPT = 1000
 TUNED = 150
 ROUNDS = 20
 SEED = 0

@@ -17,7 +17,7 @@ Liberties:
     - The papers map slip over places that a robot team shares; here slip depends on what the robot
       measures.
     - A direction is a unit vector with a turning part instead of a heading, and slip is a ratio.
-    - A few hundred windows are drawn at random instead of taking all, slow ones less often, and
+    - A thousand windows are drawn at random instead of taking all, slow ones less often, and
       inputs are clipped to what was seen.
     - The covariance of the end, and its inflation, are ours; a millimetre is added each way.
 
