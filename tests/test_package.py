@@ -27,7 +27,7 @@ def test_import_is_light_and_silent():
 
 @pytest.mark.slow
 def test_all_but_extras_runs_without_their_libraries():
-    """What `pip install slipid` brings is enough to identify, deploy, tune and run the demo."""
+    """What `pip install slipid` brings is enough to identify, deploy and run the demo."""
     rooms = (
         *(
             "cli.demo",
@@ -36,7 +36,7 @@ def test_all_but_extras_runs_without_their_libraries():
             "job.compare",
             "identify.posterior.diagnosis",
         ),
-        *("deploy.deploy", "deploy.tune", "deploy.trial", "api.fit", "api.driving", "plots.fit"),
+        *("deploy.deploy", "deploy.trial", "api.fit", "api.driving", "plots.fit"),
     )
     code = (
         "import sys\nfrom importlib import import_module\n"

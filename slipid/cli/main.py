@@ -25,7 +25,6 @@ from slipid.cli.selftest import selftest
 from slipid.cli.simulate import simulate
 from slipid.cli.track import track
 from slipid.cli.trial import trial
-from slipid.cli.tune import tune
 from slipid.cli.validate import validate
 
 app = typer.Typer(
@@ -37,7 +36,7 @@ app = typer.Typer(
 )
 for command in (
     *(new, reference, motor, check, selftest, identify, sample, validate, compare),
-    *(design, tune, trial, export, simulate, calibrate, track, map_, floors, paper),
+    *(design, trial, export, simulate, calibrate, track, map_, floors, paper),
     *(benchmark, demo),
 ):
     app.command(command.__name__.rstrip("_"))(command)  # map is a word of Python

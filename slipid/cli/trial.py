@@ -44,9 +44,8 @@ def trial(
 ) -> int:
     """Drive the 2021 paper's rectangle, or another path, with every controller, and judge them.
 
-    Gains are those that `slipid tune` put into robot.json, if it found them better than those set
-    by hand. Writes trial.json and trial.png to OUT; runs that are done are kept and not driven
-    again.
+    Gains are those set by hand, or tuned ones of an older robot.json that are better than those.
+    Writes trial.json and trial.png to OUT; runs that are done are kept and not driven again.
     """
     from slipid.deploy.trial import Wish, names_of
     from slipid.deploy.trial import trial as run

@@ -15,18 +15,16 @@ does not come about it stops and says so.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import UNTIMED_S, Estimate, Numbers
-from slipid.control.least_error import wheel_speeds
 from slipid.parameter import parameter
 
 Correction = Literal["none", "torque", "paper_print", "paper_code"]
@@ -55,7 +53,6 @@ class Gains(eqx.Module):
     place: Array = parameter("1/s", "k", "pose loop", start=1.5)
     yaw: Array = parameter("1/s", "k_yaw", "heading loop", start=1.5)
     integral: Array = parameter("1/s^2", "k_i", "pose error's integral", start=0.0)
-    ahead: Array = parameter("1", "k_f", "share of wheel speeds by the contact model", start=0.0)
     observer: Array = parameter("1", "k_d", "disturbance observer", start=0.0)
     preview: Array = parameter(
         "s", "t_p", "how early rates are asked for, as wheels follow late", start=0.2
@@ -72,7 +69,7 @@ class Gains(eqx.Module):
             return cls()
         if not (tuned.is_better or forced):
             return cls()
-        return cls.at([g["value"] for g in asdict(tuned.values).values()])
+        return cls.at([getattr(tuned.values, f.name).value for f in fields(cls)])
 
     @classmethod
     def at(cls, values: Sequence[Float[Array, ""] | float] | Float[Numbers, " gain"]) -> "Gains":
@@ -232,7 +229,7 @@ class Controller(eqx.Module):
         a = 1 - jnp.exp(-dt / OBSERVE_S)
         miss = old.miss + a * (twist - old.wanted - old.miss)
         asked = wanted - k.observer * miss
-        wheels = self._wheels(old, asked, e) + self._torque(wanted, e)
+        wheels = self.robot.forward @ asked / self.robot.frame.radius + self._torque(wanted, e)
         before = jnp.where(old.begun, old.command, jnp.where(safe, e.wheel_speed, 0.0))
         wheels = jnp.where(safe, wheels, 0.0)
         since = jnp.where(safe, dt, jnp.maximum(dt, UNTIMED_S))
@@ -277,15 +274,6 @@ class Controller(eqx.Module):
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         turn = ref[5] + self.gains.yaw * jnp.sin(ref[2] - pose[2])
         return jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0], turn])
-
-    def _wheels(self, old: ControllerState, asked: Array, e: Estimate) -> Array:
-        """Wheel speeds for a twist: a share of those by the contact model, the rest kinematics."""
-        f, ahead = self.robot, self.gains.ahead
-        plain = f.forward @ asked / f.frame.radius
-        if not isinstance(ahead, jax.core.Tracer) and float(ahead) == 0.0:
-            return plain  # the compiled code goes without the contact model
-        known = wheel_speeds(f, asked, e.believed, e.wheel_speed, old.command)
-        return plain + ahead * (known - plain)
 
     def _torque(self, wanted: Array, e: Estimate) -> Array:
         """The 2021 paper's correction by the forces off the commanded direction [rad/s]."""

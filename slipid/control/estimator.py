@@ -19,7 +19,7 @@ from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.filter.pose_filter import PoseFilter, turned_axes
 from slipid.control.filter.pose_fix import PoseState, placed
 from slipid.control.filter.wheels import WheelState, read_currents, read_wheels, time_step
-from slipid.control.interface import AbstractEstimator, Believed, Estimate, Pose, Readings, Settings
+from slipid.control.interface import AbstractEstimator, Estimate, Pose, Readings, Settings
 from slipid.model.se2 import advance, compose
 
 CURRENT_FROM = 0.4
@@ -120,7 +120,6 @@ class Estimator(AbstractEstimator[EstimatorState]):
             stale=jnp.any(wheels.age > s.stale_s),
             immobilised=stuck > 0.4,
             out_of_range=self._beyond(w, currents.filtered, unknown),
-            believed=Believed(floors.belief, floors.twist),
             labels=f.labels,
         )
 
@@ -222,6 +221,5 @@ class Odometry(AbstractEstimator[OdometryState]):
             stale=jnp.any(wheels.age > s.stale_s),
             immobilised=jnp.zeros((), bool),
             out_of_range=jnp.max(jnp.abs(w)) > 1.3 * f.highest[0],
-            believed=Believed.nothing(len(hypotheses_of(f))),
             labels=f.labels,
         )

@@ -139,24 +139,6 @@ class Measurement(eqx.Module):
         return Readings(**given)
 
 
-class Believed(eqx.Module):
-    """What is believed of the floors under the wheels, all wheels together.
-
-    Attributes:
-        probability: of every hypothesis, and of none of them in the last place.
-        twist: of the body by the contact alone, if it were true, at the estimate's wheel speeds
-            [m/s, m/s, rad/s].
-    """
-
-    probability: Float[Array, " hypothesis_or_none"]
-    twist: Float[Array, "hypothesis 3"]
-
-    @classmethod
-    def nothing(cls, hypotheses: int) -> "Believed":
-        """Of an estimator that knows no floors."""
-        return cls(jnp.zeros(hypotheses + 1).at[-1].set(1.0), jnp.zeros((hypotheses, 3)))
-
-
 class Estimate(eqx.Module):
     """What an estimator believes after a step; runs have leading axes in front of every array.
 
@@ -167,7 +149,6 @@ class Estimate(eqx.Module):
         surface_probability: of each floor in the order of `labels`, and of none of them in the last
             column, under each wheel.
         covariance: of the pose in the world frame [m, m, rad, each times each].
-        believed: of the floors, all wheels together.
         stale: wheels are not heard.
         immobilised: the wheels turn and the body does not move.
         out_of_range: faster, or drawing more, than the fit has seen, or on an unknown floor.
@@ -181,7 +162,6 @@ class Estimate(eqx.Module):
     current: Float[Array, " drive"]
     surface_probability: Float[Array, "wheel floor_or_none"]
     covariance: Float[Array, "3 3"]
-    believed: Believed
     stale: Bool[Array, ""]
     immobilised: Bool[Array, ""]
     out_of_range: Bool[Array, ""]

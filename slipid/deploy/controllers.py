@@ -17,6 +17,7 @@ from slipid.baselines.steering.goswami_padhy import (
     by_swarm,
 )
 from slipid.baselines.steering.indiveri import Indiveri, inverse_kinematics
+from slipid.control.actuation import Habits
 from slipid.control.closed_loop import PERIOD, Pilot
 from slipid.control.controller import Controller, Correction, Gains, Law, Limits
 from slipid.control.deployed import DeployedRobot
@@ -24,7 +25,6 @@ from slipid.control.estimator import Estimator, Odometry
 from slipid.control.filter.floor import Floor
 from slipid.control.interface import AbstractEstimator, Settings
 from slipid.control.trajectory import STEP, rectangle
-from slipid.control.tuning.actuation import Habits
 from slipid.support.errors import DataError
 
 
@@ -37,8 +37,7 @@ class Row:
         about: one sentence for people.
         correction: of the 2021 paper.
         law: a published one in place of the pose loop, made for a robot.
-        tuned: whether it has the gains of `slipid tune`, where they are better than by hand.
-        ahead: whether wheel speeds come from the contact model, whatever the gains say.
+        tuned: whether it has the tuned gains of its file, where they are better than by hand.
         gyro: whether the robot has one.
         mapped: whether it is told the map of its floors.
     """
@@ -48,7 +47,6 @@ class Row:
     correction: Correction = "none"
     law: Callable[[DeployedRobot], Law] | None = None
     tuned: bool = False
-    ahead: bool = False
     gyro: bool = False
     mapped: bool = False
 
@@ -112,7 +110,6 @@ ROWS: Mapping[str, Row] = {
     ),
     "indiveri": Row("encoder", "law of Indiveri, its limit keeps the direction", law=_indiveri),
     "contact": Row("contact", "contact estimator, tuned gains where they are better", tuned=True),
-    "contact_ahead": Row("contact", "and wheel speeds by the contact model", ahead=True),
     "contact_map": Row("contact", "contact, told the map of its floors", tuned=True, mapped=True),
     "contact_gyro": Row("contact", "contact, with a gyro", tuned=True, gyro=True),
 }
@@ -134,37 +131,36 @@ def applying(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
     return kept
 
 
-def check_gains(out: Path, robot: DeployedRobot, forced: bool) -> None:
-    """Refuse gains that `slipid tune` found for other numbers or another load set-up.
-
-    So are gains that are wanted (`forced`) and not there.
-    """
-    tuned, path = robot.record.gains, out / "gains.json"
-    if tuned is None and path.is_file():
+def check_gains(out: Path, robot: DeployedRobot) -> None:
+    """Raise `DataError` if tuned gains are wanted that this robot and load set-up do not have."""
+    tuned, path = robot.record.gains, out / "robot.json"
+    if tuned is None:
+        raise DataError(f"{path}: it has no tuned gains; leave out --tuned-gains")
+    if tuned.load != robot.load_setup:
         raise DataError(
-            f"{path}: tuned for another fit; run slipid tune again, or remove it to drive with "
-            "gains set by hand"
-        )
-    if forced and tuned is None:
-        raise DataError(
-            f"{out / 'robot.json'}: it has no tuned gains; run slipid tune, or leave out "
-            "--tuned-gains"
-        )
-    if tuned is not None and (tuned.is_better or forced) and tuned.load != robot.load_setup:
-        raise DataError(
-            f"{out / 'robot.json'}: gains were tuned for another load set-up ({tuned.load}); run "
-            f"slipid tune again with --load {robot.load_setup}"
+            f"{path}: gains were tuned for another load set-up ({tuned.load}), not for "
+            f"{robot.load_setup}; leave out --tuned-gains, or drive with --load {tuned.load}"
         )
 
 
 def unused_gains(robot: DeployedRobot, forced: bool) -> str:
-    """What a driver must know of tuned gains that are not taken; empty where there are none."""
+    """Return which tuned gains of the file are not taken, and why; empty where all are."""
     tuned = robot.record.gains
-    if tuned is None or tuned.is_better or forced:
+    if tuned is None:
+        return ""
+    if tuned.load != robot.load_setup:
+        return f"gains were tuned for load set-up {tuned.load}: driving with those set by hand"
+    if not (tuned.is_better or forced):
+        return (
+            f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "
+            f"{tuned.loss.hand:.1f} mm): driving with those set by hand; --tuned-gains takes the "
+            "others"
+        )
+    if tuned.values.ahead.value == 0.0:
         return ""
     return (
-        f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "
-        f"{tuned.loss.hand:.1f} mm): driving with those set by hand; --tuned-gains takes the others"
+        f"tuned gain ahead = {tuned.values.ahead.value:g} is not taken: there are no wheel speeds "
+        "by the contact model any more"
     )
 
 
@@ -189,8 +185,6 @@ def pilot_of(
             f"robot has {robot.wheels}"
         )
     own = Gains.of(robot, forced) if row.tuned else Gains()
-    if row.ahead:
-        own = replace(own, ahead=jnp.asarray(1.0))
     estimator: AbstractEstimator[Any] = Estimator(robot, settings, floor if row.mapped else None)
     if row.observer != "contact":
         estimator = Odometry(robot, settings, curve=row.observer == "curve")

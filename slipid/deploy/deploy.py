@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from slipid.control.actuation import Habits
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import MIXED
 from slipid.control.robot_file.record import Number, Sensors, Source
 from slipid.control.robot_file.typed import typed
-from slipid.control.tuning.actuation import Habits
 from slipid.deploy.record_of import record_of
 from slipid.deploy.told import told_by_load
 from slipid.identify.posterior.diagnosis import Posterior, estimates
@@ -29,9 +29,8 @@ from slipid.support.errors import DataError
 ROBOT = "robot.json"
 NO_CONTROLLER = (
     "the wheels of this robot cannot be asked for any motion ahead, sideways and in yaw, each "
-    "wheel alone: it has an estimator (slipid.Estimator), but no controller, so nothing to tune, "
-    "to drive in a trial or to export; identify, validate, compare, sample, selftest and design "
-    "apply"
+    "wheel alone: it has an estimator (slipid.Estimator), but no controller, so nothing to drive "
+    "in a trial or to export; identify, validate, compare, sample, selftest and design apply"
 )
 """What is said of wheels that have no controller."""
 DRAWS = 64

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.control import closed_loop, trajectory
+from slipid.control.actuation import Habits
 from slipid.control.controller import Gains
 from slipid.control.deployed import DeployedRobot
 from slipid.control.interface import Settings
 from slipid.control.robot_file.typed import typed
-from slipid.control.tuning.actuation import Habits
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import ROWS, applying, check_gains, pilot_of, unused_gains
 from slipid.deploy.deploy import habits_of, read_robot
@@ -169,7 +169,8 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         known_to_fit(floor, robot, str(wish.map))
     if wish.told_map is not None:
         known_to_fit(told, robot, str(wish.told_map))
-    check_gains(out, robot, wish.tuned_gains)
+    if wish.tuned_gains:
+        check_gains(out, robot)
     key = key_of(
         *(
             wish.plant,

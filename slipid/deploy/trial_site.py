@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from slipid.control.actuation import Habits
 from slipid.control.deployed import DeployedRobot, drawn
 from slipid.control.interface import Measurement
 from slipid.control.trajectory import Path
-from slipid.control.tuning.actuation import Habits
-from slipid.control.tuning.twin import Twin, TwinPlant
+from slipid.control.twin import Twin, TwinPlant
 from slipid.data.floor_map import FloorMap, patchwork
 from slipid.deploy.floors import floor_of
 from slipid.support.errors import DataError
@@ -158,6 +158,6 @@ def twin(
     seed: int,
     habits: Habits,
 ) -> TwinPlant:
-    """The identified model itself as a plant, see `slipid.control.tuning.twin`."""
+    """The identified model itself as a plant, see `slipid.control.twin`."""
     made = Twin(robot, floor_of(floor, robot.labels), habits)
     return TwinPlant(made, jnp.asarray(start), jax.random.key(seed))

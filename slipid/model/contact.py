@@ -220,28 +220,3 @@ def settle(
     twist = jnp.stack(jax.tree.map(lambda x, p: jnp.where(sound, x, p), found, free))
     felt = jnp.where(nearer, balance.felt(xi), balance.felt(near))
     return twist, jnp.where(jnp.isfinite(felt), felt, 0.0)
-
-
-def steered(
-    xi: Planar, rim: Float[Array, " wheel"], on: Stance, most: Float[Array, "3"]
-) -> Float[Array, "wheel 3 floors"]:
-    """Derivative of many equilibria at once by the rim speed of each wheel, [1], [1] and [rad/m].
-
-    Where all wheels slide the balance is flat and its derivative leads nowhere; `most` bounds it.
-
-    Args:
-        xi: twists at which the forces balance; rim: rim speeds of the robot [m/s].
-        on: how it stands on each combination of floors.
-        most: bound of each axis.
-    """
-
-    def force(rim: Array) -> Planar:
-        return Balance(rim[:, None], on).force(xi)
-
-    def by(one: Array) -> Planar:
-        return jax.jvp(force, (rim,), (one,))[1]
-
-    pushed = jax.vmap(by)(jnp.eye(len(rim)))
-    slope = jnp.stack(solve3(Balance(rim[:, None], on).jacobian(xi), pushed), axis=1)
-    bound = most[None, :, None]
-    return -jnp.nan_to_num(jnp.clip(slope, -bound, bound))

@@ -133,29 +133,6 @@ def _saving(s: Content) -> str:
     )
 
 
-def show_gains(page: Page, found: Content) -> None:
-    """Write the content of gains.json."""
-    gains = table(("gain", "value", "spread", "by hand", "unit"), right=("value", "spread"))
-    hand = found["settings"]["hand"]
-    for name, g in found["gains"].items():
-        gains.add_row(name, f"{g['value']:.3f}", f"{g['spread']:.3f}", f"{hand[name]:g}", g["unit"])
-    page.table(gains)
-    loss, margin = found["loss"], found["stability_margin"]
-    page.line(
-        f"loss on {found['settings']['judged_on']} cases not tuned on: by hand {loss['hand']:.1f} "
-        f"mm, tuned {loss['tuned']:.1f} mm; better in {found['better_than_hand']:.0%} of them"
-    )
-    gained = found["improvement"]
-    page.line(
-        f"tuned gains are {found['verdict']}: the loss changes by {-gained['value']:+.1f} mm "
-        f"(standard error {gained['se']:.1f})"
-    )
-    page.line(
-        f"stability margin (1 - spectral radius): worst {margin['worst']:.4f}, "
-        f"median {margin['median']:.4f}"
-    )
-
-
 def show_export(page: Page, done: Exported) -> None:
     """Write what is in a folder for a robot, and what must be known of its numbers."""
     page.line(f"in {done.folder}: README.md, robot.json, {', '.join(f'{x}/' for x in done.forms)}")

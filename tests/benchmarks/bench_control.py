@@ -20,7 +20,7 @@ import pytest
 
 TWIN = Path(__file__).with_name("twin.c")
 STEPS, SECONDS = 1_000_000, 120.0
-BARS = {"contact": 100.0, "contact_map": 200.0, "contact_ahead": 200.0, "slip_odometry": 15.0}
+BARS = {"contact": 100.0, "contact_map": 200.0, "slip_odometry": 15.0}
 """Medians to stay below [us], of rows of `slipid trial`."""
 
 

@@ -125,7 +125,7 @@ def driven(robot, row, path, steps=STEPS):
     from slipid.control.closed_loop import PERIOD, Course, Pilot, metrics
     from slipid.control.filter.floor import Floor
     from slipid.control.interface import Settings
-    from slipid.control.tuning.twin import rollout
+    from slipid.control.twin import rollout
     from slipid.deploy.controllers import ROWS as TRIAL
     from slipid.deploy.controllers import pilot_of
     from slipid.deploy.deploy import habits_of

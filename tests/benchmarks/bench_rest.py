@@ -43,7 +43,7 @@ def ends(robot):
     from slipid.control.closed_loop import PERIOD
     from slipid.control.filter.floor import Floor
     from slipid.control.interface import Settings
-    from slipid.control.tuning.twin import rollout
+    from slipid.control.twin import rollout
     from slipid.deploy.controllers import ROWS, pilot_of
     from slipid.deploy.deploy import habits_of
     from slipid.deploy.trial_site import one_of

@@ -27,7 +27,7 @@ from slipid.control import trajectory
 from slipid.control.closed_loop import PERIOD, Pilot
 from slipid.control.deployed import DeployedRobot
 from slipid.control.export.c99.code import Code
-from slipid.control.tuning.twin import Twin
+from slipid.control.twin import Twin
 from slipid.deploy.controllers import ROWS, pilot_of
 from slipid.deploy.deploy import habits_of, read_robot
 from slipid.deploy.floors import floor_of

@@ -200,7 +200,7 @@ def test_check_says_what_there_is(bench):
     "words",
     [
         ("validate", "OUT", "--data", "."),
-        *((name, "OUT") for name in ("tune", "trial", "sample", "design")),
+        *((name, "OUT") for name in ("trial", "sample", "design")),
         ("export", "OUT", "--out", "x"),
         ("compare", "CONFIG", "--data", ".", "--out", "x"),
         ("selftest", "CONFIG"),

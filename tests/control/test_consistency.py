@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from slipid.control.actuation import Habits
 from slipid.control.estimator import Estimator
 from slipid.control.filter.effects import SETTLES, TURN, stays
 from slipid.control.filter.floor import Floor
@@ -19,8 +20,7 @@ from slipid.control.filter.floor_filter import FloorFilter
 from slipid.control.filter.pose_filter import PoseFilter, _learnt
 from slipid.control.filter.pose_fix import _given, fixed
 from slipid.control.interface import MIXED, Measurement, Readings, Settings
-from slipid.control.tuning.actuation import Habits
-from slipid.control.tuning.twin import Twin
+from slipid.control.twin import Twin
 from slipid.model import contact
 from slipid.model.se2 import advance, compose
 from tests.helpers.kept import kept

@@ -21,14 +21,14 @@ from slipid.control.filter.floor import Floor
 from slipid.control.filter.floor_filter import FloorFilter
 from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.filter.pose_fix import _within
-from slipid.control.interface import UNTIMED_S, Believed, Measurement, Readings, Settings
+from slipid.control.interface import UNTIMED_S, Measurement, Readings, Settings
 from slipid.control.trajectory import rectangle
-from slipid.control.tuning.twin import Twin, TwinPlant
+from slipid.control.twin import Twin, TwinPlant
 from slipid.model import contact
-from slipid.model.geometry import mecanum, omni
+from slipid.model.geometry import omni
 from slipid.model.robot import build
 from tests.helpers import small_twin
-from tests.helpers.compiled_pilot import CompiledPilot, Flat
+from tests.helpers.compiled_pilot import Flat
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.stepped import stepped
 
@@ -62,9 +62,9 @@ def robot():
 def pilot(kind):
     deployed = robot()
     if kind == "curve":
-        gains = Gains.at((2.0, 2.0, 0.2, 0.0, 0.0, 0.15))
+        gains = Gains.at((2.0, 2.0, 0.2, 0.0, 0.15))
         return Pilot(Odometry(deployed, curve=True), Controller(deployed, gains))
-    gains = Gains.at((2.0, 2.0, 0.2, 1.0, 0.3, 0.15))
+    gains = Gains.at((2.0, 2.0, 0.2, 0.3, 0.15))
     there = CHESS if kind == "mapped" else None
     return Pilot(Estimator(deployed, floor=there), Controller(deployed, gains))
 
@@ -491,7 +491,7 @@ def test_the_observer_takes_a_constant_disturbance_out():
     """A body that does what it is asked to but for a constant: what is wanted comes about."""
     f = robot()
     for gain, left in ((0.0, 1.0), (1.0, 0.0)):
-        con = Controller(f, Gains.at((0.0, 0.0, 0.0, 0.0, gain, 0.0)))
+        con = Controller(f, Gains.at((0.0, 0.0, 0.0, gain, 0.0)))
         reference = jnp.array([0.0, 0.0, 0.0, 0.1, 0.05, 0.0])
         off, state, twist = np.array([-0.04, 0.02, 0.1]), con.init(), np.zeros(3)
         for _ in range(120):
@@ -504,7 +504,7 @@ def test_the_observer_takes_a_constant_disturbance_out():
 def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_and_says_so():
     """Going and turning cancel at two of its three wheels, as they do where only one spins."""
     f = robot()
-    con = Controller(f, Gains.at((1.5, 1.5, 0.0, 0.0, 0.0, 0.0)), Limits(acceleration=1e4))
+    con = Controller(f, Gains.at((1.5, 1.5, 0.0, 0.0, 0.0)), Limits(acceleration=1e4))
     reference = jnp.array([0.0, 0.05, np.arcsin(0.25), 0.0, 0.0, 0.0])
     said = estimate(f, immobilised=jnp.ones((), bool))
     step = jax.jit(lambda s, e: con.step(s, reference, e, DT))
@@ -533,7 +533,7 @@ def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_an
 
 def test_a_robot_that_hardly_goes_where_it_is_asked_to_go_counts_as_stuck_and_one_that_goes_not():
     f = robot()
-    con = Controller(f, Gains.at((1.5, 1.5, 0.0, 0.0, 0.0, 0.0)))
+    con = Controller(f, Gains.at((1.5, 1.5, 0.0, 0.0, 0.0)))
     reference = jnp.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0])
     step = jax.jit(lambda s, e: con.step(s, reference, e, DT))
     for speed, stuck in ((0.1, False), (0.02, True)):
@@ -577,55 +577,16 @@ def estimate(f, **known):
 
 
 @pytest.mark.slow
-def test_gains_that_are_known_when_compiled_command_the_same():
-    """Zero ones skip the contact model; the same gains as arguments do not."""
-    for ahead in (0.0, 0.7):
-        gains = Gains.at((1.5, 1.5, 0.1, ahead, 0.0, 0.2))
-        p = Pilot(Estimator(robot()), Controller(robot(), gains))
-        traced = eqx.filter_jit(lambda p, state, z: p.step(PATH, state, z, DT))
-        known, commands = CompiledPilot(p, PATH), []
-        start = (0.05, 0.02, 0.1)
-        one, two = known.init(start), p.init(start)
-        for k in range(20):
-            z = reading(wheel_angle=jnp.array([0.3, -0.1, 0.2]) * k, current=jnp.full(3, 0.4))
-            one, out = known.call(one, np.asarray(known.measurements.ravel(z)), DT)
-            two, expected = traced(p, two, z)
-            np.testing.assert_allclose(out, known.outputs.ravel(expected), atol=1e-9)
-            commands.append(known.outputs.unravel(out).command)
-        assert np.abs(commands).max() > 1.0
-
-
-@pytest.mark.slow
-def test_mecanum_wheels_miss_less_of_a_twist_by_the_contact_model():
-    f = deploy_known(build(mecanum(0.2, 0.15, 0.05), ("a",)), highest_speed=10.0)
-    con = Controller(f, Gains.at((1.0, 1.0, 0.0, 1.0, 0.0, 0.0)))
-    asked = jnp.array([0.1, 0.1, 0.2])
-    speeds = plain = f.forward @ asked / f.frame.radius
-
-    def moved(w):
-        return contact.equilibrium(f.frame.radius * w, f.frame, f.floors.at(0), f.rest)
-
-    def missed(w):
-        return float(jnp.linalg.norm((moved(w) - asked) * jnp.array([1.0, 1.0, f.frame.base])))
-
-    for _ in range(5):  # periods in which wheels follow at once
-        sure = Believed(jnp.array([1.0, 0.0]), moved(speeds)[None])
-        state = eqx.tree_at(lambda s: s.command, con.init(), speeds)
-        speeds = con._wheels(state, asked, estimate(f, believed=sure, wheel_speed=speeds))
-    assert missed(speeds) < 0.5 * missed(plain)
-
-
-@pytest.mark.slow
-def test_what_is_believed_of_the_body_is_at_the_wheels_speeds_of_the_estimate():
+def test_twists_of_the_hypotheses_are_at_the_wheel_speeds_of_the_estimate():
     f, speed = robot(), wheels([0.15, -0.1, 0.4])
-    _, said = drive(watch()[0].init(), 30, speed, current=np.full(3, 0.4))
+    state, said = drive(watch()[0].init(), 30, speed, current=np.full(3, 0.4))
     e = said[-1]
     each = jax.vmap(
         lambda under: contact.equilibrium(
             f.frame.radius * e.wheel_speed, f.frame, f.floors.at(under), f.rest
         )
     )(jnp.asarray(hypotheses_of(f).under))
-    np.testing.assert_allclose(e.believed.twist, each, atol=3e-3)
+    np.testing.assert_allclose(state.floors.twist, each, atol=3e-3)
 
 
 @pytest.mark.slow

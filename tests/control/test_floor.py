@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from slipid.control import trajectory
+from slipid.control.actuation import Habits
 from slipid.control.closed_loop import Pilot
 from slipid.control.controller import Controller, Gains
 from slipid.control.estimator import Estimator
@@ -21,8 +22,7 @@ from slipid.control.filter.pose_filter import PoseFilter
 from slipid.control.filter.pose_fix import placed
 from slipid.control.filter.wheels import Currents
 from slipid.control.interface import MIXED, Measurement, Settings
-from slipid.control.tuning.actuation import Habits
-from slipid.control.tuning.twin import Twin, rollout
+from slipid.control.twin import Twin, rollout
 from tests.helpers.small_twin import deployed, floor
 
 CHESS = [[(i + j) % 2 for j in range(6)] for i in range(6)]

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from slipid.control import trajectory as reference
+from slipid.control.actuation import Habits
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.filter.floor import Floor
 from slipid.control.interface import Settings
-from slipid.control.tuning.actuation import Habits
-from slipid.control.tuning.twin import Twin, rollout
+from slipid.control.twin import Twin, rollout
 from slipid.data.floor_map import patchwork
 from slipid.data.reading.presets import preset
 from slipid.data.runs import Runs, collect
@@ -108,7 +108,6 @@ def test_twin_and_controllers_do_what_was_reviewed(deployed: DeployedRobot, gold
             "encoder",
             "paper_code",
             "contact",
-            "contact_ahead",
             "contact_map",
             "contact_gyro",
         ):

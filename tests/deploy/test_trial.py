@@ -265,15 +265,13 @@ def test_the_distance_from_a_path_is_from_its_line():
 
 
 def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
-    tuned = Gains.at(np.arange(6) + 0.5)
+    tuned = Gains.at(TUNED)
     robot = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
-    for name, row in ROWS.items():
+    for row in ROWS.values():
         if row.law is not None:  # it takes a second to make
             continue
         found = pilot_of(robot, row).controller.gains
         expected = tuned if row.tuned else Gains()
-        if name == "contact_ahead":
-            expected = replace(expected, ahead=jnp.asarray(1.0))
         if row.observer != "contact":
             expected = replace(expected, preview=jnp.asarray(0.0))
         assert values(found) == values(expected)
@@ -281,7 +279,7 @@ def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
 
 def test_a_law_stands_in_place_of_the_pose_loop(deployed):
     """With gains that are all the same the law of Goswami and Padhy is the pose loop."""
-    gains = Gains.at((1.5, 1.5, 0.0, 0.0, 0.0, 0.0))
+    gains = Gains.at((1.5, 1.5, 0.0, 0.0, 0.0))
     loop = Controller(deployed, gains)
     same, other = (
         Controller(deployed, gains, law=GoswamiPadhy(jnp.full(3, k))) for k in (1.5, 3.0)
@@ -559,27 +557,31 @@ def values(gains):
     return [float(x) for x in jax.tree.leaves(gains)]
 
 
-def tuned_for(load, verdict="better than by hand"):
-    values = GainValues(*(GainRecord(k + 0.5, "1", 0.1) for k in range(6)))
+TUNED = [0.5, 1.5, 2.5, 4.5, 5.5]
+
+
+def tuned_for(load, verdict="better than by hand", ahead=0.0):
+    values = GainValues(*(GainRecord(k, "1", 0.1) for k in (*TUNED[:3], ahead, *TUNED[3:])))
     losses = Losses(hand=2.0, tuned=1.0)
     return GainsRecord(values, load, False, "pso", losses, 0.9, 0.01, verdict)
 
 
 def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
-    check_gains(tmp_path, deployed, False)
     assert values(Controller(deployed).gains) == values(Gains())
+    assert unused_gains(deployed, forced=False) == ""
     tuned = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
-    check_gains(tmp_path, tuned, False)
-    assert values(Controller(tuned).gains) == [k + 0.5 for k in range(6)]
+    check_gains(tmp_path, tuned)
+    assert values(Controller(tuned).gains) == TUNED
+    assert unused_gains(tuned, forced=False) == ""
     other = DeployedRobot.of(replace(deployed.record, gains=tuned_for("far")))
     assert values(Controller(other).gains) == values(Gains())
-    with pytest.raises(DataError, match=r"another load set-up \(far\); run slipid tune again with"):
-        check_gains(tmp_path, other, False)
-    with pytest.raises(DataError, match="it has no tuned gains; run slipid tune, or leave out"):
-        check_gains(tmp_path, deployed, True)
-    (tmp_path / "gains.json").write_text("{}")
-    with pytest.raises(DataError, match="tuned for another fit; run slipid tune again, or remove"):
-        check_gains(tmp_path, deployed, False)
+    assert "tuned for load set-up far: driving with those set by hand" in unused_gains(other, False)
+    with pytest.raises(
+        DataError, match=r"another load set-up \(far\), not for as_built; leave out"
+    ):
+        check_gains(tmp_path, other)
+    with pytest.raises(DataError, match="it has no tuned gains; leave out --tuned-gains"):
+        check_gains(tmp_path, deployed)
 
 
 def test_tuned_gains_that_are_no_better_are_left_aside_and_that_is_said(deployed):
@@ -591,10 +593,14 @@ def test_tuned_gains_that_are_no_better_are_left_aside_and_that_is_said(deployed
     row = ROWS["contact"]
     assert values(pilot_of(robot, row).controller.gains) == values(Gains())
     assert unused_gains(robot, forced=True) == ""
-    assert values(pilot_of(robot, row, forced=True).controller.gains) == [k + 0.5 for k in range(6)]
-    assert unused_gains(deployed, forced=False) == ""
-    better = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
-    assert unused_gains(better, forced=False) == ""
+    assert values(pilot_of(robot, row, forced=True).controller.gains) == TUNED
+
+
+def test_a_file_with_the_gain_that_is_gone_drives_with_the_others_and_that_is_said(deployed):
+    gains = tuned_for("as_built", ahead=0.7)
+    robot = DeployedRobot.of(replace(deployed.record, gains=gains))
+    assert values(pilot_of(robot, ROWS["contact"]).controller.gains) == TUNED
+    assert "tuned gain ahead = 0.7 is not taken" in unused_gains(robot, forced=False)
 
 
 def run_of(name, k, closure, finished=True):

@@ -29,6 +29,8 @@ GAINS = GainsRecord(
     verdict="better than by hand",
 )
 """Tuned for a load set-up named "moved"."""
+USED = [0.0, 0.1, 0.2, 0.4, 0.5]
+"""Values of those that a controller takes."""
 
 
 def deploy_known(

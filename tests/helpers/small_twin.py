@@ -1,4 +1,4 @@
-"""A small deployed robot on two floors, for tests of the twin and of tuning."""
+"""A small deployed robot on two floors, for tests of the twin."""
 
 from functools import cache
 

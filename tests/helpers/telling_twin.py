@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from slipid.control.interface import Readings
-from slipid.control.tuning.twin import Twin, TwinState
+from slipid.control.twin import Twin, TwinState
 
 
 class TellingTwin(Twin):

@@ -19,7 +19,7 @@ def origin(robot: DeployedRobot) -> str:
     limits = "Limits are the defaults of slipid: put in those of your motors and supply."
     tuned = robot.record.gains
     if tuned is None:
-        return f"Gains set by hand; `slipid tune` has not looked for others. {limits}"
+        return f"Gains set by hand. {limits}"
     if tuned.load != robot.load_setup:
         load = one_line(tuned.load)
         return f"Gains set by hand; those tuned are for the load set-up {load}. {limits}"

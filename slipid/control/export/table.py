@@ -80,7 +80,7 @@ def _lines(robot: DeployedRobot) -> Iterator[Line]:
 def _gains(robot: DeployedRobot) -> Iterator[Line]:
     gains, tuned = Gains.of(robot), robot.record.gains
     taken = tuned is not None and tuned.is_better and tuned.load == robot.load_setup
-    sure = ("tuned, better than by hand", "slipid tune") if taken else ("by hand", "default")
+    sure = ("tuned, better than by hand", "robot.json") if taken else ("by hand", "default")
     for e in entries(gains):
         d = e.declaration
         spread = getattr(tuned.values, e.path).spread if tuned is not None and taken else None

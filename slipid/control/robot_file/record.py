@@ -165,7 +165,11 @@ class GainRecord:
 
 @dataclass(frozen=True)
 class GainValues:
-    """Every gain, as `slipid.control.controller.Gains` has them."""
+    """Every gain as `slipid.control.controller.Gains` has them, and one that is not used any more.
+
+    Attributes:
+        ahead: share of wheel speeds by the contact model, which controllers had.
+    """
 
     place: GainRecord
     yaw: GainRecord
@@ -185,7 +189,7 @@ class Losses:
 
 @dataclass(frozen=True)
 class GainsRecord:
-    """Gains that `slipid tune` found.
+    """Tuned gains of a file that an earlier version wrote; nothing tunes gains any more.
 
     Attributes:
         load: set-up they were tuned for; gyro: whether with one.

@@ -1,4 +1,4 @@
-"""The identified robot as a plant: what closed-loop runs are tuned and rehearsed on.
+"""The identified robot as a plant: what closed-loop runs are rehearsed on.
 
 Commands reach the wheels late, a slew and a lag after; wheels on several floors move the body as
 the contact says, and what the fit says the model misses is drawn anew for every run, effects as
@@ -24,13 +24,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.control.actuation import RING, Habits
 from slipid.control.closed_loop import PERIOD, Pilot, PilotOutput, PilotState
 from slipid.control.deployed import DeployedRobot
 from slipid.control.filter.effects import Course, direction, stays
 from slipid.control.filter.floor import Floor
 from slipid.control.interface import Measurement, Pose, Readings, State
 from slipid.control.trajectory import Path
-from slipid.control.tuning.actuation import RING, Habits
 from slipid.model import contact
 from slipid.model.robot import GRAVITY
 from slipid.model.se2 import advance, compose

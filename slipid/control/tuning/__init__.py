@@ -1,1 +1,0 @@
-"""Gains by rehearsal on the identified robot; not deployed."""
