@@ -32,7 +32,7 @@ ifneq ($(NOTEBOOKS),)
 endif
 	$(BIN)/python -m pytest -q $(TWO) -m "not slow and not nightly"
 
-bench: $(VENV)/.dev-stamp ## speed, left-out errors, load shares, known truth, posteriors (hours)
+bench: $(VENV)/.dev-stamp ## speed, left-out errors, load shares, known truth, posteriors (hours; SLIPID_BENCH_QUICK=1: minutes, tries them)
 ifneq ($(BENCHES),)
 	$(BIN)/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks
 else

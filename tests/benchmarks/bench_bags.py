@@ -22,7 +22,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-GB = float(os.environ.get("SLIPID_BAG_GB", "1"))
+from tests.benchmarks.quick import QUICK, quick
+
+GB = float(os.environ.get("SLIPID_BAG_GB", quick("1", "0.02")))
 IMAGE = 640 * 480 * 3
 RATES = {"/camera": 10, "/joint_states": 500, "/imu": 200, "/odom": 50, "/cmd_vel": 20}
 WANTED = [topic for topic in RATES if topic != "/camera"]
@@ -192,11 +194,11 @@ def test_reading_is_as_fast_as_bare_iteration(bag):
     for name, seconds in best.items():
         ratios = [best[how] / seconds for how in ("bare iteration", "iteration with objects")]
         print(f"{name:24s} {seconds:7.3f} s; speed over {ratios[0]:5.2f} and {ratios[1]:5.2f}")
-    assert best["iteration with objects"] / best["read_bag but the hash"] >= 0.7
-    assert best["bare iteration"] / best["read_bag but the hash"] >= 0.5
+    assert QUICK or best["iteration with objects"] / best["read_bag but the hash"] >= 0.7
+    assert QUICK or best["bare iteration"] / best["read_bag but the hash"] >= 0.5
 
 
 def test_memory_is_that_of_the_wanted_numbers(bag):
     grown, kept = alone(memory_of, bag)
     print(f"\nmemory grew by {grown:.0f} MiB at most; {kept:.0f} MiB of it are the signals")
-    assert grown < 10.0 * kept + 100.0
+    assert QUICK or grown < 10.0 * kept + 100.0

@@ -17,9 +17,10 @@ import jax
 import numpy as np
 from scipy.stats import binom, chi2
 
+from tests.benchmarks.quick import QUICK, quick
 from tests.helpers import calibration
 
-REPLICATES = 200
+REPLICATES = quick(200, 2)
 BINS = 10
 
 
@@ -41,8 +42,8 @@ def test_coverage_and_ranks():
             took = time.perf_counter() - began
             print(f"{len(rows)}: {took:.0f} s, R-hat {rows[-1]['r_hat']:.3f}", flush=True)
     covered, even = report(rows, folder)
-    assert covered.all()
-    assert even.all()
+    assert QUICK or covered.all()
+    assert QUICK or even.all()
 
 
 def replicate(seed):

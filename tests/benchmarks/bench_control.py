@@ -18,8 +18,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.benchmarks.quick import QUICK, quick
+
 TWIN = Path(__file__).with_name("twin.c")
-STEPS, SECONDS = 1_000_000, 120.0
+STEPS, SECONDS = quick((1_000_000, 120.0), (300, 20.0))
 BARS = {"contact": 100.0, "contact_map": 200.0, "slip_odometry": 15.0}
 """Medians to stay below [us], of rows of `slipid trial`."""
 
@@ -112,7 +114,7 @@ def test_one_step(kind):
         f" empty call {nothing:.1f}; compiled in {compiling:.1f} s"
     )
     # no time is asserted; a tail needs steps
-    assert len(took) >= 10_000
+    assert QUICK or len(took) >= 10_000
 
 
 # rollouts ------------------------------------------------------------------------------------
@@ -195,9 +197,9 @@ def rollouts(folder, robots, steps):
 
 
 @pytest.mark.skipif(not (shutil.which("gcc") or shutil.which("cc")), reason="no C compiler")
-@pytest.mark.parametrize("robots", [27, 256, 1024])
+@pytest.mark.parametrize("robots", quick([27, 256, 1024], [27]))
 def test_rollouts_beside_their_twin_in_c(tmp_path, robots):
-    steps = 100_000 // robots
+    steps = quick(100_000, 1_000) // robots
     took, apart = alone(rollouts, str(tmp_path), robots, steps)
     each = {name: 1e9 * t / (steps * robots) for name, t in took.items()}
     print(

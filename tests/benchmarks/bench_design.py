@@ -18,9 +18,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from tests.benchmarks.quick import QUICK, quick
 from tests.helpers import designs
 
-SEEDS, WHOLE = 12, 36
+SEEDS, WHOLE = quick((12, 36), (1, 8))
 NAMES = ("load share", "end point")
 FREE = 2
 """Least independent numbers behind each error: two shares, an end's two coordinates."""
@@ -31,7 +32,7 @@ def driven(drives, expected):
     began, found = time.perf_counter(), []
     for seed in range(SEEDS):
         z, converged = designs.fit_logs(drives, seed)
-        assert converged
+        assert QUICK or converged
         found.append(designs.errors(z))
     real = np.sqrt(np.mean(np.square(found), axis=0))
     for name, r, e in zip(NAMES, real, expected, strict=True):
@@ -57,8 +58,10 @@ def test_chosen_runs_do_what_was_expected_of_them():
         gain = real["grid"][k] / real["chosen"][k]
         hoped = plans.expected["grid"][k] / plans.expected["chosen"][k]
         print(f"{name}: the grid's error is {gain:.2f} times as large, expected {hoped:.2f}")
-        assert gain > 1.0
-    fewer = next(n for n in range(4, WHOLE) if better(designs.plans(n), plans))
+        assert QUICK or gain > 1.0
+    few = (n for n in range(4, WHOLE) if better(designs.plans(n), plans))
+    fewer = next(few, WHOLE)
+    assert QUICK or fewer < WHOLE
     print(f"\n{fewer} chosen runs are expected to do what {WHOLE} of the grid do")
     again = designs.plans(fewer)
     short = driven(again.drives["chosen"], again.expected["chosen"])
@@ -68,10 +71,10 @@ def test_chosen_runs_do_what_was_expected_of_them():
             (plans.expected["chosen"], real["chosen"]),
             (plans.expected["grid"], real["grid"]),
         ):
-            assert within(found[k] / plan[k])
-        assert within(short[k] / again.expected["chosen"][k])
+            assert QUICK or within(found[k] / plan[k])
+        assert QUICK or within(short[k] / again.expected["chosen"][k])
         # both sides scatter by chance
-        assert short[k] / real["grid"][k] < 1.5
+        assert QUICK or short[k] / real["grid"][k] < 1.5
 
 
 def better(plan, whole):

@@ -21,12 +21,13 @@ from slipid.control.export.c99.folder import c_files
 from slipid.control.export.golden import golden
 from slipid.control.trajectory import rectangle
 from tests.benchmarks.export_builds import HERE, KINDS, needs, pilot, ran
+from tests.benchmarks.quick import QUICK, quick
 
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
 FLAGS = ("-fno-math-errno", "-fno-trapping-math")
 """Flags that the exported folder asks CMake and PlatformIO for."""
-FUZZ_S = float(os.environ.get("SLIPID_FUZZ_S", "600"))
-ROWS = ("slip_odometry", "contact")
+FUZZ_S = float(os.environ.get("SLIPID_FUZZ_S", quick("600", "4")))
+ROWS = quick(("slip_odometry", "contact"), ("slip_odometry",))
 CHIPS = {
     "cortex-m4": ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"),
     "cortex-m7": ("-mcpu=cortex-m7", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv5-sp-d16"),
@@ -165,8 +166,8 @@ def test_small_controllers(tmp_path, row, chip):
         f"{', '.join(s.calls)}"
     )
     assert not [name for name in s.calls if name.startswith("__aeabi_d")], "double arithmetic"
-    assert s.code <= CODE_BAR
-    assert s.held["state"] <= STATE_BAR
+    assert QUICK or s.code <= CODE_BAR
+    assert QUICK or s.held["state"] <= STATE_BAR
 
 
 # sanitizers and fuzzing -----------------------------------------------------------------------

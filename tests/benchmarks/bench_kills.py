@@ -8,9 +8,10 @@ import time
 import numpy as np
 import xarray
 
+from tests.benchmarks.quick import quick
 from tests.cli import test_cli
 
-KILLS = 20
+KILLS = quick(20, 1)
 JOB = ("--draws", "40", "--most", "80", "--block", "4", "--quiet")
 
 
@@ -30,7 +31,7 @@ def test_twenty_kills(small, tmp_path):
     kept, killed = [], 0
     while killed < KILLS:
         again = test_cli.process("sample", out, *JOB)
-        time.sleep(rng.uniform(0.5 * start, start + 2 * took / KILLS))
+        time.sleep(rng.uniform(0.5 * start, start + quick(2.0, 0.5) * took / KILLS))
         assert again.poll() is None, "done before it could be killed so often: a longer job is due"
         again.kill()
         again.communicate()

@@ -11,14 +11,18 @@ from scipy.stats import binom
 
 from slipid.identify.bench.fit import fit_motor
 from slipid.identify.bench.verdict import bench_fit
+from tests.benchmarks.quick import QUICK, quick
 from tests.helpers import made_bench as made
 
-SEEDS = 20
-CASES = [
-    *((made.FLYWHEEL, rate, 0.0) for rate in (50, 100, 200, 500, 1000, 2000)),
-    (made.FLYWHEEL, 500, 0.6),
-    *((made.ROTOR, rate, 0.0) for rate in (100, 500, 1000, 2000)),
-]
+SEEDS = quick(20, 1)
+CASES = quick(
+    [
+        *((made.FLYWHEEL, rate, 0.0) for rate in (50, 100, 200, 500, 1000, 2000)),
+        (made.FLYWHEEL, 500, 0.6),
+        *((made.ROTOR, rate, 0.0) for rate in (100, 500, 1000, 2000)),
+    ],
+    [(made.FLYWHEEL, 100, 0.6)],
+)
 
 
 @pytest.mark.parametrize(("inertia", "rate", "drop"), CASES)
@@ -40,6 +44,6 @@ def test_intervals_hold_the_truth(inertia, rate, drop):
             f"90 % intervals hold {inside:.2f}, identified {claimed:.2f}"
         )
         # of what is called identified, intervals hold the truth
-        assert claimed < 0.5 or inside >= low, path
-    assert all(f.converged for f in fits)
-    assert np.mean([f.good for f in fits]) >= 0.9
+        assert QUICK or claimed < 0.5 or inside >= low, path
+    assert QUICK or all(f.converged for f in fits)
+    assert QUICK or np.mean([f.good for f in fits]) >= 0.9

@@ -6,9 +6,10 @@ import time
 
 import numpy as np
 
+from tests.benchmarks.quick import QUICK, quick
 from tests.helpers import recovery
 
-SEEDS = 40
+SEEDS = quick(40, 1)
 
 
 def test_recovery_over_seeds():
@@ -22,12 +23,14 @@ def test_recovery_over_seeds():
     z = np.stack([f.score for f in found])[:, by_plan]
     of_load = np.array(["load" in name for name in np.array(found[0].names)[by_plan]])
     for path in ("motor.resistance", "motor.back_emf"):
-        assert max(abs(f.relative_error(path)) for f in found) < 0.02
-    assert max(gap for f in found for gap in f.curve_gap.values()) < 0.02
-    assert 0.8 < z[:, ~of_load].std() < 1.25
-    assert z[:, of_load].std() < 1.25  # two floors cannot show that their law is right about loads
-    assert np.abs(z).max() < 4
-    assert all(f.converged for f in found)
+        assert QUICK or max(abs(f.relative_error(path)) for f in found) < 0.02
+    assert QUICK or max(gap for f in found for gap in f.curve_gap.values()) < 0.02
+    assert QUICK or 0.8 < z[:, ~of_load].std() < 1.25
+    assert (
+        QUICK or z[:, of_load].std() < 1.25
+    )  # two floors cannot show that their law is right about loads
+    assert QUICK or np.abs(z).max() < 4
+    assert QUICK or all(f.converged for f in found)
 
 
 def summary(found):

@@ -37,6 +37,7 @@ from slipid.identify.slip_curves import current_trend
 from slipid.job.config import parsed
 from slipid.job.problem import Job, read_job, with_mixed
 from slipid.support.progress import Reporter
+from tests.benchmarks.quick import QUICK, quick
 from tests.helpers import replayed
 from tests.helpers.replayed import Judged
 
@@ -50,7 +51,7 @@ CODE = sha256(
     )
     + CONFIG.read_bytes()
 )
-OUT = ROOT / "out" / "bench_replay" / CODE.hexdigest()[:8]
+OUT = ROOT / "out" / quick("bench_replay", "bench_replay_quick") / CODE.hexdigest()[:8]
 TOP = 8.0
 """Highest wheel speed of the fitted runs [rad/s]."""
 BARS = {"table": 0.02, "brown": 0.03, "gray": 0.065, "green": 0.11}
@@ -144,8 +145,8 @@ def test_one_floor(job: Job) -> None:
     assert len(rows) == built.sum()
     for name, bar in BARS.items():
         some = [r for r in rows if r.surface == name]
-        assert np.mean([r.error for r in some]) < bar
-    assert np.mean([r.told == r.surface for r in rows]) > TOLD
+        assert QUICK or np.mean([r.error for r in some]) < bar
+    assert QUICK or np.mean([r.told == r.surface for r in rows]) > TOLD
 
 
 def test_two_floors(job: Job) -> None:
@@ -178,7 +179,7 @@ def test_two_floors(job: Job) -> None:
             share = np.bincount(told, minlength=len(labels)) / len(told)
             text = "  ".join(f"{n} {s:.2f}" for n, s in zip(labels, share, strict=True))
             print(f"  on {name}: {text}")
-        assert error < 0.75 * straight
+        assert QUICK or error < 0.75 * straight
 
 
 def balanced(truth: np.ndarray, belief: np.ndarray) -> float:

@@ -18,8 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-CASES, SEED = 256, 4000
-STEPS, LAST_S = 1200, 6.0
+from tests.benchmarks.quick import QUICK, quick
+
+CASES, SEED = quick(256, 2), 4000
+STEPS, LAST_S = quick(1200, 160), 6.0
 STILL_M, STILL_RAD = 0.01, 0.05
 NEAR = 0.02
 """Distance from the end of its path in x and y [m], and in half the angle, at which it is there."""
@@ -30,7 +32,7 @@ def test_nothing_rests_away_from_its_path(robot, monkeypatch):
     print(f"\n{shares(found)}")
     monkeypatch.setattr("slipid.control.controller.STUCK_S", np.inf)
     print(f"without freeing: {shares(ends(robot))}")
-    assert not found["rest"].any()
+    assert QUICK or not found["rest"].any()
 
 
 def shares(found):

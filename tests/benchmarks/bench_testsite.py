@@ -32,11 +32,14 @@ from slipid.testsite.simulate.observe import observe
 from slipid.testsite.simulate.sections import Headings, PaperGrid, Rectangle, Wander
 from slipid.testsite.simulate.simulate import simulate, truth
 from slipid.testsite.site import Site
+from tests.benchmarks.quick import QUICK, quick
 
 ROOT = Path(__file__).resolve().parents[2]
 CODE = sha256(b"".join(p.read_bytes() for p in sorted((ROOT / "slipid").rglob("*.py"))))
-OUT = ROOT / "out" / "bench_testsite" / CODE.hexdigest()[:8]  # nothing of other code is reused
-SEEDS = int(os.environ.get("SLIPID_BENCH_SEEDS", "40"))
+OUT = (
+    ROOT / "out" / quick("bench_testsite", "bench_testsite_quick") / CODE.hexdigest()[:8]
+)  # nothing of other code is reused
+SEEDS = int(os.environ.get("SLIPID_BENCH_SEEDS", quick("40", "1")))
 
 HEADINGS = """
 [[runs]]
@@ -83,13 +86,13 @@ def test_speed_on_one_core() -> None:
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         for surface, (pace, parts) in zip(GROUNDS, pool.map(_pace, GROUNDS), strict=True):
             print(f"{surface:8}  {pace:10.1f}   " + "  ".join(f"{p:14.1f}" for p in parts))
-            assert pace > 4.0
+            assert QUICK or pace > 4.0
 
 
 def _pace(surface: str) -> tuple[float, list[float]]:
     """Best of three times real time, with sensors and files left out; and the profile."""
     run, paces = straight(surface, "as_built", 1.0, 0.2, 0.8), []
-    for _ in range(3):
+    for _ in range(quick(3, 1)):
         began = time.perf_counter()
         trace = drive(run, Site(), 0)
         paces.append(float(trace.time[-1]) / (time.perf_counter() - began))
@@ -127,7 +130,9 @@ def _profile(surface: str) -> list[float]:
 def test_left_out_sectors() -> None:
     """Six 60-degree sectors, each predicted by a fit that has not seen it on any floor."""
     text = "seed = 11\n" + "".join(
-        HEADINGS.format(surface=s, load="as_built", step=15, speeds=[0.1, 0.2])
+        HEADINGS.format(
+            surface=s, load="as_built", step=quick(15, 60), speeds=quick([0.1, 0.2], [0.2])
+        )
         for s in ("firm", "medium", "soft")
     )
     out = OUT / "sectors"
@@ -144,7 +149,7 @@ def test_left_out_sectors() -> None:
             f"90 % regions hold {mine.coverage90:.0%}"
         )
     soft = floors["soft"].models
-    assert soft["encoder"].endpoint_error > 4 * soft["identified"].endpoint_error
+    assert QUICK or soft["encoder"].endpoint_error > 4 * soft["identified"].endpoint_error
 
 
 def _experiment(seed: int) -> dict:
@@ -161,9 +166,9 @@ def _experiment(seed: int) -> dict:
         f"[motor]\nresistance_ohm = {resistance}\nback_emf_vs = {back_emf}\n"
     )
     for load in ("as_built", "moved"):
-        text += HEADINGS.format(surface="soft", load=load, step=30, speeds=[0.2])
+        text += HEADINGS.format(surface="soft", load=load, step=quick(30, 90), speeds=[0.2])
         text += CURVES.format(surface="soft", load=load)
-    text += HEADINGS.format(surface="firm", load="as_built", step=60, speeds=[0.2])
+    text += HEADINGS.format(surface="firm", load="as_built", step=quick(60, 90), speeds=[0.2])
     out = OUT / "coverage" / f"seed{seed:02d}"
     made = driven(text, out)
     found = _fitted(job_of(out))
@@ -220,7 +225,7 @@ def test_coverage_over_seeds() -> None:
     for name in names:
         value, _, _, true = np.array([f["numbers"][name] for f in found]).T
         if name.startswith("motor."):
-            assert np.abs(value / true - 1).max() < 0.03
+            assert QUICK or np.abs(value / true - 1).max() < 0.03
 
 
 def _power(found: list[dict]) -> None:
@@ -246,15 +251,19 @@ BIAS = {
     "shallow (1 mm)": "softness_m = 0.001",
     "stiff (shear 1e5 N/m)": "shear_n_m = 1e5",
 }
+CHANGES = quick(tuple(BIAS), ("soft",))
+"""Names of those that are driven."""
 
 
 def test_what_biases_load_shares() -> None:
     """Shares of one robot on floors that differ in one thing from `soft`."""
     print(f"\n{'floor':24} largest error of a share as built, moved   largest half width")
-    for k, (name, change) in enumerate(BIAS.items()):
-        text = f"seed = 5\n[surfaces.soft]\n{change}\n"
+    for k, name in enumerate(CHANGES):
+        text = f"seed = 5\n[surfaces.soft]\n{BIAS[name]}\n"
         for load in ("as_built", "moved"):
-            text += HEADINGS.format(surface="soft", load=load, step=30, speeds=[0.1, 0.2])
+            text += HEADINGS.format(
+                surface="soft", load=load, step=quick(30, 90), speeds=[0.1, 0.2]
+            )
             text += CURVES.format(surface="soft", load=load)
         made = driven(text, OUT / "bias" / str(k))
         fit = _fitted(job_of(OUT / "bias" / str(k)))
@@ -267,7 +276,7 @@ def test_what_biases_load_shares() -> None:
             widths.append(float(np.ptp(np.array(found.interval90), axis=1).max() / 2))
         print(f"{name:24} {errors[0]:24.3f} {errors[1]:14.3f} {max(widths):20.3f}", flush=True)
         if name == "soft":
-            assert max(errors) < 0.03
+            assert QUICK or max(errors) < 0.03
 
 
 # the paper's observation
@@ -277,7 +286,7 @@ def test_currents_on_mixed_surfaces() -> None:
     """Wheels of a pair on two surfaces: does each draw the current of the floor beneath it?"""
     machine = replace(Machine(), centres_m={"as_built": (0.0, 0.0)})
     site = Site(machine=machine)
-    seeds = range(6)
+    seeds = range(quick(6, 2))
 
     def currents(floor: FloorMap | None, surface: str | None, speed: float) -> np.ndarray:
         """Mean |current| of wheels 1 and 3, which x motion drives alike (seed, 2)."""
@@ -296,14 +305,17 @@ def test_currents_on_mixed_surfaces() -> None:
         "surfaces       m/s   first alone  second alone  mixed: wheel 1  wheel 3   "
         "difference over that of the floors"
     )
-    for pair in (("soft", "firm"), ("medium", "firm"), ("soft", "medium")):
+    pairs = ("soft", "firm"), ("medium", "firm"), ("soft", "medium")
+    for pair in quick(pairs, pairs[:1]):
         halves = FloorMap(pair, np.array([[1], [0]]), (-2.0, -2.0), 2.0)  # y > 0 is the first
-        for speed in (0.1, 0.3):
+        for speed in quick((0.1, 0.3), (0.3,)):
             first, second = (currents(None, s, speed).mean() for s in pair)
             both = currents(halves, None, speed)
             ratio = (both[:, 0] - both[:, 1]) / (first - second)
             error = ratio.std(ddof=1) / np.sqrt(len(ratio))
-            assert abs(ratio.mean()) < 0.5  # 1 if each drew the current of the floor beneath it
+            assert (
+                QUICK or abs(ratio.mean()) < 0.5
+            )  # 1 if each drew the current of the floor beneath it
             print(
                 f"{pair[0]:7}{pair[1]:7} {speed:4.1f} {first:11.2f} {second:13.2f} "
                 f"{both[:, 0].mean():14.2f} {both[:, 1].mean():9.2f} "
@@ -416,9 +428,9 @@ def test_figures_beside_the_real_ones(real_data: Path) -> None:
     path = OUT / "beside_the_real_ones.png"
     figure.savefig(path, dpi=80)
     print(f"\n{path}")
-    assert 0.01 < np.median(slips["firm"]) < 0.03
-    assert 0.2 < np.median(slips["soft"]) < 0.5
-    assert np.ptp(slips["soft"]) > 0.15  # the load is off the middle
+    assert QUICK or 0.01 < np.median(slips["firm"]) < 0.03
+    assert QUICK or 0.2 < np.median(slips["soft"]) < 0.5
+    assert QUICK or np.ptp(slips["soft"]) > 0.15  # the load is off the middle
 
 
 def _figure_logs(site: Site) -> dict:
@@ -426,13 +438,15 @@ def _figure_logs(site: Site) -> dict:
     floor = patchwork(["firm", "short", "medium", "soft"], seed=2)
     zones = four_zones(["firm", "medium", "soft", "short"])
     plans = {
-        "site": Wander(map="site", count=12).runs(floor, 4),
-        "rectangle": Rectangle(map="zones", repeats=6).runs(zones, 0),
+        "site": Wander(map="site", count=quick(12, 2)).runs(floor, 4),
+        "rectangle": Rectangle(map="zones", repeats=quick(6, 1)).runs(zones, 0),
     }
     for surface in ("firm", "medium", "soft"):
-        plans[surface] = PaperGrid(surface=surface).runs()
+        plans[surface] = PaperGrid(surface=surface).runs()[:: quick(1, 20)]
     for surface in ("firm", "short", "medium", "soft"):
-        plan = Headings(surface=surface, step_deg=10.0, speeds_m_s=[0.2], distance_m=0.6)
+        plan = Headings(
+            surface=surface, step_deg=quick(10.0, 120.0), speeds_m_s=[0.2], distance_m=0.6
+        )
         plans[f"{surface} headings"] = plan.runs()
     jobs = [(key, k, run) for key, runs in plans.items() for k, run in enumerate(runs)]
     out: dict = {key: [] for key in plans}

@@ -12,7 +12,9 @@ import os
 
 import numpy as np
 
-MAPS, STARTS = (101, 102, 103, 104), 12
+from tests.benchmarks.quick import QUICK, quick
+
+MAPS, STARTS = quick(((101, 102, 103, 104), 12), ((101,), 1))
 ROWS = ("encoder", "contact", "contact_map", "contact_gyro")
 
 
@@ -46,5 +48,5 @@ def test_other_starts_on_other_maps(fit_folder, robot, tmp_path):
             f" {row.finished_share:4.0%} finish"
         )
     print("not told apart:", ", ".join(not_told_apart(runs)))
-    assert min(row.finished_share for row in table.values()) > 0.9
+    assert QUICK or min(row.finished_share for row in table.values()) > 0.9
     assert np.isfinite(base["closure_error_median"])

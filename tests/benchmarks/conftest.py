@@ -1,4 +1,4 @@
-"""What benchmarks of the closed loop share: the fit they drive with."""
+"""What benchmarks share: the real logs, and the fit that those of the closed loop drive with."""
 
 from __future__ import annotations
 
@@ -7,18 +7,35 @@ from pathlib import Path
 
 import pytest
 
+from tests.benchmarks.quick import QUICK, thinned
+
 
 @pytest.fixture(scope="session")
-def fit_folder() -> Path:
-    """Folder that `slipid identify` wrote, named by SLIPID_FIT."""
+def real_data(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the real logs; in the quick form one with few of them."""
+    return thinned(real_data, tmp_path_factory.mktemp("data")) if QUICK else real_data
+
+
+@pytest.fixture(scope="session")
+def fit_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder that `slipid identify` wrote, named by SLIPID_FIT; in the quick form a made one."""
     folder = os.environ.get("SLIPID_FIT")
-    if not folder:
+    if folder:
+        return Path(folder)
+    if not QUICK:
         pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
-    return Path(folder)
+    from slipid.selftest.known import grid
+    from tests.helpers.shared import identify
+
+    floors = ("firm", "as_built"), ("soft", "as_built")
+    made = tmp_path_factory.mktemp("fit")
+    done = identify(made, grid(setups=floors, headings=6, speeds=(0.1, 0.3), turns=0))
+    assert done.exit_code in (0, 1), done.stderr
+    return made / "out"
 
 
 @pytest.fixture(scope="session")
-def robot(fit_folder):
+def robot(fit_folder: Path):
     """The robot of that fit."""
     from slipid.deploy.deploy import read_robot
 

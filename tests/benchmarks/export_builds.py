@@ -33,6 +33,7 @@ from slipid.deploy.deploy import habits_of, read_robot
 from slipid.deploy.floors import floor_of
 from slipid.deploy.trial_site import site, starts
 from slipid.model.geometry import omni
+from tests.benchmarks.quick import quick
 from tests.helpers.compiled_c import CompiledC
 from tests.helpers.exported import known
 
@@ -40,7 +41,7 @@ HERE = Path(__file__).parent
 FAST = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 PLAIN = ("-O2",)
 KINDS = {"double": (), "float": ("-DSLIPID_FLOAT",)}
-SHARE = float(os.environ.get("SLIPID_BENCH_SHARE", "1"))
+SHARE = float(os.environ.get("SLIPID_BENCH_SHARE", quick("1", "0.002")))
 """Part of all steps and runs that is done, to try the benchmark."""
 NUDGE = 1e-14
 """What states and inputs of a doubtful step are changed by, relatively."""

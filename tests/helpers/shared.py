@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from slipid.cli.main import app
 from slipid.job.packaged import packaged_config
-from slipid.selftest.known import Sensors, grid, truth
+from slipid.selftest.known import Drive, Sensors, grid, truth
 from slipid.selftest.logs import make_logs
 from tests.helpers.made_logs import write_logs
 
@@ -51,11 +51,11 @@ def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], Said
     return folder, Said(**json.loads(said.read_text(encoding="utf-8")))
 
 
-def identify(folder: Path) -> Said:
+def identify(folder: Path, drives: Sequence[Drive] = DRIVES) -> Said:
     """A config, made logs, unseen logs, and the result of identify on them."""
-    for name, drives, seed in (("logs", DRIVES, 1), ("unseen", UNSEEN, 2)):
-        robot = truth(drives)
-        write_logs(make_logs(robot, drives, seed, Sensors()), robot, folder / name, folder / "t")
+    for name, some, seed in (("logs", drives, 1), ("unseen", UNSEEN, 2)):
+        robot = truth(some)
+        write_logs(make_logs(robot, some, seed, Sensors()), robot, folder / name, folder / "t")
     (folder / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
     args = ("identify", folder / "my.toml", "--data", folder / "logs", "--out", folder / "out")
     done = invoke(*args)
