@@ -16,7 +16,6 @@ backwards.
 """
 
 from dataclasses import replace
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -25,12 +24,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.control.actuation import RING, Habits
-from slipid.control.closed_loop import PERIOD, Pilot, PilotOutput, PilotState
+from slipid.control.closed_loop import PERIOD
 from slipid.control.deployed import DeployedRobot
 from slipid.control.filter.effects import Course, direction, stays
 from slipid.control.filter.floor import Floor
-from slipid.control.interface import Measurement, Pose, Readings, State
-from slipid.control.trajectory import Path
+from slipid.control.interface import Measurement, Pose, Readings
 from slipid.model import contact
 from slipid.model.robot import GRAVITY
 from slipid.model.se2 import advance, compose
@@ -195,37 +193,8 @@ class Twin(eqx.Module):
         ).filled(wheels)
 
 
-def rollout(
-    pilot: Pilot[State], path: Path, twin: Twin, start: Pose, key: Array, steps: int
-) -> tuple[Float[Array, "step 3"], PilotOutput]:
-    """True poses [m, m, rad] and what the pilot says over a fixed number of steps.
-
-    A path that is over is a rest at its end.
-
-    Args:
-        pilot, twin: who drives, and what is driven.
-        path: as it lies for the start.
-        start: where it stands and believes to stand [m, m, rad].
-        key: of all that is drawn.
-        steps: how many.
-    """
-    noise = jax.vmap(partial(twin.noise, key))(jnp.arange(steps + 1))
-    state = twin.init(start, key)
-    reading = twin.first(state, noise[0])
-
-    def step(
-        carry: tuple[TwinState, PilotState[State], Readings], drawn: Array
-    ) -> tuple[tuple[TwinState, PilotState[State], Readings], tuple[Array, PilotOutput]]:
-        before, held, reading = carry
-        held, out = pilot.step(path, held, reading, PERIOD)
-        state, reading = twin.step(before, out.command, drawn)
-        return (state, held, reading), (before.pose, out)
-
-    return jax.lax.scan(step, (state, pilot.init(start), reading), noise[1:])[1]
-
-
 class TwinPlant:
-    """A twin behind `slipid.control.closed_loop.Plant`; a key gives the same run as `rollout`."""
+    """A twin behind `slipid.control.closed_loop.Plant`; a key gives the same run every time."""
 
     def __init__(self, twin: Twin, start: Pose, key: Array):
         self.twin, self.start, self.key = twin, start, key

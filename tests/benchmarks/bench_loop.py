@@ -129,12 +129,12 @@ def driven(robot, row, path, steps=STEPS):
     from slipid.control.closed_loop import PERIOD, Course, Pilot, metrics
     from slipid.control.filter.floor import Floor
     from slipid.control.interface import Settings
-    from slipid.control.twin import rollout
     from slipid.deploy.controllers import ROWS as TRIAL
     from slipid.deploy.controllers import pilot_of
     from slipid.deploy.deploy import habits_of
     from slipid.deploy.floors import floor_of
     from slipid.deploy.trial_site import one_of, site, starts
+    from tests.helpers.rolled_out import rollout
     from tests.helpers.telling_twin import TellingTwin
 
     class UnderWheels(Floor):

@@ -45,10 +45,10 @@ def ends(robot):
     from slipid.control.closed_loop import PERIOD
     from slipid.control.filter.floor import Floor
     from slipid.control.interface import Settings
-    from slipid.control.twin import rollout
     from slipid.deploy.controllers import ROWS, pilot_of
     from slipid.deploy.deploy import habits_of
     from slipid.deploy.trial_site import one_of
+    from tests.helpers.rolled_out import rollout
     from tests.helpers.telling_twin import TellingTwin
 
     class OneEach(Floor):

@@ -22,7 +22,8 @@ from slipid.control.filter.pose_filter import PoseFilter
 from slipid.control.filter.pose_fix import placed
 from slipid.control.filter.wheels import Currents
 from slipid.control.interface import MIXED, Measurement, Settings
-from slipid.control.twin import Twin, rollout
+from slipid.control.twin import Twin
+from tests.helpers.rolled_out import rollout
 from tests.helpers.small_twin import deployed, floor
 
 CHESS = [[(i + j) % 2 for j in range(6)] for i in range(6)]

@@ -19,7 +19,7 @@ from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.filter.floor import Floor
 from slipid.control.interface import Settings
-from slipid.control.twin import Twin, rollout
+from slipid.control.twin import Twin
 from slipid.data.floor_map import patchwork
 from slipid.data.reading.presets import preset
 from slipid.data.runs import Runs, collect
@@ -30,6 +30,7 @@ from slipid.search_space import Choice, Space
 from tests.helpers import replayed
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.one_log import read_log
+from tests.helpers.rolled_out import rollout
 
 FIT = Path(__file__).parents[1] / "helpers" / "robotino2022_sectors.json"
 """Numbers of a fit that has seen no heading of 0 to 60 deg."""

@@ -10,8 +10,9 @@ from slipid.control.closed_loop import Pilot, Plant, drive
 from slipid.control.controller import Controller, Gains
 from slipid.control.estimator import Odometry
 from slipid.control.trajectory import waypoints
-from slipid.control.twin import Twin, TwinPlant, rollout
+from slipid.control.twin import Twin, TwinPlant
 from slipid.model import contact
+from tests.helpers.rolled_out import rollout
 from tests.helpers.small_twin import deployed, floor, stacked
 
 KEY = jax.random.PRNGKey(3)

@@ -104,7 +104,7 @@ class PoseFilter(eqx.Module):
         """
         dt = tick.dt
         way = self._way(motion, gyro)
-        old = self._forgotten(old, motion, way, tick)
+        old = self._forgotten(old, motion, tick)
         free = motion.twist + way.slope @ old.nuisance[:-1]  # however slow: creeping adds up
         old = replace(old, history=old.history.at[:, 0].add(dt))
         twist = free.at[2].set(self._turned(old, free[2], gyro))
@@ -136,7 +136,7 @@ class PoseFilter(eqx.Module):
             by_gyro=jnp.isfinite(gyro),
         )
 
-    def _forgotten(self, old: PoseState, motion: Motion, way: _Way, tick: Tick) -> PoseState:
+    def _forgotten(self, old: PoseState, motion: Motion, tick: Tick) -> PoseState:
         """With effects as far as they stay the same over the step, their variance as it was."""
         f = self.robot
         speed = length(motion.twist[:2]) + f.frame.base * jnp.abs(motion.twist[2])

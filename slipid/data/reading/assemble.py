@@ -23,7 +23,6 @@ EPOCH = 1e6
 """Time from which on it is taken to count from 1970 and not from the start of the robot [s]."""
 TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
 """Channels that tell how far the wheels turned, the first that is there counts."""
-POSE = ("pose_x", "pose_y", "pose_heading")
 
 
 @dataclass(frozen=True)

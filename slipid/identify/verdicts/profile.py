@@ -22,7 +22,7 @@ from scipy.stats import chi2
 from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.identify.fit.variances import MOTIONS
-from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE, Z95
+from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.parameter import Entry
 from slipid.search_space import Space
 
@@ -50,7 +50,6 @@ class Profile:
         interval90: of the likelihood, None on a side that is open.
         ends: per side, `closed`, `open` (level as far as the prior reaches) or `at_bound` (level
             towards the number's bound, which then ends the interval).
-        laplace90: of the Laplace posterior.
         given: numbers that were held at the fit's, in words; empty where all were refitted.
         settled: whether every refit converged.
         said: the same for people, one sentence.
@@ -65,7 +64,6 @@ class Profile:
     estimate: float
     interval90: tuple[float | None, float | None]
     ends: tuple[str, str]
-    laplace90: tuple[float, float]
     given: str
     settled: bool
     said: str
@@ -121,7 +119,6 @@ def profile(
     for k, bound in enumerate((d.lower, d.upper)):
         if ends[k] == "open" and ends[1 - k] == "closed" and np.isfinite(bound):
             ends[k], interval[k] = "at_bound", float(bound)
-    half = Z95 * walk.std
     return Profile(
         path=entry.path,
         unit=d.unit,
@@ -132,7 +129,6 @@ def profile(
         estimate=si(walk.start),
         interval90=(interval[0], interval[1]),
         ends=(ends[0], ends[1]),
-        laplace90=(si(walk.start - half), si(walk.start + half)),
         given="" if problem.target.joint or walk.of_motion else "the motion as fitted",
         settled=walk.settled,
         said=_sentence(entry, interval, ends, problem.windows.has_voltage)

@@ -66,15 +66,14 @@ class Drive:
     Attributes:
         wheels: the robot's, in the order in which the controller has them.
         turned: whether a wheel's positive speed is the controller's negative one, in that order.
-        kinematics: the controller's, as the robot's `forward`.
-        off: largest difference of the two, as of `MOST`.
+        off: largest difference of the controller's kinematics and the robot's `forward`, as of
+            `MOST`.
     """
 
     controller: Controller
     wheels: tuple[int, ...]
     turned: tuple[bool, ...]
     parameters: tuple[Parameter, ...]
-    kinematics: Float[np.ndarray, "wheel 3"]
     off: float
 
 
@@ -115,14 +114,11 @@ class _Wheels:
     ) -> Drive:
         """The controller that has these rows as its own."""
         scale = np.array([1.0, 1.0, 1.0 / float(robot.frame.base)])
-        kinematics = np.empty_like(own)
-        kinematics[self.order] = np.where(self.turned, -1.0, 1.0)[:, None] * own
         return Drive(
             controller=controller,
             wheels=tuple(self.order.tolist()),
             turned=self.turned,
             parameters=parameters,
-            kinematics=kinematics,
             off=float(np.abs((own - self.rows) * scale).max()),
         )
 

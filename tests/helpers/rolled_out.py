@@ -1,0 +1,41 @@
+"""A pilot on a twin as one function of JAX, for runs that are compiled, many at once."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from slipid.control.closed_loop import PERIOD, Pilot, PilotOutput, PilotState
+from slipid.control.interface import Pose, Readings, State
+from slipid.control.trajectory import Path
+from slipid.control.twin import Twin, TwinState
+
+
+def rollout(
+    pilot: Pilot[State], path: Path, twin: Twin, start: Pose, key: Array, steps: int
+) -> tuple[Float[Array, "step 3"], PilotOutput]:
+    """True poses [m, m, rad] and what the pilot says over a fixed number of steps.
+
+    A path that is over is a rest at its end.
+
+    Args:
+        pilot, twin: who drives, and what is driven.
+        path: as it lies for the start.
+        start: where it stands and believes to stand [m, m, rad].
+        key: of all that is drawn.
+        steps: how many.
+    """
+    noise = jax.vmap(partial(twin.noise, key))(jnp.arange(steps + 1))
+    state = twin.init(start, key)
+    reading = twin.first(state, noise[0])
+
+    def step(
+        carry: tuple[TwinState, PilotState[State], Readings], drawn: Array
+    ) -> tuple[tuple[TwinState, PilotState[State], Readings], tuple[Array, PilotOutput]]:
+        before, held, reading = carry
+        held, out = pilot.step(path, held, reading, PERIOD)
+        state, reading = twin.step(before, out.command, drawn)
+        return (state, held, reading), (before.pose, out)
+
+    return jax.lax.scan(step, (state, pilot.init(start), reading), noise[1:])[1]
