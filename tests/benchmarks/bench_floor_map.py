@@ -51,7 +51,7 @@ schema = "slipid.palette/1"
 firm = "#e8e4da"
 soft = "#1f6b45"
 """
-STARTS = quick(99, 1)
+STARTS = quick(99, 2)
 """Where a run goes is hard to foretell on patches: a median of few starts says little."""
 MANY = quick(1_000_000, 10_000)
 """Poses that are looked up."""

@@ -37,7 +37,7 @@ from slipid.identify.slip_curves import current_trend
 from slipid.job.config import parsed
 from slipid.job.problem import Job, read_job, with_mixed
 from slipid.support.progress import Reporter
-from tests.benchmarks.quick import QUICK, quick
+from tests.benchmarks.quick import QUICK
 from tests.helpers import replayed
 from tests.helpers.replayed import Judged
 
@@ -51,7 +51,7 @@ CODE = sha256(
     )
     + CONFIG.read_bytes()
 )
-OUT = ROOT / "out" / quick("bench_replay", "bench_replay_quick") / CODE.hexdigest()[:8]
+OUT = ROOT / "out" / "bench_replay" / CODE.hexdigest()[:8]
 TOP = 8.0
 """Highest wheel speed of the fitted runs [rad/s]."""
 BARS = {"table": 0.02, "brown": 0.03, "gray": 0.065, "green": 0.11}

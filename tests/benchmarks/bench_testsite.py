@@ -36,9 +36,7 @@ from tests.benchmarks.quick import QUICK, quick
 
 ROOT = Path(__file__).resolve().parents[2]
 CODE = sha256(b"".join(p.read_bytes() for p in sorted((ROOT / "slipid").rglob("*.py"))))
-OUT = (
-    ROOT / "out" / quick("bench_testsite", "bench_testsite_quick") / CODE.hexdigest()[:8]
-)  # nothing of other code is reused
+OUT = ROOT / "out" / "bench_testsite" / CODE.hexdigest()[:8]  # nothing of other code is reused
 SEEDS = int(os.environ.get("SLIPID_BENCH_SEEDS", quick("40", "1")))
 
 HEADINGS = """
@@ -313,9 +311,8 @@ def test_currents_on_mixed_surfaces() -> None:
             both = currents(halves, None, speed)
             ratio = (both[:, 0] - both[:, 1]) / (first - second)
             error = ratio.std(ddof=1) / np.sqrt(len(ratio))
-            assert (
-                QUICK or abs(ratio.mean()) < 0.5
-            )  # 1 if each drew the current of the floor beneath it
+            # 1 if each drew the current of the floor beneath it
+            assert QUICK or abs(ratio.mean()) < 0.5
             print(
                 f"{pair[0]:7}{pair[1]:7} {speed:4.1f} {first:11.2f} {second:13.2f} "
                 f"{both[:, 0].mean():14.2f} {both[:, 1].mean():9.2f} "

@@ -14,7 +14,7 @@ import numpy as np
 
 from tests.benchmarks.quick import QUICK, quick
 
-MAPS, STARTS = quick(((101, 102, 103, 104), 12), ((101,), 1))
+MAPS, STARTS = quick(((101, 102, 103, 104), 12), ((101,), 2))
 ROWS = ("encoder", "contact", "contact_map", "contact_gyro")
 
 

@@ -16,6 +16,13 @@ def real_data(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return thinned(real_data, tmp_path_factory.mktemp("data")) if QUICK else real_data
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _nothing_kept(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """In the quick form nothing is kept in `out/` and nothing of it is found again."""
+    if QUICK and hasattr(request.module, "OUT"):
+        request.module.OUT = tmp_path_factory.mktemp("out")
+
+
 @pytest.fixture(scope="session")
 def fit_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder that `slipid identify` wrote, named by SLIPID_FIT; in the quick form a made one."""

@@ -82,8 +82,11 @@ class Rival:
         sets_in = contact_law.V0 + contact_law.S1 * active
         driven = traction + s["rolling_resistance"] * np.tanh(along / sets_in)
         weight = s["friction"] * v["body", "mass"] * 9.81
-        torque = v["geometry", "wheel_radius"] * weight * load * driven
         m = {k[1]: x for k, x in v.items() if k[0] == "motor"}
+        turns = rim * pull / active
+        rolled = v["surfaces", "roller_drag"][self.floor][:, None] * turns * np.abs(turns)
+        borne = load * driven + m["rolling_drag"] * rolled / rim.shape[1]
+        torque = v["geometry", "wheel_radius"] * weight * borne
         drag = m["coulomb_friction"] * np.tanh(speed / 0.2) + m["viscous_friction"] * speed
         amps = (torque + drag) / (self.g.gear_ratio * m["efficiency"] * m["back_emf"])
         amps = np.sqrt(amps**2 + SMOOTH**2) if not self.b.signed else amps
