@@ -111,7 +111,9 @@ def repeated(windows, times):
         for f in fields(windows)
         if isinstance(getattr(windows, f.name), np.ndarray | tuple)
     }
-    return replace(windows, **many)
+    number = windows.run.max() + 1
+    runs = [windows.run + k * number for k in range(times)]
+    return replace(windows, **many | {"run": np.concatenate(runs)})
 
 
 def test_cost_is_linear_in_the_number_of_runs(problem):
