@@ -5,9 +5,19 @@ BIN := $(VENV)/bin
 NOTEBOOKS := $(wildcard notebooks/*.ipynb)
 BENCHES := $(wildcard tests/benchmarks/bench_*.py)
 TWO := -n 2 --dist loadfile --no-loadscope-reorder
+QUICK = $(BIN)/python -m pytest -q $(TWO) -m "not slow and not nightly"
+# The newest Python named in pyproject.toml, of another version than the default one, on the PATH or kept by pyenv.
+NEWEST = $(shell \
+  default=$$($(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])'); \
+  for v in 3.13 3.12 3.11; do \
+    test "$$v" != "$$default" || continue; \
+    for p in python$$v "$${PYENV_ROOT:-$$HOME/.pyenv}"/versions/$$v.*/bin/python$$v; do \
+      "$$p" -c 'import sys, venv, ensurepip; print(sys.executable)' 2>/dev/null && exit; \
+    done; \
+  done)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test nightly check bench format clean
+.PHONY: help demo test quick newest every nightly check bench format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | awk -F '\t' '{printf "make %-8s %s\n", $$1, $$2}'
@@ -19,8 +29,18 @@ demo: $(VENV)/.run-stamp ## the main job on logs of the virtual test site, pictu
 test: $(VENV)/.dev-stamp ## the test suite but for what is nightly, a file at a time on two cores
 	$(BIN)/python -m pytest $(TWO)
 
-nightly: $(VENV)/.dev-stamp ## every test, the long statistical ones too, compiled with XLA's optimisations, as users run it
+quick: $(VENV)/.dev-stamp ## the quick tests alone
+	$(QUICK)
+
+newest: ## the quick tests on the newest other Python, which brings the newest libraries
+	$(call on_newest,quick)
+
+# every test of one Python
+every: $(VENV)/.dev-stamp
 	JAX_DISABLE_MOST_OPTIMIZATIONS=0 JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.cache/jax-optimised $(BIN)/python -m pytest $(TWO) -m ""
+
+nightly: every ## every test, the long statistical ones too, compiled with XLA's optimisations, as users run it, on both Pythons
+	$(call on_newest,every)
 
 check: $(VENV)/.dev-stamp ## format, lint, types, import rules, quick tests: before every push
 	$(BIN)/ruff format --check .
@@ -30,7 +50,7 @@ check: $(VENV)/.dev-stamp ## format, lint, types, import rules, quick tests: bef
 ifneq ($(NOTEBOOKS),)
 	$(BIN)/nbstripout --verify $(NOTEBOOKS)
 endif
-	$(BIN)/python -m pytest -q $(TWO) -m "not slow and not nightly"
+	$(QUICK)
 
 bench: $(VENV)/.dev-stamp ## speed, left-out errors, load shares, known truth, posteriors (hours; SLIPID_BENCH_QUICK=1: minutes, tries them)
 ifneq ($(BENCHES),)
@@ -44,7 +64,7 @@ format: $(VENV)/.dev-stamp ## rewrite the sources in the project's format
 	$(BIN)/ruff check --fix .
 
 clean: ## remove the environment, the caches and demo_out (never out/)
-	rm -rf $(VENV) .cache .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-newest .cache .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	rm -rf demo_out build dist *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -67,4 +87,10 @@ define install
 	@test -x $(BIN)/pip || { echo "slipid: creating $(VENV) with $(PYTHON)"; $(PYTHON) -m venv $(VENV); }
 	@echo "slipid: installing $(1) into $(VENV) (about a minute the first time)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '$(1)'
+endef
+
+define on_newest
+	@newest='$(NEWEST)'; \
+	if [ -z "$$newest" ]; then echo "slipid: no other Python than '$(PYTHON)' here, so none for 'make $(1)' with the newest libraries"; \
+	else echo "slipid: make $(1) with $$newest"; $(MAKE) --no-print-directory $(1) VENV=$(VENV)-newest PYTHON="$$newest"; fi
 endef

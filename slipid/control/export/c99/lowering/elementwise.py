@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from math import prod
-from typing import Any
 
 import jax
 
@@ -23,11 +22,10 @@ from slipid.control.export.c99.lowering.ir import (
     longest,
     varies,
 )
+from slipid.control.export.c99.lowering.jaxpr import Params
 from slipid.control.export.c99.lowering.sources import UNROLLED
 from slipid.control.export.fields import Kind, kind_of
 
-Params = dict[str, Any]
-"""Parameters of a primitive, as JAX has them."""
 Shaped = jax.ShapeDtypeStruct
 Rule = Callable[[Builder, list[Value], Params, Shaped], Value]
 Simpler = Callable[[tuple[Cell, ...]], Cell | None]

@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
-from jax.extend.core import ClosedJaxpr
 
 from slipid.control.export.c99.lowering.builder import Builder, Names
 from slipid.control.export.c99.lowering.ir import Array, Memory, Value, in_memory
+from slipid.control.export.c99.lowering.jaxpr import Traced
 from slipid.control.export.c99.lowering.lower import apart, lowered, store
 from slipid.control.export.c99.lowering.text import Body, folded
 from slipid.control.export.fields import Field, Struct
@@ -100,7 +100,7 @@ def function(
     name: str,
     about: str,
     arguments: Sequence[Argument],
-    traced: ClosedJaxpr,
+    traced: Traced,
 ) -> Function:
     """A traced function as one of C.
 
@@ -135,14 +135,14 @@ def function(
     return Function(name, about, tuple(arguments), lines, body.reads, body.scratch)
 
 
-def traced(run: Callable[..., object], *like: object) -> ClosedJaxpr:
+def traced(run: Callable[..., object], *like: object) -> Traced:
     """A function of some trees, traced as one from their leaves to those of its result."""
     structure = jax.tree.structure(like)
 
     def of(*given: jax.Array) -> list[jax.Array]:
         return jax.tree.leaves(run(*jax.tree.unflatten(structure, given)))
 
-    return jax.make_jaxpr(of)(*jax.tree.leaves(like))
+    return Traced.of(jax.make_jaxpr(of)(*jax.tree.leaves(like)))
 
 
 def _holds(memory: Memory, value: Value) -> bool:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import prod
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Var
+from jax.extend.core import JaxprEqn, Var
 from jax.extend.core import Literal as JaxLiteral
 
 from slipid.control.export.c99.lowering import elementwise, moves, sums
@@ -31,6 +30,14 @@ from slipid.control.export.c99.lowering.ir import (
     kind_of_value,
     longest,
     varies,
+)
+from slipid.control.export.c99.lowering.jaxpr import (
+    Params,
+    ScanParameters,
+    Traced,
+    branches,
+    called,
+    source_line,
 )
 from slipid.control.export.c99.lowering.moves import MOVES, SOURCES, moved
 from slipid.control.export.c99.lowering.sums import REDUCED
@@ -67,23 +74,24 @@ class UnsupportedError(Exception):
     """A step that has no form in C, with the primitive and the line of Python that asks for it."""
 
 
-def lowered(builder: Builder, closed: ClosedJaxpr, values: Sequence[Value]) -> list[Value]:
+def lowered(builder: Builder, traced: Traced, values: Sequence[Value]) -> list[Value]:
     """Results of a traced function of these values.
 
     Raises:
         UnsupportedError: it uses a primitive without a rule.
+        DataError: this version of JAX writes it in a way that is not known.
     """
-    return _Lowering(builder).run(closed.jaxpr, [np.asarray(c) for c in closed.consts], values)
+    return _Lowering(builder).run(traced, values)
 
 
 class _Lowering:
     def __init__(self, builder: Builder):
         self._builder = builder
 
-    def run(self, jaxpr: Jaxpr, consts: Sequence[Value], values: Sequence[Value]) -> list[Value]:
+    def run(self, traced: Traced, values: Sequence[Value]) -> list[Value]:
         """Results of a function."""
-        known: dict[Var, Value] = {}
-        known.update(zip(jaxpr.constvars, consts, strict=True))
+        jaxpr, known = traced.jaxpr, dict[Var, Value]()
+        known.update(zip(jaxpr.constvars, map(np.asarray, traced.constants), strict=True))
         known.update(zip(jaxpr.invars, values, strict=True))
 
         def of(atom: Var | JaxLiteral) -> Value:
@@ -96,15 +104,13 @@ class _Lowering:
         return [of(atom) for atom in jaxpr.outvars]
 
     def _equation(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        primitive, params = equation.primitive, equation.params
-        name = primitive.name
+        name = equation.primitive.name
         constant = not any(isinstance(v, Array) for v in values)
         if name in INLINED:
-            inner = _inner(params)
-            return self.run(inner.jaxpr, [np.asarray(c) for c in inner.consts], values)
+            return self.run(called(Params(equation)), values)
         if constant:
             return _evaluated(equation, values)
-        self._builder.source = _line(equation) or self._builder.source
+        self._builder.source = source_line(equation) or self._builder.source
         try:
             return self._ruled(equation, values)
         except NoFormError as error:
@@ -115,7 +121,7 @@ class _Lowering:
             ) from error
 
     def _ruled(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        primitive, params, name = equation.primitive, equation.params, equation.primitive.name
+        primitive, params, name = equation.primitive, Params(equation), equation.primitive.name
         if name == "cond":
             return self._cond(params, values)
         if name == "scan":
@@ -139,18 +145,16 @@ class _Lowering:
         parts = equation.primitive.bind(places, **equation.params)
         return [rearranged(self._builder, [value], np.asarray(part)) for part in parts]
 
-    def _cond(self, params: dict[str, Any], values: list[Value]) -> list[Value]:
+    def _cond(self, params: Params, values: list[Value]) -> list[Value]:
         """One of two functions."""
-        builder, which = self._builder, values[0]
-        if len(params["branches"]) != 2:
+        builder, which, choices = self._builder, values[0], branches(params)
+        if len(choices) != 2:
             raise NoFormError("more than two branches")
         if not isinstance(which, Array):
-            branch = params["branches"][int(np.clip(which, 0, 1))]
-            return lowered(builder, branch, values[1:])
+            return lowered(builder, choices[int(np.clip(which, 0, 1))], values[1:])
         bodies = [Builder(builder.names, builder) for _ in range(2)]
         found = [
-            lowered(body, branch, values[1:])
-            for body, branch in zip(bodies, params["branches"], strict=True)
+            lowered(body, branch, values[1:]) for body, branch in zip(bodies, choices, strict=True)
         ]
         when = builder.compute("bool", "{0} != 0", (along(builder, which, (), None).item(),))
         block = builder.append(nested=Nested(when, 1, bodies[::-1]))
@@ -166,20 +170,21 @@ class _Lowering:
         number = self._builder.names.number()
         return Memory(f"m{number}", kind_of_value(like), prod(like.shape), block)
 
-    def _scan(self, params: dict[str, Any], values: list[Value]) -> list[Value]:
+    def _scan(self, params: Params, values: list[Value]) -> list[Value]:
         """A function applied to its own result a fixed number of times."""
-        carried, consts = params["num_carry"], params["num_consts"]
-        if len(values) != carried + consts or len(params["jaxpr"].out_avals) != carried:
+        scan = ScanParameters.of(params)
+        carried, consts = scan.carried, scan.constants
+        if len(values) != carried + consts or len(scan.body.jaxpr.outvars) != carried:
             raise NoFormError("a loop that goes through an array")
         builder = self._builder
         body = Builder(builder.names, builder)
-        body.turns = Block(builder, 0, nested=Nested(None, params["length"], [body]))
+        body.turns = Block(builder, 0, nested=Nested(None, scan.turns, [body]))
         begun = values[consts:]
         memories = [self._memory(value, body.turns) for value in begun]
         for value, memory in zip(begun, memories, strict=True):
             store(builder, value, memory)
         carry = [in_memory(m, v.shape) for m, v in zip(memories, begun, strict=True)]
-        found = lowered(body, params["jaxpr"], [*values[:consts], *carry])
+        found = lowered(body, scan.body, [*values[:consts], *carry])
         names = frozenset(memory.name for memory in memories)
         kept = [apart(body, value, names) for value in found]
         for value, memory in zip(kept, memories, strict=True):
@@ -232,15 +237,6 @@ def _filled(value: Value) -> Value:
     return value if prod(value.shape) else np.zeros(value.shape, DTYPES[kind_of_value(value)])
 
 
-def _inner(params: dict[str, Any]) -> ClosedJaxpr:
-    """The function that a primitive calls."""
-    found = params.get("jaxpr", params.get("call_jaxpr", params.get("fun_jaxpr")))
-    if isinstance(found, Jaxpr):
-        return ClosedJaxpr(found, ())
-    assert isinstance(found, ClosedJaxpr)
-    return found
-
-
 def _evaluated(equation: JaxprEqn, values: list[Value]) -> list[Value]:
     """Results that depend on constants alone."""
     avals: list[Any] = [atom.aval for atom in equation.invars]
@@ -249,14 +245,3 @@ def _evaluated(equation: JaxprEqn, values: list[Value]) -> list[Value]:
         found = equation.primitive.bind(*given, **equation.params)
     many = equation.primitive.multiple_results
     return [np.asarray(x) for x in (found if many else [found])]
-
-
-def _line(equation: JaxprEqn) -> str:
-    """File and line of the innermost own code that asks for an equation; empty if none does."""
-    traceback = equation.source_info.traceback
-    for frame in traceback.frames if traceback is not None else ():
-        path = Path(frame.file_name)
-        if "slipid" in path.parts and "export" not in path.parts:
-            start = len(path.parts) - 1 - path.parts[::-1].index("slipid")
-            return f"{'/'.join(path.parts[start:])}:{frame.line_num}"
-    return ""

@@ -11,7 +11,7 @@ from jax.extend.core import Primitive
 
 from slipid.control.export.c99.lowering.arrays import along, rearranged
 from slipid.control.export.c99.lowering.builder import Builder
-from slipid.control.export.c99.lowering.elementwise import Params, Rule, Shaped, binary
+from slipid.control.export.c99.lowering.elementwise import Rule, Shaped, binary
 from slipid.control.export.c99.lowering.ir import (
     Array,
     At,
@@ -24,6 +24,7 @@ from slipid.control.export.c99.lowering.ir import (
     longest,
     varies,
 )
+from slipid.control.export.c99.lowering.jaxpr import Params
 from slipid.control.export.c99.lowering.sources import contiguous
 
 MOVES = frozenset(
@@ -69,7 +70,7 @@ def scattered(name: str, neutral: float) -> Rule:
         size = prod(new.shape)
         places = _scattered(np.full(old.shape, size), where, new.shape, params, 0)
         others = rearranged(builder, [new, np.asarray([neutral])], places)
-        return binary(name)(builder, [old, others], {}, out)
+        return binary(name)(builder, [old, others], params, out)
 
     return rule
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from slipid.control.export.c99.lowering.arrays import along
 from slipid.control.export.c99.lowering.builder import Builder
-from slipid.control.export.c99.lowering.elementwise import Params, Rule, Shaped
+from slipid.control.export.c99.lowering.elementwise import Rule, Shaped
 from slipid.control.export.c99.lowering.ir import (
     Array,
     At,
@@ -27,6 +27,7 @@ from slipid.control.export.c99.lowering.ir import (
     kind_of_value,
     varies,
 )
+from slipid.control.export.c99.lowering.jaxpr import Params
 from slipid.control.export.fields import Kind, kind_of
 
 REDUCED = {

@@ -213,7 +213,9 @@ def of_battery(voltages: Sequence[Found], speed: Found | None) -> bool:
     """
     runs = [one.values[~np.isnan(one.values)] for one in voltages]
     high = [float(np.quantile(np.abs(run), 0.95)) if run.size else 0.0 for run in runs]
-    values = np.concatenate([run / h for run, h in zip(runs, high, strict=True) if h] or [[0.0]])
+    values = np.concatenate(
+        [run / h for run, h in zip(runs, high, strict=True) if h] or [np.zeros(1)]
+    )
     stays_up = float(np.quantile(values, 0.05)) > 0.6
     return stays_up and (speed is None or float(np.nanstd(speed.values)) > 0.0)
 
