@@ -17,7 +17,7 @@ and fades out where wheels hardly turn.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.control.deployed import DeployedRobot
+from slipid.control.deployed import RobotArrays
 from slipid.control.filter.effects import Course
 from slipid.control.filter.floor_filter import told_of
 from slipid.control.filter.hypotheses import hypotheses_of
@@ -55,7 +55,7 @@ def solved(m: Float[Array, "wheel wheel"], b: Float[Array, " wheel"]) -> Float[A
 
 
 def wheel_speeds(
-    robot: DeployedRobot,
+    robot: RobotArrays,
     asked: Float[Array, "3"],
     believed: Believed,
     turning: Float[Array, " wheel"],

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from slipid.control.deployed import DeployedRobot
+from slipid.control.deployed import RobotArrays
 from slipid.control.filter.effects import direction, stays
 from slipid.control.filter.floor import Floor
 from slipid.control.filter.floor_filter import HASTE, Motion, Tick, length
@@ -57,8 +57,8 @@ class _Way(eqx.Module):
 class PoseFilter(eqx.Module):
     """Filter of the pose."""
 
-    robot: DeployedRobot
-    settings: Settings = eqx.field(static=True)
+    robot: RobotArrays
+    settings: Settings
 
     def init(self, pose: Float[Array, "3"], std: tuple[float, float] = (0.0, 0.0)) -> PoseState:
         """At rest at a pose [m, m, rad], known this well [m], [rad]."""

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from slipid.control.closed_loop import PERIOD
 from slipid.control.controller import Controller, ControllerState, Gains
-from slipid.control.deployed import DeployedRobot
+from slipid.control.deployed import DeployedRobot, RobotArrays
 from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.interface import Believed, Estimate
 from slipid.control.tuning.actuation import RING, Habits
@@ -97,7 +97,7 @@ class Loop(eqx.Module):
         pose = pose - self.rates * PERIOD
         return LoopState(pose=pose, speed=w, ring=ring, control=control)
 
-    def _twist(self, robot: DeployedRobot, w: Array) -> Array:
+    def _twist(self, robot: RobotArrays, w: Array) -> Array:
         floor = robot.floors.at(self.surface)
         return contact.equilibrium(robot.frame.radius * w, robot.frame, floor, robot.rest)
 
