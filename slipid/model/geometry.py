@@ -116,10 +116,12 @@ class Geometry(eqx.Module):
 
     @property
     def around(self) -> tuple[int, ...]:
-        """Wheels in the order in which one meets them going around the robot."""
+        """Wheels in the order in which one meets them going around the robot from the first."""
         place = np.asarray(self.place)
         x, y = (place - place.mean(axis=0)).T
-        return tuple(int(k) for k in np.argsort(np.arctan2(y, x), kind="stable"))
+        order = np.argsort(np.arctan2(y, x), kind="stable").tolist()
+        first = order.index(0)
+        return (*order[first:], *order[:first])
 
     def mirror(self) -> float | None:
         """Axis of the body about which its wheels are their own mirror image [rad], or None.
