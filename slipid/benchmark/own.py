@@ -19,7 +19,7 @@ from slipid.benchmark.steps import Cut, body_poses
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
 from slipid.control.interface import MIXED, NO_FLOOR, Readings, Settings
-from slipid.control.robot_file.record import FloorRecord, RobotRecord, Sensors
+from slipid.control.robot_file.record import Sensors
 from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
 from slipid.deploy.floors import floor_of
@@ -205,34 +205,13 @@ def _estimator(own: Own, load: str, only: str | None, place: Place, several: boo
     if several or place.map is not None:
         settings = replace(settings, alike=MIXED)
     known = None if place.map is None else floor_of(place.map, robot.labels)
-    return Estimator(_same_structure(robot), settings, known)
+    return Estimator(robot, settings, known)
 
 
 def _starts(runs: Sequence[Any], mine: Sequence[int], floor: FloorMap | None) -> np.ndarray:
     if floor is None:
         return np.zeros((len(mine), 3))
     return np.stack([runs[n][0].pose[0] for n in mine])
-
-
-def _same_structure(robot: DeployedRobot) -> DeployedRobot:
-    """The robot with a record that says no more than what compiled code depends on.
-
-    Robots of several fits then share it.
-    """
-    record = robot.record
-    blank = RobotRecord(
-        wheels=record.wheels,
-        parameters={},
-        floors=tuple(
-            FloorRecord(floor.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, None, floor.unseen)
-            for floor in record.floors
-        ),
-        loads=(),
-        current_trend=(0.0, 0.0),
-        highest_speed=0.0,
-        draws={},
-    )
-    return replace(robot, record=blank, load_setup="")
 
 
 class _Rows(eqx.Module):
@@ -273,7 +252,7 @@ def replay(estimator: Estimator, runs: Sequence[Heard], start: np.ndarray) -> li
     longest = max(int(part.sum()) for part in parts)
     longest = -(-longest // STEPS) * STEPS + 1
     drives = estimator.robot.drives
-    known = [k for k, floor in enumerate(estimator.robot.record.floors) if not floor.unseen]
+    known = [k for k, unseen in enumerate(estimator.robot.unseen) if not unseen]
     out: list[Said] = []
     for first in range(0, len(runs), TOGETHER):
         some = range(first, min(first + TOGETHER, len(runs)))

@@ -15,7 +15,7 @@ does not come about it stops and says so.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Literal
 
 import equinox as eqx
@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from slipid.control.deployed import DeployedRobot
-from slipid.control.interface import UNTIMED_S, Estimate, Numbers
+from slipid.control.deployed import RobotArrays, recorded
+from slipid.control.interface import UNTIMED_S, Estimate, Numbers, Scalar, as_arrays
 from slipid.parameter import parameter
 
 Correction = Literal["none", "torque", "paper_print", "paper_code"]
@@ -59,13 +59,17 @@ class Gains(eqx.Module):
     )
 
     @classmethod
-    def of(cls, robot: DeployedRobot, forced: bool = False) -> "Gains":
+    def of(cls, robot: RobotArrays, forced: bool = False) -> "Gains":
         """Those tuned for a robot and its load set-up if they are better, else those set by hand.
 
         If they are forced, those tuned for them, whether they are better or not.
+
+        Raises:
+            ValueError: the robot comes without its record.
         """
-        tuned = robot.record.gains
-        if tuned is None or tuned.load != robot.load_setup:
+        known = recorded(robot)
+        tuned = known.record.gains
+        if tuned is None or tuned.load != known.load_setup:
             return cls()
         if not (tuned.is_better or forced):
             return cls()
@@ -77,8 +81,7 @@ class Gains(eqx.Module):
         return cls(*(jnp.asarray(value, dtype=float) for value in values))
 
 
-@dataclass(frozen=True)
-class Limits:
+class Limits(eqx.Module):
     """What a command may not exceed.
 
     Attributes:
@@ -86,10 +89,10 @@ class Limits:
         voltage: of the supply [V]; twist: largest speed asked of the body [m/s].
     """
 
-    wheel_speed: float = 13.0
-    acceleration: float = 25.0
-    voltage: float = 22.0
-    twist: float = 0.5
+    wheel_speed: Scalar = 13.0
+    acceleration: Scalar = 25.0
+    voltage: Scalar = 22.0
+    twist: Scalar = 0.5
 
 
 class ControllerState(eqx.Module):
@@ -122,7 +125,7 @@ def limited(
     wanted: Float[Array, " wheel"],
     before: Float[Array, " wheel"],
     current: Float[Array, " wheel"],
-    robot: DeployedRobot,
+    robot: RobotArrays,
     limits: Limits,
     dt: Float[Array, ""] | float,
 ) -> Float[Array, " wheel"]:
@@ -175,21 +178,22 @@ class Controller(eqx.Module):
             its kind need no other compilation.
     """
 
-    robot: DeployedRobot
+    robot: RobotArrays
     gains: Gains
-    limits: Limits = eqx.field(static=True)
+    limits: Limits
     correction: Correction = eqx.field(static=True)
     law: Law | None = None
 
     def __init__(
         self,
-        robot: DeployedRobot,
+        robot: RobotArrays,
         gains: Gains | None = None,
-        limits: Limits = Limits(),
+        limits: Limits | None = None,
         correction: Correction = "none",
         law: Law | None = None,
     ):
-        self.robot, self.limits, self.correction, self.law = robot, limits, correction, law
+        self.robot, self.limits = robot.arrays, as_arrays(Limits() if limits is None else limits)
+        self.correction, self.law = correction, law
         self.gains = Gains.of(robot) if gains is None else gains
 
     def init(self) -> ControllerState:

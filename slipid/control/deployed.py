@@ -21,8 +21,11 @@ from slipid.model.motor import Motor
 from slipid.support.errors import DataError
 
 
-class DeployedRobot(eqx.Module):
-    """An identified robot, ready to be deployed: what robot.json holds, for one load set-up.
+class RobotArrays(eqx.Module):
+    """An identified robot with one load set-up as arrays: what estimators and controllers hold.
+
+    Compiled code depends on what is static here, the robot's structure, and on no number: robots of
+    one structure share it.
 
     Attributes:
         frame: wheel directions; `places`: wheel centres in the body frame [m].
@@ -43,8 +46,8 @@ class DeployedRobot(eqx.Module):
         highest: wheel speed up to which the fit has seen the robot [rad/s], and the model's largest
             current up to 0.8 of it [A].
         wheel_curve: a + b |I|, the slip ratio of each drive, of all floors together (drive, 2).
-        record: every number with its interval, verdict and provenance.
-        load_setup: name of the load set-up.
+        drive_of, around: of the wheels, as of `slipid.model.geometry.Geometry`.
+        unseen: for each floor, whether nobody drove on it.
     """
 
     frame: Frame
@@ -63,18 +66,62 @@ class DeployedRobot(eqx.Module):
     current_trend: Float[Array, "2"]
     highest: Float[Array, "2"]
     wheel_curve: Float[Array, "drive 2"]
-    record: RobotRecord = eqx.field(static=True)
-    load_setup: str = eqx.field(static=True)
+    drive_of: tuple[int, ...] = eqx.field(static=True)
+    around: tuple[int, ...] = eqx.field(static=True)
+    unseen: tuple[bool, ...] = eqx.field(static=True)
+
+    @property
+    def arrays(self) -> "RobotArrays":
+        """The robot without its record."""
+        return RobotArrays(**{f.name: getattr(self, f.name) for f in fields(RobotArrays)})
 
     @property
     def wheels(self) -> int:
         """Number of wheels."""
-        return len(self.record.wheels.place)
+        return len(self.around)
 
     @property
     def drives(self) -> int:
         """Number of drives: as many angles, currents and voltages are measured."""
-        return self.record.wheels.drives
+        return len(set(self.drive_of)) or self.wheels
+
+    @property
+    def by_wheels(self) -> Float[Array, "3 wheel"]:
+        """Twist per rim speed of every wheel, where those of a drive turn alike."""
+        if not self.drive_of:
+            return self.inverse
+        return self.inverse @ self.on_average(jnp.eye(self.wheels)).T
+
+    def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
+        """What every wheel has of its drive, such as its speed."""
+        return at_wheels(self.drive_of, of_drives)
+
+    def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
+        """What every drive has of all its wheels together, such as their torque."""
+        return at_drives(self.drive_of, of_wheels)
+
+    def on_average(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
+        """Mean of what the wheels of every drive have."""
+        if not self.drive_of:
+            return of_wheels
+        return self.at_drives(of_wheels) / self.at_drives(jnp.ones(self.wheels))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the floors, in the order of every `floor` axis."""
+        return self.floors.labels
+
+
+class DeployedRobot(RobotArrays):
+    """An identified robot, ready to be deployed: what robot.json holds, for one load set-up.
+
+    Attributes:
+        record: every number with its interval, verdict and provenance.
+        load_setup: name of the load set-up.
+    """
+
+    record: RobotRecord = eqx.field(static=True)
+    load_setup: str = eqx.field(static=True)
 
     @property
     def steers(self) -> bool:
@@ -85,32 +132,6 @@ class DeployedRobot(eqx.Module):
         """
         shape = shape_of(self.record)
         return not shape.drive_of and shape.determines_twist
-
-    @property
-    def by_wheels(self) -> Float[Array, "3 wheel"]:
-        """Twist per rim speed of every wheel, where those of a drive turn alike."""
-        if not self.record.wheels.drive_of:
-            return self.inverse
-        return self.inverse @ self.on_average(jnp.eye(self.wheels)).T
-
-    def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """What every wheel has of its drive, such as its speed."""
-        return at_wheels(self.record.wheels.drive_of, of_drives)
-
-    def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
-        """What every drive has of all its wheels together, such as their torque."""
-        return at_drives(self.record.wheels.drive_of, of_wheels)
-
-    def on_average(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
-        """Mean of what the wheels of every drive have."""
-        if not self.record.wheels.drive_of:
-            return of_wheels
-        return self.at_drives(of_wheels) / self.at_drives(jnp.ones(self.wheels))
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Names of the floors, in the order of every `floor` axis."""
-        return self.record.labels
 
     @classmethod
     def of(cls, record: RobotRecord, load: str | None = None) -> "DeployedRobot":
@@ -182,6 +203,20 @@ class DeployedRobot(eqx.Module):
         return DeployedRobot.of(with_unseen(self.record), self.load_setup)
 
 
+def recorded(robot: RobotArrays) -> DeployedRobot:
+    """The same robot, once it is sure that it has its record.
+
+    Raises:
+        ValueError: these are arrays alone.
+    """
+    if not isinstance(robot, DeployedRobot):
+        raise ValueError(
+            "arrays of a robot without its record; expected a DeployedRobot, or settings and gains "
+            "to go with the arrays"
+        )
+    return robot
+
+
 def drawn(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
     """Robots that the posterior holds possible, stacked along a leading axis.
 
@@ -221,7 +256,7 @@ def _arrays(
         places=jnp.asarray(geometry.place) * geometry.base_radius,
         forward=geometry.forward(),
         inverse=geometry.least(),
-        motor=Motor(**of("motor", Motor), gear_ratio=wheels.gear_ratio),
+        motor=Motor(**of("motor", Motor), gear_ratio=_array(wheels.gear_ratio)),
         floors=ContactSurface(
             **{name: jnp.stack([row[name] for row in rows]) for name in rows[0]},
             labels=record.labels,
@@ -236,6 +271,9 @@ def _arrays(
         current_trend=_array(record.current_trend),
         highest=_array([record.highest_speed, chosen.highest_current]),
         wheel_curve=_array(chosen.wheel_curve),
+        drive_of=wheels.drive_of,
+        around=geometry.around,
+        unseen=tuple(floor.unseen for floor in floors),
         record=record,
         load_setup=chosen.name,
     )

@@ -12,14 +12,21 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from slipid.control.deployed import DeployedRobot
+from slipid.control.deployed import RobotArrays
 from slipid.control.filter.floor import Floor
 from slipid.control.filter.floor_filter import FloorFilter, FloorState, Tick, length
 from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.filter.pose_filter import PoseFilter, turned_axes
 from slipid.control.filter.pose_fix import PoseState, placed
 from slipid.control.filter.wheels import WheelState, read_currents, read_wheels, time_step
-from slipid.control.interface import AbstractEstimator, Estimate, Pose, Readings, Settings
+from slipid.control.interface import (
+    AbstractEstimator,
+    Estimate,
+    Pose,
+    Readings,
+    Settings,
+    as_arrays,
+)
 from slipid.model.se2 import advance, compose
 
 CURRENT_FROM = 0.4
@@ -53,15 +60,15 @@ class Estimator(AbstractEstimator[EstimatorState]):
             is none.
     """
 
-    robot: DeployedRobot
-    settings: Settings = eqx.field(static=True)
+    robot: RobotArrays
+    settings: Settings
     floor: Floor | None = None
 
     def __init__(
-        self, robot: DeployedRobot, settings: Settings | None = None, floor: Floor | None = None
+        self, robot: RobotArrays, settings: Settings | None = None, floor: Floor | None = None
     ):
-        self.robot, self.floor = robot, floor
-        self.settings = Settings.of(robot) if settings is None else settings
+        self.robot, self.floor = robot.arrays, floor
+        self.settings = as_arrays(Settings.of(robot) if settings is None else settings)
 
     def init(
         self, pose: Pose = (0.0, 0.0, 0.0), std: tuple[float, float] = (0.0, 0.0)
@@ -175,13 +182,13 @@ class Odometry(AbstractEstimator[OdometryState]):
             believed.
     """
 
-    robot: DeployedRobot
-    settings: Settings = eqx.field(static=True)
+    robot: RobotArrays
+    settings: Settings
     curve: bool = eqx.field(static=True)
 
-    def __init__(self, robot: DeployedRobot, settings: Settings | None = None, curve: bool = False):
-        self.robot, self.curve = robot, curve
-        self.settings = Settings.of(robot) if settings is None else settings
+    def __init__(self, robot: RobotArrays, settings: Settings | None = None, curve: bool = False):
+        self.robot, self.curve = robot.arrays, curve
+        self.settings = as_arrays(Settings.of(robot) if settings is None else settings)
 
     def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> OdometryState:
         """State of a robot at rest at a pose [m, m, rad]."""

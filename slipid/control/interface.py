@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from typing import Generic, TypeVar
 
 import equinox as eqx
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from slipid.control.deployed import DeployedRobot
+from slipid.control.deployed import RobotArrays, recorded
 
 Numbers = Array | np.ndarray
 Pose = Float[Numbers, "3"] | tuple[float, float, float]
@@ -24,10 +24,16 @@ MIXED = 1.0
 UNTIMED_S = 0.01
 """What a step without a time counts as, until readings are stale and while the robot stops [s]."""
 State = TypeVar("State", bound=eqx.Module)
+Some = TypeVar("Some", bound=eqx.Module)
+Scalar = Float[Array, ""] | float
 
 
-@dataclass(frozen=True)
-class Settings:
+def as_arrays(given: Some) -> Some:
+    """The same module with arrays in place of numbers, so that compiled code takes any of them."""
+    return jax.tree.map(partial(jnp.asarray, dtype=float), given)
+
+
+class Settings(eqx.Module):
     """What is not identified.
 
     Attributes:
@@ -46,26 +52,30 @@ class Settings:
         longest_s: time step beyond which the robot's motion is not made up [s].
     """
 
-    current_is_signed: bool = False
-    forget_s: float = 0.4
-    filter_s: float = 0.05
-    patch_m: float = 0.1
-    doubt_m: float = 1.5
-    alike: float = 3.0
-    unknown_std: float = 3.0
-    ammeter_std_a: float = 0.07
-    voltmeter_std_v: float = 0.06
-    gyro_std: float = 0.004
-    gyro_bias_std: float = 0.01
-    gyro_delay_s: float = 0.0
-    still_m_s: float = 0.003
-    stale_s: float = 0.3
-    longest_s: float = 0.5
+    current_is_signed: bool = eqx.field(static=True, default=False)
+    forget_s: Scalar = 0.4
+    filter_s: Scalar = 0.05
+    patch_m: Scalar = 0.1
+    doubt_m: Scalar = 1.5
+    alike: Scalar = 3.0
+    unknown_std: Scalar = 3.0
+    ammeter_std_a: Scalar = 0.07
+    voltmeter_std_v: Scalar = 0.06
+    gyro_std: Scalar = 0.004
+    gyro_bias_std: Scalar = 0.01
+    gyro_delay_s: Scalar = 0.0
+    still_m_s: Scalar = 0.003
+    stale_s: Scalar = 0.3
+    longest_s: Scalar = 0.5
 
     @classmethod
-    def of(cls, robot: DeployedRobot) -> "Settings":
-        """Those of a robot: the sensors of its logs, and what they were driven over."""
-        record = robot.record
+    def of(cls, robot: RobotArrays) -> "Settings":
+        """Those of a robot: the sensors of its logs, and what they were driven over.
+
+        Raises:
+            ValueError: it comes without its record.
+        """
+        record = recorded(robot).record
         return cls(current_is_signed=record.sensors.current_is_signed, alike=record.alike)
 
 
@@ -183,7 +193,7 @@ class Estimate(eqx.Module):
 class AbstractEstimator(eqx.Module, Generic[State]):
     """An estimator as pure functions: `init` gives a state, `step` the next one and an estimate."""
 
-    robot: eqx.AbstractVar[DeployedRobot]
+    robot: eqx.AbstractVar[RobotArrays]
     settings: eqx.AbstractVar[Settings]
 
     @abstractmethod

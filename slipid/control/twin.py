@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 
 from slipid.control.actuation import RING, Habits
 from slipid.control.closed_loop import PERIOD
-from slipid.control.deployed import DeployedRobot
+from slipid.control.deployed import RobotArrays
 from slipid.control.filter.effects import Course, direction, stays
 from slipid.control.filter.floor import Floor
 from slipid.control.interface import Measurement, Pose, Readings
@@ -70,7 +70,7 @@ class Twin(eqx.Module):
         habits: what no fit tells.
     """
 
-    robot: DeployedRobot
+    robot: RobotArrays = eqx.field(converter=lambda robot: robot.arrays)
     floor: Floor
     habits: Habits = eqx.field(static=True, default=Habits())
 

@@ -159,7 +159,7 @@ def _form(
         return stablehlo_files(pilot)
     if form == "c":
         try:
-            text = c_files(pilot, path, recorded(robot, pilot, path, wish, place))
+            text = c_files(robot, pilot, path, recorded(robot, pilot, path, wish, place))
         except UnsupportedError as error:
             raise DataError(f"controller {wish.controller}: {error}") from error
     else:

@@ -252,7 +252,7 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
     paths, skipped = [e.path for e in entries(robot)], []
     choices = said_of(robot, config.content.wheels.mass_kg or float(robot.body.mass))
     choices += lengths(config.content.fit.lengths_from, robot.geometry)
-    measured, told = bench_priors(config, robot.motor.gear_ratio)
+    measured, told = bench_priors(config, float(robot.motor.gear_ratio))
     choices += measured
     skipped += told
     try:

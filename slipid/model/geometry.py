@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -98,7 +99,29 @@ class Geometry(eqx.Module):
 
     def frame(self) -> "Frame":
         """The wheels as rows of matrices, at the current radius, base and offsets."""
-        return _frame(self)
+        return _frame(
+            jnp.asarray(self.place) * self.base_radius,
+            jnp.asarray(self.drive_angle) + self.drive_offset,
+            jnp.asarray(self.roller_angle),
+            self._larger(),
+            self.wheel_radius,
+            self.base_radius,
+            self.grips,
+        )
+
+    def _larger(self) -> Float[Array, " wheel"]:
+        """Radius of each wheel over r."""
+        of_drives = jnp.broadcast_to(self.radius_deviation, (self.drives,))
+        return 1.0 + self.at_wheels(of_drives)
+
+    @property
+    def around(self) -> tuple[int, ...]:
+        """Wheels in the order in which one meets them going around the robot from the first."""
+        place = np.asarray(self.place)
+        x, y = (place - place.mean(axis=0)).T
+        order = np.argsort(np.arctan2(y, x), kind="stable").tolist()
+        first = order.index(0)
+        return (*order[first:], *order[:first])
 
     def mirror(self) -> float | None:
         """Axis of the body about which its wheels are their own mirror image [rad], or None.
@@ -182,31 +205,35 @@ class Frame(eqx.Module):
     ordinary: bool = eqx.field(static=True, default=False)
 
 
-@jax.jit
-def _frame(of: Geometry) -> Frame:
-    drive = jnp.asarray(of.drive_angle) + of.drive_offset
-    roller = jnp.asarray(of.roller_angle)
+@partial(jax.jit, static_argnames="grips")
+def _frame(
+    p: Float[Array, "wheel 2"],
+    drive: Float[Array, " wheel"],
+    roller: Float[Array, " wheel"],
+    larger: Float[Array, " wheel"],
+    radius: Float[Array, ""],
+    base: Float[Array, ""],
+    grips: tuple[bool, ...],
+) -> Frame:
     free = drive - roller
     hold = free + 0.5 * math.pi
-    p = jnp.asarray(of.place) * of.base_radius
 
     def row(angle: Float[Array, " wheel"]) -> Float[Array, "wheel 3"]:
         c, s = jnp.cos(angle), jnp.sin(angle)
         return jnp.stack([c, s, p[:, 0] * s - p[:, 1] * c], axis=-1)
 
     # loads move when the contact patches do: N = N0 - shift @ (displacement), minimum change
-    lever = jnp.concatenate([jnp.ones((1, of.wheels)), p.T], axis=0)
-    larger = 1.0 + of.at_wheels(jnp.broadcast_to(of.radius_deviation, (of.drives,)))
+    lever = jnp.concatenate([jnp.ones((1, len(p))), p.T], axis=0)
     return Frame(
         hold=row(hold),
         roll=row(free),
         pull=larger * jnp.sin(roller),
         slip_through=larger * jnp.cos(roller),
-        grip=jnp.asarray(of.grips, dtype=float),
+        grip=jnp.asarray(grips, dtype=float),
         shift=jnp.linalg.pinv(lever)[:, 1:],
-        radius=of.wheel_radius,
-        base=of.base_radius,
-        ordinary=any(of.grips),
+        radius=radius,
+        base=base,
+        ordinary=any(grips),
     )
 
 

@@ -3,6 +3,7 @@
 from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -51,7 +52,10 @@ class Motor(eqx.Module):
     rotor_inertia: Array = held(
         "kg*m^2", "J_m", "inertia of the rotor", start=1e-5, lower=0.0, spread=1.0
     )
-    gear_ratio: float = eqx.field(static=True, default=1.0)
+    gear_ratio: Array = eqx.field(
+        converter=lambda x: x if isinstance(x, jax.core.Tracer) else jnp.asarray(x, dtype=float),
+        default=1.0,
+    )
 
     def voltage(
         self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
@@ -101,7 +105,7 @@ class Motor(eqx.Module):
 
 
 def signed(
-    current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"], gear_ratio: float
+    current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"], gear_ratio: Array | float
 ) -> Float[Array, " *w"]:
     """Sign for magnitudes of an unsigned log: I = |I| wm / sqrt(wm^2 + w0^2); braking is lost."""
     wm = gear_ratio * wheel_speed

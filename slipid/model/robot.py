@@ -154,7 +154,7 @@ def build(
     return Robot(
         geometry=geometry,
         body=Body(load_share=jnp.full((len(loads), wheels), 1 / wheels), loads=tuple(loads)),
-        motor=Motor(gear_ratio=geometry.gear_ratio),
+        motor=Motor(gear_ratio=jnp.asarray(geometry.gear_ratio)),
         surfaces=ContactSurface(**stack, labels=tuple(names)),
         camera=Camera(
             session_yaw=jnp.zeros(len(sessions)),

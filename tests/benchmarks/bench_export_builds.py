@@ -20,7 +20,7 @@ from slipid.control.export.c99.code import Code
 from slipid.control.export.c99.folder import c_files
 from slipid.control.export.golden import golden
 from slipid.control.trajectory import rectangle
-from tests.benchmarks.export_builds import HERE, KINDS, needs, pilot, ran
+from tests.benchmarks.export_builds import HERE, KINDS, needs, pilot, ran, three_floors
 from tests.benchmarks.quick import QUICK, quick
 
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
@@ -61,7 +61,7 @@ void _exit(int code) { (void)code; for (;;) {} }
 
 @cache
 def _files(row: str) -> dict[str, str]:
-    return c_files(pilot(row), rectangle())
+    return c_files(three_floors(), pilot(row), rectangle())
 
 
 def folder_of(row: str, into: Path) -> Path:
@@ -126,7 +126,7 @@ class Sizes:
 
 @cache
 def _bare(row: str) -> Code:
-    return Code(pilot(row))
+    return Code(three_floors(), pilot(row))
 
 
 def sizes(row: str, chip: str, folder: Path) -> Sizes:

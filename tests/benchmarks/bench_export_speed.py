@@ -252,7 +252,7 @@ ALL = 99
 def test_many_floors(tmp_path, monkeypatch, floors, changes):
     monkeypatch.setattr(hypotheses, "CHANGES", changes)
     robot = known(mecanum(0.2, 0.15, 0.05, 20.0), [f"floor{k}" for k in range(floors)])
-    made = Code(pilot_of(robot, ROWS["contact"]), PATH)
+    made = Code(robot, pilot_of(robot, ROWS["contact"]), PATH)
     fleet = Fleet(made, tmp_path, FAST)
     drive = driven(made, robot, fleet, 400).write(tmp_path / "drive")
     took = timed(unfleeted(made, tmp_path / "alone"), drive, FAST)[0]

@@ -91,7 +91,7 @@ def pilot(row: str) -> Pilot:
 @cache
 def code(row: str) -> Code:
     """Their code."""
-    return Code(pilot(row), PATH)
+    return Code(three_floors(), pilot(row), PATH)
 
 
 class Fleet(CompiledC):

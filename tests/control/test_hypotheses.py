@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from slipid.control.filter.hypotheses import CHANGES, _hypotheses
+from slipid.model.geometry import general
 
 
 def ways(place, floors, changes=CHANGES, unseen=0):
     """So many floors that were driven on, and after them so many that were not."""
-    return _hypotheses(tuple(place), (False,) * floors + (True,) * unseen, changes)
+    around = general(place, [0.0] * len(place), [90.0] * len(place), 0.05).around
+    return _hypotheses(around, (False,) * floors + (True,) * unseen, changes)
 
 
 THREE = [(0.5, 0.9), (-1.0, 0.0), (0.5, -0.9)]

@@ -123,7 +123,7 @@ def test_the_program_drives_the_test_site_to_the_last_printed_digit(tmp_path):
     """One process is the robot, in C; the other is the world, in MuJoCo."""
     pytest.importorskip("mujoco")
     pilot, path = pilot_of(ROBOT, ROWS["contact"]), rectangle(0.4, 0.2).waiting(REST_S)
-    for name, text in c_files(pilot, path).items():
+    for name, text in c_files(ROBOT, pilot, path).items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     sources = ("examples/drive/drive.c", "src/slipid.c", "-lm")

@@ -43,7 +43,8 @@ NEEDS_COMPILER = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a 
 @cache
 def code(row: str) -> Code:
     """Of a row of the trial for a small robot, with a rectangle to follow."""
-    return Code(pilot_of(small_twin.deployed(1.0, 1.0, 0.3), ROWS[row]), rectangle())
+    robot = small_twin.deployed(1.0, 1.0, 0.3)
+    return Code(robot, pilot_of(robot, ROWS[row]), rectangle())
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from slipid.control.deployed import DeployedRobot
+from slipid.control.deployed import RobotArrays
 from slipid.control.filter.effects import Course
 from slipid.control.filter.hypotheses import hypotheses_of
 from slipid.control.filter.wheels import Currents
@@ -96,8 +96,8 @@ class Motion(eqx.Module):
 class FloorFilter(eqx.Module):
     """Filter over the floors under the wheels."""
 
-    robot: DeployedRobot
-    settings: Settings = eqx.field(static=True)
+    robot: RobotArrays
+    settings: Settings
 
     def init(self) -> FloorState:
         """Before anything is measured."""
@@ -116,10 +116,10 @@ class FloorFilter(eqx.Module):
         """
         under = hypotheses_of(self.robot).under
         kinds = np.array([len(set(row)) for row in under.tolist()])
-        unseen = np.array([floor.unseen for floor in self.robot.record.floors])[under[:, 0]]
+        unseen = np.array(self.robot.unseen)[under[:, 0]]
         further = kinds - 1 + unseen  # floors beside the one that is under the robot for sure
-        weight = np.exp(-self.settings.alike * further) / np.where(unseen, unseen.sum(), 1)
-        return jnp.asarray(weight / weight.sum())
+        weight = jnp.exp(-self.settings.alike * further) / np.where(unseen, unseen.sum(), 1)
+        return weight / jnp.sum(weight)
 
     def step(
         self,
@@ -292,7 +292,7 @@ class FloorFilter(eqx.Module):
 
         That is as rare as a floor that none of the hypotheses knows.
         """
-        unseen = np.array([floor.unseen for floor in self.robot.record.floors])
+        unseen = np.array(self.robot.unseen)
         if not unseen.any():
             return p
         whole = hypotheses_of(self.robot).uniform
@@ -323,9 +323,7 @@ class FloorFilter(eqx.Module):
         return jnp.einsum("c,cwf->wf", known, hypotheses_of(self.robot).on.astype(float))
 
 
-def told_of(
-    robot: DeployedRobot, of_floor: Float[Array, "floor 3"]
-) -> Float[Array, "hypothesis 3"]:
+def told_of(robot: RobotArrays, of_floor: Float[Array, "floor 3"]) -> Float[Array, "hypothesis 3"]:
     """What is told of the body under every hypothesis: of all wheels on one floor, no more."""
     ways = hypotheses_of(robot)
     return jnp.zeros((len(ways), 3)).at[ways.uniform].set(of_floor)

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
-from slipid.control.deployed import DeployedRobot
+from slipid.control.deployed import RobotArrays
 
 CHANGES = 2
 """Changes of floor around the robot, from wheel to wheel, that count as possible."""
@@ -42,20 +42,17 @@ class Hypotheses:
         return len(self.under)
 
 
-def hypotheses_of(robot: DeployedRobot) -> Hypotheses:
+def hypotheses_of(robot: RobotArrays) -> Hypotheses:
     """Ways in which the wheels of a robot may stand on the floors it knows."""
-    unseen = tuple(floor.unseen for floor in robot.record.floors)
-    return _hypotheses(robot.record.wheels.place, unseen, CHANGES)
+    return _hypotheses(robot.around, robot.unseen, CHANGES)
 
 
 @lru_cache(maxsize=32)
-def _hypotheses(
-    place: tuple[tuple[float, float], ...], unseen: tuple[bool, ...], changes: int
-) -> Hypotheses:
-    around, floors = _around(np.asarray(place)), len(unseen)
+def _hypotheses(around: tuple[int, ...], unseen: tuple[bool, ...], changes: int) -> Hypotheses:
+    wheels, floors = len(around), len(unseen)
     driven = [k for k in range(floors) if not unseen[k]]
-    ways = list(itertools.product(driven, repeat=len(place)))
-    ways += [(k,) * len(place) for k in range(floors) if unseen[k]]
+    ways = list(itertools.product(driven, repeat=wheels))
+    ways += [(k,) * wheels for k in range(floors) if unseen[k]]
     under = np.array([way for way in ways if _changes(way, around) <= changes])
     number = {tuple(way): k for k, way in enumerate(under.tolist())}
 
@@ -67,20 +64,14 @@ def _hypotheses(
         beside=np.array(
             [
                 [[beside(way, wheel, floor) for floor in range(floors)] for way in under.tolist()]
-                for wheel in range(len(place))
+                for wheel in range(wheels)
             ]
         ),
-        uniform=np.array([number[(floor,) * len(place)] for floor in range(floors)]),
+        uniform=np.array([number[(floor,) * wheels] for floor in range(floors)]),
         on=under[:, :, None] == np.arange(floors),
     )
 
 
-def _around(place: Float[np.ndarray, "wheel 2"]) -> list[int]:
-    """Wheels in the order in which one meets them going around the robot."""
-    x, y = (place - place.mean(axis=0)).T
-    return [int(k) for k in np.argsort(np.arctan2(y, x), kind="stable")]
-
-
-def _changes(way: tuple[int, ...], around: list[int]) -> int:
+def _changes(way: tuple[int, ...], around: tuple[int, ...]) -> int:
     """How often the floor changes on the way around the robot."""
     return sum(way[a] != way[b] for a, b in zip(around, around[1:] + around[:1], strict=True))

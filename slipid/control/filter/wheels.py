@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from slipid.control.deployed import DeployedRobot
+from slipid.control.deployed import RobotArrays
 from slipid.control.interface import UNTIMED_S, Readings, Settings
 
 
@@ -21,7 +21,7 @@ class WheelState(eqx.Module):
     age: Float[Array, " drive"]
 
     @classmethod
-    def init(cls, robot: DeployedRobot, settings: Settings) -> "WheelState":
+    def init(cls, robot: RobotArrays, settings: Settings) -> "WheelState":
         """At rest, and not heard of yet."""
         n = robot.drives
         return cls(
@@ -53,7 +53,7 @@ def time_step(dt: Float[Array, ""] | float, settings: Settings) -> Float[Array, 
 
 
 def read_wheels(
-    robot: DeployedRobot, settings: Settings, old: WheelState, z: Readings, dt: Array
+    robot: RobotArrays, settings: Settings, old: WheelState, z: Readings, dt: Array
 ) -> WheelState:
     """Wheel speeds, angles up to which motion is counted, and how old each wheel's reading is.
 
@@ -77,7 +77,7 @@ def read_wheels(
 
 
 def read_currents(
-    robot: DeployedRobot, settings: Settings, old: Array, z: Readings, w: Array, dt: Array
+    robot: RobotArrays, settings: Settings, old: Array, z: Readings, w: Array, dt: Array
 ) -> Currents:
     """Currents from ammeters and, through the motor's equation, from voltmeters.
 

@@ -198,7 +198,7 @@ def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
         return z
     speed = (w.turn / w.dt[..., None]).ravel()
     amps = w.current.ravel() if w.current_is_signed else (w.current.ravel() * np.sign(speed))
-    wm = speed * problem.robot.motor.gear_ratio
+    wm = speed * float(problem.robot.motor.gear_ratio)
     a, *_ = np.linalg.lstsq(np.stack([amps, wm], -1), w.voltage.ravel(), rcond=None)
     place = problem.space.place
     for path, value in (("motor.resistance", a[0]), ("motor.back_emf", a[1])):

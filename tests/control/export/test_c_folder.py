@@ -19,7 +19,8 @@ pytestmark = NEEDS_COMPILER
 def folder(tmp_path_factory):
     """C folder of a small robot."""
     place = tmp_path_factory.mktemp("c")
-    for name, text in c_files(code("contact").pilot, rectangle()).items():
+    made = code("contact")
+    for name, text in c_files(made.robot, made.pilot, rectangle()).items():
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         (place / name).write_text(text)
     return place

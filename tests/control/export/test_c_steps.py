@@ -132,9 +132,9 @@ def test_the_loop_closes_in_c_as_it_does_in_the_library(tmp_path):
 
     made = code("contact")
     path = rectangle(length=0.4, width=0.2)
-    loop = Code(made.pilot, path)
+    loop = Code(made.robot, made.pilot, path)
     compiled = CompiledC(loop, tmp_path)
-    robot = made.pilot.controller.robot
+    robot = made.robot
     floor = site(robot)
     place = Place(floor, starts(20, floor, path)[0], (0.0, 0.0, 0.0))
     kept = recorded(robot, made.pilot, path, Wish(), place)

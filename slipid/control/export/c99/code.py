@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from slipid.control.closed_loop import Pilot
+from slipid.control.deployed import DeployedRobot
 from slipid.control.export.c99.lowering.builder import Names
 from slipid.control.export.c99.lowering.function import Argument, Function, function, traced
 from slipid.control.export.c99.lowering.text import TYPES, WIDTH, folded, table
@@ -29,21 +30,22 @@ class Code:
     """The C code of a pilot, and of a path if it follows one.
 
     Attributes:
-        pilot: estimator and controller; path: as it lies for a robot that starts at 0.
+        robot: for the record of its numbers; pilot: its estimator and controller.
+        path: as it lies for a robot that starts at 0.
         estimator, controller: structs of what they keep.
         reading, estimate: structs of what goes in and what comes out.
         functions: all that are generated.
     """
 
-    def __init__(self, pilot: Pilot[eqx.Module], path: Path | None = None):
+    def __init__(self, robot: DeployedRobot, pilot: Pilot[eqx.Module], path: Path | None = None):
         """Trace and lower all functions.
 
         Raises:
             UnsupportedError: a step uses a primitive without a form in C.
         """
-        self.pilot, self.path = pilot, path
+        self.robot, self.pilot, self.path = robot, pilot, path
         self._names = Names()
-        begin, nothing = pilot.init(), Readings.nothing(pilot.controller.robot.wheels)
+        begin, nothing = pilot.init(), Readings.nothing(robot.wheels)
         zero = jnp.zeros(())
         believed = pilot.estimator.step(begin.seen, nothing, zero)[1]
         self.estimator = Struct.of("slipid_estimator", "What the estimator keeps.", begin.seen)
@@ -151,7 +153,7 @@ class Code:
 
     def header(self) -> str:
         """Text of slipid.h."""
-        robot = self.pilot.controller.robot
+        robot = self.robot
         named = identifiers(robot.labels, "floor")
         floors = [f"SLIPID_FLOOR_{name.upper()} {k}" for k, name in enumerate(named)]
         sizes = [f"SLIPID_WHEELS {robot.wheels}", f"SLIPID_FLOORS {len(robot.labels)}"]
@@ -185,7 +187,7 @@ class Code:
         reads = frozenset[str]().union(*(f.reads for f in self.functions))
         tables = [m for m in self._names.tables.values() if m.name in reads]
         values = {
-            "HEAD": "\n".join(_comment(*header(self.pilot.controller.robot))),
+            "HEAD": "\n".join(_comment(*header(self.robot))),
             "PRELUDE": template("prelude.c"),
             "TABLES": "\n".join(line for m in tables for line in table(m)),
             "FUNCTIONS": "\n".join(line for f in self.functions for line in f.text),
@@ -209,7 +211,7 @@ def about(pilot: Pilot[eqx.Module]) -> Iterator[str]:
         )
     settings = pilot.estimator.settings
     signs = "with their signs" if settings.current_is_signed else "without a sign (a sign is lost)"
-    yield f"Currents are taken {signs}. A wheel unheard for {settings.stale_s:g} s is stale."
+    yield f"Currents are taken {signs}. A wheel unheard for {float(settings.stale_s):g} s is stale."
     yield "Floors, as columns count them: " + listed([*robot.labels, "none of them"]) + "."
     ways = hypotheses_of(robot).under.tolist()
     each = "; ".join(f"{k}: {' '.join(map(str, way))}" for k, way in enumerate(ways))

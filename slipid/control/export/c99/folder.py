@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.control.closed_loop import Pilot
+from slipid.control.deployed import DeployedRobot
 from slipid.control.export.c99.code import Code, filled, template
 from slipid.control.export.c99.golden_header import golden_header
 from slipid.control.export.header import facts, made_with, warned
@@ -60,18 +61,22 @@ def _kib(numbers: int) -> str:
 
 
 def c_files(
-    pilot: Pilot[eqx.Module], path: Path, recording: Recording | None = None
+    robot: DeployedRobot,
+    pilot: Pilot[eqx.Module],
+    path: Path,
+    recording: Recording | None = None,
 ) -> dict[str, str]:
     """Text of the files by their paths in the folder.
 
     Args:
-        pilot: estimator and controller; path: that the example follows.
+        robot: for the record of its numbers; pilot: its estimator and controller.
+        path: that the example follows.
         recording: a run of it, as a test of the example.
 
     Raises:
         UnsupportedError: a step uses a primitive that has no form in C.
     """
-    code = Code(pilot, path)
+    code = Code(robot, pilot, path)
     named = {"VERSION": made_with()}
     files = {
         "src/slipid.h": code.header(),
@@ -89,7 +94,6 @@ def c_files(
         files["examples/drive/readings.txt"] = recording.readings
         files["examples/drive/commands.txt"] = recording.commands
         steps = filled("recording.md", {"PLANT": recording.plant})
-    robot = pilot.controller.robot
     values = {
         "WARNINGS": "\n".join(warned(robot)),
         "HEAD": "\n".join(facts(robot)),

@@ -52,12 +52,12 @@ def filter_parameters(
 
 def process_noise(robot: DeployedRobot, errs: Errs) -> Parameter:
     """Process noise on a floor, 15 x 15 as rows."""
-    matrix = np.diag(_diagonal(robot, errs))
+    matrix, most = np.diag(_diagonal(robot, errs)), float(Limits().acceleration)
     about = (
         f"On '{errs.floor}'. Pose: what stays the same all the way and so is no noise of single "
         f"velocities, as a random walk that is as far off after {short(DISTANCE_M)} m, at the "
         f"highest speed seen by the fit, {short(top_speed(robot))} m/s. Velocity: the change that "
-        f"the limit of wheel acceleration, {short(Limits().acceleration)} rad/s^2, allows within "
+        f"the limit of wheel acceleration, {short(most)} rad/s^2, allows within "
         f"{short(PERIOD_S)} s. Accelerations: the package's default. two_d_mode holds the rest."
     )
     entries = tuple(float(x) for x in matrix.reshape(-1))
@@ -67,7 +67,7 @@ def process_noise(robot: DeployedRobot, errs: Errs) -> Parameter:
 def _diagonal(robot: DeployedRobot, errs: Errs) -> Float[np.ndarray, " state"]:
     """Per second: pose as `Errs.walk`, velocities as (a T)^2 per period T."""
     pose = errs.walk(top_speed(robot), DISTANCE_M)
-    change = Limits().acceleration * float(robot.frame.radius)
+    change = float(Limits().acceleration) * float(robot.frame.radius)
     speed, turn = change**2 * PERIOD_S, (change / float(robot.frame.base)) ** 2 * PERIOD_S
     known = dict(zip(("x", "y", "yaw"), pose, strict=True))
     known |= {"vx": speed, "vy": speed, "vyaw": turn, "ax": ACCELERATION, "ay": ACCELERATION}

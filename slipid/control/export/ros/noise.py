@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.control.deployed import DeployedRobot
+from slipid.control.deployed import DeployedRobot, RobotArrays
 from slipid.control.robot_file.record import Axes
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
@@ -79,7 +79,7 @@ class Errs:
 
 def errs_of(robot: DeployedRobot) -> tuple[Errs, ...]:
     """Errors of odometry on each floor, in the robot's order."""
-    slip = np.asarray(_slip(robot, jnp.asarray(top_speed(robot))))
+    slip = np.asarray(_slip(robot.arrays, jnp.asarray(top_speed(robot))))
     process, effect = np.asarray(robot.process), np.asarray(robot.effect)
     return tuple(
         Errs(name, _axes(process[k]), _axes(effect[k]), _axes(slip[k]))
@@ -104,7 +104,7 @@ def diagonal(planar: Axes) -> tuple[float, ...]:
 
 
 @eqx.filter_jit
-def _slip(robot: DeployedRobot, speed: Float[Array, ""]) -> Float[Array, "floor 3"]:
+def _slip(robot: RobotArrays, speed: Float[Array, ""]) -> Float[Array, "floor 3"]:
     """Root mean square of what encoders err by per metre, along, across and in yaw."""
     angle = jnp.linspace(0.0, 2 * jnp.pi, WAYS, endpoint=False)
     way = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(WAYS)], axis=-1)
