@@ -167,4 +167,4 @@ def test_a_robot_that_cannot_be_identified_drives_no_rectangle(tmp_path, monkeyp
 
     monkeypatch.setattr("slipid.benchmark.rectangle.data_of", broken)
     assert rectangle.run() == "rectangle"
-    assert rectangle.drive(1, Reporter(quiet=True)) == {"failed": "OSError: disk on fire"}
+    assert rectangle.drive(Here(), Reporter(quiet=True)) == {"failed": "OSError: disk on fire"}
