@@ -11,14 +11,10 @@ if TYPE_CHECKING:
     from slipid.api.check import check as check
     from slipid.api.driving import drive as drive
     from slipid.api.export import export as export
-    from slipid.api.fit import Fit as Fit
     from slipid.api.fit import Prior as Prior
     from slipid.api.fit import fit as fit
     from slipid.api.known_robot import made_runs as made_runs
     from slipid.api.known_robot import move as move
-    from slipid.api.posterior import Posterior as Posterior
-    from slipid.api.results import Profile as Profile
-    from slipid.api.results import Validation as Validation
     from slipid.control.controller import Controller as Controller
     from slipid.control.deployed import DeployedRobot as DeployedRobot
     from slipid.control.estimator import Estimator as Estimator
@@ -27,7 +23,11 @@ if TYPE_CHECKING:
     from slipid.data.reading.reader import read_runs as read_runs
     from slipid.deploy.floors import FloorLookup as FloorLookup
     from slipid.deploy.floors import floor_map as floor_map
+    from slipid.identify.compare.validation import Validation as Validation
     from slipid.identify.posterior.blocks import Plan as Plan
+    from slipid.identify.posterior.diagnosis import Posterior as Posterior
+    from slipid.identify.result import Fit as Fit
+    from slipid.identify.verdicts.profile import Profile as Profile
     from slipid.model.robot import Robot as Robot
     from slipid.plots.raw import plot_runs as plot_runs
     from slipid.plots.wheels import wheel_curve as wheel_curve
@@ -42,17 +42,17 @@ _ROOMS = {
     "DataError": "slipid.support.errors",
     "DeployedRobot": "slipid.control.deployed",
     "Estimator": "slipid.control.estimator",
-    "Fit": "slipid.api.fit",
+    "Fit": "slipid.identify.result",
     "FloorLookup": "slipid.deploy.floors",
     "LoneMarker": "slipid.vision.tracking.tracking",
     "Measurement": "slipid.control.interface",
     "OverheadCamera": "slipid.vision.camera",
     "Plan": "slipid.identify.posterior.blocks",
-    "Posterior": "slipid.api.posterior",
+    "Posterior": "slipid.identify.posterior.diagnosis",
     "Prior": "slipid.api.fit",
-    "Profile": "slipid.api.results",
+    "Profile": "slipid.identify.verdicts.profile",
     "Robot": "slipid.model.robot",
-    "Validation": "slipid.api.results",
+    "Validation": "slipid.identify.compare.validation",
     "check": "slipid.api.check",
     "drive": "slipid.api.driving",
     "export": "slipid.api.export",

@@ -9,12 +9,12 @@ from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.check import Expected, expected, overview
 from slipid.model.robot import Robot
 from slipid.report.estimates import show_check
-from slipid.report.page import Page
+from slipid.report.page import text_of
 from slipid.support.content import Content
 
 
 @dataclass(frozen=True, eq=False)
-class Check:
+class LogCheck:
     """What runs hold and can be expected to tell; `print` shows it, `check[path]` is one number.
 
     Attributes:
@@ -26,9 +26,7 @@ class Check:
     result: Expected
 
     def __str__(self) -> str:
-        page = Page(kept=True)
-        show_check(page, self.content | self.result.to_json())
-        return page.text
+        return text_of(show_check, self.content | self.result.to_json())
 
     def __getitem__(self, path: str) -> Estimate:
         """What is to be expected of one number; KeyError where there is none of this name."""
@@ -42,7 +40,7 @@ def check(
     priors: Mapping[str, Prior] | None = None,
     fixed: Mapping[str, Numbers] | None = None,
     free: Sequence[str] = (),
-) -> Check:
+) -> LogCheck:
     """Look before you fit: arguments and errors as of `fit`, which takes far longer."""
     task = task_of(runs, robot, priors or {}, fixed or {}, {}, free)
-    return Check(overview(task), expected(task, task.problem()))
+    return LogCheck(overview(task), expected(task, task.problem()))

@@ -14,7 +14,7 @@ from slipid.deploy.trial_site import known_to_fit, site, starts, twin
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class ClosedLoopDrive:
     """One closed-loop run; `print` says what became of the path.
 
     Attributes:
@@ -45,7 +45,7 @@ def drive(
     speed: float = 0.2,
     start: int = 0,
     seed: int = 0,
-) -> Drive:
+) -> ClosedLoopDrive:
     """Drive the 2021 paper's rectangle, or another path, on the twin of a robot.
 
     The twin is the model itself, with delays and noise.
@@ -76,4 +76,4 @@ def drive(
     plant = twin(robot, floor, begin, seed, habits_of(robot, gyro=row.gyro))
     pilot = pilot_of(robot, row, floor=floor_of(floor, robot.labels))
     driven = closed_loop.drive(pilot, course.moved(begin).waiting(REST_S), plant, begin)
-    return Drive(driven, floor, closed_loop.metrics(driven))
+    return ClosedLoopDrive(driven, floor, closed_loop.metrics(driven))

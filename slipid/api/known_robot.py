@@ -68,7 +68,7 @@ def made_runs(
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class SteadyMotion:
     """Steady motions, a row per command.
 
     Attributes:
@@ -88,7 +88,7 @@ class Motion:
 
 def move(
     robot: Robot, floor: str, command: Sequence[Sequence[float]] | np.ndarray, load: str = ""
-) -> Motion:
+) -> SteadyMotion:
     """Steady motion of a robot whose wheels keep the speeds that commands ask for.
 
     Args:
@@ -104,7 +104,7 @@ def move(
     """
     places = robot.surface_index(floor), robot.load_index(load or robot.body.loads[0])
     rows = jnp.atleast_2d(jnp.asarray(command, dtype=float))
-    return Motion(*(np.asarray(x) for x in _moved(robot, rows, *map(jnp.asarray, places))))
+    return SteadyMotion(*(np.asarray(x) for x in _moved(robot, rows, *map(jnp.asarray, places))))
 
 
 @eqx.filter_jit

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict
 from itertools import zip_longest
 from typing import Protocol
@@ -20,10 +21,10 @@ from slipid.benchmark.work import OWN_MAP, QUICK_KIND, Piece, Wish, data_of
 from slipid.support.checkpoint import versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError, near
+from slipid.support.executor import results
 from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
-from slipid.support.workers import spread
 
 SCHEMA = "slipid.benchmark/1"
 Tables = dict[str, dict[str, dict[str, Summary]]]
@@ -43,7 +44,7 @@ class Part(Protocol):
         ...
 
 
-def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
+def benchmark(wish: Wish, executor: Executor, report: Reporter) -> Content:
     """Run every row on every data set that is there, and write benchmark.json.
 
     What is done is kept, and not done again; a row that fails is said, and stops no other.
@@ -76,8 +77,8 @@ def benchmark(wish: Wish, jobs: int, report: Reporter) -> Content:
     if not wish.quick and set(CONTROLLERS) & set(wish.only or CONTROLLERS):
         parts.insert(0, rectangle)
     report.stage(f"{len(parts)} parts")
-    spread(work, {part.name: part for part in parts}, jobs, report)
-    driven = rectangle.drive(jobs, report) if rectangle in parts else None
+    results(executor, work, {part.name: part for part in parts}, report)
+    driven = rectangle.drive(executor, report) if rectangle in parts else None
     report.stage("comparing")
     tables = tables_of(pieces)
     content = {

@@ -89,25 +89,20 @@ def fit_own(job: Job, problem: Problem, fitted: np.ndarray, kept: Checkpoint) ->
     """
     problem = of_some(problem, job.choices, job.dataset, fitted)
     keep = np.isin(problem.windows.run, fitted).astype(float)
-    found = kept.load("fit")
-    if found is None:
+    if (found := kept.load("fit")) is None:
         began = time.perf_counter()
         most = job.settings.rounds
         optimum = optimise(problem, keep=keep, most_rounds=most, tolerance=TOLERANCE)
-        kept.save(
-            "fit",
-            {k: v for k, v in vars(optimum.state).items() if v is not None}
-            | {
-                "covariance": optimum.covariance,
-                "seconds": time.perf_counter() - began,
-                "converged": bool(optimum.converged),
-            },
-        )
+        about = {
+            "covariance": optimum.covariance,
+            "seconds": time.perf_counter() - began,
+            "converged": bool(optimum.converged),
+        }
+        kept.save("fit", optimum.state.arrays | about)
         found = kept.load("fit")
         assert found is not None
     covariance, seconds, converged = (found.pop(k) for k in ("covariance", "seconds", "converged"))
-    plain: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in found.items()}
-    contact = contact_of(problem, State(**plain), covariance, keep)
+    contact = contact_of(problem, State.of(found), covariance, keep)
     speed, trend = _seen(problem, contact, keep)
     seen = {job.dataset.logs[k].surface for k in fitted.tolist()}
     rows = tuple(k for k, name in enumerate(contact.robot.surfaces.labels) if name in seen)

@@ -1,5 +1,6 @@
 """The rectangle of the 2021 paper, driven by the published controllers and slipid's."""
 
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -71,7 +72,7 @@ class Rectangle:
         sensors = Sensors(current_is_signed=data.heard.current_is_signed, voltage=True)
         robot_of(own.contact, own.highest_speed, own.trend, sensors).save(self.folder / ROBOT)
 
-    def drive(self, jobs: int, report: Reporter) -> Content:
+    def drive(self, executor: Executor, report: Reporter) -> Content:
         """Drive all controllers on the virtual test site, or where MuJoCo is missing on the twin.
 
         Returns:
@@ -82,7 +83,7 @@ class Rectangle:
         plant = "testsite" if find_spec("mujoco") is not None else "twin"
         asked = [name for name in CONTROLLERS if not self.wish.only or name in self.wish.only]
         try:
-            wish = trial.Wish(plant, controllers=tuple(asked), starts=STARTS, jobs=jobs)
-            return trial.trial(self.folder, wish, report).content
+            wish = trial.Wish(plant, controllers=tuple(asked), starts=STARTS)
+            return trial.trial(self.folder, wish, executor, report).content
         except Exception as error:  # all else is written all the same
             return {"failed": Row.of_error(error).absent}

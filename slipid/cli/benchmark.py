@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Jobs, Json, Out, Quiet, emit, guarded, processes
+from slipid.cli.common import Jobs, Json, Out, Quiet, emit, executor_of, guarded
 from slipid.support.progress import Reporter
 
 
@@ -44,8 +44,8 @@ def benchmark(
     from slipid.report.benchmark_page import write_page
 
     only = () if rows is None else tuple(name.strip() for name in rows.split(",") if name.strip())
-    with Reporter(quiet=quiet) as report:
-        found = run(Wish(data, out, only, quick), processes(jobs), report)
+    with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
+        found = run(Wish(data, out, only, quick), executor, report)
         report.stage("drawing")
         written = write_page(found, benchmark_pictures(found), out)
         report.line(f"in {out}: benchmark.json, {written.name}")

@@ -12,6 +12,8 @@ import typer
 from slipid.support.errors import DataError
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from slipid.report.page import Page
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Config, a TOML file.")]
@@ -36,9 +38,12 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
 Words = ParamSpec("Words")
 
 
-def processes(jobs: int | None) -> int:
-    """How many at once."""
-    return jobs or os.cpu_count() or 1
+def executor_of(jobs: int | None) -> "Executor":
+    """So many processes, by default one for every core; this one where that is one."""
+    from slipid.support.executor import Here, Processes
+
+    count = jobs or os.cpu_count() or 1
+    return Here() if count == 1 else Processes(count)
 
 
 def guarded(command: Callable[Words, int]) -> Callable[Words, None]:

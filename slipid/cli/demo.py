@@ -5,12 +5,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Out, Quiet, guarded, processes
+from slipid.cli.common import Out, Quiet, executor_of, guarded
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from slipid.job.identify import Identified
 
 PARTS = ("fit", "unseen")
@@ -29,8 +31,8 @@ def demo(
     quiet: Quiet = False,
 ) -> int:
     """The whole job on logs of the virtual test site, small: a folder to look at."""
-    with Reporter(quiet=quiet) as report:
-        done, found, truth = run(out, plant, seed, processes(None), report)
+    with Reporter(quiet=quiet) as report, executor_of(None) as executor:
+        done, found, truth = run(out, plant, seed, executor, report)
     from slipid.report.estimates import show_truth, show_validation
     from slipid.report.page import Page
 
@@ -46,7 +48,7 @@ def demo(
 
 
 def run(
-    out: Path, plant: str, seed: int | None, jobs: int, report: Reporter
+    out: Path, plant: str, seed: int | None, executor: "Executor", report: Reporter
 ) -> tuple["Identified", Content, Content]:
     """Logs of the test site, identify, predict unseen runs: the fit, what validate says, the truth.
 
@@ -67,7 +69,7 @@ def run(
         report.stage("unpacking recorded logs")
         unpack(source)
     else:
-        drive_anew(source, seed or 0, jobs, report)
+        drive_anew(source, seed or 0, executor, report)
     write_bytes(out / "robotino.toml", packaged_config("robotino.toml").encode())
     result = out / "result"
     done = identify(out / "robotino.toml", source / "fit" / "logs", result, report)
@@ -77,7 +79,7 @@ def run(
     return done, found, truth["parameters"]
 
 
-def drive_anew(out: Path, seed: int, jobs: int, report: Reporter) -> None:
+def drive_anew(out: Path, seed: int, executor: "Executor", report: Reporter) -> None:
     """Drive the runs that ship recorded, and those to be predicted, on the test site."""
     from slipid.job.packaged import packaged_config
     from slipid.testsite.simulate.config import plan
@@ -86,4 +88,4 @@ def drive_anew(out: Path, seed: int, jobs: int, report: Reporter) -> None:
     for k, part in enumerate(PARTS):
         name = f"testsite_{part}.toml"
         text = packaged_config(name).replace(f"seed = {k}\n", f"seed = {2 * seed + k}\n")
-        simulate(plan(Path(name), text), out / part, jobs, report)
+        simulate(plan(Path(name), text), out / part, executor, report)

@@ -40,11 +40,11 @@ def sample(
         raise DataError(f"{error}; expected `pip install slipid[posterior]`") from error
     with Reporter(quiet=quiet) as report:
         done = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)
-        robot = write_robot(out, done.fit, done.posterior)
+        robot = write_robot(out, done.posterior)
         report.stage("drawing")
-        drawn = posterior_plots(done.fit, done.posterior, out)
+        drawn = posterior_plots(done.posterior, out)
     content = read_json(out / "identified.json", "what sample wrote")
-    told = done.parameters.values(), done.about, content["messages"]
+    told = done.posterior.parameters.values(), done.about, content["messages"]
     written = (*done.written, *robot, *(path.name for path in drawn))
     emit(json, content, lambda page: show_sample(page, *told), out, written)
     return 0 if done.posterior.converged else 1

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slipid.cli.common import ConfigFile, Jobs, Json, Out, Quiet, emit, guarded, processes
+from slipid.cli.common import ConfigFile, Jobs, Json, Out, Quiet, emit, executor_of, guarded
 from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
@@ -26,8 +26,8 @@ def simulate(
     from slipid.testsite.simulate.simulate import simulate as run
 
     plan = read(config, text_of(config))
-    with Reporter(quiet=quiet) as report:
-        found = run(plan, out, processes(jobs), report)
+    with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
+        found = run(plan, out, executor, report)
     emit(json, found, lambda page: show(page, found, plan, out))
     return 0
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Jobs, Json, Load, OutFolder, Quiet, emit, on_wheels, processes
+from slipid.cli.common import Jobs, Json, Load, OutFolder, Quiet, emit, executor_of, on_wheels
 from slipid.support.progress import Reporter
 
 
@@ -61,11 +61,10 @@ def trial(
         speed=speed,
         starts=starts,
         load=load,
-        jobs=processes(jobs),
         tuned_gains=tuned_gains,
     )
-    with Reporter(quiet=quiet) as report:
-        done = run(out, wish, report)
+    with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
+        done = run(out, wish, executor, report)
         report.stage("drawing")
         trial_plot(done.content, done.paths, done.wanted, done.floor, out / "trial.png")
     emit(json, done.content, lambda page: show_trial(page, done.content, out))

@@ -27,4 +27,4 @@ def run(out: Path, data: Path, report: Reporter) -> Content:
     report.stage("drawing")
     drawn = validate_plots(fit, dataset, found, out)
     report.line(f"in {out}: {', '.join(path.name for path in drawn)}")
-    return found
+    return found.to_json()

@@ -18,7 +18,7 @@ from slipid.control.robot_file.record import Number, Sensors, Source
 from slipid.control.robot_file.typed import typed
 from slipid.deploy.record_of import record_of
 from slipid.deploy.told import told_by_load
-from slipid.identify.posterior.diagnosis import Posterior, estimates
+from slipid.identify.posterior.diagnosis import Posterior
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.estimates import Estimate
 from slipid.model.robot import Robot
@@ -35,24 +35,23 @@ NO_CONTROLLER = (
 """What is said of wheels that have no controller."""
 DRAWS = 64
 """Draws of the posterior that are kept."""
+SOURCE: dict[type, Source] = {Fit: "laplace", Posterior: "posterior"}
+"""What the intervals of a robot are made of."""
 
 
-def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
-    """The robot of a fit, with its first load set-up.
+def deploy(found: Fit | Posterior) -> DeployedRobot:
+    """The robot of a fit or of its posterior, with its first load set-up.
 
     Its numbers are those of `identified.json`: of the posterior where there is one, else of the
     fit's Laplace approximation. `DeployedRobot.record.source` says which.
     """
-    source: Source = "laplace"
-    numbers, messages = fit.parameters, fit.messages
-    vectors, center = fit.draws(DRAWS), fit.z
-    if posterior is not None:
-        source, numbers = "posterior", estimates(fit, posterior.z)
-        flat = posterior.z.reshape(-1, fit.space.size)
+    numbers, source = found.parameters, SOURCE[type(found)]
+    if isinstance(found, Posterior):
+        fit, flat = found.fit, found.flat
         rows = np.random.default_rng(0).choice(len(flat), DRAWS, replace=len(flat) < DRAWS)
         vectors, center = flat[rows], flat.mean(axis=0)
-        if not posterior.converged:
-            messages += (f"the posterior did not converge: {posterior.reason}",)
+    else:
+        fit, vectors, center = found, found.draws(DRAWS), found.z
     record = record_of(
         _at(fit.robot, numbers),
         {path: _number(e) for path, e in numbers.items()},
@@ -70,16 +69,16 @@ def deploy(fit: Fit, posterior: Posterior | None = None) -> DeployedRobot:
         source=source,
         sensors=Sensors(current_is_signed=fit.channels.signed, voltage=fit.channels.voltage),
         alike=alike,
-        messages=messages,
+        messages=found.messages,
         data=fit.data_hash,
         versions=versions(),
     )
     return DeployedRobot.of(about)
 
 
-def write_robot(out: Path, fit: Fit, posterior: Posterior | None = None) -> tuple[str, ...]:
+def write_robot(out: Path, found: Fit | Posterior) -> tuple[str, ...]:
     """Write robot.json beside a fit; names of files written."""
-    robot, kept = deploy(fit, posterior), out / ROBOT
+    robot, kept = deploy(found), out / ROBOT
     with suppress(DataError):  # gains outlive a fit that came to the same numbers
         before = DeployedRobot.load(kept).record if kept.is_file() else robot.record
         if before.numbers == robot.record.numbers:

@@ -1,6 +1,7 @@
 """`slipid trial`: the rectangle of the 2021 paper's figure 7, or another path, judged."""
 
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -31,10 +32,10 @@ from slipid.deploy.trial_site import (
 from slipid.deploy.trial_summary import Run, not_told_apart, summaries
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.errors import DataError
+from slipid.support.executor import results
 from slipid.support.files import write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
-from slipid.support.workers import spread
 
 SCHEMA = "slipid.trial/1"
 FOLDER = "trial"
@@ -75,7 +76,7 @@ class Wish:
         controllers: names of `ROWS`.
         load: name of the load set-up; None for the first.
         path: name of `trajectory.PATHS`; speed: along it [m/s].
-        starts, jobs: how many, and processes at once.
+        starts: how many.
         tuned_gains: whether tuned gains are taken that are no better than those set by hand.
     """
 
@@ -87,7 +88,6 @@ class Wish:
     speed: float = 0.2
     starts: int = 20
     load: str | None = None
-    jobs: int = 1
     tuned_gains: bool = False
 
 
@@ -109,7 +109,7 @@ class Driven:
     floor: FloorMap
 
 
-def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
+def trial(out: Path, wish: Wish, executor: Executor, report: Reporter) -> Driven:
     """Drive every controller from every start, and write trial.json.
 
     Runs that are done are kept, and not driven again as long as nothing they depend on changes.
@@ -127,7 +127,7 @@ def trial(out: Path, wish: Wish, report: Reporter) -> Driven:
         report.line(unused)
     todo = {job.name: job for job in jobs if _driven(job) is None}
     report.stage(f"driving {len(todo)} of {len(jobs)} runs")
-    spread(drive, todo, wish.jobs, report)
+    results(executor, drive, todo, report)
     driven = {job.name: found for job in jobs if (found := _driven(job)) is not None}
     runs = [run for run, _ in driven.values()]
     table, able = summaries(runs), list(not_told_apart(runs))

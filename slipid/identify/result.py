@@ -1,9 +1,13 @@
-"""The result of a fit: a frozen value with intervals and verdicts, identifiability included."""
+"""The result of a fit: a frozen value with intervals and verdicts, identifiability included.
+
+What shows, samples, deploys or writes a fit lies above it and is loaded when a method asks for it.
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +17,9 @@ from jaxtyping import Array, Float
 from slipid.data.runs import Runs
 from slipid.identify import slip_curves as curves_of
 from slipid.identify.compare.predictive import Contact, contact_of
+from slipid.identify.compare.ranking import Comparison, compared
+from slipid.identify.compare.slip_models import restored
+from slipid.identify.compare.validation import Validation, validation
 from slipid.identify.fit.noise import POOLED
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem, log_jacobian
@@ -21,10 +28,22 @@ from slipid.identify.fit.variances import MOTIONS, Search, Square
 from slipid.identify.slip_curves import SlipCurve
 from slipid.identify.verdicts.disputed import Dispute, disputes, marked
 from slipid.identify.verdicts.estimates import Estimate, derived, estimates
+from slipid.identify.verdicts.profile import Profile, profile
 from slipid.identify.verdicts.unidentified import Flat, flat_directions, members, sentences
 from slipid.model.robot import Robot, Validity
 from slipid.search_space import Choice, Space
 from slipid.support.files import hash_of
+from slipid.support.progress import Reporter
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from slipid.control.deployed import DeployedRobot
+    from slipid.identify.design.proposal import Design
+    from slipid.identify.posterior.blocks import Plan
+    from slipid.identify.posterior.diagnosis import Posterior
+
+Evidence = TypeVar("Evidence")
 
 CONFLICT = 4.0
 """Prior stds from the prior mean beyond which a reader is told."""
@@ -44,7 +63,7 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a fit found, how sure it is and how it went.
+    """What a fit found; `print` shows its numbers, and `fit[path]` gives one of them.
 
     Attributes:
         space: free and fixed numbers, priors; its template holds the fixed values.
@@ -69,6 +88,8 @@ class Fit:
         mixed: how runs over several floors were predicted before they were learnt from, and by a
             fit to half of them; end-point errors of the others before and after, by floor.
         refused: the same, and why, where they contradict the others and were not learnt from.
+        data, problem, optimum: the runs on one floor each, their likelihood, and where the search
+            ended; None where the fit was loaded from its files, which have none of them.
     """
 
     space: Space
@@ -95,6 +116,143 @@ class Fit:
     refused: Mapping[str, Any] | None = None
     shared: Mapping[str, FoundShared] = field(default_factory=dict)
     extrapolation: Mapping[str, float] = field(default_factory=dict)
+    data: Runs | None = None
+    problem: Problem | None = None
+    optimum: Optimum | None = None
+
+    def __str__(self) -> str:
+        from slipid.report.estimates import show_fit
+        from slipid.report.page import text_of
+
+        return text_of(show_fit, self)
+
+    def __repr__(self) -> str:
+        """The table, so that a notebook shows it."""
+        return str(self)
+
+    def __getitem__(self, path: str) -> Estimate:
+        """One number with its interval and verdict.
+
+        Raises:
+            KeyError: no such number; names those there are.
+        """
+        if path not in self.parameters:
+            raise KeyError(f"no parameter '{path}'; there are {', '.join(self.parameters)}")
+        return self.parameters[path]
+
+    def plot(self, name: str) -> "Figure":
+        """One of the fit's pictures.
+
+        Args:
+            name: `load_share`, `slip_by_heading`, `slip_by_torque`, `current_by_traction` or
+                `paths`.
+
+        Raises:
+            ValueError: no such picture, or the runs have nothing for it.
+        """
+        from slipid.plots.fit import picture
+
+        return picture(self, known(self.data), name)
+
+    def profile(self, path: str, quiet: bool = False) -> Profile:
+        """Profile likelihood of one free number: every other one is fitted again at each point.
+
+        Raises:
+            ValueError: no such number, fixed, or a vector; names the choices.
+        """
+        with Reporter(quiet=quiet) as report:
+            report.stage(f"profile of {path}")
+            return profile(known(self.problem), known(self.optimum), path)
+
+    def validate(self, runs: Runs) -> Validation:
+        """Open-loop prediction of runs, by the fit and by every simpler model that it learnt.
+
+        Raises:
+            DataError: a run on a floor or with a load set-up that was not identified.
+        """
+        rungs = restored(self.space.template.geometry, dict(self.baselines))
+        return validation(self.contact, rungs, runs, self.new_runs(runs))
+
+    def new_runs(self, data: Runs) -> int:
+        """Number of runs that the fit has not seen."""
+        seen = {sha for _, sha in self.runs}
+        return sum(log.sha256 not in seen for log in data.logs)
+
+    def sample(
+        self,
+        seed: int = 0,
+        draws: int = 400,
+        most: int = 400,
+        plan: "Plan | None" = None,
+        quiet: bool = False,
+    ) -> "Posterior":
+        """Posterior by emcee, several ensembles; needs `pip install slipid[posterior]`.
+
+        Args:
+            seed: of everything.
+            draws: that are kept of each of the ensembles.
+            most: blocks of steps after which it ends without having converged.
+            plan: of walkers and steps, in place of `seed` and `most`.
+            quiet: no progress.
+        """
+        from slipid.identify.posterior import blocks, sample
+
+        plan = plan or blocks.Plan(seed=seed, most=most)
+        with Reporter(quiet=quiet) as report:
+            return sample.sampled(self, plan, draws, None, report)
+
+    def compare(self, question: str = "sectors", parts: int = 6, quiet: bool = False) -> Comparison:
+        """Every slip model fitted anew without some runs, and judged on those.
+
+        Args:
+            question: what is left out together: `sectors` of 60 degrees of headings, `speeds`, or
+                `random` headings.
+            parts: into which runs are dealt, 2 at least: one after another is left out. With 2,
+                every second sector.
+            quiet: show no progress.
+
+        Raises:
+            DataError: no such question.
+        """
+        problem, data = known(self.problem), known(self.data)
+        return compared(problem, self.choices, data, question, parts, quiet)
+
+    def design(self, *parameters: str, runs: int = 12) -> "Design":
+        """Runs to drive next, that shrink some numbers most; without names whatever is weak.
+
+        Raises:
+            DataError: no such number, or fixed.
+        """
+        from slipid.identify.design import proposal, wish
+
+        return proposal.design(self, wish.Wish(parameters=parameters, runs=runs))
+
+    def deploy(self) -> "DeployedRobot":
+        """What runs on the robot, with the intervals of the fit's own curvature.
+
+        Raises:
+            ValueError: the wheels' kinematics have rank below 3.
+        """
+        from slipid.deploy.deploy import deploy
+
+        return deploy(self)
+
+    def save(self, folder: Path | str) -> None:
+        """Write fit.json, its arrays and identified.json, each whole or not at all."""
+        from slipid.identify import fit_file
+
+        fit_file.save(self, Path(folder))
+
+    @classmethod
+    def load(cls, folder: Path | str) -> "Fit":
+        """The fit whose files are in a folder.
+
+        Raises:
+            DataError: a file is absent, damaged, of another version or of another fit.
+        """
+        from slipid.identify import fit_file
+
+        return fit_file.load(Path(folder))
 
     @cached_property
     def contact(self) -> Contact:
@@ -174,6 +332,16 @@ class Fit:
         return draws(self.z, self.covariance, count, seed)
 
 
+def known(evidence: Evidence | None) -> Evidence:
+    """What a fit was made of; ValueError where it was loaded from files, which do not hold it."""
+    if evidence is None:
+        raise ValueError(
+            "this fit was loaded from its files, which hold neither runs nor their likelihood; "
+            "expected one that `fit` has made of runs"
+        )
+    return evidence
+
+
 def summarise(
     problem: Problem, optimum: Optimum, data: Runs, choices: Iterable[Choice], seed: int = 0
 ) -> Fit:
@@ -221,6 +389,9 @@ def summarise(
         current_trend=curves_of.current_trend(robot, problem.batch)
         if windows.has_current
         else (0.0, 0.0),
+        data=data,
+        problem=problem,
+        optimum=optimum,
     )
 
 

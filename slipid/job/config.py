@@ -181,7 +181,7 @@ class Camera(Section):
     image_centre_m: tuple[Number, Number] = (0.0, 0.0)
 
 
-class Prior(Section):
+class PriorSection(Section):
     """Gaussian prior, in SI around its mean.
 
     Attributes:
@@ -206,7 +206,7 @@ class Setting(Section):
     start: Numbers | None = None
     fixed: Numbers | None = None
     free: bool | None = None
-    prior: Prior | None = None
+    prior: PriorSection | None = None
 
     @model_validator(mode="after")
     def _not_both(self) -> "Setting":

@@ -193,7 +193,7 @@ def _optimised(
         report.advance(min(math.log(first[0] / moved), whole), whole, what)
         history.append(state.loss)
         if kept is not None:
-            kept.save(CHECKPOINT, vars(state) | {"history": np.array(history)})
+            kept.save(CHECKPOINT, state.arrays | {"history": np.array(history)})
 
     report.stage("compiling")
     rounds = wanted.rounds
@@ -211,8 +211,7 @@ def _restored(kept: Checkpoint | None, report: Reporter) -> tuple[State | None, 
     if found is None or kept is None:
         return None, []
     history = found.pop("history").tolist()
-    plain: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in found.items()}
-    start = State(**plain)
+    start = State.of(found)
     report.line(f"going on from round {start.round} of {kept.folder / CHECKPOINT}.npz")
     return start, history
 

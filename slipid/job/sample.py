@@ -1,21 +1,17 @@
 """The posterior of a fit by sampling: what `slipid sample` does, but for its pictures."""
 
-import importlib
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from slipid.identify.fit.problem import Problem
 from slipid.identify.fit_file import load, write_identified
 from slipid.identify.posterior import netcdf
-from slipid.identify.posterior import sample as posterior
-from slipid.identify.posterior.blocks import FORMAT, Block, Plan, Record, packed, unpacked
-from slipid.identify.posterior.coordinates import Fitted
-from slipid.identify.posterior.diagnosis import Posterior, estimates, identified
+from slipid.identify.posterior.blocks import FORMAT, Plan
+from slipid.identify.posterior.diagnosis import Posterior, identified
+from slipid.identify.posterior.sample import sampled
 from slipid.identify.result import Fit
-from slipid.identify.verdicts.estimates import Estimate
 from slipid.job.config import read_config
 from slipid.job.problem import Job, read_job
 from slipid.support.checkpoint import Checkpoint, key_of, versions
@@ -24,9 +20,6 @@ from slipid.support.errors import DataError
 from slipid.support.files import read_json, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
-
-for _module in ("arviz_base", "arviz_stats", "h5netcdf"):
-    importlib.import_module(_module)  # they are used after hours of work: what is missing shows now
 
 FOLDER = "sampling"
 """Folder of the blocks of an unfinished chain, inside the result's."""
@@ -37,14 +30,11 @@ class Sampled:
     """End of `sample`.
 
     Attributes:
-        parameters: numbers from the draws, by path.
         about: content of sample.json: how the chains did.
         written: names of the files.
     """
 
-    fit: Fit
     posterior: Posterior
-    parameters: dict[str, Estimate]
     about: Content
     written: tuple[str, ...]
 
@@ -63,67 +53,21 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     job = read_job(read_config(out / "config.toml"), folder, report)
     _same_logs(fit, job)
     report.stage("compiling")
-    problem = job.problem(fit.robot)
+    fit = replace(fit, data=job.dataset, problem=job.problem(fit.robot))
     # all that a chain depends on; how long it may become is not of it
     told = FORMAT, fit.data_hash, replace(plan, most=10**9), draws, sorted(fit.variance.items())
     kept = Checkpoint(out / FOLDER, key_of(*told, np.asarray(fit.z), np.asarray(fit.covariance)))
-    found = sampled_around(fit, problem, plan, draws, kept, report)
+    found = sampled(fit, plan, draws, kept, report)
     report.stage("writing")
     about = _summary(found, plan, time.monotonic() - began)
-    numbers = estimates(fit, found.z)
-    marks = {k: str(v) for k, v in about.items() if not isinstance(v, dict)}
-    marks |= {"schema": netcdf.SCHEMA, "data_hash": fit.data_hash}
-    runs = tuple(log.name for log in job.dataset.logs)
-    netcdf.write(netcdf.tree(problem, found, runs, marks), out / "posterior.nc")
-    write_identified(out, identified(fit, found, numbers, problem))
+    marks = {k: str(v) for k, v in about.items() if not isinstance(v, dict) and k != "schema"}
+    netcdf.write(netcdf.tree(found, marks), out / "posterior.nc")
+    write_identified(out, identified(found))
     write_json(out / "sample.json", about)
     if found.converged:
         kept.remove()
     written = ("posterior.nc", "sample.json", "identified.json")
-    return Sampled(fit, found, numbers, about, written)
-
-
-def sampled_around(
-    fit: Fit, problem: Problem, plan: Plan, draws: int, kept: Checkpoint | None, report: Reporter
-) -> Posterior:
-    """Posterior of a fit by the likelihood it was made of; arguments as of `sample`.
-
-    It goes on from the blocks that an earlier call has kept, and keeps new ones.
-    """
-
-    def done(part: str) -> list[Block]:
-        blocks: list[Block] = []
-        if kept is None:
-            return blocks
-        while (arrays := kept.load(f"{part}-{len(blocks):04d}")) is not None:
-            blocks.append(unpacked(arrays))
-        if blocks:
-            report.line(f"going on from block {len(blocks)} ({part}) of {kept.folder}")
-        return blocks
-
-    def keep(part: str, block: Block) -> None:
-        if kept is not None:
-            kept.save(f"{part}-{block.number:04d}", packed(block))
-        _tell(block, plan, report)
-
-    def steps(part: str, count: int) -> None:
-        report.stage(f"sampling {part}")
-
-    variance = np.array([fit.variance[name] for name in problem.noise.names])
-    fitted = Fitted(fit.z, np.log(variance), fit.covariance)
-    return posterior.sample(problem, fitted, plan, draws=draws, record=Record(done, keep, steps))
-
-
-def _tell(block: Block, plan: Plan, report: Reporter) -> None:
-    """Progress of a chain; the time left is what it takes at most."""
-    count = block.number + 1
-    warm = "warm-up, " if count <= plan.warm_up[-1] else ""
-    what = (
-        f"block {count}: {warm}{count * block.chain.shape[1]} steps, "
-        f"{100 * block.accepted.mean():.0f} % moved, "
-        f"log density {block.log_prob[:, -1].mean():.1f}"
-    )
-    report.advance(count, plan.most, what)
+    return Sampled(found, about, written)
 
 
 def _summary(found: Posterior, plan: Plan, seconds: float) -> Content:

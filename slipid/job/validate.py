@@ -4,22 +4,20 @@ from pathlib import Path
 
 from slipid.data.runs import Runs
 from slipid.data.sanity.columns import refuse_misordered
-from slipid.identify.compare.slip_models import restored
-from slipid.identify.compare.validation import validation
+from slipid.identify.compare.validation import Validation
 from slipid.identify.fit_file import load
 from slipid.identify.result import Fit
 from slipid.job.config import one_floor, read_config
 from slipid.job.logs import read_dataset
-from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 
-def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Content]:
+def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Validation]:
     """Predict runs of `data` with the fit in `out`, and with every simpler model that it learnt.
 
-    Returns the fit, the runs, and the content of the validation file.
+    Returns the fit, the runs, and how they were predicted.
     """
     setup_jax(quiet=True)
     fit = load(out)
@@ -30,14 +28,12 @@ def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Conten
     refuse_misordered(dataset.logs)
     for sentence in skipped:
         report.line(sentence)
-    seen = {sha for _, sha in fit.runs}
-    again = sum(log.sha256 in seen for log in dataset.logs)
-    if again:
+    if again := len(dataset) - fit.new_runs(dataset):
         report.line(f"{again} of {len(dataset)} runs were fitted: they say little about new ones")
     report.stage("predicting")
     try:
-        rungs = restored(fit.space.template.geometry, dict(fit.baselines))
+        return fit, dataset, fit.validate(dataset)
+    except DataError:
+        raise
     except ValueError as error:
         raise DataError(f"{out / 'fit.json'}: {error}") from error
-    fitted = fit.contact
-    return fit, dataset, validation(fitted, rungs, dataset).to_json()

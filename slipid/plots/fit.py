@@ -6,14 +6,13 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from slipid.data.runs import Runs
+from slipid.identify.compare.validation import Validation
 from slipid.identify.result import Fit
-from slipid.plots.compare import ladder_figure
 from slipid.plots.drawing import save_all, warned
 from slipid.plots.load import load_figure
 from slipid.plots.motion import heading_figure, path_figure
 from slipid.plots.seen import Seen, seen
 from slipid.plots.wheels import current_figure, curve_figure
-from slipid.support.content import Content
 
 PATHS = (
     "Where the encoders say the robot went (dotted), where the fitted robot says (blue),\n"
@@ -56,20 +55,12 @@ def picture(fit: Fit, data: Runs, name: str) -> Figure:
     return made
 
 
-def new_runs(fit: Fit, data: Runs) -> str:
-    """How many runs the fit has not seen, for people."""
-    seen_before = {sha for _, sha in fit.runs}
-    new = sum(log.sha256 not in seen_before for log in data.logs)
-    return f"{new} of {len(data)} runs are new to the fit"
-
-
-def validate_plots(fit: Fit, data: Runs, found: Content, out: Path) -> list[Path]:
+def validate_plots(fit: Fit, data: Runs, found: Validation, out: Path) -> list[Path]:
     """Files of how well runs are predicted, as the validation found, and some of their paths."""
-    which = new_runs(fit, data)
     names = {log.surface or "unknown": None for log in data.logs}
     order = [(floor, load) for floor in sorted(names) for load in fit.robot.body.loads]
     figures = {
-        "validation_errors": ladder_figure(found, which),
-        "validation_paths": path_figure(fit.contact, data, order, PATHS + which),
+        "validation_errors": found.plot(),
+        "validation_paths": path_figure(fit.contact, data, order, PATHS + found.which),
     }
     return save_all(figures, out)

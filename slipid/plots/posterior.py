@@ -8,7 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from slipid.identify.posterior.diagnosis import Posterior
-from slipid.identify.result import Fit
 from slipid.identify.verdicts.profile import RISE, Profile
 from slipid.plots import drawing
 
@@ -16,14 +15,14 @@ PANELS = 6
 """Pairs of numbers drawn."""
 
 
-def posterior_plots(fit: Fit, found: Posterior, out: Path) -> list[Path]:
+def posterior_plots(found: Posterior, out: Path) -> list[Path]:
     """Files of all `PICTURES`."""
-    z = found.z.reshape(-1, fit.space.size)
-    return drawing.save_all({f"posterior_{k}": draw(fit, z) for k, draw in PICTURES.items()}, out)
+    return drawing.save_all({f"posterior_{k}": draw(found) for k, draw in PICTURES.items()}, out)
 
 
-def interval_figure(fit: Fit, z: np.ndarray) -> Figure:
+def interval_figure(found: Posterior) -> Figure:
     """90 % intervals of draws and of the fit's curvature, in prior standard deviations."""
+    fit, z = found.fit, found.flat
     chosen = np.flatnonzero(fit.space.where(lambda e: e.session is None)).tolist()
     mean, std = fit.judged.prior_mean[chosen], fit.judged.prior_std[chosen]
     low, middle, high = (np.quantile(z[:, chosen], (0.05, 0.5, 0.95), axis=0) - mean) / std
@@ -52,8 +51,9 @@ def interval_figure(fit: Fit, z: np.ndarray) -> Figure:
     return made
 
 
-def pair_figure(fit: Fit, z: np.ndarray) -> Figure:
+def pair_figure(found: Posterior) -> Figure:
     """The pairs of numbers whose draws are furthest from an ellipse."""
+    fit, z = found.fit, found.flat
     pairs = bent(z)
     made, axes = drawing.panels(
         len(pairs),

@@ -11,6 +11,7 @@ from slipid.report.page import Page, percent, table, verdict
 from slipid.support.content import Content
 
 if TYPE_CHECKING:  # the tables need none of what fits
+    from slipid.identify.posterior.diagnosis import Posterior
     from slipid.identify.result import Fit
     from slipid.identify.verdicts.estimates import Estimate
     from slipid.identify.verdicts.profile import Profile
@@ -67,6 +68,13 @@ def show_sample(
             f"NOT converged, do not trust the intervals: worst is {about['reason']}; "
             "a larger --most goes on from here"
         )
+
+
+def show_posterior(page: Page, found: "Posterior") -> None:
+    """Write the numbers of a posterior, and whether its chains agree."""
+    page.table(estimates(found.parameters.values(), f"{found.log_prob.size} draws"))
+    state = "converged" if found.converged else "NOT converged, do not trust the intervals"
+    page.line(f"{state}: {found.reason}")
 
 
 def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None:

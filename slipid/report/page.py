@@ -1,7 +1,8 @@
 """A page of text, and what its tables share."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from io import StringIO
+from typing import TypeVar
 
 from rich.console import Console
 from rich.table import Table
@@ -22,6 +23,7 @@ SEVERITY = {"wrong": "bold red", "suspicious": "yellow", "note": "dim"}
 """Colours of what a check of logs and config says."""
 WIDTH = 140
 """Of text that no terminal shows [characters]."""
+Shown = TypeVar("Shown")
 
 
 class Page:
@@ -69,6 +71,13 @@ class Page:
             where = f" (in {listed(one['runs'])})" if one["runs"] else ""
             said = Text.assemble((f"{one['severity']}: ", SEVERITY[one["severity"]]))
             self._console.print(said.append(f"{one['found']}{where}{remedy}"), soft_wrap=True)
+
+
+def text_of(show: Callable[[Page, Shown], None], found: Shown) -> str:
+    """The text that a function writes to a page about something."""
+    page = Page(kept=True)
+    show(page, found)
+    return page.text
 
 
 def table(columns: Sequence[str], title: str | None = None, right: Sequence[str] = ()) -> Table:

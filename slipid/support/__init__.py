@@ -1,1 +1,1 @@
-"""What any program needs and that knows nothing of robots: errors, files, workers, progress."""
+"""What any program needs and that knows nothing of robots: errors, files, executor, progress."""

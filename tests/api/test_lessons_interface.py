@@ -46,12 +46,12 @@ def fit():
 @pytest.mark.slow
 def test_a_check_counts_runs_and_forecasts_verdicts(fit):
     robot = sl.Robot.omni([60, 180, 300], base_radius=0.125, wheel_radius=0.04, gear_ratio=16)
-    check = sl.check(fit.task.dataset, robot, fixed={"camera.scale": 1.117})
+    check = sl.check(fit.data, robot, fixed={"camera.scale": 1.117})
     assert check["motor.resistance"].verdict == "not_identified"
     assert check["camera.scale"].verdict == "fixed"
     assert "current (unsigned)" in str(check)
     assert check.content["groups"][0]["runs"] == 12
-    assert sl.plot_runs(fit.task.dataset, [0, 1], "two runs").axes
+    assert sl.plot_runs(fit.data, [0, 1], "two runs").axes
 
 
 @pytest.mark.slow
@@ -69,7 +69,7 @@ def test_a_comparison_ranks_every_model_on_left_out_runs(fit):
 @pytest.mark.slow
 def test_a_proposal_has_the_runs_that_were_asked_for(fit):
     proposal = fit.design("surface.soft.creep", runs=2)
-    assert len(proposal.result.drives) == 2
+    assert len(proposal.drives) == 2
     assert str(proposal).startswith("run,floor,load,vx_m_s")
     assert proposal.plot().axes
     with pytest.raises(sl.DataError, match="matches no parameter"):

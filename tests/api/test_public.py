@@ -14,8 +14,8 @@ import pytest
 
 import slipid as sl
 from slipid.data.write import robotino2022_csv
+from slipid.identify.posterior import blocks, sample
 from slipid.identify.posterior.blocks import Plan
-from slipid.job import sample
 from slipid.selftest.known import Sensors, grid, truth
 from slipid.selftest.logs import make_logs
 
@@ -44,16 +44,14 @@ def world(tmp_path_factory) -> dict:
     """Names that the README's example leaves behind, run where its logs are; few steps sampled."""
     folder = tmp_path_factory.mktemp("readme")
     write_runs(folder / "logs")
-    around = sample.sampled_around
+    around = sample.sampled
     names: dict = {"angle": [0.0, 0.1, 0.2], "amps": [0.3, 0.1, 0.4]}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         few = Plan(ensembles=2, walkers=6, block=4, warm_up=(1, 2), most=3)
-        patch.setattr("slipid.api.fit.Plan", lambda seed, most: replace(few, seed=seed))
+        patch.setattr(blocks, "Plan", lambda seed, most: replace(few, seed=seed))
         patch.setattr(
-            sample,
-            "sampled_around",
-            lambda fit, problem, plan, draws, *rest: around(fit, problem, plan, 16, *rest),
+            sample, "sampled", lambda fit, plan, draws, *rest: around(fit, plan, 16, *rest)
         )
         exec(compile(example(), "README.md", "exec"), names)
     names["folder"] = folder

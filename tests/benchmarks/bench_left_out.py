@@ -19,10 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.api.results import compared
 from slipid.data.runs import Runs
 from slipid.identify.compare.folds import judge
-from slipid.identify.compare.ranking import Ranking, ranking
+from slipid.identify.compare.ranking import Ranking, compared, ranking
 from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.identify.result import draws
@@ -82,13 +81,13 @@ def some(job: Job, runs: np.ndarray) -> tuple[Runs, Problem]:
 
 
 def test_sectors(job: Job) -> None:
-    floors = compared(job, job.problem(), "sectors", 6, quiet=True).floors
+    floors = compared(job.problem(), job.choices, job.dataset, "sectors", 6, quiet=True).floors
     show("(a) left-out 60-degree sectors", floors)
     assert count(floors) == len(job.dataset)
 
 
 def test_random_headings(job: Job) -> None:
-    floors = compared(job, job.problem(), "random", 6, quiet=True).floors
+    floors = compared(job.problem(), job.choices, job.dataset, "random", 6, quiet=True).floors
     show("(d) random headings", floors)
     assert count(floors) == len(job.dataset)
 

@@ -18,10 +18,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from slipid.api.results import compared
 from slipid.data.floor_map import FloorMap, four_zones, patchwork
+from slipid.identify.compare.ranking import compared
 from slipid.job.config import parsed
 from slipid.job.problem import read_job
+from slipid.support.executor import Processes
 from slipid.support.progress import Reporter
 from slipid.testsite.driving import Run, Timed, drive, straight
 from slipid.testsite.ground import GROUNDS
@@ -62,8 +63,8 @@ distance_m = 0.6
 def driven(text: str, out: Path):
     """The plan of a config, driven below a folder."""
     made = plan(out / "site.toml", text)
-    with Reporter(quiet=True) as report:
-        simulate(made, out, os.cpu_count() or 1, report)
+    with Reporter(quiet=True) as report, Processes(os.cpu_count() or 1) as executor:
+        simulate(made, out, executor, report)
     return made
 
 
@@ -136,7 +137,7 @@ def test_left_out_sectors() -> None:
     out = OUT / "sectors"
     driven(text, out)
     job = job_of(out)
-    floors = compared(job, job.problem(), "sectors", 6, quiet=True).floors
+    floors = compared(job.problem(), job.choices, job.dataset, "sectors", 6, quiet=True).floors
     print()
     for name, floor in floors.items():
         errors = {model: one.endpoint_error for model, one in floor.models.items()}

@@ -17,12 +17,12 @@ from scipy.stats import binom
 
 from slipid.identify.compare.open_loop import chain, corrected
 from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.optimise import optimise
+from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD
 from slipid.identify.posterior import sample as posterior
 from slipid.identify.posterior.blocks import Plan
-from slipid.identify.posterior.coordinates import Fitted
+from slipid.identify.result import Channels, Fit
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
@@ -83,7 +83,7 @@ def problem() -> Problem:
     return Problem(windows, blank, CHOICES)
 
 
-def experiment(seed: int) -> tuple[Problem, Fitted, np.ndarray]:
+def experiment(seed: int) -> tuple[Fit, np.ndarray]:
     """A truth drawn, windows filled and fitted; the truth of numbers and log variances."""
     rng, common = np.random.default_rng(seed), problem()
     space, typical = common.space, 2 * np.log(common.noise.typical)
@@ -95,15 +95,41 @@ def experiment(seed: int) -> tuple[Problem, Fitted, np.ndarray]:
     z = space.prior_mean + prior_std * rng.standard_normal(space.size)
     this = common.of(filled(common, z, log_v, rng))
     optimum = optimise(this)
-    fitted = Fitted(optimum.state.z, np.asarray(optimum.state.log_variance), optimum.covariance)
-    return this, fitted, np.concatenate([z, log_v])
+    return bare_fit(this, optimum), np.concatenate([z, log_v])
+
+
+def bare_fit(this: Problem, optimum: Optimum) -> Fit:
+    """The end of an optimisation as a fit, without curves and what floors were seen with."""
+    names, variance = this.noise.names, np.exp(np.asarray(optimum.state.log_variance))
+    return Fit(
+        space=this.space,
+        choices=tuple(CHOICES),
+        z=np.asarray(optimum.state.z),
+        covariance=optimum.covariance,
+        laplace=optimum.covariance,
+        variance=dict(zip(names, variance.tolist(), strict=True)),
+        variance_unit={},
+        runs=(),
+        channels=Channels(voltage=True),
+        curves={},
+        validity={},
+        converged=optimum.converged,
+        reason=optimum.reason,
+        rounds=0,
+        remaining=0.0,
+        history=(),
+        lag=0.0,
+        seed=0,
+        problem=this,
+        optimum=optimum,
+    )
 
 
 def replicate(seed: int, plan: Plan = PLAN) -> Replicate:
     """An experiment and draws of its posterior."""
-    this, fitted, truth = experiment(seed)
-    space, names = this.space, this.noise.names
-    found = posterior.sample(this, fitted, replace(plan, seed=seed), draws=DRAWS)
+    fit, truth = experiment(seed)
+    space, names = fit.space, problem().noise.names
+    found = posterior.sample(fit, replace(plan, seed=seed), draws=DRAWS)
     draws = np.concatenate([found.z, found.log_variance], axis=-1)
     prior_std = np.concatenate([space.prior_std, np.full(len(names), VARIANCE_SPREAD)])
     return Replicate(

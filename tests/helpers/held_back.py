@@ -4,8 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from slipid.data.runs import Runs
-from slipid.identify.compare.slip_models import restored
-from slipid.identify.compare.validation import Validation, validation
+from slipid.identify.compare.validation import Validation
 from slipid.job.config import read_config
 from slipid.job.identify import optimised, summarised
 from slipid.job.problem import Job, job_of, read_job
@@ -23,11 +22,10 @@ def held_back(
         problem, optimum = optimised(job, job.problem(), None, report)
         fit = summarised(job, problem, optimum, report)
     assert fit.converged, fit.reason
-    rungs = restored(fit.space.template.geometry, dict(fit.baselines))
     other = part(whole.dataset, judged)
     # a session that was not fitted has the marker where the robot has it
     other = replace(other, session=tuple(fit.robot.camera.sessions[:1] * len(other)))
-    return validation(fit.contact, rungs, other)
+    return fit.validate(other)
 
 
 def part(data: Runs, names: tuple[str, ...]) -> Runs:

@@ -513,3 +513,16 @@ def test_damaged_results_are_refused_with_a_message(tmp_path):
     (tmp_path / "fit.json").write_text("{")
     with pytest.raises(DataError, match="no valid JSON"):
         load(tmp_path)
+
+
+def test_a_fit_from_its_files_is_the_same_type_and_says_what_it_lacks(tmp_path):
+    fit = fit_of(True)
+    fit.save(tmp_path)
+    again = Fit.load(tmp_path)
+    assert str(again) == str(fit)
+    assert again["surface.soft.creep"] == fit["surface.soft.creep"]
+    with pytest.raises(KeyError, match=r"no parameter 'motor\.nonsense'; there are"):
+        _ = again["motor.nonsense"]
+    assert again.new_runs(fit.data) == 0
+    with pytest.raises(ValueError, match="this fit was loaded from its files"):
+        again.profile("surface.soft.creep", quiet=True)

@@ -35,7 +35,7 @@ MODELS = (
         c.Motor,
         c.Logs,
         c.Camera,
-        c.Prior,
+        c.PriorSection,
         c.Setting,
     ),
     *(

@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from slipid.cli.common import executor_of
 from slipid.cli.main import app
 from slipid.data.floor_map import four_zones, read_map
 from slipid.data.reading.presets import declared_layout, preset
 from slipid.job.config import parsed
 from slipid.support.errors import DataError
+from slipid.support.executor import Here
 from slipid.support.progress import Reporter
 from slipid.testsite.ground import GROUNDS
 from slipid.testsite.machine import Machine
@@ -65,8 +67,8 @@ def config(tmp_path):
 
 
 def quietly(config, out, jobs=1):
-    with Reporter(quiet=True) as report:
-        return simulate(plan(config, config.read_text()), out, jobs, report)
+    with Reporter(quiet=True) as report, executor_of(jobs) as executor:
+        return simulate(plan(config, config.read_text()), out, executor, report)
 
 
 def sums(folder):
@@ -367,7 +369,7 @@ distance_m = 0.1
     path.write_text(text)
     try:
         with Reporter(quiet=True) as report:
-            simulate(plan(path, text), tmp_path, 1, report)
+            simulate(plan(path, text), tmp_path, Here(), report)
     except DataError as error:
         pytest.skip(f"frames cannot be drawn here: {error}")
     times = np.loadtxt(tmp_path / "video/as_built/firm/run000.csv", delimiter=",", skiprows=1)

@@ -1,13 +1,23 @@
 """Which model the left-out runs of a floor prefer, by how much, and whether they can tell."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import binom
 
+from slipid.data.runs import Runs
+from slipid.identify.compare.folds import folds_of, judge
 from slipid.identify.compare.validation import Judged, Score, by_floor, finite
+from slipid.identify.fit.problem import Problem
+from slipid.search_space import Choice
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SURE, SMALL = 2.0, 4.0
 """A difference counts from so many standard errors on, and so many nats over all runs together.
@@ -166,3 +176,49 @@ def _apart(model: Ranked) -> str:
 
 def _name(model: str) -> str:
     return "contact equilibrium" if model == "identified" else model
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Which slip model each floor prefers; `print` says so in a sentence per floor.
+
+    Attributes:
+        floors: by name; each has its `best` model, and every model's score and verdict.
+        question: what was left out together.
+    """
+
+    floors: dict[str, Ranking]
+    question: str
+
+    def __str__(self) -> str:
+        return "\n".join(floor.sentence for floor in self.floors.values())
+
+    def plot(self) -> "Figure":
+        """Every model's distance to the best one, and its end-point error."""
+        from slipid.plots.compare import SHOWN, compare_figure
+
+        floors = {name: asdict(floor) for name, floor in self.floors.items()}
+        return compare_figure(floors, SHOWN[self.question])
+
+
+def compared(
+    problem: Problem,
+    choices: Sequence[Choice],
+    data: Runs,
+    question: str,
+    parts: int,
+    quiet: bool = False,
+) -> Comparison:
+    """Every rung of the ladder judged fold by fold; `problem` is of all runs and the choices.
+
+    The other arguments and errors are those of `Fit.compare`.
+    """
+    fold = folds_of(data, question, parts)
+    if (fold < 0).all():
+        raise DataError("no run can be left out; expected several headings or speeds")
+    rows: list[Judged] = []
+    with Reporter(quiet=quiet) as report:
+        for k in sorted(set(fold[fold >= 0].tolist())):
+            report.stage(f"{question}: without part {k + 1} of {fold.max() + 1}")
+            rows += judge(problem, choices, data, question, np.flatnonzero(fold == k)).rows
+    return Comparison(ranking(rows), question)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -13,6 +14,9 @@ from slipid.identify.compare.rung import Rung
 from slipid.model.robot import Robot
 from slipid.support.content import Content
 from slipid.support.errors import DataError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SCHEMA = "slipid.validation/1"
 
@@ -90,9 +94,29 @@ class Summary:
 
 @dataclass(frozen=True)
 class Validation:
-    """Runs a fit has predicted."""
+    """Runs that a fit predicted open loop, model by model; `print` shows the mean errors.
+
+    Attributes:
+        runs: with the scores of every model.
+        new: how many of them the fit has not seen.
+    """
 
     runs: tuple[Judged, ...]
+    new: int = 0
+
+    def __str__(self) -> str:
+        return self.table
+
+    @property
+    def which(self) -> str:
+        """A line on how many runs the fit has not seen."""
+        return f"{self.new} of {len(self.runs)} runs are new to the fit"
+
+    def plot(self) -> "Figure":
+        """End-point errors of every model."""
+        from slipid.plots.compare import ladder_figure
+
+        return ladder_figure(self.to_json(), self.which)
 
     @property
     def summary(self) -> dict[str, dict[str, Summary]]:
@@ -123,8 +147,10 @@ class Validation:
         return "\n".join(lines)
 
 
-def validation(fit: Contact, rungs: Sequence[Rung], data: Runs) -> Validation:
+def validation(fit: Contact, rungs: Sequence[Rung], data: Runs, new: int = 0) -> Validation:
     """Prediction of runs of known floors by a fit, beside every rung fitted on the same runs.
+
+    The fit has not seen `new` of the runs.
 
     As in `folds`, every run is predicted as of a session of its own: what its session
     shares widens its region by the variance found in fitting, whether or not other runs of that
@@ -140,7 +166,7 @@ def validation(fit: Contact, rungs: Sequence[Rung], data: Runs) -> Validation:
         for rung in rungs:
             tracks = replay.follow(fit.robot, w, rung.increments(w, fit.robot))
             score(runs, data, rung.name, tracks, None)
-    return Validation(tuple(runs[k] for k in range(len(data))))
+    return Validation(tuple(runs[k] for k in range(len(data))), new)
 
 
 def _known(robot: Robot, data: Runs) -> None:

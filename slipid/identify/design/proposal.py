@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.model.robot import Validity
 from slipid.support.content import Content
 from slipid.support.errors import DataError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SCHEMA = "slipid.design/1"
 REACHED = 0.9
@@ -36,9 +40,11 @@ ASSUMPTIONS = (
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Proposed runs, the most useful first, with the content of design.json.
+    """Proposed runs, the most useful first; `print` shows their commands as CSV.
 
-    Seen is what each floor was driven with; reached, whether every goal that was asked for can be.
+    The content is that of design.json: what each run is expected to tell, and what they save
+    against grids. Seen is what each floor was driven with; reached, whether every goal that was
+    asked for can be.
     """
 
     content: Content
@@ -46,6 +52,16 @@ class Design:
     base_radius: float
     seen: Mapping[str, Validity]
     reached: bool
+
+    def __str__(self) -> str:
+        notes = [f"note: {text}" for text in self.content["messages"]]
+        return "\n".join([commands(self).rstrip(), *notes])
+
+    def plot(self) -> "Figure":
+        """The runs, and how fast uncertainty falls."""
+        from slipid.plots.design import design_figure
+
+        return design_figure(self)
 
 
 def design(fit: Fit, wish: Wish) -> Design:

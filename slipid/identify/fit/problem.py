@@ -1,7 +1,7 @@
 """Posterior of a robot given windows of its runs, compiled for all windows of the same shapes."""
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from glob import escape
 from typing import Any, NamedTuple
@@ -56,6 +56,17 @@ class State:
     def shared(self, pieces: int) -> Float[np.ndarray, "piece 3"]:
         """The effects, zero where none were found yet."""
         return np.zeros((pieces, 3)) if self.effect is None else self.effect
+
+    @property
+    def arrays(self) -> dict[str, Any]:
+        """What a checkpoint keeps of it, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    @classmethod
+    def of(cls, kept: Mapping[str, np.ndarray]) -> "State":
+        """The state whose `arrays` a checkpoint has kept."""
+        plain: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in kept.items()}
+        return cls(**plain)
 
 
 class Problem:

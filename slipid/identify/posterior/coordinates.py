@@ -13,6 +13,7 @@ from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem, effects_of, twists
 from slipid.identify.fit.shared import FloorShared, Tie
 from slipid.identify.fit.variances import DEGREES, Blocks, Square, Vector, expected, inverse_root
+from slipid.identify.result import Fit, known
 from slipid.model.robot import Robot
 
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
@@ -32,6 +33,12 @@ class Fitted:
     z: np.ndarray
     log_variance: np.ndarray
     covariance: Square
+
+    @classmethod
+    def of(cls, fit: Fit) -> "Fitted":
+        """The end of a fit, with the variances in the order of its problem."""
+        names = known(fit.problem).noise.names
+        return cls(fit.z, np.log([fit.variance[name] for name in names]), fit.covariance)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,10 +1,12 @@
 """Draws of a posterior, what they say of a robot, and whether its chains may be believed.
 
-Needs nothing that samples.
+Needs nothing that samples; what shows, deploys or writes a posterior is loaded by its methods.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -12,15 +14,19 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.identify import slip_curves as curves_of
-from slipid.identify.fit.problem import Problem
 from slipid.identify.fit_file import curves_json, identified_json, number_json
 from slipid.identify.posterior.blocks import Chain, Plan
-from slipid.identify.posterior.coordinates import Fitted
-from slipid.identify.result import Fit
+from slipid.identify.result import Fit, known
 from slipid.identify.verdicts import estimates as verdicts
 from slipid.identify.verdicts.disputed import marked
 from slipid.identify.verdicts.unidentified import members
 from slipid.support.content import Content
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from xarray import DataTree
+
+    from slipid.control.deployed import DeployedRobot
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,21 +49,98 @@ class Diagnosis:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Draws, and whether and why they may be believed.
+    """Posterior of a fit; `print` shows its numbers and whether the chains agree.
 
     Log density, names and diagnosis are of the numbers that are sampled first; accepted is the part
     of the moves that moved something, by stage.
+
+    Attributes:
+        fit: that was sampled around.
+        z, log_variance: draws of the search vector and of the noise.
     """
 
+    fit: Fit
     z: Float[np.ndarray, "ensemble draw free"]
     log_variance: Float[np.ndarray, "ensemble draw variance"]
-    fitted: Fitted
     log_prob: Float[np.ndarray, "ensemble draw"]
     names: tuple[str, ...]
     diagnosis: Diagnosis
     accepted: dict[str, float]
     converged: bool
     reason: str
+
+    def __str__(self) -> str:
+        from slipid.report.estimates import show_posterior
+        from slipid.report.page import text_of
+
+        return text_of(show_posterior, self)
+
+    @cached_property
+    def parameters(self) -> dict[str, verdicts.Estimate]:
+        """Every number by path, with mean, interval and verdict from the draws."""
+        return estimates(self.fit, self.z)
+
+    @property
+    def flat(self) -> Float[np.ndarray, "draw free"]:
+        """The draws of all ensembles."""
+        return self.z.reshape(-1, self.fit.space.size)
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """What a reader of the numbers must know, one sentence each."""
+        doubt = f"the posterior did not converge: {self.reason}"
+        return self.fit.messages + (() if self.converged else (doubt,))
+
+    def draws(self, path: str) -> Float[np.ndarray, "ensemble draw *number"]:
+        """Draws of a free number [SI], a row per ensemble, early steps first.
+
+        Raises:
+            KeyError: no such number, or fixed; names those there are.
+        """
+        space = self.fit.space
+        if path not in space.place:
+            raise KeyError(f"no draws of '{path}'; there are {', '.join(space.place)}")
+        d = next(e.declaration for e in space.free if e.path == path)
+        found = jax.vmap(jax.vmap(d.to_si))(jnp.asarray(self.z[..., space.place[path]]))
+        return np.asarray(found if d.tied else found[..., 0])
+
+    @cached_property
+    def tree(self) -> "DataTree":
+        """Draws, likelihoods and replicated data as an ArviZ DataTree."""
+        from slipid.identify.posterior import netcdf
+
+        return netcdf.tree(self)
+
+    def plot(self, name: str = "intervals") -> "Figure":
+        """One of the posterior's pictures.
+
+        Args:
+            name: `intervals` of every number, or `pairs` that are bent the most.
+
+        Raises:
+            ValueError: no such picture.
+        """
+        from slipid.plots.posterior import PICTURES
+
+        if name not in PICTURES:
+            raise ValueError(f"no picture '{name}'; there are {', '.join(PICTURES)}")
+        return PICTURES[name](self)
+
+    def deploy(self) -> "DeployedRobot":
+        """What runs on the robot, with the intervals of the draws.
+
+        Raises:
+            ValueError: the wheels' kinematics have rank below 3.
+        """
+        from slipid.deploy.deploy import deploy
+
+        return deploy(self)
+
+    def save(self, path: Path | str) -> None:
+        """Write posterior.nc, whole or not at all."""
+        from slipid.identify.posterior import netcdf
+
+        netcdf.write(self.tree, Path(path))
 
 
 def diagnose(chain: Chain, plan: Plan) -> Diagnosis:
@@ -140,22 +223,17 @@ def estimates(
     return marked(out, fit.disputes)
 
 
-def identified(
-    fit: Fit, found: Posterior, numbers: Mapping[str, verdicts.Estimate], problem: Problem
-) -> Content:
-    """Content of identified.json with what the posterior says, `numbers` being its estimates."""
+def identified(found: Posterior) -> Content:
+    """Content of identified.json with what the posterior says."""
+    fit, flat = found.fit, found.flat
     content = identified_json(fit)
-    for path, e in numbers.items():
+    for path, e in found.parameters.items():
         content["parameters"][path] = number_json(e)
-    flat = found.z.reshape(-1, fit.space.size)
     ratios = verdicts.derived(fit.space, flat.mean(axis=0), np.cov(flat.T), fit.channels.voltage)
     content["derived"] = {e.path: number_json(_drawn(e, fit, flat)) for e in ratios}
     some = flat[:: max(1, len(flat) // 400)]
-    curves = curves_of.curves(fit.space, flat.mean(axis=0), some, problem.batch)
-    content["curves"] = curves_json(curves)
-    if not found.converged:
-        content["messages"].append(f"the posterior did not converge: {found.reason}")
-    return content
+    curves = curves_of.curves(fit.space, flat.mean(axis=0), some, known(fit.problem).batch)
+    return content | {"curves": curves_json(curves), "messages": list(found.messages)}
 
 
 def _drawn(ratio: verdicts.Estimate, fit: Fit, flat: np.ndarray) -> verdicts.Estimate:

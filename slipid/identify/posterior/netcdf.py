@@ -1,6 +1,7 @@
 """posterior.nc: draws in the layout of ArviZ, with names for everything."""
 
 import tempfile
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,9 +15,10 @@ from xarray import DataTree
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.variances import DEGREES
-from slipid.identify.posterior.coordinates import EVERYTHING
+from slipid.identify.posterior.coordinates import EVERYTHING, Fitted
 from slipid.identify.posterior.density import Density
 from slipid.identify.posterior.diagnosis import Posterior
+from slipid.identify.result import known
 from slipid.search_space import Space
 from slipid.support.files import write_bytes
 
@@ -26,15 +28,14 @@ REPLICATES = 50
 _AXES = ("x", "y", "yaw")
 
 
-def tree(
-    problem: Problem, found: Posterior, runs: tuple[str, ...], about: dict[str, str]
-) -> DataTree:
-    """All groups of the file, for runs of these names, with these attributes of the whole."""
-    w, robot = problem.windows, problem.robot
+def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
+    """All groups of the file, with these attributes of the whole beside schema and data."""
+    fit, problem = found.fit, known(found.fit.problem)
+    w, robot, runs = problem.windows, problem.robot, [name for name, _ in fit.runs]
     values, dims, units = _numbers(problem.space, found)
     noise, noise_dims = _noise(problem, found)
     means = found.z.mean(axis=(0, 1))
-    middle = replace(found.fitted, z=means)
+    middle = replace(Fitted.of(fit), z=means)
     density = Density(problem, middle, EVERYTHING)
     x = found.z
     of_piece = density.pointwise(x.reshape(-1, x.shape[-1]))
@@ -76,7 +77,7 @@ def tree(
     for name, unit in units.items():
         made["posterior"][name].attrs["units"] = unit
     made["observed_data"].attrs["run_of_piece"] = [runs[k] for k in w.run]
-    made.attrs.update(about)
+    made.attrs.update({"schema": SCHEMA, "data_hash": fit.data_hash, **(about or {})})
     return made
 
 

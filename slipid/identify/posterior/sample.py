@@ -6,6 +6,7 @@ electric numbers are nearly linear with Gaussian noise, so that they are drawn b
 Metropolis-Hastings steps with proposals around their most likely values.
 """
 
+import importlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,20 +16,74 @@ from slipid.identify.fit.hierarchy import effect_information, pooled_stds
 from slipid.identify.fit.problem import Problem, linear
 from slipid.identify.fit.variances import VARIANCE_SPREAD, information
 from slipid.identify.posterior import diagnosis, ensemble
-from slipid.identify.posterior.blocks import Block, Chain, Plan, Record, Target
+from slipid.identify.posterior.blocks import (
+    Block,
+    Chain,
+    Plan,
+    Record,
+    Target,
+    packed,
+    unpacked,
+)
 from slipid.identify.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted, effects_at
 from slipid.identify.posterior.density import Density
 from slipid.identify.posterior.diagnosis import Posterior
 from slipid.identify.posterior.electric import electric_given_motion
+from slipid.identify.result import Fit, known
+from slipid.support.checkpoint import Checkpoint
+from slipid.support.progress import Reporter
+
+for _module in ("arviz_base", "arviz_stats", "h5netcdf"):
+    importlib.import_module(_module)  # they are used after hours of work: what is missing shows now
 
 STILL = 0.01
 """Part of the draws whose electric numbers may never have moved."""
 
 
-def sample(
-    problem: Problem, fitted: Fitted, plan: Plan, draws: int = 400, record: Record | None = None
+def sampled(
+    fit: Fit, plan: Plan, draws: int, kept: Checkpoint | None, report: Reporter
 ) -> Posterior:
+    """Posterior of a fit by the likelihood it was made of, with progress.
+
+    It goes on from the blocks that an earlier call has kept, and keeps new ones.
+    """
+
+    def done(part: str) -> list[Block]:
+        blocks: list[Block] = []
+        if kept is None:
+            return blocks
+        while (arrays := kept.load(f"{part}-{len(blocks):04d}")) is not None:
+            blocks.append(unpacked(arrays))
+        if blocks:
+            report.line(f"going on from block {len(blocks)} ({part}) of {kept.folder}")
+        return blocks
+
+    def keep(part: str, block: Block) -> None:
+        if kept is not None:
+            kept.save(f"{part}-{block.number:04d}", packed(block))
+        _tell(block, plan, report)
+
+    def steps(part: str, count: int) -> None:
+        report.stage(f"sampling {part}")
+
+    return sample(fit, plan, draws, Record(done, keep, steps))
+
+
+def _tell(block: Block, plan: Plan, report: Reporter) -> None:
+    """Progress of a chain; the time left is what it takes at most."""
+    count = block.number + 1
+    warm = "warm-up, " if count <= plan.warm_up[-1] else ""
+    what = (
+        f"block {count}: {warm}{count * block.chain.shape[1]} steps, "
+        f"{100 * block.accepted.mean():.0f} % moved, "
+        f"log density {block.log_prob[:, -1].mean():.1f}"
+    )
+    report.advance(count, plan.most, what)
+
+
+def sample(fit: Fit, plan: Plan, draws: int = 400, record: Record | None = None) -> Posterior:
     """Posterior around a fit, so many draws of each ensemble."""
+    problem, fitted = known(fit.problem), Fitted.of(fit)
     assert problem.several is None, "runs on one floor each"
     record = record or Record()
     parts = (EVERYTHING,) if problem.target.joint else (MOTION, ELECTRIC)
@@ -56,9 +111,9 @@ def sample(
     elif found.converged and still > STILL:
         reason = f"{100 * still:.1f} % of the electric draws, which never moved"
     return Posterior(
+        fit=fit,
         z=out,
         log_variance=drawn_variances(problem, fitted, shape, plan.seed),
-        fitted=fitted,
         log_prob=log_prob,
         names=at.names,
         diagnosis=found,

@@ -13,6 +13,7 @@ Source: Venzon and Moolgavkar 1988 (Applied Statistics 37(1)); Raue et al. 2009 
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +27,9 @@ from slipid.identify.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.parameter import Entry
 from slipid.search_space import Space
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 RISE = float(chi2.ppf(0.9, 1)) / 2
 """Rise of minus log likelihood at the ends of the 90 % interval."""
 _ENOUGH, _TOO_FAR = 1.5 * RISE, 3 * RISE
@@ -38,7 +42,7 @@ _LEAST, _MOST = 0.1, 24
 
 @dataclass(frozen=True)
 class Profile:
-    """Profile of one number.
+    """Profile likelihood of one number; `print` says in a sentence what it tells.
 
     Attributes:
         path, unit: of the number.
@@ -67,6 +71,15 @@ class Profile:
     given: str
     settled: bool
     said: str
+
+    def __str__(self) -> str:
+        return self.said
+
+    def plot(self) -> "Figure":
+        """How fast the fit gets worse when the number is held elsewhere."""
+        from slipid.plots.posterior import profile_figure
+
+        return profile_figure([self])
 
 
 def profiled(space: Space, path: str) -> Entry:

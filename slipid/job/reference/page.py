@@ -29,7 +29,7 @@ _SECTIONS: tuple[tuple[str, type], ...] = (
     ("[[logs]]", c.Logs),
     ("[camera]", c.Camera),
     ('[parameters] "PATTERN"', c.Setting),
-    ("prior, of a parameter", c.Prior),
+    ("prior, of a parameter", c.PriorSection),
     ("[weights.LOAD]", c.Weights),
     ("[fit]", c.FitSection),
     ("[validate]", c.ValidateSection),

@@ -2,7 +2,8 @@
 
 import time
 from collections.abc import Sequence
-from contextlib import closing
+from concurrent.futures import Executor
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -12,9 +13,9 @@ from slipid.data.floor_map import write_map
 from slipid.data.write import own_csv, robotino2022_csv
 from slipid.support.content import Content
 from slipid.support.errors import DataError
+from slipid.support.executor import Here, Processes, results
 from slipid.support.files import read_json, write_arrays, write_bytes, write_json
 from slipid.support.progress import Reporter
-from slipid.support.workers import spread
 from slipid.testsite.driving import Run, Trace, drive
 from slipid.testsite.plant import engine
 from slipid.testsite.simulate.config import Plan, all_filmed, can_identify, identify_config
@@ -42,7 +43,7 @@ class Job:
     out: Path
 
 
-def simulate(plan: Plan, out: Path, jobs: int, report: Reporter) -> Content:
+def simulate(plan: Plan, out: Path, executor: Executor, report: Reporter) -> Content:
     """Drive every run of a plan that is not there yet; what simulate.json holds.
 
     A run's truth is written last: a run that has one is done. Called again after an interrupt it
@@ -72,23 +73,25 @@ def simulate(plan: Plan, out: Path, jobs: int, report: Reporter) -> Content:
     todo = {job.name: job for job in every if not _truth(job).is_file()}
     report.stage(f"driving {len(todo)} of {len(every)} runs")
     began = time.monotonic()
-    seconds = sum(spread(drive_and_write, todo, jobs, report, alone=True), 0.0)
+    seconds = sum(results(executor, drive_and_write, todo, report), 0.0)
     pace = seconds / max(time.monotonic() - began, 1e-9)
-    _film([job for job in every if job.name in plan.filmed], plan.content.camera, jobs, report)
+    filmed = [job for job in every if job.name in plan.filmed]
+    _film(filmed, plan.content.camera, executor, report)
     content = {**about, "runs": [name for name, _ in plan.runs]}
     write_json(manifest, content)
     return {**content, "driven": len(todo), "seconds": seconds, "pace": pace if todo else None}
 
 
-def _film(jobs: Sequence[Job], camera: Camera, processes: int, report: Reporter) -> None:
+def _film(jobs: Sequence[Job], camera: Camera, executor: Executor, report: Reporter) -> None:
     """Videos of the runs that have none yet, with the camera's numbers beside them."""
     todo = {job.name: (job, camera) for job in jobs if not _video(job).is_file()}
     if not todo:
         return
     write_json(jobs[0].out / "video" / "camera.json", camera.as_dict())
     report.stage(f"filming {len(todo)} of {len(jobs)} runs")
-    # in processes of their own, also one by one: what draws has to be chosen before MuJoCo is there
-    spread(film_and_write, todo, processes, report)
+    # not in this process, even alone: what draws has to be chosen before MuJoCo is there
+    with Processes(1) if isinstance(executor, Here) else nullcontext(executor) as apart:
+        results(apart, film_and_write, todo, report)
 
 
 def film_and_write(what: tuple[Job, Camera]) -> None:

@@ -45,9 +45,9 @@ def test_a_variance_that_may_be_anything_small_is_not_held_near_the_fit(replicat
 @pytest.mark.parametrize("count", kept([1, 3], [1]))
 def test_it_goes_on_from_any_block_as_if_it_had_not_ended(whole, count):
     """Electric numbers and variances too, though they are drawn after the last block."""
-    experiment, plan, blocks, found = whole
+    fit, plan, blocks, found = whole
     again = posterior.sample(
-        *experiment, plan, draws=10, record=Record(done=lambda part: blocks[part][:count])
+        fit, plan, draws=10, record=Record(done=lambda part: blocks[part][:count])
     )
     np.testing.assert_array_equal(again.z, found.z)
     np.testing.assert_array_equal(again.log_variance, found.log_variance)
@@ -57,20 +57,18 @@ def test_it_goes_on_from_any_block_as_if_it_had_not_ended(whole, count):
 @pytest.mark.slow
 def test_electric_numbers_are_drawn_anew_for_a_longer_chain(whole):
     """Electric draws are of the very draws of the motion they were made with."""
-    experiment, plan, blocks, found = whole
+    fit, plan, blocks, found = whole
     longer = replace(plan, most=plan.most + 1)
-    anew = posterior.sample(*experiment, longer, draws=10)
-    again = posterior.sample(
-        *experiment, longer, draws=10, record=Record(done=lambda part: blocks[part])
-    )
+    anew = posterior.sample(fit, longer, draws=10)
+    again = posterior.sample(fit, longer, draws=10, record=Record(done=lambda part: blocks[part]))
     np.testing.assert_array_equal(again.z, anew.z)
-    electric = experiment[0].space.electric
+    electric = fit.space.electric
     assert (again.z[..., electric] != found.z[..., electric]).any()
 
 
 @pytest.mark.slow
 def test_electric_draws_that_never_moved_are_not_believed(whole, monkeypatch):
-    experiment, plan, blocks, _ = whole
+    fit, plan, blocks, _ = whole
     diagnose = posterior.diagnosis.diagnose
     monkeypatch.setattr(
         posterior.diagnosis,
@@ -78,12 +76,12 @@ def test_electric_draws_that_never_moved_are_not_believed(whole, monkeypatch):
         lambda chain, plan: replace(diagnose(chain, plan), converged=True),
     )
     record = Record(done=lambda part: blocks[part])
-    assert posterior.sample(*experiment, plan, draws=10, record=record).converged
+    assert posterior.sample(fit, plan, draws=10, record=record).converged
     drawn = posterior.electric_given_motion
     monkeypatch.setattr(
         posterior, "electric_given_motion", lambda *given: replace(drawn(*given), still=0.5)
     )
-    found = posterior.sample(*experiment, plan, draws=10, record=record)
+    found = posterior.sample(fit, plan, draws=10, record=record)
     assert not found.converged
     assert found.reason == "50.0 % of the electric draws, which never moved"
 
@@ -91,14 +89,14 @@ def test_electric_draws_that_never_moved_are_not_believed(whole, monkeypatch):
 @pytest.fixture(scope="module")
 def whole():
     """An experiment, and blocks and draws of its posterior."""
-    *experiment, _ = calibration.experiment(12)
+    fit, _ = calibration.experiment(12)
     plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=4)
     blocks = defaultdict(list)
     found = posterior.sample(
-        *experiment,
+        fit,
         plan,
         draws=10,
         record=Record(keep=lambda part, block: blocks[part].append(block)),
     )
     assert {part: len(made) for part, made in blocks.items()} == {MOTION: 4}
-    return experiment, plan, blocks, found
+    return fit, plan, blocks, found

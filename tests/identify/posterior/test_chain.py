@@ -15,11 +15,10 @@ PLAN = Plan(ensembles=2, walkers=6, block=4, warm_up=(1, 2), most=3)
 @pytest.mark.slow
 def test_a_short_chain(golden):
     """Chains amplify rounding; so few steps do not."""
-    problem, fitted, _ = calibration.experiment(3)
+    fit, _ = calibration.experiment(3)
     blocks = []
     found = posterior.sample(
-        problem,
-        fitted,
+        fit,
         PLAN,
         draws=10,
         record=Record(keep=lambda part, block: blocks.append((part, block))),
@@ -39,7 +38,7 @@ def test_a_short_chain(golden):
                 | {f"x{k}": float(v) for k, v in enumerate(mean[:12])}
             )
     golden("chain", rows, rtol=1e-4, atol=1e-5)
-    of_electric = found.z[..., problem.space.electric].mean(axis=1)
+    of_electric = found.z[..., fit.space.electric].mean(axis=1)
     beside = {"electric": of_electric, "variance": found.log_variance.mean(axis=1)}
     golden(
         "chain_beside",
