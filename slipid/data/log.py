@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.data.clocks.clock import Clock
+from slipid.data.align.clock import Clock
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -97,16 +97,23 @@ def read_anew(
     return out
 
 
-def body_steps(pose: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "step 3"]:
-    """Increments ahead [m], to the left [m] and in heading [rad] between rows of a pose.
+def body_increments(
+    before: Float[np.ndarray, "step 3"], after: Float[np.ndarray, "step 3"]
+) -> Float[np.ndarray, "step 3"]:
+    """Increments ahead [m], to the left [m] and in heading [rad] from poses to others.
 
     They are in the body's axes halfway through each step: turned back by the mean heading.
     """
-    middle = 0.5 * (pose[1:, 2] + pose[:-1, 2])
-    dx, dy, turn = np.diff(pose, axis=0).T
+    middle = 0.5 * (after[:, 2] + before[:, 2])
+    dx, dy, turn = (after - before).T
     ahead = np.cos(middle) * dx + np.sin(middle) * dy
     left = np.cos(middle) * dy - np.sin(middle) * dx
     return np.stack([ahead, left, turn], axis=1)
+
+
+def body_steps(pose: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "step 3"]:
+    """Increments from each row of a pose to the next, as `body_increments`."""
+    return body_increments(pose[:-1], pose[1:])
 
 
 def stretches(mask: Bool[np.ndarray, " row"]) -> Int[np.ndarray, "stretch 2"]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.data.clocks.clock import Clock
+from slipid.data.align.clock import Clock
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.identify import slip_curves as curves_of
@@ -115,7 +115,7 @@ def _clock(clock: Clock) -> Content:
         "offset_interval90_s": clock.offset_interval90,
         "drift": clock.drift,
         "drift_std": clock.drift_std,
-        "told_by": clock.told_by,
+        "told_by": clock.source,
     }
 
 

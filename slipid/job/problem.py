@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from slipid.data.align.lag import pose_lag
 from slipid.data.floor_map import FloorMap, read_map
-from slipid.data.lag import pose_lag
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.sanity.columns import refuse_misordered
@@ -30,8 +30,9 @@ SIZE_STD = 0.1
 """Std of its prior, as a part of the nominal value: tyres give way, cameras are set up by eye."""
 ANEW_S = 0.02
 """Gap between a fitted lag and that at which windows were cut, from which they are cut anew [s]."""
-LAG_STD = 0.1
-"""Std of the prior of a lag that was found from the motion [s]."""
+LAG_STD, MOST_LAG = 0.1, 3.0
+"""Std of the prior of a lag that was found from the motion, and the longest that a fit starts from
+[s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,9 +192,9 @@ def job_of(config: Config, dataset: Runs, skipped: Sequence[str], report: Report
 
 
 def told_lag(dataset: Runs) -> list[Choice]:
-    """The camera's lag as the motion itself tells it, free around that."""
+    """The choice of a free camera lag around the one that the motion shows, if it shows one."""
     lag = pose_lag(dataset)
-    if lag is None:
+    if lag is None or abs(lag.seconds) > MOST_LAG:
         return []
     return [Choice("camera.lag", prior_mean=lag.seconds, prior_std=LAG_STD, free=True)]
 

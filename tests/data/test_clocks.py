@@ -7,9 +7,9 @@ import re
 import numpy as np
 import pytest
 
-from slipid.data.clocks.clock import SURE_STD, best_clock, clock_of_poses
-from slipid.data.clocks.motion import Motion
-from slipid.data.clocks.noise import StepNoise
+from slipid.data.align.clock import SURE_STD, best_clock, clock_of_poses
+from slipid.data.align.motion_pair import MotionPair
+from slipid.data.align.regression import StepNoise
 from slipid.data.reading.presets import declared_layout
 from slipid.data.reading.reader import read_logs, read_runs
 from slipid.support.errors import DataError
@@ -47,10 +47,10 @@ class Drive:
         self.pose_time = (seen - OFFSET) / (1.0 + drift)
 
     def by_wheels(self):
-        return Motion.of_wheels(self.time, self.angle, self.pose_time, self.pose)
+        return MotionPair.of_wheels(self.time, self.angle, self.pose_time, self.pose)
 
     def by_gyro(self):
-        return Motion.of_gyro(self.time, self.gyro, self.pose_time, self.pose)
+        return MotionPair.of_gyro(self.time, self.gyro, self.pose_time, self.pose)
 
 
 @pytest.mark.slow
@@ -67,7 +67,7 @@ def test_a_gyro_tells_the_offset_to_milliseconds_and_how_sure_it_is():
 def test_wheels_tell_it_too_and_claim_less():
     clock = clock_of_poses(Drive(3).by_wheels())
     assert clock is not None
-    assert clock.told_by == "wheels"
+    assert clock.source == "wheels"
     assert clock.offset == pytest.approx(OFFSET, abs=0.01)
     assert 0.015 <= clock.offset_std < 0.02
 
@@ -82,12 +82,12 @@ def test_the_gyro_is_asked_first_and_wheels_only_where_it_does_not_tell():
 
     clock = best_clock(views())
     assert clock is not None
-    assert clock.told_by == "gyro"
+    assert clock.source == "gyro"
     assert clock.offset_std <= SURE_STD
     drive.gyro = np.zeros_like(drive.gyro)
     other = best_clock([drive.by_gyro(), drive.by_wheels()])
     assert other is not None
-    assert other.told_by == "wheels"
+    assert other.source == "wheels"
 
 
 def test_times_of_poses_come_out_on_the_clock_of_the_robot():
@@ -166,8 +166,8 @@ def test_parts_of_a_run_that_disagree_make_the_interval_wider():
 def test_no_step_goes_across_a_gap_of_the_poses():
     drive = Drive(2)
     there = np.abs(drive.pose_time - 4.0) > 0.7
-    motion = Motion.of_gyro(drive.time, drive.gyro, drive.pose_time[there], drive.pose[there])
-    steps = motion.steps(0.1)
+    motion = MotionPair.of_gyro(drive.time, drive.gyro, drive.pose_time[there], drive.pose[there])
+    steps = motion.increments(0.1)
     assert (steps.last - steps.first).max() < 0.25
     assert len(steps.first) > 90
 
@@ -175,9 +175,9 @@ def test_no_step_goes_across_a_gap_of_the_poses():
 def test_a_short_record_tells_nothing():
     drive = Drive(0)
     few = slice(0, 15)
-    short = Motion.of_wheels(drive.time, drive.angle, drive.pose_time[few], drive.pose[few])
+    short = MotionPair.of_wheels(drive.time, drive.angle, drive.pose_time[few], drive.pose[few])
     assert clock_of_poses(short) is None
-    short = Motion.of_wheels(drive.time[few], drive.angle[few], drive.pose_time, drive.pose)
+    short = MotionPair.of_wheels(drive.time[few], drive.angle[few], drive.pose_time, drive.pose)
     assert clock_of_poses(short) is None
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slipid.data.lag import pose_lag
+from slipid.data.align.lag import pose_lag
 from slipid.data.log import Log
 from slipid.data.runs import collect
 
@@ -73,6 +73,11 @@ def test_slow_poses_of_a_robot_with_three_wheels_tell_it_too():
 
 def test_steady_motion_tells_no_lag():
     assert pose_lag(collect([run(0.4, seed, steady=True) for seed in range(3)])) is None
+
+
+def test_it_is_searched_once_for_a_set_of_runs():
+    data = collect([run(0.4, seed) for seed in range(4)])
+    assert pose_lag(data) is pose_lag(data)
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from slipid.data.clocks.clock import Clock
+from slipid.data.align.clock import Clock
 from slipid.job.check import _clock
 from slipid.report.estimates import show_check
 from slipid.report.page import Page
@@ -18,7 +18,7 @@ CLOCK = Clock(
     drift_std=1e-4,
     middle=4.0,
     left=0.1,
-    told_by="gyro",
+    source="gyro",
 )
 
 
@@ -31,7 +31,7 @@ def shown(*clocks: Clock) -> str:
 
 
 def test_offsets_and_their_intervals_are_one_line():
-    slow = replace(CLOCK, offset=-1.25, offset_std=0.012, told_by="wheels")
+    slow = replace(CLOCK, offset=-1.25, offset_std=0.012, source="wheels")
     text = shown(CLOCK, slow)
     assert "(gyro, wheels): -1.300 to -1.250 s from the robot's in 2 runs" in text
     assert "90 % intervals +- 3.3 to 19.7 ms" in text

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.clocks.clock import Clock, best_clock
-from slipid.data.clocks.motion import Motion
+from slipid.data.align.clock import Clock, best_clock
+from slipid.data.align.motion_pair import MotionPair
 from slipid.data.log import Log
 from slipid.data.reading.assemble import TURNS, Identity, assembled, heading
 from slipid.data.reading.checks import Unsteady
@@ -48,8 +48,8 @@ def clock_against(
 
 def _views(
     robot: Log, time: Float[np.ndarray, " pose"], pose: Float[np.ndarray, "pose 3"]
-) -> Iterator[Motion]:
+) -> Iterator[MotionPair]:
     """By the gyro where there is one, which turns with the body itself; by the wheels."""
     if robot.gyro is not None:
-        yield Motion.of_gyro(robot.time, robot.gyro, time, pose)
-    yield Motion.of_wheels(robot.time, robot.wheel_angle, time, pose)
+        yield MotionPair.of_gyro(robot.time, robot.gyro, time, pose)
+    yield MotionPair.of_wheels(robot.time, robot.wheel_angle, time, pose)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.data.clocks.clock import Clock
+from slipid.data.align.clock import Clock
 from slipid.data.log import Log
 from slipid.data.reading.layout import Recorded
 from slipid.data.reading.signal import Signal, clock_of

@@ -1,1 +1,1 @@
-"""Do encoders, commands, gyro and poses tell of the same robot? Asked before anything is fitted."""
+"""Check of encoders, commands, gyro and poses against each other, before anything is fitted."""

@@ -1,27 +1,40 @@
-"""Whether commanded and reported wheel speeds are of the wheels that the encoders say, run by run.
+"""Findings from the channels of the wheels alone, without poses or a geometry.
 
-Poses tell which columns are right where all runs have the same mistake. Here one channel of the
-wheels is compared with another, which needs neither poses nor a geometry, and one run is enough.
+Columns are in another order in one channel than in another; one run is enough for that. Or those of
+commanded and reported wheel speeds are exchanged: a command comes before the motion, and holds
+still in between, so what is called the command then changes later than what is called the measured
+speed, and in more rows.
 """
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from slipid.data.log import Log
 from slipid.data.sanity.finding import Finding
+from slipid.data.sanity.motion.joined import JoinedChannel, JoinedRuns
 from slipid.data.wheel_signals import integral, interpolate, swapped_order
 from slipid.support.errors import DataError
 
 SAME = ("wheel_sign", "wheel_order", "command_sign", "command_order")
 """Findings from the poses of all runs together, which say it better."""
 BROUGHT = ("wheel_scale", "wheel_speed_unit")
-"""Findings that columns in another order may bring about; with the right order they are told."""
+"""Findings that columns in another order may bring about; they come again once it is right."""
 STEP_S = 0.5
 """Length of a step [s]: delays and jitter do not matter."""
 CHANNELS = ("wheel_speed_command", "wheel_speed")
-"""That are compared with the encoders."""
+"""Channels that are compared with the encoders."""
+LONGEST_S = 1.0
+"""Lags between command and motion that are looked at, either way [s]."""
+MOST_SHIFTS = 50
+"""The same in rows, for time in a wrong unit."""
+MOST_ROWS = 20_000
+"""Rows that are looked at."""
+ALIKE = 0.3
+"""Correlation from which a lag is believed."""
+BUSIER = 1.5
+"""Times as many rows in which a measured speed changes as in a command."""
 
 
 def misordered(logs: Sequence[Log]) -> Iterator[Finding]:
@@ -38,15 +51,14 @@ def misordered(logs: Sequence[Log]) -> Iterator[Finding]:
             f"{listed}, where those below zero count backwards",
             f"list the columns of the wheels, or those of {name}, in another order, or set "
             "scale = -1 for those that count backwards",
-            "wrong",
-            () if len(names) == len(logs) else tuple(names),
+            runs=() if len(names) == len(logs) else tuple(names),
         )
 
 
 def refuse_misordered(logs: Sequence[Log]) -> None:
     """DataError with all findings, for commands that look for no other mistakes."""
-    if said := "\n".join(f"not used: {finding}" for finding in misordered(logs)):
-        raise DataError(said)
+    if listed := "\n".join(f"not used: {finding}" for finding in misordered(logs)):
+        raise DataError(listed)
 
 
 def _orders(log: Log) -> Iterator[tuple[str, tuple[int, ...]]]:
@@ -59,6 +71,54 @@ def _orders(log: Log) -> Iterator[tuple[str, tuple[int, ...]]]:
             continue
         if measured is None:
             measured = np.diff(interpolate(log.time, log.wheel_angle, edges), axis=0)
-        said = np.diff(interpolate(log.time, integral(log.time, rate), edges), axis=0)
-        if order := swapped_order(measured, said):
+        turned = np.diff(interpolate(log.time, integral(log.time, rate), edges), axis=0)
+        if order := swapped_order(measured, turned):
             yield name, order
+
+
+def exchanged(data: JoinedRuns) -> Iterator[Finding]:
+    """The finding, if columns are exchanged."""
+    if data.commanded is None or data.reported is None:
+        return
+    row = float(np.median(data.row))
+    when = np.arange(data.begin[0], data.end[-1], row)[:MOST_ROWS]
+    inside = when + row <= data.end[data.runs_of(when).clip(0)]
+    command, speed = (
+        _changes(channel, when, row, inside) for channel in (data.commanded, data.reported)
+    )
+    if not (command**2).sum() > 0 or not (speed**2).sum() > 0:
+        return
+    most = min(int(LONGEST_S / row), MOST_SHIFTS)
+    shifts = np.arange(-most, most + 1)
+    alike = np.array([_correlation(command, speed, int(k)) for k in shifts])
+    best = int(np.argmax(alike))
+    busy = [float((np.abs(x) > 1e-3 * np.abs(x).max()).mean()) for x in (command, speed)]
+    if alike[best] > ALIKE and shifts[best] < 0 and busy[0] > BUSIER * busy[1]:
+        yield Finding(
+            "command_exchanged",
+            f"what is called the commanded wheel speed comes {-shifts[best] * row:.2g} s after the "
+            f"measured one, and changes in {busy[0]:.0%} of the rows, the measured one in "
+            f"{busy[1]:.0%}",
+            "exchange the columns of wheel_speed_command and wheel_speed (or of "
+            "motor_speed_command and motor_speed)",
+        )
+
+
+def _changes(
+    channel: JoinedChannel,
+    when: Float[np.ndarray, " at"],
+    row: float,
+    inside: Bool[np.ndarray, " at"],
+) -> Float[np.ndarray, "change wheel"]:
+    """Change of a speed from row to row [rad/s], zero across the ends of runs."""
+    speed = (channel.at(when + row) - channel.at(when)) / row
+    speed[~inside] = np.nan
+    return np.nan_to_num(np.diff(speed, axis=0))
+
+
+def _correlation(command: np.ndarray, speed: np.ndarray, shift: int) -> float:
+    """Of a command with the speed so many rows later."""
+    n = len(command) - abs(shift)
+    first, second = (command[:n], speed[-n:]) if shift >= 0 else (command[-n:], speed[:n])
+    size = np.sqrt((first**2).sum() * (second**2).sum())
+    return float((first * second).sum() / size) if size > 0 else 0.0

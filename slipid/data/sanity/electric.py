@@ -6,9 +6,9 @@ from itertools import permutations
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.sanity.axes.reading import Reading, columns
+from slipid.data.sanity.axes.interpretation import Interpretation, columns
 from slipid.data.sanity.finding import Finding
-from slipid.data.sanity.motion.recorded import Recorded
+from slipid.data.sanity.motion.joined import JoinedRuns
 
 BACKWARDS = -0.25
 """Work over the sum of its magnitudes below which a sign is wrong."""
@@ -34,18 +34,18 @@ GRAVITY = 9.81
 
 
 def electric(
-    data: Recorded, reading: Reading, radius: float, mass_kg: float | None, by_power: bool
+    data: JoinedRuns, meant: Interpretation, radius: float, mass_kg: float | None, by_power: bool
 ) -> Iterator[Finding]:
     """Findings about currents and voltages.
 
     Args:
-        reading: order and signs of the wheels, as they were found.
+        meant: order and signs of the wheels, as they were found.
         radius: of the wheels [m].
         mass_kg: of the robot, None where it is not known.
         by_power: whether speeds can be trusted, so that power can be compared with them.
     """
     declared = _speeds(data)
-    speed = declared @ columns(reading, data.wheels).T
+    speed = declared @ columns(meant, data.wheels).T
     driving = np.abs(speed).max(axis=1, initial=0.0) > 0.2 * np.nanquantile(np.abs(speed), 0.95)
     for channel, name in ((data.current, "current"), (data.voltage, "voltage")):
         if channel is None or (name == "current" and not data.current_is_signed):
@@ -65,12 +65,11 @@ def electric(
             "current_unit",
             f"the motors take {power:.3g} times the power of lifting the robot at its speed",
             "correct the unit of current (mA?) or voltage (mV?), or mass_kg in [robot]",
-            "wrong",
         )
     yield from odd
 
 
-def _speeds(data: Recorded) -> Float[np.ndarray, "row wheel"]:
+def _speeds(data: JoinedRuns) -> Float[np.ndarray, "row wheel"]:
     """Speed of each column's wheel [rad/s]; nothing between runs."""
     step = np.diff(data.angle.time)
     speed = np.diff(data.angle.value, axis=0) / step[:, None]
@@ -90,8 +89,8 @@ def _signs(
     The speed is in the order and with the signs that were found, or as `declared`.
     """
     work = np.nan_to_num(values * speed)
-    forth, back = (_share(work[way]) for way in (speed > 0, speed < 0))
-    if name == "current" and forth > SIDED and back < -SIDED:
+    forwards, backwards = (_share(work[way]) for way in (speed > 0, speed < 0))
+    if name == "current" and forwards > SIDED and backwards < -SIDED:
         both = "currents are positive whichever way the wheels drive"
         if np.nanmin(values) < 0.0:
             yield Finding(
@@ -116,7 +115,6 @@ def _signs(
             f"the columns of the {name} are in another order than the wheels: number {listed} "
             f"go with wheels 1 to {len(order)}",
             f"name the columns of the channel {name} in the order {listed}",
-            "wrong",
         )
         return
     share = np.array([_share(column) for column in work.T])
@@ -131,7 +129,6 @@ def _signs(
         f"speed sums to {share[turned].min():+.2f} of its magnitude",
         f"set scale = -1 for {'the channel' if every else 'its column of the channel'} {name}, "
         "if it is 1 (else turn its sign)",
-        "wrong",
     )
 
 
@@ -149,9 +146,9 @@ def _other_order(
         return None
     share, as_declared = (_shares(values, one) for one in (speed, declared))
     best = max(permutations(wheels), key=lambda order: float(share[list(order), wheels].sum()))
-    told = share[list(best), wheels]
+    ordered = share[list(best), wheels]
     signs = max(float(np.abs(np.diagonal(one)).sum()) for one in (share, as_declared))
-    return best if told.min() > ORDERED and told.sum() > signs + ORDERED else None
+    return best if ordered.min() > ORDERED and ordered.sum() > signs + ORDERED else None
 
 
 def _shares(
@@ -179,14 +176,12 @@ def _size_of_current(amps: np.ndarray | None, mass_kg: float | None) -> Iterator
             "current_unit",
             f"the motors draw {high:.4g} A{weighs}, where at most {most:.3g} A are to be expected",
             "set unit = 'mA' for the channel current (scale = 0.001)",
-            "wrong",
         )
     elif high < LEAST_A:
         yield Finding(
             "current_unit",
             f"the motors draw no more than {high:.2g} A while they drive",
             "set unit = 'A' for the channel current, if it is declared in mA (scale = 1000)",
-            "wrong",
         )
 
 
@@ -202,5 +197,4 @@ def _size_of_voltage(volts: np.ndarray | None) -> Iterator[Finding]:
         "voltage_unit",
         f"the motors see {high:.4g} V while they drive",
         f"set unit = '{unit}' for the channel voltage or bus_voltage (scale = {scale})",
-        "wrong",
     )

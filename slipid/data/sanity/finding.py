@@ -1,7 +1,7 @@
-"""What was found wrong, or could not be checked: a sentence of it and a sentence of what to do."""
+"""Findings of the check: what is wrong or could not be checked, and the remedy."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from slipid.support.content import Content
@@ -15,12 +15,12 @@ NAMED = 4
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found in runs.
+    """One thing that the check found in runs.
 
     Attributes:
         kind: its name, such as `wheel_sign`; the rooms' files list them.
-        found: what was seen, with numbers.
-        remedy: what to do: which key to change, and to what; or None.
+        found: what is wrong, with numbers.
+        remedy: which key to change, and to what; or None.
         severity: how bad it is.
         runs: names of the runs concerned; empty where all are.
     """
@@ -28,12 +28,17 @@ class Finding:
     kind: str
     found: str
     remedy: str | None
-    severity: Severity
+    severity: Severity = "wrong"
     runs: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         where = f" (in {listed(self.runs)})" if self.runs else ""
         return self.found + where + (f"; {self.remedy}" if self.remedy else "")
+
+    def explained(self, how: str, others: Iterable["Finding"] = ()) -> "Finding":
+        """The finding with how it explains the logs, and the remedies of others that do as well."""
+        more = "".join(f"; or, which explains these logs as well: {o.remedy}" for o in others)
+        return replace(self, found=f"{self.found}: {how}", remedy=f"{self.remedy}{more}")
 
     def to_json(self) -> Content:
         """Its part of check.json."""
@@ -44,14 +49,6 @@ class Finding:
             "remedy": self.remedy,
             "runs": list(self.runs),
         }
-
-
-@dataclass(frozen=True)
-class Words:
-    """What was found, and what to do."""
-
-    found: str
-    remedy: str
 
 
 def listed(names: Sequence[str]) -> str:

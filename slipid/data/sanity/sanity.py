@@ -1,4 +1,4 @@
-"""Sanity before fitting: do encoders, commands, gyro and poses tell of the same robot?
+"""The check before a fit: whether encoders, commands, gyro and poses are of the declared robot.
 
 Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_speed_unit`,
 `heading_sign`, `heading_unit`, `heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`,
@@ -10,37 +10,45 @@ Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`,
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
 
+from slipid.data.align.lag import PoseLag, pose_lag
 from slipid.data.runs import Runs
-from slipid.data.sanity.axes.gather import gather
-from slipid.data.sanity.axes.reading import Evidence, Reading, misfits
-from slipid.data.sanity.axes.shape import mistakes
-from slipid.data.sanity.axes.words import of_mistake
-from slipid.data.sanity.columns import BROUGHT, SAME, misordered
+from slipid.data.sanity.axes.interpretation import (
+    Evidence,
+    Interpretation,
+    gather,
+    misfits,
+    to_body,
+)
+from slipid.data.sanity.axes.mistakes import mistakes
+from slipid.data.sanity.columns import BROUGHT, SAME, exchanged, misordered
 from slipid.data.sanity.electric import electric
-from slipid.data.sanity.exchanged import exchanged
 from slipid.data.sanity.finding import Finding, worst_first
-from slipid.data.sanity.motion.evidence import usable
-from slipid.data.sanity.motion.lag import Lag, find_lag
-from slipid.data.sanity.motion.recorded import Recorded, recorded
-from slipid.data.sanity.motion.steps import Edges, Steps, edges, steps
-from slipid.data.sanity.notes import not_checked, notes
+from slipid.data.sanity.motion.joined import (
+    ChannelIncrements,
+    JoinedChannel,
+    JoinedRuns,
+    StepEdges,
+    edges,
+    increments,
+    joined,
+)
+from slipid.data.sanity.motion.products import usable
 from slipid.data.sanity.scales.causes import explained
-from slipid.data.sanity.scales.ratios import Ratios, ratios
-from slipid.data.sanity.scales.words import of_causes, of_ratios
-from slipid.data.sanity.single_runs import likeness, single_runs, standing
+from slipid.data.sanity.scales.ratios import FORWARD, TURNS, ScaleRatios, ratios
+from slipid.data.sanity.single_runs import agreement, single_runs, standing
+from slipid.data.sanity.words import of_causes, of_mistake, of_ratios
 from slipid.model.geometry import Geometry
 
 FEW = 20
 """Steps below which nothing is compared."""
 FOREIGN = 0.4
-"""Share of the poses' motion, left unexplained in any reading, from which it is said."""
+"""Share of the poses' motion, left unexplained in any interpretation, that is a finding."""
 LATE_S = 1.0
-"""Lag of the poses from which it is said [s]."""
+"""Lag of the poses that is a finding [s]."""
 TOO_LATE_S = 1.9
 """Lag beyond which a fit of it would not be near enough at its start [s]."""
 SLOW_M_S, SLOW_ROW_S = 0.01, 2.0
@@ -48,103 +56,104 @@ SLOW_M_S, SLOW_ROW_S = 0.01, 2.0
 FAST_M_S, FAST_ROW_S = 50.0, 1e-3
 """The reverse."""
 SHORT = 0.62
-"""Body over wheels below which, without commands to vouch for the wheels, it is said."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Declared:
-    """Numbers of the declared robot; `rolling` is J / r with the heading at the base radius."""
-
-    rolling: Float[np.ndarray, "wheel 3"]
-    base: float
-    radius: float
-    gear_ratio: float
-    mass_kg: float | None
+"""Body over wheels below which, without commands to vouch for the wheels, there is a finding."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """What poses and wheels say of each other.
+    """Comparison of poses and wheels.
 
-    `findings` are about lag, order, signs and axes, and about single runs; `reading` is how they
-    are right; `poses` says whether the poses can be compared any further.
+    Attributes:
+        findings: about lag, order, signs, axes and single runs.
+        moved: increments of the robot's channels at the lag of the poses.
+        evidence: products of these.
+        meant: the interpretation that is right.
+        poses: whether the poses can be compared any further.
     """
 
     findings: tuple[Finding, ...]
-    moved: Steps
+    moved: ChannelIncrements
     evidence: Evidence
-    reading: Reading
-    poses: bool
+    meant: Interpretation = field(default_factory=Interpretation)
+    poses: bool = False
 
 
 def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tuple[Finding, ...]:
-    """What is wrong with runs or with what was declared, the worst first, then what is not known.
+    """Return what is wrong with runs or with their declaration, the worst first, then notes.
 
     Args:
         data: runs.
         geometry: as it was declared.
         mass_kg: of the robot, None where it is not known.
     """
-    base, radius = float(geometry.base_radius), float(geometry.wheel_radius)
-    rolling = np.asarray(geometry.forward()) / radius / np.array([1.0, 1.0, base])
-    robot = _Declared(rolling, base, radius, float(geometry.gear_ratio), mass_kg)
-    channels = recorded(data)
-    said = tuple(_all(channels, edges(channels), robot))
-    if not {finding.kind for finding in said} & {*SAME}:
+    channels = joined(data)
+    found = tuple(_all(channels, edges(channels), geometry, mass_kg, pose_lag(data)))
+    if not {finding.kind for finding in found} & {*SAME}:
         columns = tuple(misordered(data.logs))
-        said = tuple(f for f in said if not columns or f.kind not in BROUGHT) + columns
-    return worst_first(said)
+        found = tuple(f for f in found if not columns or f.kind not in BROUGHT) + columns
+    return worst_first(found)
 
 
-def _all(data: Recorded, at: Edges, robot: _Declared) -> Iterator[Finding]:
+def _all(
+    data: JoinedRuns,
+    at: StepEdges,
+    geometry: Geometry,
+    mass_kg: float | None,
+    lag: PoseLag | None,
+) -> Iterator[Finding]:
     """Findings in no order."""
-    found = _compared(data, at, robot)
+    found = _compared(data, at, geometry, lag)
     if found is None:
-        yield not_checked(f"the runs are too short: {len(at.run)} steps, {FEW} are needed")
+        yield _not_checked(f"the runs are too short: {len(at.run)} steps, {FEW} are needed")
         return
     yield from found.findings
-    seen = ratios(data, at, found.moved, found.evidence, found.reading)
+    scales = ratios(data, at, found.moved, found.evidence, found.meant)
     if not found.poses:
-        known = {k: r for k, r in seen.known.items() if k not in ("travel", "turning", "gyro")}
-        seen = Ratios(known, seen.speed_is_angle)
-    factors = tuple(_factors(seen, data, robot)) or tuple(_of_time(data, found.moved, at, robot))
+        known = {k: r for k, r in scales.known.items() if k not in ("travel", "turning", "gyro")}
+        scales = ScaleRatios(known, scales.speed_is_angle)
+    radius, gear_ratio = float(geometry.wheel_radius), float(geometry.gear_ratio)
+    factors = tuple(_factors(scales, float(np.median(data.row)), gear_ratio))
+    factors = factors or tuple(_of_time(data, found.moved, at, radius))
     yield from factors
-    yield from electric(data, found.reading, robot.radius, robot.mass_kg, not factors)
+    yield from electric(data, found.meant, radius, mass_kg, not factors)
     yield from exchanged(data)
-    yield from _suspicious(seen)
-    yield from notes(data, found.evidence, found.reading)
+    yield from _suspicious(scales)
+    yield from _notes(data, found.evidence, found.meant)
 
 
-def _compared(data: Recorded, at: Edges, robot: _Declared) -> _Compared | None:
+def _compared(
+    data: JoinedRuns, at: StepEdges, geometry: Geometry, lag: PoseLag | None
+) -> _Compared | None:
     """Comparison of poses and wheels; None where there are too few steps."""
-    lag = find_lag(data, at, robot.base)
-    moved = steps(data, at, lag.seconds)
+    lag = lag if lag is not None and lag.decisive else PoseLag(0.0, 1.0, 1.0)
+    moved = increments(data, at, lag.seconds)
     if usable(moved.wheels).sum() < FEW:
         return None
-    evidence = gather(robot.rolling, at, moved, robot.base)
-    declared = likeness(at, moved, evidence, Reading(), robot.base, len(data.names))
+    evidence = gather(geometry, at, moved)
+    declared = agreement(data, at, moved, evidence, Interpretation())
     if standing(data, declared).all():
-        return _Compared(tuple(single_runs(data, declared)), moved, evidence, Reading(), False)
-    reading, found = mistakes(evidence)
-    left = misfits(evidence, reading)["pose"]
+        return _Compared(tuple(single_runs(data, declared)), moved, evidence)
+    meant, found = mistakes(evidence)
+    left = misfits(evidence, meant)["pose"]
     if left > FOREIGN:
-        return _Compared((_foreign(left),), moved, evidence, Reading(), False)
-    alike = likeness(at, moved, evidence, reading, robot.base, len(data.names))
+        return _Compared((_foreign(left),), moved, evidence)
     # a half sine turns back at half a turn, which puts single runs out of step
-    alone = () if reading.frame.heading == "half_sine" else tuple(single_runs(data, alike))
-    said = (*_of_lag(lag), *map(of_mistake, found), *alone)
-    return _Compared(said, moved, evidence, reading, True)
+    half_sine = meant.convention.heading == "half_sine"
+    agreeing = agreement(data, at, moved, evidence, meant)
+    alone = () if half_sine else tuple(single_runs(data, agreeing))
+    listed = (*_of_lag(lag), *map(of_mistake, found), *alone)
+    return _Compared(listed, moved, evidence, meant, True)
 
 
-def _of_lag(lag: Lag) -> Iterator[Finding]:
+def _of_lag(lag: PoseLag) -> Iterator[Finding]:
     """Poses that come much later or earlier than encoders."""
     if abs(lag.seconds) < LATE_S:
         return
     late = "after" if lag.seconds > 0 else "before"
     yield Finding(
         "lag",
-        f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: so {lag.unexplained:.2f} of "
-        f"the motion is left unexplained, without {lag.without:.2f}",
+        f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: so {lag.left:.2f} of "
+        f"the motion is left unexplained, without {lag.left_at_zero:.2f}",
         f"shift the poses' times by {-lag.seconds:+.1f} s, or start 'camera.lag' in [parameters] "
         f"at {lag.seconds:.1f}",
         "wrong" if abs(lag.seconds) > TOO_LATE_S else "suspicious",
@@ -158,28 +167,28 @@ def _foreign(left: float) -> Finding:
         "any order, with any signs and axes",
         "check whether poses and encoders are of the same runs and of the same time, and whether "
         "the wheels were on the ground",
-        "wrong",
     )
 
 
-def _factors(seen: Ratios, data: Recorded, robot: _Declared) -> Iterator[Finding]:
+def _factors(scales: ScaleRatios, row_s: float, gear_ratio: float) -> Iterator[Finding]:
     """Units and sizes that are wrong."""
-    fitting, single = explained(seen, float(np.median(data.row)), robot.gear_ratio)
-    yield from of_causes(fitting, single, of_ratios(seen), robot.gear_ratio)
-    if not fitting and not all(r.natural for r in seen.known.values()):
+    fitting, single = explained(scales, row_s, gear_ratio)
+    yield from of_causes(fitting, single, of_ratios(scales), gear_ratio)
+    if not fitting and not all(r.natural for r in scales.known.values()):
         yield Finding(
             "scales",
             "the channels disagree about how far the robot went, and no single number explains "
-            f"it: {of_ratios(seen)}",
+            f"it: {of_ratios(scales)}",
             "check the units of all channels, gear_ratio, wheel_radius_m and base_radius_m",
-            "wrong",
         )
 
 
-def _of_time(data: Recorded, moved: Steps, at: Edges, robot: _Declared) -> Iterator[Finding]:
-    """Time in another unit, where only its size tells it."""
+def _of_time(
+    data: JoinedRuns, moved: ChannelIncrements, at: StepEdges, radius: float
+) -> Iterator[Finding]:
+    """Time in another unit, where only its size shows it."""
     row = float(np.median(data.row))
-    speed = np.abs(moved.wheels) / (at.after - at.before)[:, None] * robot.radius
+    speed = np.abs(moved.wheels) / (at.after - at.before)[:, None] * radius
     top = float(np.nanquantile(speed, 0.95))
     slow = row > SLOW_ROW_S and top < SLOW_M_S
     if slow or (row < FAST_ROW_S and top > FAST_M_S):
@@ -187,14 +196,13 @@ def _of_time(data: Recorded, moved: Steps, at: Edges, robot: _Declared) -> Itera
             "time_unit",
             f"rows are {row:.3g} s apart and wheels reach {top:.2g} m/s",
             f"set unit = '{'ms' if slow else 's'}' for the channel time",
-            "wrong",
         )
 
 
-def _suspicious(seen: Ratios) -> Iterator[Finding]:
+def _suspicious(scales: ScaleRatios) -> Iterator[Finding]:
     """Wheels that go much further than the body, with nothing to vouch for them."""
-    travel = seen.known.get("travel")
-    if travel is None or "drive" in seen.known or "command" in seen.known:
+    travel = scales.known.get("travel")
+    if travel is None or "drive" in scales.known or "command" in scales.known:
         return
     if travel.natural and travel.value < SHORT:
         yield Finding(
@@ -205,3 +213,43 @@ def _suspicious(seen: Ratios) -> Iterator[Finding]:
             "unless the wheels slip so much",
             "suspicious",
         )
+
+
+def _notes(data: JoinedRuns, evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
+    """A note for everything that the runs leave open."""
+    yield from _unmoved(evidence, meant)
+    if evidence.twist is None and evidence.command is None:
+        yield _not_checked(
+            "no command is logged: wheels that are said to turn too far cannot be told from wheels "
+            "that slip"
+        )
+    if data.current is not None and not data.current_is_signed:
+        yield _not_checked("currents are magnitudes: their signs cannot be checked")
+    if _constant(data.gyro):
+        yield _not_checked("the gyro never changes: it cannot be checked")
+
+
+def _not_checked(what: str) -> Finding:
+    """The note that something was not checked."""
+    return Finding("not_checked", what, None, "note")
+
+
+def _unmoved(evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
+    """Directions in which no run moves."""
+    pose = next(iter(evidence.pose.values()), None)
+    if pose is None:
+        return
+    predict = to_body(evidence, meant)
+    share = np.einsum("aw,wv,av->a", predict, pose.turns, predict)
+    share = share / max(float(share.sum()), 1e-300)
+    if share[2] < TURNS:
+        yield _not_checked("no run turns: base radius, unit of the heading and gyro are unchecked")
+    if share[0] < FORWARD:
+        yield _not_checked("no run drives ahead: order and signs are checked in part only")
+    if evidence.free and share[1] < FORWARD:
+        yield _not_checked("no run drives sideways: order and signs are checked in part only")
+
+
+def _constant(channel: JoinedChannel | None) -> bool:
+    """Whether a channel never changes."""
+    return channel is not None and not np.nanmax(np.abs(np.diff(channel.value, axis=0))) > 0

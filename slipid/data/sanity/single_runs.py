@@ -6,52 +6,55 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.data.sanity.axes.reading import Evidence, Reading, to_body
+from slipid.data.sanity.axes.interpretation import Evidence, Interpretation, to_body
 from slipid.data.sanity.finding import Finding
-from slipid.data.sanity.motion.headings import Frame, body_motion
-from slipid.data.sanity.motion.recorded import Recorded
-from slipid.data.sanity.motion.steps import Edges, Steps
+from slipid.data.sanity.motion.convention import body_motion, rotation
+from slipid.data.sanity.motion.joined import ChannelIncrements, JoinedRuns, StepEdges
+from slipid.data.sanity.motion.products import usable
 
 MOVED_M = 0.2
-"""Way of the wheels from which a run must move its poses [m]."""
+"""Path length of the wheels from which a run must move its poses [m]."""
 STILL_M = 1e-6
-"""Way of poses that do not change, but for rounding [m]."""
+"""Path length of poses that do not change, but for rounding [m]."""
 ROWS = 20
 """Rows below which a run says nothing alone."""
-STRANGE, TIMES, USUAL = 0.3, 10.0, 0.9
-"""Distance from full likeness from which a run is strange, and the part of the middle one's from
-which it is, where that one is at least so alike."""
+ODD, TIMES, USUAL = 0.3, 10.0, 0.9
+"""Distance from full agreement from which a run is odd, and the multiple of the median one's from
+which it is, where that one agrees at least so well."""
 CLIPPED = 4.0
 """Steps of the body beyond so many usual ones are shortened to that."""
 ALL = 0.5
-"""Part of the runs from which something is said of all of them."""
+"""Part of the runs from which a finding is about all of them."""
 
 
 @dataclass(frozen=True, eq=False)
-class Likeness:
-    """How poses follow wheels in each run.
+class RunAgreement:
+    """Agreement of poses and wheels in each run.
 
     Attributes:
-        wheels_m: way of the wheels (run,) [m].
-        poses_m: way of the poses, headings counted at the base radius (run,) [m].
-        alike: cosine between the steps of poses and those predicted by wheels (run,).
+        wheels_m: path length by the wheels (run,) [m].
+        poses_m: path length of the poses, headings counted at the base radius (run,) [m].
+        cosine: between the steps of poses and those predicted by wheels (run,).
     """
 
     wheels_m: Float[np.ndarray, " run"]
     poses_m: Float[np.ndarray, " run"]
-    alike: Float[np.ndarray, " run"]
+    cosine: Float[np.ndarray, " run"]
 
 
-def likeness(
-    at: Edges, moved: Steps, evidence: Evidence, reading: Reading, base: float, runs: int
-) -> Likeness:
-    """Likeness of every run under a reading; commands stand in for nothing."""
-    body = body_motion(at, Frame(reading.frame.heading, reading.frame.y_down))
-    body = body * [1.0, 1.0, base]
-    c, s = np.cos(np.radians(-reading.frame.offset)), np.sin(np.radians(-reading.frame.offset))
-    body = body @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
-    predicted = moved.wheels @ to_body(evidence, reading).T
-    known = np.isfinite(body).all(axis=1) & np.isfinite(predicted).all(axis=1)
+def agreement(
+    data: JoinedRuns,
+    at: StepEdges,
+    moved: ChannelIncrements,
+    evidence: Evidence,
+    meant: Interpretation,
+) -> RunAgreement:
+    """Agreement of every run under an interpretation; commands stand in for nothing."""
+    convention = meant.convention
+    body = body_motion(at, convention.bare) * [1.0, 1.0, evidence.base]
+    body = body @ rotation(-convention.offset).T
+    predicted = moved.wheels @ to_body(evidence, meant).T
+    known = usable(body, predicted)
     body, predicted, run = body[known], predicted[known], at.run[known]
     far = np.linalg.norm(body, axis=1)
     most = CLIPPED * float(np.median(far[far > 0])) if (far > 0).any() else 1.0
@@ -62,23 +65,23 @@ def likeness(
     scaled = predicted * np.where(factor > 0, factor, 0.0)
 
     def total(values: np.ndarray) -> np.ndarray:
-        return np.bincount(run, values, minlength=runs)
+        return np.bincount(run, values, minlength=len(data.names))
 
     size = np.sqrt(total((body**2).sum(axis=1)) * total((scaled**2).sum(axis=1)))
     both = total((body * scaled).sum(axis=1))
-    return Likeness(
+    return RunAgreement(
         total(np.linalg.norm(predicted, axis=1)),
         total(np.linalg.norm(body, axis=1)),
         np.where(size > 0, both / np.where(size > 0, size, 1.0), 0.0),
     )
 
 
-def standing(data: Recorded, of: Likeness) -> Bool[np.ndarray, " run"]:
+def standing(data: JoinedRuns, of: RunAgreement) -> Bool[np.ndarray, " run"]:
     """Runs whose poses do not change while wheels turn."""
     return (of.poses_m < STILL_M) & (of.wheels_m > MOVED_M) & (_rows(data) >= ROWS)
 
 
-def single_runs(data: Recorded, of: Likeness) -> Iterator[Finding]:
+def single_runs(data: JoinedRuns, of: RunAgreement) -> Iterator[Finding]:
     """Findings about runs that do not go with the others."""
     still = standing(data, of)
     if still.any():
@@ -90,32 +93,30 @@ def single_runs(data: Recorded, of: Likeness) -> Iterator[Finding]:
             "check the columns of pose_x, pose_y and pose_heading, and whether the marker was seen"
             if every
             else "leave these runs out of the globs of [[logs]]",
-            "wrong",
-            () if every else _names(data, still),
+            runs=() if every else _names(data, still),
         )
     # a robot that is held in place by the floor is not like another run
     moves = ~still & (_rows(data) >= ROWS) & (of.wheels_m > MOVED_M)
     if moves.any():
         moves &= of.poses_m > 0.25 * np.median(of.poses_m[moves] / of.wheels_m[moves]) * of.wheels_m
-    if moves.sum() < 2 or (usual := float(np.median(of.alike[moves]))) < USUAL:
+    if moves.sum() < 2 or (usual := float(np.median(of.cosine[moves]))) < USUAL:
         return
-    strange = moves & (1 - of.alike > max(STRANGE, TIMES * (1 - usual)))
-    if strange.any():
+    odd = moves & (1 - of.cosine > max(ODD, TIMES * (1 - usual)))
+    if odd.any():
         yield Finding(
             "pose_of_another_run",
-            f"the poses of {strange.sum()} of {len(strange)} runs do not follow their wheels "
-            f"(likeness {np.median(of.alike[strange]):.2f}, in the others "
-            f"{np.median(of.alike[moves & ~strange]):.2f})",
+            f"the poses of {odd.sum()} of {len(odd)} runs do not follow their wheels "
+            f"(agreement {np.median(of.cosine[odd]):.2f}, in the others "
+            f"{np.median(of.cosine[moves & ~odd]):.2f})",
             "check whether these files hold poses of another run, or of another time, and leave "
             "them out of the globs of [[logs]]",
-            "wrong",
-            _names(data, strange),
+            runs=_names(data, odd),
         )
 
 
-def _rows(data: Recorded) -> Float[np.ndarray, " run"]:
+def _rows(data: JoinedRuns) -> Float[np.ndarray, " run"]:
     return np.asarray((data.end - data.begin) / data.row)
 
 
-def _names(data: Recorded, which: Bool[np.ndarray, " run"]) -> tuple[str, ...]:
+def _names(data: JoinedRuns, which: Bool[np.ndarray, " run"]) -> tuple[str, ...]:
     return tuple(data.names[k] for k in np.flatnonzero(which))

@@ -1,1 +1,1 @@
-"""Which order, signs and axes explain the motion?"""
+"""Order, signs and axes that explain the motion."""

@@ -1,1 +1,1 @@
-"""What did wheels, commands and poses do over the same steps, and how late are the poses?"""
+"""Motion of wheels, commands, gyro and poses over the same steps."""

@@ -1,1 +1,1 @@
-"""Which units and sizes explain how far each channel says the robot went?"""
+"""Units and sizes that explain how far the robot went by each channel."""

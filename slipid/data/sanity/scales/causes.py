@@ -9,11 +9,11 @@ ends of their ranges, a cause fits where one factor brings all of them into thei
 believed: 1000, 2 pi, 57.3, the gear ratio.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import exp, inf, log, pi
 
-from slipid.data.sanity.scales.ratios import Ratio, Ratios
+from slipid.data.sanity.scales.ratios import ScaleRatio, ScaleRatios
 
 NEAR = 0.02
 """A range that ends this near a factor (in its logarithm) still holds it."""
@@ -40,59 +40,48 @@ _OF_RATES = (30 / pi, 180 / pi, 2 * pi, 1000.0, 60.0)
 
 
 @dataclass(frozen=True)
-class Cause:
-    """A wrong factor.
-
-    Attributes:
-        name: what is wrong.
-        power: of the factor in each ratio that it changes.
-    """
-
-    name: str
-    power: Mapping[str, float]
-
-
-@dataclass(frozen=True)
 class Explained:
     """A cause that fits.
 
     Attributes:
         name: of the cause.
-        factor: what the declared number must be divided by, or the readings multiplied with.
+        factor: divisor of the declared number, or factor of the values of its channels.
         common: whether it is one that people do get wrong.
-        low, high: range of the factor.
     """
 
     name: str
     factor: float
     common: bool
-    low: float
-    high: float
 
 
-def causes(speed_is_angle: bool) -> Iterator[Cause]:
+def causes(speed_is_angle: bool) -> Mapping[str, Mapping[str, float]]:
     """Everything that may be wrong by a factor, the likeliest first.
 
-    A factor above 1 stands for channels that say too much: turns, lengths, angles, time.
+    Each has the power of its factor in every ratio that it changes. A factor above 1 stands for
+    channels that are too large: turns, lengths, angles, time.
     """
     rates = {"drive": 1.0, "steer": 1.0, "command": 1.0, "gyro": 1.0, "report": 1.0}
     integrated = {"travel": -1.0, "turning": -1.0, "gyro": 1.0}
-    yield Cause("time", integrated if speed_is_angle else rates)
     wheels = {"travel": -1.0, "turning": -1.0, "drive": -1.0, "steer": -1.0}
-    yield Cause("pose_length", {"travel": 1.0})
-    yield Cause("heading", {"turning": 1.0, "gyro": -1.0})
-    yield Cause("wheel_gear", wheels | {"command": -1.0})
-    yield Cause("wheel_turns", wheels | {"command": -1.0, "report": -1.0})
-    yield Cause("wheel_radius", wheels)
-    yield Cause("base", {"turning": 1.0, "steer": 1.0})
-    yield Cause("gyro", {"gyro": 1.0})
-    yield Cause("report", {"report": 1.0})
-    yield Cause("command_wheels", {"command": 1.0})
-    yield Cause("command_twist", {"drive": 1.0})
-    yield Cause("command_yaw", {"steer": 1.0})
+    return {
+        "time": integrated if speed_is_angle else rates,
+        "pose_length": {"travel": 1.0},
+        "heading": {"turning": 1.0, "gyro": -1.0},
+        "wheel_gear": wheels | {"command": -1.0},
+        "wheel_turns": wheels | {"command": -1.0, "report": -1.0},
+        "wheel_radius": wheels,
+        "base": {"turning": 1.0, "steer": 1.0},
+        "gyro": {"gyro": 1.0},
+        "report": {"report": 1.0},
+        "command_wheels": {"command": 1.0},
+        "command_twist": {"drive": 1.0},
+        "command_yaw": {"steer": 1.0},
+    }
 
 
-def explained(seen: Ratios, row_s: float, gear_ratio: float) -> tuple[tuple[Explained, ...], bool]:
+def explained(
+    seen: ScaleRatios, row_s: float, gear_ratio: float
+) -> tuple[tuple[Explained, ...], bool]:
     """Causes that fit, the likeliest first, and whether single ones do.
 
     Where no single cause fits, the first pair that does is returned. Nothing where every ratio is
@@ -100,50 +89,49 @@ def explained(seen: Ratios, row_s: float, gear_ratio: float) -> tuple[tuple[Expl
     """
     if all(r.natural for r in seen.known.values()):
         return (), True
-    open_ = [c for c in causes(seen.speed_is_angle) if c.name != "time" or not _natural(row_s)]
+    open_ = dict(causes(seen.speed_is_angle))
+    if ROWS_S[0] <= row_s <= ROWS_S[1]:
+        del open_["time"]
     common = _common(gear_ratio, seen.speed_is_angle)
     single = _singles(seen.known, open_, common)
     if single:
         return tuple(sorted(single, key=lambda e: not e.common)), True
-    for first in open_:
-        for factor in common[first.name]:
+    for first, power in open_.items():
+        for factor in common[first]:
             left = {
-                name: replace(r, value=r.value / factor ** first.power.get(name, 0.0))
+                name: replace(r, value=r.value / factor ** power.get(name, 0.0))
                 for name, r in seen.known.items()
             }
-            rest = [c for c in open_ if c.name != first.name]
+            rest = {name: other for name, other in open_.items() if name != first}
             second = [e for e in _singles(left, rest, common) if e.common]
             if second:
-                return (Explained(first.name, factor, True, factor, factor), second[0]), False
+                return (Explained(first, factor, True), second[0]), False
     return (), False
 
 
-def _natural(row_s: float) -> bool:
-    return ROWS_S[0] <= row_s <= ROWS_S[1]
-
-
 def _singles(
-    known: Mapping[str, Ratio], open_: list[Cause], common: Mapping[str, Sequence[float]]
+    known: Mapping[str, ScaleRatio],
+    open_: Mapping[str, Mapping[str, float]],
+    common: Mapping[str, Sequence[float]],
 ) -> list[Explained]:
     """Causes that fit alone."""
     found = []
-    for cause in open_:
-        low, high = _range(known, cause)
+    for name, power in open_.items():
+        low, high = _range(known, power)
         if low > high:
             continue
-        inside = [f for f in common[cause.name] if low - NEAR <= log(f) <= high + NEAR]
-        middle = min(max(_middle(known, cause), low), high)
+        inside = [f for f in common[name] if low - NEAR <= log(f) <= high + NEAR]
+        middle = min(max(_middle(known, power), low), high)
         best = min(inside, key=lambda f: abs(log(f) - middle), default=None)
-        factor = exp(middle) if best is None else best
-        found.append(Explained(cause.name, factor, best is not None, exp(low), exp(min(high, 60))))
+        found.append(Explained(name, exp(middle) if best is None else best, best is not None))
     return found
 
 
-def _range(known: Mapping[str, Ratio], cause: Cause) -> tuple[float, float]:
+def _range(known: Mapping[str, ScaleRatio], powers: Mapping[str, float]) -> tuple[float, float]:
     """Logarithms of the factors that bring every ratio into its range; empty where none does."""
     low, high = -inf, inf
     for name, ratio in known.items():
-        power = cause.power.get(name, 0.0)
+        power = powers.get(name, 0.0)
         if power == 0.0:
             if not ratio.natural:
                 return inf, -inf
@@ -153,11 +141,11 @@ def _range(known: Mapping[str, Ratio], cause: Cause) -> tuple[float, float]:
     return low, high
 
 
-def _middle(known: Mapping[str, Ratio], cause: Cause) -> float:
-    """Logarithm of the factor that ratios say if they are as usual; narrow ranges count most."""
+def _middle(known: Mapping[str, ScaleRatio], powers: Mapping[str, float]) -> float:
+    """Logarithm of the factor by usual ratios; narrow ranges count most."""
     total = weights = 0.0
     for name, ratio in known.items():
-        if power := cause.power.get(name, 0.0):
+        if power := powers.get(name, 0.0):
             weight = log(ratio.high / ratio.low) ** -2
             total += weight * log(ratio.value / ratio.usual) / power
             weights += weight

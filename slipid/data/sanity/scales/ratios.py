@@ -1,4 +1,4 @@
-"""How far different channels say the robot went, as ratios, and what of that is natural.
+"""How far different channels have the robot go, as ratios, and what of that is natural.
 
 travel      body over wheels, along        pose / (r / J turns): less than 1 where wheels slip
 turning     body over wheels, heading      the same in heading
@@ -10,16 +10,15 @@ gyro        gyro over heading of the poses
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.sanity.axes.reading import Evidence, Reading, columns, to_body
-from slipid.data.sanity.motion.evidence import Products, usable
-from slipid.data.sanity.motion.headings import Frame, body_motion
-from slipid.data.sanity.motion.recorded import Recorded
-from slipid.data.sanity.motion.steps import Edges, Steps
+from slipid.data.sanity.axes.interpretation import Evidence, Interpretation, columns, to_body
+from slipid.data.sanity.motion.convention import body_motion, rotation
+from slipid.data.sanity.motion.joined import ChannelIncrements, JoinedRuns, StepEdges
+from slipid.data.sanity.motion.products import Products, usable
 
 TURNS = 0.01
 """Share of the predicted motion that must be turning, for the heading to be compared."""
@@ -49,7 +48,7 @@ _SCRUBBING: Mapping[str, _Range] = {"turning": (0.25, 0.55, 1.15), "steer": (0.4
 
 
 @dataclass(frozen=True)
-class Ratio:
+class ScaleRatio:
     """One ratio, the range in which it is natural, and what is usual."""
 
     value: float
@@ -64,41 +63,42 @@ class Ratio:
 
 
 @dataclass(frozen=True)
-class Ratios:
-    """Every ratio that the runs tell, by name.
+class ScaleRatios:
+    """Ratios of a set of runs.
 
     Attributes:
         known: by name.
         speed_is_angle: whether the wheels' angle is the integral of the reported speeds.
     """
 
-    known: Mapping[str, Ratio]
+    known: Mapping[str, ScaleRatio]
     speed_is_angle: bool
 
 
-def ratios(data: Recorded, at: Edges, moved: Steps, evidence: Evidence, reading: Reading) -> Ratios:
-    """Ratios under a reading: order, signs and axes are put right before."""
+def ratios(
+    data: JoinedRuns,
+    at: StepEdges,
+    moved: ChannelIncrements,
+    evidence: Evidence,
+    meant: Interpretation,
+) -> ScaleRatios:
+    """Ratios under an interpretation: order, signs and axes are put right before."""
     values: dict[str, float | None] = {}
-    predict = to_body(evidence, reading)
-    pose = evidence.pose.get(Frame(reading.frame.heading, reading.frame.y_down))
+    predict = to_body(evidence, meant)
+    pose = evidence.pose.get(meant.convention.bare)
     if pose is not None:
-        values["travel"], values["turning"] = _along(pose, predict, reading.frame.offset)
-        values["gyro"] = _gyro(at, moved, pose, reading)
+        values["travel"], values["turning"] = _along(pose, predict, meant.convention.offset)
+        values["gyro"] = _gyro(at, moved, pose, meant)
     if evidence.twist is not None:
-        signs = np.array(reading.twist_sign)
-        said = evidence.twist
-        signed = Products(
-            said.turns,
-            said.across * signs,
-            said.body * np.outer(signs, signs),
-            said.unexplained,
-            said.known,
-            said.weight,
+        signs = np.array(meant.twist_sign)
+        twist = evidence.twist
+        signed = replace(
+            twist, across=twist.across * signs, body=twist.body * np.outer(signs, signs)
         )
         values["drive"], values["steer"] = _along(signed, predict, 0)
     if evidence.command is not None:
-        mine = columns(reading, evidence.wheels)
-        theirs = columns(Reading(reading.command_order, reading.command_sign), evidence.wheels)
+        mine = columns(meant, evidence.wheels)
+        theirs = columns(Interpretation(meant.command_order, meant.command_sign), evidence.wheels)
         both = float(np.trace(mine @ evidence.command.across @ theirs.T))
         values["command"] = both / evidence.command.turns
     values["report"], same = _reported(data)
@@ -109,8 +109,8 @@ def ratios(data: Recorded, at: Edges, moved: Steps, evidence: Evidence, reading:
         wide["travel"] = _UNVOUCHED
     if not evidence.free:
         wide.update(_SCRUBBING)
-    known = {k: Ratio(v, *wide[k]) for k, v in values.items() if v is not None and v > 0}
-    return Ratios(known, same)
+    known = {k: ScaleRatio(v, *wide[k]) for k, v in values.items() if v is not None and v > 0}
+    return ScaleRatios(known, same)
 
 
 def _along(
@@ -118,9 +118,7 @@ def _along(
 ) -> tuple[float | None, float | None]:
     """Ratios of the body's motion to the predicted one along and in heading, by least squares."""
     predicted = np.einsum("aw,wv,av->a", predict, of.turns, predict)
-    c, s = np.cos(np.radians(-offset)), np.sin(np.radians(-offset))
-    turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    both = np.einsum("aw,wa->a", predict, of.across @ turned.T)
+    both = np.einsum("aw,wa->a", predict, of.across @ rotation(-offset).T)
     total = predicted.sum()
     if not total > 0:
         return None, None
@@ -131,12 +129,14 @@ def _along(
     return along, float(both[2] / about) if turns else None
 
 
-def _gyro(at: Edges, moved: Steps, pose: Products, reading: Reading) -> float | None:
+def _gyro(
+    at: StepEdges, moved: ChannelIncrements, pose: Products, meant: Interpretation
+) -> float | None:
     """Turn of the gyro over that of the heading, where both are alike."""
     if moved.gyro is None:
         return None
-    body = body_motion(at, Frame(reading.frame.heading, reading.frame.y_down))[pose.known, 2]
-    gyro = reading.gyro_sign * moved.gyro[pose.known, 0]
+    body = body_motion(at, meant.convention.bare)[pose.known, 2]
+    gyro = meant.gyro_sign * moved.gyro[pose.known, 0]
     known = np.isfinite(gyro)
     weight, body, gyro = pose.weight[known], body[known], gyro[known]
     own, both, other = (
@@ -147,23 +147,20 @@ def _gyro(at: Edges, moved: Steps, pose: Products, reading: Reading) -> float | 
     return float(np.sqrt(own / other))
 
 
-def _reported(data: Recorded) -> tuple[float | None, bool]:
+def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
     """Ratio of reported speeds to encoders, whole runs; and whether they are the same thing."""
     if data.reported is None:
         return None, False
-    ends = [
-        channel.at(data.end) - channel.at(data.begin) for channel in (data.reported, data.angle)
-    ]
-    middle = 0.5 * (data.begin + data.end)
-    halves = [
-        channel.at(middle) - channel.at(data.begin) for channel in (data.reported, data.angle)
-    ]
-    said, turned = (np.concatenate(pair) for pair in zip(ends, halves, strict=True))
-    known = usable(said, turned)
-    said, turned = said[known], turned[known]
+    edges = [data.begin, 0.5 * (data.begin + data.end), data.end]
+    reported, turned = (
+        np.concatenate([channel.at(edge) - channel.at(edges[0]) for edge in edges[1:]])
+        for channel in (data.reported, data.angle)
+    )
+    known = usable(reported, turned)
+    reported, turned = reported[known], turned[known]
     total = float((turned**2).sum())
     if not total > 0:
         return None, False
-    same = float(((said - turned) ** 2).sum()) < RIGID**2 * total
-    ratio = float(np.abs(said * turned).sum()) / total
+    same = float(((reported - turned) ** 2).sum()) < RIGID**2 * total
+    ratio = float(np.abs(reported * turned).sum()) / total
     return ratio, same

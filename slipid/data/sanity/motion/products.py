@@ -1,6 +1,6 @@
-"""Products of what wheels, commands, gyro and poses say: all that a comparison of readings needs.
+"""Products of increments of wheels, commands and poses, by which interpretations are compared.
 
-A robust fit of the body's steps on the wheels' turns tells outliers, whatever wheels and axes mean:
+A robust fit of the body's steps on the wheels' turns finds outliers, whatever wheels and axes mean:
 
     body = K turn,    weight = (1 + (|residual| / s)^2)^-2,    s = 2 median |residual|
 
@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 ROUNDS = 8
-"""Of reweighting."""
+"""Rounds of reweighting."""
 RIDGE = 1e-4
-"""Of the products of turns: wheels of one side turn alike."""
+"""Ridge over the mean product of turns: wheels of one side turn alike."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,6 @@ class Products:
         turns: of turns with turns (wheel, wheel) [rad^2].
         across: of turns with steps of the body (wheel, 3); heading in metres at the base radius.
         body: of steps of the body with each other (3, 3) [m^2].
-        unexplained: share of the body's motion that no linear map of turns explains.
         known: steps in which wheels and body are known (every step,).
         weight: of these (step,).
     """
@@ -34,7 +33,6 @@ class Products:
     turns: Float[np.ndarray, "wheel wheel"]
     across: Float[np.ndarray, "wheel 3"]
     body: Float[np.ndarray, "3 3"]
-    unexplained: float
     known: Bool[np.ndarray, " every"]
     weight: Float[np.ndarray, " step"]
 
@@ -42,18 +40,6 @@ class Products:
 def usable(*parts: Float[np.ndarray, "step _"]) -> Bool[np.ndarray, " step"]:
     """Steps in which all parts are known."""
     return np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
-
-
-def robust_weights(
-    turns: Float[np.ndarray, "step wheel"], body: Float[np.ndarray, "step 3"], rounds: int = ROUNDS
-) -> Float[np.ndarray, " step"]:
-    """Weight of each step, small for outliers from the best linear map."""
-    weight = np.ones(len(turns))
-    for _ in range(rounds):
-        off = np.linalg.norm(body - turns @ _linear(turns, body, weight), axis=1)
-        usual = 2 * float(np.median(off)) + 1e-12
-        weight = (1 + (off / usual) ** 2) ** -2
-    return weight
 
 
 def products(
@@ -72,27 +58,13 @@ def products(
     if known.sum() < 2 * turns.shape[1]:
         return None
     turns, body = turns[known], body[known] * [1.0, 1.0, base]
-    weight = robust_weights(turns, body, rounds)
-    left = body - turns @ _linear(turns, body, weight)
-    total = float((weight[:, None] * body**2).sum())
+    weight = np.ones(len(turns))
+    for _ in range(rounds):
+        off = np.linalg.norm(body - turns @ _linear(turns, body, weight), axis=1)
+        weight = (1 + (off / (2 * float(np.median(off)) + 1e-12)) ** 2) ** -2
     weighted = turns * weight[:, None]
-    return Products(
-        weighted.T @ turns,
-        weighted.T @ body,
-        (body * weight[:, None]).T @ body,
-        float((weight[:, None] * left**2).sum()) / total if total > 0 else 1.0,
-        known,
-        weight,
-    )
-
-
-def left_by_linear(
-    turns: Float[np.ndarray, "step wheel"], body: Float[np.ndarray, "step 3"]
-) -> float:
-    """Share of the body's motion that no linear map of turns explains; no step counts less."""
-    total = float((body**2).sum())
-    left = body - turns @ _linear(turns, body, np.ones(len(turns)))
-    return float((left**2).sum()) / total if total > 0 else 1.0
+    own = (body * weight[:, None]).T @ body
+    return Products(weighted.T @ turns, weighted.T @ body, own, known, weight)
 
 
 def _linear(turns: np.ndarray, body: np.ndarray, weight: np.ndarray) -> np.ndarray:
