@@ -9,12 +9,12 @@ from slipid.cli.common import Json, MaybeOut, Quiet, emit, guarded
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
-    from slipid.data.reading.guess import Named
+    from slipid.data.reading.motor_layout import GivenColumns
 
 
 @guarded
 def motor(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Log, a CSV file.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Log, a CSV or Parquet file.")],
     time: Annotated[
         str | None, typer.Option(metavar="NAME[:UNIT]", help="Column of the time, in s.")
     ] = None,
@@ -82,8 +82,9 @@ def motor(
     return 0 if fit.good else 1
 
 
-def _named(columns: dict[str, str | None]) -> "dict[str, Named]":
+def _named(columns: dict[str, str | None]) -> "dict[str, GivenColumns]":
     """What was named, by channel."""
-    from slipid.data.reading.guess import named
+    from slipid.data.reading.motor_layout import given_columns
 
-    return {channel: named(text, channel) for channel, text in columns.items() if text is not None}
+    given = {channel: text for channel, text in columns.items() if text is not None}
+    return {channel: given_columns(text, channel) for channel, text in given.items()}

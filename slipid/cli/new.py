@@ -8,7 +8,7 @@ import typer
 from slipid.cli.common import guarded
 
 if TYPE_CHECKING:
-    from slipid.job.new.written import NewConfig
+    from slipid.job.new.config_text import NewConfig
 
 _WHEELS = "For omni and general wheels"
 _BOX = "For mecanum and skid"
@@ -62,14 +62,13 @@ def new(
     force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False,
 ) -> int:
     """Write a commented config for your robot: asks for it, or looks into its logs (--from)."""
-    from slipid.job.new.answers import Told
-    from slipid.job.new.blank import blank
+    from slipid.job.new.config_text import absent, new_config
     from slipid.job.new.look.propose import propose
-    from slipid.job.new.questions import ask
-    from slipid.job.new.written import absent, new_config
+    from slipid.job.new.robot_questions import RobotOptions, ask
+    from slipid.job.new.sketch import blank
 
     absent(out, force)
-    told = Told(
+    options = RobotOptions(
         drive=drive,
         wheels=wheels,
         azimuths_deg=azimuths_deg,
@@ -87,12 +86,12 @@ def new(
     )
     data = "DIR"
     if log is not None:
-        proposal = propose(log, told)
-        for sentence in proposal.said:
+        proposal = propose(log, options)
+        for sentence in proposal.sentences:
             typer.echo(sentence)
         config, data = new_config(proposal.sketch, out.name), proposal.sketch.data
     else:
-        config = new_config(blank(ask(told, None if yes else _asked)), out.name)
+        config = new_config(blank(ask(options, None if yes else _asked)), out.name)
     config.write(out, force)
     _show(config, out, data)
     return 0

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.data.reading.guess import header_of, layout_of, named
+from slipid.data.reading.motor_layout import given_columns, motor_layout
+from slipid.data.reading.table_format import format_of
 from slipid.job.bench.priors import bench_priors
 from slipid.job.config import parsed
 from slipid.support.errors import DataError
@@ -162,9 +163,9 @@ def test_an_angle_or_a_duty_will_do(tmp_path):
 def test_guesses(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text(
-        "time [ms];motor_current_mA;speed_set;speed (rpm);Vbat;voltage\n" + "1;2;3;4;5;6\n" * 9
+        "time [ms];motor_current_mA;speed_set;speed (rpm);Vbat;voltage\n" + "1;2;3;4;5;6\n" * 12
     )
-    layout = layout_of(path, {}, header_of(path, None), signed=True)
+    layout = motor_layout(format_of(path), {}, signed=True)
     found = {k: (c.columns[0], c.unit) for k, c in layout.channels.items()}
     assert found == {
         "time": ("time [ms]", "ms"),
@@ -172,8 +173,44 @@ def test_guesses(tmp_path):
         "motor_speed": ("speed (rpm)", "rpm"),
         "voltage": ("voltage", "V"),
     }
-    assert named("a,b:mA", "current").columns == ("a", "b")
-    assert named("/motor:current", "current").unit is None
+    assert given_columns("a,b:mA", "current").columns == ("a", "b")
+    assert given_columns("/motor:current", "current").unit is None
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        # a row of units below the names, of single letters as well
+        (["time;voltage;current;speed", "s;V;A;rpm"], ["s", "V", "A", "rpm"]),
+        (["a motor", "s,V,mA,deg/s", "t,U,I,w"], ["s", "V", "mA", "deg/s"]),
+        (["t_ms,umotor,I (mA),omega_rpm,sample_rate"], ["ms", "V", "mA", "rpm"]),
+        (["seconds\tvolts\tampere\tvel\twanted vel"], ["s", "V", "A", "rad/s"]),
+    ],
+)
+def test_units_of_guesses(tmp_path, lines, expected):
+    path = tmp_path / "log.csv"
+    delimiter = next(d for d in ";,\t" if d in lines[-1])
+    row = delimiter.join("12345"[: lines[-1].count(delimiter) + 1])
+    path.write_text("\n".join([*lines, *[row] * 12]))
+    layout = motor_layout(format_of(path), {}, signed=True)
+    names = ("time", "voltage", "current", "motor_speed")
+    assert [layout.channels[name].unit for name in names] == expected
+    assert [len(layout.channels[name].columns) for name in names] == [1, 1, 1, 1]
+
+
+def test_columns_of_parquet_and_columns_without_names(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    path = tmp_path / "log.parquet"
+    rows = [float(k) for k in range(12)]
+    parquet.write_table(pyarrow.table(dict.fromkeys(("t_ms", "U", "I_mA", "rpm"), rows)), path)
+    layout = motor_layout(format_of(path), {}, signed=True)
+    assert [c.unit for c in layout.channels.values()] == ["ms", "V", "mA", "rpm"]
+    path = tmp_path / "log.csv"
+    path.write_text("1,2,3,4\n" * 12)
+    with pytest.raises(DataError, match="no names for 4 columns; expected a line of column names"):
+        motor_layout(format_of(path), {}, signed=True)
 
 
 @pytest.mark.slow

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from slipid.job.config import parsed
 from slipid.job.logs import read_dataset
-from slipid.job.new.answers import Told
+from slipid.job.new.config_text import new_config
 from slipid.job.new.look.propose import propose
-from slipid.job.new.written import new_config
+from slipid.job.new.robot_questions import RobotOptions
 from tests.helpers.made_tables import RADIUS, TRACK
 from tests.helpers.said import Said
 
@@ -23,7 +23,7 @@ ROBOT = {
 
 
 def proposed(path: Path, **told: str):
-    proposal = propose(path, Told(**told))
+    proposal = propose(path, RobotOptions(**told))
     return proposal, new_config(proposal.sketch, "mine.toml")
 
 

@@ -11,12 +11,11 @@ import pytest
 
 from slipid.data.reading.presets import declared_layout
 from slipid.job.config import geometry, parsed
-from slipid.job.new.answers import Told
-from slipid.job.new.blank import blank
+from slipid.job.new.config_lines import ASKS, ConfigLine
+from slipid.job.new.config_text import new_config
 from slipid.job.new.drawing import drawing
-from slipid.job.new.lines import ASKS, Line
-from slipid.job.new.questions import DRIVES, ask
-from slipid.job.new.written import new_config
+from slipid.job.new.robot_questions import DRIVES, RobotOptions, ask
+from slipid.job.new.sketch import blank
 from slipid.model import geometry as g
 from slipid.support.errors import DataError
 
@@ -48,7 +47,7 @@ CASES = {
 
 
 def made(drive: str, **more: str):
-    told = Told(**{**CASES[drive][0], **SIZES, "drive": drive, **more})
+    told = RobotOptions(**{**CASES[drive][0], **SIZES, "drive": drive, **more})
     return new_config(blank(ask(told, None)), "mine.toml")
 
 
@@ -59,7 +58,7 @@ def refuse(*_: object) -> str:
 @pytest.mark.parametrize("drive", CASES)
 def test_wheels_stand_where_they_were_said_to_be(drive):
     _, places, directions, drives = CASES[drive]
-    told = Told(**{**CASES[drive][0], **SIZES, "drive": drive})
+    told = RobotOptions(**{**CASES[drive][0], **SIZES, "drive": drive})
     config = new_config(blank(ask(told, refuse)), "mine.toml")
     content = parsed(Path("mine.toml"), config.text).content
     robot = geometry(content.robot)
@@ -109,7 +108,7 @@ def test_logs_without_ticks_have_speeds():
 
 
 def test_what_nobody_said_is_a_question_in_the_file_and_in_the_list():
-    config = new_config(blank(ask(Told(drive="skid", track_m="0.5"), None)), "mine.toml")
+    config = new_config(blank(ask(RobotOptions(drive="skid", track_m="0.5"), None)), "mine.toml")
     asked = [question.partition(":")[0] for question in config.questions]
     assert "half_length_m" in asked
     assert "half_width_m" not in asked
@@ -128,7 +127,7 @@ def test_people_are_asked_only_what_the_drive_needs_and_again_where_they_are_wro
         said.append((asks.split(",")[0], wrong))
         return next(answers)
 
-    known = ask(Told(), asker)
+    known = ask(RobotOptions(), asker)
     assert (known.drive, known.wheelbase_m, known.track_m, known.shared) == ("skid", 0.5, 0.6, True)
     assert not known.taken
     wrong = [text for _, text in said if text]
@@ -157,13 +156,13 @@ def test_people_are_asked_only_what_the_drive_needs_and_again_where_they_are_wro
 )
 def test_what_was_told_wrong_is_one_clear_error(told, message):
     with pytest.raises(DataError) as caught:
-        new_config(blank(ask(Told(**told), None)), "mine.toml")
+        new_config(blank(ask(RobotOptions(**told), None)), "mine.toml")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_long_comments_stand_above_their_key():
-    line = Line("key", '"' + "x" * 70 + '"', "a comment that does not fit beside it")
+    line = ConfigLine("key", '"' + "x" * 70 + '"', "a comment that does not fit beside it")
     assert line.text().splitlines()[0] == "# a comment that does not fit beside it"
 
 

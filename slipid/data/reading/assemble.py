@@ -5,16 +5,18 @@ of their own; what else was not measured at a time is what was measured last, an
 nothing counts twice, and nothing is invented.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.data.align.clock import Clock
+from slipid.data.align.clock import Clock, best_clock
+from slipid.data.align.motion_pair import MotionPair
 from slipid.data.log import Log
-from slipid.data.reading.layout import Recorded
+from slipid.data.reading.checks import Unsteady
+from slipid.data.reading.layout import SensorLayout
 from slipid.data.reading.signal import Signal, clock_of
 from slipid.data.wheel_signals import integral, readings
 from slipid.support.errors import bad_data
@@ -38,7 +40,10 @@ class Identity:
 
 
 def assembled(
-    signals: Mapping[str, Signal], layout: Recorded, identity: Identity, notes: tuple[str, ...] = ()
+    signals: Mapping[str, Signal],
+    layout: SensorLayout,
+    identity: Identity,
+    notes: tuple[str, ...] = (),
 ) -> Log:
     """The log of one run from its signals, by the names of their channels.
 
@@ -81,7 +86,7 @@ def assembled(
     )
 
 
-def _check_gaps(signal: Signal, layout: Recorded) -> None:
+def _check_gaps(signal: Signal, layout: SensorLayout) -> None:
     """Refuse wheels that were not measured for a while: nobody knows how they turned then."""
     for column in range(signal.values.shape[1]):
         there = np.flatnonzero(~np.isnan(signal.values[:, column]))
@@ -134,7 +139,7 @@ def _fresh(
 def _angle(
     name: str | None,
     signals: Mapping[str, Signal],
-    layout: Recorded,
+    layout: SensorLayout,
     clock: Float[np.ndarray, " time"],
     notes: list[str],
 ) -> Float[np.ndarray, "time wheel"]:
@@ -161,7 +166,7 @@ def _angle(
     return angle - angle[0]
 
 
-def _per_wheel(name: str, layout: Recorded) -> float:
+def _per_wheel(name: str, layout: SensorLayout) -> float:
     """Angle of a wheel per tick, or per angle of what was measured."""
     if name == "wheel_ticks":
         return 2.0 * np.pi / (float(layout.ticks_per_revolution or 1.0) * layout.gear_ratio)
@@ -169,7 +174,7 @@ def _per_wheel(name: str, layout: Recorded) -> float:
 
 
 def _ticks(
-    ticks: Float[np.ndarray, " sample"], layout: Recorded, notes: list[str]
+    ticks: Float[np.ndarray, " sample"], layout: SensorLayout, notes: list[str]
 ) -> Float[np.ndarray, " sample"]:
     """Cumulative ticks, without the wrap-around of a counter of `tick_bits` bits."""
     if layout.ticks_are_increments:
@@ -184,7 +189,7 @@ def _ticks(
     return ticks - period * np.concatenate([[0.0], np.cumsum(np.round(steps / period))])
 
 
-def _at_wheel(held: Mapping[str, np.ndarray], layout: Recorded, what: str) -> np.ndarray | None:
+def _at_wheel(held: Mapping[str, np.ndarray], layout: SensorLayout, what: str) -> np.ndarray | None:
     if f"wheel_{what}" in held:
         return held[f"wheel_{what}"]
     if f"motor_{what}" in held:
@@ -192,7 +197,7 @@ def _at_wheel(held: Mapping[str, np.ndarray], layout: Recorded, what: str) -> np
     return None
 
 
-def _current(held: Mapping[str, np.ndarray], layout: Recorded) -> np.ndarray | None:
+def _current(held: Mapping[str, np.ndarray], layout: SensorLayout) -> np.ndarray | None:
     """As logged, else the torque that a driver reports over its constant."""
     if "current" in held:
         return held["current"]
@@ -260,3 +265,46 @@ def heading(signals: Mapping[str, Signal]) -> Signal:
         )
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
     return Signal(turned.time, yaw[:, None], turned.source)
+
+
+def clock_against(
+    robot: Mapping[str, Signal],
+    layout: SensorLayout,
+    identity: Identity,
+    poses: Mapping[str, Signal],
+) -> Clock:
+    """The clock of poses against that of the robot's signals, from the motion that both saw.
+
+    Args:
+        robot: what the robot itself logged, by channel; layout and identity are of its file.
+        poses: signals of a pose, by channel, on their own clock.
+
+    Raises:
+        Unsteady: the motion does not tell how far the clocks are apart.
+    """
+    log = assembled(robot, layout, identity)
+    parts = (poses["pose_x"], poses["pose_y"], heading(poses))
+    time = clock_of(parts)
+    columns = [np.interp(time, part.time, part.values[:, 0]) for part in parts[:2]]
+    turned = np.unwrap(parts[2].values[:, 0])
+    pose = np.column_stack([*columns, np.interp(time, parts[2].time, turned)])
+    clock = best_clock(_views(log, time, pose))
+    if clock is None:
+        raise Unsteady(
+            f"{parts[0].source.path}: the motion does not tell its clock from that of {log.name}; "
+            "expected poses of this very run, with starts, stops and turns that both saw, and the "
+            "frame rate that the video has"
+        )
+    # a log that counts from 1970 was made to begin at zero
+    turns = next(name for name in TURNS if name in robot)
+    began = float(robot[turns].time[0] - log.time[0])
+    return replace(clock, offset=clock.offset + began)
+
+
+def _views(
+    robot: Log, time: Float[np.ndarray, " pose"], pose: Float[np.ndarray, "pose 3"]
+) -> Iterator[MotionPair]:
+    """By the gyro where there is one, which turns with the body itself; by the wheels."""
+    if robot.gyro is not None:
+        yield MotionPair.of_gyro(robot.time, robot.gyro, time, pose)
+    yield MotionPair.of_wheels(robot.time, robot.wheel_angle, time, pose)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.layout import Layout, Recorded
+from slipid.data.reading.layout import Layout, SensorLayout
 from slipid.data.reading.signal import Signal
 from slipid.data.reading.table import Table
 from slipid.data.wheel_signals import integral
@@ -62,7 +62,7 @@ class Unsteady(DataError):
     """The pose of a run jumps: it is to be set aside, and the others can be read."""
 
 
-def check_log(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> None:
+def check_log(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:
     """Refuse what no robot does: absurd magnitudes, signs, jumps, and channels that stand still."""
     for name, (limit, unit) in _LIMITS.items():
         values = getattr(log, name)
@@ -82,7 +82,7 @@ def check_log(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> None
         _check_pose(log, signals, layout)
 
 
-def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> None:
+def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:
     """Refuse angles no wheel can make, and a wheel that stands still when commanded."""
     if not log.wheels:
         return
@@ -110,7 +110,7 @@ def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> 
         raise _at(log, signals, "wheel", None, j, found, "a wheel that turns when commanded")
 
 
-def _check_pose(log: Log, signals: Mapping[str, Signal], layout: Recorded) -> None:
+def _check_pose(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:
     """Refuse a pose that stands still while wheels turn; set a run aside whose pose jumps."""
     assert log.pose is not None
     assert log.pose_fresh is not None

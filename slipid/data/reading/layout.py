@@ -1,6 +1,6 @@
 """What a log file's layout is: which column holds which channel, in which unit."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import field
 from typing import Annotated, Literal
 
@@ -52,8 +52,8 @@ CHANNELS: dict[str, str] = {**SINGLE, **SEVERAL, **PER_WHEEL}
 Count = Annotated[int, Field(ge=0, strict=True)]
 
 
-def _several(value: object) -> object:
-    """One column or one scale, or a list of them."""
+def several(value: object) -> object:
+    """One value of a config, or a list of them, as a tuple."""
     return tuple(value) if isinstance(value, list | tuple) else (value,)
 
 
@@ -71,11 +71,11 @@ class Channel:
 
     columns: Annotated[
         tuple[StrictStr | StrictInt, ...],
-        BeforeValidator(_several),
+        BeforeValidator(several),
         Field(min_length=1, validation_alias=AliasChoices("columns", "column")),
     ]
     unit: StrictStr
-    scale: Annotated[tuple[StrictFloat, ...], BeforeValidator(_several)] = (1.0,)
+    scale: Annotated[tuple[StrictFloat, ...], BeforeValidator(several)] = (1.0,)
     offset: StrictFloat = 0.0
 
     def __post_init__(self) -> None:
@@ -86,7 +86,7 @@ class Channel:
 
 
 @dataclass(frozen=True, config=CLOSED, kw_only=True)
-class Recorded:
+class SensorLayout:
     """What a layout says of the robot's sensors, whatever the files are.
 
     Attributes:
@@ -111,6 +111,15 @@ class Recorded:
     max_pose_jump: Positive = 0.5
     max_heading_jump: Positive = 1.6
 
+    def lacks(self, channels: Collection[str]) -> str | None:
+        """Return what some channels need of the layout and do not have; None where nothing."""
+        if "wheel_ticks" in channels and self.ticks_per_revolution is None:
+            return "wheel_ticks without ticks_per_revolution; expected ticks per turn of the motor"
+        if {"motor_torque", "wheel_torque"} & {*channels} and self.torque_constant is None:
+            wanted = "expected the motor's torque per current [N m/A]"
+            return f"a torque without torque_constant; {wanted}"
+        return None
+
 
 def _pair(value: object) -> object:
     """Scales along x and y; one number counts for both."""
@@ -120,7 +129,7 @@ def _pair(value: object) -> object:
 
 
 @dataclass(frozen=True, config=CLOSED)
-class Layout(Recorded):
+class Layout(SensorLayout):
     """How one kind of log file is laid out.
 
     Attributes:

@@ -254,12 +254,10 @@ def _problem(layout: Layout) -> str | None:
         return f"channel '{twice[0]}' in two files; expected it in one of them"
     have = {name: c for one in files for name, c in one.channels.items()}
     counts = {name: len(c.columns) for name, c in have.items() if name in PER_WHEEL}
-    if "wheel_ticks" in have and layout.ticks_per_revolution is None:
-        return "wheel_ticks without ticks_per_revolution; expected ticks per turn of the motor"
     if len(set(counts.values())) > 1:
         return f"channels disagree on the number of wheels: {counts}; expected the same of each"
-    if {"motor_torque", "wheel_torque"} & set(have) and layout.torque_constant is None:
-        return "a torque without torque_constant; expected the motor's torque per current [N m/A]"
+    if lacking := layout.lacks(have):
+        return lacking
     turned = {"pose_heading", "pose_quaternion"} & set(have)
     if 0 < len({"pose_x", "pose_y"} & set(have)) + len(turned) != 3:
         return (

@@ -12,14 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.aligned import clock_against
-from slipid.data.reading.assemble import Identity, assembled
+from slipid.data.reading.assemble import Identity, assembled, clock_against
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.reader import read_bag
 from slipid.data.reading.checks import MIN_ROWS, Unsteady, check_log, check_time
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import preset
-from slipid.data.reading.signal import Signal, Source
+from slipid.data.reading.signal import Signal, SignalSource
 from slipid.data.reading.table import Table, read_table
 from slipid.data.runs import Runs, collect, counted_once, default_session
 from slipid.support.errors import DataError
@@ -260,7 +259,7 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
             continue
         columns = tuple(str(column) for column in channel.columns)
         cells = table.stacked(channel)
-        source = Source(table.path, columns, table.lines)
+        source = SignalSource(table.path, columns, table.lines)
         for i, j in np.argwhere(np.isinf(cells))[:1].tolist():
             raise source.error("an infinite value", "a number", sample=i, column=j)
         missing = np.isnan(cells)

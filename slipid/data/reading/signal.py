@@ -11,7 +11,7 @@ from slipid.support.errors import DataError, bad_data
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class SignalSource:
     """Where the samples of a signal come from, for messages.
 
     Attributes:
@@ -37,9 +37,9 @@ class Source:
         where += "" if row is None else f" message {row}"
         return bad_data(where, found, expected, column=name)
 
-    def part(self, which: slice | np.ndarray) -> "Source":
+    def part(self, which: slice | np.ndarray) -> "SignalSource":
         """The same for some of the samples."""
-        return Source(self.path, self.columns, self.lines[which], self.topic)
+        return SignalSource(self.path, self.columns, self.lines[which], self.topic)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class Signal:
 
     time: Float[np.ndarray, " sample"]
     values: Float[np.ndarray, "sample column"]
-    source: Source
+    source: SignalSource
 
     def part(self, which: slice | np.ndarray) -> "Signal":
         """Some of the samples."""

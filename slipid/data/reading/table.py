@@ -1,15 +1,25 @@
 """From the bytes of a CSV or Parquet file to columns of numbers, or to the cell that is wrong."""
 
 import hashlib
+import re
+from collections import Counter
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from slipid.data.reading import csv_text
 from slipid.data.reading.layout import Channel, Layout
+from slipid.data.reading.units import same_unit
 from slipid.support.errors import bad_data
+
+if TYPE_CHECKING:
+    from pyarrow import Table as ParquetTable
+
+MISSING = {"", "nan", "na", "n/a", "null", "none"}
+"""Cells that hold no number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,34 +62,36 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     Raises:
         DataError: names the file, the row or column, what is there and what was expected.
     """
-    raw = _bytes(path)
+    raw = bytes_of(path)
     sha256 = hashlib.sha256(raw).hexdigest()
     if path.suffix == ".parquet":
         names, values = _parquet(path, raw, layout, all_columns)
         return Table(path, sha256, names, values, 1 + np.arange(len(values)))
-    text = csv_text.text_lines(path, raw)
-    header = csv_text.header_cells(path, text, layout)
-    names = csv_text.wanted_names(path, header, layout, all_columns)
+    text = text_lines(path, raw)
+    header = header_cells(path, text, layout)
+    names = wanted_names(path, header, layout, all_columns)
     body = text[layout.first_data_row - 1 :]
     if not body:
         raise bad_data(path, "no row of numbers after the header", "data", row=len(text))
-    csv_text.check_fields(path, body, header, layout)
+    check_fields(path, body, header, layout)
     if layout.units_row:
-        csv_text.check_units(path, text[layout.units_row - 1], header, layout)
+        check_units(path, text[layout.units_row - 1], header, layout)
     where = [header.index(str(name)) if layout.names_row else int(name) for name in names]
     try:
         values = np.loadtxt(body, delimiter=layout.delimiter, usecols=where, ndmin=2, comments=None)
     except ValueError:
-        values = csv_text.cell_by_cell(path, body, names, where, layout)
+        values = cell_by_cell(path, body, names, where, layout)
     lines_read = layout.first_data_row + np.arange(len(values))
     return Table(path, sha256, names, values, lines_read)
 
 
-def _bytes(path: Path) -> bytes:
+def bytes_of(path: Path, limit: int = -1) -> bytes:
+    """Bytes of a file, or its first ones; DataError where it cannot be read or is empty."""
     if path.is_dir():
         raise bad_data(path, "a folder", "a CSV or Parquet file")
     try:
-        raw = path.read_bytes()
+        with path.open("rb") as file:
+            raw = file.read(limit)
     except OSError as error:
         raise bad_data(path, f"cannot be read ({error.strerror})", "a readable file") from error
     if not raw.strip():
@@ -87,9 +99,8 @@ def _bytes(path: Path) -> bytes:
     return raw
 
 
-def _parquet(
-    path: Path, raw: bytes, layout: Layout, all_columns: bool
-) -> tuple[tuple[str | int, ...], Float[np.ndarray, "row column"]]:
+def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
+    """The table in the bytes of a Parquet file; DataError where it is none, or has no rows."""
     try:
         import pyarrow
         import pyarrow.parquet as parquet
@@ -100,11 +111,19 @@ def _parquet(
         table = parquet.read_table(pyarrow.BufferReader(raw))
     except pyarrow.ArrowException as error:
         raise bad_data(path, f"no Parquet ({error})", "a whole Parquet file") from error
-    header = list(table.column_names)
-    layout = replace(layout, names_row=layout.names_row or 1)
-    names = csv_text.wanted_names(path, header, layout, all_columns)
-    if table.num_rows == 0:
+    if not table.num_rows:
         raise bad_data(path, "no rows", "rows of numbers")
+    return table
+
+
+def _parquet(
+    path: Path, raw: bytes, layout: Layout, all_columns: bool
+) -> tuple[tuple[str | int, ...], Float[np.ndarray, "row column"]]:
+    import pyarrow
+
+    table = parquet_of(path, raw)
+    layout = replace(layout, names_row=layout.names_row or 1)
+    names = wanted_names(path, list(table.column_names), layout, all_columns)
     columns = []
     for name in names:
         column = table.column(name)
@@ -114,3 +133,145 @@ def _parquet(
             found = f"values of type {column.type}"
             raise bad_data(path, found, "numbers", column=str(name)) from error
     return names, np.column_stack(columns)
+
+
+def text_lines(path: Path, raw: bytes) -> list[str]:
+    """Lines of a file in UTF-8, with or without a byte order mark, whatever ends its lines."""
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise bad_data(path, "text in UTF-16", "UTF-8", row=1)
+    if b"\0" in raw:
+        row = raw.count(b"\n", 0, raw.index(b"\0")) + 1
+        raise bad_data(
+            path, "a binary file (zero bytes in it)", "text with one row per line", row=row
+        )
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        row = raw.count(b"\n", 0, error.start) + 1
+        found = f"byte 0x{raw[error.start]:02x}, which is no UTF-8"
+        raise bad_data(
+            path, found, "UTF-8 text (is the file binary or Latin-1?)", row=row
+        ) from error
+    return text.replace("\r\n", "\n").replace("\r", "\n").rstrip().split("\n")
+
+
+def cells_of(line: str, delimiter: str) -> list[str]:
+    """Cells of a line, without blanks and quotes around them."""
+    return [cell.strip().strip("\"'").strip() for cell in line.split(delimiter)]
+
+
+def number_in(cell: str) -> float | None:
+    """The number in a cell; None where it holds something else."""
+    try:
+        # Python would read 1_000 as a thousand; no logger writes that on purpose.
+        return float(cell) if "_" not in cell else None
+    except ValueError:
+        return None
+
+
+def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
+    """Names of the columns, empty ones included; without a names row as many empty ones."""
+    row = layout.names_row or layout.first_data_row
+    if len(lines) < row:
+        expected = f"column names in row {row}" if layout.names_row else f"numbers from row {row}"
+        raise bad_data(path, f"the file ends after row {len(lines)}", expected, row=len(lines))
+    line = lines[row - 1]
+    cells = cells_of(line, layout.delimiter)
+    counts = {d: line.count(d) for d in (";", ",", "\t", "|") if d != layout.delimiter}
+    likely = max(counts, key=lambda d: counts[d])
+    if len(cells) < 2 <= counts[likely] + 1:
+        found = f"no delimiter {layout.delimiter!r}, but {counts[likely]} of {likely!r}"
+        raise bad_data(path, found, f"cells separated by {layout.delimiter!r}", row=row)
+    if not layout.names_row:
+        return [""] * len(cells)
+    try:
+        [float(cell) for cell in cells if cell]
+    except ValueError:
+        return cells
+    names = ", ".join(map(str, layout.columns[:6])) + ", ..." * (len(layout.columns) > 6)
+    raise bad_data(path, "numbers", f"the column names ({names})", row=row)
+
+
+def wanted_names(
+    path: Path, header: list[str], layout: Layout, all_columns: bool
+) -> tuple[str | int, ...]:
+    """Names or positions of the columns to read, each of them there once."""
+    if not layout.names_row:
+        for position in layout.columns:
+            if int(position) >= len(header):
+                found = f"{len(header)} columns"
+                expected = f"a column at position {position} (counted from 0)"
+                raise bad_data(path, found, expected, row=layout.first_data_row)
+        return tuple(range(len(header))) if all_columns else layout.columns
+    for name in layout.columns:
+        if name not in header:
+            unused = [other for other in header if other not in layout.columns]
+            near = get_close_matches(str(name), unused, n=2)
+            hint = f"did you mean {' or '.join(near)}? It has" if near else "it has"
+            expected = f"it among the names; {hint} {', '.join(filter(None, header))}"
+            raise bad_data(path, "no such column", expected, row=layout.names_row, column=str(name))
+    names = tuple(filter(None, header)) if all_columns else layout.columns
+    for name, times in Counter(header).items():
+        if times > 1 and name in names:
+            found = f"{times} columns of this name"
+            raise bad_data(path, found, "one", row=layout.names_row, column=name)
+    return names
+
+
+def check_fields(path: Path, body: list[str], header: list[str], layout: Layout) -> None:
+    """Refuse rows with more or fewer cells than there are names; one trailing delimiter is fine."""
+    counts = np.array([line.count(layout.delimiter) for line in body]) + 1
+    expected = len(header)
+    if (counts == expected).all():
+        return
+    if (counts == expected + 1).all() and all(line.endswith(layout.delimiter) for line in body):
+        return
+    if (counts == expected - 1).all() and header[-1] == "":
+        return
+    usual = int(np.bincount(counts).argmax())
+    if usual == expected or not layout.names_row:
+        expected = usual
+    bad = int(np.flatnonzero(counts != expected)[0])
+    row, line = layout.first_data_row + bad, body[bad]
+    wanted = f"{expected} as in the {'names' if layout.names_row else 'other rows'}"
+    if not line.strip():
+        raise bad_data(path, "an empty line", wanted + " cells", row=row)
+    found = f"{counts[bad]} cells"
+    if bad == len(body) - 1 and counts[bad] < expected:
+        found += " in the last line, as if the log was cut off while it was written"
+    elif layout.delimiter == "," and counts[bad] > expected and re.search(r"\d,\d", line):
+        found += " (decimal commas, with a comma between cells as well?)"
+    raise bad_data(path, found, wanted, row=row)
+
+
+def check_units(path: Path, line: str, header: list[str], layout: Layout) -> None:
+    """Refuse a units row that says another unit than the layout declares."""
+    units = cells_of(line, layout.delimiter)
+    for channel in layout.channels.values():
+        for column in channel.columns:
+            at = header.index(str(column))
+            written = units[at] if at < len(units) else ""
+            if not same_unit(written, channel.unit):
+                found = f"the units row says '{written}'"
+                expected = f"'{channel.unit}' as the layout {layout.name} declares"
+                row = layout.units_row
+                raise bad_data(path, found, expected, row=row, column=str(column))
+
+
+def cell_by_cell(
+    path: Path, body: list[str], names: tuple[str | int, ...], where: list[int], layout: Layout
+) -> Float[np.ndarray, "row column"]:
+    """The slow way, taken when the fast one fails: accepts empty cells, names the first bad one."""
+    values = np.empty((len(body), len(where)))
+    for i, line in enumerate(body):
+        cells = cells_of(line, layout.delimiter)
+        for j, at in enumerate(where):
+            cell = cells[at]
+            number = np.nan if cell.lower() in MISSING else number_in(cell)
+            if number is None:
+                comma = re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell)
+                more = " with a decimal point, not a decimal comma" if comma else ""
+                row, column = layout.first_data_row + i, str(names[j])
+                raise bad_data(path, f"'{cell[:40]}'", f"a number{more}", row=row, column=column)
+            values[i, j] = number
+    return values

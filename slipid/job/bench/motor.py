@@ -12,9 +12,10 @@ from jaxtyping import Bool
 
 from slipid.data.log import Log
 from slipid.data.reading.checks import MIN_ROWS
-from slipid.data.reading.guess import Named, header_of, layout_of
-from slipid.data.reading.layout import Recorded
+from slipid.data.reading.layout import SensorLayout
+from slipid.data.reading.motor_layout import GivenColumns, motor_layout
 from slipid.data.reading.reader import read_logs
+from slipid.data.reading.table_format import format_of
 from slipid.data.runs import counted_once
 from slipid.data.sanity.columns import refuse_misordered
 from slipid.identify.bench.doubts import refuse
@@ -94,11 +95,10 @@ def read_bench_job(config: Config, root: Path, report: Reporter) -> BenchJob:
 
 
 def read_one(
-    path: Path, given: Mapping[str, Named], delimiter: str | None, signed: bool
+    path: Path, given: Mapping[str, GivenColumns], delimiter: str | None, signed: bool
 ) -> BenchJob:
-    """Motors of a single file, with columns as named or guessed."""
-    header = header_of(path, delimiter)
-    layout = layout_of(path, given, header, signed)
+    """Motors of a single file, with given columns, the others by their names."""
+    layout = motor_layout(format_of(path, delimiter), given, signed)
     logs = counted_once(read_logs(path, layout, path.parent, None, "bench").logs)
     refuse_misordered(logs)
     parts = [records_of(log, layout) for log in logs]
@@ -112,7 +112,7 @@ def read_one(
     return BenchJob(records, dict.fromkeys(labels, ()), (), taken, said)
 
 
-def records_of(log: Log, layout: Recorded) -> list[Record]:
+def records_of(log: Log, layout: SensorLayout) -> list[Record]:
     """Record of each motor of a log, at its shaft."""
     if log.current is None:
         raise DataError(f"{log.name}: no current; expected a column of it for each motor")

@@ -22,7 +22,7 @@ _WHAT = "what `slipid identify` of a motor, or `slipid motor --out`, wrote"
 
 
 @dataclass(frozen=True)
-class Told:
+class BenchEstimate:
     """What a bench says of one number of one motor."""
 
     value: float
@@ -31,14 +31,14 @@ class Told:
 
 
 @dataclass(frozen=True)
-class Bench:
+class BenchFile:
     """A bench's file, and its numbers by name, one for each of its motors."""
 
     path: Path
-    numbers: Mapping[str, list[Told]]
+    numbers: Mapping[str, list[BenchEstimate]]
 
 
-def bench_of(config: Config) -> Bench | None:
+def bench_of(config: Config) -> BenchFile | None:
     """The bench that the config names, None where it names none.
 
     Raises:
@@ -50,7 +50,7 @@ def bench_of(config: Config) -> Bench | None:
     # a result keeps a copy, so that later commands need no other folder
     kept = config.path.parent / KEPT
     path = kept if kept.is_file() else config.path.parent / named
-    return Bench(path, _read(path, f"{config.path}: robot.motor"))
+    return BenchFile(path, _read(path, f"{config.path}: robot.motor"))
 
 
 def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[str]]:
@@ -83,27 +83,27 @@ def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[
     return choices, lines
 
 
-def _pooled(sure: list[Told]) -> tuple[float, float]:
+def _pooled(sure: list[BenchEstimate]) -> tuple[float, float]:
     """Mean of several motors, and std of one of them: its error and how they differ."""
     values = [t.value for t in sure]
     spread = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
     return float(np.mean(values)), float(np.hypot(spread, np.mean([t.std for t in sure])))
 
 
-def _read(path: Path, where: str) -> Mapping[str, list[Told]]:
+def _read(path: Path, where: str) -> Mapping[str, list[BenchEstimate]]:
     """Numbers of a bench by name, one for each of its motors."""
     content = read_json(path, _WHAT)
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema != SCHEMA or content.get("drive") != "motor":
         found = "a robot's numbers" if schema == SCHEMA else f"schema {schema}"
         raise DataError(f"{where}: {path}: {found}; expected {_WHAT}")
-    told: dict[str, list[Told]] = {}
+    told: dict[str, list[BenchEstimate]] = {}
     try:
         for full, number in content["parameters"].items():
             if number["std"] is not None:
                 name = full.partition("@")[0].removeprefix("motor.")
                 known = float(number["value"]), float(number["std"]), str(number["verdict"])
-                told.setdefault(name, []).append(Told(*known))
+                told.setdefault(name, []).append(BenchEstimate(*known))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{where}: {path}: damaged ({error}); expected {_WHAT}") from error
     return told

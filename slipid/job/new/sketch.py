@@ -1,12 +1,19 @@
-"""What a new config shall say: layouts, sections of logs and a robot, before they are text."""
+"""The content of a new config before it is text; also the one for logs that nobody has shown."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from slipid.data.reading.layout import Layout
-from slipid.job.new.answers import Answers
-from slipid.job.new.lines import Line, toml
+from slipid.job.new.config_lines import ConfigLine, toml
+from slipid.job.new.robot_questions import RobotAnswers
 from slipid.job.reference.meanings import in_short
+
+_NAMES = "the column names and units below are examples: write those of your files"
+_LABELS = {
+    (4, False): ("fl", "fr", "rl", "rr"),
+    (4, True): ("left", "right"),
+    (2, False): ("left", "right"),
+}
 
 
 @dataclass(frozen=True)
@@ -18,16 +25,14 @@ class ChannelSketch:
     unit: str
     comment: str = ""
     question: str = ""
-    scale: float = 1.0
     off: bool = False
 
-    def line(self) -> Line:
+    def line(self) -> ConfigLine:
         """Its line in the config."""
         several = len(self.columns) > 1
         named = toml(list(self.columns) if several else self.columns[0])
         inside = f"column{'s' if several else ''} = {named}, unit = {toml(self.unit)}"
-        inside += "" if self.scale == 1.0 else f", scale = {toml(self.scale)}"
-        return Line(self.channel, f"{{ {inside} }}", self.comment, self.question, self.off)
+        return ConfigLine(self.channel, f"{{ {inside} }}", self.comment, self.question, self.off)
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,7 @@ class FileSketch:
             of a file without text (Parquet).
         settings: other keys of its layout.
         above: comments on the columns; questions: on the whole file.
-        preset: name of the preset that the layout is made from.
+        pattern: name of a file that lies beside a run's own, as of `Layout.beside`; empty for that.
     """
 
     channels: tuple[ChannelSketch, ...]
@@ -48,11 +53,12 @@ class FileSketch:
     names_row: int = 1
     units_row: int = 0
     first_data_row: int = 2
-    settings: tuple[Line, ...] = ()
+    settings: tuple[ConfigLine, ...] = ()
     above: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()
+    pattern: str = ""
 
-    def lines(self) -> tuple[Line, ...]:
+    def lines(self) -> tuple[ConfigLine, ...]:
         """Keys of its layout but for the columns."""
         if not self.delimiter:
             return self.settings
@@ -63,26 +69,18 @@ class FileSketch:
 
 
 @dataclass(frozen=True)
-class BesideSketch:
-    """A file that lies beside a run's own: its name as of `Layout.beside`."""
-
-    pattern: str
-    file: FileSketch
-
-
-@dataclass(frozen=True)
 class LayoutSketch:
     """A layout of the config's own; `examples`: whether other ways to log are shown below it."""
 
     name: str
     file: FileSketch
-    beside: tuple[BesideSketch, ...] = ()
+    beside: tuple[FileSketch, ...] = ()
     examples: bool = False
 
     @property
     def channels(self) -> Iterator[ChannelSketch]:
         """Every channel that counts, of all its files."""
-        for file in (self.file, *(one.file for one in self.beside)):
+        for file in (self.file, *self.beside):
             yield from (channel for channel in file.channels if not channel.off)
 
 
@@ -91,8 +89,8 @@ class BagSketch:
     """A layout of bags: its keys, a line for each topic that counts, and what they hold."""
 
     name: str
-    settings: tuple[Line, ...]
-    topics: tuple[Line, ...]
+    settings: tuple[ConfigLine, ...]
+    topics: tuple[ConfigLine, ...]
     above: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()
 
@@ -135,7 +133,7 @@ class Sketch:
         bags: layouts of bags.
     """
 
-    robot: Answers
+    robot: RobotAnswers
     layouts: tuple[LayoutSketch, ...]
     logs: tuple[LogsSketch, ...]
     carries: frozenset[str] = frozenset()
@@ -151,6 +149,65 @@ class Sketch:
         return self.carries | frozenset(own)
 
 
-def setting(key: str, value: object, question: str = "", comment: str = "") -> Line:
+@dataclass(frozen=True)
+class ConfigProposal:
+    """A config to be, and what was found in the logs, in sentences."""
+
+    sketch: Sketch
+    sentences: tuple[str, ...]
+
+
+def setting(key: str, value: object, question: str = "", comment: str = "") -> ConfigLine:
     """A key of a layout with what it means."""
-    return Line(key, toml(value), comment or in_short(Layout, key), question)
+    return ConfigLine(key, toml(value), comment or in_short(Layout, key), question)
+
+
+def blank(known: RobotAnswers) -> Sketch:
+    """Everything that this robot may log, in one file for each run."""
+    layout = LayoutSketch(
+        "mine", FileSketch(_channels(known), settings=_settings(known)), examples=True
+    )
+    return Sketch(known, (layout,), (LogsSketch("*/*.csv", "mine"),))
+
+
+def _settings(known: RobotAnswers) -> tuple[ConfigLine, ...]:
+    gear = setting("gear_ratio", known.gear_ratio, comment="as above")
+    signed = setting("current_is_signed", True, comment="false where only magnitudes are logged")
+    if not known.ticks_per_revolution:
+        return (gear, signed)
+    question = ""
+    if "ticks_per_revolution" in known.taken:
+        question = "taken by default: look it up, of the motor shaft with all edges"
+    ticks = setting("ticks_per_revolution", known.ticks_per_revolution, question)
+    increments = setting("ticks_are_increments", False)
+    return (ticks, increments, gear, signed)
+
+
+def _channels(known: RobotAnswers) -> tuple[ChannelSketch, ...]:
+    labels = _LABELS.get((known.wheels, known.shared))
+    if labels is None or known.drive in ("omni", "general"):
+        labels = tuple(str(k + 1) for k in range(known.wheels))
+
+    def each(name: str) -> tuple[str, ...]:
+        return tuple(f"{name}_{label}" for label in labels)
+
+    ticks = bool(known.ticks_per_revolution)
+    turns = ChannelSketch("wheel_ticks", each("ticks"), "tick", "or wheel_angle, motor_angle")
+    speed = ChannelSketch("wheel_speed", each("speed"), "rad/s", "or motor_speed, before the gear")
+    sideways = known.drive in ("omni", "mecanum", "general")
+    twist = [("twist_command_x", "command_x", "m/s"), ("twist_command_y", "command_y", "m/s")]
+    twist = twist if sideways else twist[:1]
+    commands = [
+        ChannelSketch(*(channel, (column,), unit))
+        for channel, column, unit in (*twist, ("twist_command_yaw", "command_yaw", "rad/s"))
+    ]
+    return (
+        ChannelSketch("time", ("time",), "s", question=_NAMES),
+        turns if ticks else speed,
+        ChannelSketch("current", each("current"), "A"),
+        ChannelSketch("voltage", each("voltage"), "V", "at the motors, not the battery's"),
+        ChannelSketch("pose_x", ("x",), "m", "at the rate of its sensor; empty cells between"),
+        ChannelSketch("pose_y", ("y",), "m"),
+        ChannelSketch("pose_heading", ("heading",), "rad"),
+        *commands,
+    )

@@ -10,9 +10,9 @@ import pytest
 
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.bag.reader import read_bag
-from slipid.job.new.answers import Told
+from slipid.job.new.config_text import new_config
 from slipid.job.new.look.propose import propose
-from slipid.job.new.written import new_config
+from slipid.job.new.robot_questions import RobotOptions
 from tests.helpers.made_bags import (
     ROBOTINO,
     Said,
@@ -51,7 +51,7 @@ def messages(pose: str = POSE, effort: bool = False, more: tuple[str, ...] = ())
 
 
 def proposed(path: Path, **told: str):
-    proposal = propose(path, Told(**told))
+    proposal = propose(path, RobotOptions(**told))
     return new_config(proposal.sketch, "mine.toml")
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slipid.job.new.answers import Told
 from slipid.job.new.look.propose import propose
+from slipid.job.new.robot_questions import RobotOptions
 from slipid.support.errors import DataError
 from tests.helpers.made_tables import motion, plain, table, wheel_speeds
 from tests.helpers.proposals import ROBOT, layout_in, proposed, read
@@ -100,7 +100,7 @@ def test_files_at_other_times_are_not_of_the_run(tmp_path):
     table(tmp_path / "pose.csv", {**{n: si[n] for n in ("x", "y", "yaw")}, "t": si["t"] + 900})
     proposal, config = proposed(tmp_path, **ROBOT)
     assert "beside" not in layout_in(config)
-    assert any(line.startswith("left out") and "pose.csv" in line for line in proposal.said)
+    assert any(line.startswith("left out") and "pose.csv" in line for line in proposal.sentences)
     assert any("no pose was found" in question for question in config.questions)
 
 
@@ -118,25 +118,25 @@ def test_parquet(tmp_path):
 
 def test_what_is_no_log_is_one_clear_error(tmp_path):
     with pytest.raises(DataError, match="no such file or folder"):
-        propose(tmp_path / "none.csv", Told())
+        propose(tmp_path / "none.csv", RobotOptions())
     (tmp_path / "empty.csv").write_bytes(b"")
     with pytest.raises(DataError, match="the file is empty"):
-        propose(tmp_path / "empty.csv", Told())
+        propose(tmp_path / "empty.csv", RobotOptions())
     (tmp_path / "words.csv").write_text("a,b\nc,d\n" * 20)
     with pytest.raises(DataError, match="no rows of numbers"):
-        propose(tmp_path / "words.csv", Told())
+        propose(tmp_path / "words.csv", RobotOptions())
     (tmp_path / "binary.csv").write_bytes(b"\0\1\2\3" * 100)
     with pytest.raises(DataError, match="a binary file"):
-        propose(tmp_path / "binary.csv", Told())
+        propose(tmp_path / "binary.csv", RobotOptions())
     with pytest.raises(DataError, match="no log in 3 files"):
-        propose(tmp_path, Told())
+        propose(tmp_path, RobotOptions())
     (tmp_path / "sub").mkdir()
     with pytest.raises(DataError, match="no CSV or Parquet file below it"):
-        propose(tmp_path / "sub", Told())
+        propose(tmp_path / "sub", RobotOptions())
     rows = "\n".join(f"{k},5;0,1" for k in range(30))
     (tmp_path / "sub" / "comma.csv").write_text(f"t;x\n{rows}\n")
     with pytest.raises(DataError, match="decimal points, not commas"):
-        propose(tmp_path / "sub" / "comma.csv", Told())
+        propose(tmp_path / "sub" / "comma.csv", RobotOptions())
 
 
 def test_a_file_of_which_no_column_is_known_is_a_question_and_still_a_config(tmp_path):

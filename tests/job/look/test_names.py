@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slipid.job.new.look.columns.names import named, without_unit
-from slipid.job.new.look.signals.magnitudes import heading_unit, place_unit, time_unit
+from slipid.data.reading.column_names import meaning_of, without_unit
+from slipid.job.new.look.magnitudes import heading_unit, place_unit, time_unit
 
 
 @pytest.mark.parametrize(
@@ -50,17 +50,17 @@ from slipid.job.new.look.signals.magnitudes import heading_unit, place_unit, tim
     ],
 )
 def test_names_as_people_use_them(name, channel, label, unit):
-    found = named(name)
+    found = meaning_of(name)
     assert (found.channel, found.label, found.unit, found.doubt) == (channel, label, unit, "")
 
 
 @pytest.mark.parametrize("name", ["temperature", "accel_std", "dx", "delta_x", "n", "foo", "lux"])
 def test_names_of_other_things_say_nothing(name):
-    assert named(name).channel == ""
+    assert meaning_of(name).channel == ""
 
 
 def test_odometry_is_no_pose():
-    assert named("odom_x").channel == "odometry"
+    assert meaning_of("odom_x").channel == "odometry"
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_odometry_is_no_pose():
     [("headng", "pose_heading"), ("lef_vel", "wheel_speed"), ("curent_left", "current")],
 )
 def test_misspelled_names_are_understood_and_doubted(name, channel):
-    found = named(name)
+    found = meaning_of(name)
     assert found.channel == channel
     assert found.doubt.startswith("misspelled? ")
 

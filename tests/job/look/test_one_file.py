@@ -7,8 +7,8 @@ import tomllib
 import numpy as np
 import pytest
 
-from slipid.job.new.lines import ASKS
-from slipid.job.new.look.files.file import head_of
+from slipid.data.reading.table_format import format_of
+from slipid.job.new.config_lines import ASKS
 from slipid.support.errors import DataError
 from tests.helpers.made_tables import RADIUS, motion, plain, table
 from tests.helpers.proposals import ROBOT, layout_in, proposed, read
@@ -33,7 +33,7 @@ def test_a_plain_file_leaves_nothing_open_and_reads(tmp_path):
     angle, pose = motion(log.time)
     np.testing.assert_allclose(log.wheel_angle, angle - angle[0], atol=2e-3)
     np.testing.assert_allclose(log.pose, pose, atol=1e-6)
-    assert "2 like" in proposal.said[0]
+    assert "2 like" in proposal.sentences[0]
 
 
 def test_other_units_are_told_by_names_units_row_and_magnitude(tmp_path):
@@ -72,8 +72,8 @@ def test_a_row_of_units_above_the_names(tmp_path):
     )
     rows = path.read_text().splitlines()
     path.write_text("\n".join(["made by hand", "s,rad/s,rad/s,m,m,rad", *rows]) + "\n")
-    head = head_of(path)
-    assert (head.units_row, head.names_row, head.first_data_row) == (2, 3, 4)
+    found = format_of(path)
+    assert (found.units_row, found.names_row, found.first_data_row) == (2, 3, 4)
     _, config = proposed(path, **ROBOT)
     assert layout_in(config)["units_row"] == 2
     assert len(read(config, tmp_path)) == 1

@@ -43,7 +43,7 @@ def test_omni3_has_no_names(real_data):
         "wheel_ticks": 0,
     }
     assert layout["columns"]["wheel_ticks"]["columns"] == [4, 5, 6]
-    assert any("format = omni3_optitrack" in line for line in proposal.said)
+    assert any("format = omni3_optitrack" in line for line in proposal.sentences)
     assert not any("metadata" in glob for glob in formats(config)["mine"])
 
 

@@ -9,7 +9,7 @@ from pydantic import AliasChoices, BeforeValidator, Field, StrictBool, StrictFlo
 from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.bag.messages.shape import steps_of
-from slipid.data.reading.layout import CHANNELS, PER_WHEEL, Recorded, unknown
+from slipid.data.reading.layout import CHANNELS, PER_WHEEL, SensorLayout, several, unknown
 from slipid.data.reading.units import factor
 from slipid.support.errors import DataError
 from slipid.support.toml_file import CLOSED, NotNegative, Positive, checked
@@ -25,12 +25,7 @@ EFFORT = '"A" (current), "N*m" (motor_torque or wheel_torque), "V" (voltage) or 
 """What drivers put into the effort of a JointState."""
 
 
-def _several(value: object) -> object:
-    """One, or a list of them."""
-    return tuple(value) if isinstance(value, list | tuple) else (value,)
-
-
-Texts = Annotated[tuple[StrictStr, ...], BeforeValidator(_several)]
+Texts = Annotated[tuple[StrictStr, ...], BeforeValidator(several)]
 
 
 @dataclass(frozen=True, config=CLOSED)
@@ -52,7 +47,7 @@ class TopicChannel:
     topics: Annotated[Texts, Field(min_length=1, validation_alias=AliasChoices("topics", "topic"))]
     fields: Annotated[Texts, Field(validation_alias=AliasChoices("fields", "field"))] = ()
     unit: StrictStr | None = None
-    scale: Annotated[tuple[StrictFloat, ...], BeforeValidator(_several)] = (1.0,)
+    scale: Annotated[tuple[StrictFloat, ...], BeforeValidator(several)] = (1.0,)
     offset: StrictFloat = 0.0
     frame: StrictStr | None = None
     child: StrictStr | None = None
@@ -99,7 +94,7 @@ class RunRule:
 
 
 @dataclass(frozen=True, config=CLOSED)
-class BagLayout(Recorded):
+class BagLayout(SensorLayout):
     """How the bags of one robot are laid out.
 
     Attributes:
@@ -200,10 +195,8 @@ def _problem(layout: BagLayout) -> str | None:
             return f"{group} and {min(twice)}; expected one of them"
     if 0 < len(have & set(GROUPS["pose"])) < 3:
         return "a pose in parts; expected pose, or all of pose_x, pose_y and pose_heading"
-    if "wheel_ticks" in have and layout.ticks_per_revolution is None:
-        return "wheel_ticks without ticks_per_revolution; expected ticks per turn of the motor"
-    if {"motor_torque", "wheel_torque"} & have and layout.torque_constant is None:
-        return "a torque without torque_constant; expected the motor's torque per current [N m/A]"
+    if lacking := layout.lacks(have):
+        return lacking
     if len(set(layout.joints)) < len(layout.joints):
         return f"joints {list(layout.joints)}; expected each once"
     if layout.runs is not None and layout.runs.pause_s is not None and not have & set(TURNS):

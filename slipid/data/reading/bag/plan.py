@@ -1,15 +1,11 @@
 """What a layout wants of a bag: for each channel the topics, and the numbers in their messages."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 
-from slipid.data.reading.bag.frames import chain_of
 from slipid.data.reading.bag.layout import GROUPS, BagLayout, TopicChannel
-from slipid.data.reading.bag.messages.definitions import definition_of
-from slipid.data.reading.bag.messages.kinds import Message
+from slipid.data.reading.bag.messages.definitions import Message, definition_of
 from slipid.data.reading.bag.messages.meanings import (
-    JOINT_STATE,
     Unfit,
     channel_meaning,
     fits,
@@ -18,10 +14,10 @@ from slipid.data.reading.bag.messages.meanings import (
     listed,
 )
 from slipid.data.reading.bag.messages.picks import Pick, TransformPick, edges_of
-from slipid.data.reading.bag.messages.shape import Shape, shape_of, steps_of
+from slipid.data.reading.bag.messages.shape import MessageShape, shape_of, steps_of
 from slipid.data.reading.bag.messages.streams import topic_error
 from slipid.data.reading.bag.storage.opened import OpenBag, StoredTopic
-from slipid.data.reading.bag.transforms import STATIC, Link
+from slipid.data.reading.bag.transforms import STATIC, Link, chain_of
 from slipid.support.errors import DataError, bad_data, near
 
 
@@ -81,7 +77,9 @@ def _planned(bag: OpenBag, layout: BagLayout, channel: str, spec: TopicChannel) 
         except Unfit as error:
             expected = error.expected
             if "joints are named" in error.found:
-                expected += f" (there are: {listed(joints_in(bag, name, message))})"
+                shapes = first_shapes(bag, name, message, 10)
+                there = [joint for one in shapes for joint in one.texts(steps_of("name"))]
+                expected += f" (there are: {listed(dict.fromkeys(there))})"
             raise topic_error(bag.path, name, error.found, expected) from None
         unit = meaning.unit
         wanted.append(Wanted(name, message, meaning.pick))
@@ -141,7 +139,9 @@ def _one_of(bag: OpenBag, layout: BagLayout, channel: str) -> str:
     return f"one of {listed(bag.topics)}"
 
 
-def first_shapes(bag: OpenBag, topic: str, message: Message, count: int) -> tuple[Shape, ...]:
+def first_shapes(
+    bag: OpenBag, topic: str, message: Message, count: int
+) -> tuple[MessageShape, ...]:
     """Shapes of the first messages of a topic."""
     raws = islice(bag.messages((topic,)), count)
     try:
@@ -149,17 +149,3 @@ def first_shapes(bag: OpenBag, topic: str, message: Message, count: int) -> tupl
     except ValueError as error:
         expected = "messages as their definition says; is the bag damaged?"
         raise topic_error(bag.path, topic, f"no {message.name}: {error}", expected) from error
-
-
-def joints_in(bag: OpenBag, topic: str, message: Message) -> tuple[str, ...]:
-    """Names of the joints in the first messages of a topic."""
-    if message.name != JOINT_STATE:
-        return ()
-    shapes = first_shapes(bag, topic, message, 10)
-    names = (name for shape in shapes for name in shape.texts(steps_of("name")))
-    return tuple(dict.fromkeys(names))
-
-
-def topics_in(plans: Sequence[ChannelPlan]) -> tuple[str, ...]:
-    """Every topic of some plans, each once."""
-    return tuple(dict.fromkeys(wanted.topic for plan in plans for wanted in plan.wanted))

@@ -7,14 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.data.reading.bag.channels import channel_signal
 from slipid.data.reading.bag.clock import check_clocks
 from slipid.data.reading.bag.layout import GROUPS, BagLayout
 from slipid.data.reading.bag.messages.streams import Stream, TopicStreams
-from slipid.data.reading.bag.plan import ChannelPlan, plan, topics_in
-from slipid.data.reading.bag.poses import group_signals
-from slipid.data.reading.bag.runs.stretch import Stretch
-from slipid.data.reading.bag.runs.stretches import stretches_of
+from slipid.data.reading.bag.plan import ChannelPlan, plan
+from slipid.data.reading.bag.runs import RunSpan, run_spans
+from slipid.data.reading.bag.signals import channel_signal, group_signals
 from slipid.data.reading.bag.storage.opened import OpenBag, open_bag
 from slipid.data.reading.layout import PER_WHEEL
 from slipid.data.reading.signal import Signal
@@ -59,14 +57,14 @@ def read_bag(path: Path, layout: BagLayout) -> tuple[BagRun, ...]:
         sha256 = beside.submit(lambda: bag.files.sha256)
         notes = list(bag.notes)
         signals = _signals(bag, layout, notes)
-        stretches = stretches_of(bag, layout, signals, notes)
+        stretches = run_spans(bag, layout, signals, notes)
         # two channels of one topic say the same of it
         said = tuple(dict.fromkeys(notes))
         return tuple(_run(signals, one, sha256.result(), said) for one in stretches)
 
 
 def _run(
-    signals: dict[str, Signal], stretch: Stretch, sha256: str, notes: tuple[str, ...]
+    signals: dict[str, Signal], stretch: RunSpan, sha256: str, notes: tuple[str, ...]
 ) -> BagRun:
     """The part of all signals that lies in one run."""
     parts, without = {}, []
@@ -105,7 +103,7 @@ def _signals(bag: OpenBag, layout: BagLayout, notes: list[str]) -> dict[str, Sig
 def _collected(bag: OpenBag, plans: Sequence[ChannelPlan]) -> list[list[Stream]]:
     """Numbers of every plan, topic by topic."""
     topics = {}
-    for name in topics_in(plans):
+    for name in dict.fromkeys(w.topic for one in plans for w in one.wanted):
         wanted = [w for one in plans for w in one.wanted if w.topic == name]
         picks = [one.pick for one in wanted]
         topics[name] = TopicStreams(bag.path, name, wanted[0].message, picks, cdr=bag.cdr)

@@ -1,14 +1,13 @@
 """What is in a bag: its topics, with what their first messages tell, without reading them all."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
-from slipid.data.reading.bag.messages.definitions import definition_of
-from slipid.data.reading.bag.messages.kinds import Message
+from slipid.data.reading.bag.messages.definitions import Message, definition_of
 from slipid.data.reading.bag.messages.meanings import JOINT_STATE, fits
 from slipid.data.reading.bag.messages.picks import edges_of
-from slipid.data.reading.bag.messages.shape import Shape, shape_of, steps_of
+from slipid.data.reading.bag.messages.shape import MessageShape, shape_of, steps_of
 from slipid.data.reading.bag.storage.opened import OpenBag, StoredTopic, open_bag
 from slipid.support.errors import DataError
 
@@ -89,11 +88,11 @@ def _looked_into(bag: OpenBag, stored: StoredTopic, definitions: Path | None) ->
         message = definition_of(bag.path, stored.name, stored.type, stored.carried, definitions)
         shapes = [shape_of(raw.data, message, cdr=bag.cdr) for raw in raws]
     except (DataError, ValueError) as error:
-        return Topic(stored.name, stored.type, stored.count, first, last, problem=str(error))
+        return replace(known, problem=str(error))
     joints = (name for shape in shapes for name in shape.texts(steps_of("name")))
     frames = (f"{edge.parent} -> {edge.child}" for shape in shapes for edge in edges_of(shape))
-    return Topic(
-        *(known.name, known.type, known.count, known.first, known.last),
+    return replace(
+        known,
         fields=_fields(message, shapes[0]),
         joints=tuple(dict.fromkeys(joints)) if message.name == JOINT_STATE else (),
         frames=tuple(dict.fromkeys(frames)),
@@ -101,14 +100,14 @@ def _looked_into(bag: OpenBag, stored: StoredTopic, definitions: Path | None) ->
     )
 
 
-def _served(message: Message, shape: Shape) -> tuple[str, ...]:
+def _served(message: Message, shape: MessageShape) -> tuple[str, ...]:
     """Channels that messages of a type tell of themselves, of joints those that are filled in."""
     if message.name == JOINT_STATE:
         return tuple(name for name, array in _JOINTS.items() if shape.places(steps_of(array)))
     return tuple(name for name in _TOLD if fits(name, message))
 
 
-def _fields(message: Message, shape: Shape) -> tuple[TopicField, ...]:
+def _fields(message: Message, shape: MessageShape) -> tuple[TopicField, ...]:
     """Everything in a type of message, with how much of it one message has."""
     return tuple(
         TopicField(path, what, shape.count(steps_of(path))) for path, what in message.paths.items()

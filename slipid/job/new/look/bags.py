@@ -6,14 +6,14 @@ from pathlib import Path, PurePosixPath
 
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.topics import Topic, topics_of
+from slipid.data.reading.column_names import meaning_of
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, Layout
-from slipid.job.new.answers import Answers, Told
-from slipid.job.new.lines import Line, toml
-from slipid.job.new.look.columns.found import rank
-from slipid.job.new.look.columns.names import named
-from slipid.job.new.look.files.kinds import common_glob, floor_of
+from slipid.job.new.config_lines import ConfigLine, toml
+from slipid.job.new.look.file_channels import rank
+from slipid.job.new.look.kinds import common_glob, floor_of
 from slipid.job.new.look.robot import robot_from
-from slipid.job.new.sketch import BagSketch, LogsSketch, Sketch
+from slipid.job.new.robot_questions import RobotAnswers, RobotOptions
+from slipid.job.new.sketch import BagSketch, ConfigProposal, LogsSketch, Sketch
 from slipid.job.reference.meanings import in_short, meanings
 
 SUFFIXES = (".bag", ".db3", ".mcap")
@@ -25,14 +25,6 @@ _EFFORT = (
     "what is the effort: a current (A), a torque (motor_torque or wheel_torque, N*m), a voltage "
     "(V) or a duty (1)?"
 )
-
-
-@dataclass(frozen=True)
-class BagProposal:
-    """A config for bags, and what was found, in sentences."""
-
-    sketch: Sketch
-    said: tuple[str, ...]
 
 
 _BY_NAME = ("current", "voltage", "duty")
@@ -66,12 +58,12 @@ def bags_in(path: Path) -> list[Path]:
     return sorted([*(folder / _METADATA for folder in folders), *alone])
 
 
-def propose_bags(bags: Sequence[Path], asked: Path, told: Told) -> BagProposal:
+def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> ConfigProposal:
     """The config that bags are proposed to have, by the first; DataError where it is unreadable.
 
     Args:
-        bags: as of `bags_in`; asked: what was named.
-        told: what is known of the robot.
+        bags: as of `bags_in`; path: of the log or folder that was named.
+        options: what is known of the robot.
     """
     bag = bags[0]
     topics = topics_of(bag)
@@ -79,14 +71,14 @@ def propose_bags(bags: Sequence[Path], asked: Path, told: Told) -> BagProposal:
     served = list(_first_of_each(topics, len(joints)))
     wheels = next((one.wheels for name in _TURNS for one in served if one.channel == name), 0)
     served += _by_field_names(topics, served, wheels)
-    guessed = robot_from(told, wheels, ())
+    guessed = robot_from(options, wheels, ())
     questions = [doubt] if doubt else []
     if not any(one.channel == "pose" for one in served):
         questions.append("no topic with a pose was found: a fit needs one")
     if not wheels:
         questions.append("no topic tells how wheels turn: which one does, and in which field?")
-    is_bag = asked.is_file() or bag == asked / _METADATA
-    root = asked.parent if is_bag else asked
+    is_bag = path.is_file() or bag == path / _METADATA
+    root = path.parent if is_bag else path
     inside = [PurePosixPath(one.relative_to(root)) for one in bags]
     inside = [one for one in inside if len(one.parts) == len(inside[0].parts)]
     layout = BagSketch(
@@ -108,15 +100,15 @@ def propose_bags(bags: Sequence[Path], asked: Path, told: Told) -> BagProposal:
         hints=guessed.hints,
         bags=(layout,),
     )
-    said = [f"{bag}: {len(topics)} topics"]
-    said += [f"  {one.topic.name} ({one.topic.type}): {one.channel}" for one in served]
-    return BagProposal(sketch, tuple(said))
+    sentences = [f"{bag}: {len(topics)} topics"]
+    sentences += [f"  {one.topic.name} ({one.topic.type}): {one.channel}" for one in served]
+    return ConfigProposal(sketch, tuple(sentences))
 
 
 def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
     """Names of the wheels' joints in the order of the drives, and what is not sure of them."""
     names = tuple(dict.fromkeys(name for topic in topics for name in topic.joints))
-    labels = {name: named(f"{name}_velocity") for name in names}
+    labels = {name: meaning_of(f"{name}_velocity") for name in names}
     wheels = [
         name for name in names if labels[name].channel == "wheel_speed" and labels[name].label
     ]
@@ -133,16 +125,16 @@ def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
 def _first_of_each(topics: Sequence[Topic], joints: int) -> Iterator[_Served]:
     """The best topic for every channel: poses that are no odometry come before those that are."""
     order = sorted(topics, key=lambda t: (t.type == _ODOMETRY, t.type == _TRANSFORMS, t.name))
-    seen: set[str] = set()
+    taken: set[str] = set()
     for topic in order:
         for channel in topic.serves:
-            if channel in seen or not topic.count:
+            if channel in taken or not topic.count:
                 continue
-            seen.add(channel)
+            taken.add(channel)
             wheels = joints if topic.joints else _count(topic) if channel in PER_WHEEL else 0
             yield _Served(channel, topic, wheels, _doubt(channel, topic))
-        if any(f.path == "effort" and f.count for f in topic.fields) and "current" not in seen:
-            seen.add("current")
+        if any(f.path == "effort" and f.count for f in topic.fields) and "current" not in taken:
+            taken.add("current")
             yield _Served("current", topic, joints, _EFFORT)
 
 
@@ -150,18 +142,18 @@ def _by_field_names(
     topics: Sequence[Topic], served: Sequence[_Served], wheels: int
 ) -> Iterator[_Served]:
     """Channels in messages of unknown types: numbers of every wheel in a field of that name."""
-    seen = {one.channel for one in served}
+    taken = {one.channel for one in served}
     for topic in (one for one in topics if one.count and not one.serves and not one.joints):
         for field in topic.fields:
-            told = named(f"wheel {field.path.replace('.', ' ')}")
-            if told.channel not in _BY_NAME or told.channel in seen:
+            meaning = meaning_of(f"wheel {field.path.replace('.', ' ')}")
+            if meaning.channel not in _BY_NAME or meaning.channel in taken:
                 continue
             if field.count != wheels or field.type.startswith("text"):
                 continue
-            seen.add(told.channel)
-            unit = told.unit or CHANNELS[told.channel]
+            taken.add(meaning.channel)
+            unit = meaning.unit or CHANNELS[meaning.channel]
             ask = f"by the name of the field: is it that, in {unit}, in the order of the joints?"
-            yield _Served(told.channel, topic, wheels, ask, field.path, unit)
+            yield _Served(meaning.channel, topic, wheels, ask, field.path, unit)
 
 
 def _count(topic: Topic) -> int:
@@ -181,7 +173,7 @@ def _doubt(channel: str, topic: Topic) -> str:
     return ""
 
 
-def _lines(served: Sequence[_Served]) -> Iterator[Line]:
+def _lines(served: Sequence[_Served]) -> Iterator[ConfigLine]:
     """A line for each channel."""
     for one in served:
         inside = f"topic = {toml(one.topic.name)}"
@@ -193,7 +185,7 @@ def _lines(served: Sequence[_Served]) -> Iterator[Line]:
         if one.topic.type == _TRANSFORMS and one.topic.frames:
             frame, _, child = one.topic.frames[0].partition(" -> ")
             inside += f", frame = {toml(frame)}, child = {toml(child)}"
-        yield Line(one.channel, f"{{ {inside} }}", _rate(one.topic), one.question, off)
+        yield ConfigLine(one.channel, f"{{ {inside} }}", _rate(one.topic), one.question, off)
 
 
 def _rate(topic: Topic) -> str:
@@ -203,25 +195,26 @@ def _rate(topic: Topic) -> str:
 
 
 def _settings(
-    robot: Answers, joints: tuple[str, ...], served: Sequence[_Served]
-) -> tuple[Line, ...]:
+    robot: RobotAnswers, joints: tuple[str, ...], served: Sequence[_Served]
+) -> tuple[ConfigLine, ...]:
     """Keys of the layout but for its topics."""
 
-    def line(key: str, value: object, question: str = "") -> Line:
+    def line(key: str, value: object, question: str = "") -> ConfigLine:
         kind = BagLayout if key in meanings(BagLayout) else Layout
-        return Line(key, toml(value), in_short(kind, key), question)
+        return ConfigLine(key, toml(value), in_short(kind, key), question)
 
-    lines = [Line("kind", toml("bag"))]
+    lines = [ConfigLine("kind", toml("bag"))]
     have = {one.channel for one in served}
     lines += [line("joints", list(joints))] if joints else []
     if "wheel_ticks" in have:
-        asked = "ticks_per_revolution" in robot.taken
-        ask = "how many, of the motor shaft, all edges counted?" if asked else ""
+        ask = ""
+        if "ticks_per_revolution" in robot.taken:
+            ask = "how many, of the motor shaft, all edges counted?"
         lines.append(line("ticks_per_revolution", robot.ticks_per_revolution or 1000.0, ask))
-    lines.append(Line("gear_ratio", toml(robot.gear_ratio), "as above"))
+    lines.append(ConfigLine("gear_ratio", toml(robot.gear_ratio), "as above"))
     if "current" in have:
         ask = "do currents have a sign, or are they magnitudes?"
-        lines.append(Line("current_is_signed", "true", "false for magnitudes", ask))
+        lines.append(ConfigLine("current_is_signed", "true", "false for magnitudes", ask))
     return tuple(lines)
 
 

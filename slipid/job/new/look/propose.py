@@ -5,58 +5,53 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from slipid.data.log import Log
-from slipid.data.reading import guess
-from slipid.data.reading.bag.runs.pauses import PAUSE_S, parts_between_pauses
+from slipid.data.reading.bag.runs import PAUSE_S, parts_between_pauses
 from slipid.data.reading.layout import Layout
+from slipid.data.reading.motor_layout import motor_layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.reader import read_logs
 from slipid.data.sanity.columns import refuse_misordered
 from slipid.job.config import geometry, parsed
 from slipid.job.logs import layout_of
-from slipid.job.new.answers import Answers, Told
-from slipid.job.new.lines import Line
+from slipid.job.new.config_lines import ConfigLine
+from slipid.job.new.config_text import new_config
 from slipid.job.new.look.bags import bags_in, propose_bags
-from slipid.job.new.look.files.kinds import a_folder_each, floor_of, globs_of
+from slipid.job.new.look.kinds import a_folder_each, floor_of, globs_of
 from slipid.job.new.look.robot import robot_from
-from slipid.job.new.look.runs import Group, Sorted, sorted_logs
-from slipid.job.new.look.signals.known import Known
-from slipid.job.new.look.signals.study import Study
+from slipid.job.new.look.runs import Group, SortedLogs, sorted_logs
 from slipid.job.new.look.sketches import file_sketch, radius_hint
-from slipid.job.new.questions import robot_of
-from slipid.job.new.sketch import BesideSketch, LayoutSketch, LogsSketch, Sketch
-from slipid.job.new.written import new_config
+from slipid.job.new.look.study import Known, Study
+from slipid.job.new.robot_questions import RobotAnswers, RobotOptions, robot_of
+from slipid.job.new.sketch import (
+    ConfigProposal,
+    LayoutSketch,
+    LogsSketch,
+    Sketch,
+)
 from slipid.support.errors import DataError
 
 FLOOR = "floor"
 _FLOOR = "on which floor was {} driven? Its name, or folder where folders are called after floors"
 
 
-@dataclass(frozen=True)
-class Proposal:
-    """A config to be, and what was found, in sentences."""
-
-    sketch: Sketch
-    said: tuple[str, ...]
-
-
-def propose(path: Path, told: Told) -> Proposal:
+def propose(path: Path, options: RobotOptions) -> ConfigProposal:
     """The config that a log, or a folder of logs, is proposed to have.
 
     Raises:
-        DataError: there is no log, or what was told is no answer.
+        DataError: there is no log, or an option is no answer.
     """
     if not path.exists():
         raise DataError(f"{path}: no such file or folder; expected a log, or a folder of logs")
     if bags := bags_in(path):
-        proposed = propose_bags(bags, path, told)
-        return Proposal(_bags_tried(proposed.sketch, bags[0]), proposed.said)
+        proposed = propose_bags(bags, path, options)
+        return replace(proposed, sketch=_bags_tried(proposed.sketch, bags[0]))
     found = sorted_logs(path)
     wheels = max((group.main.columns.wheels for group in found.groups), default=0)
     for _, name in found.presets:
         wheels = max(wheels, _wheels_of(PRESETS[name]))
     files = tuple(one for group in found.groups for one in group.all)
     _no_bench(path, found, wheels, files)
-    guessed = robot_from(told, wheels, files)
+    guessed = robot_from(options, wheels, files)
     robot = _as_presets_say(guessed.robot, found)
     known = [_known(group, robot) for group in found.groups]
     logs = _logs(found)
@@ -74,22 +69,23 @@ def propose(path: Path, told: Told) -> Proposal:
         data=str(found.root),
         hints=(*guessed.hints, *(hint for one in known for hint in radius_hint(one))),
     )
-    return Proposal(_tried(sketch, found, wheels), (*found.told, *found.hints))
+    return ConfigProposal(_tried(sketch, found, wheels), (*found.sentences, *found.hints))
 
 
-def _no_bench(path: Path, found: Sorted, wheels: int, files: Sequence[Study]) -> None:
+def _no_bench(path: Path, found: SortedLogs, wheels: int, files: Sequence[Study]) -> None:
     """DataError where a log is of a motor on a bench, which another command is for."""
     if found.presets or wheels > 1 or not files or any(one.columns.has_pose for one in files):
         return
-    first = files[0].head.path
+    first = files[0].format.path
     try:
-        guessed = guess.layout_of(first, {}, guess.header_of(first, None), signed=True)
+        guessed = motor_layout(files[0].format, {}, signed=True)
     except DataError:
         return
-    seen = ", ".join(channel.removeprefix("motor_") for channel in guessed.channels)
+    channels = ", ".join(channel.removeprefix("motor_") for channel in guessed.channels)
     also = 'several logs of it: drive = "motor" in [robot] of a config, see slipid reference'
     raise DataError(
-        f"{path}: no wheels and no pose; {first.name} is like that of a motor on a bench ({seen})\n"
+        f"{path}: no wheels and no pose; "
+        f"{first.name} is like that of a motor on a bench ({channels})\n"
         f"run: slipid motor {first} --out DIR\n{also}"
     )
 
@@ -99,15 +95,15 @@ def _wheels_of(layout: Layout) -> int:
     return max((len(layout.channels[c].columns) for c in turns if c in layout.channels), default=0)
 
 
-def _as_presets_say(robot: Answers, found: Sorted) -> Answers:
-    """The gear ratio that a published format has, unless another was told."""
+def _as_presets_say(robot: RobotAnswers, found: SortedLogs) -> RobotAnswers:
+    """The gear ratio that a published format has, unless an option gives another."""
     gears = {PRESETS[name].gear_ratio for _, name in found.presets}
     if len(gears) != 1 or "gear_ratio" not in robot.taken:
         return robot
     return replace(robot, gear_ratio=gears.pop(), taken=robot.taken - {"gear_ratio"})
 
 
-def _known(group: Group, robot: Answers) -> Known:
+def _known(group: Group, robot: RobotAnswers) -> Known:
     others = tuple(Known(robot, other.main, other.all) for other in group.others)
     return Known(robot, group.main, group.all, others)
 
@@ -117,7 +113,7 @@ def _layout(group: Group, known: Known, number: int) -> LayoutSketch:
     if not any(one.columns.has_pose for one in group.all):
         ask = "no pose was found (x, y, and a heading or a quaternion): a fit needs one"
         file = replace(file, questions=(*file.questions, ask))
-    beside = tuple(BesideSketch(name, file_sketch(one, known)) for name, one in group.beside)
+    beside = tuple(replace(file_sketch(one, known), pattern=name) for name, one in group.beside)
     return LayoutSketch(_name(number), file, beside)
 
 
@@ -125,7 +121,7 @@ def _name(number: int) -> str:
     return "mine" if number == 0 else f"mine{number + 1}"
 
 
-def _logs(found: Sorted) -> list[LogsSketch]:
+def _logs(found: SortedLogs) -> list[LogsSketch]:
     """A section for each glob; those of files that lack wheels or a pose are commented out."""
     named = [(kind, name) for kind, name in found.presets]
     named += [(group.kind, _name(k)) for k, group in enumerate(found.groups)]
@@ -147,17 +143,17 @@ def _logs(found: Sorted) -> list[LogsSketch]:
     return sorted(out, key=lambda one: one.off)
 
 
-def _tried(sketch: Sketch, found: Sorted, wheels: int) -> Sketch:
+def _tried(sketch: Sketch, found: SortedLogs, wheels: int) -> Sketch:
     """The sketch with what the reader says of the first file of each layout, if it refuses it."""
     drives = geometry(robot_of(sketch.robot)).drives
     layouts = []
     for layout, group in zip(sketch.layouts, found.groups, strict=True):
-        asked = list(layout.file.questions)
+        questions = list(layout.file.questions)
         if wheels and drives != wheels:
-            asked.append(f"[robot] has {drives} drives, but {wheels} have columns here: which?")
+            questions.append(f"[robot] has {drives} drives, but {wheels} have columns here: which?")
         if problem := _tried_on(sketch, layout.name, group.kind.paths[0]).problem:
-            asked.append(f"the reader says: {problem}")
-        layouts.append(replace(layout, file=replace(layout.file, questions=tuple(asked))))
+            questions.append(f"the reader says: {problem}")
+        layouts.append(replace(layout, file=replace(layout.file, questions=tuple(questions))))
     return replace(sketch, layouts=tuple(layouts))
 
 
@@ -169,35 +165,35 @@ def _bags_tried(sketch: Sketch, first: Path) -> Sketch:
     (bag,) = sketch.bags
     tried = _tried_on(sketch, bag.name, first)
     if tried.problem:
-        asked = (*bag.questions, f"the reader says: {tried.problem}")
-        return replace(sketch, bags=(replace(bag, questions=asked),))
+        questions = (*bag.questions, f"the reader says: {tried.problem}")
+        return replace(sketch, bags=(replace(bag, questions=questions),))
     count = max((parts_between_pauses(log, PAUSE_S) for log in tried.logs), default=1)
     if count < 2:
         return sketch
-    said = f"cut where no wheel moves for longer: {count} runs in the first bag"
-    cut = Line("runs", f"{{ pause_s = {PAUSE_S:g} }}", said)
+    comment = f"cut where no wheel moves for longer: {count} runs in the first bag"
+    cut = ConfigLine("runs", f"{{ pause_s = {PAUSE_S:g} }}", comment)
     logs = tuple(replace(one, session="file") for one in sketch.logs)
     return replace(sketch, bags=(replace(bag, settings=(*bag.settings, cut)),), logs=logs)
 
 
 @dataclass(frozen=True)
-class _Tried:
+class _ReadAttempt:
     """What the reader made of a file: its runs, or why it refused it."""
 
     logs: tuple[Log, ...] = ()
     problem: str = ""
 
 
-def _tried_on(sketch: Sketch, name: str, path: Path) -> _Tried:
+def _tried_on(sketch: Sketch, name: str, path: Path) -> _ReadAttempt:
     """The first file of a layout as the reader reads it by the sketch."""
     try:
         config = parsed(Path("robot.toml"), new_config(sketch, "robot.toml").text)
         section = next((one for one in config.content.logs if one.format == name), None)
         if section is None:
-            return _Tried()
+            return _ReadAttempt()
         layout = layout_of(config, section)
         logs = read_logs(path, layout, path.parent, FLOOR, "as_built").logs
         refuse_misordered(logs)
-        return _Tried(tuple(logs))
+        return _ReadAttempt(tuple(logs))
     except DataError as error:
-        return _Tried(problem=str(error).splitlines()[0].replace("robot.toml ", ""))
+        return _ReadAttempt(problem=str(error).splitlines()[0].replace("robot.toml ", ""))

@@ -6,9 +6,8 @@ import numpy as np
 
 from slipid.data.reading.units import factor
 from slipid.data.wheel_signals import body_steps
-from slipid.job.new.answers import Answers, Told
-from slipid.job.new.look.signals.study import Study, pose_study
-from slipid.job.new.questions import ask
+from slipid.job.new.look.study import Study, pose_study
+from slipid.job.new.robot_questions import RobotAnswers, RobotOptions, ask
 from slipid.job.new.sketch import Hint
 
 _SIDEWAYS = 0.3
@@ -16,25 +15,25 @@ _SIDEWAYS = 0.3
 
 
 @dataclass(frozen=True)
-class Guessed:
+class GuessedRobot:
     """A robot, with what is to be asked of it in words that fit the logs."""
 
-    robot: Answers
+    robot: RobotAnswers
     hints: tuple[Hint, ...]
 
 
-def robot_from(told: Told, wheels: int, files: tuple[Study, ...]) -> Guessed:
-    """The robot as told, the rest as the logs have it; DataError as of `ask`."""
+def robot_from(options: RobotOptions, wheels: int, files: tuple[Study, ...]) -> GuessedRobot:
+    """The robot of the options, the rest as the logs have it; DataError as of `ask`."""
     drive, hint = _drive(wheels, sideways(files))
-    drive = told.drive or drive
-    if wheels == 2 and drive in ("mecanum", "skid") and told.shared is None:
-        told = replace(told, shared="yes")
-    if wheels >= 3 and drive == "omni" and told.wheels is None and told.azimuths_deg is None:
-        told = replace(told, wheels=str(wheels))
-    known = ask(told, None, drive)
-    if drive == "general" and told.places_m is None and wheels >= 2:
+    drive = options.drive or drive
+    if wheels == 2 and drive in ("mecanum", "skid") and options.shared is None:
+        options = replace(options, shared="yes")
+    if wheels >= 3 and drive == "omni" and options.wheels is None and options.azimuths_deg is None:
+        options = replace(options, wheels=str(wheels))
+    known = ask(options, None, drive)
+    if drive == "general" and options.places_m is None and wheels >= 2:
         known = _in_rows(known, wheels)
-    return Guessed(known, (Hint("drive", hint),))
+    return GuessedRobot(known, (Hint("drive", hint),))
 
 
 def _drive(wheels: int, aside: bool | None) -> tuple[str, str]:
@@ -79,7 +78,7 @@ def sideways(files: tuple[Study, ...]) -> bool | None:
     return left > _SIDEWAYS * (ahead + left) if ahead + left > 0 else None
 
 
-def _in_rows(known: Answers, wheels: int) -> Answers:
+def _in_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
     """Wheels in two rows, left and right, as a place to start from; in one where they are odd."""
     pairs = wheels // 2
     places = [

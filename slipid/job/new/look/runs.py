@@ -3,11 +3,17 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from slipid.job.new.look.columns.found import without
-from slipid.job.new.look.files.file import SUFFIXES, head_of, heads_below
-from slipid.job.new.look.files.formats import likely_presets
-from slipid.job.new.look.files.kinds import Kind, kinds_of, pattern_beside
-from slipid.job.new.look.signals.study import Study, study
+from slipid.data.reading.table_format import format_of
+from slipid.job.new.look.file_channels import without
+from slipid.job.new.look.kinds import (
+    SUFFIXES,
+    Kind,
+    formats_below,
+    kinds_of,
+    likely_presets,
+    pattern_beside,
+)
+from slipid.job.new.look.study import Study, study
 from slipid.support.errors import DataError
 
 _RUNS = 4
@@ -44,10 +50,10 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False)
-class Sorted:
+class SortedLogs:
     """All files that were found: those of published formats, and others by run.
 
-    `told` are lines about what was found and left out.
+    `sentences` are lines about what was found and left out.
     """
 
     root: Path
@@ -55,25 +61,25 @@ class Sorted:
     groups: tuple[Group, ...]
     also: tuple[Kind, ...]
     hints: tuple[str, ...]
-    told: tuple[str, ...]
+    sentences: tuple[str, ...]
     no_logs: tuple[Path, ...]
 
 
-def sorted_logs(path: Path) -> Sorted:
+def sorted_logs(path: Path) -> SortedLogs:
     """All files that belong to what was named."""
     if path.is_dir():
-        heads, no_logs = heads_below(path)
-        root, kinds = path, kinds_of(heads)
+        formats, no_logs = formats_below(path)
+        root, kinds = path, kinds_of(formats)
     else:
-        heads, no_logs = [head_of(path)], []
-        root, kinds = path.parent, kinds_of(heads)
+        formats, no_logs = [format_of(path)], []
+        root, kinds = path.parent, kinds_of(formats)
     presets, others, hints = [], [], []
     for kind in kinds:
         likely = likely_presets(kind)
         if likely.sure:
             presets.append((kind, likely.sure))
             continue
-        others.append((kind, study(kind.heads[0])))
+        others.append((kind, study(kind.formats[0])))
         if likely.perhaps:
             hints.append(
                 f"If {kind.paths[0].name} is of the published logs: format = "
@@ -82,13 +88,17 @@ def sorted_logs(path: Path) -> Sorted:
     if path.is_file() and others and not _complete(others[0][1]):
         others += _siblings(path, others[0][0])
     groups, left_out = _groups(others)
-    told = [f"{len(kind.paths)} of format {name}: {kind.paths[0]} ..." for kind, name in presets]
-    told += [_found(group) for group in groups]
-    told += [f"left out: {line}" for line in (*left_out, *(one.why for one in no_logs[:3]))]
-    told += [f"left out: {len(no_logs) - 3} more that are no logs"] * (len(no_logs) > 3)
+    sentences = [
+        f"{len(kind.paths)} of format {name}: {kind.paths[0]} ..." for kind, name in presets
+    ]
+    sentences += [_found(group) for group in groups]
+    sentences += [f"left out: {line}" for line in (*left_out, *(one.why for one in no_logs[:3]))]
+    sentences += [f"left out: {len(no_logs) - 3} more that are no logs"] * (len(no_logs) > 3)
     paths = tuple(one.path for one in no_logs)
     also = tuple(kind for kind, _ in others)
-    return Sorted(root, tuple(presets), tuple(groups), also, tuple(hints), tuple(told), paths)
+    return SortedLogs(
+        root, tuple(presets), tuple(groups), also, tuple(hints), tuple(sentences), paths
+    )
 
 
 def _siblings(path: Path, kind: Kind) -> list[tuple[Kind, Study]]:
@@ -97,11 +107,11 @@ def _siblings(path: Path, kind: Kind) -> list[tuple[Kind, Study]]:
     out = []
     for other in near:
         try:
-            head = head_of(other)
+            format = format_of(other)
         except DataError:
             continue
-        if head.signature != kind.heads[0].signature:
-            out.append((Kind((head,)), study(head)))
+        if format.signature != kind.formats[0].signature:
+            out.append((Kind((format,)), study(format)))
     return out
 
 
@@ -143,17 +153,17 @@ def _groups(kinds: list[tuple[Kind, Study]]) -> tuple[list[Group], list[str]]:
 
 def _further(group: Group) -> tuple[Group, ...]:
     """Some more runs of a kind, spread over all of them."""
-    count = len(group.kind.heads)
+    count = len(group.kind.formats)
     chosen = sorted({k * count // (_RUNS + 1) for k in range(1, _RUNS + 1)} - {0})
     out = []
     for k in chosen:
-        head = group.kind.heads[k]
+        format = group.kind.formats[k]
         names = [
-            (n, head.path.parent / n.replace("{stem}", head.path.stem)) for n, _ in group.beside
+            (n, format.path.parent / n.replace("{stem}", format.path.stem)) for n, _ in group.beside
         ]
         try:
-            beside = tuple((name, study(head_of(path))) for name, path in names)
-            out.append(Group(group.kind, study(head), beside))
+            beside = tuple((name, study(format_of(path))) for name, path in names)
+            out.append(Group(group.kind, study(format), beside))
         except DataError:
             continue  # the reader will say it of this run; the first one tells enough
     return tuple(out)
@@ -166,10 +176,10 @@ def _together(one: Study, other: Study) -> bool:
 
 def _found(group: Group) -> str:
     """What a group of files holds, in a sentence."""
-    said = [", ".join(found.channel for found in one.columns.found) for one in group.all]
+    listed = [", ".join(found.channel for found in one.columns.found) for one in group.all]
     more = [
         f"; beside it {name}: {channels}"
-        for (name, _), channels in zip(group.beside, said[1:], strict=True)
+        for (name, _), channels in zip(group.beside, listed[1:], strict=True)
     ]
     like = f"{len(group.kind.paths)} like {group.kind.paths[0]}"
-    return f"{like}: {said[0] or 'nothing known'}{''.join(more)}"
+    return f"{like}: {listed[0] or 'nothing known'}{''.join(more)}"

@@ -1,23 +1,89 @@
-"""Definitions of message types: from the bag, from a folder of .msg files, or the standard ones."""
+"""Types of messages: resolved to numbers and texts, from the bag, .msg files or the standard."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Union, cast
 
-from slipid.data.reading.bag.messages.kinds import Field, Kind, Many, Message, Number, Text
 from slipid.support.errors import DataError, bad_data
 
-if TYPE_CHECKING:
-    import rosbags.interfaces
-    import rosbags.interfaces.typing
-
+Kind = Union["NumberType", "Text", "Many", "Message"]
+"""Of a field: one number, one text, several of a kind, or a message of its own."""
 _DTYPES = {
     **{f"int{8 * size}": f"i{size}" for size in (1, 2, 4, 8)},
     **{f"uint{8 * size}": f"u{size}" for size in (1, 2, 4, 8)},
     **{"float32": "f4", "float64": "f8", "bool": "b1", "byte": "i1", "char": "u1"},
 }
+_NAMES = {dtype: name for name, dtype in reversed(_DTYPES.items())}
 _SEPARATOR = "=" * 80 + "\n"
+
+
+@dataclass(frozen=True)
+class NumberType:
+    """A number: its numpy type without byte order, such as `f8`."""
+
+    dtype: str
+
+    @property
+    def size(self) -> int:
+        """Bytes that it takes."""
+        return int(self.dtype[1:])
+
+
+@dataclass(frozen=True)
+class Text:
+    """A text in UTF-8."""
+
+
+@dataclass(frozen=True)
+class Many:
+    """Several of a kind: `count` of them, or None where each message says how many."""
+
+    element: Kind
+    count: int | None
+
+
+@dataclass(frozen=True)
+class MessageField:
+    """A field of a message by name."""
+
+    name: str
+    kind: Kind
+
+
+@dataclass(frozen=True)
+class Message:
+    """A type of message: its name, as `sensor_msgs/msg/Imu`, and its fields in order."""
+
+    name: str
+    fields: tuple[MessageField, ...]
+
+    @property
+    def paths(self) -> dict[str, str]:
+        """Dotted path of every number and text in it, and what is there: `float64[]`, `text`."""
+        return dict(_below(self, ""))
+
+
+def _below(kind: Kind, path: str) -> Iterator[tuple[str, str]]:
+    """Paths at and below a field."""
+    if isinstance(kind, NumberType):
+        yield path, _NAMES.get(kind.dtype, kind.dtype)
+    elif isinstance(kind, Text):
+        yield path, "text"
+    elif isinstance(kind, Many):
+        count = "" if kind.count is None else str(kind.count)
+        for below, what in _below(kind.element, path):
+            # arrays in messages of an array: the brackets stand behind the name of the number
+            yield below, f"{what}[{count}]"
+    else:
+        for field in kind.fields:
+            yield from _below(field.kind, f"{path}.{field.name}" if path else field.name)
+
+
+if TYPE_CHECKING:
+    import rosbags.interfaces
+    import rosbags.interfaces.typing
 
 
 class NoDefinition(ValueError):
@@ -41,7 +107,7 @@ class Definitions:
         fields = self.own.get(name) or _from_folder(self.folder, name) or _standard().get(name)
         if fields is None:
             raise NoDefinition(name)
-        found = (Field(key, self._kind(description)) for key, description in fields[1])
+        found = (MessageField(key, self._kind(description)) for key, description in fields[1])
         return Message(name, tuple(found))
 
     def _kind(self, description: "rosbags.interfaces.typing.FieldDesc") -> Kind:
@@ -56,13 +122,13 @@ class Definitions:
         return Many(self._kind(element), count if what == Nodetype.ARRAY else None)
 
 
-def _plain(base: str) -> Number | Text:
+def _plain(base: str) -> NumberType | Text:
     """A number or a text by the name of its type."""
     if base == "string":
         return Text()
     if base not in _DTYPES:
         raise NoDefinition(base)
-    return Number(_DTYPES[base])
+    return NumberType(_DTYPES[base])
 
 
 def definition_of(

@@ -4,11 +4,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from slipid.data.reading.bag.layout import EFFORT, TopicChannel
-from slipid.data.reading.bag.messages.kinds import Message
+from slipid.data.reading.bag.messages.definitions import Message
 from slipid.data.reading.bag.messages.picks import FieldPick, JointPick, Pick
 from slipid.data.reading.bag.messages.shape import steps_of
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL
-from slipid.data.reading.units import factor
+from slipid.data.reading.units import converts, factor
 from slipid.support.errors import near
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -17,7 +17,7 @@ _JOINT_ARRAYS = {"position": "rad", "velocity": "rad/s", "effort": None}
 
 
 @dataclass(frozen=True)
-class _Known:
+class _KnownField:
     """A field whose meaning is known: its path, and the unit of its numbers."""
 
     path: str
@@ -25,21 +25,21 @@ class _Known:
 
 
 # By the name of the type; without a package where several packages have their own copy of it.
-_KNOWN: dict[str, dict[str, _Known]] = {
-    "sensor_msgs/msg/Imu": {"gyro": _Known("angular_velocity.z", "rad/s")},
+_KNOWN: dict[str, dict[str, _KnownField]] = {
+    "sensor_msgs/msg/Imu": {"gyro": _KnownField("angular_velocity.z", "rad/s")},
     "sensor_msgs/msg/BatteryState": {
-        "bus_voltage": _Known("voltage", "V"),
-        "current": _Known("current", "A"),
+        "bus_voltage": _KnownField("voltage", "V"),
+        "current": _KnownField("current", "A"),
     },
     # the packages robotino_msgs and rto_msgs
     "MotorReadings": {
-        "motor_speed": _Known("velocities", "rpm"),
-        "wheel_ticks": _Known("positions", "tick"),
-        "current": _Known("currents", "A"),
+        "motor_speed": _KnownField("velocities", "rpm"),
+        "wheel_ticks": _KnownField("positions", "tick"),
+        "current": _KnownField("currents", "A"),
     },
     "PowerReadings": {
-        "bus_voltage": _Known("voltage", "V"),
-        "current": _Known("current", "A"),
+        "bus_voltage": _KnownField("voltage", "V"),
+        "current": _KnownField("current", "A"),
     },
 }
 _POSES = ("pose.pose", "pose", "transform", "")
@@ -161,17 +161,10 @@ def _check_unit(channel: str, path: str, unit: str) -> None:
         fitting = [
             name
             for name, wanted in CHANNELS.items()
-            if name not in ("time", channel) and _converts(unit, wanted)
+            if name not in ("time", channel) and converts(unit, wanted)
         ]
         other = f"; numbers in {unit} belong to {' or '.join(fitting)}" if fitting else ""
         raise Unfit(f"field '{path}': {error}", f"a field of {channel}{other}") from error
-
-
-def _converts(unit: str, target: str) -> bool:
-    try:
-        return factor(unit, target) > 0
-    except ValueError:
-        return False
 
 
 def _check_number(path: str, message: Message) -> None:
@@ -184,7 +177,7 @@ def _check_number(path: str, message: Message) -> None:
         raise Unfit(f"field '{path}' of {message.name} is a text", "a field with numbers")
 
 
-def _known(message: Message) -> dict[str, _Known]:
+def _known(message: Message) -> dict[str, _KnownField]:
     """What is known of a type: by its whole name, else by its name without the package."""
     return _KNOWN.get(message.name) or _KNOWN.get(message.name.rsplit("/", 1)[-1], {})
 

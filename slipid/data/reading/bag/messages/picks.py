@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
-from slipid.data.reading.bag.messages.shape import Place, Shape, Step, steps_of
+from slipid.data.reading.bag.messages.shape import BytePlace, MessageShape, PathStep, steps_of
 
 STAMPS = ("header.stamp", "stamp")
 """Where messages that have a time of their own keep it."""
@@ -21,16 +21,16 @@ class Located:
         numbers: the wanted ones in order, None for one that is not in these messages.
     """
 
-    seconds: Place | None
-    nanoseconds: Place | None
-    numbers: tuple[Place | None, ...]
+    seconds: BytePlace | None
+    nanoseconds: BytePlace | None
+    numbers: tuple[BytePlace | None, ...]
 
 
 @runtime_checkable
 class Pick(Protocol):
     """What is wanted of the messages of a topic: one row of numbers a message, or none, or more."""
 
-    def located(self, shape: Shape) -> tuple[Located, ...]:
+    def located(self, shape: MessageShape) -> tuple[Located, ...]:
         """The rows in messages of a shape."""
 
     @property
@@ -44,18 +44,18 @@ class FieldPick:
 
     Attributes:
         paths: of the fields.
-        seen: name of each number, as the first message told them.
+        names: name of each number, as the first message has them.
     """
 
     paths: tuple[str, ...]
-    seen: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
 
     @property
     def columns(self) -> tuple[str, ...]:
-        return self.seen or self.paths
+        return self.names or self.paths
 
-    def located(self, shape: Shape) -> tuple[Located, ...]:
-        numbers: list[Place] = []
+    def located(self, shape: MessageShape) -> tuple[Located, ...]:
+        numbers: list[BytePlace] = []
         names: list[str] = []
         for path in self.paths:
             places = shape.places(steps_of(path))
@@ -63,7 +63,7 @@ class FieldPick:
             names += [path] if len(places) == 1 else [f"{path}[{k}]" for k in range(len(places))]
         if not numbers:
             return ()
-        self.seen = self.seen or tuple(names)
+        self.names = self.names or tuple(names)
         return (_located(shape, (), numbers),)
 
 
@@ -74,21 +74,21 @@ class JointPick:
     Attributes:
         joints: names of the wanted ones, in the order of the columns.
         array: which array holds the numbers: `position`, `velocity` or `effort`.
-        seen: every name that was in some message.
+        names: every name that was in some message.
     """
 
     joints: tuple[str, ...]
     array: str
-    seen: dict[str, None] = field(default_factory=dict)
+    names: dict[str, None] = field(default_factory=dict)
 
     @property
     def columns(self) -> tuple[str, ...]:
         return self.joints
 
-    def located(self, shape: Shape) -> tuple[Located, ...]:
-        names = shape.texts((Step("name"),))
-        self.seen.update(dict.fromkeys(names))
-        places = shape.places((Step(self.array),))
+    def located(self, shape: MessageShape) -> tuple[Located, ...]:
+        names = shape.texts((PathStep("name"),))
+        self.names.update(dict.fromkeys(names))
+        places = shape.places((PathStep(self.array),))
         # an array may be left empty; of any other length it says nothing of the names
         have = dict(zip(names, places, strict=True)) if len(places) == len(names) else {}
         numbers = [have.get(joint) for joint in self.joints]
@@ -115,18 +115,18 @@ class TransformPick:
     def columns(self) -> tuple[str, ...]:
         return (*POSITION, *ROTATION)
 
-    def located(self, shape: Shape) -> tuple[Located, ...]:
+    def located(self, shape: MessageShape) -> tuple[Located, ...]:
         rows = []
         for k, edge in enumerate(edges_of(shape)):
             if edge == self.edge:
-                first = (Step("transforms", k),)
+                first = (PathStep("transforms", k),)
                 paths = [(*first, *steps_of(f"transform.{name}")) for name in self.columns]
                 numbers = [place for path in paths for place in shape.places(path)]
                 rows.append(_located(shape, first, numbers))
         return tuple(rows)
 
 
-def edges_of(shape: Shape) -> tuple[Edge, ...]:
+def edges_of(shape: MessageShape) -> tuple[Edge, ...]:
     """Every transform of a TFMessage, names without the slash that ROS 1 once began them with."""
     parents = shape.texts(steps_of("transforms.header.frame_id"))
     children = shape.texts(steps_of("transforms.child_frame_id"))
@@ -134,7 +134,9 @@ def edges_of(shape: Shape) -> tuple[Edge, ...]:
     return tuple(Edge(parent.lstrip("/"), child.lstrip("/")) for parent, child in pairs)
 
 
-def _located(shape: Shape, first: tuple[Step, ...], numbers: Sequence[Place | None]) -> Located:
+def _located(
+    shape: MessageShape, first: tuple[PathStep, ...], numbers: Sequence[BytePlace | None]
+) -> Located:
     """With the time of the message, or of the part of it that `first` leads to."""
     for stamp in STAMPS:
         whole, part = (

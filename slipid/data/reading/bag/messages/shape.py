@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from slipid.data.reading.bag.messages.kinds import Kind, Many, Message, Number, Text
+from slipid.data.reading.bag.messages.definitions import Kind, Many, Message, NumberType, Text
 
 
 @dataclass(frozen=True)
-class Step:
+class PathStep:
     """One step of a path: the name of a field, and which element of it, or None for all."""
 
     name: str
@@ -25,7 +25,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Place:
+class BytePlace:
     """A number in a message: its first byte, and its numpy type with byte order."""
 
     offset: int
@@ -44,7 +44,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Leaf:
+class MessageLeaf:
     """What lies at one path of a message.
 
     Attributes:
@@ -55,23 +55,23 @@ class Leaf:
         text: of a text.
     """
 
-    path: tuple[Step, ...]
+    path: tuple[PathStep, ...]
     dtype: str
     offset: int
     count: int | None = None
     text: str = ""
 
-    def places(self, index: int | None) -> tuple[Place, ...]:
+    def places(self, index: int | None) -> tuple[BytePlace, ...]:
         """Places of its numbers, or of the one with an index."""
         size = int(self.dtype[2:])
         every = range(1 if self.count is None else self.count)
         if index is not None:
             every = every[index : index + 1]
-        return tuple(Place(self.offset + k * size, self.dtype) for k in every)
+        return tuple(BytePlace(self.offset + k * size, self.dtype) for k in every)
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class MessageShape:
     """How the messages of a topic that look like one of them are laid out.
 
     Attributes:
@@ -82,7 +82,7 @@ class Shape:
     """
 
     size: int
-    leaves: tuple[Leaf, ...]
+    leaves: tuple[MessageLeaf, ...]
     fixed: Int[np.ndarray, " fixed"]
     values: UInt8[np.ndarray, " fixed"]
 
@@ -90,19 +90,19 @@ class Shape:
         """Which of some messages of its size have this shape."""
         return np.all(block[:, self.fixed] == self.values, axis=1)
 
-    def places(self, path: Sequence[Step]) -> tuple[Place, ...]:
+    def places(self, path: Sequence[PathStep]) -> tuple[BytePlace, ...]:
         """Places of the numbers at a path, none where there are none."""
         return tuple(p for leaf, index in self._at(path) if leaf.dtype for p in leaf.places(index))
 
-    def texts(self, path: Sequence[Step]) -> tuple[str, ...]:
+    def texts(self, path: Sequence[PathStep]) -> tuple[str, ...]:
         """Texts at a path."""
         return tuple(leaf.text for leaf, _ in self._at(path) if not leaf.dtype)
 
-    def count(self, path: Sequence[Step]) -> int:
+    def count(self, path: Sequence[PathStep]) -> int:
         """How many numbers or texts are at a path."""
         return sum(1 if leaf.count is None else leaf.count for leaf, _ in self._at(path))
 
-    def _at(self, path: Sequence[Step]) -> list[tuple[Leaf, int | None]]:
+    def _at(self, path: Sequence[PathStep]) -> list[tuple[MessageLeaf, int | None]]:
         """Leaves at a path, and which of its elements is meant."""
         found = []
         for leaf in self._by_names.get(tuple(step.name for step in path), ()):
@@ -116,14 +116,14 @@ class Shape:
         return found
 
     @cached_property
-    def _by_names(self) -> dict[tuple[str, ...], list[Leaf]]:
-        leaves: dict[tuple[str, ...], list[Leaf]] = {}
+    def _by_names(self) -> dict[tuple[str, ...], list[MessageLeaf]]:
+        leaves: dict[tuple[str, ...], list[MessageLeaf]] = {}
         for leaf in self.leaves:
             leaves.setdefault(tuple(step.name for step in leaf.path), []).append(leaf)
         return leaves
 
 
-def steps_of(path: str) -> tuple[Step, ...]:
+def steps_of(path: str) -> tuple[PathStep, ...]:
     """Steps of a path as people write it, such as `motors[0].current`; ValueError otherwise."""
     steps = []
     for part in path.split("."):
@@ -132,11 +132,11 @@ def steps_of(path: str) -> tuple[Step, ...]:
         whole = not bracket or (bool(end) and not after and index.isdecimal())
         if not (name.isidentifier() and whole):
             raise ValueError(f"no path of a field: '{path}'; expected such as motors[0].current")
-        steps.append(Step(name, int(index) if bracket else None))
+        steps.append(PathStep(name, int(index) if bracket else None))
     return tuple(steps)
 
 
-def shape_of(raw: bytes, message: Message, *, cdr: bool) -> Shape:
+def shape_of(raw: bytes, message: Message, *, cdr: bool) -> MessageShape:
     """Shape of one message.
 
     Args:
@@ -147,23 +147,23 @@ def shape_of(raw: bytes, message: Message, *, cdr: bool) -> Shape:
     Raises:
         ValueError: the bytes are no such message; the text says why.
     """
-    walk = _Walk(raw, cdr)
+    walk = _MessageWalk(raw, cdr)
     walk.through(message, ())
     over = len(raw) - walk.at
     if not 0 <= over < (4 if cdr else 1):
         raise ValueError(f"{over} bytes are left over after its last field")
     fixed = np.concatenate([np.arange(0), *(np.arange(a, b) for a, b in walk.fixed)])
     values = np.frombuffer(raw, np.uint8)[fixed]
-    return Shape(len(raw), tuple(walk.leaves), fixed, values)
+    return MessageShape(len(raw), tuple(walk.leaves), fixed, values)
 
 
-class _Walk:
+class _MessageWalk:
     """A walk through the bytes of one message, which notes what it passes."""
 
     def __init__(self, raw: bytes, cdr: bool) -> None:
         self.raw, self.cdr, self.order = raw, cdr, "<"
         self.at = self.origin = 0
-        self.leaves: list[Leaf] = []
+        self.leaves: list[MessageLeaf] = []
         self.fixed: list[tuple[int, int]] = []
         if cdr:
             if raw[:2] not in (b"\x00\x00", b"\x00\x01") or len(raw) < 4:
@@ -172,32 +172,32 @@ class _Walk:
             self.at = self.origin = 4
             self.fixed.append((0, 2))
 
-    def through(self, kind: Kind, path: tuple[Step, ...]) -> None:
+    def through(self, kind: Kind, path: tuple[PathStep, ...]) -> None:
         """Note the leaves of a field."""
-        if isinstance(kind, Number):
+        if isinstance(kind, NumberType):
             dtype = self.order + kind.dtype
-            self.leaves.append(Leaf(path, dtype, self.numbers(kind.size, 1)))
+            self.leaves.append(MessageLeaf(path, dtype, self.numbers(kind.size, 1)))
         elif isinstance(kind, Text):
-            self.leaves.append(Leaf(path, "", self.at, None, self.text()))
+            self.leaves.append(MessageLeaf(path, "", self.at, None, self.text()))
         elif isinstance(kind, Message):
             for field in kind.fields:
-                self.through(field.kind, (*path, Step(field.name)))
+                self.through(field.kind, (*path, PathStep(field.name)))
         else:
             self.several(kind, path)
 
-    def several(self, kind: Many, path: tuple[Step, ...]) -> None:
+    def several(self, kind: Many, path: tuple[PathStep, ...]) -> None:
         """Note the leaves of an array."""
         count = self.length() if kind.count is None else kind.count
-        if isinstance(kind.element, Number):
+        if isinstance(kind.element, NumberType):
             dtype = self.order + kind.element.dtype
             at = self.numbers(kind.element.size, count)
-            self.leaves.append(Leaf(path, dtype, at, count))
+            self.leaves.append(MessageLeaf(path, dtype, at, count))
             return
         if count > len(self.raw) - self.at:
             raise ValueError(f"it ends before the {count} elements of '{path[-1].name}'")
         *before, last = path
         for k in range(count):
-            self.through(kind.element, (*before, Step(last.name, k)))
+            self.through(kind.element, (*before, PathStep(last.name, k)))
 
     def numbers(self, size: int, count: int) -> int:
         """Pass some numbers and return their first byte."""

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from slipid.data.reading.bag.messages.kinds import Message
+from slipid.data.reading.bag.messages.definitions import Message
 from slipid.data.reading.bag.messages.picks import Located, Pick
-from slipid.data.reading.bag.messages.shape import Shape, shape_of
-from slipid.data.reading.bag.storage.opened import Batch
+from slipid.data.reading.bag.messages.shape import MessageShape, shape_of
+from slipid.data.reading.bag.storage.opened import MessageBatch
 from slipid.support.errors import DataError, bad_data
 
 MAX_SHAPES = 256
@@ -60,27 +60,16 @@ class Stream:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
-    """Rows of one pick in one batch, as in `Stream`."""
-
-    stamp: Int[np.ndarray, " row"] | None
-    received: Int[np.ndarray, " row"]
-    number: Int[np.ndarray, " row"]
-    values: Float[np.ndarray, "row column"]
-    absent: Bool[np.ndarray, "row column"]
-
-
-@dataclass(frozen=True, eq=False)
-class _Known:
+class _KnownShape:
     """A shape that was met, and where the numbers of each pick lie in it."""
 
-    shape: Shape
+    shape: MessageShape
     places: tuple[tuple[Located, ...], ...]
 
 
 @dataclass(frozen=True, eq=False)
 class _Alike:
-    """Messages of one shape: which of a batch they are, their bytes, and as in `_Known`."""
+    """Messages of one shape: which of a batch they are, their bytes, and as in `_KnownShape`."""
 
     which: Int[np.ndarray, " message"]
     block: UInt8[np.ndarray, "message byte"]
@@ -96,19 +85,22 @@ class TopicStreams:
         self.path, self.topic, self.message, self.cdr = path, topic, message, cdr
         self.picks = tuple(picks)
         self.count = 0
-        self._rows: list[list[_Rows]] = [[] for _ in self.picks]
-        self._shapes: dict[int, list[_Known]] = {}
+        self._rows: list[list[Stream]] = [[] for _ in self.picks]
+        self._shapes: dict[int, list[_KnownShape]] = {}
 
-    def add(self, batch: Batch) -> None:
+    def add(self, batch: MessageBatch) -> None:
         """Take the messages that follow in the topic."""
         if set(map(type, batch.data)) != {bytes}:
             raise topic_error(self.path, self.topic, "a message that is no bytes", "a whole bag")
         received = np.array(batch.received, dtype=np.int64)
         numbers = self.count + 1 + np.arange(len(received))
         for alike in self._alike(batch.data):
-            for rows, located in zip(self._rows, alike.places, strict=True):
-                which = alike.which
-                rows += [_taken(alike.block, received[which], numbers[which], x) for x in located]
+            which = alike.which
+            for pick, rows, located in zip(self.picks, self._rows, alike.places, strict=True):
+                rows += [
+                    self._taken(pick, alike.block, received[which], numbers[which], x)
+                    for x in located
+                ]
         self.count += len(received)
 
     def stream(self, pick: Pick) -> Stream:
@@ -160,7 +152,7 @@ class TopicStreams:
                     yield _Alike(left[same], block[same], one.places)
                     left, block = left[~same], block[~same]
 
-    def _known(self, data: bytes, number: int) -> _Known:
+    def _known(self, data: bytes, number: int) -> _KnownShape:
         """Shape of a message that has a new one, and where the wanted numbers lie in it."""
         try:
             shape = shape_of(data, self.message, cdr=self.cdr)
@@ -170,9 +162,27 @@ class TopicStreams:
             raise topic_error(self.path, self.topic, found, expected, number) from error
         if sum(map(len, self._shapes.values())) >= MAX_SHAPES:
             self._shapes.clear()
-        known = _Known(shape, tuple(pick.located(shape) for pick in self.picks))
+        known = _KnownShape(shape, tuple(pick.located(shape) for pick in self.picks))
         self._shapes.setdefault(shape.size, []).append(known)
         return known
+
+    def _taken(
+        self,
+        pick: Pick,
+        block: UInt8[np.ndarray, "message byte"],
+        received: Int[np.ndarray, " message"],
+        number: Int[np.ndarray, " message"],
+        located: Located,
+    ) -> Stream:
+        """The wanted numbers of some messages of one shape."""
+        columns = [np.zeros(len(block)) if p is None else p.of(block) for p in located.numbers]
+        absent = np.tile([place is None for place in located.numbers], (len(block), 1))
+        stamp = None
+        if located.seconds is not None and located.nanoseconds is not None:
+            stamp = located.seconds.whole(block) * 10**9 + located.nanoseconds.whole(block)
+        values = np.column_stack(columns)
+        where = (self.path, self.topic, pick.columns)
+        return Stream(*where, stamp, received, number, values, absent)
 
 
 def _laid(parts: Sequence[np.ndarray], none: np.ndarray) -> np.ndarray:
@@ -186,18 +196,3 @@ def topic_error(
     """The error about a topic, or about one of its messages, counted from 1."""
     where = f"{path} topic '{topic}'" + ("" if message is None else f" message {message}")
     return bad_data(where, found, expected)
-
-
-def _taken(
-    block: UInt8[np.ndarray, "message byte"],
-    received: Int[np.ndarray, " message"],
-    number: Int[np.ndarray, " message"],
-    located: Located,
-) -> _Rows:
-    """The wanted numbers of some messages of one shape."""
-    columns = [np.zeros(len(block)) if p is None else p.of(block) for p in located.numbers]
-    absent = np.tile([place is None for place in located.numbers], (len(block), 1))
-    stamp = None
-    if located.seconds is not None and located.nanoseconds is not None:
-        stamp = located.seconds.whole(block) * 10**9 + located.nanoseconds.whole(block)
-    return _Rows(stamp, received, number, np.column_stack(columns), absent)

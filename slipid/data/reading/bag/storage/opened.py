@@ -7,7 +7,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
-from slipid.data.reading.bag.storage.damage import damaged
 from slipid.data.reading.bag.storage.files import BagFiles, files_of
 from slipid.data.reading.bag.storage.mended import MendedMcap, mended
 from slipid.support.errors import DataError, bad_data
@@ -19,6 +18,12 @@ if TYPE_CHECKING:
 
 Reader: TypeAlias = "rosbags.rosbag1.Reader | rosbags.rosbag2.Reader"
 _BATCH_BYTES = 1 << 20
+_REMEDY = {
+    "rosbag1": "run: rosbag reindex {file}",
+    "sqlite3": "save what is left with: sqlite3 {file} .recover | sqlite3 whole.db3",
+    "mcap": "save what is left with: mcap recover {file} -o whole.mcap",
+}
+_METADATA = "copy the folder again, or run: ros2 bag reindex {file}"
 
 
 class Raw(NamedTuple):
@@ -30,7 +35,7 @@ class Raw(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class MessageBatch:
     """Messages of one topic that follow each other in it.
 
     Attributes:
@@ -121,7 +126,7 @@ class OpenBag:
             except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
                 raise damaged(self.files, error) from error
 
-    def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
+    def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
         """The same messages topic by topic, about a megabyte at a time.
 
         What is done for each message is done here, in one loop: on a big bag that is the work.
@@ -129,7 +134,7 @@ class OpenBag:
         Raises:
             DataError: the bag is damaged.
         """
-        waiting = {topic: Batch(topic, [], []) for topic in topics}
+        waiting = {topic: MessageBatch(topic, [], []) for topic in topics}
         room = dict.fromkeys(topics, _BATCH_BYTES)
         for reader in self.readers:
             wanted = [c for c in reader.connections if c.topic in waiting]
@@ -144,7 +149,7 @@ class OpenBag:
                     room[topic] -= len(data)
                     if room[topic] < 0:
                         yield batch
-                        waiting[topic], room[topic] = Batch(topic, [], []), _BATCH_BYTES
+                        waiting[topic], room[topic] = MessageBatch(topic, [], []), _BATCH_BYTES
             except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
                 raise damaged(self.files, error) from error
         yield from (batch for batch in waiting.values() if batch.data)
@@ -232,3 +237,26 @@ def _topic(name: str, same: "list[rosbags.interfaces.Connection]") -> StoredTopi
     carried = [c.msgdef for c in same if c.msgdef.format.value] or [same[0].msgdef]
     count = sum(connection.msgcount for connection in same)
     return StoredTopic(name, " and ".join(types), count, carried[0])
+
+
+def damaged(files: BagFiles, error: Exception) -> DataError:
+    """The error about a bag that rosbags cannot read."""
+    said = (str(error).splitlines() or [type(error).__name__])[0][:200]
+    file = files.parts[0]
+    if "not indexed" in said:
+        expected = f"a whole bag; {_REMEDY['rosbag1'].format(file=file)}"
+        return bad_data(files.path, "the bag has no index: its recording was cut off", expected)
+    if isinstance(error, PermissionError):
+        return bad_data(files.path, f"cannot be read ({error.strerror})", "a readable bag")
+    if isinstance(error, KeyError) and error.args[0] in ("protobuf", "jsonschema", "flatbuffer"):
+        found = f"it holds messages encoded as {error.args[0]}, which are not read"
+        expected = "ROS messages only; filter them out with: mcap filter"
+        return bad_data(files.path, found, expected)
+    if "Profile is not ros2" in said:
+        expected = "one that ROS 2 recorded (profile ros2); write it again with: ros2 bag convert"
+        return bad_data(files.path, "an MCAP file of another profile", expected)
+    remedy = _REMEDY[files.storage].format(file=file)
+    if "metadata" in said.lower() or "files are missing" in said:
+        remedy = _METADATA.format(file=files.path)
+    found = f"the bag is damaged or was cut off ({said})"
+    return bad_data(files.path, found, f"a whole one; {remedy}")

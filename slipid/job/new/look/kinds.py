@@ -1,4 +1,4 @@
-"""Log files of a folder sorted by kind: globs that find each, and which lie beside which."""
+"""Log files of a folder by kind: published formats, globs that find each, which lie together."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,26 +6,66 @@ from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from re import sub
 
-from slipid.job.new.look.files.file import Head
+from slipid.data.reading.layout import Layout
+from slipid.data.reading.presets import PRESETS
+from slipid.data.reading.reader import read_logs
+from slipid.data.reading.table_format import TableFormat, format_of
+from slipid.data.sanity.columns import refuse_misordered
+from slipid.support.errors import DataError
+
+SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".parquet")
+"""Of files that may be logs."""
+_TELLING = 8
+"""Named columns from which nobody else will have the same by chance."""
+_TRIED = 3
+"""Files that are read to see whether a preset fits."""
+
+
+@dataclass(frozen=True)
+class NoLog:
+    """A file that might have been a log, and why it is none."""
+
+    path: Path
+    why: str
+
+
+def formats_below(folder: Path) -> tuple[list[TableFormat], list[NoLog]]:
+    """Every log in a folder and below, and the files that are none.
+
+    Raises:
+        DataError: there is none.
+    """
+    found, not_logs = [], []
+    paths = sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix.lower() in SUFFIXES)
+    for path in paths:
+        try:
+            found.append(format_of(path))
+        except DataError as error:
+            not_logs.append(NoLog(path, str(error)))
+    if not found:
+        there = f"no log in {len(paths)} files" if paths else "no CSV or Parquet file below it"
+        listed = "".join(f"\n{one.why}" for one in not_logs[:3])
+        raise DataError(f"{folder}: {there}; expected logs of a robot{listed}")
+    return found, not_logs
 
 
 @dataclass(frozen=True)
 class Kind:
     """Files that are laid out alike, sorted by path."""
 
-    heads: tuple[Head, ...]
+    formats: tuple[TableFormat, ...]
 
     @property
     def paths(self) -> tuple[Path, ...]:
         """Where they are."""
-        return tuple(head.path for head in self.heads)
+        return tuple(one.path for one in self.formats)
 
 
-def kinds_of(heads: Sequence[Head]) -> list[Kind]:
+def kinds_of(formats: Sequence[TableFormat]) -> list[Kind]:
     """Files by kind, the kind with most of them first."""
-    groups: dict[Head, list[Head]] = {}
-    for head in heads:
-        groups.setdefault(head.signature, []).append(head)
+    groups: dict[TableFormat, list[TableFormat]] = {}
+    for one in formats:
+        groups.setdefault(one.signature, []).append(one)
     return [Kind(tuple(g)) for g in sorted(groups.values(), key=len, reverse=True)]
 
 
@@ -112,3 +152,50 @@ def pattern_beside(main: Kind, other: Kind) -> str | None:
 def a_folder_each(kind: Kind) -> bool:
     """Whether every file is alone of its kind in its folder: then the folder is a run."""
     return len(kind.paths) > 1 and len({path.parent for path in kind.paths}) == len(kind.paths)
+
+
+@dataclass(frozen=True)
+class Likely:
+    """Presets that a kind of files can be read with.
+
+    Attributes:
+        sure: that which uses most of their columns, if its names are telling.
+        perhaps: others, whose columns anybody could have.
+    """
+
+    sure: str | None
+    perhaps: tuple[str, ...]
+
+
+def likely_presets(kind: Kind) -> Likely:
+    """Presets that read the first files of a kind."""
+    fits = [name for name, layout in PRESETS.items() if _matches(kind.formats[0], layout)]
+    fits = [name for name in fits if _reads(kind, PRESETS[name])]
+    fits.sort(key=lambda name: len(PRESETS[name].columns), reverse=True)
+    telling = [name for name in fits if PRESETS[name].names_row and _many(PRESETS[name])]
+    sure = telling[0] if telling else None
+    return Likely(sure, tuple(name for name in fits if name not in telling))
+
+
+def _many(layout: Layout) -> bool:
+    return len(layout.columns) >= _TELLING
+
+
+def _matches(format: TableFormat, layout: Layout) -> bool:
+    """Whether names and numbers stand where a layout says."""
+    rows = (layout.delimiter, layout.names_row, layout.first_data_row)
+    if rows != (format.delimiter, format.names_row, format.first_data_row):
+        return False
+    if not layout.names_row:
+        return len(format.names) == 1 + max(int(column) for column in layout.columns)
+    return set(layout.columns) <= set(format.names)
+
+
+def _reads(kind: Kind, layout: Layout) -> bool:
+    for path in kind.paths[:_TRIED]:
+        try:
+            refuse_misordered(read_logs(path, layout, path.parent, "floor", "as_built").logs)
+        except DataError:
+            continue
+        return True
+    return False

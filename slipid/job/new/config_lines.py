@@ -13,7 +13,7 @@ Value = str | bool | int | float | list[int] | list[float] | list[str] | list[li
 
 
 @dataclass(frozen=True)
-class Line:
+class ConfigLine:
     """One key of a config.
 
     Attributes:
@@ -44,11 +44,11 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Block:
+class ConfigBlock:
     """A table of a config: its header, comments above it, its keys, comments at its end."""
 
     header: str
-    lines: tuple[Line, ...] = ()
+    lines: tuple[ConfigLine, ...] = ()
     above: tuple[str, ...] = ()
     below: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()
@@ -106,6 +106,6 @@ def wrapped(text: str, width: int) -> list[str]:
     return out
 
 
-def all_asked(blocks: Iterable[Block]) -> tuple[str, ...]:
+def all_asked(blocks: Iterable[ConfigBlock]) -> tuple[str, ...]:
     """Every open question of a config, in its order."""
     return tuple(question for block in blocks for question in block.asked)

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from slipid.data.reading.column_names import ColumnMeaning, meaning_of
 from slipid.data.reading.layout import PER_WHEEL
-from slipid.job.new.look.columns.names import Named, named
-from slipid.job.new.look.files.file import Numbers
+from slipid.data.reading.table_format import TableNumbers
 
 _ORDER = ("fl", "fr", "ml", "mr", "rl", "rr", "l", "r")
 """Wheels as the drives count them."""
@@ -20,7 +20,7 @@ _COUNTS = 50
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class FileChannel:
     """A channel and where it is.
 
     Attributes:
@@ -41,7 +41,7 @@ class Found:
 
 
 @dataclass(frozen=True, eq=False)
-class Columns:
+class FileChannels:
     """What is in a file.
 
     Attributes:
@@ -50,20 +50,20 @@ class Columns:
         notes: what people should know of it.
     """
 
-    found: tuple[Found, ...]
+    found: tuple[FileChannel, ...]
     unused: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
-    def get(self, channel: str) -> Found | None:
+    def get(self, channel: str) -> FileChannel | None:
         """A channel, if it is there."""
         return next((one for one in self.found if one.channel == channel), None)
 
-    def first(self, *channels: str) -> Found | None:
+    def first(self, *channels: str) -> FileChannel | None:
         """The first of some channels that is there."""
         return next((found for name in channels if (found := self.get(name))), None)
 
     @property
-    def turns(self) -> Found | None:
+    def turns(self) -> FileChannel | None:
         """The channel that tells how far the wheels turned."""
         return self.first(*TURNS)
 
@@ -79,41 +79,47 @@ class Columns:
         return bool(self.get("pose_x") and self.get("pose_y") and turned)
 
 
-def columns_of(numbers: Numbers) -> Columns:
+def columns_of(numbers: TableNumbers) -> FileChannels:
     """What the named columns of a file hold."""
-    head, said = numbers.head, {}
-    for at, name in enumerate(head.names):
+    format, meanings = numbers.format, {}
+    for at, name in enumerate(format.names):
         if at not in numbers.texts and name and not np.isnan(numbers.values[:, at]).all():
-            said[at] = named(name, head.units[at])
+            meanings[at] = meaning_of(name, format.units[at])
     channels: dict[str, dict[str, int]] = {}
     also: list[str] = []
-    for at, one in said.items():
+    for at, one in meanings.items():
         if not one.channel or one.channel == "odometry":
             continue
         there = channels.setdefault(one.channel, {})
         if one.label in there:
-            also.append(f"{head.names[at]} (as {head.names[there[one.label]]})")
+            also.append(f"{format.names[at]} (as {format.names[there[one.label]]})")
         else:
             there[one.label] = at
-    found = [_found(numbers, said, name, places) for name, places in channels.items()]
+    found = [_found(numbers, meanings, name, places) for name, places in channels.items()]
     found = _one_of_each(_told_apart(found))
-    notes = _odometry(numbers, said) + [f"not used, said twice: {', '.join(also)}"] * bool(also)
+    notes = _odometry(numbers, meanings) + [f"not used, said twice: {', '.join(also)}"] * bool(also)
     kept, dropped = _agreeing(found)
     used = {at for one in kept for at in one.at}
-    unused = [name for at, name in enumerate(head.names) if name and at in said and at not in used]
-    return Columns(tuple(kept), tuple(unused), tuple(notes + dropped))
+    unused = [
+        name for at, name in enumerate(format.names) if name and at in meanings and at not in used
+    ]
+    return FileChannels(tuple(kept), tuple(unused), tuple(notes + dropped))
 
 
-def _found(numbers: Numbers, said: dict[int, Named], channel: str, places: dict[str, int]) -> Found:
+def _found(
+    numbers: TableNumbers, meanings: dict[int, ColumnMeaning], channel: str, places: dict[str, int]
+) -> FileChannel:
     """A channel with its columns in order."""
     labels = sorted(places, key=rank)
     at = tuple(places[label] for label in labels)
-    units = Counter(said[k].unit for k in at)
-    doubts = [f"column '{numbers.head.names[k]}': {said[k].doubt}" for k in at if said[k].doubt]
+    units = Counter(meanings[k].unit for k in at)
+    doubts = [
+        f"column '{numbers.format.names[k]}': {meanings[k].doubt}" for k in at if meanings[k].doubt
+    ]
     if len(units) > 1:
         doubts.append(f"columns of one channel in several units ({', '.join(units)})")
     unit = units.most_common(1)[0][0]
-    return Found(channel, at, tuple(labels), numbers.values[:, at], unit, tuple(doubts))
+    return FileChannel(channel, at, tuple(labels), numbers.values[:, at], unit, tuple(doubts))
 
 
 def rank(label: str) -> tuple[int, int, str]:
@@ -125,7 +131,7 @@ def rank(label: str) -> tuple[int, int, str]:
     return (2, int(label) if label.isdecimal() else 0, label)
 
 
-def _told_apart(found: list[Found]) -> list[Found]:
+def _told_apart(found: list[FileChannel]) -> list[FileChannel]:
     """Positions are ticks where they are whole numbers; v is a speed where no speed is logged."""
     speeds = {one.labels for one in found if one.channel.endswith("_speed")}
     out = []
@@ -156,15 +162,15 @@ def _always_far(values: Float[np.ndarray, "row column"]) -> bool:
     return bool(known.size) and float(known.min()) > 0.5 * float(known.max()) > 0.0
 
 
-def _one_of_each(found: list[Found]) -> list[Found]:
+def _one_of_each(found: list[FileChannel]) -> list[FileChannel]:
     """The first of channels that turned out to be the same."""
-    out: dict[str, Found] = {}
+    out: dict[str, FileChannel] = {}
     for one in found:
         out.setdefault(one.channel, one)
     return list(out.values())
 
 
-def _agreeing(found: list[Found]) -> tuple[list[Found], list[str]]:
+def _agreeing(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
     """Channels that go together, and a line for each that is left out."""
     turns = [one for name in TURNS for one in found if one.channel == name]
     per_wheel = turns or [one for one in found if one.channel in PER_WHEEL]
@@ -182,20 +188,20 @@ def _agreeing(found: list[Found]) -> tuple[list[Found], list[str]]:
     return kept, dropped
 
 
-def _alike(labels: set[str], one: Found) -> bool:
+def _alike(labels: set[str], one: FileChannel) -> bool:
     """Whether channels name the same wheels, or one names sides and the other numbers."""
     numbers = all(label.isdecimal() for label in labels)
     return set(one.labels) == labels or numbers != all(label.isdecimal() for label in one.labels)
 
 
-def _odometry(numbers: Numbers, said: dict[int, Named]) -> list[str]:
-    names = [numbers.head.names[at] for at, one in said.items() if one.channel == "odometry"]
+def _odometry(numbers: TableNumbers, meanings: dict[int, ColumnMeaning]) -> list[str]:
+    names = [numbers.format.names[at] for at, one in meanings.items() if one.channel == "odometry"]
     if not names:
         return []
     return [f"{', '.join(names)}: odometry is no pose of its own, wheels tell it already"]
 
 
-def without_names(numbers: Numbers) -> Columns:
+def without_names(numbers: TableNumbers) -> FileChannels:
     """What columns without names may hold: time, a pose and whole numbers as ticks."""
     values = numbers.values
     whole = [k for k in range(values.shape[1]) if _counted(values[:, [k]])]
@@ -207,7 +213,7 @@ def without_names(numbers: Numbers) -> Columns:
     def put(channel: str, *at: int) -> None:
         labels = tuple(str(k + 1) for k in range(len(at)))
         doubt = (f"taken for {channel} by its numbers: is it?",)
-        found.append(Found(channel, at, labels, values[:, at], "", doubt))
+        found.append(FileChannel(channel, at, labels, values[:, at], "", doubt))
 
     if time is not None:
         put("time", time)
@@ -218,12 +224,12 @@ def without_names(numbers: Numbers) -> Columns:
             put(channel, at)
     used = {at for one in found for at in one.at}
     unused = tuple(str(k) for k in range(values.shape[1]) if k not in used)
-    return Columns(tuple(found), unused)
+    return FileChannels(tuple(found), unused)
 
 
-def without(columns: Columns, names: frozenset[str]) -> Columns:
-    """Columns less some channels, which another file of the run has as well."""
-    kept = tuple(one for one in columns.found if one.channel not in names)
-    again = sorted(one.channel for one in columns.found if one.channel in names)
-    said = (f"Also here, but taken from the other file: {', '.join(again)}.",) if again else ()
-    return replace(columns, found=kept, notes=(*columns.notes, *said))
+def without(channels: FileChannels, names: frozenset[str]) -> FileChannels:
+    """Channels of a file less some channels, which another file of the run has as well."""
+    kept = tuple(one for one in channels.found if one.channel not in names)
+    again = sorted(one.channel for one in channels.found if one.channel in names)
+    notes = (f"Also here, but taken from the other file: {', '.join(again)}.",) if again else ()
+    return replace(channels, found=kept, notes=(*channels.notes, *notes))

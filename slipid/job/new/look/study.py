@@ -1,22 +1,27 @@
-"""A file looked into: its columns, its clock in seconds, and what its signals are like."""
+"""A file looked into: its channels, clock and signals, and what files of a run tell together."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
+from slipid.data.reading.table_format import TableFormat, TableNumbers, numbers_of
 from slipid.data.reading.units import factor
 from slipid.data.wheel_signals import refresh_period
-from slipid.job.new.look.columns.found import Columns, Found, columns_of, without_names
-from slipid.job.new.look.files.file import Head, Numbers, numbers_of
-from slipid.job.new.look.signals.magnitudes import Unit, place_unit, speed_of, time_unit
+from slipid.job.new.look.file_channels import FileChannel, FileChannels, columns_of, without_names
+from slipid.job.new.look.magnitudes import Unit, place_unit, speed_of, time_unit
+from slipid.job.new.robot_questions import RobotAnswers
 
 METRES = Unit("m")
 _AHEAD = 2
 """Drives up to which all wheels point ahead."""
 _SPARSE = 0.02
 """Share of empty cells from which a channel is said to be slower than the rows."""
+CURRENTS = ("current", "motor_torque", "wheel_torque")
+SPEEDS = ("wheel_speed", "motor_speed")
+ANGLES = ("wheel_angle", "motor_angle")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,15 +35,15 @@ class Study:
         clock: unit of the time, or None without one.
     """
 
-    numbers: Numbers
-    columns: Columns
+    numbers: TableNumbers
+    columns: FileChannels
     time: Float[np.ndarray, " row"]
     clock: Unit | None
 
     @property
-    def head(self) -> Head:
+    def format(self) -> TableFormat:
         """Where things stand in the file."""
-        return self.numbers.head
+        return self.numbers.format
 
     @property
     def usual_step(self) -> float:
@@ -48,10 +53,10 @@ class Study:
         return float(np.median(steps)) if len(steps) else 1.0
 
 
-def study(head: Head) -> Study:
+def study(format: TableFormat) -> Study:
     """A file looked into; DataError where its numbers cannot be read."""
-    numbers = numbers_of(head)
-    columns = columns_of(numbers) if any(head.names) else without_names(numbers)
+    numbers = numbers_of(format)
+    columns = columns_of(numbers) if any(format.names) else without_names(numbers)
     found = columns.get("time")
     if found is None:
         return Study(numbers, columns, np.arange(len(numbers.values), dtype=float), None)
@@ -60,7 +65,7 @@ def study(head: Head) -> Study:
     return Study(numbers, columns, values * factor(clock.unit, "s"), clock)
 
 
-def rate(one: Study, found: Found) -> str:
+def rate(one: Study, found: FileChannel) -> str:
     """How often a channel is read, in words: by empty cells, by repeats, else by rows."""
     values, time = found.values[:, 0], one.time
     there = ~np.isnan(values) & ~np.isnan(time)
@@ -70,11 +75,11 @@ def rate(one: Study, found: Found) -> str:
     steps = np.diff(time)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
     empty = 1.0 - float(there.mean())
-    said = f"{_hertz(usual)}, empty in between" if empty > _SPARSE else _hertz(usual)
+    often = f"{_hertz(usual)}, empty in between" if empty > _SPARSE else _hertz(usual)
     period = refresh_period([(time, values)])
     if period is not None and period > 1.5 * usual:
-        return f"{said}; read anew {_hertz(period)}"
-    return said
+        return f"{often}; read anew {_hertz(period)}"
+    return often
 
 
 def _hertz(period: float) -> str:
@@ -82,7 +87,7 @@ def _hertz(period: float) -> str:
 
 
 @dataclass(frozen=True)
-class Motion:
+class PoseMotion:
     """How the robot moves by its pose.
 
     Attributes:
@@ -100,10 +105,10 @@ class Motion:
     steps: Float[np.ndarray, " pose"] | None = None
 
 
-def motion(one: Study | None) -> Motion:
+def motion(one: Study | None) -> PoseMotion:
     """How the robot moves by the pose in a file; nothing where it has none."""
     if one is None or not one.columns.has_pose:
-        return Motion()
+        return PoseMotion()
     x, y = one.columns.get("pose_x"), one.columns.get("pose_y")
     assert x is not None
     assert y is not None
@@ -115,15 +120,15 @@ def motion(one: Study | None) -> Motion:
     else:
         place = place_unit(one.time, px, py)
     if place.unit in ("pixel", "pixels", "pix", "px") or one.clock is None:
-        return Motion(place=place)
+        return PoseMotion(place=place)
     scale = factor(place.unit, "m")
     there = ~(np.isnan(px) | np.isnan(py) | np.isnan(one.time))
     time, px, py = one.time[there], px[there] * scale, py[there] * scale
     steps = np.append(0.0, np.hypot(np.diff(px), np.diff(py)))
-    return Motion(speed_of(time, px, py), place, time, px, py, steps)
+    return PoseMotion(speed_of(time, px, py), place, time, px, py, steps)
 
 
-def increments(found: Found, one: Study, moved: Motion) -> bool | None:
+def increments(found: FileChannel, one: Study, moved: PoseMotion) -> bool | None:
     """Whether ticks are those since the last row and not a sum; None where nothing tells.
 
     The way of the pose goes along with the ticks of each row, or with their changes.
@@ -154,7 +159,7 @@ def _in_parts(values: Float[np.ndarray, " row"], width: int) -> Float[np.ndarray
     return values[: count * width].reshape(count, width).sum(axis=1)
 
 
-def over_wheels(one: Study, speed: Found, moved: Motion) -> float | None:
+def over_wheels(one: Study, speed: FileChannel, moved: PoseMotion) -> float | None:
     """Speed of the pose over that of the wheels, of seconds in which they turn; None without both.
 
     It is the radius of wheels that all point ahead, if their speeds are in rad/s, and near it
@@ -183,7 +188,7 @@ def over_wheels(one: Study, speed: Found, moved: Motion) -> float | None:
     return ratio if ratio > 0 else None
 
 
-def signed(current: Found, speed: Found | None) -> bool | None:
+def signed(current: FileChannel, speed: FileChannel | None) -> bool | None:
     """Whether currents have a sign; None where nothing drove backwards and nothing tells."""
     values = current.values[~np.isnan(current.values)]
     most = float(np.abs(values).max(initial=0.0))
@@ -192,7 +197,7 @@ def signed(current: Found, speed: Found | None) -> bool | None:
     return False if driven_backwards(current, speed) else None
 
 
-def driven_backwards(current: Found, speed: Found | None) -> bool:
+def driven_backwards(current: FileChannel, speed: FileChannel | None) -> bool:
     """Whether currents are positive where wheels drive backwards, as magnitudes are.
 
     Two files with rows of their own do not tell.
@@ -205,7 +210,7 @@ def driven_backwards(current: Found, speed: Found | None) -> bool:
     return float(strong.mean()) > max(0.01, 3 * float(least.mean()))
 
 
-def of_battery(voltages: Sequence[Found], speed: Found | None) -> bool:
+def of_battery(voltages: Sequence[FileChannel], speed: FileChannel | None) -> bool:
     """Whether the voltage of some runs stays up whatever the wheels do, as a battery's does.
 
     Every run is measured by what is high in it: batteries of other robots, or other charges, are
@@ -223,3 +228,72 @@ def of_battery(voltages: Sequence[Found], speed: Found | None) -> bool:
 def pose_study(studies: tuple[Study, ...]) -> Study | None:
     """The file that has the pose."""
     return next((one for one in studies if one.columns.has_pose), None)
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What files of a run tell of each other.
+
+    Attributes:
+        robot: its sizes, as far as they are known.
+        main: the file that has the wheels; `all`: every file of the run.
+        others: the same of further runs, for what a single run may not show.
+    """
+
+    robot: RobotAnswers
+    main: Study
+    all: tuple[Study, ...]
+    others: tuple["Known", ...] = ()
+
+    @cached_property
+    def moved(self) -> PoseMotion:
+        """Motion by the pose."""
+        return motion(pose_study(self.all))
+
+    def find(self, *channels: str) -> FileChannel | None:
+        """The first of some channels, in any of the files."""
+        found = (one.columns.get(name) for name in channels for one in self.all)
+        return next((one for one in found if one is not None), None)
+
+    @property
+    def runs(self) -> tuple["Known", ...]:
+        """This run, and the others."""
+        return (self, *self.others)
+
+    @cached_property
+    def over_wheels(self) -> float | None:
+        """Speed of the pose over that of the wheels, the middle one of all runs."""
+        found = []
+        for run in self.runs:
+            speed = run.main.columns.first(*SPEEDS)
+            angle = run.main.columns.first(*ANGLES)
+            if speed is None and angle is not None and run.main.clock is not None:
+                rates = np.gradient(angle.values, run.main.time, axis=0)
+                speed = replace(angle, values=rates)
+            ratio = None if speed is None else over_wheels(run.main, speed, run.moved)
+            found += [ratio] if ratio is not None else []
+        return float(np.median(found)) if found else None
+
+    @property
+    def signed(self) -> bool | None:
+        """Whether currents have a sign in any of the runs; None where none tells."""
+        signs = [
+            signed(current, run.find(*SPEEDS))
+            for run in self.runs
+            if (current := run.find(*CURRENTS)) is not None
+        ]
+        return True if True in signs else False if False in signs else None
+
+    @property
+    def of_supply(self) -> bool:
+        """Whether currents are what the battery gives: positive both ways, negative at times."""
+        currents = [(run.find(*CURRENTS), run.find(*SPEEDS)) for run in self.runs]
+        known = [(current, speed) for current, speed in currents if current is not None]
+        both_ways = any(driven_backwards(current, speed) for current, speed in known)
+        return both_ways and any(np.nanmin(current.values) < 0.0 for current, _ in known)
+
+    @property
+    def radius(self) -> float | None:
+        """Wheel radius, where somebody said it [m]."""
+        taken = "wheel_radius_m" in self.robot.taken
+        return None if taken else self.robot.wheel_radius_m

@@ -105,39 +105,39 @@ def heading_unit(values: Float[np.ndarray, " row"], turned: float = 0.0) -> Unit
     return Unit("rad" if most < 30 else "deg", doubt=f"radians or degrees? It reaches {most:.4g}")
 
 
-def speed_unit(seen: float | None, radius: float | None) -> Unit:
+def speed_unit(ratio: float | None, radius: float | None) -> Unit:
     """Unit of wheel speeds, from the way of the pose, if there is one, and a radius, if it is said.
 
     Args:
-        seen: speed of the pose over that of the wheels, [m/s] over their unit.
+        ratio: speed of the pose over that of the wheels, [m/s] over their unit.
         radius: of the wheels [m], over the gear ratio for speeds of the motor.
     """
     options = "rad/s, rpm or deg/s; or m/s at the rim: then divide by the radius with scale"
-    if seen is None:
+    if ratio is None:
         return Unit("rad/s", doubt=f"in which unit: {options}?")
     if radius is not None:
-        units = {unit: seen / factor(unit, "rad/s") for unit in ("rad/s", "rpm", "deg/s", "rev/s")}
+        units = {unit: ratio / factor(unit, "rad/s") for unit in ("rad/s", "rpm", "deg/s", "rev/s")}
         best = min(units, key=lambda unit: abs(np.log(units[unit] / radius)))
         apart = abs(np.log(units[best] / radius))
-        if apart < 0.7 and apart < abs(np.log(seen)):
+        if apart < 0.7 and apart < abs(np.log(ratio)):
             return Unit(best, "as fast as the pose")
-    elif RADII[0] <= seen <= RADII[1]:
-        return Unit("rad/s", f"as fast as the pose with wheels of about {seen:.2g} m")
-    if 0.7 < seen < 1.5:
+    elif RADII[0] <= ratio <= RADII[1]:
+        return Unit("rad/s", f"as fast as the pose with wheels of about {ratio:.2g} m")
+    if 0.7 < ratio < 1.5:
         doubt = "as fast as the pose itself, hence m/s at the rim: put scale = 1 / wheel radius"
         return Unit("rad/s", doubt=doubt)
-    if RADII[0] <= seen / factor("rpm", "rad/s") <= RADII[1]:
+    if RADII[0] <= ratio / factor("rpm", "rad/s") <= RADII[1]:
         return Unit("rpm", doubt="rpm, or deg/s? With rad/s wheels would be too small")
     return Unit("rad/s", doubt=f"in which unit: {options}?")
 
 
-def angle_unit(seen: float | None, radius: float | None) -> Unit:
+def angle_unit(ratio: float | None, radius: float | None) -> Unit:
     """Unit of wheel angles; arguments as of `speed_unit`."""
-    if seen is None:
+    if ratio is None:
         return Unit("rad", doubt="radians, degrees, turns or ticks?")
     low, high = RADII if radius is None else (radius / 2, radius * 2)
     for unit in ("rad", "deg", "rev"):
-        if low <= seen / factor(unit, "rad") <= high:
+        if low <= ratio / factor(unit, "rad") <= high:
             return Unit(unit, "turns as far as the pose goes")
     return Unit("rad", doubt="radians, degrees, turns or ticks? The pose goes another way")
 

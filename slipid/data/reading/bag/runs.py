@@ -1,0 +1,300 @@
+"""Where the runs of a bag begin and end: by a topic, by pauses or by a table."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import inf, tau
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.log import Log
+from slipid.data.reading.bag.layout import TURNS, BagLayout, RunRule
+from slipid.data.reading.bag.messages.picks import STAMPS
+from slipid.data.reading.bag.messages.shape import MessageShape, shape_of, steps_of
+from slipid.data.reading.bag.messages.streams import topic_error
+from slipid.data.reading.bag.plan import message_of
+from slipid.data.reading.bag.storage.opened import OpenBag
+from slipid.data.reading.signal import Signal
+from slipid.support.errors import bad_data, near
+
+STILL = 0.02
+"""A wheel that turned by less [rad], or is turning slower [rad/s], stands still."""
+PAUSE_S = 1.0
+"""Pause at which a long drive is proposed to be cut [s]."""
+COLUMNS = ("start", "end", "surface", "load", "name", "bag")
+"""Columns that a table of runs may have; the first two it must have."""
+Value = str | float
+
+
+@dataclass(frozen=True)
+class RunSpan:
+    """One run in time.
+
+    Attributes:
+        start: of its time [s].
+        end: first time behind it [s].
+        suffix: what follows the bag's name; empty where it is to be numbered.
+        surface: name of the floor, or None.
+        load: name of the load set-up, or None.
+    """
+
+    start: float
+    end: float
+    suffix: str = ""
+    surface: str | None = None
+    load: str | None = None
+
+
+def run_spans(
+    bag: OpenBag, layout: BagLayout, signals: Mapping[str, Signal], notes: list[str]
+) -> tuple[RunSpan, ...]:
+    """The runs of a bag; all of it where the layout does not say what tells them apart.
+
+    Runs in which a wheel has fewer than two samples are left out, with a note.
+
+    Raises:
+        DataError: there is no run, or the topic or the table that tells them is wrong.
+    """
+    rule = layout.runs
+    if rule is None:
+        return (RunSpan(-inf, inf),)
+    first = min(float(signal.time[0]) for signal in signals.values())
+    if rule.topic is not None:
+        found = by_topic(bag, layout, rule)
+    elif rule.pause_s is not None:
+        found = by_pauses(layout, signals, rule.pause_s)
+    else:
+        found = by_table(bag.path, rule, first if rule.from_start else 0.0)
+    inside = [one for one in found if _sampled(signals, one)]
+    if not inside:
+        last = max(float(signal.time[-1]) for signal in signals.values())
+        raise bad_data(bag.path, *_none(rule, found, f"from {first:.3f} to {last:.3f} s"))
+    if len(inside) < len(found):
+        notes.append(f"{len(found) - len(inside)} runs left out in which the wheels were not seen")
+    return _named(inside)
+
+
+def _sampled(signals: Mapping[str, Signal], stretch: RunSpan) -> bool:
+    """Whether a run has two samples of every signal that tells of motion, or else of any."""
+    telling = [signals[name] for name in TURNS if name in signals] or list(signals.values())
+    ends = [np.searchsorted(signal.time, (stretch.start, stretch.end)) for signal in telling]
+    return all(end - first >= 2 for first, end in ends)
+
+
+def _none(rule: RunRule, found: Sequence[RunSpan], samples: str) -> tuple[str, str]:
+    """What was found instead of runs, and what was expected."""
+    times = ", ".join(f"{one.start:.3f} to {one.end:.3f} s" for one in found[:3])
+    if rule.pause_s is not None:
+        return "no run: no wheel moves", f"a wheel that turns by more than {STILL:g} rad"
+    if rule.topic is not None and not found:
+        between = ", ".join(repr(value) for value in rule.between)
+        return (
+            f"no run in topic '{rule.topic}'",
+            f"a value other than those between runs ({between})",
+        )
+    if rule.topic is not None:
+        found_ = f"no sample in the runs of topic '{rule.topic}' ({times})"
+        return found_, f'runs where the samples are, {samples}; perhaps stamp = "received"'
+    hint = "" if rule.from_start else "; where times count from the first sample: from_start = true"
+    where = f" ({times})" if found else ""
+    return f"no run of table {rule.table} lies in the bag{where}", f"times {samples}{hint}"
+
+
+def _named(found: Sequence[RunSpan]) -> tuple[RunSpan, ...]:
+    """Runs by their names, else by numbers; a single one without a name needs none."""
+    if len(found) == 1:
+        return tuple(found)
+    width = max(2, len(str(len(found))))
+    return tuple(
+        replace(one, suffix=one.suffix or f"#{k:0{width}d}") for k, one in enumerate(found, start=1)
+    )
+
+
+def by_pauses(layout: BagLayout, signals: Mapping[str, Signal], pause_s: float) -> list[RunSpan]:
+    """Runs between pauses, each with half of the shortest pause before and behind it.
+
+    Args:
+        layout: how the wheels are read.
+        signals: with one of `TURNS`.
+        pause_s: shortest time without motion that parts two runs [s].
+    """
+    moves = _moves(layout, signals)
+    if not len(moves):
+        return []
+    cuts = np.flatnonzero(np.diff(moves) > pause_s)
+    firsts, lasts = moves[[0, *(cuts + 1)]], moves[[*cuts, len(moves) - 1]]
+    rest = 0.5 * pause_s
+    ends = zip((firsts - rest).tolist(), (lasts + rest).tolist(), strict=True)
+    return [RunSpan(first, last) for first, last in ends]
+
+
+def _moves(layout: BagLayout, signals: Mapping[str, Signal]) -> Float[np.ndarray, " move"]:
+    """Times at which some wheel was seen to have moved [s]."""
+    name = next(name for name in TURNS if name in signals)
+    time, values = signals[name].time, signals[name].values
+    if name.startswith("motor_") or name == "wheel_ticks":
+        values = values / layout.gear_ratio
+    if name.endswith("_speed"):
+        return time[(np.abs(values) > STILL).any(axis=1)]
+    if name == "wheel_ticks":
+        values = values * (tau / float(layout.ticks_per_revolution or 1.0))
+        values = np.cumsum(values, axis=0) if layout.ticks_are_increments else values
+    moved = {row for column in values.T for row in _moved(column)}
+    return time[sorted(moved)]
+
+
+def _moved(angle: Float[np.ndarray, " sample"]) -> list[int]:
+    """Samples at which an angle is farther than `STILL` from where it last was found moved.
+
+    So neither the last digit of an encoder, which may flicker, nor noise counts as motion.
+    """
+    found, held = [], float(angle[0])
+    changed = np.flatnonzero(np.diff(angle)) + 1
+    for row, value in zip(changed.tolist(), angle[changed].tolist(), strict=True):
+        if abs(value - held) > STILL:
+            held = value
+            found.append(row)
+    return found
+
+
+def parts_between_pauses(log: Log, pause_s: float) -> int:
+    """Into how many runs longer pauses of its wheels would cut a log."""
+    turned = np.abs(np.diff(log.wheel_angle, axis=0)) > STILL * np.diff(log.time)[:, None]
+    moves = log.time[1:][turned.any(axis=1)]
+    return int((np.diff(moves) > pause_s).sum()) + 1 if len(moves) else 0
+
+
+def by_table(path: Path, rule: RunRule, zero: float) -> list[RunSpan]:
+    """Runs in a CSV file.
+
+    Args:
+        path: the bag; rows whose column `bag` names another are left out.
+        rule: names the table.
+        zero: time that its times count from [s].
+
+    Raises:
+        DataError: the table is missing or wrong; the message names the row.
+    """
+    file = path.parent / str(rule.table)
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        expected = f"a CSV table of runs with the columns {', '.join(COLUMNS[:2])}"
+        raise bad_data(file, f"cannot be read ({error})", expected) from error
+    reader = csv.DictReader(lines, skipinitialspace=True)
+    names = reader.fieldnames or []
+    for name in names:
+        if name not in COLUMNS:
+            found = f"column '{name}'{near(name, COLUMNS)}"
+            raise bad_data(file, found, f"columns of {', '.join(COLUMNS)}", row=1)
+    if missing := [name for name in COLUMNS[:2] if name not in names]:
+        raise bad_data(file, f"no column '{missing[0]}'", "the columns start and end", row=1)
+    found_runs = []
+    for cells in reader:
+        row = reader.line_num
+        if (cells.get("bag") or path.name) not in (path.name, path.stem):
+            continue
+        start, end = (_time(file, row, name, cells[name]) for name in COLUMNS[:2])
+        if not start < end:
+            raise bad_data(file, f"a run from {start:g} to {end:g} s", "start before end", row=row)
+        suffix = f"#{cells['name']}" if cells.get("name") else ""
+        surface, load = cells.get("surface") or None, cells.get("load") or None
+        found_runs.append(RunSpan(zero + start, zero + end, suffix, surface, load))
+    return found_runs
+
+
+def _time(file: Path, row: int, column: str, cell: str | None) -> float:
+    try:
+        return float(cell or "")
+    except ValueError as error:
+        found = f"'{cell or ''}'"
+        raise bad_data(file, found, "a time in seconds", row=row, column=column) from error
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """What one message says: when [s], its value, and the floor and the load it names."""
+
+    time: float
+    value: Value
+    surface: str | None
+    load: str | None
+
+    @property
+    def marked(self) -> tuple[Value, str | None, str | None]:
+        """All but the time."""
+        return self.value, self.surface, self.load
+
+
+def by_topic(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[RunSpan]:
+    """A run as long as the value of a topic stays, but for values between runs.
+
+    Raises:
+        DataError: the topic or a field is missing.
+    """
+    found: list[RunSpan] = []
+    start: _Mark | None = None
+    for mark in (*_marks(bag, layout, rule), None):
+        if start is not None and mark is not None and mark.marked == start.marked:
+            continue
+        if start is not None and start.value not in rule.between:
+            end = inf if mark is None else mark.time
+            found.append(RunSpan(start.time, end, "", start.surface, start.load))
+        start = mark
+    return found
+
+
+def _marks(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[_Mark]:
+    """Every message of the topic in order of time."""
+    name = str(rule.topic)
+    message = message_of(bag, layout, name, "runs")
+    for path in (rule.field, rule.surface, rule.load):
+        plain = ".".join(step.name for step in steps_of(path)) if path else None
+        if plain is not None and plain not in message.paths:
+            found = f"no field '{path}' in {message.name}{near(path, message.paths)}"
+            raise topic_error(bag.path, name, found, f"one of {', '.join(message.paths)}")
+    marks = []
+    for number, raw in enumerate(bag.messages((name,)), start=1):
+        try:
+            shape = shape_of(raw.data, message, cdr=bag.cdr)
+            value = _value(shape, raw.data, rule.field)
+        except ValueError as error:
+            expected = "messages as their definition says; is the bag damaged?"
+            raise topic_error(bag.path, name, str(error), expected, number) from error
+        surface, load = (_text(shape, path) for path in (rule.surface, rule.load))
+        own = _stamp(shape, raw.data) if layout.stamp == "header" else None
+        marks.append(_Mark((raw.received if own is None else own) / 1e9, value, surface, load))
+    return sorted(marks, key=lambda mark: mark.time)
+
+
+def _value(shape: MessageShape, raw: bytes, path: str) -> Value:
+    """Text or number at a path; ValueError where there is none."""
+    steps = steps_of(path)
+    if texts := shape.texts(steps):
+        return texts[0]
+    numbers = shape.places(steps)
+    if not numbers:
+        raise ValueError(f"nothing in field '{path}'")
+    return float(numbers[0].of(_block(raw))[0])
+
+
+def _text(shape: MessageShape, path: str | None) -> str | None:
+    """Text at a path, None where there is none or it is empty."""
+    texts: Sequence[str] = shape.texts(steps_of(path)) if path else ()
+    return (texts[0] or None) if texts else None
+
+
+def _stamp(shape: MessageShape, raw: bytes) -> int | None:
+    """Time of a message itself [ns], None where it has none."""
+    for path in STAMPS:
+        parts = [shape.places(steps_of(f"{path}.{unit}")) for unit in ("sec", "nanosec")]
+        if all(len(places) == 1 for places in parts):
+            whole, rest = (int(places[0].whole(_block(raw))[0]) for places in parts)
+            return whole * 10**9 + rest
+    return None
+
+
+def _block(raw: bytes) -> np.ndarray:
+    return np.frombuffer(raw, np.uint8)[None]

@@ -1,0 +1,285 @@
+"""Signals of channels, poses and twists, from rows of numbers of one or several topics."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.reading.bag.clock import clock, seconds, timed
+from slipid.data.reading.bag.layout import GROUPS, BagLayout
+from slipid.data.reading.bag.messages.meanings import listed
+from slipid.data.reading.bag.messages.picks import Edge, JointPick, TransformPick
+from slipid.data.reading.bag.messages.streams import Stream
+from slipid.data.reading.bag.plan import ChannelPlan
+from slipid.data.reading.bag.transforms import STATIC, Moving, composed, heading, tilt
+from slipid.data.reading.layout import CHANNELS, PER_WHEEL
+from slipid.data.reading.signal import Signal, SignalSource
+from slipid.data.reading.units import factor
+from slipid.support.errors import near
+
+ABSURD = 1e30
+"""No sensor gives a number as large, in whatever unit: the bag is damaged."""
+TILT_NOTED = np.radians(20.0)
+"""Tilt of a robot on a floor that is worth a note: the z axis may not point up."""
+
+
+def signal_of(stream: Stream, layout: BagLayout) -> Signal:
+    """Rows of a stream as they are in the messages, no unit converted, at their times."""
+    source = SignalSource(stream.path, stream.columns, stream.number, stream.topic)
+    return Signal(seconds(clock(stream, layout)), stream.values, source)
+
+
+def whole_signal(stream: Stream, layout: BagLayout, notes: list[str]) -> Signal:
+    """Rows of one stream that have every number, ordered in time.
+
+    Raises:
+        DataError: there are none, numbers are not finite, or the clock jumps.
+    """
+    stream = timed(finite(stream, layout, notes), layout, notes)
+    whole = np.all(~stream.absent, axis=1)
+    if not whole.all():
+        notes.append(
+            f"topic {stream.topic}: {(~whole).sum()} messages without all of "
+            f"{', '.join(stream.columns)} left out"
+        )
+        stream = stream.part(whole)
+    return signal_of(stream, layout)
+
+
+def side_by_side(
+    streams: Sequence[Stream], layout: BagLayout, notes: list[str], *, by_name: bool
+) -> Signal:
+    """Columns that lie in several topics, or in messages that have some of them only.
+
+    They are laid side by side at the times of the first column; the others are interpolated
+    linearly there, and times that they do not span are left out.
+
+    Args:
+        streams: which hold the columns.
+        layout: what the bag is read by.
+        notes: which more are added to.
+        by_name: whether the streams have the same columns, of which each is taken from the first
+            that fills it in; else all columns of all streams are wanted.
+
+    Raises:
+        DataError: as `whole_signal`, or no time is common to the columns.
+    """
+    ordered = [timed(finite(one, layout, notes), layout, notes) for one in streams]
+    columns = _columns(ordered, layout, by_name)
+    first = columns[0]
+    inside = np.ones(len(first.time), dtype=bool)
+    for other in columns[1:]:
+        inside &= (first.time >= other.time[0]) & (first.time <= other.time[-1])
+    time = first.time[inside]
+    values = [np.interp(time, one.time, one.values[:, 0]) for one in columns]
+    topics = ", ".join(dict.fromkeys(str(one.source.topic) for one in columns))
+    names = tuple(one.source.columns[0] for one in columns)
+    lines = first.source.lines[inside]
+    source = replace(first.source, columns=names, lines=lines, topic=topics)
+    if not len(time):
+        raise source.error("its columns share no time", "columns that were recorded together")
+    gap = max(float(np.diff(one.time).max(initial=0.0)) for one in columns)
+    notes.append(
+        f"topics {topics}: {', '.join(names[1:])} came at other times than {names[0]} and were "
+        f"interpolated to them (longest gap {gap:.3g} s)"
+    )
+    return Signal(time, np.column_stack(values), source)
+
+
+def _columns(streams: Sequence[Stream], layout: BagLayout, by_name: bool) -> list[Signal]:
+    """Each column for itself."""
+    pairs = [(stream, j) for stream in streams for j in range(len(stream.columns))]
+    if by_name:
+        # every stream has a column for every joint, in which most of them are empty
+        having = [(stream, j) for stream, j in pairs if not stream.absent[:, j].all()]
+        owner = {j: stream for stream, j in reversed(having)}
+        pairs = [(owner[j], j) for j in sorted(owner)]
+    columns = []
+    for stream, j in pairs:
+        one = signal_of(stream.part(~stream.absent[:, j]), layout)
+        source = replace(one.source, columns=(stream.columns[j],))
+        columns.append(Signal(one.time, one.values[:, [j]], source))
+    return columns
+
+
+def mostly_whole(stream: Stream) -> bool:
+    """Whether about all rows that have one of the numbers have all of them."""
+    whole = int((~stream.absent.any(axis=1)).sum())
+    return whole >= 0.5 * int((~stream.absent).sum(axis=0).max(initial=0))
+
+
+def finite(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
+    """Rows without NaN, where the layout lets these be left out; refuses all that is no number."""
+    bad = ~np.all(np.abs(stream.values) < ABSURD, axis=1)
+    if not bad.any():
+        return stream
+    rows = np.flatnonzero(bad)
+    numbers = stream.values[rows[0]]
+    j = int(np.argmin(np.abs(numbers) < ABSURD))
+    if bad.all() or not layout.drop_nan or not np.isnan(stream.values[rows]).any(axis=1).all():
+        found = f"{stream.columns[j]} is {numbers[j]:.3g} here, the first of {len(rows)} such"
+        found += f" among {len(bad)} messages"
+        expected = "numbers; to leave out messages with nan say: drop_nan = true"
+        if bad.all():
+            expected = "numbers; does the driver fill this field in?"
+        raise stream.error(found, expected, int(rows[0]))
+    column = stream.columns[j]
+    notes.append(
+        f"topic {stream.topic}: {len(rows)} messages without a number in {column} left out"
+    )
+    return stream.part(~bad)
+
+
+def channel_signal(
+    plan: ChannelPlan, streams: Sequence[Stream], layout: BagLayout, notes: list[str]
+) -> Signal:
+    """Signal of a channel.
+
+    Args:
+        plan: of the channel.
+        streams: of its topics, in the order of the plan.
+        layout: what the bag is read by.
+        notes: which more are added to.
+
+    Raises:
+        DataError: a joint or a number is missing, not finite, or out of time.
+    """
+    by_name = isinstance(plan.wanted[0].pick, JointPick)
+    if by_name:
+        _check_joints(plan, streams)
+    else:
+        streams = [filled(stream) for stream in streams]
+    if len(streams) == 1 and mostly_whole(streams[0]):
+        samples = whole_signal(streams[0], layout, notes)
+    else:
+        samples = side_by_side(streams, layout, notes, by_name=by_name)
+    columns = samples.values.shape[1]
+    scale = np.array(plan.spec.scale)
+    if len(scale) not in (1, columns):
+        found = f"{plan.channel} has {columns} columns for {len(scale)} scales"
+        raise samples.source.error(found, "as many, or one scale for all")
+    if plan.channel not in PER_WHEEL and columns != 1:
+        found = f"{columns} numbers for {plan.channel}"
+        raise samples.source.error(found, "one; name it by its index, such as [0]")
+    values = (samples.values * scale + plan.spec.offset) * factor(plan.unit, CHANNELS[plan.channel])
+    return Signal(samples.time, values, samples.source)
+
+
+def filled(stream: Stream) -> Stream:
+    """The same stream; DataError where no message has the wanted numbers."""
+    if len(stream.number):
+        return stream
+    found = f"no numbers in {', '.join(stream.columns)} of any message"
+    raise stream.error(found, "an array that is filled in, and has the wanted index")
+
+
+def _check_joints(plan: ChannelPlan, streams: Sequence[Stream]) -> None:
+    """Refuse joints that no message has, with the names that are there."""
+    picks = [wanted.pick for wanted in plan.wanted if isinstance(wanted.pick, JointPick)]
+    there = list(dict.fromkeys(name for pick in picks for name in pick.names))
+    for j, joint in enumerate(picks[0].joints):
+        if joint not in there:
+            found = f"no joint '{joint}'{near(joint, there)}"
+            raise streams[0].error(found, f"one of the names that are there: {listed(there)}")
+        if all(stream.absent[:, j].all() for stream in streams):
+            found = f"{picks[0].array} of joint '{joint}' is empty in every message"
+            expected = "numbers in it; is another field meant: position, velocity or effort?"
+            raise streams[0].error(found, expected)
+
+
+def group_signals(
+    plan: ChannelPlan, streams: Sequence[Stream], layout: BagLayout, notes: list[str]
+) -> dict[str, Signal]:
+    """Signals of a pose (x, y, heading without wrap-around) or a twist, by channel.
+
+    Args:
+        plan: of the pose or twist.
+        streams: of its topics, in the order of the plan.
+        layout: what the bag is read by.
+        notes: which more are added to.
+
+    Raises:
+        DataError: numbers are missing, not finite, or out of time.
+    """
+    if plan.links:
+        samples = _transformed(plan, streams, layout, notes)
+    else:
+        samples = whole_signal(filled(streams[0]), layout, notes)
+    values = samples.values
+    if plan.channel == "pose":
+        values = _planar(samples, notes)
+    names = GROUPS[plan.channel]
+    # a column each, and all of them at the times of the messages
+    return {
+        name: Signal(samples.time, values[:, [j]], _column(samples.source, j))
+        for j, name in enumerate(names)
+    }
+
+
+def _column(source: SignalSource, j: int) -> SignalSource:
+    """Source of one column; a heading may be made of a whole quaternion."""
+    names = source.columns
+    name = names[min(j, len(names) - 1)]
+    if j == 2 and len(names) > 3:
+        name = name.rpartition(".")[0]
+    return replace(source, columns=(name,))
+
+
+def _planar(samples: Signal, notes: list[str]) -> Float[np.ndarray, "sample 3"]:
+    """Place and heading of x, y and a quaternion, or of x, y and a heading with wrap-around."""
+    place = samples.values[:, :2]
+    if samples.values.shape[1] == 3:
+        return np.column_stack([place, np.unwrap(samples.values[:, 2])])
+    rotation = _unit(samples.values[:, 2:], samples.source)
+    if (tilted := float(tilt(rotation).max(initial=0.0))) > TILT_NOTED:
+        notes.append(
+            f"topic {samples.source.topic}: the pose tilts by up to {np.degrees(tilted):.0f} deg; "
+            "its heading is about the z axis of the frame: does that point up?"
+        )
+    return np.column_stack([place, heading(rotation)])
+
+
+def _transformed(
+    plan: ChannelPlan, streams: Sequence[Stream], layout: BagLayout, notes: list[str]
+) -> Signal:
+    """Place in the plane, and quaternion, of a chain of transforms."""
+    moving: dict[Edge, Moving] = {}
+    sources: dict[Edge, SignalSource] = {}
+    for stream, wanted in zip(streams, plan.wanted, strict=True):
+        assert isinstance(wanted.pick, TransformPick)
+        # topics that move come first in a plan, and the static one repeats what never changes
+        if wanted.pick.edge not in moving and len(stream.number):
+            if stream.topic.endswith(STATIC):
+                stream = finite(stream.part(np.array([len(stream.number) - 1])), layout, notes)
+            else:
+                stream = timed(finite(stream, layout, notes), layout, notes)
+            one = signal_of(stream, layout)
+            rotation = _unit(one.values[:, 3:], one.source)
+            moving[wanted.pick.edge] = Moving(one.time, one.values[:, :3], rotation)
+            sources[wanted.pick.edge] = one.source
+    edge = max(moving, key=lambda edge: len(moving[edge].time))
+    source, densest = sources[edge], moving[edge].time
+    if len(densest) == 1:
+        found = f"every transform from '{plan.spec.frame}' to '{plan.spec.child}' is there once"
+        raise source.error(found, "one that changes with time: frames that move")
+    whole = composed(plan.links, moving)
+    if not len(whole.time):
+        found = f"the transforms from '{plan.spec.frame}' to '{plan.spec.child}' share no time"
+        raise source.error(found, "transforms that were recorded together")
+    lines = source.lines[np.searchsorted(densest, whole.time)]
+    columns = (f"{plan.spec.child} in {plan.spec.frame}",)
+    values = np.column_stack([whole.translation[:, :2], whole.rotation])
+    return Signal(whole.time, values, replace(source, columns=columns, lines=lines))
+
+
+def _unit(
+    rotation: Float[np.ndarray, "sample 4"], source: SignalSource
+) -> Float[np.ndarray, "sample 4"]:
+    """Quaternions made of length 1; DataError where they are far from it."""
+    length = np.linalg.norm(rotation, axis=1)
+    wrong = np.flatnonzero(np.abs(length - 1.0) > 0.1)
+    if len(wrong):
+        found = f"a quaternion of length {length[wrong[0]]:.3g}"
+        raise source.error(found, "length 1; is the orientation filled in?", int(wrong[0]))
+    return rotation / length[:, None]

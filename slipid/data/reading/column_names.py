@@ -1,0 +1,353 @@
+"""Names of columns and topics as people write them, and the channel and unit that each says."""
+
+import re
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import lru_cache
+
+from slipid.data.reading.layout import CHANNELS
+from slipid.data.reading.units import converts
+
+_TABLE: dict[str, str] = {
+    # which wheel
+    "side l": "left l lt lh links",
+    "side r": "right r rt rh rechts",
+    "end f": "front fore forward f",
+    "end m": "mid middle centre center",
+    "end r": "rear back hind aft b",
+    "corner fl": "fl lf",
+    "corner fr": "fr rf",
+    "corner rl": "rl bl",
+    "corner rr": "rr br",
+    "kind motor": "motor motors m mot engine",
+    "kind wheel": "wheel wheels whl joint joints tyre tire track",
+    # what is measured
+    "what time": "t time stamp timestamp times tstamp seconds elapsed clock zeit",
+    "what ticks": "tick ticks enc encoder encoders count counts counter pulse pulses cnt",
+    "what position": "pos position positions pose place loc location translation p",
+    "what speed": "vel velocity velocities speed speeds spd omega qd rate",
+    "what w": "w",
+    "what v": "v",
+    "what command": (
+        "cmd command commanded set setpoint sp ref reference target des desired goal wanted"
+    ),
+    "what current": "cur curr current currents amp amps ampere i strom",
+    "what torque": "torque torques tau effort efforts moment",
+    "what voltage": "volt volts voltage voltages u spannung",
+    "what duty": "duty pwm dutycycle throttle",
+    "what battery": "bat batt battery bus supply vbat vbatt vbus ubat ubus",
+    "what rpm": "rpm",
+    "what gyro": "gyro gyroscope gz",
+    "what yaw": "yaw heading theta th psi bearing hdg",
+    "what angle": "angle angles ang phi rot rotation rotational",
+    "what linear": "linear lin",
+    "what angular": "angular",
+    "what orientation": "orientation quaternion quat q attitude",
+    "what quaternion": "qx qy qz qw",
+    "what axis": "x y z",
+    # of no use to slipid, but to be known
+    "not odometry": "odom odometry odo",
+    "not wanted": (
+        "delta diff d dt dx dy dtheta accel acc acceleration mag temp temperature std cov "
+        "covariance error err sum mean row index seq id flag status roll pitch lat lon rssi step"
+    ),
+    # says nothing
+    "noise": (
+        "data field fields msg value values actual measured meas feedback fb state states link "
+        "robot base body global world map camera cam mocap vicon optitrack tag marker tracker "
+        "lidar slam imu header twist coordinate coordinates coord axis of the from to in at along "
+        "log sensor drive shaft nsec sec secs ros"
+    ),
+}
+"""Roles, and the words that play them: the dictionary of all names."""
+_ROLES: dict[str, tuple[str, str]] = {
+    word: (role.partition(" ")[0], role.partition(" ")[2])
+    for role, words in _TABLE.items()
+    for word in words.split()
+}
+_LONG = [word for word in _ROLES if len(word) >= 4]
+_NEAR = 0.82
+"""Likeness from which a word is taken for a misspelled one."""
+_LETTERS = 3
+"""Longest word that may be made of single letters alone, as wl or u1l."""
+_SUFFIXES = {
+    **{"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us"},
+    **{"usec": "us", "ns": "ns", "nsec": "ns", "m": "m", "mm": "mm", "cm": "cm"},
+    **{"px": "pixel", "pix": "pixel", "pixels": "pixel", "rev": "rev", "ticks": "tick"},
+    **{"rad": "rad", "deg": "deg", "degrees": "deg", "degs": "deg/s", "deg_s": "deg/s"},
+    **{"dps": "deg/s", "rads": "rad/s", "rad_s": "rad/s", "radps": "rad/s", "rps": "rev/s"},
+    **{"rpm": "rpm", "mps": "m/s", "m_s": "m/s", "mm_s": "mm/s", "mmps": "mm/s"},
+    **{"a": "A", "amps": "A", "ma": "mA", "v": "V", "mv": "mV", "nm": "N*m"},
+    **{"%": "%", "percent": "percent", "pct": "percent"},
+}
+"""Ends of names that say a unit."""
+_BY_UNIT = {"tick": "ticks", "A": "current", "V": "voltage", "N*m": "torque", "rad/s": "speed"}
+_SHORT = ("v", "a", "s", "m")
+"""Ends of names that mean a unit only where the rest of the name is not understood with them."""
+
+
+@dataclass(frozen=True)
+class ColumnMeaning:
+    """What the name of a column says.
+
+    Attributes:
+        channel: of `CHANNELS`, or `wheel_position` and `wheel_v` where numbers must tell between
+            two (also `motor_`); empty where the name says nothing.
+        label: which wheel, or which part of a quaternion.
+        unit: that the name says, else empty.
+        doubt: what was assumed, else empty.
+    """
+
+    channel: str = ""
+    label: str = ""
+    unit: str = ""
+    doubt: str = ""
+
+
+def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMeaning:
+    """Return what a column or a topic's field of this name holds.
+
+    Args:
+        name: of the column.
+        unit: by a row of units, if there is one.
+        of_motor: whether the log is of motors alone, whose columns need not name a wheel or motor.
+    """
+    bare, own = without_unit(name)
+    unit = unit_in(unit) or unit or own
+    texts = [bare] if "[" in name or "(" in name or "," in name else [bare, name]
+    if name[len(bare) :].lower()[1:] in _SHORT:  # v may be a speed, a and s other things
+        texts.reverse()
+    tried = [(name_parts(text), strict) for strict in (True, False) for text in texts]
+    for parts, strict in tried:
+        if strict and (parts.unknown or parts.mended):
+            continue
+        if found := _motor_channel(parts, unit) if of_motor else _channel(parts, unit):
+            channel, label = found
+            unit = "rpm" if parts.has("what", "rpm") else unit
+            fitting = unit if _fits(channel, unit) else ""
+            return ColumnMeaning(channel, label, fitting, _doubt(parts, channel))
+    return ColumnMeaning(unit=unit)
+
+
+@lru_cache(maxsize=4096)
+def is_unit(text: str) -> bool:
+    """Whether a text is a unit of something that is logged."""
+    return bool(text.strip()) and any(
+        converts(text, target) for target in {*CHANNELS.values(), "pixel"}
+    )
+
+
+def unit_in(text: str) -> str:
+    """The unit that a text of its own is, such as V or ma; empty where it is none."""
+    return text if is_unit(text) else _SUFFIXES.get(text.lower(), "")
+
+
+def without_unit(name: str) -> tuple[str, str]:
+    """A name less the unit in it, and that unit: brackets, after a comma, or the end of it."""
+    if inside := re.match(r"^(.*\S)\s*[\[(]([^\])]*)[\])]\s*$", name):
+        if inside[2].isdecimal():
+            return name, ""
+        return inside[1], unit_in(inside[2])
+    if (comma := re.match(r"^(.+), *([^,]+)$", name)) and is_unit(comma[2]):
+        return comma[1], comma[2].strip()
+    parts = re.split(r"[_/ ]", name.lower())
+    for length in (2, 1):
+        end = "_".join(parts[-length:])
+        if len(parts) > length and end in _SUFFIXES:
+            return name[: -len(end) - 1], _SUFFIXES[end]
+    return name, ""
+
+
+def _fits(channel: str, unit: str) -> bool:
+    """Whether a unit can be that of a channel."""
+    targets = {
+        "position": ("rad", "tick"),
+        "v": ("V", "rad/s", "m/s"),
+        "speed": ("rad/s", "m/s"),
+        "x": ("m", "pixel"),
+        "y": ("m", "pixel"),
+    }.get(channel.rpartition("_")[2], (CHANNELS.get(channel, "1"),))
+    return bool(unit) and any(converts(unit, target) for target in targets)
+
+
+@dataclass(frozen=True)
+class NameParts:
+    """A column's name taken apart.
+
+    Attributes:
+        roles: what its words say, such as ("what", "speed"), with the word itself at the end.
+        numbers: digits in it.
+        unknown: words that say nothing to anybody.
+        mended: words that were taken for others: written as `headng -> heading`.
+    """
+
+    roles: tuple[tuple[str, str, str], ...]
+    numbers: tuple[str, ...]
+    unknown: tuple[str, ...]
+    mended: tuple[str, ...]
+
+    def has(self, role: str, *values: str) -> bool:
+        """Whether a word plays a role (with one of these values)."""
+        return any(r == role and (not values or v in values) for r, v, _ in self.roles)
+
+    def of(self, role: str) -> list[str]:
+        """Values of a role, in the order of the words."""
+        return [v for r, v, _ in self.roles if r == role]
+
+    def words(self, *values: str) -> list[str]:
+        """The words of what is measured that have one of these values."""
+        return [w for r, v, w in self.roles if r == "what" and v in values]
+
+
+def name_parts(name: str) -> NameParts:
+    """A column's name taken apart, misspelled words mended."""
+    roles, numbers, unknown, mended = [], [], [], []
+    for part in _split(name):
+        if part.isdecimal():
+            numbers.append(part)
+            continue
+        for word in [part] if part in _ROLES else _apart(part):
+            near = [] if word in _ROLES else get_close_matches(word, _LONG, n=1, cutoff=_NEAR)
+            if word not in _ROLES and (len(word) < 3 or not near):
+                unknown.append(word)
+                continue
+            if near:
+                mended.append(f"{word} -> {near[0]}")
+            word = near[0] if near else word
+            roles.append((*_ROLES[word], word))
+    return NameParts(tuple(roles), tuple(numbers), tuple(unknown), tuple(mended))
+
+
+def _split(name: str) -> list[str]:
+    """Lower-case words and numbers: at capitals, digits and signs, `1st` as 1."""
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Za-z])(?=\d)", "_", name)
+    name = re.sub(r"(\d)(?:st|nd|rd|th)\b", r"\1", name.lower())
+    name = re.sub(r"(?<=\d)(?=[a-z])", "_", name)
+    return re.findall(r"[a-z]+|\d+", name)
+
+
+def _apart(word: str) -> list[str]:
+    """A word made of others, such as setvel or wl, in as few as there can be; else itself."""
+    best: list[list[str] | None] = [[]] + [None] * len(word)
+    for end in range(1, len(word) + 1):
+        for start in range(end):
+            head, tail = best[start], word[start:end]
+            if head is None or tail not in _ROLES:
+                continue
+            if best[end] is None or len(head) + 1 < len(best[end] or []):
+                best[end] = [*head, tail]
+    found = best[-1]
+    if found is None or (len(word) > _LETTERS and any(len(part) == 1 for part in found[1:-1])):
+        return [word]
+    single = sum(len(part) == 1 for part in found)
+    if single == len(found) > _LETTERS - 1 or (len(word) > _LETTERS and single > 1):
+        return [word]
+    return found
+
+
+def _doubt(parts: NameParts, channel: str) -> str:
+    """What was assumed about a name."""
+    if channel.startswith("twist") and not parts.has("what", "command"):
+        return "is it what was commanded? Measured speeds do not belong here"
+    if parts.mended:
+        return "misspelled? " + ", ".join(parts.mended)
+    return f"{', '.join(parts.unknown)} in its name is not known" if parts.unknown else ""
+
+
+def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
+    """Channel and label of a name; None where it says none."""
+    if parts.has("not"):
+        return ("odometry", "") if parts.has("not", "odometry") else None
+    label = _label(parts)
+    single = _single(parts)
+    if not parts.unknown and single and (not label or parts.has("what", "time", "battery", "gyro")):
+        return single
+    what = _measured(parts, unit)
+    if what is None or not (label or parts.has("kind")):
+        return None
+    if what in ("current", "voltage", "duty"):
+        return what, label
+    if what == "ticks":
+        return "wheel_ticks", label
+    return f"{'motor' if parts.has('kind', 'motor') else 'wheel'}_{what}", label
+
+
+def _motor_channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
+    """Channel and label of a name in a log of motors alone; None where it says none."""
+    if parts.has("not"):
+        return None
+    single = _single(parts)
+    if single and single[0] in ("time", "bus_voltage"):
+        return single
+    what = _measured(parts, unit)
+    names = {"v": "voltage", "position": "motor_angle", "speed": "motor_speed"}
+    return (names.get(what, what), _label(parts)) if what else None
+
+
+def _label(parts: NameParts) -> str:
+    """Which wheel a name is of: fl, r, 2; empty for none."""
+    if parts.has("corner"):
+        return parts.of("corner")[0]
+    side = parts.of("side")[:1]
+    end = parts.of("end")[:1]
+    if side and end:
+        return end[0] + side[0]
+    return side[0] if side else parts.numbers[-1] if parts.numbers else ""
+
+
+def _measured(parts: NameParts, unit: str) -> str | None:
+    """What of a wheel is measured: the end of the channel's name."""
+    if parts.has("what", "command"):
+        return "speed_command" if not parts.has("what", "current", "torque", "voltage") else None
+    if parts.has("what", "rpm"):
+        return "speed"
+    for what in ("ticks", "current", "torque", "voltage", "duty", "speed"):
+        if parts.has("what", what):
+            return what
+    if parts.has("what", "position", "angle", "yaw"):  # before w, which may be a wheel
+        return "position"
+    if parts.has("what", "angular", "w"):
+        return "speed"
+    if parts.has("what", "v"):
+        return "v"
+    by_unit = (what for target, what in _BY_UNIT.items() if unit and converts(unit, target))
+    return None if parts.has("what") else next(by_unit, None)
+
+
+def _single(parts: NameParts) -> tuple[str, str] | None:
+    """Channel of the whole robot, and which part of a quaternion."""
+    what = set(parts.of("what"))
+    axis = parts.words("axis")
+    if what and what <= {"time"}:
+        return "time", ""
+    if quaternion := parts.words("quaternion"):
+        return "pose_quaternion", quaternion[0][1]
+    if "orientation" in what and (axis or "w" in what):
+        return "pose_quaternion", axis[-1] if axis else "w"
+    if "battery" in what:
+        return None if what & {"current", "duty"} else ("bus_voltage", "")
+    angular = what >= {"angular", "speed"} or (what == {"w", "axis"} and axis == ["z"])
+    if "gyro" in what or (angular and "command" not in what):
+        return ("gyro", "") if axis in (["z"], []) else None
+    if "command" in what or "linear" in what or "angular" in what:
+        return _twist(what, axis)
+    if what & {"speed", "current", "voltage", "torque", "ticks", "v", "w", "duty"}:
+        return None
+    if parts.has("kind") or parts.has("side"):
+        return None
+    if axis and what <= {"axis", "position"} and axis[-1] in "xy" and len(axis) == 1:
+        return f"pose_{axis[0]}", ""
+    turned = what & {"yaw", "angle", "orientation"} and not axis
+    return ("pose_heading", "") if turned or (axis == ["z"] and "angle" in what) else None
+
+
+def _twist(what: set[str], axis: list[str]) -> tuple[str, str] | None:
+    """Which part of a commanded twist."""
+    turning = what & {"w", "yaw", "angular", "angle"}
+    if turning and axis in ([], ["z"]):
+        return "twist_command_yaw", ""
+    if axis == ["y"] and not turning:
+        return "twist_command_y", ""
+    straight = what & {"v", "linear", "speed", "position"} or axis == ["x"]
+    ahead = straight and axis in ([], ["x"]) and not turning
+    return ("twist_command_x", "") if ahead else None

@@ -1,0 +1,121 @@
+"""Layout of a log of motors alone: columns that a person named, and the rest by their names."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from slipid.data.reading.column_names import ColumnMeaning, meaning_of, unit_in, without_unit
+from slipid.data.reading.layout import CHANNELS, Channel, Layout
+from slipid.data.reading.table_format import TableFormat
+from slipid.data.reading.units import converts
+from slipid.support.errors import DataError, bad_data, near
+
+SHAFT = 10.0
+"""Times by which a motor's shaft may turn faster than any wheel, whose speed the reader checks."""
+_CHANNELS = ("time", "voltage", "current", "motor_speed", "motor_angle", "duty", "bus_voltage")
+_INSTEAD = {"motor_speed": "motor_angle", "motor_angle": "motor_speed"}
+"""Channels of which one is enough."""
+
+
+@dataclass(frozen=True)
+class GivenColumns:
+    """Columns of a channel as a person named them, and their unit; None for the usual one."""
+
+    columns: tuple[str, ...]
+    unit: str | None
+
+
+def given_columns(text: str, channel: str) -> GivenColumns:
+    """`NAME`, `NAME:UNIT`, or several names by commas for several motors."""
+    names, colon, unit = text.rpartition(":")
+    if colon and converts(unit, CHANNELS[channel]):
+        return GivenColumns(tuple(n.strip() for n in names.split(",")), unit)
+    return GivenColumns(tuple(n.strip() for n in text.split(",")), None)
+
+
+def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed: bool) -> Layout:
+    """Layout of a log of motors: the named columns, and for other channels those called so.
+
+    Args:
+        format: where names and numbers stand in the file.
+        given: columns that a person named, by channel.
+        signed: whether currents have a sign.
+
+    Raises:
+        DataError: a column is not there, or there is none of time, current or speed.
+    """
+    names = [name for name in format.names if name]
+    if not names:
+        found = f"no names for {len(format.names)} columns"
+        expected = "a line of column names above the numbers"
+        raise bad_data(format.path, found, expected, row=format.first_data_row)
+    meanings = {
+        name: meaning_of(name, unit, of_motor=True)
+        for name, unit in zip(format.names, format.units, strict=True)
+        if name
+    }
+    channels = {}
+    for channel, one in given.items():
+        for name in one.columns:
+            if name not in names:
+                found = f"no column '{name}'{near(name, names)}"
+                raise bad_data(format.path, found, f"one of {', '.join(names)}")
+        channels[channel] = _channel(channel, one.columns, format, one.unit)
+    taken = {column for one in channels.values() for column in one.columns}
+    for channel in _CHANNELS:
+        more = channel in ("duty", "bus_voltage") and "voltage" in channels
+        columns = _called(channel, {n: m for n, m in meanings.items() if n not in taken})
+        if columns and not more and not {channel, _INSTEAD.get(channel)} & channels.keys():
+            channels[channel] = _channel(channel, columns, format)
+    if "voltage" not in channels and not {"duty", "bus_voltage"} <= channels.keys():
+        channels = {k: v for k, v in channels.items() if k not in ("duty", "bus_voltage")}
+    _check_whole(format.path, channels, names)
+    return Layout(
+        name="motor",
+        channels=channels,
+        delimiter=format.delimiter or ",",
+        names_row=format.names_row,
+        first_data_row=format.first_data_row,
+        gear_ratio=SHAFT,
+        current_is_signed=signed,
+        drop_repeated_time=True,
+    )
+
+
+def _called(channel: str, meanings: Mapping[str, ColumnMeaning]) -> tuple[str, ...]:
+    """Columns called after a channel, one where a channel has one.
+
+    Sure names come before doubtful ones, and names that count motors before those that do not.
+    """
+    found = {name: one for name, one in meanings.items() if one.channel == channel}
+    names = [name for name, one in found.items() if not one.doubt] or list(found)
+    names = [name for name in names if found[name].label] or names
+    return tuple(names[:1] if channel in ("time", "bus_voltage") else names)
+
+
+def _channel(
+    channel: str, columns: tuple[str, ...], format: TableFormat, unit: str | None = None
+) -> Channel:
+    """Columns with their unit: a given one, that of a row of units or of their names, the usual."""
+    usual, name = CHANNELS[channel], columns[0]
+    row = format.units[format.names.index(name)]
+    own = (meaning_of(name, row, of_motor=True).unit, unit_in(row), without_unit(name)[1])
+    known = (one for one in own if one and converts(one, usual))
+    return Channel(columns, unit or next(known, usual))
+
+
+def _check_whole(path: Path, channels: Mapping[str, Channel], names: list[str]) -> None:
+    """DataError where something is missing, or motors differ in number."""
+    have = f"it has {', '.join(names)}"
+    for wanted, option in (
+        (("time",), "--time"),
+        (("current",), "--current"),
+        (("motor_speed", "motor_angle"), "--speed or --angle"),
+    ):
+        if not {*wanted} & channels.keys():
+            what = " or ".join(n.removeprefix("motor_") for n in wanted)
+            raise bad_data(path, f"no column for the {what}", f"{option} with its name; {have}")
+    count = {k: len(c.columns) for k, c in channels.items() if k not in ("time", "bus_voltage")}
+    if len({*count.values()}) > 1:
+        listed = ", ".join(f"{k} {', '.join(map(str, channels[k].columns))}" for k in count)
+        raise DataError(f"{path}: columns for different numbers of motors ({listed}); name them")

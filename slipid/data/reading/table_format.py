@@ -1,0 +1,208 @@
+"""Where names, units and numbers stand in a table that nobody described, and its numbers."""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.reading.column_names import is_unit, unit_in
+from slipid.data.reading.table import MISSING, bytes_of, cells_of, number_in, parquet_of, text_lines
+from slipid.support.errors import bad_data
+
+ROWS = 50_000
+"""Rows that are looked at for what the numbers are like."""
+_DELIMITERS = (",", ";", "\t", "|", " ")
+_HEAD = 60
+"""Lines that are looked at for the header."""
+_FEW = 10
+"""Rows of numbers from which a file can be a log: settings have fewer."""
+_BEGINNING = 200_000
+"""Bytes of a file that are read to see what kind it is."""
+
+
+@dataclass(frozen=True)
+class TableFormat:
+    """Where things stand in a file of rows.
+
+    Attributes:
+        path: the file.
+        delimiter: between its cells; empty for Parquet.
+        names_row, units_row, first_data_row: as of `Layout`.
+        names: of its columns, empty ones where it has none.
+        units: of its columns as a row of units says, empty ones where there is none.
+    """
+
+    path: Path
+    delimiter: str
+    names_row: int
+    units_row: int
+    first_data_row: int
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+
+    @property
+    def signature(self) -> "TableFormat":
+        """The format without its path: files of one kind have it in common."""
+        return replace(self, path=Path())
+
+    def column(self, at: int) -> str | int:
+        """Name of a column in a layout, or its position."""
+        return self.names[at] if self.names_row else at
+
+
+@dataclass(frozen=True, eq=False)
+class TableNumbers:
+    """Cells of a file of rows, NaN where they are empty or no number.
+
+    `texts` are the columns that hold something else than numbers.
+    """
+
+    format: TableFormat
+    values: Float[np.ndarray, "row column"]
+    texts: frozenset[int]
+
+
+def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
+    """Where things stand in a CSV or Parquet file.
+
+    Args:
+        path: the file.
+        delimiter: between its cells; None where it is to be found.
+
+    Raises:
+        DataError: it cannot be read, is empty, or is no log of rows of numbers.
+    """
+    if path.suffix == ".parquet":
+        header = tuple(parquet_of(path, bytes_of(path)).column_names)
+        return TableFormat(path, "", 1, 0, 2, header, ("",) * len(header))
+    lines = _lines(path, _BEGINNING)
+    delimiter = delimiter or _delimiter_of(lines)
+    rows = [cells_of(line, delimiter) for line in lines[:_HEAD]]
+    first = _first_numbers(rows)
+    _refuse_commas(path, rows[first or 0 :], delimiter, first or 0)
+    if first is None or len(rows) - first < min(_FEW, _HEAD - first):
+        raise bad_data(path, "no rows of numbers", "a log: a row of numbers for every time")
+    names_row, units_row = _header_rows(rows[:first], len(rows[first]))
+    top = rows[names_row - 1] if names_row else []
+    if not top and any(number_in(c) is None and c.lower() not in MISSING for c in rows[first]):
+        raise bad_data(path, "texts among the numbers, and no names", "a log", row=first + 1)
+    width = len(top) or len(rows[first])
+    names = [*top, *[""] * width][:width]
+    if names_row and width > 1 and not names[-1]:
+        width -= 1  # a delimiter at the end of every line
+    units = rows[units_row - 1] if units_row else []
+    units = [*units, *[""] * width][:width]
+    where = (names_row, units_row, first + 1)
+    return TableFormat(path, delimiter, *where, tuple(names[:width]), tuple(units))
+
+
+def numbers_of(format: TableFormat) -> TableNumbers:
+    """The numbers of a file, its first `ROWS` rows."""
+    if not format.delimiter:
+        return _parquet_numbers(format)
+    lines = _lines(format.path)
+    body = [line for line in lines[format.first_data_row - 1 :][:ROWS] if line.strip()]
+    between, columns = format.delimiter, range(len(format.names))
+    try:
+        values = np.loadtxt(body, delimiter=between, usecols=columns, ndmin=2, comments=None)
+        return TableNumbers(format, values, frozenset())
+    except ValueError:
+        return _cell_by_cell(format, body)
+
+
+def _cell_by_cell(format: TableFormat, body: list[str]) -> TableNumbers:
+    """The slow way: accepts empty cells and texts."""
+    width = len(format.names)
+    values = np.full((len(body), width), np.nan)
+    wrong = np.zeros(width, dtype=int)
+    for i, line in enumerate(body):
+        for j, cell in enumerate(cells_of(line, format.delimiter)[:width]):
+            number = number_in(cell)
+            if number is not None:
+                values[i, j] = number
+            elif cell.lower() not in MISSING:
+                wrong[j] += 1
+    texts = np.flatnonzero(wrong > 0.02 * len(body)).tolist()
+    return TableNumbers(format, values, frozenset(texts))
+
+
+def _parquet_numbers(format: TableFormat) -> TableNumbers:
+    import pyarrow
+
+    table = parquet_of(format.path, bytes_of(format.path))
+    values = np.full((min(table.num_rows, ROWS), table.num_columns), np.nan)
+    texts = set()
+    for k, name in enumerate(table.column_names):
+        try:
+            column = table.column(name).slice(0, ROWS).cast(pyarrow.float64())
+            values[:, k] = column.to_numpy()
+        except pyarrow.ArrowException:
+            texts.add(k)
+    return TableNumbers(format, values, frozenset(texts))
+
+
+def _lines(path: Path, limit: int = -1) -> list[str]:
+    """Lines of a text file, or of its beginning, the last one whole."""
+    raw = bytes_of(path, limit)
+    if len(raw) == limit and b"\n" in raw:
+        raw = raw[: raw.rindex(b"\n")]
+    return text_lines(path, raw)
+
+
+def _delimiter_of(lines: list[str]) -> str:
+    """The character that is in most lines the same number of times; most times, if several are."""
+
+    def score(delimiter: str) -> tuple[float, int]:
+        counts = Counter(line.count(delimiter) for line in lines[:_HEAD] if line.strip())
+        count, times = counts.most_common(1)[0]
+        return (times / sum(counts.values()) if count else 0.0, count)
+
+    best = max(_DELIMITERS[:-1], key=score)
+    if score(best)[1]:
+        return best
+    return " " if score(" ")[1] and score(" ")[0] > 0.5 else ","
+
+
+def _first_numbers(rows: list[list[str]]) -> int | None:
+    """Place of the first row that holds numbers and nothing else, or nearly."""
+    usual = Counter(len(row) for row in rows).most_common(1)[0][0]
+    for k, row in enumerate(rows):
+        filled = [cell for cell in row if cell.lower() not in MISSING]
+        numbers = sum(number_in(cell) is not None for cell in filled)
+        if len(row) >= usual - 1 and numbers > 0.5 * len(filled):
+            return k
+    return None
+
+
+def _header_rows(rows: list[list[str]], width: int) -> tuple[int, int]:
+    """Rows of names and of units, counted from 1, 0 where there is none."""
+    names = units = 0
+    for k, row in enumerate(rows, start=1):
+        filled = [cell for cell in row if cell]
+        if len(row) < width - 1 or len(filled) < len(row) - 2:
+            continue
+        # below names single letters are units as well: above, they may be the names themselves
+        counted = sum(map(bool, map(unit_in, filled))) if names else sum(map(is_unit, filled))
+        if counted > 0.5 * len(filled) and (names or any(len(c) > 1 for c in filled)):
+            units = k
+        elif sum(number_in(cell) is None for cell in filled) > 0.5 * len(filled):
+            names = k
+    if names or not units:
+        return names, units
+    # units written out, each once, are the names of their columns
+    cells = [cell for cell in rows[units - 1] if cell]
+    words = any(len(cell) > 4 and cell.isalpha() for cell in cells)
+    return (units, 0) if words and len(set(cells)) == len(cells) else (0, 0)
+
+
+def _refuse_commas(path: Path, body: list[list[str]], delimiter: str, first: int) -> None:
+    """Refuse decimal commas here already: no layout could read them."""
+    if delimiter == ",":
+        return
+    for k, cells in enumerate(body[:_HEAD]):
+        for cell in cells:
+            whole, comma, part = cell.lstrip("+-").partition(",")
+            if comma and whole.isdecimal() and part.isdecimal():
+                raise bad_data(path, f"'{cell}'", "decimal points, not commas", row=first + 1 + k)

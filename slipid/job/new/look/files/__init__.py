@@ -1,1 +1,0 @@
-"""Log files: how each is laid out, and which belong together."""

@@ -1,1 +1,0 @@
-"""What the numbers themselves tell: units by magnitudes, rates, signs, sums."""
