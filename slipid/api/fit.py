@@ -123,9 +123,9 @@ class Fit:
             DataError: a run on a floor or with a load set-up that was not identified.
         """
         fit = self.result
-        rungs = restored(fit.space.template.geometry, dict(fit.baselines))
+        models = restored(fit.space.template.geometry, dict(fit.baselines))
         fitted = fit.contact
-        return Validation(validation(fitted, rungs, runs), fit, runs)
+        return Validation(validation(fitted, models, runs), fit, runs)
 
     def sample(
         self,

@@ -111,11 +111,11 @@ class Comparison:
 
 
 def compared(task: Task, problem: Problem, question: str, parts: int, quiet: bool) -> Comparison:
-    """Every rung of the ladder judged fold by fold; arguments as of `Fit.compare`."""
+    """Every slip model judged fold by fold; arguments as of `Fit.compare`."""
     fold = folds_of(task.dataset, question, parts)
     if (fold < 0).all():
         raise DataError("no run can be left out; expected several headings or speeds")
-    rows: list[validation.Judged] = []
+    rows: list[validation.ScoredRun] = []
     with Reporter(quiet=quiet) as report:
         for k in sorted(set(fold[fold >= 0].tolist())):
             report.stage(f"{question}: without part {k + 1} of {fold.max() + 1}")

@@ -36,8 +36,8 @@ def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Conten
         report.line(f"{again} of {len(dataset)} runs were fitted: they say little about new ones")
     report.stage("predicting")
     try:
-        rungs = restored(fit.space.template.geometry, dict(fit.baselines))
+        models = restored(fit.space.template.geometry, dict(fit.baselines))
     except ValueError as error:
         raise DataError(f"{out / 'fit.json'}: {error}") from error
     fitted = fit.contact
-    return fit, dataset, validation(fitted, rungs, dataset).to_json()
+    return fit, dataset, validation(fitted, models, dataset).to_json()

@@ -1,4 +1,4 @@
-"""A fit to some runs of a config, and what it and the rungs predict of others."""
+"""A fit to some runs of a config, and what it and simpler models predict of others."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,11 +23,11 @@ def held_back(
         problem, optimum = optimised(job, job.problem(), None, report)
         fit = summarised(job, problem, optimum, report)
     assert fit.converged, fit.reason
-    rungs = restored(fit.space.template.geometry, dict(fit.baselines))
+    models = restored(fit.space.template.geometry, dict(fit.baselines))
     other = part(whole.dataset, judged)
     # a session that was not fitted has the marker where the robot has it
     other = replace(other, session=tuple(fit.robot.camera.sessions[:1] * len(other)))
-    return validation(fit.contact, rungs, other)
+    return validation(fit.contact, models, other)
 
 
 def part(data: Runs, names: tuple[str, ...]) -> Runs:
