@@ -1,11 +1,7 @@
 """The rows of the benchmark's tables: every published system, in the order of its year or so."""
 
-from slipid.baselines.interface import ByFloor, Machine, Method
 from slipid.baselines.motion.boosted_trees import BoostedTrees
-from slipid.baselines.motion.effective_track import EffectiveTrack, InstantaneousCentres
-from slipid.baselines.motion.encoder import Encoder
 from slipid.baselines.motion.gmdh.method import GmdhClass, GmdhOne
-from slipid.baselines.motion.heading_lookup import HeadingLookup
 from slipid.baselines.motion.neural_network import NeuralNetwork
 from slipid.baselines.motion.ojeda import ojeda_rows
 from slipid.baselines.motion.paper import paper_rows
@@ -13,16 +9,18 @@ from slipid.baselines.motion.quann.energy import QuannEnergy
 from slipid.baselines.motion.quann.slip import QuannSlip
 from slipid.baselines.motion.reina.method import ReinaDeterministic, ReinaFuzzy
 from slipid.baselines.motion.ward_iagnemma.method import WardIagnemma
+from slipid.identify.compare.heading_lookup import HeadingLookup
+from slipid.identify.compare.kinematics import Corrected, Encoder
+from slipid.identify.compare.slip_model import ByFloor, Machine, SlipModel
 
 KINEMATIC = ("effective_track", "instantaneous_centres")
 """Rows for wheels that do not determine the twist."""
 
 
-def _every() -> list[Method]:
+def _every() -> list[SlipModel]:
     """All methods, unfitted; those that handle floors themselves as they are."""
-    of_one_floor: list[Method] = [
-        EffectiveTrack(),
-        InstantaneousCentres(),
+    of_one_floor: list[SlipModel] = [
+        *(Corrected(name) for name in KINEMATIC),
         ReinaDeterministic(),
         ReinaFuzzy(),
         WardIagnemma(),
@@ -42,7 +40,7 @@ ROWS = tuple(method.name for method in _every())
 """Their names."""
 
 
-def rows(machine: Machine) -> list[Method]:
+def rows(machine: Machine) -> list[SlipModel]:
     """Methods for a robot, unfitted; those that lack a channel they need are among them."""
     every = _every()
     if machine.determines_twist:

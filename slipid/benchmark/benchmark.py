@@ -16,7 +16,7 @@ from slipid.benchmark.reading import reading
 from slipid.benchmark.rectangle import CONTROLLERS, Rectangle
 from slipid.benchmark.row import Row
 from slipid.benchmark.sets import SOURCES, there
-from slipid.benchmark.summary import Summary, summary
+from slipid.benchmark.summary import RowSummary, summary
 from slipid.benchmark.work import OWN_MAP, QUICK_KIND, Piece, Wish, data_of
 from slipid.support.checkpoint import versions
 from slipid.support.content import Content
@@ -27,7 +27,7 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.benchmark/1"
-Tables = dict[str, dict[str, dict[str, Summary]]]
+Tables = dict[str, dict[str, dict[str, RowSummary]]]
 """Summaries by data set, protocol and row."""
 
 
@@ -153,7 +153,7 @@ def tables_of(pieces: Sequence[Piece]) -> Tables:
     return tables
 
 
-def _set(wish: Wish, name: str, protocols: Mapping[str, Mapping[str, Summary]]) -> Content:
+def _set(wish: Wish, name: str, protocols: Mapping[str, Mapping[str, RowSummary]]) -> Content:
     data = data_of(wish, name)
     return {
         "about": data.source.about,

@@ -1,4 +1,4 @@
-"""What a method's word on a run is worth, against the poses that it has not seen."""
+"""Scores of the benchmark's predictions, against poses that the models have not seen."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -6,7 +6,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.baselines.interface import (
+from slipid.benchmark.protocols import base_of
+from slipid.benchmark.sets import Over
+from slipid.identify.compare.score import chords, clusters, lengths, scores
+from slipid.identify.compare.slip_model import (
     WINDOW_S,
     Machine,
     Run,
@@ -16,22 +19,17 @@ from slipid.baselines.interface import (
     path_of,
     seen_from_start,
 )
-from slipid.benchmark.protocols import base_of
-from slipid.benchmark.sets import Over
-from slipid.identify.compare.ranking import CLUSTER_DEG
 from slipid.support.content import Content
 
 SLIPS = 0.2
 """A robot slips where its twist is off that of its wheels by more than this part of the latter."""
 STANDS = 0.02
 """Rim speed below which a window says nothing of slip [m/s]."""
-CHI2_90 = 4.605170185988092
-"""Square of the radius that holds 90 % of a plane Gaussian, in stds."""
 
 
 @dataclass(frozen=True)
-class Judged:
-    """One run, judged.
+class RunScore:
+    """Errors of a prediction of one run.
 
     Attributes:
         name, floor: of the run; the floor with the load set-up.
@@ -64,22 +62,22 @@ class Judged:
         return asdict(self)
 
 
-def judged(run: Run, said: Said, machine: Machine, over: Over) -> Judged:
-    """A run against what was said of it."""
+def scored(run: Run, said: Said, machine: Machine, over: Over) -> RunScore:
+    """Score of a prediction of a run."""
     true = seen_from_start(run.pose)
-    gap = said.path[-1] - true[-1]
-    most = max(_length(true, over), 1e-9)
+    cov = None if said.end_covariance is None else said.end_covariance[None]
+    (end,) = scores(said.path[None], true[None], cov, said.freedom)
     first = groups(run.heard.dt, WINDOW_S)
     off, slip, slips = _windows(run, said, machine, first)
-    return Judged(
+    return RunScore(
         name=run.heard.name,
         floor=run.floor,
-        cluster=_cluster(run),
-        endpoint_error=float(np.hypot(*gap[:2])) / most,
-        length_error=abs(_length(said.path, over) / most - 1),
-        heading_error_deg=abs(float(np.degrees(np.angle(np.exp(1j * gap[2]))))),
+        cluster=int(clusters([float(np.degrees(run.heading))])[0]),
+        endpoint_error=end.endpoint_error if over == "chord" else end.endpoint_error_over_path,
+        length_error=abs(_length(said.path, over) / max(_length(true, over), 1e-9) - 1),
+        heading_error_deg=end.heading_error_deg,
         twist_error=off,
-        covered90=_covered(gap[:2], said.end_covariance),
+        covered90=end.covered90,
         scores=[float(f"{x:.4g}") for x in slip.tolist()],
         slips=slips.tolist(),
         floor_right=_floor_right(run, said),
@@ -88,17 +86,8 @@ def judged(run: Run, said: Said, machine: Machine, over: Over) -> Judged:
 
 
 def _length(path: Float[np.ndarray, "edge 3"], over: Over) -> float:
-    """Of the straight way from the origin to the end, or of the way driven [m]."""
-    if over == "chord":
-        return float(np.hypot(*path[-1, :2]))
-    return float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum())
-
-
-def _cluster(run: Run) -> int:
-    """Sector of directions of a run; a run without a direction is by itself."""
-    if not np.isfinite(run.heading):
-        return -1
-    return int((np.degrees(run.heading) % 360.0 + 1e-6) // CLUSTER_DEG)
+    """Straight-line displacement, or length of the path [m]."""
+    return (chords if over == "chord" else lengths)(path[None])[0]
 
 
 def _windows(
@@ -122,10 +111,6 @@ def _windows(
         score = np.add.reduceat(said.slipping * run.heard.dt, first) / dt[:, 0]
     off = float(np.sqrt(np.mean(np.sum((told - true) ** 2, axis=1))))
     return off, score[moves], slips[moves]
-
-
-def _covered(gap: np.ndarray, cov: np.ndarray | None) -> bool | None:
-    return None if cov is None else bool(gap @ np.linalg.solve(cov, gap) <= CHI2_90)
 
 
 def _floor_right(run: Run, said: Said) -> float | None:

@@ -11,10 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import f as fisher
 
-from slipid.baselines.interface import Heard, Machine, Said, seen_from_start
-from slipid.benchmark.judge import CHI2_90
 from slipid.benchmark.steps import Cut, body_poses
 from slipid.control.deployed import DeployedRobot
 from slipid.control.estimator import Estimator
@@ -26,6 +23,7 @@ from slipid.deploy.floors import floor_of
 from slipid.deploy.forecaster import robot_of
 from slipid.identify.compare.folds import of_some
 from slipid.identify.compare.predictive import Contact, contact_of
+from slipid.identify.compare.slip_model import Heard, Machine, Said, seen_from_start
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.optimise import optimise
 from slipid.identify.fit.problem import Problem, State
@@ -35,9 +33,6 @@ from slipid.job.problem import Job
 from slipid.support.checkpoint import Checkpoint
 
 NAME = "slipid"
-WIDER = 2 * float(fisher.ppf(0.9, 2, DEGREES)) / CHI2_90
-"""Ends that the force balance predicts scatter as a Student t: its region of 90 % is that of a
-Gaussian with a covariance larger by this factor."""
 TOLERANCE = 0.1
 """A fit is done when nothing moves by more than this part of its std: runs scatter far more."""
 STEPS = 16
@@ -130,7 +125,8 @@ def told(own: Own, cut: Cut, machine: Machine) -> list[Said]:
     return [
         Said(
             path=seen_from_start(paths[k]),
-            end_covariance=WIDER * turned_covariance(cov[k], -float(paths[k, 0, 2])),
+            end_covariance=turned_covariance(cov[k], -float(paths[k, 0, 2])),
+            freedom=DEGREES,
             power=None if power is None else power[k],
         )
         for k in range(len(cut.runs))

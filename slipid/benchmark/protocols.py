@@ -1,14 +1,17 @@
 """What is left out, and what methods are told: the questions that every row is asked."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int
 
-from slipid.baselines.interface import Run
 from slipid.data.runs import Runs
+from slipid.identify.compare import folds as compared
+from slipid.identify.compare.folds import Facts, speeds
+from slipid.identify.compare.slip_model import Run
 
 FOLDS = 2
 """Parts into which headings and sectors are dealt; every other sector is left out together."""
@@ -16,7 +19,6 @@ SPEEDS = 2
 """Parts of speeds, where there are many."""
 INNER = 1
 """Parts of the training runs that are left out in turn while a method picks its settings."""
-SECTOR_DEG = 60.0
 LEAST_FITTED, LEAST_JUDGED = 8, 3
 """Runs without which nothing is fitted, and nothing judged."""
 ALL = -1
@@ -51,22 +53,6 @@ PROTOCOLS: dict[str, Protocol] = {
 }
 
 
-@dataclass(frozen=True)
-class Facts:
-    """What splits go by: floor, direction commanded [deg] and speed [m/s] of a run.
-
-    The floor has the name of the load set-up after it where that is not the usual one.
-    """
-
-    floor: str
-    heading_deg: float
-    speed: float
-
-    @classmethod
-    def of(cls, run: Run) -> "Facts":
-        return cls(run.floor, float(np.degrees(run.heading)), run.speed)
-
-
 @dataclass(frozen=True, eq=False)
 class Split:
     """One fold: numbers of the runs that are fitted and of those that are judged.
@@ -95,29 +81,21 @@ def base_of(floor: str) -> str:
     return floor.partition("@")[0]
 
 
-def setups_of(data: Runs) -> list[str]:
-    """Floor of each run, and its load set-up where that is not the one most runs have."""
-    loads = [log.load for log in data.logs]
-    main = max(dict.fromkeys(loads), key=loads.count)
-    return [
-        f"{log.surface or 'unknown'}" + ("" if log.load == main else f"@{log.load}")
-        for log in data.logs
-    ]
-
-
 def facts_of(data: Runs, base_radius: float) -> list[Facts]:
-    """Of all runs; a robot that does not drive sideways has the direction of (speed, turning)."""
-    out = []
-    floors = setups_of(data)
+    """Facts of all runs; a robot that cannot drive sideways has the direction (speed, turning)."""
+    out = compared.facts_of(data)
     for k, log in enumerate(data.logs):
-        speed, turn = float(data.speed[k]), float(data.turn[k])
-        heading = float(np.degrees(data.heading[k]))
-        if log.wheels == 2 and np.isfinite(speed) and log.twist_command is not None:
+        if log.wheels == 2 and np.isfinite(data.speed[k]) and log.twist_command is not None:
             ahead = float(np.median(log.twist_command[:, 0]))
-            heading = float(np.degrees(np.arctan2(base_radius * turn, ahead)))
-            speed = float(np.hypot(ahead, base_radius * turn))
-        out.append(Facts(floors[k], heading, speed))
+            aside = base_radius * float(data.turn[k])
+            way = float(np.degrees(np.arctan2(aside, ahead)))
+            out[k] = replace(out[k], heading_deg=way, speed=float(np.hypot(ahead, aside)))
     return out
+
+
+def facts_of_run(run: Run) -> Facts:
+    """Facts of a run as methods are given it."""
+    return Facts(run.floor, float(np.degrees(run.heading)), run.speed)
 
 
 def headings(facts: Sequence[Facts]) -> Labels:
@@ -134,27 +112,8 @@ def headings(facts: Sequence[Facts]) -> Labels:
 
 def sectors(facts: Sequence[Facts]) -> Labels:
     """Parts of every other sector of directions; -1 of runs without a direction."""
-    way = np.array([f.heading_deg for f in facts])
-    known = np.isfinite(way)
-    turn = np.where(known, way, 0.0) % 360.0
-    return np.where(known, np.floor((turn + 1e-6) / SECTOR_DEG).astype(int) % FOLDS, -1)
-
-
-def speeds(facts: Sequence[Facts]) -> Labels:
-    """Parts of one commanded speed, or halves where there are many.
-
-    Runs on a floor that saw one part only are of none, -1.
-    """
-    speed = np.round([f.speed for f in facts], 3)
-    where = np.array([f.floor for f in facts])
-    every = np.unique(speed[np.isfinite(speed) & (speed > 0)])
-    many = len(every) > 2 * SPEEDS
-    edges = np.quantile(every, np.arange(1, SPEEDS) / SPEEDS) if many else every[1:]
-    part = np.where(np.isfinite(speed) & (speed > 0), np.searchsorted(edges, speed, "right"), -1)
-    for floor in np.unique(where):
-        if len(np.unique(part[(where == floor) & (part >= 0)])) < 2:
-            part[where == floor] = -1
-    return part
+    sector = compared.sectors(facts)
+    return np.where(sector < 0, sector, sector % FOLDS)
 
 
 def floors(facts: Sequence[Facts]) -> Labels:
@@ -165,7 +124,7 @@ def floors(facts: Sequence[Facts]) -> Labels:
 KINDS: dict[str, Callable[[Sequence[Facts]], Labels]] = {
     "headings": headings,
     "sectors": sectors,
-    "speeds": speeds,
+    "speeds": partial(speeds, most=SPEEDS),
     "floors": floors,
 }
 
@@ -198,7 +157,7 @@ def inner(runs: Sequence[Run], kind: str) -> Labels:
     training runs have fewer than two parts of the kind, and so always for sectors: every other one
     is missing already, and without one more the gap would be three times as wide as is asked about.
     """
-    facts = [Facts.of(run) for run in runs]
+    facts = [facts_of_run(run) for run in runs]
     for name in dict.fromkeys((kind if kind in KINDS else "headings", "headings")):
         part = KINDS[name](facts)
         names, count = np.unique(part[part >= 0], return_counts=True)

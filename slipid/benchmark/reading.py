@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 
 from slipid.benchmark.own import NAME
-from slipid.benchmark.summary import Number, Summary
+from slipid.benchmark.summary import Number, RowSummary
 
 NAMED = 4
 """Rows that a sentence names."""
 
 
-def reading(tables: Mapping[str, Mapping[str, Mapping[str, Summary]]]) -> list[str]:
+def reading(tables: Mapping[str, Mapping[str, Mapping[str, RowSummary]]]) -> list[str]:
     """A sentence for each protocol of each data set."""
     return [
         sentence(name, protocol, found)
@@ -18,7 +18,7 @@ def reading(tables: Mapping[str, Mapping[str, Mapping[str, Summary]]]) -> list[s
     ]
 
 
-def sentence(name: str, protocol: str, found: Mapping[str, Summary]) -> str:
+def sentence(name: str, protocol: str, found: Mapping[str, RowSummary]) -> str:
     """What the end-point errors of one table say of slipid."""
     head = f"{name}, {protocol.replace('_', ' ')}: "
     own = found.get(NAME)

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from slipid.benchmark.judge import Judged
+from slipid.benchmark.judge import RunScore
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Row:
         converged: of a fit that goes in rounds.
     """
 
-    runs: tuple[Judged, ...] = ()
+    runs: tuple[RunScore, ...] = ()
     absent: str = ""
     failed: bool = False
     settings: str = ""
@@ -38,7 +38,7 @@ class Row:
 
     @classmethod
     def of_json(cls, content: dict[str, Any]) -> "Row":
-        return cls(**{**content, "runs": tuple(Judged(**run) for run in content["runs"])})
+        return cls(**{**content, "runs": tuple(RunScore(**run) for run in content["runs"])})
 
     @classmethod
     def lacking(cls, channels: Iterable[str]) -> "Row":

@@ -7,11 +7,12 @@ from typing import Literal
 
 import numpy as np
 
-from slipid.baselines.interface import Machine
-from slipid.benchmark.protocols import Facts, facts_of, setups_of
+from slipid.benchmark.protocols import facts_of
 from slipid.benchmark.steps import POSES_PER_STEP
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.runs import Runs, collect
+from slipid.identify.compare.folds import Facts
+from slipid.identify.compare.slip_model import Machine
 from slipid.job.config import Config, Logs, one_floor, parsed
 from slipid.job.logs import read_dataset
 from slipid.job.packaged import packaged_path, unpack
@@ -149,8 +150,8 @@ class DataSet:
 
     @property
     def setups(self) -> list[str]:
-        """Floor of each run, and its load set-up where that is not the one most runs have."""
-        return setups_of(self.heard)
+        """Floor of each run, and its load set-up where that is not the main one."""
+        return [f.floor for f in self.facts]
 
 
 def there(source: Source, data: Path) -> bool:

@@ -1,18 +1,18 @@
 """Runs in short steps with true body poses, as every method of the benchmark is given them."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from slipid.baselines.interface import Heard, Run
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import integral, interpolate
-from slipid.data.windows import Windows, windows
+from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.rung import turned
+from slipid.identify.compare.marker import turned
+from slipid.identify.compare.slip_model import Heard, Run
 from slipid.model.robot import Robot
 
 POSES_PER_STEP = 3
@@ -40,20 +40,10 @@ def cut(data: Runs, robot: Robot, poses_per_step: int = POSES_PER_STEP) -> list[
     The robot's camera says how true poses follow from logged ones, and how late they are. Nearly
     all runs have the same number of steps, so that few shapes are compiled; it is a power of two.
     """
-    radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
     poses = [int(data.fresh[data.rows(k)].sum()) for k in range(len(data))]
     usual = _steps(float(np.quantile(poses, 0.1)), poses_per_step)
-    groups: dict[int, list[int]] = {}
-    for k, count in enumerate(poses):
-        groups.setdefault(min(usual, _steps(float(count), poses_per_step)), []).append(k)
-    out = []
-    for steps, runs in sorted(groups.items()):
-        for first in range(0, len(runs), replay.TOGETHER):
-            some = runs[first : first + replay.TOGETHER]
-            w = windows(data.subset(some), radius, lag, per_piece=steps, longest=np.inf)
-            filled = np.minimum(np.arange(replay.TOGETHER), len(w) - 1)
-            out.append(_cut(data, robot, replace(w, run=np.asarray(some)[w.run]).pieces(filled)))
-    return out
+    steps = [min(usual, _steps(float(count), poses_per_step)) for count in poses]
+    return [_cut(data, robot, w) for w in replay.whole_runs(data, robot, steps)]
 
 
 def _steps(poses: float, poses_per_step: int) -> int:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.benchmark.judge import Judged
+from slipid.benchmark.judge import RunScore
 from slipid.benchmark.row import Row
 
 DRAWS = 1000
@@ -27,8 +27,8 @@ class Number(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Summary:
-    """A row in one protocol of one data set; attributes as of `Judged` where they are means of it.
+class RowSummary:
+    """A row in one protocol of one data set; attributes as of `RunScore` where they are its means.
 
     Means are over the runs of each floor, then over floors. What a method does not say is None.
 
@@ -66,14 +66,14 @@ class Summary:
     failed: bool = False
 
 
-def summary(folds: Mapping[str, Sequence[Row]], reference: str) -> dict[str, Summary]:
+def summary(folds: Mapping[str, Sequence[Row]], reference: str) -> dict[str, RowSummary]:
     """Every row by its folds; the reference is the row that the others are compared with.
 
     A row that is absent in some fold is absent altogether: its runs would be others.
     """
     there = {name: each for name, each in folds.items() if each and not any(r.absent for r in each)}
     done = {name: [run for row in each for run in row.runs] for name, each in there.items()}
-    out: dict[str, Summary] = {}
+    out: dict[str, RowSummary] = {}
     first = next(iter(done.values()), [])
     if first:
         weights = Resampled.of(first)
@@ -85,7 +85,7 @@ def summary(folds: Mapping[str, Sequence[Row]], reference: str) -> dict[str, Sum
     for name, each in folds.items():
         if name not in out:
             said = next((row for row in each if row.absent), Row(absent="no run"))
-            out[name] = Summary(absent=said.absent, failed=any(row.failed for row in each))
+            out[name] = RowSummary(absent=said.absent, failed=any(row.failed for row in each))
     return {name: out[name] for name in folds}
 
 
@@ -103,7 +103,7 @@ class Resampled:
     draws: Weights
 
     @classmethod
-    def of(cls, runs: Sequence[Judged]) -> "Resampled":
+    def of(cls, runs: Sequence[RunScore]) -> "Resampled":
         """Runs by their clusters; a run whose cluster is negative is one by itself."""
         sector = np.array([run.cluster for run in runs])
         alone = -1 - np.arange(len(runs))
@@ -148,9 +148,9 @@ def number(draws: Float[np.ndarray, " draw"]) -> Number:
 
 
 def _summary(
-    rows: Sequence[Row], runs: Sequence[Judged], rival: Sequence[Judged] | None, by: Resampled
-) -> Summary:
-    def mean(of: Callable[[Judged], float | bool | None]) -> Number | None:
+    rows: Sequence[Row], runs: Sequence[RunScore], rival: Sequence[RunScore] | None, by: Resampled
+) -> RowSummary:
+    def mean(of: Callable[[RunScore], float | bool | None]) -> Number | None:
         x = np.array([np.nan if (v := of(run)) is None else float(v) for run in runs])
         return number(by.mean(x)) if np.isfinite(x).any() else None
 
@@ -162,7 +162,7 @@ def _summary(
     def median(name: str) -> float:
         return float(np.median([getattr(row, name) for row in rows]))
 
-    return Summary(
+    return RowSummary(
         endpoint_error=number(by.mean(error)),
         floors={name: number(by.on(error, k)) for k, name in enumerate(by.names)},
         behind=behind,
@@ -183,7 +183,7 @@ def _summary(
     )
 
 
-def _auc(runs: Sequence[Judged], by: Resampled) -> Number | None:
+def _auc(runs: Sequence[RunScore], by: Resampled) -> Number | None:
     """Area under the curve of slip detection over all windows, in a part of the draws."""
     score = np.concatenate([run.scores for run in runs])
     slips = np.concatenate([np.asarray(run.slips, bool) for run in runs])

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slipid.baselines.interface import TRIES, ByFloor, Machine, Method, Run
-from slipid.benchmark.judge import judged
+from slipid.benchmark.judge import scored
 from slipid.benchmark.protocols import INNER, inner
+from slipid.identify.compare.slip_model import TRIES, ByFloor, Machine, Run, SlipModel
 
 WORST = 2.0
 """Relative error beyond which it does not matter how far a setting is off."""
@@ -17,20 +17,20 @@ WORST = 2.0
 class Tuned:
     """A method with its settings, and in words which these are and how many were tried."""
 
-    method: Method
+    method: SlipModel
     settings: str
     tried: int
 
 
-def tuned(method: Method, runs: Sequence[Run], machine: Machine, kind: str) -> Tuned:
+def tuned(method: SlipModel, runs: Sequence[Run], machine: Machine, kind: str) -> Tuned:
     """The method with the best of its settings, unfitted.
 
     Each is fitted without a part of the runs, of the kind that the method will be judged by as far
     as the training runs have such parts, and judged on that part by its mean error, of the end over
-    the path or of the energy (`Method.aim`), floors counting alike. A setting with which the method
-    cannot be fitted counts as the worst. All training runs are used, since settings that are best
-    for fewer are too cautious. A method that is fitted floor by floor may also do better with one
-    fit to all runs: with the best settings both are tried.
+    the path or of the energy (`SlipModel.aim`), floors counting alike. A setting with which the
+    method cannot be fitted counts as the worst. All training runs are used, since settings that are
+    best for fewer are too cautious. A method that is fitted floor by floor may also do better with
+    one fit to all runs: with the best settings both are tried.
     """
     candidates = list(method.candidates())[:TRIES]
     part = inner(runs, kind)
@@ -49,7 +49,7 @@ def tuned(method: Method, runs: Sequence[Run], machine: Machine, kind: str) -> T
     return Tuned(best, words, len(candidates) + pools)
 
 
-def _loss(method: Method, runs: Sequence[Run], part: np.ndarray, machine: Machine) -> float:
+def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, machine: Machine) -> float:
     """Mean error over parts left out in turn, over runs and then over floors."""
     errors: dict[str, list[float]] = {}
     for k in range(INNER):
@@ -65,7 +65,7 @@ def _loss(method: Method, runs: Sequence[Run], part: np.ndarray, machine: Machin
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             return np.inf
         for run, one in zip(left_out, said, strict=True):
-            found = judged(run, one, machine, "path")
+            found = scored(run, one, machine, "path")
             error = found.energy_error if method.aim == "energy" else found.endpoint_error
             error = np.inf if error is None else error
             mine = errors.setdefault(run.floor, [])

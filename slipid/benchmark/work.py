@@ -5,20 +5,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
-from slipid.baselines.interface import Channel, Machine, Method, Run, Said
+from slipid.baselines.motion.features import common
 from slipid.baselines.rows import rows
 from slipid.benchmark import own as slipid_rows
-from slipid.benchmark.judge import Judged, judged
+from slipid.benchmark.judge import RunScore, scored
 from slipid.benchmark.protocols import PROTOCOLS, Protocol, Split, base_of, splits
 from slipid.benchmark.row import Row
 from slipid.benchmark.sets import SOURCES, DataSet, Source, read_set
 from slipid.benchmark.steps import Cut, cut
 from slipid.benchmark.tuned import tuned
 from slipid.data.runs import Runs
+from slipid.identify.compare.slip_model import Channel, Machine, Run, Said, SlipModel
 from slipid.identify.fit.problem import Problem
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
@@ -228,17 +228,13 @@ def _row(scene: Scene, protocol: str, name: str) -> Row:
         return Row.of_error(error)
 
 
-def channels_of(runs: Sequence[Run], machine: Machine) -> set[Channel]:
+def channels_of(runs: Sequence[Run], machine: Machine) -> frozenset[Channel]:
     """What all these runs have beside encoders."""
-    found = {
-        name
-        for name in ("current", "gyro", "command")
-        if all(getattr(run.heard, name) is not None for run in runs)
-    }
-    return cast(set[Channel], found | ({"twist"} if machine.determines_twist else set()))
+    twist: frozenset[Channel] = frozenset({"twist"} if machine.determines_twist else ())
+    return common(runs) | twist
 
 
-def _published(scene: Scene, asked: Protocol, runs: list[Run], method: Method) -> Row:
+def _published(scene: Scene, asked: Protocol, runs: list[Run], method: SlipModel) -> Row:
     machine = scene.data.machine
     fitted = [run.told(asked.told) for run in scene.fitted]
     began = time.perf_counter()
@@ -289,9 +285,9 @@ def _own(scene: Scene, asked: Protocol, runs: list[Run], name: str) -> Row:
     )
 
 
-def _judged(scene: Scene, runs: Sequence[Run], said: Sequence[Said]) -> tuple[Judged, ...]:
+def _judged(scene: Scene, runs: Sequence[Run], said: Sequence[Said]) -> tuple[RunScore, ...]:
     machine, over = scene.data.machine, scene.data.source.over
-    return tuple(judged(run, one, machine, over) for run, one in zip(runs, said, strict=True))
+    return tuple(scored(run, one, machine, over) for run, one in zip(runs, said, strict=True))
 
 
 def _timed(predict: Callable[[], list[Said]], runs: Sequence[Run]) -> tuple[list[Said], float]:

@@ -170,8 +170,8 @@ class Fit:
         Raises:
             DataError: a run on a floor or with a load set-up that was not identified.
         """
-        rungs = restored(self.space.template.geometry, dict(self.baselines))
-        return validation(self.contact, rungs, runs, self.new_runs(runs))
+        models = restored(self.space.template.geometry, dict(self.baselines))
+        return validation(self.contact, models, runs, self.new_runs(runs))
 
     def new_runs(self, data: Runs) -> int:
         """Number of runs that the fit has not seen."""

@@ -11,7 +11,7 @@ from slipid.data.sanity.columns import refuse_misordered
 from slipid.identify.compare.folds import Fold, folds_of, judge
 from slipid.identify.compare.ranking import ranking
 from slipid.identify.compare.transfer import transfer
-from slipid.identify.compare.validation import Judged
+from slipid.identify.compare.validation import ScoredRun
 from slipid.identify.fit.optimise import optimise
 from slipid.identify.fit.problem import Problem, State
 from slipid.job.config import read_config
@@ -32,7 +32,7 @@ FOLDS = "folds"
 def compare(
     config_path: Path, data: Path, out: Path, questions: Sequence[str], report: Reporter
 ) -> Content:
-    """Judge every rung of the ladder on left-out runs and write comparison.json to `out`.
+    """Judge every slip model on held-out runs and write comparison.json to `out`.
 
     What is left out say the questions, some of `slipid.identify.compare.folds.QUESTIONS`; folds
     that are finished in `out` are not done again. DataError where config, logs or questions are
@@ -64,7 +64,7 @@ def compare(
                 "converged": all(fold["converged"] for fold in some),
                 "floors": {
                     floor: asdict(one)
-                    for floor, one in ranking([Judged.of_json(r) for r in _rows(some)]).items()
+                    for floor, one in ranking([ScoredRun.of_json(r) for r in _rows(some)]).items()
                 },
                 "cost": _cost(some),
             }

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from slipid.identify.compare.agreement import contradiction, floor_errors, most_moved
-from slipid.identify.compare.slip_models import rungs
+from slipid.identify.compare.slip_models import slip_models
 from slipid.identify.fit.across import across
 from slipid.identify.fit.crossing import crossing
 from slipid.identify.fit.optimise import Optimum, optimise
@@ -276,6 +276,6 @@ def _judged(about: Mapping[str, Any]) -> str:
 def _with_baselines(fit: Fit, task: Task) -> Fit:
     """The fit, with every simpler model learnt from the same runs at the fitted camera and lag."""
     cut, shape = task.windows(fit.robot), fit.space.template.geometry
-    learnt = [rung.fit(cut, fit.robot) for rung in rungs(shape, fit.channels.current)]
-    plain = {r.name: {floor: v.tolist() for floor, v in r.state.items()} for r in learnt}
+    learnt = [model.fit(cut, fit.robot) for model in slip_models(shape, fit.channels.current)]
+    plain = {m.name: {floor: v.tolist() for floor, v in m.state.items()} for m in learnt}
     return replace(fit, baselines=plain)

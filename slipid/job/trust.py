@@ -7,12 +7,15 @@ import numpy as np
 
 from slipid.data.runs import Runs
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.slip_models import Encoder
+from slipid.identify.compare.floor_models import FloorModels
+from slipid.identify.compare.kinematics import Encoder
+from slipid.identify.compare.validation import ScoredRun, add_scores
 from slipid.identify.result import Fit
 from slipid.identify.verdicts.trust import EndPoints, Trust, verdict_of_trust
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 
+ENCODER = FloorModels(Encoder())
 MOST_RUNS = 24
 """Runs that are replayed of every floor, evenly picked from those that were fitted."""
 
@@ -53,27 +56,24 @@ class Judgement:
 def judgement(fit: Fit, data: Runs) -> Judgement:
     """Verdict on a fit by the runs it was made of, replayed from their first pose on."""
     some = data.subset(_picked(data))
-    errors: dict[str, list[tuple[float, float]]] = {}
+    runs: dict[int, ScoredRun] = {}
     try:
         cuts = replay.cuts(some, fit.robot)
     except DataError:  # a fitted lag can be so long that a short run shows nothing
         cuts = []
-    seen: set[int] = set()
     for w in cuts:
-        tracks = fit.contact.tracks(w)
-        plain = replay.follow(fit.robot, w, Encoder().increments(w, fit.robot))
-        for k, run in enumerate(tracks.run.tolist()):
-            if run in seen:
-                continue
-            seen.add(run)
-            way = max(float(tracks.path[k]), 1e-9)
-            off = [float(np.hypot(*one.gap[k, :2])) / way for one in (tracks, plain)]
-            errors.setdefault(w.surface[k], []).append((off[0], off[1]))
+        plain = replay.follow(fit.robot, w, ENCODER.increments(w, fit.robot))
+        for name, tracks in ((fit.contact.name, fit.contact.tracks(w)), (ENCODER.name, plain)):
+            add_scores(runs, some, name, tracks, None)
+    errors: dict[str, list[list[float]]] = {}
+    for run in runs.values():
+        off = [score.endpoint_error_over_path for score in run.models.values()]
+        errors.setdefault(run.surface, []).append(off)
     floors = {
         name: EndPoints(*np.mean(each, axis=0).tolist()) for name, each in sorted(errors.items())
     }
     trust = verdict_of_trust(floors, fit.converged, fit.parameters.values())
-    return Judgement(trust, floors, len(seen))
+    return Judgement(trust, floors, len(runs))
 
 
 def _picked(data: Runs) -> list[int]:

@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 
 from slipid.data.runs import Runs
 from slipid.identify.compare import open_loop as replay
+from slipid.identify.compare.floor_models import FloorModels
+from slipid.identify.compare.kinematics import Encoder
 from slipid.identify.compare.predictive import Contact
-from slipid.identify.compare.slip_models import Encoder
 from slipid.model.robot import Robot
 from slipid.plots import drawing
 from slipid.plots.seen import Seen, by_heading
@@ -149,7 +150,7 @@ def _paths(model: Contact, data: Runs) -> list[tuple[np.ndarray, np.ndarray, np.
     robot = model.robot
     for w in replay.cuts(data, robot):
         tracks = model.tracks(w)
-        encoder = replay.follow(robot, w, Encoder().increments(w, robot))
+        encoder = replay.follow(robot, w, FloorModels(Encoder()).increments(w, robot))
         for n, k in enumerate(tracks.run):
             yaw = float(robot.camera.yaw(jnp.asarray(robot.session_index(w.session[n]))))
             first = tracks.measured[n, 0]

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from slipid.data.runs import Runs
 from slipid.data.windows import windows
 from slipid.identify import slip_curves as curves
-from slipid.identify.compare.rung import body_twist
+from slipid.identify.compare.marker import body_twist
 from slipid.identify.fit import likelihood as lk
 from slipid.model import robot as model
 from slipid.model.robot import Robot

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 from pydantic import TypeAdapter
 
 from slipid.data.windows import Windows
+from slipid.identify.compare.marker import as_increments
 from slipid.identify.compare.open_loop import chain, contact_increments
-from slipid.identify.compare.rung import as_increments
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, State

@@ -58,7 +58,7 @@ def test_one_command_makes_a_table_and_goes_on_from_what_was_kept(tmp_path, monk
     def broken(*_: object) -> list:
         raise ZeroDivisionError("a wheel of size 0")
 
-    monkeypatch.setattr("slipid.baselines.motion.encoder.Encoder.predict", broken)
+    monkeypatch.setattr("slipid.identify.compare.kinematics.Encoder.predict", broken)
     assert piece.run() == "testsite/headings_0"
     left = {name: row for (_, name), row in piece.rows().items()}
     assert left["encoder"] == Row(absent="ZeroDivisionError: a wheel of size 0", failed=True)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from slipid.baselines.floors.interface import FloorMethod, floors_of
-from slipid.baselines.interface import Said
 from slipid.benchmark.felt.benchmark import felt_rows
 from slipid.benchmark.felt.fitting import (
     Cells,
@@ -24,7 +23,7 @@ from slipid.benchmark.felt.meters import MeteredMotor, clipped
 from slipid.benchmark.felt.part import HuskyFloors, RobotinoFloors
 from slipid.benchmark.felt.protocol import (
     Asked,
-    Judged,
+    ScoredClassifier,
     answers_of,
     felt_table,
     folds_of,
@@ -35,6 +34,7 @@ from slipid.benchmark.felt.result import Answer, FeltRow, after_seconds, confuse
 from slipid.benchmark.felt.robotino import _joined, beliefs_of, felt_of, robotino_rows
 from slipid.benchmark.felt.slipid_row import SlipidFloors, kinds
 from slipid.benchmark.work import Wish
+from slipid.identify.compare.slip_model import Said
 from slipid.support.errors import DataError
 from slipid.support.files import json_text
 from tests.helpers.made_felt import HZ, ahead, made_felt, made_felts
@@ -482,10 +482,10 @@ def test_what_the_estimator_calls_unknown_is_left_out_of_the_comparison():
 
 
 def test_a_classifier_that_fails_in_one_fold_has_an_empty_row():
-    lost = Judged(FeltRow("trees", absent="ValueError: no leaf"), ())
-    there = Judged(FeltRow("trees", numbers=4), (answer("a", 1),))
+    lost = ScoredClassifier(FeltRow("trees", absent="ValueError: no leaf"), ())
+    there = ScoredClassifier(FeltRow("trees", numbers=4), (answer("a", 1),))
     assert _joined([there, lost]) == lost
-    assert _joined([there, there]) == Judged(there.row, there.answers * 2)
+    assert _joined([there, there]) == ScoredClassifier(there.row, there.answers * 2)
 
 
 def test_rows_on_the_robotino_hear_no_vibration():

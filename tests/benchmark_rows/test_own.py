@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from slipid.api.known_robot import made_runs
-from slipid.baselines.interface import Machine, Said
 from slipid.benchmark import own as slipid_rows
-from slipid.benchmark.own import WIDER, Own, Place, estimated, replay, told
+from slipid.benchmark.own import Own, Place, estimated, replay, told
 from slipid.benchmark.steps import cut
 from slipid.control.estimator import Estimator
 from slipid.control.interface import MIXED, Settings
+from slipid.identify.compare.slip_model import Machine, Said
+from slipid.identify.fit.variances import DEGREES
 from tests.helpers.small_twin import deployed
 
 
@@ -49,7 +50,8 @@ def test_where_the_floor_is_told_the_region_is_that_of_a_student_t(made):
         assert run.end_covariance is not None
         # a turn to the run's own start leaves both variances, whatever their axes
         found = np.sort(np.linalg.eigvalsh(run.end_covariance))
-        assert found == pytest.approx(WIDER * np.array([1.0, 4.0]))
+        assert found == pytest.approx(np.array([1.0, 4.0]))
+        assert run.freedom == DEGREES
         assert run.power is None
 
 

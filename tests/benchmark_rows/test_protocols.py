@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from slipid.baselines.interface import FEWEST, ByFloor, Machine, Method, Said, path_of
 from slipid.baselines.motion.quann.energy import QuannEnergy
-from slipid.benchmark.protocols import PROTOCOLS, Facts, base_of, inner, splits
+from slipid.benchmark.protocols import PROTOCOLS, base_of, facts_of_run, inner, splits
 from slipid.benchmark.tuned import _loss, tuned
+from slipid.identify.compare.folds import Facts
+from slipid.identify.compare.slip_model import FEWEST, ByFloor, Machine, Said, SlipModel, path_of
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 
@@ -110,13 +111,13 @@ def test_inner_parts_are_of_the_kind_that_is_judged_by():
 
 def test_headings_are_held_back_where_every_other_sector_is_missing_already():
     every = runs()
-    split = splits([Facts.of(run) for run in every], "sectors")[0]
+    split = splits([facts_of_run(run) for run in every], "sectors")[0]
     training = [every[k] for k in split.fitted]
     assert inner(training, "sectors").tolist() == inner(training, "headings").tolist()
 
 
 @dataclass(frozen=True)
-class Scaled(Method):
+class Scaled(SlipModel):
     """Encoders, times a number that is a setting."""
 
     name: str = "scaled"

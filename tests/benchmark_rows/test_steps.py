@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from slipid.api.known_robot import made_runs, move
-from slipid.baselines.interface import seen_from_start
 from slipid.benchmark.own import turned_covariance
 from slipid.benchmark.steps import cut
 from slipid.data.runs import collect
+from slipid.identify.compare.slip_model import seen_from_start
 
 
 @pytest.fixture(scope="module")

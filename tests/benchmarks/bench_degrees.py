@@ -20,7 +20,7 @@ from scipy.special import gammaln
 from slipid.identify.compare import open_loop
 from slipid.identify.compare.folds import folds_of
 from slipid.identify.compare.predictive import contact_of
-from slipid.identify.compare.validation import Judged, score
+from slipid.identify.compare.validation import ScoredRun, add_scores
 from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, less
 from slipid.job.config import read_config
@@ -66,16 +66,16 @@ def test_degrees(degrees: float, real_data: Path, monkeypatch: pytest.MonkeyPatc
         if name.endswith((".creep", ".roller_drag")) or "load_share" in name:
             print(f"  {name:30} {end.state.z[k]:8.4f} +- {std[k]:.4f} (search space)")
     fold = folds_of(data, "sectors", 6)
-    rows: list[Judged] = []
+    rows: list[ScoredRun] = []
     for k in range(6):
         judged = np.flatnonzero(fold == k)
         keep = (~np.isin(problem.windows.run, judged)).astype(float)
         part = optimise(problem, keep=keep, start=replace(end.state, round=0))
         model = contact_of(problem, part.state, part.covariance, keep)
-        runs: dict[int, Judged] = {}
+        runs: dict[int, ScoredRun] = {}
         some = data.subset(judged)
         for w in open_loop.cuts(some, model.robot):
-            score(runs, some, model.name, *model.ends(w))
+            add_scores(runs, some, model.name, *model.ends(w))
         density = model.log_density(problem)
         for i, row in runs.items():
             told = float(density[problem.windows.run == judged[i]].sum())

@@ -29,7 +29,7 @@ from slipid.control.estimator import Estimator
 from slipid.control.interface import MIXED, Settings
 from slipid.deploy.floors import floor_of
 from slipid.deploy.forecaster import robot_of
-from slipid.identify.compare.folds import sectors
+from slipid.identify.compare.folds import facts_of, sectors
 from slipid.identify.compare.predictive import Contact, contact_of
 from slipid.identify.fit.likelihood import batch
 from slipid.identify.fit.optimise import optimise
@@ -131,7 +131,7 @@ def show(rows: list[Judged]) -> None:
 
 def test_one_floor(job: Job) -> None:
     data = job.dataset
-    fold = sectors(data) % 3
+    fold = sectors(facts_of(data)) % 3
     built = np.array([log.load == "as_built" for log in data.logs])
     rows: list[Judged] = []
     for k in range(3):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from slipid.identify.compare.validation import Summary
+from slipid.identify.compare.validation import FloorSummary
 from tests.benchmarks.quick import QUICK, quick
 from tests.helpers.held_back import held_back
 
@@ -48,7 +48,7 @@ SPLITS = quick(
 )
 
 
-def judged(split: Split, real_data: Path) -> dict[str, Summary]:
+def judged(split: Split, real_data: Path) -> dict[str, FloorSummary]:
     config = ROOT / "configs" / f"{split.config}.toml"
     found = held_back(config, real_data / "drive_skid", split.fitted, split.judged)
     (floor,) = found.summary.values()

@@ -1,4 +1,4 @@
-"""A fit to some runs of a config, and what it and the rungs predict of others."""
+"""A fit to some runs of a config, and what it and simpler models predict of others."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slipid.baselines.interface import Heard, Machine, Run, path_of
+from slipid.identify.compare.slip_model import Heard, Machine, Run, path_of
 from slipid.model.geometry import omni, skid_steer
 from slipid.model.robot import build
 

@@ -12,7 +12,7 @@ from matplotlib.image import imread
 
 from slipid.data.runs import collect
 from slipid.data.windows import windows
-from slipid.identify.compare.slip_models import rungs
+from slipid.identify.compare.slip_models import slip_models
 from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.optimise import Optimum
 from slipid.identify.fit.problem import Problem, State
@@ -168,7 +168,7 @@ def test_loads_are_written_at_their_wheels():
 
 def test_every_rung_has_words_in_the_picture():
     shapes = omni([60.0, 180.0, 300.0], 0.1, 0.04), differential(0.2, 0.04)
-    names = {rung.name for shape in shapes for rung in rungs(shape, has_current=True)}
+    names = {model.name for shape in shapes for model in slip_models(shape, has_current=True)}
     assert set(WORDS) == {"identified", *names}
 
 

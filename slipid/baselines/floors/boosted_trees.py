@@ -45,7 +45,7 @@ from slipid.baselines.floors.interface import (
     floors_of,
     rows_of,
 )
-from slipid.baselines.interface import Machine
+from slipid.identify.compare.slip_model import Machine
 
 if TYPE_CHECKING:
     from sklearn.ensemble import HistGradientBoostingClassifier

@@ -47,7 +47,7 @@ from slipid.baselines.floors.interface import (
     floors_of,
     rows_of,
 )
-from slipid.baselines.interface import Machine
+from slipid.identify.compare.slip_model import Machine
 
 GRAVITY = 9.81
 """[m/s^2]"""

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.baselines.floors.interface import Felt
-from slipid.baselines.interface import Machine
+from slipid.identify.compare.slip_model import Machine
 
 WINDOWS_S = (0.5, 1.0, 2.0)
 """Lengths of the windows [s]."""

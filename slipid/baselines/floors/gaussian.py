@@ -30,7 +30,7 @@ from slipid.baselines.floors.interface import (
     floors_of,
     rows_of,
 )
-from slipid.baselines.interface import Machine
+from slipid.identify.compare.slip_model import Machine
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.baselines.interface import Machine
+from slipid.identify.compare.slip_model import Machine
 
 Beliefs = Float[np.ndarray, "row floor"]
 """Probability of each floor after every row."""

@@ -25,8 +25,8 @@ from typing import final
 
 import numpy as np
 
-from slipid.baselines.interface import Channel, Heard, Machine, Method, Run, Said
 from slipid.baselines.motion.features import Lessons, Regressor, Windows, with_slip
+from slipid.identify.compare.slip_model import Channel, Heard, Machine, Run, Said, SlipModel
 
 FEWEST = 20
 """Windows in a leaf at least."""
@@ -52,7 +52,7 @@ CANDIDATES = (
 
 @final
 @dataclass(frozen=True, eq=False)
-class BoostedTrees(Method):
+class BoostedTrees(SlipModel):
     """Boosted trees for each component of the slip.
 
     Attributes:

@@ -30,7 +30,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.baselines.interface import (
+from slipid.identify.compare.slip_model import (
     WINDOW_S,
     Channel,
     Heard,

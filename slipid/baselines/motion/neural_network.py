@@ -25,8 +25,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import final
 
-from slipid.baselines.interface import Channel, Heard, Machine, Method, Run, Said
 from slipid.baselines.motion.features import Lessons, Regressor, Scale, Windows, with_slip
+from slipid.identify.compare.slip_model import Channel, Heard, Machine, Run, Said, SlipModel
 
 PASSES = 60
 """Through all windows, at most."""
@@ -50,7 +50,7 @@ CANDIDATES = (Shape((32,), 1e-3), Shape((16,), 1e-1), Shape((16,), 1.0), Shape((
 
 @final
 @dataclass(frozen=True, eq=False)
-class NeuralNetwork(Method):
+class NeuralNetwork(SlipModel):
     """A multilayer perceptron for the slip.
 
     Attributes:

@@ -47,8 +47,17 @@ from typing import Literal, final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.baselines.interface import Channel, Heard, Machine, Method, Run, Said, Twists
-from slipid.baselines.motion.steps import Steps, Windows, least
+from slipid.identify.compare.slip_model import (
+    Channel,
+    Heard,
+    Machine,
+    Run,
+    Said,
+    SlipModel,
+    Twists,
+    seen_from_start,
+)
+from slipid.identify.compare.steps import Steps, TrainingWindows, least
 
 Line = Float[np.ndarray, "2"]
 """k0 [m/s] and k1 [m/s/A]."""
@@ -103,7 +112,7 @@ class Scene:
 
 @final
 @dataclass(frozen=True)
-class Ojeda(Method):
+class Ojeda(SlipModel):
     """See the head of this module; do not fit it floor by floor, it does that itself.
 
     Attributes:
@@ -162,7 +171,7 @@ class Ojeda(Method):
             return np.zeros(2)
         if self.tuning == "sporadic":
             return sporadic(scene, runs, machine)
-        w = Windows.of(runs)
+        w = TrainingWindows.of(runs)
         if self.tuning == "continuous":
             return continuous(scene, w, machine)
         return by_gyro(scene, w, hard.mean, machine)
@@ -186,14 +195,10 @@ def hard_runs(runs: Sequence[Run], machine: Machine) -> list[Run]:
 
 def true_ends(runs: Sequence[Run]) -> Float[np.ndarray, "run 3"]:
     """Pose at each run's end, seen from its start [m, m, rad]."""
-    start = np.stack([run.pose[0] for run in runs])
-    moved = np.stack([run.pose[-1] for run in runs]) - start
-    c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
-    x, y, turn = moved.T
-    return np.stack([c * x + s * y, c * y - s * x, turn], axis=1)
+    return np.stack([seen_from_start(run.pose)[-1] for run in runs])
 
 
-def continuous(scene: Scene, w: Windows, machine: Machine) -> Line:
+def continuous(scene: Scene, w: TrainingWindows, machine: Machine) -> Line:
     """By the pose at all times; only windows with slip flagged count."""
     rows = w.rows(machine.back @ scene.features(), machine)
     told = rows.parts.any(axis=(1, 2))
@@ -230,7 +235,7 @@ def sporadic(scene: Scene, runs: Sequence[Run], machine: Machine) -> Line:
     return np.asarray(least_squares(gap, np.zeros(2), x_scale="jac").x)
 
 
-def by_gyro(scene: Scene, w: Windows, middle: float, machine: Machine) -> Line:
+def by_gyro(scene: Scene, w: TrainingWindows, middle: float, machine: Machine) -> Line:
     """By the yaw rate alone; the middle is the hard floor's mean current [A]."""
     heard = scene.steps.heard
     if heard.gyro is None:
@@ -241,7 +246,7 @@ def by_gyro(scene: Scene, w: Windows, middle: float, machine: Machine) -> Line:
     return np.array([offset - gain * middle, gain])
 
 
-def ojeda_rows() -> list[Method]:
+def ojeda_rows() -> list[SlipModel]:
     """The three rows, unfitted."""
     return [
         Ojeda("ojeda_continuous", "continuous"),

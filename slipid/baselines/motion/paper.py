@@ -35,55 +35,37 @@ Source: Belyaev, Brylev, Ivanov 2021, IFAC-PapersOnLine 54(13), section 3, figur
 code that its authors published, BrOleg5/Slippage-compensation.
 """
 
-import abc
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
 from jaxtyping import Float
 
-from slipid.baselines.interface import Channel, Heard, Machine, Method, Run, Said
-from slipid.baselines.motion.steps import Steps, Windows
 from slipid.baselines.paper2021 import table as tables
 from slipid.baselines.paper2021.samples import FIGURES_3_AND_4, Samples
+from slipid.identify.compare.curves import Curve, Slips, WheelSlip, above, powers, robust_std
+from slipid.identify.compare.slip_model import Channel, Machine, SlipModel
+from slipid.identify.compare.steps import Steps, TrainingWindows
 
-Slips = Float[np.ndarray, "step drive"]
+NEEDS: frozenset[Channel] = frozenset({"current", "twist"})
 TIME_CONSTANT = -0.031 / float(np.log(tables.DEPLOYED_MEMORY))
 """Of the authors' smoothing [s]: their computer sampled about every 31 ms."""
 MOST = 3000
 """Samples that a support vector regression is fitted to."""
 
 
-@dataclass(frozen=True)
-class Wheelwise(Method, abc.ABC):
-    """A method that says the slip of each wheel from what its own motor takes."""
-
-    needs: frozenset[Channel] = field(default=frozenset({"current", "twist"}), kw_only=True)
-
-    @abc.abstractmethod
-    def slip(self, steps: Steps, machine: Machine) -> Slips:
-        """Slip of each drive [-] in every step."""
-
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "Wheelwise":
-        return self
-
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
-        steps = Steps.of(runs)
-        rim = steps.heard.speed * machine.wheel_radius * (1.0 - self.slip(steps, machine))
-        return steps.said(rim @ machine.back.T)
-
-    @property
-    def numbers(self) -> int:
-        return 0
-
-
 @final
 @dataclass(frozen=True)
-class PaperPrint(Wheelwise):
+class PaperPrint(WheelSlip):
     """The printed curve over torque, with the motor's constants of the authors' scripts."""
 
+    learns: ClassVar[bool] = False
     name: str = "paper_print"
+    needs: frozenset[Channel] = field(default=NEEDS, kw_only=True)
+
+    def learn(self, w: TrainingWindows, machine: Machine) -> "PaperPrint":
+        return self
 
     def slip(self, steps: Steps, machine: Machine) -> Slips:
         recipe = FIGURES_3_AND_4
@@ -94,10 +76,15 @@ class PaperPrint(Wheelwise):
 
 @final
 @dataclass(frozen=True)
-class PaperCode(Wheelwise):
+class PaperCode(WheelSlip):
     """The lines over smoothed current that ran on the authors' robot."""
 
+    learns: ClassVar[bool] = False
     name: str = "paper_code"
+    needs: frozenset[Channel] = field(default=NEEDS, kw_only=True)
+
+    def learn(self, w: TrainingWindows, machine: Machine) -> "PaperCode":
+        return self
 
     def slip(self, steps: Steps, machine: Machine) -> Slips:
         current = steps.smoothed(steps.heard.along(machine), TIME_CONSTANT)
@@ -107,76 +94,18 @@ class PaperCode(Wheelwise):
         return np.asarray(of_each.mean(axis=1).reshape(current.shape))
 
 
-@dataclass(frozen=True)
-class Refitted(Wheelwise, abc.ABC):
-    """Slip linear in coefficients, by least squares in displacement.
-
-    Attributes:
-        coefficients: of the features.
-    """
-
-    coefficients: Float[np.ndarray, " k"] | None = None
-
-    @abc.abstractmethod
-    def features(self, steps: Steps, machine: Machine) -> Float[np.ndarray, "step drive k"]:
-        """What slip is linear in: s_i = sum_k c_k phi_ik."""
-
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "Refitted":
-        w = Windows.of(runs)
-        rim = w.steps.heard.speed * machine.wheel_radius
-        phi = self.features(w.steps, machine)
-        lost = machine.back @ (rim[..., None] * phi)
-        return replace(self, coefficients=w.rows(lost, machine).solved())
-
-    def slip(self, steps: Steps, machine: Machine) -> Slips:
-        if self.coefficients is None:
-            raise ValueError(f"{self.name}: not fitted")
-        return np.clip(self.features(steps, machine) @ self.coefficients, -1.0, 1.0)
-
-    @property
-    def numbers(self) -> int:
-        return 0 if self.coefficients is None else len(self.coefficients)
-
-
-@final
-@dataclass(frozen=True)
-class PaperPrintRefit(Refitted):
-    """The printed curve's form, one for all motors."""
-
-    name: str = "paper_print_refit"
-
-    def features(self, steps: Steps, machine: Machine) -> Float[np.ndarray, "step drive k"]:
-        return np.asarray(steps.heard.torque(machine)[..., None] ** np.arange(3))
-
-
-@final
-@dataclass(frozen=True)
-class PaperCodeRefit(Refitted):
-    """The deployed form: a gain and an offset for each motor, in this order, above a current."""
-
-    name: str = "paper_code_refit"
-
-    def features(self, steps: Steps, machine: Machine) -> Float[np.ndarray, "step drive k"]:
-        current = steps.smoothed(steps.heard.along(machine), TIME_CONSTANT)
-        line = np.stack([current, np.ones_like(current)], axis=-1)
-        line[current <= tables.DEPLOYED_THRESHOLD] = 0.0
-        own = np.eye(current.shape[1])
-        return np.einsum("sdk,de->sdek", line, own).reshape(*current.shape, -1)
-
-
-def recipe_samples(runs: Sequence[Run], machine: Machine) -> Samples:
+def recipe_samples(w: TrainingWindows, machine: Machine) -> Samples:
     """All wheels and windows that the authors' cuts leave, at most `MOST` of them by lot."""
-    windows = [run.windowed() for run in runs]
-    steps = Steps.of([run.heard for run in windows])
-    rim = steps.heard.speed * machine.wheel_radius
-    real = np.concatenate([run.twist for run in windows]) @ machine.forward.T
+    signals = w.signals
+    rim = signals.speed * machine.wheel_radius
+    real = w.twist @ machine.forward.T
     with np.errstate(divide="ignore", invalid="ignore"):
         # a wheel at rest has no slip ratio: not finite, so that no comparison keeps it
         slip = 1.0 - real / rim
-    amps = steps.heard.along(machine)
+    amps = signals.along(machine)
     kept = (slip > 0.0) & (slip <= 1.0) & (amps > FIGURES_3_AND_4.min_current)
     lot = np.random.default_rng(0).permutation(int(kept.sum()))[:MOST]
-    torque = steps.heard.torque(machine)
+    torque = signals.torque(machine)
     return Samples(amps[kept][lot], torque[kept][lot], slip[kept][lot])
 
 
@@ -196,9 +125,7 @@ def insensitive_curve(
 
     powers = x[:, None] ** np.arange(1, degree + 1)
     middle, size = powers.mean(axis=0), powers.std(axis=0)
-    # iqr / 1.349 is the std of what is Gaussian
-    epsilon = tube * float(np.subtract(*np.percentile(slip, (75, 25)))) / 1.349
-    regression = LinearSVR(C=c, epsilon=epsilon, random_state=0, max_iter=20_000)
+    regression = LinearSVR(C=c, epsilon=tube * robust_std(slip), random_state=0, max_iter=20_000)
     found = regression.fit((powers - middle) / size, slip - slip.mean())
     gain = found.coef_ / size
     return np.append(slip.mean() + found.intercept_[0] - gain @ middle, gain)
@@ -206,45 +133,56 @@ def insensitive_curve(
 
 @final
 @dataclass(frozen=True)
-class PaperSvr(Wheelwise):
+class PaperSvr(WheelSlip):
     """Support vector regression of slip over torque, by the authors' recipe.
+
+    The coefficients are of 1, M, M^2, as far as its degree goes.
 
     Attributes:
         degree: 1 or 2.
         c: weight of what lies outside the tube, for each sample.
         tube: half width epsilon of the tube without a price, in robust stds of the slip.
-        curve: coefficients of 1, M, M^2, as far as its degree goes.
     """
 
+    needs: frozenset[Channel] = field(default=NEEDS, kw_only=True)
     degree: int = 1
     c: float = 0.1
     tube: float = 0.1
-    curve: tuple[float, ...] = ()
 
     def candidates(self) -> Sequence["PaperSvr"]:
         return [replace(self, c=c, tube=tube) for c in (1e-3, 0.1) for tube in (0.1, 0.5)]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "PaperSvr":
-        seen = recipe_samples(runs, machine)
+    def learn(self, w: TrainingWindows, machine: Machine) -> "PaperSvr":
+        seen = recipe_samples(w, machine)
         if len(np.unique(seen.torque.round(9))) <= self.degree:
             # nothing to fit a curve to: the slip that was seen, if any was
             level = float(seen.slip.mean()) if len(seen) else 0.0
-            return replace(self, curve=(level,) + (0.0,) * self.degree)
+            return replace(self, coefficients=np.array([level] + [0.0] * self.degree))
         curve = insensitive_curve(seen.torque, seen.slip, self.degree, self.c, self.tube)
-        return replace(self, curve=tuple(curve.tolist()))
+        return replace(self, coefficients=curve)
 
     def slip(self, steps: Steps, machine: Machine) -> Slips:
-        if not self.curve:
-            raise ValueError(f"{self.name}: not fitted")
         torque = steps.heard.torque(machine)
-        return np.clip(np.polynomial.polynomial.polyval(torque, self.curve), 0.0, 1.0)
-
-    @property
-    def numbers(self) -> int:
-        return len(self.curve)
+        return np.clip(np.polynomial.polynomial.polyval(torque, self.known), 0.0, 1.0)
 
 
-def paper_rows() -> list[Method]:
+def refits() -> list[Curve]:
+    """The forms that were printed and deployed, unfitted, in [-1, 1]."""
+    deployed = above(tables.DEPLOYED_THRESHOLD)
+    return [
+        Curve("paper_print_refit", powers(0, 1, 2), torque=True, most=1.0, needs=NEEDS),
+        Curve(
+            "paper_code_refit",
+            deployed,
+            per_wheel=True,
+            smoothing=TIME_CONSTANT,
+            most=1.0,
+            needs=NEEDS,
+        ),
+    ]
+
+
+def paper_rows() -> list[SlipModel]:
     """The paper's rows, unfitted."""
     svr = PaperSvr("paper_linear_svr", 1), PaperSvr("paper_quadratic_svr", 2)
-    return [PaperPrint(), PaperCode(), PaperPrintRefit(), PaperCodeRefit(), *svr]
+    return [PaperPrint(), PaperCode(), *refits(), *svr]

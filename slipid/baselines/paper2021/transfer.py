@@ -8,9 +8,7 @@ import numpy as np
 from slipid.baselines.paper2021.samples import FIGURES_3_AND_4, Recipe
 from slipid.data.log import Log
 from slipid.data.wheel_signals import body_steps, first_moved
-
-DEGREE = 1
-"""Of the polynomial in current, as deployed."""
+from slipid.identify.compare.transfer import errors_by_floor
 
 
 @dataclass(frozen=True)
@@ -86,19 +84,12 @@ def leave_one_surface_out(logs: Iterable[Log]) -> Transfer:
     points = {surface: np.concatenate(part) for surface, part in parts.items()}
     if len(points) < 2:
         raise ValueError(f"surfaces {list(points)}: leaving one out needs at least two")
-    for surface, point in points.items():
-        if len(point) <= DEGREE:
-            raise ValueError(f"surface {surface!r}: {len(point)} samples, too few for a curve")
-    pooled, constant, own = {}, {}, {}
-    for surface, here in points.items():
-        others = np.concatenate([p for name, p in points.items() if name != surface])
-        pooled[surface] = _curve_error(others, here, DEGREE)
-        constant[surface] = _curve_error(others, here, 0)
-        own[surface] = _curve_error(here, here, DEGREE)
     counts = {surface: len(point) for surface, point in points.items()}
+    for surface, count in counts.items():
+        if count < 2:
+            raise ValueError(f"surface {surface!r}: {count} samples, too few for a curve")
+    current, slip = np.concatenate(list(points.values())).T
+    floor = np.repeat(list(counts), list(counts.values()))
+    found = errors_by_floor(slip, current, floor)
+    pooled, constant, own = (found[k]["each"] for k in ("pooled", "constant", "per_surface"))
     return Transfer(samples=counts, pooled=pooled, constant=constant, own=own)
-
-
-def _curve_error(train: np.ndarray, test: np.ndarray, degree: int) -> float:
-    curve = np.polynomial.Polynomial.fit(train[:, 0], train[:, 1], degree)
-    return float(np.sqrt(np.mean((test[:, 1] - curve(test[:, 0])) ** 2)))

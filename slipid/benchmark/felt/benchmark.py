@@ -6,12 +6,12 @@ from slipid.baselines.floors.boosted_trees import tree_rows
 from slipid.baselines.floors.cosine_energy import CosineEnergy
 from slipid.baselines.floors.gaussian import Gaussian
 from slipid.baselines.floors.interface import FloorMethod
-from slipid.baselines.interface import Machine
 from slipid.benchmark.felt.husky import RADIUS, ZERO_A, husky
 from slipid.benchmark.felt.protocol import Asked, felt_table
 from slipid.benchmark.felt.reading import read_felt
 from slipid.benchmark.felt.result import FeltTable
 from slipid.benchmark.felt.slipid_row import SlipidFloors
+from slipid.identify.compare.slip_model import Machine
 
 FOLDER = "borealtc"
 ABOUT = (

@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Int
 
 from slipid.baselines.floors.interface import Beliefs, Felt, FloorMethod
-from slipid.baselines.interface import Machine
 from slipid.benchmark.felt.result import (
     Answer,
     FeltRow,
@@ -26,6 +25,7 @@ from slipid.benchmark.felt.result import (
 )
 from slipid.benchmark.row import Row
 from slipid.benchmark.tuned import settings_of
+from slipid.identify.compare.slip_model import Machine
 
 SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """After which classifiers are asked [s]."""
@@ -138,14 +138,16 @@ def _some(felts: Sequence[Felt], take: np.ndarray) -> list[Felt]:
 
 
 @dataclass(frozen=True)
-class Judged:
+class ScoredClassifier:
     """A classifier in all folds: its row but for what is compared, and its answers."""
 
     row: FeltRow
     answers: tuple[Answer, ...]
 
 
-def judged(method: FloorMethod, felts: Sequence[Felt], machine: Machine, asked: Asked) -> Judged:
+def judged(
+    method: FloorMethod, felts: Sequence[Felt], machine: Machine, asked: Asked
+) -> ScoredClassifier:
     """A classifier fitted and asked, fold by fold."""
     fold = folds_of(felts, asked.folds)
     answers: list[Answer] = []
@@ -172,15 +174,15 @@ def judged(method: FloorMethod, felts: Sequence[Felt], machine: Machine, asked: 
         tune_s=float(np.median(tune_s)),
         row_us=1e6 * heard_s / max(rows, 1),
     )
-    return Judged(row, tuple(answers))
+    return ScoredClassifier(row, tuple(answers))
 
 
-def attempted(name: str, work: Callable[[], Judged]) -> Judged:
+def attempted(name: str, work: Callable[[], ScoredClassifier]) -> ScoredClassifier:
     """What a classifier came to; if it fails, an empty row that says why."""
     try:
         return work()
     except Exception as error:  # other rows are judged all the same
-        return Judged(FeltRow(name, absent=Row.of_error(error).absent), ())
+        return ScoredClassifier(FeltRow(name, absent=Row.of_error(error).absent), ())
 
 
 def felt_table(
@@ -200,7 +202,11 @@ def felt_table(
 
 
 def table_of(
-    done: dict[str, Judged], felts: Sequence[Felt], about: str, asked: Asked, reference: str
+    done: dict[str, ScoredClassifier],
+    felts: Sequence[Felt],
+    about: str,
+    asked: Asked,
+    reference: str,
 ) -> FeltTable:
     """Rows put together."""
     rival = (done[reference].answers or None) if reference in done else None

@@ -17,10 +17,9 @@ from slipid.baselines.floors.boosted_trees import tree_rows
 from slipid.baselines.floors.cosine_energy import CosineEnergy
 from slipid.baselines.floors.gaussian import Gaussian
 from slipid.baselines.floors.interface import Felt, FloorMethod
-from slipid.baselines.interface import Machine, Run, Said
 from slipid.benchmark.felt.protocol import (
     Asked,
-    Judged,
+    ScoredClassifier,
     answers_of,
     asked_after,
     attempted,
@@ -33,6 +32,7 @@ from slipid.benchmark.protocols import Split, base_of, splits
 from slipid.benchmark.sets import DataSet
 from slipid.benchmark.steps import Cut, cut
 from slipid.benchmark.work import Piece, Wish, data_of, kept_of, problem_of
+from slipid.identify.compare.slip_model import Machine, Run, Said
 
 SOURCE, KIND = "robotino2022", "headings"
 SECONDS = (0.5, 1.0, 2.0, 4.0)
@@ -54,7 +54,7 @@ def robotino_felt(wish: Wish) -> FeltTable:
     data = data_of(wish, SOURCE)
     found = splits(data.facts, KIND)[: 1 if wish.quick else None]
     asked = Asked(seconds=SECONDS, inner=1 if wish.quick else 2)
-    parts: dict[str, list[Judged]] = {}
+    parts: dict[str, list[ScoredClassifier]] = {}
     judged: list[Felt] = []
     for split in found:
         own = fit_own(
@@ -108,7 +108,9 @@ def _judged(data: DataSet, split: Split, own: Own) -> list[Cut]:
     return cut(data.heard.subset(split.judged), own.contact.robot, data.source.poses_per_step)
 
 
-def _own(own: Own, cuts: list[Cut], data: DataSet, split: Split, felts: list[Felt]) -> Judged:
+def _own(
+    own: Own, cuts: list[Cut], data: DataSet, split: Split, felts: list[Felt]
+) -> ScoredClassifier:
     """What the estimator says of the runs that were left out."""
     began = time.perf_counter()
     said = estimated(own, cuts, data.heard.subset(split.judged), Place())
@@ -119,7 +121,7 @@ def _own(own: Own, cuts: list[Cut], data: DataSet, split: Split, felts: list[Fel
         answers += asked_after(felt, beliefs, labels, SECONDS)
     rows = sum(len(felt) for felt in felts)
     row = FeltRow(NAME, numbers=own.numbers, fit_s=own.seconds, row_us=1e6 * took / rows)
-    return Judged(row, tuple(answers))
+    return ScoredClassifier(row, tuple(answers))
 
 
 def beliefs_of(said: Said) -> tuple[tuple[str, ...], np.ndarray]:
@@ -132,7 +134,7 @@ def beliefs_of(said: Said) -> tuple[tuple[str, ...], np.ndarray]:
 
 def _published(
     method: FloorMethod, fitted: list[Felt], felts: list[Felt], machine: Machine, asked: Asked
-) -> Judged:
+) -> ScoredClassifier:
     """A classifier fitted to some runs and asked of others, from their starts on."""
     starts = [felt.pieces(max(SECONDS))[0] for felt in felts]
     found = tuned(method, fitted, machine, asked)
@@ -148,10 +150,10 @@ def _published(
         tune_s=found.seconds,
         row_us=1e6 * (time.perf_counter() - ended) / sum(len(felt) for felt in starts),
     )
-    return Judged(row, tuple(answers))
+    return ScoredClassifier(row, tuple(answers))
 
 
-def _joined(parts: list[Judged]) -> Judged:
+def _joined(parts: list[ScoredClassifier]) -> ScoredClassifier:
     """All folds of a classifier; an empty row if it failed in one."""
     if failed := [part for part in parts if part.row.absent]:
         return failed[0]
@@ -167,4 +169,4 @@ def _joined(parts: list[Judged]) -> Judged:
         tune_s=median("tune_s"),
         row_us=median("row_us"),
     )
-    return Judged(row, tuple(answer for part in parts for answer in part.answers))
+    return ScoredClassifier(row, tuple(answer for part in parts for answer in part.answers))

@@ -27,7 +27,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from slipid.baselines.floors.interface import Beliefs, Felt, FloorMethod, floors_of
-from slipid.baselines.interface import Machine
 from slipid.benchmark.felt.deployed import deployed
 from slipid.benchmark.felt.fitting import (
     currents_off,
@@ -38,6 +37,7 @@ from slipid.benchmark.felt.fitting import (
 from slipid.benchmark.felt.meters import MeteredMotor
 from slipid.control.estimator import Estimator, EstimatorState
 from slipid.control.interface import Readings, Settings
+from slipid.identify.compare.slip_model import Machine
 from slipid.model.contact_law import ContactSurface
 from slipid.model.robot import Robot
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from slipid.data.runs import Runs
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.compare.predictive import Predictive
+from slipid.identify.compare.score import chords, mean_error
 from slipid.identify.fit.variances import Search, Square
 from slipid.search_space import Space
 
@@ -52,7 +53,7 @@ def compared(
     for name in dict.fromkeys(floors):
         mine = np.array([floor == name for floor in floors])
         grown = new[mine] - old[mine]
-        error = float(grown.std(ddof=1)) / np.sqrt(mine.sum()) if mine.sum() > 1 else np.inf
+        _, error, _ = mean_error(grown, np.arange(len(grown)))
         much = new[mine].mean() > WORSE * old[mine].mean()
         way = max(float(far[mine].sum()), 1e-9)  # runs may only have turned
         out[name] = FloorErrors(
@@ -71,7 +72,7 @@ def end_errors(
     for w in replay.cuts(data, model.robot):
         tracks, _ = model.ends(w)
         error[tracks.run] = np.linalg.norm(tracks.gap[:, :2], axis=1)
-        far[tracks.run] = tracks.chord
+        far[tracks.run] = chords(tracks.measured)
     return error, far
 
 

@@ -1,4 +1,4 @@
-"""Every rung of the ladder judged on runs left out: who is left out together, and what they say.
+"""Every slip model judged on held-out runs: who is left out together, and how they score.
 
 Runs of one heading stay in one fold at every speed and on every floor, so that nothing of a
 left-out heading is seen.
@@ -9,14 +9,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 
 from slipid.data.runs import Runs
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.noisy_rung import with_noise
+from slipid.identify.compare.noisy import with_noise
 from slipid.identify.compare.predictive import Predictive, contact_of
-from slipid.identify.compare.slip_models import rungs
-from slipid.identify.compare.validation import Judged, score, told
+from slipid.identify.compare.score import setups
+from slipid.identify.compare.slip_models import slip_models
+from slipid.identify.compare.validation import ScoredRun, add_scores, told
 from slipid.identify.fit.optimise import Optimum, optimise
 from slipid.identify.fit.problem import Problem, still_viscosities
 from slipid.search_space import Choice, Space
@@ -26,38 +27,62 @@ from slipid.support.errors import DataError
 Fold = Int[np.ndarray, " run"]
 
 
-def sectors(data: Runs) -> Fold:
+@dataclass(frozen=True)
+class Facts:
+    """What folds go by: floor with load set-up, direction commanded [deg] and speed [m/s]."""
+
+    floor: str
+    heading_deg: float
+    speed: float
+
+
+def facts_of(data: Runs) -> list[Facts]:
+    """Facts of all runs; directions and speeds are nan where they are not known."""
+    where = setups([log.surface or "unknown" for log in data.logs], [log.load for log in data.logs])
+    way = np.degrees(data.heading).tolist()
+    return [Facts(*one) for one in zip(where, way, data.speed.tolist(), strict=True)]
+
+
+def sectors(facts: Sequence[Facts]) -> Fold:
     """Fold of every run by the 60 deg its commanded heading lies in, -1 where it has none."""
-    known = np.isfinite(data.heading)
-    turn = np.degrees(np.where(known, data.heading, 0.0)) % 360.0
-    return np.where(known, (np.floor((turn + 1e-6) / 60.0) % 6).astype(int), -1)
+    way, known = _headings(facts)
+    return np.where(known, (np.floor((way % 360.0 + 1e-6) / 60.0) % 6).astype(int), -1)
 
 
-def random_headings(data: Runs) -> Fold:
+def random_headings(facts: Sequence[Facts]) -> Fold:
     """One of six folds of every run by its heading, dealt every 5 deg, -1 where it has none."""
     dealt = np.random.default_rng(0).permutation(72) % 6
-    known = np.isfinite(data.heading)
-    way = np.degrees(np.where(known, data.heading, 0.0))
+    way, known = _headings(facts)
     return np.where(known, dealt[np.round(way / 5.0).astype(int) % 72], -1)
 
 
-def speeds(data: Runs) -> Fold:
-    """Fold of every run by its commanded speed, -1 where its floor and load saw one speed only.
+def speeds(facts: Sequence[Facts], most: int | None = None) -> Fold:
+    """Fold of every run by its commanded speed, -1 where its floor and load saw one fold only.
 
-    Turns on the spot have no speed to leave out.
+    Where there are more than twice `most` speeds, so many folds have equally many of them. Turns on
+    the spot have no speed to leave out.
     """
-    speed = np.round(data.speed, 3)
-    speed[speed == 0] = np.nan
-    group, out = _groups(data), np.full(len(data), -1)
-    every = np.unique(speed[np.isfinite(speed)])
-    for name in np.unique(group):
-        mine = (group == name) & np.isfinite(speed)
-        if len(np.unique(speed[mine])) > 1:
-            out[mine] = np.searchsorted(every, speed[mine])
-    return out
+    speed = np.round([f.speed for f in facts], 3)
+    where, known = np.array([f.floor for f in facts]), np.isfinite(speed) & (speed > 0)
+    every = np.unique(speed[known])
+    edges = every[1:]
+    if most is not None and len(every) > 2 * most:
+        edges = np.quantile(every, np.arange(1, most) / most)
+    fold = np.where(known, np.searchsorted(edges, speed, "right"), -1)
+    for floor in np.unique(where):
+        if len(np.unique(fold[(where == floor) & (fold >= 0)])) < 2:
+            fold[where == floor] = -1
+    return fold
 
 
-QUESTIONS: dict[str, Callable[[Runs], Fold]] = {
+def _headings(facts: Sequence[Facts]) -> tuple[Float[np.ndarray, " run"], Bool[np.ndarray, " run"]]:
+    """Commanded headings, zero where there is none [deg], and whether there is one."""
+    way = np.array([f.heading_deg for f in facts], float)
+    known = np.isfinite(way)
+    return np.where(known, way, 0.0), known
+
+
+QUESTIONS: dict[str, Callable[[Sequence[Facts]], Fold]] = {
     "sectors": sectors,
     "speeds": speeds,
     "random": random_headings,
@@ -66,12 +91,12 @@ QUESTIONS: dict[str, Callable[[Runs], Fold]] = {
 
 
 def nested(data: Runs, question: str, judged: np.ndarray) -> Fold:
-    """Fold of every run while a rung tunes itself for a question on the runs that are not judged.
+    """Fold of every run while a model tunes itself for a question on the runs that are not judged.
 
     A sector beside one that is judged would leave a wider gap than is asked about: it is -1, seen
     always, where two sectors or more are left.
     """
-    fold = QUESTIONS[question](data)
+    fold = QUESTIONS[question](facts_of(data))
     if question != "sectors":
         return fold
     left_out = np.unique(fold[judged])
@@ -97,18 +122,15 @@ def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
         )
     if parts is not None and parts < 2:
         raise ValueError(f"{parts} parts; expected 2 or more")
-    fold = QUESTIONS[question](data)
+    facts = facts_of(data)
+    fold = QUESTIONS[question](facts)
     if parts is not None:
         fold = np.where(fold < 0, fold, fold % parts)
-    group = _groups(data)
+    group = np.array([f.floor for f in facts])
     for name in np.unique(group):
         if len(np.unique(fold[group == name])) < 2:
             fold[group == name] = -1
     return fold
-
-
-def _groups(data: Runs) -> np.ndarray:
-    return np.array([f"{log.surface}@{log.load}" for log in data.logs])
 
 
 @dataclass(frozen=True)
@@ -119,7 +141,7 @@ class FoldResult:
     floor.
     """
 
-    rows: tuple[Judged, ...]
+    rows: tuple[ScoredRun, ...]
     seconds: dict[str, dict[str, float]]
     numbers: dict[str, dict[str, int]]
     converged: bool
@@ -150,7 +172,7 @@ def learn(
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
 ) -> Learnt:
-    """Every rung fitted without some runs; arguments as of `judge`.
+    """Every slip model fitted without some runs; arguments as of `judge`.
 
     Of the runs left out nothing is used but which they are.
     """
@@ -162,12 +184,11 @@ def learn(
     contact = contact_of(problem, optimum.state, optimum.covariance, keep)
     models: list[Predictive] = [contact]
     seconds = {contact.name: time.perf_counter() - began}
-    for rung in rungs(
-        problem.robot.geometry, problem.windows.has_current, nested(data, question, judged)
-    ):
+    together, shape = nested(data, question, judged), problem.robot.geometry
+    for model in slip_models(shape, problem.windows.has_current, together):
         began = time.perf_counter()
-        models.append(with_noise(rung, contact, problem, keep))
-        seconds[rung.name] = time.perf_counter() - began
+        models.append(with_noise(model, contact, problem, keep))
+        seconds[model.name] = time.perf_counter() - began
     return Learnt(problem, optimum, tuple(models), seconds)
 
 
@@ -187,22 +208,22 @@ def judge(
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
 ) -> FoldResult:
-    """One fold: every rung fitted without some runs, and what it says of them.
+    """One fold: every slip model fitted without some runs, and its scores on them.
 
     The problem is of all the runs of `data`, made with these choices; `judged` are numbers of runs,
-    left out for one of the `QUESTIONS`; a rung that tunes itself does so for that question, on the
+    left out for one of the `QUESTIONS`; a model that tunes itself does so for that question, on the
     other runs. `fit` is how the problem is fitted.
     """
     learnt = learn(problem, choices, data, question, judged, fit)
     problem, optimum = learnt.problem, learnt.optimum
     seconds = {name: {"fit": spent} for name, spent in learnt.seconds.items()}
     part = data.subset(judged)
-    runs: dict[int, Judged] = {}
+    runs: dict[int, ScoredRun] = {}
     cuts = replay.cuts(part, learnt.models[0].robot)
     for model in learnt.models:
         began = time.perf_counter()
         for w in cuts:
-            score(runs, part, model.name, *model.ends(w))
+            add_scores(runs, part, model.name, *model.ends(w))
         seconds[model.name]["predict"] = time.perf_counter() - began
         density = model.log_density(problem)
         for k, number in enumerate(judged):

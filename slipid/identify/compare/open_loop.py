@@ -4,7 +4,7 @@ Everything is in the corrected metres of the fitted camera; the measured pose is
 start.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -12,15 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import f as fisher
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
-from slipid.identify.compare.rung import sideways, turned
+from slipid.identify.compare.marker import sideways, turned
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.noise import travel
 from slipid.identify.fit.sessions import by_axis
-from slipid.identify.fit.variances import DEGREES
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
 from slipid.search_space import Space
@@ -45,38 +43,36 @@ class Tracks:
         """Predicted less measured end pose."""
         return self.predicted[:, -1] - self.measured[:, -1]
 
-    @property
-    def chord(self) -> Float[np.ndarray, " run"]:
-        """The camera's straight-line displacement [m]."""
-        return np.linalg.norm((self.measured[:, -1] - self.measured[:, 0])[:, :2], axis=1)
-
-    @property
-    def path(self) -> Float[np.ndarray, " run"]:
-        """Length of the camera's path, step by step [m]."""
-        return np.linalg.norm(np.diff(self.measured[..., :2], axis=1), axis=2).sum(axis=1)
-
 
 def cuts(data: Runs, robot: Robot) -> list[Windows]:
     """The runs, each as one piece of short steps, `TOGETHER` at a time.
 
-    Numbers of steps are powers of two and the last runs of a group are repeated to fill it up, so
-    that few shapes are compiled.
+    Numbers of steps are powers of two, so that few shapes are compiled.
     """
-    radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
-    groups: dict[int, list[int]] = {}
+    steps = []
     for k, log in enumerate(data.logs):
         want = 2 ** int(np.ceil(np.log2(max(log.duration / STEP, 16))))
         frames = int(data.fresh[data.rows(k)].sum())
         while want > 1 and want > frames // 3:
             want //= 2
-        groups.setdefault(want, []).append(k)
+        steps.append(want)
+    return whole_runs(data, robot, steps)
+
+
+def whole_runs(data: Runs, robot: Robot, steps: Sequence[int]) -> list[Windows]:
+    """The runs, each as one piece of so many steps, `TOGETHER` of as many steps at a time.
+
+    The last runs of a group are repeated to fill it up, so that few shapes are compiled.
+    """
+    radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
     out = []
-    for steps, runs in sorted(groups.items()):
+    for count in sorted(set(steps)):
+        runs = np.flatnonzero(np.asarray(steps) == count)
         for first in range(0, len(runs), TOGETHER):
             some = runs[first : first + TOGETHER]
-            w = windows(data.subset(some), radius, lag, per_piece=steps, longest=np.inf)
+            w = windows(data.subset(some), radius, lag, per_piece=count, longest=np.inf)
             filled = np.minimum(np.arange(TOGETHER), len(w) - 1)
-            out.append(replace(w, run=np.asarray(some)[w.run]).pieces(filled))
+            out.append(replace(w, run=some[w.run]).pieces(filled))
     return out
 
 
@@ -174,25 +170,3 @@ def end_covariance(
     cov += variance["camera.heading"] * turn[:, :, None] * turn[:, None, :]
     cov += 2 * variance["camera.place"] * float(robot.camera.scale) ** 2 * np.eye(2)
     return cov
-
-
-def scores(
-    gap: Float[np.ndarray, "run 2"], cov: Float[np.ndarray, "run 2 2"] | None
-) -> tuple[np.ndarray | None, np.ndarray]:
-    """Probability of the region whose edge each end lies on, and the energy score of each [m].
-
-    An end lies in the 90 % region where the first is at most 0.9. The predictive distribution is a
-    Student t with `DEGREES` degrees of freedom; without one (None) the energy score is the distance
-    itself, as for a point forecast.
-    Source: Gneiting and Raftery 2007, JASA 102, eq. 22.
-    """
-    if cov is None:
-        return None, np.linalg.norm(gap, axis=1)
-    q = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(cov), gap)
-    level = fisher.cdf(q / 2, 2, DEGREES)
-    rng = np.random.default_rng(0)
-    normal = rng.normal(size=(500, 2)) / np.sqrt(rng.chisquare(DEGREES, (500, 1)) / DEGREES)
-    draws = np.einsum("nij,kj->nki", np.linalg.cholesky(cov), normal)
-    near = np.linalg.norm(draws - gap[:, None], axis=2).mean(axis=1)
-    apart = np.linalg.norm(draws[:, :250] - draws[:, 250:], axis=2).mean(axis=1)
-    return level, near - 0.5 * apart

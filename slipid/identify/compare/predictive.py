@@ -1,4 +1,4 @@
-"""What any model of the ladder says of runs it has not seen, and how sure it may be.
+"""What any slip model predicts of runs it has not seen, and how sure it may be.
 
 Every model gets a predictive distribution of the same form: a Student t around what it predicts,
 with scale
@@ -10,7 +10,7 @@ residuals; v what runs share, E what that moves; J the slope by its own numbers 
 their covariance. Simpler models have v of sessions (`slipid.identify.fit.sessions`); the force
 balance has what its fit found of sessions and neighbours (`slipid.identify.fit.shared`), and v
 grows where leaving out sectors asks for it. All models share the fitted camera;
-a rung's numbers follow it.
+the numbers of a simpler model follow it.
 """
 
 import abc

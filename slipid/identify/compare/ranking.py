@@ -5,12 +5,12 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
 from scipy.stats import binom
 
 from slipid.data.runs import Runs
 from slipid.identify.compare.folds import folds_of, judge
-from slipid.identify.compare.validation import Judged, Score, by_floor, finite
+from slipid.identify.compare.score import Score, clusters, mean_error
+from slipid.identify.compare.validation import ScoredRun, by_floor, finite
 from slipid.identify.fit.problem import Problem
 from slipid.search_space import Choice
 from slipid.support.errors import DataError
@@ -26,30 +26,6 @@ Below four nats models predict alike, and the standard error of their difference
 on: one with an idle number more loses a little in every run.
 Source: Sivula, Magnusson, Matamoros and Vehtari 2020, arXiv:2008.10296.
 """
-CLUSTER_DEG = 30.0
-"""Neighbouring headings share their errors (they are correlated by a half at 5 degrees, by nothing
-at 30): runs of one such sector are one observation of the clustered standard error."""
-
-
-def mean_error(
-    value: Float[np.ndarray, " run"], cluster: Int[np.ndarray, " run"]
-) -> tuple[float, float, float]:
-    """Mean, its standard error over runs, and that over clusters of runs.
-
-        se^2 = G / (G - 1) sum_g (sum_{i in g} (x_i - mean))^2 / n^2
-
-    Source: Cameron and Miller 2015, J. Human Resources 50, for a regression on a constant. With one
-    run, or one cluster, an error is not known and is nan.
-    """
-    n = len(value)
-    gap = value - value.mean()
-    sums = np.bincount(np.unique(cluster, return_inverse=True)[1], weights=gap)
-
-    def error(parts: np.ndarray) -> float:
-        g = len(parts)
-        return float(np.sqrt(g / (g - 1) * np.sum(parts**2)) / n) if g > 1 else float("nan")
-
-    return float(value.mean()), error(gap), error(sums)
 
 
 @dataclass(frozen=True)
@@ -91,14 +67,7 @@ class Ranking:
     models: dict[str, Ranked]
 
 
-def clusters(runs: Sequence[Judged]) -> Int[np.ndarray, " run"]:
-    """Sector of heading of each run; a run without heading is by itself."""
-    ways = enumerate(run.heading_deg for run in runs)
-    sector = [-1 - k if h is None else int((h % 360.0 + 1e-6) // CLUSTER_DEG) for k, h in ways]
-    return np.array(sector)
-
-
-def ranking(runs: Sequence[Judged]) -> dict[str, Ranking]:
+def ranking(runs: Sequence[ScoredRun]) -> dict[str, Ranking]:
     """Every floor: every model's score, its distance to the best, and who cannot be told from it.
 
     The score is the expected log predictive density of a run's logged poses [nats per run], every
@@ -108,8 +77,8 @@ def ranking(runs: Sequence[Judged]) -> dict[str, Ranking]:
     return {floor: _floor(floor, mine) for floor, mine in by_floor(runs).items()}
 
 
-def _floor(floor: str, runs: Sequence[Judged]) -> Ranking:
-    names, cluster = list(runs[0].models), clusters(runs)
+def _floor(floor: str, runs: Sequence[ScoredRun]) -> Ranking:
+    names, cluster = list(runs[0].models), clusters([run.heading_deg for run in runs])
     scores = {m: [run.models[m] for run in runs] for m in names}
     density = {m: np.array([s.log_density for s in scores[m]], float) for m in names}
     best = max(names, key=lambda m: float(density[m].mean()))
@@ -209,14 +178,14 @@ def compared(
     parts: int,
     quiet: bool = False,
 ) -> Comparison:
-    """Every rung of the ladder judged fold by fold; `problem` is of all runs and the choices.
+    """Every slip model judged fold by fold; `problem` is of all runs and the choices.
 
     The other arguments and errors are those of `Fit.compare`.
     """
     fold = folds_of(data, question, parts)
     if (fold < 0).all():
         raise DataError("no run can be left out; expected several headings or speeds")
-    rows: list[Judged] = []
+    rows: list[ScoredRun] = []
     with Reporter(quiet=quiet) as report:
         for k in sorted(set(fold[fold >= 0].tolist())):
             report.stage(f"{question}: without part {k + 1} of {fold.max() + 1}")

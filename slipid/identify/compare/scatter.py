@@ -21,13 +21,13 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.windows import Windows
-from slipid.identify.compare.rung import body_twist, turned
+from slipid.identify.compare.heading_lookup import fourier
+from slipid.identify.compare.marker import body_twist, turned
 from slipid.identify.fit.noise import travel
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.shared import AXES
 from slipid.model.robot import Robot
 
-HARMONICS = 6
 _TINY = 1e-6
 """Ridge, as part of a feature's own size: of runs too few to be predicted."""
 
@@ -63,11 +63,9 @@ def _left(w: Windows, robot: Robot, place_is_free: bool) -> Float[np.ndarray, "p
     back = np.asarray(shape.least()).T * float(shape.wheel_radius)
     step, late = w.turn @ back, w.faster @ back
     moved = body_twist(w, robot) * w.dt[..., None]
-    angle = np.arctan2(step[..., 1], step[..., 0])
+    angle, series = np.arctan2(step[..., 1], step[..., 0]), fourier(step)
     for vector in (step, late, moved):
         vector[..., :2] = turned(-angle, vector[..., :2])
-    waves = [f(k * angle) for k in range(1, HARMONICS + 1) for f in (np.cos, np.sin)]
-    series = np.stack([np.ones_like(angle), *waves], -1) * step[..., :1]
     turns = step[..., 2:]
     swept = [turns * np.stack([np.cos(angle), np.sin(angle)], -1)] if place_is_free else []
     x = np.concatenate([series, turns, late, *swept], axis=-1)

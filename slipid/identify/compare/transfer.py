@@ -7,8 +7,8 @@ beside a constant fitted to the same floors and a curve fitted to the floor itse
 import numpy as np
 
 from slipid.data.windows import Windows
-from slipid.identify.compare.rung import body_twist
-from slipid.identify.compare.validation import main_load
+from slipid.identify.compare.marker import body_twist
+from slipid.identify.compare.score import main_load
 from slipid.model.robot import Robot
 from slipid.support.content import Content
 
@@ -52,11 +52,12 @@ def transfer(w: Windows, robot: Robot) -> dict[str, Content]:
         if cut:
             rows &= (slip > 0) & (slip <= 1) & (amps > 0.25)
         if len(set(floor[rows].tolist())) > 1:
-            out[name] = _errors(slip[rows], amps[rows], floor[rows])
+            out[name] = errors_by_floor(slip[rows], amps[rows], floor[rows])
     return out
 
 
-def _errors(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Content:
+def errors_by_floor(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Content:
+    """Errors of rows of slip and current [A] on floors by name, see `transfer`."""
     pooled, constant, own = {}, {}, {}
     line = np.stack([np.ones_like(amps), amps], axis=-1)
     for name in sorted(set(floor.tolist())):

@@ -1,4 +1,4 @@
-"""Open-loop prediction of runs a fit has not seen, beside every rung it was compared with."""
+"""Open-loop prediction of runs a fit has not seen, beside every slip model it was compared with."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -9,8 +9,9 @@ from jaxtyping import Float
 
 from slipid.data.runs import Runs
 from slipid.identify.compare import open_loop as replay
+from slipid.identify.compare.floor_models import FloorModels
 from slipid.identify.compare.predictive import Contact
-from slipid.identify.compare.rung import Rung
+from slipid.identify.compare.score import Score, chords, lengths, scores, setups
 from slipid.model.robot import Robot
 from slipid.support.content import Content
 from slipid.support.errors import DataError
@@ -22,29 +23,7 @@ SCHEMA = "slipid.validation/1"
 
 
 @dataclass(frozen=True)
-class Score:
-    """What a model's prediction of a run is worth.
-
-    The pose at the end is x, y [m] and yaw [rad]; the end-point error is over the chord, and over
-    the path, which means something on closed paths, too; the length error is relative. `level` is
-    the probability of the region whose edge the end lies on, `covered90` whether that is at most
-    0.9, both None for a model without. The energy score is in m, the log density of the logged
-    poses in nats, None where it was not asked for.
-    """
-
-    predicted_end: Sequence[float]
-    endpoint_error: float
-    endpoint_error_over_path: float
-    length_error: float
-    heading_error_deg: float
-    level: float | None
-    covered90: bool | None
-    energy_score: float
-    log_density: float | None = None
-
-
-@dataclass(frozen=True)
-class Judged:
+class ScoredRun:
     """A run and the scores of every model on it.
 
     Heading and speed are as commanded [deg], [m/s], None where not known; the chord is the camera's
@@ -67,7 +46,7 @@ class Judged:
         return asdict(self, dict_factory=told)
 
     @classmethod
-    def of_json(cls, content: Content) -> "Judged":
+    def of_json(cls, content: Content) -> "ScoredRun":
         models = {name: Score(**score) for name, score in content["models"].items()}
         return cls(**{**content, "models": models})
 
@@ -78,7 +57,7 @@ def told(values: Iterable[tuple[str, object]]) -> Content:
 
 
 @dataclass(frozen=True)
-class Summary:
+class FloorSummary:
     """Scores of a model over the runs on a floor; attributes as of `Score`."""
 
     endpoint_error_mean: float
@@ -101,7 +80,7 @@ class Validation:
         new: how many of them the fit has not seen.
     """
 
-    runs: tuple[Judged, ...]
+    runs: tuple[ScoredRun, ...]
     new: int = 0
 
     def __str__(self) -> str:
@@ -119,7 +98,7 @@ class Validation:
         return ladder_figure(self.to_json(), self.which)
 
     @property
-    def summary(self) -> dict[str, dict[str, Summary]]:
+    def summary(self) -> dict[str, dict[str, FloorSummary]]:
         """Means by floor and model; a floor with another load set-up is a floor of its own."""
         return {
             name: {m: _mean([run.models[m] for run in runs]) for m in runs[0].models}
@@ -147,8 +126,10 @@ class Validation:
         return "\n".join(lines)
 
 
-def validation(fit: Contact, rungs: Sequence[Rung], data: Runs, new: int = 0) -> Validation:
-    """Prediction of runs of known floors by a fit, beside every rung fitted on the same runs.
+def validation(fit: Contact, models: Sequence[FloorModels], data: Runs, new: int = 0) -> Validation:
+    """Prediction of runs of known floors by a fit, beside every slip model fitted on the same runs.
+
+    The fit has not seen `new` of the runs.
 
     The fit has not seen `new` of the runs.
 
@@ -160,12 +141,12 @@ def validation(fit: Contact, rungs: Sequence[Rung], data: Runs, new: int = 0) ->
         DataError: a run on a floor or with a load set-up that was not identified.
     """
     _known(fit.robot, data)
-    runs: dict[int, Judged] = {}
+    runs: dict[int, ScoredRun] = {}
     for w in replay.cuts(data, fit.robot):
-        score(runs, data, fit.name, *fit.ends(w))
-        for rung in rungs:
-            tracks = replay.follow(fit.robot, w, rung.increments(w, fit.robot))
-            score(runs, data, rung.name, tracks, None)
+        add_scores(runs, data, fit.name, *fit.ends(w))
+        for model in models:
+            tracks = replay.follow(fit.robot, w, model.increments(w, fit.robot))
+            add_scores(runs, data, model.name, tracks, None)
     return Validation(tuple(runs[k] for k in range(len(data))), new)
 
 
@@ -182,46 +163,35 @@ def _known(robot: Robot, data: Runs) -> None:
                 )
 
 
-def score(
-    runs: dict[int, Judged],
+def add_scores(
+    runs: dict[int, ScoredRun],
     data: Runs,
     model: str,
     tracks: replay.Tracks,
     cov: Float[np.ndarray, "run 2 2"] | None,
 ) -> None:
-    """Write what a model's tracks are worth into the scores of their runs.
+    """Write the scores of a model's tracks into those of their runs.
 
     `runs` go by their number in `data`; those that are met for the first time are added. `cov` is
     of the ends, None for a model without.
     """
-    gap = tracks.gap
-    level, energy = replay.scores(gap[:, :2], cov)
-    path = tracks.path.tolist()
-    ahead = np.linalg.norm((tracks.predicted[:, -1] - tracks.predicted[:, 0])[:, :2], axis=1)
+    found = scores(tracks.predicted, tracks.measured, cov)
+    chord, path = chords(tracks.measured), lengths(tracks.measured)
     for n, k in enumerate(tracks.run.tolist()):
-        log, chord = data.logs[k], float(tracks.chord[n])
+        log = data.logs[k]
         if k not in runs:
-            runs[k] = Judged(
+            runs[k] = ScoredRun(
                 name=log.name,
                 surface=str(log.surface),
                 load=log.load,
                 heading_deg=finite(np.degrees(data.heading[k])),
                 speed=finite(data.speed[k]),
-                chord=chord,
+                chord=chord[n],
                 path=path[n],
                 measured_end=tracks.measured[n, -1].tolist(),
                 models={},
             )
-        runs[k].models[model] = Score(
-            predicted_end=tracks.predicted[n, -1].tolist(),
-            endpoint_error=float(np.hypot(*gap[n, :2])) / max(chord, 1e-9),
-            endpoint_error_over_path=float(np.hypot(*gap[n, :2])) / max(path[n], 1e-9),
-            length_error=abs(float(ahead[n]) / max(chord, 1e-9) - 1.0),
-            heading_error_deg=abs(float(np.degrees(gap[n, 2]))),
-            level=None if level is None else float(level[n]),
-            covered90=None if level is None else bool(level[n] <= 0.9),
-            energy_score=float(energy[n]),
-        )
+        runs[k].models[model] = found[n]
 
 
 def finite(x: float) -> float | None:
@@ -229,30 +199,25 @@ def finite(x: float) -> float | None:
     return float(x) if np.isfinite(x) else None
 
 
-def main_load(loads: Sequence[str]) -> str:
-    """The set-up as built, else the most common."""
-    return "as_built" if "as_built" in loads else max(sorted(set(loads)), key=loads.count)
-
-
-def by_floor(runs: Sequence[Judged]) -> dict[str, list[Judged]]:
+def by_floor(runs: Sequence[ScoredRun]) -> dict[str, list[ScoredRun]]:
     """Runs of every floor, those of other load set-ups by themselves.
 
     A set-up other than the one as built, else the most common, is written `<floor>@<load>`.
     """
-    main = main_load([run.load for run in runs])
-    groups: dict[str, list[Judged]] = {}
-    for run in runs:
-        name = run.surface if run.load == main else f"{run.surface}@{run.load}"
+    groups: dict[str, list[ScoredRun]] = {}
+    for name, run in zip(
+        setups([r.surface for r in runs], [r.load for r in runs]), runs, strict=True
+    ):
         groups.setdefault(name, []).append(run)
     return dict(sorted(groups.items()))
 
 
-def _mean(scores: Sequence[Score]) -> Summary:
+def _mean(each: Sequence[Score]) -> FloorSummary:
     def all_of(name: str) -> np.ndarray:
-        return np.array([getattr(s, name) for s in scores if getattr(s, name) is not None], float)
+        return np.array([getattr(s, name) for s in each if getattr(s, name) is not None], float)
 
     covered = all_of("covered90")
-    return Summary(
+    return FloorSummary(
         endpoint_error_mean=float(np.mean(all_of("endpoint_error"))),
         endpoint_error_median=float(np.median(all_of("endpoint_error"))),
         endpoint_error_over_path_mean=float(np.mean(all_of("endpoint_error_over_path"))),
@@ -261,5 +226,5 @@ def _mean(scores: Sequence[Score]) -> Summary:
         heading_error_median_deg=float(np.median(all_of("heading_error_deg"))),
         coverage90=float(np.mean(covered)) if covered.size else None,
         energy_score=float(np.mean(all_of("energy_score"))),
-        runs=len(scores),
+        runs=len(each),
     )

@@ -1,8 +1,8 @@
 """What the runs of one session share beyond the model, and how much less they then tell.
 
 Runs driven on one floor at one time slip a little more or less than the model says, all of them
-together: a rung of the ladder is fitted as if they were independent. After its fit the effects
-that are left in its runs,
+together: a slip model of the comparison is fitted as if they were independent. After its fit the
+effects that are left in its runs,
 
     a_i = (E_i^T W_i E_i)^-1 E_i^T W_i r_i     along, across, yaw
 

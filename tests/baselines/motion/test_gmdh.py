@@ -6,7 +6,6 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 
-from slipid.baselines.interface import Run, path_of
 from slipid.baselines.motion.gmdh.method import (
     CANDIDATES,
     MEMORY,
@@ -25,6 +24,7 @@ from slipid.baselines.motion.gmdh.polynomial_network import (
     grown,
     pruned,
 )
+from slipid.identify.compare.slip_model import Run, path_of
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 EXACT = Growth(1e-12, 20, 5)

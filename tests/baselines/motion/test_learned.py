@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.baselines.interface import ByFloor, Run, path_of
 from slipid.baselines.motion.boosted_trees import BoostedTrees, Boosting
 from slipid.baselines.motion.features import (
     Lessons,
@@ -17,6 +16,7 @@ from slipid.baselines.motion.features import (
     with_slip,
 )
 from slipid.baselines.motion.neural_network import PASSES, NeuralNetwork, Shape
+from slipid.identify.compare.slip_model import ByFloor, Run, path_of
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
 SIZES = np.array([1.0, 1.0, 0.125])

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.baselines.interface import TRIES, ByFloor
 from slipid.baselines.motion.ojeda import Hard, Ojeda, forgetful, hard_runs, ojeda_rows
-from slipid.baselines.motion.steps import Steps
+from slipid.identify.compare.slip_model import TRIES, ByFloor
+from slipid.identify.compare.steps import Steps
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
 CONTINUOUS, SPORADIC, GYRO = ojeda_rows()

@@ -7,23 +7,24 @@ import pytest
 from sklearn.linear_model import LinearRegression
 from sklearn.svm import SVR
 
-from slipid.baselines.interface import SHAFT_W0, TRIES, ByFloor, Machine
 from slipid.baselines.motion.paper import (
     MOST,
     PaperCode,
-    PaperCodeRefit,
     PaperPrint,
-    PaperPrintRefit,
     PaperSvr,
     insensitive_curve,
     paper_rows,
     recipe_samples,
+    refits,
 )
 from slipid.baselines.paper2021.table import CURRENT_SVR, field_table
+from slipid.identify.compare.slip_model import SHAFT_W0, TRIES, ByFloor, Machine
+from slipid.identify.compare.steps import TrainingWindows
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
+PRINT_REFIT, CODE_REFIT = refits()
 FOUR = Machine.of(build(omni([45.0, 135.0, 225.0, 315.0], 0.2, 0.05, 20.0), ("gray",)))
 
 
@@ -137,7 +138,7 @@ def test_the_printed_form_comes_back(rng):
         return np.polynomial.polynomial.polyval(torque(heard), truth)
 
     runs = [slipping(rng, curve) for _ in range(20)]
-    method = PaperPrintRefit().fit(runs[:10], ROBOTINO)
+    method = PRINT_REFIT.fit(runs[:10], ROBOTINO)
     assert method.coefficients == pytest.approx(truth)
     assert method.numbers == 3
     assert path_error(method, runs[10:]) < 1e-9
@@ -156,7 +157,7 @@ def test_the_refit_is_least_squares_in_displacement(rng):
             rows.append(lost * [[1.0], [1.0], [0.125]])
             gaps.append(gap * [1.0, 1.0, 0.125])
     oracle = LinearRegression(fit_intercept=False).fit(np.concatenate(rows), np.concatenate(gaps))
-    method = PaperPrintRefit().fit(runs, ROBOTINO)
+    method = PRINT_REFIT.fit(runs, ROBOTINO)
     assert method.coefficients == pytest.approx(oracle.coef_, rel=1e-6)
 
 
@@ -171,7 +172,7 @@ def test_the_deployed_form_comes_back_for_each_motor(rng):
         return np.where(x > 0.4, gain * x + offset, 0.0)
 
     runs = [slipping(rng, curve, dt=0.5) for _ in range(20)]
-    method = PaperCodeRefit().fit(runs[:10], ROBOTINO)
+    method = CODE_REFIT.fit(runs[:10], ROBOTINO)
     assert method.coefficients == pytest.approx(np.stack([gain, offset], axis=1).ravel())
     assert method.numbers == 6
     assert path_error(method, runs[10:]) < 1e-9
@@ -179,7 +180,7 @@ def test_the_deployed_form_comes_back_for_each_motor(rng):
 
 def test_a_motor_that_never_draws_enough_is_not_corrected(rng):
     runs = [slipping(rng, lambda heard: 0.0 * heard.current, high=0.39) for _ in range(3)]
-    method = PaperCodeRefit().fit(runs, ROBOTINO)
+    method = CODE_REFIT.fit(runs, ROBOTINO)
     assert np.array_equal(method.coefficients, np.zeros(6))
     assert path_error(method, runs) < 1e-12
 
@@ -187,7 +188,7 @@ def test_a_motor_that_never_draws_enough_is_not_corrected(rng):
 def test_a_refit_never_turns_a_wheel_backwards():
     heard = made_run(straight(0.4), current=np.full((40, 3), 2.0)).heard
     for slip, held in ((3.0, 1.0), (-3.0, -1.0)):
-        method = PaperPrintRefit(coefficients=np.array([slip, 0.0, 0.0]))
+        method = replace(PRINT_REFIT, coefficients=np.array([slip, 0.0, 0.0]))
         path = method.predict([heard], ROBOTINO)[0].path
         assert np.allclose(path, (1 - held) * made_run(straight(0.4)).pose)
 
@@ -202,17 +203,20 @@ def test_the_recipe_keeps_what_the_authors_kept():
     rim = drifting.heard.speed * ROBOTINO.wheel_radius
     twist = (rim * (1 - slip)) @ ROBOTINO.back.T
     run = made_run(straight(0.4), twist, current=np.tile(current, (40, 1)))
-    found = recipe_samples([run], ROBOTINO)
+    found = recipe_samples(TrainingWindows.of([run]), ROBOTINO)
     assert np.allclose(found.slip, np.full(8, 0.3))
     assert np.allclose(found.torque, run.heard.torque(ROBOTINO)[0, 0])
     idle = replace(run, heard=replace(run.heard, current=np.full((40, 3), 0.25)))
-    assert len(recipe_samples([idle], ROBOTINO)) == 0
+    assert len(recipe_samples(TrainingWindows.of([idle]), ROBOTINO)) == 0
 
 
 def test_at_most_so_many_samples_are_drawn_and_always_the_same(rng):
     slips = np.linspace(0.1, 0.5, 30)
     runs = [slipping(rng, lambda heard, s=s: s + 0 * heard.current, dt=0.5, low=0.3) for s in slips]
-    found, again = recipe_samples(runs, ROBOTINO), recipe_samples(runs, ROBOTINO)
+    found, again = (
+        recipe_samples(TrainingWindows.of(runs), ROBOTINO),
+        recipe_samples(TrainingWindows.of(runs), ROBOTINO),
+    )
     assert len(found) == MOST < 30 * 40 * 3
     assert np.array_equal(found.slip, again.slip)
     # by lot, not those of the first runs alone
@@ -227,7 +231,7 @@ def test_a_curve_that_is_the_truth_comes_back_within_the_tube(rng, truth):
     runs = [slipping(rng, curve, low=0.26, angle=0.3) for _ in range(30)]
     name = "paper_linear_svr" if len(truth) == 2 else "paper_quadratic_svr"
     method = PaperSvr(name, len(truth) - 1, c=1.0, tube=0.0).fit(runs, ROBOTINO)
-    assert method.curve == pytest.approx(truth, abs=0.02)
+    assert method.coefficients == pytest.approx(truth, abs=0.02)
     assert method.numbers == len(truth)
     assert path_error(method, runs) < 0.01
 
@@ -249,7 +253,7 @@ def test_regressions_fall_back_to_encoders_where_the_recipe_leaves_nothing(rng):
     run = slipping(rng, lambda heard: -0.1 + 0.0 * heard.current)
     for degree in (1, 2):
         method = PaperSvr("paper_svr", degree).fit([run], ROBOTINO)
-        assert method.curve == (0.0,) * (degree + 1)
+        assert method.coefficients.tolist() == [0.0] * (degree + 1)
         path = method.predict([run.heard], ROBOTINO)[0].path
         assert np.allclose(path, made_run(run.heard.rolling(ROBOTINO)).pose)
 
@@ -260,14 +264,14 @@ def test_one_torque_alone_makes_no_curve_but_a_level(rng):
     current = 0.5 + 1e-13 * rng.normal(size=(40, 3))
     run = made_run(rolling, 0.7 * rolling, current=current)
     for degree in (1, 2):
-        curve = PaperSvr("svr", degree).fit([run], ROBOTINO).curve
+        curve = PaperSvr("svr", degree).fit([run], ROBOTINO).coefficients
         assert curve == pytest.approx([0.3, 0.0, 0.0][: degree + 1])
 
 
 def test_regressed_slip_is_held_between_none_and_all():
     run = made_run(straight(0.4), current=np.full((40, 3), 0.5))
     for curve, share in (((-0.5, 0.0), 1.0), ((1.5, 0.0), 0.0), ((0.5, 0.0), 0.5)):
-        path = PaperSvr("svr", curve=curve).predict([run.heard], ROBOTINO)[0].path
+        path = PaperSvr("svr", coefficients=np.array(curve)).predict([run.heard], ROBOTINO)[0].path
         assert np.allclose(path, share * run.pose)
 
 
@@ -295,7 +299,7 @@ def test_every_row_wants_currents_and_a_twist_and_has_a_name_of_its_own():
         assert {m.degree for m in method.candidates()} == {method.degree}
 
 
-@pytest.mark.parametrize("method", [PaperPrintRefit(), PaperCodeRefit(), PaperSvr("svr")])
+@pytest.mark.parametrize("method", [PRINT_REFIT, CODE_REFIT, PaperSvr("svr")])
 def test_what_is_fitted_does_not_predict_before(method):
     with pytest.raises(ValueError, match="not fitted"):
         method.predict([made_run(straight(0.1), current=np.ones((40, 3))).heard], ROBOTINO)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.baselines.interface import Heard, Run, path_of
 from slipid.baselines.motion.features import Windows
 from slipid.baselines.motion.quann.energy import QuannEnergy, places
 from slipid.baselines.motion.quann.gaussian_process import KEPT, Kernel, Process, Rows
@@ -17,6 +16,7 @@ from slipid.baselines.motion.quann.slip import (
     parts,
     slip_inputs,
 )
+from slipid.identify.compare.slip_model import Heard, Run, path_of
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 SIZES = np.array([1.0, 1.0, 0.125])

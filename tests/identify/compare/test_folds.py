@@ -17,12 +17,13 @@ from slipid.cli.main import app
 from slipid.data.runs import collect
 from slipid.identify.compare import open_loop as replay
 from slipid.identify.compare.folds import folds_of, nested
-from slipid.identify.compare.noisy_rung import slopes, with_noise
+from slipid.identify.compare.noisy import slopes, with_noise
 from slipid.identify.compare.predictive import Contact, by_name, log_student
-from slipid.identify.compare.ranking import mean_error, ranking
-from slipid.identify.compare.slip_models import rungs
+from slipid.identify.compare.ranking import ranking
+from slipid.identify.compare.score import Score, mean_error
+from slipid.identify.compare.slip_models import slip_models
 from slipid.identify.compare.transfer import transfer
-from slipid.identify.compare.validation import Judged, Score
+from slipid.identify.compare.validation import ScoredRun
 from slipid.identify.design.planned_runs import Drive
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import Linear, shared
@@ -39,7 +40,7 @@ from tests.helpers.made_windows import SCALE, made
 from tests.helpers.made_windows import robot as made_robot
 
 ROBOT = made_robot(sessions=("one",))
-ALL = {rung.name: rung for rung in rungs(ROBOT.geometry, has_current=True)}
+ALL = {model.name: model for model in slip_models(ROBOT.geometry, has_current=True)}
 STD = {
     "run.along": 0.02,
     "run.across": 0.02,
@@ -84,7 +85,7 @@ def rows(densities, seed=0):
     """Rows of 36 headings for models with these log densities per run."""
     rng = np.random.default_rng(seed)
     return [
-        Judged(
+        ScoredRun(
             name=f"run{k}",
             surface="floor",
             load="as_built",
@@ -114,7 +115,7 @@ def rows(densities, seed=0):
 
 def test_a_judged_run_comes_back_from_its_file():
     run = rows({"identified": np.arange(36.0)})[3]
-    back = Judged.of_json(json.loads(json.dumps(run.to_json())))
+    back = ScoredRun.of_json(json.loads(json.dumps(run.to_json())))
     assert back.models["identified"].log_density == 3.0
     assert back.to_json() == json.loads(json.dumps(run.to_json()))
 
@@ -148,16 +149,16 @@ def test_errors_that_neighbouring_headings_share_do_not_make_a_winner():
     assert one.verdict == "tied"
 
 
-# predictive distributions of rungs --------------------------------------------------------------
+# predictive distributions of slip models --------------------------------------------------------
 
 
 def driven(name, state, seed, runs=96):
-    """Windows whose poses a rung made, with noise of STD, and the same problem's start."""
+    """Windows whose poses a model made, with noise of STD, and the same problem's start."""
     w = made(ROBOT, runs=runs, count=2, seed=seed, voltage=False)
     amps = np.random.default_rng(seed).uniform(0.1, 2.0, w.current.shape)
     w = replace(w, current=amps)
     by_floor = {f: np.asarray(b, float) for f, b in zip(ROBOT.surfaces.labels, state, strict=True)}
-    step = replace(ALL[name], state=by_floor).increments(w, ROBOT)
+    step = ALL[name].with_state(by_floor).increments(w, ROBOT)
     noise = made(ROBOT, runs=runs, count=2, seed=seed, voltage=False, std=STD)
     still = made(ROBOT, runs=runs, count=2, seed=seed, voltage=False, std={})
     step = step + increments_of(noise) - increments_of(still)
@@ -173,7 +174,7 @@ def increments_of(w):
 
 
 def judged(w, names):
-    """Rows of the odd runs under rungs fitted to the even ones, at the true camera."""
+    """Rows of the odd runs under slip models fitted to the even ones, at the true camera."""
     problem = Problem(w, ROBOT, HELD)
     z = problem.space.vector(ROBOT)
     variance = by_name(problem, 2 * np.log(problem.noise.typical))
@@ -247,15 +248,15 @@ def test_models_that_say_the_same_can_hardly_be_told_apart():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["affine", "paper", "heading_lookup"])
-def test_slopes_by_a_rungs_numbers_are_those_of_a_step_in_them(name):
+def test_slopes_by_a_models_numbers_are_those_of_a_step_in_them(name):
     w = made(ROBOT, runs=24, count=2, seed=5, voltage=False)
-    rung = ALL[name].fit(w, ROBOT)
-    slope = slopes(rung, w, lambda r: r.twist(w, ROBOT))
+    model = ALL[name].fit(w, ROBOT)
+    slope = slopes(model, w, lambda r: r.twist(w, ROBOT))
     rng = np.random.default_rng(0)
-    step = {key: rng.normal(size=value.shape) for key, value in rung.state.items()}
-    moved = replace(rung, state={key: rung.state[key] + step[key] for key in step})
+    step = {key: rng.normal(size=value.shape) for key, value in model.state.items()}
+    moved = model.with_state({key: model.state[key] + step[key] for key in step})
     expected = slope @ np.concatenate([v.ravel() for v in step.values()])
-    np.testing.assert_allclose(moved.twist(w, ROBOT) - rung.twist(w, ROBOT), expected, atol=1e-6)
+    np.testing.assert_allclose(moved.twist(w, ROBOT) - model.twist(w, ROBOT), expected, atol=1e-6)
 
 
 # transfer ---------------------------------------------------------------------------------------
@@ -308,7 +309,7 @@ def test_folds_that_are_left_out_together_leave_some_of_every_floor(logs):
         folds_of(data, "sectors", 1)
 
 
-def test_a_rung_that_tunes_itself_leaves_out_gaps_as_wide_as_the_one_it_is_asked_about(logs):
+def test_a_model_that_tunes_itself_leaves_out_gaps_as_wide_as_the_one_it_is_asked_about(logs):
     data = collect(logs)
     sector = folds_of(data, "sectors")
     inner = nested(data, "sectors", np.flatnonzero(sector == 0))

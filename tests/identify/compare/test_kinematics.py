@@ -8,7 +8,7 @@ import pytest
 
 from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.slip_models import restored, rungs
+from slipid.identify.compare.slip_models import restored, slip_models
 from slipid.model.geometry import differential, skid_steer
 from slipid.model.robot import build
 
@@ -56,19 +56,19 @@ def windows(shape, seed=0, runs=24, count=4):
     )
 
 
-def driven(shape, w, rung):
-    """The windows with poses as the rung has them."""
-    step = rung.increments(w, robot(shape))
+def driven(shape, w, model):
+    """The windows with poses as the model has them."""
+    step = model.increments(w, robot(shape))
     start = jnp.asarray(w.pose[:, 0])
     return replace(w, pose=np.array(replay.chain(start, jnp.asarray(step))))
 
 
 def of(shape, name):
-    return next(rung for rung in rungs(shape, has_current=False) if rung.name == name)
+    return next(model for model in slip_models(shape, has_current=False) if model.name == name)
 
 
 def with_truth(shape, name):
-    return replace(of(shape, name), state={"grass": np.array([*TRUE[name], LAG])})
+    return of(shape, name).with_state({"grass": np.array([*TRUE[name], LAG])})
 
 
 @pytest.mark.parametrize("kind", SHAPES)
@@ -131,9 +131,9 @@ def test_nominal_has_no_lag_and_keeps_its_sizes_when_the_fit_changes_them():
 def test_corrections_come_back_from_their_names_and_numbers():
     shape = SHAPES["differential"]
     w = driven(shape, windows(shape), with_truth(shape, "full_linear"))
-    fitted = [rung.fit(w, robot(shape)) for rung in rungs(shape, has_current=True)]
+    fitted = [model.fit(w, robot(shape)) for model in slip_models(shape, has_current=True)]
     names = ["nominal", "encoder", "effective_track", "instantaneous_centres", "full_linear"]
-    assert [rung.name for rung in fitted] == names
+    assert [model.name for model in fitted] == names
     states = {r.name: {f: v.tolist() for f, v in r.state.items()} for r in fitted}
     for one, two in zip(fitted, restored(shape, states), strict=True):
         np.testing.assert_array_equal(
@@ -145,4 +145,4 @@ def test_a_floor_that_was_not_fitted_is_refused():
     shape = SHAPES["differential"]
     w = windows(shape)
     with pytest.raises(ValueError, match="no surface 'grass'; identified: snow"):
-        replace(of(shape, "effective_track"), state={"snow": np.ones(4)}).twist(w, robot(shape))
+        of(shape, "effective_track").with_state({"snow": np.ones(4)}).twist(w, robot(shape))

@@ -9,7 +9,7 @@ import pytest
 from slipid.data.runs import collect
 from slipid.identify.compare import folds, predictive
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.noisy_rung import Noisy
+from slipid.identify.compare.noisy import Noisy
 from slipid.identify.fit.optimise import optimise
 from slipid.job.config import FitSection
 from slipid.job.problem import Task, on_runs
@@ -97,9 +97,9 @@ def test_nothing_of_a_left_out_run_is_learnt(logs, judged, learnt):
         both = size * size[:, None]
         same(now.covariance / both, before.covariance / both, err_msg=now.name)
         if isinstance(now, Noisy):
-            assert now.rung.state.keys() == before.rung.state.keys()
+            assert now.model.state.keys() == before.model.state.keys()
             # of a curve that is straight where it was seen, numbers may be anything
-            one, two = (m.rung.twist(kept, m.robot) for m in (now, before))
+            one, two = (m.model.twist(kept, m.robot) for m in (now, before))
             same(one, two, err_msg=now.name)
 
     def rows(task, found):

@@ -1,4 +1,4 @@
-"""Rungs below the force balance: each finds what made the data, and none knows more than it saw."""
+"""Models below the force balance: each finds what made the data, none knows more than it saw."""
 
 from dataclasses import replace
 
@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 
 from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.slip_models import insensitive, restored, rungs
+from slipid.identify.compare.curves import insensitive
+from slipid.identify.compare.floor_models import FloorModels
+from slipid.identify.compare.heading_lookup import HeadingLookup
+from slipid.identify.compare.score import chords
+from slipid.identify.compare.slip_models import restored, slip_models
 from tests.helpers.made_windows import SCALE, made
 from tests.helpers.made_windows import robot as made_robot
 
 ROBOT = made_robot(sessions=("one",))
-ALL = {rung.name: rung for rung in rungs(ROBOT.geometry, has_current=True)}
+ALL = {model.name: model for model in slip_models(ROBOT.geometry, has_current=True)}
 SPLINE = np.array([0.02, 0.01, 0.05, 0.1, 0.0, 0.2, 0.1])
 TRUE = {
     "constant": ([0.1], [0.4]),
@@ -33,9 +37,9 @@ def windows(seed=0):
     return replace(w, current=amps)
 
 
-def driven(w, rung):
-    """The windows with poses as the rung has them."""
-    step = rung.increments(w, ROBOT)
+def driven(w, model):
+    """The windows with poses as the model has them."""
+    step = model.increments(w, ROBOT)
     pose = np.array(replay.chain(jnp.asarray(w.pose[:, 0]), jnp.asarray(step)))
     pose[..., :2] /= SCALE
     return replace(w, pose=pose)
@@ -44,7 +48,7 @@ def driven(w, rung):
 def with_truth(name):
     floors = ROBOT.surfaces.labels
     state = {f: np.asarray(b, float) for f, b in zip(floors, TRUE[name], strict=True)}
-    return replace(ALL[name], state=state)
+    return ALL[name].with_state(state)
 
 
 @pytest.mark.slow
@@ -107,9 +111,10 @@ def test_encoders_are_right_where_nothing_slips():
     tracks = replay.follow(ROBOT, w, ALL["encoder"].increments(w, ROBOT))
     np.testing.assert_allclose(tracks.gap, 0.0, atol=1e-12)
     far = np.linalg.norm((w.turn.sum(axis=1) @ j.T)[:, :2], axis=1)
-    assert (tracks.chord <= far + 0.02).all()
+    chord = np.array(chords(tracks.measured))
+    assert (chord <= far + 0.02).all()
     straight = np.abs(w.pose[:, -1, 2] - w.pose[:, 0, 2]) < 0.05
-    np.testing.assert_allclose(tracks.chord[straight], far[straight], rtol=2e-3)
+    np.testing.assert_allclose(chord[straight], far[straight], rtol=2e-3)
 
 
 def test_the_lookup_learns_a_smooth_series_of_each_floor_and_load():
@@ -119,7 +124,7 @@ def test_the_lookup_learns_a_smooth_series_of_each_floor_and_load():
         for floor in ROBOT.surfaces.labels
         for load in ROBOT.body.loads
     }
-    truth = replace(ALL["heading_lookup"], state=series)
+    truth = ALL["heading_lookup"].with_state(series)
     found = ALL["heading_lookup"].fit(driven(windows(), truth), ROBOT)
     assert sorted(found.state) == sorted(series)
     other = driven(windows(seed=1), truth)
@@ -135,9 +140,9 @@ def test_the_lookup_is_tuned_on_runs_left_out_as_they_will_be():
     sector = w.run * 6 // 96
     error, size = {}, {}
     for name, together in {"sectors": sector, "at random": None}.items():
-        rung = replace(ALL["heading_lookup"], together=together)
-        found = [rung.fit(w.pieces(np.flatnonzero(sector != k)), ROBOT) for k in range(6)]
-        size[name] = sum(np.abs(v[1:]).sum() for rung in found for v in rung.state.values())
+        model = FloorModels(HeadingLookup(ridge=None, together=together))
+        found = [model.fit(w.pieces(np.flatnonzero(sector != k)), ROBOT) for k in range(6)]
+        size[name] = sum(np.abs(v[1:]).sum() for model in found for v in model.state.values())
         error[name] = 0.0
         for k, fitted in enumerate(found):
             other = w.pieces(np.flatnonzero(sector == k))
@@ -150,7 +155,7 @@ def test_the_lookup_is_tuned_on_runs_left_out_as_they_will_be():
 @pytest.mark.slow
 def test_a_lookup_that_has_nothing_to_leave_out_is_tuned_on_random_runs():
     w = made(ROBOT, runs=48, count=2, seed=4)
-    one = replace(ALL["heading_lookup"], together=np.where(w.run < 20, 3, -1))
+    one = FloorModels(HeadingLookup(ridge=None, together=np.where(w.run < 20, 3, -1)))
     plain = ALL["heading_lookup"].fit(w, ROBOT)
     for key, series in one.fit(w, ROBOT).state.items():
         np.testing.assert_array_equal(series, plain.state[key])
@@ -158,23 +163,23 @@ def test_a_lookup_that_has_nothing_to_leave_out_is_tuned_on_random_runs():
 
 def test_the_lookup_lends_a_load_it_never_saw_the_series_of_another():
     state = {"firm@as_built": np.ones((13, 3)), "soft@as_built": np.zeros((13, 3))}
-    rung = replace(ALL["heading_lookup"], state=state)
+    model = ALL["heading_lookup"].with_state(state)
     w = windows()
     as_built = replace(w, load=("as_built",) * len(w))
-    np.testing.assert_array_equal(rung.increments(w, ROBOT), rung.increments(as_built, ROBOT))
+    np.testing.assert_array_equal(model.increments(w, ROBOT), model.increments(as_built, ROBOT))
 
 
 @pytest.mark.slow
-def test_rungs_come_back_from_their_names_and_numbers():
-    fitted = [rung.fit(driven(windows(), with_truth("affine")), ROBOT) for rung in ALL.values()]
+def test_models_come_back_from_their_names_and_numbers():
+    fitted = [model.fit(driven(windows(), with_truth("affine")), ROBOT) for model in ALL.values()]
     states = {r.name: {f: v.tolist() for f, v in r.state.items()} for r in fitted}
     w = windows(seed=2)
     for one, two in zip(fitted, restored(ROBOT.geometry, states), strict=True):
         np.testing.assert_array_equal(one.increments(w, ROBOT), two.increments(w, ROBOT))
 
 
-def test_without_currents_only_rungs_that_need_none_are_there():
-    names = [r.name for r in rungs(ROBOT.geometry, has_current=False)]
+def test_without_currents_only_models_that_need_none_are_there():
+    names = [r.name for r in slip_models(ROBOT.geometry, has_current=False)]
     assert names == ["nominal", "encoder", "constant", "heading_lookup"]
 
 

@@ -37,7 +37,6 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.baselines.interface import Channel, Heard, Machine, Method, Run, Said
 from slipid.baselines.motion.features import (
     Inputs,
     Lessons,
@@ -47,6 +46,7 @@ from slipid.baselines.motion.features import (
     with_slip,
 )
 from slipid.baselines.motion.gmdh.polynomial_network import Growth, PolynomialNetwork, grown
+from slipid.identify.compare.slip_model import Channel, Heard, Machine, Run, Said, SlipModel
 
 KEPT = 20
 LEAST = 0.05
@@ -96,7 +96,7 @@ class Networks:
 
 @final
 @dataclass(frozen=True, eq=False)
-class GmdhOne(Method):
+class GmdhOne(SlipModel):
     """One set of networks for all floors.
 
     Attributes:
@@ -133,7 +133,7 @@ class GmdhOne(Method):
 
 @final
 @dataclass(frozen=True, eq=False)
-class GmdhClass(Method):
+class GmdhClass(SlipModel):
     """Networks that tell the floor, and then those of the slip on that floor.
 
     Attributes:

@@ -30,19 +30,19 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from slipid.baselines.interface import (
+from slipid.baselines.motion.features import Windows, at_steps
+from slipid.baselines.motion.quann.gaussian_process import Kernel, Process, Rows
+from slipid.identify.compare.slip_model import (
     Aim,
     Channel,
     Heard,
     Machine,
-    Method,
     Run,
     Said,
+    SlipModel,
     Twists,
     path_of,
 )
-from slipid.baselines.motion.features import Windows, at_steps
-from slipid.baselines.motion.quann.gaussian_process import Kernel, Process, Rows
 
 SLOW = 0.02
 """Speed below which energy is counted per time instead of per way [m/s]."""
@@ -50,7 +50,7 @@ SLOW = 0.02
 
 @final
 @dataclass(frozen=True, eq=False)
-class QuannEnergy(Method):
+class QuannEnergy(SlipModel):
     """Energy per metre as a linear law of the motion and a Gaussian process of the place.
 
     Attributes:

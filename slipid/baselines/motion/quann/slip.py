@@ -34,18 +34,18 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, Int
 
-from slipid.baselines.interface import (
+from slipid.baselines.motion.features import Inputs, Lessons, Scale, Windows, at_steps, with_slip
+from slipid.baselines.motion.quann.gaussian_process import Kernel, Process, Rows
+from slipid.identify.compare.slip_model import (
     Channel,
     Heard,
     Machine,
-    Method,
     Run,
     Said,
+    SlipModel,
     Twists,
     path_of,
 )
-from slipid.baselines.motion.features import Inputs, Lessons, Scale, Windows, at_steps, with_slip
-from slipid.baselines.motion.quann.gaussian_process import Kernel, Process, Rows
 
 PARTS = 4
 """Of the runs, each predicted by what the others say, to inflate the covariance."""
@@ -58,7 +58,7 @@ SEED = 0
 
 @final
 @dataclass(frozen=True, eq=False)
-class QuannSlip(Method):
+class QuannSlip(SlipModel):
     """Slip as a Gaussian process of currents, speeds and direction.
 
     Attributes:

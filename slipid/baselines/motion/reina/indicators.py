@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.baselines.interface import WINDOW_S, Heard, Machine, Numbers, Run, groups
+from slipid.identify.compare.slip_model import WINDOW_S, Heard, Machine, Numbers, Run, groups
 
 SLIPS = 0.2
 """Slip from which on a window counts as slipping, as a share of what the encoders say."""

@@ -47,24 +47,24 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from slipid.baselines.interface import (
+from slipid.baselines.motion.reina.fuzzy import Sugeno
+from slipid.baselines.motion.reina.indicators import Example, Indicators, Limits, Signals
+from slipid.identify.compare.slip_model import (
     Channel,
     Heard,
     Machine,
-    Method,
     Numbers,
     Run,
     Said,
+    SlipModel,
     path_of,
 )
-from slipid.baselines.motion.reina.fuzzy import Sugeno
-from slipid.baselines.motion.reina.indicators import Example, Indicators, Limits, Signals
 
 _CURRENT: frozenset[Channel] = frozenset({"current"})
 
 
 @dataclass(frozen=True)
-class _Detector(Method):
+class _Detector(SlipModel):
     """What both rows share.
 
     Attributes:

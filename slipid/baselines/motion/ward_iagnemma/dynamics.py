@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.baselines.interface import Machine
+from slipid.identify.compare.slip_model import Machine
 
 Drives = Float[np.ndarray, "run drive"]
 Speeds = Float[np.ndarray, "run 3"]

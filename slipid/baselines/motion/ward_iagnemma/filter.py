@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from slipid.baselines.interface import WINDOW_S
 from slipid.baselines.motion.ward_iagnemma.dynamics import Drives, Dynamics, Each
 from slipid.baselines.motion.ward_iagnemma.padded import Padded
+from slipid.identify.compare.slip_model import WINDOW_S
 
 Spread = Float[np.ndarray, "run 8 8"]
 Row = Float[np.ndarray, "run 8"]

@@ -11,7 +11,6 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Int
 
-from slipid.baselines.interface import Machine, Run
 from slipid.baselines.motion.ward_iagnemma.dynamics import (
     REST,
     Drives,
@@ -23,6 +22,7 @@ from slipid.baselines.motion.ward_iagnemma.dynamics import (
 )
 from slipid.baselines.motion.ward_iagnemma.filter import Noise
 from slipid.baselines.motion.ward_iagnemma.padded import Padded
+from slipid.identify.compare.slip_model import Machine, Run
 
 _STEADY = 10.0
 """Time after which speeds are taken for steady [s]."""

@@ -61,16 +61,16 @@ from typing import final
 
 import numpy as np
 
-from slipid.baselines.interface import Heard, Machine, Method, Run, Said, path_of
 from slipid.baselines.motion.ward_iagnemma.dynamics import REST, Dynamics, Law
 from slipid.baselines.motion.ward_iagnemma.filter import Filter, Noise
 from slipid.baselines.motion.ward_iagnemma.fit import Windows, fitted_law, fitted_noise
 from slipid.baselines.motion.ward_iagnemma.padded import Padded
+from slipid.identify.compare.slip_model import Heard, Machine, Run, Said, SlipModel, path_of
 
 
 @final
 @dataclass(frozen=True)
-class WardIagnemma(Method):
+class WardIagnemma(SlipModel):
     """The filter, with or without currents.
 
     Attributes:

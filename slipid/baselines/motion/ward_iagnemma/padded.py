@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from slipid.baselines.interface import Heard, Machine
 from slipid.baselines.motion.ward_iagnemma.dynamics import REST
+from slipid.identify.compare.slip_model import Heard, Machine
 
 _DRIVING = 0.3
 """Share of the fastest rim speed from which on a wheel counts as driving."""

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from sklearn.metrics import roc_auc_score
 
-from slipid.baselines.interface import TRIES, ByFloor, groups, path_of
 from slipid.baselines.motion.reina.fuzzy import Sugeno
 from slipid.baselines.motion.reina.indicators import Indicators, Limits, Signals
 from slipid.baselines.motion.reina.method import ReinaDeterministic, ReinaFuzzy
+from slipid.identify.compare.slip_model import TRIES, ByFloor, groups, path_of
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 from tests.helpers.patchy_runs import LOST, patchy, slipping
 

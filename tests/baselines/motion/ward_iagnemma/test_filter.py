@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.baselines.interface import path_of
 from slipid.baselines.motion.ward_iagnemma.dynamics import GRAVITY, Dynamics, Law
 from slipid.baselines.motion.ward_iagnemma.filter import Filter, Noise, State
 from slipid.baselines.motion.ward_iagnemma.padded import Padded, pulls
+from slipid.identify.compare.slip_model import path_of
 from tests.helpers.driven_runs import FLOOR
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 

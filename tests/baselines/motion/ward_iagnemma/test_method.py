@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from slipid.baselines.interface import TRIES, ByFloor, body_increments
 from slipid.baselines.motion.ward_iagnemma.dynamics import Law
 from slipid.baselines.motion.ward_iagnemma.filter import Noise
 from slipid.baselines.motion.ward_iagnemma.method import WardIagnemma
+from slipid.identify.compare.slip_model import TRIES, ByFloor, body_increments
 from tests.helpers.driven_runs import FLOOR, MACHINES, TRUE, driven, pulling, scattered
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 

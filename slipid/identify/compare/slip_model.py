@@ -1,7 +1,7 @@
-"""The one interface of every published system: what it hears of a run, and what it says of it.
+"""The interface of every slip model, ours and published ones, and the runs that it predicts.
 
-A method is fitted to runs with poses, and then predicts runs from what the robot itself measures:
-wheels, currents, commands, perhaps a gyro. All methods are given the same steps of the same runs.
+A slip model is fitted to runs with poses, and then predicts runs from what the robot itself
+measures: wheels, currents, commands, perhaps a gyro. All are given the same steps of the same runs.
 """
 
 import abc
@@ -12,6 +12,8 @@ from typing import Literal, Self
 import numpy as np
 from jaxtyping import Float
 
+from slipid.identify.compare.marker import turned
+from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 
 Channel = Literal["current", "gyro", "command", "twist"]
@@ -73,6 +75,11 @@ class Machine:
             mass=float(robot.body.mass),
             determines_twist=bool(shape.determines_twist),
         )
+
+    def of_shape(self, shape: Geometry) -> "Machine":
+        """The same robot whose encoders are read with other sizes of its wheels and places."""
+        back = np.asarray(shape.least())
+        return replace(self, back=back, wheel_radius=float(shape.wheel_radius))
 
     @property
     def size(self) -> Float[np.ndarray, "3"]:
@@ -213,6 +220,8 @@ class Said:
         path: pose at every edge of the steps, seen from the pose at the start [m, m, rad].
         end_covariance: of the place at the end, seen from the start [m^2]; None of a method that
             knows no uncertainty.
+        freedom: degrees of freedom of the Student t that it is the scale matrix of; infinite where
+            it is the covariance of a Gaussian.
         slipping: how sure it is that the robot slips in a step; any rising scale. None where that
             is to be taken from how far its twist is from that of the encoders.
         floors: probability of each floor in every step, by name; None of a method that does not
@@ -223,14 +232,15 @@ class Said:
 
     path: Float[np.ndarray, "edge 3"]
     end_covariance: Float[np.ndarray, "2 2"] | None = None
+    freedom: float = np.inf
     slipping: Float[np.ndarray, " step"] | None = None
     floors: Mapping[str, Numbers] | None = None
     power: Numbers | None = None
 
 
 @dataclass(frozen=True)
-class Method(abc.ABC):
-    """A system as published, before or after it is fitted.
+class SlipModel(abc.ABC):
+    """Anything that predicts the motion of the body from wheels, before or after it is fitted.
 
     Attributes:
         name: of its row.
@@ -242,7 +252,7 @@ class Method(abc.ABC):
     needs: frozenset[Channel] = field(default=frozenset(), kw_only=True)
     aim: Aim = field(default="end", kw_only=True)
 
-    def candidates(self) -> Sequence["Method"]:
+    def candidates(self) -> Sequence["SlipModel"]:
         """Itself with other settings, at most `TRIES`, from which cross-validation picks one."""
         return (self,)
 
@@ -261,8 +271,8 @@ class Method(abc.ABC):
 
 
 @dataclass(frozen=True)
-class ByFloor(Method):
-    """A method fitted floor by floor where floors are told, else load set-up by load set-up.
+class ByFloor(SlipModel):
+    """A slip model fitted floor by floor where floors are told, else load set-up by load set-up.
 
     Groups of fewer than `FEWEST` runs have the fit to all runs.
 
@@ -273,12 +283,12 @@ class ByFloor(Method):
             runs.
     """
 
-    method: Method
+    method: SlipModel
     pooled: bool = False
-    fitted: Mapping[str | None, Method] = field(default_factory=dict)
+    fitted: Mapping[str | None, SlipModel] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, method: Method) -> "ByFloor":
+    def of(cls, method: SlipModel) -> "ByFloor":
         return cls(method.name, method, needs=method.needs, aim=method.aim)
 
     def candidates(self) -> Sequence["ByFloor"]:
@@ -338,23 +348,20 @@ def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, 
     middle = 0.5 * (heading[1:] + heading[:-1])
     # a chord is the arc times sinc, and points half the turn away from its start
     chord = np.sinc(np.diff(heading) / (2 * np.pi)) * dt
-    c, s = np.cos(middle), np.sin(middle)
-    step = np.stack([c * twist[:, 0] - s * twist[:, 1], s * twist[:, 0] + c * twist[:, 1]], axis=1)
-    place = np.concatenate([np.zeros((1, 2)), np.cumsum(step * chord[:, None], axis=0)])
+    step = turned(middle, twist[:, :2] * chord[:, None])
+    place = np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
     return np.column_stack([place, heading])
 
 
 def seen_from_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "edge 3"]:
     """Poses as they are seen from the first of them."""
-    x, y, yaw = (path - path[0]).T
-    c, s = np.cos(path[0, 2]), np.sin(path[0, 2])
-    return np.stack([c * x + s * y, c * y - s * x, yaw], axis=1)
+    moved = path - path[0]
+    return np.column_stack([turned(-path[0, 2], moved[:, :2]), moved[:, 2]])
 
 
 def body_increments(pose: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "step 3"]:
     """Logarithm on SE(2) of each step of a path: twist times time [m, m, rad]."""
     turn = np.diff(pose[:, 2])
     middle = 0.5 * (pose[1:, 2] + pose[:-1, 2])
-    dx, dy = np.diff(pose[:, 0]), np.diff(pose[:, 1])
-    c, s, arc = np.cos(middle), np.sin(middle), np.sinc(turn / (2 * np.pi))
-    return np.stack([(c * dx + s * dy) / arc, (c * dy - s * dx) / arc, turn], axis=1)
+    arc = turned(-middle, np.diff(pose[:, :2], axis=0)) / np.sinc(turn / (2 * np.pi))[:, None]
+    return np.column_stack([arc, turn])

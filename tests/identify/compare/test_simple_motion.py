@@ -7,11 +7,10 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from slipid.baselines.interface import TRIES, ByFloor, path_of
-from slipid.baselines.motion.effective_track import EffectiveTrack, InstantaneousCentres
-from slipid.baselines.motion.encoder import Encoder
-from slipid.baselines.motion.heading_lookup import HeadingLookup
-from slipid.baselines.motion.steps import Steps, Windows, least
+from slipid.identify.compare.heading_lookup import HeadingLookup
+from slipid.identify.compare.kinematics import Corrected, Encoder
+from slipid.identify.compare.slip_model import TRIES, ByFloor, path_of
+from slipid.identify.compare.steps import Steps, TrainingWindows, least
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
 
@@ -73,7 +72,7 @@ def test_ends_are_those_of_the_paths(rng):
 
 def test_windows_are_those_of_the_runs(rng):
     runs = [wild(rng, n) for n in (30, 3, 12)]
-    w, windowed = Windows.of(runs), [run.windowed() for run in runs]
+    w, windowed = TrainingWindows.of(runs), [run.windowed() for run in runs]
     assert np.allclose(w.dt, np.concatenate([run.heard.dt for run in windowed]))
     assert np.allclose(w.twist, np.concatenate([run.twist for run in windowed]))
     rolling = np.concatenate([run.heard.rolling(ROBOTINO) for run in windowed])
@@ -83,7 +82,7 @@ def test_windows_are_those_of_the_runs(rng):
 def test_rows_are_displacements_with_yaw_at_the_base_radius():
     rolling = np.tile([0.2, 0.1, 0.4], (5, 1))
     run = made_run(rolling, rolling - [0.1, 0.0, 0.2])
-    rows = Windows.of([run]).rows(rolling[..., None], ROBOTINO)
+    rows = TrainingWindows.of([run]).rows(rolling[..., None], ROBOTINO)
     assert np.allclose(rows.gap, [[0.05, 0.0, 0.1 * 0.125]])
     assert np.allclose(rows.parts[..., 0], [[0.1, 0.05, 0.2 * 0.125]])
 
@@ -139,10 +138,8 @@ def one_track(s, d):
 
 def test_the_effective_track_comes_back(rng):
     runs = skid_runs(rng, one_track)
-    method = EffectiveTrack().fit(runs[:3], HUSKY)
-    assert method.ahead == pytest.approx([1.2, 0.0])
-    assert method.yaw == pytest.approx([0.0, 0.6])
-    assert method.place == pytest.approx(0.15)
+    method = Corrected("effective_track").fit(runs[:3], HUSKY)
+    assert method.coefficients == pytest.approx([1.2, 0.6, 0.15])
     said = method.predict([run.heard for run in runs[3:]], HUSKY)
     for each, run in zip(said, runs[3:], strict=True):
         assert np.allclose(each.path, run.pose)
@@ -150,7 +147,7 @@ def test_the_effective_track_comes_back(rng):
 
 def test_the_effective_track_is_the_joint_least_squares(rng):
     runs = skid_runs(rng, one_track, noise=0.1)
-    method = EffectiveTrack().fit(runs, HUSKY)
+    method = Corrected("effective_track").fit(runs, HUSKY)
     windows = [run.windowed() for run in runs]
     s, _, d = np.concatenate([run.heard.rolling(HUSKY) for run in windows]).T
     twist = np.concatenate([run.twist for run in windows])
@@ -159,15 +156,14 @@ def test_the_effective_track_is_the_joint_least_squares(rng):
         return (np.stack([q[0] * s, -q[2] * q[1] * d, q[1] * d], axis=1) - twist).ravel()
 
     a, b, x = least_squares(gap, [1.0, 1.0, 0.0], xtol=1e-12, ftol=1e-12).x
-    # x b is as free as x, so that one after the other is as good as all at once
-    assert [method.ahead[0], method.yaw[1], method.place] == pytest.approx([a, b, x], rel=1e-5)
+    assert method.coefficients == pytest.approx([a, b, x], rel=1e-5)
 
 
 def test_instantaneous_centres_come_back_where_sides_differ(rng):
     runs = skid_runs(rng, sides)
-    method = InstantaneousCentres().fit(runs[:3], HUSKY)
-    assert method.place == pytest.approx(0.08)
-    plain = EffectiveTrack().fit(runs[:3], HUSKY)
+    method = Corrected("instantaneous_centres").fit(runs[:3], HUSKY)
+    assert method.coefficients[2] == pytest.approx(0.08)
+    plain = Corrected("effective_track").fit(runs[:3], HUSKY)
     for run in runs[3:]:
         said, less = (m.predict([run.heard], HUSKY)[0] for m in (method, plain))
         assert np.allclose(said.path, run.pose)
@@ -177,7 +173,10 @@ def test_instantaneous_centres_come_back_where_sides_differ(rng):
 def test_kinematics_are_counted_by_floor(rng):
     grass = skid_runs(rng, one_track)
     ice = [replace(run, floor="ice").told(True) for run in grass]
-    for method, numbers in ((EffectiveTrack(), 3), (InstantaneousCentres(), 5)):
+    for method, numbers in (
+        (Corrected("effective_track"), 3),
+        (Corrected("instantaneous_centres"), 5),
+    ):
         assert method.fit(grass, HUSKY).numbers == numbers
         assert ByFloor.of(method).fit(grass + ice, HUSKY).numbers == 2 * numbers
         untold = [run.told(False) for run in grass + ice]
@@ -228,12 +227,12 @@ def test_the_ridge_is_least_squares_with_rows_of_its_own(rng):
     held = np.diag(np.sqrt(0.02 * (far**2).sum() * np.append(0.0, k.repeat(2) ** 4.0)))
     yaw = np.concatenate([run.windowed().twist[:, 2] for run in runs]) * 0.5
     rows = np.concatenate([phi, held]), np.concatenate([yaw, np.zeros(13)])
-    assert np.allclose(method.series[:, 2], np.linalg.lstsq(*rows, rcond=None)[0])
+    assert np.allclose(method.coefficients[:, 2], np.linalg.lstsq(*rows, rcond=None)[0])
 
 
 def test_a_heavy_ridge_leaves_what_all_headings_share():
     runs = [by_heading(a) for a in HEADINGS]
-    series = HeadingLookup(ridge=1e6).fit(runs, ROBOTINO).series
+    series = HeadingLookup(ridge=1e6).fit(runs, ROBOTINO).coefficients
     assert series[0] == pytest.approx([-0.2, 0.0, 0.3], abs=1e-6)
     assert np.abs(series[1:]).max() < 1e-5
 

@@ -1,4 +1,4 @@
-"""A rung of the ladder with noise of its own, so that it forecasts as the force balance does."""
+"""A slip model with noise of its own, so that it forecasts as the force balance does."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,8 +12,8 @@ from scipy.linalg import block_diag
 
 from slipid.data.windows import Windows
 from slipid.identify.compare import open_loop as replay
+from slipid.identify.compare.floor_models import FloorModels
 from slipid.identify.compare.predictive import Contact, Gaps, Predictive, Slopes, around, by_name
-from slipid.identify.compare.rung import Rung
 from slipid.identify.fit import likelihood as lk
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.variances import DEGREES, scored
@@ -21,52 +21,52 @@ from slipid.model.robot import Robot
 from slipid.search_space import Space
 
 MOST_TURNS, SCORING, SETTLED = 15, 4, 0.02
-"""Turns of a rung's covariance and so many steps of its log variances, and what counts as rest."""
+"""Turns of a model's covariance and so many steps of its log variances, and what counts as rest."""
 VAGUE = 1e-2
-"""Precision of a rung's number before any data: of slips below one, a std of 10 says nothing."""
+"""Precision of a model's number before any data: of slips below one, a std of 10 says nothing."""
 STEP = 1e-4
-"""Of the difference quotients by a rung's numbers."""
+"""Of the difference quotients by a model's numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Noisy(Predictive):
-    """A rung with noise of its own and the camera of a fit, whose numbers follow the rung's."""
+    """A slip model with noise of its own and a fit's camera, which the model's numbers follow."""
 
-    rung: Rung
+    model: FloorModels
     contact: Contact
 
     @property
     def name(self) -> str:
-        return self.rung.name
+        return self.model.name
 
     @property
     def numbers(self) -> dict[str, int]:
         sizes = dict.fromkeys(self.robot.surfaces.labels, 0)
-        for key, value in self.rung.state.items():
+        for key, value in self.model.state.items():
             sizes[next(f for f in sizes if key == f or key.startswith(f"{f}@"))] += value.size
         return sizes | {"shared": 0}
 
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
-        rung, z, b = self.rung, self.contact.z, problem.batch
+        model, z, b = self.model, self.contact.z, problem.batch
         w = problem.windows.at_lag(float(self.robot.camera.lag))
 
-        def gap(some: Rung) -> np.ndarray:
+        def gap(some: FloorModels) -> np.ndarray:
             return np.asarray(_gap(problem.space, z, some.twist(w, self.robot), b))
 
-        by_z = np.asarray(_gap_jacobian(problem.space, z, rung.twist(w, self.robot), b))
+        by_z = np.asarray(_gap_jacobian(problem.space, z, model.twist(w, self.robot), b))
         by_camera = by_z[..., self.contact.camera]
-        return gap(rung), np.concatenate([slopes(rung, w, gap), by_camera], axis=-1)
+        return gap(model), np.concatenate([slopes(model, w, gap), by_camera], axis=-1)
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
         robot, contact = self.robot, self.contact
 
-        def tracks_of(rung: Rung) -> replay.Tracks:
-            return replay.follow(robot, w, rung.increments(w, robot))
+        def tracks_of(model: FloorModels) -> replay.Tracks:
+            return replay.follow(robot, w, model.increments(w, robot))
 
-        tracks = tracks_of(self.rung)
-        twist, start = self.rung.twist(w, robot), tracks.predicted[:, 0]
+        tracks = tracks_of(self.model)
+        twist, start = self.model.twist(w, robot), tracks.predicted[:, 0]
         camera = replay.end_jacobian(contact.space, contact.z, lk.batch(w, robot), start, twist)
-        own = slopes(self.rung, w, lambda rung: tracks_of(rung).predicted[:, -1, :2])
+        own = slopes(self.model, w, lambda model: tracks_of(model).predicted[:, -1, :2])
         jac = np.concatenate([own, np.asarray(camera)[..., contact.camera]], axis=-1)
         spread = around(jac, self.covariance)
         effect = self.effect_covariance(w)
@@ -74,19 +74,19 @@ class Noisy(Predictive):
 
 
 def with_noise(
-    rung: Rung, contact: Contact, problem: Problem, keep: Float[np.ndarray, " piece"]
+    model: FloorModels, contact: Contact, problem: Problem, keep: Float[np.ndarray, " piece"]
 ) -> Noisy:
-    """A rung fitted to the kept pieces of a problem, and its noise found from what it leaves there.
+    """A slip model fitted to the kept pieces of a problem, with noise found from what it leaves.
 
     Variances by Fisher scoring of the restricted likelihood, as for the force balance; the degrees
-    of freedom of the rung's own numbers are taken off.
+    of freedom of the model's own numbers are taken off.
     """
     robot = contact.robot
     seen = problem.windows.at_lag(float(robot.camera.lag)).pieces(np.flatnonzero(keep > 0))
-    rung = rung.fit(seen, robot)
-    before = _before(rung, seen, robot)
+    model = model.fit(seen, robot)
+    before = _before(model, seen, robot)
     common = contact.covariance[np.ix_(contact.camera, contact.camera)]
-    plain = Noisy(robot, contact.variance, common, rung, contact)
+    plain = Noisy(robot, contact.variance, common, model, contact)
     gap, slope = plain.linear(problem)
     log_v, count = jnp.asarray(contact.log_variance(problem)), jnp.asarray(keep, float)
     own_effects = np.array([c.kind == "run" for c in problem.noise.components])
@@ -108,17 +108,17 @@ def with_noise(
     return plain.with_sessions(problem, (gap, slope), wide, keep)
 
 
-def _before(rung: Rung, w: Windows, robot: Robot) -> np.ndarray:
-    """Precision of a rung's numbers without the data."""
-    held = rung.stiffness(w, robot)
-    parts = [VAGUE * np.eye(v.size) + held.get(key, 0.0) for key, v in rung.state.items()]
+def _before(model: FloorModels, w: Windows, robot: Robot) -> np.ndarray:
+    """Precision of a model's numbers without the data."""
+    held = model.stiffness(w, robot)
+    parts = [VAGUE * np.eye(v.size) + held.get(key, 0.0) for key, v in model.state.items()]
     return np.asarray(block_diag(np.zeros((0, 0)), *parts))
 
 
 def _numbers(
     before: np.ndarray, common: np.ndarray, scale: np.ndarray, slope: Slopes, keep: np.ndarray
 ) -> np.ndarray:
-    """Covariance of a rung's numbers and the camera's; the former follow the latter."""
+    """Covariance of a model's numbers and the camera's; the former follow the latter."""
     own, m = len(before), slope.shape[1]
     factor = keep * (DEGREES + m) / (DEGREES + m + 2)
     weighted = np.linalg.solve(scale, slope[..., :own]) * factor[:, None, None]
@@ -142,21 +142,21 @@ def _gap(space: Space, z: replay.Numbers, twist: replay.Numbers, b: lk.Batch) ->
 _gap_jacobian = eqx.filter_jit(jax.jacfwd(_gap, argnums=1))
 
 
-def slopes(rung: Rung, w: Windows, of: Callable[[Rung], np.ndarray]) -> np.ndarray:
-    """Slope of a function of a rung by its numbers, key after key (piece, ..., number).
+def slopes(model: FloorModels, w: Windows, of: Callable[[FloorModels], np.ndarray]) -> np.ndarray:
+    """Slope of a function of a model by its numbers, key after key (piece, ..., number).
 
     Keys share no piece, so one number of each is moved at once.
     """
-    ends = np.cumsum([0, *(v.size for v in rung.state.values())]).tolist()
-    now = of(rung)
+    ends = np.cumsum([0, *(v.size for v in model.state.values())]).tolist()
+    now = of(model)
     out = np.zeros((*now.shape, ends[-1]))
-    keys = np.array([rung.series(s, load) for s, load in zip(w.surface, w.load, strict=True)])
-    for k in range(max((v.size for v in rung.state.values()), default=0)):
-        moved = {key: np.array(value, float) for key, value in rung.state.items()}
+    keys = np.array([model.series(s, load) for s, load in zip(w.surface, w.load, strict=True)])
+    for k in range(max((v.size for v in model.state.values()), default=0)):
+        moved = {key: np.array(value, float) for key, value in model.state.items()}
         for value in moved.values():
             value.flat[k : k + 1] += STEP
-        quotient = (of(replace(rung, state=moved)) - now) / STEP
-        for key, first, last in zip(rung.state, ends[:-1], ends[1:], strict=True):
+        quotient = (of(model.with_state(moved)) - now) / STEP
+        for key, first, last in zip(model.state, ends[:-1], ends[1:], strict=True):
             if first + k < last:
                 out[keys == key, ..., first + k] = quotient[keys == key]
     return out

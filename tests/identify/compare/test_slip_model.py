@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slipid.baselines.interface import body_increments, groups, path_of
+from slipid.identify.compare.slip_model import body_increments, groups, path_of
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 

@@ -1,17 +1,21 @@
-"""The steps of many runs together, as methods that are linear in displacement take them."""
+"""The steps of many runs together, and slip models that give a body twist in each of them."""
 
+import abc
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from slipid.baselines.interface import (
+from slipid.identify.compare.marker import turned
+from slipid.identify.compare.slip_model import (
     WINDOW_S,
     Heard,
     Machine,
     Run,
     Said,
+    SlipModel,
     Twists,
     body_increments,
     groups,
@@ -26,10 +30,15 @@ class Steps:
     Attributes:
         heard: all steps as if they were one run; its name and floor are those of the first.
         first: first step of each run.
+        faster: wheel speed at the end of each step less that at its start [rad/s], so that
+            d turn / d lag = -faster; None where the lag of the poses is settled.
+        lag: lag of the poses behind the wheels that was assumed [s].
     """
 
     heard: Heard
     first: Int[np.ndarray, " run"]
+    faster: Float[np.ndarray, "step drive"] | None = None
+    lag: float = 0.0
 
     @classmethod
     def of(cls, runs: Sequence[Heard]) -> "Steps":
@@ -52,6 +61,13 @@ class Steps:
             command=None,
         )
         return cls(heard, np.cumsum([0, *(len(run) for run in runs[:-1])]))
+
+    def at_lag(self, lag: float) -> "Steps":
+        """The same steps at another lag, to first order [s]; as they are where it is settled."""
+        if self.faster is None:
+            return self
+        turn = self.heard.turn - (lag - self.lag) * self.faster
+        return replace(self, heard=replace(self.heard, turn=turn), lag=lag)
 
     @property
     def length(self) -> Int[np.ndarray, " run"]:
@@ -91,11 +107,9 @@ class Steps:
         turn = twist[:, 2] * dt
         before = np.cumsum(turn) - turn
         before -= np.repeat(before[self.first], self.length)
-        c, s = np.cos(before + 0.5 * turn), np.sin(before + 0.5 * turn)
         chord = np.sinc(turn / (2 * np.pi)) * dt
-        x = (c * twist[:, 0] - s * twist[:, 1]) * chord
-        y = (s * twist[:, 0] + c * twist[:, 1]) * chord
-        return np.add.reduceat(np.stack([x, y, turn], axis=1), self.first)
+        step = turned(before + 0.5 * turn, twist[:, :2] * chord[:, None])
+        return np.add.reduceat(np.column_stack([step, turn]), self.first)
 
     def _runs(self, values: np.ndarray) -> list[np.ndarray]:
         """Values of all steps, run by run."""
@@ -103,7 +117,7 @@ class Steps:
 
 
 @dataclass(frozen=True, eq=False)
-class Windows:
+class TrainingWindows:
     """Windows of about half a second of the same steps, with the true twist in each.
 
     A camera's noise is large over one step, so methods learn from windows; what they learn from is
@@ -114,22 +128,33 @@ class Windows:
         first: first step of each window.
         dt: length of each window [s].
         twist: by the poses [m/s, m/s, rad/s].
+        run: number of the run that each window is of.
     """
 
     steps: Steps
     first: Int[np.ndarray, " window"]
     dt: Float[np.ndarray, " window"]
     twist: Float[np.ndarray, "window 3"]
+    run: Int[np.ndarray, " window"]
 
     @classmethod
-    def of(cls, runs: Sequence[Run]) -> "Windows":
+    def of(cls, runs: Sequence[Run]) -> "TrainingWindows":
         steps = Steps.of([run.heard for run in runs])
         begins = [groups(run.heard.dt, WINDOW_S) for run in runs]
         edges = [np.append(begin, len(run.heard)) for begin, run in zip(begins, runs, strict=True)]
         moved = [body_increments(run.pose[edge]) for run, edge in zip(runs, edges, strict=True)]
         first = np.concatenate([s + begin for s, begin in zip(steps.first, begins, strict=True)])
         dt = np.add.reduceat(steps.heard.dt, first)
-        return cls(steps, first, dt, np.concatenate(moved) / dt[:, None])
+        run = np.repeat(np.arange(len(runs)), [len(begin) for begin in begins])
+        return cls(steps, first, dt, np.concatenate(moved) / dt[:, None], run)
+
+    @property
+    def signals(self) -> Heard:
+        """What was measured, each window as one step."""
+        heard = self.steps.heard
+        current = None if heard.current is None else self.means(heard.current)
+        turn = np.add.reduceat(heard.turn, self.first)
+        return replace(heard, dt=self.dt, turn=turn, current=current, gyro=None, command=None)
 
     def means(self, values: Float[np.ndarray, "step *any"]) -> Float[np.ndarray, "window *any"]:
         """Mean over time of every window."""
@@ -159,10 +184,6 @@ class Rows:
     parts: Float[np.ndarray, "window 3 k"]
     gap: Float[np.ndarray, "window 3"]
 
-    def solved(self) -> Float[np.ndarray, " k"]:
-        """Least squares; where rows do not tell coefficients apart, the smallest of them."""
-        return least(self.parts.reshape(-1, self.parts.shape[-1]), self.gap.ravel())
-
 
 def least(a: Float[np.ndarray, "row k"], b: Float[np.ndarray, " row"]) -> Float[np.ndarray, " k"]:
     """Least squares with columns of one length; of many solutions the shortest in those lengths."""
@@ -170,3 +191,52 @@ def least(a: Float[np.ndarray, "row k"], b: Float[np.ndarray, " row"]) -> Float[
     # a column of nothing but rounding says nothing
     size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
     return np.asarray(np.linalg.lstsq(a / size, b, rcond=1e-6)[0] / size)
+
+
+@dataclass(frozen=True)
+class TwistModel(SlipModel, abc.ABC):
+    """A slip model that gives the body twist of every step, from the signals of its run.
+
+    Attributes:
+        coefficients: fitted numbers; None before a fit, and of a model that learns nothing.
+    """
+
+    learns: ClassVar[bool] = True
+    """Whether numbers are fitted."""
+    by_load: ClassVar[bool] = False
+    """Whether `slipid compare` fits every load set-up of a floor by itself."""
+    coefficients: np.ndarray | None = field(default=None, kw_only=True)
+
+    @abc.abstractmethod
+    def learn(self, w: TrainingWindows, machine: Machine) -> Self:
+        """The model fitted to windows."""
+
+    @abc.abstractmethod
+    def twist(self, steps: Steps, machine: Machine) -> Twists:
+        """Body twist of every step [m/s, m/s, rad/s]."""
+
+    def stiffness(self, w: TrainingWindows, machine: Machine) -> Float[np.ndarray, "k k"]:
+        """Precision of the flat coefficients by what holds them besides the windows."""
+        return np.zeros((self.numbers, self.numbers))
+
+    def fit(self, runs: Sequence[Run], machine: Machine) -> "TwistModel":
+        return self.learn(TrainingWindows.of(runs), machine) if self.learns else self
+
+    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+        steps = Steps.of(runs)
+        return steps.said(self.twist(steps, machine))
+
+    @property
+    def numbers(self) -> int:
+        return 0 if self.coefficients is None else self.coefficients.size
+
+    @property
+    def known(self) -> np.ndarray:
+        """The fitted numbers.
+
+        Raises:
+            ValueError: the model is not fitted.
+        """
+        if self.coefficients is None:
+            raise ValueError(f"{self.name}: not fitted")
+        return self.coefficients
