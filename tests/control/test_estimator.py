@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from slipid.control import closed_loop
 from slipid.control.closed_loop import Pilot
-from slipid.control.controller import Controller, Gains, Limits, limited
+from slipid.control.controller import LONGEST_I, Controller, Gains, Limits, limited
 from slipid.control.estimator import Estimator, Odometry
 from slipid.control.filter.floor import Floor
 from slipid.control.filter.floor_filter import FloorFilter
@@ -499,6 +499,17 @@ def test_the_observer_takes_a_constant_disturbance_out():
             state, command = con.step(state, reference, said, DT)
             twist = np.asarray(f.inverse @ (f.frame.radius * command)) + off
         np.testing.assert_allclose(twist, [0.1, 0.05, 0.0] + left * off, atol=1e-3)
+
+
+def test_the_integral_asks_for_no_more_than_it_may_however_long_a_robot_is_off():
+    f = robot()
+    con = Controller(f, Gains.at((0.0, 0.0, 1.0, 0.0, 0.0, 0.0)))
+    step = jax.jit(lambda s, e: con.step(s, jnp.array([0.3, -0.1, 0.0, 0.0, 0.0, 0.0]), e, DT))
+    state = con.init()
+    for _ in range(40):
+        state, command = step(state, estimate(f))
+    np.testing.assert_allclose(state.integral, [LONGEST_I, -LONGEST_I], rtol=1e-12)
+    np.testing.assert_allclose(command, wheels([LONGEST_I, -LONGEST_I, 0.0]), rtol=1e-9)
 
 
 def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_and_says_so():

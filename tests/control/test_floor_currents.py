@@ -10,7 +10,7 @@ import pytest
 from slipid.control.estimator import Estimator
 from slipid.control.filter.floor_filter import FloorFilter
 from slipid.control.filter.hypotheses import hypotheses_of
-from slipid.control.filter.wheels import Currents
+from slipid.control.filter.wheels import Currents, read_currents
 from slipid.control.interface import Measurement, Settings
 from slipid.model.geometry import omni
 from slipid.model.robot import build, motor_current, twist
@@ -92,3 +92,22 @@ def test_evidence_is_that_of_normal_errors_of_what_was_heard(turn):
     wanted = sum(-0.5 * (np.minimum(g**2 / v, worst) + np.log(v)) for g, v in parts)
     of_none = sum(-0.5 * (s.unknown_std**2 + np.log(v.mean())) for _, v in parts)
     np.testing.assert_allclose(told - none, wanted - of_none, rtol=1e-10)
+
+
+def test_an_ammeter_and_a_voltmeter_count_by_how_sure_each_is():
+    robot, w = deployed(), jnp.array([3.0, -2.0, 0.0])
+    s = Settings(current_is_signed=True, ammeter_std_a=0.2, voltmeter_std_v=0.3, filter_s=1e-9)
+    amps, by_volts = np.array([0.2, -0.3, 0.1]), np.array([0.3, -0.1, 0.0])
+    zero = amps + float(robot.motor.current_offset)
+    volts = robot.motor.voltage(jnp.asarray(by_volts), w)
+    whole = Measurement(current=zero, voltage=volts).filled(3)
+    found = read_currents(robot, s, jnp.zeros(3), whole, w, jnp.asarray(0.05))
+    of_amps, of_volts = 0.2**-2, (0.3 / float(robot.motor.resistance)) ** -2
+    mean = (of_amps * amps + of_volts * by_volts) / (of_amps + of_volts)
+    np.testing.assert_allclose(found.filtered, mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.variance, 1 / (of_amps + of_volts), rtol=1e-12)
+    for one, value, sure in (("current", amps, of_amps), ("voltage", by_volts, of_volts)):
+        part = Measurement(**{one: zero if one == "current" else volts}).filled(3)
+        found = read_currents(robot, s, jnp.zeros(3), part, w, jnp.asarray(0.05))
+        np.testing.assert_allclose(found.filtered, value, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(found.variance, 1 / sure, rtol=1e-12)

@@ -6,6 +6,9 @@ import re
 
 import numpy as np
 import pytest
+from scipy.stats import norm
+from slipid.data.clocks.clock import SURE_STD, Clock, best_clock, clock_of_poses
+from slipid.data.clocks.noise import StepNoise
 
 from slipid.data.align.clock import SURE_STD, best_clock, clock_of_poses
 from slipid.data.align.motion_pair import MotionPair
@@ -99,6 +102,13 @@ def test_times_of_poses_come_out_on_the_clock_of_the_robot():
     moved = clock.robot_time(np.array([clock.middle, clock.middle + 10.0]))
     assert moved[0] == pytest.approx(clock.middle + clock.offset)
     assert moved[1] - moved[0] == pytest.approx(10.0 * (1.0 + clock.drift))
+
+
+def test_intervals_of_a_clock_hold_nine_truths_in_ten():
+    clock = Clock(1.2, 0.01, 3e-5, 2e-5, 5.0, 0.1, "gyro")
+    low, high = clock.offset_interval90
+    assert norm.cdf([low, high], 1.2, 0.01) == pytest.approx([0.05, 0.95], abs=1e-4)
+    assert str(clock) == "+1.2000 s (+- 0.0164), +30 ppm (+- 33)"
 
 
 @pytest.mark.slow

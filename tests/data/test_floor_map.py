@@ -8,6 +8,7 @@ import pytest
 from matplotlib.image import imsave
 
 from slipid.data.floor_map import (
+    FloorMap,
     four_zones,
     from_polygons,
     patchwork,
@@ -51,6 +52,16 @@ def test_beyond_the_edge_the_floor_goes_on():
     assert surface_at(floor, 7.0, 8.0) == "green"
     assert surface_at(floor, -1.0, 8.0) == "table"
     assert surface_at(uniform("sand"), 9.0, -9.0) == "sand"
+
+
+def test_a_place_has_the_surface_of_the_cell_it_lies_in():
+    rng = np.random.default_rng(0)
+    cells = rng.integers(0, 3, (5, 7))
+    made = FloorMap(("a", "b", "c"), cells, (-0.3, 0.2), 0.1)
+    row, column = np.indices(cells.shape)
+    for aside in rng.uniform(0.02, 0.98, (10, 2)):
+        xy = np.stack([column, row], axis=-1) + aside
+        np.testing.assert_array_equal(made.at([-0.3, 0.2] + 0.1 * xy), cells)
 
 
 def test_a_map_comes_back_from_its_file(tmp_path):

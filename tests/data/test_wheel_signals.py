@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from slipid.data.wheel_signals import (
+    STALLED,
     body_steps,
     bridge_stalls,
     first_moved,
@@ -39,6 +40,14 @@ def test_stalls_are_bridged(rng):
     bridged, stalled = bridge_stalls(time, frozen)
     np.testing.assert_allclose(bridged, angle, atol=1e-12)
     assert np.flatnonzero(stalled).tolist() == list(range(101, 108))
+
+
+@pytest.mark.parametrize(("rows", "stalls"), [(STALLED - 1, False), (STALLED, True)])
+def test_so_many_steps_without_change_are_a_stall_and_fewer_are_none(rng, rows, stalls):
+    time, angle, frozen = stalled_run(rng, rows=rows)
+    bridged, stalled = bridge_stalls(time, frozen)
+    assert np.flatnonzero(stalled).tolist() == (list(range(101, 101 + rows)) if stalls else [])
+    np.testing.assert_allclose(bridged, angle if stalls else frozen, atol=1e-12)
 
 
 def test_wheels_that_stop_are_no_stall(rng):

@@ -193,6 +193,17 @@ def test_faster_is_the_derivative_by_the_lag(logs, lag):
     assert np.abs(slope).max() > 0.05
 
 
+def test_windows_know_what_another_lag_makes_of_them(logs):
+    data = collect(logs)
+    w, other = (windows(data, RADIUS, lag=lag) for lag in (0.1, 0.13))
+    moved = w.at_lag(0.13)
+    assert moved.lag == 0.13
+    inside = np.s_[:, 1:-1]  # away from start and end
+    change = np.abs(other.turn - w.turn)[inside].max()
+    assert change > 1e-3
+    np.testing.assert_allclose(moved.turn[inside], other.turn[inside], atol=0.1 * change)
+
+
 def test_lag_shifts_the_wheels_and_not_the_poses(logs):
     data = collect(logs)
     w = windows(data, RADIUS, lag=0.1)

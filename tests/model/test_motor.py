@@ -50,6 +50,12 @@ def test_torque_constant_is_the_back_emf_constant():
     np.testing.assert_allclose(mechanical, electrical, atol=1e-12)
 
 
+def test_a_gear_loses_a_part_of_what_the_motor_turns_with():
+    current = jnp.linspace(-2.0, 2.0, 41)
+    kept = MOTOR.torque(current, SPEEDS) + MOTOR.friction(SPEEDS)
+    np.testing.assert_allclose(kept, 16.0 * 0.8 * 0.0514 * current, atol=1e-14)
+
+
 def test_friction_opposes_the_motion():
     friction = np.asarray(MOTOR.friction(SPEEDS))
     moves = np.abs(np.asarray(SPEEDS)) > 1e-9

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from functools import cache
+from math import pi
 
 import pytest
 
 from slipid.data.sanity.sanity import findings
+from slipid.data.sanity.scales.causes import explained
+from slipid.data.sanity.scales.ratios import Ratio, Ratios
 from tests.helpers.mistakes import MISTAKES
 from tests.helpers.plain_robot import DRIVES, Drive, as_runs, drive
 
@@ -110,3 +113,32 @@ def test_two_mistakes_are_both_named():
         by_name["sign of the third wheel"].runs(driven(omni))
     )
     assert {f.kind for f in alarms(as_runs(raws), omni.geometry)} == {"wheel_sign", "heading_sign"}
+
+
+def test_a_turned_marker_hides_no_other_unit_of_the_pose():
+    """The way is compared with that of the wheels in the axes that the heading was put right to."""
+    (omni, *_) = DRIVES
+    by_name = {m.name: m for m in MISTAKES}
+    raws = by_name["marker turned by 90 deg"].runs(
+        by_name["pose in mm as m"].runs([raw.less(*ONLY_POSES) for raw in driven(omni)])
+    )
+    assert {f.kind for f in alarms(as_runs(raws), omni.geometry)} == {
+        "heading_offset",
+        "pose_length",
+    }
+
+
+def test_a_heading_in_another_unit_makes_a_gyro_look_too_small():
+    """One cause explains both ratios, and no gyro is told to be wrong."""
+    deg = 180 / pi
+    seen = Ratios(
+        {
+            "travel": Ratio(0.8, 0.3, 0.8, 1.35),
+            "turning": Ratio(0.8 * deg, 0.35, 0.8, 1.35),
+            "gyro": Ratio(1 / deg, 0.75, 1.0, 1.33),
+        },
+        speed_is_angle=False,
+    )
+    found, alone = explained(seen, 0.05, 16.0)
+    assert alone
+    assert [(e.name, e.factor) for e in found] == [("heading", pytest.approx(deg))]

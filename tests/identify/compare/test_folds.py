@@ -25,6 +25,7 @@ from slipid.identify.compare.slip_models import slip_models
 from slipid.identify.compare.transfer import transfer
 from slipid.identify.compare.validation import ScoredRun
 from slipid.identify.design.planned_runs import Drive
+from slipid.identify.fit.likelihood import batch
 from slipid.identify.fit.problem import Problem
 from slipid.identify.fit.sessions import Linear, shared
 from slipid.identify.fit.variances import DEGREES
@@ -65,6 +66,37 @@ def test_the_density_is_that_of_scipy():
         multivariate_t.logpdf(x, shape=v, df=DEGREES) for x, v in zip(gap, scale, strict=True)
     ]
     np.testing.assert_allclose(log_student(gap, scale), oracle, rtol=1e-10)
+
+
+def test_regions_and_energy_scores_are_those_of_many_draws():
+    cov, gap = np.array([[0.04, 0.01], [0.01, 0.02]]), np.array([[0.0, 0.0], [0.3, -0.1]])
+    draws = multivariate_t(shape=cov, df=DEGREES).rvs(20_000, random_state=1)
+    level, score = replay.scores(gap, np.array([cov, cov]))
+    far = np.einsum("ni,ij,nj->n", gap, np.linalg.inv(cov), gap)
+    inside = np.einsum("ni,ij,nj->n", draws, np.linalg.inv(cov), draws) <= far[1]
+    np.testing.assert_allclose(level, [0.0, inside.mean()], atol=0.01)
+    near = [np.linalg.norm(draws - one, axis=1).mean() for one in gap]
+    apart = np.linalg.norm(draws[::2] - draws[1::2], axis=1).mean()
+    # of a few hundred draws; half of the distance between two draws is 0.14
+    np.testing.assert_allclose(score, np.array(near) - 0.5 * apart, atol=0.03)
+    level, score = replay.scores(gap, None)
+    assert level is None
+    np.testing.assert_allclose(score, np.linalg.norm(gap, axis=1))
+
+
+def test_a_camera_errs_at_both_ends_of_a_way_and_turns_it_by_the_heading_at_its_start():
+    w = made(ROBOT, runs=4)
+    tracks = replay.follow(ROBOT, w, np.asarray(replay.contact_increments(ROBOT, batch(w, ROBOT))))
+    none = np.zeros((4, 3, 3)), np.zeros((4, 2, 2))
+    variance = {"camera.place": 4e-6, "camera.heading": 0.0}
+    found = replay.end_covariance(ROBOT, w, tracks, variance, *none)
+    np.testing.assert_allclose(found, [2 * 4e-6 * SCALE**2 * np.eye(2)] * 4, rtol=1e-12)
+    variance = {"camera.place": 0.0, "camera.heading": 9e-6}
+    found = replay.end_covariance(ROBOT, w, tracks, variance, *none)
+    way = (tracks.predicted[:, -1] - tracks.predicted[:, 0])[:, :2]
+    across = way[:, ::-1] * [-1.0, 1.0]
+    expected = 9e-6 * across[:, :, None] * across[:, None, :]
+    np.testing.assert_allclose(found, expected, atol=1e-18)
 
 
 def test_the_error_of_a_paired_difference_is_that_of_a_mean_and_clusters_count_once():
@@ -435,6 +467,18 @@ def test_regions_hold_runs_of_other_sessions_as_often_as_they_say():
     low, high = binom.interval(0.99, 200, 0.9)
     assert low <= 200 * covered(np.array(list(variance.values())), covariance) <= high
     assert covered(np.zeros(3), own) < 0.6
+
+
+@pytest.mark.slow
+def test_a_run_gone_wrong_hardly_counts_for_what_its_session_shares():
+    model, w = with_sessions(np.array([0.03, 0.02, 0.08]), 3, np.arange(80) % 8)
+    gap = model.gap.copy()
+    gap[0] += model.effect[0] @ [1.0, -1.0, 3.0]
+    keep = np.ones(len(w))
+    wrong = shared(replace(model, gap=gap), w, keep)[0]
+    keep[0] = 0.0
+    without = shared(model, w, keep)[0]
+    np.testing.assert_allclose(list(wrong.values()), list(without.values()), rtol=0.1)
 
 
 @pytest.mark.slow

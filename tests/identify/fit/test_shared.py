@@ -351,6 +351,16 @@ def test_sectors_are_cut_where_no_runs_are_parted():
         assert {k // 3 for k in mine} == {k // 3 for k in mine if k % 3 == 0}
 
 
+def test_what_floors_differ_by_has_the_pooled_std_a_priori(problem):
+    log_v = log_variance(problem)
+    log_v[problem.target.pooled] = 2 * np.log(0.03)
+    std = np.asarray(problem.target.prior_std(log_v))
+    pooled = problem.space.pooled
+    assert 0 < pooled.sum() < len(std)
+    np.testing.assert_allclose(std[pooled], 0.03, rtol=1e-12)
+    np.testing.assert_array_equal(std[~pooled], problem.space.prior_std[~pooled])
+
+
 def test_the_pooled_variance_weighs_every_std_by_its_evidence(problem):
     """One floor's two coordinates of a Gaussian with known information, by brute force."""
     log_v = log_variance(problem)
