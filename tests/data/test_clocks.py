@@ -7,10 +7,8 @@ import re
 import numpy as np
 import pytest
 from scipy.stats import norm
-from slipid.data.clocks.clock import SURE_STD, Clock, best_clock, clock_of_poses
-from slipid.data.clocks.noise import StepNoise
 
-from slipid.data.align.clock import SURE_STD, best_clock, clock_of_poses
+from slipid.data.align.clock import SURE_STD, Clock, best_clock, clock_of_poses
 from slipid.data.align.motion_pair import MotionPair
 from slipid.data.align.regression import StepNoise
 from slipid.data.reading.presets import declared_layout
