@@ -21,6 +21,7 @@ from slipid.data.align.regression import (
     LEAST_STEPS,
     Linearised,
     StepNoise,
+    clear_best,
     left_over,
     linearised,
 )
@@ -38,9 +39,6 @@ BLOCKS = 10
 """Parts of a run that are compared for the interval."""
 ROUNDS, SETTLED = 20, 6
 """Rounds of Gauss-Newton, and the first of them, in which the noise is estimated anew."""
-ELSEWHERE, BETTER = 0.5, 0.02
-"""Other offsets, further away than this [s], must leave more of the motion unexplained, by so much
-of it [1]: steady motion, or the same again and again, determines no offset."""
 MOST_LEFT = 0.5
 """Part of the motion that the best offset may leave unexplained [1]."""
 GOOD_STD = 0.03
@@ -113,11 +111,8 @@ def _searched(pair: MotionPair) -> float | None:
         return None
     offsets = np.arange(low, high + COARSE, COARSE)
     left = left_over([pair], offsets, SEARCHED)
-    best = int(np.argmin(left))
-    others = left[np.abs(offsets - offsets[best]) > ELSEWHERE]
-    if (len(others) and not others.min() > left[best] + BETTER) or not left[best] < MOST_LEFT:
-        return None
-    return float(offsets[best])
+    best = clear_best(offsets, left)
+    return None if best is None or not left[best] < MOST_LEFT else float(offsets[best])
 
 
 def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | None:

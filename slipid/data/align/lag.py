@@ -6,7 +6,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from slipid.data.align.motion_pair import MotionPair
-from slipid.data.align.regression import left_over
+from slipid.data.align.regression import clear_best, left_over
 from slipid.data.runs import Runs
 
 LONGEST, SHARED = 8.0, 0.3
@@ -17,9 +17,7 @@ STEP = 0.2
 """Least length of the steps that are compared [s]."""
 MOST_RUNS = 40
 """Runs that are looked at, evenly picked from all."""
-BETTER = 0.02
-"""Part of what is left at the worst lag that the best must be better by."""
-GAIN, DROP = 0.6, 0.02
+GAIN, DROP = 0.75, 0.02
 """A lag is decisive where it leaves less than this part of what no lag leaves, and so much less of
 the motion."""
 
@@ -49,7 +47,7 @@ _FOUND: WeakKeyDictionary[Runs, PoseLag | None] = WeakKeyDictionary()
 
 
 def pose_lag(data: Runs) -> PoseLag | None:
-    """Lag of the poses of some runs; None where no lag is better than others.
+    """Lag of the poses of some runs; None where none is clearly the best.
 
     It is searched once for each set of runs: a fit starts from it, and `check` reports it.
     """
@@ -68,8 +66,8 @@ def _searched(data: Runs) -> PoseLag | None:
     most = round(min(LONGEST, (1.0 - SHARED) * usual) / COARSE)
     coarse = COARSE * np.arange(-most, most + 1)
     left = left_over(pairs, -coarse, STEP)
-    best = int(np.argmin(left))
-    if best in (0, len(coarse) - 1) or left.max() - left[best] < BETTER * left.max():
+    best = clear_best(coarse, left)
+    if best is None or best in (0, len(coarse) - 1):
         return None
     fine = coarse[best] + np.arange(-COARSE, COARSE + FINE / 2, FINE)
     near = left_over(pairs, -np.append(fine, 0.0), STEP)

@@ -21,6 +21,9 @@ LEAST_STEPS = 20
 """Steps that offset and drift are fitted to."""
 LEAST_PER_COLUMN = 3
 """Steps that a search needs for every column of what turned."""
+ELSEWHERE, BETTER = 0.5, 0.02
+"""Other offsets, further away than this [s], must leave more of the motion unexplained, by so much
+of it [1]: steady motion, or the same again and again, determines no offset."""
 
 
 def left_over(
@@ -51,6 +54,15 @@ def left_over(
         return float(np.exp(np.log(share.clip(1e-12)).mean()))
 
     return np.array([left(float(offset)) for offset in offsets])
+
+
+def clear_best(
+    offsets: Float[np.ndarray, " offset"], left: Float[np.ndarray, " offset"]
+) -> int | None:
+    """Number of the offset that leaves least; None where one elsewhere does about as well."""
+    best = int(np.argmin(left))
+    others = left[np.abs(offsets - offsets[best]) > ELSEWHERE]
+    return best if others.min(initial=np.inf) > left[best] + BETTER else None
 
 
 @dataclass(frozen=True, eq=False)
