@@ -8,60 +8,60 @@ from importlib import import_module
 TYPE_CHECKING = False  # known to type checkers by its name, without loading `typing`
 if TYPE_CHECKING:
     from slipid.api.camera import track as track
-    from slipid.api.check import check as check
-    from slipid.api.driving import drive as drive
-    from slipid.api.export import export as export
     from slipid.api.fit import Prior as Prior
     from slipid.api.fit import fit as fit
-    from slipid.api.known_robot import made_runs as made_runs
-    from slipid.api.known_robot import move as move
-    from slipid.control.controller import Controller as Controller
-    from slipid.control.deployed import DeployedRobot as DeployedRobot
-    from slipid.control.estimator import Estimator as Estimator
-    from slipid.control.interface import Measurement as Measurement
+    from slipid.api.robot import drive as drive
+    from slipid.api.robot import export as export
+    from slipid.api.runs import check as check
+    from slipid.api.runs import made_runs as made_runs
+    from slipid.api.runs import move as move
+    from slipid.camera.overhead import OverheadCamera as OverheadCamera
+    from slipid.camera.tracking.tracking import LoneMarker as LoneMarker
     from slipid.data.reading.presets import layout as layout
     from slipid.data.reading.reader import read_runs as read_runs
     from slipid.deploy.floors import FloorLookup as FloorLookup
     from slipid.deploy.floors import floor_map as floor_map
-    from slipid.identify.compare.validation import Validation as Validation
-    from slipid.identify.posterior.blocks import Plan as Plan
-    from slipid.identify.posterior.diagnosis import Posterior as Posterior
-    from slipid.identify.result import Fit as Fit
-    from slipid.identify.verdicts.profile import Profile as Profile
+    from slipid.infer.posterior.blocks import Plan as Plan
+    from slipid.infer.posterior.diagnosis import Posterior as Posterior
+    from slipid.infer.result import Fit as Fit
+    from slipid.infer.verdicts.profile import Profile as Profile
     from slipid.model.robot import Robot as Robot
-    from slipid.plots.raw import plot_runs as plot_runs
+    from slipid.plots.fit import plot_runs as plot_runs
     from slipid.plots.wheels import wheel_curve as wheel_curve
+    from slipid.predict.validation import Validation as Validation
+    from slipid.robot.controller import Controller as Controller
+    from slipid.robot.deployed import DeployedRobot as DeployedRobot
+    from slipid.robot.estimator import Estimator as Estimator
+    from slipid.robot.interface import Measurement as Measurement
     from slipid.support.errors import DataError as DataError
     from slipid.support.jax_setup import setup_jax as setup_jax
-    from slipid.vision.camera import OverheadCamera as OverheadCamera
-    from slipid.vision.tracking.tracking import LoneMarker as LoneMarker
 
 __version__ = "0.1.0"
 _ROOMS = {
-    "Controller": "slipid.control.controller",
+    "Controller": "slipid.robot.controller",
     "DataError": "slipid.support.errors",
-    "DeployedRobot": "slipid.control.deployed",
-    "Estimator": "slipid.control.estimator",
-    "Fit": "slipid.identify.result",
+    "DeployedRobot": "slipid.robot.deployed",
+    "Estimator": "slipid.robot.estimator",
+    "Fit": "slipid.infer.result",
     "FloorLookup": "slipid.deploy.floors",
-    "LoneMarker": "slipid.vision.tracking.tracking",
-    "Measurement": "slipid.control.interface",
-    "OverheadCamera": "slipid.vision.camera",
-    "Plan": "slipid.identify.posterior.blocks",
-    "Posterior": "slipid.identify.posterior.diagnosis",
+    "LoneMarker": "slipid.camera.tracking.tracking",
+    "Measurement": "slipid.robot.interface",
+    "OverheadCamera": "slipid.camera.overhead",
+    "Plan": "slipid.infer.posterior.blocks",
+    "Posterior": "slipid.infer.posterior.diagnosis",
     "Prior": "slipid.api.fit",
-    "Profile": "slipid.identify.verdicts.profile",
+    "Profile": "slipid.infer.verdicts.profile",
     "Robot": "slipid.model.robot",
-    "Validation": "slipid.identify.compare.validation",
-    "check": "slipid.api.check",
-    "drive": "slipid.api.driving",
-    "export": "slipid.api.export",
+    "Validation": "slipid.predict.validation",
+    "check": "slipid.api.runs",
+    "drive": "slipid.api.robot",
+    "export": "slipid.api.robot",
     "fit": "slipid.api.fit",
     "floor_map": "slipid.deploy.floors",
     "layout": "slipid.data.reading.presets",
-    "made_runs": "slipid.api.known_robot",
-    "move": "slipid.api.known_robot",
-    "plot_runs": "slipid.plots.raw",
+    "made_runs": "slipid.api.runs",
+    "move": "slipid.api.runs",
+    "plot_runs": "slipid.plots.fit",
     "read_runs": "slipid.data.reading.reader",
     "setup_jax": "slipid.support.jax_setup",
     "track": "slipid.api.camera",

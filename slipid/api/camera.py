@@ -3,12 +3,12 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from slipid.camera.frames.source import open_source
+from slipid.camera.overhead import OverheadCamera
+from slipid.camera.tracking.target import Target, read_targets
+from slipid.camera.tracking.tracking import LoneMarker, Tracked
+from slipid.camera.tracking.tracking import track as run
 from slipid.support.progress import Reporter
-from slipid.vision.camera import OverheadCamera
-from slipid.vision.tracking.frames.source import open_source
-from slipid.vision.tracking.target import Target, read_targets
-from slipid.vision.tracking.tracking import LoneMarker, Tracked
-from slipid.vision.tracking.tracking import track as run
 
 
 def track(

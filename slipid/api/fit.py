@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slipid.app.config import FitSection
+from slipid.app.identify import optimised, summarised
+from slipid.app.problem import Task, on_runs, said_of
+from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
-from slipid.data.sanity.columns import refuse_misordered
-from slipid.identify.fit.problem import still_viscosities
-from slipid.identify.result import Fit
-from slipid.job.config import FitSection
-from slipid.job.identify import optimised, summarised
-from slipid.job.problem import Task, on_runs, said_of
+from slipid.fit.problem import still_viscosities
+from slipid.infer.result import Fit
 from slipid.model.robot import Robot
 from slipid.search_space import Choice
 from slipid.support.progress import Reporter
@@ -61,7 +61,7 @@ def fit(
         DataError: the runs cannot be cut into windows, or columns of wheels are exchanged.
         ValueError: no such number, or a value outside its bounds.
 
-    Source: the contact law of `slipid.model.contact_law`, the likelihood of `slipid.identify.fit`.
+    Source: the contact law of `slipid.model.contact_law`, the likelihood of `slipid.fit`.
     """
     refuse_misordered(runs.logs)
     wishes = priors or {}, fixed or {}, start or {}, free

@@ -37,11 +37,10 @@ def benchmark(
     Writes benchmark.json and benchmark.html. What is done is kept: called again after an interrupt
     it goes on from there. The exit code is 1 where anything failed.
     """
-    from slipid.benchmark.benchmark import benchmark as run
-    from slipid.benchmark.work import Wish
-    from slipid.plots.benchmark import benchmark_pictures
-    from slipid.report.benchmark import show_benchmark
-    from slipid.report.benchmark_page import write_page
+    from slipid.lab.benchmark.benchmark import benchmark as run
+    from slipid.lab.benchmark.plots import benchmark_pictures
+    from slipid.lab.benchmark.report import show_benchmark, write_page
+    from slipid.lab.benchmark.work import Wish
 
     only = () if rows is None else tuple(name.strip() for name in rows.split(",") if name.strip())
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import Json, Quiet, emit, guarded
-from slipid.support.content import Content
 from slipid.support.errors import DataError
+from slipid.support.files import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
+    from slipid.camera.calibration.board import Board
+    from slipid.camera.calibration.calibrate import FloorFound, LensFound
     from slipid.report.page import Page
-    from slipid.vision.calibration.board import Board
-    from slipid.vision.calibration.calibrate import FloorFound, LensFound
 
 SIZE_STD = 0.001
 """How well a printed board or a tape is known, relative."""
@@ -130,7 +130,7 @@ def _positive(option: str, value: float | None) -> float:
 def _board(
     size: str | None, edges: tuple[float | None, float | None], dictionary: str, legacy: bool
 ) -> "Board":
-    from slipid.vision.calibration.board import board_of
+    from slipid.camera.calibration.board import board_of
 
     if size is None:
         raise DataError("--board is missing; expected squares along x and y, such as 7x5")
@@ -142,7 +142,7 @@ def _board(
 
 
 def _lens(words: list[str], camera: Path | None, board: "Board | None", k3: bool) -> "LensFound":
-    from slipid.vision.calibration.calibrate import lens_from_file, lens_from_pictures
+    from slipid.camera.calibration.calibrate import lens_from_file, lens_from_pictures
 
     if camera is not None:
         return lens_from_file(camera)
@@ -158,7 +158,7 @@ def _floor(
     points: Path | None,
     size_std: float,
 ) -> "FloorFound | None":
-    from slipid.vision.calibration.calibrate import floor_from_board, floor_from_points
+    from slipid.camera.calibration.calibrate import floor_from_board, floor_from_points
 
     if points is not None:
         return floor_from_points(lens, points, size_std)
@@ -177,7 +177,7 @@ def _straight(
     json: str | None,
 ) -> int:
     """A camera straight above the floor, without a calibration."""
-    from slipid.vision.calibration.calibrate import told as camera_told
+    from slipid.camera.calibration.calibrate import told as camera_told
 
     per_pixel = _positive("--metres-per-pixel", told[0])
     height, turn = _positive("--lens-height", told[1]), told[2] or 0.0
@@ -191,9 +191,9 @@ def _straight(
 
 def _written(lens: "LensFound", place: "FloorFound | None", out: Path, json: str | None) -> int:
     """Write the camera and its pictures, and say what was found."""
+    from slipid.camera.calibration.calibrate import save_lens
     from slipid.plots.calibration import coverage_picture, floor_picture
     from slipid.support.files import read_json
-    from slipid.vision.calibration.calibrate import save_lens
 
     files = [out]
     if place is None:
@@ -214,7 +214,7 @@ def _written(lens: "LensFound", place: "FloorFound | None", out: Path, json: str
 
 def _show(page: "Page", report: Content, lens_too: bool = True) -> None:
     """Print what was found, and what is not as it should be."""
-    from slipid.vision.calibration.words import described
+    from slipid.camera.calibration.report import described
 
     for line in described(report, lens_too):
         page.line(line)

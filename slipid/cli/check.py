@@ -7,7 +7,7 @@ from slipid.cli.common import ConfigFile, DataFolder, Json, MaybeOut, Quiet, emi
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
-    from slipid.job.config import Config
+    from slipid.app.config import Config
 
 
 @guarded
@@ -22,8 +22,8 @@ def check(
 
     Exit code 1 where logs and config do not go together.
     """
-    from slipid.job import check as job
-    from slipid.job.config import Motor, read_config
+    from slipid.app import check as job
+    from slipid.app.config import Motor, read_config
     from slipid.report.estimates import show_check
 
     wanted = read_config(config)
@@ -32,7 +32,7 @@ def check(
     with Reporter(quiet=quiet) as report:
         logs, found = job.check(config, data, out, report)
         if out is not None:
-            from slipid.plots.raw import raw_plots
+            from slipid.plots.fit import raw_plots
 
             report.stage("drawing")
             raw_plots(logs, out)
@@ -42,8 +42,8 @@ def check(
 
 def bench(config: "Config", data: Path, out: Path | None, json: str | None, quiet: bool) -> int:
     """The same for motors on a bench."""
-    from slipid.job.bench.motor import check_bench
-    from slipid.report.bench import show_bench_check
+    from slipid.app.bench import check_bench
+    from slipid.report.estimates import show_bench_check
 
     with Reporter(quiet=quiet) as report:
         fit, found = check_bench(config, data, out, report)

@@ -24,7 +24,7 @@ def compare(
     Every model is fitted without some runs and judged on them. Writes comparison.json and a
     picture; finished folds are kept and not done again.
     """
-    from slipid.job.compare import compare as run
+    from slipid.app.compare import compare as run
     from slipid.plots.compare import compare_plot
     from slipid.report.answers import show_comparison
 

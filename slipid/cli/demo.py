@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import Out, Quiet, executor_of, guarded
-from slipid.support.content import Content
 from slipid.support.errors import DataError
+from slipid.support.files import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from slipid.job.identify import Identified
+    from slipid.app.identify import Identified
 
 PARTS = ("fit", "unseen")
 """What is fitted, and what is predicted: folders, and configs `testsite_<part>.toml`."""
@@ -55,9 +55,9 @@ def run(
     Raises:
         DataError: no such plant, a seed for what is recorded, or MuJoCo is missing.
     """
+    from slipid.app.logs import packaged_config, unpack
     from slipid.cli.identify import run as identify
     from slipid.cli.validate import run as validate
-    from slipid.job.packaged import packaged_config, unpack
     from slipid.support.files import read_json, write_bytes, write_json
 
     if plant not in ("recorded", "mujoco"):
@@ -81,9 +81,9 @@ def run(
 
 def drive_anew(out: Path, seed: int, executor: "Executor", report: Reporter) -> None:
     """Drive the runs that ship recorded, and those to be predicted, on the test site."""
-    from slipid.job.packaged import packaged_config
-    from slipid.testsite.simulate.config import plan
-    from slipid.testsite.simulate.simulate import simulate
+    from slipid.app.logs import packaged_config
+    from slipid.lab.testsite.config import plan
+    from slipid.lab.testsite.simulate import simulate
 
     for k, part in enumerate(PARTS):
         name = f"testsite_{part}.toml"

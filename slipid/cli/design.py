@@ -9,7 +9,7 @@ from slipid.cli.common import Json, OutFolder, Quiet, emit, on_wheels
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
-    from slipid.identify.design.proposal import Design
+    from slipid.infer.design.proposal import Design
 
 
 @on_wheels
@@ -54,9 +54,9 @@ def design(
 
     Writes design.json, design.png and design_commands.csv to OUT.
     """
-    from slipid.identify.design import proposal
-    from slipid.identify.design.wish import Wish
-    from slipid.identify.fit_file import load as load_fit
+    from slipid.infer.design import proposal
+    from slipid.infer.design.wish import Wish
+    from slipid.infer.fit_file import load as load_fit
     from slipid.report.answers import show_design
     from slipid.support.jax_setup import setup_jax
 
@@ -75,7 +75,7 @@ def design(
 
 def write(found: "Design", out: Path) -> list[str]:
     """Write a design; where it proposes no runs, files of an earlier one do not stay."""
-    from slipid.identify.design.proposal import commands
+    from slipid.infer.design.proposal import commands
     from slipid.plots.design import design_figure
     from slipid.plots.drawing import save
     from slipid.support.files import write_bytes, write_json

@@ -49,9 +49,10 @@ def export(
     The folder has a README, and the checksum of every file. With --check nothing is written, and
     exit code 2 says that a byte was changed.
     """
-    from slipid.control.export.folder import check_folder
     from slipid.deploy.export import Wish, robot_at
     from slipid.deploy.export import export as run
+    from slipid.export.folder import check_folder
+    from slipid.lab.trial.controllers import ROWS
     from slipid.report.answers import show_export
     from slipid.support.errors import DataError
     from slipid.support.jax_setup import setup_jax
@@ -60,7 +61,7 @@ def export(
     if check:
         names = check_folder(source)
         if any(name.startswith("stablehlo/") for name in names):
-            from slipid.control.export.stablehlo import load_program
+            from slipid.export.stablehlo import load_program
 
             load_program(source / "stablehlo")
         found = {"folder": str(source), "files": list(names), "intact": True}
@@ -72,7 +73,7 @@ def export(
         report.stage("reading the robot")
         robot = robot_at(source, load, _names(floors))
         wish = Wish(_names(to), controller, path, speed, map)
-        done = run(robot, out, wish, report)
+        done = run(robot, out, wish, report, ROWS)
     content = {
         "schema": "slipid.export/1",
         "folder": str(done.folder),

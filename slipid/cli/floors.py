@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import DataFolder, Json, Out, OutFolder, Quiet, emit, on_wheels
-from slipid.support.content import Content
+from slipid.support.files import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def floors(
     Poses are corrected by the camera of the fit. Writes a CSV file for each run. Exit code 1 where
     wheels are often beyond the map.
     """
-    from slipid.deploy.floors_under import floors_under, summary, write_floors
+    from slipid.app.floors import floors_under, summary, write_floors
     from slipid.support.jax_setup import setup_jax
 
     setup_jax(quiet=True)

@@ -12,8 +12,8 @@ from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
-    from slipid.job.config import Config
-    from slipid.job.identify import Identified
+    from slipid.app.config import Config
+    from slipid.app.identify import Identified
     from slipid.report.page import Page
 
 
@@ -37,7 +37,7 @@ def identify(
     Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt. Exit code
     1 where it did not converge, or predicts worse than the encoders.
     """
-    from slipid.job.config import Motor, read_config
+    from slipid.app.config import Motor, read_config
     from slipid.report.estimates import show_fit, show_trust
     from slipid.support.files import read_json
 
@@ -64,13 +64,13 @@ def run(
     profiles: Sequence[str] = (),
     anyway: bool = False,
 ) -> "Identified":
-    """The fit and its pictures; arguments as of `slipid.job.identify.identify`.
+    """The fit and its pictures; arguments as of `slipid.app.identify.identify`.
 
     Raises:
         DataError: config or logs are wrong; nothing was written then.
     """
+    from slipid.app.identify import identify
     from slipid.deploy.deploy import write_robot
-    from slipid.job.identify import identify
     from slipid.plots.drawing import save
     from slipid.plots.fit import identify_plots
     from slipid.plots.posterior import profile_figure
@@ -92,9 +92,9 @@ def bench(
     config: "Config", data: Path, out: Path, profile: Sequence[str], json: str | None, quiet: bool
 ) -> int:
     """The same for motors on a bench."""
-    from slipid.job.bench.motor import identify_bench
+    from slipid.app.bench import identify_bench
     from slipid.plots.bench import bench_plots
-    from slipid.report.bench import show_bench
+    from slipid.report.estimates import show_bench
 
     if profile:
         raise DataError(

@@ -10,8 +10,8 @@ from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
+    from slipid.camera.floor.found import FoundMap
     from slipid.report.page import Page
-    from slipid.vision.floor.found import FoundMap
 
 PROPOSAL = "palette.toml"
 
@@ -52,12 +52,12 @@ def map_(
     again with. Writes map.geojson, which every option for a map takes, and a picture to check it.
     Exit code 1 where the map is poor.
     """
-    from slipid.plots.floor import floor_plot
+    from slipid.camera.floor.grid import Robot
+    from slipid.camera.floor.picture import Wish, map_of
+    from slipid.camera.overhead import OverheadCamera
+    from slipid.plots.bench import floor_plot
     from slipid.support.files import write_bytes
     from slipid.support.jax_setup import one_blas_thread
-    from slipid.vision.camera import OverheadCamera
-    from slipid.vision.floor.picture import Wish, map_of
-    from slipid.vision.floor.robot_mask import Robot
 
     one_blas_thread()  # many small matrices
     robot = Robot(dictionary, robot_radius, marker_height)

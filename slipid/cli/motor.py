@@ -54,8 +54,8 @@ def motor(
     of the motor shaft: no log shows that it was taken behind a gear. With --out it writes
     motor.json and a picture. Exit code 1 where the model does not explain the log.
     """
-    from slipid.job.bench.motor import read_one
-    from slipid.report.bench import show_bench
+    from slipid.app.bench import read_one
+    from slipid.report.estimates import show_bench
     from slipid.support.files import write_json
 
     columns = {

@@ -8,7 +8,7 @@ import typer
 from slipid.cli.common import guarded
 
 if TYPE_CHECKING:
-    from slipid.job.new.config_text import NewConfig
+    from slipid.app.new.config_text import NewConfig
 
 _WHEELS = "For omni and general wheels"
 _BOX = "For mecanum and skid"
@@ -62,10 +62,10 @@ def new(
     force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False,
 ) -> int:
     """Write a commented config for your robot: asks for it, or looks into its logs (--from)."""
-    from slipid.job.new.config_text import absent, new_config
-    from slipid.job.new.look.propose import propose
-    from slipid.job.new.robot_questions import RobotOptions, ask
-    from slipid.job.new.sketch import blank
+    from slipid.app.new.config_text import absent, new_config
+    from slipid.app.new.propose import propose
+    from slipid.app.new.robot_questions import RobotOptions, ask
+    from slipid.app.new.sketch import blank
 
     absent(out, force)
     options = RobotOptions(

@@ -16,7 +16,7 @@ def paper(
     out: Out,
 ) -> int:
     """Regenerate the 2021 paper's tables and figures from its own data."""
-    from slipid.plots.paper import run
+    from slipid.lab.paper2021.plots import run
 
     for path in run(data, out):
         typer.echo(str(path))

@@ -25,8 +25,8 @@ def reference(
     ] = None,
 ) -> int:
     """Every key, channel, unit and parameter, with its default and what it means (Markdown)."""
-    from slipid.job.config import read_config
-    from slipid.job.reference.page import reference
+    from slipid.app.config import read_config
+    from slipid.app.reference.page import reference
 
     typer.echo(reference(what, None if config is None else read_config(config)), nl=False)
     return 0

@@ -32,9 +32,9 @@ def sample(
     from slipid.support.files import read_json
 
     try:
+        from slipid.app.sample import sample as run
         from slipid.deploy.deploy import write_robot
-        from slipid.identify.posterior.blocks import Plan
-        from slipid.job.sample import sample as run
+        from slipid.infer.posterior.blocks import Plan
         from slipid.plots.posterior import posterior_plots
     except ImportError as error:
         raise DataError(f"{error}; expected `pip install slipid[posterior]`") from error

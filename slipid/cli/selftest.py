@@ -27,8 +27,8 @@ def selftest(
     Without --data it is the plan of \[selftest] in the config. Writes selftest.json; goes on from
     the replicates that are done. Exit code 1 where a number that is wanted is not recovered.
     """
+    from slipid.lab.selftest.experiment import selftest as run
     from slipid.report.estimates import show_selftest
-    from slipid.selftest.experiment import selftest as run
 
     with Reporter(quiet=quiet) as report:
         found = run(config, data, out, replicates, seed, report)

@@ -4,12 +4,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from slipid.cli.common import ConfigFile, Jobs, Json, Out, Quiet, emit, executor_of, guarded
-from slipid.support.content import Content
+from slipid.support.files import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
+    from slipid.lab.testsite.config import Plan
     from slipid.report.page import Page
-    from slipid.testsite.simulate.config import Plan
 
 
 @guarded
@@ -21,9 +21,9 @@ def simulate(
     Writes logs, a config that identifies them, floor maps, and the truth in a folder of its own.
     Runs that are done are kept and not driven again.
     """
+    from slipid.lab.testsite.config import plan as read
+    from slipid.lab.testsite.simulate import simulate as run
     from slipid.support.toml_file import text_of
-    from slipid.testsite.simulate.config import plan as read
-    from slipid.testsite.simulate.simulate import simulate as run
 
     plan = read(config, text_of(config))
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
@@ -34,7 +34,7 @@ def simulate(
 
 def show(page: "Page", found: Content, plan: "Plan", out: Path) -> None:
     """Print how much was driven, and what to do with it."""
-    from slipid.testsite.simulate.config import can_identify
+    from slipid.lab.testsite.config import can_identify
 
     page.line(f"{len(found['runs'])} runs, {found['driven']} of them driven now")
     if found["pace"] is not None:

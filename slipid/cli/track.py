@@ -10,8 +10,8 @@ from slipid.cli.common import Json, Quiet, emit, guarded
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
+    from slipid.camera.tracking.finder import Region
     from slipid.report.page import Page
-    from slipid.vision.tracking.finder import Region
 
 
 @guarded
@@ -71,11 +71,11 @@ def track(
     Every frame has a row with pose and covariance, or with the reason why it has none; nothing is
     filled. Exit code 1 where the poses should not be used as they are.
     """
+    from slipid.camera.frames.source import open_source
+    from slipid.camera.overhead import OverheadCamera
+    from slipid.camera.tracking import tracking
+    from slipid.camera.tracking.target import read_targets
     from slipid.support.errors import DataError
-    from slipid.vision.camera import OverheadCamera
-    from slipid.vision.tracking import tracking
-    from slipid.vision.tracking.frames.source import open_source
-    from slipid.vision.tracking.target import read_targets
 
     above = OverheadCamera.load(camera)
     with Reporter(quiet=quiet) as report:
@@ -113,8 +113,8 @@ def track(
 
 def _region(text: str | None) -> "Region | None":
     """A part of the picture from four numbers; DataError where they are none."""
+    from slipid.camera.tracking.finder import Region
     from slipid.support.errors import DataError
-    from slipid.vision.tracking.finder import Region
 
     if text is None:
         return None

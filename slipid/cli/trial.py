@@ -47,9 +47,9 @@ def trial(
     Gains are those set by hand, or tuned ones of an older robot.json that are better than those.
     Writes trial.json and trial.png to OUT; runs that are done are kept and not driven again.
     """
-    from slipid.deploy.trial import Wish, names_of
-    from slipid.deploy.trial import trial as run
-    from slipid.plots.trial import trial_plot
+    from slipid.lab.trial.plots import trial_plot
+    from slipid.lab.trial.trial import Wish, names_of
+    from slipid.lab.trial.trial import trial as run
     from slipid.report.answers import show_trial
 
     wish = Wish(

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from slipid.cli.common import DataFolder, Json, OutFolder, Quiet, emit, on_wheels
-from slipid.support.content import Content
+from slipid.support.files import Content
 from slipid.support.progress import Reporter
 
 
@@ -20,7 +20,7 @@ def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet =
 
 def run(out: Path, data: Path, report: Reporter) -> Content:
     """Content of the validation file, and pictures; arguments as of `job.validate.validate`."""
-    from slipid.job.validate import validate
+    from slipid.app.compare import validate
     from slipid.plots.fit import validate_plots
 
     fit, dataset, found = validate(out, data, report)

@@ -1,4 +1,7 @@
-"""From a fit, or its posterior, to robot.json, which is all that runs on the robot needs."""
+"""From a fit, or its posterior, to robot.json, which is all that runs on the robot needs.
+
+From a force balance that forecasts to a deployed robot, without the verdicts of a whole fit.
+"""
 
 import glob
 import json
@@ -11,17 +14,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.control.actuation import Habits
-from slipid.control.deployed import DeployedRobot
-from slipid.control.interface import MIXED
-from slipid.control.robot_file.record import Number, Sensors, Source
-from slipid.control.robot_file.typed import typed
-from slipid.deploy.record_of import record_of
-from slipid.deploy.told import told_by_load
-from slipid.identify.posterior.diagnosis import Posterior
-from slipid.identify.result import Fit
-from slipid.identify.verdicts.estimates import Estimate
+from slipid.deploy.effects import told_by_load
+from slipid.deploy.record_of import plain, record_of
+from slipid.infer.posterior.diagnosis import Posterior
+from slipid.infer.result import Fit, draws
+from slipid.infer.verdicts.estimates import Estimate
 from slipid.model.robot import Robot
+from slipid.parameter import entries
+from slipid.predict.predictive import Contact
+from slipid.robot.actuation import Habits
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.interface import MIXED
+from slipid.robot.record import Number, Sensors, Source
+from slipid.robot.robot_file import typed
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
 from slipid.support.errors import DataError
@@ -124,3 +129,50 @@ def _number(e: Estimate) -> Number:
     """As robot.json has it."""
     kept = {f.name: getattr(e, f.name) for f in fields(Number)}
     return typed(Number, json.loads(json.dumps(kept)), e.path)
+
+
+def robot_of(
+    contact: Contact,
+    highest_speed: float,
+    current_trend: tuple[float, float] = (0.0, 0.0),
+    sensors: Sensors | None = None,
+    load: str | None = None,
+) -> DeployedRobot:
+    """The robot of a fit as `slipid.deploy.deploy` has it, but for what a reader is told of it.
+
+    Args:
+        contact: the fit.
+        highest_speed: of the wheels in the fitted runs [rad/s].
+        current_trend: of the currents in the fitted runs, see
+            `slipid.infer.slip_curves.current_trend`.
+        sensors: of the logs; None where they are not known.
+        load: set-up it drives with, the first one by default.
+    """
+    several = draws(contact.z, contact.covariance, DRAWS, seed=0)
+    record = record_of(
+        contact.robot,
+        given(contact.robot),
+        {name: float(np.sqrt(v)) for name, v in contact.forecast.items()},
+        jax.vmap(contact.space.tree)(jnp.asarray(several)),
+        highest_speed,
+        current_trend,
+        {},
+        told_by_load(contact, contact.z, several),
+    )
+    return DeployedRobot.of(replace(record, sensors=sensors or Sensors()), load)
+
+
+def given(robot: Robot) -> Mapping[str, Number]:
+    """The numbers of a robot as they were given, by path."""
+    return {
+        e.path: Number(
+            value=plain(np.asarray(e.get(robot))),
+            unit=e.declaration.unit,
+            std=None,
+            interval90=None,
+            verdict="fixed",
+            provenance="override",
+            source="given",
+        )
+        for e in entries(robot)
+    }

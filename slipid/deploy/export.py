@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,25 +11,23 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from slipid.control import trajectory
-from slipid.control.closed_loop import PERIOD, Pilot, Plant, drive
-from slipid.control.deployed import DeployedRobot
-from slipid.control.export.c99.folder import Recording, c_files
-from slipid.control.export.c99.lowering.lower import UnsupportedError
-from slipid.control.export.folder import check_folder, check_writable, write_folder
-from slipid.control.export.header import warnings
-from slipid.control.export.readme import readme
-from slipid.control.export.ros2 import ros2_files
-from slipid.control.export.stablehlo import load_program, stablehlo_files
-from slipid.control.export.table import table_files
-from slipid.control.interface import Measurement, Readings
-from slipid.control.robot_file.file import robot_bytes
 from slipid.data.floor_map import FloorMap, read_map
-from slipid.deploy.controllers import ROWS, pilot_of
+from slipid.deploy.controllers import OWN_ROWS, ControllerRow, pilot_of
 from slipid.deploy.deploy import ROBOT, habits_of, read_robot, steered
 from slipid.deploy.floors import floor_of
-from slipid.deploy.trial import REST_S, path_of
-from slipid.deploy.trial_site import known_to_fit, site, starts, twin
+from slipid.deploy.twin_run import REST_S, known_to_fit, path_of, site, starts, twin
+from slipid.export.c99.folder import Recording, c_files
+from slipid.export.c99.lower import UnsupportedError
+from slipid.export.folder import check_folder, check_writable, write_folder
+from slipid.export.header import readme, warnings
+from slipid.export.ros.folder import ros2_files
+from slipid.export.stablehlo import load_program, stablehlo_files
+from slipid.export.table import table_files
+from slipid.robot import trajectory
+from slipid.robot.closed_loop import PERIOD, Pilot, Plant, drive
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.interface import Measurement, Readings
+from slipid.robot.robot_file import robot_bytes
 from slipid.support.errors import DataError, near
 from slipid.support.progress import Reporter
 
@@ -106,8 +104,14 @@ def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedR
         raise DataError(f"{path}: {error}") from error
 
 
-def export(robot: DeployedRobot, out: Path, wish: Wish, report: Reporter) -> Exported:
-    """Write a robot in all wanted forms to a folder.
+def export(
+    robot: DeployedRobot,
+    out: Path,
+    wish: Wish,
+    report: Reporter,
+    rows: Mapping[str, ControllerRow] = OWN_ROWS,
+) -> Exported:
+    """Write a robot in all wanted forms to a folder, with one of the controllers `rows`.
 
     Raises:
         DataError: no such form, controller or path; a step that has no form in C; nothing can be
@@ -118,11 +122,11 @@ def export(robot: DeployedRobot, out: Path, wish: Wish, report: Reporter) -> Exp
     for name in wish.forms:
         if name not in FORMS:
             raise DataError(f"no form '{name}'{near(name, FORMS)}; expected {', '.join(FORMS)}")
-    if wish.controller not in ROWS:
-        close = near(wish.controller, ROWS)
-        choices = ", ".join(ROWS)
+    if wish.controller not in rows:
+        close = near(wish.controller, rows)
+        choices = ", ".join(rows)
         raise DataError(f"no controller '{wish.controller}'{close}; expected one of {choices}")
-    row = ROWS[wish.controller]
+    row = rows[wish.controller]
     if row.mapped != (wish.map is not None):
         told = "the map of its floors; name one with --map"
         none = "no map; leave out --map, or take contact_map"
@@ -136,7 +140,7 @@ def export(robot: DeployedRobot, out: Path, wish: Wish, report: Reporter) -> Exp
     forms = tuple(form for form in FORMS if form in wish.forms)
     for form in forms:
         report.stage(f"writing {form}")
-        files = _form(form, robot, pilot, path, wish, place)
+        files = _form(form, robot, pilot, path, wish, place, row.gyro)
         content |= {f"{form}/{name}": data for name, data in files.items()}
     content["README.md"] = readme(robot, forms, wish.controller).encode()
     write_folder(out, content)
@@ -154,12 +158,13 @@ def _form(
     path: trajectory.Path,
     wish: Wish,
     place: Place,
+    gyro: bool,
 ) -> dict[str, bytes]:
     if form == "stablehlo":
         return stablehlo_files(pilot)
     if form == "c":
         try:
-            text = c_files(robot, pilot, path, recorded(robot, pilot, path, wish, place))
+            text = c_files(robot, pilot, path, recorded(robot, pilot, path, wish, place, gyro))
         except UnsupportedError as error:
             raise DataError(f"controller {wish.controller}: {error}") from error
     else:
@@ -195,9 +200,10 @@ def recorded(
     path: trajectory.Path,
     wish: Wish,
     place: Place,
+    gyro: bool = False,
 ) -> Recording:
     """A run of a path, as it lies for the robot's start, on the twin."""
-    habits = habits_of(robot, gyro=ROWS[wish.controller].gyro)
+    habits = habits_of(robot, gyro=gyro)
     plant = _Recorded(twin(robot, place.floor, place.true, 0, habits), robot.wheels)
     course = drive(pilot, path, plant, place.believed)
     given = [

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
-from slipid.control.deployed import DeployedRobot
-from slipid.control.filter.floor import Floor
 from slipid.data.floor_map import FloorMap, read_map
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.filter.floor import Floor
 from slipid.support.errors import DataError
 
 

@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.control.robot_file import record
-from slipid.identify.fit.noise import SHARED
-from slipid.identify.fit.shared import AXES
+from slipid.fit.noise import SHARED
+from slipid.fit.shared import AXES
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Frame, at_drives, at_wheels
 from slipid.model.motor import Motor
 from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.parameter import entries
+from slipid.robot import record
 
 
 def record_of(

@@ -8,11 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from slipid.camera.calibration.lens import LensFit
+from slipid.camera.calibration.place import FloorFit
+from slipid.camera.calibration.quality import Quality
+from slipid.camera.overhead import OverheadCamera
 from slipid.plots.drawing import BLUE, GREEN, INK, ORANGE, figure, save
-from slipid.vision.calibration.lens.fit import LensFit
-from slipid.vision.calibration.lens.quality import Quality
-from slipid.vision.calibration.place.floor import FloorFit
-from slipid.vision.camera import OverheadCamera
 
 LONGEST = 0.06
 """Of the picture's width: how long the larger residuals are drawn."""

@@ -8,10 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 
-from slipid.identify.design.planned_runs import Drive
-from slipid.identify.design.proposal import Design
+from slipid.infer.design.planned_runs import Drive
+from slipid.infer.design.proposal import Design
 from slipid.plots import drawing
-from slipid.support.content import Content
+from slipid.support.files import Content
 
 CURVES = (
     ("greedy", drawing.BLUE, "-", "chosen one after another"),

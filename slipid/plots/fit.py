@@ -1,18 +1,131 @@
-"""Pictures of a result, as PNG files."""
+"""Raw signals of a data set as pictures, one per floor and load: look before you fit.
 
-from collections.abc import Callable
+Load shares on a drawing of the robot from above.
+
+Pictures of a result, as PNG files.
+"""
+
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle, FancyArrow, Polygon
 
 from slipid.data.runs import Runs
-from slipid.identify.compare.validation import Validation
-from slipid.identify.result import Fit
-from slipid.plots.drawing import save_all, warned
-from slipid.plots.load import load_figure
+from slipid.infer.result import Fit
+from slipid.infer.verdicts.estimates import Estimate
+from slipid.plots import drawing
+from slipid.plots.drawing import figure, save, save_all, warned
 from slipid.plots.motion import heading_figure, path_figure
 from slipid.plots.seen import Seen, seen
 from slipid.plots.wheels import current_figure, curve_figure
+from slipid.predict.validation import Validation
+
+
+def raw_plots(data: Runs, out: Path) -> list[Path]:
+    """`plot_runs` of each floor and load set-up; PNG files."""
+    groups: dict[tuple[str, str], list[int]] = {}
+    for k, log in enumerate(data.logs):
+        groups.setdefault((log.surface or "unknown", log.load), []).append(k)
+    return [
+        save(plot_runs(data, runs, f"{floor}, {load}"), out / f"raw_{floor}_{load}.png")
+        for (floor, load), runs in sorted(groups.items())
+    ]
+
+
+def plot_runs(data: Runs, runs: Sequence[int] | None = None, title: str = "as logged") -> Figure:
+    """Paths, wheel speeds and currents of runs, all on one another.
+
+    Args:
+        runs: numbers of those that are shown; all by default.
+    """
+    runs = range(len(data)) if runs is None else runs
+    wheels = data.wheel_angle.shape[1]
+    made = figure(12.0, 7.0, f"{title}: {len(runs)} runs")
+    axes = made.subplots(2, 1 + wheels, squeeze=False)
+    for axis in axes[:, 0]:
+        axis.remove()
+    place = made.add_subplot(2, 1 + wheels, (1, 2 + wheels))
+    for k in runs:
+        rows = data.rows(k)
+        t = data.time[rows] - data.time[rows][0]
+        pose = data.pose[rows]
+        place.plot(pose[:, 0] - pose[0, 0], pose[:, 1] - pose[0, 1], lw=0.6, color="C0", alpha=0.6)
+        speed = np.gradient(data.wheel_angle[rows], t, axis=0)
+        for w in range(wheels):
+            axes[0, 1 + w].plot(t, speed[:, w], lw=0.3, color="C0", alpha=0.3)
+            if data.current is not None:
+                axes[1, 1 + w].plot(t, data.current[rows][:, w], lw=0.3, color="C1", alpha=0.3)
+    place.set(xlabel="x from the start [m]", ylabel="y [m]", title="paths as logged")
+    place.set_aspect("equal", adjustable="datalim")
+    for w in range(wheels):
+        axes[0, 1 + w].set(title=f"wheel {w + 1}", ylabel="speed [rad/s]" if w == 0 else "")
+        axes[1, 1 + w].set(xlabel="time [s]", ylabel="current [A]" if w == 0 else "")
+    return made
+
+
+def load_figure(fit: Fit) -> Figure | None:
+    """Share of the weight on each wheel, one robot per load set-up; None where all are fixed."""
+    loads = fit.robot.body.loads
+    found = [fit.parameters[f"robot.load_share@{load}"] for load in loads]
+    if all(e.interval90 is None for e in found):
+        return None
+    made, axes = drawing.panels(
+        len(loads), 5.2, 4.7, "Share of the weight on each wheel, seen from above (90 % interval)"
+    )
+    for ax, load, estimate in zip(axes, loads, found, strict=True):
+        _robot(ax, fit, estimate)
+        ax.set_title(f"load {load}")
+    return made
+
+
+def _robot(ax: Axes, fit: Fit, estimate: Estimate) -> None:
+    """One robot; x ahead points up, y to the left."""
+    shape = fit.robot.geometry
+    base, radius = float(shape.base_radius), float(shape.wheel_radius)
+    place = np.asarray(shape.place) * base
+    reach = float(np.linalg.norm(place, axis=1).max())
+    ax.add_patch(Circle((0, 0), reach * 0.93, fc="#f2f2f2", ec=drawing.SHADE, lw=1.2))
+    start, length, wide = 0.42 * reach, 0.25 * reach, 0.02 * reach
+    ax.add_patch(FancyArrow(0, start, 0, length, width=wide, fc=drawing.SHADE, ec="none"))
+    ax.text(0.06 * reach, 0.5 * reach, "ahead", color=drawing.INK, fontsize=9)
+    share = np.asarray(estimate.value, float)
+    angles = np.asarray(shape.drive_angle)
+    for k, (p, angle) in enumerate(zip(place, angles, strict=True)):
+        along = np.array([np.cos(angle), np.sin(angle)])
+        side = np.array([-along[1], along[0]]) * 0.35 * radius
+        ways = (radius * along + side, radius * along - side)
+        corners = [_up(p + way) for way in (*ways, -ways[0], -ways[1])]
+        size = reach * 0.62 * np.sqrt(share[k])
+        ax.add_patch(Circle(_up(p), size, fc=drawing.BLUE, alpha=0.25, ec="none"))
+        ax.add_patch(Polygon(corners, fc=drawing.INK, ec="none"))
+        ax.text(*_up(p * [1.75, 1.95]), _words(k, estimate), ha="center", va="center", fontsize=10)
+    ax.plot(*_up(share @ place), "X", color=drawing.ORANGE, ms=11, mec="white")
+    ahead, left = 1000 * (share @ place)
+    where = f"{abs(ahead):.0f} mm {'ahead of' if ahead > 0 else 'behind'} the middle"
+    if abs(left) >= 0.5:
+        where += f" and {abs(left):.0f} mm to the {'left' if left > 0 else 'right'}"
+    said = f"cross: centre of weight, {where}"
+    ax.text(0, -2.3 * reach, said, ha="center", fontsize=9, color=drawing.ORANGE)
+    ax.set(xlim=(-2.2 * reach, 2.2 * reach), ylim=(-2.4 * reach, 1.6 * reach), aspect="equal")
+    ax.grid(False)
+    ax.axis("off")
+
+
+def _up(p: np.ndarray | Sequence[float]) -> tuple[float, float]:
+    """Body x, y on a page where ahead is up and left is left."""
+    return -float(p[1]), float(p[0])
+
+
+def _words(k: int, estimate: Estimate) -> str:
+    text = f"wheel {k + 1}\n{100 * estimate.value[k]:.1f} %"
+    if estimate.interval90 is not None:
+        low, high = estimate.interval90[k]
+        text += f"\n({100 * low:.1f} to {100 * high:.1f})"
+    return text
+
 
 PATHS = (
     "Where the encoders say the robot went (dotted), where the fitted robot says (blue),\n"

@@ -8,13 +8,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from slipid.data.runs import Runs
-from slipid.identify.compare import open_loop as replay
-from slipid.identify.compare.floor_models import FloorModels
-from slipid.identify.compare.kinematics import Encoder
-from slipid.identify.compare.predictive import Contact
 from slipid.model.robot import Robot
 from slipid.plots import drawing
 from slipid.plots.seen import Seen, by_heading
+from slipid.predict import open_loop as replay
+from slipid.predict.floor_models import FloorModels
+from slipid.predict.kinematics import Encoder
+from slipid.predict.predictive import Contact
 
 ROWS = (
     ("slip", "slip: way lost [%]"),

@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from slipid.identify.posterior.diagnosis import Posterior
-from slipid.identify.verdicts.profile import RISE, Profile
+from slipid.infer.posterior.diagnosis import Posterior
+from slipid.infer.verdicts.profile import RISE, Profile
 from slipid.plots import drawing
 
 PANELS = 6

@@ -9,11 +9,11 @@ from jaxtyping import Array, Bool, Float
 
 from slipid.data.runs import Runs
 from slipid.data.windows import windows
-from slipid.identify import slip_curves as curves
-from slipid.identify.compare.marker import body_twist
-from slipid.identify.fit import likelihood as lk
+from slipid.fit import likelihood as lk
+from slipid.infer import slip_curves as curves
 from slipid.model import robot as model
 from slipid.model.robot import Robot
+from slipid.predict.slip_model import body_twist
 
 STRAIGHT = 0.98
 """Part of the encoders' path that must be displacement for a piece to have a direction."""

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from slipid.identify.result import Fit
+from slipid.infer.result import Fit
 from slipid.model import contact_law as law
 from slipid.model.robot import GRAVITY, Robot
 from slipid.plots import drawing

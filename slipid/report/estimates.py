@@ -1,4 +1,7 @@
-"""Numbers as tables: before a fit, after it, and beside the truth or the camera."""
+"""Numbers as tables: before a fit, after it, and beside the truth or the camera.
+
+What is known of motors on a bench, as tables.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -7,15 +10,16 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
+from slipid.infer.bench.verdict import BenchFit
 from slipid.report.page import Page, percent, table, verdict
-from slipid.support.content import Content
+from slipid.support.files import Content
 
-if TYPE_CHECKING:  # the tables need none of what fits
-    from slipid.identify.posterior.diagnosis import Posterior
-    from slipid.identify.result import Fit
-    from slipid.identify.verdicts.estimates import Estimate
-    from slipid.identify.verdicts.profile import Profile
-    from slipid.job.trust import Judgement
+if TYPE_CHECKING:
+    from slipid.app.trust import Judgement
+    from slipid.infer.posterior.diagnosis import Posterior
+    from slipid.infer.result import Fit
+    from slipid.infer.verdicts.estimates import Estimate
+    from slipid.infer.verdicts.profile import Profile
 
 RECOVERED = {"yes": "green", "roughly": "yellow", "no": "red", "wrong": "magenta"}
 """Colours of what a self-test says."""
@@ -268,3 +272,48 @@ def show_selftest(page: Page, found: Content) -> None:
     page.notes(found["messages"])
     if found["failed"]:
         page.line(f"NOT recovered: {', '.join(found['failed'])}")
+
+
+def show_bench(page: Page, fit: BenchFit, taken: Sequence[str] = ()) -> None:
+    """Write the numbers of motors, what the logs leave open, and how the fits ended."""
+    if taken:
+        page.line(f"columns: {'; '.join(taken)}")
+    rows = sum(len(r.time) for f in fit.fits for r in f.records)
+    motors = f"{len(fit.fits)} motors, " if len(fit.fits) > 1 else ""
+    page.table(estimates(fit.parameters.values(), f"{motors}{rows} rows; everything at the shaft"))
+    if fit.derived:
+        page.table(estimates(fit.derived.values(), "\nknown as ratios, or not even so"))
+    page.notes(fit.messages)
+    ended = "converged" if fit.converged else "NOT converged"
+    model = "" if fit.good or not fit.converged else "; the model does NOT explain the log"
+    page.line(f"{ended}: {fit.reason}{model}")
+
+
+def show_bench_check(page: Page, found: Content) -> None:
+    """Write the content of check.json of motors."""
+    columns = (
+        "log",
+        "rows",
+        "seconds",
+        "rows/s",
+        r"voltage \[V]",
+        r"current \[A]",
+        r"speed \[rad/s]",
+    )
+    made = table(columns)
+    for row in found["logs"]:
+        spans = [
+            "none" if row[k] is None else f"{row[k][0]:.3g} .. {row[k][1]:.3g}"
+            for k in ("voltage", "current", "speed")
+        ]
+        rate = f"{1 / row['row_period_s']:.4g}"
+        made.add_row(Text(row["name"]), str(row["rows"]), f"{row['seconds']:.1f}", rate, *spans)
+    page.table(made)
+    before = table(
+        ("parameter", "unit", "std after / before", "verdict"), "\nwhat the logs can tell"
+    )
+    for path, e in found["parameters"].items():
+        if e["ratio"] is not None:
+            before.add_row(Text(path), e["unit"], f"{e['ratio']:.3f}", verdict(e["verdict"]))
+    page.table(before)
+    page.notes(found["messages"])

@@ -1,4 +1,7 @@
-"""Files that are either whole or not there: atomic writes, strict JSON, arrays without pickle."""
+"""Plain values, as JSON and TOML files hold them.
+
+Files that are either whole or not there: atomic writes, strict JSON, arrays without pickle.
+"""
 
 import hashlib
 import io
@@ -13,6 +16,9 @@ from typing import Any
 import numpy as np
 
 from slipid.support.errors import DataError
+
+Content = dict[str, Any]
+"""Content of such a file, or of a table in it: numbers, words, lists and tables by name."""
 
 
 def write_bytes(path: Path, data: bytes) -> None:

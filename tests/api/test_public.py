@@ -14,10 +14,9 @@ import pytest
 
 import slipid as sl
 from slipid.data.write import robotino2022_csv
-from slipid.identify.posterior import blocks, sample
-from slipid.identify.posterior.blocks import Plan
-from slipid.selftest.known import Sensors, grid, truth
-from slipid.selftest.logs import make_logs
+from slipid.infer.posterior import blocks, sample
+from slipid.infer.posterior.blocks import Plan
+from slipid.lab.selftest.logs import Sensors, grid, make_logs, truth
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOORS = (("gray", "as_built"),)

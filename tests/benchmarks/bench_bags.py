@@ -120,9 +120,8 @@ def seconds_of(path: Path) -> dict[str, float]:
     On a machine that others use as well, the time on the wall tells of them.
     """
     from slipid.data.reading.bag.layout import declared_bag_layout
-    from slipid.data.reading.bag.reader import read_bag
-    from slipid.data.reading.bag.storage.files import BagFiles, files_of
-    from slipid.data.reading.bag.topics import topics_of
+    from slipid.data.reading.bag.storage import BagFiles, files_of
+    from slipid.data.reading.bag.topics import read_bag, topics_of
 
     layout = declared_bag_layout(LAYOUT, "layout")
     hashed = BagFiles.sha256
@@ -152,8 +151,7 @@ def seconds_of(path: Path) -> dict[str, float]:
 def memory_of(path: Path) -> tuple[float, float]:
     """By how much reading made this process grow at most, and what of it the signals are [MiB]."""
     from slipid.data.reading.bag.layout import declared_bag_layout
-    from slipid.data.reading.bag.reader import read_bag
-    from slipid.data.reading.bag.topics import topics_of
+    from slipid.data.reading.bag.topics import read_bag, topics_of
 
     layout = declared_bag_layout(LAYOUT, "layout")
     topics_of(path)  # imports what reading imports

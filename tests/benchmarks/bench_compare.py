@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from slipid.identify.compare.folds import QUESTIONS
-from slipid.job.compare import compare
+from slipid.app.compare import compare
+from slipid.predict.folds import QUESTIONS
 from slipid.report.answers import show_comparison
 from slipid.report.page import Page
 from slipid.support.progress import Reporter

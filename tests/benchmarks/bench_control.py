@@ -70,10 +70,11 @@ def steps_of(kind):
     import jax
     import jax.numpy as jnp
 
-    from slipid.control.trajectory import rectangle
     from slipid.data.floor_map import patchwork
-    from slipid.deploy.controllers import ROWS, pilot_of
+    from slipid.deploy.controllers import pilot_of
     from slipid.deploy.floors import floor_of
+    from slipid.lab.trial.controllers import ROWS
+    from slipid.robot.trajectory import rectangle
     from tests.helpers.compiled_pilot import CompiledPilot
 
     patches = floor_of(patchwork(f.labels, 7, patch=0.35, half=2.0), f.labels)

@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slipid.identify.compare.folds import folds_of
-from slipid.identify.compare.predictive import log_student
-from slipid.identify.fit.optimise import optimise
-from slipid.job.config import read_config
-from slipid.job.problem import Job, read_job
+from slipid.app.config import read_config
+from slipid.app.problem import Job, read_job
+from slipid.fit.optimise import optimise
+from slipid.predict.folds import folds_of
+from slipid.predict.predictive import log_student
 from slipid.search_space import Choice
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK

@@ -17,19 +17,19 @@ import numpy as np
 import pytest
 from scipy.special import gammaln
 
-from slipid.identify.compare import open_loop
-from slipid.identify.compare.folds import folds_of
-from slipid.identify.compare.predictive import contact_of
-from slipid.identify.compare.validation import ScoredRun, add_scores
-from slipid.identify.fit.optimise import Optimum, optimise
-from slipid.identify.fit.problem import Problem, less
-from slipid.job.config import read_config
-from slipid.job.problem import read_job
+from slipid.app.config import read_config
+from slipid.app.problem import read_job
+from slipid.fit.optimise import Optimum, optimise
+from slipid.fit.problem import Problem, less
+from slipid.predict import open_loop
+from slipid.predict.folds import folds_of
+from slipid.predict.predictive import contact_of
+from slipid.predict.validation import ScoredRun, add_scores
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK, quick
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "robotino2022.toml"
-OWN = "slipid.identify.posterior.proposals"
+OWN = "slipid.infer.posterior.proposals"
 """Its degrees are of proposals of a sampler."""
 
 

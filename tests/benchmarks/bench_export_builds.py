@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slipid.control.export.c99.code import Code
-from slipid.control.export.c99.folder import c_files
-from slipid.control.export.golden import golden
-from slipid.control.trajectory import rectangle
+from slipid.export.c99.code import Code
+from slipid.export.c99.folder import c_files
+from slipid.export.golden import golden
+from slipid.robot.trajectory import rectangle
 from tests.benchmarks.export_builds import HERE, KINDS, needs, pilot, ran, three_floors
 from tests.benchmarks.quick import QUICK, quick
 

@@ -13,7 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.control.controller import (
+from slipid.deploy.controllers import pilot_of
+from slipid.export.c99.builder import Names
+from slipid.export.c99.code import Code, template
+from slipid.export.c99.function import Argument, function, traced
+from slipid.export.c99.text import table
+from slipid.lab.trial.controllers import ROWS
+from slipid.model import contact
+from slipid.model.contact_balance import stand
+from slipid.model.geometry import mecanum
+from slipid.robot.controller import (
     GIVES_UP_S,
     GO_S,
     HARDER,
@@ -23,18 +32,10 @@ from slipid.control.controller import (
     TURN_S,
     Limits,
 )
-from slipid.control.estimator import CURRENT_FROM
-from slipid.control.export.c99.code import Code, template
-from slipid.control.export.c99.lowering.builder import Names
-from slipid.control.export.c99.lowering.function import Argument, function, traced
-from slipid.control.export.c99.lowering.text import table
-from slipid.control.filter import hypotheses
-from slipid.control.filter.hypotheses import hypotheses_of
-from slipid.control.interface import UNTIMED_S, Settings
-from slipid.deploy.controllers import ROWS, pilot_of
-from slipid.model import contact
-from slipid.model.contact_balance import stand
-from slipid.model.geometry import mecanum
+from slipid.robot.estimator import CURRENT_FROM
+from slipid.robot.filter import hypotheses
+from slipid.robot.filter.hypotheses import hypotheses_of
+from slipid.robot.interface import UNTIMED_S, Settings
 from tests.benchmarks.export_builds import (
     FAST,
     HERE,

@@ -23,9 +23,9 @@ from tests.benchmarks.export_builds import (
     three_floors,
 )
 from tests.benchmarks.quick import QUICK
-from tests.control.test_estimator import SENSED, adversary
 from tests.helpers.c_against_jax import LEAST, Batch, Source, records, wander
 from tests.helpers.compiled_c import CompiledC
+from tests.robot.test_estimator import SENSED, adversary
 
 STEPS = {"wander": 1_000_000, "extreme": 10_000}
 ROBOTS, ROWS_OF_BATCH = 50, 40

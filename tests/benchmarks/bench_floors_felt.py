@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from slipid.benchmark.felt.benchmark import FOLDER, felt_benchmark
+from slipid.lab.benchmark.floors.part import FOLDER, felt_benchmark
 from tests.benchmarks.quick import QUICK
 
 

@@ -19,15 +19,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from slipid.app.config import read_config
+from slipid.app.problem import Job, read_job
 from slipid.data.runs import Runs
-from slipid.identify.compare.folds import judge
-from slipid.identify.compare.ranking import Ranking, compared, ranking
-from slipid.identify.fit.optimise import Optimum, optimise
-from slipid.identify.fit.problem import Problem, still_viscosities
-from slipid.identify.result import draws
-from slipid.job.config import read_config
-from slipid.job.problem import Job, read_job
+from slipid.fit.optimise import Optimum, optimise
+from slipid.fit.problem import Problem, still_viscosities
+from slipid.infer.result import draws
 from slipid.model.robot import build
+from slipid.predict.folds import judge
+from slipid.predict.ranking import Ranking, compared, ranking
 from slipid.search_space import Choice
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK, quick

@@ -67,7 +67,7 @@ KINDS = quick(tuple(ROWS), ("encoders", "map, a tenth wrong", "told the floors",
 
 
 def test_what_closes_and_what_limits_it(robot):
-    from slipid.control import trajectory
+    from slipid.robot import trajectory
 
     path = trajectory.rectangle()
     found = {name: driven(robot, ROWS[name], path) for name in KINDS}
@@ -86,7 +86,7 @@ def test_what_closes_and_what_limits_it(robot):
 @pytest.mark.parametrize("speed", quick([0.1, 0.2], [0.2]))
 @pytest.mark.parametrize("name", quick(["circle", "eight", "turning"], ["turning"]))
 def test_other_paths_close(robot, name, speed):
-    from slipid.control import trajectory
+    from slipid.robot import trajectory
 
     path = trajectory.PATHS[name](speed)
     steps = quick(int(20 * (2 * path.duration + 10)), STEPS)
@@ -106,7 +106,7 @@ def test_other_paths_close(robot, name, speed):
 def flawed(ground, flaw, seed):
     """The map as it is believed."""
     from slipid.data.floor_map import patchwork
-    from slipid.deploy.trial_site import SITE_SEED
+    from slipid.deploy.twin_run import SITE_SEED
 
     rng = np.random.default_rng(seed)
     if flaw == "shift":
@@ -126,14 +126,15 @@ def flawed(ground, flaw, seed):
 
 def driven(robot, row, path, steps=STEPS):
     """Closure [mm], cross-track rms [mm], whether it finished and whether it gave up, by start."""
-    from slipid.control.closed_loop import PERIOD, Course, Pilot, metrics
-    from slipid.control.filter.floor import Floor
-    from slipid.control.interface import Settings
-    from slipid.deploy.controllers import ROWS as TRIAL
     from slipid.deploy.controllers import pilot_of
     from slipid.deploy.deploy import habits_of
     from slipid.deploy.floors import floor_of
-    from slipid.deploy.trial_site import one_of, site, starts
+    from slipid.deploy.twin_run import site, starts
+    from slipid.lab.trial.controllers import ROWS as TRIAL
+    from slipid.lab.trial.plants import one_of
+    from slipid.robot.closed_loop import PERIOD, Course, Pilot, metrics
+    from slipid.robot.filter.floor import Floor
+    from slipid.robot.interface import Settings
     from tests.helpers.rolled_out import rollout
     from tests.helpers.telling_twin import TellingTwin
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from slipid.identify.bench.fit import fit_motor
-from slipid.identify.bench.verdict import bench_fit
+from slipid.infer.bench.fit import fit_motor
+from slipid.infer.bench.verdict import bench_fit
 from tests.benchmarks.quick import QUICK, quick
 from tests.helpers import made_bench as made
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slipid.identify.compare.validation import Validation
+from slipid.predict.validation import Validation
 from tests.benchmarks.quick import QUICK
 from tests.helpers.held_back import held_back
 

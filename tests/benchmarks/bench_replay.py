@@ -24,18 +24,18 @@ from typing import TypeVar
 import numpy as np
 import pytest
 
-from slipid.control.deployed import DeployedRobot
-from slipid.control.estimator import Estimator
-from slipid.control.interface import MIXED, Settings
+from slipid.app.config import parsed
+from slipid.app.problem import Job, read_job, with_mixed
+from slipid.deploy.deploy import robot_of
 from slipid.deploy.floors import floor_of
-from slipid.deploy.forecaster import robot_of
-from slipid.identify.compare.folds import facts_of, sectors
-from slipid.identify.compare.predictive import Contact, contact_of
-from slipid.identify.fit.likelihood import batch
-from slipid.identify.fit.optimise import optimise
-from slipid.identify.slip_curves import current_trend
-from slipid.job.config import parsed
-from slipid.job.problem import Job, read_job, with_mixed
+from slipid.fit.likelihood import batch
+from slipid.fit.optimise import optimise
+from slipid.infer.slip_curves import current_trend
+from slipid.predict.folds import facts_of, sectors
+from slipid.predict.predictive import Contact, contact_of
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.estimator import Estimator
+from slipid.robot.interface import MIXED, Settings
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK
 from tests.helpers import replayed

@@ -30,7 +30,7 @@ NEAR = 0.02
 def test_nothing_rests_away_from_its_path(robot, monkeypatch):
     found = ends(robot)
     print(f"\n{shares(found)}")
-    monkeypatch.setattr("slipid.control.controller.STUCK_S", np.inf)
+    monkeypatch.setattr("slipid.robot.controller.STUCK_S", np.inf)
     print(f"without freeing: {shares(ends(robot))}")
     assert QUICK or not found["rest"].any()
 
@@ -41,13 +41,14 @@ def shares(found):
 
 def ends(robot):
     """Whether each case came to this end, by name of the end."""
-    from slipid.control import trajectory
-    from slipid.control.closed_loop import PERIOD
-    from slipid.control.filter.floor import Floor
-    from slipid.control.interface import Settings
-    from slipid.deploy.controllers import ROWS, pilot_of
+    from slipid.deploy.controllers import pilot_of
     from slipid.deploy.deploy import habits_of
-    from slipid.deploy.trial_site import one_of
+    from slipid.lab.trial.controllers import ROWS
+    from slipid.lab.trial.plants import one_of
+    from slipid.robot import trajectory
+    from slipid.robot.closed_loop import PERIOD
+    from slipid.robot.filter.floor import Floor
+    from slipid.robot.interface import Settings
     from tests.helpers.rolled_out import rollout
     from tests.helpers.telling_twin import TellingTwin
 

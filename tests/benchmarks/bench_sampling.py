@@ -33,9 +33,9 @@ pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no real logs: {DATA}
 
 def problem_of(floor):
     """Likelihood of the runs on one floor."""
-    from slipid.job.config import read_config
-    from slipid.job.logs import read_dataset
-    from slipid.job.problem import job_of
+    from slipid.app.config import read_config
+    from slipid.app.logs import read_dataset
+    from slipid.app.problem import job_of
     from slipid.support.jax_setup import setup_jax
     from slipid.support.progress import Reporter
 
@@ -50,8 +50,8 @@ def problem_of(floor):
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     """The problem, where its fit ended, and a file of the latter."""
-    from slipid.identify.fit.optimise import optimise
-    from slipid.identify.posterior.coordinates import Fitted
+    from slipid.fit.optimise import optimise
+    from slipid.infer.posterior.coordinates import Fitted
 
     problem = problem_of(FLOOR)
     optimum = optimise(problem)
@@ -62,8 +62,8 @@ def fitted(tmp_path_factory):
 
 
 def density_of(problem, found):
-    from slipid.identify.posterior.coordinates import MOTION
-    from slipid.identify.posterior.density import Density
+    from slipid.infer.posterior.coordinates import MOTION
+    from slipid.infer.posterior.density import Density
 
     return Density(problem, found, MOTION)
 
@@ -80,10 +80,10 @@ def ess_of(chain):
 
 def by_slipid(density):
     """Chains (chain, draw, coordinate), seconds of sampling and of the warm-up, the last block."""
-    from slipid.identify.posterior import ensemble as sampler
-    from slipid.identify.posterior.blocks import Plan, Record, Target
-    from slipid.identify.posterior.coordinates import MOTION
-    from slipid.identify.posterior.diagnosis import diagnose
+    from slipid.infer.posterior import ensemble as sampler
+    from slipid.infer.posterior.blocks import Plan, Record, Target
+    from slipid.infer.posterior.coordinates import MOTION
+    from slipid.infer.posterior.diagnosis import diagnose
 
     d = density
     target = Target(d.terms, d.slope, d.coordinates.group, d.centre, d.covariance)
@@ -108,7 +108,7 @@ def by_nuts(path, block=None):
     Args:
         block: through whose map; None for the Gaussian one of the Laplace approximation.
     """
-    from slipid.identify.posterior.blocks import packed
+    from slipid.infer.posterior.blocks import packed
 
     files = [path.with_name(f"nuts{k}.npz") for k in range(CHAINS)]
     words = []
@@ -132,8 +132,8 @@ def nuts(path, seed, out, block=None):
     import jax.numpy as jnp
     from numpyro.infer import MCMC, NUTS
 
-    from slipid.identify.posterior.blocks import unpacked
-    from slipid.identify.posterior.transport.transport_map import _placed, gaussian
+    from slipid.infer.posterior.blocks import unpacked
+    from slipid.infer.posterior.transport_map import _placed, gaussian
 
     d = density = density_of(problem_of(FLOOR), pickle.loads(Path(path).read_bytes()))
     map = gaussian(d.centre, d.covariance, d.coordinates.group)

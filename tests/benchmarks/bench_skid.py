@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from slipid.identify.compare.validation import FloorSummary
+from slipid.predict.validation import FloorSummary
 from tests.benchmarks.quick import QUICK, quick
 from tests.helpers.held_back import held_back
 

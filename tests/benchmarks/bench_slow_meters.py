@@ -11,8 +11,7 @@ that no number is more than 3.5 of its stds off.
 import pytest
 
 from slipid.data.runs import collect
-from slipid.selftest.known import Sensors
-from slipid.selftest.logs import make_logs
+from slipid.lab.selftest.logs import Sensors, make_logs
 from tests.benchmarks.quick import QUICK, quick
 from tests.helpers.kinds import SHAPES, fitted, known, plan, wanted
 from tests.helpers.slow_meters import held

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.identify.fit.problem import Problem
+from slipid.fit.problem import Problem
 from slipid.search_space import Choice
 from tests.benchmarks.quick import QUICK, quick
 from tests.helpers.made_windows import made, robot
@@ -43,8 +43,8 @@ def problem():
 
 
 def real_job():
-    from slipid.job.config import read_config
-    from slipid.job.problem import job_of, read_job
+    from slipid.app.config import read_config
+    from slipid.app.problem import job_of, read_job
     from slipid.support.progress import Reporter
 
     config = read_config(ROOT / "configs" / "robotino2022.toml")
@@ -147,7 +147,7 @@ def test_whole_2022_fit_cold_and_warm(tmp_path):
 def main():
     """The whole 2022 fit, once, with the time of each stage."""
     began = time.perf_counter()
-    from slipid.identify.fit.optimise import optimise
+    from slipid.fit.optimise import optimise
     from slipid.support.jax_setup import setup_jax
 
     setup_jax(quiet=True)

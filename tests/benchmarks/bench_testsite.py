@@ -18,21 +18,20 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from slipid.app.config import parsed
+from slipid.app.problem import read_job
 from slipid.data.floor_map import FloorMap, four_zones, patchwork
-from slipid.identify.compare.ranking import compared
-from slipid.job.config import parsed
-from slipid.job.problem import read_job
+from slipid.lab.testsite.config import plan
+from slipid.lab.testsite.driving import Run, Timed, drive, straight
+from slipid.lab.testsite.ground import GROUNDS
+from slipid.lab.testsite.motors import Machine
+from slipid.lab.testsite.plant import Plant
+from slipid.lab.testsite.sections import Headings, PaperGrid, Rectangle, Wander
+from slipid.lab.testsite.simulate import observe, simulate, truth
+from slipid.lab.testsite.site import Site
+from slipid.predict.ranking import compared
 from slipid.support.executor import Processes
 from slipid.support.progress import Reporter
-from slipid.testsite.driving import Run, Timed, drive, straight
-from slipid.testsite.ground import GROUNDS
-from slipid.testsite.machine import Machine
-from slipid.testsite.plant import Plant
-from slipid.testsite.simulate.config import plan
-from slipid.testsite.simulate.observe import observe
-from slipid.testsite.simulate.sections import Headings, PaperGrid, Rectangle, Wander
-from slipid.testsite.simulate.simulate import simulate, truth
-from slipid.testsite.site import Site
 from tests.benchmarks.quick import QUICK, quick
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -189,8 +188,8 @@ def _experiment(seed: int) -> dict:
 
 def _fitted(job):
     """What `identify` finds of a job, without the simpler models."""
-    from slipid.identify.fit.optimise import optimise
-    from slipid.identify.result import summarise
+    from slipid.fit.optimise import optimise
+    from slipid.infer.result import summarise
 
     problem = job.problem()
     return summarise(problem, optimise(problem), job.dataset, job.choices)
@@ -329,10 +328,10 @@ def test_figures_beside_the_real_ones(real_data: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from slipid.baselines.paper2021.result import regenerate
     from slipid.data.reading.presets import preset
     from slipid.data.reading.reader import find_logs
-    from slipid.plots.paper import _floor
+    from slipid.lab.paper2021.plots import _floor
+    from slipid.lab.paper2021.result import regenerate
     from tests.helpers.one_log import read_log
 
     OUT.mkdir(parents=True, exist_ok=True)
@@ -461,8 +460,7 @@ def _figure_logs(site: Site) -> dict:
 
 def _points(logs: list) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Current, slip and torque variable M of motor 1 over half seconds, cut as the authors did."""
-    from slipid.baselines.paper2021.samples import FIGURES_3_AND_4
-    from slipid.baselines.paper2021.transfer import wheel_windows
+    from slipid.lab.paper2021.samples import FIGURES_3_AND_4, wheel_windows
 
     currents, slips, speeds = [], [], []
     for log in logs:

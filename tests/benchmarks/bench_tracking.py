@@ -20,14 +20,14 @@ import cv2
 import numpy as np
 import pytest
 
+from slipid.camera.frames.source import open_source
+from slipid.camera.overhead import Lens, OverheadCamera
+from slipid.camera.tracking.track import summary
+from slipid.camera.tracking.tracking import LoneMarker, track
 from slipid.data.floor_map import uniform
+from slipid.lab.testsite.site import Camera, Site
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
-from slipid.testsite.site import Camera, Site
-from slipid.vision.camera import Lens, OverheadCamera
-from slipid.vision.tracking.frames.source import open_source
-from slipid.vision.tracking.track import summary
-from slipid.vision.tracking.tracking import LoneMarker, track
 from tests.benchmarks.quick import QUICK, quick
 from tests.helpers.made_drives import round_trip
 from tests.helpers.made_sources import write_video
@@ -98,7 +98,7 @@ def test_speed(video, tmp_path):
 
 @pytest.mark.parametrize("speed", quick([0.0, 0.1, 0.3], [0.1]))
 def test_accuracy_on_the_test_site(tmp_path, speed):
-    from slipid.testsite.studio import Studio, film
+    from slipid.lab.testsite.studio import Studio, film
 
     camera, site = Camera(), Site()
     try:

@@ -20,8 +20,8 @@ ROWS = ("encoder", "contact", "contact_map", "contact_gyro")
 
 def test_other_starts_on_other_maps(fit_folder, robot, tmp_path):
     from slipid.data.floor_map import patchwork, write_map
-    from slipid.deploy.trial import Wish, trial
-    from slipid.deploy.trial_summary import not_told_apart, summaries
+    from slipid.lab.trial.summary import not_told_apart, summaries
+    from slipid.lab.trial.trial import Wish, trial
     from slipid.support.progress import Reporter
 
     labels = robot.labels

@@ -31,7 +31,7 @@ def fit_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return Path(folder)
     if not QUICK:
         pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
-    from slipid.selftest.known import grid
+    from slipid.lab.selftest.logs import grid
     from tests.helpers.shared import identify
 
     floors = ("firm", "as_built"), ("soft", "as_built")

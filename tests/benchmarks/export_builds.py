@@ -23,16 +23,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.control import trajectory
-from slipid.control.closed_loop import PERIOD, Pilot
-from slipid.control.deployed import DeployedRobot
-from slipid.control.export.c99.code import Code
-from slipid.control.twin import Twin
-from slipid.deploy.controllers import ROWS, pilot_of
+from slipid.deploy.controllers import pilot_of
 from slipid.deploy.deploy import habits_of, read_robot
 from slipid.deploy.floors import floor_of
-from slipid.deploy.trial_site import site, starts
+from slipid.deploy.twin_run import site, starts
+from slipid.export.c99.code import Code
+from slipid.lab.trial.controllers import ROWS
 from slipid.model.geometry import omni
+from slipid.robot import trajectory
+from slipid.robot.closed_loop import PERIOD, Pilot
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.twin import Twin
 from tests.benchmarks.quick import quick
 from tests.helpers.compiled_c import CompiledC
 from tests.helpers.exported import known

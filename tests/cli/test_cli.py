@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slipid.job.packaged import packaged_config
+from slipid.app.logs import packaged_config
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
 from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
@@ -376,7 +376,7 @@ def test_an_interrupt_that_python_must_ignore_where_it_arrives_stops_the_command
     code = """if True:
         import gc, signal, time
         from slipid.cli import main as cli
-        from slipid.job import check
+        from slipid.app import check
 
         def collecting(phase, info):
             gc.callbacks.remove(collecting)
@@ -437,8 +437,8 @@ def test_a_posterior_that_has_not_converged_says_so_everywhere(sampled):
 def test_a_posterior_that_has_converged_is_0_and_takes_its_blocks_away(
     sampled, tmp_path, monkeypatch
 ):
-    from slipid.identify.posterior import diagnosis
-    from slipid.identify.posterior import sample as posterior
+    from slipid.infer.posterior import diagnosis
+    from slipid.infer.posterior import sample as posterior
 
     shutil.copytree(sampled[0], tmp_path / "out")
     out, found = tmp_path / "out", diagnosis.diagnose

@@ -9,19 +9,19 @@ from zipfile import ZipFile
 import numpy as np
 import pytest
 
+from slipid.app import logs as packaged
+from slipid.app.config import read_config
+from slipid.app.logs import RECORDED, packaged_config, unpack
+from slipid.app.problem import read_job
 from slipid.cli import demo
 from slipid.cli.demo import PARTS, drive_anew
-from slipid.job import packaged
-from slipid.job.config import read_config
-from slipid.job.packaged import RECORDED, packaged_config, unpack
-from slipid.job.problem import read_job
+from slipid.lab.testsite.config import plan
+from slipid.lab.testsite.driving import drive
 from slipid.plots.motion import path_figure
 from slipid.report.estimates import compared
 from slipid.support.errors import DataError
 from slipid.support.executor import Here
 from slipid.support.progress import Reporter
-from slipid.testsite.driving import drive
-from slipid.testsite.simulate.config import plan
 from tests.helpers.golden_rows import of_identified, of_validation
 from tests.helpers.recording import pack
 
@@ -47,7 +47,7 @@ def test_packing_what_was_unpacked_gives_the_same_bytes(tmp_path):
 def test_the_recording_is_what_its_config_drives():
     """To what another version of MuJoCo or another processor may change."""
     made = plan(Path("x"), packaged_config("testsite_fit.toml"))
-    from slipid.testsite.simulate.simulate import _seed
+    from slipid.lab.testsite.simulate import _seed
 
     name, run = made.runs[40]
     trace = drive(run, made.site, _seed(0, 40))
@@ -82,10 +82,10 @@ def test_the_recording_needs_neither_mujoco_nor_opencv(tmp_path):
         "            raise ImportError(name)\n"
         "sys.meta_path.insert(0, Absent())\n"
         "from pathlib import Path\n"
-        "from slipid.job.packaged import packaged_config, unpack\n"
+        "from slipid.app.logs import packaged_config, unpack\n"
         "from slipid.support.progress import Reporter\n"
-        "from slipid.testsite.simulate.simulate import simulate\n"
-        "from slipid.testsite.simulate.config import plan\n"
+        "from slipid.lab.testsite.simulate import simulate\n"
+        "from slipid.lab.testsite.config import plan\n"
         "from slipid.support.errors import DataError\n"
         f"unpack(Path({str(tmp_path)!r}))\n"
         "made = plan(Path('x'), packaged_config('testsite_unseen.toml'))\n"
@@ -108,7 +108,7 @@ def test_a_missing_recording_is_said(tmp_path, monkeypatch):
 def test_driving_anew_drives_what_ships(tmp_path, monkeypatch):
     seen = {}
     monkeypatch.setattr(
-        "slipid.testsite.simulate.simulate.simulate",
+        "slipid.lab.testsite.simulate.simulate",
         lambda made, out, executor, report: seen.update({out.name: made}),
     )
     drive_anew(tmp_path, 0, Here(), Reporter(quiet=True))

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from slipid.app.bench_priors import bench_priors
+from slipid.app.config import parsed
 from slipid.data.reading.motor_layout import given_columns, motor_layout
 from slipid.data.reading.table_format import format_of
-from slipid.job.bench.priors import bench_priors
-from slipid.job.config import parsed
 from slipid.support.errors import DataError
 from tests.helpers import made_bench as made
 from tests.helpers.shared import invoke

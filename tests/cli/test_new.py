@@ -8,8 +8,8 @@ import sys
 import pytest
 from typer.testing import CliRunner
 
+from slipid.app.config import read_config
 from slipid.cli.main import app
-from slipid.job.config import read_config
 from tests.helpers.made_tables import RADIUS, TRACK, plain, table
 from tests.helpers.shared import invoke
 
@@ -113,7 +113,7 @@ def test_help_of_new_loads_nothing_heavy():
     code = (
         "import sys; from slipid.cli.main import app; from typer.testing import CliRunner; "
         "r = CliRunner().invoke(app, ['new', '--help']); assert r.exit_code == 0; "
-        "print(sorted({'jax', 'numpy', 'slipid.job'} & set(sys.modules)))"
+        "print(sorted({'jax', 'numpy', 'slipid.app'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from slipid.data.check.columns import refuse_misordered
+from slipid.data.check.sanity import findings
 from slipid.data.reading.presets import declared_layout
 from slipid.data.runs import collect
-from slipid.data.sanity.columns import refuse_misordered
-from slipid.data.sanity.sanity import findings
 from slipid.model.geometry import omni
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import (

@@ -82,8 +82,8 @@ def test_it_is_searched_once_for_a_set_of_runs():
 
 @pytest.mark.slow
 def test_real_robots_have_the_lag_that_each_day_tells(real_data):
-    from slipid.job.config import read_config
-    from slipid.job.logs import read_dataset
+    from slipid.app.config import read_config
+    from slipid.app.logs import read_dataset
     from slipid.support.progress import Reporter
 
     config = read_config(Path("configs/warthog.toml"))

@@ -10,13 +10,13 @@ import jax
 import numpy as np
 import pytest
 
-from slipid.control.controller import Gains
-from slipid.control.deployed import DeployedRobot
-from slipid.control.interface import MIXED, Settings
 from slipid.deploy.deploy import DRAWS, deploy, read_robot, write_robot
-from slipid.deploy.told import DIRECTIONS
-from slipid.identify.fit.shared import Directions, Pace
-from slipid.identify.fit_file import load
+from slipid.deploy.effects import DIRECTIONS
+from slipid.fit.shared import Directions, Pace
+from slipid.infer.fit_file import load
+from slipid.robot.controller import Gains
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.interface import MIXED, Settings
 from slipid.support.errors import DataError
 from slipid.support.files import write_json
 from tests.helpers.shared import DRIVES, invoke

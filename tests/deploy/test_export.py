@@ -12,17 +12,18 @@ import jax
 import numpy as np
 import pytest
 
-from slipid.control import closed_loop
-from slipid.control.closed_loop import PERIOD
-from slipid.control.deployed import DeployedRobot
-from slipid.control.export.c99.folder import c_files
-from slipid.control.export.folder import check_folder
-from slipid.control.interface import Measurement
-from slipid.control.trajectory import rectangle
-from slipid.deploy.controllers import ROWS, pilot_of
+from slipid.deploy.controllers import pilot_of
 from slipid.deploy.export import FORMS, Wish, export, robot_at
-from slipid.deploy.trial import REST_S
-from slipid.deploy.trial_site import SitePlant, site, starts
+from slipid.deploy.twin_run import REST_S, site, starts
+from slipid.export.c99.folder import c_files
+from slipid.export.folder import check_folder
+from slipid.lab.trial.controllers import ROWS
+from slipid.lab.trial.plants import SitePlant
+from slipid.robot import closed_loop
+from slipid.robot.closed_loop import PERIOD
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.interface import Measurement
+from slipid.robot.trajectory import rectangle
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.helpers import small_twin

@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from slipid.app.floors import _of_run, summary
 from slipid.data.floor_map import from_polygons, write_map
 from slipid.data.log import Log
 from slipid.deploy.floors import FloorLookup
-from slipid.deploy.floors_under import _of_run, summary
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from tests.helpers.shared import invoke

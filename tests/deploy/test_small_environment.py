@@ -21,12 +21,12 @@ ON_THE_ROBOT = """
 import sys
 import jax
 jax.config.update("jax_enable_x64", True)
-from slipid.control.controller import Controller
-from slipid.control.deployed import DeployedRobot
-from slipid.control.estimator import Estimator
-from slipid.control.filter.floor import Floor
-from slipid.control.interface import Measurement
-from slipid.control.trajectory import rectangle
+from slipid.robot.controller import Controller
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.estimator import Estimator
+from slipid.robot.filter.floor import Floor
+from slipid.robot.interface import Measurement
+from slipid.robot.trajectory import rectangle
 
 robot = DeployedRobot.load(sys.argv[1])
 floor = Floor.load(sys.argv[2], robot.labels)

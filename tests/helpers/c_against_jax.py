@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from slipid.control.closed_loop import Pilot
-from slipid.control.interface import Readings
+from slipid.robot.closed_loop import Pilot
+from slipid.robot.interface import Readings
 from tests.helpers.compiled_c import CompiledC
 
 Draw = Callable[[Array, Array], tuple[Readings, Array]]

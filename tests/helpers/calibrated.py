@@ -5,13 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from slipid.vision.calibration.board import Board, View
-from slipid.vision.calibration.lens.outliers import fit_kept
-from slipid.vision.calibration.lens.quality import judged
-from slipid.vision.calibration.lens.views import enough
-from slipid.vision.calibration.pictures import Picture
-from slipid.vision.calibration.place.points import FloorPoints
-from slipid.vision.camera import Lens
+from slipid.camera.calibration.board import Board, Picture, View
+from slipid.camera.calibration.lens import fit_kept
+from slipid.camera.calibration.points import FloorPoints
+from slipid.camera.calibration.quality import judged
+from slipid.camera.calibration.views import enough
+from slipid.camera.overhead import Lens
 from tests.helpers import made_boards as made
 
 TRUE = made.TrueLens()

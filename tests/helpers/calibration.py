@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import binom
 
-from slipid.identify.compare.open_loop import chain, corrected
-from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit.optimise import Optimum, optimise
-from slipid.identify.fit.problem import Problem
-from slipid.identify.fit.variances import DEGREES, VARIANCE_SPREAD
-from slipid.identify.posterior import sample as posterior
-from slipid.identify.posterior.blocks import Plan
-from slipid.identify.result import Channels, Fit
+from slipid.fit import likelihood as lk
+from slipid.fit.optimise import Optimum, optimise
+from slipid.fit.problem import Problem
+from slipid.fit.variances import DEGREES, VARIANCE_SPREAD
+from slipid.infer.posterior import sample as posterior
+from slipid.infer.posterior.blocks import Plan
+from slipid.infer.result import Channels, Fit
+from slipid.predict.open_loop import chain, corrected
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 

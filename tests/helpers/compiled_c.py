@@ -14,10 +14,11 @@ import jax
 import numpy as np
 import pytest
 
-from slipid.control.export.c99.code import Code
-from slipid.control.export.fields import Struct
-from slipid.control.trajectory import rectangle
-from slipid.deploy.controllers import ROWS, pilot_of
+from slipid.deploy.controllers import pilot_of
+from slipid.export.c99.code import Code
+from slipid.export.fields import Struct
+from slipid.lab.trial.controllers import ROWS
+from slipid.robot.trajectory import rectangle
 from tests.helpers import small_twin
 
 MANY = """

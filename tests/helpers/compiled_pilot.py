@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.control.closed_loop import Pilot
-from slipid.control.interface import Pose, Readings, State
-from slipid.control.trajectory import Path
+from slipid.robot.closed_loop import Pilot
+from slipid.robot.interface import Pose, Readings, State
+from slipid.robot.trajectory import Path
 
 Tree = TypeVar("Tree")
 

@@ -13,29 +13,17 @@ import numpy as np
 
 from slipid.data.runs import collect
 from slipid.data.windows import windows
-from slipid.identify.compare import open_loop as replay
-from slipid.identify.design import fisher as info
-from slipid.identify.design.planned_runs import (
-    HEADINGS,
-    Drive,
-    candidates,
-    paper_grid,
-    steady_windows,
-)
-from slipid.identify.design.planner import (
-    Planner,
-    parameter_goal,
-    prediction_goal,
-    weighed,
-)
-from slipid.identify.fit import likelihood as lk
-from slipid.identify.fit import noise as of_noise
-from slipid.identify.fit.optimise import optimise
-from slipid.identify.fit.problem import Problem, State
-from slipid.identify.result import Channels
+from slipid.fit import likelihood as lk
+from slipid.fit import noise as of_noise
+from slipid.fit.optimise import optimise
+from slipid.fit.problem import Problem, State
+from slipid.infer.design import fisher as info
+from slipid.infer.design.planned_runs import HEADINGS, Drive, candidates, paper_grid, steady_windows
+from slipid.infer.design.planner import Planner, parameter_goal, prediction_goal, weighed
+from slipid.infer.result import Channels
+from slipid.lab.selftest.logs import Sensors, blank, make_logs, truth
+from slipid.predict import open_loop as replay
 from slipid.search_space import Choice
-from slipid.selftest.known import Sensors, blank, truth
-from slipid.selftest.logs import make_logs
 from tests.helpers.made_windows import measure
 
 SETUP = ("soft", "as_built")

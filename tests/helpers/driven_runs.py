@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.baselines.motion.ward_iagnemma.dynamics import Dynamics, Law
-from slipid.baselines.motion.ward_iagnemma.filter import Noise
-from slipid.identify.compare.slip_model import Run
+from slipid.lab.systems.motion.ward_iagnemma_dynamics import Dynamics, Law
+from slipid.lab.systems.motion.ward_iagnemma_filter import Noise
+from slipid.predict.slip_model import Run
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
 MACHINES = pytest.mark.parametrize("machine", [ROBOTINO, HUSKY], ids=["omni", "skid"])

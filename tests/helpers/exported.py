@@ -8,9 +8,9 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 
-from slipid.control.deployed import DeployedRobot
 from slipid.model.geometry import Geometry, mecanum, omni
 from slipid.model.robot import build
+from slipid.robot.deployed import DeployedRobot
 from tests.helpers.known_robot import GAINS, deploy_known
 
 ODD = ('wet | "sand" -->', "class", "Wet sand", "2nd")

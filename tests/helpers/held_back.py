@@ -3,11 +3,11 @@
 from dataclasses import replace
 from pathlib import Path
 
+from slipid.app.config import read_config
+from slipid.app.identify import optimised, summarised
+from slipid.app.problem import Job, job_of, read_job
 from slipid.data.runs import Runs
-from slipid.identify.compare.validation import Validation
-from slipid.job.config import read_config
-from slipid.job.identify import optimised, summarised
-from slipid.job.problem import Job, job_of, read_job
+from slipid.predict.validation import Validation
 from slipid.support.progress import Reporter
 
 

@@ -5,19 +5,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slipid.app.problem import told_lag
 from slipid.data.runs import Runs, collect
 from slipid.data.windows import windows
-from slipid.identify.design.planned_runs import Drive
-from slipid.identify.fit.optimise import optimise
-from slipid.identify.fit.problem import Problem
-from slipid.identify.result import Fit, summarise
-from slipid.job.problem import told_lag
+from slipid.fit.optimise import optimise
+from slipid.fit.problem import Problem
+from slipid.infer.design.planned_runs import Drive
+from slipid.infer.result import Fit, summarise
+from slipid.lab.selftest.logs import Sensors, grid, make_logs, turning_grid
 from slipid.model.geometry import Geometry, differential, mecanum, omni, skid_steer
 from slipid.model.robot import Robot, build
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
-from slipid.selftest.known import Sensors, grid, turning_grid
-from slipid.selftest.logs import make_logs
 
 SHAPES = {
     "omni 4": omni([45.0, 135.0, 225.0, 315.0], 0.2, 0.05, 16.0),

@@ -6,17 +6,11 @@ from collections.abc import Mapping
 
 import jax
 
-from slipid.control.deployed import DeployedRobot
-from slipid.control.robot_file.record import (
-    GainRecord,
-    GainsRecord,
-    GainValues,
-    Losses,
-    ToldRecord,
-)
-from slipid.deploy.forecaster import given
+from slipid.deploy.deploy import given
 from slipid.deploy.record_of import record_of
 from slipid.model.robot import Robot
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.record import GainRecord, GainsRecord, GainValues, Losses, ToldRecord
 
 GAINS = GainsRecord(
     values=GainValues(*(GainRecord(0.1 * k, "1", 0.01) for k in range(6))),

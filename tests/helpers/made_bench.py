@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.identify.bench.record import Record
-from slipid.testsite.motors import Drive, Motor, SpeedLoop
+from slipid.infer.bench.motor import Record
+from slipid.lab.testsite.motors import Drive, Motor, SpeedLoop
 
 FLYWHEEL, ROTOR = 1e-4, 7.1e-6
 STEPS = (0, 6, 0, -6, 12, 3, -12, -3, 0, 18, 9, -18, 8, -8, 0)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slipid.baselines.floors.interface import Felt
+from slipid.lab.systems.floors.interface import Felt
 
 HZ = 6.5
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from slipid.camera.floor.colour import as_light, as_shown
+from slipid.camera.overhead import Lens, OverheadCamera
 from slipid.data.floor_map import FloorMap, from_polygons
-from slipid.vision.camera import Lens, OverheadCamera
-from slipid.vision.floor.segmentation.colour import as_light, as_shown
 
 COLOURS = {
     "wood": "#b08a5a",

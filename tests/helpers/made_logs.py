@@ -5,9 +5,9 @@ from pathlib import Path
 
 from slipid.data.log import Log
 from slipid.data.write import own_columns, own_csv
+from slipid.lab.selftest.logs import numbers
 from slipid.model.robot import Robot
 from slipid.parameter import entries
-from slipid.selftest.known import numbers
 from slipid.support.files import write_bytes, write_json
 
 TICKS = 2000

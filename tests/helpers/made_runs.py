@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from slipid.identify.compare.slip_model import Heard, Machine, Run, path_of
 from slipid.model.geometry import omni, skid_steer
 from slipid.model.robot import build
+from slipid.predict.slip_model import Heard, Machine, Run, path_of
 
 ROBOTINO = Machine.of(build(omni([60.0, 180.0, 300.0], 0.125, 0.040, 16.0), ("gray",)))
 HUSKY = Machine.of(build(skid_steer(0.256, 0.275, 0.165, 78.71, drive_of=(0, 1, 0, 1)), ("grass",)))

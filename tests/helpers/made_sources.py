@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slipid.vision.tracking.frames.frame import Frame
+from slipid.camera.frames.frame import Frame
 from tests.helpers.made_videos import FPS
 
 

@@ -9,7 +9,7 @@ from functools import cache, cached_property
 import cv2
 import numpy as np
 
-from slipid.vision.camera import Lens, OverheadCamera
+from slipid.camera.overhead import Lens, OverheadCamera
 from tests.helpers.made_boards import FINE, TrueLens, from_world, overhead
 
 DOTS = 24

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.data.windows import Windows
-from slipid.identify.fit import likelihood as lk
+from slipid.fit import likelihood as lk
+from slipid.lab.selftest.replicates import measure
 from slipid.model.geometry import omni
 from slipid.model.robot import build
-from slipid.selftest.windows import measure
 
 GEOMETRY = omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0)
 SCALE = 1.1

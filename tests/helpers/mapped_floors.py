@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from slipid.camera.floor.found import FoundMap
+from slipid.camera.floor.grid import Robot
+from slipid.camera.floor.picture import Wish, map_of
 from slipid.support.progress import Reporter
-from slipid.vision.floor.found import FoundMap
-from slipid.vision.floor.picture import Wish, map_of
-from slipid.vision.floor.robot_mask import Robot
 from tests.helpers.made_floors import MadeFloor
 
 REGION = "[region]\nat_m = [[-1.1, -0.9], [1.1, -0.9], [1.1, 0.9], [-1.1, 0.9]]\n"

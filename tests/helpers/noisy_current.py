@@ -13,10 +13,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.identify.fit.optimise import optimise
-from slipid.identify.fit.problem import Problem, State
+from slipid.fit.optimise import optimise
+from slipid.fit.problem import Problem, State
+from slipid.lab.selftest.replicates import measure
 from slipid.search_space import Choice
-from slipid.selftest.windows import measure
 from tests.helpers.made_windows import made, robot
 
 MOTOR = {"motor.resistance": 5.95, "motor.back_emf": 0.0425}

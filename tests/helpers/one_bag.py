@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from slipid.data.reading.bag.layout import BagLayout, declared_bag_layout
-from slipid.data.reading.bag.reader import BagRun, read_bag
+from slipid.data.reading.bag.topics import BagRun, read_bag
 from tests.helpers.made_bags import SUFFIX, Said, in_order, write_bag
 
 TIME = 1.7e9 + np.arange(0.0, 4.0, 0.01)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slipid.identify.compare.slip_model import Run
+from slipid.predict.slip_model import Run
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 LOST = 0.4

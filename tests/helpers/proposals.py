@@ -5,11 +5,11 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 
-from slipid.job.config import parsed
-from slipid.job.logs import read_dataset
-from slipid.job.new.config_text import new_config
-from slipid.job.new.look.propose import propose
-from slipid.job.new.robot_questions import RobotOptions
+from slipid.app.config import parsed
+from slipid.app.logs import read_dataset
+from slipid.app.new.config_text import new_config
+from slipid.app.new.propose import propose
+from slipid.app.new.robot_questions import RobotOptions
 from tests.helpers.made_tables import RADIUS, TRACK
 from tests.helpers.said import Said
 

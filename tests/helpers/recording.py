@@ -4,8 +4,8 @@ from io import BytesIO
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
+from slipid.app.logs import RECORDED
 from slipid.cli.demo import PARTS
-from slipid.job.packaged import RECORDED
 from slipid.support.files import write_bytes
 
 

@@ -9,13 +9,12 @@ import numpy as np
 
 from slipid.data.runs import collect
 from slipid.data.windows import windows
-from slipid.identify.fit.optimise import optimise
-from slipid.identify.fit.problem import Problem
-from slipid.identify.slip_curves import curves, slip_on
-from slipid.identify.verdicts.estimates import by_ratio, from_zero
+from slipid.fit.optimise import optimise
+from slipid.fit.problem import Problem
+from slipid.infer.slip_curves import curves, slip_on
+from slipid.infer.verdicts.estimates import by_ratio, from_zero
+from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
 from slipid.search_space import Choice, Space
-from slipid.selftest.known import Sensors, blank, grid, truth
-from slipid.selftest.logs import make_logs
 
 SETUPS = (("firm", "as_built"), ("soft", "as_built"), ("soft", "moved"))
 PLAN = grid(SETUPS, headings=8, turns=1)

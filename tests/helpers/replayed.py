@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2
 
-from slipid.control.interface import AbstractEstimator, Estimate, Readings
 from slipid.data.floor_map import FloorMap
 from slipid.data.log import Log
 from slipid.data.runs import Runs, first_row
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
+from slipid.robot.interface import AbstractEstimator, Estimate, Readings
 
 TOGETHER = 32
 """Runs replayed in one call."""

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.control.closed_loop import PERIOD, Pilot, PilotOutput, PilotState
-from slipid.control.interface import Pose, Readings, State
-from slipid.control.trajectory import Path
-from slipid.control.twin import Twin, TwinState
+from slipid.robot.closed_loop import PERIOD, Pilot, PilotOutput, PilotState
+from slipid.robot.interface import Pose, Readings, State
+from slipid.robot.trajectory import Path
+from slipid.robot.twin import Twin, TwinState
 
 
 def rollout(

@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from slipid.app.logs import packaged_config
 from slipid.cli.main import app
-from slipid.job.packaged import packaged_config
-from slipid.selftest.known import Drive, Sensors, grid, truth
-from slipid.selftest.logs import make_logs
+from slipid.lab.selftest.logs import Drive, Sensors, grid, make_logs, truth
 from tests.helpers.made_logs import write_logs
 
 DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)

@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from slipid.control.deployed import DeployedRobot
-from slipid.control.filter.floor import Floor
 from slipid.model.geometry import omni
 from slipid.model.robot import build
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.filter.floor import Floor
 from tests.helpers.known_robot import deploy_known
 
 AXES = ("along", "across", "yaw")

@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.control.interface import Readings
-from slipid.control.twin import Twin, TwinState
+from slipid.robot.interface import Readings
+from slipid.robot.twin import Twin, TwinState
 
 
 class TellingTwin(Twin):

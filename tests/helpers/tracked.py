@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from slipid.camera.tracking.finder import Finder, MarkerDetector
+from slipid.camera.tracking.sightings import look_through
+from slipid.camera.tracking.target import Marker, Target
+from slipid.camera.tracking.track import Track, track_of
 from slipid.support.checkpoint import Checkpoint
-from slipid.vision.tracking.finder import Finder, MarkerDetector
-from slipid.vision.tracking.sightings import look_through
-from slipid.vision.tracking.target import Marker, Target
-from slipid.vision.tracking.track import Track, track_of
 from tests.helpers.made_sources import InMemory
 from tests.helpers.made_videos import Body, Printed, Stage
 from tests.helpers.said import Said

@@ -12,22 +12,21 @@ from matplotlib.image import imread
 
 from slipid.data.runs import collect
 from slipid.data.windows import windows
-from slipid.identify.compare.slip_models import slip_models
-from slipid.identify.design.planned_runs import Drive
-from slipid.identify.fit.optimise import Optimum
-from slipid.identify.fit.problem import Problem, State
-from slipid.identify.result import Fit, summarise
+from slipid.fit.optimise import Optimum
+from slipid.fit.problem import Problem, State
+from slipid.infer.design.planned_runs import Drive
+from slipid.infer.result import Fit, summarise
+from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
 from slipid.model.geometry import differential, omni
 from slipid.plots import fit as plots
-from slipid.plots import load as plots_robot
+from slipid.plots import fit as plots_robot
 from slipid.plots.compare import WORDS, ladder_figure
 from slipid.plots.drawing import figure, save
 from slipid.plots.motion import heading_figure
 from slipid.plots.seen import by_heading, seen
 from slipid.plots.wheels import current_figure, driving_torque, wheel_curve
+from slipid.predict.slip_models import slip_models
 from slipid.search_space import Choice
-from slipid.selftest.known import Sensors, blank, grid, truth
-from slipid.selftest.logs import make_logs
 
 pytestmark = pytest.mark.slow  # traces whole fits
 

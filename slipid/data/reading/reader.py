@@ -14,7 +14,7 @@ from jaxtyping import Float
 from slipid.data.log import Log
 from slipid.data.reading.assemble import Identity, assembled, clock_against
 from slipid.data.reading.bag.layout import BagLayout
-from slipid.data.reading.bag.reader import read_bag
+from slipid.data.reading.bag.topics import read_bag
 from slipid.data.reading.checks import MIN_ROWS, Unsteady, check_log, check_time
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import preset

@@ -302,8 +302,8 @@ def test_runs_of_two_sets_keep_what_was_set_aside(tmp_path):
 
 
 def test_real_skid_steer_logs_are_read_and_wild_poses_set_aside(real_data):
-    from slipid.job.config import read_config
-    from slipid.job.logs import read_dataset
+    from slipid.app.config import read_config
+    from slipid.app.logs import read_dataset
     from slipid.support.progress import Reporter
 
     config = read_config(Path("configs/husky.toml"))

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AliasChoices, BeforeValidator, Field, StrictBool, StrictFloat, StrictStr
 from pydantic.dataclasses import dataclass
 
-from slipid.data.reading.bag.messages.shape import steps_of
+from slipid.data.reading.bag.shape import steps_of
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, SensorLayout, several, unknown
 from slipid.data.reading.units import factor
 from slipid.support.errors import DataError

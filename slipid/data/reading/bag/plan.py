@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from itertools import islice
 
+from slipid.data.reading.bag.definitions import Message, definition_of
 from slipid.data.reading.bag.layout import GROUPS, BagLayout, TopicChannel
-from slipid.data.reading.bag.messages.definitions import Message, definition_of
-from slipid.data.reading.bag.messages.meanings import (
+from slipid.data.reading.bag.meanings import (
     Unfit,
     channel_meaning,
     fits,
@@ -13,10 +13,16 @@ from slipid.data.reading.bag.messages.meanings import (
     is_transforms,
     listed,
 )
-from slipid.data.reading.bag.messages.picks import Pick, TransformPick, edges_of
-from slipid.data.reading.bag.messages.shape import MessageShape, shape_of, steps_of
-from slipid.data.reading.bag.messages.streams import topic_error
-from slipid.data.reading.bag.storage.opened import OpenBag, StoredTopic
+from slipid.data.reading.bag.opened import OpenBag, StoredTopic
+from slipid.data.reading.bag.shape import (
+    MessageShape,
+    Pick,
+    TransformPick,
+    edges_of,
+    shape_of,
+    steps_of,
+)
+from slipid.data.reading.bag.streams import topic_error
 from slipid.data.reading.bag.transforms import STATIC, Link, chain_of
 from slipid.support.errors import DataError, bad_data, near
 

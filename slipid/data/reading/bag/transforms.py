@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.reading.bag.messages.definitions import Message
-from slipid.data.reading.bag.messages.meanings import listed
-from slipid.data.reading.bag.messages.picks import Edge, Located, edges_of
-from slipid.data.reading.bag.messages.shape import MessageShape
-from slipid.data.reading.bag.messages.streams import TopicStreams, topic_error
-from slipid.data.reading.bag.storage.opened import OpenBag
+from slipid.data.reading.bag.definitions import Message
+from slipid.data.reading.bag.meanings import listed
+from slipid.data.reading.bag.opened import OpenBag
+from slipid.data.reading.bag.shape import Edge, Located, MessageShape, edges_of
+from slipid.data.reading.bag.streams import TopicStreams, topic_error
 from slipid.support.errors import near
 
 STATIC = "_static"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slipid.data.reading.bag.layout import declared_bag_layout
-from slipid.data.reading.bag.reader import read_bag
+from slipid.data.reading.bag.topics import read_bag
 from slipid.support.errors import DataError
 from tests.helpers.made_bags import (
     Said,

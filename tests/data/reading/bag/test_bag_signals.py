@@ -167,14 +167,8 @@ def test_the_hash_is_what_sha256sum_prints(tmp_path):
 
 
 def test_a_big_endian_message(tmp_path):
-    from slipid.data.reading.bag.messages.definitions import (
-        Many,
-        Message,
-        MessageField,
-        NumberType,
-        Text,
-    )
-    from slipid.data.reading.bag.messages.shape import shape_of, steps_of
+    from slipid.data.reading.bag.definitions import Many, Message, MessageField, NumberType, Text
+    from slipid.data.reading.bag.shape import shape_of, steps_of
 
     kind = Message(
         "x/msg/Y", (MessageField("s", Text()), MessageField("v", Many(NumberType("f8"), None)))
@@ -192,7 +186,7 @@ def test_importing_slipid_reads_no_bags():
     import sys
 
     code = (
-        "import sys, slipid, slipid.data.reading.bag.reader, slipid.data.reading.bag.topics\n"
+        "import sys, slipid, slipid.data.reading.bag.topics, slipid.data.reading.bag.topics\n"
         "print([m for m in sys.modules if m.startswith(('rosbags', 'apsw', 'lz4'))])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from slipid.data.reading.bag.layout import declared_bag_layout
-from slipid.data.reading.bag.reader import read_bag
-from slipid.data.reading.bag.topics import topics_of
+from slipid.data.reading.bag.topics import read_bag, topics_of
 from slipid.support.errors import DataError
 from tests.helpers.kept import kept
 from tests.helpers.made_bags import Said, in_order, joint_states, transform, write_bag

@@ -1,0 +1,117 @@
+"""A deployed robot that drives on its own model: is the path kept, and does it know where it is?
+
+A deployed robot in the forms that robots load.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from slipid.data.floor_map import FloorMap, read_map
+from slipid.deploy.controllers import pilot_of
+from slipid.deploy.deploy import NO_CONTROLLER, habits_of
+from slipid.deploy.export import FORMS, Exported, Wish
+from slipid.deploy.export import export as run
+from slipid.deploy.floors import floor_of
+from slipid.deploy.twin_run import REST_S, known_to_fit, path_of, site, starts, twin
+from slipid.lab.trial.controllers import ROWS
+from slipid.robot import closed_loop
+from slipid.robot.deployed import DeployedRobot
+from slipid.support.progress import Reporter
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoopDrive:
+    """One closed-loop run; `print` says what became of the path.
+
+    Attributes:
+        course: path, true and believed poses, commands and estimates, a row per period.
+        floor: the map it was driven on.
+        metrics: what became of the path, from true poses.
+    """
+
+    course: closed_loop.Course
+    floor: FloorMap
+    metrics: closed_loop.Metrics
+
+    def __str__(self) -> str:
+        m = self.metrics
+        ended = "ends" if m.finished else "was given up, with the way that was left it ends"
+        return (
+            f"{ended} {m.closure_mm:.0f} mm from where it should, turned by "
+            f"{m.heading_error_deg:+.1f} deg; {m.cross_track_rmse_mm:.0f} mm beside the path (rms)"
+        )
+
+
+def drive(
+    robot: DeployedRobot,
+    controller: str = "contact",
+    *,
+    map: Path | str | None = None,
+    path: str = "rectangle",
+    speed: float = 0.2,
+    start: int = 0,
+    seed: int = 0,
+) -> ClosedLoopDrive:
+    """Drive the 2021 paper's rectangle, or another path, on the twin of a robot.
+
+    The twin is the model itself, with delays and noise.
+
+    Args:
+        robot: a fit's or a posterior's `deploy()`, or `DeployedRobot.load`.
+        controller: as of `slipid trial`: `encoder`, `contact`, `contact_map`, `contact_gyro`, ...
+        map: file of a floor map; patches of the robot's floors by default.
+        path: `rectangle`, `circle`, `eight` or `turning`; speed: along it [m/s].
+        start: which of twenty poses on the map.
+        seed: of the sensors' noise.
+
+    Raises:
+        ValueError: no such controller or start, or wheels that have no controller.
+        DataError: no such path or map, a speed beyond what the fit has seen, or a floor that the
+            robot does not know.
+    """
+    if not robot.steers:
+        raise ValueError(NO_CONTROLLER)
+    course = path_of(path, speed, robot)
+    floor = site(robot) if map is None else read_map(Path(map))
+    known_to_fit(floor, robot, str(map))
+    places = starts(20, floor, course)
+    if controller not in ROWS or not 0 <= start < len(places):
+        names = ", ".join(ROWS)
+        raise ValueError(f"controller '{controller}' from start {start}; expected {names}; 0 to 19")
+    row, begin = ROWS[controller], places[start]
+    plant = twin(robot, floor, begin, seed, habits_of(robot, gyro=row.gyro))
+    pilot = pilot_of(robot, row, floor=floor_of(floor, robot.labels))
+    driven = closed_loop.drive(pilot, course.moved(begin).waiting(REST_S), plant, begin)
+    return ClosedLoopDrive(driven, floor, closed_loop.metrics(driven))
+
+
+def export(
+    robot: DeployedRobot,
+    folder: Path | str,
+    to: Sequence[str] = FORMS,
+    *,
+    controller: str = "contact",
+    path: str = "rectangle",
+    speed: float = 0.2,
+    map: Path | str | None = None,
+) -> Exported:
+    """Write a robot to a folder: robot.json, a README, checksums, and what is made of it.
+
+    Args:
+        robot: a fit's or a posterior's `deploy()`, or `DeployedRobot.load`; `on(...)` leaves
+            floors out.
+        folder: that is new, empty, or an older export, which is then replaced.
+        to: `c` (C99 of the very steps of estimator and controller), `ros2` (parameters by the names
+            of ros2_controllers and robot_localization), `stablehlo`, `table` (Markdown and CSV).
+        controller: as of `slipid trial`.
+        path: that the example in C follows; speed: along it [m/s].
+        map: file of a floor map, for `contact_map`, which is told one.
+
+    Raises:
+        DataError: no such form, controller or path, a step that has no form in C, or other files
+            lie there.
+    """
+    file = None if map is None else Path(map)
+    wish = Wish(tuple(to), controller, path, speed, map=file)
+    return run(robot, Path(folder), wish, Reporter(quiet=True), ROWS)

@@ -1,0 +1,168 @@
+"""What runs hold and can tell, before anything is fitted.
+
+A robot whose every number is known: its runs, to learn on, and what it does with a command.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.api.fit import Numbers, Prior, task_of
+from slipid.app.check import Expected, expected, overview
+from slipid.data.runs import Runs, collect
+from slipid.infer.verdicts.estimates import Estimate
+from slipid.lab.selftest import logs as known
+from slipid.lab.selftest.logs import make_logs
+from slipid.model.robot import Robot, motor_current, twist, wheel_torque
+from slipid.report.estimates import show_check
+from slipid.report.page import text_of
+from slipid.support.files import Content
+
+
+@dataclass(frozen=True, eq=False)
+class LogCheck:
+    """What runs hold and can be expected to tell; `print` shows it, `check[path]` is one number.
+
+    Attributes:
+        content: runs by floor, channels, what the reader repaired.
+        result: verdicts that can be expected, and what stays open.
+    """
+
+    content: Content
+    result: Expected
+
+    def __str__(self) -> str:
+        return text_of(show_check, self.content | self.result.to_json())
+
+    def __getitem__(self, path: str) -> Estimate:
+        """What is to be expected of one number; KeyError where there is none of this name."""
+        return self.result.parameters[path]
+
+
+def check(
+    runs: Runs,
+    robot: Robot,
+    *,
+    priors: Mapping[str, Prior] | None = None,
+    fixed: Mapping[str, Numbers] | None = None,
+    free: Sequence[str] = (),
+) -> LogCheck:
+    """Look before you fit: arguments and errors as of `fit`, which takes far longer."""
+    task = task_of(runs, robot, priors or {}, fixed or {}, {}, free)
+    return LogCheck(overview(task), expected(task, task.problem()))
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """Made runs and what is true of them.
+
+    Attributes:
+        runs: as `read_runs` would give them.
+        robot: that drove them, a three-wheeled Robotino; no fit sees it.
+    """
+
+    runs: Runs
+    robot: Robot
+
+    @cached_property
+    def truth(self) -> dict[str, float | list[float]]:
+        """Every true number by its path [SI]."""
+        return known.numbers(self.robot)
+
+
+def made_runs(
+    floors: Sequence[str] = ("firm", "soft"),
+    *,
+    headings: int = 12,
+    speeds: Sequence[float] = (0.1, 0.2),
+    turns: int = 2,
+    truth: Mapping[str, float | Sequence[float]] | None = None,
+    current: bool = True,
+    voltage: bool = True,
+    seed: int = 0,
+) -> Made:
+    """Drive a grid of runs with known numbers, seen by noisy sensors as those of a real Robotino.
+
+    Args:
+        floors: their names; `firm` and `soft` have numbers of their own, others the declared ones.
+        headings: evenly spread, on every floor at every speed.
+        speeds: [m/s].
+        turns: curved runs beside them, at every speed.
+        truth: numbers that are to be others, by path [SI].
+        current, voltage: whether those of the motors are logged.
+        seed: of the noise.
+
+    Raises:
+        ValueError: no such number; names those there are.
+    """
+    drives = known.grid([(floor, "as_built") for floor in floors], headings, speeds, turns)
+    robot = known.truth(drives, truth)
+    if wrong := sorted(set(truth or {}) - set(known.numbers(robot))):
+        raise ValueError(f"no parameter '{wrong[0]}'; there are: {', '.join(known.numbers(robot))}")
+    logs = make_logs(robot, drives, seed, known.Sensors(has_voltage=voltage))
+    return Made(collect(logs if current else [replace(log, current=None) for log in logs]), robot)
+
+
+@dataclass(frozen=True, eq=False)
+class SteadyMotion:
+    """Steady motions, a row per command.
+
+    Attributes:
+        twist: of the body, x [m/s], y [m/s], yaw rate [rad/s].
+        wheel_speed: that the command asks for [rad/s].
+        slip: 1 - v / (r w) of every wheel along its drive; of one that stands it is no number.
+        torque: of the traction at every wheel, positive where it drives [N m].
+        current: of every motor, positive where it drives [A].
+    """
+
+    twist: Float[np.ndarray, "command 3"]
+    wheel_speed: Float[np.ndarray, "command wheel"]
+    slip: Float[np.ndarray, "command wheel"]
+    torque: Float[np.ndarray, "command wheel"]
+    current: Float[np.ndarray, "command drive"]
+
+
+def move(
+    robot: Robot, floor: str, command: Sequence[Sequence[float]] | np.ndarray, load: str = ""
+) -> SteadyMotion:
+    """Steady motion of a robot whose wheels keep the speeds that commands ask for.
+
+    Args:
+        robot: with its numbers, such as `fit.robot`.
+        floor: name.
+        command: body twists x [m/s], y [m/s], yaw rate [rad/s], a row each.
+        load: name of the load set-up, the first one by default.
+
+    Raises:
+        ValueError: no such floor or load set-up.
+
+    Source: the force balance of `slipid.model.contact`.
+    """
+    places = robot.surface_index(floor), robot.load_index(load or robot.body.loads[0])
+    rows = jnp.atleast_2d(jnp.asarray(command, dtype=float))
+    return SteadyMotion(*(np.asarray(x) for x in _moved(robot, rows, *map(jnp.asarray, places))))
+
+
+@eqx.filter_jit
+def _moved(
+    robot: Robot, command: Float[Array, "command 3"], floor: Array, load: Array
+) -> tuple[Array, ...]:
+    frame = robot.geometry.frame()
+
+    def one(row: Float[Array, "3"]) -> tuple[Array, ...]:
+        driven = robot.geometry.forward() @ row / frame.radius
+        speed = robot.geometry.at_wheels(driven)
+        way, stands = jnp.sign(speed), jnp.abs(speed) < 1e-6
+        xi = twist(robot, frame, speed, floor, load)
+        torque = wheel_torque(robot, frame, xi, speed, floor, load)
+        rim = jnp.where(stands, jnp.nan, frame.radius * frame.pull * speed)
+        current = motor_current(robot, frame, xi, driven, floor, load) * jnp.sign(driven)
+        return xi, speed, 1 - frame.hold @ xi / rim, torque * way, current
+
+    return jax.vmap(one)(command)

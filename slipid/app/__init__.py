@@ -1,0 +1,1 @@
+"""Configs, and what each command does."""

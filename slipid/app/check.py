@@ -1,0 +1,266 @@
+"""What is wrong with the logs of a job or with its config, before anything is fitted.
+
+What a set of logs holds and can tell before anything is fitted: what `slipid check` does.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slipid.app.config import read_config
+from slipid.app.logs import layout_of
+from slipid.app.problem import Job, Task, read_job
+from slipid.data.align.clock import Clock
+from slipid.data.check.columns import Finding, worst_first, wrong
+from slipid.data.check.sanity import findings
+from slipid.data.log import Log
+from slipid.data.reading.reader import AnyLayout
+from slipid.data.runs import Runs
+from slipid.fit.problem import CREEPS, Problem
+from slipid.infer import slip_curves as curves_of
+from slipid.infer.verdicts.estimates import Estimate, derived, estimates
+from slipid.infer.verdicts.unidentified import Flat, flat_directions, members, sentences
+from slipid.predict.agreement import scatter
+from slipid.support.errors import DataError
+from slipid.support.files import Content, write_json
+from slipid.support.jax_setup import setup_jax
+from slipid.support.progress import Reporter
+
+_AT_MOTOR = ("wheel_ticks", "motor_angle", "motor_speed", "motor_speed_command")
+"""Channels that the gear ratio of a layout turns into motion of the wheel."""
+
+
+def sanity(task: Task) -> tuple[Finding, ...]:
+    """Findings about the runs of a task, and about the config where there is one; worst first."""
+    mass = task.config.content.wheels.mass_kg if isinstance(task, Job) else None
+    said = [*_braking(task), *findings(task.dataset, task.robot.geometry, mass)]
+    if isinstance(task, Job):
+        said += [*_forgotten(task), *_two_gears(task)]
+    return worst_first(said)
+
+
+def refuse_if_wrong(found: Sequence[Finding]) -> None:
+    """DataError with all that is wrong, if anything is."""
+    if bad := wrong(found):
+        listed = "\n".join(f"  {k}. {finding}" for k, finding in enumerate(bad, start=1))
+        raise DataError(
+            f"not fitted: logs and config do not go together\n{listed}\n"
+            "expected them put right, or --anyway to fit all the same"
+        )
+
+
+def _braking(task: Task) -> Iterator[Finding]:
+    """Magnitudes of currents beside voltages, of wheels that drag each other along in turns.
+
+    On made runs of a skid-steer robot R then was off by ten of its stds, and called identified.
+    """
+    runs = task.dataset
+    has = runs.current is not None and runs.voltage is not None
+    if has and not runs.current_is_signed and not task.robot.geometry.determines_twist:
+        yield Finding(
+            "braking_unseen",
+            "currents are magnitudes, and in turns a wheel that is dragged along brakes: read with "
+            "the voltages as if it drove, they give a wrong resistance and back-EMF",
+            "log currents with their sign, or take the voltage out of the layout",
+            "wrong",
+        )
+
+
+def _forgotten(job: Job) -> Iterator[Finding]:
+    """Numbers of the robot that torques scale with, and that were left at their defaults."""
+    logged = [n for n in ("current", "voltage") if getattr(job.dataset, n) is not None]
+    robot = job.config.content.wheels
+    absent = ["mass_kg"] if robot.mass_kg is None else []
+    absent += [] if "gear_ratio" in robot.model_fields_set else ["gear_ratio"]
+    if not logged or not absent:
+        return
+    taken = {"mass_kg": f"{float(job.robot.body.mass):g} kg", "gear_ratio": "1"}
+    yield Finding(
+        "forgotten",
+        f"{' and '.join(f'{n} ({taken[n]} would be taken)' for n in absent)} left out of [robot], "
+        f"though a {' and a '.join(logged)} is logged: motor and friction scale with them",
+        "write " + " and ".join(f"{n} = ..." for n in absent) + " into [robot]",
+        "wrong",
+    )
+
+
+def _two_gears(job: Job) -> Iterator[Finding]:
+    """Gear ratios of the robot and of a layout that differ."""
+    robot = job.config.content.wheels
+    if "gear_ratio" not in robot.model_fields_set:
+        return
+    seen: set[str] = set()
+    for section in job.config.content.logs:
+        layout = layout_of(job.config, section)
+        if section.format in seen or not _uses_gear(layout):
+            continue
+        seen.add(section.format)
+        if abs(layout.gear_ratio / robot.gear_ratio - 1) > 1e-3:
+            yield Finding(
+                "two_gear_ratios",
+                f"gear_ratio is {robot.gear_ratio:g} in [robot] and {layout.gear_ratio:g} in the "
+                f"layout '{section.format}' of the logs",
+                "write the same number into both, or name the columns as those of the wheel "
+                "(wheel_angle, wheel_speed), if they are of the wheel",
+                "wrong",
+            )
+
+
+def _uses_gear(layout: AnyLayout) -> bool:
+    return any(channel in layout.holds for channel in _AT_MOTOR)
+
+
+_CHANNELS = (
+    *("wheel_speed", "wheel_speed_command", "twist_command", "current", "voltage"),
+    *("duty", "bus_voltage", "gyro", "pose"),
+)
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What logs can be expected to tell of every number and ratio, by path.
+
+    `messages` say what stays open and what would close it, one sentence each.
+    """
+
+    parameters: dict[str, Estimate]
+    derived: dict[str, Estimate]
+    messages: tuple[str, ...]
+
+    def to_json(self) -> Content:
+        """Its part of check.json."""
+        return {
+            "parameters": {path: _before(e) for path, e in self.parameters.items()},
+            "derived": {path: _before(e) for path, e in self.derived.items()},
+            "messages": list(self.messages),
+        }
+
+
+def check(
+    config_path: Path, data: Path, out: Path | None, report: Reporter
+) -> tuple[Runs, Content]:
+    """Say what the logs hold, and what they can be expected to tell, before any fit.
+
+    That is the content of check.json, which is written to `out`, if that is wanted.
+    """
+    setup_jax(quiet=True)
+    job = read_job(read_config(config_path), data, report)
+    report.stage("do logs and config go together?")
+    content = overview(job, job.skipped)
+    report.stage("expected information")
+    content |= _expected_if_any(job).to_json()
+    if out is not None:
+        write_json(out / "check.json", content)
+    return job.dataset, content
+
+
+def _expected_if_any(job: Task) -> Expected:
+    """`expected`; nothing where what is wrong with the logs leaves no windows to fit."""
+    try:
+        return expected(job, job.problem())
+    except DataError as error:
+        return Expected({}, {}, (f"nothing can be expected of a fit: {error}",))
+
+
+def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
+    """Findings, runs by floor, load and session, channels, repairs, what was left out."""
+    data = job.dataset
+    groups: dict[tuple[str, str, str], list[int]] = {}
+    for k, log in enumerate(data.logs):
+        groups.setdefault((log.surface or "unknown", log.load, data.session[k]), []).append(k)
+    # the same repair in many files is one line: numbers and names are taken out
+    notes = Counter(note for log in data.logs for note in log.notes)
+    return {
+        "schema": "slipid.check/1",
+        "findings": [finding.to_json() for finding in sanity(job)],
+        "runs": len(data),
+        "groups": [
+            {
+                "surface": surface,
+                "load": load,
+                "session": session,
+                "runs": len(runs),
+                "seconds": round(sum(data.logs[k].duration for k in runs), 1),
+                "headings": len(curves_of.distinct(np.degrees(data.heading[runs]), 1)),
+                "speeds": list(curves_of.distinct(data.speed[runs], 3)),
+            }
+            for (surface, load, session), runs in sorted(groups.items())
+        ],
+        "channels": _channels(data.logs),
+        "clocks": {log.name: _clock(log.pose_clock) for log in data.logs if log.pose_clock},
+        "notes": dict(notes.most_common()),
+        "skipped": list(skipped),
+        "data": {"hash": job.data_hash, "logs": {log.name: log.sha256 for log in data.logs}},
+    }
+
+
+def _clock(clock: Clock) -> Content:
+    """The clock of a run's poses against the robot's; intervals of 90 %."""
+    return {
+        "offset_s": clock.offset,
+        "offset_interval90_s": clock.offset_interval90,
+        "drift": clock.drift,
+        "drift_std": clock.drift_std,
+        "told_by": clock.source,
+    }
+
+
+def _channels(logs: tuple[Log, ...]) -> list[str]:
+    """Channels that logs have, and what is special of them."""
+    said = []
+    for name in _CHANNELS:
+        if count := sum(getattr(log, name) is not None for log in logs):
+            part = "" if count == len(logs) else f" ({count} of {len(logs)} runs)"
+            unsigned = name == "current" and not all(log.current_is_signed for log in logs)
+            said.append(f"{name}{part}{' (unsigned)' if unsigned else ''}")
+    return said
+
+
+def expected(job: Task, problem: Problem) -> Expected:
+    """Verdicts from the expected information, with noise as the runs scatter, if not typical.
+
+    What floors are like is not known yet: of the start values and of every creep that a fit starts
+    from, the one counts for a number at which the runs tell least of it, and for what stays open
+    the one at which they tell least of all.
+    """
+    space, w = problem.space, problem.windows
+    log_v, keep, volt = scatter(problem), np.ones(len(w)), w.has_voltage
+    creep = space.where(lambda e: e.quantity == "surface.creep")
+    parameters: dict[str, Estimate] = {}
+    ratios: dict[str, Estimate] = {}
+    open_: tuple[Flat, ...] = ()
+    most = -np.inf
+    starts = (space.start, *(np.where(creep, np.log(c), space.start) for c in CREEPS))
+    covariances = [problem.laplace(z, log_v, keep) for z in starts]
+    # after them: what it compiles they have traced
+    robot = space.tree(space.start)
+    validity = curves_of.validity(job.dataset, robot, problem.batch)
+    where = w.has_current, volt, validity, robot.geometry.determines_twist
+    for covariance in covariances:
+        flat = flat_directions(space, covariance, *where)
+        found = estimates(space, job.choices, space.start, covariance, volt, members(flat))
+        _least(parameters, found)
+        _least(ratios, derived(space, space.start, covariance, volt))
+        left = float(np.linalg.slogdet(covariance)[1])
+        if left > most:
+            most, open_ = left, flat
+    return Expected(parameters, ratios, sentences(open_))
+
+
+def _least(kept: dict[str, Estimate], found: Iterable[Estimate]) -> None:
+    """Keep of every number the estimate that promises less."""
+    order = ("identified", "weak", "not_identified")
+
+    def promise(e: Estimate) -> tuple[int, float]:
+        return order.index(e.verdict) if e.verdict in order else -1, e.ratio or 0.0
+
+    for e in found:
+        kept[e.path] = max(kept.get(e.path, e), e, key=promise)
+
+
+def _before(e: Estimate) -> Content:
+    kept = {"unit": e.unit, "start": e.value, "expected_std": e.std}
+    return kept | {"ratio": e.ratio, "verdict": e.verdict}

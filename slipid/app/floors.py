@@ -1,0 +1,146 @@
+"""Which floor was under each wheel in logged runs, from a map and a fit that knows the camera."""
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from slipid.app.config import Logs, read_config
+from slipid.app.logs import read_dataset
+from slipid.data.log import Log
+from slipid.data.reading.reader import find_logs
+from slipid.deploy.floors import FloorLookup
+from slipid.infer.fit_file import load
+from slipid.model.robot import Robot
+from slipid.support.errors import DataError
+from slipid.support.files import Content, write_bytes
+from slipid.support.progress import Reporter
+
+SCHEMA = "slipid.floors/1"
+
+
+@dataclass(frozen=True, eq=False)
+class FloorsOfRun:
+    """A run with the floor under each wheel, in the rows in which a pose was read.
+
+    Attributes:
+        name: of the run.
+        time: [s]; pose: of the body in the frame of the map, x, y [m], heading [rad].
+        surface: number of the surface under each wheel.
+        border: distance of each wheel from the nearest other surface [m].
+        inside: whether each wheel is on the map; nothing is known of its floor where it is not.
+    """
+
+    name: str
+    time: Float[np.ndarray, " row"]
+    pose: Float[np.ndarray, "row 3"]
+    surface: Int[np.ndarray, "row wheel"]
+    border: Float[np.ndarray, "row wheel"]
+    inside: Bool[np.ndarray, "row wheel"]
+
+
+def floors_under(
+    out: Path, map_file: Path, data: Path, glob: str | None, report: Reporter
+) -> tuple[FloorLookup, list[FloorsOfRun]]:
+    """Floors under the wheels in runs over a map, by the camera of a fit.
+
+    Args:
+        out: folder that `slipid identify` wrote.
+        map_file: of the floor; its frame is that of the poses.
+        data: folder of the logs.
+        glob: which logs below it; by default those that the config of the fit names with a map.
+
+    Raises:
+        DataError: no fit, no map, no logs, or logs without poses.
+    """
+    fit = load(out)
+    lookup = FloorLookup.read(map_file)
+    config = read_config(out / "config.toml")
+    named = config.content.logs
+    sections = [section for section in named if section.map is not None]
+    if glob is not None:
+        find_logs(data, glob)
+        sections = [Logs(glob=glob, format=named[0].format, map=str(map_file), load=named[0].load)]
+    if not sections:
+        raise DataError(
+            f"{out / 'config.toml'}: no [[logs]] with a map; expected --logs GLOB for runs over it"
+        )
+    report.stage("reading logs")
+    runs, skipped = read_dataset(config, sections, data, report)
+    for sentence in skipped:
+        report.line(sentence)
+    report.stage("looking up floors")
+    sessions = zip(runs.logs, runs.session, strict=True)
+    found = [_of_run(fit.robot, lookup, log, session) for log, session in sessions]
+    if not any(run.inside.any() for run in found):
+        x, y = np.concatenate([run.pose for run in found])[0, :2]
+        raise DataError(
+            f"{map_file}: no wheel of any run is on this map (the first stands at x {x:.2f} m, "
+            f"y {y:.2f} m); expected a map in the frame of the poses"
+        )
+    return lookup, found
+
+
+def _of_run(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> FloorsOfRun:
+    if log.pose is None or log.pose_fresh is None:
+        raise DataError(f"{log.name}: no pose; expected poses in the frame of the map")
+    rows = np.flatnonzero(log.pose_fresh)
+    pose = jax.vmap(robot.camera.corrected)(jnp.asarray(log.pose[rows]))
+    pose = pose.at[:, 2].add(-robot.camera.yaw(robot.session_index(session)))
+    wheels = (
+        jnp.asarray(robot.geometry.place) * robot.geometry.base_radius - robot.camera.marker_place
+    )
+    found = lookup.under(pose, wheels)
+    return FloorsOfRun(
+        log.name,
+        log.time[rows],
+        np.asarray(pose),
+        np.asarray(found.surface),
+        np.asarray(found.border),
+        np.asarray(found.inside),
+    )
+
+
+def write_floors(folder: Path, lookup: FloorLookup, runs: list[FloorsOfRun]) -> list[Path]:
+    """A CSV file for each run: time, pose, and of every wheel floor and distance to the border."""
+    paths = []
+    for run in runs:
+        wheels = run.surface.shape[1]
+        text = io.StringIO()
+        names = [f"floor_{k + 1}" for k in range(wheels)] + [
+            f"border_{k + 1}" for k in range(wheels)
+        ]
+        text.write(",".join(["time", "x", "y", "heading", *names]) + "\n")
+        for k in range(len(run.time)):
+            numbers = [f"{v:.5f}" for v in (run.time[k], *run.pose[k])]
+            there = run.inside[k]
+            floors = [
+                lookup.surfaces[s] if i else "" for s, i in zip(run.surface[k], there, strict=True)
+            ]
+            known = np.isfinite(run.border[k]) & there
+            borders = [f"{v:.4f}" if i else "" for v, i in zip(run.border[k], known, strict=True)]
+            text.write(",".join([*numbers, *floors, *borders]) + "\n")
+        path = folder / Path(run.name.replace("#", "_")).with_suffix(".csv")
+        write_bytes(path, text.getvalue().encode())
+        paths.append(path)
+    return paths
+
+
+def summary(lookup: FloorLookup, runs: list[FloorsOfRun]) -> Content:
+    """How much of each run every floor was under every wheel."""
+    return {
+        "schema": SCHEMA,
+        "surfaces": list(lookup.surfaces),
+        "beyond_the_map": float(np.mean([1.0 - run.inside.mean() for run in runs])),
+        "runs": {
+            run.name: {
+                name: np.round(((run.surface == number) & run.inside).mean(axis=0), 4).tolist()
+                for number, name in enumerate(lookup.surfaces)
+            }
+            for run in runs
+        },
+    }

@@ -1,0 +1,126 @@
+"""The logs that a config names, read into one data set.
+
+What ships with slipid beside its code: configs, and recorded logs of the virtual test site.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from zipfile import ZipFile
+
+from slipid.app.config import Config, Logs
+from slipid.data.log import Log
+from slipid.data.reading.bag.layout import declared_bag_layout
+from slipid.data.reading.presets import PRESETS, declared_layout, preset
+from slipid.data.reading.reader import AnyLayout, find_logs, read_logs, session_of, without_beside
+from slipid.data.runs import Runs, collect, counted_once
+from slipid.support.errors import DataError, near
+from slipid.support.files import write_bytes
+from slipid.support.progress import Reporter
+
+
+def read_dataset(
+    config: Config, sections: Sequence[Logs], root: Path, report: Reporter
+) -> tuple[Runs, list[str]]:
+    """Runs of some log sections, and a line for each section without files."""
+    if not root.is_dir():
+        raise DataError(f"{root}: no such folder; expected the folder of the logs (--data)")
+    found, skipped = files_of(config, sections, root)
+    if not found:
+        raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
+    count = sum(len(paths) for _, paths in found)
+    logs: list[Log] = []
+    aside: list[str] = []
+    sessions: dict[str, str] = {}
+    done = short = 0
+    for section, paths in found:
+        layout = layout_of(config, section)
+        surface = None if section.map is not None else section.surface
+        for path in paths:
+            found_there = read_logs(path, layout, root, surface, section.load)
+            aside += found_there.aside
+            for log in found_there.logs:
+                if log.samples < section.min_rows:
+                    short += 1
+                    continue
+                if log.name in sessions:
+                    raise DataError(
+                        f"{log.name}: found by two globs of {config.path}; expected it once"
+                    )
+                named = section.session_name
+                sessions[log.name] = named or session_of(log, section.session)
+                logs.append(log)
+            done += 1
+            report.advance(done, count)
+    if short:
+        skipped.append(f"skipped: {short} runs shorter than their min_rows")
+    if not logs:
+        raise DataError("\n".join([*aside, *skipped]) or f"{root}: no run in any file")
+    return collect(counted_once(logs), list(sessions.values()), aside), [*skipped, *aside]
+
+
+def files_of(
+    config: Config, sections: Sequence[Logs], root: Path
+) -> tuple[list[tuple[Logs, list[Path]]], list[str]]:
+    """Files of every log section that has some, and a line for each that has none."""
+    found: list[tuple[Logs, list[Path]]] = []
+    skipped: list[str] = []
+    for section in sections:
+        try:
+            found.append((section, find_logs(root, section.glob)))
+        except DataError as error:
+            skipped.append(f"skipped: {error}")
+        except (ValueError, NotImplementedError) as error:
+            raise DataError(f"{config.path}: logs.glob '{section.glob}': {error}") from error
+    own = [(one, without_beside(paths, layout_of(config, one))) for one, paths in found]
+    return own, skipped
+
+
+def layout_of(config: Config, section: Logs) -> AnyLayout:
+    """Layout a log section names: one of the config's own, else a preset."""
+    own = config.content.layouts
+    if section.format in own:
+        where, declared = f"{config.path} layouts.{section.format}", own[section.format]
+        kind = declared.get("kind", "rows")
+        if kind == "bag":
+            return declared_bag_layout(declared, where, config.path.parent)
+        if kind != "rows":
+            raise DataError(f"{where}.kind: {kind!r}; expected 'rows' (CSV, Parquet) or 'bag'")
+        return declared_layout({k: v for k, v in declared.items() if k != "kind"}, where)
+    if section.format not in PRESETS:
+        names = [*own, *PRESETS]
+        hint = near(section.format, names)
+        raise DataError(
+            f"{config.path}: logs.format '{section.format}': no such layout{hint}; "
+            f"expected one of {', '.join(names)}"
+        )
+    return preset(section.format)
+
+
+RECORDED = Path(__file__).with_name("recorded.zip")
+"""Logs of the test site that ship with slipid."""
+
+
+def packaged_path(name: str) -> Path:
+    """Path of a config that ships with slipid, or of a file below it."""
+    package = Path(__file__).parents[1]
+    # beside the package in a clone, inside it in an installation
+    for folder in (package / "configs", package.parent / "configs"):
+        if (folder / name).is_file():
+            return folder / name
+    raise FileNotFoundError(f"{name} is missing from this installation of slipid")
+
+
+def packaged_config(name: str) -> str:
+    """Text of a config that ships with slipid."""
+    return packaged_path(name).read_text(encoding="utf-8")
+
+
+def unpack(out: Path) -> None:
+    """Write the recorded logs, their truth and nothing else below a folder."""
+    try:
+        archive = ZipFile(RECORDED)
+    except OSError as error:
+        raise DataError(f"{RECORDED}: {error.strerror}; expected the recorded logs") from error
+    with archive:
+        for name in archive.namelist():
+            write_bytes(out / name, archive.read(name))

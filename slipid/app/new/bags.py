@@ -1,0 +1,231 @@
+"""A bag looked into: which topics hold what, proposed as a layout."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from slipid.app.new.config_lines import ConfigLine, toml
+from slipid.app.new.file_channels import common_glob, floor_of, rank
+from slipid.app.new.robot import robot_from
+from slipid.app.new.robot_questions import RobotAnswers, RobotOptions
+from slipid.app.new.sketch import BagSketch, ConfigProposal, LogsSketch, Sketch
+from slipid.app.reference.parameters import in_short, meanings
+from slipid.data.reading.bag.layout import BagLayout
+from slipid.data.reading.bag.topics import Topic, topics_of
+from slipid.data.reading.column_names import meaning_of
+from slipid.data.reading.layout import CHANNELS, PER_WHEEL, Layout
+
+SUFFIXES = (".bag", ".db3", ".mcap")
+_METADATA = "metadata.yaml"
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_TURNS = ("wheel_ticks", "wheel_angle", "wheel_speed", "motor_speed")
+_EFFORT = (
+    "what is the effort: a current (A), a torque (motor_torque or wheel_torque, N*m), a voltage "
+    "(V) or a duty (1)?"
+)
+
+
+_BY_NAME = ("current", "voltage", "duty")
+"""Channels that are looked for in messages of unknown types, by what their fields are called."""
+
+
+@dataclass(frozen=True)
+class _Served:
+    """A channel, or a group of them, that a topic holds; `wheels` where it has one per wheel.
+
+    `field` and `unit` where the type of the messages does not tell them.
+    """
+
+    channel: str
+    topic: Topic
+    wheels: int = 0
+    question: str = ""
+    field: str = ""
+    unit: str = ""
+
+
+def bags_in(path: Path) -> list[Path]:
+    """Files that a config names for bags: of a path itself, or below it.
+
+    That is the metadata.yaml of a rosbag2 folder, whose other files belong to it.
+    """
+    if path.is_file():
+        return [path] if path.suffix in SUFFIXES or path.name == _METADATA else []
+    folders = {p.parent for p in path.rglob(_METADATA)}
+    alone = (p for p in path.rglob("*") if p.suffix in SUFFIXES and p.parent not in folders)
+    return sorted([*(folder / _METADATA for folder in folders), *alone])
+
+
+def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> ConfigProposal:
+    """The config that bags are proposed to have, by the first; DataError where it is unreadable.
+
+    Args:
+        bags: as of `bags_in`; path: of the log or folder that was named.
+        options: what is known of the robot.
+    """
+    bag = bags[0]
+    topics = topics_of(bag)
+    joints, doubt = _joints(topics)
+    served = list(_first_of_each(topics, len(joints)))
+    wheels = next((one.wheels for name in _TURNS for one in served if one.channel == name), 0)
+    served += _by_field_names(topics, served, wheels)
+    guessed = robot_from(options, wheels, ())
+    questions = [doubt] if doubt else []
+    if not any(one.channel == "pose" for one in served):
+        questions.append("no topic with a pose was found: a fit needs one")
+    if not wheels:
+        questions.append("no topic tells how wheels turn: which one does, and in which field?")
+    is_bag = path.is_file() or bag == path / _METADATA
+    root = path.parent if is_bag else path
+    inside = [PurePosixPath(one.relative_to(root)) for one in bags]
+    inside = [one for one in inside if len(one.parts) == len(inside[0].parts)]
+    layout = BagSketch(
+        "mine",
+        _settings(guessed.robot, joints, served),
+        tuple(_lines(served)),
+        _unused(topics, served),
+        tuple(questions),
+    )
+    floor = "on which floor was it driven? Or a topic or table tells: runs, in the layout"
+    glob = common_glob(inside)
+    sketch = Sketch(
+        guessed.robot,
+        (),
+        (LogsSketch(glob, "mine", floor_of(glob), question=floor),),
+        carries=frozenset(one.channel for one in served if one.question != _EFFORT),
+        above=(f"Proposed from {bag}.",),
+        data=str(root),
+        hints=guessed.hints,
+        bags=(layout,),
+    )
+    sentences = [f"{bag}: {len(topics)} topics"]
+    sentences += [f"  {one.topic.name} ({one.topic.type}): {one.channel}" for one in served]
+    return ConfigProposal(sketch, tuple(sentences))
+
+
+def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
+    """Names of the wheels' joints in the order of the drives, and what is not sure of them."""
+    names = tuple(dict.fromkeys(name for topic in topics for name in topic.joints))
+    labels = {name: meaning_of(f"{name}_velocity") for name in names}
+    wheels = [
+        name for name in names if labels[name].channel == "wheel_speed" and labels[name].label
+    ]
+    if not names:
+        return (), ""
+    if not wheels:
+        return names, f"which of the joints are wheels, in which order? {', '.join(names)}"
+    ordered = tuple(sorted(wheels, key=lambda name: rank(labels[name].label)))
+    others = [name for name in names if name not in wheels]
+    doubt = f"joints that are taken for no wheels: {', '.join(others)}" if others else ""
+    return ordered, doubt
+
+
+def _first_of_each(topics: Sequence[Topic], joints: int) -> Iterator[_Served]:
+    """The best topic for every channel: poses that are no odometry come before those that are."""
+    order = sorted(topics, key=lambda t: (t.type == _ODOMETRY, t.type == _TRANSFORMS, t.name))
+    taken: set[str] = set()
+    for topic in order:
+        for channel in topic.serves:
+            if channel in taken or not topic.count:
+                continue
+            taken.add(channel)
+            wheels = joints if topic.joints else _count(topic) if channel in PER_WHEEL else 0
+            yield _Served(channel, topic, wheels, _doubt(channel, topic))
+        if any(f.path == "effort" and f.count for f in topic.fields) and "current" not in taken:
+            taken.add("current")
+            yield _Served("current", topic, joints, _EFFORT)
+
+
+def _by_field_names(
+    topics: Sequence[Topic], served: Sequence[_Served], wheels: int
+) -> Iterator[_Served]:
+    """Channels in messages of unknown types: numbers of every wheel in a field of that name."""
+    taken = {one.channel for one in served}
+    for topic in (one for one in topics if one.count and not one.serves and not one.joints):
+        for field in topic.fields:
+            meaning = meaning_of(f"wheel {field.path.replace('.', ' ')}")
+            if meaning.channel not in _BY_NAME or meaning.channel in taken:
+                continue
+            if field.count != wheels or field.type.startswith("text"):
+                continue
+            taken.add(meaning.channel)
+            unit = meaning.unit or CHANNELS[meaning.channel]
+            ask = f"by the name of the field: is it that, in {unit}, in the order of the joints?"
+            yield _Served(meaning.channel, topic, wheels, ask, field.path, unit)
+
+
+def _count(topic: Topic) -> int:
+    """How many wheels a message has numbers of."""
+    return max((field.count for field in topic.fields if field.type.endswith("[]")), default=1)
+
+
+def _doubt(channel: str, topic: Topic) -> str:
+    if channel != "pose":
+        return ""
+    if topic.type == _ODOMETRY:
+        return (
+            "is this pose from a camera, lidar or motion capture? Odometry of wheels is of no use"
+        )
+    if topic.type == _TRANSFORMS:
+        return f"which frame and which child? There are: {'; '.join(topic.frames)}"
+    return ""
+
+
+def _lines(served: Sequence[_Served]) -> Iterator[ConfigLine]:
+    """A line for each channel."""
+    for one in served:
+        inside = f"topic = {toml(one.topic.name)}"
+        off = one.question == _EFFORT
+        if off:
+            inside += ', field = "effort", unit = "A"'
+        elif one.field:
+            inside += f", field = {toml(one.field)}, unit = {toml(one.unit)}"
+        if one.topic.type == _TRANSFORMS and one.topic.frames:
+            frame, _, child = one.topic.frames[0].partition(" -> ")
+            inside += f", frame = {toml(frame)}, child = {toml(child)}"
+        yield ConfigLine(one.channel, f"{{ {inside} }}", _rate(one.topic), one.question, off)
+
+
+def _rate(topic: Topic) -> str:
+    if topic.first is None or topic.last is None or topic.count < 2 or topic.last <= topic.first:
+        return topic.type
+    return f"{topic.type}, {(topic.count - 1) / (topic.last - topic.first):.3g} Hz"
+
+
+def _settings(
+    robot: RobotAnswers, joints: tuple[str, ...], served: Sequence[_Served]
+) -> tuple[ConfigLine, ...]:
+    """Keys of the layout but for its topics."""
+
+    def line(key: str, value: object, question: str = "") -> ConfigLine:
+        kind = BagLayout if key in meanings(BagLayout) else Layout
+        return ConfigLine(key, toml(value), in_short(kind, key), question)
+
+    lines = [ConfigLine("kind", toml("bag"))]
+    have = {one.channel for one in served}
+    lines += [line("joints", list(joints))] if joints else []
+    if "wheel_ticks" in have:
+        ask = ""
+        if "ticks_per_revolution" in robot.taken:
+            ask = "how many, of the motor shaft, all edges counted?"
+        lines.append(line("ticks_per_revolution", robot.ticks_per_revolution or 1000.0, ask))
+    lines.append(ConfigLine("gear_ratio", toml(robot.gear_ratio), "as above"))
+    if "current" in have:
+        ask = "do currents have a sign, or are they magnitudes?"
+        lines.append(ConfigLine("current_is_signed", "true", "false for magnitudes", ask))
+    return tuple(lines)
+
+
+def _unused(topics: Sequence[Topic], served: Sequence[_Served]) -> tuple[str, ...]:
+    """Other topics, with what their messages hold."""
+    used = {one.topic.name for one in served}
+    others = [topic for topic in topics if topic.name not in used and topic.count]
+    return tuple(f"Not used: {topic.name} ({topic.type}){_holds(topic)}" for topic in others)
+
+
+def _holds(topic: Topic) -> str:
+    if topic.problem:
+        return f": {topic.problem}"
+    paths = [field.path for field in topic.fields if not field.path.startswith("header")]
+    return f" has {', '.join(paths[:8])}" if paths else ""

@@ -1,0 +1,255 @@
+"""Lines of a config that people read: keys with what they mean, and questions that are open.
+
+A robot as it was understood, drawn in text: wrong orders and frames are seen at once.
+"""
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slipid.model.geometry import Geometry
+
+ASKS = "# ? "
+"""What the line of an open question begins with."""
+_COLUMN = 38
+"""Where comments begin, if the line leaves room."""
+_WIDTH = 98
+Value = str | bool | int | float | list[int] | list[float] | list[str] | list[list[int]] | object
+
+
+@dataclass(frozen=True)
+class ConfigLine:
+    """One key of a config.
+
+    Attributes:
+        key: its name; value: as TOML.
+        comment: what it means.
+        question: what the reader is to fill in here; nothing where all is known.
+        off: whether it is commented out.
+    """
+
+    key: str
+    value: str
+    comment: str = ""
+    question: str = ""
+    off: bool = False
+
+    def text(self) -> str:
+        """The line, below its question."""
+        asked = _asked(self.question)
+        line = f"{'# ' if self.off else ''}{self.key} = {self.value}"
+        if not self.comment:
+            return asked + line
+        if len(line) < _COLUMN:
+            line = line.ljust(_COLUMN - 1)
+        elif len(line) + len(self.comment) + 3 > _WIDTH + 4:
+            above = "".join(f"# {part}\n" for part in wrapped(self.comment, _WIDTH - 2))
+            return asked + above + line
+        return f"{asked}{line} # {self.comment}"
+
+
+@dataclass(frozen=True)
+class ConfigBlock:
+    """A table of a config: its header, comments above it, its keys, comments at its end."""
+
+    header: str
+    lines: tuple[ConfigLine, ...] = ()
+    above: tuple[str, ...] = ()
+    below: tuple[str, ...] = ()
+    questions: tuple[str, ...] = ()
+
+    def text(self) -> str:
+        """Its part of the file."""
+        out = [f"# {part}".rstrip() for text in self.above for part in wrapped(text, _WIDTH - 2)]
+        out += [_asked(question).rstrip("\n") for question in self.questions]
+        out += [self.header] if self.header else []
+        out += [line.text() for line in self.lines]
+        out += [f"# {part}".rstrip() for text in self.below for part in wrapped(text, _WIDTH - 2)]
+        return "\n".join(out)
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """Every question in it."""
+        lines = (f"{line.key}: {line.question}" for line in self.lines if line.question)
+        return (*self.questions, *lines)
+
+
+def toml(value: Value) -> str:
+    """A plain value as inline TOML; whole floats as people write them."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return f"{value:.10g}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(toml(one) for one in value) + "]"
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _asked(question: str) -> str:
+    """A question as comment lines, the first of which begins with `ASKS`."""
+    if not question:
+        return ""
+    first, *others = wrapped(question, _WIDTH - len(ASKS))
+    return "".join([f"{ASKS}{first}\n", *(f"#   {part}\n" for part in others)])
+
+
+def wrapped(text: str, width: int) -> list[str]:
+    """Text in lines of at most so many characters; line breaks and drawings stay."""
+    out: list[str] = []
+    for line in text.splitlines() or [""]:
+        if len(line) <= width:
+            out.append(line)
+            continue
+        here = ""
+        for word in line.split(" "):
+            if here and len(here) + 1 + len(word) > width:
+                out.append(here)
+                here = word
+            else:
+                here = f"{here} {word}" if here else word
+        out.append(here)
+    return out
+
+
+def all_asked(blocks: Iterable[ConfigBlock]) -> tuple[str, ...]:
+    """Every open question of a config, in its order."""
+    return tuple(question for block in blocks for question in block.asked)
+
+
+_ARROWS = "↑↖←↙↓↘→↗"
+"""Directions from ahead (up) counter-clockwise, an eighth of a turn apart."""
+_LINES = r"|\-/"
+"""Lines along ahead (up), ahead left, left and back left."""
+_ROWS, _COLUMNS, _LEAST = 5, 13, 3
+"""Rows ahead of the middle and columns left of it that the furthest wheel may use; rows at least
+on either side."""
+_MARGIN = 12
+"""Columns beyond the wheels, for the axis to the left and the labels."""
+_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+LABEL = 3
+"""Characters of a wheel: its number, its arrow, the letter of a drive that it shares."""
+
+
+@dataclass(frozen=True)
+class _Wheel:
+    """A wheel as it is drawn: row 0 is the middle, rows count down, columns to the right."""
+
+    row: int
+    column: int
+    label: str
+
+
+def drawing(robot: Geometry) -> str:
+    """The robot from above, x ahead up and y left, and a line for every wheel.
+
+    A wheel is its number in the order of the columns of the logs, an arrow the way it rolls when
+    its speed is positive, and a letter the motor that it shares with others.
+    """
+    lines = ["seen from above, arrows: the way of a positive wheel speed", ""]
+    lines += _picture(_placed(robot))
+    lines += ["", *(_said(robot, wheel) for wheel in range(robot.wheels)), *_shared(robot)]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def direction(degrees: float) -> str:
+    """A direction in words, counter-clockwise from ahead."""
+    names = ("ahead", "ahead left", "left", "back left", "back", "back right", "right")
+    return (*names, "ahead right")[round(degrees / 45) % 8]
+
+
+def _placed(robot: Geometry) -> list[_Wheel]:
+    """Wheels on a grid whose rows are twice as far apart as its columns, none on another."""
+    place = np.asarray(robot.place) * float(robot.base_radius)
+    # a character is about twice as high as it is wide
+    step = max(np.abs(place[:, 0]).max() / _ROWS, np.abs(place[:, 1]).max() / (_COLUMNS / 2), 1e-9)
+    taken: set[tuple[int, int]] = {(0, 0)}
+    wheels = []
+    for k, (x, y) in enumerate(place.tolist()):
+        row, column = -round(x / step), -round(2 * y / step)
+        while any((row, column + d) in taken for d in range(-LABEL, LABEL + 1)):
+            row += 1
+        taken.add((row, column))
+        wheels.append(_Wheel(row, column, _label(robot, k)))
+    return wheels
+
+
+def _label(robot: Geometry, wheel: int) -> str:
+    arrow = _ARROWS[round(math.degrees(robot.drive_angle[wheel]) / 45) % 8]
+    return f"{wheel + 1}{arrow}{_letter(robot, wheel)}"
+
+
+def _letter(robot: Geometry, wheel: int) -> str:
+    """Letter of the motor that a wheel shares; nothing where it has its own."""
+    if not robot.drive_of or robot.drive_of.count(robot.drive_of[wheel]) == 1:
+        return ""
+    return _LETTERS[robot.drive_of[wheel] % len(_LETTERS)]
+
+
+def _picture(wheels: list[_Wheel]) -> list[str]:
+    top = min(-_LEAST, *(w.row for w in wheels)) - 1
+    bottom = max(0, *(w.row for w in wheels))
+    width = max(_COLUMNS, *(abs(w.column) for w in wheels)) + _MARGIN
+    canvas = [[" "] * (2 * width) for _ in range(bottom - top + 1)]
+
+    def put(row: int, column: int, text: str) -> None:
+        canvas[row - top][width + column : width + column + len(text)] = text
+
+    for row in range(top + 1, 0):
+        put(row, 0, "|")
+    put(top, 0, "^ x")
+    left = min(w.column for w in wheels) - 6 if any(w.row == 0 for w in wheels) else -8
+    for column in range(left, 0):
+        put(0, column, "-")
+    put(0, left - 3, "y <")
+    put(0, 0, "+")
+    for w in wheels:
+        put(w.row, w.column - 1, w.label)
+    rows = ["".join(row).rstrip() for row in canvas]
+    blank = min(len(row) - len(row.lstrip()) for row in rows if row)
+    return [f"    {row[blank:]}" if row else "" for row in rows]
+
+
+def _said(robot: Geometry, wheel: int) -> str:
+    """Where a wheel stands and what it does, in a line."""
+    x, y = (float(robot.base_radius) * c for c in robot.place[wheel])
+    degrees = math.degrees(robot.drive_angle[wheel]) % 360
+    way = f"drives {direction(degrees)}" + (f" ({degrees:.0f} deg)" if degrees % 90 else "")
+    if robot.grips[wheel]:
+        rollers = "no rollers"
+    else:
+        rollers = f"rollers at {math.degrees(robot.roller_angle[wheel]):.0f} deg"
+        rollers += _tilt(degrees, math.degrees(robot.roller_angle[wheel]))
+    at = f"{_corner(x, y):<12} x = {x:+.3f} m, y = {y:+.3f} m"
+    return f"wheel {wheel + 1}: {at}, {way}, {rollers}"
+
+
+def _tilt(drive: float, roller: float) -> str:
+    """How rollers on top of a wheel lie as one looks down at it, where they are tilted."""
+    if abs(roller % 180 - 90) < 1:
+        return ""
+    # on top they lie as a mirror shows those that touch the floor, whose axes are across `free`
+    return f", from above {_LINES[round((drive + roller - 90) / 45) % 4]}"
+
+
+def _corner(x: float, y: float) -> str:
+    """Which part of the robot a place is in."""
+    far = 0.2 * math.hypot(x, y)
+    along = "front" if x > far else "rear" if x < -far else ""
+    return f"{along} {'left' if y > far else 'right' if y < -far else ''}".strip()
+
+
+def _shared(robot: Geometry) -> list[str]:
+    """Which columns of the logs belong to which wheels, where they are not one for each."""
+    if not robot.drive_of:
+        return []
+    out = []
+    for drive in range(robot.drives):
+        wheels = [str(k + 1) for k, d in enumerate(robot.drive_of) if d == drive]
+        first = robot.drive_of.index(drive)
+        letter = f"motor {_letter(robot, first)}".rstrip() + ", "
+        plural = "s" if len(wheels) > 1 else ""
+        out.append(f"{letter}column {drive + 1} of the logs: wheel{plural} {' and '.join(wheels)}")
+    return out

@@ -1,0 +1,267 @@
+"""The text of a new config: every key explained, and read back before it is written."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from slipid.app.config import FitSection, Logs, Wheels, geometry, parsed
+from slipid.app.new.config_lines import ConfigBlock, ConfigLine, all_asked, drawing, toml
+from slipid.app.new.robot_questions import robot_of
+from slipid.app.new.sketch import BagSketch, FileSketch, LayoutSketch, LogsSketch, Sketch
+from slipid.app.reference.parameters import in_short
+from slipid.support.errors import DataError
+from slipid.support.files import write_bytes
+
+_ORDER = {
+    "omni": "each wheel drives 90 deg further than it stands",
+    "mecanum": "wheels: front left, front right, rear left, rear right",
+    "skid": "wheels: front left, front right, rear left, rear right",
+    "differential": "wheels: left, right",
+    "general": "any wheels",
+}
+_ASKED = {
+    "wheel_azimuths_deg": "azimuths_deg",
+    "half_length_m": "wheelbase_m",
+    "half_width_m": "track_m",
+    "wheel_places_m": "places_m",
+    "drive_directions_deg": "directions_deg",
+    "roller_angles_deg": "rollers_deg",
+    "drives": "shared",
+}
+"""Which answer a key of `[robot]` is made of, where it is not called the same."""
+_MEASURE = "taken by default: measure it, or look it up"
+_WHERE = "taken by default: where do the wheels stand, in the order of the columns?"
+_PUT = {
+    "drive": "which drive is it: omni, mecanum, skid, differential or general?",
+    "wheel_azimuths_deg": _WHERE,
+    "wheel_places_m": _WHERE,
+    "drive_directions_deg": "taken by default: which way does each wheel roll?",
+    "roller_angles_deg": "taken by default: do the wheels have rollers, and how are they tilted?",
+    "gear_ratio": "taken by default: is there a gear, and are speeds and ticks of the motor?",
+    "mass_kg": "taken by default: weigh the robot",
+    "wheel_radius_m": _MEASURE,
+}
+_DATASHEET = (
+    "without the voltages of the motors this and the next stay what is written: what are they, by "
+    "the datasheet?"
+)
+FRAME = "x ahead, y left, angles counter-clockwise from ahead; wheels in the order of the columns"
+_LENGTHS = (
+    '"poses" of motion capture, lidar or RTK, which make the wheel radius free; or "wheels" that '
+    "were measured, which make the scale of the camera free:"
+)
+_UNITS = (
+    "Which column of your files holds what, in which unit. Time: s, ms, us or ns, since the start "
+    "or since 1970. Others: rad, deg, rev, rad/s, rpm, tick, m, mm, A, mA, V, percent and so on.",
+    "Take out what you do not log. To be fitted a run needs time, the motion of the wheels and the "
+    "pose; currents tell friction, voltages (or duty and bus_voltage) the motor's constants.",
+)
+_ELSE = (
+    'With a quaternion: pose_quaternion = { columns = ["qx", "qy", "qz", "qw"], unit = "1" }',
+    'Effort of a JointState: current (unit "A"), or motor_torque or wheel_torque (unit "N*m"), for '
+    "which the layout needs torque_constant [N m/A]. Sensors may be slower than the rows: leave "
+    "cells empty, or repeat the last value.",
+)
+_BESIDE = (
+    "More files of the same run, each with its own rows, beside the first one:",
+    '[layouts.mine.beside."mocap.csv"]    # or "{stem}_pose.csv"; keys as above',
+    '[layouts.mine.beside."mocap.csv".columns]',
+    'time = { column = "stamp", unit = "ns" }',
+)
+
+
+def blocks_of(sketch: Sketch, robot: Wheels, picture: str, name: str) -> list[ConfigBlock]:
+    """Every part of a config.
+
+    Args:
+        sketch: what it shall say.
+        robot: made of its answers; picture: of that robot.
+        name: what the file will be called.
+    """
+    return [
+        ConfigBlock("", above=_head(sketch, name)),
+        _robot_block(sketch, robot, picture),
+        *(block for layout in sketch.layouts for block in _layout_blocks(layout)),
+        *(block for bag in sketch.bags for block in _bag_blocks(bag)),
+        *(_logs_block(logs, first=k == 0) for k, logs in enumerate(sketch.logs)),
+        _fit_block(),
+        _weights_block(geometry(robot).wheels),
+        _parameters_block(sketch.channels),
+    ]
+
+
+def _head(sketch: Sketch, name: str) -> tuple[str, ...]:
+    return (
+        *sketch.above,
+        f"  slipid check {name} --data {sketch.data}",
+        f"  slipid identify {name} --data {sketch.data} --out OUT",
+        "Every number is SI or has its unit in the name of its key. `slipid reference` explains "
+        'all keys, channels, units and parameters. A line that begins with "# ?" is to be '
+        "answered, and then taken out.",
+    )
+
+
+def _robot_block(sketch: Sketch, robot: Wheels, picture: str) -> ConfigBlock:
+    """`[robot]` with the drawing in front of it."""
+    lines = [ConfigLine("drive", toml(robot.drive), _ORDER[robot.drive], _open(sketch, "drive"))]
+    given = robot.model_dump(exclude_none=True, exclude={"drive"}, exclude_defaults=False)
+    own = {key: value for key, value in given.items() if _worth_saying(robot, key, value)}
+    # what the drive is made of comes first, what all robots have after it
+    common = ("wheel_radius_m", "gear_ratio", "mass_kg")
+    for key in (*(k for k in own if k not in common), *common):
+        comment = in_short(type(robot), key)
+        lines.append(ConfigLine(key, toml(own[key]), comment, _open(sketch, key)))
+    return ConfigBlock("[robot]", tuple(lines), above=(*picture.splitlines(), "", FRAME))
+
+
+def _worth_saying(robot: Wheels, key: str, value: object) -> bool:
+    """Ordinary omni wheels need no word about their rollers, whose angle has a default."""
+    return key not in ("roller_angle_deg",) or value != type(robot).model_fields[key].default
+
+
+def _open(sketch: Sketch, key: str) -> str:
+    """The question about a key that nobody answered."""
+    if _ASKED.get(key, key) not in sketch.robot.taken or key == "drives":
+        return ""
+    hints = (hint.asks for hint in sketch.hints if hint.key == key and hint.asks)
+    return next(hints, _PUT.get(key, _MEASURE))
+
+
+def _layout_blocks(layout: LayoutSketch) -> list[ConfigBlock]:
+    """A layout with its columns, and those of the files beside."""
+    where = f"layouts.{layout.name}"
+    below = (*_ELSE, *_BESIDE) if layout.examples else ()
+    blocks = _file_blocks(where, layout.file, _UNITS, below)
+    for one in layout.beside:
+        above = (f"Of the same run, in {one.pattern}:",)
+        blocks += _file_blocks(f"{where}.beside.{toml(one.pattern)}", one, above)
+    return blocks
+
+
+def _file_blocks(
+    where: str, file: FileSketch, above: tuple[str, ...], below: tuple[str, ...] = ()
+) -> list[ConfigBlock]:
+    columns = tuple(channel.line() for channel in file.channels)
+    return [
+        ConfigBlock(f"[{where}]", file.lines(), above=above, questions=file.questions),
+        ConfigBlock(f"[{where}.columns]", columns, above=file.above, below=below),
+    ]
+
+
+def _bag_blocks(bag: BagSketch) -> list[ConfigBlock]:
+    """A layout of bags with its topics."""
+    above = (
+        "Which topic holds what. Known types of messages need neither field nor unit; the frame of "
+        "a pose in /tf and what the effort of joints is must be said.",
+    )
+    return [
+        ConfigBlock(f"[layouts.{bag.name}]", bag.settings, above=above, questions=bag.questions),
+        ConfigBlock(f"[layouts.{bag.name}.topics]", bag.topics, above=bag.above),
+    ]
+
+
+def _logs_block(logs: LogsSketch, first: bool) -> ConfigBlock:
+    """A section of logs; the first one explains its keys."""
+
+    def line(key: str, value: str, off: bool = False) -> ConfigLine:
+        return ConfigLine(key, toml(value), in_short(Logs, key) if first else "", off=off)
+
+    surface = in_short(Logs, "surface") + '; "folder": the folder names it'
+    lines = [
+        line("glob", logs.glob, logs.off),
+        line("format", logs.format, logs.off),
+        ConfigLine(
+            "surface", toml(logs.surface), surface if first else "", logs.question, logs.off
+        ),
+        line("load", "as_built", logs.off),
+    ]
+    if logs.session:
+        lines.append(line("session", logs.session, logs.off))
+    if first:
+        lines.append(line("map", "maps/site.toml", off=True))
+    above = logs.above or (("One section per set of logs.",) if first else ())
+    return ConfigBlock("# [[logs]]" if logs.off else "[[logs]]", tuple(lines), above=above)
+
+
+def _fit_block() -> ConfigBlock:
+    """Whether poses are in true metres, which logs do not tell."""
+    above = (
+        f"Of lengths, {in_short(FitSection, 'lengths_from')}? " + _LENGTHS,
+        "[fit]",
+    )
+    return ConfigBlock("", (ConfigLine("lengths_from", toml("poses"), off=True),), above=above)
+
+
+def _weights_block(wheels: int) -> ConfigBlock:
+    kg = toml([round(10.0 / wheels, 1)] * wheels)
+    lines = (
+        ConfigLine("kg", kg, "in the order of the wheels", off=True),
+        ConfigLine("std_kg", "0.05", "standard deviation of each scale", off=True),
+    )
+    above = ("What scales show under each wheel, if you weighed the robot:", "[weights.as_built]")
+    return ConfigBlock("", lines, above=above)
+
+
+def _parameters_block(channels: frozenset[str]) -> ConfigBlock:
+    """What is known of the parameters before, of those that these logs can tell."""
+    current = channels & {"current", "motor_torque", "wheel_torque"}
+    voltage = "voltage" in channels or {"duty", "bus_voltage"} <= channels
+    yaw = '"camera.marker_yaw"'
+    lines = [
+        ConfigLine(yaw, "{ free = true }", "marker's heading less the robot's [rad]"),
+    ]
+    if current:
+        ask = "" if voltage else _DATASHEET
+        resistance, emf = "{ mean = 1.0, std = 0.5 }", "{ mean = 0.05, std = 0.025 }"
+        lines.append(
+            ConfigLine('"motor.resistance"', f"{{ prior = {resistance} }}", "[ohm], datasheet", ask)
+        )
+        lines.append(ConfigLine('"motor.back_emf"', f"{{ prior = {emf} }}", "[V s/rad]"))
+    else:
+        lines.append(ConfigLine('"motor.*"', "{ free = false }", "no current: motors are not seen"))
+        lines.append(
+            ConfigLine('"surface.*.friction"', "{ free = false }", "nor how much floors can hold")
+        )
+    above = (
+        "Patterns of parameter names. fixed = value; start = value; free = true or false; prior is "
+        "Gaussian in the parameter's own unit. `slipid reference parameters` lists the names.",
+    )
+    return ConfigBlock("[parameters]", tuple(lines), above=above)
+
+
+@dataclass(frozen=True)
+class NewConfig:
+    """A config that reads: its text, the robot in it, its drawing and what is still open."""
+
+    text: str
+    robot: Wheels
+    drawing: str
+    questions: tuple[str, ...]
+
+    def write(self, out: Path, force: bool = False) -> None:
+        """Write it; DataError where the file exists and shall not be replaced."""
+        absent(out, force)
+        write_bytes(out, self.text.encode())
+
+
+def absent(out: Path, force: bool) -> None:
+    """DataError where a file exists and shall not be replaced; said before anything is asked."""
+    if out.exists() and not force:
+        raise DataError(f"{out}: exists already; expected a new file, or --force")
+
+
+def new_config(sketch: Sketch, name: str) -> NewConfig:
+    """The config of a sketch, checked as if it had been read.
+
+    Args:
+        sketch: what it shall say.
+        name: what the file will be called.
+
+    Raises:
+        DataError: the answers make no robot.
+    """
+    robot = robot_of(sketch.robot)
+    picture = drawing(geometry(robot))
+    blocks = blocks_of(sketch, robot, picture, name)
+    text = "\n\n".join(block.text() for block in blocks) + "\n"
+    parsed(Path(name), text)
+    return NewConfig(text, robot, picture, all_asked(blocks))

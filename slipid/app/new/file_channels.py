@@ -1,0 +1,434 @@
+"""Which column of a file holds which channel, by their names and by what the numbers are like.
+
+Log files of a folder by kind: published formats, globs that find each, which lie together.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path, PurePosixPath
+from re import sub
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.check.columns import refuse_misordered
+from slipid.data.reading.column_names import ColumnMeaning, meaning_of
+from slipid.data.reading.layout import PER_WHEEL, Layout
+from slipid.data.reading.presets import PRESETS
+from slipid.data.reading.reader import read_logs
+from slipid.data.reading.table_format import TableFormat, TableNumbers, format_of
+from slipid.support.errors import DataError
+
+_ORDER = ("fl", "fr", "ml", "mr", "rl", "rr", "l", "r")
+"""Wheels as the drives count them."""
+_QUATERNION = ("x", "y", "z", "w")
+TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
+"""Channels that tell how far the wheels turned, the best first."""
+_COUNTS = 50
+"""Whole numbers up to which a position is no count of ticks."""
+
+
+@dataclass(frozen=True, eq=False)
+class FileChannel:
+    """A channel and where it is.
+
+    Attributes:
+        channel: its name.
+        at: places of its columns.
+        labels: which wheel each is of, as the names say.
+        values: of the columns, as they are in the file.
+        unit: that names or a row of units say; empty where they say none.
+        doubts: what was assumed, one sentence each.
+    """
+
+    channel: str
+    at: tuple[int, ...]
+    labels: tuple[str, ...]
+    values: Float[np.ndarray, "row column"]
+    unit: str = ""
+    doubts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class FileChannels:
+    """What is in a file.
+
+    Attributes:
+        found: its channels.
+        unused: names of other columns of numbers.
+        notes: what people should know of it.
+    """
+
+    found: tuple[FileChannel, ...]
+    unused: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def get(self, channel: str) -> FileChannel | None:
+        """A channel, if it is there."""
+        return next((one for one in self.found if one.channel == channel), None)
+
+    def first(self, *channels: str) -> FileChannel | None:
+        """The first of some channels that is there."""
+        return next((found for name in channels if (found := self.get(name))), None)
+
+    @property
+    def turns(self) -> FileChannel | None:
+        """The channel that tells how far the wheels turned."""
+        return self.first(*TURNS)
+
+    @property
+    def wheels(self) -> int:
+        """How many wheels, or drives, have columns."""
+        return len(self.turns.at) if self.turns else 0
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether there is a whole pose."""
+        turned = self.get("pose_heading") or self.get("pose_quaternion")
+        return bool(self.get("pose_x") and self.get("pose_y") and turned)
+
+
+def columns_of(numbers: TableNumbers) -> FileChannels:
+    """What the named columns of a file hold."""
+    format, meanings = numbers.format, {}
+    for at, name in enumerate(format.names):
+        if at not in numbers.texts and name and not np.isnan(numbers.values[:, at]).all():
+            meanings[at] = meaning_of(name, format.units[at])
+    channels: dict[str, dict[str, int]] = {}
+    also: list[str] = []
+    for at, one in meanings.items():
+        if not one.channel or one.channel == "odometry":
+            continue
+        there = channels.setdefault(one.channel, {})
+        if one.label in there:
+            also.append(f"{format.names[at]} (as {format.names[there[one.label]]})")
+        else:
+            there[one.label] = at
+    found = [_found(numbers, meanings, name, places) for name, places in channels.items()]
+    found = _one_of_each(_told_apart(found))
+    notes = _odometry(numbers, meanings) + [f"not used, said twice: {', '.join(also)}"] * bool(also)
+    kept, dropped = _agreeing(found)
+    used = {at for one in kept for at in one.at}
+    unused = [
+        name for at, name in enumerate(format.names) if name and at in meanings and at not in used
+    ]
+    return FileChannels(tuple(kept), tuple(unused), tuple(notes + dropped))
+
+
+def _found(
+    numbers: TableNumbers, meanings: dict[int, ColumnMeaning], channel: str, places: dict[str, int]
+) -> FileChannel:
+    """A channel with its columns in order."""
+    labels = sorted(places, key=rank)
+    at = tuple(places[label] for label in labels)
+    units = Counter(meanings[k].unit for k in at)
+    doubts = [
+        f"column '{numbers.format.names[k]}': {meanings[k].doubt}" for k in at if meanings[k].doubt
+    ]
+    if len(units) > 1:
+        doubts.append(f"columns of one channel in several units ({', '.join(units)})")
+    unit = units.most_common(1)[0][0]
+    return FileChannel(channel, at, tuple(labels), numbers.values[:, at], unit, tuple(doubts))
+
+
+def rank(label: str) -> tuple[int, int, str]:
+    """Order of wheels: by the drives' convention, else by number."""
+    if label in _QUATERNION:
+        return (0, _QUATERNION.index(label), label)
+    if label in _ORDER:
+        return (1, _ORDER.index(label), label)
+    return (2, int(label) if label.isdecimal() else 0, label)
+
+
+def _told_apart(found: list[FileChannel]) -> list[FileChannel]:
+    """Positions are ticks where they are whole numbers; v is a speed where no speed is logged."""
+    speeds = {one.labels for one in found if one.channel.endswith("_speed")}
+    out = []
+    for one in found:
+        kind, _, what = one.channel.rpartition("_")
+        if what == "position":
+            ticks = one.unit in ("tick", "ticks") or (not one.unit and _counted(one.values))
+            one = replace(one, channel="wheel_ticks" if ticks else f"{kind}_angle")
+        elif what == "v":
+            volts = (
+                one.unit in ("V", "mV")
+                or one.labels in speeds
+                or (not one.unit and _always_far(one.values))
+            )
+            one = replace(one, channel="voltage" if volts else f"{kind}_speed")
+        out.append(one)
+    return out
+
+
+def _counted(values: Float[np.ndarray, "row column"]) -> bool:
+    known = values[~np.isnan(values)]
+    return bool((known == np.round(known)).all() and np.abs(known).max(initial=0.0) > _COUNTS)
+
+
+def _always_far(values: Float[np.ndarray, "row column"]) -> bool:
+    """Whether numbers keep away from 0, as a battery's voltage does and a speed does not."""
+    known = values[~np.isnan(values)]
+    return bool(known.size) and float(known.min()) > 0.5 * float(known.max()) > 0.0
+
+
+def _one_of_each(found: list[FileChannel]) -> list[FileChannel]:
+    """The first of channels that turned out to be the same."""
+    out: dict[str, FileChannel] = {}
+    for one in found:
+        out.setdefault(one.channel, one)
+    return list(out.values())
+
+
+def _agreeing(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
+    """Channels that go together, and a line for each that is left out."""
+    turns = [one for name in TURNS for one in found if one.channel == name]
+    per_wheel = turns or [one for one in found if one.channel in PER_WHEEL]
+    count = len(per_wheel[0].at) if per_wheel else 0
+    labels = set(per_wheel[0].labels) if per_wheel else set()
+    kept, dropped = [], []
+    for one in found:
+        if one.channel == "pose_quaternion" and len(one.at) != 4:
+            dropped.append(f"{len(one.at)} columns of a quaternion; expected x, y, z and w")
+        elif one.channel in PER_WHEEL and (len(one.at) != count or not _alike(labels, one)):
+            what = f"{len(one.at)} columns of {one.channel}"
+            dropped.append(f"{what} are left out: {count} wheels have {per_wheel[0].channel}")
+        else:
+            kept.append(one)
+    return kept, dropped
+
+
+def _alike(labels: set[str], one: FileChannel) -> bool:
+    """Whether channels name the same wheels, or one names sides and the other numbers."""
+    numbers = all(label.isdecimal() for label in labels)
+    return set(one.labels) == labels or numbers != all(label.isdecimal() for label in one.labels)
+
+
+def _odometry(numbers: TableNumbers, meanings: dict[int, ColumnMeaning]) -> list[str]:
+    names = [numbers.format.names[at] for at, one in meanings.items() if one.channel == "odometry"]
+    if not names:
+        return []
+    return [f"{', '.join(names)}: odometry is no pose of its own, wheels tell it already"]
+
+
+def without_names(numbers: TableNumbers) -> FileChannels:
+    """What columns without names may hold: time, a pose and whole numbers as ticks."""
+    values = numbers.values
+    whole = [k for k in range(values.shape[1]) if _counted(values[:, [k]])]
+    time = next((k for k in range(values.shape[1]) if (np.diff(values[:, k]) > 0).all()), None)
+    whole = [k for k in whole if k != time]
+    others = [k for k in range(values.shape[1]) if k not in (*whole, time)]
+    found = []
+
+    def put(channel: str, *at: int) -> None:
+        labels = tuple(str(k + 1) for k in range(len(at)))
+        doubt = (f"taken for {channel} by its numbers: is it?",)
+        found.append(FileChannel(channel, at, labels, values[:, at], "", doubt))
+
+    if time is not None:
+        put("time", time)
+    if whole:
+        put("wheel_ticks", *whole)
+    for channel, at in zip(("pose_x", "pose_y", "pose_heading"), others, strict=False):
+        if len(others) >= 3:
+            put(channel, at)
+    used = {at for one in found for at in one.at}
+    unused = tuple(str(k) for k in range(values.shape[1]) if k not in used)
+    return FileChannels(tuple(found), unused)
+
+
+def without(channels: FileChannels, names: frozenset[str]) -> FileChannels:
+    """Channels of a file less some channels, which another file of the run has as well."""
+    kept = tuple(one for one in channels.found if one.channel not in names)
+    again = sorted(one.channel for one in channels.found if one.channel in names)
+    notes = (f"Also here, but taken from the other file: {', '.join(again)}.",) if again else ()
+    return replace(channels, found=kept, notes=(*channels.notes, *notes))
+
+
+SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".parquet")
+"""Of files that may be logs."""
+_TELLING = 8
+"""Named columns from which nobody else will have the same by chance."""
+_TRIED = 3
+"""Files that are read to see whether a preset fits."""
+
+
+@dataclass(frozen=True)
+class NoLog:
+    """A file that might have been a log, and why it is none."""
+
+    path: Path
+    why: str
+
+
+def formats_below(folder: Path) -> tuple[list[TableFormat], list[NoLog]]:
+    """Every log in a folder and below, and the files that are none.
+
+    Raises:
+        DataError: there is none.
+    """
+    found, not_logs = [], []
+    paths = sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix.lower() in SUFFIXES)
+    for path in paths:
+        try:
+            found.append(format_of(path))
+        except DataError as error:
+            not_logs.append(NoLog(path, str(error)))
+    if not found:
+        there = f"no log in {len(paths)} files" if paths else "no CSV or Parquet file below it"
+        listed = "".join(f"\n{one.why}" for one in not_logs[:3])
+        raise DataError(f"{folder}: {there}; expected logs of a robot{listed}")
+    return found, not_logs
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Files that are laid out alike, sorted by path."""
+
+    formats: tuple[TableFormat, ...]
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Where they are."""
+        return tuple(one.path for one in self.formats)
+
+
+def kinds_of(formats: Sequence[TableFormat]) -> list[Kind]:
+    """Files by kind, the kind with most of them first."""
+    groups: dict[TableFormat, list[TableFormat]] = {}
+    for one in formats:
+        groups.setdefault(one.signature, []).append(one)
+    return [Kind(tuple(g)) for g in sorted(groups.values(), key=len, reverse=True)]
+
+
+def globs_of(root: Path, kind: Kind, others: Sequence[Path]) -> list[str]:
+    """Globs below a folder that find the files of a kind and none of the others.
+
+    Folders two levels deep have one each: they tell sets of logs apart.
+    """
+    mine = [path.relative_to(root) for path in kind.paths]
+    theirs = [PurePosixPath(path.relative_to(root)) for path in others]
+    buckets: dict[tuple[str, int], list[PurePosixPath]] = {}
+    for path in map(PurePosixPath, mine):
+        top = path.parts[0] if len(path.parts) > 2 else ""
+        buckets.setdefault((top, len(path.parts)), []).append(path)
+    return [glob for paths in buckets.values() for glob in _narrow(paths, theirs)]
+
+
+def _narrow(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> list[str]:
+    """A glob for some files, narrower ones where it finds others."""
+    glob = common_glob(paths)
+    if not any(_finds(glob, path) for path in theirs):
+        return [glob]
+    folders = {path.parent for path in paths}
+    if len(folders) > 1:
+        parts = [[p for p in paths if p.parent == folder] for folder in sorted(folders)]
+        return [one for part in parts for one in _narrow(part, theirs)]
+    return [path.as_posix() for path in paths]
+
+
+def common_glob(paths: Sequence[PurePosixPath]) -> str:
+    """A glob that finds paths of the same depth: what they have in common, around stars."""
+    return "/".join(_part(parts) for parts in zip(*(p.parts for p in paths), strict=True))
+
+
+def floor_of(glob: str) -> str:
+    """Name of a floor by a glob: that of a folder above the runs', or only that it is a floor."""
+    first, *others = glob.split("/")
+    return first if len(others) > 1 and "*" not in first else "floor"
+
+
+def _finds(glob: str, path: PurePosixPath) -> bool:
+    parts = glob.split("/")
+    return len(parts) == len(path.parts) and all(
+        fnmatchcase(name, part) for name, part in zip(path.parts, parts, strict=True)
+    )
+
+
+def _part(names: tuple[str, ...]) -> str:
+    """One name, or what several have in common around a star."""
+    if len(set(names)) == 1:
+        return names[0]
+    suffixes = {PurePosixPath(name).suffix for name in names}
+    end = suffixes.pop() if len(suffixes) == 1 else ""
+    counted = {sub(r"\d+", "*", name) for name in names}
+    if len(counted) == 1:
+        return counted.pop()
+    # digits at its end are a number, of which others may begin otherwise
+    first, last = min(names), max(names)
+    alike = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
+    return f"{first[:alike].rstrip('0123456789')}*{end}"
+
+
+def pattern_beside(main: Kind, other: Kind) -> str | None:
+    """Name of the file beside each of the main ones, as of `Layout.beside`; None if they have none.
+
+    Either it is called the same in every folder, or after the main file.
+    """
+    there = set(other.paths)
+    first = main.paths[0]
+    near = [path for path in other.paths if path.parent == first.parent]
+    patterns = [path.name for path in near]
+    patterns += [
+        path.name.replace(first.stem, "{stem}") for path in near if first.stem in path.name
+    ]
+    for pattern in patterns:
+        named = [path.parent / pattern.replace("{stem}", path.stem) for path in main.paths]
+        # a name without the stem belongs to one main file a folder
+        alone = "{stem}" in pattern or len({path.parent for path in main.paths}) == len(named)
+        if alone and there.issuperset(named):
+            return pattern
+    return None
+
+
+def a_folder_each(kind: Kind) -> bool:
+    """Whether every file is alone of its kind in its folder: then the folder is a run."""
+    return len(kind.paths) > 1 and len({path.parent for path in kind.paths}) == len(kind.paths)
+
+
+@dataclass(frozen=True)
+class Likely:
+    """Presets that a kind of files can be read with.
+
+    Attributes:
+        sure: that which uses most of their columns, if its names are telling.
+        perhaps: others, whose columns anybody could have.
+    """
+
+    sure: str | None
+    perhaps: tuple[str, ...]
+
+
+def likely_presets(kind: Kind) -> Likely:
+    """Presets that read the first files of a kind."""
+    fits = [name for name, layout in PRESETS.items() if _matches(kind.formats[0], layout)]
+    fits = [name for name in fits if _reads(kind, PRESETS[name])]
+    fits.sort(key=lambda name: len(PRESETS[name].columns), reverse=True)
+    telling = [name for name in fits if PRESETS[name].names_row and _many(PRESETS[name])]
+    sure = telling[0] if telling else None
+    return Likely(sure, tuple(name for name in fits if name not in telling))
+
+
+def _many(layout: Layout) -> bool:
+    return len(layout.columns) >= _TELLING
+
+
+def _matches(format: TableFormat, layout: Layout) -> bool:
+    """Whether names and numbers stand where a layout says."""
+    rows = (layout.delimiter, layout.names_row, layout.first_data_row)
+    if rows != (format.delimiter, format.names_row, format.first_data_row):
+        return False
+    if not layout.names_row:
+        return len(format.names) == 1 + max(int(column) for column in layout.columns)
+    return set(layout.columns) <= set(format.names)
+
+
+def _reads(kind: Kind, layout: Layout) -> bool:
+    for path in kind.paths[:_TRIED]:
+        try:
+            refuse_misordered(read_logs(path, layout, path.parent, "floor", "as_built").logs)
+        except DataError:
+            continue
+        return True
+    return False

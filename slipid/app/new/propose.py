@@ -1,0 +1,193 @@
+"""From logs to the config that is proposed for them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from slipid.app.config import geometry, parsed
+from slipid.app.logs import layout_of
+from slipid.app.new.bags import bags_in, propose_bags
+from slipid.app.new.config_lines import ConfigLine
+from slipid.app.new.config_text import new_config
+from slipid.app.new.file_channels import a_folder_each, floor_of, globs_of
+from slipid.app.new.robot import Group, SortedLogs, robot_from, sorted_logs
+from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, robot_of
+from slipid.app.new.sketch import ConfigProposal, LayoutSketch, LogsSketch, Sketch
+from slipid.app.new.sketches import file_sketch, radius_hint
+from slipid.app.new.study import Known, Study
+from slipid.data.check.columns import refuse_misordered
+from slipid.data.log import Log
+from slipid.data.reading.bag.runs import PAUSE_S, parts_between_pauses
+from slipid.data.reading.layout import Layout
+from slipid.data.reading.motor_layout import motor_layout
+from slipid.data.reading.presets import PRESETS
+from slipid.data.reading.reader import read_logs
+from slipid.support.errors import DataError
+
+FLOOR = "floor"
+_FLOOR = "on which floor was {} driven? Its name, or folder where folders are called after floors"
+
+
+def propose(path: Path, options: RobotOptions) -> ConfigProposal:
+    """The config that a log, or a folder of logs, is proposed to have.
+
+    Raises:
+        DataError: there is no log, or an option is no answer.
+    """
+    if not path.exists():
+        raise DataError(f"{path}: no such file or folder; expected a log, or a folder of logs")
+    if bags := bags_in(path):
+        proposed = propose_bags(bags, path, options)
+        return replace(proposed, sketch=_bags_tried(proposed.sketch, bags[0]))
+    found = sorted_logs(path)
+    wheels = max((group.main.columns.wheels for group in found.groups), default=0)
+    for _, name in found.presets:
+        wheels = max(wheels, _wheels_of(PRESETS[name]))
+    files = tuple(one for group in found.groups for one in group.all)
+    _no_bench(path, found, wheels, files)
+    guessed = robot_from(options, wheels, files)
+    robot = _as_presets_say(guessed.robot, found)
+    known = [_known(group, robot) for group in found.groups]
+    logs = _logs(found)
+    used = {one.format for one in logs if not one.off}
+    presets = [PRESETS[name] for _, name in found.presets if name in used]
+    sketch = Sketch(
+        robot,
+        tuple(
+            _layout(group, one, k)
+            for k, (group, one) in enumerate(zip(found.groups, known, strict=True))
+        ),
+        tuple(logs),
+        carries=frozenset(channel for layout in presets for channel in layout.channels),
+        above=(f"Proposed from {path}.", *found.hints),
+        data=str(found.root),
+        hints=(*guessed.hints, *(hint for one in known for hint in radius_hint(one))),
+    )
+    return ConfigProposal(_tried(sketch, found, wheels), (*found.sentences, *found.hints))
+
+
+def _no_bench(path: Path, found: SortedLogs, wheels: int, files: Sequence[Study]) -> None:
+    """DataError where a log is of a motor on a bench, which another command is for."""
+    if found.presets or wheels > 1 or not files or any(one.columns.has_pose for one in files):
+        return
+    first = files[0].format.path
+    try:
+        guessed = motor_layout(files[0].format, {}, signed=True)
+    except DataError:
+        return
+    channels = ", ".join(channel.removeprefix("motor_") for channel in guessed.channels)
+    also = 'several logs of it: drive = "motor" in [robot] of a config, see slipid reference'
+    raise DataError(
+        f"{path}: no wheels and no pose; "
+        f"{first.name} is like that of a motor on a bench ({channels})\n"
+        f"run: slipid motor {first} --out DIR\n{also}"
+    )
+
+
+def _wheels_of(layout: Layout) -> int:
+    turns = ("wheel_ticks", "motor_speed", "wheel_speed")
+    return max((len(layout.channels[c].columns) for c in turns if c in layout.channels), default=0)
+
+
+def _as_presets_say(robot: RobotAnswers, found: SortedLogs) -> RobotAnswers:
+    """The gear ratio that a published format has, unless an option gives another."""
+    gears = {PRESETS[name].gear_ratio for _, name in found.presets}
+    if len(gears) != 1 or "gear_ratio" not in robot.taken:
+        return robot
+    return replace(robot, gear_ratio=gears.pop(), taken=robot.taken - {"gear_ratio"})
+
+
+def _known(group: Group, robot: RobotAnswers) -> Known:
+    others = tuple(Known(robot, other.main, other.all) for other in group.others)
+    return Known(robot, group.main, group.all, others)
+
+
+def _layout(group: Group, known: Known, number: int) -> LayoutSketch:
+    file = file_sketch(group.main, known)
+    if not any(one.columns.has_pose for one in group.all):
+        ask = "no pose was found (x, y, and a heading or a quaternion): a fit needs one"
+        file = replace(file, questions=(*file.questions, ask))
+    beside = tuple(replace(file_sketch(one, known), pattern=name) for name, one in group.beside)
+    return LayoutSketch(_name(number), file, beside)
+
+
+def _name(number: int) -> str:
+    return "mine" if number == 0 else f"mine{number + 1}"
+
+
+def _logs(found: SortedLogs) -> list[LogsSketch]:
+    """A section for each glob; those of files that lack wheels or a pose are commented out."""
+    named = [(kind, name) for kind, name in found.presets]
+    named += [(group.kind, _name(k)) for k, group in enumerate(found.groups)]
+    every = {path for kind, _ in named for path in kind.paths}
+    every |= {path for one in found.also for path in one.paths} | set(found.no_logs)
+    whole = {name for name in PRESETS if {"pose_x"} <= PRESETS[name].channels.keys()}
+    whole -= {name for name in PRESETS if not _wheels_of(PRESETS[name])}
+    whole |= {_name(k) for k, group in enumerate(found.groups) if group.complete}
+    out = []
+    for kind, name in named:
+        for glob in globs_of(found.root, kind, sorted(every - set(kind.paths))):
+            floors = glob.count("/") > 0 and not a_folder_each(kind)
+            off = name not in whole
+            surface, ask = ("folder", "") if floors else (floor_of(glob), _FLOOR.format(glob))
+            above = ("Without wheels or without a pose, so nothing to fit:",) if off else ()
+            out.append(LogsSketch(glob, name, surface, above, "" if off else ask, off))
+    if all(one.off for one in out):  # a config has one section at least; the layout asks for a pose
+        return [replace(one, off=False, above=()) for one in out]
+    return sorted(out, key=lambda one: one.off)
+
+
+def _tried(sketch: Sketch, found: SortedLogs, wheels: int) -> Sketch:
+    """The sketch with what the reader says of the first file of each layout, if it refuses it."""
+    drives = geometry(robot_of(sketch.robot)).drives
+    layouts = []
+    for layout, group in zip(sketch.layouts, found.groups, strict=True):
+        questions = list(layout.file.questions)
+        if wheels and drives != wheels:
+            questions.append(f"[robot] has {drives} drives, but {wheels} have columns here: which?")
+        if problem := _tried_on(sketch, layout.name, group.kind.paths[0]).problem:
+            questions.append(f"the reader says: {problem}")
+        layouts.append(replace(layout, file=replace(layout.file, questions=tuple(questions))))
+    return replace(sketch, layouts=tuple(layouts))
+
+
+def _bags_tried(sketch: Sketch, first: Path) -> Sketch:
+    """The sketch with what the reader says of the first bag, if it refuses it.
+
+    A bag that is one long drive with pauses is cut at them: its runs share a session.
+    """
+    (bag,) = sketch.bags
+    tried = _tried_on(sketch, bag.name, first)
+    if tried.problem:
+        questions = (*bag.questions, f"the reader says: {tried.problem}")
+        return replace(sketch, bags=(replace(bag, questions=questions),))
+    count = max((parts_between_pauses(log, PAUSE_S) for log in tried.logs), default=1)
+    if count < 2:
+        return sketch
+    comment = f"cut where no wheel moves for longer: {count} runs in the first bag"
+    cut = ConfigLine("runs", f"{{ pause_s = {PAUSE_S:g} }}", comment)
+    logs = tuple(replace(one, session="file") for one in sketch.logs)
+    return replace(sketch, bags=(replace(bag, settings=(*bag.settings, cut)),), logs=logs)
+
+
+@dataclass(frozen=True)
+class _ReadAttempt:
+    """What the reader made of a file: its runs, or why it refused it."""
+
+    logs: tuple[Log, ...] = ()
+    problem: str = ""
+
+
+def _tried_on(sketch: Sketch, name: str, path: Path) -> _ReadAttempt:
+    """The first file of a layout as the reader reads it by the sketch."""
+    try:
+        config = parsed(Path("robot.toml"), new_config(sketch, "robot.toml").text)
+        section = next((one for one in config.content.logs if one.format == name), None)
+        if section is None:
+            return _ReadAttempt()
+        layout = layout_of(config, section)
+        logs = read_logs(path, layout, path.parent, FLOOR, "as_built").logs
+        refuse_misordered(logs)
+        return _ReadAttempt(tuple(logs))
+    except DataError as error:
+        return _ReadAttempt(problem=str(error).splitlines()[0].replace("robot.toml ", ""))

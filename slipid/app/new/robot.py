@@ -1,0 +1,280 @@
+"""Which robot logs can be of: its drive by the number of wheels, and whether it goes sideways.
+
+Log files sorted into runs: published formats, and files that belong together.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from slipid.app.new.file_channels import (
+    SUFFIXES,
+    Kind,
+    formats_below,
+    kinds_of,
+    likely_presets,
+    pattern_beside,
+    without,
+)
+from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, ask
+from slipid.app.new.sketch import Hint
+from slipid.app.new.study import Study, pose_study, study
+from slipid.data.reading.table_format import format_of
+from slipid.data.reading.units import factor
+from slipid.data.wheel_signals import body_steps
+from slipid.support.errors import DataError
+
+_SIDEWAYS = 0.3
+"""Share of the way that is sideways, from which a robot can drive so."""
+
+
+@dataclass(frozen=True)
+class GuessedRobot:
+    """A robot, with what is to be asked of it in words that fit the logs."""
+
+    robot: RobotAnswers
+    hints: tuple[Hint, ...]
+
+
+def robot_from(options: RobotOptions, wheels: int, files: tuple[Study, ...]) -> GuessedRobot:
+    """The robot of the options, the rest as the logs have it; DataError as of `ask`."""
+    drive, hint = _drive(wheels, sideways(files))
+    drive = options.drive or drive
+    if wheels == 2 and drive in ("mecanum", "skid") and options.shared is None:
+        options = replace(options, shared="yes")
+    if wheels >= 3 and drive == "omni" and options.wheels is None and options.azimuths_deg is None:
+        options = replace(options, wheels=str(wheels))
+    known = ask(options, None, drive)
+    if drive == "general" and options.places_m is None and wheels >= 2:
+        known = _in_rows(known, wheels)
+    return GuessedRobot(known, (Hint("drive", hint),))
+
+
+def _drive(wheels: int, aside: bool | None) -> tuple[str, str]:
+    """The likeliest drive, and the question that remains."""
+    if wheels == 2:
+        return (
+            "differential",
+            'two drives: differential, or "skid" with drives = [[1, 3], [2, 4]], half_length_m and '
+            "half_width_m instead of track_m?",
+        )
+    if wheels == 3:
+        return "omni", "three wheels: omni, or general (two driven and steered ones do not work)?"
+    if wheels == 4:
+        drive = "mecanum" if aside else "skid"
+        moves = {True: ", it goes sideways", False: ", it never goes sideways", None: ""}[aside]
+        return drive, f"four wheels{moves}: skid, mecanum or omni, in which order of the columns?"
+    if wheels > 4:
+        return "general", f"{wheels} wheels: where do they stand, in the order of the columns?"
+    if wheels == 1:
+        return "omni", "one column of wheels only: a motor on a bench (slipid motor FILE), or more?"
+    return "omni", "no column tells how wheels turn: which drive is it, and how many wheels?"
+
+
+def sideways(files: tuple[Study, ...]) -> bool | None:
+    """Whether the robot was told to drive sideways, or did; None where nothing says."""
+    for one in files:
+        command = one.columns.get("twist_command_y")
+        if command is not None and np.nanmax(np.abs(command.values)) > 0:
+            return True
+    posed = pose_study(files)
+    if posed is None or (turned := posed.columns.get("pose_heading")) is None:
+        return None
+    if not turned.unit:
+        return None
+    x, y = posed.columns.get("pose_x"), posed.columns.get("pose_y")
+    assert x is not None
+    assert y is not None
+    heading = turned.values[:, 0] * factor(turned.unit, "rad")
+    pose = np.stack([x.values[:, 0], y.values[:, 0], heading], axis=1)
+    steps = np.abs(body_steps(pose[~np.isnan(pose).any(axis=1)]))
+    ahead, left = float(steps[:, 0].sum()), float(steps[:, 1].sum())
+    return left > _SIDEWAYS * (ahead + left) if ahead + left > 0 else None
+
+
+def _in_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
+    """Wheels in two rows, left and right, as a place to start from; in one where they are odd."""
+    pairs = wheels // 2
+    places = [
+        (0.2 - 0.4 * k / max(pairs - 1, 1), side) for k in range(pairs) for side in (0.15, -0.15)
+    ]
+    places += [(-0.3, 0.0)] * (wheels % 2)
+    return replace(
+        known,
+        wheels=wheels,
+        places_m=tuple(places),
+        directions_deg=(0.0,) * wheels
+        if len(known.directions_deg) != wheels
+        else known.directions_deg,
+        rollers_deg=(None,) * wheels if len(known.rollers_deg) != wheels else known.rollers_deg,
+    )
+
+
+_RUNS = 4
+"""Runs beside the first that are looked into."""
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Files of a run: those of one kind with the wheels, and others beside them.
+
+    Attributes:
+        kind: the files with the wheels.
+        main: the first of them, looked into.
+        beside: name of each other file, as of `Layout.beside`, and the first of them looked into.
+        others: the same of further runs.
+    """
+
+    kind: Kind
+    main: Study
+    beside: tuple[tuple[str, Study], ...] = ()
+    others: tuple["Group", ...] = ()
+
+    @property
+    def all(self) -> tuple[Study, ...]:
+        """Every file of the first run."""
+        return (self.main, *(one for _, one in self.beside))
+
+    @property
+    def complete(self) -> bool:
+        """Whether it has wheels and a pose."""
+        return any(one.columns.wheels for one in self.all) and any(
+            one.columns.has_pose for one in self.all
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SortedLogs:
+    """All files that were found: those of published formats, and others by run.
+
+    `sentences` are lines about what was found and left out.
+    """
+
+    root: Path
+    presets: tuple[tuple[Kind, str], ...]
+    groups: tuple[Group, ...]
+    also: tuple[Kind, ...]
+    hints: tuple[str, ...]
+    sentences: tuple[str, ...]
+    no_logs: tuple[Path, ...]
+
+
+def sorted_logs(path: Path) -> SortedLogs:
+    """All files that belong to what was named."""
+    if path.is_dir():
+        formats, no_logs = formats_below(path)
+        root, kinds = path, kinds_of(formats)
+    else:
+        formats, no_logs = [format_of(path)], []
+        root, kinds = path.parent, kinds_of(formats)
+    presets, others, hints = [], [], []
+    for kind in kinds:
+        likely = likely_presets(kind)
+        if likely.sure:
+            presets.append((kind, likely.sure))
+            continue
+        others.append((kind, study(kind.formats[0])))
+        if likely.perhaps:
+            hints.append(
+                f"If {kind.paths[0].name} is of the published logs: format = "
+                f"{' or '.join(likely.perhaps)} in [[logs]] reads it, and no layout is needed."
+            )
+    if path.is_file() and others and not _complete(others[0][1]):
+        others += _siblings(path, others[0][0])
+    groups, left_out = _groups(others)
+    sentences = [
+        f"{len(kind.paths)} of format {name}: {kind.paths[0]} ..." for kind, name in presets
+    ]
+    sentences += [_found(group) for group in groups]
+    sentences += [f"left out: {line}" for line in (*left_out, *(one.why for one in no_logs[:3]))]
+    sentences += [f"left out: {len(no_logs) - 3} more that are no logs"] * (len(no_logs) > 3)
+    paths = tuple(one.path for one in no_logs)
+    also = tuple(kind for kind, _ in others)
+    return SortedLogs(
+        root, tuple(presets), tuple(groups), also, tuple(hints), tuple(sentences), paths
+    )
+
+
+def _siblings(path: Path, kind: Kind) -> list[tuple[Kind, Study]]:
+    """Files beside one that lacks something."""
+    near = [p for p in sorted(path.parent.iterdir()) if p.is_file() and p.suffix in SUFFIXES]
+    out = []
+    for other in near:
+        try:
+            format = format_of(other)
+        except DataError:
+            continue
+        if format.signature != kind.formats[0].signature:
+            out.append((Kind((format,)), study(format)))
+    return out
+
+
+def _complete(one: Study) -> bool:
+    return one.columns.wheels > 0 and one.columns.has_pose
+
+
+def _groups(kinds: list[tuple[Kind, Study]]) -> tuple[list[Group], list[str]]:
+    """Runs: kinds that have wheels, and with each the kinds that lie beside it."""
+    mains = [pair for pair in kinds if pair[1].columns.wheels] or kinds[:1]
+    rest = [pair for pair in kinds if pair not in mains]
+    if len(mains) > 1 and not any(_complete(one) for _, one in mains):
+        # the same wheels in two files: the one with the better channel leads
+        mains, more = mains[:1], mains[1:]
+        rest = more + rest
+    groups, used = [], []
+    for kind, main in mains:
+        beside: list[tuple[str, Study]] = []
+        have = frozenset(one.channel for one in main.columns.found) - {"time"}
+        for other, one in rest:
+            pattern = pattern_beside(kind, other)
+            one = replace(one, columns=without(one.columns, have))
+            fresh = {found.channel for found in one.columns.found} - {"time"}
+            if pattern is None or not fresh or one.clock is None or main.clock is None:
+                continue
+            if not _together(main, one):
+                continue
+            beside.append((pattern, one))
+            have |= fresh
+            used.append(other)
+        group = Group(kind, main, tuple(beside))
+        groups.append(replace(group, others=_further(group)))
+    lost = [kind for kind, _ in rest if kind not in used]
+    lines = [
+        f"{k.paths[0]}: no wheels in it, and nothing of a run that it lies beside" for k in lost
+    ]
+    return groups, lines
+
+
+def _further(group: Group) -> tuple[Group, ...]:
+    """Some more runs of a kind, spread over all of them."""
+    count = len(group.kind.formats)
+    chosen = sorted({k * count // (_RUNS + 1) for k in range(1, _RUNS + 1)} - {0})
+    out = []
+    for k in chosen:
+        format = group.kind.formats[k]
+        names = [
+            (n, format.path.parent / n.replace("{stem}", format.path.stem)) for n, _ in group.beside
+        ]
+        try:
+            beside = tuple((name, study(format_of(path))) for name, path in names)
+            out.append(Group(group.kind, study(format), beside))
+        except DataError:
+            continue  # the reader will say it of this run; the first one tells enough
+    return tuple(out)
+
+
+def _together(one: Study, other: Study) -> bool:
+    """Whether two files cover the same time: then they are of one run."""
+    return bool(max(one.time[0], other.time[0]) < min(one.time[-1], other.time[-1]))
+
+
+def _found(group: Group) -> str:
+    """What a group of files holds, in a sentence."""
+    listed = [", ".join(found.channel for found in one.columns.found) for one in group.all]
+    more = [
+        f"; beside it {name}: {channels}"
+        for (name, _), channels in zip(group.beside, listed[1:], strict=True)
+    ]
+    like = f"{len(group.kind.paths)} like {group.kind.paths[0]}"
+    return f"{like}: {listed[0] or 'nothing known'}{''.join(more)}"

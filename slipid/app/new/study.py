@@ -1,0 +1,299 @@
+"""A file looked into: its channels, clock and signals, and what files of a run tell together."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.app.new.file_channels import FileChannel, FileChannels, columns_of, without_names
+from slipid.app.new.magnitudes import Unit, place_unit, speed_of, time_unit
+from slipid.app.new.robot_questions import RobotAnswers
+from slipid.data.reading.table_format import TableFormat, TableNumbers, numbers_of
+from slipid.data.reading.units import factor
+from slipid.data.wheel_signals import refresh_period
+
+METRES = Unit("m")
+_AHEAD = 2
+"""Drives up to which all wheels point ahead."""
+_SPARSE = 0.02
+"""Share of empty cells from which a channel is said to be slower than the rows."""
+CURRENTS = ("current", "motor_torque", "wheel_torque")
+SPEEDS = ("wheel_speed", "motor_speed")
+ANGLES = ("wheel_angle", "motor_angle")
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A file of one kind.
+
+    Attributes:
+        numbers: what is in it.
+        columns: what its columns hold.
+        time: of every row [s], counted from 0 in rows where there is none.
+        clock: unit of the time, or None without one.
+    """
+
+    numbers: TableNumbers
+    columns: FileChannels
+    time: Float[np.ndarray, " row"]
+    clock: Unit | None
+
+    @property
+    def format(self) -> TableFormat:
+        """Where things stand in the file."""
+        return self.numbers.format
+
+    @property
+    def usual_step(self) -> float:
+        """Time between rows [s]."""
+        steps = np.diff(self.time)
+        steps = steps[steps > 0]
+        return float(np.median(steps)) if len(steps) else 1.0
+
+
+def study(format: TableFormat) -> Study:
+    """A file looked into; DataError where its numbers cannot be read."""
+    numbers = numbers_of(format)
+    columns = columns_of(numbers) if any(format.names) else without_names(numbers)
+    found = columns.get("time")
+    if found is None:
+        return Study(numbers, columns, np.arange(len(numbers.values), dtype=float), None)
+    values = found.values[:, 0]
+    clock = Unit(found.unit) if found.unit else time_unit(values)
+    return Study(numbers, columns, values * factor(clock.unit, "s"), clock)
+
+
+def rate(one: Study, found: FileChannel) -> str:
+    """How often a channel is read, in words: by empty cells, by repeats, else by rows."""
+    values, time = found.values[:, 0], one.time
+    there = ~np.isnan(values) & ~np.isnan(time)
+    if there.sum() < 3 or one.clock is None:
+        return ""
+    time, values = time[there], values[there]
+    steps = np.diff(time)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    empty = 1.0 - float(there.mean())
+    often = f"{_hertz(usual)}, empty in between" if empty > _SPARSE else _hertz(usual)
+    period = refresh_period([(time, values)])
+    if period is not None and period > 1.5 * usual:
+        return f"{often}; read anew {_hertz(period)}"
+    return often
+
+
+def _hertz(period: float) -> str:
+    return f"{1.0 / period:.3g} Hz" if period > 0 else ""
+
+
+@dataclass(frozen=True)
+class PoseMotion:
+    """How the robot moves by its pose.
+
+    Attributes:
+        speed: a high speed [m/s], None where there is no pose.
+        place: unit of x and y.
+        time, x, y: when poses came [s], and where they were [m].
+        steps: how far each is from the last [m].
+    """
+
+    speed: float | None = None
+    place: Unit = METRES
+    time: Float[np.ndarray, " pose"] | None = None
+    x: Float[np.ndarray, " pose"] | None = None
+    y: Float[np.ndarray, " pose"] | None = None
+    steps: Float[np.ndarray, " pose"] | None = None
+
+
+def motion(one: Study | None) -> PoseMotion:
+    """How the robot moves by the pose in a file; nothing where it has none."""
+    if one is None or not one.columns.has_pose:
+        return PoseMotion()
+    x, y = one.columns.get("pose_x"), one.columns.get("pose_y")
+    assert x is not None
+    assert y is not None
+    px, py = x.values[:, 0], y.values[:, 0]
+    if x.unit:
+        place = Unit(x.unit)
+    elif one.clock is None:
+        place = Unit("m", doubt="in which unit?")
+    else:
+        place = place_unit(one.time, px, py)
+    if place.unit in ("pixel", "pixels", "pix", "px") or one.clock is None:
+        return PoseMotion(place=place)
+    scale = factor(place.unit, "m")
+    there = ~(np.isnan(px) | np.isnan(py) | np.isnan(one.time))
+    time, px, py = one.time[there], px[there] * scale, py[there] * scale
+    steps = np.append(0.0, np.hypot(np.diff(px), np.diff(py)))
+    return PoseMotion(speed_of(time, px, py), place, time, px, py, steps)
+
+
+def increments(found: FileChannel, one: Study, moved: PoseMotion) -> bool | None:
+    """Whether ticks are those since the last row and not a sum; None where nothing tells.
+
+    The way of the pose goes along with the ticks of each row, or with their changes.
+    """
+    values = np.nan_to_num(found.values)
+    of_rows, of_changes = (
+        np.abs(values).sum(axis=1)[1:],
+        np.abs(np.diff(values, axis=0)).sum(axis=1),
+    )
+    if moved.time is not None and moved.steps is not None and len(moved.time) > 20:
+        way = np.interp(one.time, moved.time, np.cumsum(moved.steps))
+        width = max(1, len(way) // 60)
+        sums = [_in_parts(row, width) for row in (of_rows, of_changes, np.abs(np.diff(way)))]
+        if all(float(np.std(part)) > 0 for part in sums):
+            rows, changes = (float(np.corrcoef(part, sums[2])[0, 1]) for part in sums[:2])
+            if abs(rows - changes) > 0.15:
+                return rows > changes
+    if not of_changes.any():
+        return None
+    usual = float(np.median(of_changes[of_changes > 0]))
+    most = float(np.abs(values).sum(axis=1).max())
+    return False if most > 60 * usual else None
+
+
+def _in_parts(values: Float[np.ndarray, " row"], width: int) -> Float[np.ndarray, " part"]:
+    """Sums over stretches of so many rows: one row alone is noise."""
+    count = len(values) // width
+    return values[: count * width].reshape(count, width).sum(axis=1)
+
+
+def over_wheels(one: Study, speed: FileChannel, moved: PoseMotion) -> float | None:
+    """Speed of the pose over that of the wheels, of seconds in which they turn; None without both.
+
+    It is the radius of wheels that all point ahead, if their speeds are in rad/s, and near it
+    for others.
+    """
+    if moved.time is None or moved.x is None or moved.y is None or one.clock is None:
+        return None
+    # two wheels point ahead: their mean has the sign of the way; of others the sizes are as good
+    ahead = speed.values.shape[1] <= _AHEAD
+    rows = speed.values.mean(axis=1) if ahead else np.sqrt((speed.values**2).mean(axis=1))
+    there = ~(np.isnan(rows) | np.isnan(one.time))
+    time, rows = one.time[there], rows[there]
+    if len(time) < 3:
+        return None
+    turned = np.append(0.0, np.cumsum(0.5 * (rows[1:] + rows[:-1]) * np.diff(time)))
+    start, end = max(time[0], moved.time[0]), min(time[-1], moved.time[-1])
+    if end <= start:
+        return None
+    edges = np.linspace(start, end, max(2, int(end - start)))
+    by_wheels = np.abs(np.diff(np.interp(edges, time, turned)))
+    # chords and not the way along all poses, which noise makes longer
+    x, y = (np.interp(edges, moved.time, part) for part in (moved.x, moved.y))
+    way = np.hypot(np.diff(x), np.diff(y))
+    good = by_wheels > 0.3 * by_wheels.max(initial=0.0)
+    ratio = float(np.median(way[good] / by_wheels[good])) if good.any() else 0.0
+    return ratio if ratio > 0 else None
+
+
+def signed(current: FileChannel, speed: FileChannel | None) -> bool | None:
+    """Whether currents have a sign; None where nothing drove backwards and nothing tells."""
+    values = current.values[~np.isnan(current.values)]
+    most = float(np.abs(values).max(initial=0.0))
+    if float(values.min(initial=0.0)) < -0.02 * most:
+        return True
+    return False if driven_backwards(current, speed) else None
+
+
+def driven_backwards(current: FileChannel, speed: FileChannel | None) -> bool:
+    """Whether currents are positive where wheels drive backwards, as magnitudes are.
+
+    Two files with rows of their own do not tell.
+    """
+    if speed is None or speed.values.shape != current.values.shape:
+        return False
+    backwards = np.nan_to_num(speed.values) < -0.1 * float(np.nanmax(np.abs(speed.values)))
+    known = np.nan_to_num(current.values)
+    strong, least = (backwards & (k * known > 0.1 * np.abs(known).max()) for k in (1, -1))
+    return float(strong.mean()) > max(0.01, 3 * float(least.mean()))
+
+
+def of_battery(voltages: Sequence[FileChannel], speed: FileChannel | None) -> bool:
+    """Whether the voltage of some runs stays up whatever the wheels do, as a battery's does.
+
+    Every run is measured by what is high in it: batteries of other robots, or other charges, are
+    no sign of a motor.
+    """
+    runs = [one.values[~np.isnan(one.values)] for one in voltages]
+    high = [float(np.quantile(np.abs(run), 0.95)) if run.size else 0.0 for run in runs]
+    values = np.concatenate(
+        [run / h for run, h in zip(runs, high, strict=True) if h] or [np.zeros(1)]
+    )
+    stays_up = float(np.quantile(values, 0.05)) > 0.6
+    return stays_up and (speed is None or float(np.nanstd(speed.values)) > 0.0)
+
+
+def pose_study(studies: tuple[Study, ...]) -> Study | None:
+    """The file that has the pose."""
+    return next((one for one in studies if one.columns.has_pose), None)
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What files of a run tell of each other.
+
+    Attributes:
+        robot: its sizes, as far as they are known.
+        main: the file that has the wheels; `all`: every file of the run.
+        others: the same of further runs, for what a single run may not show.
+    """
+
+    robot: RobotAnswers
+    main: Study
+    all: tuple[Study, ...]
+    others: tuple["Known", ...] = ()
+
+    @cached_property
+    def moved(self) -> PoseMotion:
+        """Motion by the pose."""
+        return motion(pose_study(self.all))
+
+    def find(self, *channels: str) -> FileChannel | None:
+        """The first of some channels, in any of the files."""
+        found = (one.columns.get(name) for name in channels for one in self.all)
+        return next((one for one in found if one is not None), None)
+
+    @property
+    def runs(self) -> tuple["Known", ...]:
+        """This run, and the others."""
+        return (self, *self.others)
+
+    @cached_property
+    def over_wheels(self) -> float | None:
+        """Speed of the pose over that of the wheels, the middle one of all runs."""
+        found = []
+        for run in self.runs:
+            speed = run.main.columns.first(*SPEEDS)
+            angle = run.main.columns.first(*ANGLES)
+            if speed is None and angle is not None and run.main.clock is not None:
+                rates = np.gradient(angle.values, run.main.time, axis=0)
+                speed = replace(angle, values=rates)
+            ratio = None if speed is None else over_wheels(run.main, speed, run.moved)
+            found += [ratio] if ratio is not None else []
+        return float(np.median(found)) if found else None
+
+    @property
+    def signed(self) -> bool | None:
+        """Whether currents have a sign in any of the runs; None where none tells."""
+        signs = [
+            signed(current, run.find(*SPEEDS))
+            for run in self.runs
+            if (current := run.find(*CURRENTS)) is not None
+        ]
+        return True if True in signs else False if False in signs else None
+
+    @property
+    def of_supply(self) -> bool:
+        """Whether currents are what the battery gives: positive both ways, negative at times."""
+        currents = [(run.find(*CURRENTS), run.find(*SPEEDS)) for run in self.runs]
+        known = [(current, speed) for current, speed in currents if current is not None]
+        both_ways = any(driven_backwards(current, speed) for current, speed in known)
+        return both_ways and any(np.nanmin(current.values) < 0.0 for current, _ in known)
+
+    @property
+    def radius(self) -> float | None:
+        """Wheel radius, where somebody said it [m]."""
+        taken = "wheel_radius_m" in self.robot.taken
+        return None if taken else self.robot.wheel_radius_m

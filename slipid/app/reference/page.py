@@ -1,0 +1,225 @@
+"""The reference of configs as Markdown, made from what checks them."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from slipid.app import config as c
+from slipid.app.new.config_lines import drawing
+from slipid.app.reference.kinds import Key, keys_of
+from slipid.app.reference.parameters import ParameterRow, parameter_rows, purpose
+from slipid.data.reading.bag.layout import BagLayout, RunRule, TopicChannel
+from slipid.data.reading.layout import CHANNELS, PER_WHEEL, SEVERAL, Channel, Layout
+from slipid.data.reading.presets import PRESETS
+from slipid.data.reading.units import KNOWN
+from slipid.support.errors import DataError, near
+
+_DRIVES: tuple[tuple[type[c.Wheels], str, dict[str, object]], ...] = (
+    (c.Omni, "omni", {"base_radius_m": 0.2, "wheel_azimuths_deg": [60, 180, 300]}),
+    (c.Box, "mecanum", {"half_length_m": 0.2, "half_width_m": 0.15}),
+    (
+        c.Box,
+        "skid",
+        {"half_length_m": 0.2, "half_width_m": 0.15, "drives": [[1, 3], [2, 4]]},
+    ),
+    (c.Differential, "differential", {"track_m": 0.3}),
+)
+"""Drives with a robot to draw."""
+_SECTIONS: tuple[tuple[str, type], ...] = (
+    ("[[logs]]", c.Logs),
+    ("[camera]", c.Camera),
+    ('[parameters] "PATTERN"', c.Setting),
+    ("prior, of a parameter", c.PriorSection),
+    ("[weights.LOAD]", c.Weights),
+    ("[fit]", c.FitSection),
+    ("[validate]", c.ValidateSection),
+    ("[selftest]", c.SelftestSection),
+)
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """A part of the reference that can be asked for by its name."""
+
+    name: str
+    text: Callable[["c.Config | None"], str]
+
+
+def reference(what: str | None = None, config: "c.Config | None" = None) -> str:
+    """The reference, or a part of it; for the robot of a config, where one is given.
+
+    Raises:
+        DataError: no part is called so.
+    """
+    names = [chapter.name for chapter in CHAPTERS]
+    if what is None:
+        parts = [_INTRODUCTION, *(chapter.text(config) for chapter in CHAPTERS)]
+        return "\n\n".join(parts) + "\n"
+    found = [chapter for chapter in CHAPTERS if chapter.name == what]
+    if not found:
+        raise DataError(f"'{what}'{near(what, names)}; expected one of {', '.join(names)}")
+    return found[0].text(config) + "\n"
+
+
+_INTRODUCTION = """\
+# What a config may say
+
+Written by `slipid reference`, from the models that check a config; do not edit. `slipid new` writes
+a config with what your robot needs of this, `configs/` has one for each public data set."""
+
+
+def _config(_: object) -> str:
+    parts = ["## Config", _table_of_keys(keys_of(c.Content))]
+    for header, kind in _SECTIONS:
+        parts += [f"### `{header}`", purpose(kind), _table_of_keys(keys_of(kind))]
+    return "\n\n".join(parts)
+
+
+_FRAMES = """\
+## Drives
+
+The frame of the robot has x ahead, y to the left and yaw counter-clockwise, seen from above, in
+metres and radians; its origin is the middle of the wheels. Columns of the logs, and every list with
+a value per wheel, are in the order of the wheels. Where wheels share a motor, columns are in the
+order of `drives`. A positive speed of a wheel rolls the robot along the arrow of that wheel."""
+
+
+def _drives(_: object) -> str:
+    parts = [_FRAMES, "### Keys of every drive", _table_of_keys(keys_of(c.Wheeled))]
+    common = {key.name for key in keys_of(c.Wheeled)}
+    for kind, name, sizes in _DRIVES:
+        robot = kind.model_validate({"drive": name, "wheel_radius_m": 0.05, **sizes})
+        own = [key for key in keys_of(kind) if key.name not in common and key.name != "drive"]
+        picture = f"```text\n{drawing(c.geometry(robot))}\n```"
+        parts += [f'### `drive = "{name}"`', purpose(kind), _table_of_keys(own), picture]
+    own = [key for key in keys_of(c.General) if key.name not in common and key.name != "drive"]
+    parts += ['### `drive = "general"`', purpose(c.General), _table_of_keys(own)]
+    own = [key for key in keys_of(c.Motor) if key.name != "drive"]
+    parts += ['### `drive = "motor"`', purpose(c.Motor), _table_of_keys(own)]
+    return "\n\n".join(parts)
+
+
+_LAYOUT = """\
+## Layouts
+
+`[layouts.NAME]` says how one kind of log file is laid out, and `format = "NAME"` in `[[logs]]` uses
+it. `format` in a layout names a preset, which its other keys change. `[layouts.NAME.columns]` has a
+line for each channel, `CHANNEL = { column = "name", unit = "deg" }`, or `false` to take one of a
+preset away. `[layouts.NAME.beside."FILE"]` is a layout for a file beside a run's own."""
+
+
+_BAGS = """\
+### Bags
+
+`kind = "bag"` makes a layout one of ROS bags (rosbag1, rosbag2, MCAP). `[layouts.NAME.topics]` has
+a line for each channel, `CHANNEL = { topic = "/name" }`, where `pose` and `twist_command` stand for
+the three numbers that a message holds together. Keys about encoders, currents and jumps are as
+above."""
+
+
+def _bags() -> list[str]:
+    alike = tuple(key.name for key in keys_of(Layout))
+    return [
+        _BAGS,
+        _table_of_keys(keys_of(BagLayout, hidden=(*alike, "topics"))),
+        "#### A channel of `topics`",
+        purpose(TopicChannel),
+        _table_of_keys(keys_of(TopicChannel)),
+        "#### `runs`",
+        purpose(RunRule),
+        _table_of_keys(keys_of(RunRule)),
+    ]
+
+
+def _layouts(_: object) -> str:
+    keys = keys_of(Layout, hidden=("name", "channels"))
+    parts = [_LAYOUT, _table_of_keys(keys), "### A channel of `columns`", purpose(Channel)]
+    return "\n\n".join([*parts, _table_of_keys(keys_of(Channel)), *_bags()])
+
+
+def _channels(_: object) -> str:
+    rows = [(f"`{name}`", _spelled(unit), _columns(name)) for name, unit in CHANNELS.items()]
+    head = "## Channels\n\nWhat a column may hold, and the unit that slipid turns it into."
+    return f"{head}\n\n{_table(('channel', 'unit', 'columns'), rows)}"
+
+
+def _columns(channel: str) -> str:
+    if channel in SEVERAL:
+        return "four: x, y, z, w"
+    return "one per wheel, or per motor" if channel in PER_WHEEL else "one"
+
+
+def _units(_: object) -> str:
+    known = ", ".join(f"`{unit}`" for unit in KNOWN)
+    return f"""\
+## Units
+
+{known}
+
+Products, quotients and prefixes of these are understood as well (`mm/s`, `kN*m`). An angle is a
+dimension of its own, so that `Hz` is no `rad/s`. `pixel` needs `metres_per_pixel`."""
+
+
+def _presets(_: object) -> str:
+    rows = [
+        (f"`{name}`", ", ".join(layout.channels), ", ".join(map(str, layout.columns[:4])) + " ...")
+        for name, layout in PRESETS.items()
+    ]
+    head = "## Presets\n\nLayouts of published logs, for `format`."
+    return f"{head}\n\n{_table(('preset', 'channels', 'first columns'), rows)}"
+
+
+def _parameters(config: "c.Config | None") -> str:
+    rows = parameter_rows(config)
+    whose = f"the robot of {config.path.name}" if config else "a robot with three omni wheels"
+    head = f"""\
+## Parameters
+
+Of {whose}. `FLOOR` and `SESSION` stand for names that the logs
+tell. In `[parameters]` a pattern such as `"surface.*.creep"` says what is wanted of all that match
+it."""
+    columns: list[str] = [
+        "parameter",
+        "numbers",
+        "symbol",
+        "unit",
+        "meaning",
+        "start",
+        "default prior",
+    ]
+    columns += ["in this config"] if config else []
+    return f"{head}\n\n{_table(columns, [_cells(row, config is not None) for row in rows])}"
+
+
+def _cells(row: ParameterRow, of_config: bool) -> tuple[str, ...]:
+    cells = (
+        *(f"`{row.path}`", str(row.size), row.symbol, _spelled(row.unit)),
+        *(row.means, row.start, row.prior),
+    )
+    return (*cells, row.here) if of_config else cells
+
+
+def _spelled(unit: str) -> str:
+    return "1" if unit in ("1", "") else unit
+
+
+def _table_of_keys(keys: Iterable[Key]) -> str:
+    rows = [(f"`{key.name}`", key.kind, key.default, key.means) for key in keys]
+    return _table(("key", "value", "default", "meaning"), rows)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    def line(cells: Sequence[str]) -> str:
+        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+    return "\n".join([line(head), "|" + "---|" * len(head), *(line(row) for row in rows)])
+
+
+CHAPTERS = (
+    Chapter("config", _config),
+    Chapter("drives", _drives),
+    Chapter("layouts", _layouts),
+    Chapter("channels", _channels),
+    Chapter("units", _units),
+    Chapter("presets", _presets),
+    Chapter("parameters", _parameters),
+)

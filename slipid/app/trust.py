@@ -1,0 +1,88 @@
+"""How far a fit may be trusted: its open-loop predictions against those of the encoders."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from slipid.data.runs import Runs
+from slipid.infer.result import Fit
+from slipid.infer.verdicts.disputed import EndPoints, Trust, verdict_of_trust
+from slipid.predict import open_loop as replay
+from slipid.predict.floor_models import FloorModels
+from slipid.predict.kinematics import Encoder
+from slipid.predict.validation import ScoredRun, add_scores
+from slipid.support.errors import DataError
+from slipid.support.files import Content
+
+ENCODER = FloorModels(Encoder())
+MOST_RUNS = 24
+"""Runs that are replayed of every floor, evenly picked from those that were fitted."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A verdict and the errors it rests on.
+
+    Attributes:
+        trust: the verdict, with its reasons.
+        floors: mean end-point error over the way, of the fit and of the encoders alone.
+        runs: how many were replayed.
+    """
+
+    trust: Trust
+    floors: Mapping[str, EndPoints]
+    runs: int
+
+    @property
+    def warning(self) -> str | None:
+        """What a picture must say of a fit that is not to be used."""
+        return f"THIS FIT IS {self.trust.word.upper()}" if self.is_bad else None
+
+    @property
+    def is_bad(self) -> bool:
+        """Whether the fit is not to be trusted at all."""
+        return self.trust.word == "not to be trusted"
+
+    def to_json(self) -> Content:
+        return {
+            "verdict": self.trust.word,
+            "reasons": list(self.trust.reasons),
+            "runs": self.runs,
+            "endpoint_error_over_path": {name: asdict(e) for name, e in self.floors.items()},
+        }
+
+
+def judgement(fit: Fit, data: Runs) -> Judgement:
+    """Verdict on a fit by the runs it was made of, replayed from their first pose on."""
+    some = data.subset(_picked(data))
+    runs: dict[int, ScoredRun] = {}
+    try:
+        cuts = replay.cuts(some, fit.robot)
+    except DataError:  # a fitted lag can be so long that a short run shows nothing
+        cuts = []
+    for w in cuts:
+        plain = replay.follow(fit.robot, w, ENCODER.increments(w, fit.robot))
+        for name, tracks in ((fit.contact.name, fit.contact.tracks(w)), (ENCODER.name, plain)):
+            add_scores(runs, some, name, tracks, None)
+    errors: dict[str, list[list[float]]] = {}
+    for run in runs.values():
+        off = [score.endpoint_error_over_path for score in run.models.values()]
+        errors.setdefault(run.surface, []).append(off)
+    floors = {
+        name: EndPoints(*np.mean(each, axis=0).tolist()) for name, each in sorted(errors.items())
+    }
+    trust = verdict_of_trust(floors, fit.converged, fit.parameters.values())
+    return Judgement(trust, floors, len(runs))
+
+
+def _picked(data: Runs) -> list[int]:
+    """Numbers of at most `MOST_RUNS` runs of every floor."""
+    of_floor: dict[str, list[int]] = {}
+    for k, log in enumerate(data.logs):
+        of_floor.setdefault(log.surface or "unknown", []).append(k)
+    out = []
+    for runs in of_floor.values():
+        at = np.unique(np.linspace(0, len(runs) - 1, MOST_RUNS).round().astype(int))
+        out += [runs[k] for k in at]
+    return sorted(out)

@@ -1,1 +1,0 @@
-"""Slip from the encoders and the currents alone: no slip at all, corrections, and slip curves."""

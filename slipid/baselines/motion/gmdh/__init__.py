@@ -1,1 +1,0 @@
-"""Andrakhanov and Belyaev's GMDH networks: slip from wheels and currents."""

@@ -1,1 +1,0 @@
-"""Quann and others' Gaussian processes: slip from what is measured, energy from places."""

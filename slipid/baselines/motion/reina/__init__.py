@@ -1,1 +1,0 @@
-"""Reina and others' slip detectors: indicators from encoders, gyro and currents."""

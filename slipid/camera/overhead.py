@@ -1,0 +1,239 @@
+"""The overhead camera: lens, place above the floor, and from pixels to places at a known height.
+
+A pixel tells a ray, not a place. What lies `h` above the floor is seen where the ray crosses the
+plane z = h: for a camera at height H that looks straight down, marker corners appear H / (H - h)
+times as far from the point below the lens as the robot really is. A marker on a robot that is read
+as if it lay on the floor makes every way too long by that factor (12 % where h is 0.105 H), and the
+marker too large by the same: its known size gives such a mistake away.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, FiniteFloat
+
+from slipid.camera.opencv import ideal_points, opencv
+from slipid.support.errors import DataError
+from slipid.support.files import Content, read_json, write_json
+from slipid.support.toml_file import Section, checked
+
+SCHEMA = "slipid.camera/1"
+Pixels = Annotated[int, Field(gt=0, le=100_000)]
+Row = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+Three = Annotated[list[Row], Field(min_length=3, max_length=3)]
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """How a camera draws: OpenCV's pinhole with distortion.
+
+    Attributes:
+        image_px: width and height of its images [pixel].
+        matrix: focal lengths and principal point [pixel].
+        distortion: k1, k2, p1, p2, k3, ... of OpenCV's model.
+    """
+
+    image_px: tuple[int, int]
+    matrix: Float[np.ndarray, "3 3"]
+    distortion: Float[np.ndarray, " coefficient"]
+
+    def to_json(self) -> Content:
+        """What a camera file says of it."""
+        return {
+            "schema": SCHEMA,
+            "image_px": list(self.image_px),
+            "matrix": self.matrix.tolist(),
+            "distortion": self.distortion.tolist(),
+        }
+
+    def ideal(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Where a pinhole with focal length 1 sees what the lens shows at some pixels."""
+        flat = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
+        if not len(flat):
+            return flat.reshape(np.shape(pixels))
+        return ideal_points(flat, self.matrix, self.distortion).reshape(np.shape(pixels))
+
+
+@dataclass(frozen=True, eq=False)
+class OverheadCamera:
+    """A calibrated camera above a floor, whose world has z = 0 on the floor and z up.
+
+    Attributes:
+        lens: how it draws.
+        rotation: from the world to the camera's axes: x right, y down, z away.
+        place: of the lens in the world [m].
+        scale_std: how well lengths on the floor are known, as a part of them [1]; None where that
+            was not told.
+        report: what the calibration found, kept as it stands.
+    """
+
+    lens: Lens
+    rotation: Float[np.ndarray, "3 3"]
+    place: Float[np.ndarray, "3"]
+    scale_std: float | None = None
+    report: Content = field(default_factory=dict)
+
+    @classmethod
+    def straight_down(
+        cls,
+        image_px: tuple[int, int],
+        metres_per_pixel: float,
+        height_m: float,
+        turn_deg: float = 0.0,
+    ) -> "OverheadCamera":
+        """A camera without distortion that looks straight down on the middle of its picture.
+
+        World x is the picture's right, y its up; the origin is the middle of the picture.
+
+        Args:
+            metres_per_pixel: on the floor.
+            height_m: of the lens above the floor.
+            turn_deg: by which the world's x and y are turned to the left in the picture, about z;
+                at 180, x is the picture's left and y its down.
+        """
+        focal, (width, height) = height_m / metres_per_pixel, image_px
+        matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+        cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+        # columns are the world's x, y, z in the axes right, down, away
+        rotation = np.array([[cosine, -sine, 0], [-sine, -cosine, 0], [0, 0, -1]])
+        return cls(Lens(image_px, matrix, np.zeros(4)), rotation, np.array([0.0, 0.0, height_m]))
+
+    @property
+    def height(self) -> float:
+        """Height of the lens above the floor [m]."""
+        return float(self.place[2])
+
+    def pixels(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
+        """Where places in the world [m] are seen."""
+        cv2 = opencv()
+        flat = np.ascontiguousarray(points, float).reshape(-1, 1, 3)
+        shape = (*np.shape(points)[:-1], 2)
+        if not len(flat):
+            return np.zeros(shape)
+        turn = cv2.Rodrigues(self.rotation)[0]
+        shift = -self.rotation @ self.place
+        seen = cv2.projectPoints(flat, turn, shift, self.lens.matrix, self.lens.distortion)[0]
+        return np.asarray(seen).reshape(shape)
+
+    def on_plane(
+        self, pixels: Float[np.ndarray, "*batch 2"], height_m: float
+    ) -> Float[np.ndarray, "*batch 2"]:
+        """x, y [m] of what is seen at some pixels and lies at a height above the floor.
+
+        NaN where a ray does not go down to that height.
+        """
+        ideal = self.lens.ideal(pixels)
+        rays = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1) @ self.rotation
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far = (height_m - self.place[2]) / rays[..., 2:]
+            found = self.place[:2] + far * rays[..., :2]
+        return np.asarray(np.where(far > 0, found, np.nan))
+
+    def of_size(self, image_px: tuple[int, int], source: Path | str) -> None:
+        """Refuse images of another size than it was calibrated at.
+
+        Raises:
+            DataError: they have another one; a smaller image may be a part or a shrunk whole.
+        """
+        if tuple(image_px) != tuple(self.lens.image_px):
+            w, h = self.lens.image_px
+            raise DataError(
+                f"{source}: images of {image_px[0]} x {image_px[1]} pixels, but the camera was "
+                f"calibrated at {w} x {h}; expected the same resolution: record at it, or "
+                "calibrate at this one"
+            )
+
+    def to_json(self) -> Content:
+        """What `load` reads."""
+        return self.lens.to_json() | {
+            "rotation_from_world": self.rotation.tolist(),
+            "place_m": self.place.tolist(),
+            "scale_std": self.scale_std,
+            "report": self.report,
+        }
+
+    def save(self, path: Path | str) -> None:
+        """Write the camera as a JSON file.
+
+        Raises:
+            DataError: nothing can be written there.
+        """
+        write_json(Path(path), self.to_json())
+
+    @classmethod
+    def load(cls, path: Path | str) -> "OverheadCamera":
+        """The camera of a file that `slipid calibrate` or `slipid simulate` wrote.
+
+        Raises:
+            DataError: the file is absent or no camera, or one whose floor was not calibrated.
+        """
+        return read_camera(Path(path)).above_floor(path)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFile:
+    """What a file says: the lens, and the whole camera where its floor is known too."""
+
+    lens: Lens
+    camera: OverheadCamera | None
+    report: Content
+
+    def above_floor(self, path: Path | str) -> OverheadCamera:
+        """The camera; DataError where its floor was not calibrated."""
+        if self.camera is None:
+            raise DataError(
+                f"{path}: a lens without a floor; expected one with rotation_from_world and "
+                "place_m: `slipid calibrate --camera FILE --floor PICTURE` adds them"
+            )
+        return self.camera
+
+
+class _File(Section):
+    """A camera file as it stands."""
+
+    schema_: Literal["slipid.camera/1"] = Field(alias="schema")
+    image_px: tuple[Pixels, Pixels]
+    matrix: Three
+    distortion: list[FiniteFloat] = Field(default_factory=list, max_length=14)
+    rotation_from_world: Three | None = None
+    place_m: Row | None = None
+    frame_s: FiniteFloat | None = None
+    scale_std: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    report: Content = Field(default_factory=dict)
+
+
+def read_camera(path: Path) -> CameraFile:
+    """A camera file, checked.
+
+    Raises:
+        DataError: absent, no camera file, or numbers that no camera has.
+    """
+    what = "a camera file (slipid.camera/1) that `slipid calibrate` wrote"
+    given = checked(path, read_json(path, what), _File)
+    matrix = np.array(given.matrix)
+    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and (matrix[2] == [0, 0, 1]).all()):
+        raise DataError(
+            f"{path}: matrix {given.matrix}; expected [[f, 0, x], [0, f, y], [0, 0, 1]]"
+        )
+    count = len(given.distortion)
+    if count not in (0, 4, 5, 8, 12, 14):
+        raise DataError(f"{path}: {count} numbers of distortion; expected 4, 5, 8, 12 or 14")
+    lens = Lens(given.image_px, matrix, np.array(given.distortion or [0.0] * 4))
+    if given.rotation_from_world is None or given.place_m is None:
+        return CameraFile(lens, None, given.report)
+    rotation, place = np.array(given.rotation_from_world), np.array(given.place_m)
+    if not (
+        np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
+    ):
+        raise DataError(f"{path}: rotation_from_world is no rotation")
+    if not (place[2] > 0 and rotation[2, 2] < 0):
+        raise DataError(
+            f"{path}: the camera is {place[2]:g} m high and "
+            f"{'looks up' if rotation[2, 2] >= 0 else 'looks down'}; expected it above the floor "
+            "(z up), looking down"
+        )
+    camera = OverheadCamera(lens, rotation, place, given.scale_std, given.report)
+    return CameraFile(lens, camera, given.report)

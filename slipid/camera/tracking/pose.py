@@ -1,0 +1,174 @@
+"""From the corners of markers to the pose of the body on the floor, with its covariance.
+
+Every corner is a ray, met by the plane at the corner's height. There the corners of a body at x, y
+with heading theta, whose markers look s times as large as they are, lie at
+
+    place_i = (x, y) + R(theta) (middle_i + s own_i)                                         (1)
+
+with the middle of the corner's marker on the body and, from there, the corner's own place. What is
+left over, turned into pixels by the local derivative of the ray's place, is least. The factor s is
+fitted because the edge between black and white is found a little within or beside where it is, in
+all corners alike: it takes that up, and tells a wrong height of the markers. It does not stretch
+the way from the body's origin to a marker: that was measured with a ruler.
+With corners that err by sigma pixels each, independently, the covariance of (x, y, theta) is that
+part of sigma^2 (J^T J)^-1.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from slipid.camera.overhead import OverheadCamera
+from slipid.camera.tracking.target import Target
+
+ROUNDS = 3
+"""Of Gauss-Newton: the first guess is exact but for the tilt of the camera."""
+STEP = 0.5
+"""Step of the derivative of a ray's place [pixel]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses of a body, NaN where it was not seen.
+
+    Attributes:
+        pose: x, y [m], heading [rad] between -pi and pi.
+        unit_covariance: of the pose where corners err by one pixel [m, rad per pixel, squared].
+        size: how large the markers look over what they are, at their height [1].
+        squares: sum of the squares left over [pixel^2].
+        free: how many numbers were left over for it: two a corner less four.
+    """
+
+    pose: Float[np.ndarray, "frame 3"]
+    unit_covariance: Float[np.ndarray, "frame 3 3"]
+    size: Float[np.ndarray, " frame"]
+    squares: Float[np.ndarray, " frame"]
+    free: Float[np.ndarray, " frame"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """All corners of a target.
+
+    Attributes:
+        middle: of the corner's marker, ahead and left on the body [m].
+        own: from there to the corner [m].
+        height: above the floor [m].
+    """
+
+    middle: Float[np.ndarray, "corner 2"]
+    own: Float[np.ndarray, "corner 2"]
+    height: Float[np.ndarray, " corner"]
+
+    @classmethod
+    def of(cls, target: Target) -> "_Body":
+        corners = np.stack([marker.corners for marker in target.markers])
+        middle = np.repeat(corners[..., :2].mean(axis=1), 4, axis=0)
+        flat = corners.reshape(-1, 3)
+        return cls(middle, flat[:, :2] - middle, flat[:, 2])
+
+
+def poses_of(
+    camera: OverheadCamera, target: Target, corners: Float[np.ndarray, "frame marker 4 2"]
+) -> Poses:
+    """Poses of a body from where the corners of its markers are seen.
+
+    Args:
+        camera: with its place above the floor.
+        target: the body; markers in this order.
+        corners: x, y [pixel], NaN where a marker is not seen.
+    """
+    frames = len(corners)
+    body = _Body.of(target)
+    pixels = corners.reshape(frames, len(body.height), 2)
+    place, per_pixel = _on_planes(camera, pixels, body.height)
+    seen = np.isfinite(place).all(axis=-1) & np.isfinite(per_pixel).all(axis=(-1, -2))
+    seen &= seen.sum(axis=1, keepdims=True) >= 3
+    some = seen.any(axis=1)
+    out = Poses(*(np.full((frames, *shape), np.nan) for shape in ((3,), (3, 3), (), (), ())))
+    if not some.any():  # another body than those in view
+        return out
+    place, per_pixel, used = place[some], per_pixel[some], seen[some]
+    place = np.where(used[..., None], place, 0.0)
+    into_pixels = np.linalg.inv(np.where(used[..., None, None], per_pixel, np.eye(2)))
+    fitted = _similarity(place, body.middle + body.own, used)
+    for _ in range(ROUNDS):
+        left, slope = _left_over(fitted, place, into_pixels, body, used)
+        normal = np.swapaxes(slope, 1, 2) @ slope
+        step = np.linalg.solve(normal, np.swapaxes(slope, 1, 2) @ left[..., None])
+        fitted = fitted - step[..., 0]
+    left, slope = _left_over(fitted, place, into_pixels, body, used)
+    unit = np.linalg.inv(np.swapaxes(slope, 1, 2) @ slope)[:, :3, :3]
+    turned = np.angle(np.exp(1j * fitted[:, 2]))
+    out.pose[some] = np.column_stack([fitted[:, :2], turned])
+    out.unit_covariance[some], out.size[some] = unit, fitted[:, 3]
+    out.squares[some], out.free[some] = (left**2).sum(axis=1), 2.0 * used.sum(axis=1) - 4.0
+    return out
+
+
+def _on_planes(
+    camera: OverheadCamera,
+    pixels: Float[np.ndarray, "frame corner 2"],
+    heights: Float[np.ndarray, " corner"],
+) -> tuple[Float[np.ndarray, "frame corner 2"], Float[np.ndarray, "frame corner 2 2"]]:
+    """Places [m] of corners at their heights, and how they move with their pixels [m/pixel]."""
+    place = np.full(pixels.shape, np.nan)
+    slope = np.full((*pixels.shape, 2), np.nan)
+    for height in np.unique(heights):
+        at = heights == height
+        some = pixels[:, at]
+        place[:, at] = camera.on_plane(some, float(height))
+        moved = [
+            (
+                camera.on_plane(some + step, float(height))
+                - camera.on_plane(some - step, float(height))
+            )
+            / (2 * STEP)
+            for step in STEP * np.eye(2)
+        ]
+        slope[:, at] = np.stack(moved, axis=-1)
+    return place, slope
+
+
+def _similarity(
+    place: Float[np.ndarray, "frame corner 2"],
+    body: Float[np.ndarray, "corner 2"],
+    used: Bool[np.ndarray, "frame corner"],
+) -> Float[np.ndarray, "frame 4"]:
+    """x, y, heading and size by least squares in metres, in closed form."""
+    weight = used / used.sum(axis=1, keepdims=True)
+    z, c = place[..., 0] + 1j * place[..., 1], body[:, 0] + 1j * body[:, 1]
+    middle, own = (weight * z).sum(axis=1), (weight * c).sum(axis=1)
+    away = c - own[:, None]
+    turn = (weight * np.conj(away) * (z - middle[:, None])).sum(axis=1)
+    turn = turn / (weight * np.abs(away) ** 2).sum(axis=1)
+    origin = middle - turn * own
+    return np.column_stack([origin.real, origin.imag, np.angle(turn), np.abs(turn)])
+
+
+def _left_over(
+    fitted: Float[np.ndarray, "frame 4"],
+    place: Float[np.ndarray, "frame corner 2"],
+    into_pixels: Float[np.ndarray, "frame corner 2 2"],
+    body: _Body,
+    used: Bool[np.ndarray, "frame corner"],
+) -> tuple[Float[np.ndarray, "frame number"], Float[np.ndarray, "frame number 4"]]:
+    """Equation (1) less what was seen [pixel], and its derivative by x, y, heading and size."""
+    own, size = _turned(body.own, fitted[:, 2]), fitted[:, 3, None, None]
+    turned = _turned(body.middle, fitted[:, 2]) + size * own
+    across = np.stack([-turned[..., 1], turned[..., 0]], axis=-1)
+    gap = fitted[:, None, :2] + turned - place
+    moved = np.broadcast_to(np.eye(2), (*place.shape[:2], 2, 2))
+    slope = np.concatenate([moved, across[..., None], own[..., None]], axis=-1)
+    left = np.where(used[..., None], np.einsum("fcij,fcj->fci", into_pixels, gap), 0.0)
+    bent = np.where(used[..., None, None], into_pixels @ slope, 0.0)
+    return left.reshape(len(left), -1), bent.reshape(len(bent), -1, 4)
+
+
+def _turned(
+    points: Float[np.ndarray, "corner 2"], heading: Float[np.ndarray, " frame"]
+) -> Float[np.ndarray, "frame corner 2"]:
+    c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    x, y = points[:, 0], points[:, 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)

@@ -1,0 +1,136 @@
+"""One frame of a video with what was found in it, for a person to check."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from slipid.camera.opencv import opencv
+from slipid.camera.overhead import OverheadCamera
+from slipid.camera.tracking.track import Track
+from slipid.support.errors import DataError
+from slipid.support.files import writable, write_bytes
+
+GRID = 0.25
+"""Distance of the lines that are drawn on the floor [m]."""
+FLOOR, EDGE, AHEAD, LEFT = (190, 190, 60), (0, 170, 255), (40, 40, 230), (60, 190, 60)
+"""Colours, in blue, green, red."""
+
+
+def write_preview(
+    path: Path,
+    grey: UInt8[np.ndarray, "row column"],
+    camera: OverheadCamera,
+    tracks: tuple[Track, ...],
+    row: int,
+) -> None:
+    """Write a frame with a grid on the floor, the markers' edges and the bodies' axes.
+
+    Args:
+        path: of a PNG or JPEG file.
+        grey: the frame.
+        tracks: of every body.
+        row: of the frame in the tracks.
+
+    Raises:
+        DataError: the suffix is of no picture, or nothing can be written there.
+    """
+    cv2 = opencv()
+    drawn = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    _grid(drawn, camera)
+    for track in tracks:
+        if track.good[row]:
+            _body(drawn, camera, track, track.pose[row])
+    write_bytes(path, _encoded(path, drawn))
+
+
+def can_draw(path: Path) -> None:
+    """Try whether a picture can be written there.
+
+    Raises:
+        DataError: not so, or its suffix is of no picture.
+    """
+    _encoded(path, np.zeros((8, 8, 3), np.uint8))
+    writable(path.parent)
+
+
+def _encoded(path: Path, drawn: UInt8[np.ndarray, "row column 3"]) -> bytes:
+    cv2 = opencv()
+    try:
+        there, data = cv2.imencode(path.suffix or ".", drawn)
+    except cv2.error:
+        there = False
+    if not there:
+        raise DataError(f"{path}: no picture that OpenCV writes; expected .png or .jpg")
+    return bytes(data)
+
+
+def _line(
+    drawn: np.ndarray,
+    camera: OverheadCamera,
+    points: Float[np.ndarray, "point 3"],
+    colour: tuple[int, int, int],
+    width: int,
+) -> None:
+    """A line through places in the world, where the picture has room for it."""
+    cv2 = opencv()
+    pixels = camera.pixels(points)
+    if np.isfinite(pixels).all() and (np.abs(pixels) < 1e5).all():
+        whole = np.round(pixels).astype(np.int32).reshape(-1, 1, 2)
+        cv2.polylines(drawn, [whole], False, colour, width, cv2.LINE_AA)
+
+
+def _grid(drawn: np.ndarray, camera: OverheadCamera) -> None:
+    """Lines on the floor, as far as the picture shows it, with their distance written down."""
+    cv2 = opencv()
+    width, height = camera.lens.image_px
+    frame = np.stack(np.meshgrid(np.linspace(0, width, 9), np.linspace(0, height, 9)), -1)
+    floor = camera.on_plane(frame.reshape(-1, 2), 0.0)
+    floor = floor[np.isfinite(floor).all(axis=1)]
+    low, high = floor.min(axis=0), floor.max(axis=0)
+    high = np.minimum(high, low + 100 * GRID)  # a tilted camera sees the horizon
+    lines = [np.arange(np.ceil(low[k] / GRID), high[k] / GRID) * GRID for k in range(2)]
+    for axis in range(2):
+        along = np.linspace(low[1 - axis], high[1 - axis], 40)
+        for at in lines[axis]:
+            points = np.zeros((len(along), 3))
+            points[:, axis], points[:, 1 - axis] = at, along
+            _line(drawn, camera, points, FLOOR, 2 if abs(at) < 1e-9 else 1)
+            if abs(at) > 1e-9:
+                _label(drawn, camera, at * np.eye(3)[axis], f"{'xy'[axis]} {at:g}")
+    text = f"lines on the floor every {GRID:g} m, thick through the origin"
+    cv2.putText(drawn, text, (20, height - 20), cv2.FONT_HERSHEY_SIMPLEX, 0.8, FLOOR, 2)
+
+
+def _label(
+    drawn: np.ndarray, camera: OverheadCamera, place: Float[np.ndarray, "3"], text: str
+) -> None:
+    """Words beside a place on the floor, where the picture shows it."""
+    cv2 = opencv()
+    x, y = camera.pixels(place[None])[0].tolist()
+    width, height = camera.lens.image_px
+    if 0 <= x < width and 0 <= y < height:
+        where = (round(x) + 6, round(y) - 6)
+        cv2.putText(drawn, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.6, FLOOR, 1, cv2.LINE_AA)
+
+
+def _body(
+    drawn: np.ndarray, camera: OverheadCamera, track: Track, pose: Float[np.ndarray, "3"]
+) -> None:
+    """Edges of the markers, where they should be; the body's axes, x red and y green."""
+    cv2 = opencv()
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    place = np.array([pose[0], pose[1], 0.0])
+    for marker in track.target.markers:
+        around = marker.corners[[0, 1, 2, 3, 0]] @ turn.T + place
+        _line(drawn, camera, around, EDGE, 2)
+    length = 1.5 * max(marker.size for marker in track.target.markers)
+    origin = np.array([0.0, 0.0, track.target.height])
+    for axis, colour in enumerate((AHEAD, LEFT)):
+        tip = origin + length * np.eye(3)[axis]
+        _line(drawn, camera, np.stack([origin, tip]) @ turn.T + place, colour, 3)
+    at = camera.pixels((origin + place)[None])[0] + (30, -60)
+    text = f"{track.target.name}: {pose[0]:.3f}, {pose[1]:.3f} m, {np.degrees(pose[2]):.1f} deg"
+    where = tuple(np.round(at).astype(int).tolist())
+    cv2.putText(drawn, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.9, AHEAD, 2)

@@ -1,0 +1,192 @@
+"""What is tracked: markers that stand still on one body, by dictionary, number, size and place.
+
+A marker alone lies in the middle of the body, and its top edge is ahead: the heading is the
+direction from its bottom edge to its top edge as the dictionary draws it. A file places several,
+or boards, anywhere on the body:
+
+    [[target]]
+    name = "robot"
+    dictionary = "4X4_50"
+
+    [[target.marker]]
+    id = 0
+    size_m = 0.131
+    height_m = 0.25            # above the floor
+    place_m = [0.05, 0.0]      # of its middle on the body, x ahead, y left
+    yaw_deg = 90.0             # of its top edge, counter-clockwise from ahead
+
+    [[target.board]]           # a grid of markers, numbered along its rows
+    first_id = 10
+    columns = 3
+    rows = 2
+    size_m = 0.04
+    gap_m = 0.01
+    height_m = 0.25
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, FiniteFloat
+
+from slipid.camera.opencv import marker_dictionary
+from slipid.support.errors import DataError
+from slipid.support.toml_file import Positive, Section, checked, mapping_of, text_of
+
+Id = Annotated[int, Field(ge=0, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class Marker:
+    """One marker on a body.
+
+    Attributes:
+        id: its number in the dictionary.
+        size: length of an edge of its black square [m].
+        corners: x ahead, y left, height above the floor [m] of its corners as OpenCV counts them:
+            top left, top right, bottom right, bottom left.
+    """
+
+    id: int
+    size: float
+    corners: Float[np.ndarray, "corner 3"]
+
+    @classmethod
+    def at(
+        cls,
+        id: int,
+        size: float,
+        height: float,
+        place: tuple[float, float] = (0.0, 0.0),
+        yaw: float = 0.0,
+    ) -> "Marker":
+        """A marker at a place on the body [m], its top edge turned by a yaw [rad] from ahead."""
+        ahead_left = 0.5 * size * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
+        c, s = np.cos(yaw), np.sin(yaw)
+        flat = ahead_left @ np.array([[c, s], [-s, c]]) + np.asarray(place)
+        return cls(id, size, np.column_stack([flat, np.full(4, height)]))
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A body and its markers, all of one dictionary; no two of them have the same number."""
+
+    name: str
+    dictionary: str
+    markers: tuple[Marker, ...]
+
+    @property
+    def ids(self) -> frozenset[int]:
+        """Numbers of its markers."""
+        return frozenset(marker.id for marker in self.markers)
+
+    @property
+    def height(self) -> float:
+        """Mean height of its markers above the floor [m]."""
+        return float(np.mean([marker.corners[:, 2] for marker in self.markers]))
+
+    def below(self, camera_m: float) -> None:
+        """DataError where a marker is as high as the camera [m], which does not see it then."""
+        for marker in self.markers:
+            if (height := float(marker.corners[:, 2].max())) >= camera_m:
+                raise DataError(
+                    f"{self.name}: marker {marker.id} at {height:g} m above the floor, but the "
+                    f"camera at {camera_m:g} m; expected heights in metres, below the camera"
+                )
+
+
+class _Placed(Section):
+    """Where something lies on the body."""
+
+    size_m: Positive
+    height_m: FiniteFloat
+    place_m: tuple[FiniteFloat, FiniteFloat] = (0.0, 0.0)
+    yaw_deg: FiniteFloat = 0.0
+
+
+class _Single(_Placed):
+    id: Id
+
+
+class _Board(_Placed):
+    """A grid of markers; its middle is at its place, its first row is ahead."""
+
+    first_id: Id
+    columns: Annotated[int, Field(ge=1, le=100)]
+    rows: Annotated[int, Field(ge=1, le=100)]
+    gap_m: Positive
+
+    def markers(self) -> list[Marker]:
+        """Its markers, from the one ahead on the left on, row by row."""
+        pitch, yaw = self.size_m + self.gap_m, np.radians(self.yaw_deg)
+        c, s = np.cos(yaw), np.sin(yaw)
+        out = []
+        for k in range(self.rows * self.columns):
+            row, column = divmod(k, self.columns)
+            ahead = pitch * (0.5 * (self.rows - 1) - row)
+            left = pitch * (0.5 * (self.columns - 1) - column)
+            place = (
+                self.place_m[0] + c * ahead - s * left,
+                self.place_m[1] + s * ahead + c * left,
+            )
+            out.append(Marker.at(self.first_id + k, self.size_m, self.height_m, place, yaw))
+        return out
+
+
+class _Target(Section):
+    name: Annotated[str, Field(pattern="^[A-Za-z0-9_-]+$")] = "robot"
+    dictionary: str = "4X4_50"
+    marker: list[_Single] = Field(default_factory=list)
+    board: list[_Board] = Field(default_factory=list)
+
+
+class _File(Section):
+    schema_: Literal["slipid.targets/1"] = Field("slipid.targets/1", alias="schema")
+    target: list[_Target] = Field(min_length=1)
+
+
+def read_targets(path: Path) -> tuple[Target, ...]:
+    """What a TOML file says is to be tracked.
+
+    Raises:
+        DataError: unreadable or wrong; no marker, or the same number twice in a dictionary.
+    """
+    given = checked(path, mapping_of(path, text_of(path, "targets to track")), _File)
+    targets = tuple(_target(one, f"{path}: target '{one.name}'") for one in given.target)
+    _told_apart(targets, str(path))
+    return targets
+
+
+def _target(given: _Target, where: str) -> Target:
+    markers = [
+        Marker.at(m.id, m.size_m, m.height_m, m.place_m, float(np.radians(m.yaw_deg)))
+        for m in given.marker
+    ]
+    markers += [marker for board in given.board for marker in board.markers()]
+    if not markers:
+        raise DataError(f"{where}: no marker; expected [[target.marker]] or [[target.board]]")
+    most = len(marker_dictionary(given.dictionary).bytesList)
+    for marker in markers:
+        if marker.id >= most:
+            raise DataError(
+                f"{where}: marker {marker.id}; expected 0 to {most - 1} in {given.dictionary}"
+            )
+    return Target(given.name, given.dictionary, tuple(markers))
+
+
+def _told_apart(targets: Sequence[Target], where: str) -> None:
+    """DataError where a number or a name is there twice, or dictionaries differ."""
+    if len({target.name for target in targets}) < len(targets):
+        raise DataError(f"{where}: two targets with one name; expected names of their own")
+    if len({target.dictionary for target in targets}) > 1:
+        raise DataError(f"{where}: targets in several dictionaries; expected one for all")
+    seen: set[int] = set()
+    for target in targets:
+        for marker in target.markers:
+            if marker.id in seen:
+                raise DataError(f"{where}: marker {marker.id} twice; expected every number once")
+            seen.add(marker.id)

@@ -1,1 +1,0 @@
-"""What robot.json holds, and how it is read, checked and written."""

@@ -1,0 +1,1 @@
+"""The sanity check of runs before a fit: findings and their remedies."""

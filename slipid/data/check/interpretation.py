@@ -1,0 +1,228 @@
+"""An interpretation of the logs: which column is which wheel, which sign each has, how axes lie.
+
+The declared interpretation has no mistake; each candidate differs from it by one. How badly
+one fits is the sum of what it leaves unexplained, each a share of 0 to 1 and each blind to lengths,
+so that slip does not count against the true one:
+
+    pose, and commanded twist   steps of the body along each axis, by those that wheels predict
+    wheels                      turns that no motion of a rigid body makes (beyond three wheels)
+    commanded wheel speeds      turns, by those that were commanded
+    gyro                        turns of the heading, by those of the gyro
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.check.joined import (
+    CONVENTIONS,
+    ChannelIncrements,
+    PoseConvention,
+    Products,
+    StepEdges,
+    body_motion,
+    products,
+    rotation,
+    usable,
+)
+from slipid.model.geometry import Geometry
+
+STILL = 1e-3
+"""Share of the wheels' predicted motion along an axis below which the axis is not looked at."""
+
+
+@dataclass(frozen=True)
+class Interpretation:
+    """One meant of the columns.
+
+    Attributes:
+        order: column that each wheel is found in, counted from 0; empty for the declared order.
+        sign: of each wheel's column; empty where all are as declared.
+        azimuth: to be added to the declared directions of all wheels [deg].
+        convention: how the pose is meant.
+        command_order, command_sign: as `order` and `sign`, of the commanded wheel speeds.
+        twist_sign: of the commanded x, y and yaw rate.
+        gyro_sign: of the gyro.
+    """
+
+    order: tuple[int, ...] = ()
+    sign: tuple[int, ...] = ()
+    azimuth: int = 0
+    convention: PoseConvention = field(default_factory=PoseConvention)
+    command_order: tuple[int, ...] = ()
+    command_sign: tuple[int, ...] = ()
+    twist_sign: tuple[int, int, int] = (1, 1, 1)
+    gyro_sign: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Commanded:
+    """Products of turns with commanded turns (wheel, wheel), and both sums of squares [rad^2]."""
+
+    across: Float[np.ndarray, "wheel wheel"]
+    turns: float
+    commanded: float
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Products that interpretations are compared with.
+
+    Attributes:
+        rolling: J / r, turns of each wheel per step of the body, heading in metres at the base
+            radius (wheel, 3) [rad/m].
+        base: base radius [m].
+        pose: products of the declared turns with the body's steps, for each bare convention.
+        twist: the same with the commanded twist, or None.
+        command: products of the declared turns with the commanded ones (wheel, wheel), and the sums
+            of squares of both, or None.
+        gyro: covariance of gyro and heading over the product of their spreads, for each bare
+            convention, or None where neither turns.
+    """
+
+    rolling: Float[np.ndarray, "wheel 3"]
+    base: float
+    pose: Mapping[PoseConvention, Products]
+    twist: Products | None
+    command: Commanded | None
+    gyro: Mapping[PoseConvention, float] | None
+
+    @property
+    def wheels(self) -> int:
+        """Number of wheels."""
+        return len(self.rolling)
+
+    @property
+    def free(self) -> bool:
+        """Whether the wheels fix all three parts of the twist."""
+        return bool(np.linalg.matrix_rank(self.rolling, tol=1e-6) == 3)
+
+
+def gather(geometry: Geometry, at: StepEdges, moved: ChannelIncrements) -> Evidence:
+    """Products of all channels, for a robot of the declared geometry."""
+    base = float(geometry.base_radius)
+    rolling = np.asarray(geometry.forward()) / float(geometry.wheel_radius) / [1.0, 1.0, base]
+    pose: dict[PoseConvention, Products] = {}
+    gyro: dict[PoseConvention, float] = {}
+    for convention in CONVENTIONS:
+        body = body_motion(at, convention)
+        found = products(moved.wheels, body, base)
+        if found is None:
+            continue
+        pose[convention] = found
+        if moved.gyro is not None:
+            gyro[convention] = _alike(moved.gyro, body, found)
+    twist = None if moved.twist is None else products(moved.wheels, moved.twist, base, rounds=0)
+    if twist is not None and not np.trace(twist.body) > 0:
+        twist = None
+    alike = gyro if any(gyro.values()) else None
+    return Evidence(rolling, base, pose, twist, _commanded(moved), alike)
+
+
+def _alike(gyro: np.ndarray, body: np.ndarray, found: Products) -> float:
+    """Covariance of gyro and heading over the product of their spreads; 0 where none turns."""
+    turned = np.stack([gyro[found.known, 0], body[found.known, 2]])
+    (own, both), (_, other) = (turned * found.weight) @ turned.T
+    return float(both / np.sqrt(own * other)) if own * other > 0 else 0.0
+
+
+def _commanded(moved: ChannelIncrements) -> Commanded | None:
+    """Products of turns with commanded ones."""
+    if moved.commanded is None:
+        return None
+    known = usable(moved.wheels, moved.commanded)
+    turns, commanded = moved.wheels[known], moved.commanded[known]
+    if not (commanded**2).sum() > 0:
+        return None
+    return Commanded(turns.T @ commanded, float((turns**2).sum()), float((commanded**2).sum()))
+
+
+def misfit(evidence: Evidence, meant: Interpretation) -> float:
+    """Sum of the unexplained shares of an interpretation."""
+    return sum(misfits(evidence, meant).values())
+
+
+def misfits(evidence: Evidence, meant: Interpretation) -> dict[str, float]:
+    """Unexplained share of each thing that interpretations are compared with."""
+    convention = meant.convention
+    bare = convention.bare
+    pose = evidence.pose.get(bare)
+    wheels = columns(meant, evidence.wheels)
+    predict = to_body(evidence, meant)
+    out = {"pose": 1.0}
+    if pose is not None:
+        out["pose"] = _unexplained(pose, predict, rotation(-convention.offset), evidence.free)
+        out["wheels"] = _beyond_rigid(pose, evidence.rolling, wheels)
+    if evidence.twist is not None:
+        signs = np.diag(np.array(meant.twist_sign, float))
+        out["twist"] = _unexplained(evidence.twist, predict, signs, evidence.free)
+    if evidence.command is not None:
+        out["command"] = _uncommanded(evidence.command, meant)
+    if evidence.gyro is not None:
+        out["gyro"] = 0.5 * (1.0 - meant.gyro_sign * evidence.gyro.get(bare, -1.0))
+    return out
+
+
+def columns(meant: Interpretation, wheels: int) -> Float[np.ndarray, "wheel wheel"]:
+    """Turns of the true wheels from the declared columns: a permutation with signs."""
+    order, sign = meant.order or tuple(range(wheels)), meant.sign or (1,) * wheels
+    out = np.zeros((wheels, wheels))
+    out[np.arange(wheels), list(order)] = sign
+    return out
+
+
+def to_body(evidence: Evidence, meant: Interpretation) -> Float[np.ndarray, "3 wheel"]:
+    """Steps of the body from the declared columns, by wheels that roll without slip."""
+    inverse = np.linalg.pinv(evidence.rolling, rcond=1e-6)
+    turned = rotation(meant.azimuth) @ inverse
+    return np.asarray(turned @ columns(meant, evidence.wheels))
+
+
+def _unexplained(
+    of: Products,
+    predict: Float[np.ndarray, "3 wheel"],
+    axes: Float[np.ndarray, "3 3"],
+    free: bool,
+) -> float:
+    """Share of the body's motion that the predicted one does not explain, at a factor per axis.
+
+    Sideways and turning motion count by the mean of their shares in what is predicted and in what
+    the poses have: lengths in a wrong unit must not hide either. Wheels that do not fix the twist
+    (not `free`) determine one direction, which has one factor.
+    """
+    predicted = np.einsum("aw,wv,av->a", predict, of.turns, predict)
+    both = np.einsum("aw,wa->a", predict, of.across @ axes.T)
+    own = np.diag(axes @ of.body @ axes.T)
+    total = predicted.sum()
+    if not total > 0 or not own.sum() > 0:
+        return 1.0
+    moves = predicted > STILL * total
+    explained = np.where(moves, both.clip(0) ** 2 / np.where(moves, predicted, 1.0), 0.0)
+    if not free and moves[:2].any():  # wheels that roll in one direction only: no factor per axis
+        explained[:2] = 0.5 * max(both[:2].sum(), 0.0) ** 2 / predicted[:2].sum()
+    along = 1.0 - explained[:2].sum() / max(own[:2].sum(), 1e-300)
+    about = 1.0 - explained[2] / max(own[2], 1e-300)
+    share = 0.5 * (predicted[2] / total + own[2] / own.sum())
+    return float((1 - share) * along + share * about)
+
+
+def _beyond_rigid(
+    of: Products, rolling: Float[np.ndarray, "wheel 3"], wheels: Float[np.ndarray, "wheel wheel"]
+) -> float:
+    """Share of the turns that no motion of a rigid body makes without slip."""
+    basis, values, _ = np.linalg.svd(rolling, full_matrices=False)
+    basis = basis[:, values > 1e-6 * values[0]]
+    turns = wheels @ of.turns @ wheels.T
+    total = float(np.trace(turns))
+    return 1.0 - float(np.trace(basis.T @ turns @ basis)) / total if total > 0 else 0.0
+
+
+def _uncommanded(of: Commanded, meant: Interpretation) -> float:
+    """Share of the turns that the commanded ones do not explain, at one factor."""
+    wheels = len(of.across)
+    mine = columns(meant, wheels)
+    theirs = Interpretation(meant.command_order, meant.command_sign)
+    both = float(np.trace(mine @ of.across @ columns(theirs, wheels).T))
+    return 1.0 - max(both, 0.0) ** 2 / max(of.turns * of.commanded, 1e-300)

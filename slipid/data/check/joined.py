@@ -1,0 +1,334 @@
+"""The channels of all runs on one clock, and their increments over the same steps.
+
+Conventions by which a logged pose may be meant, and the body's steps under each.
+
+Products of increments of wheels, commands and poses, by which interpretations are compared.
+
+A robust fit of the body's steps on the wheels' turns finds outliers, whatever wheels and axes mean:
+
+    body = K turn,    weight = (1 + (|residual| / s)^2)^-2,    s = 2 median |residual|
+
+since a linear map of turns swallows order, signs, radius, azimuths and heading offset alike.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from slipid.data.log import Log
+from slipid.data.runs import Runs
+from slipid.data.wheel_signals import body_increments, integral, interpolate
+
+STEP_S = 0.4
+"""Length of a step [s]: long beside jitter and rounding, short beside a turn of the robot."""
+MOST_STEPS = 20_000
+"""Steps beyond which they are made longer; that happens where time is in the wrong unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedChannel:
+    """One channel of all runs, end to end on the clock of `JoinedRuns`.
+
+    Attributes:
+        time: on that clock [s], increasing.
+        value: one column per wheel or axis; nan in runs that lack the channel.
+    """
+
+    time: Float[np.ndarray, " row"]
+    value: Float[np.ndarray, "row column"]
+
+    def at(self, when: Float[np.ndarray, " at"]) -> Float[np.ndarray, "at column"]:
+        """Values at other times of the clock [s], linear in between."""
+        return interpolate(self.time, self.value, when)
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedRuns:
+    """The channels of all runs, run after run on one clock with pauses in between.
+
+    Attributes:
+        names: of the runs.
+        begin: when each run's poses and encoders begin (run,) [s].
+        end: when they end (run,) [s].
+        row: usual time between rows of each run (run,) [s].
+        angle: angle of each wheel [rad].
+        pose: x [m], y [m], heading [rad] where it is fresh.
+        reported: integral of the reported wheel speeds [rad], or None.
+        commanded: integral of the commanded wheel speeds [rad], or None.
+        twist: integral of the commanded twist in the body's axes [m, m, rad], or None.
+        gyro: integral of the yaw rate [rad], or None.
+        current: of each motor [A], or None.
+        voltage: of each motor [V], or None.
+        bus: voltage of the battery [V], or None.
+        current_is_signed: False where some run has magnitudes only.
+    """
+
+    names: tuple[str, ...]
+    begin: Float[np.ndarray, " run"]
+    end: Float[np.ndarray, " run"]
+    row: Float[np.ndarray, " run"]
+    angle: JoinedChannel
+    pose: JoinedChannel
+    reported: JoinedChannel | None
+    commanded: JoinedChannel | None
+    twist: JoinedChannel | None
+    gyro: JoinedChannel | None
+    current: JoinedChannel | None
+    voltage: JoinedChannel | None
+    bus: JoinedChannel | None
+    current_is_signed: bool
+
+    @property
+    def wheels(self) -> int:
+        """Number of wheels."""
+        return self.angle.value.shape[1]
+
+    def runs_of(self, when: Float[np.ndarray, " at"]) -> Int[np.ndarray, " at"]:
+        """Run that each time of the clock belongs to."""
+        return np.searchsorted(self.begin, when + 1e-9, side="right") - 1
+
+
+@dataclass(frozen=True, eq=False)
+class StepEdges:
+    """Times between which motion is compared, and where the poses were then.
+
+    Attributes:
+        before, after: begin and end of each step on the clock of `JoinedRuns` (step,) [s].
+        run: that each step belongs to (step,).
+        pose_before, pose_after: poses then (step, 3), as logged.
+    """
+
+    before: Float[np.ndarray, " step"]
+    after: Float[np.ndarray, " step"]
+    run: Int[np.ndarray, " step"]
+    pose_before: Float[np.ndarray, "step 3"]
+    pose_after: Float[np.ndarray, "step 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelIncrements:
+    """Increments of the robot's own channels over the same steps.
+
+    Attributes:
+        wheels: rotation of each wheel [rad]; nan where it was not recorded for the whole step.
+        commanded: rotation of each wheel that was commanded [rad], or None.
+        twist: step of the body that was commanded, in its axes [m, m, rad], or None.
+        gyro: turn by the gyro [rad], or None.
+    """
+
+    wheels: Float[np.ndarray, "step wheel"]
+    commanded: Float[np.ndarray, "step wheel"] | None
+    twist: Float[np.ndarray, "step 3"] | None
+    gyro: Float[np.ndarray, "step 1"] | None
+
+
+def joined(data: Runs) -> JoinedRuns:
+    """Channels of runs on one clock; with a second between them."""
+    first = np.array([log.time[0] for log in data.logs])
+    length = np.array([log.duration for log in data.logs])
+    starts = np.concatenate([[0.0], np.cumsum(length + 1.0)])[:-1]
+    time = data.time + np.repeat(starts - first, np.diff(data.offset))
+    # a pose holds to both ends of its run: nothing is drawn between runs
+    fresh = data.fresh.copy()
+    fresh[data.offset[:-1]] = fresh[data.offset[1:] - 1] = True
+
+    def channel(of: Callable[[Log], np.ndarray | None], summed: bool) -> JoinedChannel | None:
+        """A channel, or its integral, nan where a run lacks it; None where every run does."""
+        parts = [_columns(log, of(log), summed) for log in data.logs]
+        columns = next((part.shape[1] for part in parts if part is not None), None)
+        if columns is None:
+            return None
+        filled = [
+            np.full((log.samples, columns), np.nan) if part is None else part
+            for log, part in zip(data.logs, parts, strict=True)
+        ]
+        return JoinedChannel(time, np.concatenate(filled))
+
+    return JoinedRuns(
+        names=tuple(log.name for log in data.logs),
+        begin=starts,
+        end=starts + length,
+        row=np.array([float(np.median(np.diff(log.time))) for log in data.logs]),
+        angle=JoinedChannel(time, data.wheel_angle),
+        pose=JoinedChannel(time[fresh], data.pose[fresh]),
+        reported=channel(lambda log: log.wheel_speed, summed=True),
+        commanded=channel(lambda log: log.wheel_speed_command, summed=True),
+        twist=channel(lambda log: log.twist_command, summed=True),
+        gyro=channel(lambda log: log.gyro, summed=True),
+        current=channel(lambda log: log.current, summed=False),
+        voltage=channel(lambda log: log.voltage, summed=False),
+        bus=channel(lambda log: log.bus_voltage, summed=False),
+        current_is_signed=data.current_is_signed,
+    )
+
+
+def _columns(log: Log, values: np.ndarray | None, summed: bool) -> np.ndarray | None:
+    """Columns of a channel of a run, or their integrals."""
+    if values is None:
+        return None
+    columns = values.reshape(log.samples, -1)
+    return integral(log.time, columns) if summed else columns
+
+
+def edges(data: JoinedRuns) -> StepEdges:
+    """Steps of about `STEP_S` of every run, from its first pose to its last."""
+    length = data.end - data.begin
+    step = max(min(STEP_S, float(np.median(length)) / 8), float(np.median(data.row)))
+    step = max(step, float(length.sum()) / MOST_STEPS)
+    count = np.maximum(np.round(length / step).astype(int), 1)
+    run = np.repeat(np.arange(len(count)), count)
+    within = np.arange(len(run)) - np.repeat(np.cumsum(count) - count, count)
+    each = (length / count)[run]
+    before = data.begin[run] + within * each
+    after = before + each
+    return StepEdges(before, after, run, data.pose.at(before), data.pose.at(after))
+
+
+def increments(data: JoinedRuns, at: StepEdges, lag: float) -> ChannelIncrements:
+    """Increments of the robot's channels, `lag` [s] before the steps of the poses."""
+    slack, before, after = data.row[at.run], at.before - lag, at.after - lag
+    outside = (before < data.begin[at.run] - slack) | (after > data.end[at.run] + slack)
+
+    def moved(channel: JoinedChannel) -> np.ndarray:
+        change = channel.at(after) - channel.at(before)
+        change[outside] = np.nan
+        return change
+
+    def maybe(channel: JoinedChannel | None) -> np.ndarray | None:
+        return None if channel is None else moved(channel)
+
+    return ChannelIncrements(
+        moved(data.angle), maybe(data.commanded), maybe(data.twist), maybe(data.gyro)
+    )
+
+
+Heading = Literal["as_logged", "turned_round", "degrees", "radians", "half_sine"]
+"""What the logged heading is: the heading [rad]; its negative; degrees that were taken for radians;
+radians that were taken for degrees; sin(heading / 2), the z of a quaternion."""
+
+
+@dataclass(frozen=True)
+class PoseConvention:
+    """Convention by which a logged pose is meant.
+
+    Attributes:
+        heading: what the logged heading is.
+        y_down: whether y has the opposite sign.
+        offset: to be added to the heading, in steps of whole degrees [deg].
+    """
+
+    heading: Heading = "as_logged"
+    y_down: bool = False
+    offset: int = 0
+
+    @property
+    def bare(self) -> "PoseConvention":
+        """The convention without its offset."""
+        return replace(self, offset=0)
+
+
+CONVENTIONS = tuple(
+    PoseConvention(heading, down) for heading in get_args(Heading) for down in (False, True)
+)
+"""Every convention whose steps of the body differ by more than a rotation."""
+
+
+def rotation(degrees: int) -> Float[np.ndarray, "3 3"]:
+    """Rotation of a step of the body about the vertical."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, "step 3"]:
+    """Steps ahead [m], to the left [m] and in heading [rad] under a convention without its offset.
+
+    nan where a heading cannot be what the convention says.
+    """
+    flip = [1.0, -1.0 if convention.y_down else 1.0, 1.0]
+    before, after = at.pose_before * flip, at.pose_after * flip
+    before[:, 2] = _heading(before[:, 2], convention.heading)
+    turned = _heading(after[:, 2], convention.heading) - before[:, 2]
+    if convention.heading in ("radians", "half_sine"):  # the reader could not see where it wraps
+        turned = np.mod(turned + np.pi, 2 * np.pi) - np.pi
+    after[:, 2] = before[:, 2] + turned
+    return body_increments(before, after)
+
+
+def _heading(logged: Float[np.ndarray, " step"], meaning: Heading) -> Float[np.ndarray, " step"]:
+    """Heading [rad] that was meant."""
+    if meaning == "turned_round":
+        return -logged
+    if meaning == "degrees":
+        return np.radians(logged)
+    if meaning == "radians":
+        return np.degrees(logged)
+    if meaning == "half_sine":
+        # beyond: no sine
+        return 2 * np.arcsin(np.where(np.abs(logged) <= 1.0 + 1e-3, logged.clip(-1, 1), np.nan))
+    return logged
+
+
+ROUNDS = 8
+"""Rounds of reweighting."""
+RIDGE = 1e-4
+"""Ridge over the mean product of turns: wheels of one side turn alike."""
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """Weighted sums of products over steps.
+
+    Attributes:
+        turns: of turns with turns (wheel, wheel) [rad^2].
+        across: of turns with steps of the body (wheel, 3); heading in metres at the base radius.
+        body: of steps of the body with each other (3, 3) [m^2].
+        known: steps in which wheels and body are known (every step,).
+        weight: of these (step,).
+    """
+
+    turns: Float[np.ndarray, "wheel wheel"]
+    across: Float[np.ndarray, "wheel 3"]
+    body: Float[np.ndarray, "3 3"]
+    known: Bool[np.ndarray, " every"]
+    weight: Float[np.ndarray, " step"]
+
+
+def usable(*parts: Float[np.ndarray, "step _"]) -> Bool[np.ndarray, " step"]:
+    """Steps in which all parts are known."""
+    return np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
+
+
+def products(
+    turns: Float[np.ndarray, "step wheel"],
+    body: Float[np.ndarray, "step 3"],
+    base: float,
+    rounds: int = ROUNDS,
+) -> Products | None:
+    """Products of steps that are known; None where these are fewer than twice the wheels.
+
+    Args:
+        base: base radius, at which headings become metres [m].
+        rounds: of reweighting; none for commands, which have no outliers.
+    """
+    known = usable(turns, body)
+    if known.sum() < 2 * turns.shape[1]:
+        return None
+    turns, body = turns[known], body[known] * [1.0, 1.0, base]
+    weight = np.ones(len(turns))
+    for _ in range(rounds):
+        off = np.linalg.norm(body - turns @ _linear(turns, body, weight), axis=1)
+        weight = (1 + (off / (2 * float(np.median(off)) + 1e-12)) ** 2) ** -2
+    weighted = turns * weight[:, None]
+    own = (body * weight[:, None]).T @ body
+    return Products(weighted.T @ turns, weighted.T @ body, own, known, weight)
+
+
+def _linear(turns: np.ndarray, body: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Map from turns to steps of the body (wheel, 3), by least squares with a little ridge."""
+    weighted = turns * weight[:, None]
+    gram = weighted.T @ turns
+    ridge = RIDGE * np.trace(gram) / len(gram) + 1e-300
+    return np.asarray(np.linalg.solve(gram + ridge * np.eye(len(gram)), weighted.T @ body))

@@ -1,0 +1,165 @@
+"""Single mistakes in order, signs and axes that explain logs far better than what is declared."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations, permutations, product
+
+import numpy as np
+
+from slipid.data.check.interpretation import Evidence, Interpretation, misfit, misfits
+from slipid.data.check.joined import PoseConvention
+
+MISTAKES = 3
+"""Mistakes that are looked for, one after the other."""
+GAIN = 0.05
+"""A mistake is believed where its interpretation leaves so much less unexplained,"""
+SHARE = 0.3
+"""and this part of what it still leaves; no real log comes near it without a mistake."""
+EXPLAINED = 0.4
+"""Part of the poses' motion that another convention of theirs may leave unexplained."""
+ALIKE = 0.02
+"""Interpretations that differ by less are named as other explanations."""
+TURN_DEG = 15
+"""Grid on which rotations of axes and azimuths are looked for [deg]."""
+MANY = 6
+"""Wheels beyond which only pairs of columns are exchanged, not all orders tried."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An interpretation with one mistake more.
+
+    Attributes:
+        kind: name of the mistake.
+        meant: the interpretation.
+        cost: small; of candidates that fit alike that with the least is believed.
+    """
+
+    kind: str
+    meant: Interpretation
+    cost: float
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A mistake that explains the logs.
+
+    Attributes:
+        found: the interpretation that is right.
+        before: what is left unexplained without it; `after`: with it.
+        others: other kinds of mistake that explain the logs as well.
+    """
+
+    found: Candidate
+    before: float
+    after: float
+    others: tuple[Candidate, ...]
+
+
+def mistakes(evidence: Evidence) -> tuple[Interpretation, tuple[Mistake, ...]]:
+    """The right interpretation, as far as single mistakes explain the logs, and the mistakes."""
+    meant, found = Interpretation(), []
+    for _ in range(MISTAKES):
+        one = _one(evidence, meant)
+        if one is None:
+            break
+        found.append(one)
+        meant = one.found.meant
+    return meant, tuple(found)
+
+
+def _one(evidence: Evidence, of: Interpretation) -> Mistake | None:
+    """The simplest mistake that explains decisively better, or None."""
+    before = misfit(evidence, of)
+    tried = [(misfit(evidence, c.meant), c) for c in candidates(evidence, of)]
+    # poses of another convention must then follow the wheels
+    tried = [
+        (left, c)
+        for left, c in tried
+        if c.meant.convention == of.convention or misfits(evidence, c.meant)["pose"] < EXPLAINED
+    ]
+    after, best = min(tried, key=lambda pair: pair[0] + pair[1].cost)
+    if before - after < GAIN + SHARE * after:
+        return None
+    alike: dict[str, Candidate] = {}
+    for left, other in sorted(tried, key=lambda pair: pair[0] + pair[1].cost):
+        if other.kind != best.kind and left < after + ALIKE:
+            alike.setdefault(other.kind, other)
+    return Mistake(best, before, after, tuple(alike.values()))
+
+
+def candidates(evidence: Evidence, of: Interpretation) -> Iterator[Candidate]:
+    """Interpretations that are one mistake away."""
+    wheels = evidence.wheels
+    for sign, cost in _signs(wheels, evidence.rolling):
+        yield Candidate("wheel_sign", replace(of, sign=sign), cost)
+    for order, cost in _orders(wheels):
+        yield Candidate("wheel_order", replace(of, order=order), cost)
+    for azimuth in range(-180 + TURN_DEG, 180, TURN_DEG):
+        if azimuth:
+            yield Candidate("wheel_azimuths", replace(of, azimuth=azimuth), 0.025)
+    if of.convention == PoseConvention():
+        yield from _conventions(of)
+    if evidence.command is not None:
+        for sign, cost in _signs(wheels, evidence.rolling):
+            yield Candidate("command_sign", replace(of, command_sign=sign), 0.01 + cost)
+        for order, cost in _orders(wheels):
+            yield Candidate("command_order", replace(of, command_order=order), 0.01 + cost)
+    if evidence.twist is not None:
+        for signs in product((1, -1), repeat=3):
+            if -1 in signs:
+                x, y, yaw = signs
+                read = replace(of, twist_sign=(x, y, yaw))
+                yield Candidate("command_sign", read, 0.01 * (1 + signs.count(-1)))
+    if evidence.gyro is not None:
+        yield Candidate("gyro_sign", replace(of, gyro_sign=-1), 0.0)
+
+
+def _conventions(of: Interpretation) -> Iterator[Candidate]:
+    """Other conventions of the pose."""
+    found: list[tuple[str, float, PoseConvention]] = []
+    for quarter in (0, 90, 180, -90):
+        more = 0.0 if quarter == 0 else 0.02
+        found += [
+            ("heading_sign", more, PoseConvention("turned_round", False, quarter)),
+            ("pose_mirrored", more, PoseConvention("turned_round", True, quarter)),
+        ]
+        kind = "pose_swapped" if abs(quarter) == 90 else "pose_axis"
+        cost = 0.005 if quarter == 180 else 0.0
+        found.append((kind, cost, PoseConvention("as_logged", True, quarter)))
+    found += [
+        ("heading_unit", 0.0, PoseConvention("degrees")),
+        ("heading_unit", 0.0, PoseConvention("radians")),
+        ("heading_quaternion", 0.005, PoseConvention("half_sine")),
+    ]
+    for offset in range(-180 + TURN_DEG, 181, TURN_DEG):
+        if offset:
+            cost = 0.01 if offset % 90 == 0 else 0.02
+            found.append(("heading_offset", cost, PoseConvention(offset=offset)))
+    for kind, cost, convention in found:
+        yield Candidate(kind, replace(of, convention=convention), cost)
+
+
+def _signs(wheels: int, rolling: np.ndarray) -> Iterator[tuple[tuple[int, ...], float]]:
+    """Signs of wheels, with what they cost: one wheel, all, one side, then any."""
+    sides = {tuple(np.flatnonzero(side)) for side in (rolling[:, 2] > 0, rolling[:, 2] < 0)}
+    for count in range(1, wheels + 1):
+        for turned in combinations(range(wheels), count):
+            plain = count in (1, wheels) or turned in sides
+            sign = tuple(-1 if k in turned else 1 for k in range(wheels))
+            yield sign, 0.0 if plain else 0.02
+
+
+def _orders(wheels: int) -> Iterator[tuple[tuple[int, ...], float]]:
+    """Other orders of the wheels' columns, with what they cost: less for an exchange of two."""
+    declared = tuple(range(wheels))
+    for order in permutations(declared) if wheels <= MANY else _exchanges(declared):
+        moved = sum(k != at for at, k in enumerate(order))
+        if moved:
+            yield order, {2: 0.0, 3: 0.01}.get(moved, 0.015)
+
+
+def _exchanges(declared: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+    """Orders in which two columns are exchanged."""
+    for a, b in combinations(declared, 2):
+        yield tuple({a: b, b: a}.get(k, k) for k in declared)

@@ -1,0 +1,248 @@
+"""The check before a fit: whether encoders, commands, gyro and poses are of the declared robot.
+
+Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_speed_unit`,
+`heading_sign`, `heading_unit`, `heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`,
+`pose_mirrored`, `pose_length`, `pose_constant`, `pose_of_another_run`, `pose_unexplained`, `lag`,
+`base_radius`, `time_unit`, `current_sign`, `current_order`, `current_unit`, `current_of_supply`,
+`voltage_sign`, `voltage_order`, `voltage_unit`, `gyro_sign`, `gyro_unit`, `command_sign`,
+`command_order`, `command_unit`, `command_exchanged`, `wheel_columns`, `scales`, `travel`,
+`not_checked`.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from slipid.data.align.lag import PoseLag, pose_lag
+from slipid.data.check.causes import explained
+from slipid.data.check.columns import BROUGHT, SAME, Finding, exchanged, misordered, worst_first
+from slipid.data.check.electric import electric
+from slipid.data.check.interpretation import Evidence, Interpretation, gather, misfits, to_body
+from slipid.data.check.joined import (
+    ChannelIncrements,
+    JoinedChannel,
+    JoinedRuns,
+    StepEdges,
+    edges,
+    increments,
+    joined,
+    usable,
+)
+from slipid.data.check.mistakes import mistakes
+from slipid.data.check.ratios import FORWARD, TURNS, ScaleRatios, ratios
+from slipid.data.check.single_runs import agreement, single_runs, standing
+from slipid.data.check.words import of_causes, of_mistake, of_ratios
+from slipid.data.runs import Runs
+from slipid.model.geometry import Geometry
+
+FEW = 20
+"""Steps below which nothing is compared."""
+FOREIGN = 0.4
+"""Share of the poses' motion, left unexplained in any interpretation, that is a finding."""
+LATE_S = 1.0
+"""Lag of the poses that is a finding [s]."""
+TOO_LATE_S = 1.9
+"""Lag beyond which a fit of it would not be near enough at its start [s]."""
+SLOW_M_S, SLOW_ROW_S = 0.01, 2.0
+"""Rim speeds below and times between rows above which time is in a smaller unit than declared."""
+FAST_M_S, FAST_ROW_S = 50.0, 1e-3
+"""The reverse."""
+SHORT = 0.62
+"""Body over wheels below which, without commands to vouch for the wheels, there is a finding."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """Comparison of poses and wheels.
+
+    Attributes:
+        findings: about lag, order, signs, axes and single runs.
+        moved: increments of the robot's channels at the lag of the poses.
+        evidence: products of these.
+        meant: the interpretation that is right.
+        poses: whether the poses can be compared any further.
+    """
+
+    findings: tuple[Finding, ...]
+    moved: ChannelIncrements
+    evidence: Evidence
+    meant: Interpretation = field(default_factory=Interpretation)
+    poses: bool = False
+
+
+def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tuple[Finding, ...]:
+    """Return what is wrong with runs or with their declaration, the worst first, then notes.
+
+    Args:
+        data: runs.
+        geometry: as it was declared.
+        mass_kg: of the robot, None where it is not known.
+    """
+    channels = joined(data)
+    found = tuple(_all(channels, edges(channels), geometry, mass_kg, pose_lag(data)))
+    if not {finding.kind for finding in found} & {*SAME}:
+        columns = tuple(misordered(data.logs))
+        found = tuple(f for f in found if not columns or f.kind not in BROUGHT) + columns
+    return worst_first(found)
+
+
+def _all(
+    data: JoinedRuns,
+    at: StepEdges,
+    geometry: Geometry,
+    mass_kg: float | None,
+    lag: PoseLag | None,
+) -> Iterator[Finding]:
+    """Findings in no order."""
+    found = _compared(data, at, geometry, lag)
+    if found is None:
+        yield _not_checked(f"the runs are too short: {len(at.run)} steps, {FEW} are needed")
+        return
+    yield from found.findings
+    scales = ratios(data, at, found.moved, found.evidence, found.meant)
+    if not found.poses:
+        known = {k: r for k, r in scales.known.items() if k not in ("travel", "turning", "gyro")}
+        scales = ScaleRatios(known, scales.speed_is_angle)
+    radius, gear_ratio = float(geometry.wheel_radius), float(geometry.gear_ratio)
+    factors = tuple(_factors(scales, float(np.median(data.row)), gear_ratio))
+    factors = factors or tuple(_of_time(data, found.moved, at, radius))
+    yield from factors
+    yield from electric(data, found.meant, radius, mass_kg, not factors)
+    yield from exchanged(data)
+    yield from _suspicious(scales)
+    yield from _notes(data, found.evidence, found.meant)
+
+
+def _compared(
+    data: JoinedRuns, at: StepEdges, geometry: Geometry, lag: PoseLag | None
+) -> _Compared | None:
+    """Comparison of poses and wheels; None where there are too few steps."""
+    lag = lag if lag is not None and lag.decisive else PoseLag(0.0, 1.0, 1.0)
+    moved = increments(data, at, lag.seconds)
+    if usable(moved.wheels).sum() < FEW:
+        return None
+    evidence = gather(geometry, at, moved)
+    declared = agreement(data, at, moved, evidence, Interpretation())
+    if standing(data, declared).all():
+        return _Compared(tuple(single_runs(data, declared)), moved, evidence)
+    meant, found = mistakes(evidence)
+    left = misfits(evidence, meant)["pose"]
+    if left > FOREIGN:
+        return _Compared((_foreign(left),), moved, evidence)
+    # a half sine turns back at half a turn, which puts single runs out of step
+    half_sine = meant.convention.heading == "half_sine"
+    agreeing = agreement(data, at, moved, evidence, meant)
+    alone = () if half_sine else tuple(single_runs(data, agreeing))
+    listed = (*_of_lag(lag), *map(of_mistake, found), *alone)
+    return _Compared(listed, moved, evidence, meant, True)
+
+
+def _of_lag(lag: PoseLag) -> Iterator[Finding]:
+    """Poses that come much later or earlier than encoders."""
+    if abs(lag.seconds) < LATE_S:
+        return
+    late = "after" if lag.seconds > 0 else "before"
+    yield Finding(
+        "lag",
+        f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: so {lag.left:.2f} of "
+        f"the motion is left unexplained, without {lag.left_at_zero:.2f}",
+        f"shift the poses' times by {-lag.seconds:+.1f} s, or start 'camera.lag' in [parameters] "
+        f"at {lag.seconds:.1f}",
+        "wrong" if abs(lag.seconds) > TOO_LATE_S else "suspicious",
+    )
+
+
+def _foreign(left: float) -> Finding:
+    return Finding(
+        "pose_unexplained",
+        f"the poses do not follow the wheels: {left:.2f} of their motion is left unexplained, in "
+        "any order, with any signs and axes",
+        "check whether poses and encoders are of the same runs and of the same time, and whether "
+        "the wheels were on the ground",
+    )
+
+
+def _factors(scales: ScaleRatios, row_s: float, gear_ratio: float) -> Iterator[Finding]:
+    """Units and sizes that are wrong."""
+    fitting, single = explained(scales, row_s, gear_ratio)
+    yield from of_causes(fitting, single, of_ratios(scales), gear_ratio)
+    if not fitting and not all(r.natural for r in scales.known.values()):
+        yield Finding(
+            "scales",
+            "the channels disagree about how far the robot went, and no single number explains "
+            f"it: {of_ratios(scales)}",
+            "check the units of all channels, gear_ratio, wheel_radius_m and base_radius_m",
+        )
+
+
+def _of_time(
+    data: JoinedRuns, moved: ChannelIncrements, at: StepEdges, radius: float
+) -> Iterator[Finding]:
+    """Time in another unit, where only its size shows it."""
+    row = float(np.median(data.row))
+    speed = np.abs(moved.wheels) / (at.after - at.before)[:, None] * radius
+    top = float(np.nanquantile(speed, 0.95))
+    slow = row > SLOW_ROW_S and top < SLOW_M_S
+    if slow or (row < FAST_ROW_S and top > FAST_M_S):
+        yield Finding(
+            "time_unit",
+            f"rows are {row:.3g} s apart and wheels reach {top:.2g} m/s",
+            f"set unit = '{'ms' if slow else 's'}' for the channel time",
+        )
+
+
+def _suspicious(scales: ScaleRatios) -> Iterator[Finding]:
+    """Wheels that go much further than the body, with nothing to vouch for them."""
+    travel = scales.known.get("travel")
+    if travel is None or "drive" in scales.known or "command" in scales.known:
+        return
+    if travel.natural and travel.value < SHORT:
+        yield Finding(
+            "travel",
+            f"the body moves {travel.value:.2f} times as far as the wheels say, and no command is "
+            "logged that could vouch for the wheels",
+            "check wheel_radius_m, gear_ratio, ticks_per_revolution and the unit of the poses, "
+            "unless the wheels slip so much",
+            "suspicious",
+        )
+
+
+def _notes(data: JoinedRuns, evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
+    """A note for everything that the runs leave open."""
+    yield from _unmoved(evidence, meant)
+    if evidence.twist is None and evidence.command is None:
+        yield _not_checked(
+            "no command is logged: wheels that are said to turn too far cannot be told from wheels "
+            "that slip"
+        )
+    if data.current is not None and not data.current_is_signed:
+        yield _not_checked("currents are magnitudes: their signs cannot be checked")
+    if _constant(data.gyro):
+        yield _not_checked("the gyro never changes: it cannot be checked")
+
+
+def _not_checked(what: str) -> Finding:
+    """The note that something was not checked."""
+    return Finding("not_checked", what, None, "note")
+
+
+def _unmoved(evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
+    """Directions in which no run moves."""
+    pose = next(iter(evidence.pose.values()), None)
+    if pose is None:
+        return
+    predict = to_body(evidence, meant)
+    share = np.einsum("aw,wv,av->a", predict, pose.turns, predict)
+    share = share / max(float(share.sum()), 1e-300)
+    if share[2] < TURNS:
+        yield _not_checked("no run turns: base radius, unit of the heading and gyro are unchecked")
+    if share[0] < FORWARD:
+        yield _not_checked("no run drives ahead: order and signs are checked in part only")
+    if evidence.free and share[1] < FORWARD:
+        yield _not_checked("no run drives sideways: order and signs are checked in part only")
+
+
+def _constant(channel: JoinedChannel | None) -> bool:
+    """Whether a channel never changes."""
+    return channel is not None and not np.nanmax(np.abs(np.diff(channel.value, axis=0))) > 0

@@ -1,0 +1,127 @@
+"""Runs that do not go with the others: poses of another run, poses that stand still."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from slipid.data.check.columns import Finding
+from slipid.data.check.interpretation import Evidence, Interpretation, to_body
+from slipid.data.check.joined import (
+    ChannelIncrements,
+    JoinedRuns,
+    StepEdges,
+    body_motion,
+    rotation,
+    usable,
+)
+
+MOVED_M = 0.2
+"""Path length of the wheels from which a run must move its poses [m]."""
+STILL_M = 1e-6
+"""Path length of poses that do not change, but for rounding [m]."""
+ROWS = 20
+"""Rows below which a run says nothing alone."""
+ODD, TIMES, USUAL = 0.3, 10.0, 0.9
+"""Distance from full agreement from which a run is odd, and the multiple of the median one's from
+which it is, where that one agrees at least so well."""
+CLIPPED = 4.0
+"""Steps of the body beyond so many usual ones are shortened to that."""
+ALL = 0.5
+"""Part of the runs from which a finding is about all of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunAgreement:
+    """Agreement of poses and wheels in each run.
+
+    Attributes:
+        wheels_m: path length by the wheels (run,) [m].
+        poses_m: path length of the poses, headings counted at the base radius (run,) [m].
+        cosine: between the steps of poses and those predicted by wheels (run,).
+    """
+
+    wheels_m: Float[np.ndarray, " run"]
+    poses_m: Float[np.ndarray, " run"]
+    cosine: Float[np.ndarray, " run"]
+
+
+def agreement(
+    data: JoinedRuns,
+    at: StepEdges,
+    moved: ChannelIncrements,
+    evidence: Evidence,
+    meant: Interpretation,
+) -> RunAgreement:
+    """Agreement of every run under an interpretation; commands stand in for nothing."""
+    convention = meant.convention
+    body = body_motion(at, convention.bare) * [1.0, 1.0, evidence.base]
+    body = body @ rotation(-convention.offset).T
+    predicted = moved.wheels @ to_body(evidence, meant).T
+    known = usable(body, predicted)
+    body, predicted, run = body[known], predicted[known], at.run[known]
+    far = np.linalg.norm(body, axis=1)
+    most = CLIPPED * float(np.median(far[far > 0])) if (far > 0).any() else 1.0
+    body = body * np.minimum(1.0, most / np.maximum(far, 1e-300))[:, None]
+    # slip shortens each axis by its own factor
+    own = (predicted**2).sum(axis=0)
+    factor = (predicted * body).sum(axis=0) / np.where(own > 0, own, 1.0)
+    scaled = predicted * np.where(factor > 0, factor, 0.0)
+
+    def total(values: np.ndarray) -> np.ndarray:
+        return np.bincount(run, values, minlength=len(data.names))
+
+    size = np.sqrt(total((body**2).sum(axis=1)) * total((scaled**2).sum(axis=1)))
+    both = total((body * scaled).sum(axis=1))
+    return RunAgreement(
+        total(np.linalg.norm(predicted, axis=1)),
+        total(np.linalg.norm(body, axis=1)),
+        np.where(size > 0, both / np.where(size > 0, size, 1.0), 0.0),
+    )
+
+
+def standing(data: JoinedRuns, of: RunAgreement) -> Bool[np.ndarray, " run"]:
+    """Runs whose poses do not change while wheels turn."""
+    return (of.poses_m < STILL_M) & (of.wheels_m > MOVED_M) & (_rows(data) >= ROWS)
+
+
+def single_runs(data: JoinedRuns, of: RunAgreement) -> Iterator[Finding]:
+    """Findings about runs that do not go with the others."""
+    still = standing(data, of)
+    if still.any():
+        every = bool(still.mean() >= ALL)
+        yield Finding(
+            "pose_constant",
+            f"the poses do not change in {still.sum()} of {len(still)} runs while the wheels "
+            f"travel {np.median(of.wheels_m[still]):.2g} m",
+            "check the columns of pose_x, pose_y and pose_heading, and whether the marker was seen"
+            if every
+            else "leave these runs out of the globs of [[logs]]",
+            runs=() if every else _names(data, still),
+        )
+    # a robot that is held in place by the floor is not like another run
+    moves = ~still & (_rows(data) >= ROWS) & (of.wheels_m > MOVED_M)
+    if moves.any():
+        moves &= of.poses_m > 0.25 * np.median(of.poses_m[moves] / of.wheels_m[moves]) * of.wheels_m
+    if moves.sum() < 2 or (usual := float(np.median(of.cosine[moves]))) < USUAL:
+        return
+    odd = moves & (1 - of.cosine > max(ODD, TIMES * (1 - usual)))
+    if odd.any():
+        yield Finding(
+            "pose_of_another_run",
+            f"the poses of {odd.sum()} of {len(odd)} runs do not follow their wheels "
+            f"(agreement {np.median(of.cosine[odd]):.2f}, in the others "
+            f"{np.median(of.cosine[moves & ~odd]):.2f})",
+            "check whether these files hold poses of another run, or of another time, and leave "
+            "them out of the globs of [[logs]]",
+            runs=_names(data, odd),
+        )
+
+
+def _rows(data: JoinedRuns) -> Float[np.ndarray, " run"]:
+    return np.asarray((data.end - data.begin) / data.row)
+
+
+def _names(data: JoinedRuns, which: Bool[np.ndarray, " run"]) -> tuple[str, ...]:
+    return tuple(data.names[k] for k in np.flatnonzero(which))

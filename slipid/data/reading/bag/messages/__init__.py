@@ -1,1 +1,0 @@
-"""From the bytes of messages to arrays of numbers."""

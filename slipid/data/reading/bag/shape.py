@@ -1,0 +1,369 @@
+"""Where the numbers of a serialised message lie in its bytes.
+
+Messages of one topic mostly have one shape: the same texts, and arrays of the same lengths. So one
+message is walked through field by field, and the numbers of all others that have its shape are
+taken from the same places, thousands at a time.
+
+Which numbers of a message are wanted: by paths, by names of joints, by frames of a transform.
+"""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from slipid.data.reading.bag.definitions import Kind, Many, Message, NumberType, Text
+
+
+@dataclass(frozen=True)
+class PathStep:
+    """One step of a path: the name of a field, and which element of it, or None for all."""
+
+    name: str
+    index: int | None = None
+
+
+@dataclass(frozen=True)
+class BytePlace:
+    """A number in a message: its first byte, and its numpy type with byte order."""
+
+    offset: int
+    dtype: str
+
+    def of(self, block: UInt8[np.ndarray, "message byte"]) -> Float[np.ndarray, " message"]:
+        """The number in each of some messages of one shape."""
+        size = int(self.dtype[2:])
+        cells = np.ascontiguousarray(block[:, self.offset : self.offset + size])
+        return cells.view(self.dtype)[:, 0].astype(float)
+
+    def whole(self, block: UInt8[np.ndarray, "message byte"]) -> Int[np.ndarray, " message"]:
+        """The same of a whole number, without rounding."""
+        cells = np.ascontiguousarray(block[:, self.offset : self.offset + int(self.dtype[2:])])
+        return cells.view(self.dtype)[:, 0].astype(np.int64)
+
+
+@dataclass(frozen=True)
+class MessageLeaf:
+    """What lies at one path of a message.
+
+    Attributes:
+        path: the steps from the message to it.
+        dtype: of its numbers, with byte order; empty for a text.
+        offset: first byte.
+        count: how many numbers, None where it is one and no array.
+        text: of a text.
+    """
+
+    path: tuple[PathStep, ...]
+    dtype: str
+    offset: int
+    count: int | None = None
+    text: str = ""
+
+    def places(self, index: int | None) -> tuple[BytePlace, ...]:
+        """Places of its numbers, or of the one with an index."""
+        size = int(self.dtype[2:])
+        every = range(1 if self.count is None else self.count)
+        if index is not None:
+            every = every[index : index + 1]
+        return tuple(BytePlace(self.offset + k * size, self.dtype) for k in every)
+
+
+@dataclass(frozen=True, eq=False)
+class MessageShape:
+    """How the messages of a topic that look like one of them are laid out.
+
+    Attributes:
+        size: bytes of the message.
+        leaves: everything in it, in order.
+        fixed: bytes that are the same in all messages of this shape: texts and lengths of arrays.
+        values: what these bytes are.
+    """
+
+    size: int
+    leaves: tuple[MessageLeaf, ...]
+    fixed: Int[np.ndarray, " fixed"]
+    values: UInt8[np.ndarray, " fixed"]
+
+    def fits(self, block: UInt8[np.ndarray, "message byte"]) -> Bool[np.ndarray, " message"]:
+        """Which of some messages of its size have this shape."""
+        return np.all(block[:, self.fixed] == self.values, axis=1)
+
+    def places(self, path: Sequence[PathStep]) -> tuple[BytePlace, ...]:
+        """Places of the numbers at a path, none where there are none."""
+        return tuple(p for leaf, index in self._at(path) if leaf.dtype for p in leaf.places(index))
+
+    def texts(self, path: Sequence[PathStep]) -> tuple[str, ...]:
+        """Texts at a path."""
+        return tuple(leaf.text for leaf, _ in self._at(path) if not leaf.dtype)
+
+    def count(self, path: Sequence[PathStep]) -> int:
+        """How many numbers or texts are at a path."""
+        return sum(1 if leaf.count is None else leaf.count for leaf, _ in self._at(path))
+
+    def _at(self, path: Sequence[PathStep]) -> list[tuple[MessageLeaf, int | None]]:
+        """Leaves at a path, and which of its elements is meant."""
+        found = []
+        for leaf in self._by_names.get(tuple(step.name for step in path), ()):
+            ends = zip(leaf.path[:-1], path[:-1], strict=True)
+            inner = all(want.index in (None, have.index) for have, want in ends)
+            own, want = leaf.path[-1].index, path[-1].index
+            if inner and leaf.count is not None:
+                found.append((leaf, want))
+            elif inner and want in (None, own):
+                found.append((leaf, None))
+        return found
+
+    @cached_property
+    def _by_names(self) -> dict[tuple[str, ...], list[MessageLeaf]]:
+        leaves: dict[tuple[str, ...], list[MessageLeaf]] = {}
+        for leaf in self.leaves:
+            leaves.setdefault(tuple(step.name for step in leaf.path), []).append(leaf)
+        return leaves
+
+
+def steps_of(path: str) -> tuple[PathStep, ...]:
+    """Steps of a path as people write it, such as `motors[0].current`; ValueError otherwise."""
+    steps = []
+    for part in path.split("."):
+        name, bracket, rest = part.partition("[")
+        index, end, after = rest.partition("]")
+        whole = not bracket or (bool(end) and not after and index.isdecimal())
+        if not (name.isidentifier() and whole):
+            raise ValueError(f"no path of a field: '{path}'; expected such as motors[0].current")
+        steps.append(PathStep(name, int(index) if bracket else None))
+    return tuple(steps)
+
+
+def shape_of(raw: bytes, message: Message, *, cdr: bool) -> MessageShape:
+    """Shape of one message.
+
+    Args:
+        raw: its bytes.
+        message: its type.
+        cdr: whether it is serialised as in ROS 2 (CDR), else as in ROS 1.
+
+    Raises:
+        ValueError: the bytes are no such message; the text says why.
+    """
+    walk = _MessageWalk(raw, cdr)
+    walk.through(message, ())
+    over = len(raw) - walk.at
+    if not 0 <= over < (4 if cdr else 1):
+        raise ValueError(f"{over} bytes are left over after its last field")
+    fixed = np.concatenate([np.arange(0), *(np.arange(a, b) for a, b in walk.fixed)])
+    values = np.frombuffer(raw, np.uint8)[fixed]
+    return MessageShape(len(raw), tuple(walk.leaves), fixed, values)
+
+
+class _MessageWalk:
+    """A walk through the bytes of one message, which notes what it passes."""
+
+    def __init__(self, raw: bytes, cdr: bool) -> None:
+        self.raw, self.cdr, self.order = raw, cdr, "<"
+        self.at = self.origin = 0
+        self.leaves: list[MessageLeaf] = []
+        self.fixed: list[tuple[int, int]] = []
+        if cdr:
+            if raw[:2] not in (b"\x00\x00", b"\x00\x01") or len(raw) < 4:
+                raise ValueError(f"it is not serialised as CDR (it starts with {raw[:4].hex(' ')})")
+            self.order = "<" if raw[1] else ">"
+            self.at = self.origin = 4
+            self.fixed.append((0, 2))
+
+    def through(self, kind: Kind, path: tuple[PathStep, ...]) -> None:
+        """Note the leaves of a field."""
+        if isinstance(kind, NumberType):
+            dtype = self.order + kind.dtype
+            self.leaves.append(MessageLeaf(path, dtype, self.numbers(kind.size, 1)))
+        elif isinstance(kind, Text):
+            self.leaves.append(MessageLeaf(path, "", self.at, None, self.text()))
+        elif isinstance(kind, Message):
+            for field in kind.fields:
+                self.through(field.kind, (*path, PathStep(field.name)))
+        else:
+            self.several(kind, path)
+
+    def several(self, kind: Many, path: tuple[PathStep, ...]) -> None:
+        """Note the leaves of an array."""
+        count = self.length() if kind.count is None else kind.count
+        if isinstance(kind.element, NumberType):
+            dtype = self.order + kind.element.dtype
+            at = self.numbers(kind.element.size, count)
+            self.leaves.append(MessageLeaf(path, dtype, at, count))
+            return
+        if count > len(self.raw) - self.at:
+            raise ValueError(f"it ends before the {count} elements of '{path[-1].name}'")
+        *before, last = path
+        for k in range(count):
+            self.through(kind.element, (*before, PathStep(last.name, k)))
+
+    def numbers(self, size: int, count: int) -> int:
+        """Pass some numbers and return their first byte."""
+        if count and self.cdr:
+            self.at += -(self.at - self.origin) % size
+        first = self.at
+        self.at += size * count
+        if self.at > len(self.raw):
+            raise ValueError(f"it ends after {len(self.raw)} bytes, within its fields")
+        return first
+
+    def length(self) -> int:
+        """Pass the length of an array or a text."""
+        at = self.numbers(4, 1)
+        self.fixed.append((at, at + 4))
+        return int(struct.unpack_from(self.order + "I", self.raw, at)[0])
+
+    def text(self) -> str:
+        """Pass a text."""
+        size = self.length()
+        at = self.numbers(1, size)
+        self.fixed.append((at, at + size))
+        text = self.raw[at : at + size]
+        # CDR counts the zero at the end
+        return (text[:-1] if self.cdr else text).decode(errors="replace")
+
+
+STAMPS = ("header.stamp", "stamp")
+"""Where messages that have a time of their own keep it."""
+POSITION = ("translation.x", "translation.y", "translation.z")
+ROTATION = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
+
+
+@dataclass(frozen=True)
+class Located:
+    """Where the wanted numbers lie in messages of one shape.
+
+    Attributes:
+        seconds: of the message's own time, and `nanoseconds`; None where it has none.
+        numbers: the wanted ones in order, None for one that is not in these messages.
+    """
+
+    seconds: BytePlace | None
+    nanoseconds: BytePlace | None
+    numbers: tuple[BytePlace | None, ...]
+
+
+@runtime_checkable
+class Pick(Protocol):
+    """What is wanted of the messages of a topic: one row of numbers a message, or none, or more."""
+
+    def located(self, shape: MessageShape) -> tuple[Located, ...]:
+        """The rows in messages of a shape."""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Name of each number in a row; may be empty before a message was seen."""
+
+
+@dataclass(eq=False)
+class FieldPick:
+    """Numbers by the paths of their fields; an array without an index counts with all elements.
+
+    Attributes:
+        paths: of the fields.
+        names: name of each number, as the first message has them.
+    """
+
+    paths: tuple[str, ...]
+    names: tuple[str, ...] = ()
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        return self.names or self.paths
+
+    def located(self, shape: MessageShape) -> tuple[Located, ...]:
+        numbers: list[BytePlace] = []
+        names: list[str] = []
+        for path in self.paths:
+            places = shape.places(steps_of(path))
+            numbers += places
+            names += [path] if len(places) == 1 else [f"{path}[{k}]" for k in range(len(places))]
+        if not numbers:
+            return ()
+        self.names = self.names or tuple(names)
+        return (_located(shape, (), numbers),)
+
+
+@dataclass(eq=False)
+class JointPick:
+    """Numbers of joints by name, from messages like JointState.
+
+    Attributes:
+        joints: names of the wanted ones, in the order of the columns.
+        array: which array holds the numbers: `position`, `velocity` or `effort`.
+        names: every name that was in some message.
+    """
+
+    joints: tuple[str, ...]
+    array: str
+    names: dict[str, None] = field(default_factory=dict)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        return self.joints
+
+    def located(self, shape: MessageShape) -> tuple[Located, ...]:
+        names = shape.texts((PathStep("name"),))
+        self.names.update(dict.fromkeys(names))
+        places = shape.places((PathStep(self.array),))
+        # an array may be left empty; of any other length it says nothing of the names
+        have = dict(zip(names, places, strict=True)) if len(places) == len(names) else {}
+        numbers = [have.get(joint) for joint in self.joints]
+        if not any(numbers):
+            return ()
+        return (_located(shape, (), numbers),)
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A transform as messages name it: the pose of frame `child` in frame `parent`."""
+
+    parent: str
+    child: str
+
+
+@dataclass(frozen=True, eq=False)
+class TransformPick:
+    """Translation and rotation of one edge in messages that hold several (TFMessage)."""
+
+    edge: Edge
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        return (*POSITION, *ROTATION)
+
+    def located(self, shape: MessageShape) -> tuple[Located, ...]:
+        rows = []
+        for k, edge in enumerate(edges_of(shape)):
+            if edge == self.edge:
+                first = (PathStep("transforms", k),)
+                paths = [(*first, *steps_of(f"transform.{name}")) for name in self.columns]
+                numbers = [place for path in paths for place in shape.places(path)]
+                rows.append(_located(shape, first, numbers))
+        return tuple(rows)
+
+
+def edges_of(shape: MessageShape) -> tuple[Edge, ...]:
+    """Every transform of a TFMessage, names without the slash that ROS 1 once began them with."""
+    parents = shape.texts(steps_of("transforms.header.frame_id"))
+    children = shape.texts(steps_of("transforms.child_frame_id"))
+    pairs = zip(parents, children, strict=True)
+    return tuple(Edge(parent.lstrip("/"), child.lstrip("/")) for parent, child in pairs)
+
+
+def _located(
+    shape: MessageShape, first: tuple[PathStep, ...], numbers: Sequence[BytePlace | None]
+) -> Located:
+    """With the time of the message, or of the part of it that `first` leads to."""
+    for stamp in STAMPS:
+        whole, part = (
+            shape.places((*first, *steps_of(f"{stamp}.{unit}"))) for unit in ("sec", "nanosec")
+        )
+        if len(whole) == len(part) == 1:
+            return Located(whole[0], part[0], tuple(numbers))
+    return Located(None, None, tuple(numbers))

@@ -1,0 +1,217 @@
+"""Which files a bag is made of, of which kind, and the hash of them all.
+
+An MCAP file that was cut off, shown to a reader as if it ended with its last whole record.
+"""
+
+import hashlib
+import io
+import re
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from slipid.support.errors import bad_data
+
+if TYPE_CHECKING:
+    from _typeshed import WriteableBuffer
+
+Storage = Literal["rosbag1", "sqlite3", "mcap"]
+EXPECTED = "a bag: a .bag file, a .db3 or .mcap file, or the folder that ros2 bag record wrote"
+_MAGIC: dict[Storage, bytes] = {
+    "rosbag1": b"#ROSBAG V",
+    "sqlite3": b"SQLite format 3\0",
+    "mcap": b"\x89MCAP0\r\n",
+}
+_SUFFIX: dict[Storage, str] = {"rosbag1": ".bag", "sqlite3": ".db3", "mcap": ".mcap"}
+_BLOCK = 1 << 20
+
+
+@dataclass(frozen=True)
+class BagFiles:
+    """The files of one bag.
+
+    Attributes:
+        path: what was asked for: a file, or the folder of a rosbag2.
+        storage: how messages are stored.
+        parts: the files with messages, in order of their numbers.
+        metadata: metadata.yaml of a rosbag2 folder, None for a single file or where it is missing.
+    """
+
+    path: Path
+    storage: Storage
+    parts: tuple[Path, ...]
+    metadata: Path | None
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the only file, else of the lines `hash  name` that sha256sum prints of all."""
+        files = [*self.parts, *([self.metadata] if self.metadata else [])]
+        if len(files) == 1:
+            return _hash(files[0])
+        lines = sorted((path.name, _hash(path)) for path in files)
+        text = "".join(f"{digest}  {name}\n" for name, digest in lines)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def files_of(path: Path) -> BagFiles:
+    """Files of a bag.
+
+    Args:
+        path: a file, the folder of a rosbag2, or the metadata.yaml in it.
+
+    Raises:
+        DataError: there is no bag.
+    """
+    if path.name == "metadata.yaml":
+        path = path.parent
+    if not path.exists():
+        raise bad_data(path, "no such file or folder", EXPECTED)
+    if not path.is_dir():
+        return BagFiles(path, _storage_of(path), (path,), None)
+    found = [p for p in path.iterdir() if re.search(r"\.(mcap|db3)(\.zstd)?$", p.name)]
+    if not found:
+        inside = sorted(p.name for p in path.iterdir())
+        listed = ", ".join(inside[:8] + ["..."] * (len(inside) > 8))
+        raise bad_data(
+            path, f"a folder without a .db3 or .mcap file ({listed or 'empty'})", EXPECTED
+        )
+    parts = tuple(sorted(found, key=_numbers_in_name))
+    storage: Storage = "mcap" if ".mcap" in parts[0].name else "sqlite3"
+    metadata = path / "metadata.yaml"
+    return BagFiles(path, storage, parts, metadata if metadata.exists() else None)
+
+
+def _storage_of(path: Path) -> Storage:
+    """What a file is by its first bytes, which its name must agree with."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(16)
+    except OSError as error:
+        raise bad_data(path, f"cannot be read ({error.strerror})", "a readable bag") from error
+    if not start:
+        raise bad_data(path, "the file is empty", EXPECTED)
+    for storage, magic in _MAGIC.items():
+        if start.startswith(magic):
+            if path.suffix != _SUFFIX[storage]:
+                expected = f"a name that says so; rename it to {path.stem}{_SUFFIX[storage]}"
+                raise bad_data(path, f"a {storage} bag", expected)
+            return storage
+    raise bad_data(path, f"not a bag (it starts with {start[:8]!r})", EXPECTED)
+
+
+def _numbers_in_name(path: Path) -> tuple[tuple[int, str], ...]:
+    """Key that sorts `bag_10` behind `bag_9`."""
+    parts = re.split(r"(\d+)", path.name)
+    return tuple((int(part), "") if part.isdigit() else (-1, part) for part in parts)
+
+
+def _hash(path: Path) -> str:
+    """Hash of a file, block by block."""
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            while block := file.read(_BLOCK):
+                digest.update(block)
+    except OSError as error:
+        raise bad_data(path, f"cannot be read ({error.strerror})", "a readable bag") from error
+    return digest.hexdigest()
+
+
+MAGIC = b"\x89MCAP0\r\n"
+_DATA_END, _FOOTER = 0x0F, 0x02
+# A footer that names no summary: readers then look through the records themselves.
+_END = struct.pack("<BQQQI", _FOOTER, 20, 0, 0, 0) + MAGIC
+
+
+@dataclass(frozen=True)
+class MendedMcap:
+    """Path of a cut MCAP file that opens as a whole one.
+
+    Attributes:
+        path: the file.
+        end: byte after its last whole record.
+    """
+
+    path: Path
+    end: int
+
+    @property
+    def suffix(self) -> str:
+        """As of a path."""
+        return self.path.suffix
+
+    @property
+    def stem(self) -> str:
+        """As of a path."""
+        return self.path.stem
+
+    def exists(self) -> bool:
+        """As of a path."""
+        return True
+
+    def is_dir(self) -> bool:
+        """As of a path."""
+        return False
+
+    def open(self, *_: object, **__: object) -> io.BufferedReader:
+        """The whole records, and an end."""
+        return io.BufferedReader(_Mended(self.path, self.end), buffer_size=1 << 16)
+
+
+def mended(path: Path) -> MendedMcap | None:
+    """The whole records of a cut MCAP file, None where there are none, or where it has its end."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if file.read(8) != MAGIC:
+            return None
+        end, records = 8, 0
+        while True:
+            head = file.read(9)
+            if len(head) < 9:
+                break
+            kind, length = struct.unpack("<BQ", head)
+            # where the summary begins there are no more messages
+            if kind == _DATA_END or kind == 0 or end + 9 + length > size:
+                break
+            end, records = file.seek(end + 9 + length), records + 1
+    # the first record is a header, which alone is no bag
+    return MendedMcap(path, end) if records > 1 else None
+
+
+class _Mended(io.RawIOBase):
+    """Bytes of a file up to an end, and behind them the end of an MCAP file."""
+
+    def __init__(self, path: Path, end: int) -> None:
+        super().__init__()
+        self._file, self._end, self._at = path.open("rb"), end, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._end + len(_END)}[whence]
+        self._at = base + offset
+        return self._at
+
+    def readinto(self, buffer: "WriteableBuffer") -> int:
+        view = memoryview(buffer)
+        if self._at < self._end:
+            self._file.seek(self._at)
+            data = self._file.read(min(len(view), self._end - self._at))
+        else:
+            first = self._at - self._end
+            data = _END[first : first + len(view)]
+        view[: len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()

@@ -1,1 +1,0 @@
-"""Order, signs and axes that explain the motion."""

@@ -1,1 +1,0 @@
-"""Motion of wheels, commands, gyro and poses over the same steps."""

@@ -1,1 +1,0 @@
-"""Units and sizes that explain how far the robot went by each channel."""

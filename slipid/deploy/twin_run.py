@@ -1,0 +1,90 @@
+"""Where a robot's twin is driven: patches of its floors, starts, and the paths."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.data.floor_map import FloorMap, patchwork
+from slipid.deploy.floors import floor_of
+from slipid.robot import trajectory
+from slipid.robot.actuation import Habits
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.trajectory import Path
+from slipid.robot.twin import Twin, TwinPlant
+from slipid.support.errors import DataError
+
+SITE_SEED, STARTS_SEED = 7, 2021
+REST_S = 1.0
+"""Time for which the robot stands before it drives: a gyro learns its zero [s]."""
+
+
+def site(robot: DeployedRobot) -> FloorMap:
+    """Patches of about the robot's size, half of them of the floor on which it slips least.
+
+    On the test site's firm, medium and soft floors encoders then travel 80 to 90 % of the first
+    side, as on the paper's site.
+    """
+    labels = robot.labels
+    slip = [float(np.mean(f.seen.slip)) if f.seen is not None else 0.0 for f in robot.record.floors]
+    order = [labels[k] for k in np.argsort(slip)]
+    names = order if len(order) == 1 else [*order, "more of the first"]
+    drawn = patchwork(names, seed=SITE_SEED, patch=0.35, half=2.0)
+    cells = np.where(drawn.cells == len(order), 0, drawn.cells)
+    return FloorMap(tuple(order), cells, drawn.corner, drawn.cell)
+
+
+def starts(count: int, floor: FloorMap, path: Path) -> list[tuple[float, float, float]]:
+    """Poses all over a site in evenly spread headings, the same ones for every controller.
+
+    The middle of the path, which begins at the origin, keeps 0.8 m from the site's edge where there
+    is room.
+    """
+    rng = np.random.default_rng(STARTS_SEED)
+    x0, y0, x1, y1 = floor.extent
+    middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
+    reach = np.maximum([0.5 * (x1 - x0) - 0.8, 0.5 * (y1 - y0) - 0.8], 0.0)
+    places = np.asarray(path.rows)[:, :2]
+    a, b = (0.5 * (places.min(axis=0) + places.max(axis=0))).tolist()
+    out = []
+    for k in range(count):
+        heading = (k + rng.uniform()) * 2 * np.pi / count - np.pi
+        c, s = np.cos(heading), np.sin(heading)
+        x, y = middle + reach * rng.uniform(-1.0, 1.0, 2)
+        out.append((float(x - (c * a - s * b)), float(y - (s * a + c * b)), float(heading)))
+    return out
+
+
+def known_to_fit(floor: FloorMap, robot: DeployedRobot, path: str) -> None:
+    """Refuse a map, from this file, with a surface that the twin of a robot does not have."""
+    if absent := [name for name in floor.surfaces if name not in robot.labels]:
+        known = ", ".join(robot.labels)
+        raise DataError(f"{path}: no surface '{absent[0]}'; identified: {known}")
+
+
+def path_of(name: str, speed: float, robot: DeployedRobot) -> trajectory.Path:
+    """A path from the origin at a speed [m/s].
+
+    Raises:
+        DataError: no such path, or a speed at which wheels are faster than the fit has seen them.
+    """
+    if name not in trajectory.PATHS:
+        raise DataError(f"no path '{name}'; expected one of {', '.join(trajectory.PATHS)}")
+    most = float(robot.highest[0] * robot.frame.radius)
+    if not 0 < speed <= most:
+        raise DataError(
+            f"speed {speed:g} m/s; expected above 0 and at most {most:.2g} m/s, the rim speed up "
+            "to which the fit has seen the wheels"
+        )
+    return trajectory.PATHS[name](speed)
+
+
+def twin(
+    robot: DeployedRobot,
+    floor: FloorMap,
+    start: tuple[float, float, float],
+    seed: int,
+    habits: Habits,
+) -> TwinPlant:
+    """The identified model itself as a plant, see `slipid.robot.twin`."""
+    made = Twin(robot, floor_of(floor, robot.labels), habits)
+    return TwinPlant(made, jnp.asarray(start), jax.random.key(seed))

@@ -1,0 +1,179 @@
+"""Steps that the generated code must repeat, as a header of C.
+
+Files of a C folder: the code, its test, an example, and what builds them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from slipid.export.c99.code import Code, filled, template
+from slipid.export.c99.text import wrapped
+from slipid.export.fields import Struct
+from slipid.export.golden import golden
+from slipid.export.header import facts, made_with, warned
+from slipid.robot.closed_loop import Pilot
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.trajectory import Path
+
+
+def golden_header(code: Code) -> str:
+    """Text of golden.h: the steps as tables, and how structs are filled and read."""
+    kept = golden(code.pilot)
+    names = [f.name for f in code.estimate.fields for _ in range(f.size)]
+    scale = np.maximum(np.abs(kept.said).max(axis=0), 1e-3)
+    rows = [
+        "#include <math.h>",
+        "",
+        f"#define GOLDEN_STEPS {len(kept.given)}",
+        f"#define GOLDEN_GIVEN {kept.given.shape[1]}",
+        f"#define GOLDEN_SAID {kept.said.shape[1]}",
+        "",
+        *_table("golden_given[GOLDEN_STEPS][GOLDEN_GIVEN]", kept.given),
+        *_table("golden_said[GOLDEN_STEPS][GOLDEN_SAID]", kept.said),
+        *_table("golden_command[GOLDEN_STEPS][SLIPID_WHEELS]", kept.command),
+        *_table("golden_scale[GOLDEN_SAID]", scale),
+        "static const char *const golden_names[GOLDEN_SAID] = {",
+        *wrapped((f'"{name}"' for name in names), "  "),
+        "};",
+        "",
+        *_filling(code.reading),
+        *_reading_out(code.estimate),
+    ]
+    return "\n".join(rows) + "\n"
+
+
+def _table(declared: str, values: np.ndarray) -> list[str]:
+    def word(value: float) -> str:
+        return "NAN" if np.isnan(value) else repr(float(value))
+
+    if values.ndim == 1:
+        lines = wrapped(map(word, values), "  ")
+    else:
+        lines = [x for row in values for x in ("  {", *wrapped(map(word, row), "    "), "  },")]
+    return [f"static const double {declared} = {{", *lines, "};", ""]
+
+
+def _filling(struct: Struct) -> list[str]:
+    lines = [f"static void golden_reading({struct.name} *reading, const double *row) {{"]
+    place = 0
+    for field in struct.fields:
+        for k in range(field.size):
+            at = f"[{k}]" if field.shape else ""
+            lines.append(f"  reading->{field.name}{at} = (slipid_real)row[{place}];")
+            place += 1
+    return [*lines, "}", ""]
+
+
+def _reading_out(struct: Struct) -> list[str]:
+    lines = [f"static void golden_said_of(const {struct.name} *estimate, double *out) {{"]
+    place = 0
+    for field in struct.fields:
+        if field.size:
+            index = "[k]" if field.shape else ""
+            value = f"(double)estimate->{field.name}{index}"
+            if field.kind == "bool":
+                value = f"estimate->{field.name}{index} ? 1.0 : 0.0"
+            lines.append(
+                f"  for (int k = 0; k < {field.size}; ++k) out[{place} + k] = {value};"
+                if field.shape
+                else f"  out[{place}] = {value};"
+            )
+        place += field.size
+    return [*lines, "}", ""]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A run of a path that the library has driven, a row per period.
+
+    Attributes:
+        plant: what it was driven on; start: pose at which it began [m, m, rad].
+        given: dt [s] and the leaves of the reading; command: wheel speeds [rad/s].
+        time: of the path [s].
+    """
+
+    plant: str
+    start: tuple[float, float, float]
+    given: Float[np.ndarray, "step given"]
+    command: Float[np.ndarray, "step wheel"]
+    time: Float[np.ndarray, " step"]
+
+    @property
+    def readings(self) -> str:
+        """Text of readings.txt, which the example reads."""
+        rows = [" ".join(repr(float(x)) for x in row) for row in self.given]
+        return "\n".join([" ".join(map(repr, self.start)), *rows]) + "\n"
+
+    @property
+    def commands(self) -> str:
+        """Text of commands.txt, as the example prints it."""
+        rows = zip(self.command, self.time, strict=True)
+        return "".join(f"{' '.join(f'{x:.9f}' for x in c)} {t:.9f}\n" for c, t in rows)
+
+
+def _path(path: Path) -> str:
+    """Description of a path for people."""
+    corners = [f"({x:.2f}, {y:.2f})" for x, y in np.asarray(path.corners).tolist()]
+    x, y, heading = np.asarray(path.rows)[0, :3].tolist()
+    return (
+        f"from ({x:.2f}, {y:.2f}), heading {heading:.2f} rad, over {', '.join(corners)} [m] in "
+        f"{path.duration:g} s"
+    )
+
+
+def _kib(numbers: int) -> str:
+    """Size of so many numbers in `double`."""
+    return f"{numbers * 8 / 1024:.1f} KiB"
+
+
+def c_files(
+    robot: DeployedRobot,
+    pilot: Pilot[eqx.Module],
+    path: Path,
+    recording: Recording | None = None,
+) -> dict[str, str]:
+    """Text of the files by their paths in the folder.
+
+    Args:
+        robot: for the record of its numbers; pilot: its estimator and controller.
+        path: that the example follows.
+        recording: a run of it, as a test of the example.
+
+    Raises:
+        UnsupportedError: a step uses a primitive that has no form in C.
+    """
+    code = Code(robot, pilot, path)
+    named = {"VERSION": made_with()}
+    files = {
+        "src/slipid.h": code.header(),
+        "src/slipid.c": code.source(),
+        "test/golden.h": golden_header(code),
+        "test/check.c": template("check.c"),
+        "examples/drive/drive.c": template("drive.c"),
+        "examples/Slipid/Slipid.ino": filled("Slipid.ino", {"STACK": _kib(code.scratch)}),
+        "CMakeLists.txt": template("CMakeLists.txt"),
+        "library.json": filled("library.json", named),
+        "library.properties": filled("library.properties", named),
+    }
+    steps = ""
+    if recording is not None:
+        files["examples/drive/readings.txt"] = recording.readings
+        files["examples/drive/commands.txt"] = recording.commands
+        steps = filled("recording.md", {"PLANT": recording.plant})
+    values = {
+        "WARNINGS": "\n".join(warned(robot)),
+        "HEAD": "\n".join(facts(robot)),
+        "RECORDING": steps,
+        "FLOORS": ", ".join(f"`{name}` ({k})" for k, name in enumerate(robot.labels)),
+        "WHEELS": str(robot.wheels),
+        "STATE": _kib(code.kept),
+        "STACK": _kib(code.scratch),
+        "PATH": _path(path),
+    }
+    files["README.md"] = filled("README.md", values)
+    return files

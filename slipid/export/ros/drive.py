@@ -1,0 +1,200 @@
+"""The drive controller of ros2_controllers whose kinematics are those of a robot, if one has them.
+
+Such controllers take a body twist (vx, vy, yaw rate W) to wheel speeds by
+
+    omni      r w_k = sin(t_k) vx - cos(t_k) vy - R W,   t_k = wheel_offset + 2 pi k / n
+    mecanum   r w   = vx -/+ vy -/+ s W,                 s = lx + ly, about the middle of the wheels
+
+with mecanum's signs - - front left, + + front right, - + rear right, + - rear left. Omni wheels
+stand evenly on a circle and count counter-clockwise; a positive speed turns the robot clockwise.
+Wheels count from 0 here.
+
+Source: github.com/ros-controls/ros2_controllers, `compute_robot_velocity` of
+omni_wheel_drive_controller, `update_and_write_commands` of mecanum_drive_controller.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from slipid.export.ros.yaml_text import Parameter
+from slipid.robot.deployed import DeployedRobot
+
+MOST = 0.05
+"""Largest difference of kinematics with which a controller still counts as one for the robot: of a
+rim speed, at a body that goes at 1, or turns so that points on its base radius do."""
+CORNERS = ("front_left", "front_right", "rear_right", "rear_left")
+
+
+@dataclass(frozen=True)
+class Controller:
+    """A drive controller by the names that its users know.
+
+    Attributes:
+        plugin: its type; odometry: topic, below the name.
+        pose, twist: parameters with the diagonals of covariances.
+    """
+
+    name: str
+    plugin: str
+    odometry: str
+    pose: str
+    twist: str
+
+
+OMNI = Controller(
+    "omni_wheel_drive_controller",
+    "omni_wheel_drive_controller/OmniWheelDriveController",
+    "odom",
+    "diagonal_covariance.pose",
+    "diagonal_covariance.twist",
+)
+MECANUM = Controller(
+    "mecanum_drive_controller",
+    "mecanum_drive_controller/MecanumDriveController",
+    "odometry",
+    "pose_covariance_diagonal",
+    "twist_covariance_diagonal",
+)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A controller with the numbers of a robot.
+
+    Attributes:
+        wheels: the robot's, in the order in which the controller has them.
+        turned: whether a wheel's positive speed is the controller's negative one, in that order.
+        off: largest difference of the controller's kinematics and the robot's `forward`, as of
+            `MOST`.
+    """
+
+    controller: Controller
+    wheels: tuple[int, ...]
+    turned: tuple[bool, ...]
+    parameters: tuple[Parameter, ...]
+    off: float
+
+
+def drive_of(robot: DeployedRobot) -> Drive | None:
+    """The controller for a robot; None where no controller has its kinematics."""
+    made = _mecanum(robot) or _omni(robot)
+    return made if made is not None and made.off <= MOST else None
+
+
+def joint(wheel: int) -> str:
+    """Name of a wheel's joint until the user has put in his own."""
+    return f"wheel_{wheel + 1}_joint"
+
+
+@dataclass(frozen=True)
+class _Wheels:
+    """The robot's wheels in a controller's order, rows of its kinematics with the signs there."""
+
+    order: Int[np.ndarray, " wheel"]
+    turned: tuple[bool, ...]
+    rows: Float[np.ndarray, "wheel 3"]
+
+    @classmethod
+    def of(
+        cls, robot: DeployedRobot, order: Int[np.ndarray, " wheel"], axis: int, sign: float
+    ) -> "_Wheels":
+        """With signs that give the entries of an axis of the twist this sign."""
+        rows = np.asarray(robot.forward)[order]
+        turned = rows[:, axis] * sign < 0
+        return cls(order, tuple(turned.tolist()), np.where(turned, -1.0, 1.0)[:, None] * rows)
+
+    def drive(
+        self,
+        controller: Controller,
+        robot: DeployedRobot,
+        own: Float[np.ndarray, "wheel 3"],
+        parameters: tuple[Parameter, ...],
+    ) -> Drive:
+        """The controller that has these rows as its own."""
+        scale = np.array([1.0, 1.0, 1.0 / float(robot.frame.base)])
+        return Drive(
+            controller=controller,
+            wheels=tuple(self.order.tolist()),
+            turned=self.turned,
+            parameters=parameters,
+            off=float(np.abs((own - self.rows) * scale).max()),
+        )
+
+
+def _omni(robot: DeployedRobot) -> Drive | None:
+    """Wheels that stand evenly on a circle, the first one of the robot first."""
+    places, count = np.asarray(robot.places), robot.wheels
+    azimuth = np.arctan2(places[:, 1], places[:, 0])
+    # the first wheel itself, and those a rounding error before it, count as at 0
+    order = np.argsort(np.mod(azimuth - azimuth[0] + 1e-6, 2 * np.pi))
+    wheels = _Wheels.of(robot, order, axis=2, sign=-1.0)
+    even = 2 * np.pi * np.arange(count) / count
+    beyond = np.arctan2(wheels.rows[:, 0], -wheels.rows[:, 1]) - azimuth[0] - even
+    offset = float(azimuth[0] + np.mean(np.mod(beyond + np.pi, 2 * np.pi) - np.pi))
+    base, angle = float(robot.frame.base), offset + even
+    own = np.stack([np.sin(angle), -np.cos(angle), np.full(count, -base)], axis=-1)
+    parameters = (
+        Parameter("wheel_names", tuple(joint(k) for k in order.tolist()), _JOINTS),
+        Parameter("wheel_offset", offset, _OFFSET),
+        Parameter("robot_radius", base, _BASE),
+        Parameter("wheel_radius", float(robot.frame.radius), _RADIUS),
+    )
+    return wheels.drive(OMNI, robot, own, parameters) if count >= 3 else None
+
+
+def _mecanum(robot: DeployedRobot) -> Drive | None:
+    """Four wheels, one at each corner about their middle."""
+    places = np.asarray(robot.places)
+    middle = places.mean(axis=0)
+    found = {(x > 0, y > 0): k for k, (x, y) in enumerate((places - middle).tolist())}
+    if robot.wheels != 4 or len(found) != 4:
+        return None
+    corners = ((True, True), (True, False), (False, False), (False, True))
+    order = np.array([found[corner] for corner in corners])
+    wheels = _Wheels.of(robot, order, axis=0, sign=1.0)
+    rows = wheels.rows
+    about = rows[:, 2] - (middle[0] * rows[:, 1] - middle[1] * rows[:, 0])
+    turns, aside = np.array([-1.0, 1.0, 1.0, -1.0]), np.array([-1.0, 1.0, -1.0, 1.0])
+    reach = float(np.mean(about * turns))
+    yaw = reach * turns + middle[0] * aside - middle[1]
+    own = np.stack([np.ones(4), aside, yaw], axis=-1)
+    parameters = (*_joints(order), *_kinematics(robot, reach, middle))
+    made = wheels.drive(MECANUM, robot, own, parameters)
+    return made if made.off <= MOST else None
+
+
+def _joints(order: Int[np.ndarray, "4"]) -> tuple[Parameter, ...]:
+    names = [
+        (f"{corner}_wheel_command_joint_name", joint(int(k)))
+        for corner, k in zip(CORNERS, order, strict=True)
+    ]
+    return tuple(Parameter(*pair, "" if n else _JOINTS) for n, pair in enumerate(names))
+
+
+def _kinematics(
+    robot: DeployedRobot, reach: float, middle: Float[np.ndarray, "2"]
+) -> tuple[Parameter, ...]:
+    x, y = (float(-m) if abs(m) > 1e-12 else 0.0 for m in middle)
+    return (
+        Parameter("kinematics.base_frame_offset.x", x, _MIDDLE),
+        Parameter("kinematics.base_frame_offset.y", y),
+        Parameter("kinematics.base_frame_offset.theta", 0.0),
+        Parameter("kinematics.wheels_radius", float(robot.frame.radius), _RADIUS),
+        Parameter("kinematics.sum_of_robot_center_projection_on_X_Y_axis", reach, _REACH),
+    )
+
+
+_JOINTS = (
+    "Put in your own joint names, in this order; the number is that of the wheel in robot.json and "
+    "in the logs. README.md says which joints must be reversed."
+)
+_OFFSET = (
+    "Direction in which the first of these wheels stands, from ahead [rad]: the mean over the "
+    "wheels of what their identified drive directions say."
+)
+_BASE = "robot.base_radius, from the middle to the wheels [m]. It has no multiplier."
+_RADIUS = "robot.wheel_radius [m]. It has no multiplier: the identified value itself stands in."
+_MIDDLE = "The origin of the body as seen from the middle of the wheels [m, m, rad]."
+_REACH = "lx + ly [m]: the mean over the wheels of their identified levers about their middle."

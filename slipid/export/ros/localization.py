@@ -1,0 +1,207 @@
+"""What odometry errs by on each floor, as the variances that ROS messages and filters take.
+
+On a way d [m] an error grows by a part that stays the same (effect e [per m]) and one that comes
+anew (process q [per sqrt(m)]), so that its variance is (e d)^2 + q^2 d. Odometry that believes its
+encoders errs by the slip of its wheels as well: its e^2 is effect^2 + slip^2, slip being the root
+mean square, over directions of travel, of what the contact model says the wheels slip by. Which way
+a robot goes is not known to a constant covariance, so x and y both get the larger of along and
+across. A heading that is off carries the robot sideways: with e_w and q_w of the yaw, by
+(e_w d^2 / 2)^2 + q_w^2 d^3 / 3.
+
+ROS drive controllers put one constant diagonal into every message, which no true covariance of
+odometry is; it is taken at `DISTANCE_M`, and for twists at the highest speed that the fit has seen.
+
+Parameters of robot_localization's extended Kalman filter for the odometry of a robot.
+
+Its state is x, y, z, roll, pitch, yaw, their rates in the body frame, and accelerations ahead,
+sideways and up; it adds process noise times the time that has passed.
+
+Source: github.com/cra-ros-pkg/robot_localization, params/ekf.yaml, `Ekf::predict`.
+"""
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.export.ros.yaml_text import Parameter
+from slipid.export.text import short
+from slipid.model import contact
+from slipid.model.contact_law import ContactSurface
+from slipid.robot.controller import Limits
+from slipid.robot.deployed import DeployedRobot, RobotArrays
+from slipid.robot.record import Axes
+
+DISTANCE_M = 1.0
+"""Way since the pose was last set right for which constant variances are."""
+PERIOD_S = 0.02
+"""Time between two messages of odometry for which they are."""
+UNKNOWN = 1e6
+"""Variance of what wheels do not tell: height, roll and pitch."""
+WAYS = 24
+"""Directions of travel over which slip is averaged."""
+
+
+@dataclass(frozen=True)
+class Errs:
+    """What odometry errs by on a floor, along, across and in yaw.
+
+    Attributes:
+        process: [m/sqrt(m)], [m/sqrt(m)], [rad/sqrt(m)].
+        effect: what the contact model misses all the way; slip: of wheels, which encoders do not
+            see; both [m/m], [m/m], [rad/m].
+    """
+
+    floor: str
+    process: Axes
+    effect: Axes
+    slip: Axes
+
+    @property
+    def stays(self) -> Axes:
+        """What stays the same all the way of odometry that believes its encoders, per metre."""
+        return _axes(np.hypot(self.effect, self.slip))
+
+    def without_slip(self) -> "Errs":
+        """Of odometry that estimates slip, and so errs by what the contact model misses."""
+        return replace(self, slip=(0.0, 0.0, 0.0))
+
+    def pose(self, distance: float) -> Axes:
+        """Variance of x, y and heading after a way [m^2, m^2, rad^2]."""
+        e, q = np.asarray(self.stays), np.asarray(self.process)
+        along, across, yaw = (e * distance) ** 2 + q**2 * distance
+        across += (e[2] * distance**2 / 2) ** 2 + q[2] ** 2 * distance**3 / 3
+        place = max(along, across)
+        return _axes(np.array([place, place, yaw]))
+
+    def twist(self, speed: float, period: float) -> Axes:
+        """Variance of the velocity over one period, (e v)^2 + q^2 v / period, at a speed [m/s]."""
+        e, q = np.asarray(self.stays), np.asarray(self.process)
+        return _level((e * speed) ** 2 + q**2 * speed / period)
+
+    def walk(self, speed: float, distance: float) -> Axes:
+        """Variance per second of a random walk that is e d off after a way d, e^2 d v."""
+        return _level(np.asarray(self.stays) ** 2 * distance * speed)
+
+
+def errs_of(robot: DeployedRobot) -> tuple[Errs, ...]:
+    """Errors of odometry on each floor, in the robot's order."""
+    slip = np.asarray(_slip(robot.arrays, jnp.asarray(top_speed(robot))))
+    process, effect = np.asarray(robot.process), np.asarray(robot.effect)
+    return tuple(
+        Errs(name, _axes(process[k]), _axes(effect[k]), _axes(slip[k]))
+        for k, name in enumerate(robot.labels)
+    )
+
+
+def worst(errs: tuple[Errs, ...]) -> Errs:
+    """Errors on the floor on which the place is least known after `DISTANCE_M`."""
+    return max(errs, key=lambda e: e.pose(DISTANCE_M)[0])
+
+
+def top_speed(robot: DeployedRobot) -> float:
+    """Rim speed up to which the fit has seen the robot [m/s]."""
+    return float(robot.highest[0] * robot.frame.radius)
+
+
+def diagonal(planar: Axes) -> tuple[float, ...]:
+    """Variances of x, y, z, roll, pitch and yaw."""
+    x, y, yaw = planar
+    return (x, y, UNKNOWN, UNKNOWN, UNKNOWN, yaw)
+
+
+@eqx.filter_jit
+def _slip(robot: RobotArrays, speed: Float[Array, ""]) -> Float[Array, "floor 3"]:
+    """Root mean square of what encoders err by per metre, along, across and in yaw."""
+    angle = jnp.linspace(0.0, 2 * jnp.pi, WAYS, endpoint=False)
+    way = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(WAYS)], axis=-1)
+    rim = speed * way @ robot.forward.T
+
+    def one(floor: ContactSurface) -> Array:
+        return jax.vmap(lambda r: contact.equilibrium(r, robot.frame, floor, robot.rest))(rim)
+
+    miss = way - jax.vmap(one)(robot.floors) / speed
+    along = jnp.sum(miss * way, axis=-1)
+    across = miss[..., 1] * way[:, 0] - miss[..., 0] * way[:, 1]
+    return jnp.sqrt(jnp.mean(jnp.stack([along, across, miss[..., 2]], axis=-1) ** 2, axis=1))
+
+
+def _axes(row: Float[np.ndarray, "3"]) -> Axes:
+    along, across, yaw = (float(x) for x in row)
+    return along, across, yaw
+
+
+def _level(row: Float[np.ndarray, "3"]) -> Axes:
+    """The same errors with the larger of along and across for both."""
+    return _axes(np.array([row[:2].max(), row[:2].max(), row[2]]))
+
+
+NODE = "ekf_filter_node"
+_POSE = ("x", "y", "z", "roll", "pitch", "yaw")
+STATE = (*_POSE, *(f"v{name}" for name in _POSE), "ax", "ay", "az")
+FUSED = ("vx", "vy", "vyaw")
+"""What the filter takes from odometry: its pose is the sum of the same velocities."""
+HELD = 1e-6
+"""Process noise of what `two_d_mode` holds at zero."""
+ACCELERATION = 0.01
+"""Process noise of accelerations, which nothing here measures: the package's own default."""
+
+
+def filter_parameters(
+    robot: DeployedRobot, errs: Errs, odometry: str, whose: str
+) -> tuple[Parameter, ...]:
+    """All parameters, for odometry on a topic that is of `whose` kind and errs like this."""
+    about = (
+        f"Odometry of {whose}. Velocities only are fused: its pose is their sum, and would count "
+        "twice. Order: " + ", ".join(STATE) + "."
+    )
+    return (
+        Parameter("frequency", 1 / PERIOD_S, "As often as odometry is taken to come [Hz]."),
+        Parameter("two_d_mode", True, "The robot stays on a plane."),
+        Parameter("publish_tf", True, _TF),
+        Parameter("odom_frame", "odom"),
+        Parameter("base_link_frame", "base_link"),
+        Parameter("world_frame", "odom"),
+        Parameter("odom0", odometry, about),
+        Parameter("odom0_config", tuple(name in FUSED for name in STATE), per_line=3),
+        Parameter("odom0_differential", False),
+        Parameter("odom0_relative", False),
+        Parameter("dynamic_process_noise_covariance", False, _DYNAMIC),
+        process_noise(robot, errs),
+    )
+
+
+def process_noise(robot: DeployedRobot, errs: Errs) -> Parameter:
+    """Process noise on a floor, 15 x 15 as rows."""
+    matrix, most = np.diag(_diagonal(robot, errs)), float(Limits().acceleration)
+    about = (
+        f"On '{errs.floor}'. Pose: what stays the same all the way and so is no noise of single "
+        f"velocities, as a random walk that is as far off after {short(DISTANCE_M)} m, at the "
+        f"highest speed seen by the fit, {short(top_speed(robot))} m/s. Velocity: the change that "
+        f"the limit of wheel acceleration, {short(most)} rad/s^2, allows within "
+        f"{short(PERIOD_S)} s. Accelerations: the package's default. two_d_mode holds the rest."
+    )
+    entries = tuple(float(x) for x in matrix.reshape(-1))
+    return Parameter("process_noise_covariance", entries, about, per_line=len(STATE))
+
+
+def _diagonal(robot: DeployedRobot, errs: Errs) -> Float[np.ndarray, " state"]:
+    """Per second: pose as `Errs.walk`, velocities as (a T)^2 per period T."""
+    pose = errs.walk(top_speed(robot), DISTANCE_M)
+    change = float(Limits().acceleration) * float(robot.frame.radius)
+    speed, turn = change**2 * PERIOD_S, (change / float(robot.frame.base)) ** 2 * PERIOD_S
+    known = dict(zip(("x", "y", "yaw"), pose, strict=True))
+    known |= {"vx": speed, "vy": speed, "vyaw": turn, "ax": ACCELERATION, "ay": ACCELERATION}
+    return np.array([known.get(name, HELD) for name in STATE])
+
+
+_TF = (
+    "Only one node may publish this transform: set enable_odom_tf of the drive controller to false."
+)
+_DYNAMIC = (
+    "False: the pose grows uncertain while the robot stands, too. True would scale it with the "
+    "square of the speed, which forgets slow ways."
+)

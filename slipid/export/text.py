@@ -1,0 +1,82 @@
+"""Text for people: words on one line, rounded numbers, Markdown tables.
+
+Names of floors and load set-ups that ROS parameters, C++ and files can have.
+"""
+
+import re
+import textwrap
+from collections.abc import Iterator, Sequence
+
+WIDTH = 96
+"""Longest line of a comment, its sign left out."""
+
+
+def one_line(text: str) -> str:
+    """Words of any origin on one line, without what no file may hold."""
+    shown = "".join(c if c.isprintable() else " " for c in text)
+    return " ".join(shown.split())
+
+
+def short(value: float) -> str:
+    """A number rounded for people, to four digits."""
+    return f"{value:.4g}"
+
+
+def interval(ends: tuple[float, float] | None) -> str:
+    """An interval rounded for people; empty where there is none."""
+    return "" if ends is None else f"{short(ends[0])} to {short(ends[1])}"
+
+
+def wrapped(text: str, width: int = WIDTH) -> Iterator[str]:
+    """A paragraph as lines of a comment; paths and addresses stay whole."""
+    lines = textwrap.wrap(one_line(text), width, break_long_words=False, break_on_hyphens=False)
+    yield from lines or [""]
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return ["| " + " | ".join(map(_cell, line)) + " |" for line in lines]
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names with commas, or the word that there are none."""
+    return ", ".join(one_line(name) for name in names) or "none"
+
+
+def _cell(text: str) -> str:
+    return one_line(text).replace("\\", "\\\\").replace("|", "\\|")
+
+
+_WORDS = """
+alignas alignof and asm auto bitand bitor bool break case catch char class compl concept const
+constexpr continue decltype default delete do double else enum explicit export extern false float
+for friend goto if inline int long mutable namespace new not operator or private protected public
+register requires return short signed sizeof static struct switch template this throw true try
+typedef typeid typename union unsigned using virtual void volatile while xor
+"""
+_TAKEN = frozenset(_WORDS.split())
+"""Words of C++, which the fields of a generated struct cannot have."""
+
+
+def identifiers(labels: Sequence[str], kind: str) -> tuple[str, ...]:
+    """A name of small letters, digits and single underscores for each label, no two alike.
+
+    They differ without underscores, too: generated structs are called after them in that way.
+    `kind` stands before a label that is no name by itself.
+    """
+    names: list[str] = []
+    for label in labels:
+        plain = re.sub(r"[^a-z0-9]+", "_", label.lower()).strip("_")
+        name = (
+            plain if plain[:1].isalpha() and plain not in _TAKEN else f"{kind}_{plain}".strip("_")
+        )
+        count, first = 2, name
+        while _bare(name) in map(_bare, names):
+            name, count = f"{first}_v{count}", count + 1
+        names.append(name)
+    return tuple(names)
+
+
+def _bare(name: str) -> str:
+    return name.replace("_", "")

@@ -1,0 +1,87 @@
+"""What runs over several floors teach beside those that each keep to one floor.
+
+They are further pieces of the one likelihood. How well they are predicted is told by left-out ones:
+each half of the runs is judged by a fit that has seen the other half only.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from slipid.fit.crossing import Crossing, Errors, Several, errors, residuals_at
+from slipid.fit.optimise import Optimum, optimise
+from slipid.fit.problem import Problem, State
+
+_ROUNDS = 6
+"""Most rounds of the fits to half of the runs, which only judge."""
+
+
+@dataclass(frozen=True, eq=False)
+class Across:
+    """A fit of runs on one floor and on several together.
+
+    Attributes:
+        problem, optimum: of all runs.
+        before: errors of the runs over several floors by a fit that has seen none of them.
+        after: of each half by a fit that has seen the other, None where there is only one run.
+        learnt: by the fit to all of them.
+        as_if: the same had all wheels stood on one floor all the while, by floor; a map that is
+            right predicts better than that.
+    """
+
+    problem: Problem
+    optimum: Optimum
+    before: Errors
+    after: Errors | None
+    learnt: Errors
+    as_if: Mapping[str, Errors]
+
+
+def across(
+    problem: Problem,
+    optimum: Optimum,
+    several: Crossing,
+    tell: Callable[[State], None],
+    most_rounds: int = 30,
+    tolerance: float = 0.02,
+) -> Across:
+    """Goes on from the optimum of a problem with runs over several floors.
+
+    `tell` is called after every round of the fit to all runs; the limits are those of `optimise`.
+    """
+    whole = problem.crossed(several)
+    start = replace(whole.restated(optimum.state, problem), round=0)
+    on_one, number = len(problem.windows), np.unique(several.windows.run, return_inverse=True)[1]
+    odd = number % 2 == 1
+    target, every = whole.target, np.ones(len(odd))
+    assert target.several is not None, "runs over several floors"
+
+    def off(several: Several, *judged: tuple[State, Float[np.ndarray, " run"]]) -> Errors:
+        """Errors, each run by the state that judges it with weight 1 and the others with 0."""
+        found = [(residuals_at(target.space, several, jnp.asarray(s.z)), w) for s, w in judged]
+        return errors(several, found)
+
+    learnt = optimise(whole, start=start, tell=tell, most_rounds=most_rounds, tolerance=tolerance)
+    after = None
+    if odd.any() and not odd.all():
+        parts = []
+        for half in (odd, ~odd):
+            keep = np.concatenate([np.ones(on_one), ~half])
+            other = optimise(whole, keep=keep, start=start, most_rounds=_ROUNDS)
+            parts.append((other.state, half.astype(float)))
+        after = off(target.several, *parts)
+    end = (learnt.state, every)
+    return Across(
+        problem=whole,
+        optimum=learnt,
+        before=off(target.several, (start, every)),
+        after=after,
+        learnt=off(target.several, end),
+        as_if={
+            floor: off(target.several.as_if_on(k), end)
+            for k, floor in enumerate(whole.robot.surfaces.labels)
+        },
+    )

@@ -1,0 +1,329 @@
+"""What neighbouring runs, and runs of one session, share beyond the model.
+
+Runs in nearly one direction at nearly one speed err alike, and so do runs of one time. The effect
+of a run along, across and in yaw is
+
+    e = d(direction, speed, load) + s(session) + own
+
+d is a Gaussian process per floor and axis, with a kernel that is periodic in the direction of
+travel relative to the body, and s one number per floor, axis and session; `own` is in the noise of
+the run. A robot whose wheels are their own mirror image errs alike to either side, along its way by
+as much, and across it and in yaw by as much the other way: k(a, b) = k0(a - b) +- h k0(a + b), with
+angles from the axis of the mirror.
+
+With r the residuals of a floor's runs, whitened by roots W of their own noise, and coefs u of unit
+variance, e = S u, the effects are marginalised:
+
+    min over u of |W (r - E S u)|^2 + |u|^2,    u^ = C^-1 (W E S)^T W r,    C = 1 + (W E S)^T W E S
+
+(E moves residuals by an effect). Source: Rasmussen and Williams 2006, section 2.7.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_solve
+from jaxtyping import Array, Float, Int
+from scipy.special import ive
+
+from slipid.data.windows import Windows
+from slipid.fit.noise import Noise, effects, sessions_on, steps, travel
+from slipid.model.robot import Robot
+
+AXES = ("along", "across", "yaw")
+LENGTH = np.radians(10.0)
+"""Length of the kernel over directions [rad]."""
+SPEED_LENGTH = 0.5
+"""Length of the kernel over logarithms of speed."""
+OTHER_LOAD = 0.5
+"""Correlation of effects with different load set-ups."""
+OTHER_SIDE = 0.7
+"""Correlation of effects in mirrored directions, h."""
+_HARMONICS = 15
+"""Of the kernel over directions; those beyond hold 1 % of its variance."""
+_SPEED = 0.25
+"""Logarithms of speed are taken in steps of this."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """A speed, as the rounded logarithm of m/s, and a load set-up, driven on a floor."""
+
+    log_speed: float
+    load: str
+
+    def near(self, other: "Pace") -> float:
+        """Correlation of effects in the same direction."""
+        apart = (self.log_speed - other.log_speed) / SPEED_LENGTH
+        return float(np.exp(-0.5 * apart**2) * (1.0 if self.load == other.load else OTHER_LOAD))
+
+
+@dataclass(frozen=True, eq=False)
+class Directions:
+    """Direction of travel of every piece relative to the body [rad], and its pace.
+
+    The direction is nan where a robot turns on the spot; `mirror` is the axis of `Geometry.mirror`.
+    """
+
+    direction: Float[np.ndarray, " piece"]
+    pace: tuple[Pace, ...]
+    mirror: float | None
+
+    @staticmethod
+    def of(w: Windows, robot: Robot) -> "Directions":
+        """As the encoders have it."""
+        far = travel(w, robot)[0]
+        moved = steps(w, robot)[..., :2].sum(axis=1)
+        straight = np.hypot(*moved.T)
+        moves = straight > 0.2 * far.sum(axis=1)
+        speed = np.log(np.maximum(straight / w.dt.sum(axis=1), 1e-3))
+        rounded = np.round(speed / _SPEED) * _SPEED
+        return Directions(
+            np.where(moves, np.arctan2(moved[:, 1], moved[:, 0]), np.nan),
+            tuple(Pace(float(s), load) for s, load in zip(rounded, w.load, strict=True)),
+            robot.geometry.mirror(),
+        )
+
+    def of_pieces(self, mine: Int[np.ndarray, " some"]) -> "Directions":
+        """Those of some pieces."""
+        return Directions(self.direction[mine], tuple(self.pace[k] for k in mine), self.mirror)
+
+    def around(self) -> Float[np.ndarray, "3 piece harmonic"]:
+        """Root of the kernel over directions, along, across and in yaw; zero on the spot."""
+        alike = 0.0 if self.mirror is None else OTHER_SIDE
+        wave = 1 / LENGTH**2
+        k = np.arange(1, _HARMONICS + 1)
+        angle = np.nan_to_num(self.direction - (self.mirror or 0.0))[:, None] * k
+        size = np.sqrt(2 * ive(k, wave))
+        constant = np.full((len(angle), 1), np.sqrt(ive(0, wave)))
+        even = np.concatenate([constant, size * np.cos(angle)], axis=1)
+        odd = size * np.sin(angle)
+        more, less = np.sqrt(1 + alike), np.sqrt(1 - alike)
+        of_even, of_odd = (more, less, less), (less, more, more)
+        root = [
+            np.concatenate([a * even, b * odd], axis=1)
+            for a, b in zip(of_even, of_odd, strict=True)
+        ]
+        return np.stack(root) * np.isfinite(self.direction)[:, None]
+
+    def basis(self, paces: tuple[Pace, ...]) -> Float[np.ndarray, "3 piece coef"]:
+        """Root of the kernel: effects of unit coefs, from paces that were seen.
+
+        Its rows are as long as those of `around`, less where the pace is another.
+        """
+        if not paces:
+            return np.zeros((len(AXES), len(self.pace), 0))
+        seen = np.array([[a.near(b) for b in paces] for a in paces])
+        root = np.linalg.cholesky(seen + 1e-9 * np.eye(len(paces)))
+        met = {pace: np.array([pace.near(b) for b in paces]) for pace in set(self.pace)}
+        share = {pace: np.linalg.solve(root, row) for pace, row in met.items()}
+        of_pace = np.array([share[pace] for pace in self.pace]).reshape(-1, len(paces))
+        whole = np.einsum("pc,apd->apcd", of_pace, self.around())
+        return np.asarray(whole.reshape(len(AXES), len(self.pace), -1))
+
+
+class FloorShared(eqx.Module):
+    """What the runs on a floor share, as arrays.
+
+    Attributes:
+        pieces: their numbers.
+        effect: what one unit along, across and in yaw moves in their residuals.
+        near: root of the kernel by axis and piece; session: 1 for the session of each piece.
+        numbers: of the variances of own, neighbours' and session's effects, -1 where there is none.
+    """
+
+    pieces: Int[Array, " run"]
+    effect: Float[Array, "run m 3"]
+    near: Float[Array, "3 run condition"]
+    session: Float[Array, "run session"]
+    numbers: Int[Array, "3 3"]
+
+    def root(self, log_v: Float[Array, " variance"]) -> Float[Array, "3 run coef"]:
+        """S, by which unit coefs make effects along, across and in yaw."""
+        std = jnp.where(self.numbers < 0, 0.0, jnp.exp(0.5 * log_v)[self.numbers])
+        parts = [std[k, :, None, None] * x for k, x in ((1, self.near), (2, self.session[None]))]
+        return jnp.concatenate(parts, axis=-1)
+
+
+Paces = dict[str, tuple[Pace, ...]]
+"""Those that each floor was driven at."""
+
+
+def shared_of(w: Windows, robot: Robot, noise: Noise) -> tuple[tuple[FloorShared, ...], Paces]:
+    """What runs share on every floor, and the paces it was driven at."""
+    every, moved, place = Directions.of(w, robot), effects(w, robot), noise.names.index
+    floors, found, paces = np.asarray(w.surface), [], {}
+    for floor in robot.surfaces.labels:
+        mine = np.flatnonzero(floors == floor)
+        here = every.of_pieces(mine)
+        paces[floor] = tuple(dict.fromkeys(here.pace))
+        names = sessions_on(w, floor)
+        session = np.array([w.session[k] for k in mine])[:, None] == np.asarray(names)
+        kinds = [
+            [f"{kind}.{floor}.{axis}" for axis in AXES] for kind in ("run", "neighbours", "session")
+        ]
+        number = [[place(n) if n in noise.names else -1 for n in row] for row in kinds]
+        found.append(
+            FloorShared(
+                pieces=jnp.asarray(mine),
+                effect=jnp.asarray(moved[mine]),
+                near=jnp.asarray(here.basis(paces[floor])),
+                session=jnp.asarray(session[:, : len(names) if len(names) > 1 else 0], float),
+                numbers=jnp.asarray(number),
+            )
+        )
+    return tuple(found), paces
+
+
+class Tie(eqx.Module):
+    """Shared effects of a floor given whitened residuals of its runs.
+
+    Attributes:
+        pieces: numbers of its runs; span: W E, what effects move in whitened residuals.
+        root: S; factor: Cholesky factor of C.
+    """
+
+    pieces: Int[Array, " run"]
+    span: Float[Array, "run m 3"]
+    root: Float[Array, "3 run coef"]
+    factor: Float[Array, "coefs coefs"]
+
+    def coefs(self, white: Float[Array, "piece m"]) -> Float[Array, " coefs"]:
+        """Conditional mean u^ of the coefs given whitened residuals of all pieces."""
+        told = jnp.einsum("nma,nm->an", self.span, white[self.pieces])
+        return cho_solve((self.factor, True), jnp.einsum("anq,an->aq", self.root, told).ravel())
+
+    def effects(self, coefs: Float[Array, " coefs"]) -> Float[Array, "run 3"]:
+        """Effects S u along, across and in yaw."""
+        return jnp.einsum("anq,aq->na", self.root, coefs.reshape(3, -1))
+
+
+@eqx.filter_jit
+def ties(
+    shared: tuple[FloorShared, ...],
+    log_v: Float[Array, " variance"],
+    white: Float[Array, "piece m m"],
+) -> tuple[Tie, ...]:
+    """Shared effects of every floor for given whitening roots of all pieces."""
+
+    def tie(of: FloorShared) -> Tie:
+        span = jnp.einsum("nij,nja->nia", white[of.pieces], of.effect)
+        gram = jnp.einsum("nia,nib->abn", span, span)
+        root = of.root(log_v)
+        weighed = jnp.einsum("abn,bnk->abnk", gram, root)
+        size = root.shape[0] * root.shape[2]
+        inner = jnp.einsum("anq,abnk->aqbk", root, weighed).reshape(size, size)
+        return Tie(of.pieces, span, root, jnp.linalg.cholesky(jnp.eye(size) + inner))
+
+    return tuple(tie(of) for of in shared)
+
+
+def freed(tied: tuple[Tie, ...], white: Float[Array, "piece m"]) -> Float[Array, " rows"]:
+    """Whitened residuals less shared effects at their conditional mean, and the coefs' own.
+
+    Its square is the quadratic form of the marginal likelihood.
+    """
+    coefs = [tie.coefs(white) for tie in tied]
+    for tie, u in zip(tied, coefs, strict=True):
+        moved = jnp.einsum("nma,na->nm", tie.span, tie.effects(u))
+        white = white.at[tie.pieces].add(-moved)
+    return jnp.concatenate([white.ravel(), *coefs])
+
+
+@eqx.filter_jit
+def shared_effects(
+    tied: tuple[Tie, ...], white: Float[Array, "piece m"]
+) -> Float[Array, "piece 3"]:
+    """Conditional mean of the effects that runs share, for every piece."""
+    out = jnp.zeros((len(white), len(AXES)))
+    for tie in tied:
+        out = out.at[tie.pieces].set(tie.effects(tie.coefs(white)))
+    return out
+
+
+@eqx.filter_jit
+def shared_spread(tied: tuple[Tie, ...], count: int) -> Float[Array, "piece 3 3"]:
+    """Covariance of the shared effects of every piece, given the numbers of the model."""
+    out = jnp.zeros((count, len(AXES), len(AXES)))
+    for tie in tied:
+        axes, runs, _ = tie.root.shape
+        rows = jnp.einsum("ab,anq->nabq", jnp.eye(axes), tie.root).reshape(runs * axes, -1)
+        half = jax.scipy.linalg.solve_triangular(tie.factor, rows.T, lower=True)
+        half = half.reshape(-1, runs, axes)
+        out = out.at[tie.pieces].set(jnp.einsum("kna,knb->nab", half, half))
+    return out
+
+
+def freed_slopes(
+    tied: tuple[Tie, ...], white: Float[Array, "piece m free"]
+) -> Float[Array, "rows free"]:
+    """`freed` of every column."""
+    return jax.vmap(lambda column: freed(tied, column), in_axes=-1, out_axes=-1)(white)
+
+
+def shared_slopes(
+    tied: tuple[Tie, ...], white: Float[Array, "piece m free"]
+) -> Float[Array, "piece 3 free"]:
+    """`shared_effects` of every column."""
+    return jax.vmap(lambda column: shared_effects(tied, column), in_axes=-1, out_axes=-1)(white)
+
+
+class Told(NamedTuple):
+    """What shared effects add to the motion of pieces: mean, slope by numbers, and covariance."""
+
+    mean: Float[np.ndarray, "piece 3"]
+    slope: Float[np.ndarray, "piece 3 free"]
+    covariance: Float[np.ndarray, "piece 3 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class FoundShared:
+    """What neighbouring runs on a floor were found to share.
+
+    Attributes:
+        paces: they were driven at.
+        std: of the process along, across and in yaw.
+        coefs: mean of its unit coefs at the fit; by_number: their slope by the search vector.
+        covariance: of the coefs given the numbers.
+    """
+
+    paces: tuple[Pace, ...]
+    std: Float[np.ndarray, "3"]
+    coefs: Float[np.ndarray, "3 coef"]
+    by_number: Float[np.ndarray, "3 coef free"]
+    covariance: Float[np.ndarray, "3 coef 3 coef"]
+
+    def told(self, way: Directions) -> Told:
+        """Of new runs on this floor."""
+        basis, around = way.basis(self.paces), way.around()
+        of = self.std[:, None, None] * basis
+        whole = np.where(np.isfinite(way.direction), (around**2).sum(axis=-1), 1.0)
+        rest = (self.std[:, None] ** 2 * np.maximum(whole - (basis**2).sum(axis=-1), 0.0)).T
+        known = np.einsum("anq,aqbr->nabr", of, self.covariance)
+        return Told(
+            np.einsum("anq,aq->na", of, self.coefs),
+            np.einsum("anq,aqp->nap", of, self.by_number),
+            np.einsum("nabr,bnr->nab", known, of) + rest[:, :, None] * np.eye(len(AXES)),
+        )
+
+
+def told_of(found: Mapping[str, FoundShared], w: Windows, robot: Robot, free: int) -> Told:
+    """What neighbours tell of runs, on every floor; nothing where no floor was found to share."""
+    n, axes = len(w), len(AXES)
+    out = Told(np.zeros((n, axes)), np.zeros((n, axes, free)), np.zeros((n, axes, axes)))
+    if not found:
+        return out
+    every, floors = Directions.of(w, robot), np.asarray(w.surface)
+    for floor, one in found.items():
+        mine = np.flatnonzero(floors == floor)
+        if not len(mine):
+            continue
+        here = every.of_pieces(mine)
+        for whole, part in zip(out, one.told(here), strict=True):
+            whole[mine] = part
+    return out

@@ -1,0 +1,326 @@
+"""Weights of residuals given their variances, and the variances by Fisher scoring.
+
+Residuals of a piece are a multivariate Student t with the scale matrix V of `noise`. The restricted
+likelihood of the variances takes into account what the structural numbers have been fitted to
+(Patterson and Thompson 1971, Biometrika 58(3)).
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from slipid.fit import likelihood as lk
+from slipid.fit.crossing import CURRENT, MOTION, Several
+from slipid.fit.noise import Components, electric_noise
+from slipid.fit.shared import FloorShared, Tie, freed_slopes, shared_slopes, shared_spread, ties
+from slipid.search_space import Space
+
+Vector = Array | np.ndarray
+"""One-dimensional, of jax or numpy."""
+Search = Float[np.ndarray, " free"]
+"""A search vector, or one number for each of its coordinates."""
+Square = Float[np.ndarray, "free free"]
+"""Covariance or information of the search vector."""
+Blocks = dict[str, Array]
+"""An array for every block of residuals: `motion`, `current`, `voltage`, those of `crossing`."""
+Noises = dict[str, Components]
+"""Covariance pieces of every block."""
+MOTIONS = ("motion", MOTION)
+"""Blocks of residuals of the motion; the others are read given it."""
+DEGREES = 8.0
+"""Degrees of freedom of the Student-t weight of a run."""
+VARIANCE_SPREAD = 3.0
+"""Std of the prior of every log variance."""
+
+
+class Target(eqx.Module):
+    """What a fit maximises, as an argument of compiled functions.
+
+    Attributes:
+        several: runs over several floors, None where there are none.
+        shared: what runs on each floor share.
+        typical: centre of the prior of the log variances.
+        scored: variances that are found from the residuals of each piece alone.
+        pooled: number of the variance that the space's pooled coordinates have a priori.
+        joint: there are no currents, and all numbers are the motion's.
+    """
+
+    space: Space
+    batch: lk.Batch
+    several: Several | None
+    blocks: dict[str, Components]
+    shared: tuple[FloorShared, ...]
+    typical: Float[Array, " variance"]
+    scored: Bool[np.ndarray, " variance"]
+    pooled: int = eqx.field(static=True)
+    joint: bool = eqx.field(static=True)
+
+    def prior_std(self, log_v: Vector) -> Array:
+        """Std of the prior of every coordinate at given variances."""
+        pooled = jnp.exp(0.5 * jnp.asarray(log_v)[self.pooled])
+        return jnp.where(self.space.pooled, pooled, jnp.asarray(self.space.prior_std))
+
+
+class Whitening(NamedTuple):
+    """Root W of every piece with W^T W = w V^-1, weight w, small for an outlier, and the loss.
+
+    The loss is minus log likelihood, less constants.
+    """
+
+    root: Blocks
+    weight: Blocks
+    loss: Array
+
+
+class ThroughVoltage(NamedTuple):
+    """What voltages tell of variances, each (piece, m).
+
+    Attributes:
+        residual: of the voltages, in units of their own noise.
+        share: part that this noise has in the variance of every residual.
+        slope: derivative of the log likelihood by the scatter of the true current.
+        information: expected, of that scatter.
+        steeper: by how much the loss bends more than expected in the log of the voltage noise,
+            where others explain the residuals.
+    """
+
+    residual: Array
+    share: Array
+    slope: Array
+    information: Array
+    steeper: Array
+
+
+@eqx.filter_jit
+def through_voltage(target: Target, z: Vector, log_v: Vector, felt: Array) -> ThroughVoltage:
+    """What voltages tell of variances given the traction of every wheel's motor."""
+    robot, b = target.space.tree(z), target.batch
+    noise = electric_noise(target.blocks, log_v, robot.motor.resistance)
+
+    def scaled(scatter: Array) -> tuple[Array, Array]:
+        at = lk.ElectricNoise(noise.voltage_std, scatter, noise.resistance)
+        return lk.electric_residuals(robot, b, felt, at)["voltage"], lk.spread(b, at)
+
+    # every residual depends on its own scatter only
+    (r, spread), (more, wider) = jax.jvp(scaled, (noise.scatter,), (jnp.ones_like(noise.scatter),))
+    variance, m, wider = noise.voltage_std**2, r.shape[1], wider / spread
+    weight = (DEGREES + m) / (DEGREES + jnp.sum(r**2, axis=1, keepdims=True) / variance)
+    moved = (more + r * wider) ** 2 / variance * (DEGREES + m) / (DEGREES + m + 2)
+    slope = -wider - weight * r * more / variance
+    share = 1 / spread**2
+    steeper = 0.5 * share * (2 * share - 1) * (weight * r**2 / variance - 1)
+    return ThroughVoltage(r, share, slope, moved + 2 * wider**2, steeper)
+
+
+@eqx.filter_jit
+def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
+    """Weights of residuals, for pieces that count as `keep` says."""
+    roots, weights, loss = {}, {}, jnp.zeros(())
+    for k, r in residual.items():
+        inverse = inverse_root(noises[k].covariance(log_v))
+        m, kept = noises[k].count, jnp.asarray(keep)[noises[k].pieces]
+        q = jnp.sum(jnp.einsum("nij,nj->ni", inverse, r) ** 2, axis=-1)
+        weights[k] = (DEGREES + m) / (DEGREES + q) * kept
+        roots[k] = jnp.sqrt(weights[k])[:, None, None] * inverse
+        log_det = -jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=-2, axis2=-1)), axis=-1)
+        loss += jnp.sum(kept * (log_det + 0.5 * (DEGREES + m) * jnp.log1p(q / DEGREES)))
+    return Whitening(roots, weights, loss)
+
+
+@eqx.filter_jit
+def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> Blocks:
+    """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
+    out = {}
+    for k, jac in jacobian.items():
+        factor = jnp.asarray(keep)[noises[k].pieces] * expected(noises[k].count)
+        root = inverse_root(noises[k].covariance(log_v)) * jnp.sqrt(factor)[:, None, None]
+        out[k] = jnp.einsum("nij,njp->nip", root, jac)
+    return out
+
+
+@eqx.filter_jit
+def precision(
+    target: Target, jacobian: Blocks, log_v: Vector, keep: Vector, alone: bool = False
+) -> Array:
+    """Expected information of the search vector, prior included (free, free).
+
+    What runs share is marginalised; `alone` counts every run as if it shared nothing.
+    """
+    prior = jnp.diag(1 / target.prior_std(log_v) ** 2)
+    total, of_motion = prior, prior
+    for k, half in whitened(target.blocks, jacobian, log_v, keep).items():
+        flat = half.reshape(-1, half.shape[-1])
+        if k == "motion" and not alone:
+            tied = expected_ties(target, log_v, keep)
+            flat = freed_slopes(tied, half)
+        total += flat.T @ flat
+        of_motion += flat.T @ flat if k in MOTIONS else 0.0
+    return total if target.joint else _cut(total, of_motion, jnp.asarray(target.space.electric))
+
+
+def expected_ties(target: Target, log_v: Vector, keep: Vector) -> tuple[Tie, ...]:
+    """What runs share, given residuals whitened by `whitened`."""
+    block = target.blocks["motion"]
+    roots = inverse_root(block.covariance(jnp.asarray(log_v)))
+    factor = expected(block.count) * jnp.asarray(keep)[block.pieces]
+    return ties(target.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None])
+
+
+def expected(m: Array | float | int) -> Any:
+    """Fisher information of a Student-t location in m dimensions, over that of a Gaussian."""
+    return (DEGREES + m) / (DEGREES + m + 2)
+
+
+def _cut(total: Array, of_motion: Array, e: Array) -> Array:
+    """Information of p(motion | motion data) p(electric | motion, all data).
+
+    Where wheels stand on several floors motion depends on their friction, which is electric: it is
+    marginalised in the first factor, as if currents told nothing of it. The fit's estimate of the
+    motion does follow what currents tell of friction: its interval is rather too wide there.
+    """
+    first = of_motion - _carried(of_motion, e)
+    motion = ~e[:, None] & ~e[None, :]
+    return jnp.where(motion, first + _carried(total, e), total)
+
+
+def _carried(information: Array, e: Array) -> Array:
+    """B^T A^-1 B for the block A of the coordinates e, and B between these and the others."""
+    own = jnp.where(e[:, None] & e[None, :], information, jnp.diag(jnp.where(e, 0.0, 1.0)))
+    cross = jnp.where(e[:, None] & ~e[None, :], information, 0.0)
+    return cross.T @ jnp.linalg.solve(own, cross)
+
+
+@eqx.filter_jit
+def spread_of(target: Target, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
+    """Covariance of the residuals from fitted numbers and from what runs share (piece, m, m).
+
+    The Jacobian is of the structural numbers; what runs share follows them.
+    """
+    cov = jnp.linalg.inv(precision(target, jacobian, log_v, keep))
+    tied = expected_ties(target, log_v, keep)
+    half = whitened(target.blocks, jacobian, log_v, keep)["motion"]
+    followed = shared_slopes(tied, half)
+    motion = jacobian["motion"]
+    for of in target.shared:
+        off = jnp.einsum("nma,nap->nmp", of.effect, followed[of.pieces])
+        motion = motion.at[of.pieces].add(-off)
+    slopes = jacobian | {"motion": motion}
+    spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in slopes.items()}
+    around = shared_spread(tied, len(motion))
+    for of in target.shared:
+        more = jnp.einsum("nma,nab,nlb->nml", of.effect, around[of.pieces], of.effect)
+        spread["motion"] = spread["motion"].at[of.pieces].add(more)
+    return spread
+
+
+@eqx.filter_jit
+def scored(
+    target: Target,
+    residual: Blocks,
+    spread: Blocks,
+    log_v: Array,
+    keep: Array,
+    voltage: ThroughVoltage | None,
+) -> Array:
+    """One Fisher-scoring step of the restricted likelihood in the log variances of blocks.
+
+    Residuals are those of a model, this or another, less what runs share. `spread` is their
+    covariance from what was fitted to them (piece, m, m); the degrees of freedom it stands for are
+    not the variances' to have.
+    """
+    _, weights, _ = whitening(target.blocks, residual, log_v, keep)
+    score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])
+    for k, r in residual.items():
+        noise, mine = target.blocks[k], _own(k, voltage)
+        root = inverse_root(noise.covariance(log_v))
+        inverse = jnp.einsum("nji,njk->nik", root, root)
+        base, which = _shared(noise.base, mine), noise.which
+        v = jnp.exp(log_v)[which]
+        vr, kept = jnp.einsum("nij,nj->ni", inverse, r), keep[noise.pieces]
+        fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
+        trace = jnp.einsum("nij,ncij->nc", inverse, base)
+        spent = jnp.einsum("nij,njk,nkl->nil", inverse, spread[k], inverse)
+        lost = jnp.einsum("nij,ncij->nc", spent, base)
+        slope = 0.5 * v * (fit + kept[:, None] * (lost - trace))
+        if voltage is not None and k == "current":
+            told = jnp.einsum("ni,nci->nc", voltage.slope, noise.single)
+            slope += v * kept[:, None] * told
+        score = score.at[which].add(slope)
+        if voltage is not None and k == "voltage":
+            steeper = steeper.at[which].add((kept * jnp.sum(voltage.steeper, axis=1))[:, None])
+        if k in (MOTION, CURRENT) or (voltage is not None and k == "current"):
+            # a logarithm that falls bends the more: its slope is in proportion to the variance
+            steeper = steeper.at[which].add(-slope)
+    score -= (log_v - target.typical) / VARIANCE_SPREAD**2
+    info = information(target.blocks, log_v, keep, voltage)
+    info += jnp.diag(jnp.maximum(steeper, 0.0))
+    step = jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
+    return log_v + jnp.where(target.scored, step, 0.0)
+
+
+@eqx.filter_jit
+def information(
+    noises: Noises, log_v: Vector, keep: Vector, voltage: ThroughVoltage | None
+) -> Array:
+    """Expected information of the log variances, prior included (variance, variance)."""
+    info = jnp.eye(log_v.shape[0]) / VARIANCE_SPREAD**2
+    for k, noise in noises.items():
+        base, which = _shared(noise.base, _own(k, voltage)), noise.which
+        root = inverse_root(noise.covariance(log_v))
+        vb = jnp.einsum("nji,njk,nckl->ncil", root, root, base)
+        v = jnp.exp(log_v)[which]
+        cross = 0.5 * jnp.einsum("ncij,ndji->ncd", vb, vb)
+        cross *= v[:, :, None] * v[:, None, :]
+        kept = jnp.asarray(keep)[noise.pieces, None, None]
+        info = info.at[which[:, :, None], which[:, None, :]].add(kept * cross)
+    return info if voltage is None else info + _through(noises["current"], log_v, keep, voltage)
+
+
+def _through(noise: Components, log_v: Vector, keep: Vector, voltage: ThroughVoltage) -> Array:
+    """Expected information of the log variances that voltages have of the scatter of currents."""
+    grown = jnp.exp(log_v)[noise.which][..., None] * noise.single
+    kept = jnp.asarray(keep)[noise.pieces]
+    cross = jnp.einsum("n,ni,nci,ndi->ncd", kept, voltage.information, grown, grown)
+    info = jnp.zeros((log_v.shape[0],) * 2)
+    return info.at[noise.which[:, :, None], noise.which[:, None, :]].add(cross)
+
+
+def _own(block: str, voltage: ThroughVoltage | None) -> Array | None:
+    """Part that the variances have in that of the residuals of a block, None for all."""
+    return voltage.share if voltage is not None and block == "voltage" else None
+
+
+def _shared(base: Array, own: Array | None) -> Array:
+    """How the covariance of residuals grows with each variance, of which only a part is in them."""
+    if own is None:
+        return base
+    root = jnp.sqrt(own)
+    return base * root[:, None, :, None] * root[:, None, None, :]
+
+
+def inverse_root(v: Float[Array, "piece m m"]) -> Float[Array, "piece m m"]:
+    """L^-1 of V = L L^T for many small matrices, all at once, column by column.
+
+    Written out because batched LAPACK calls that run beside each other inside one compiled function
+    can wait for each other for ever on a machine with two cores (seen with jax 0.10).
+    """
+    a = jnp.moveaxis(v, 0, -1)
+    m = a.shape[0]
+    rows = jnp.arange(m)[:, None]
+
+    def column(j: Array, low: Array) -> Array:
+        rest = a[:, j] - jnp.sum(low * low[j], axis=1)
+        return low.at[:, j].set(jnp.where(rows >= j, rest / jnp.sqrt(rest[j]), 0.0))
+
+    low = jax.lax.fori_loop(0, m, column, jnp.zeros_like(a))
+
+    def row(i: Array, inverse: Array) -> Array:
+        known = jnp.sum(low[i][:, None] * inverse, axis=0)
+        return inverse.at[i].set(((rows == i) - known) / low[i, i])
+
+    inverse = jax.lax.fori_loop(0, m, row, jnp.zeros_like(a))
+    return jnp.moveaxis(inverse, -1, 0)

@@ -1,1 +1,0 @@
-"""Likelihood, staged fit, intervals and verdicts."""

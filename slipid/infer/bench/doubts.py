@@ -1,0 +1,112 @@
+"""What is wrong with a log of a motor, said before numbers are made of it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from slipid.infer.bench.moments import scatter, start, sums
+from slipid.infer.bench.motor import REST, Record, noise_of
+from slipid.infer.bench.windows import Windows, electrical, mechanical
+from slipid.support.errors import DataError
+
+FEWEST_WINDOWS = 30
+"""Of either equation, below which nothing is fitted."""
+SURE = 5.0
+"""Stds by which a coefficient has the wrong sign, from which a column is wrong."""
+FAST = 3000.0
+"""Shaft speed that no brushed motor has [rad/s]."""
+POWER = 2e4
+"""U^2 / R above which a current is rather in milliamperes [W]."""
+
+
+def refuse(records: Sequence[Record], label: str, units_said: bool = False) -> None:
+    """DataError where the records cannot be what they are said to be; what to do stands in it.
+
+    `units_said`: the unit of the current is not doubted, whatever comes of it.
+    """
+    where = records[0].name + (f", motor {label}" if label else "")
+    speed = np.concatenate([r.speed for r in records])
+    current = np.concatenate([r.current for r in records])
+    if float(np.abs(speed).max()) > FAST:
+        _fail(where, f"the shaft turns at {np.abs(speed).max():.4g} rad/s", "its unit, rpm perhaps")
+    if float(np.ptp(speed)) < max(6 * noise_of(records).speed, REST):
+        found = f"the shaft does not turn (speeds within {np.ptp(speed):.3g} rad/s)"
+        _fail(where, found, "a log in which the motor turns, both ways and at several speeds")
+    if np.ptp(current) == 0:
+        _fail(where, f"the current is {current[0]:g} A in every row", "the motor's current")
+    if all(r.signed for r in records):
+        _signed(where, speed, current)
+    amps, volts = mechanical(records), electrical(records, 0.0)
+    if amps.usable.sum() < FEWEST_WINDOWS:
+        found = f"{amps.usable.sum()} short stretches in which the shaft turns steadily"
+        _fail(where, found, f"at least {FEWEST_WINDOWS}: a longer log, or more rows a second")
+    _signs(where, records, volts, amps)
+    if volts is not None and not units_said:
+        _milliamperes(where, records, volts)
+
+
+def _fail(where: str, found: str, expected: str) -> None:
+    raise DataError(f"{where}: {found}; expected {expected}")
+
+
+def _signed(where: str, speed: np.ndarray, current: np.ndarray) -> None:
+    """Refuse a magnitude that is said to have a sign."""
+    back = speed < -0.2 * float(np.abs(speed).max())
+    level = 0.1 * float(np.abs(current).max())
+    negative = (current < -level).mean()
+    driven = back.mean() > 0.05 and float(np.median(current[back])) > 0
+    if driven and negative == 0 and current.min() > -level:
+        found = "the current is never negative, though the shaft turns both ways"
+        _fail(
+            where,
+            found,
+            "a signed current, or --unsigned (current_is_signed = false) for magnitudes",
+        )
+
+
+def _signs(where: str, records: Sequence[Record], volts: Windows | None, amps: Windows) -> None:
+    """Refuse columns that are exchanged or reversed, by signs no motor has.
+
+    Inertia makes the current rise with acceleration, and back-EMF the voltage with speed.
+    """
+    # magnitudes were given their sign by the speed, which proves nothing
+    inertia = _sure(amps, 0) if all(r.signed for r in records) else 0.0
+    if volts is None:
+        if inertia < -SURE:
+            found = "the shaft speeds up against its current"
+            _fail(where, found, "current and speed of one sign (turn one of them: scale -1)")
+        return
+    usual = sum(float(np.sum(r.voltage * r.speed)) for r in records if r.voltage is not None)
+    back, through = _sure(volts, 1), _sure(volts, 0)
+    if inertia < -SURE:
+        column = "current" if usual > 0 else "speed"
+        found = f"the {column} has the wrong sign: the shaft speeds up against its current"
+        _fail(where, found, f"the {column} times -1")
+    if usual < 0 and back < -SURE:
+        _fail(where, "the voltage has the wrong sign: it opposes the speed", "the voltage times -1")
+    if back < -SURE and through > 0:
+        found = "the voltage falls with speed: voltage and current look exchanged"
+        _fail(where, found, "their columns the other way round")
+
+
+def _sure(w: Windows, column: int) -> float:
+    """A coefficient over its std, with nothing known but the equation."""
+    signals = w.even.signals.shape[1] - (w.even.signals.shape[1] == 6)
+    found = start(w, signals, list(range(signals)))
+    s = sums(w, found, signals)
+    inverse = np.linalg.pinv(s.tangent[:, :signals], rcond=1e-10)
+    std = np.sqrt(np.diag(inverse @ scatter(s.moments, 8) @ inverse.T))
+    return float(found[column] / max(std[column], 1e-300))
+
+
+def _milliamperes(where: str, records: Sequence[Record], volts: Windows) -> None:
+    found = start(volts, 5, list(range(5)))
+    highest = max(float(np.abs(r.voltage).max()) for r in records if r.voltage is not None)
+    if 0 < found[0] < highest**2 / POWER and _sure(volts, 0) > SURE:
+        heat = highest**2 / found[0] / 1e3
+        said = f"a resistance of {found[0]:.2g} ohm at {highest:.3g} V, {heat:.0f} kW at standstill"
+        _fail(
+            where,
+            said,
+            "the current in amperes (I:mA for mA; else I:A, or a prior of motor.resistance)",
+        )

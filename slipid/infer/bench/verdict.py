@@ -1,0 +1,324 @@
+"""What residuals still go with: speed, current or time, where they should go with nothing.
+
+What may be said of a motor on a bench: numbers with verdicts, and what would tell more.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Int
+
+from slipid.infer.bench.fit import MotorFit
+from slipid.infer.bench.moments import Sums, cell_length, celled
+from slipid.infer.bench.windows import Windows
+from slipid.infer.fit_file import SCHEMA, number_json
+from slipid.infer.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
+from slipid.infer.verdicts.unidentified import Flat, flat_directions, members, sentences
+from slipid.infer.verdicts.wording import VOLTAGE
+from slipid.support.files import Content, hash_of
+
+BINS = 8
+"""Of about as many windows."""
+SURE = 5.0
+"""Stds by which the mean of a bin is not 0."""
+MATTERS = 0.01
+"""Part of the range of the voltage, or of the current, from which a mean matters to people."""
+FEWEST = 5
+"""Stretches of time in a bin by which its scatter is judged, at least."""
+LONG_S = 0.3
+"""Memory of residuals from which a reader is told [s]."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Where the model is off most: so much of a channel, at this value of another one."""
+
+    channel: str
+    unit: str
+    off: float
+    over: str
+    at: str
+    sure: float
+
+    @property
+    def text(self) -> str:
+        return (
+            f"the {self.channel} is {abs(self.off):.2g} {self.unit} "
+            f"{'above' if self.off > 0 else 'below'} the model's at {self.at} ({self.over}, "
+            f"{self.sure:.0f} stds): the motor has something that the model lacks, and intervals "
+            "are wider for it"
+        )
+
+
+def misfits(fit: MotorFit) -> tuple[Misfit, ...]:
+    """The worst of each equation, if it is sure and matters."""
+    pairs = [("current", "A", fit.amps, fit.amps_sums)]
+    if fit.volts is not None and fit.volts_sums is not None:
+        pairs.insert(0, ("voltage", "V", fit.volts, fit.volts_sums))
+    found = (_worst(fit, *pair) for pair in pairs)
+    return tuple(m for m in found if m is not None)
+
+
+def _worst(fit: MotorFit, channel: str, unit: str, w: Windows, s: Sums) -> Misfit | None:
+    """Largest mean of a bin, in its stds, over speed, current and time."""
+    size = MATTERS * float(np.ptp(w.both.left))
+    best: Misfit | None = None
+    used = np.flatnonzero(w.usable)
+    time = w.time, w.time
+    for over, (odd, even), what in (
+        ("speed", (w.odd.speed, w.even.speed), "rad/s"),
+        ("current", (w.odd.current, w.even.current), "A"),
+        ("time", time, "s"),
+    ):
+        # a window is put by the rows that its residual is not of, or noise would sort residuals
+        bins = [np.array_split(used[np.argsort(v[used], kind="stable")], BINS) for v in (odd, even)]
+        for one, other in zip(*bins, strict=True):
+            off, sure = _mean(fit, w, s, one, other)
+            if abs(off) > size and sure > max(SURE, 0.0 if best is None else best.sure):
+                at = f"{odd[one].min():.3g} to {odd[one].max():.3g} {what}"
+                best = Misfit(channel, unit, off, over, at, sure)
+    return best
+
+
+def _mean(
+    fit: MotorFit,
+    w: Windows,
+    s: Sums,
+    even: Int[np.ndarray, " some"],
+    odd: Int[np.ndarray, " some"],
+) -> tuple[float, float]:
+    """Weighted mean of residuals of even and odd rows of some windows, and its size in stds.
+
+    Cells of the length of the residuals' memory count as independent.
+    """
+    weight, sum_ = np.zeros(len(w.time)), np.zeros(len(w.time))
+    for asked, some in ((s.even, even), (s.odd, odd)):
+        weight[some] += asked.weight[some]
+        sum_[some] += asked.weight[some] * asked.residual[some]
+    total = float(weight.sum())
+    if total <= 0:
+        return 0.0, 0.0
+    off = float(sum_.sum()) / total
+    length = max(fit.remember, cell_length([w]))
+    away = celled((sum_ - weight * off)[:, None], w, length)
+    square = away[:, 0] ** 2
+    # too few stretches of time to judge by, or one that outweighs the others
+    if np.count_nonzero(square) < FEWEST or square.max() > square.sum() / 2:
+        return 0.0, 0.0
+    return off, abs(off) * total / float(np.sqrt(square.sum()))
+
+
+ROWS_ELECTRICAL, ROWS_MECHANICAL = 2.0, 6.0
+"""Rows in one time constant, L/R and J R / C_e^2, for inductance and inertia to be told."""
+_OF = {
+    "voltage": tuple(
+        f"motor.{name}"
+        for name in ("resistance", "back_emf", "brush_drop", "inductance", "voltage_offset")
+    ),
+    "current": tuple(
+        f"motor.{name}"
+        for name in ("coulomb_friction", "viscous_friction", "rotor_inertia", "current_offset")
+    ),
+}
+"""Numbers of the equation that is about each channel."""
+ONE_POINT = 0.05
+"""Range of the speed, over its largest, below which a log shows one point."""
+SLOW_S = 1.0
+"""Time between rows from which its unit is doubted [s]."""
+_CURES = (
+    (("motor.inductance",), "log faster, several rows in L/R, with steps of the voltage"),
+    (("motor.rotor_inertia",), "speed up and slow down, over some tenths of a second"),
+    (
+        ("motor.current_offset", "motor.coulomb_friction"),
+        "turn both ways: one way only, the zero of the ammeter looks like friction",
+    ),
+    (("motor.coulomb_friction", "motor.viscous_friction"), "turn steadily at several speeds"),
+    (("motor.resistance",), "let more current flow: load the shaft, or speed it up harder"),
+    (("motor.back_emf",), "turn at several speeds"),
+    (("motor.brush_drop",), "let small and large currents flow, both ways"),
+    (("motor.viscous_friction",), "turn faster: so far it hardly matters"),
+)
+"""Quantities that must all occur, and what helps; the first that fits counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class BenchFit:
+    """What is known of the motors of a bench.
+
+    Attributes:
+        fits: of each motor.
+        parameters, derived: numbers, and quotients of them, by path, with `@label` of a motor.
+        messages: what a reader must know, one sentence each.
+        misfits: what the models lack, by label.
+    """
+
+    fits: tuple[MotorFit, ...]
+    parameters: dict[str, Estimate]
+    derived: dict[str, Estimate]
+    messages: tuple[str, ...]
+    misfits: dict[str, tuple[Misfit, ...]]
+
+    @property
+    def converged(self) -> bool:
+        return all(f.converged for f in self.fits)
+
+    @property
+    def good(self) -> bool:
+        """Whether the fits settled and explain the logs."""
+        return self.converged and not any(self.misfits.values())
+
+    @property
+    def reason(self) -> str:
+        """How the fits ended, for people."""
+        said = [f"{f.label}: {f.reason}" if f.label else f.reason for f in self.fits]
+        return "; ".join(said)
+
+    def to_json(self) -> Content:
+        """Content of identified.json."""
+        runs = dict.fromkeys((r.name, r.sha256) for f in self.fits for r in f.records)
+        return {
+            "schema": SCHEMA,
+            "drive": "motor",
+            "converged": self.converged,
+            "explained": self.good,
+            "parameters": {path: number_json(e) for path, e in self.parameters.items()},
+            "derived": {path: number_json(e) for path, e in self.derived.items()},
+            "surfaces": [],
+            "curves": {},
+            "validity": {},
+            "motors": {f.label or "motor": _about(f) for f in self.fits},
+            "messages": list(self.messages),
+            "data": {"hash": hash_of(runs), "runs": [name for name, _ in runs]},
+        }
+
+
+def bench_fit(fits: Sequence[MotorFit]) -> BenchFit:
+    """Estimates, verdicts and messages of fitted motors."""
+    parameters: dict[str, Estimate] = {}
+    ratios: dict[str, Estimate] = {}
+    messages: list[str] = []
+    found = {f.label: misfits(f) for f in fits}
+    for f in fits:
+        flat = _flat(f)
+        slow = _too_slow(f)
+        voltage = f.has_voltage
+        numbers = estimates(f.space, f.choices, f.z, f.covariance, voltage, members(flat))
+        doubted = {path for m in found[f.label] for path in _OF[m.channel]}
+        for e in (_judged(f, e, slow, doubted) for e in numbers):
+            parameters[_labelled(e.path, f.label)] = replace(e, path=_labelled(e.path, f.label))
+        for e in derived(f.space, f.z, f.covariance, voltage):
+            e = _judged(f, e, slow, doubted)
+            path = "/".join(_labelled(p, f.label) for p in e.path.split("/"))
+            ratios[path] = replace(e, path=path)
+        own = [*slow.values(), *sentences(flat), *(m.text for m in found[f.label]), *_remarks(f)]
+        messages += [f"{f.label}: {text}" if f.label else text for text in own]
+    return BenchFit(tuple(fits), parameters, ratios, tuple(messages), found)
+
+
+def _labelled(path: str, label: str) -> str:
+    return f"{path}@{label}" if label else path
+
+
+def _flat(f: MotorFit) -> tuple[Flat, ...]:
+    """Directions that stay open, with what a bench can do about them."""
+    found = flat_directions(f.space, f.covariance, has_current=True, has_voltage=f.has_voltage)
+    return tuple(replace(one, remedy=_cure(one.paths, f.has_voltage)) for one in found)
+
+
+def _cure(paths: Sequence[str], has_voltage: bool) -> str:
+    electrical = {"motor.resistance", "motor.back_emf", "motor.brush_drop", "motor.inductance"}
+    if not has_voltage and {*paths} & (electrical | {"motor.voltage_offset"}):
+        return VOLTAGE
+    for needed, text in _CURES:
+        if {*paths} >= {*needed}:
+            return text
+    return "turn both ways, at several speeds, with more and less current"
+
+
+def _too_slow(f: MotorFit) -> dict[str, str]:
+    """Numbers whose transients fall between the rows, with a sentence for each."""
+    m, rows, slow = f.motor, f.period, {}
+    if not f.has_voltage:
+        return {}
+    electrical = max(float(m.inductance), 0.0) / float(m.resistance)
+    mechanical = float(m.rotor_inertia * m.resistance / m.back_emf**2)
+    for path, constant, least, name in (
+        ("motor.inductance", electrical, ROWS_ELECTRICAL, "L_a / R"),
+        ("motor.rotor_inertia", mechanical, ROWS_MECHANICAL, "J R / C_e^2"),
+    ):
+        if path in f.space.place and constant < least * rows:
+            about = f"about {_time(constant)}" if constant > 0.05 * rows else "far shorter"
+            slow[path] = (
+                f"{path} is not identified at this rate: its time constant {name} is {about}, "
+                f"and rows are {_time(rows)} apart: log {least:g} rows or more in it"
+            )
+    return slow
+
+
+def _one_point(f: MotorFit) -> bool:
+    """Whether speed and voltage keep to one value each."""
+    used = f.amps.both.speed[f.amps.usable]
+    return float(np.ptp(np.quantile(used, (0.02, 0.98)))) < ONE_POINT * float(np.abs(used).max())
+
+
+def _time(seconds: float) -> str:
+    return f"{1e3 * seconds:.2g} ms" if seconds < 1 else f"{seconds:.2g} s"
+
+
+def _judged(f: MotorFit, e: Estimate, slow: Collection[str], doubted: Collection[str]) -> Estimate:
+    """The verdict, less what rows are too slow for, what may be 0, and what a misfit disputes."""
+    if (e.path in slow or _one_point(f)) and e.verdict not in ("fixed", "not_identified"):
+        return replace(e, verdict="not_identified", provenance="borrowed")
+    small = e.path == "motor.inductance" and e.std is not None and e.value < FROM_ZERO * e.std
+    if e.verdict == "identified" and (small or {*e.path.split("/")} & {*doubted}):
+        return replace(e, verdict="weak")
+    return e
+
+
+def _remarks(f: MotorFit) -> list[str]:
+    """Further things that a reader must know."""
+    said = []
+    if _one_point(f):
+        said.append(
+            "speed and voltage keep to one value: nothing can be told apart there: turn at several "
+            "speeds, both ways, and speed up and slow down"
+        )
+    if not f.has_voltage:
+        said.append(
+            "without a voltage neither resistance nor back-EMF is known: friction and inertia are "
+            f"known over the back-EMF only; {VOLTAGE}"
+        )
+    if not all(r.signed for r in f.records):
+        said.append(
+            "currents are magnitudes: they were given the sign of the speed, stretches in which "
+            "the motor may brake were left out, and the zero of the ammeter looks like friction"
+        )
+    if f.period > SLOW_S:
+        said.append(
+            f"rows are {f.period:.3g} s apart: if the time is in milliseconds, say so (t:ms); "
+            "inertia and inductance come from it"
+        )
+    if f.remember > LONG_S:
+        said.append(
+            f"residuals remember {f.remember:.2g} s: the intervals count {f.stretches:.0f} "
+            "stretches of that length, not the rows"
+        )
+    if "motor.rotor_inertia" in f.space.place:
+        said.append("motor.rotor_inertia is that of the rotor with everything that turned with it")
+    return said
+
+
+def _about(f: MotorFit) -> Content:
+    """How one motor was fitted."""
+    kept = [w.usable.mean() for w in (f.volts, f.amps) if w is not None]
+    return {
+        "rounds": f.rounds,
+        "reason": f.reason,
+        "row_period_s": f.period,
+        "noise": {"voltage": f.noise.voltage, "current": f.noise.current, "speed": f.noise.speed},
+        "memory_s": f.remember,
+        "windows": [len(w.time) for w in (f.volts, f.amps) if w is not None],
+        "usable": [float(np.round(k, 3)) for k in kept],
+        "misfit": [m.text for m in misfits(f)],
+    }

@@ -1,0 +1,169 @@
+"""What a user wants to know of the next runs, and which runs may be driven for it."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from slipid.infer.design.planned_runs import HEADINGS, Drive, Setup, candidates, drivable
+from slipid.infer.result import Fit
+from slipid.support.errors import DataError
+
+MOST_SPEEDS = 4
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a user asks for, in words of the command line; what is absent is as the fit has seen.
+
+    Attributes:
+        parameters: patterns of names; predictions: `floor[@load][:speed[:heading_deg]]`.
+        runs: to propose.
+        headings, speeds, turns: of candidates, numbers with commas [deg], [m/s], [deg/s].
+        distance: of candidates [m].
+        floors, loads: of candidates.
+    """
+
+    parameters: Sequence[str] = ()
+    predictions: Sequence[str] = ()
+    runs: int = 12
+    headings: str | None = None
+    speeds: str | None = None
+    turns: str | None = None
+    distance: float | None = None
+    floors: Sequence[str] = ()
+    loads: Sequence[str] = ()
+
+
+def _numbers(name: str, text: str | None, least: float = -np.inf) -> tuple[float, ...] | None:
+    if text is None:
+        return None
+    try:
+        found = tuple(float(x) for x in text.split(","))
+    except ValueError:
+        found = ()
+    if not found or not np.isfinite(found).all() or min(found) < least:
+        rule = "numbers" if least < 0 else f"numbers not below {least:g}"
+        raise DataError(f"--{name} {text}: expected {rule} with commas between, as in 0,45,90")
+    return tuple(dict.fromkeys(found))
+
+
+@dataclass(frozen=True, eq=False)
+class Scope:
+    """What may be driven: floors and loads of the fit within the limits of the wish.
+
+    Raises:
+        DataError: a floor or load that the fit does not have, no numbers, none to be driven.
+    """
+
+    fit: Fit
+    wish: Wish
+
+    def __post_init__(self) -> None:
+        far = self.wish.distance
+        if far is not None and not 0 < far < np.inf:
+            raise DataError(f"--distance {far:g}: expected metres above zero")
+        self._known("floor", self.wish.floors, self.fit.validity)
+        self._known("load set-up", self.wish.loads, self.fit.robot.body.loads)
+
+    @staticmethod
+    def _known(what: str, names: Sequence[str], known: Collection[str]) -> None:
+        for name in names:
+            if name not in known:
+                raise DataError(f"no {what} '{name}'; identified: {', '.join(known)}")
+
+    @property
+    def driven(self) -> tuple[Setup, ...]:
+        """Floors and loads of the fit's runs."""
+        seen = self.fit.validity
+        return tuple((floor, load) for floor in seen for load in seen[floor].loads)
+
+    @property
+    def setups(self) -> tuple[Setup, ...]:
+        """Floors and loads of candidates."""
+        floors = self.wish.floors or tuple(self.fit.validity)
+        loads = self.wish.loads or self.fit.robot.body.loads
+        return tuple((floor, load) for floor in floors for load in loads)
+
+    @property
+    def base(self) -> float:
+        return float(self.fit.robot.geometry.base_radius)
+
+    @cached_property
+    def driven_speeds(self) -> dict[str, tuple[float, ...]]:
+        """A few of each floor's [m/s]; without commands in the logs what the fastest wheel did."""
+        out = {}
+        for floor, seen in self.fit.validity.items():
+            found = [v for v in seen.speeds if v > 0]
+            top = seen.wheel_speed[1] * float(self.fit.robot.geometry.wheel_radius)
+            if len(found) > MOST_SPEEDS:
+                at = np.linspace(0, 1, MOST_SPEEDS)
+                found = np.quantile(found, at, method="nearest").tolist()
+            out[floor] = tuple(dict.fromkeys(found)) or (round(0.5 * top, 3), round(top, 3))
+        return out
+
+    @property
+    def distance(self) -> dict[str, float]:
+        """Of each floor's runs [m]: as driven, on the whole."""
+        if self.wish.distance is not None:
+            return dict.fromkeys(self.fit.validity, self.wish.distance)
+        return {floor: round(seen.distance, 2) for floor, seen in self.fit.validity.items()}
+
+    def candidates(self) -> tuple[Drive, ...]:
+        speeds = _numbers("speeds", self.wish.speeds, least=0.0)
+        turns = _numbers("turns", self.wish.turns)
+        found = candidates(
+            self.setups,
+            dict.fromkeys(self.fit.validity, speeds) if speeds else self.driven_speeds,
+            self.distance,
+            self.base,
+            _numbers("headings", self.wish.headings) or HEADINGS,
+            np.radians(turns).tolist() if turns else None,
+        )
+        return self._drivable(
+            found,
+            "no candidate run is left; expected at least one heading and speed, or turning "
+            "rate, that the robot can drive",
+        )
+
+    def predicted(self, text: str) -> tuple[Drive, ...]:
+        """Runs of a prediction `floor[@load][:speed[:heading]]`."""
+        head, *rest = text.split(":")
+        floor, _, load = head.partition("@")
+        try:
+            numbers = [float(x) for x in rest]
+            ok = len(rest) < 3 and np.isfinite(numbers).all() and (not rest or numbers[0] > 0)
+        except ValueError:
+            ok = False
+        if not ok:
+            raise DataError(
+                f"--predict {text}: expected floor[@load][:speed in m/s[:heading in degrees]], "
+                "as in gray:0.3:45"
+            )
+        self._known("floor", [floor], self.fit.validity)
+        self._known("load set-up", [load] if load else [], self.fit.robot.body.loads)
+        loads = self.fit.validity[floor].loads
+        load = load or ("as_built" if "as_built" in loads else loads[0])
+        runs = self._straight([(floor, load)], numbers[:1], numbers[1:] or HEADINGS)
+        return self._drivable(runs, f"--predict {text}: these wheels cannot drive in that heading")
+
+    def all_predicted(self) -> tuple[Drive, ...]:
+        runs = self._straight(self.driven, [], HEADINGS)
+        return self._drivable(runs, "predictions: these wheels cannot drive in that heading")
+
+    def _straight(
+        self, setups: Sequence[Setup], speeds: Sequence[float], headings_deg: Sequence[float]
+    ) -> list[Drive]:
+        return [
+            Drive(floor, load, float(heading), speed, 0.0, self.distance[floor])
+            for floor, load in setups
+            for speed in speeds or self.driven_speeds[floor]
+            for heading in np.radians(headings_deg)
+        ]
+
+    def _drivable(self, runs: Sequence[Drive], otherwise: str) -> tuple[Drive, ...]:
+        kept = drivable(runs, self.fit.robot)
+        if not kept:
+            raise DataError(otherwise)
+        return kept

@@ -1,0 +1,264 @@
+"""A fit as files: fit.json names its arrays by their hash, identified.json is for people.
+
+Whatever a fit consists of is covered by one checksum, and renaming fit.json is what puts a new fit
+in the place of an old one: a process that dies before it leaves the old fit, and one that dies
+after it the new one.
+"""
+
+import hashlib
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.fit.shared import FoundShared, Pace
+from slipid.infer.result import Channels, Fit
+from slipid.infer.slip_curves import SlipCurve
+from slipid.infer.verdicts.estimates import Estimate
+from slipid.model.geometry import Geometry
+from slipid.model.robot import Robot, Validity, build
+from slipid.parameter import entries
+from slipid.search_space import Choice, Space, put
+from slipid.support.errors import DataError
+from slipid.support.files import Content, checksum, json_text, read_json, write_bytes
+
+FIT, IDENTIFIED = "fit.json", "identified.json"
+_RESULT = "the result of `slipid identify`"
+SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/6"
+_PLAIN = ("converged", "reason", "rounds", "remaining")
+_CURVE = ("torque_nm", "slip", "slip_lo", "slip_hi")
+_SHARED = ("std", "coefs", "by_number", "covariance")
+_SHAPE = ("place", "drive_angle", "roller_angle", "grips", "drive_of", "gear_ratio")
+
+
+def save(fit: Fit, folder: Path) -> tuple[str, ...]:
+    """Write a fit to a folder, in the place of the one that may be there; returns names of files.
+
+    Raises:
+        ValueError: a number is not finite; nothing is written then.
+        DataError: nothing can be written there.
+    """
+    arrays = _packed(fit)
+    sha256 = hashlib.sha256(arrays).hexdigest()
+    name = f"fit-{sha256[:12]}.npz"
+    content = to_json(fit) | {"arrays": {"file": name, "sha256": sha256}}
+    content = json.loads(json_text(content))
+    content |= {"checksum": checksum(content)}
+    table = json_text(identified_json(fit))
+    write_bytes(folder / name, arrays)
+    write_bytes(folder / FIT, json_text(content).encode())  # from here on it is the new fit
+    write_identified(folder, json.loads(table))
+    for old in folder.glob("fit-????????????.npz"):
+        if old.name != name:
+            old.unlink()
+    return IDENTIFIED, FIT, name
+
+
+def write_identified(folder: Path, content: Content) -> None:
+    """Write identified.json for the fit that is there, under whose checksum it is valid."""
+    fit = read_json(folder / FIT, _RESULT)
+    write_bytes(folder / IDENTIFIED, json_text(content | {"fit": fit["checksum"]}).encode())
+
+
+def load(folder: Path) -> Fit:
+    """Fit from the files `save` wrote.
+
+    Raises:
+        DataError: a file is absent, damaged, of another version or of another fit.
+    """
+    path = folder / FIT
+    content = read_json(path, _RESULT)
+    found = content.get("schema") if isinstance(content, dict) else None
+    if found != SCHEMA_FIT:
+        what = f"its schema is {found}" if isinstance(found, str) else "it has no schema"
+        raise DataError(f"{path}: {what}; expected {SCHEMA_FIT}, {_RESULT} of this version")
+    if content.pop("checksum", None) != (mark := checksum(content)):
+        raise DataError(f"{path}: damaged or edited, its checksum differs; expected {_RESULT}")
+    try:
+        fit = from_json(content, _unpacked(folder, **content["arrays"]))
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"{path}: {error}; expected {_RESULT} of this version") from error
+    table = folder / IDENTIFIED
+    other = read_json(table, _RESULT) if table.exists() else {"fit": mark}
+    if not isinstance(other, dict) or other.get("fit") != mark:
+        raise DataError(
+            f"{table}: of another fit than {FIT} beside it, its writing was interrupted; "
+            "expected both of one fit (run `slipid identify` again)"
+        )
+    return fit
+
+
+def _packed(fit: Fit) -> bytes:
+    buffer = io.BytesIO()
+    arrays = {"covariance": fit.covariance, "laplace": fit.laplace}
+    for floor, found in fit.shared.items():
+        arrays |= {f"shared/{floor}/{name}": getattr(found, name) for name in _SHARED}
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def _unpacked(folder: Path, file: str, sha256: str) -> dict[str, np.ndarray]:
+    """The arrays of a fit; damage is noticed before they are decoded."""
+    path = folder / file
+    try:
+        packed = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; expected the arrays of {FIT}") from error
+    if hashlib.sha256(packed).hexdigest() != sha256:
+        raise DataError(f"{path}: damaged, its hash differs from the one in {FIT}")
+    with np.load(io.BytesIO(packed), allow_pickle=False) as npz:
+        return {name: npz[name] for name in npz.files}
+
+
+def identified_json(fit: Fit) -> Content:
+    """Content of identified.json."""
+    return {
+        "schema": SCHEMA,
+        "parameters": {path: number_json(e) for path, e in fit.parameters.items()},
+        "derived": {path: number_json(e) for path, e in fit.derived.items()},
+        "surfaces": list(fit.robot.surfaces.labels),
+        "curves": curves_json(fit.curves),
+        "validity": {floor: asdict(v) for floor, v in fit.validity.items()},
+        "messages": list(fit.messages),
+        "data": {"hash": fit.data_hash, "runs": [name for name, _ in fit.runs]},
+    }
+
+
+def number_json(e: Estimate) -> Content:
+    """A number as identified.json has it."""
+    shape = [len(e.labels)] if e.labels else []
+    known = {k: getattr(e, k) for k in ("std", "interval90", "source", "verdict", "provenance")}
+    return {"value": e.value, "unit": e.unit, "shape": shape, "labels": list(e.labels)} | known
+
+
+def curves_json(curves: Mapping[str, SlipCurve]) -> Content:
+    """Slip curves by floor."""
+    return {
+        floor: {name: getattr(c, name).tolist() for name in _CURVE}
+        | {"at": {"wheel_speed": c.wheel_speed, "load_share": c.load_share}}
+        for floor, c in curves.items()
+    }
+
+
+def to_json(fit: Fit) -> Content:
+    """Content of fit.json: everything but the large arrays, and what people read of it."""
+    return {
+        "schema": SCHEMA_FIT,
+        **{name: getattr(fit, name) for name in _PLAIN},
+        "history": [x if np.isfinite(x) else None for x in fit.history],
+        "parameters": {p: asdict(e) for p, e in fit.parameters.items()},
+        "derived": {p: asdict(e) for p, e in fit.derived.items()},
+        "flat": [asdict(f) | {"text": f.text} for f in fit.flat],
+        "messages": list(fit.messages),
+        "variances": {
+            name: {"variance": v, "std": float(np.sqrt(v)), "unit": fit.variance_unit[name]}
+            for name, v in fit.variance.items()
+        },
+        "names": fit.space.names,
+        "z": fit.z.tolist(),
+        "robot": _robot_json(fit.space.template),
+        "choices": [asdict(c) for c in fit.choices],
+        "has": {"current": fit.channels.current, "voltage": fit.channels.voltage},
+        "curves": curves_json(fit.curves),
+        "validity": {floor: asdict(v) for floor, v in fit.validity.items()},
+        "settings": {
+            "lag": fit.lag,
+            "windows_per_piece": fit.channels.windows,
+            "current_is_signed": fit.channels.signed,
+            "seed": fit.seed,
+        }
+        | ({} if fit.mixed is None else {"mixed": dict(fit.mixed)})
+        | ({} if fit.refused is None else {"refused": dict(fit.refused)}),
+        "current_trend": list(fit.current_trend),
+        "shared": {floor: [asdict(p) for p in found.paces] for floor, found in fit.shared.items()},
+        "extrapolation": dict(fit.extrapolation),
+        "baselines": dict(fit.baselines),
+        "data": {"hash": fit.data_hash, "runs": [list(r) for r in fit.runs]},
+    }
+
+
+def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
+    """Fit from the content of fit.json and its arrays."""
+    choices = tuple(Choice(**c) for c in content["choices"])
+    space = Space(_robot_of(content["robot"]), choices)
+    if space.names != content["names"]:
+        raise ValueError("it has other parameters than this version declares")
+    variances, settings = content["variances"], content["settings"]
+    return Fit(
+        space=space,
+        choices=choices,
+        z=np.asarray(content["z"], float),
+        variance={name: v["variance"] for name, v in variances.items()},
+        variance_unit={name: v["unit"] for name, v in variances.items()},
+        runs=tuple((str(name), str(sha)) for name, sha in content["data"]["runs"]),
+        channels=Channels(
+            **content["has"],
+            signed=settings["current_is_signed"],
+            windows=settings["windows_per_piece"],
+        ),
+        curves={floor: _curve_of(c) for floor, c in content["curves"].items()},
+        validity={floor: Validity(**_tuples(v)) for floor, v in content["validity"].items()},
+        history=tuple(np.inf if x is None else x for x in content["history"]),
+        lag=settings["lag"],
+        seed=settings["seed"],
+        mixed=settings.get("mixed"),
+        refused=settings.get("refused"),
+        extrapolation=content["extrapolation"],
+        baselines=content["baselines"],
+        current_trend=(content["current_trend"][0], content["current_trend"][1]),
+        shared={
+            floor: FoundShared(
+                tuple(Pace(**pace) for pace in paces),
+                **{name: arrays[f"shared/{floor}/{name}"] for name in _SHARED},
+            )
+            for floor, paces in content["shared"].items()
+        },
+        covariance=arrays["covariance"],
+        laplace=arrays["laplace"],
+        **{name: content[name] for name in _PLAIN},
+    )
+
+
+def _curve_of(content: Content) -> SlipCurve:
+    rows: Content = {name: np.asarray(content[name], float) for name in _CURVE}
+    return SlipCurve(**rows, **content["at"])
+
+
+def _tuples(plain: Content) -> Content:
+    """With tuples, and tuples in them, where JSON has lists."""
+
+    def deep(x: Any) -> Any:
+        return tuple(map(deep, x)) if isinstance(x, list) else x
+
+    return {name: deep(x) for name, x in plain.items()}
+
+
+def _robot_json(robot: Robot) -> Content:
+    """A robot as plain values: its shape, its names, every number."""
+    return {
+        "geometry": {name: getattr(robot.geometry, name) for name in _SHAPE},
+        "surfaces": list(robot.surfaces.labels),
+        "loads": list(robot.body.loads),
+        "sessions": list(robot.camera.sessions),
+        "centre": list(robot.camera.centre),
+        "values": {e.path: np.asarray(e.get(robot)).tolist() for e in entries(robot)},
+    }
+
+
+def _robot_of(kept: Content) -> Robot:
+    shape = _tuples(kept["geometry"])
+    wheels, drives = len(shape["place"]), len(set(shape["drive_of"]))
+    geometry = Geometry(
+        drive_offset=jnp.zeros(wheels), radius_deviation=jnp.zeros(drives or wheels), **shape
+    )
+    names = kept["surfaces"], kept["loads"], kept["sessions"]
+    robot = build(geometry, *names, centre=tuple(kept["centre"]))
+    restored: Robot = put(robot, {e: kept["values"][e.path] for e in entries(robot)})
+    return restored

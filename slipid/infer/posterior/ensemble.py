@@ -1,0 +1,176 @@
+"""Several independent emcee ensembles, in blocks that can be kept and gone on from.
+
+Walkers of one ensemble know of each other, so that whether the chains agree is asked of ensembles.
+During the warm-up, which is thrown away, proposals are learnt from all of them; after it nothing
+changes any more. What a block holds and when sampling stops depend on blocks before it only, so
+that a chain that was interrupted goes on as if it had not been.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import emcee
+import numpy as np
+from emcee.state import State
+
+from slipid.infer.posterior import diagnosis
+from slipid.infer.posterior.blocks import Block, Chain, Plan, Record, Target
+from slipid.infer.posterior.proposals import WAY, Hamiltonian, families, moves
+from slipid.infer.posterior.transport_map import Transport, learnt
+
+RandomState = tuple[str, np.ndarray, int, int, float]
+"""State of a Mersenne twister as numpy gives it."""
+
+ACCEPTED = 0.8
+"""Part of Hamiltonian moves that shall be accepted; their step is adapted in the warm-up."""
+FIRST_ANGLE, LEAST_ANGLE = 0.3, 0.03
+"""First and smallest step of Hamiltonian moves [rad]."""
+DRAWS_PER_EFFECTIVE = 20.0
+"""Draws of the warm-up that tell as much as an independent one, about."""
+
+
+def extended(
+    target: Target,
+    plan: Plan,
+    part: str,
+    record: Record,
+    done: Sequence[Block] | None = None,
+) -> list[Block]:
+    """Blocks of a part until `diagnose` finds them good or the plan's most, each kept when made.
+
+    Goes on from the blocks that are done, by default those of the record.
+    """
+    blocks = list(record.done(part) if done is None else done)
+    while not _ended(blocks, plan):
+        block = _block(target, plan, blocks, lambda steps: record.tell(part, steps))
+        blocks.append(block)
+        record.keep(part, block)
+    return blocks
+
+
+def _ended(blocks: list[Block], plan: Plan) -> bool:
+    after = len(blocks) - plan.warm_up[-1]
+    if len(blocks) >= plan.most:
+        return True
+    # looked at every fourth block at first, then less often: looking costs, too
+    if after < 4 or after % max(4, 2 ** int(np.log2(after) - 3)):
+        return False
+    return diagnosis.diagnose(chain(blocks, plan), plan).converged
+
+
+def chain(blocks: Sequence[Block], plan: Plan) -> Chain:
+    """Positions after the warm-up."""
+    return np.concatenate([b.chain for b in blocks[plan.warm_up[-1] :]], axis=1)
+
+
+def _block(target: Target, plan: Plan, blocks: list[Block], tell: Callable[[int], None]) -> Block:
+    states, map, angle = _begin(target, plan, blocks)
+    stop, told = threading.Event(), [0] * plan.ensembles
+
+    def ensemble(k: int) -> tuple[np.ndarray, np.ndarray, State, float, list[list[float]]]:
+        inner = target.seen_by(map)
+        made = moves(inner, angle)
+        sampler = emcee.EnsembleSampler(
+            plan.walkers,
+            len(inner.centre),
+            inner.log_prob,
+            moves=made,
+            vectorize=True,
+            blobs_dtype=float,
+        )
+        places, log_probs, moved = [], [], 0.0
+        before = states[k].coords
+        for state in sampler.sample(
+            states[k], iterations=plan.block, store=False, skip_initial_state_check=True
+        ):
+            if stop.is_set():
+                break
+            places.append(state.coords.copy())
+            log_probs.append(state.log_prob.copy())
+            moved += float((state.coords != before).any(axis=1).mean()) / plan.block
+            before = places[-1]
+            told[k] += 1
+            tell(min(told))
+        turns = [move.accepted for move, _ in made if isinstance(move, Hamiltonian)]
+        return np.stack(places), np.stack(log_probs), state, moved, turns
+
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, plan.ensembles)) as pool:
+        try:
+            found = list(pool.map(ensemble, range(plan.ensembles)))
+        finally:
+            stop.set()  # an interrupt of the caller ends the others at their next step
+    ends = [f[2] for f in found]
+    places = np.stack([f[0] for f in found])
+    x, log = map.placed(places.reshape(-1, places.shape[-1]))
+    block = Block(
+        number=len(blocks),
+        chain=x.reshape(places.shape),
+        log_prob=np.stack([f[1] for f in found]) - log.sum(axis=1).reshape(places.shape[:-1]),
+        random=(
+            np.stack([s.random_state[1] for s in ends]),
+            np.array([s.random_state[2:] for s in ends], float),
+        ),
+        accepted=np.array([f[3] for f in found]),
+        map=map,
+        angle=angle,
+    )
+    turns = [[a for of in every for a in of] for every in zip(*(f[4] for f in found), strict=True)]
+    return _with_learnt(block, target, plan, blocks, turns)
+
+
+def _begin(
+    target: Target, plan: Plan, blocks: list[Block]
+) -> tuple[list[State], Transport, np.ndarray]:
+    """State of every ensemble in mapped coordinates, the map, and the angle."""
+    if not blocks:
+        map = target.laplace()
+        starts = [_start(target, plan, k) for k in range(plan.ensembles)]
+        angle = np.full(len(families(target)), FIRST_ANGLE)
+        return [State(map.forward(x), random_state=r) for x, r in starts], map, angle
+    last, states = blocks[-1], []
+    for x, key, (place, has_gauss, gauss) in zip(last.chain[:, -1], *last.random, strict=True):
+        random: RandomState = ("MT19937", key, int(place), int(has_gauss), float(gauss))
+        states.append(State(last.map.forward(x), random_state=random))
+    return states, last.map, last.angle
+
+
+def _start(target: Target, plan: Plan, ensemble: int) -> tuple[np.ndarray, RandomState]:
+    """Walkers spread wider than the fit's own uncertainty, at places with a density."""
+    root = np.linalg.cholesky(target.covariance)
+    wide = plan.spread * np.geomspace(0.25, 1.0, plan.walkers)[:, None]
+    seeds = np.random.SeedSequence((plan.seed, ensemble))
+    random = np.random.RandomState(np.random.MT19937(seeds))
+    x = np.empty((plan.walkers, len(root)))
+    lost = np.ones(plan.walkers, bool)
+    for shrink in 0.7 ** np.arange(30):
+        # all are drawn, so that what is compiled has one shape
+        tried = target.centre + shrink * wide * random.standard_normal(x.shape) @ root.T
+        found = np.isfinite(target.terms(tried)).all(axis=1)
+        x[lost & found] = tried[lost & found]
+        lost &= ~found
+        if not lost.any():
+            state = random.get_state(legacy=True)
+            assert isinstance(state, tuple)
+            return x, state
+    raise ValueError("the log density is not finite anywhere near the fit")
+
+
+def _with_learnt(
+    block: Block, target: Target, plan: Plan, blocks: list[Block], turns: list[list[float]]
+) -> Block:
+    """The block with what the warm-up has learnt for the next."""
+    count = block.number + 1
+    if count > plan.warm_up[-1]:
+        return block
+    more = np.array([np.mean(of) - ACCEPTED if of else 0.0 for of in turns])
+    block = replace(block, angle=np.clip(block.angle * np.exp(more), LEAST_ANGLE, WAY))
+    if count in plan.warm_up[:-1]:
+        recent = [b.chain for b in [*blocks, block][count // 2 :]]
+        draws = np.concatenate(recent, axis=1).reshape(-1, len(target.centre))
+        effective = len(draws) / DRAWS_PER_EFFECTIVE
+        map = learnt(draws, effective, target.covariance, target.group)
+        block = replace(block, map=map)
+    return block

@@ -1,0 +1,254 @@
+"""Moves of an ensemble of walkers in coordinates in which its target is nearly a Gaussian.
+
+A target's log density is a sum of one term per group of coordinates, given those that groups share,
+and a term of the shared ones. In the coordinates of `transport_map` independence moves and
+differential evolution move all groups in one evaluation, each accepted or not by its own term, or
+the shared ones, which groups then follow. So do Hamiltonian moves, which take them far along the
+gradient where the density still bends; walks along a single coordinate cross its plateaus.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from emcee.model import Model
+from emcee.moves import Move
+from emcee.state import State
+from jaxtyping import Float, Int
+from numpy.random import RandomState
+from scipy.special import gammaln
+
+from slipid.infer.posterior.blocks import Target
+from slipid.infer.posterior.transport_map import Matrix
+
+STUDENT = 0.2
+"""Part of independent draws that come from a Student t, so that no tail is left out."""
+DEGREES = 8.0
+"""Degrees of freedom of that Student t."""
+WAY = 0.5 * np.pi
+"""Length of a Hamiltonian move [rad]: a quarter turn leads to an independent draw of a Gaussian."""
+MOST_STEPS, SHORTEST = 12, 0.2
+"""Steps of a Hamiltonian move at most, and the shortest over the longest that is made."""
+ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 1.2, 0.1, 0.8
+"""How often, relatively, moves of each kind are made.
+
+A Hamiltonian one takes six times longer, but is what frees walkers from where the map is wrong.
+"""
+ALONE = 0.5
+"""Part of walks along a coordinate that no other one of x follows."""
+_FINITE = 1e100
+"""Bound of slopes whose squares are summed."""
+STEEPEST = 50.0
+"""Kicks are bounded by this many times the step, so that walkers far out are not thrown away."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """Coordinates that are moved together: those of each group, or the shared ones alone (None)."""
+
+    places: tuple[Int[np.ndarray, " _"], ...]
+    groups: tuple[int, ...] | None
+
+
+def families(target: Target) -> list[Family]:
+    """Coordinates of all groups, and those that they share."""
+    groups = tuple(int(g) for g in np.unique(target.group) if g >= 0)
+    places = tuple(np.flatnonzero(target.group == g) for g in groups)
+    shared = np.flatnonzero(target.group < 0)
+    found = [Family(places, groups)] if groups else []
+    return [*found, Family((shared,), None)] if len(shared) else found
+
+
+Jump = tuple[Matrix, Float[np.ndarray, " walker"]]
+"""New coordinates of some places, and log q(old | new) - log q(new | old)."""
+
+
+class FamilyMove(Move):
+    """Metropolis-Hastings of a family."""
+
+    halves = 1
+    """2 where a proposal needs walkers that stand still."""
+
+    def __init__(self, family: Family):
+        self.family = family
+
+    def jump(self, old: Matrix, still: Matrix, random: RandomState) -> Jump:
+        raise NotImplementedError
+
+    def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
+        """New vectors, and the log factor of each group's part or of the shared one."""
+        new, factor = x.copy(), np.empty((len(x), len(self.family.places)))
+        for k, own in enumerate(self.family.places):
+            new[:, own], factor[:, k] = self.jump(x[:, own], still[:, own], random)
+        return new, factor
+
+    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
+        random, count = model.random, len(state.coords)
+        accepted, taken = np.zeros(count, bool), []
+        order = random.permutation(count) if self.halves == 2 else np.arange(count)
+        for mine in np.array_split(order, self.halves):
+            still = state.coords[np.setdiff1d(order, mine)]
+            new, factor = self.proposed(state.coords[mine], still, random)
+            log_prob, terms = model.compute_log_prob_fn(new)
+            if self.family.groups is None:
+                gain = (log_prob - state.log_prob[mine])[:, None] + factor
+            else:
+                own_terms = list(self.family.groups)
+                gain = terms[:, own_terms] - state.blobs[mine][:, own_terms] + factor
+            took = np.log(random.uniform(size=gain.shape)) < np.where(np.isnan(gain), -1e9, gain)
+            for k, own in enumerate(self.family.places):
+                rows = mine[took[:, k]]
+                state.coords[np.ix_(rows, own)] = new[took[:, k]][:, own]
+                of = slice(None) if self.family.groups is None else self.family.groups[k]
+                state.blobs[rows, of] = terms[took[:, k], of]
+            state.log_prob[mine] = state.blobs[mine].sum(axis=1)
+            accepted[mine] = took.any(axis=1)
+            taken.append(took.mean())
+        self.taken = float(np.mean(taken))
+        return state, accepted
+
+
+class Independence(FamilyMove):
+    """Draws that do not depend on where a walker is: Gaussian, or Student t of as many degrees."""
+
+    def jump(self, old: Matrix, still: Matrix, random: RandomState) -> Jump:
+        count = len(old)
+        new = random.standard_normal(old.shape)
+        stretch = np.sqrt(DEGREES / random.chisquare(DEGREES, count))
+        new *= np.where(random.uniform(size=count) < STUDENT, stretch, 1.0)[:, None]
+        return new, _log_density(old) - _log_density(new)
+
+
+def _log_density(u: Matrix) -> Float[np.ndarray, " walker"]:
+    """Log density of the mixture that independence moves draw from, up to a constant."""
+    size, q = u.shape[1], (u**2).sum(axis=1)
+    of_t = gammaln(0.5 * (DEGREES + size)) - gammaln(0.5 * DEGREES)
+    of_t -= 0.5 * size * np.log(DEGREES / 2)  # less the Gaussian's 2 pi
+    of_t -= 0.5 * (DEGREES + size) * np.log1p(q / DEGREES)
+    return np.asarray(np.logaddexp(np.log(1 - STUDENT) - 0.5 * q, np.log(STUDENT) + of_t))
+
+
+class Differential(FamilyMove):
+    """Differential evolution: differences of walkers that stand still, at times whole ones.
+
+    Source: ter Braak 2006, Statistics and Computing 16; whole differences lead from mode to mode.
+    """
+
+    halves = 2
+    whole = 0.1
+
+    def jump(self, old: Matrix, still: Matrix, random: RandomState) -> Jump:
+        count, size = old.shape
+        first = random.randint(len(still), size=count)
+        second = (first + random.randint(1, len(still), size=count)) % len(still)
+        usual = 2.38 / np.sqrt(2 * size) * np.exp(0.5 * random.standard_normal(count))
+        scale = np.where(random.uniform(size=count) < self.whole, 1.0, usual)
+        jitter = 1e-5 * still.std(axis=0) * random.standard_normal((count, size))
+        return old + scale[:, None] * (still[first] - still[second]) + jitter, np.zeros(count)
+
+
+class Along(FamilyMove):
+    """Random walk of x of one coordinate of each group, or of a shared one.
+
+    Where data say no more than that a number is small, its logarithm may be anything: a plateau
+    that no map of the whole has straight, but along which this walks far. The others of u are held,
+    so that those of x follow as the map says, or else the others of x.
+    """
+
+    def __init__(self, target: Target, groups: tuple[int, ...] | None):
+        assert target.map, "a target that is seen by a map"
+        everything = np.arange(len(target.group))
+        of_group = [np.flatnonzero(target.group == g) for g in groups or ()]
+        super().__init__(Family(tuple(of_group or [everything]), groups))
+        self.map = target.map
+        self.mine = tuple(of_group or [np.flatnonzero(target.group < 0)])
+        self.std = np.sqrt(np.diag(target.covariance))
+
+    def proposed(self, u: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
+        rows = np.arange(len(u))
+        x, before = self.map.placed(u)
+        moved = np.zeros(u.shape, bool)
+        for mine in self.mine:
+            which = random.choice(mine, len(u))
+            reach = 10 ** random.uniform(-0.5, 1.0, len(u)) * self.std[which]
+            x[rows, which] += reach * random.standard_normal(len(u))
+            moved[rows, which] = True
+        moved |= random.uniform(size=(len(u), 1)) < ALONE
+        new = np.where(moved, self.map.forward(x), u)
+        change = np.where(moved, before - self.map.placed(new)[1], 0.0)
+        return new, np.stack([change[:, own].sum(axis=1) for own in self.family.places], axis=1)
+
+
+class Hamiltonian(FamilyMove):
+    """Turns of position and momentum that suit a Gaussian, kicked by what it does not know.
+
+    With momentum p and the log density l, steps of
+
+        turn (u, p) by h/2;    p += h (dl/du + u);    turn (u, p) by h/2
+
+    Groups do not feel each other while the shared coordinates are held, so that each has a way of
+    its own, accepted or not by itself. A walker whose slope is lost on the way stays where it was
+    with all its groups: a slope that is no number may be so for any of them.
+
+    Source: Beskos et al. 2011, Stochastic Processes and their Applications 121, section 4.
+    """
+
+    def __init__(self, target: Target, family: Family, angle: float):
+        super().__init__(family)
+        self.target, self.angle = target, angle
+        self.accepted: list[float] = []
+
+    def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
+        count, places = len(x), self.family.places
+        # shorter steps, now and then, and more of them, for walkers where the density is steep
+        h = self.angle * SHORTEST ** (random.uniform() ** 3)
+        steps = int(np.clip(random.uniform(0.7, 1.3) * WAY / h + 0.5, 1, MOST_STEPS))
+        h *= random.uniform(0.8, 1.0, (count, 1))
+        u, start, lost = x.copy(), np.zeros(x.shape), np.zeros(count, bool)
+        own = np.concatenate(places)
+        start[:, own] = random.standard_normal((count, len(own)))
+        p = start.copy()
+        u[:, own], p[:, own] = _turn(u[:, own], p[:, own], h / 2)
+        for step in range(steps):
+            slope = self.target.slope(u)
+            lost |= ~np.isfinite(slope).all(axis=1)
+            for place in places:
+                p[:, place] += h * _bounded(np.where(lost[:, None], 0.0, slope + u)[:, place])
+            u[:, own], p[:, own] = _turn(u[:, own], p[:, own], h if step < steps - 1 else h / 2)
+        factor = np.stack([_energy(start[:, k]) - _energy(p[:, k]) for k in places], axis=1)
+        return u, np.where(lost[:, None], -np.inf, factor)
+
+    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
+        state, accepted = super().propose(model, state)
+        self.accepted.append(self.taken)
+        return state, accepted
+
+
+def _bounded(kick: Matrix) -> Matrix:
+    """Kicks of coordinates of one group, so long at most that they are not thrown far away."""
+    most = np.linalg.norm(np.clip(kick, -_FINITE, _FINITE), axis=1, keepdims=True) / STEEPEST
+    return kick / np.maximum(most, 1.0)
+
+
+def _energy(p: Matrix) -> Float[np.ndarray, " walker"]:
+    """Kinetic energy of momenta of one group."""
+    return np.asarray(0.5 * (p**2).sum(axis=1))
+
+
+def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
+    c, s = np.cos(angle), np.sin(angle)
+    return c * u + s * p, c * p - s * u
+
+
+def moves(target: Target, angles: Float[np.ndarray, " family"]) -> list[tuple[Move, float]]:
+    """Moves in the target's coordinates, and how often each is made.
+
+    Angles are the steps of Hamiltonian moves of every family.
+    """
+    of_family = families(target)
+    found: list[tuple[Move, float]] = []
+    for family, angle in zip(of_family, angles, strict=True):
+        found.append((Along(target, family.groups), ALONG))
+        found.append((Independence(family), INDEPENDENT / len(of_family)))
+        found.append((Differential(family), DIFFERENTIAL / len(of_family)))
+        found.append((Hamiltonian(target, family, float(angle)), HAMILTONIAN / len(of_family)))
+    return found

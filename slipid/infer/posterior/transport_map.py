@@ -1,0 +1,376 @@
+"""What a transport map is made of: warps of single coordinates, bends by others.
+
+Coordinates in which a posterior is nearly a standard Gaussian, learnt from draws of it.
+
+A triangular map (Knothe-Rosenblatt) from coordinates x to u:
+
+    shared ones       v = L^-1 (x - m)
+    those of a group  w = L^-1 (x - m - B s), widest first
+                      v_i = (w_i - a_i(w_1 .. w_i-1)) exp(-b_i(w_1 .. w_i-1))
+
+with polynomials a and b, s the shared x - m, and a sinh-arcsinh map (Jones and Pewsey 2009,
+Biometrika 96, eq. 2) of every coordinate from v to u,
+
+    sinh(tail arcsinh((v - place) / scale) - skew)
+
+Groups follow the shared coordinates and are bent by themselves, so that groups that are independent
+given the shared ones stay so. It is one of the maps of Marzouk et al. 2016 (Sampling via measure
+transport, section 3).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations_with_replacement
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.optimize import minimize
+
+Matrix = Float[np.ndarray, "_ _"]
+Vector = Float[np.ndarray, " _"]
+Leaf = Array | np.ndarray
+"""An array of numpy while a map is learnt, of jax where the way back is computed."""
+A = TypeVar("A", Array, np.ndarray)
+"""Either of them; what comes out is what went in."""
+FAR = 4.0
+"""Polynomials stay what they are beyond this many stds."""
+SQUARED = 5
+"""Coordinates of a group, the widest first, whose squares and products are monomials."""
+CUBED = 3
+"""Coordinates of a group, the widest first, whose cubes are monomials."""
+WORTH = 3.0
+"""Gain in log likelihood [nats] that a monomial must bring to be taken in."""
+MOST_MONOMIALS = 12
+"""Largest number of monomials in the mean and in the log std of a coordinate."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Warp:
+    """Sinh-arcsinh map of every coordinate: middle, width, lean (skew), lightness of tails.
+
+    Skew 0 and tail 1 make a straight line.
+    """
+
+    place: Leaf
+    scale: Leaf
+    skew: Leaf
+    tail: Leaf
+
+    def forward(self, v: Matrix) -> Matrix:
+        """The way from v to u."""
+        inner = self.tail * np.arcsinh((v - self.place) / self.scale)
+        return np.asarray(np.sinh(inner - self.skew))
+
+    def back(self, u: Leaf) -> Array:
+        """The way from u to v."""
+        inner = (jnp.arcsinh(u) + self.skew) / self.tail
+        return jnp.asarray(self.place + self.scale * jnp.sinh(inner))
+
+    def log_slope(self, u: A) -> A:
+        """Log dv/du of every coordinate."""
+        xp = u.__array_namespace__()
+        inner = xp.abs((xp.asinh(u) + self.skew) / self.tail)
+        cosh = inner + xp.log1p(xp.exp(-2 * inner)) - np.log(2)  # without overflow
+        return xp.log(self.scale / self.tail) + cosh - 0.5 * xp.log1p(u**2)
+
+    @staticmethod
+    def none(size: int) -> "Warp":
+        """A map that changes nothing."""
+        one, zero = np.ones(size), np.zeros(size)
+        return Warp(zero, one, zero, one)
+
+    @staticmethod
+    def learnt(draws: Matrix) -> "Warp":
+        """Map by maximum likelihood, column by column."""
+        return Warp(*np.array([_sinh_arcsinh(column) for column in draws.T]).T)
+
+
+def _sinh_arcsinh(x: Vector) -> tuple[float, float, float, float]:
+    middle, width = float(np.median(x)), float(x.std())
+    t = (x - middle) / width
+
+    def loss(q: np.ndarray) -> float:
+        inner = np.arcsinh((t - q[0]) / np.exp(q[1]))
+        y = np.exp(q[3]) * inner - q[2]
+        density = -0.5 * np.sinh(y) ** 2 + np.log(np.cosh(y)) + q[3] - q[1]
+        spread = np.mean(density - 0.5 * np.log1p(((t - q[0]) / np.exp(q[1])) ** 2))
+        return float(-spread + 1e-2 * (q @ q))
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        q = minimize(loss, np.zeros(4), method="BFGS").x
+    return middle + width * q[0], width * float(np.exp(q[1])), q[2], float(np.exp(q[3]))
+
+
+@dataclass(frozen=True, eq=False)
+class Bend:
+    """Polynomials a (shift) and b (scale) of a group's coordinates.
+
+    Factors are the columns whose product each monomial is, from (w, 1).
+    """
+
+    factors: Int[np.ndarray, "monomial 3"]
+    shift: Float[np.ndarray, "coordinate monomial"]
+    scale: Float[np.ndarray, "coordinate monomial"]
+
+    def monomials(self, w: Matrix) -> Matrix:
+        """Products of columns (row, monomial)."""
+        columns = np.concatenate([np.clip(w, -FAR, FAR), np.ones((len(w), 1))], axis=1)
+        return np.asarray(columns[:, self.factors].prod(axis=2))
+
+    def forward(self, w: Matrix) -> Matrix:
+        """The way from w to v."""
+        f = self.monomials(w)
+        return np.asarray((w - f @ self.shift.T) * np.exp(-f @ self.scale.T))
+
+    @staticmethod
+    def none(size: int) -> "Bend":
+        """No bend, with all monomials that there can be."""
+        one = size  # the column of ones
+        factors = [(one, one, one)] + [(k, one, one) for k in range(size)]
+        squared, cubed = range(min(SQUARED, size - 1)), range(min(CUBED, size - 1))
+        factors += [(*pair, one) for pair in combinations_with_replacement(squared, 2)]
+        factors += [(k, k, k) for k in cubed]
+        nothing = np.zeros((size, len(factors)))
+        return Bend(np.array(factors), nothing, nothing.copy())
+
+    @staticmethod
+    def learnt(w: Matrix, effective: float) -> "Bend":
+        """Polynomials for draws that are worth so many independent ones."""
+        size = w.shape[1]
+        bend = Bend.none(size)
+        f = bend.monomials(w)
+        reach = np.where(bend.factors >= size, -1, bend.factors).max(axis=1)
+        for i in range(size):
+            own = np.flatnonzero(reach < i)
+            bend.shift[i, own], bend.scale[i, own] = _regression(f[:, own], w[:, i], effective)
+        return bend
+
+
+def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]:
+    """Coefficients of the mean and of the log std of a Gaussian, most of them zero.
+
+    Monomials are taken in one by one, the one with the largest score statistic first, as long as
+    one is worth more than `WORTH` nats to so many independent rows.
+    """
+    shift, scale, means, spreads = np.zeros(f.shape[1]), np.zeros(f.shape[1]), [0], [0]
+    share = effective / len(w)
+    for _ in range(MOST_MONOMIALS):
+        for _ in range(6):
+            weight = np.exp(-2 * f @ scale)
+            by = f[:, means].T * weight
+            shift[means] = np.linalg.solve(by @ f[:, means], by @ w)
+            excess = (w - f @ shift) ** 2 * weight - 1
+            # Fisher's information of a log std is 2
+            of = f[:, spreads]
+            step = np.linalg.solve(2 * of.T @ of, of.T @ excess)
+            scale[spreads] += step * min(1.0, 1.0 / (np.abs(of @ step).max() + 1e-9))
+        root = np.sqrt(weight)
+        of_mean = _scores(f * root[:, None], means, root * (w - f @ shift))
+        gains = share * np.stack([0.5 * of_mean, 0.25 * _scores(f, spreads, excess)])
+        which, best = np.unravel_index(np.argmax(gains), gains.shape)
+        if gains[which, best] < WORTH:
+            break
+        (means, spreads)[which].append(int(best))
+    return shift, scale
+
+
+def _scores(f: Matrix, taken: list[int], left: Vector) -> Vector:
+    """Squared length of what is left along each column, less what columns taken say of it."""
+    others = f - f[:, taken] @ np.linalg.lstsq(f[:, taken], f, rcond=None)[0]
+    square = (others**2).sum(axis=0)
+    known = square < 1e-6 * (f**2).sum(axis=0)
+    return np.where(known, 0.0, (others.T @ left) ** 2 / np.where(known, 1.0, square))
+
+
+MOST_DRAWS = 4000
+"""Largest number of draws that a map is learnt from."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stair:
+    """Some coordinates, by their places, after those they follow.
+
+    Slope is the derivative of own ones by given ones, root the Cholesky factor of the
+    covariance of what is left, bend the bend of that, None for shared coordinates.
+    """
+
+    own: Int[np.ndarray, " own"]
+    given: Int[np.ndarray, " given"]
+    slope: Float[np.ndarray, "given own"]
+    root: Float[np.ndarray, "own own"]
+    bend: Bend | None
+
+    def left(self, about: Matrix) -> Matrix:
+        """What others do not say of own coordinates, by the root.
+
+        From all coordinates less their means.
+        """
+        left = about[:, self.own] - about[:, self.given] @ self.slope
+        return np.asarray(np.linalg.solve(self.root, left.T).T)
+
+
+@dataclass(frozen=True, eq=False)
+class Transport:
+    """The whole map, of vectors x (row, size) to and from u (row, size).
+
+    Stairs lead from x to v, every coordinate is in one of them, and the last warp from v to u.
+    """
+
+    mean: Vector
+    stairs: tuple[Stair, ...]
+    last: Warp
+
+    def forward(self, x: Matrix) -> Matrix:
+        """The way from x to u."""
+        about = x - self.mean
+        v = np.empty_like(about)
+        for s in self.stairs:
+            w = s.left(about)
+            v[:, s.own] = s.bend.forward(w) if s.bend else w
+        return self.last.forward(v)
+
+    def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
+        """x, and the part of every coordinate in log |dx/du| (row, size)."""
+        x, log = _placed(self._back, u)
+        return np.array(x), np.array(log)
+
+    def pull(self, u: Matrix, slope: Callable[[Matrix], Matrix]) -> Matrix:
+        """Derivative by u of log |dx/du| plus a function of x that has the derivative slope(x)."""
+        return np.array(_pulled(self._back, u, slope(self.placed(u)[0])))
+
+    @cached_property
+    def _back(self) -> "Steps":
+        with jax.ensure_compile_time_eval():  # kept, so never a tracer's
+            return _steps(self)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The way from u to x, a coordinate at a time, in arrays whose shapes nothing learnt changes.
+
+    XLA compiles it once so, though stairs and monomials are others after every look at the draws.
+    With columns of all w and of all x - m, zeros until their turn, and of ones:
+
+        w_i = f_i . shift_i + exp(f_i . scale_i) v_i,   x_i - m_i = columns . slope_i
+
+    Order is the coordinate of each step, root its log dx/dw, factors the columns whose product each
+    monomial f is (step, term, 3).
+    """
+
+    mean: Array
+    last: Warp
+    order: Array
+    slope: Array
+    root: Array
+    factors: Array
+    shift: Array
+    scale: Array
+
+
+def _steps(map: Transport) -> Steps:
+    size = len(map.mean)
+    slope, root = np.zeros((size, 2 * size + 1)), np.zeros(size)
+    factors = np.full((size, MOST_MONOMIALS + 1, 3), 2 * size)
+    shift, scale = np.zeros((2, size, MOST_MONOMIALS + 1))
+    k = 0
+    for s in map.stairs:
+        columns = np.append(s.own, 2 * size)
+        for i in range(len(s.own)):
+            slope[k, s.own], slope[k, size + s.given] = s.root[i], s.slope[:, i]
+            root[k] = np.log(s.root[i, i])
+            if s.bend:
+                own = np.flatnonzero((s.bend.shift[i] != 0) | (s.bend.scale[i] != 0))
+                factors[k, : len(own)] = columns[s.bend.factors[own]]
+                shift[k, : len(own)] = s.bend.shift[i, own]
+                scale[k, : len(own)] = s.bend.scale[i, own]
+            k += 1
+    order = np.concatenate([s.own for s in map.stairs])
+    # on the device once, not in every call
+    arrays = (map.mean, map.last, order, slope, root, factors, shift, scale)
+    return Steps(*jax.device_put(arrays))
+
+
+_Step = tuple[Array, Array, Array, Array, Array, Array]
+"""A row of `Steps`: place, slope, root, factors, shift, scale."""
+
+
+@jax.jit
+def _placed(map: Steps, u: Array) -> tuple[Array, Array]:
+    rows, size = u.shape
+    v = map.last.back(u)
+
+    def step(columns: Array, s: _Step) -> tuple[Array, tuple[Array, Array]]:
+        i, slope, root, factors, shift, scale = s
+        f = jnp.clip(columns[:, factors], -FAR, FAR).prod(axis=2)
+        spread = f @ scale
+        columns = columns.at[:, i].set(f @ shift + jnp.exp(spread) * v[:, i])
+        about = columns @ slope
+        return columns.at[:, size + i].set(about), (about, spread + root)
+
+    start = jnp.zeros((rows, 2 * size + 1)).at[:, -1].set(1.0)
+    steps = (map.order, map.slope, map.root, map.factors, map.shift, map.scale)
+    _, (about, log) = jax.lax.scan(step, start, steps)
+    there = jnp.zeros_like(u).at[:, map.order].set(about.T)
+    return map.mean + there, map.last.log_slope(u).at[:, map.order].add(log.T)
+
+
+@jax.jit
+def _pulled(map: Steps, u: Array, slope: Array) -> Array:
+    (_, log), back = jax.vjp(lambda u: _placed(map, u), u)
+    (out,) = back((slope, jnp.ones_like(log)))
+    return jnp.asarray(out)
+
+
+def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray) -> Transport:
+    """Map of a Gaussian.
+
+    Groups are those of each coordinate, -1 where groups share it.
+    """
+    return Transport(mean, _stairs(covariance, group, covariance), Warp.none(len(mean)))
+
+
+def _stairs(covariance: Matrix, group: np.ndarray, at_mode: Matrix) -> tuple[Stair, ...]:
+    """Stairs of a Gaussian, shared coordinates first, then group by group.
+
+    Coordinates that are widest at the mode come first in a stair: a valley has its direction at the
+    mode, where draws are as wide across as they are bent.
+    """
+    stairs, shared = [], np.flatnonzero(group < 0)
+    for g in range(-1, int(group.max()) + 1):
+        own, given = np.flatnonzero(group == g), shared if g >= 0 else shared[:0]
+        if not len(own):
+            continue
+        own = own[np.argsort(-np.diag(_given(at_mode, own, given)[1]))]
+        slope, left = _given(covariance, own, given)
+        bend = Bend.none(len(own)) if g >= 0 else None
+        stairs.append(Stair(own, given, slope, np.linalg.cholesky(left), bend))
+    return tuple(stairs)
+
+
+def _given(covariance: Matrix, own: np.ndarray, given: np.ndarray) -> tuple[Matrix, Matrix]:
+    """Slope of own coordinates by given ones, and the covariance of what is left."""
+    cross = covariance[np.ix_(given, own)]
+    slope = np.linalg.solve(covariance[np.ix_(given, given)], cross)
+    return slope, covariance[np.ix_(own, own)] - cross.T @ slope
+
+
+def learnt(draws: Matrix, effective: float, covariance: Matrix, group: np.ndarray) -> Transport:
+    """Map learnt from draws (draw, size) that are worth so many independent ones, about.
+
+    The Laplace covariance counts as many draws as there are coordinates.
+    """
+    some = draws[:: max(1, len(draws) // MOST_DRAWS)]
+    size, mean = some.shape[1], some.mean(axis=0)
+    about, stairs = some - mean, []
+    both = (effective * np.cov(about.T) + size * covariance) / (effective + size)
+    for s in _stairs(both, group, covariance):
+        bend = Bend.learnt(s.left(about), effective) if s.bend else None
+        stairs.append(replace(s, bend=bend))
+    found = Transport(mean, tuple(stairs), Warp.none(size))
+    return replace(found, last=Warp.learnt(found.forward(some)))

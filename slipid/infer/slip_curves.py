@@ -1,0 +1,202 @@
+"""Slip against torque of every floor, with its band, and what range the data saw."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.data.log import Log
+from slipid.data.runs import Runs
+from slipid.fit import likelihood as lk
+from slipid.fit.noise import travel
+from slipid.model import contact_law as law
+from slipid.model import robot as model
+from slipid.model.contact_law import ContactSurface
+from slipid.model.robot import GRAVITY, Robot, Validity
+from slipid.search_space import Space
+
+POINTS = 41
+_STEADY, _MOVED = 0.1, 0.1
+"""Parts: of a command, by which rows may differ from it; of the fastest window, to have moved."""
+_SECTOR, _COMMON = 30.0, 0.02
+"""Directions that count as one [deg], and the part of all windows from which one counts."""
+_SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])
+
+
+@dataclass(frozen=True, eq=False)
+class SlipCurve:
+    """Slip of a wheel over its torque on one floor, from rest to what occurred, with its 90 % band.
+
+    It is given for this speed [rad/s] and this share of the weight.
+    """
+
+    torque_nm: Float[np.ndarray, " torque"]
+    slip: Float[np.ndarray, " torque"]
+    slip_lo: Float[np.ndarray, " torque"]
+    slip_hi: Float[np.ndarray, " torque"]
+    wheel_speed: float
+    load_share: float
+
+
+@jax.jit
+def seen(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
+    """Wheel speeds [rad/s], torques [N m] and slips of every window (piece, window, wheel).
+
+    The slip is the sliding speed over the wheel's activity, rim and roller speed together, so that
+    it stays finite at a wheel that stands.
+    """
+    frame = robot.geometry.frame()
+    speed = robot.geometry.at_wheels(lk.wheel_speed(robot, b))
+
+    def one(w: Array, surface: Array, load: Array) -> tuple[Array, Array]:
+        xi = model.twist(robot, frame, w, surface, load)
+        rim = frame.radius * w
+        active = jnp.sqrt(rim**2 + (frame.roll @ xi) ** 2 + 1e-12)
+        torque = model.wheel_torque(robot, frame, xi, w, surface, load)
+        return torque, (rim * frame.pull - frame.hold @ xi) / active
+
+    return speed, *jax.vmap(jax.vmap(one, (0, None, None)))(speed, b.surface, b.load)
+
+
+def torque_of_slip(
+    robot: Robot, wheel_speed: Float[Array, " surface"], share: float
+) -> Float[Array, "surface slip"]:
+    """Torque [N m] of a wheel that slips by `_SLIP` along its drive direction, on every floor.
+
+    At this speed [rad/s], with this share of the weight on the wheel. Source:
+    `slipid.model.contact_law` without sideways rolling.
+    """
+    radius, weight = robot.geometry.wheel_radius, robot.body.mass * GRAVITY
+
+    def one(floor: ContactSurface, speed: Array) -> Array:
+        rim = radius * speed
+        traction = law.wheel_traction(jnp.asarray(_SLIP) * rim, rim, floor).force()
+        return radius * weight * law.load_force(jnp.asarray(share), floor) * traction
+
+    return jax.vmap(one)(robot.surfaces, wheel_speed)
+
+
+def curves(
+    space: Space, z: np.ndarray, draws: Float[np.ndarray, "draw free"], b: lk.Batch
+) -> dict[str, SlipCurve]:
+    """Slip over torque per floor with a 90 % band, over the torques that occurred.
+
+    Taken at the median speed of the wheels that turned and an even load.
+    """
+    robot = space.tree(jnp.asarray(z))
+    speed, torque = (np.abs(np.asarray(x)) for x in seen(robot, b)[:2])
+    labels, floor = robot.surfaces.labels, np.asarray(b.surface)
+    share = 1.0 / speed.shape[-1]
+    median = []
+    for k in range(len(labels)):
+        mine = speed[floor == k]
+        turned = mine[mine > 0.05 * max(mine.max(initial=0.0), 1e-9)]
+        median.append(float(np.median(turned)) if turned.size else 1.0)
+    at = jnp.asarray(median)
+    best = np.asarray(torque_of_slip(robot, at, share))
+    drawn = jax.jit(jax.vmap(lambda x: torque_of_slip(space.tree(x), at, share)))
+    band = np.asarray(drawn(jnp.asarray(draws)))
+    out = {}
+    for k, label in enumerate(labels):
+        top = min(float(np.quantile(torque[floor == k], 0.98)), 0.999 * float(best[k].max()))
+        grid = np.linspace(0.0, top, POINTS)
+        each = np.stack([np.interp(grid, row, _SLIP) for row in band[:, k]])
+        low, high = np.quantile(each, [0.05, 0.95], axis=0)
+        slip = np.interp(grid, best[k], _SLIP)
+        out[label] = SlipCurve(grid, slip, low, high, median[k], share)
+    return out
+
+
+def slip_on(robot: Robot, floor: str, curve: SlipCurve) -> Float[np.ndarray, " torque"]:
+    """Slip by a robot's own law at the torques, the speed and the load of a curve of `curves`."""
+    at = jnp.full(len(robot.surfaces.labels), curve.wheel_speed)
+    torque = torque_of_slip(robot, at, curve.load_share)[robot.surface_index(floor)]
+    return np.interp(curve.torque_nm, np.asarray(torque), _SLIP)
+
+
+def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
+    """What each floor was seen with."""
+    speed, torque, slip = (np.asarray(x) for x in seen(robot, b))
+    back = np.asarray(robot.geometry.least()) * float(robot.geometry.wheel_radius)
+    # by the encoders: what was driven, not how it slipped
+    twist = np.asarray(lk.wheel_speed(robot, b)) @ back.T
+    yaw = twist[..., 2]
+    floor, far = np.asarray(b.surface), travel(b, robot)[0].sum(axis=1)
+    out: dict[str, Validity] = {}
+    for k, label in enumerate(robot.surfaces.labels):
+        runs = [i for i, log in enumerate(data.logs) if (log.surface or "unknown") == label]
+        mine = floor == k
+        most = [float(np.abs(x[mine]).max()) for x in (speed, torque, slip, yaw)]
+        if 2 * sum(has_steady_command(data.logs[i]) for i in runs) > len(runs):
+            driven = Driven(
+                distinct(np.degrees(data.heading[runs]), 1),
+                distinct(data.speed[runs], 3),
+                distinct(data.turn[runs], 2),
+            )
+        else:
+            driven = by_encoders(twist[mine].reshape(-1, 3))
+        out[label] = Validity(
+            runs=len(runs),
+            loads=tuple(sorted({data.logs[i].load for i in runs})),
+            wheel_speed=(0.0, most[0]),
+            torque_nm=(0.0, most[1]),
+            slip=(0.0, most[2]),
+            yaw_rate=(0.0, most[3]),
+            headings_deg=driven.headings_deg,
+            speeds=driven.speeds,
+            turn_rates=driven.turn_rates,
+            distance=round(float(far[mine].sum()) / max(len(runs), 1), 3),
+        )
+    return out
+
+
+class Driven(NamedTuple):
+    """Headings [deg], speeds [m/s] and turn rates [rad/s] that were driven, each once, rising."""
+
+    headings_deg: tuple[float, ...]
+    speeds: tuple[float, ...]
+    turn_rates: tuple[float, ...]
+
+
+def has_steady_command(log: Log) -> bool:
+    """Whether a run was asked for one motion most of the time, which then tells what it drove."""
+    if log.twist_command is None:
+        return False
+    gap = np.linalg.norm(log.twist_command - np.median(log.twist_command, axis=0), axis=1)
+    usual = float(np.linalg.norm(np.median(log.twist_command, axis=0)))
+    return usual > 0.0 and float((gap < _STEADY * usual).mean()) > 0.5
+
+
+def by_encoders(twist: Float[np.ndarray, "window 3"]) -> Driven:
+    """What windows drove by their wheels: roughly, of windows that moved, what is no exception."""
+    speed = np.linalg.norm(twist[:, :2], axis=1)
+    ahead = speed > _MOVED * speed.max(initial=0.0)
+    turned = np.abs(twist[:, 2])
+    on = turned > _MOVED * turned.max(initial=0.0)
+    way = np.degrees(np.arctan2(twist[ahead, 1], twist[ahead, 0]))
+    headings, count = np.unique((np.round(way / _SECTOR) * _SECTOR) % 360.0, return_counts=True)
+    common = headings[count >= _COMMON * count.sum()]
+    signed = np.where(common > 180.0, common - 360.0, common)  # as commands have them
+    parts = (0.1, 0.5, 0.9)
+    speeds = np.quantile(speed[ahead], parts) if ahead.any() else np.zeros(0)
+    rates = np.quantile(twist[on, 2], parts) if on.any() else np.zeros(0)
+    return Driven(distinct(signed, 1), distinct(speeds, 3), distinct(rates, 2))
+
+
+def distinct(x: np.ndarray, digits: int) -> tuple[float, ...]:
+    """Values that are known, rounded, each once, rising."""
+    return tuple(sorted({round(float(v), digits) + 0.0 for v in x[np.isfinite(x)]}))
+
+
+def current_trend(robot: Robot, b: lk.Batch) -> tuple[float, float]:
+    """Least squares a [A] + b [A s/m] v of measured less predicted currents' sizes, all floors."""
+    predicted = lk.predicted_current(robot, b, lk.predict(robot, b).felt)
+    gap = np.asarray((b.current - predicted) * jnp.sign(predicted))
+    speed = np.broadcast_to((travel(b, robot)[0] / b.dt)[..., None], gap.shape).ravel()
+    rows = np.stack([np.ones_like(speed), speed], axis=1)
+    known = np.isfinite(gap).ravel() & np.isfinite(speed)
+    a, slope = np.linalg.lstsq(rows[known], gap.ravel()[known])[0]
+    return float(a), float(slope)

@@ -1,0 +1,273 @@
+"""What may be said of every number and of ratios of them: interval and verdict.
+
+Before a fit from the information that is expected, after it from the Laplace posterior.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.fit.variances import Search, Square
+from slipid.parameter import Declaration, Entry
+from slipid.search_space import Choice, Space
+
+IDENTIFIED, WEAK = 0.3, 0.8
+"""Largest std(posterior) / std(prior) of the verdicts, in the search space."""
+FROM_ZERO = 3.0
+"""Stds, in its own unit, by which an identified positive number is away from 0: the likelihood of a
+number that is small rises no further towards 0, however narrow the interval of its logarithm is."""
+TAIL, SMALL = 4.0, 0.05
+"""A positive number counts as being at 0 when it is so many prior stds below its prior mean, and
+below this part of it: a tight prior that the data contradict is something else."""
+NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
+"""Without a voltage nothing sets the scale of these; a prior elsewhere must not lend them one."""
+Z95 = 1.6448536269514722
+LARGEST = 600.0
+"""Largest exponent at an end of an interval: of what nothing is known it would be infinite."""
+
+
+class Ratio(NamedTuple):
+    """A quotient of two positive numbers that may be known where neither of them is.
+
+    The numerator is a quantity, of every floor where floors have their own, the denominator a path.
+    """
+
+    over: str
+    under: str
+    unit: str
+    doc: str
+
+
+RATIOS = (
+    Ratio("motor.resistance", "motor.back_emf", "ohm*rad/(V*s)", "needs the voltage, as both do"),
+    Ratio("surface.friction", "motor.back_emf", "rad/(V*s)", "the torque scale currents fix"),
+    Ratio("motor.coulomb_friction", "motor.back_emf", "A", "current at crawling speed"),
+    Ratio("motor.viscous_friction", "motor.back_emf", "A*s/rad", "current per wheel speed"),
+    Ratio("camera.scale", "robot.wheel_radius", "1/m", "all that motion without slip tells"),
+)
+"""Quotients with a verdict of their own, where both numbers are free.
+
+The resistance enters the voltage equation and nothing else: contact forces decide how the body
+moves, and currents follow from them with the torque constant. So without a voltage not even
+R / C_e is known, other than in models that read slip from R I^2 + C_e I wm.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """One fitted or fixed number (or short vector) as people and files get it.
+
+    Attributes:
+        path: its name.
+        value, std: [unit], a float or one per label; std is None where it was fixed.
+        interval90: equal-tailed, (low, high), or one such pair per label.
+        labels: of a vector's entries, () for a scalar.
+        verdict: identified, weak, disputed, not_identified, at_bound or fixed; of a vector the
+            verdict of its worst direction.
+        provenance: measured (data decide), borrowed (a prior decides), override (a choice
+            fixed it: the user's, or slipid's where one speed cannot tell).
+        ratio: std(posterior) / std(prior) in the search space, None where it was fixed.
+        pull: (estimate - prior mean) / std(prior), of a vector the largest, None where fixed.
+        prior_mean, prior_std: [unit], None where it was fixed.
+    """
+
+    path: str
+    unit: str
+    doc: str
+    labels: tuple[str, ...] = ()
+    value: Any
+    std: Any = None
+    interval90: Any = None
+    verdict: str
+    provenance: str
+    ratio: float | None = None
+    pull: float | None = None
+    prior_mean: Any = None
+    prior_std: Any = None
+    source: str = "laplace"
+
+
+def estimates(
+    space: Space,
+    choices: Sequence[Choice],
+    z: Search,
+    covariance: Square,
+    has_voltage: bool,
+    flat: Collection[str],
+) -> tuple[Estimate, ...]:
+    """Every declared number with its interval and verdict, in order of declaration.
+
+    `flat` are the paths of the numbers that move along directions which the data leave open.
+    """
+    tree = space.tree(z)
+    return tuple(
+        _free(space, e, tree, z, covariance, has_voltage, e.path in flat)
+        if e.path in space.place
+        else _fixed(e, tree, choices)
+        for e in space.all
+    )
+
+
+def plain(x: Any) -> Any:
+    """A single number, or a tuple of several."""
+    x = np.asarray(x, float)
+    return float(x.reshape(())) if x.size == 1 else tuple(float(v) for v in x)
+
+
+def _fixed(entry: Entry, tree: Any, choices: Sequence[Choice]) -> Estimate:
+    chosen = any(
+        fnmatchcase(entry.path, c.pattern) and (c.fixed is not None or c.start is not None)
+        for c in choices
+    )
+    return Estimate(
+        path=entry.path,
+        unit=entry.declaration.unit,
+        doc=entry.declaration.doc,
+        labels=entry.labels,
+        value=plain(entry.get(tree)),
+        verdict="fixed",
+        provenance="override" if chosen else "borrowed",
+    )
+
+
+def _free(
+    space: Space,
+    entry: Entry,
+    tree: Any,
+    z: np.ndarray,
+    covariance: np.ndarray,
+    has_voltage: bool,
+    is_flat: bool,
+) -> Estimate:
+    at, d = space.place[entry.path], entry.declaration
+    mean, block = np.asarray(z)[at], covariance[at, at]
+    prior_mean, prior_std = space.prior_mean[at], space.prior_std[at]
+    value = np.atleast_1d(np.asarray(entry.get(tree), float))
+    std_z = np.sqrt(np.diag(block))
+    center = np.asarray(d.to_si(prior_mean))
+    if d.tied:
+        rng = np.random.default_rng(0)
+        spread = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
+        draws = np.asarray(d.to_si(spread))
+        low, high = np.quantile(draws, [0.05, 0.95], axis=0)
+        std = draws.std(axis=0)
+        wide = np.full(entry.size, prior_std.mean() / entry.size)
+    else:
+        most = LARGEST if d.logarithmic else np.inf
+        ends = (np.minimum(mean + k * std_z, most) for k in (-Z95, Z95))
+        low, high = (np.asarray(d.to_si(end)) for end in ends)
+        std = d.slope(value) * std_z
+        wide = d.slope(center) * prior_std
+    scaled = block / prior_std[:, None] / prior_std[None, :]
+    ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
+    pull = (mean - prior_mean) / prior_std
+    pairs = tuple(zip(low.tolist(), high.tolist(), strict=True))
+    forced = None
+    if entry.path in NEEDS_VOLTAGE and not has_voltage:
+        forced = "not_identified"
+    elif _at_bound(d, value, pull, prior_std):
+        forced = "at_bound"
+    verdict, provenance = said(ratio, from_zero(d, std_z), forced, is_flat)
+    return Estimate(
+        path=entry.path,
+        unit=d.unit,
+        doc=d.doc,
+        labels=entry.labels,
+        value=plain(value),
+        std=plain(std),
+        interval90=pairs[0] if len(pairs) == 1 else pairs,
+        verdict=verdict,
+        provenance=provenance,
+        ratio=ratio,
+        pull=float(pull[np.argmax(np.abs(pull))]),
+        prior_mean=plain(center),
+        prior_std=plain(wide),
+    )
+
+
+def _at_bound(d: Declaration, value: np.ndarray, pull: np.ndarray, prior_std: np.ndarray) -> bool:
+    if d.shares or not np.isfinite(d.lower):
+        return False
+    if np.isfinite(d.upper):
+        part = (value - d.lower) / (d.upper - d.lower)
+        return bool(((part < 0.01) | (part > 0.99)).any())
+    return bool(((pull < -TAIL) & (pull * prior_std < np.log(SMALL))).any())
+
+
+def from_zero(declaration: Declaration, std_z: Float[np.ndarray, " coordinate"]) -> float:
+    """Stds by which a positive number is away from 0, from that of its logarithm; else infinite."""
+    positive = np.isfinite(declaration.lower) and not np.isfinite(declaration.upper)
+    return float(1 / std_z.max()) if positive and not declaration.shares else np.inf
+
+
+def by_ratio(ratio: float, from_zero: float = np.inf) -> str:
+    """Verdict of std(posterior) / std(prior), and of how many stds a positive number is from 0."""
+    if ratio < IDENTIFIED and from_zero >= FROM_ZERO:
+        return "identified"
+    return "weak" if ratio < WEAK else "not_identified"
+
+
+def said(ratio: float, from_zero: float, forced: str | None, is_flat: bool) -> tuple[str, str]:
+    """Verdict and provenance of a number, after a fit as after sampling.
+
+    Below 1/sqrt(2) the data hold more information than the prior. A number that moves along a
+    direction which the data leave open is known as part of a ratio at most: however narrow its
+    interval, another number's prior decides on its scale.
+
+    Args:
+        ratio: std(posterior) / std(prior).
+        from_zero: stds by which a positive number is from 0.
+        forced: verdict that no interval changes.
+        is_flat: whether it moves along an open direction.
+    """
+    verdict = forced or by_ratio(ratio, from_zero)
+    if is_flat and verdict == "identified":
+        verdict = "weak"
+    held = verdict != "not_identified" and ratio < np.sqrt(0.5) and not is_flat
+    return verdict, "measured" if held else "borrowed"
+
+
+def derived(space: Space, z: Search, covariance: Square, has_voltage: bool) -> tuple[Estimate, ...]:
+    """`RATIOS` with interval and verdict: the log of each is a difference of coordinates.
+
+    Its std under the posterior, sqrt(c^T C c) with c = (.., 1, .., -1, ..), is compared with that
+    under the prior.
+    """
+    return tuple(
+        _quotient(space, wanted, over.path, z, covariance, has_voltage)
+        for wanted in RATIOS
+        for over in space.free
+        if over.quantity == wanted.over and wanted.under in space.place
+    )
+
+
+def _quotient(
+    space: Space, wanted: Ratio, over: str, z: np.ndarray, covariance: np.ndarray, has_voltage: bool
+) -> Estimate:
+    c = np.zeros(len(z))
+    c[space.place[over]], c[space.place[wanted.under]] = 1.0, -1.0
+    log_value, log_prior = c @ z, c @ space.prior_mean
+    std = float(np.sqrt(c @ covariance @ c))
+    prior_std = float(np.sqrt(np.sum((c * space.prior_std) ** 2)))
+    value, ratio = float(np.exp(log_value)), std / prior_std
+    forced = "not_identified" if over == NEEDS_VOLTAGE[0] and not has_voltage else None
+    verdict, provenance = said(ratio, 1 / std, forced, is_flat=False)
+    low, high = (float(np.exp(min(log_value + k * std, LARGEST))) for k in (-Z95, Z95))
+    return Estimate(
+        path=f"{over}/{wanted.under}",
+        unit=wanted.unit,
+        doc=wanted.doc,
+        value=value,
+        std=value * std,
+        interval90=(low, high),
+        verdict=verdict,
+        provenance=provenance,
+        ratio=ratio,
+        pull=float((log_value - log_prior) / prior_std),
+        prior_mean=float(np.exp(log_prior)),
+        prior_std=float(np.exp(log_prior)) * prior_std,
+    )

@@ -1,0 +1,249 @@
+"""Profile likelihood of one number: how much worse the data fit when it is held elsewhere.
+
+With -log posterior f and the other numbers eta,
+
+    F(theta) = min over eta of f(theta, eta),    D(theta) = F(theta) - F at its minimum
+
+D is half a squared distance where Laplace is right; the 90 % interval of the likelihood is where
+D, less what the number's own prior puts into it, stays below chi2_1(0.9) / 2 = 1.353.
+
+Source: Venzon and Moolgavkar 1988 (Applied Statistics 37(1)); Raue et al. 2009 (Bioinformatics
+25(15)): a profile that stays level tells a number that is not identifiable.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.stats import chi2
+
+from slipid.fit.optimise import Optimum, optimise
+from slipid.fit.problem import Problem, State
+from slipid.fit.variances import MOTIONS
+from slipid.infer.verdicts.estimates import NEEDS_VOLTAGE
+from slipid.parameter import Entry
+from slipid.search_space import Space
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RISE = float(chi2.ppf(0.9, 1)) / 2
+"""Rise of minus log likelihood at the ends of the 90 % interval."""
+_ENOUGH, _TOO_FAR = 1.5 * RISE, 3 * RISE
+"""Rise at which a side is done, and the one that tells that an interval's end was stepped over."""
+_FAR = 3.0
+"""A side ends so many prior stds from the prior mean: beyond it, nobody expects the number."""
+_LEAST, _MOST = 0.1, 24
+"""Laplace stds below which no step is halved, and points on a side."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Profile likelihood of one number; `print` says in a sentence what it tells.
+
+    Attributes:
+        path, unit: of the number.
+        value: where it was held, rising [unit].
+        posterior: D at each, the number's own prior included.
+        likelihood: the same without it, 0 at its lowest.
+        laplace: the parabola of the Laplace posterior in the search space, given what `given` says.
+        estimate: of the fit.
+        interval90: of the likelihood, None on a side that is open.
+        ends: per side, `closed`, `open` (level as far as the prior reaches) or `at_bound` (level
+            towards the number's bound, which then ends the interval).
+        given: numbers that were held at the fit's, in words; empty where all were refitted.
+        settled: whether every refit converged.
+        said: the same for people, one sentence.
+    """
+
+    path: str
+    unit: str
+    value: tuple[float, ...]
+    posterior: tuple[float, ...]
+    likelihood: tuple[float, ...]
+    laplace: tuple[float, ...]
+    estimate: float
+    interval90: tuple[float | None, float | None]
+    ends: tuple[str, str]
+    given: str
+    settled: bool
+    said: str
+
+    def __str__(self) -> str:
+        return self.said
+
+    def plot(self) -> "Figure":
+        """How fast the fit gets worse when the number is held elsewhere."""
+        from slipid.plots.posterior import profile_figure
+
+        return profile_figure([self])
+
+
+def profiled(space: Space, path: str) -> Entry:
+    """The free scalar of a path.
+
+    Raises:
+        ValueError: no such number, fixed, or a vector; names the choices.
+    """
+    can = {e.path: e for e in space.free if e.size == 1}
+    if path not in can:
+        why = {e.path: f"{path} is fixed" for e in space.all}
+        why |= {e.path: f"{path} has {e.size} numbers" for e in space.free}
+        said = why.get(path, f"no parameter '{path}'")
+        raise ValueError(f"{said}; a profile is of one free number: {', '.join(can)}")
+    return can[path]
+
+
+def profile(
+    problem: Problem,
+    optimum: Optimum,
+    path: str,
+    tell: Callable[[int, float], None] = lambda points, rise: None,
+) -> Profile:
+    """Profile of a number about the end of a fit; every other number is fitted again at each point.
+
+    The noise keeps the variances of the fit. Where currents were logged, a number that
+    currents tell is profiled given the motion, and one of the motion by the motion's likelihood:
+    Laplace's parabola beside it is then the one of the same question. `tell` is called after every
+    point with their number and the rise there.
+    """
+    entry = profiled(problem.space, path)
+    at = problem.space.place[path].start
+    walk = _Walk(problem, optimum, at, tell)
+    points = sorted([*walk.side(-1.0), *walk.side(1.0), (walk.start, walk.lowest)])
+    z = np.array([p[0] for p in points])
+    posterior = np.array([p[1] for p in points])
+    own = 0.5 * ((z - problem.space.prior_mean[at]) / problem.space.prior_std[at]) ** 2
+    likelihood = posterior - own
+    posterior, likelihood = posterior - posterior.min(), likelihood - likelihood.min()
+    d = entry.declaration
+
+    def si(x: float) -> float:
+        return float(np.asarray(d.to_si(jnp.atleast_1d(jnp.asarray(float(x))))).reshape(()))
+
+    low = int(np.argmin(likelihood))
+    sides = (slice(low, None, -1), slice(low, None))
+    cross = [_crossing(z[side], likelihood[side]) for side in sides]
+    ends = ["open" if x is None else "closed" for x in cross]
+    interval = [None if x is None else si(x) for x in cross]
+    for k, bound in enumerate((d.lower, d.upper)):
+        if ends[k] == "open" and ends[1 - k] == "closed" and np.isfinite(bound):
+            ends[k], interval[k] = "at_bound", float(bound)
+    return Profile(
+        path=entry.path,
+        unit=d.unit,
+        value=tuple(si(x) for x in z),
+        posterior=tuple(posterior.tolist()),
+        likelihood=tuple(likelihood.tolist()),
+        laplace=tuple((0.5 * ((z - walk.start) / walk.std) ** 2).tolist()),
+        estimate=si(walk.start),
+        interval90=(interval[0], interval[1]),
+        ends=(ends[0], ends[1]),
+        given="" if problem.target.joint or walk.of_motion else "the motion as fitted",
+        settled=walk.settled,
+        said=_sentence(entry, interval, ends, problem.windows.has_voltage)
+        + ("" if walk.settled else "; some refits did not settle: it may be wider"),
+    )
+
+
+class _Walk:
+    """Refits along one coordinate, each from where its neighbour ended."""
+
+    def __init__(
+        self, problem: Problem, optimum: Optimum, at: int, tell: Callable[[int, float], None]
+    ):
+        self.problem, self.at, self.tell = problem, at, tell
+        self.free, self.of_motion = np.ones(problem.space.size), False
+        covariance = optimum.covariance
+        if not problem.target.joint:
+            electric = problem.space.electric
+            self.of_motion = not electric[at]
+            mine = electric == electric[at]
+            self.free = mine.astype(float)
+            if not self.of_motion:  # given the motion: a block of the information
+                held = np.where(mine[:, None] & mine, np.linalg.inv(covariance), np.eye(len(mine)))
+                covariance = np.linalg.inv(held)
+        self.free[at] = 0.0
+        self.std = float(np.sqrt(covariance[at, at]))
+        self.start, self.state = float(optimum.state.z[at]), optimum.state
+        self.fitted = optimum.state
+        self.count, self.settled = 0, True
+        self.electric = problem.electric(optimum.state.z, optimum.state.log_variance)
+        self.lowest = self.loss(optimum.state)
+
+    def loss(self, state: State) -> float:
+        """Minus log posterior at fixed noise, of the motion alone where that is the question."""
+        problem, log_v = self.problem, state.log_variance
+        blocks, _ = problem.linear(jnp.asarray(state.z), self.electric)
+        if self.of_motion:
+            blocks = {k: r for k, r in blocks.items() if k in MOTIONS}
+        keep = problem.every
+        moving = problem.target.joint or self.of_motion
+        effect = (state if moving else self.fitted).shared(len(problem.windows))
+        seen = problem.seen(blocks, log_v, keep, effect)
+        return problem.loss(state.z, log_v, keep, seen, self.electric)
+
+    def side(self, sign: float) -> list[tuple[float, float]]:
+        """Points from the estimate outward until the data object or the prior ends."""
+        points: list[tuple[float, float]] = []
+        state, step, before = self.state, 0.5 * self.std, 0.0
+        mean, wide = self.problem.space.prior_mean[self.at], self.problem.space.prior_std[self.at]
+        base = self.lowest - 0.5 * ((self.start - mean) / wide) ** 2
+        reach = max(sign * mean + _FAR * wide, sign * self.start + _FAR * self.std)
+        growth = 1.5
+        while len(points) < _MOST:
+            z = np.array(state.z)
+            z[self.at] += sign * step
+            if sign * z[self.at] > reach:
+                break
+            held = replace(state, z=z, round=0)
+            end = optimise(
+                self.problem, start=held, most_rounds=12, free=self.free, variances=False
+            )
+            loss = self.loss(end.state)
+            points.append((float(z[self.at]), loss))
+            self.settled &= end.converged
+            rise = loss - 0.5 * ((z[self.at] - mean) / wide) ** 2 - base
+            self.count += 1
+            self.tell(self.count, rise)
+            if rise > _TOO_FAR and before < RISE and step > _LEAST * self.std:
+                step, growth = 0.5 * step, 1.0
+                continue
+            if rise > _ENOUGH:
+                break
+            if rise - before < 0.2 * RISE:
+                step *= growth
+            state, before = end.state, rise
+        return points
+
+
+def _crossing(z: np.ndarray, rise: np.ndarray) -> float | None:
+    """Where the rise, going outward, first reaches `RISE`; monotone cubic between points."""
+    above = np.flatnonzero(rise >= RISE)
+    if not above.size:
+        return None
+    k = int(above[0])
+    away = np.abs(z[: k + 1] - z[0])
+    [*_, place] = PchipInterpolator(away, rise[: k + 1] - RISE).roots(extrapolate=False)
+    return float(z[0] + np.sign(z[k] - z[0]) * place)
+
+
+def _sentence(
+    entry: Entry, interval: list[float | None], ends: list[str], has_voltage: bool
+) -> str:
+    unit = "" if entry.declaration.unit == "1" else f" {entry.declaration.unit}"
+    low, high = (None if x is None else f"{x:.4g}{unit}" for x in interval)
+    if "at_bound" in ends:
+        side = f"below {high}" if ends[0] == "at_bound" else f"above {low}"
+        return f"{entry.path} is at its bound: the data only put it {side} (90 %)"
+    if low is None and high is None:
+        return f"{entry.path}: the data do not tell it, their likelihood is level across the prior"
+    if entry.path in NEEDS_VOLTAGE and not has_voltage:
+        return f"{entry.path}: no voltage is logged, its limits are those of other numbers' priors"
+    if low is None or high is None:
+        side = f"below {high}" if low is None else f"above {low}"
+        return f"{entry.path}: the data only put it {side} (90 %), the other side is level"
+    return f"{entry.path}: the data put it between {low} and {high} (90 %)"

@@ -1,0 +1,223 @@
+"""Directions of the parameter space in words, and what would tell the numbers in them apart."""
+
+from collections.abc import Mapping, Sequence, Set
+from typing import NamedTuple
+
+import numpy as np
+
+from slipid.infer.verdicts.estimates import NEEDS_VOLTAGE
+from slipid.model.robot import Validity
+from slipid.parameter import Entry
+
+_LARGE = 10.0
+"""Powers that differ more are no formula for people."""
+_SAME = 0.05
+"""Powers that differ less are one."""
+
+NOTHING = "the data say next to nothing of "
+SMALL = ", while others move a little"
+
+
+class Axis(NamedTuple):
+    """One coordinate of the search space, the number it is of, and what people call it.
+
+    The unit is of a step along it; a step of a logarithm multiplies the number.
+    """
+
+    entry: Entry
+    label: str
+    unit: str
+    is_log: bool
+
+
+def axes_of(entry: Entry) -> list[Axis]:
+    """The coordinates of a free number, of shares the log ratios that their basis is made of."""
+    d = entry.declaration
+    unit = "log-odds" if np.isfinite(d.upper) else d.unit
+    is_log = bool(np.isfinite(d.lower) and not np.isfinite(d.upper))
+    if entry.size == 1:
+        return [Axis(entry, entry.path, unit, is_log)]
+    if d.shares:
+        wheels = [", ".join(map(str, range(1, k))) for k in range(2, entry.size + 1)]
+        before = ["wheel 1", *(f"wheels {several}" for several in wheels[1:])]
+        each = [f"{entry.path} ({first} : wheel {k})" for k, first in enumerate(before, start=2)]
+        return [Axis(entry, label, d.unit, True) for label in each]
+    labels = entry.labels[: entry.coordinates]
+    return [Axis(entry, f"{entry.path} [{label}]", unit, is_log) for label in labels]
+
+
+def formula(axes: list[Axis], power: np.ndarray, step: np.ndarray) -> str:
+    """Direction in words: powers relative to the largest, step of one prior std."""
+    names = [axis.label for axis in axes]
+    if len(axes) == 1:
+        return NOTHING + names[0]
+    if all(axis.is_log for axis in axes) and np.ptp(np.log(np.abs(power))) < np.log(_LARGE):
+        return _product(axes, power)
+    if not any(axis.is_log for axis in axes) and len({axis.unit for axis in axes}) == 1:
+        return _sum(names, power)
+    moves = [
+        f"{axis.label} x {np.exp(s):.4g}" if axis.is_log else f"{axis.label} {s:+.2g} {axis.unit}"
+        for axis, s in zip(axes, step, strict=True)
+    ]
+    return f"nearly unseen if together: {', '.join(moves)}"
+
+
+def _product(axes: list[Axis], power: np.ndarray) -> str:
+    names = [axis.label for axis in axes]
+    if (np.abs(power - 1) < _SAME).all():
+        short = _short(axes)
+        last = NEEDS_VOLTAGE[1] if NEEDS_VOLTAGE[1] in short else short[0]
+        return f"{', '.join(short)} only as {', '.join(f'{p}/{last}' for p in short if p != last)}"
+    if len(names) == 2:
+        k = float(power[1] / power[0])  # b / a^k does not change
+        first, other = names if abs(k) >= 1 else names[::-1]
+        k = k if abs(k) >= 1 else 1 / k
+        held = _power(first, abs(k))
+        held = f"{held} * {other}" if k < 0 else f"{other} / {held}"
+        return f"{names[0]} and {names[1]} only as {held}"
+    if (np.abs(np.abs(power) - 1) < _SAME).all():
+        up, down = (
+            listed([n for n, k in zip(names, power, strict=True) if s * k > 0]) for s in (1, -1)
+        )
+        return f"unseen for any factor: {up} times it, {down} divided by it"
+    parts = [
+        f"{name} {'times' if k > 0 else 'divided by'} {_power('t', abs(k))}"
+        for name, k in zip(names, power, strict=True)
+    ]
+    return f"unseen for any factor t: {', '.join(parts)}"
+
+
+def _power(name: str, k: float) -> str:
+    return name if abs(k - 1) < _SAME else f"{name}^{k:.2g}"
+
+
+def _sum(names: list[str], weight: np.ndarray) -> str:
+    if (np.abs(weight - 1) < _SAME).all():
+        return f"{', '.join(names)} only as their differences"
+    if len(names) == 2:
+        k = float(weight[1] / weight[0])  # b - k a does not change
+        first, other = names if abs(k) >= 1 else names[::-1]
+        k = k if abs(k) >= 1 else 1 / k
+        times = "" if abs(abs(k) - 1) < _SAME else f"{abs(k):.2g} "
+        sign = "+" if k < 0 else "-"
+        return f"{names[0]} and {names[1]} only as {other} {sign} {times}{first}"
+    parts = [f"{n} {k:+.2g} t" for n, k in zip(names, weight, strict=True)]
+    return f"unseen for any t: {', '.join(parts)}"
+
+
+def _short(axes: list[Axis]) -> list[str]:
+    """Their names, with one pattern in place of the frictions of several floors."""
+    others = [axis.label for axis in axes if axis.entry.quantity != "surface.friction"]
+    several = len(axes) - len(others) > 1
+    return [*others, "surface.*.friction"] if several else [axis.label for axis in axes]
+
+
+VOLTAGE = "log the motor voltage (or duty and bus voltage)"
+_SCALE = ("motor.resistance", "motor.back_emf", "motor.efficiency", "motor.brush_drop")
+_DRAG = ("motor.coulomb_friction", "motor.viscous_friction")
+_FLOOR = "surface"
+_CAMERA = (
+    (
+        ("camera.scale", "robot.wheel_radius"),
+        "measure the wheel radius, or a length in the camera's picture, motion tells no more",
+    ),
+    (
+        ("camera.marker_yaw", "robot.drive_offset"),
+        "measure how the marker stands on the body, no motion tells them apart",
+    ),
+    (("camera.scale", _FLOOR), "add a floor on which the wheels do not slip"),
+    (("robot.wheel_radius", _FLOOR), "add a floor on which the wheels do not slip"),
+    (("robot.base_radius",), "turn on the spot"),
+    (("camera.marker_place",), "turn on the spot in view of the camera"),
+    (("camera.lag",), "start, stop and change speed in view of the camera"),
+    *(
+        ((f"camera.{name}",), "drive across the whole picture, its corners included")
+        for name in ("tilt", "radial", "tangential")
+    ),
+    (("camera.scale",), "measure a length in the camera's picture"),
+    (("robot.wheel_radius",), "measure the wheel radius"),
+)
+"""Quantities that must all occur (any of a floor) and what helps; the first that fits counts."""
+FEW_HEADINGS = 4
+"""Directions of travel, opposite ones counted as two, below which more are asked for."""
+TURNING = 0.05
+"""Yaw rate by the encoders from which a run is a curve [rad/s]."""
+LITTLE_SLIP = 0.03
+"""Slip below which a floor is hardly felt."""
+SPEEDS_DIFFER = 1.3
+"""Factor between two speeds from which they count as two."""
+
+
+def remedy(
+    found: Sequence[Entry],
+    has_current: bool,
+    has_voltage: bool,
+    validity: Mapping[str, Validity],
+    sideways: bool = True,
+) -> str:
+    """What to log or to drive for numbers that are open, by what each floor was driven with.
+
+    `sideways` is whether the robot can drive in any direction.
+    """
+    quantities = {e.quantity for e in found}
+    electric = all(e.declaration.electric or e.quantity == "robot.mass" for e in found)
+    if electric or quantities & {*_SCALE}:
+        return _electric(quantities, has_current, has_voltage, validity)
+    if any(e.surface is not None for e in found):
+        quantities.add(_FLOOR)
+    for needed, text in _CAMERA:
+        if quantities.issuperset(needed):
+            return text
+    return _runs(found, validity, sideways)
+
+
+def _electric(
+    quantities: Set[str], has_current: bool, has_voltage: bool, validity: Mapping[str, Validity]
+) -> str:
+    if not has_current:
+        return f"log the motor currents, and {VOLTAGE.removeprefix('log ')}"
+    if not has_voltage and quantities & {*_SCALE}:
+        return VOLTAGE
+    if quantities & {*_DRAG} and not any(_speeds(v) > 1 for v in validity.values()):
+        return "drive at other speeds"
+    return "drive with other loads and speeds, or weigh the robot"
+
+
+def _runs(found: Sequence[Entry], validity: Mapping[str, Validity], sideways: bool) -> str:
+    """What to drive for numbers of floors, loads and marker, by what was driven."""
+    floors = {e.surface for e in found if e.surface is not None}
+    loads = {e.load for e in found if e.load is not None}
+    mine = [
+        v
+        for floor, v in validity.items()
+        if (floor in floors if floors else not loads or loads & set(v.loads))
+    ]
+    where = " there" if floors else " with that load" if loads else ""
+    said = []
+    headings = sorted({h for v in mine for h in v.headings_deg})
+    if sideways and len(headings) < FEW_HEADINGS:
+        seen = f" than {', '.join(f'{h:g}' for h in headings)} deg" if headings else ""
+        said.append(f"in other directions{seen}")
+    if any(_speeds(v) < 2 for v in mine) or not mine:
+        said.append("at other speeds")
+    if max((v.yaw_rate[1] for v in mine), default=0.0) < TURNING:
+        said.append("in curves" if sideways else "in curves and on the spot")
+    slip = max((v.slip[1] for v in mine), default=1.0)
+    if floors and slip < LITTLE_SLIP:
+        said.append(f"loaded unevenly (wheels slip by {slip:.1%} at most, so it hardly matters)")
+    if not said and loads:
+        return "weigh each wheel"
+    return f"drive{where} {listed(said) if said else 'more often'}"
+
+
+def listed(parts: Sequence[str]) -> str:
+    """The parts as a sentence lists them."""
+    return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]
+
+
+def _speeds(seen: Validity) -> int:
+    count, last = 0, 0.0
+    for speed in np.sort(np.asarray(seen.speeds, float)):
+        if speed > SPEEDS_DIFFER * max(last, 1e-3):
+            count, last = count + 1, float(speed)
+    return count

@@ -1,0 +1,1 @@
+"""Everything that judges: test site, self test, trial, benchmark, published systems, the 2021 paper."""

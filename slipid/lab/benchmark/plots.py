@@ -1,0 +1,70 @@
+"""End-point errors of every row, protocol by protocol."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from slipid.plots import drawing
+from slipid.support.files import Content
+
+TICKS = [m * 10.0**k for k in range(-2, 4) for m in (1, 2, 5)]
+"""Of a logarithmic axis of errors [%]."""
+OWN = "slipid"
+"""Rows whose names begin with it are drawn in colour."""
+
+
+def benchmark_pictures(found: Content) -> dict[str, bytes]:
+    """A picture in the bytes of a PNG file for every data set of benchmark.json, by its name."""
+    made = {n: benchmark_figure(one, found["protocols"], n) for n, one in found["sets"].items()}
+    return {name: drawing.png(figure) for name, figure in made.items() if figure is not None}
+
+
+def benchmark_figure(one: Content, about: Content, name: str) -> Figure | None:
+    """A panel per protocol of one data set: mean end-point error with its 90 % interval.
+
+    Args:
+        one: of a data set in benchmark.json.
+        about: protocols in words.
+        name: of the data set.
+    """
+    protocols = {
+        protocol: ends
+        for protocol, rows in one["protocols"].items()
+        if (ends := {n: row["endpoint_error"] for n, row in rows.items() if row["endpoint_error"]})
+    }
+    if not protocols:
+        return None
+    rows = max(len(ends) for ends in protocols.values())
+    made, axes = drawing.panels(
+        len(protocols),
+        4.6,
+        1.4 + 0.24 * rows,
+        f"{name}: {one['about']}\nmean end-point error over the {one['over']}, 90 % intervals",
+    )
+    for ax, (protocol, ends) in zip(axes, protocols.items(), strict=True):
+        _panel(ax, ends)
+        ax.set_title(about[protocol], fontsize=9, loc="left", wrap=True)
+    return made
+
+
+def _panel(ax: Axes, ends: Mapping[str, Sequence[float]]) -> None:
+    order = sorted(ends, key=lambda row: -ends[row][0])
+    for k, row in enumerate(order):
+        middle, low, high = (100 * x for x in ends[row])
+        colour = drawing.ORANGE if row.startswith(OWN) else drawing.BLUE
+        ax.plot([low, high], [k, k], color=colour, lw=1.5)
+        ax.plot(middle, k, "o", color=colour, ms=4)
+    ax.set_yticks(np.arange(len(order)), order, fontsize=7)
+    for label in ax.get_yticklabels():
+        if label.get_text().startswith(OWN):
+            label.set_color(drawing.ORANGE)
+            label.set_fontweight("bold")
+    ax.set_xscale("log")
+    ax.set_xlabel("end-point error, %")
+    low, high = ax.get_xlim()
+    ticks = [t for t in TICKS if low <= t <= high]
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    ax.minorticks_off()
+    ax.set_ylim(-0.7, len(order) - 0.3)

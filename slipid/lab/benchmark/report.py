@@ -1,0 +1,286 @@
+"""The tables of the benchmark on a terminal.
+
+The benchmark as one page of HTML, with its pictures inside.
+"""
+
+from base64 import b64encode
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.text import Text
+
+from slipid.report.page import Page, table
+from slipid.support.files import Content, write_bytes
+
+COLUMNS: Mapping[str, tuple[str, float, int]] = {
+    "endpoint_error": ("end point, %", 100.0, 1),
+    "behind": ("minus slipid's", 100.0, 1),
+    "length_error": ("length, %", 100.0, 1),
+    "heading_error_deg": ("heading, deg", 1.0, 1),
+    "twist_error": ("twist, mm/s", 1000.0, 0),
+    "coverage90": ("in 90 %", 100.0, 0),
+    "slip_auc": ("slip AUC", 1.0, 2),
+    "floor_accuracy": ("floor, %", 100.0, 0),
+    "energy_error": ("energy, %", 100.0, 0),
+}
+"""Heading, factor and places of each number of a row."""
+ENDS = ("endpoint_error", "behind")
+"""Numbers that are shown with their 90 % interval."""
+ON_THE_PAGE = ("length_error", "twist_error")
+"""Numbers for which a terminal is too narrow."""
+
+
+def show_benchmark(page: Page, found: Content) -> None:
+    """Write every table, best rows first, and what they say."""
+    for name, one in found["sets"].items():
+        for protocol, rows in one["protocols"].items():
+            about = found["protocols"][protocol]
+            title = f"\n{name}: {about}; end points over the {one['over']}"
+            brief = [number for number in shown(rows) if number not in ON_THE_PAGE]
+            head = ("row", *headings(brief), *COSTS[1:])
+            made = table(head, title, right=head[1:])
+            for row, content in ranked(rows):
+                made.add_row(Text(row), *cells(content, brief), *costs(content)[1:])
+            for column in made.columns:
+                column.no_wrap = True
+            page.table(made)
+            page.notes(absent(rows))
+    for name, one in others(found):
+        if one.said:
+            page.line(f"\n{name}: {one.said}")
+            continue
+        made = table(one.head, f"\n{one.title}", right=one.head[1:])
+        for of_row in one.body:
+            made.add_row(*of_row)
+        page.table(made)
+    page.line()
+    for sentence in found["reading"]:
+        page.line(sentence)
+
+
+COSTS = ("numbers", "fit, s", "step, us")
+
+
+def ranked(rows: Content) -> list[tuple[str, Content]]:
+    """Rows that are there, the least end-point error first."""
+    there = [(name, one) for name, one in rows.items() if one["endpoint_error"] is not None]
+    return sorted(there, key=lambda item: item[1]["endpoint_error"][0])
+
+
+def shown(rows: Content) -> list[str]:
+    """Numbers that some row has."""
+    return [name for name in COLUMNS if any(row[name] is not None for row in rows.values())]
+
+
+def headings(numbers: Sequence[str]) -> list[str]:
+    """Of numbers by their names."""
+    return [COLUMNS[name][0] for name in numbers]
+
+
+def cells(row: Content, numbers: Sequence[str]) -> list[str]:
+    """Numbers of a row in words."""
+    return [in_words(name, row[name]) for name in numbers]
+
+
+def in_words(name: str, value: Sequence[float] | None) -> str:
+    """A number, with its interval where it is one of `ENDS`; nothing where it is not known."""
+    if value is None:
+        return ""
+    _, factor, places = COLUMNS[name]
+    sign = "+" if name == "behind" else ""
+    middle, low, high = (f"{factor * x:{sign}.{places}f}" for x in value)
+    return f"{middle} [{low}, {high}]" if name in ENDS else middle
+
+
+def costs(row: Content) -> list[str]:
+    """Fitted numbers, seconds to fit, microseconds a step."""
+    fit, step = row["fit_s"], row["step_us"]
+    seconds = "< 0.1" if fit < 0.1 else f"{fit:.1f}" if fit < 10 else f"{fit:.0f}"
+    return [str(row["numbers"]), seconds, f"{step:.1f}" if step < 10 else f"{step:.0f}"]
+
+
+def absent(rows: Content) -> list[str]:
+    """Why rows are not in a table or not to be trusted, rows of one reason together."""
+    why: dict[str, list[str]] = {}
+    for name, row in rows.items():
+        if row["unconverged"]:
+            why.setdefault(f"fits did not come to rest: {row['unconverged']}", []).append(name)
+        if row["absent"]:
+            why.setdefault(("failed: " if row["failed"] else "") + row["absent"], []).append(name)
+    return [f"{', '.join(names)}: {reason}" for reason, names in why.items()]
+
+
+class Other(NamedTuple):
+    """A part of benchmark.json that is one table, or why there is none."""
+
+    title: str
+    head: tuple[str, ...]
+    body: list[tuple[str, ...]]
+    said: str = ""
+
+
+def others(found: Content) -> list[tuple[str, Other]]:
+    """Tables beside those of the data sets, by their names."""
+    parts: list[tuple[str, Content, Callable[[Content], Other]]]
+    parts = [(name, one, felt) for name, one in found["floors"].items()]
+    if found["rectangle"] is not None:
+        parts.append(("rectangle", found["rectangle"], rectangle))
+    return [
+        (name, Other("", (), [], f"failed: {one['failed']}") if "failed" in one else made(one))
+        for name, one, made in parts
+    ]
+
+
+def rectangle(driven: Content) -> Other:
+    """Controllers of the trial, the least closure error first."""
+    plant = {"testsite": "the virtual test site", "twin": "the identified model itself"}
+    runs = min(row["runs"] for row in driven["summary"].values())
+    title = f"rectangle on {plant[driven['plant']]}, {runs} starts, medians with 90 % intervals"
+    head = ("controller", "closure, mm", "of encoders', %", "finished, %", "cross-track, mm")
+    rows = sorted(driven["summary"].items(), key=lambda item: item[1]["closure_error_median"])
+    body: list[tuple[str, ...]] = []
+    for name, row in rows:
+        low, high = row["interval90"]["closure_error_median"]
+        ratio = row.get("to_encoder", {}).get("closure_error_median")
+        said = "" if ratio is None else f"{100 * ratio['value']:.0f}"
+        if ratio is not None and name != "encoder":
+            said += " [{:.0f}, {:.0f}]".format(*(100 * x for x in ratio["interval90"]))
+        closure = f"{row['closure_error_median']:.0f} [{low:.0f}, {high:.0f}]"
+        finished, cross = f"{100 * row['finished_share']:.0f}", f"{row['cross_track_rmse']:.0f}"
+        body.append((name, closure, said, finished, cross))
+    return Other(title, head, body)
+
+
+def felt(found: Content) -> Other:
+    """Classifiers: how often they are right, by the time heard; the best at the end first."""
+    chance = f"always naming the commonest floor is right in {100 * found['chance']:.0f} %"
+    title = f"{found['about']}; {found['runs']} runs; {chance}"
+    if lost := [f"{row['name']}: {row['absent']}" for row in found["rows"] if row["absent"]]:
+        title = f"{title}; failed: {'; '.join(lost)}"
+    rows = [row for row in found["rows"] if row["after"]]
+    seconds = [after["seconds"] for after in rows[0]["after"]] if rows else []
+    head = ("right, %, after", *(f"{x:g} s" for x in seconds), "points over slipid", "numbers")
+    body: list[tuple[str, ...]] = []
+    for row in sorted(rows, key=lambda row: -row["after"][-1]["accuracy"][0]):
+        right = [
+            "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * x for x in after["accuracy"]))
+            for after in row["after"]
+        ]
+        over = in_words("behind", row["after"][-1]["behind"])
+        body.append((row["name"], *right, over, str(row["numbers"])))
+    return Other(title, head, body)
+
+
+def picked(rows: Content) -> list[str]:
+    """Settings that cross-validation picked in each fold, of the rows that have some."""
+    return [
+        f"{name}: {'; '.join(dict.fromkeys(row['settings']))}"
+        for name, row in rows.items()
+        if any(row["settings"])
+    ]
+
+
+PAGE = "benchmark.html"
+LEGEND = (
+    "End point: distance between the predicted and the true end, over the chord or the path. "
+    "Minus slipid's: the difference on the same runs, below zero where the row is better. "
+    "Length: of the chord or the path. Heading: at the end. "
+    "Twist: root mean square in windows of half a second. "
+    "In 90 %: how many ends lie in the row's own 90 % region. "
+    "Slip AUC: area under the receiver operating characteristic of slip detection. "
+    "Floor: part of the time in which the right floor is named, or rightly none. "
+    "Energy: error of the electric energy of a run. "
+    "Numbers: how many are fitted. Fit, step: time to fit once, and to predict one step of a run."
+)
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 92rem; margin: 2rem auto }
+body { padding: 0 1rem }
+h2 { margin-top: 2.5rem; border-bottom: 1px solid #ccc } h3 { margin-bottom: .3rem }
+.wide { overflow-x: auto } img { max-width: 100% }
+table { border-collapse: collapse; font-size: 13px; white-space: nowrap }
+th, td { text-align: right; padding: .15rem .6rem; border-bottom: 1px solid #eee }
+th:first-child, td:first-child { text-align: left; font-family: monospace }
+tr.own { background: #fdeee3; font-weight: 600 } .note { color: #666; font-size: 13px }
+"""
+
+
+def write_page(found: Content, pictures: Mapping[str, bytes], out: Path) -> Path:
+    """Write the page of a benchmark's content below a folder; arguments as of `page`."""
+    path = out / PAGE
+    write_bytes(path, page(found, pictures).encode())
+    return path
+
+
+def page(found: Content, pictures: Mapping[str, bytes]) -> str:
+    """The whole page: what it says, then a picture and the tables of every data set.
+
+    Args:
+        found: content of benchmark.json.
+        pictures: PNG files by the name of the data set they show.
+    """
+    parts = [
+        "<!doctype html><html lang='en'><meta charset='utf-8'>",
+        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
+        f"<title>Slip methods compared</title><style>{STYLE}</style>",
+        "<h1>Slip methods compared</h1>",
+        "<p>Every row was fitted to the same runs and predicts others, from what the robot itself "
+        "measures; the pose is used once, at the start. Numbers in brackets are 90&nbsp;% "
+        "intervals by resampling runs; settings were picked on training runs alone.</p>",
+        f"<p class='note'>{escape(LEGEND)}</p>",
+        "<h2>What the tables say</h2><ul>",
+        *(f"<li>{escape(sentence)}</li>" for sentence in found["reading"]),
+        "</ul>",
+    ]
+    for name, one in found["sets"].items():
+        parts += _set(found, name, one, pictures.get(name))
+    for name, other in others(found):
+        parts.append(f"<h2>{escape(name.replace('_', ' '))}</h2>")
+        parts.append(f"<p>{escape(other.said or other.title)}</p>")
+        if not other.said:
+            parts.append(html_table(other.head, other.body))
+    parts.append(f"<p class='note'>{_versions(found)}</p></html>")
+    return "\n".join(parts)
+
+
+def _set(found: Content, name: str, one: Content, drawn: bytes | None) -> list[str]:
+    parts = [f"<h2>{escape(name)}</h2><p>{escape(one['about'])}; {one['runs']} runs</p>"]
+    if drawn is not None:
+        parts.append(picture(drawn, f"End-point errors on {name}"))
+    for protocol, rows in one["protocols"].items():
+        title = f"{protocol.replace('_', ' ')}: {found['protocols'][protocol]}"
+        parts.append(f"<h3>{escape(title)}</h3>")
+        numbers = shown(rows)
+        head = ("row", *headings(numbers), *COSTS)
+        body = [(row, *cells(content, numbers), *costs(content)) for row, content in ranked(rows)]
+        parts.append(html_table(head, body))
+        parts += [f"<p class='note'>{escape(line)}</p>" for line in absent(rows)]
+        if lines := picked(rows):
+            parts.append("<details class='note'><summary>settings picked, fold by fold</summary>")
+            parts += [*(f"<div>{escape(line)}</div>" for line in lines), "</details>"]
+    return parts
+
+
+def html_table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
+    """A table whose first column names the row; slipid's own rows stand out."""
+    lines = [
+        "<div class='wide'><table><tr>",
+        *(f"<th>{escape(cell)}</th>" for cell in head),
+        "</tr>",
+    ]
+    for row in body:
+        own = " class='own'" if row[0].startswith(("slipid", "contact")) else ""
+        lines.append(f"<tr{own}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
+    return "".join([*lines, "</table></div>"])
+
+
+def picture(png: bytes, said: str) -> str:
+    """A picture inside the page, with what it shows in words."""
+    data = b64encode(png).decode()
+    return f"<img alt='{escape(said)}' src='data:image/png;base64,{data}'>"
+
+
+def _versions(found: Content) -> str:
+    said = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+    return escape(f"{said}; this call took {found['seconds']:.0f} s")

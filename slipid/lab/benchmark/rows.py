@@ -1,0 +1,45 @@
+"""The rows of the benchmark's tables: every published system, in the order of its year or so."""
+
+from slipid.lab.paper2021.deployed_form import paper_rows
+from slipid.lab.systems.motion.gmdh import GmdhClass, GmdhOne
+from slipid.lab.systems.motion.learners import BoostedTrees, NeuralNetwork
+from slipid.lab.systems.motion.ojeda import ojeda_rows
+from slipid.lab.systems.motion.quann import QuannEnergy, QuannSlip
+from slipid.lab.systems.motion.reina import ReinaDeterministic, ReinaFuzzy
+from slipid.lab.systems.motion.ward_iagnemma import WardIagnemma
+from slipid.predict.kinematics import Corrected, Encoder, HeadingLookup
+from slipid.predict.slip_model import ByFloor, Machine, SlipModel
+
+KINEMATIC = ("effective_track", "instantaneous_centres")
+"""Rows for wheels that do not determine the twist."""
+
+
+def _every() -> list[SlipModel]:
+    """All methods, unfitted; those that handle floors themselves as they are."""
+    of_one_floor: list[SlipModel] = [
+        *(Corrected(name) for name in KINEMATIC),
+        ReinaDeterministic(),
+        ReinaFuzzy(),
+        WardIagnemma(),
+        WardIagnemma.with_current(),
+        QuannSlip(),
+        QuannEnergy(),
+        *paper_rows(),
+        HeadingLookup(),
+        BoostedTrees(),
+        NeuralNetwork(),
+    ]
+    by_floor = [ByFloor.of(method) for method in of_one_floor]
+    return [Encoder(), *ojeda_rows(), *by_floor, GmdhOne(), GmdhClass()]
+
+
+ROWS = tuple(method.name for method in _every())
+"""Their names."""
+
+
+def rows(machine: Machine) -> list[SlipModel]:
+    """Methods for a robot, unfitted; those that lack a channel they need are among them."""
+    every = _every()
+    if machine.determines_twist:
+        every = [method for method in every if method.name not in KINEMATIC]
+    return every

@@ -1,0 +1,195 @@
+"""The three camera tracks of figure 7: how far along the side, how crooked, how far from home.
+
+Everything the paper's data says, in one value: tables, tracks, transfer between surfaces.
+"""
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slipid.data.log import Log
+from slipid.lab.paper2021 import table as tables
+from slipid.lab.paper2021.samples import Transfer, leave_one_surface_out, read_columns
+from slipid.lab.paper2021.table import FittedForm, MotorTable, field_table, surface_tables
+from slipid.support.errors import DataError, bad_data
+
+
+@dataclass(frozen=True)
+class TrackFile:
+    """One camera track of the 2021 data set and how the paper describes it.
+
+    Args:
+        name: key in results.
+        label: what steered the robot.
+        square: how files in the folder figure7 call it: `square_<this>_camera.csv`.
+        authors_frames: camera frames of the first side, by the authors' own index.
+        side_frames: camera frames of the first side in this file, to where the robot turns off.
+        printed_path_length: length of the first side as the paper prints it [mm].
+    """
+
+    name: str
+    label: str
+    square: str
+    authors_frames: int
+    side_frames: int
+    printed_path_length: float
+
+
+# Encoders: by the authors' index the first side has 216 frames, but this track turns off at frame
+# 181. Their length script reads a variable of another name, most likely a repeat of the run.
+TRACK_FILES = (
+    TrackFile("encoders", "encoders only", "without_controller", 216, 181, 760.0),
+    TrackFile("slip_model", "slip model", "without_controller_with_compensation", 324, 324, 940.0),
+    TrackFile(
+        "compensation", "slip model and torque correction", "with_controller", 268, 268, 1031.0
+    ),
+)
+COMMANDED_SIDES = (900.0, 400.0)
+"""Sides of the commanded rectangle, forward and to the right [mm]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One camera track, with the numbers a reader of figure 7 asks for.
+
+    Args:
+        file: where it comes from.
+        time: [s], shape (frame,).
+        position: image x to the right and y down [mm], shape (frame, 2).
+        heading: heading as logged [deg], unwrapped, shape (frame,).
+    """
+
+    file: TrackFile
+    time: np.ndarray
+    position: np.ndarray
+    heading: np.ndarray
+
+    @property
+    def side(self) -> np.ndarray:
+        """Positions on the first side [mm]."""
+        return self.position[: self.file.side_frames]
+
+    @property
+    def path_length(self) -> float:
+        """Sum of the steps between frames on the first side [mm]; camera jitter adds to it.
+
+        The paper sums pose deltas logged by the robot, which are not in the data set.
+        """
+        return float(np.sum(np.hypot(*np.diff(self.side, axis=0).T)))
+
+    @property
+    def displacement(self) -> float:
+        """Way gained along the commanded side, image y [mm]."""
+        return float(abs(self.side[-1, 1] - self.side[0, 1]))
+
+    @property
+    def closure(self) -> float:
+        """Distance from the first to the last position of the whole track [mm]."""
+        return float(np.hypot(*(self.position[-1] - self.position[0])))
+
+    def as_dict(self) -> dict[str, float | str | int]:
+        """The numbers by name, units in the names."""
+        return {
+            "label": self.file.label,
+            "side_frames": self.file.side_frames,
+            "authors_frames": self.file.authors_frames,
+            "path_length_mm": self.path_length,
+            "path_length_printed_mm": self.file.printed_path_length,
+            "displacement_mm": self.displacement,
+            "closure_mm": self.closure,
+            "heading_start_deg": float(self.heading[0]),
+            "heading_end_deg": float(self.heading[-1]),
+        }
+
+
+def read_track(folder: Path, file: TrackFile) -> Track:
+    """One track of figure 7; DataError where the file is broken or ends within its first side."""
+    path = folder / "figure7" / f"square_{file.square}_camera.csv"
+    table = read_columns(path, "robotino2021_camera")
+    frames = len(table["time_s"])
+    if frames < file.side_frames:
+        expected = f"at least the {file.side_frames} of the first side"
+        raise bad_data(path, f"{frames} frames", expected)
+    return Track(
+        file=file,
+        time=table["time_s"],
+        position=np.stack([table["x_mm"], table["y_mm"]], axis=1),
+        heading=np.degrees(np.unwrap(np.radians(table["angle_deg"]))),
+    )
+
+
+SCHEMA = "slipid.paper2021/1"
+
+
+@dataclass(frozen=True, eq=False)
+class PaperResult:
+    """The paper regenerated.
+
+    Args:
+        field: figure 2, motor 1 over the whole site.
+        motors: figures 3 and 4 and their table, by motor.
+        tracks: figure 7.
+        transfer: one current curve across surfaces of the 2022 runs; None where they are absent.
+    """
+
+    field: MotorTable
+    motors: dict[int, MotorTable]
+    tracks: tuple[Track, ...]
+    transfer: Transfer | None
+
+    def as_dict(self) -> dict[str, object]:
+        """All numbers by name, ready for JSON."""
+        return {
+            "schema": SCHEMA,
+            "figure2": _table_dict(1, self.field),
+            "figures3and4": {f"motor{m}": _table_dict(m, t) for m, t in self.motors.items()},
+            "figure7": {track.file.name: track.as_dict() for track in self.tracks},
+            "deployed": {
+                "gain_per_A": tables.DEPLOYED_GAIN,
+                "offset": tables.DEPLOYED_OFFSET,
+                "threshold_A": tables.DEPLOYED_THRESHOLD,
+                "memory": tables.DEPLOYED_MEMORY,
+            },
+            "transfer": self.transfer and {**asdict(self.transfer), "mean": self.transfer.mean()},
+        }
+
+
+def find_folder(data: Path) -> Path:
+    """The 2021 data set under a data root, or the root itself; DataError if it is neither."""
+    for folder in (data / "robotino2021", data):
+        if (folder / "experimental_data_gray.csv").is_file():
+            return folder
+    raise DataError(
+        f"{data}: no 2021 data set; expected robotino2021/experimental_data_gray.csv below it, "
+        "or experimental_data_gray.csv in it"
+    )
+
+
+def regenerate(folder: Path, logs: Iterable[Log] | None = None) -> PaperResult:
+    """Compute the paper's numbers from its own data.
+
+    Args:
+        logs: the 2022 runs on one surface each, for the transfer between surfaces; None without.
+    """
+    return PaperResult(
+        field=field_table(folder),
+        motors=surface_tables(folder),
+        tracks=tuple(read_track(folder, file) for file in TRACK_FILES),
+        transfer=None if logs is None else leave_one_surface_out(logs),
+    )
+
+
+def _form_dict(form: FittedForm) -> dict[str, object]:
+    return asdict(form) | {"unit": "N m" if form.regressor == "torque" else "A"}
+
+
+def _table_dict(motor: int, table: MotorTable) -> dict[str, object]:
+    return {
+        "motor": motor,
+        "n": len(table.samples),
+        "n_by_surface": {name: len(part) for name, part in table.by_surface.items()},
+        "models": {name: _form_dict(form) for name, form in table.forms.items()},
+        "stored": None if table.stored is None else _form_dict(table.stored),
+    }

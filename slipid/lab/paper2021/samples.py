@@ -1,0 +1,239 @@
+"""Slip, current and torque of one motor, from the authors' half-second means, by their recipe.
+
+Does one curve of slip over current carry over to a surface unseen? The 2022 runs tell.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slipid.data.log import Log
+from slipid.data.reading.presets import preset
+from slipid.data.reading.table import read_table
+from slipid.data.wheel_signals import body_steps, first_moved
+from slipid.predict.ranking import errors_by_floor
+from slipid.support.errors import bad_data
+
+SURFACES = ("gray", "blue", "red")
+MOTORS = (1, 2, 3)
+
+_COMMAND = ("X axis speed, mm/s", "Y axis speed, mm/s", "Rotational speed, deg/s")
+_DELTA = ("Delta X, mm", "Delta Y, mm", "Delta angle, deg")
+_DELTA_RESCALED = ("dX_new", "dY_new", "dANG")
+_TO_SI = np.array([1e-3, 1e-3, np.pi / 180.0])
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Every choice the authors made between the logged columns and the points of a figure.
+
+    w_eff = n J v / r; s = 1 - w_eff / w; U = C_e w + R I sign(w); M = U I / w, with w and w_eff at
+    the motor shaft.
+
+    Args:
+        wheel_radius: r [m].
+        base_radius: L [m].
+        gear_ratio: n [-].
+        azimuth_deg: wheel centres seen from the body's x axis [deg].
+        resistance: R [ohm], as in the authors' scripts.
+        back_emf: C_e [V s/rad], as in the authors' scripts.
+        row_period: time each row's pose delta is divided by [s]; the rows are about 0.45 s apart.
+        delta_columns: pose deltas used, x, y [mm] and heading [deg].
+        drop_rotation: leave out rows with a rotation command.
+        speed_limit: rows with any |w_eff| at or above it are taken for camera jumps [rpm, motor].
+        min_current: samples at or below it are taken for idling [A].
+        max_torque: samples above it are left out [N m].
+    """
+
+    wheel_radius: float = 0.040
+    base_radius: float = 0.125
+    gear_ratio: float = 16.0
+    azimuth_deg: tuple[float, ...] = (60.0, 180.0, 300.0)
+    resistance: float = 5.3361
+    back_emf: float = 0.0501
+    row_period: float = 0.5
+    delta_columns: tuple[str, str, str] = _DELTA
+    drop_rotation: bool = True
+    speed_limit: float = 1500.0
+    min_current: float = 0.25
+    max_torque: float = 0.5
+
+    @property
+    def rim(self) -> np.ndarray:
+        """J: rim speed of each wheel [m/s] from the body twist, (wheel, 3)."""
+        azimuth = np.radians(self.azimuth_deg)
+        arm = np.full(len(azimuth), self.base_radius)
+        return np.stack([-np.sin(azimuth), np.cos(azimuth), arm], axis=1)
+
+
+FIGURES_3_AND_4 = Recipe()
+# The whole-field figure keeps turning rows and idling wheels and uses the re-calibrated deltas.
+FIGURE_2 = Recipe(
+    delta_columns=_DELTA_RESCALED,
+    drop_rotation=False,
+    speed_limit=np.inf,
+    min_current=-np.inf,
+    max_torque=np.inf,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Points of one motor: current [A], torque M [N m, motor] and slip [-], all (sample,)."""
+
+    current: np.ndarray
+    torque: np.ndarray
+    slip: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.slip)
+
+
+def pool(parts: Sequence[Samples]) -> Samples:
+    """All points of several sets of one motor, in order."""
+    columns = zip(*((p.current, p.torque, p.slip) for p in parts), strict=True)
+    return Samples(*map(np.concatenate, columns))
+
+
+def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Samples:
+    """Points of one motor that survive the recipe; the table is in the file's units."""
+    effective = effective_speed(table, recipe)
+    rpm = 2.0 * np.pi / 60.0
+    keep = np.all(np.abs(effective) < recipe.speed_limit * rpm, axis=1)
+    if recipe.drop_rotation:
+        keep &= table[_COMMAND[2]] == 0.0
+    speed = table[f"Motor {motor} velocity, rpm"] * rpm
+    current = table[f"Motor {motor} current, A"]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # A wheel at rest has no slip ratio: not finite here, so no comparison below keeps it.
+        slip = 1.0 - effective[:, motor - 1] / speed
+        voltage = recipe.back_emf * speed + recipe.resistance * current * np.sign(speed)
+        torque = voltage * current / speed
+        keep &= (current > recipe.min_current) & (slip > 0.0) & (slip <= 1.0)
+        keep &= torque <= recipe.max_torque
+    return Samples(current=current[keep], torque=torque[keep], slip=slip[keep])
+
+
+def effective_speed(table: dict[str, np.ndarray], recipe: Recipe) -> np.ndarray:
+    """Motor speeds at which wheels without slip would move the body as seen, w_eff = n J v / r.
+
+    A component of v whose command is 0 counts as 0, as the authors did.
+
+    Returns:
+        [rad/s, motor shaft], shape (row, motor).
+    """
+    command = np.stack([table[c] for c in _COMMAND], axis=1)
+    delta = np.stack([table[c] for c in recipe.delta_columns], axis=1)
+    velocity = delta * _TO_SI / recipe.row_period * (command != 0.0)
+    return velocity @ recipe.rim.T * recipe.gear_ratio / recipe.wheel_radius
+
+
+def needed(recipe: Recipe) -> list[str]:
+    """Names of the columns that a recipe reads."""
+    motors = [f"Motor {m} {what}" for m in MOTORS for what in ("velocity, rpm", "current, A")]
+    return [*_COMMAND, *recipe.delta_columns, *motors]
+
+
+def read_columns(path: Path, layout: str, needed: Sequence[str] = ()) -> dict[str, np.ndarray]:
+    """Every column of a file by name, in the file's own units, also those no channel reads.
+
+    Raises:
+        DataError: the file cannot be read, holds a cell that is no finite number, or lacks a column
+            that is needed.
+    """
+    table = read_table(path, preset(layout), all_columns=True)
+    rows, columns = np.nonzero(~np.isfinite(table.values))
+    if len(rows):
+        row, column = int(table.lines[rows[0]]), str(table.names[columns[0]])
+        raise bad_data(path, "no finite number", "one in every cell", row=row, column=column)
+    for name in needed:
+        if name not in table.names:
+            expected = f"one of {', '.join(map(str, table.names))}"
+            raise bad_data(path, "no such column", expected, column=name)
+    return {str(name): column for name, column in zip(table.names, table.values.T, strict=True)}
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Error in slip [-] on each surface, from three sources of a prediction.
+
+    Args:
+        samples: number of them per surface.
+        pooled: root mean square error of a curve fitted to the other surfaces.
+        constant: error of the other surfaces' mean slip.
+        own: error of a curve fitted to the surface itself.
+    """
+
+    samples: dict[str, int]
+    pooled: dict[str, float]
+    constant: dict[str, float]
+    own: dict[str, float]
+
+    def mean(self) -> dict[str, float]:
+        """Each error averaged over surfaces, every surface counting the same."""
+        rows = {"pooled": self.pooled, "constant": self.constant, "own": self.own}
+        return {name: float(np.mean(list(row.values()))) for name, row in rows.items()}
+
+
+def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
+    """Mean current and slip of every wheel over a log's windows, nothing cut away.
+
+    A window is as long as a row of the 2021 files. s = 1 - J v / (r w), v the camera's body
+    velocity over the window, w the encoders' mean speed.
+
+    Returns:
+        |current| [A] and slip [-], both (window, wheel); slip is not finite where a wheel rests.
+    """
+    if log.pose is None or log.current is None:
+        raise ValueError(f"{log.name}: slip against current needs both pose and current")
+    first = first_moved(log.wheel_angle, recipe.wheel_radius)
+    start = log.time[-1] if first is None else log.time[first]
+    # unique: where rows are further apart than a window, two windows would begin at the same row
+    starts = np.arange(start, log.time[-1], recipe.row_period)
+    edges = np.unique(np.searchsorted(log.time, starts))
+    if len(edges) < 2:
+        return np.empty((0, log.wheels)), np.empty((0, log.wheels))
+    span = np.diff(log.time[edges])[:, None]
+    effective = body_steps(log.pose[edges]) / span @ recipe.rim.T
+    driven = np.diff(log.wheel_angle[edges], axis=0) / span * recipe.wheel_radius
+    # Mean over the rows of each window, not the value at its edge: the current is 10-bit and rough.
+    current = np.add.reduceat(np.abs(log.current), edges, axis=0)[:-1] / np.diff(edges)[:, None]
+    slip = np.full_like(driven, np.nan)
+    np.divide(effective, driven, out=slip, where=driven != 0)
+    return current, 1.0 - slip
+
+
+def curve_points(log: Log, recipe: Recipe) -> np.ndarray:
+    """Current [A] and slip [-] of all wheels after the paper's cuts, shape (sample, 2)."""
+    current, slip = wheel_windows(log, recipe)
+    keep = (slip > 0.0) & (slip <= 1.0) & (current > recipe.min_current)
+    return np.stack([current[keep], slip[keep]], axis=1)
+
+
+def leave_one_surface_out(logs: Iterable[Log]) -> Transfer:
+    """Predict the slip of each surface from the others' curve, their mean, and its own curve.
+
+    The camera is uncorrected.
+
+    Raises:
+        ValueError: if fewer than two surfaces are there, or one has too few samples for a curve.
+    """
+    parts: dict[str, list[np.ndarray]] = {}
+    for log in logs:
+        if log.surface is None:
+            raise ValueError(f"{log.name}: no known surface; expected runs on one surface each")
+        parts.setdefault(log.surface, []).append(curve_points(log, FIGURES_3_AND_4))
+    points = {surface: np.concatenate(part) for surface, part in parts.items()}
+    if len(points) < 2:
+        raise ValueError(f"surfaces {list(points)}: leaving one out needs at least two")
+    counts = {surface: len(point) for surface, point in points.items()}
+    for surface, count in counts.items():
+        if count < 2:
+            raise ValueError(f"surface {surface!r}: {count} samples, too few for a curve")
+    current, slip = np.concatenate(list(points.values())).T
+    floor = np.repeat(list(counts), list(counts.values()))
+    found = errors_by_floor(slip, current, floor)
+    pooled, constant, own = (found[k]["each"] for k in ("pooled", "constant", "per_surface"))
+    return Transfer(samples=counts, pooled=pooled, constant=constant, own=own)

@@ -1,0 +1,146 @@
+"""The paper's slip models: those it stored, its robot's, and each form refitted on its points."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from slipid.lab.paper2021.samples import (
+    FIGURE_2,
+    FIGURES_3_AND_4,
+    MOTORS,
+    SURFACES,
+    Samples,
+    needed,
+    pool,
+    read_columns,
+    slip_samples,
+)
+
+CURRENT_SVR = (0.120, 0.566)
+"""Figure 2: s = 0.120 + 0.566 I, epsilon-SVR with linear kernel, whole field, motor 1; I in A."""
+
+TORQUE_SVR = (-0.072, 4.888, -5.456)
+"""Figure 4: s = -0.072 + 4.888 M - 5.456 M^2, quadratic SVR, motor 1; M in N m at the motor."""
+
+DEPLOYED_GAIN, DEPLOYED_OFFSET = (-0.639, -0.4559, -0.6294), (0.988, 0.9678, 0.9913)
+"""a [1/A] and b [-] of `deployed_slip`, motors 1, 2, 3."""
+DEPLOYED_THRESHOLD = 0.4
+"""Current below which a wheel is taken not to slip [A]."""
+DEPLOYED_MEMORY = 0.97
+"""Share of the smoothed current kept from sample to sample [-]."""
+
+# name: (regressor, powers of it in the design matrix)
+_FORMS = {
+    "linear in M": ("torque", (1,)),
+    "affine in M": ("torque", (0, 1)),
+    "quadratic in M": ("torque", (0, 1, 2)),
+    "affine in I": ("current", (0, 1)),
+    "constant": ("current", (0,)),
+}
+
+
+def deployed_slip(current: np.ndarray) -> np.ndarray:
+    """Slip [-] of each wheel from its own smoothed current [A], both (sample, wheel).
+
+    1 - s_i = a_i I~_i + b_i where the smoothed current I~_i > threshold, else s_i = 0. The paper's
+    robot smoothed from sample to sample, I~_k = memory I~_(k-1) + (1 - memory) I_k. The authors'
+    lines leave [0, 1] beyond 1.55 A, so 1 - s is held inside it: a wheel is never turned backwards.
+
+    Source: Belyaev et al. 2021, section 3, coefficients as deployed.
+    """
+    grip = np.clip(np.array(DEPLOYED_GAIN) * current + DEPLOYED_OFFSET, 0.0, 1.0)
+    return np.where(current > DEPLOYED_THRESHOLD, 1.0 - grip, 0.0)
+
+
+@dataclass(frozen=True)
+class FittedForm:
+    """One form of slip model with its coefficients, rising in power from `first_power`.
+
+    Args:
+        regressor: "torque" [N m] or "current" [A].
+        coefficients: c_k of s = sum c_k x^(first_power + k).
+        first_power: 0, or 1 for a line through the origin.
+        rmse: root mean square error in slip [-] on the samples given.
+    """
+
+    regressor: str
+    coefficients: tuple[float, ...]
+    first_power: int
+    rmse: float
+
+    def slip(self, x: np.ndarray) -> np.ndarray:
+        """Slip [-] at values of the regressor."""
+        return np.polynomial.polynomial.polyval(x, (0.0,) * self.first_power + self.coefficients)
+
+
+@dataclass(frozen=True, eq=False)
+class MotorTable:
+    """All forms of one motor, on the same samples, and what the samples are.
+
+    Args:
+        samples: the points fitted.
+        by_surface: the same points, per surface.
+        forms: the least-squares fits, by name.
+        stored: the paper's stored model for these samples, not refitted; motor 1 only.
+    """
+
+    samples: Samples
+    by_surface: dict[str, Samples]
+    forms: dict[str, FittedForm]
+    stored: FittedForm | None
+
+
+def fit_form(samples: Samples, name: str) -> FittedForm:
+    """Least squares of one row of the table.
+
+    Raises:
+        ValueError: if there are fewer samples than coefficients.
+    """
+    regressor, powers = _FORMS[name]
+    x = getattr(samples, regressor)
+    if len(x) < len(powers):
+        raise ValueError(f"{name}: {len(x)} samples cannot fix {len(powers)} coefficients")
+    design = x[:, None] ** np.array(powers)
+    coefficients = np.linalg.lstsq(design, samples.slip, rcond=None)[0]
+    return FittedForm(
+        regressor=regressor,
+        coefficients=tuple(float(c) for c in coefficients),
+        first_power=powers[0],
+        rmse=_rms(samples.slip - design @ coefficients),
+    )
+
+
+def surface_tables(folder: Path) -> dict[int, MotorTable]:
+    """The table behind figures 3 and 4, motors 1 to 3, from experimental_data_<surface>.csv."""
+    recipe, tables = FIGURES_3_AND_4, {}
+    for surface in SURFACES:
+        path = folder / f"experimental_data_{surface}.csv"
+        tables[surface] = read_columns(path, "robotino2021", needed(recipe))
+    found = {}
+    for motor in MOTORS:
+        parts = {name: slip_samples(table, motor, recipe) for name, table in tables.items()}
+        samples = pool(list(parts.values()))
+        forms = {name: fit_form(samples, name) for name in _FORMS}
+        kept = _stored("torque", TORQUE_SVR, samples)
+        found[motor] = MotorTable(samples, parts, forms, kept if motor == 1 else None)
+    return found
+
+
+def field_table(folder: Path) -> MotorTable:
+    """Figure 2: motor 1 over the whole site, our least squares and the paper's SVR."""
+    path = folder / "experimental_data_on_whole_field.csv"
+    table = read_columns(path, "robotino2021_field", needed(FIGURE_2))
+    samples = slip_samples(table, 1, FIGURE_2)
+    forms = {name: fit_form(samples, name) for name in ("affine in I", "constant")}
+    kept = _stored("current", CURRENT_SVR, samples)
+    return MotorTable(samples=samples, by_surface={}, forms=forms, stored=kept)
+
+
+def _stored(regressor: str, coefficients: tuple[float, ...], samples: Samples) -> FittedForm:
+    form = FittedForm(regressor, coefficients, first_power=0, rmse=0.0)
+    return replace(form, rmse=_rms(samples.slip - form.slip(getattr(samples, regressor))))
+
+
+def _rms(error: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(error**2)))

@@ -1,0 +1,200 @@
+"""What an experiment can recover: what `slipid selftest` does."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from fnmatch import filter as matching
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import binom, chi2
+
+from slipid.app.check import expected
+from slipid.app.config import Config, one_floor, read_config
+from slipid.app.logs import layout_of
+from slipid.app.problem import Job, job_of, read_job, shape_of
+from slipid.data.runs import collect
+from slipid.fit.problem import Problem
+from slipid.infer.verdicts.estimates import derived
+from slipid.lab.selftest import replicates as test
+from slipid.lab.selftest.logs import Sensors, grid, make_logs, turning_grid
+from slipid.lab.selftest.replicates import Number, Replicate
+from slipid.model.robot import build
+from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.errors import DataError
+from slipid.support.files import Content, writable, write_json
+from slipid.support.jax_setup import setup_jax
+from slipid.support.progress import Reporter
+
+SCHEMA = "slipid.lab.selftest/1"
+CHANCE = 1e-3
+"""Probability below which errors this large, or so many intervals without the truth, are no chance.
+
+A number whose intervals fail this is wrong, whatever its verdict says.
+"""
+SETTLED = 0.75
+"""Least part of the fits that must converge."""
+ORDER = ("identified", "weak", "not_identified", "at_bound")
+
+
+def selftest(
+    config_path: Path, data: Path | None, out: Path, count: int, seed: int, report: Reporter
+) -> Content:
+    """What an experiment can recover, by making it with known truth and fitting that.
+
+    Args:
+        data: logs of the experiment, whose wheel motion is taken; without them a plan is made.
+        out: folder for selftest.json and the replicates, which a later call goes on from.
+        count: replicates.
+        seed: of truths and noise.
+    """
+    setup_jax(quiet=True)
+    config = read_config(config_path)
+    job = planned(config, report) if data is None else read_job(config, data, report)
+    problem = job.problem()
+    wanted = wanted_of(config, problem)
+    test.plausible(config, job.choices, problem)
+    writable(out)
+    report.stage("expected information")
+    before = expected(job, problem)
+    kept = Checkpoint(out, key_of(config.hash, job.data_hash, seed))
+    rows = test.replicates(config, job.choices, problem, count, seed, kept, report)
+    found = {
+        "schema": SCHEMA,
+        "source": "plan" if data is None else "logs",
+        "runs": len(job.dataset),
+        "seed": seed,
+        "noise": dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True)),
+        **summary(rows, wanted),
+        "messages": list(before.messages),
+        "data": {"hash": job.data_hash},
+    }
+    write_json(out / "selftest.json", found)
+    return found
+
+
+def planned(config: Config, report: Reporter) -> Job:
+    """Job of an experiment that nobody has driven yet: the grid of the config's `[selftest]`.
+
+    Channels are those that the config's layouts name; every load set-up of the config is driven on
+    every floor.
+    """
+    wanted, shape = config.content.selftest, shape_of(config)
+    sections = one_floor(config.content.logs)
+    loads = list(dict.fromkeys(section.load for section in sections))
+    setups = [(floor, load) for floor in wanted.surfaces for load in loads]
+    if shape.determines_twist:
+        runs = grid(setups, wanted.headings, wanted.speeds_m_s, wanted.turns)
+    else:
+        base = float(shape.base_radius)
+        runs = turning_grid(setups, wanted.headings, wanted.speeds_m_s, base)
+    drives = [replace(d, distance=wanted.distance_m) for d in runs]
+    robot = build(shape, wanted.surfaces, loads, sorted({d.session for d in drives}))
+    layouts = [layout_of(config, section) for section in sections]
+    channels = [layout.holds for layout in layouts]
+    has_current = all("current" in c for c in channels)
+    has_voltage = all("voltage" in c or {"duty", "bus_voltage"} <= c for c in channels)
+    is_signed = all(layout.current_is_signed for layout in layouts)
+    logs = make_logs(robot, drives, 0, Sensors(has_voltage=has_voltage, signed=is_signed))
+    if not has_current:
+        logs = [replace(log, current=None) for log in logs]
+    report.line(f"no logs given: {len(logs)} runs of [selftest] on {', '.join(wanted.surfaces)}")
+    return job_of(config, collect(logs), [], report)
+
+
+def wanted_of(config: Config, problem: Problem) -> tuple[str, ...]:
+    """Paths that must be recovered: the config's, else what the channels promise.
+
+    Raises:
+        DataError: a pattern of the config matches nothing that is fitted.
+    """
+    w, z = problem.windows, problem.space.start
+    ratios = derived(problem.space, z, np.eye(len(z)), w.has_voltage)
+    paths = [e.path for e in problem.space.free] + [e.path for e in ratios]
+    given = config.content.selftest.wanted
+    patterns = ["surface.*.creep"]
+    if problem.robot.geometry.determines_twist:  # else runs hardly tell where the weight is
+        patterns += ["surface.*.roller_drag", "robot.load_share@*"]
+    patterns += ["surface.*.friction/motor.back_emf"] if w.has_current else []
+    patterns += ["motor.resistance", "motor.back_emf"] if w.has_current and w.has_voltage else []
+    for pattern in given or []:
+        if not matching(paths, pattern):
+            raise DataError(
+                f"{config.path}: selftest.wanted '{pattern}': not fitted; "
+                f"expected one of {', '.join(paths)}"
+            )
+    chosen = patterns if given is None else given
+    return tuple(p for p in paths if any(matching([p], pattern) for pattern in chosen))
+
+
+def summary(made: Sequence[Replicate], wanted: Sequence[str]) -> Content:
+    """Error, coverage, verdict and whether it was recovered, of everything that was compared.
+
+    Returns:
+        `parameters` (ratios included), `curves`, `predictions`, `failed` (wanted and not
+        recovered), `recovered`.
+    """
+    first = made[0]
+    numbers = {path: judged([one.parameters[path] for one in made]) for path in first.parameters}
+    curves = {floor: [one.curves[floor] for one in made] for floor in first.curves}
+    failed = [p for p in wanted if numbers[p]["recovered"] in ("no", "wrong")]
+    converged = sum(one.converged for one in made)
+    return {
+        "replicates": len(made),
+        "converged": converged,
+        "parameters": numbers,
+        "curves": {
+            floor: {
+                "largest_gap": max(c.gap for c in each),
+                "median_gap": float(np.median([c.gap for c in each])),
+                "coverage90": float(np.mean([c.inside for c in each])),
+            }
+            for floor, each in curves.items()
+        },
+        "predictions": {
+            floor: {
+                model: float(np.mean([one.predictions[floor][model] for one in made]))
+                for model in models
+            }
+            for floor, models in first.predictions.items()
+        },
+        "wanted": list(wanted),
+        "failed": failed,
+        "recovered": not failed and converged >= SETTLED * len(made),
+    }
+
+
+def judged(found: Sequence[Number]) -> Content:
+    """One number over all replicates.
+
+    `recovered` is yes where most fits call it identified, roughly where they call it weak, no where
+    they say that they do not know it, and wrong where errors are larger than the fits say.
+    """
+    truth, value = np.array([f.truth for f in found]), np.array([f.value for f in found])
+    inside, z = np.array([f.inside for f in found]), np.array([f.z for f in found])
+    count = Counter(f.verdict for f in found)
+    verdict = max(reversed(ORDER), key=lambda v: count[v])
+    hits, total = int(inside.sum()), inside.size
+    honest = binom.cdf(hits, total, 0.9) > CHANCE and chi2.sf(float((z**2).sum()), z.size) > CHANCE
+    recovered = {"identified": "yes", "weak": "roughly"}.get(verdict, "no")
+    if recovered != "no" and not honest:
+        recovered = "wrong"
+    return {
+        "unit": found[0].unit,
+        "labels": found[0].labels,
+        "truth": truth.tolist(),
+        "value": value.tolist(),
+        "z": z.tolist(),
+        "error_rms": _rms(value - truth),
+        "relative_error_rms": _rms(value / truth - 1) if (truth > 0).all() else None,
+        "z_rms": _rms(z),
+        "coverage90": hits / total,
+        "intervals": total,
+        "verdicts": dict(count),
+        "verdict": verdict,
+        "recovered": recovered,
+    }
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))

@@ -1,0 +1,341 @@
+"""A Robotino whose every number is known, what it drives, and the sensors that see it.
+
+Logs made from a robot whose every number is known: for selftests and tests of recovery.
+
+Straight and turning runs of a grid like a Robotino's under an overhead camera. The noise is the one
+the likelihood assumes (camera, process growing with distance, run effects, current level per run);
+on top of it come the traps of real logs it does not know of: ticks, quantised unsigned currents
+with ripple, quantised voltages, repeated camera frames, uneven rows, a delayed and ramped start.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.data.log import Log
+from slipid.data.wheel_signals import interpolate
+from slipid.fit.shared import AXES
+from slipid.infer.design.planned_runs import Drive
+from slipid.model.geometry import omni
+from slipid.model.robot import Robot, build, motor_current, twist
+from slipid.model.se2 import compose, path
+from slipid.parameter import entries
+from slipid.search_space import Choice, Space
+
+
+def numbers(robot: Robot) -> dict[str, float | list[float]]:
+    """Every number of a robot by its path, as plain values."""
+    return {e.path: np.asarray(e.get(robot)).tolist() for e in entries(robot)}
+
+
+_FLOORS = {
+    "friction": (0.5, 0.8),
+    "creep": (0.15, 0.45),
+    "roller_drag": (0.18, 0.33),
+    "roller_creep": (0.25, 0.2),
+    "rolling_resistance": (0.008, 0.02),
+    "slide_viscosity": (0.03, 0.05),
+    "roller_viscosity": (0.03, 0.05),
+    "scrub": (0.001, 0.002),
+    "lead": (0.0015, 0.0045),
+}
+"""Of the floors firm and soft."""
+TRUTH: dict[str, float | tuple[float, ...]] = {
+    "robot.mass": 12.0,
+    "robot.load_share@as_built": (0.29, 0.42, 0.29),
+    "robot.load_share@moved": (0.33, 0.35, 0.32),
+    "motor.resistance": 5.5,
+    "motor.back_emf": 0.0514,
+    "motor.inductance": 8.9e-3,
+    "motor.rotor_inertia": 7.1e-6,
+    "motor.coulomb_friction": 0.07,
+    "motor.viscous_friction": 0.006,
+    "camera.scale": 1.117,
+    "camera.lag": 0.056,
+    "camera.marker_yaw": -0.015,
+    **{f"surface.firm.{name}": firm for name, (firm, _) in _FLOORS.items()},
+    **{f"surface.soft.{name}": soft for name, (_, soft) in _FLOORS.items()},
+}
+"""Numbers of the default robot [SI], the rest as declared; of the size found on real logs."""
+
+
+def blank(drives: Sequence[Drive]) -> Robot:
+    """Robotino at declared starts that knows the floors, loads and sessions of a plan."""
+    return build(
+        omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0),
+        sorted({d.surface for d in drives}),
+        tuple(dict.fromkeys(d.load for d in drives)),
+        sorted({d.session for d in drives}),
+    )
+
+
+def truth(
+    drives: Sequence[Drive], values: Mapping[str, float | Sequence[float]] | None = None
+) -> Robot:
+    """Robotino with the numbers of `TRUTH`, or others; what the plan does not need is left out."""
+    robot = blank(drives)
+    known = {e.path for e in entries(robot)}
+    values = {**TRUTH, **(values or {})}
+    return Space(robot, [Choice(p, fixed=v) for p, v in values.items() if p in known]).template
+
+
+def grid(
+    setups: Sequence[tuple[str, str]],
+    headings: int = 12,
+    speeds: Sequence[float] = (0.1, 0.2),
+    turns: int = 2,
+) -> tuple[Drive, ...]:
+    """Every heading at every speed on every (floor, load), and `turns` curved runs of each."""
+    drives = []
+    for surface, load in setups:
+        for speed in speeds:
+            ways = 2 * np.pi * np.arange(headings) / headings
+            drives += [Drive(surface, load, float(way), speed) for way in ways]
+            ways = 2 * np.pi * (np.arange(turns) + 0.5) / max(turns, 1)
+            drives += [
+                Drive(surface, load, float(way), speed, turn=(-1) ** k * 4.0 * speed)
+                for k, way in enumerate(ways)
+            ]
+    return tuple(drives)
+
+
+def turning_grid(
+    setups: Sequence[tuple[str, str]], ways: int, speeds: Sequence[float], base_radius: float
+) -> tuple[Drive, ...]:
+    """Runs of wheels that do not drive sideways, on every (floor, load).
+
+    Between straight ahead and turning on the spot `ways` of each speed, evenly around the circle of
+    (ahead, turn times base radius [m]).
+    """
+    drives = []
+    for surface, load in setups:
+        for speed in speeds:
+            for way in 2 * np.pi * np.arange(ways) / ways:
+                # rounded: the cosine of a right angle is not quite zero
+                ahead, turn = (round(speed * float(f(way)), 9) for f in (np.cos, np.sin))
+                back = 0.0 if ahead >= 0 else np.pi
+                drives.append(Drive(surface, load, back, abs(ahead), turn=turn / base_radius))
+    return tuple(drives)
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """How the logs are disturbed; stds by the names of `slipid.fit.noise.noise`.
+
+    Attributes:
+        std: of every variance component; `floor` in a name stands for every floor without its own.
+        ripple: of the current from row to row [A]; voltage_noise: [V].
+        current_step, voltage_step: of the converters [A], [V]; ticks: per turn of the motor.
+        row_period, frame_period: of the log and the camera [s].
+        delay, ramp: from command to motion, and to full speed [s].
+        wobble: of the wheel's angle, as time [s]; a real speed loop is never quite still.
+        signed: whether currents have their sign.
+    """
+
+    std: Mapping[str, float] = field(
+        default_factory=lambda: {
+            "camera.place": 0.0005,
+            "camera.heading": 0.005,
+            "process.floor.along": 0.004,
+            "process.floor.across": 0.004,
+            "process.floor.yaw": 0.008,
+            "run.floor.along": 0.006,
+            "run.floor.across": 0.006,
+            "run.floor.yaw": 0.03,
+            "current.floor.run": 0.03,
+        }
+    )
+    ripple: float = 0.06
+    voltage_noise: float = 0.07
+    current_step: float = 1 / 39
+    voltage_step: float = 0.1
+    ticks: int = 2000
+    row_period: float = 0.031
+    frame_period: float = 1 / 29
+    delay: float = 0.12
+    ramp: float = 0.2
+    wobble: float = 0.002
+    has_voltage: bool = True
+    signed: bool = False
+
+    def of(self, name: str) -> float:
+        """Std of a variance component, 0 for one that these logs are made without."""
+        head, _, last = name.partition(".")
+        of_any_floor = f"{head}.floor.{last.split('.')[-1]}"
+        return self.std.get(name, self.std.get(of_any_floor, 0.0))
+
+
+def make_logs(
+    robot: Robot, drives: Sequence[Drive], seed: int, sensors: Sensors | None = None
+) -> list[Log]:
+    """Logs of a plan, in memory, of a robot that knows the plan's floors, loads and sessions."""
+    return _Maker(robot, drives, sensors or Sensors(), np.random.default_rng(seed)).logs()
+
+
+@dataclass(frozen=True, eq=False)
+class _Maker:
+    """Makes the logs of all drives at once; arrays are (run, row or step, ...)."""
+
+    robot: Robot
+    drives: Sequence[Drive]
+    sensors: Sensors
+    random: np.random.Generator
+
+    def logs(self) -> list[Log]:
+        robot, drives, s = self.robot, self.drives, self.sensors
+        base = float(robot.geometry.base_radius)
+        seconds = [d.seconds(base) + s.delay + s.ramp for d in drives]
+        time, angle = self.wheels(int(np.ceil(max(seconds) / s.row_period)) + 2)
+        floor = jnp.asarray([robot.surface_index(d.surface) for d in drives])
+        load = jnp.asarray([robot.load_index(d.load) for d in drives])
+        dt = np.diff(time, axis=1)
+        speed = np.diff(angle, axis=1) / dt[..., None]
+        xi, amps = (np.asarray(x) for x in _twists(robot, speed, floor, load))
+        pose, fresh = self.camera(time, self.poses(dt, speed, xi))
+        channels = self.electric(speed, amps)
+        tick = 2 * np.pi / (s.ticks * robot.geometry.gear_ratio)
+        out = []
+        for k, d in enumerate(drives):
+            n = int(np.searchsorted(time[k], seconds[k]))
+            whole = np.floor(angle[k, :n] / tick) * tick
+            current, voltage, reported = (None if c is None else c[k, :n] for c in channels)
+            name = f"{d.load}/{d.surface}/run{k:03d}.csv"
+            out.append(
+                Log(
+                    name=name,
+                    path=Path(name),
+                    sha256=hashlib.sha256(whole.tobytes() + pose[k, :n].tobytes()).hexdigest(),
+                    time=time[k, :n],
+                    wheel_angle=whole - whole[0],
+                    wheel_speed=reported,
+                    twist_command=np.tile(d.command, (n, 1)),
+                    current=current,
+                    current_is_signed=s.signed,
+                    voltage=voltage,
+                    pose=pose[k, :n],
+                    pose_fresh=fresh[k, :n],
+                    surface=d.surface,
+                    load=d.load,
+                )
+            )
+        return out
+
+    def wheels(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
+        """Times and true wheel angles."""
+        s, n, j = self.sensors, len(self.drives), np.asarray(self.robot.geometry.forward())
+        radius = float(self.robot.geometry.wheel_radius)
+        want = np.stack([d.command for d in self.drives]) @ j.T / radius
+        uneven = self.random.uniform(0.9, 1.1, (n, rows))
+        time = np.cumsum(uneven * s.row_period, axis=1)
+        time -= time[:, :1]
+        x = np.clip((time - s.delay) / s.ramp, 0.0, 1.0)
+        moved = s.ramp * (x**3 - x**4 / 2) + np.clip(time - s.delay - s.ramp, 0.0, None)
+        phase = self.random.uniform(0, 2 * np.pi, (n, 1, want.shape[1]))
+        swing = s.wobble * np.sin(2 * np.pi * 2.0 * time[..., None] + phase) * x[..., None]
+        return time, want[:, None] * (moved[..., None] + swing)
+
+    def poses(
+        self,
+        dt: Float[np.ndarray, "run step"],
+        speed: Float[np.ndarray, "run step wheel"],
+        xi: Float[np.ndarray, "run step 3"],
+    ) -> Float[np.ndarray, "run row 3"]:
+        """Body poses with process noise and run effects, centred on the origin of the camera."""
+        s, shape, rng = self.sensors, self.robot.geometry, self.random
+        back = np.asarray(shape.least())
+        step = speed * dt[..., None] * float(shape.wheel_radius) @ back.T
+        far = np.linalg.norm(step[..., :2], axis=-1)[..., None]
+        u = np.where(far > 0, step[..., :2] / np.maximum(far, 1e-12), [1.0, 0.0])
+        far = far[..., 0] + np.abs(step[..., 2]) * float(shape.base_radius)
+        drawn = []
+        for part in AXES:
+            grown, level = (
+                np.array([s.of(f"{kind}.{d.surface}.{part}") for d in self.drives])[:, None]
+                for kind in ("process", "run")
+            )
+            noise = grown * np.sqrt(far) * rng.normal(size=far.shape)
+            drawn.append(noise + level * far * rng.normal(size=(len(far), 1)))
+        along, across, yaw = drawn
+        x, y = u[..., 0], u[..., 1]
+        extra = np.stack([x * along - y * across, y * along + x * across, yaw], -1)
+        start = np.zeros((len(far), 3))
+        start[:, 2] = rng.uniform(-0.1, 0.1, len(far))
+        pose = np.array(_paths(jnp.asarray(xi + extra / dt[..., None]), jnp.asarray(dt), start))
+        pose[..., :2] -= 0.5 * (pose[:, -1:, :2] + pose[:, :1, :2])
+        return pose
+
+    def camera(
+        self, time: Float[np.ndarray, "run row"], pose: Float[np.ndarray, "run row 3"]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Logged poses and whether each row brings a new frame."""
+        robot, s, rng = self.robot, self.sensors, self.random
+        fresh, marker = np.ones(time.shape, bool), np.empty_like(pose)
+        for k, t in enumerate(time):
+            frames = np.arange(t[0] - 1.0, t[-1] + 1.0, s.frame_period)
+            frames += rng.uniform(0, s.frame_period)
+            newest = np.searchsorted(frames, t) - 1
+            fresh[k, 1:] = np.diff(newest) > 0
+            at = t - float(robot.camera.lag)  # every new frame is that old
+            marker[k] = interpolate(t, pose[k], at)
+        session = [robot.session_index(d.session) for d in self.drives]
+        yaw = np.array([float(robot.camera.yaw(k)) for k in session])
+        logged = np.asarray(_as_logged(robot, jnp.asarray(marker), jnp.asarray(yaw)))
+        std = [s.of(f"camera.{part}") for part in ("place", "place", "heading")]
+        logged = logged + rng.normal(size=logged.shape) * np.array(std)
+        rows = np.arange(time.shape[1])
+        last = np.maximum.accumulate(np.where(fresh, rows, 0), axis=1)
+        return np.take_along_axis(logged, last[..., None], axis=1), fresh
+
+    def electric(
+        self, speed: Float[np.ndarray, "run step wheel"], amps: Float[np.ndarray, "run step wheel"]
+    ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+        """Logged currents or their magnitudes [A], voltages [V] and reported speeds [rad/s]."""
+        s, motor, rng = self.sensors, self.robot.motor, self.random
+        level = np.array([s.of(f"current.{d.surface}.run") for d in self.drives])[:, None, None]
+        amps = amps + level * rng.normal(size=(len(amps), 1, amps.shape[2])) * (speed != 0)
+        true, w = _at_rows(amps), _at_rows(speed)
+        measured = true + s.ripple * rng.normal(size=true.shape)
+        measured = measured if s.signed else np.abs(measured)
+        current = np.round((measured + float(motor.current_offset)) / s.current_step)
+        noise = s.voltage_noise * rng.normal(size=true.shape)
+        held = np.asarray(motor.voltage(jnp.asarray(true), jnp.asarray(w))) + noise
+        voltage = np.round(held / s.voltage_step) * s.voltage_step if s.has_voltage else None
+        quantum = 2.83 / self.robot.geometry.gear_ratio  # as a Robotino reports it, 1.3 % high
+        return current * s.current_step, voltage, np.round(1.013 * w / quantum) * quantum
+
+
+@jax.jit
+def _twists(robot: Robot, speed: Array, floor: Array, load: Array) -> tuple[Array, Array]:
+    """Body twists and signed motor currents of every step of every run."""
+    frame = robot.geometry.frame()
+
+    def one(w: Array, f: Array, s: Array) -> tuple[Array, Array]:
+        xi = twist(robot, frame, robot.geometry.at_wheels(w), f, s)
+        return xi, motor_current(robot, frame, xi, w, f, s)
+
+    return jax.vmap(jax.vmap(one, (0, None, None)))(speed, floor, load)
+
+
+_paths = jax.jit(jax.vmap(path))
+
+
+@jax.jit
+def _as_logged(robot: Robot, pose: Array, yaw: Array) -> Array:
+    """What the camera logs of true body poses."""
+
+    def one(body: Array, psi: Array) -> Array:
+        return robot.camera.logged(compose(body, jnp.stack([*robot.camera.marker_place, psi])))
+
+    return jax.vmap(lambda run, psi: jax.vmap(lambda p: one(p, psi))(run))(pose, yaw)
+
+
+def _at_rows(x: Float[np.ndarray, "run step wheel"]) -> Float[np.ndarray, "run row wheel"]:
+    """What a sensor reads at the rows between steps: the mean of the two steps that meet there."""
+    ends = np.concatenate([x[:, :1], x, x[:, -1:]], axis=1)
+    return 0.5 * (ends[:, 1:] + ends[:, :-1])

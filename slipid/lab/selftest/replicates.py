@@ -1,0 +1,341 @@
+"""Windows as a robot with known numbers would have filled them, noise included.
+
+Wheel motion, floors, loads, sessions and sampling are those of the windows given; poses, currents
+and voltages are what the likelihood's own model makes of them. So a fit of the result shows what
+this very experiment tells, and only what is wrong with the model itself is out of sight.
+
+What this very experiment can recover: made with known truth, fitted, compared, again and again.
+
+A replicate draws true numbers from what is plausible before the logs, fills the windows of the
+experiment with what a robot of these numbers would have shown, noise included, and fits them from
+the usual start. The noise is the likelihood's own at typical variances: the test tells what the
+experiment can tell if the model is right, not whether it is.
+
+Source: simulation-based calibration in small (Talts et al. 2018, arXiv:1804.06788).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from fnmatch import fnmatchcase
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from pydantic import TypeAdapter
+
+from slipid.app.config import Config
+from slipid.data.windows import Windows
+from slipid.fit import likelihood as lk
+from slipid.fit.noise import SHARED, axes, noise, travel
+from slipid.fit.optimise import Optimum, optimise
+from slipid.fit.problem import Problem, State
+from slipid.fit.shared import AXES, shared_of
+from slipid.infer.result import draws
+from slipid.infer.slip_curves import curves, slip_on
+from slipid.infer.verdicts.estimates import Estimate, derived, estimates
+from slipid.infer.verdicts.unidentified import flat_directions, members
+from slipid.model.robot import Robot
+from slipid.predict.open_loop import chain, contact_increments, corrected
+from slipid.predict.slip_model import as_increments
+from slipid.search_space import Choice, Space
+from slipid.support.checkpoint import Checkpoint
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
+
+
+def measure(
+    truth: Robot, w: Windows, rng: np.random.Generator, std: Mapping[str, float]
+) -> Windows:
+    """The windows with poses, currents and voltages as a robot gives them, plus noise.
+
+    Every piece starts at the pose it has. The scatter of the current is of the one that flows, and
+    voltages follow it; `current_var` comes on top, is the ammeter's, and no voltage sees it.
+
+    Args:
+        truth: knows the floors, loads and sessions of the windows.
+        w: what was driven; what it does not have is not made.
+        std: of the variance components by name (`fit.noise`); a name without its floor stands for
+            every floor, those left out are zero.
+    """
+    b = lk.batch(w, truth)
+    increment, amps, start = (np.asarray(x) for x in _predicted(truth, b, jnp.asarray(w.pose)))
+    steps = increment + _process(truth, w, rng, std)
+    pose = np.array(_logged(truth, chain(jnp.asarray(start), jnp.asarray(steps))))
+    pose[..., :2] += rng.normal(size=(*pose.shape[:2], 2)) * std.get("camera.place", 0.0)
+    pose[..., 2] += rng.normal(size=pose.shape[:2]) * std.get("camera.heading", 0.0)
+    each = _of(std, w, "current", "window")[:, None, None]
+    of_run = rng.normal(size=(len(w), 1, amps.shape[2]))
+    same = _of(std, w, "current", "run")[:, None, None] * of_run
+    flowing = amps + same + each * rng.normal(size=amps.shape)
+    speed = w.turn / w.dt[..., None]
+    signed = flowing - float(truth.motor.current_offset)
+    signed = signed if w.current_is_signed else signed * np.tanh(speed / 0.2)
+    volts = np.asarray(truth.motor.voltage(jnp.asarray(signed), jnp.asarray(speed)))
+    current = flowing + np.sqrt(w.current_var) * rng.normal(size=amps.shape)
+    voltage = volts + rng.normal(size=amps.shape) * std.get("voltage.window", 0.0)
+    return replace(
+        w,
+        pose=pose,
+        current=current if w.has_current else np.zeros_like(current),
+        voltage=voltage if w.has_voltage else np.zeros_like(voltage),
+    )
+
+
+@jax.jit
+def _predicted(robot: Robot, b: lk.Batch, pose: Array) -> tuple[Array, Array, Array]:
+    p = lk.predict(robot, b)
+    return p.increment, lk.predicted_current(robot, b, p.felt), corrected(robot, pose)[:, 0]
+
+
+@jax.jit
+def _logged(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, "piece edge 3"]:
+    return jax.vmap(jax.vmap(robot.camera.logged))(pose)
+
+
+def _of(std: Mapping[str, float], w: Windows, kind: str, part: str) -> np.ndarray:
+    """Std of a component of every piece, by its floor (piece,)."""
+    usual = std.get(f"{kind}.{part}", 0.0)
+    return np.array([std.get(f"{kind}.{floor}.{part}", usual) for floor in w.surface])
+
+
+def _process(
+    truth: Robot, w: Windows, rng: np.random.Generator, std: Mapping[str, float]
+) -> Float[np.ndarray, "piece window 3"]:
+    """Displacements that the model does not explain, growing with distance."""
+    far, u = travel(w, truth)
+    total, shared = np.zeros((*far.shape, 3)), _shared(truth, w, rng, std)
+    for k, (axis, name) in enumerate(zip(axes(u), AXES, strict=True)):
+        grown = _of(std, w, "process", name)[:, None] * np.sqrt(far)
+        own = _of(std, w, "run", name) * rng.normal(size=len(w)) + shared[:, k]
+        step = grown * rng.normal(size=far.shape) + own[:, None] * far
+        total += (axis @ step[..., None]).reshape(total.shape)
+    return total
+
+
+def _shared(
+    truth: Robot, w: Windows, rng: np.random.Generator, std: Mapping[str, float]
+) -> Float[np.ndarray, "piece 3"]:
+    """Effects that neighbouring runs, and runs of one session, share."""
+    components = noise(w, truth)
+    named = [
+        std.get(c.name, std.get(f"{c.kind}.{c.what}", 0.0) if c.kind in SHARED else 0.0)
+        for c in components.components
+    ]
+    log_v = jnp.asarray(2 * np.log(np.maximum(named, 1e-30)))
+    out = np.zeros((len(w), len(AXES)))
+    for of in shared_of(w, truth, components)[0]:
+        root = np.asarray(of.root(log_v))
+        drawn = np.einsum("anq,aq->na", root, rng.normal(size=root.shape[::2]))
+        out[np.asarray(of.pieces)] = drawn
+    return out
+
+
+KEPT = "replicates"
+"""File of the replicates that are done, which a later call goes on from."""
+SCATTER, MOST = 0.5, 0.5
+"""True numbers scatter by this part of their prior's std, which counts up to `MOST` [search]."""
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number of a replicate, or a short vector: truth against estimate, entry by entry.
+
+    Attributes:
+        unit, labels: as of `Estimate`.
+        truth, value: [unit].
+        inside: whether the 90 % interval holds the truth.
+        z: estimate less truth, in stds of the estimate, in the search space.
+        verdict: of the fit.
+    """
+
+    unit: str
+    labels: list[str]
+    truth: list[float]
+    value: list[float]
+    inside: list[bool]
+    z: list[float]
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Largest gap in slip to the true curve, and how much of that lies in the 90 % band."""
+
+    gap: float
+    inside: float
+
+
+@dataclass(frozen=True)
+class Replicate:
+    """One made experiment and what its fit found.
+
+    Attributes:
+        parameters: numbers and ratios by path.
+        curves: by floor.
+        predictions: by floor and model, distance of predicted ends over the true chord.
+        converged, reason: how the fit ended.
+    """
+
+    parameters: dict[str, Number]
+    curves: dict[str, Curve]
+    predictions: dict[str, dict[str, float]]
+    converged: bool
+    reason: str
+
+
+_FILE = TypeAdapter(list[Replicate])
+
+
+def plausible(
+    config: Config, choices: Sequence[Choice], problem: Problem
+) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and scatter of the true numbers, in the search space.
+
+    The centre is the prior's, the scatter half its std; what `[selftest.truth]` gives is exactly
+    that.
+
+    Raises:
+        DataError: a truth for a number that does not exist, is fixed, or cannot have it.
+    """
+    space, given = problem.space, config.content.selftest.truth
+    center = space.prior_mean.copy()
+    scatter = SCATTER * np.minimum(space.prior_std, MOST)
+    for pattern, value in given.items():
+        where = f"{config.path}: selftest.truth.'{pattern}'"
+        mine = [e for e in space.free if fnmatchcase(e.path, pattern)]
+        if not mine:
+            free = ", ".join(e.path for e in space.free)
+            raise DataError(f"{where}: no such free parameter; expected one of {free}")
+        try:
+            start = Space(problem.robot, [*choices, Choice(pattern, start=value)]).start
+        except ValueError as error:
+            raise DataError(f"{where}: {error}") from error
+        for e in mine:
+            at = space.place[e.path]
+            center[at], scatter[at] = start[at], 0.0
+    return center, scatter
+
+
+def replicates(
+    config: Config,
+    choices: Sequence[Choice],
+    problem: Problem,
+    count: int,
+    seed: int,
+    kept: Checkpoint,
+    report: Reporter,
+) -> list[Replicate]:
+    """Replicates until there are `count`; those that are kept are not repeated.
+
+    Args:
+        choices: as the problem was given.
+        problem: of its windows; what is compiled for it serves every replicate.
+        seed: with the replicate's number the seed of truth and noise.
+        kept: those that are done; every new one is added.
+    """
+    center, scatter = plausible(config, choices, problem)
+    std = dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True))
+    fit = config.content.fit
+    found = _FILE.validate_python(kept.load_json(KEPT) or [])[:count]
+    if found:
+        report.line(f"{len(found)} of {count} replicates are in {kept.folder / KEPT}.json already")
+    report.stage("replicates")
+
+    def tell(state: State) -> None:
+        report.note(f"{state.stage}, round {state.round}")
+
+    for k in range(len(found), count):
+        rng = np.random.default_rng([seed, k])
+        z = center + scatter * rng.standard_normal(len(center))
+        made = measure(problem.space.tree(jnp.asarray(z)), problem.windows, rng, std)
+        this = problem.of(made)
+        end = optimise(this, most_rounds=fit.rounds, tolerance=fit.tolerance, tell=tell)
+        found.append(compared(this, choices, z, end))
+        kept.save_json(KEPT, [asdict(one) for one in found])
+        report.advance(len(found), count)
+    return found
+
+
+def compared(
+    problem: Problem, choices: Sequence[Choice], true: Float[np.ndarray, " free"], end: Optimum
+) -> Replicate:
+    """The end of a fit beside its truth: every free number, every ratio, curves, predictions."""
+    space, volt = problem.space, problem.windows.has_voltage
+    z, covariance = end.state.z, end.covariance
+    truth = space.tree(jnp.asarray(true))
+    off = (z - true) / np.sqrt(np.diag(covariance))
+    values = {e.path: np.atleast_1d(np.asarray(e.get(truth), float)) for e in space.free}
+    flat = members(flat_directions(space, covariance, problem.windows.has_current, volt))
+    judged = {e.path for e in space.free if e.session is None}
+    numbers = {
+        e.path: _number(e, values[e.path], off[space.place[e.path]])
+        for e in estimates(space, choices, z, covariance, volt, flat)
+        if e.path in judged
+    }
+    known = {e.path: e.value for e in derived(space, true, covariance, volt)}
+    for e in derived(space, z, covariance, volt):
+        score = np.log(e.value / known[e.path]) / (e.std / e.value)
+        numbers[e.path] = _number(e, np.array([known[e.path]]), np.array([score]))
+    found = space.tree(jnp.asarray(z))
+    return Replicate(
+        parameters=numbers,
+        curves=_curves(problem, truth, z, covariance),
+        predictions=_predictions(problem.windows, truth, found),
+        converged=bool(end.converged),
+        reason=end.reason,
+    )
+
+
+def _number(e: Estimate, truth: np.ndarray, score: np.ndarray) -> Number:
+    pairs = e.interval90 if e.labels else [e.interval90]
+    values = e.value if e.labels else [e.value]
+    return Number(
+        unit=e.unit,
+        labels=list(e.labels),
+        truth=truth.tolist(),
+        value=list(values),
+        inside=[bool(a <= t <= b) for t, (a, b) in zip(truth, pairs, strict=True)],
+        z=score.tolist(),
+        verdict=e.verdict,
+    )
+
+
+def _curves(
+    problem: Problem, truth: Robot, z: np.ndarray, covariance: np.ndarray
+) -> dict[str, Curve]:
+    """Largest gap in slip to the true curve of every floor, and how much lies in the band."""
+    found = curves(problem.space, z, draws(z, covariance, 200, 0), problem.batch)
+    out = {}
+    for floor, curve in found.items():
+        true = slip_on(truth, floor, curve)
+        inside = (curve.slip_lo - 1e-9 <= true) & (true <= curve.slip_hi + 1e-9)
+        out[floor] = Curve(float(np.abs(true - curve.slip).max()), float(inside[1:].mean()))
+    return out
+
+
+def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, float]]:
+    """Distance of predicted ends from the true one over the true chord, mean per floor.
+
+    Of the experiment's own pieces without any noise: what the numbers' errors alone cost.
+    """
+    start = jnp.zeros((len(w), 3))
+
+    def ends(increment: np.ndarray | Array) -> np.ndarray:
+        return np.asarray(chain(start, jnp.asarray(increment)))[:, -1, :2]
+
+    true = ends(contact_increments(truth, lk.batch(w, truth)))
+    back = np.asarray(truth.geometry.least())
+    twist = (w.turn / w.dt[..., None]) @ (back * float(truth.geometry.wheel_radius)).T
+    said = {
+        "identified": ends(contact_increments(found, lk.batch(w, found))),
+        "encoder": ends(as_increments(twist, w, truth)),
+    }
+    chord, floor = np.linalg.norm(true, axis=1), np.asarray(w.surface)
+    far = chord > 0.1 * np.median(chord)  # those that turn on the spot have none
+    out: dict[str, dict[str, float]] = {}
+    for name in dict.fromkeys(w.surface):
+        if (mine := far & (floor == name)).any():
+            gaps = {model: np.linalg.norm(end - true, axis=1) for model, end in said.items()}
+            out[name] = {m: float(np.mean((gap / chord)[mine])) for m, gap in gaps.items()}
+    return out

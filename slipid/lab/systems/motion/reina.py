@@ -1,0 +1,194 @@
+"""Reina and others detect slip by indicators from encoders, gyro and currents.
+
+Thresholds or fuzzy rules decide on them. Signals are smoothed by a causal exponential mean (I~, w,
+gyro). Let J_i be the rim speed of wheel i per body twist, xi_c the commanded twist and xi_enc the
+twist by the encoders. The indicators are
+
+    w_ref,i = J_i xi_c / r  median_j(r w_j / J_j xi_c)   (without a command: xi_enc for xi_c)
+    EI = sat(max_i max(|w_i - w_ref,i| / |w_ref,i|, |dw_i/dt| / a_max))
+    GI = sat(|W_enc - gyro| / g_th)
+    CI = sat((min_i I~_i - I_lo) / (I_hi - I_lo)),       sat(x) = x cut to 0..1
+
+`reina_deterministic` flags slip where GI >= 1 or CI >= 1. `reina_fuzzy` feeds EI, CI and GI into
+Sugeno's inference with fuzzy sets on 0..1, whose consequents are trained by least squares on
+whether the training windows slip, and flags slip where the answer is at least one half. A window of
+half a second slips where |xi - xi_enc| > 0.2 |xi_enc|, with yaw rates weighted by the base radius.
+
+Two settings are tuned: the quantile of windows without slip that sets a_max, g_th and I_hi, and how
+long signals are smoothed. The fuzzy row has the number of fuzzy sets tuned instead of the quantile.
+
+Liberties:
+- The original only detects. Here the path is that of the encoders, whose twist is scaled by 1 - s
+  where slip is flagged; s is the mean slip of what was flagged in training windows (least squares).
+- Thresholds are quantiles over the training windows without slip (for I_lo the median); where all
+  windows slip, they are the smallest value seen.
+- Where there is no gyro, EI >= 1 takes the place of GI >= 1.
+- The original compares the wheels of a rover with each other. An omni robot's wheels turn at
+  different speeds, so they are compared with the shape of the commanded twist. What a slow wheel is
+  off is divided by 0.3 of the fastest reference instead of its own. Three omni wheels fit any twist
+  exactly: then EI tells how wheels follow their command, not whether they slip, and without a
+  command only accelerations are left of it.
+- The smallest current is taken over wheels that turn with at least 0.3 of the fastest rim speed;
+  the others carry no load that could tell of slip.
+- Fuzzy sets are triangles, every combination of sets has a rule, and consequents are constants
+  that are trained on poses; the original's own sets and rules are not taken over.
+- The score is the larger of the uncut indicators that flag, or the fuzzy answer; it is 0 at rest.
+- The original also sees by a camera how deep its wheels have sunk; that is left out.
+
+Source: Reina, Ojeda, Milella, Borenstein 2006, "Wheel slippage and sinkage detection for planetary
+rovers", IEEE/ASME Transactions on Mechatronics 11(2).
+"""
+
+import abc
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import final
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.lab.systems.motion.reina_indicators import Example, Indicators, Limits, Signals, Sugeno
+from slipid.predict.slip_model import (
+    Channel,
+    Heard,
+    Machine,
+    Numbers,
+    Run,
+    Said,
+    SlipModel,
+    path_of,
+)
+
+_CURRENT: frozenset[Channel] = frozenset({"current"})
+
+
+@dataclass(frozen=True)
+class _Detector(SlipModel):
+    """What both rows share.
+
+    Attributes:
+        smoothing: how long signals are smoothed [s].
+        quantile: of the steps without slip that sets the thresholds.
+        limits: fitted thresholds.
+        slip: share of the encoders' twist that is lost where slip is flagged, fitted.
+    """
+
+    needs: frozenset[Channel] = field(default=_CURRENT, kw_only=True)
+    smoothing: float = 0.3
+    quantile: float = 0.95
+    limits: Limits = field(default_factory=Limits)
+    slip: float = 0.0
+
+    def fit(self, runs: Sequence[Run], machine: Machine) -> "_Detector":
+        examples = [Example.of(run, machine, self.smoothing) for run in runs]
+        limited = replace(self, limits=Limits.of(examples, self.quantile))
+        trained = limited._trained(examples)
+        return replace(trained, slip=trained._mean_slip(examples))
+
+    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+        said = []
+        for heard in runs:
+            score = self.score(Signals.of(heard, machine, self.smoothing))
+            kept = 1.0 - self.slip * (score >= self._flagged)
+            path = path_of(heard.rolling(machine) * kept[:, None], heard.dt)
+            said.append(Said(path, slipping=score))
+        return said
+
+    def score(self, signals: Signals) -> Numbers:
+        """How sure it is that the robot slips in each step; 0 where it stands."""
+        return np.where(signals.moving, self._answer(Indicators.of(signals, self.limits)), 0.0)
+
+    def _mean_slip(self, examples: Sequence[Example]) -> float:
+        """Slip of the flagged parts of windows that explains their twists best."""
+        against = square = 0.0
+        for example in examples:
+            flags = (self.score(example.signals) >= self._flagged).astype(float)
+            count = np.diff(example.first, append=len(flags))
+            share = np.add.reduceat(flags, example.first) / count
+            against += float(share @ example.against)
+            square += float(share**2 @ example.square)
+        return against / square if square > 0.0 else 0.0
+
+    def _trained(self, examples: Sequence[Example]) -> "_Detector":
+        """Itself, with what it learns beside the thresholds."""
+        return self
+
+    @property
+    @abc.abstractmethod
+    def _flagged(self) -> float:
+        """Score from which on slip is flagged."""
+
+    @abc.abstractmethod
+    def _answer(self, indicators: Indicators) -> Numbers:
+        """Score of moving steps."""
+
+
+@final
+@dataclass(frozen=True)
+class ReinaDeterministic(_Detector):
+    """Slip is flagged where GI >= 1 or CI >= 1; where there is no gyro, EI >= 1 or CI >= 1."""
+
+    name: str = "reina_deterministic"
+
+    def candidates(self) -> Sequence["ReinaDeterministic"]:
+        return [replace(self, quantile=q, smoothing=s) for q in (0.9, 0.98) for s in (0.3, 1.0)]
+
+    @property
+    def numbers(self) -> int:
+        return 4 + int(np.isfinite(self.limits.turning))
+
+    @property
+    def _flagged(self) -> float:
+        return 1.0
+
+    def _answer(self, indicators: Indicators) -> Numbers:
+        turning = indicators.encoder if indicators.gyro is None else indicators.gyro
+        return np.maximum(turning, indicators.current)
+
+
+@final
+@dataclass(frozen=True)
+class ReinaFuzzy(_Detector):
+    """Slip is flagged where Sugeno's inference from EI, CI and, if there is one, GI says half.
+
+    Attributes:
+        sets: fuzzy sets of every indicator.
+        rules: fitted.
+    """
+
+    name: str = "reina_fuzzy"
+    sets: int = 2
+    rules: Sugeno | None = None
+
+    def candidates(self) -> Sequence["ReinaFuzzy"]:
+        return [replace(self, sets=n, smoothing=s) for n in (2, 3) for s in (0.3, 1.0)]
+
+    @property
+    def numbers(self) -> int:
+        rules = 0 if self.rules is None else len(self.rules.consequents)
+        return 4 + int(np.isfinite(self.limits.turning)) + rules
+
+    @property
+    def _flagged(self) -> float:
+        return 0.5
+
+    def _trained(self, examples: Sequence[Example]) -> "ReinaFuzzy":
+        signals = [example.signals for example in examples]
+        inputs = np.concatenate([self._inputs(Indicators.of(s, self.limits)) for s in signals])
+        slips = np.concatenate([example.slips for example in examples])
+        known = np.isfinite(slips)
+        untrained = Sugeno.logical_or(inputs.shape[1], self.sets)
+        return replace(self, rules=untrained.trained(inputs[known], slips[known]))
+
+    def _answer(self, indicators: Indicators) -> Numbers:
+        inputs = self._inputs(indicators)
+        rules = self.rules or Sugeno.logical_or(inputs.shape[1], self.sets)
+        return rules.infer(inputs)
+
+    def _inputs(self, indicators: Indicators) -> Float[np.ndarray, "step input"]:
+        """The indicators as columns. A gyro that is missing in a run says nothing of slip."""
+        columns = [indicators.encoder, indicators.current]
+        if np.isfinite(self.limits.turning):
+            silent = np.zeros_like(indicators.encoder)
+            columns.append(silent if indicators.gyro is None else indicators.gyro)
+        return np.stack(columns, axis=1)

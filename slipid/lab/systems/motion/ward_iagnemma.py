@@ -1,0 +1,292 @@
+"""The fit finds the law of a floor in windows of training runs, and then the noise that is left.
+
+The law is that whose steady speeds come nearest to the true ones. The noise is then taken from what
+the law leaves: how resistance scatters between runs, how twists scatter within a run, and what gyro
+and currents are off.
+
+Ward and Iagnemma detect slip by an extended Kalman filter on the robot's dynamics.
+
+The state is the body's twist v, the coefficient rho of the resistive force and the gyro's bias b.
+Wheel speeds are inputs. Let q = (vx, vy, L W), let J_i be the rim speed of drive i per q, let
+N = m g / n be the load of each of n drives, and let M = diag(m, m, m/2), p = (vx, vy) and
+q_t = L W. Then the forces and the equation of motion are
+
+    u_i    = r w_i - J_i q                                              sliding speed
+    T_i    = N (C1 sgn(u_i) (1 - exp(-A |u_i|)) + C2 u_i)               traction
+    F      = - m g rho (1 / sqrt(|p|^2 + v_s^2) + c) p                  resistive force on travel
+             - m g rho_t q_t / sqrt(|q_t|^2 + v_s^2)                    and on turning
+    M dq/dt = sum_i J_i^T T_i + F + m W (vy, -vx, 0)
+
+Wheels that do not determine the twist (skid steer) grip sideways, and they slide sideways as soon
+as the robot turns; then p = vx and q_t = (vy, L W). A step is one of backward Euler, solved by
+Newton's method with the analytic Jacobian. The filter measures gyro = W + b, and in
+`ward_iagnemma_current` also n C_e I_i / r = k sgn(w_i) T_i + f of every wheel that drives. A weak
+constraint keeps rho in its range: where rho is below 0, so that the force would push, or above
+C1 / (1 + c |p|), so that no traction could overcome it, a measurement with a tenth of rho's spread
+pulls it to that bound.
+
+A robot is called immobilised where |v| < 0.2 of what its wheels say, for 0.4 s. The score of
+slipping is 1 - |v| / |v by the wheels|, where turning is weighted by the base radius.
+
+The fit uses at most 40 runs. It finds A, rho, rho_t and c by least squares of the twists of windows
+of half a second, each as if the robot had always driven like that. From what is left it then takes
+how rho scatters between runs, the process noise (white noise of the twist that explains where
+training runs end), the noise and bias of the gyro, and k, f and the noise of the currents. Two
+settings are tuned: whether resistance grows with speed (c), and whether rho wanders within a run,
+by half its scatter between runs in a second.
+
+Liberties:
+- The original measures acceleration and, where there is one, GPS; neither is logged here. It has
+  one axis of travel and pitch; here the body moves in a plane, and the ground is level.
+- The state is the coefficient of the resistive force, not the force. The force fades out within
+  v_s = 2 cm/s of rest, and may grow with speed (c); turning has a coefficient of its own.
+- The original takes parameters from experiments and shows that their values matter little; here
+  they are fitted. At steady speed motion tells forces only in ratio to C1, so C1 is 0.6 throughout.
+  C2 is 0.1 s/m, since windows cannot tell it from the end of the exponential. A weak prior holds
+  the other parameters where motion does not tell them.
+- Every drive carries the same load, traction acts along the drive direction only (rollers are
+  free), and the inertia is m L^2 / 2.
+- Forces by currents are scaled and offset by least squares (k, f), because gear losses are not
+  known, and often not even the motor. Their errors are mostly the same all along a run, so their
+  noise is that of the mean of a run. They correct rho, and through it the twist, but they do not
+  correct the twist itself: most of its scatter is no sliding, and the steep law would take it for
+  that. Where ammeters have no sign, all driving wheels are taken to push. Wheels below 0.3 of the
+  fastest rim speed are not heard.
+- A run starts as if nothing had slipped.
+- The score is the ratio itself, without waiting for 0.4 s.
+- The pose is not corrected by later measurements: the path is that of the filtered twists, and
+  its covariance is of that path (a Kalman filter whose gain for the pose is zero).
+
+Source: Ward & Iagnemma 2008, "A dynamic-model-based wheel slip detector for mobile robots on
+outdoor terrain", IEEE Transactions on Robotics 24(4).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import final
+
+import numpy as np
+from jaxtyping import Int
+
+from slipid.lab.systems.motion.ward_iagnemma_dynamics import (
+    REST,
+    Drives,
+    Dynamics,
+    Each,
+    Law,
+    Padded,
+    Speeds,
+    Step,
+)
+from slipid.lab.systems.motion.ward_iagnemma_filter import Filter, Noise
+from slipid.predict.slip_model import Heard, Machine, Run, Said, SlipModel, path_of
+
+_STEADY = 10.0
+"""Time after which speeds are taken for steady [s]."""
+_FIT_RUNS, _FIT_WINDOWS = 40, 100
+"""Largest numbers of runs, and of windows for the law, that are fitted to."""
+_BOUNDS = {
+    "rise": (0.5, 500.0),
+    "rolling": (1e-3, 1.0),
+    "turning": (1e-3, 1.0),
+    "drag": (0.1, 500.0),
+}
+_GRID = ((0.3, 1.0), (0.3, 6.0), (3.0, 1.0), (3.0, 6.0))
+"""Starts of A and rho, times the middles of their bounds."""
+_PRIOR = 1e-3
+"""Slip, over that of the wheels, that as much as a factor e of a parameter costs."""
+_MEDIAN_OF_SQUARES = 0.4549
+"""Of a standard normal number: what a median of squares is divided by to be a variance."""
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Windows of training runs.
+
+    Attributes:
+        run: number of the run of each.
+        rolling, true: q if nothing slipped, and by the pose [m/s].
+        rim, pull: as of `Padded`.
+        gyro: less the true yaw rate [rad/s]; nan where there is none.
+        dt: [s].
+    """
+
+    run: Int[np.ndarray, " run"]
+    rolling: Speeds
+    true: Speeds
+    rim: Drives
+    pull: Drives
+    gyro: Each
+    dt: Each
+
+    @classmethod
+    def of(cls, runs: Sequence[Run], machine: Machine) -> "Windows":
+        """Of at most `_FIT_RUNS` runs, drawn with a fixed seed."""
+        drawn = np.random.default_rng(0).permutation(len(runs))[:_FIT_RUNS]
+        joined = [runs[k].windowed() for k in np.sort(drawn)]
+        padded = Padded.of([run.heard for run in joined], machine)
+        run, step = np.nonzero(padded.dt > 0.0)
+        true = np.concatenate([run.twist * machine.size for run in joined])
+        return cls(
+            run=run,
+            rolling=padded.rolling[run, step],
+            true=true,
+            rim=padded.rim[run, step],
+            pull=padded.pull[run, step],
+            gyro=padded.gyro[run, step] - true[:, 2] / machine.base_radius,
+            dt=padded.dt[run, step],
+        )
+
+    def thinned(self, most: int) -> "Windows":
+        """At most so many of them, evenly spaced."""
+        every = slice(None, None, -(-len(self.dt) // most))
+        return replace(self, **{f.name: getattr(self, f.name)[every] for f in fields(self)})
+
+    def steady(self, dynamics: Dynamics) -> Step:
+        """Every window as if it had always driven like that."""
+        rolling = np.full(len(self.dt), dynamics.law.rolling)
+        return dynamics.step(self.rolling, rolling, self.rim, np.full(len(self.dt), _STEADY))
+
+
+def fitted_law(windows: Windows, machine: Machine, with_drag: bool) -> Law:
+    """The law whose speeds come nearest to the true ones, relative to those of the wheels."""
+    from scipy.optimize import least_squares
+
+    names = [name for name in _BOUNDS if with_drag or name != "drag"]
+    low, high = np.log([_BOUNDS[name] for name in names]).T
+    middle = 0.5 * (low + high)
+    some = windows.thinned(_FIT_WINDOWS)
+    size = np.maximum(np.linalg.norm(some.rolling, axis=1), REST)[:, None]
+
+    def law(logs: np.ndarray) -> Law:
+        return Law(**dict(zip(names, np.exp(logs).tolist(), strict=True)))
+
+    def left(logs: np.ndarray) -> np.ndarray:
+        gap = (some.steady(Dynamics.of(machine, law(logs))).speeds - some.true) / size
+        return np.append(gap.ravel(), _PRIOR * np.sqrt(len(gap)) * (logs - middle))
+
+    starts = [middle + np.log([*times, 1.0, 1.0][: len(names)]) for times in _GRID]
+    found = least_squares(
+        left,
+        min(starts, key=lambda logs: float(np.abs(left(logs)).sum())),
+        bounds=(low, high),
+        loss="soft_l1",
+        f_scale=0.1,
+        diff_step=1e-3,
+        max_nfev=12,
+        ftol=1e-4,
+        xtol=1e-3,
+    )
+    return law(found.x)
+
+
+def fitted_noise(windows: Windows, dynamics: Dynamics, mass: float) -> Noise:
+    """What the law leaves in the windows."""
+    step = windows.steady(dynamics)
+    gap = windows.true - step.speeds
+    at = np.unique(windows.run, return_index=True)[1]
+    push = np.add.reduceat((gap * step.by_rolling).sum(axis=1), at)
+    shift = push / np.maximum(np.add.reduceat((step.by_rolling**2).sum(axis=1), at), 1e-12)
+    gap = gap - step.by_rolling * np.repeat(shift, np.diff(at, append=len(gap)))[:, None]
+    ends = np.add.reduceat(gap * windows.dt[:, None], at)
+    density = np.median(ends**2 / np.add.reduceat(windows.dt, at)[:, None], axis=0)
+    drift = np.maximum(np.sqrt(density / _MEDIAN_OF_SQUARES), 1e-4)
+    noise = replace(
+        Noise(),
+        rolling=max(float(np.sqrt(np.median(shift**2) / _MEDIAN_OF_SQUARES)), 1e-5),
+        drift=(float(drift[0]), float(drift[1]), float(drift[2])),
+    )
+    slide = windows.rim - step.speeds @ dynamics.rims.T
+    force = mass * np.sign(windows.rim) * dynamics.traction(slide)
+    return with_currents(with_gyro(noise, windows), windows, force)
+
+
+def with_gyro(noise: Noise, windows: Windows) -> Noise:
+    """Noise and bias of the gyro, where there is one."""
+    told = np.isfinite(windows.gyro)
+    if not told.any():
+        return noise
+    of = np.unique(windows.run[told], return_inverse=True)[1]
+    means = np.bincount(of, windows.gyro[told]) / np.bincount(of)
+    scatter = float(np.std(windows.gyro[told] - means[of]))
+    bias = float(np.sqrt(np.mean(means**2)))
+    return replace(noise, gyro=max(scatter, 1e-5), bias=max(bias, 1e-5))
+
+
+def with_currents(noise: Noise, windows: Windows, force: Drives) -> Noise:
+    """Scale, offset and noise of the forces by currents, where there are any."""
+    told = np.isfinite(windows.pull)
+    if not told.any():
+        return noise
+    pull, pushed = windows.pull[told], force[told]
+    shared = float(np.mean((pushed - pushed.mean()) * (pull - pull.mean())))
+    gain = max(shared / max(float(np.var(pushed)), 1e-12), 0.0)
+    offset = float(pull.mean() - gain * pushed.mean())
+    left = np.where(told, windows.pull - offset - gain * force, 0.0)
+    at = np.unique(windows.run, return_index=True)[1]
+    sums, counts = np.add.reduceat(left, at), np.add.reduceat(told.astype(float), at)
+    # white noise with the same error of the mean of a run
+    variance = float((sums**2).sum() / counts.sum())
+    return replace(noise, gain=gain, offset=offset, force=max(variance**0.5, 1e-6))
+
+
+@final
+@dataclass(frozen=True)
+class WardIagnemma(SlipModel):
+    """The filter, with or without currents.
+
+    Attributes:
+        with_drag: whether resistance grows with speed.
+        wander: by how much of its scatter between runs rho moves in a second of a run.
+        law, noise: fitted.
+    """
+
+    name: str = "ward_iagnemma"
+    with_drag: bool = True
+    wander: float = 0.0
+    law: Law = field(default_factory=Law)
+    noise: Noise = field(default_factory=Noise)
+
+    @classmethod
+    def with_current(cls) -> "WardIagnemma":
+        """The variant that measures traction by the currents."""
+        return cls("ward_iagnemma_current", needs=frozenset({"current"}))
+
+    def candidates(self) -> Sequence["WardIagnemma"]:
+        return [replace(self, with_drag=d, wander=w) for d in (False, True) for w in (0.0, 0.5)]
+
+    def fit(self, runs: Sequence[Run], machine: Machine) -> "WardIagnemma":
+        windows = Windows.of(runs, machine)
+        law = fitted_law(windows, machine, self.with_drag)
+        noise = fitted_noise(windows, Dynamics.of(machine, law), machine.mass)
+        return replace(self, law=law, noise=noise)
+
+    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+        padded = Padded.of(runs, machine)
+        tracked = self.filter(machine).track(padded)
+        size, fastest = (np.linalg.norm(q, axis=2) for q in (tracked.speeds, padded.rolling))
+        kept = np.where(fastest > REST, size / np.where(fastest > REST, fastest, 1.0), 1.0)
+        slipping = np.clip(1.0 - kept, 0.0, 1.0)
+        return [
+            Said(
+                path_of(tracked.speeds[k, : len(run)] / machine.size, run.dt),
+                end_covariance=tracked.covariance[k, :2, :2],
+                slipping=slipping[k, : len(run)],
+            )
+            for k, run in enumerate(runs)
+        ]
+
+    def filter(self, machine: Machine) -> Filter:
+        """The filter as fitted, for a robot."""
+        return Filter(
+            dynamics=Dynamics.of(machine, self.law),
+            noise=self.noise,
+            mass=machine.mass,
+            hears_current="current" in self.needs,
+            wander=self.wander * self.noise.rolling,
+        )
+
+    @property
+    def numbers(self) -> int:
+        heard = 2 * np.isfinite(self.noise.gyro) + 3 * ("current" in self.needs)
+        return 3 + self.with_drag + 4 + int(heard)

@@ -1,0 +1,240 @@
+"""The dynamics say how a robot moves on a floor with a law of traction and resistance.
+
+Speeds are those of q, and forces are divided by the robot's mass. A step solves the equation of
+motion, whose symbols and formulas stand at the top of `method.py`, for many runs at once, and gives
+the derivatives of the speeds after it.
+
+Runs of any lengths are laid side by side, so that the filter tracks all of them at once.
+
+Of each run it holds what the filter hears: speeds of the wheels, the gyro, and the forces that the
+motors' currents tell.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from slipid.predict.slip_model import Heard, Machine
+
+Drives = Float[np.ndarray, "run drive"]
+Speeds = Float[np.ndarray, "run 3"]
+"""q: body twist times (1, 1, base radius) [m/s]."""
+Each = Float[np.ndarray, " run"]
+GRAVITY = 9.81
+REST = 0.02
+"""v_s: speed within which resistance fades out [m/s]."""
+_OVER_MASS = np.array([1.0, 1.0, 2.0])
+"""m / M: what a force over the mass accelerates; the inertia is m L^2 / 2."""
+_MOST_STEPS = 25
+"""Newton steps after which an equation that is still not solved is left as it is."""
+_SOLVED = 1e-7
+"""Residual at which an equation counts as solved [m/s]."""
+
+
+@dataclass(frozen=True)
+class Law:
+    """Forces between wheels and floor, as shares of the weight.
+
+    Attributes:
+        grip: C1.
+        rise: A [s/m].
+        viscous: C2 [s/m].
+        rolling: rho.
+        turning: rho_t.
+        drag: c [s/m].
+    """
+
+    grip: float = 0.6
+    rise: float = 20.0
+    viscous: float = 0.1
+    rolling: float = 0.05
+    turning: float = 0.05
+    drag: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Push:
+    """Accelerations [m/s^2], and their derivatives by the speeds [1/s] and by rho [m/s^2]."""
+
+    rate: Speeds
+    slope: Float[np.ndarray, "run 3 3"]
+    by_rolling: Speeds
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Speeds after a step of the dynamics, and their derivatives by those before and by rho."""
+
+    speeds: Speeds
+    by_speeds: Float[np.ndarray, "run 3 3"]
+    by_rolling: Speeds
+
+
+@dataclass(frozen=True, eq=False)
+class Nearer:
+    """Speeds nearer to the solution of a step, and whether they solve it."""
+
+    speeds: Speeds
+    done: Bool[np.ndarray, " run"]
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """A robot on a floor.
+
+    Attributes:
+        law: of the floor.
+        rims: rim speed of each drive per q.
+        turning: 1 for the speeds that count as turning, 0 for those along which the robot rolls.
+        base_radius: L [m].
+    """
+
+    law: Law
+    rims: Float[np.ndarray, "drive 3"]
+    turning: Float[np.ndarray, "3"]
+    base_radius: float
+
+    @classmethod
+    def of(cls, machine: Machine, law: Law) -> "Dynamics":
+        """Of a robot."""
+        turning = np.array([0.0, 0.0 if machine.determines_twist else 1.0, 1.0])
+        rims = np.asarray(machine.forward / machine.size, dtype=float)
+        return cls(law, rims, turning, float(machine.base_radius))
+
+    def traction(self, slide: Drives) -> Drives:
+        """Traction of each drive over the robot's mass [m/s^2], by sliding speeds [m/s]."""
+        law, load = self.law, GRAVITY / len(self.rims)
+        rising = -np.expm1(-law.rise * np.abs(slide))
+        return np.asarray(load * (law.grip * np.sign(slide) * rising + law.viscous * slide))
+
+    def stiffness(self, slide: Drives) -> Drives:
+        """Derivative of `traction` [1/s]."""
+        law, load = self.law, GRAVITY / len(self.rims)
+        rising = law.rise * np.exp(-law.rise * np.abs(slide))
+        return np.asarray(load * (law.grip * rising + law.viscous))
+
+    def push(self, q: Speeds, rolling: Each, rim: Drives, secant: bool = False) -> Push:
+        """Accelerations at speeds q; with `secant`, slopes of the chords to where no force acts."""
+        law, slide = self.law, rim - q @ self.rims.T
+        traction, stiff = self.traction(slide), self.stiffness(slide)
+        if secant:
+            still = np.abs(slide) < 1e-9
+            stiff = np.where(still, stiff, traction / np.where(still, 1.0, slide))
+        straight = 1.0 - self.turning
+        alike = np.outer(self.turning, self.turning) + np.outer(straight, straight)
+        size = np.sqrt(q**2 @ alike + REST**2)
+        along, share = (
+            q / size,
+            GRAVITY * (rolling[:, None] * straight + law.turning * self.turning),
+        )
+        linear = share * (1.0 / size + law.drag * straight)
+        squares = (self.rims[:, :, None] * self.rims[:, None, :]).reshape(-1, 9)
+        slope = -(stiff @ squares).reshape(-1, 3, 3)
+        if not secant:
+            slope += (share / size * along)[:, :, None] * along[:, None, :] * alike
+        slope[:, range(3), range(3)] -= linear
+        rate = (traction @ self.rims - linear * q) * _OVER_MASS
+        slope *= _OVER_MASS[:, None]
+        # the axes turn with the body: W (vy, -vx)
+        yaw = q[:, 2] / self.base_radius
+        rate[:, 0] += yaw * q[:, 1]
+        rate[:, 1] -= yaw * q[:, 0]
+        slope[:, 0, 1] += yaw
+        slope[:, 1, 0] -= yaw
+        if not secant:
+            slope[:, 0, 2] += q[:, 1] / self.base_radius
+            slope[:, 1, 2] -= q[:, 0] / self.base_radius
+        return Push(rate, slope, -GRAVITY * straight * (along + law.drag * q))
+
+    def step(self, speeds: Speeds, rolling: Each, rim: Drives, dt: Each) -> Step:
+        """Backward Euler: q' = q + dt a(q'), by Newton's method, run by run until it is solved."""
+        solution, todo = speeds.copy(), np.arange(len(speeds))
+        for _ in range(_MOST_STEPS):
+            nearer = self._nearer(solution[todo], speeds[todo], rolling[todo], rim[todo], dt[todo])
+            solution[todo], todo = nearer.speeds, todo[~nearer.done]
+            if len(todo) == 0:
+                break
+        at, wait = self.push(solution, rolling, rim), dt[:, None]
+        inverse = np.linalg.inv(np.eye(3) - wait[..., None] * at.slope)
+        return Step(solution, inverse, (inverse @ (wait * at.by_rolling)[..., None])[..., 0])
+
+    def _nearer(self, q: Speeds, start: Speeds, rolling: Each, rim: Drives, dt: Each) -> "Nearer":
+        """One step of Newton's method from q.
+
+        Traction and resistance flatten out, so that the step may overshoot. Where it does not come
+        nearer, that of the secants is taken instead: but for the turning axes, the forces have a
+        potential that is concave in squares of speeds, on which the secants' step descends.
+        """
+        here, wait = self.push(q, rolling, rim), dt[:, None]
+        left = q - start - wait * here.rate
+        trial = q - solved(wait, here.slope, left)
+        left_there = trial - start - wait * self.push(trial, rolling, rim).rate
+        before, after = ((x**2 / _OVER_MASS).sum(axis=1) for x in (left, left_there))
+        done = after < _SOLVED**2
+        worse = ~done & ~(after < before)
+        if worse.any():
+            secants = self.push(q, rolling, rim, secant=True).slope
+            trial = np.where(worse[:, None], q - solved(wait, secants, left), trial)
+        return Nearer(trial, done)
+
+
+def solved(
+    wait: Float[np.ndarray, "run 1"], slope: Float[np.ndarray, "run 3 3"], right: Speeds
+) -> Speeds:
+    """What I - dt slope makes the right-hand side."""
+    return np.linalg.solve(np.eye(3) - wait[..., None] * slope, right[..., None])[..., 0]
+
+
+_DRIVING = 0.3
+"""Share of the fastest rim speed from which on a wheel counts as driving."""
+
+
+@dataclass(frozen=True, eq=False)
+class Padded:
+    """Runs side by side, padded to the same number of steps with steps of no time.
+
+    Attributes:
+        dt: [s], 0 in padding.
+        rim: rim speed of each drive [m/s].
+        rolling: q if nothing slipped [m/s].
+        gyro: [rad/s], nan where there is none.
+        pull: force of each motor at the rim by its current [N], nan where it tells nothing.
+    """
+
+    dt: Float[np.ndarray, "run step"]
+    rim: Float[np.ndarray, "run step drive"]
+    rolling: Float[np.ndarray, "run step 3"]
+    gyro: Float[np.ndarray, "run step"]
+    pull: Float[np.ndarray, "run step drive"]
+
+    @classmethod
+    def of(cls, runs: Sequence[Heard], machine: Machine) -> "Padded":
+        """Of runs of any lengths."""
+        shape, drives = (len(runs), max(len(run) for run in runs)), len(machine.forward)
+        padded = cls(
+            dt=np.zeros(shape),
+            rim=np.zeros((*shape, drives)),
+            rolling=np.zeros((*shape, 3)),
+            gyro=np.full(shape, np.nan),
+            pull=np.full((*shape, drives), np.nan),
+        )
+        for k, run in enumerate(runs):
+            steps = slice(len(run))
+            padded.dt[k, steps] = run.dt
+            padded.rim[k, steps] = run.speed * machine.wheel_radius
+            padded.rolling[k, steps] = run.rolling(machine) * machine.size
+            padded.gyro[k, steps] = np.nan if run.gyro is None else run.gyro
+            padded.pull[k, steps] = pulls(run, machine)
+        return padded
+
+
+def pulls(run: Heard, machine: Machine) -> Float[np.ndarray, "step drive"]:
+    """Force n C_e I / r along each drive's motion [N]; nan where it tells nothing."""
+    rim = np.abs(run.speed * machine.wheel_radius)
+    if run.current is None:
+        return np.full(rim.shape, np.nan)
+    drives = (rim >= _DRIVING * rim.max(axis=1, keepdims=True)) & (rim > REST)
+    scale = machine.gear_ratio * machine.back_emf / machine.wheel_radius
+    return np.where(drives, scale * run.along(machine), np.nan)

@@ -1,0 +1,175 @@
+"""The extended Kalman filter tracks the state of many runs at once.
+
+In every step it moves the state by the dynamics, corrects it by the gyro and the currents, and
+pulls the coefficient of resistance back within its bounds. What it measures stands at the top of
+`method.py`. The error of the pose rides along, so that the end of every path has a covariance.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.lab.systems.motion.ward_iagnemma_dynamics import Drives, Dynamics, Each, Padded
+from slipid.predict.slip_model import WINDOW_S
+
+Spread = Float[np.ndarray, "run 8 8"]
+Row = Float[np.ndarray, "run 8"]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the law leaves.
+
+    Attributes:
+        rolling: standard deviation of rho between runs.
+        drift: standard deviation of place and turn after a second [m], (ahead, left, turn times L).
+        gyro, bias: standard deviation of the gyro over a window, and between runs [rad/s]; the
+            former is nan where training had no gyro, and then none is heard.
+        gain, offset: k, and f [N].
+        force: standard deviation of the force by a current over a window [N]; nan like that.
+    """
+
+    rolling: float = 0.01
+    drift: tuple[float, float, float] = (0.01, 0.01, 0.01)
+    gyro: float = np.nan
+    bias: float = 0.0
+    gain: float = 1.0
+    offset: float = 0.0
+    force: float = np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Mean and covariance of q (3), rho, the gyro's bias, and the error of the pose (3).
+
+    The pose rides along without being corrected: its error is that of a path of filtered twists.
+    The mean of its error is 0 and left out.
+    """
+
+    mean: Float[np.ndarray, "run 5"]
+    spread: Spread
+
+    def moved(self, mean: Float[np.ndarray, "run 5"], by: Spread) -> "State":
+        """At another mean, the covariance carried along by the derivatives."""
+        return State(mean, by @ self.spread @ by.transpose(0, 2, 1))
+
+    def corrected(self, row: Row, news: Each, variance: Each, of: slice = slice(5)) -> "State":
+        """By a measurement with these derivatives; nan news is none.
+
+        Joseph's form, right for any gain: P - K h P - P h' K' + K s K' with s = h P h' + variance.
+        """
+        heard = np.isfinite(news + variance)
+        if not heard.any():
+            return self
+        shared = (self.spread @ row[..., None])[..., 0]
+        size = ((shared * row).sum(axis=1) + np.where(heard, variance, 1.0))[:, None]
+        gain = shared / size * heard[:, None]
+        gain[:, : of.start or 0] = 0.0
+        gain[:, of.stop :] = 0.0
+        less = gain[:, :, None] * (shared - 0.5 * size * gain)[:, None, :]
+        mean = self.mean + gain[:, :5] * np.where(heard, news, 0.0)[:, None]
+        return State(mean, self.spread - less - less.transpose(0, 2, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What the filter says of padded runs: q in every step, and the covariance of the last pose."""
+
+    speeds: Float[np.ndarray, "run step 3"]
+    covariance: Float[np.ndarray, "run 3 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Filter:
+    """The extended Kalman filter.
+
+    Attributes:
+        dynamics, noise: fitted.
+        mass: of the robot [kg].
+        hears_current: whether forces by currents are measurements.
+        wander: standard deviation by which rho moves in a second.
+    """
+
+    dynamics: Dynamics
+    noise: Noise
+    mass: float
+    hears_current: bool
+    wander: float
+
+    def track(self, runs: Padded) -> Tracked:
+        """All runs at once."""
+        count, steps = runs.dt.shape
+        rolling = np.full((count, 1), self.dynamics.law.rolling)
+        mean = np.concatenate([runs.rolling[:, 0], rolling, np.zeros((count, 1))], axis=1)
+        variances = [0.0, 0.0, 0.0, self.noise.rolling**2, self.noise.bias**2, 0.0, 0.0, 0.0]
+        state = State(mean, np.tile(np.diag(variances), (count, 1, 1)))
+        heading, speeds = np.zeros(count), np.zeros((count, steps, 3))
+        for k in range(steps):
+            dt = runs.dt[:, k]
+            state = self._bounded(self._heard(self._driven(state, runs.rim[:, k], dt), runs, k))
+            speeds[:, k] = state.mean[:, :3]
+            turn = state.mean[:, 2] / self.dynamics.base_radius * dt
+            state = self._travelled(state, heading + 0.5 * turn, dt)
+            heading = heading + turn
+        return Tracked(speeds, state.spread[:, 5:, 5:])
+
+    def _driven(self, state: State, rim: Drives, dt: Each) -> State:
+        """A step of the dynamics, and what drifts meanwhile."""
+        step = self.dynamics.step(state.mean[:, :3], state.mean[:, 3], rim, dt)
+        by = np.tile(np.eye(8), (len(dt), 1, 1))
+        by[:, :3, :3], by[:, :3, 3] = step.by_speeds, step.by_rolling
+        after = state.moved(np.concatenate([step.speeds, state.mean[:, 3:]], axis=1), by)
+        # white noise of the twist whose integral grows as the squares of the drift
+        rate = np.where(dt > 0.0, 1.0 / np.where(dt > 0.0, dt, 1.0), 0.0)[:, None]
+        after.spread[:, range(3), range(3)] += np.square(self.noise.drift) * rate
+        after.spread[:, 3, 3] += self.wander**2 * dt
+        return after
+
+    def _heard(self, state: State, runs: Padded, k: int) -> State:
+        """The gyro and the currents of a step taken in."""
+        longer = WINDOW_S / np.where(runs.dt[:, k] > 0.0, runs.dt[:, k], WINDOW_S)
+        radius = self.dynamics.base_radius
+        row = np.zeros((len(longer), 8))
+        row[:, 2], row[:, 4] = 1.0 / radius, 1.0
+        told = state.mean[:, 2] / radius + state.mean[:, 4]
+        state = state.corrected(row, runs.gyro[:, k] - told, self.noise.gyro**2 * longer)
+        if not self.hears_current:
+            return state
+        for drive, rims in enumerate(self.dynamics.rims):
+            rim, pull = runs.rim[:, k, drive], runs.pull[:, k, drive]
+            slide = rim[:, None] - state.mean[:, :3] @ rims[:, None]
+            scale = self.noise.gain * self.mass * np.sign(rim)
+            told = self.noise.offset + scale * self.dynamics.traction(slide)[:, 0]
+            row = np.zeros((len(longer), 8))
+            row[:, :3] = -scale[:, None] * self.dynamics.stiffness(slide) * rims
+            state = state.corrected(row, pull - told, self.noise.force**2 * longer, slice(3, 4))
+        return state
+
+    def _bounded(self, state: State) -> State:
+        """The weak constraint on rho."""
+        law, straight = self.dynamics.law, 1.0 - self.dynamics.turning
+        speed = np.linalg.norm(state.mean[:, :3] * straight, axis=1)
+        rolling = state.mean[:, 3]
+        beyond = np.clip(rolling, 0.0, law.grip / (1.0 + law.drag * speed)) - rolling
+        row = np.zeros((len(rolling), 8))
+        row[:, 3] = 1.0
+        variance = np.full(len(rolling), (0.1 * self.noise.rolling) ** 2)
+        return state.corrected(row, np.where(beyond == 0.0, np.nan, beyond), variance)
+
+    def _travelled(self, state: State, heading: Each, dt: Each) -> State:
+        """A step added to the error of the pose; the heading is that in its middle."""
+        radius = self.dynamics.base_radius
+        turning = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        aside = turning[:, ::-1] * [-1.0, 1.0]
+        x, y, yaw = state.mean[:, 0:1], state.mean[:, 1:2], state.mean[:, 2:3] / radius
+        along, across = x * turning + y * aside, x * aside - y * turning
+        # the chord of the step's arc, as of `path_of`, and how it shortens with the turn
+        wait = dt[:, None]
+        reach, less = np.sinc(yaw * wait / (2 * np.pi)) * wait, yaw * wait**3 / 12
+        by = np.tile(np.eye(8), (len(dt), 1, 1))
+        by[:, 5:7, 0], by[:, 5:7, 1] = turning * reach, aside * reach
+        by[:, 5:7, 2] = (0.5 * wait * reach * across - less * along) / radius
+        by[:, 7, 2] = dt / radius
+        by[:, 5:7, 7] = across * reach
+        return state.moved(state.mean, by)

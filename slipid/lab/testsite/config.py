@@ -1,0 +1,260 @@
+"""The config of `slipid simulate`, and the one with which `slipid identify` fits its logs."""
+
+import json
+import re
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from fnmatch import fnmatch
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from slipid.data import floor_map as terrain
+from slipid.data.write import OPTIONAL, own_columns
+from slipid.lab.testsite import driving as ex
+from slipid.lab.testsite.ground import GROUNDS
+from slipid.lab.testsite.sections import Content, OnMap
+from slipid.lab.testsite.site import Site
+from slipid.support.errors import DataError
+from slipid.support.toml_file import checked, mapping_of
+
+RESERVED = ("one_surface", "two_surfaces", "wheel_load")
+"""Folders of the 2022 layout."""
+_IDENTIFY = """\
+# Identifies the robot of these logs:
+#   slipid identify {name} --data logs --out result
+# They were made by slipid simulate; the truth lies in truth/, which nothing reads that fits.
+
+[robot]
+drive = "omni"
+wheel_azimuths_deg = {azimuths}
+base_radius_m = {base}
+wheel_radius_m = {radius}
+gear_ratio = {gear}
+mass_kg = {mass}
+
+[layouts.testsite]
+ticks_per_revolution = {ticks}
+gear_ratio = {gear}
+current_is_signed = {signed}
+
+[layouts.testsite.columns]
+{columns}
+{beside}{sets}
+[parameters]
+"camera.scale" = {{ prior = {{ mean = {scale}, std = 0.002 }} }}      # measured, with an error
+"camera.lag" = {{ prior = {{ mean = {lag}, std = 0.02 }} }}
+"camera.marker_yaw" = {{ free = true }}
+"motor.resistance" = {{ start = 11.0, prior = {{ mean = 8.0, std = 4.0 }} }}
+"motor.back_emf" = {{ start = 0.0257, prior = {{ mean = 0.04, std = 0.02 }} }}
+"""
+_TRACKED = """
+# what `slipid track` makes of the video of each run, such as:
+#   slipid track video/as_built/firm/run000.avi --camera video/camera.json \\
+#     --marker-size {size} --marker-height {height} --out logs/as_built/firm/run000.poses.csv
+[layouts.testsite.beside."{{stem}}.poses.csv"]
+format = "tracked"
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is to be simulated.
+
+    Attributes:
+        hash: of the config and of the map files it names.
+        maps: floors with several surfaces, by name.
+        runs: name and run of each.
+        filmed: names of the runs that are filmed.
+    """
+
+    hash: str
+    content: Content
+    site: Site
+    maps: dict[str, terrain.FloorMap]
+    runs: tuple[tuple[str, ex.Run], ...]
+    filmed: tuple[str, ...]
+
+
+def plan(path: Path, text: str) -> Plan:
+    """Plan of a config; the path is for messages, and maps lie beside it.
+
+    Raises:
+        DataError: wrong in the text or in a map it names; every mistake on a line.
+    """
+    mapping = mapping_of(path, text)
+    surfaces = mapping.get("surfaces", {})
+    if isinstance(surfaces, dict):  # a surface that slipid knows is changed, not made anew
+        known = {
+            name: {**asdict(GROUNDS[name]), **given}
+            for name, given in surfaces.items()
+            if name in GROUNDS and isinstance(given, dict)
+        }
+        mapping = {**mapping, "surfaces": {**surfaces, **known}}
+    content = checked(path, mapping, Content)
+    robot = content.robot, content.motor, content.speed_loop, content.sensors
+    grounds = {**GROUNDS, **content.surfaces}
+    site = Site(*robot, grounds, content.command_delay_s, content.acceleration_m_s2)
+    maps, everything = {}, list[ex.Run]()
+    for name, given in content.maps.items():
+        with _said_of(f"{path}: maps.{name}"):
+            maps[name] = given.floor(path.parent)
+    _check(path, content, site, maps)
+    for k, runs in enumerate(content.runs, 1):
+        with _said_of(f"{path}: runs[{k}]"):
+            if isinstance(runs, OnMap):
+                everything += runs.runs(maps[runs.map], 1000 * content.seed + k)
+            else:
+                everything += runs.runs()
+    jitter = float(np.radians(content.heading_jitter_deg))
+    named = tuple(ex.numbered(everything, jitter, content.seed))
+    for pattern in content.video:
+        if not any(fnmatch(name, pattern) for name, _ in named):
+            folders = ", ".join(dict.fromkeys(f"{name[:-3]}*" for name, _ in named))
+            raise DataError(
+                f"{path}: video: no run is named '{pattern}'; expected some of {folders}"
+            )
+    filmed = tuple(n for n, _ in named if any(fnmatch(n, pattern) for pattern in content.video))
+    return Plan(_hash(content, site, maps), content, site, maps, named, filmed)
+
+
+def _check(path: Path, content: Content, site: Site, maps: Mapping[str, terrain.FloorMap]) -> None:
+    """DataError where parts of a config do not go together."""
+    for load in site.machine.centres_m:
+        if not re.fullmatch("[A-Za-z0-9_-]+", load) or load in RESERVED:
+            raise DataError(
+                f"{path}: robot.centres_m: load '{load}'; expected letters, digits, _ and -, "
+                f"none of {', '.join(RESERVED)}"
+            )
+    for k, runs in enumerate(content.runs, 1):
+        _known(path, f"runs[{k}].load", runs.load, site.machine.centres_m)
+        if isinstance(runs, OnMap):
+            _known(path, f"runs[{k}].map", runs.map, maps)
+        else:
+            _known(path, f"runs[{k}].surface", runs.surface, site.grounds)
+    for name, floor in maps.items():
+        if name in site.grounds:
+            raise DataError(f"{path}: maps.{name}: also the name of a surface; expected another")
+        for surface in floor.surfaces:
+            _known(path, f"maps.{name}", surface, site.grounds)
+        colours = [site.grounds[s].colour.lower() for s in floor.surfaces]
+        if len(set(colours)) < len(colours):
+            raise DataError(f"{path}: maps.{name}: two surfaces have one colour; expected others")
+    if "robotino2022" in content.formats:
+        robot, sensors = site.machine, site.sensors
+        fits = len(robot.wheel_azimuths_deg) == 3 and robot.gear_ratio == 16
+        fits &= site.motor.ticks_per_revolution == 2000 and not sensors.current_is_signed
+        if not fits:
+            raise DataError(
+                f"{path}: formats: robotino2022 is for three wheels, gear 16, 2000 ticks and "
+                "unsigned current; expected slipid alone for other robots"
+            )
+
+
+def _hash(content: Content, site: Site, maps: Mapping[str, terrain.FloorMap]) -> str:
+    """Of all that decides what is driven and logged; videos may be asked for later."""
+    said = content.model_dump(mode="json", exclude={"video", "camera"})
+    floors = {
+        name: [f.surfaces, f.corner, f.cell, f.cells.shape, sha256(f.cells.tobytes()).hexdigest()]
+        for name, f in maps.items()
+    }
+    everything = {"said": said, "site": asdict(site), "maps": floors, "slipid": version("slipid")}
+    return sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
+
+
+def _known(path: Path, where: str, name: str, choices: Collection[str]) -> None:
+    if name not in choices:
+        raise DataError(
+            f"{path}: {where}: '{name}'; expected one of {', '.join(choices) or 'none'}"
+        )
+
+
+@contextmanager
+def _said_of(what: str) -> Iterator[None]:
+    """Says of which part of the config an error is that does not know."""
+    try:
+        yield
+    except DataError:
+        raise
+    except ValueError as error:
+        raise DataError(f"{what}: {error}") from error
+
+
+def identify_config(plan: Plan, by_video: bool = False) -> str:
+    """Text of a config for `slipid identify` that fits the logs in slipid's own columns.
+
+    With `by_video` the poses in the logs are passed over, for those that are tracked in videos.
+    """
+    machine, sensors = plan.site.machine, plan.site.sensors
+    measured = 0.0015 * float(np.random.default_rng([plan.content.seed, 2]).normal())
+    more = [channel for channel in OPTIONAL if getattr(sensors, channel)]
+    columns = own_columns(len(machine.wheel_azimuths_deg), more)
+    beside, scale, lag = "", sensors.camera_scale, 0.05
+    if by_video:
+        columns = {name: c for name, c in columns.items() if not name.startswith("pose_")}
+        beside = _TRACKED.format(size=machine.marker_size_m, height=machine.marker_height_m)
+        scale, lag = 1.0, 0.0
+    one = {(run.load, run.surface) for _, run in plan.runs if run.surface is not None}
+    where = [(load, surface, 'surface = "folder"') for load, surface in sorted(one)]
+    where += [(load, name, f'map = "maps/{name}.toml"') for load, name in _mapped(plan)]
+    sets = "".join(
+        f'\n[[logs]]\nglob = "{load}/{name}/run*[0-9].csv"\nformat = "testsite"\n'
+        f'{floor}\nload = "{load}"\n'
+        for load, name, floor in where
+    )
+    return _IDENTIFY.format(
+        azimuths=list(machine.wheel_azimuths_deg),
+        base=machine.base_radius_m,
+        radius=machine.wheel_radius_m,
+        gear=machine.gear_ratio,
+        mass=machine.mass_kg,
+        ticks=plan.site.motor.ticks_per_revolution,
+        signed=str(sensors.current_is_signed).lower(),
+        columns="\n".join(f"{name} = {_inline(c)}" for name, c in columns.items()),
+        sets=sets,
+        name="robot_video.toml" if by_video else "robot.toml",
+        beside=beside,
+        scale=round(scale * (1 + measured), 4),
+        lag=lag,
+    )
+
+
+def _mapped(plan: Plan) -> list[tuple[str, str]]:
+    """Load and map of runs over several floors, where runs on one floor tell of each and the load.
+
+    Whatever steered them, the camera logs their poses in the frame of the map.
+    """
+    one = [run for _, run in plan.runs if run.surface is not None]
+    floors, loads = {run.surface for run in one}, {run.load for run in one}
+    pairs = {(run.load, name.split("/")[1]) for name, run in plan.runs if run.surface is None}
+    return sorted(
+        (load, name)
+        for load, name in pairs
+        if load in loads and set(plan.maps[name].surfaces) <= floors
+    )
+
+
+def all_filmed(plan: Plan) -> bool:
+    """Whether every run that a config for `slipid identify` reads has a video."""
+    mapped = {f"{load}/{name}/" for load, name in _mapped(plan)}
+    read = [
+        n for n, r in plan.runs if r.surface is not None or n.rpartition("/")[0] + "/" in mapped
+    ]
+    return set(read) <= set(plan.filmed)
+
+
+def _inline(value: object) -> str:
+    """A value as TOML."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{k} = {_inline(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(_inline(v) for v in value) + "]"
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def can_identify(plan: Plan) -> bool:
+    """Whether there are logs in slipid's own columns that a fit can use."""
+    return "slipid" in plan.content.formats and any(r.surface is not None for _, r in plan.runs)

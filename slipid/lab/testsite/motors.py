@@ -1,0 +1,313 @@
+"""DC motors on one supply, and the speed loop that is built into the robot.
+
+The robot as a MuJoCo model: chassis, omni wheels with passive rollers, floor.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import field
+from math import exp, floor, pi
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, FiniteFloat
+from pydantic.dataclasses import dataclass
+
+from slipid.support.toml_file import CLOSED, NotNegative, Positive
+
+
+@dataclass(frozen=True, config=CLOSED)
+class Motor:
+    """A brushed DC motor with its gear.
+
+    Attributes:
+        resistance_ohm, inductance_h: resistance and inductance of the winding.
+        back_emf_vs: [V s/rad], which is its torque per current as well.
+        rotor_inertia_kg_m2: at the motor shaft.
+        coulomb_nm, viscous_nms: friction at the wheel [N m], [N m s].
+        efficiency: efficiency of the gear while the motor drives.
+        supply_v, supply_ohm: voltage and resistance of the battery that all motors share; its
+            voltage never falls below a twentieth.
+        ticks_per_revolution: ticks of the encoder in one turn of the motor shaft.
+    """
+
+    resistance_ohm: Positive = 5.5
+    inductance_h: Positive = 8.9e-3
+    back_emf_vs: Positive = 0.0514
+    rotor_inertia_kg_m2: Positive = 7.1e-6
+    coulomb_nm: NotNegative = 0.07
+    viscous_nms: NotNegative = 0.006
+    efficiency: Annotated[float, Field(gt=0, le=1)] = 0.9
+    supply_v: Positive = 24.0
+    supply_ohm: NotNegative = 0.15
+    ticks_per_revolution: Annotated[int, Field(ge=10)] = 2000
+
+
+@dataclass(frozen=True, config=CLOSED)
+class SpeedLoop:
+    """The built-in controller of wheel speed, at the engine's time step.
+
+    Attributes:
+        kind: `pi`; `feed_forward` (proportional, and the back-EMF of the wanted speed); `cascade`
+            (PI to a current, and a current loop below it).
+        gain: gain of the error in motor speed [V s/rad]; in a cascade [A s/rad].
+        integral: per second of it [V/rad]; in a cascade [A/rad].
+        current_gain: gain of the cascade's inner loop [V/A].
+        current_limit_a: limit of the cascade's current.
+        filter_s: time constant of the measured speed.
+    """
+
+    kind: Literal["pi", "feed_forward", "cascade"] = "pi"
+    gain: NotNegative = 0.08
+    integral: NotNegative = 0.8
+    current_gain: NotNegative = 4.0
+    current_limit_a: Positive = 3.0
+    filter_s: NotNegative = 0.004
+
+
+class Drive:
+    """Currents [A] and voltages [V] of all wheels, a step of `dt` [s] at a time."""
+
+    def __init__(self, motor: Motor, loop: SpeedLoop, gear_ratio: float, wheels: int, dt: float):
+        self.motor, self.loop, self.gear, self.dt = motor, loop, gear_ratio, dt
+        self._per_tick = 2 * pi / (motor.ticks_per_revolution * gear_ratio)
+        self._decay = exp(-dt * motor.resistance_ohm / motor.inductance_h)
+        self._blend = 1 - exp(-dt / loop.filter_s) if loop.filter_s > 0 else 1.0
+        self.current = [0.0] * wheels
+        self.voltage = [0.0] * wheels
+        self.bus = motor.supply_v
+        self._integral = [0.0] * wheels
+        self._speed = [0.0] * wheels
+        self._ticks: list[int] | None = None
+
+    def step(self, wanted: list[float], angle: list[float], speed: list[float]) -> list[float]:
+        """Torques at the wheels [N m] over one step.
+
+        Args:
+            wanted: wheel speeds [rad/s].
+            angle: angles of the wheels [rad]; the loop sees whole ticks of it.
+            speed: speeds of the wheels [rad/s], for the back-EMF.
+        """
+        m = self.motor
+        ticks = [floor(a / self._per_tick) for a in angle]
+        before = self._ticks or ticks
+        self._ticks = ticks
+        out = []
+        drawn = 0.0
+        for k, target in enumerate(wanted):
+            seen = (ticks[k] - before[k]) * self._per_tick / self.dt
+            self._speed[k] += self._blend * (seen - self._speed[k])
+            volts = self._voltage(k, target * self.gear, self._speed[k] * self.gear)
+            turning = speed[k] * self.gear
+            settled = (volts - m.back_emf_vs * turning) / m.resistance_ohm
+            amps = settled + (self.current[k] - settled) * self._decay
+            torque = self.gear * m.back_emf_vs * 0.5 * (amps + self.current[k])
+            self.voltage[k], self.current[k] = volts, amps
+            drawn += amps * volts / self.bus
+            out.append(torque * m.efficiency if torque * turning > 0 else torque)
+        self.bus = max(m.supply_v - m.supply_ohm * max(drawn, 0.0), 0.05 * m.supply_v)
+        return out
+
+    def _voltage(self, k: int, wanted: float, measured: float) -> float:
+        """The loop's wish within the bus voltage; where that ends the integral is held."""
+        loop, m = self.loop, self.motor
+        error = wanted - measured
+        stored = self._integral[k] + loop.integral * error * self.dt
+        if loop.kind == "pi":
+            wish = loop.gain * error + stored
+        elif loop.kind == "feed_forward":
+            wish = loop.gain * error + m.back_emf_vs * wanted
+        else:
+            amps = loop.gain * error + stored
+            held = min(max(amps, -loop.current_limit_a), loop.current_limit_a)
+            stored = stored if held == amps else self._integral[k]
+            wish = (
+                m.resistance_ohm * held
+                + m.back_emf_vs * measured
+                + loop.current_gain * (held - self.current[k])
+            )
+        volts = min(max(wish, -self.bus), self.bus)
+        if volts == wish:
+            self._integral[k] = stored
+        return volts
+
+
+@dataclass(frozen=True, config=CLOSED)
+class Machine:
+    """What the robot is made of; by default like a Robotino 2.
+
+    Attributes:
+        mass_kg: mass of the whole robot.
+        centres_m: x, y of the centre of mass of every load set-up.
+        centre_height_m: height of the centre of mass above the wheel axes.
+        wheel_azimuths_deg: azimuths of the wheel centres; each drives 90 deg further.
+        base_radius_m, wheel_radius_m: [m].
+        gear_ratio: turns of the motor per turn of the wheel.
+        rollers: number of rollers of one wheel, in two staggered rows; even.
+        roller_radius_m, roller_mass_kg: radius and mass of one roller.
+        row_offset_m: distance of each row from the middle of the wheel.
+        mount_n_m: stiffness of a roller's mount along the wheel's rim [N/m].
+        roller_friction_nm: friction of a roller's bearing.
+        wheel_mass_kg: without rollers.
+        body_radius_m: radius of the chassis, for pictures.
+        marker_height_m, marker_size_m: height of the camera's marker above the floor, its edge.
+        marker_yaw_deg: heading of the marker less the body's.
+    """
+
+    mass_kg: Positive = 12.0
+    centres_m: Annotated[Mapping[str, tuple[float, float]], Field(min_length=1)] = field(
+        default_factory=lambda: {"as_built": (-0.021, 0.002), "moved": (-0.004, -0.012)}
+    )
+    centre_height_m: Annotated[float, Field(ge=0, le=0.5)] = 0.06
+    wheel_azimuths_deg: Annotated[tuple[FiniteFloat, ...], Field(min_length=3)] = (
+        60.0,
+        180.0,
+        300.0,
+    )
+    base_radius_m: Positive = 0.125
+    wheel_radius_m: Positive = 0.04
+    gear_ratio: Positive = 16.0
+    rollers: Annotated[int, Field(ge=6, multiple_of=2)] = 12
+    roller_radius_m: Positive = 0.009
+    roller_mass_kg: Annotated[FiniteFloat, Field(ge=1e-4)] = 0.012
+    row_offset_m: NotNegative = 0.006
+    mount_n_m: Positive = 2e4
+    roller_friction_nm: NotNegative = 0.012
+    wheel_mass_kg: Positive = 0.3
+    body_radius_m: Positive = 0.18
+    marker_height_m: float = 0.25
+    marker_size_m: Positive = 0.131
+    marker_yaw_deg: FiniteFloat = -0.9
+
+    def __post_init__(self) -> None:
+        if self.roller_radius_m >= self.wheel_radius_m:
+            raise ValueError("rollers as large as the wheel; expected smaller ones")
+        if self.own_mass_kg <= 0:
+            raise ValueError(f"{self.mass_kg} kg is less than the wheels weigh; expected more")
+        if np.linalg.cond(self.wheel_from_twist * self.wheel_radius_m) > 100:
+            raise ValueError(
+                f"wheel_azimuths_deg = {self.wheel_azimuths_deg}; expected them spread"
+            )
+        if not self.marker_height_m >= self.wheel_radius_m + 0.08:
+            raise ValueError(
+                f"marker_height_m = {self.marker_height_m}; expected it 0.08 above the axes"
+            )
+        for name in self.centres_m:
+            if not self.load_share(name).min() > 0.02:
+                raise ValueError(f"load {name}: the centre of mass is not within the wheels")
+
+    @property
+    def own_mass_kg(self) -> float:
+        """Mass of the chassis without wheels."""
+        wheel = self.wheel_mass_kg + self.rollers * self.roller_mass_kg
+        return self.mass_kg - len(self.wheel_azimuths_deg) * wheel
+
+    @property
+    def places(self) -> Float[np.ndarray, "wheel 2"]:
+        """Wheel centres in the body frame [m]."""
+        azimuth = np.radians(self.wheel_azimuths_deg)
+        return self.base_radius_m * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+
+    @property
+    def wheel_from_twist(self) -> Float[np.ndarray, "wheel 3"]:
+        """Wheel speed [rad/s] of a body that rolls without slip, per twist."""
+        azimuth = np.radians(self.wheel_azimuths_deg)
+        ahead = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=1)
+        turn = np.full((len(azimuth), 1), self.base_radius_m)
+        return np.concatenate([ahead, turn], axis=1) / self.wheel_radius_m
+
+    def load_share(self, load: str) -> Float[np.ndarray, " wheel"]:
+        """Share of the weight on each wheel at rest, from statics (least squares beyond three)."""
+        count = len(self.wheel_azimuths_deg)
+        level = np.concatenate([np.ones((1, count)), self.places.T])
+        return np.linalg.lstsq(level, np.array([1.0, *self.centres_m[load]]), rcond=None)[0]
+
+
+def mjcf(
+    machine: Machine,
+    load: str,
+    timestep: float,
+    ribs: Sequence[tuple[float, float, float, float]] = (),
+    looks: str = "",
+    floor_looks: str = "",
+) -> str:
+    """MuJoCo's XML of the robot at the origin of a flat floor.
+
+    Rollers carry the contact parameters (they have priority over the floor), so that `plant` can
+    give each those of the surface beneath it.
+
+    Args:
+        load: whose centre of mass it has.
+        ribs: x, lowest y, highest y, height [m] of every rib.
+        looks: XML of assets, for pictures.
+        floor_looks: XML attributes of the floor's plane.
+    """
+    m = machine
+    # the chassis makes up for wheels that are not spread evenly
+    wheels = (m.mass_kg - m.own_mass_kg) * m.places.mean(axis=0)
+    x, y = (m.mass_kg * np.array(m.centres_m[load]) - wheels) / m.own_mass_kg
+    inertia = m.own_mass_kg * np.array([0.012, 0.012, 0.016])
+    parts = [
+        f'<mujoco><option timestep="{timestep}" cone="elliptic" impratio="10" '
+        'integrator="implicitfast" iterations="30" tolerance="1e-8"/>'
+        f'<compiler angle="radian"/><size memory="32M"/>{looks}<worldbody>'
+        f'<geom name="floor" type="plane" size="3 3 .1" contype="1" conaffinity="2" {floor_looks}/>'
+    ]
+    for place, low, high, height in ribs:
+        radius = max(0.004, 2 * height)
+        z = height - radius
+        parts.append(
+            f'<geom type="capsule" size="{radius}" fromto="{place} {low} {z} {place} {high} {z}" '
+            'contype="1" conaffinity="2" rgba=".3 .33 .4 1"/>'
+        )
+    parts.append(
+        f'<body name="chassis" pos="0 0 {m.wheel_radius_m}"><freejoint/>'
+        f'<inertial pos="{x} {y} {m.centre_height_m}" mass="{m.own_mass_kg}" '
+        f'diaginertia="{inertia[0]} {inertia[1]} {inertia[2]}"/>{_dress(m)}'
+    )
+    parts += [_wheel(m, k) for k in range(len(m.wheel_azimuths_deg))]
+    return "".join(parts) + "</body></worldbody></mujoco>"
+
+
+def _dress(m: Machine) -> str:
+    """Body and marker, for pictures: nothing touches them."""
+    from_axis = m.marker_height_m - m.wheel_radius_m
+    half, edge = 0.5 * m.marker_size_m, 0.62 * m.marker_size_m
+    nothing = 'contype="0" conaffinity="0" mass="0"'
+    yaw = np.radians(m.marker_yaw_deg)
+    return (
+        f'<geom type="cylinder" size="{m.body_radius_m} .02" pos="0 0 .05" rgba=".75 .76 .78 1" '
+        f'{nothing}/><geom type="cylinder" size=".06 {0.5 * (from_axis - 0.07)}" '
+        f'pos="0 0 {0.5 * (from_axis + 0.07) - 0.003}" rgba=".3 .3 .32 1" {nothing}/>'
+        f'<geom type="box" size="{edge + 0.03} {edge} .001" pos="0 0 {from_axis - 0.0025}" '
+        f'rgba="1 1 1 1" {nothing}/>'
+        f'<geom name="marker" type="box" size="{half} {half} .001" pos="0 0 {from_axis - 0.001}" '
+        f'euler="0 0 {yaw}" rgba="1 1 1 1" {nothing}/>'
+    )
+
+
+def _wheel(m: Machine, k: int) -> str:
+    azimuth = np.radians(m.wheel_azimuths_deg[k])
+    x, y = m.places[k]
+    ring = m.wheel_radius_m - m.roller_radius_m
+    # straight rollers bridge the gap to the next row where both are as low as one in the middle
+    step = np.pi / m.rollers
+    half = ring * (1 - np.cos(step)) / np.sin(step)
+    parts = [
+        f'<body name="wheel{k}" pos="{x} {y} 0" euler="0 0 {azimuth}">'
+        f'<joint name="wheel{k}" type="hinge" axis="-1 0 0"/>'
+        f'<inertial pos="0 0 0" mass="{m.wheel_mass_kg}" diaginertia="2.5e-4 1.5e-4 1.5e-4"/>'
+    ]
+    for j in range(m.rollers):
+        angle = 2 * np.pi * j / m.rollers
+        row = m.row_offset_m * (1 if j % 2 else -1)
+        parts.append(
+            f'<body pos="{row} {ring * np.sin(angle)} {-ring * np.cos(angle)}" euler="{angle} 0 0">'
+            f'<joint name="mount{k}_{j}" type="slide" axis="0 1 0" stiffness="{m.mount_n_m}"/>'
+            f'<joint name="roller{k}_{j}" type="hinge" axis="0 1 0" armature="1e-6" '
+            f'damping="1e-4" frictionloss="{m.roller_friction_nm}"/>'
+            f'<geom name="roller{k}_{j}" type="capsule" size="{m.roller_radius_m} {half}" '
+            f'euler="{np.pi / 2} 0 0" mass="{m.roller_mass_kg}" contype="2" conaffinity="1" '
+            'condim="6" priority="1" rgba=".15 .15 .15 1"/></body>'
+        )
+    return "".join(parts) + "</body>"

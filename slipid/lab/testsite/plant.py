@@ -1,0 +1,201 @@
+"""The robot on a floor, a millisecond at a time; MuJoCo does the mechanics."""
+
+from types import ModuleType
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.floor_map import FloorMap
+from slipid.lab.testsite.ground import Pose, Terrain, ribs
+from slipid.lab.testsite.motors import Drive, Motor, mjcf
+from slipid.lab.testsite.site import Site
+from slipid.support.errors import DataError
+
+TIMESTEP = 1e-3
+"""Time step of the engine and of the speed loop [s]."""
+SETTLING = 0.4
+"""Time for which a robot stands still before anything is recorded [s]."""
+LOOK = 5
+"""Time steps between two looks at what is beneath the rollers."""
+CREEP = 0.02
+"""Speed at which an added force has reached 0.7 of its size [m/s]."""
+
+
+def engine() -> ModuleType:
+    """The mujoco module; DataError where it is not installed."""
+    try:
+        import mujoco
+    except ImportError:
+        raise DataError(
+            "the virtual test site needs MuJoCo; expected: pip install 'slipid[testsite]'"
+        ) from None
+    return mujoco
+
+
+def heading_of(quaternion: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
+    """Angle about the vertical of a quaternion w, x, y, z [rad]."""
+    w, x, y, z = np.moveaxis(np.asarray(quaternion), -1, 0)
+    return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+
+
+class Plant:
+    """A robot standing on a floor.
+
+    Args:
+        floor: of surfaces that the site has the physics of.
+        load: name of the load set-up.
+        seed: seed of how the wheels stand at first, and of the floor's unevenness.
+        timestep: [s].
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        floor: FloorMap,
+        load: str,
+        start: Pose = (0.0, 0.0, 0.0),
+        seed: int = 0,
+        timestep: float = TIMESTEP,
+    ):
+        self.machine, self.dt = site.machine, timestep
+        mujoco = engine()
+        # warnings are counted by the engine, for `check`; else it writes a file where it runs
+        mujoco.set_mju_user_warning(lambda text: None)
+        self._step = mujoco.mj_step
+        self.model = mujoco.MjModel.from_xml_string(
+            mjcf(self.machine, load, timestep, ribs(floor, site.grounds, start))
+        )
+        self.data = mujoco.MjData(self.model)
+        rng = np.random.default_rng(seed)
+        self._find(site.motor)
+        self._lay(Terrain(floor, site.grounds, start, rng))
+        self.drive = Drive(
+            site.motor, site.loop, self.machine.gear_ratio, len(self.wheel_dof), timestep
+        )
+        self._place(start, rng)
+        self._count = 0
+        for _ in range(round(SETTLING / timestep)):
+            self.step([0.0] * len(self.wheel_dof))
+        self.angle_at_start = self.data.qpos[self.wheel_at].copy()
+        self._count = 0
+
+    @property
+    def time(self) -> float:
+        """Since the end of the settling [s]."""
+        return self._count * self.dt
+
+    @property
+    def pose(self) -> Pose:
+        """X, y [m], heading [rad, between -pi and pi] of the body."""
+        q = self.data.qpos
+        return float(q[0]), float(q[1]), float(heading_of(q[3:7]))
+
+    @property
+    def wheel_angle(self) -> Float[np.ndarray, " wheel"]:
+        """Since the end of the settling [rad]."""
+        return self.data.qpos[self.wheel_at] - self.angle_at_start
+
+    def step(self, wanted: list[float]) -> None:
+        """One time step with these wheel speeds wanted [rad/s]."""
+        d = self.data
+        if self._count % LOOK == 0:
+            self._look()
+            if self._resists:
+                self._resist()
+        self._count += 1
+        angle, speed = d.qpos[self.wheel_at].tolist(), d.qvel[self.wheel_dof].tolist()
+        d.qfrc_applied[self.wheel_dof] = self.drive.step(wanted, angle, speed)
+        self._step(self.model, d)
+
+    def check(self) -> None:
+        """DataError where the engine lost the robot: it starts again from somewhere and goes on."""
+        mujoco = engine()
+        kinds = [f"mjWARN_BAD{what}" for what in ("QPOS", "QVEL", "QACC")]
+        numbers = [int(getattr(mujoco.mjtWarning, kind)) for kind in kinds]
+        lost = any(self.data.warning[k].number for k in numbers)
+        if lost or not np.isfinite([*self.pose, *self.drive.current]).all():
+            raise DataError(
+                f"the simulation became unstable before {self.time:.2f} s; "
+                "expected smaller forces, gains or stiffness"
+            )
+
+    def _find(self, motor: Motor) -> None:
+        """Addresses of wheels and rollers in the engine's arrays."""
+        m, count = self.model, len(self.machine.wheel_azimuths_deg)
+        joints = [m.joint(f"wheel{k}") for k in range(count)]
+        self.wheel_dof = np.array([j.dofadr[0] for j in joints])
+        self.wheel_at = np.array([j.qposadr[0] for j in joints])
+        self.wheel_body = np.array([m.body(f"wheel{k}").id for k in range(count)])
+        each = [(k, j) for k in range(count) for j in range(self.machine.rollers)]
+        self._roller = np.array([m.geom(f"roller{k}_{j}").id for k, j in each])
+        mounts = [m.joint(f"mount{k}_{j}") for k, j in each]
+        self._axle_dof = np.array([m.joint(f"roller{k}_{j}").dofadr[0] for k, j in each])
+        self._mount = np.array([j.id for j in mounts])
+        self._mount_dof = np.array([j.dofadr[0] for j in mounts])
+        m.dof_armature[self.wheel_dof] = motor.rotor_inertia_kg_m2 * self.machine.gear_ratio**2
+        m.dof_frictionloss[self.wheel_dof] = motor.coulomb_nm
+        m.dof_damping[self.wheel_dof] = motor.viscous_nms
+
+    def _lay(self, terrain: Terrain) -> None:
+        """Contact parameters of every kind of floor."""
+        self.terrain = terrain
+        kinds = terrain.kinds
+        self._friction = np.array([[g.friction, 0.003, f * g.rolling_m] for g, f in kinds])
+        self._contact = np.array([[max(g.settling_s, 2 * self.dt), 1.0] for g, _ in kinds])
+        mount = self.machine.mount_n_m
+        self._shear = np.array([1 / (1 / mount + f / g.shear_n_m) for g, f in kinds])
+        self._damping = 1.4 * np.sqrt(self._shear * self.machine.roller_mass_kg)
+        self._resists = any(g.compaction or g.body_drag_n for g, _ in kinds)
+        self._beneath = np.full(len(self._roller), -1)
+        self._low = np.full(len(self._roller), -1)
+
+    def _place(self, start: Pose, rng: np.random.Generator) -> None:
+        """Put the robot at its start, with every wheel turned at random."""
+        q = self.data.qpos
+        q[:2] = start[:2]
+        q[3], q[6] = np.cos(0.5 * start[2]), np.sin(0.5 * start[2])
+        q[self.wheel_at] = rng.uniform(0, 2 * np.pi, len(self.wheel_at))
+        engine().mj_forward(self.model, self.data)
+
+    def _look(self) -> None:
+        """Give every roller the contact parameters of the floor beneath it.
+
+        The bearings of rollers that are off the floor turn freely: the engine has less to solve.
+        """
+        place = self.data.geom_xpos[self._roller]
+        now, m = self.terrain.at(place[:, :2]), self.model
+        new = np.flatnonzero(now != self._beneath)
+        if len(new):
+            self._beneath = now
+            which, geoms = now[new], self._roller[new]
+            m.geom_friction[geoms] = self._friction[which]
+            m.geom_solref[geoms] = self._contact[which]
+            m.jnt_stiffness[self._mount[new]] = self._shear[which]
+            m.dof_damping[self._mount_dof[new]] = self._damping[which]
+        low = place[:, 2] < 0.5 * self.machine.wheel_radius_m
+        if (low != self._low).any():
+            self._low = low
+            m.dof_frictionloss[self._axle_dof] = np.where(low, self.machine.roller_friction_nm, 0.0)
+
+    def _resist(self) -> None:
+        """Compaction at sunk wheels and drag on the body, as a wrench on the chassis."""
+        d = self.data
+        vx, vy, _, _, _, turn = d.qvel[:6].tolist()
+        x0, y0, z0 = d.qpos[:3].tolist()
+        places = d.xpos[self.wheel_body]
+        beneath = [self.terrain.kinds[k][0] for k in self.terrain.at(places[:, :2]).tolist()]
+        fx = fy = moment = 0.0
+        for (x, y, z), ground in zip(places.tolist(), beneath, strict=True):
+            hard = ground.compaction * max(self.machine.wheel_radius_m - z, 0.0) ** 1.5
+            ux, uy = vx - turn * (y - y0), vy + turn * (x - x0)
+            size = hard / (ux * ux + uy * uy + CREEP**2) ** 0.5
+            fx -= size * ux
+            fy -= size * uy
+            moment -= size * ((x - x0) * uy - (y - y0) * ux)
+        size = sum(g.body_drag_n for g in beneath) / len(places)
+        size /= (vx * vx + vy * vy + CREEP**2) ** 0.5
+        fx, fy = fx - size * vx, fy - size * vy
+        heading = self.pose[2]
+        c, s = np.cos(heading), np.sin(heading)
+        mx, my = z0 * fy, -z0 * fx  # it acts at the floor, z0 below the axes
+        d.qfrc_applied[:6] = [fx, fy, 0.0, c * mx + s * my, c * my - s * mx, moment]

@@ -1,0 +1,196 @@
+"""What a config of `slipid simulate` can hold: floors, runs, and the numbers of the site."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from slipid.data import floor_map as terrain
+from slipid.data.floor_map import read_map
+from slipid.lab.testsite.driving import Run, Waypoints, straight
+from slipid.lab.testsite.ground import Ground
+from slipid.lab.testsite.motors import Machine, Motor, SpeedLoop
+from slipid.lab.testsite.site import Camera, Sensors
+from slipid.support.toml_file import Section
+
+Speed = Annotated[float, Field(gt=0, le=3)]
+Speeds = Annotated[list[Speed], Field(min_length=1)]
+Distance = Annotated[float, Field(gt=0, le=100)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+"""Of surfaces, loads and maps: they name files and folders."""
+
+
+class FileMap(Section):
+    """A floor map's file, beside the config."""
+
+    kind: Literal["file"]
+    file: str
+
+    def floor(self, folder: Path) -> terrain.FloorMap:
+        return read_map(folder / self.file)
+
+
+class Patchwork(Section):
+    """Random patches, by default smaller than the robot."""
+
+    kind: Literal["patchwork"]
+    surfaces: list[str] = Field(min_length=1)
+    seed: int = Field(0, ge=0)
+    patch_m: float = Field(0.25, ge=0.01, le=10)
+    half_m: float = Field(1.2, ge=0.4, le=20)
+
+    def floor(self, folder: Path) -> terrain.FloorMap:
+        return terrain.patchwork(self.surfaces, self.seed, self.patch_m, self.half_m)
+
+
+class FourZones(Section):
+    """Four surfaces around the middle of the rectangle, as in the 2021 paper's trial."""
+
+    kind: Literal["four_zones"] = "four_zones"
+    surfaces: list[str] = Field(min_length=4, max_length=4)
+
+    def floor(self, folder: Path) -> terrain.FloorMap:
+        return terrain.four_zones(self.surfaces)
+
+
+Map = Annotated[FileMap | Patchwork | FourZones, Field(discriminator="kind")]
+
+
+class OnOneSurface(Section):
+    """Runs that begin anywhere on a floor of one surface."""
+
+    surface: str
+    load: str = "as_built"
+
+    def straight(self, heading: float, speed: float, distance: float, turn: float = 0.0) -> Run:
+        return straight(self.surface, self.load, heading, speed, distance, turn)
+
+
+class Headings(OnOneSurface):
+    """Straight runs in evenly spread directions."""
+
+    kind: Literal["headings"] = "headings"
+    step_deg: float = Field(15.0, ge=0.1, le=360)
+    first_deg: float = Field(0.0, allow_inf_nan=False)
+    speeds_m_s: Speeds = Field(default=[0.1, 0.2])
+    distance_m: Distance = 0.7
+
+    def runs(self) -> list[Run]:
+        ways = np.radians(self.first_deg + np.arange(0.0, 360.0, self.step_deg)).tolist()
+        return [self.straight(a, v, self.distance_m) for v in self.speeds_m_s for a in ways]
+
+
+class Curves(OnOneSurface):
+    """Arcs, to the left and to the right in turn."""
+
+    kind: Literal["curves"] = "curves"
+    count: int = Field(4, ge=1, le=10_000)
+    speeds_m_s: Speeds = Field(default=[0.1, 0.2])
+    distance_m: Distance = 0.7
+
+    def runs(self) -> list[Run]:
+        ways = (2 * np.pi * (np.arange(self.count) + 0.5) / self.count).tolist()
+        return [
+            self.straight(a, v, self.distance_m, (-1) ** k * 4.0 * v)
+            for v in self.speeds_m_s
+            for k, a in enumerate(ways)
+        ]
+
+
+class PaperGrid(OnOneSurface):
+    """The 2021 paper's grid: x, y, both, and turns on the spot, forwards and backwards."""
+
+    kind: Literal["paper_grid"] = "paper_grid"
+    seconds: float = Field(3.0, gt=0, le=3600)
+
+    def runs(self) -> list[Run]:
+        out = []
+        for ahead, left in ((1, 0), (0, 1), (1, 1), (1, -1)):
+            for size in (0.1, 0.2, 0.3, 0.4)[: 4 if not (ahead and left) else 3]:
+                for sign in (1, -1):
+                    x, y = sign * size * ahead, sign * size * left
+                    heading, speed = float(np.arctan2(y, x)), float(np.hypot(x, y))
+                    out.append(self.straight(heading, speed, speed * self.seconds))
+        for rate in (20, 40, 60):
+            for sign in (1, -1):
+                turn = sign * float(np.radians(rate))
+                out.append(self.straight(0.0, 0.0, abs(turn) * 0.125 * self.seconds, turn))
+        return out
+
+
+class OnMap(Section):
+    """Runs on a map of the config."""
+
+    map: str
+    load: str = "as_built"
+
+
+class Wander(OnMap):
+    """Random way-points on a map."""
+
+    kind: Literal["wander"] = "wander"
+    count: int = Field(8, ge=1, le=10_000)
+    points: int = Field(4, ge=1, le=1000)
+    by: Literal["camera", "encoders"] = "camera"
+
+    def runs(self, floor: terrain.FloorMap, seed: int) -> list[Run]:
+        rng = np.random.default_rng(seed)
+        x0, y0, x1, y1 = floor.extent
+        low, high = np.array([x0, y0]) + 0.3, np.array([x1, y1]) - 0.3
+        if (low >= high).any():
+            size = f"{x1 - x0:g} x {y1 - y0:g} m"
+            raise ValueError(f"a floor of {size}; expected more than 0.6 x 0.6 m")
+        out = []
+        for _ in range(self.count):
+            (x, y), *goals = rng.uniform(low, high, (self.points + 1, 2)).tolist()
+            start = (x, y, float(rng.uniform(-np.pi, np.pi)))
+            speed = float(rng.choice([0.1, 0.2, 0.3]))
+            program = Waypoints(tuple((x, y) for x, y in goals), speed, self.by)
+            out.append(Run(None, self.load, program, start, floor, self.map))
+        return out
+
+
+class Rectangle(OnMap):
+    """The 2021 paper's 900 x 400 mm rectangle on a map: ahead, right, back, left, without turning.
+
+    With `encoders` the corners are those of the robot's own frame at the start.
+    """
+
+    kind: Literal["rectangle"] = "rectangle"
+    by: Literal["camera", "encoders"] = "encoders"
+    repeats: int = Field(1, ge=1, le=10_000)
+    speed_m_s: Speed = 0.2
+
+    def runs(self, floor: terrain.FloorMap, seed: int) -> list[Run]:
+        x0, y0, x1, y1 = floor.extent
+        if not (x0 <= 0 <= x1 and y0 <= 0 <= y1):
+            raise ValueError(
+                f"it starts at 0, 0, but map {self.map} reaches from {x0:g}, {y0:g} to "
+                f"{x1:g}, {y1:g}; expected a map around the start"
+            )
+        corners = ((0.9, 0.0), (0.9, -0.4), (0.0, -0.4), (0.0, 0.0))
+        program = Waypoints(corners, self.speed_m_s, self.by)
+        return [Run(None, self.load, program, floor=floor, place=self.map)] * self.repeats
+
+
+Runs = Annotated[Headings | Curves | PaperGrid | Wander | Rectangle, Field(discriminator="kind")]
+
+
+class Content(Section):
+    """The whole file."""
+
+    seed: int = Field(0, ge=0)
+    formats: list[Literal["slipid", "robotino2022"]] = Field(default=["slipid"], min_length=1)
+    heading_jitter_deg: float = Field(5.0, ge=0, le=180)
+    command_delay_s: float = Field(0.12, ge=0, le=10)
+    acceleration_m_s2: float = Field(1.0, ge=0.01, le=1000)
+    robot: Machine = Field(default_factory=Machine)
+    motor: Motor = Motor()
+    speed_loop: SpeedLoop = SpeedLoop()
+    sensors: Sensors = Sensors()
+    video: list[str] = Field(default_factory=list)
+    camera: Camera = Camera()
+    surfaces: dict[Name, Ground] = Field(default_factory=dict)
+    maps: dict[Name, Map] = Field(default_factory=dict)
+    runs: list[Runs] = Field(min_length=1)

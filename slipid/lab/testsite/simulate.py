@@ -1,0 +1,273 @@
+"""What sensors and the overhead camera make of the truth: a log that errs like real ones.
+
+`slipid simulate`: logs from the virtual test site, in parallel, with the truth apart.
+"""
+
+import hashlib
+import time
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from contextlib import closing, nullcontext
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from slipid.data.floor_map import write_map
+from slipid.data.log import Log
+from slipid.data.wheel_signals import interpolate
+from slipid.data.write import own_csv, robotino2022_csv
+from slipid.lab.testsite.config import Plan, all_filmed, can_identify, identify_config
+from slipid.lab.testsite.driving import Run, Trace, drive
+from slipid.lab.testsite.plant import engine
+from slipid.lab.testsite.site import Camera, Site
+from slipid.lab.testsite.studio import Studio, film
+from slipid.support.errors import DataError
+from slipid.support.executor import Here, Processes, results
+from slipid.support.files import Content, read_json, write_arrays, write_bytes, write_json
+from slipid.support.progress import Reporter
+
+
+def observe(trace: Trace, site: Site, run: Run, name: str, seed: int) -> Log:
+    """The log of a run, by its name and the seed of its noise."""
+    s, rng = site.sensors, np.random.default_rng([seed, 1])
+    count = int(trace.time[-1] / s.row_s) + 1
+    uneven = s.row_s * (1 + s.row_jitter * rng.uniform(-1, 1, count))
+    time = np.concatenate([[0.0], np.cumsum(uneven)])
+    time = time[time <= trace.time[-1]]
+    at = np.searchsorted(trace.time, time + 1e-9) - 1
+    whole = np.floor(trace.wheel_angle[at] / site.tick) * site.tick
+    quantum = s.speed_step / site.machine.gear_ratio
+    speed = np.round(s.speed_gain * _averaged(trace.wheel_speed, at, 5) / quantum) * quantum
+    width = max(1, round(s.average_s / (trace.time[1] - trace.time[0])))
+    amps = s.amperes(_averaged(trace.current, at, width), rng)
+    volts = s.volts(_averaged(trace.voltage, at, width), rng)
+    bus = s.volts(_averaged(trace.bus[:, None], at, width)[:, 0], rng)
+    turn = trace.yaw_rate[at] + s.gyro_bias * rng.normal()
+    turn = turn + s.gyro_noise * rng.normal(size=turn.shape)
+    duty = _averaged(trace.voltage / trace.bus[:, None], at, width)
+    pose, fresh = _camera(trace, site, rng, time)
+    logged = b"".join(np.ascontiguousarray(x).tobytes() for x in (whole, amps, volts, pose, time))
+    return Log(
+        name=f"{name}.csv",
+        path=Path(f"{name}.csv"),
+        sha256=hashlib.sha256(logged).hexdigest(),
+        time=time,
+        wheel_angle=whole - whole[0],
+        wheel_speed=speed,
+        wheel_speed_command=trace.wheel_command[at],
+        twist_command=trace.twist_command[at],
+        current=amps,
+        current_is_signed=s.current_is_signed,
+        voltage=volts if s.voltage else None,
+        duty=np.round(duty, 3) if s.duty else None,
+        bus_voltage=bus if s.bus_voltage else None,
+        gyro=turn if s.gyro else None,
+        pose=pose,
+        pose_fresh=fresh,
+        surface=run.surface,
+        load=run.load,
+    )
+
+
+def _averaged(
+    x: Float[np.ndarray, "step wheel"], at: np.ndarray, width: int
+) -> Float[np.ndarray, "row wheel"]:
+    """Mean of so many steps up to each row."""
+    total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
+    first = np.maximum(at + 1 - width, 0)
+    return (total[at + 1] - total[first]) / (at + 1 - first)[:, None]
+
+
+def _camera(
+    trace: Trace, site: Site, rng: np.random.Generator, time: Float[np.ndarray, " row"]
+) -> tuple[Float[np.ndarray, "row 3"], Bool[np.ndarray, " row"]]:
+    """Marker poses as the rows hold them, and which rows bring a new frame."""
+    s = site.sensors
+    delay = s.lag_s - 0.5 * s.frame_s
+    first = -(s.lag_s + 3 * s.frame_s)  # so that there is one to be logged when it starts
+    taken = np.arange(first, trace.time[-1] + s.frame_s, s.frame_s) + rng.uniform(0, s.frame_s)
+    taken = taken[(rng.uniform(size=len(taken)) >= s.dropout) | (taken + delay <= 0.0)]
+    seen = interpolate(trace.time, trace.pose, taken)
+    seen[:, 2] += float(np.radians(site.machine.marker_yaw_deg))
+    seen[:, :2] += s.camera_noise_m * rng.normal(size=(len(taken), 2))
+    seen[:, 2] += s.camera_noise_rad * rng.normal(size=len(taken))
+    wrong = rng.uniform(size=len(taken)) < s.outlier
+    seen[:, :2] += np.where(wrong[:, None], s.outlier_m * rng.normal(size=(len(taken), 2)), 0.0)
+    seen[:, :2] /= s.camera_scale
+    newest = np.searchsorted(taken + delay, time, side="right") - 1
+    fresh = np.concatenate([[True], np.diff(newest) > 0])
+    return seen[newest], fresh
+
+
+MANIFEST = "simulate.json"
+SCHEMA = "slipid.simulation/1"
+FOLDERS = {"slipid": "logs", "robotino2022": "robotino2022"}
+"""Folder below OUT of every format."""
+TRUTH_STEP = 10
+"""Time steps between rows of a stored truth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """One run to be driven by a process of its own."""
+
+    name: str
+    run: Run
+    site: Site
+    seed: int
+    formats: tuple[str, ...]
+    out: Path
+
+
+def simulate(plan: Plan, out: Path, executor: Executor, report: Reporter) -> Content:
+    """Drive every run of a plan that is not there yet; what simulate.json holds.
+
+    A run's truth is written last: a run that has one is done. Called again after an interrupt it
+    goes on from there.
+
+    Raises:
+        DataError: MuJoCo is missing, or the folder holds runs of another config.
+    """
+    version = engine().__version__
+    manifest = out / MANIFEST
+    about = {"schema": SCHEMA, "config_hash": plan.hash, "mujoco": version}
+    if manifest.is_file():
+        before = read_json(manifest, "what slipid simulate wrote")
+        before = before if isinstance(before, dict) else {}
+        for key, what in (("config_hash", "config"), ("mujoco", "version of MuJoCo")):
+            if before.get(key) != about[key]:
+                raise DataError(
+                    f"{out}: holds runs of another {what}; expected an empty folder or the same"
+                )
+    write_json(manifest, about)
+    _describe(plan, out)
+    formats = tuple(plan.content.formats)
+    every = [
+        Job(name, run, plan.site, _seed(plan.content.seed, k), formats, out)
+        for k, (name, run) in enumerate(plan.runs)
+    ]
+    todo = {job.name: job for job in every if not _truth(job).is_file()}
+    report.stage(f"driving {len(todo)} of {len(every)} runs")
+    began = time.monotonic()
+    seconds = sum(results(executor, drive_and_write, todo, report), 0.0)
+    pace = seconds / max(time.monotonic() - began, 1e-9)
+    filmed = [job for job in every if job.name in plan.filmed]
+    _film(filmed, plan.content.camera, executor, report)
+    content = {**about, "runs": [name for name, _ in plan.runs]}
+    write_json(manifest, content)
+    return {**content, "driven": len(todo), "seconds": seconds, "pace": pace if todo else None}
+
+
+def _film(jobs: Sequence[Job], camera: Camera, executor: Executor, report: Reporter) -> None:
+    """Videos of the runs that have none yet, with the camera's numbers beside them."""
+    todo = {job.name: (job, camera) for job in jobs if not _video(job).is_file()}
+    if not todo:
+        return
+    write_json(jobs[0].out / "video" / "camera.json", camera.as_dict())
+    report.stage(f"filming {len(todo)} of {len(jobs)} runs")
+    # not in this process, even alone: what draws has to be chosen before MuJoCo is there
+    with Processes(1) if isinstance(executor, Here) else nullcontext(executor) as apart:
+        results(apart, film_and_write, todo, report)
+
+
+def film_and_write(what: tuple[Job, Camera]) -> None:
+    """Film one run that was driven. The video is written last."""
+    job, camera = what
+    with np.load(_truth(job)) as true:
+        studio = Studio(job.site, job.run.load, job.run.map, camera, job.seed)
+        path = _video(job)
+        frames = np.arange(true["time"][0] - camera.early_s, true["time"][-1], camera.frame_s)
+        rows = "".join(f"{k},{t:.4f}\n" for k, t in enumerate(frames))
+        write_bytes(path.with_suffix(".csv"), f"frame,time\n{rows}".encode())
+        with closing(studio):
+            film(studio, dict(true), frames, path)
+
+
+def _video(job: Job) -> Path:
+    return job.out / "video" / f"{job.name}.avi"
+
+
+def _truth(job: Job) -> Path:
+    return job.out / "truth" / f"{job.name}.npz"
+
+
+def drive_and_write(job: Job) -> float:
+    """Drive one run and write its log and its truth; the seconds it drove."""
+    try:
+        trace = drive(job.run, job.site, job.seed)
+    except ValueError as error:  # also the engine's, of a robot that it cannot build
+        raise DataError(f"{job.name}: {error}") from error
+    site = job.site
+    gear, ticks = site.machine.gear_ratio, site.motor.ticks_per_revolution
+    log = observe(trace, site, job.run, job.name, job.seed)
+    for form in job.formats:
+        write = own_csv if form == "slipid" else robotino2022_csv
+        path = job.out / FOLDERS[form] / _place(form, job)
+        write_bytes(path, write(log, gear, ticks).encode())
+    write_arrays(_truth(job), _true(trace, job.run, site))
+    return float(trace.time[-1])
+
+
+def _seed(seed: int, k: int) -> int:
+    """Seed of a run that stays when runs are added behind it."""
+    return int(np.random.SeedSequence(seed, spawn_key=(k,)).generate_state(1)[0])
+
+
+def _place(form: str, job: Job) -> str:
+    """Where the log of a format lies."""
+    if form == "slipid":
+        return f"{job.name}.csv"
+    load, folder, number = job.name.split("/")
+    kind = {"as_built": "one_surface", "moved": "wheel_load"}.get(load, load)
+    if job.run.surface is None:
+        kind = "two_surfaces" if load == "as_built" else f"two_surfaces/{load}"
+    return f"{kind}/{folder}/exp{number.removeprefix('run')}.csv"
+
+
+def _true(trace: Trace, run: Run, site: Site) -> dict[str, np.ndarray]:
+    """What truly happened: poses, wheels, currents, and the surface under every wheel."""
+    t = replace(trace, **{k: getattr(trace, k)[::TRUTH_STEP] for k in vars(trace)})
+    c, s = np.cos(t.pose[:, 2]), np.sin(t.pose[:, 2])
+    turned = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    places = t.pose[:, None, :2] + np.einsum("tij,wj->twi", turned, site.machine.places)
+    floor = run.map
+    names = np.array(floor.surfaces)[floor.at(places)]
+    keep = ("time", "pose", "wheel_angle", "wheel_speed", "current", "voltage", "bus", "sinkage")
+    return {**{k: getattr(t, k) for k in keep}, "surface": names.astype("S")}
+
+
+def _describe(plan: Plan, out: Path) -> None:
+    """Maps, the truth about the robot, and a config that identifies it."""
+    site = plan.site
+    for name, floor in plan.maps.items():
+        colours = {s: site.grounds[s].colour for s in floor.surfaces}
+        write_map(out / "maps" / f"{name}.toml", floor, colours)
+    known = {"schema": "slipid.truth/1", "parameters": truth(site), "site": asdict(site)}
+    write_json(out / "truth" / "truth.json", known)
+    robot = out / "robot.toml"
+    if can_identify(plan):
+        texts = {robot: identify_config(plan)}
+        if all_filmed(plan):
+            texts[out / "robot_video.toml"] = identify_config(plan, by_video=True)
+        for path, text in texts.items():
+            if not path.is_file():  # it may have been edited since
+                write_bytes(path, text.encode())
+
+
+def truth(site: Site) -> dict[str, Content]:
+    """Numbers of the site that a fit has as well, by their path names."""
+    machine, motor, sensors = site.machine, site.motor, site.sensors
+    found: dict[str, tuple[float | list[float], str]] = {
+        f"robot.load_share@{load}": (machine.load_share(load).tolist(), "1")
+        for load in machine.centres_m
+    }
+    found |= {
+        "motor.resistance": (motor.resistance_ohm, "ohm"),
+        "motor.back_emf": (motor.back_emf_vs, "V*s/rad"),
+        "camera.scale": (sensors.camera_scale, "1"),
+        "camera.lag": (sensors.lag_s, "s"),
+        "camera.marker_yaw": (float(np.radians(machine.marker_yaw_deg)), "rad"),
+    }
+    return {path: {"value": value, "unit": unit} for path, (value, unit) in found.items()}

@@ -1,0 +1,181 @@
+"""What stays the same from run to run: the robot, its sensors, the camera, the floors' physics."""
+
+from collections.abc import Mapping
+from dataclasses import field
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, FiniteFloat
+from pydantic.dataclasses import dataclass
+
+from slipid.lab.testsite.ground import GROUNDS, Ground
+from slipid.lab.testsite.motors import Machine, Motor, SpeedLoop
+from slipid.support.toml_file import CLOSED, NotNegative, Part, Positive
+
+Interval = Annotated[float, Field(ge=1e-3, le=1)]
+"""[s]."""
+Tilt = Annotated[float, Field(ge=-10, le=10)]
+"""[deg]."""
+
+
+@dataclass(frozen=True, config=CLOSED)
+class Sensors:
+    """How logs err.
+
+    Attributes:
+        row_s, row_jitter: mean time between rows [s], and its spread as part of it.
+        current_step_a, current_noise_a: step of the current's converter, and its noise [A].
+        current_is_signed: else magnitudes are logged, as most robots do.
+        speed_step, speed_gain: quantum of the reported motor speed [rad/s], and how much it reads
+            too high [1].
+        voltage, duty, bus_voltage, gyro: whether these are logged.
+        voltage_step_v, voltage_noise_v: [V].
+        gyro_noise, gyro_bias: [rad/s]; the bias is drawn anew for every run.
+        average_s: over which currents and voltages are averaged before they are sampled [s].
+        frame_s, lag_s: between camera frames, and mean age of the pose in a row [s].
+        camera_scale: true length over logged length; the camera of the 2022 logs has 1.117.
+        camera_noise_m, camera_noise_rad: noise of every frame.
+        dropout: part of the frames that is lost.
+        outlier, outlier_m: part of the frames that is wrong, and by how much [m].
+    """
+
+    row_s: Interval = 0.031
+    row_jitter: Part = 0.1
+    current_step_a: Positive = 1 / 39
+    current_noise_a: NotNegative = 0.05
+    current_is_signed: bool = False
+    speed_step: Positive = 2.83
+    speed_gain: Positive = 1.013
+    voltage: bool = True
+    duty: bool = False
+    bus_voltage: bool = False
+    gyro: bool = False
+    voltage_step_v: Annotated[float, Field(ge=0.01, allow_inf_nan=False)] = 0.1
+    voltage_noise_v: NotNegative = 0.05
+    gyro_noise: NotNegative = 0.004
+    gyro_bias: NotNegative = 0.005
+    average_s: Annotated[float, Field(ge=0, le=1)] = 0.008
+    frame_s: Interval = 1 / 29
+    lag_s: float = 0.056
+    camera_scale: Annotated[float, Field(ge=1e-3, le=100)] = 1.117
+    camera_noise_m: NotNegative = 0.0005
+    camera_noise_rad: NotNegative = 0.004
+    dropout: Part = 0.01
+    outlier: Part = 0.0005
+    outlier_m: NotNegative = 0.03
+
+    def __post_init__(self) -> None:
+        if not 0.5 * self.frame_s <= self.lag_s <= 0.4:
+            raise ValueError(f"lag_s = {self.lag_s}; expected half of frame_s or above, up to 0.4")
+
+    def amperes(
+        self, true: Float[np.ndarray, "*batch"], rng: np.random.Generator
+    ) -> Float[np.ndarray, "*batch"]:
+        """What ammeters give for true currents [A]."""
+        read = true + self.current_noise_a * rng.normal(size=true.shape)
+        read = read if self.current_is_signed else np.abs(read)
+        return np.round(read / self.current_step_a) * self.current_step_a
+
+    def volts(
+        self, true: Float[np.ndarray, "*batch"], rng: np.random.Generator
+    ) -> Float[np.ndarray, "*batch"]:
+        """What voltmeters give for true voltages [V]."""
+        read = true + self.voltage_noise_v * rng.normal(size=true.shape)
+        return np.round(read / self.voltage_step_v) * self.voltage_step_v
+
+
+@dataclass(frozen=True, config=CLOSED)
+class Site:
+    """Everything that stays the same from run to run.
+
+    Attributes:
+        machine, motor, loop: the robot; sensors: of its logs; grounds: every surface.
+        command_delay_s: from a command to the wheels.
+        acceleration: of the wheels' rims towards a new command [m/s^2].
+    """
+
+    machine: Machine = field(default_factory=Machine)
+    motor: Motor = field(default_factory=Motor)
+    loop: SpeedLoop = field(default_factory=SpeedLoop)
+    sensors: Sensors = field(default_factory=Sensors)
+    grounds: Mapping[str, Ground] = field(default_factory=lambda: dict(GROUNDS))
+    command_delay_s: float = 0.12
+    acceleration: float = 1.0
+
+    @property
+    def tick(self) -> float:
+        """Turn of a wheel from one tick of its encoder to the next [rad]."""
+        return 2 * np.pi / (self.motor.ticks_per_revolution * self.machine.gear_ratio)
+
+
+@dataclass(frozen=True, config=CLOSED)
+class Camera:
+    """A camera that looks down on the floor, its image turned by half a turn from the world's axes.
+
+    Attributes:
+        height_m: height of the lens above the floor.
+        focal_px: focal length [pixel].
+        width_px, height_px: size of the image.
+        centre_m: where on the floor it hangs above, x and y.
+        tilt_deg: about the image's x and y axes.
+        distortion: k1, k2, p1, p2 of OpenCV's lens model.
+        blur_px: std of the blur [pixel].
+        noise: std of every pixel [grey levels of 255].
+        flicker: how much the light changes within some seconds, as a part of it.
+        exposure_s: how long a frame is exposed; what moves is seen twice, at both ends.
+        frame_s: between frames.
+        early_s: how long before the robot's log somebody starts it: its clock is then ahead by
+            that.
+    """
+
+    height_m: Positive = 2.2
+    focal_px: Positive = 1200.0
+    width_px: Annotated[int, Field(gt=0)] = 1920
+    height_px: Annotated[int, Field(gt=0)] = 1080
+    centre_m: tuple[FiniteFloat, FiniteFloat] = (0.0, 0.0)
+    tilt_deg: tuple[Tilt, Tilt] = (0.6, -0.4)
+    distortion: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] = (
+        -0.06,
+        0.02,
+        0.0006,
+        -0.0004,
+    )
+    blur_px: NotNegative = 0.8
+    noise: NotNegative = 2.0
+    flicker: NotNegative = 0.06
+    exposure_s: NotNegative = 0.012
+    frame_s: Positive = 1 / 29
+    early_s: NotNegative = 0.0
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """OpenCV's camera matrix; the principal point is the middle of the image."""
+        x, y = 0.5 * (self.width_px - 1), 0.5 * (self.height_px - 1)
+        return np.array([[self.focal_px, 0.0, x], [0.0, self.focal_px, y], [0.0, 0.0, 1.0]])
+
+    @property
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
+        """Rotation from the world to OpenCV's camera axes: x right, y down, z away."""
+        a, b = np.radians(self.tilt_deg)
+        down = np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
+        about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+        about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+        return about_y @ about_x @ down
+
+    @property
+    def place(self) -> Float[np.ndarray, "3"]:
+        """Place of the lens in the world [m]."""
+        return np.array([*self.centre_m, self.height_m])
+
+    def as_dict(self) -> dict[str, object]:
+        """What a tracker has to know."""
+        return {
+            "schema": "slipid.camera/1",
+            "image_px": [self.width_px, self.height_px],
+            "matrix": self.matrix.tolist(),
+            "distortion": list(self.distortion),
+            "rotation_from_world": self.rotation.tolist(),
+            "place_m": self.place.tolist(),
+            "frame_s": self.frame_s,
+        }

@@ -1,0 +1,226 @@
+"""Frames of a run with marker, floor, perspective and a lens, as a video.
+
+Drawing needs OpenGL without a screen: EGL, in software where there is no graphics card. Driving
+does not.
+"""
+
+import os
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.floor_map import FloorMap
+from slipid.data.wheel_signals import interpolate
+from slipid.lab.testsite.motors import mjcf
+from slipid.lab.testsite.site import Camera, Site
+from slipid.support.errors import DataError
+
+MARKER = 0
+"""Number of the marker in ArUco's dictionary 4X4_50, as on the Robotino of the published frames."""
+
+WIDE = 1.12
+"""How much more is drawn than seen: the lens bends some of the outside into view."""
+
+_SHIFT = 97
+"""Places to which the noise of a frame is shifted, along each edge [pixel]."""
+
+
+class Studio:
+    """Draws frames of a robot on a floor; the seed is that of its pattern, the light and the noise.
+
+    Raises:
+        DataError: OpenGL or OpenCV is not there.
+    """
+
+    def __init__(self, site: Site, load: str, floor: FloorMap, camera: Camera, seed: int = 0):
+        mujoco, cv2 = _drawing()
+        self.camera, self._rng, self._cv2 = camera, np.random.default_rng(seed), cv2
+        (x, y), half = camera.centre_m, 0.65 * camera.height_m / camera.focal_px
+        wide, high = half * camera.width_px, half * camera.height_px
+        x0, y0, x1, y1 = x - wide, y - high, x + wide, y + high  # what is seen, with a margin
+        carpet = _carpet(floor, site, (x0, y0, x1, y1), self._rng)
+        assets = {"floor.png": _png(cv2, carpet), "marker.png": _png(cv2, _marker(cv2))}
+        fovy = np.degrees(2 * np.arctan(0.5 * WIDE * camera.height_px / camera.focal_px))
+        # MuJoCo's cameras look along -z with y up
+        axes = camera.rotation.T @ np.diag([1.0, -1.0, -1.0])
+        frame = " ".join(str(float(v)) for v in (*axes[:, 0], *axes[:, 1]))
+        place = " ".join(str(float(v)) for v in camera.place)
+        width, height = self._size
+        looks = (
+            f'<visual><global offwidth="{width}" offheight="{height}"/><quality offsamples="0"/>'
+            '<headlight ambient=".42 .42 .42" diffuse=".2 .2 .2" '
+            'specular="0 0 0"/><map znear=".05"/></visual><asset>'
+            '<texture name="floor" type="2d" file="floor.png"/>'
+            '<texture name="marker" type="2d" file="marker.png"/>'
+            '<material name="floor" texture="floor" specular="0"/>'
+            '<material name="marker" texture="marker" specular="0"/></asset>'
+        )
+        xml = mjcf(site.machine, load, 1e-3, looks=looks, floor_looks='rgba="0 0 0 0"')
+        extra = (
+            f'<geom type="plane" pos="{0.5 * (x0 + x1)} {0.5 * (y0 + y1)} .0002" '
+            f'size="{0.5 * (x1 - x0)} {0.5 * (y1 - y0)} .1" material="floor" contype="0" '
+            f'conaffinity="0"/><camera name="overhead" pos="{place}" xyaxes="{frame}" '
+            f'fovy="{fovy}"/><light pos="0.6 0.4 3" dir="-.2 -.13 -1" diffuse=".35 .35 .35" '
+            'castshadow="false"/>'
+        )
+        xml = xml.replace("<worldbody>", f"<worldbody>{extra}", 1)
+        xml = xml.replace('<geom name="marker" ', '<geom name="marker" material="marker" ')
+        self.model = mujoco.MjModel.from_xml_string(xml, assets)
+        self.data = mujoco.MjData(self.model)
+        self._forward = mujoco.mj_forward
+        count = range(len(site.machine.wheel_azimuths_deg))
+        self._wheels = [self.model.joint(f"wheel{k}").qposadr[0] for k in count]
+        try:
+            self._renderer = mujoco.Renderer(self.model, height, width)
+        except Exception as error:
+            raise _no_drawing(error) from error
+        self._bent = self._lens()
+        self._light = self._rng.uniform(0, 2 * np.pi, 2)
+        size = (camera.height_px + _SHIFT, camera.width_px + _SHIFT, 3)
+        self._grain = camera.noise * self._rng.standard_normal(size, np.float32)
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        """Width and height of what is drawn before the lens bends it [pixel]."""
+        return round(WIDE * self.camera.width_px), round(WIDE * self.camera.height_px)
+
+    def close(self) -> None:
+        """Give the drawing context back."""
+        self._renderer.close()
+
+    def frame(
+        self, pose: Float[np.ndarray, "3"], wheel_angle: Float[np.ndarray, " wheel"]
+    ) -> np.ndarray:
+        """Sharp image of the robot somewhere, through the lens: rows, columns, blue green red."""
+        q = self.data.qpos
+        q[:2], q[3], q[6] = pose[:2], np.cos(0.5 * pose[2]), np.sin(0.5 * pose[2])
+        q[self._wheels] = wheel_angle
+        self._forward(self.model, self.data)
+        self._renderer.update_scene(self.data, "overhead")
+        drawn = np.ascontiguousarray(self._renderer.render()[:, :, ::-1])
+        return self._cv2.remap(drawn, *self._bent, self._cv2.INTER_LINEAR)
+
+    def exposed(
+        self,
+        time: float,
+        pose_at: Callable[[float], Float[np.ndarray, "3"]],
+        wheels_at: Callable[[float], Float[np.ndarray, " wheel"]],
+    ) -> np.ndarray:
+        """Frame whose exposure is centred on a time, with smear, blur, light and noise."""
+        c = self.camera
+        ends = (-0.5, 0.5) if c.exposure_s > 0 else (0.0,)
+        images = [
+            self.frame(pose_at(t), wheels_at(t)) for t in (time + c.exposure_s * np.array(ends))
+        ]
+        image = np.mean(images, axis=0, dtype=np.float32)
+        if c.blur_px > 0:
+            image = self._cv2.GaussianBlur(image, (0, 0), c.blur_px)
+        fast, slow = np.sin(2 * np.pi * time / np.array([1.7, 7.3]) + self._light)
+        image = image * (1 + c.flicker * (0.3 * fast + 0.7 * slow))
+        row, column = self._rng.integers(_SHIFT, size=2)  # one noise, shifted for every frame
+        image = image + self._grain[row : row + c.height_px, column : column + c.width_px]
+        return np.clip(image, 0, 255).astype(np.uint8)
+
+    def _lens(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel of the drawing that each pixel of the image comes from."""
+        c, cv2 = self.camera, self._cv2
+        grid = np.stack(np.meshgrid(np.arange(c.width_px), np.arange(c.height_px)), -1)
+        points = grid.reshape(-1, 1, 2).astype(np.float64)
+        ideal = cv2.undistortPoints(points, c.matrix, np.array(c.distortion))[:, 0]
+        width, height = self._size
+        focal = c.focal_px * height / (WIDE * c.height_px)  # of the drawing
+        x = (focal * ideal[:, 0] + 0.5 * (width - 1)).reshape(c.height_px, c.width_px)
+        y = (focal * ideal[:, 1] + 0.5 * (height - 1)).reshape(c.height_px, c.width_px)
+        return x.astype(np.float32), y.astype(np.float32)
+
+
+def film(
+    studio: Studio, true: Mapping[str, np.ndarray], frames: Float[np.ndarray, " frame"], path: Path
+) -> None:
+    """Write a video of a run, whole or not at all.
+
+    Args:
+        true: time [s] (step,), pose (step, 3) and wheel_angle (step, wheel) of the run.
+        frames: times of the video's frames [s].
+        path: where the video goes (.avi, Motion JPEG).
+    """
+    import cv2
+
+    c = studio.camera
+
+    def at(name: str, t: float) -> np.ndarray:
+        return interpolate(true["time"], true[name], np.array([t]))[0]
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.partial.avi")
+    code = cv2.VideoWriter.fourcc(*"MJPG")
+    video = cv2.VideoWriter(str(unfinished), code, 1 / c.frame_s, (c.width_px, c.height_px))
+    if not video.isOpened():
+        raise DataError(f"{path}: OpenCV cannot write a video there")
+    try:
+        for t in frames:
+            video.write(studio.exposed(float(t), partial(at, "pose"), partial(at, "wheel_angle")))
+        video.release()
+        written = cv2.VideoCapture(str(unfinished)).get(cv2.CAP_PROP_FRAME_COUNT)
+        if written != len(frames):
+            raise DataError(
+                f"{path}: {written:.0f} of {len(frames)} frames written; is there room?"
+            )
+        os.replace(unfinished, path)
+    finally:
+        video.release()
+        unfinished.unlink(missing_ok=True)
+
+
+def _drawing() -> tuple[ModuleType, ModuleType]:
+    """The modules mujoco, ready to draw without a screen, and cv2."""
+    if os.name == "posix" and "DISPLAY" not in os.environ:
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        import cv2
+        import mujoco
+    except ImportError as error:
+        if "EGL" in str(error) or "OpenGL" in str(error):
+            raise _no_drawing(error) from error
+        raise DataError(
+            f"the test site's camera needs {error.name}; expected: pip install 'slipid[testsite]'"
+        ) from error
+    except AttributeError as error:  # PyOpenGL where libEGL is absent
+        raise _no_drawing(error) from error
+    return mujoco, cv2
+
+
+def _no_drawing(error: Exception) -> DataError:
+    return DataError(
+        f"nothing can be drawn here ({error}); expected OpenGL without a screen: MUJOCO_GL=egl "
+        "and, on Debian and Ubuntu, apt-get install libegl1 libgl1-mesa-dri"
+    )
+
+
+def _carpet(
+    floor: FloorMap, site: Site, extent: tuple[float, float, float, float], rng: np.random.Generator
+) -> np.ndarray:
+    """Picture of the floor: every surface in its colour, with a grain."""
+    step = 0.002
+    x = np.arange(extent[0], extent[2], step) + 0.5 * step
+    y = np.arange(extent[1], extent[3], step) + 0.5 * step
+    colours = [bytes.fromhex(site.grounds[name].colour[1:]) for name in floor.surfaces]
+    table = np.array([list(colour) for colour in colours], float)
+    picture = table[floor.at(np.stack(np.meshgrid(x, y), -1))]
+    grain = rng.normal(size=picture.shape[:2]) + 0.7 * np.sin(2 * np.pi * y / 0.012)[:, None]
+    return np.clip(picture * (1 + 0.06 * grain[..., None]), 0, 255).astype(np.uint8)[::-1]
+
+
+def _marker(cv2: ModuleType) -> np.ndarray:
+    """Picture of the marker, its top edge ahead: the texture's right is the body's front."""
+    book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    drawn = np.rot90(cv2.aruco.generateImageMarker(book, MARKER, 480), -1)
+    return np.repeat(drawn[..., None], 3, axis=2)
+
+
+def _png(cv2: ModuleType, picture: np.ndarray) -> bytes:
+    return bytes(cv2.imencode(".png", picture[..., ::-1])[1])

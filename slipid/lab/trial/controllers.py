@@ -1,0 +1,121 @@
+"""The controllers of a trial, each a row of its table: slipid's own and published laws."""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.deploy.controllers import OWN_ROWS, PAPER_WHEELS, ControllerRow
+from slipid.lab.trial.goswami_padhy import GoswamiPadhy, Rehearsal, by_gradient, by_swarm
+from slipid.lab.trial.indiveri import Indiveri, inverse_kinematics
+from slipid.robot.actuation import Habits
+from slipid.robot.closed_loop import PERIOD
+from slipid.robot.controller import Gains, Law, Limits
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.trajectory import STEP, rectangle
+from slipid.support.errors import DataError
+
+BESIDE = ((0.05, 0.0, 0.2), (0.0, 0.05, -0.2), (-0.05, 0.0, 0.2), (0.0, -0.05, -0.2))
+"""From where gains of published laws are rehearsed: beside the path's start [m, m, rad]."""
+
+
+def _indiveri(robot: DeployedRobot) -> Law:
+    """The wheels as they were identified, and the gains that the pose loop has by hand."""
+    numbers, wheels, gains = robot.record.parameters, robot.record.wheels, Gains()
+    matrix = inverse_kinematics(
+        np.asarray(robot.places),
+        np.asarray(wheels.drive_angle) + np.asarray(numbers["robot.drive_offset"].value),
+        np.asarray(wheels.roller_angle),
+        float(robot.frame.radius) * (1 + np.asarray(numbers["robot.radius_deviation"].value)),
+    )
+    both = jnp.stack([gains.place, gains.yaw])
+    return Indiveri(jnp.asarray(matrix), both, jnp.asarray(Limits().wheel_speed))
+
+
+def _goswami_padhy(robot: DeployedRobot) -> Law:
+    return GoswamiPadhy(jnp.asarray(_rehearsed("swarm")))
+
+
+def _goswami_padhy_gradient(robot: DeployedRobot) -> Law:
+    return GoswamiPadhy(jnp.asarray(_rehearsed("gradient")))
+
+
+@cache
+def _rehearsed(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
+    """Gains [1/s] on the first two sides of the rectangle; the others mirror them.
+
+    The ideal robot is late as every robot's twin is, so that gains are the same for all of them.
+    """
+    path, habits = rectangle(), Habits()
+    times, rows = np.arange(0.0, float(path.marks[1]), PERIOD), np.asarray(path.rows)
+    own = STEP * np.arange(len(rows))
+    reference = np.stack([np.interp(times, own, column) for column in rows.T], axis=1)
+    task = Rehearsal(reference, np.array(BESIDE), habits.held(), habits.follow, PERIOD)
+    return tuple((by_swarm(task) if by == "swarm" else by_gradient(task)).tolist())
+
+
+ROWS: Mapping[str, ControllerRow] = {
+    **OWN_ROWS,
+    "goswami_padhy": ControllerRow(
+        "encoder", "law of Goswami and Padhy, gains by a swarm", law=_goswami_padhy
+    ),
+    "goswami_padhy_gradient": ControllerRow(
+        "encoder", "and gains by the gradient", law=_goswami_padhy_gradient
+    ),
+    "indiveri": ControllerRow(
+        "encoder", "law of Indiveri, its limit keeps the direction", law=_indiveri
+    ),
+}
+"""The rows of slipid and of the 2021 paper, then the published laws."""
+
+
+def applying(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
+    """The controllers among these that apply to a robot.
+
+    Raises:
+        DataError: none does.
+    """
+    kept = tuple(name for name in names if ROWS[name].drives(robot))
+    if not kept:
+        raise DataError(
+            f"{', '.join(names)}: for robots with {PAPER_WHEELS} wheels, as that of the 2021 "
+            f"paper; this one has {robot.wheels}, expected some of "
+            f"{', '.join(name for name, row in ROWS.items() if row.drives(robot))}"
+        )
+    return kept
+
+
+def check_gains(out: Path, robot: DeployedRobot) -> None:
+    """Raise `DataError` if tuned gains are wanted that this robot and load set-up do not have."""
+    tuned, path = robot.record.gains, out / "robot.json"
+    if tuned is None:
+        raise DataError(f"{path}: it has no tuned gains; leave out --tuned-gains")
+    if tuned.load != robot.load_setup:
+        raise DataError(
+            f"{path}: gains were tuned for another load set-up ({tuned.load}), not for "
+            f"{robot.load_setup}; leave out --tuned-gains, or drive with --load {tuned.load}"
+        )
+
+
+def unused_gains(robot: DeployedRobot, forced: bool) -> str:
+    """Return which tuned gains of the file are not taken, and why; empty where all are."""
+    tuned = robot.record.gains
+    if tuned is None:
+        return ""
+    if tuned.load != robot.load_setup:
+        return f"gains were tuned for load set-up {tuned.load}: driving with those set by hand"
+    if not (tuned.is_better or forced):
+        return (
+            f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "
+            f"{tuned.loss.hand:.1f} mm): driving with those set by hand; --tuned-gains takes the "
+            "others"
+        )
+    if tuned.values.ahead.value == 0.0:
+        return ""
+    return (
+        f"tuned gain ahead = {tuned.values.ahead.value:g} is not taken: there are no wheel speeds "
+        "by the contact model any more"
+    )

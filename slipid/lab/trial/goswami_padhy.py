@@ -1,0 +1,261 @@
+"""Particle swarm optimisation: particles remember, and are drawn to, the best places found so far.
+
+    v <- w v + c1 r1 (own best - x) + c2 r2 (best of all - x),   x <- x + v
+
+with r1, r2 uniform in [0, 1], drawn anew for every particle, coordinate and iteration.
+
+Nothing is tuned: inertia and pulls are those that Goswami and Padhy 2018 set.
+
+Liberties:
+
+- Particles start at rest, and evenly drawn over the box.
+- A coordinate that would leave the box stays on its edge, and rests there; its speed is at most
+  half of the box in an iteration.
+
+Source: Kennedy and Eberhart 1995, "Particle swarm optimization", ICNN, with the inertia of Shi and
+Eberhart 1998; sizes and settings of Goswami and Padhy 2018.
+
+Goswami and Padhy 2018: a tracking law with a Lyapunov function, its gains by a swarm.
+
+For a robot that drives sideways, with the errors e of its place in its own axes, and of its heading
+
+    v = R(th)^T p_d' + (k1 e_x, k2 e_y),   W = W_d + k3 sin e_th
+    V = (e_x^2 + e_y^2) / 2 + 1 - cos e_th,   V' = -k1 e_x^2 - k2 e_y^2 - k3 sin^2 e_th
+
+so that V falls for all positive gains, if the robot does at once what it is asked to.
+
+Gains are tuned on an ideal robot that does it late: of those in [0, 5] the ones with the least
+integral of V over a path that is begun beside it. For a robot that lags as the twin does k1 and k2
+end at the edge, 5, and k3 at 4.67.
+
+- row `goswami_padhy`: by a swarm of 30 particles in 50 iterations, inertia 0.7, c1 = c2 = 1.5.
+- row `goswami_padhy_gradient`: the same integral by its gradient, a quasi-Newton method in a box
+  (L-BFGS-B of scipy), which shows what the swarm leaves.
+
+Liberties:
+
+- The law is the form for robots that drive sideways, as it is quoted; the paper's own text was not
+  at hand.
+- What is integrated is V, over the path of the trial begun from several places beside it, on a
+  robot without slip whose twist follows commands by the twin's delay and lag. The paper's own
+  robot, path and cost are not made anew.
+- All wheels follow alike, so that the twist follows as they do; limits of speed, acceleration and
+  voltage are left out, and the pose is known. While gains are tuned the path does not wait.
+- It is steered once in a period, from the pose that the encoders believe in, as all rows are; what
+  it asks for is held to the limits of all rows.
+- The swarm's start and edges: `slipid.lab.trial.goswami_padhy`.
+
+Source: Goswami and Padhy 2018, a trajectory tracking law for a mobile robot with slip, its gains by
+particle swarm; known here by quotation only.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+Places = Float[np.ndarray, "particle n"]
+Cost = Callable[[Places], Float[np.ndarray, " particle"]]
+"""Of every particle at once; what is no number counts as infinite."""
+
+
+@dataclass(frozen=True)
+class Swarm:
+    """Size of a swarm, for how many iterations it moves, and what moves it.
+
+    Attributes:
+        particles, iterations: how many.
+        inertia: part of its speed that a particle keeps.
+        own, others: pulls to the best place that it has found, and that all have found.
+    """
+
+    particles: int = 30
+    iterations: int = 50
+    inertia: float = 0.7
+    own: float = 1.5
+    others: float = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The best place of a swarm, and the least cost after its start and every iteration."""
+
+    place: Float[np.ndarray, " n"]
+    history: Float[np.ndarray, " iteration"]
+
+    @property
+    def cost(self) -> float:
+        """At the best place."""
+        return float(self.history[-1])
+
+
+def minimise(
+    cost: Cost,
+    low: Float[np.ndarray, " n"],
+    high: Float[np.ndarray, " n"],
+    swarm: Swarm,
+    seed: int = 0,
+) -> Found:
+    """The least cost in a box that a swarm finds; the same seed finds the same.
+
+    Args:
+        cost: what is minimised.
+        low, high: edges of the box.
+        swarm: which moves in it.
+        seed: of all that is drawn.
+    """
+    rng, most = np.random.default_rng(seed), 0.5 * (high - low)
+    x = rng.uniform(low, high, (swarm.particles, len(low)))
+    v, own, value = np.zeros_like(x), x, _finite(cost(x))
+    history = [float(value.min())]
+    for _ in range(swarm.iterations):
+        to_own, to_best = own - x, own[np.argmin(value)] - x
+        one, two = rng.uniform(size=(2, *x.shape))
+        v = swarm.inertia * v + swarm.own * one * to_own + swarm.others * two * to_best
+        v = np.clip(v, -most, most)
+        inside = np.clip(x + v, low, high)
+        v = np.where(inside == x + v, v, 0.0)
+        x = inside
+        now = _finite(cost(x))
+        better = now < value
+        own, value = np.where(better[:, None], x, own), np.where(better, now, value)
+        history.append(float(value.min()))
+    return Found(own[np.argmin(value)], np.array(history))
+
+
+def _finite(cost: Float[np.ndarray, " particle"]) -> Float[np.ndarray, " particle"]:
+    return np.where(np.isfinite(cost), cost, np.inf)
+
+
+Numbers = Array | np.ndarray
+"""The law is the same in jax, which drives, and in numpy, where many gains are tried at once."""
+LOW, HIGH = np.zeros(3), np.full(3, 5.0)
+"""Of the gains [1/s]."""
+STEP = 1e-4
+"""Of a gain, for central differences [1/s]."""
+
+
+class Plane(NamedTuple):
+    """Three numbers of the plane, each of any batch: a pose, an error, rates, a twist, or gains."""
+
+    x: Numbers
+    y: Numbers
+    yaw: Numbers
+
+
+def in_body(v: Plane, heading: Numbers) -> Plane:
+    """What lies along the axes of the world, as a body at a heading [rad] sees it."""
+    of = heading.__array_namespace__()
+    c, s = of.cos(heading), of.sin(heading)
+    return Plane(c * v.x + s * v.y, c * v.y - s * v.x, v.yaw)
+
+
+def errors(wanted: Plane, pose: Plane) -> Plane:
+    """Wanted less true pose: place in the axes of the body [m, m], heading [rad]."""
+    away = Plane(wanted.x - pose.x, wanted.y - pose.y, wanted.yaw - pose.yaw)
+    return in_body(away, pose.yaw)
+
+
+def lyapunov(e: Plane) -> Numbers:
+    """V of errors; squared metres and radians are added as they are."""
+    return 0.5 * (e.x * e.x + e.y * e.y) + 1.0 - e.yaw.__array_namespace__().cos(e.yaw)
+
+
+def twist(gains: Plane, e: Plane, rates: Plane, heading: Numbers) -> Plane:
+    """Twist to ask for [m/s, m/s, rad/s].
+
+    Args:
+        gains: k1, k2, k3 [1/s].
+        e: errors; rates: of the path in the world [m/s, m/s, rad/s].
+        heading: of the body [rad].
+    """
+    ahead, turn = in_body(rates, heading), e.yaw.__array_namespace__().sin(e.yaw)
+    return Plane(ahead.x + gains.x * e.x, ahead.y + gains.y * e.y, ahead.yaw + gains.yaw * turn)
+
+
+class GoswamiPadhy(eqx.Module):
+    """The law with its gains k1, k2, k3 [1/s]."""
+
+    gains: Float[Array, "3"]
+
+    def __call__(self, reference: Float[Array, "6"], pose: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Twist to ask for [m/s, m/s, rad/s].
+
+        Args:
+            reference: pose and rates of the path in the world [m, m, rad, m/s, m/s, rad/s].
+            pose: that is believed [m, m, rad].
+        """
+        wanted, rates, here = (Plane(*x) for x in (reference[:3], reference[3:], pose))
+        return jnp.stack(twist(Plane(*self.gains), errors(wanted, here), rates, here.yaw))
+
+
+@dataclass(frozen=True, eq=False)
+class Rehearsal:
+    """What gains are tried on: a path, begun beside it, by an ideal robot that follows late.
+
+    Attributes:
+        reference: pose and rates of the path, a row every period.
+        begin: poses from which it is begun [m, m, rad].
+        shares: of the last commands, the newest first, in what arrives in every substep.
+        follow: part of the gap to what has arrived that the twist makes up in a substep.
+        period: between commands [s].
+    """
+
+    reference: Float[np.ndarray, "step 6"]
+    begin: Float[np.ndarray, "start 3"]
+    shares: Float[np.ndarray, "substep command"]
+    follow: float
+    period: float
+
+    def integrals(self, gains: Places) -> Float[np.ndarray, " particle"]:
+        """Of V over the path, of many gains at once, the mean of all starts [s]."""
+        k, h = Plane(*gains.T[..., None]), self.period / len(self.shares)
+        pose = np.repeat(self.begin.T[:, None], len(gains), axis=1)
+        goes, total = np.zeros(pose.shape), np.zeros(pose.shape[1:])
+        ring = np.zeros((self.shares.shape[1], *pose.shape))
+        for row in self.reference:
+            here = Plane(*pose)
+            e = errors(Plane(*row[:3]), here)
+            total += lyapunov(e)
+            ring[1:] = ring[:-1]
+            ring[0] = twist(k, e, Plane(*row[3:]), here.yaw)
+            arrives = self.shares @ ring.reshape(len(ring), -1)
+            for arrived in arrives.reshape(-1, *pose.shape):
+                goes = goes + self.follow * (arrived - goes)
+                pose = _moved(pose, goes, h)
+        return self.period * total.mean(axis=1)
+
+    def slope(self, gains: Float[np.ndarray, "3"]) -> tuple[float, Float[np.ndarray, "3"]]:
+        """The integral of V at some gains, and its derivative by them, by central differences."""
+        off = STEP * np.eye(3)
+        value = self.integrals(gains + np.concatenate([np.zeros((1, 3)), off, -off]))
+        return float(value[0]), (value[1:4] - value[4:]) / (2 * STEP)
+
+
+def _moved(
+    pose: Float[np.ndarray, "3 *batch"], goes: Float[np.ndarray, "3 *batch"], h: float
+) -> Float[np.ndarray, "3 *batch"]:
+    """Poses after a short time at constant twists, their chord at the heading half-way."""
+    x, y, turn = goes
+    middle = pose[2] + 0.5 * h * turn
+    c, s = np.cos(middle), np.sin(middle)
+    return pose + h * np.array([c * x - s * y, s * x + c * y, turn])
+
+
+def by_swarm(task: Rehearsal, seed: int = 0) -> Float[np.ndarray, "3"]:
+    """Gains that a swarm finds [1/s]."""
+    return minimise(task.integrals, LOW, HIGH, Swarm(), seed).place
+
+
+def by_gradient(task: Rehearsal) -> Float[np.ndarray, "3"]:
+    """Gains that the gradient leads to from the middle of the box [1/s]."""
+    from scipy.optimize import minimize
+
+    box = list(zip(LOW, HIGH, strict=True))
+    exact = {"ftol": 1e-14, "gtol": 1e-10}
+    found = minimize(task.slope, 0.5 * (LOW + HIGH), jac=True, bounds=box, options=exact)
+    return np.asarray(found.x)

@@ -1,0 +1,101 @@
+"""The virtual test site as the plant of a trial, and robots that a posterior holds possible."""
+
+from functools import partial
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.floor_map import FloorMap
+from slipid.lab.testsite.driving import PERIOD, Rims
+from slipid.lab.testsite.ground import GROUNDS
+from slipid.lab.testsite.plant import Plant
+from slipid.lab.testsite.site import Sensors, Site
+from slipid.robot.deployed import DeployedRobot, drawn
+from slipid.robot.interface import Measurement
+from slipid.support.errors import DataError
+
+
+def known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
+    """Refuse wheels, a load set-up or a surface that the virtual test site does not have."""
+    machine, other = Site().machine, "With --plant twin the identified model is driven itself"
+    has = len(machine.wheel_azimuths_deg)
+    if wheels != has:
+        raise DataError(f"the test site's robot has {has} wheels, the fit's {wheels}. {other}")
+    for what, name, there in (
+        ("load set-up", load, machine.centres_m),
+        *(("surface", name, GROUNDS) for name in floor.surfaces),
+    ):
+        if name not in there:
+            raise DataError(
+                f"the test site has no {what} '{name}'; it has {', '.join(there)}. {other}"
+            )
+
+
+class SitePlant:
+    """The virtual test site as a `slipid.robot.closed_loop.Plant`, with its delay and slew.
+
+    Args:
+        floor: which surface lies where; load: name of the load set-up.
+        start: x, y [m], heading [rad].
+        seed: of unevenness, the wheels' first angles and noise.
+        gyro: whether the robot has one.
+    """
+
+    def __init__(
+        self, floor: FloorMap, load: str, start: tuple[float, float, float], seed: int, gyro: bool
+    ):
+        self._site = Site(sensors=Sensors(gyro=gyro))
+        self._new, self._seed = partial(Plant, self._site, floor, load, start, seed), seed
+        self.reset()
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """True pose [m, m, rad]."""
+        return self.plant.pose
+
+    @property
+    def power(self) -> float:
+        """Electric power of the motors [W]."""
+        drive = self.plant.drive
+        return float(np.dot(drive.voltage, drive.current))
+
+    def reset(self) -> Measurement:
+        """First readings, of the robot at rest at its start."""
+        self.plant = self._new()
+        self._rims = Rims(self._site, self.plant)
+        self._rng = np.random.default_rng([self._seed, 1])
+        self._bias = self._site.sensors.gyro_bias * float(self._rng.normal())
+        return self._read(np.zeros((1, 2 * len(self.plant.wheel_dof))))
+
+    def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Measurement:
+        """Readings one period later."""
+        plant, drive, rows = self.plant, self.plant.drive, []
+        self._rims.send(np.asarray(wheel_speed, float))
+        for _ in range(round(PERIOD / plant.dt)):
+            plant.step(self._rims.follow().tolist())
+            rows.append([*drive.current, *drive.voltage])
+        width = max(1, round(self._site.sensors.average_s / plant.dt))
+        return self._read(np.array(rows[-width:]))
+
+    def _read(self, recent: Float[np.ndarray, "step channel"]) -> Measurement:
+        """What the sensors make of the last currents and voltages, and of this moment."""
+        s, rng, tick = self._site.sensors, self._rng, self._site.tick
+        amps, volts = np.split(recent.mean(axis=0), 2)
+        amps, volts = s.amperes(amps, rng), s.volts(volts, rng)
+        turn = float(self.plant.data.qvel[5]) + self._bias + s.gyro_noise * float(rng.normal())
+        return Measurement(
+            wheel_angle=np.floor(self.plant.wheel_angle / tick) * tick,
+            current=amps,
+            voltage=volts if s.voltage else np.full_like(volts, np.nan),
+            gyro=turn if s.gyro else float("nan"),
+        )
+
+
+def one_of(robot: DeployedRobot, seed: int) -> DeployedRobot:
+    """A robot that the posterior holds possible; the robot itself where nothing was drawn."""
+    count = robot.record.drawn
+    if count == 0:
+        return robot
+    picked = int(np.random.default_rng(seed).integers(count))
+    return jax.tree.map(lambda x: x[0], drawn(robot, (picked,)))

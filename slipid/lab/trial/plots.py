@@ -1,0 +1,145 @@
+"""Picture of a trial: every controller's paths over the floor, and what they came to."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from textwrap import wrap
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from slipid.data.floor_map import FloorMap
+from slipid.plots.drawing import INK, SHADE, figure, plain, save
+from slipid.support.files import Content
+
+Paths = Mapping[str, np.ndarray]
+TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
+"""Of floors, in the order of the map."""
+OTHERS, MARKED = "#56B4E9", "#D55E00"
+ERRORS = {
+    "closure_error_median": "closure error [mm]",
+    "cross_track_rmse": "cross-track rms [mm]",
+    "first_side_along_track_mm": "first side or quarter, along-track [mm]",
+}
+
+
+def trial_plot(
+    content: Content, paths: Paths, wanted: np.ndarray, floor: FloorMap, path: Path
+) -> Path:
+    """Paths of the start nearest to the medians over the map, all starts from one corner, errors.
+
+    Args:
+        content: of trial.json.
+        paths: true poses (step, 3) by run, `CONTROLLER/startNN`; wanted: places (row, 2) [m].
+        floor: the map it was driven on.
+        path: of the picture.
+    """
+    names = list(content["summary"])
+    rows = -(-len(names) // 3)
+    course = f"{content['path'].capitalize()} at {content['speed_m_s']:g} m/s"
+    title = f"{course} on the {content['plant']}: {_verdict(content)}"
+    made = figure(13.0, 3.1 * rows + 3.4, title)
+    grid = made.add_gridspec(rows + 1, 3, height_ratios=[1.0] * rows + [1.1])
+    one = _typical(content)
+    for k, name in enumerate(names):
+        axes = made.add_subplot(grid[k // 3, k % 3])
+        _one(axes, name, content, paths, wanted, floor, one)
+    _legend(made, floor)
+    for k, (key, label) in enumerate(ERRORS.items()):
+        _bars(made.add_subplot(grid[rows, k]), content["summary"], key, label)
+    return save(made, path)
+
+
+def _verdict(content: Content) -> str:
+    """Which controller closes best, if the starts tell it."""
+    best = content["closes_best"]
+    if best is None:
+        return f"{', '.join(content['not_told_apart'])} are not told apart"
+    ratio = content["summary"][best].get("to_encoder", {}).get("closure_error_median", {})
+    return f"{best} closes best" + (f", {100 * ratio['value']:.0f} % of encoders'" if ratio else "")
+
+
+def _typical(content: Content) -> int:
+    """Start whose encoder run (else first controller's) is nearest to the median closure."""
+    first = "encoder" if "encoder" in content["summary"] else next(iter(content["summary"]))
+    runs = [r for r in content["runs"] if r["controller"] == first]
+    middle = content["summary"][first]["closure_error_median"]
+    return int(np.argmin([abs(r["closure_mm"] - middle) for r in runs]))
+
+
+def _one(
+    axes: Axes,
+    name: str,
+    content: Content,
+    paths: Paths,
+    wanted: np.ndarray,
+    floor: FloorMap,
+    one: int,
+) -> None:
+    """All starts of a controller laid on one another, the typical one over its floor."""
+    runs = [r for r in content["runs"] if r["controller"] == name]
+    own = [
+        (paths[f"{name}/start{k:02d}"][:, :2] - r["start"][:2]) @ _turned(r["start"][2])
+        for k, r in enumerate(runs)
+    ]
+    (left, low), (right, high) = wanted.min(axis=0) - 0.35, wanted.max(axis=0) + 0.35
+    x, y = np.linspace(left, right, 320), np.linspace(low, high, 220)
+    start = runs[one]["start"]
+    places = start[:2] + np.stack(np.meshgrid(x, y), -1) @ _turned(start[2]).T
+    kinds = max(len(floor.surfaces), 2)
+    tints = ListedColormap(TINTS[:kinds])
+    axes.pcolormesh(x, y, floor.at(places), cmap=tints, vmin=0, vmax=kinds - 1)
+    for p in own:
+        axes.plot(*p.T, color=OTHERS, lw=0.5, alpha=0.6)
+    axes.plot(*wanted.T, "--", color=INK, lw=1.0)
+    axes.plot(*own[one].T, color=MARKED, lw=1.8)
+    axes.plot(*own[one][-1], "o", color=MARKED, ms=5)
+    row = content["summary"][name]
+    closes, off = row["closure_error_median"], row["heading_error_deg"]
+    done = f"{100 * row['finished_share']:.0f} % finish"
+    title = f"{name}: {closes:.0f} mm, {off:.0f} deg off, {done}"
+    about = "\n".join(wrap(content["controllers"][name], 44))
+    axes.set_title(f"{title}\n{about}", fontsize=8, loc="left")
+    axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
+    axes.tick_params(labelsize=7)
+
+
+def _legend(made: Figure, floor: FloorMap) -> None:
+    """What tints and lines are."""
+    patches = [
+        Patch(facecolor=tint, edgecolor=SHADE, label=name)
+        for name, tint in zip(floor.surfaces, TINTS, strict=False)
+    ]
+    lines = [
+        Line2D([], [], color=INK, ls="--", lw=1.0, label="wanted"),
+        Line2D([], [], color=OTHERS, lw=1.0, label="every start"),
+        Line2D(
+            [], [], color=MARKED, lw=1.8, marker="o", ms=5, label="the start typical of encoders"
+        ),
+    ]
+    made.legend(handles=[*patches, *lines], loc="outside lower center", ncols=8, fontsize=8)
+
+
+def _turned(heading: float) -> np.ndarray:
+    """Rotation from the axes of a pose to the site's."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.array([[c, -s], [s, c]])
+
+
+def _bars(axes: Axes, table: Content, key: str, label: str) -> None:
+    """Medians with their 90 % intervals."""
+    names = list(table)
+    value = np.array([table[n][key] for n in names])
+    low, high = np.array([table[n]["interval90"][key] for n in names]).T
+    at = np.arange(len(names))[::-1]
+    axes.barh(at, value, color="#9bb8cf", height=0.7)
+    axes.hlines(at, low, high, color=INK, lw=1.2)
+    axes.set_yticks(at, names, fontsize=8)
+    axes.set_xlabel(
+        f"{label}\nmedian of {table[names[0]]['runs']} starts, 90 % interval", fontsize=8
+    )
+    axes.tick_params(axis="x", labelsize=8, color=SHADE)
+    plain(axes)

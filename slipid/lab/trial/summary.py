@@ -1,0 +1,157 @@
+"""What the runs of a trial came to, by controller."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.robot.closed_loop import Metrics
+
+Interval = tuple[float, float]
+"""90 %, by bootstrap over starts."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of one controller, judged.
+
+    Attributes:
+        controller: name of its row; start: pose [m, m, rad]; seed: of all that is drawn.
+        metrics: from true poses.
+        believed_error_mm: of the place it believes to be at in the end.
+    """
+
+    controller: str
+    start: tuple[float, float, float]
+    seed: int
+    metrics: Metrics
+    believed_error_mm: float
+
+    def to_json(self) -> dict[str, object]:
+        """As trial.json has it."""
+        about = {"controller": self.controller, "start": list(self.start), "seed": self.seed}
+        return {**about, **asdict(self.metrics), "believed_error_mm": self.believed_error_mm}
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """Of a median to that of the controller `encoder`, its interval over the starts they share."""
+
+    value: float
+    interval90: Interval
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One controller over its starts.
+
+    Attributes:
+        median: by name, see `columns`; what a plant does not know (the twin's energy) is left out.
+        finished_share: part of the runs that reached the end.
+        worse_share: part of the starts that it closes worse than the controller `encoder`.
+        to_encoder: ratios of medians; None without the controller `encoder`.
+    """
+
+    median: Mapping[str, float]
+    interval90: Mapping[str, Interval]
+    runs: int
+    finished_share: float
+    worse_share: float | None
+    to_encoder: Mapping[str, Ratio] | None
+
+    def to_json(self) -> dict[str, object]:
+        """As trial.json has it."""
+        rest = asdict(self)
+        if self.to_encoder is None:
+            del rest["to_encoder"], rest["worse_share"]
+        return {**rest.pop("median"), **rest}
+
+
+Columns = Mapping[str, Float[np.ndarray, " run"]]
+
+
+def summaries(runs: Sequence[Run], draws: int = 2000) -> dict[str, Summary]:
+    """Medians over starts of every controller, with 90 % bootstrap intervals."""
+    names = list(dict.fromkeys(run.controller for run in runs))
+    of = {name: [run for run in runs if run.controller == name] for name in names}
+    table = {name: columns(of[name]) for name in names}
+    rng = np.random.default_rng(0)
+    count = min(len(c["closure_error_median"]) for c in table.values())
+    again = rng.integers(count, size=(draws, count))
+    out: dict[str, Summary] = {}
+    for name, mine in table.items():
+        known = {k: v for k, v in mine.items() if np.all(np.isfinite(v))}
+        out[name] = Summary(
+            median={k: float(np.median(v)) for k, v in known.items()},
+            interval90={k: _interval(np.median(v[again], axis=1)) for k, v in known.items()},
+            runs=len(of[name]),
+            finished_share=float(np.mean([run.metrics.finished for run in of[name]])),
+            worse_share=_worse(mine, table["encoder"]) if "encoder" in table else None,
+            to_encoder=_ratios(mine, table["encoder"], again) if "encoder" in table else None,
+        )
+    return out
+
+
+def not_told_apart(runs: Sequence[Run], draws: int = 2000) -> tuple[str, ...]:
+    """Controllers that may close best, the one with the lowest median first.
+
+    Of the others they are those whose errors, start by start, are not larger for sure: the 90 %
+    bootstrap interval of the difference of medians over the starts that both drove has no more
+    than 0 at its lower end. One that left more runs unfinished than another does not close best.
+    """
+    names = list(dict.fromkeys(run.controller for run in runs))
+    of = {name: [run for run in runs if run.controller == name] for name in names}
+    unfinished = {name: sum(not run.metrics.finished for run in of[name]) for name in names}
+    able = [name for name in names if unfinished[name] == min(unfinished.values())]
+    closes = {name: np.array([run.metrics.closure_mm for run in of[name]]) for name in able}
+    best = min(able, key=lambda name: float(np.median(closes[name])))
+    count = min(len(v) for v in closes.values())
+    again = np.random.default_rng(0).integers(count, size=(draws, count))
+
+    def surely_worse(name: str) -> bool:
+        gap = np.median(closes[name][again], axis=1) - np.median(closes[best][again], axis=1)
+        return _interval(gap)[0] > 0
+
+    return (best, *(name for name in able if name != best and not surely_worse(name)))
+
+
+def columns(runs: Sequence[Run]) -> Columns:
+    """What is judged of every run.
+
+    `first_side_along_track_mm` and `heading_error_deg` are the errors' sizes;
+    `first_side_travelled` is the part of the first side. Of a curve, that is its first quarter.
+    """
+    m = [run.metrics for run in runs]
+    side, whole = np.array([(x.along_track_mm[0], x.sides_mm[0]) for x in m]).T
+    return {
+        "first_side_along_track_mm": np.abs(side),
+        "first_side_travelled": 1 + side / whole,
+        "closure_error_median": np.array([x.closure_mm for x in m]),
+        "cross_track_rmse": np.array([x.cross_track_rmse_mm for x in m]),
+        "heading_error_deg": np.abs([x.heading_error_deg for x in m]),
+        "path_length_mm": np.array([x.path_length_mm for x in m]),
+        "energy_j": np.array([np.nan if x.energy_j is None else x.energy_j for x in m]),
+        "effort": np.array([x.effort for x in m]),
+        "seconds": np.array([x.seconds for x in m]),
+        "believed_error_mm": np.array([run.believed_error_mm for run in runs]),
+    }
+
+
+def _worse(mine: Columns, base: Columns) -> float:
+    pairs = zip(mine["closure_error_median"], base["closure_error_median"], strict=False)
+    return float(np.mean([a > b for a, b in pairs]))
+
+
+def _ratios(mine: Columns, base: Columns, again: np.ndarray) -> dict[str, Ratio]:
+    out = {}
+    for key in ("closure_error_median", "cross_track_rmse", "first_side_along_track_mm"):
+        a, b = np.median(mine[key][again], axis=1), np.median(base[key][again], axis=1)
+        value = float(np.median(mine[key]) / max(float(np.median(base[key])), 1e-9))
+        out[key] = Ratio(value, _interval(a / np.maximum(b, 1e-9)))
+    return out
+
+
+def _interval(values: np.ndarray) -> Interval:
+    low, high = np.quantile(values, [0.05, 0.95]).tolist()
+    return low, high

@@ -1,0 +1,235 @@
+"""`slipid trial`: the rectangle of the 2021 paper's figure 7, or another path, judged."""
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.data.floor_map import FloorMap, read_map
+from slipid.deploy.controllers import pilot_of
+from slipid.deploy.deploy import habits_of, read_robot
+from slipid.deploy.floors import floor_of
+from slipid.deploy.twin_run import REST_S, known_to_fit, path_of, site, starts, twin
+from slipid.lab.trial.controllers import ROWS, applying, check_gains, unused_gains
+from slipid.lab.trial.plants import SitePlant, known_to_site, one_of
+from slipid.lab.trial.summary import Run, not_told_apart, summaries
+from slipid.robot import closed_loop, trajectory
+from slipid.robot.actuation import Habits
+from slipid.robot.controller import Gains
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.interface import Settings
+from slipid.robot.robot_file import typed
+from slipid.support.checkpoint import Checkpoint, key_of, source_hash
+from slipid.support.errors import DataError
+from slipid.support.executor import results
+from slipid.support.files import write_json
+from slipid.support.jax_setup import setup_jax
+from slipid.support.progress import Reporter
+
+SCHEMA = "slipid.trial/1"
+FOLDER = "trial"
+"""Finished runs, below OUT."""
+PLANTS = ("testsite", "twin")
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """One run of one controller from one start; `told` is the floor map that it may be told."""
+
+    name: str
+    row: str
+    path: trajectory.Path
+    start: tuple[float, float, float]
+    seed: int
+    plant: str
+    floor: FloorMap
+    told: FloorMap
+    robot: DeployedRobot
+    settings: Settings
+    habits: Habits
+    forced: bool
+    kept: Checkpoint
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is asked of a trial.
+
+    Attributes:
+        plant: `testsite` (MuJoCo) or `twin` (the identified model itself, another draw of its
+            numbers for every start).
+        map: file of a floor map; None for patches of the identified floors.
+        told_map: file of the map that controllers with a map are told; None for the true one.
+        controllers: names of `ROWS`.
+        load: name of the load set-up; None for the first.
+        path: name of `trajectory.PATHS`; speed: along it [m/s].
+        starts: how many.
+        tuned_gains: whether tuned gains are taken that are no better than those set by hand.
+    """
+
+    plant: str = "testsite"
+    map: Path | None = None
+    told_map: Path | None = None
+    controllers: tuple[str, ...] = tuple(ROWS)
+    path: str = "rectangle"
+    speed: float = 0.2
+    starts: int = 20
+    load: str | None = None
+    tuned_gains: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """End of a trial.
+
+    Attributes:
+        content: of trial.json; runs: that it is of.
+        paths: true poses of every run by its name (step, 3); wanted: places from the origin
+            (row, 2) [m].
+        floor: the map it was driven on.
+    """
+
+    content: dict[str, Any]
+    runs: tuple[Run, ...]
+    paths: Mapping[str, np.ndarray]
+    wanted: np.ndarray
+    floor: FloorMap
+
+
+def trial(out: Path, wish: Wish, executor: Executor, report: Reporter) -> Driven:
+    """Drive every controller from every start, and write trial.json.
+
+    Runs that are done are kept, and not driven again as long as nothing they depend on changes.
+
+    Raises:
+        DataError: no fit, no such plant, controller, path, load or map, MuJoCo missing, floors that
+            the plant or the fit does not know, or a speed beyond what the fit has seen.
+    """
+    setup_jax(quiet=True)
+    jobs = _jobs(out, wish)
+    rows = tuple(dict.fromkeys(job.row for job in jobs))
+    if left := [name for name in wish.controllers if name not in rows]:
+        report.line(f"left out, for robots with three wheels: {', '.join(left)}")
+    if unused := unused_gains(jobs[0].robot, wish.tuned_gains):
+        report.line(unused)
+    todo = {job.name: job for job in jobs if _driven(job) is None}
+    report.stage(f"driving {len(todo)} of {len(jobs)} runs")
+    results(executor, drive, todo, report)
+    driven = {job.name: found for job in jobs if (found := _driven(job)) is not None}
+    runs = [run for run, _ in driven.values()]
+    table, able = summaries(runs), list(not_told_apart(runs))
+    content = {
+        "schema": SCHEMA,
+        "plant": wish.plant,
+        "map": "patches" if wish.map is None else str(wish.map),
+        "told_map": None if wish.told_map is None else str(wish.told_map),
+        "path": wish.path,
+        "speed_m_s": wish.speed,
+        "gains": _named(jobs[0].robot, wish.tuned_gains),
+        "closes_best": None if len(able) > 1 else able[0],
+        "not_told_apart": able,
+        "summary": {name: row.to_json() for name, row in table.items()},
+        "controllers": {name: ROWS[name].about for name in rows},
+        "runs": [run.to_json() for run in runs],
+    }
+    write_json(out / "trial.json", content)
+    paths = {name: path for name, (_, path) in driven.items()}
+    return Driven(content, tuple(runs), paths, np.asarray(jobs[0].path.rows)[:, :2], jobs[0].floor)
+
+
+def _jobs(out: Path, wish: Wish) -> list[Job]:
+    if wish.plant not in PLANTS:
+        raise DataError(f"no plant '{wish.plant}'; expected {' or '.join(PLANTS)}")
+    strange = [f" '{name}'" for name in wish.controllers if name not in ROWS]
+    if strange or not wish.controllers:
+        said = strange[0] if strange else ""
+        raise DataError(f"no controller{said}; expected some of {', '.join(ROWS)}")
+    robot = jax.tree.map(np.asarray, read_robot(out, wish.load))
+    path = path_of(wish.path, wish.speed, robot)
+    floor = site(robot) if wish.map is None else read_map(wish.map)
+    told = floor if wish.told_map is None else read_map(wish.told_map)
+    settings, habits = Settings.of(robot), habits_of(robot, gyro=False)
+    if wish.plant == "testsite":  # it has the sensors it has, whatever the logs had
+        known_to_site(floor, robot.load_setup, robot.wheels)
+        settings, habits = replace(settings, current_is_signed=False), Habits()
+    else:
+        known_to_fit(floor, robot, str(wish.map))
+    if wish.told_map is not None:
+        known_to_fit(told, robot, str(wish.told_map))
+    if wish.tuned_gains:
+        check_gains(out, robot)
+    key = key_of(
+        *(
+            wish.plant,
+            wish.path,
+            wish.speed,
+            robot.load_setup,
+            _named(robot, wish.tuned_gains),
+            settings,
+            habits,
+            *jax.tree.leaves(robot),
+        ),
+        *(part for m in (floor, told) for part in (m.surfaces, m.corner, m.cell, m.cells)),
+        # runs of other code are not taken for this one's
+        source_hash("control", "model", "testsite", "data", "deploy", "baselines/steering"),
+    )
+    # trials of other gains or floors lie beside this one, so that going back to them costs nothing
+    kept = Checkpoint(out / FOLDER / key[:12] / f"of{wish.starts}", key)
+    shared = wish.plant, floor, told, robot, settings, habits, wish.tuned_gains, kept
+    return [
+        Job(f"{row}/start{k:02d}", row, path, start, 1000 + k, *shared)
+        for row in applying(wish.controllers, robot)
+        for k, start in enumerate(starts(wish.starts, floor, path))
+    ]
+
+
+def _named(robot: DeployedRobot, forced: bool) -> dict[str, float]:
+    gains = Gains.of(robot, forced)
+    return {f.name: float(getattr(gains, f.name)) for f in fields(gains)}
+
+
+def _driven(job: Job) -> tuple[Run, np.ndarray] | None:
+    """A run and its true poses; None where it has not been driven yet."""
+    run, path = job.kept.load_json(job.name), job.kept.load(job.name)
+    return None if run is None or path is None else (typed(Run, run), path["pose"])
+
+
+def drive(job: Job) -> None:
+    """Drive one run and write its metrics and its path."""
+    setup_jax(quiet=True)
+    row = ROWS[job.row]
+    robot = jax.tree.map(jnp.asarray, job.robot)
+    path = job.path.moved(job.start).waiting(REST_S)
+    plant: closed_loop.Plant
+    if job.plant == "twin":
+        truth = one_of(robot, job.seed)
+        plant = twin(truth, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro))
+    else:
+        plant = SitePlant(job.floor, robot.load_setup, job.start, job.seed, row.gyro)
+    there = floor_of(job.told, robot.labels)
+    pilot = pilot_of(robot, row, job.settings, job.forced, there)
+    course = closed_loop.drive(pilot, path, plant, job.start)
+    off = course.pose[-1] - course.believed[-1]
+    run = Run(
+        controller=job.row,
+        start=job.start,
+        seed=job.seed,
+        metrics=closed_loop.metrics(course),
+        believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
+    )
+    # the path first: a run that has metrics is done
+    poses = {"time": course.time, "pose": course.pose, "believed": course.believed}
+    job.kept.save(job.name, poses)
+    job.kept.save_json(job.name, asdict(run))
+
+
+def names_of(text: str | None) -> tuple[str, ...]:
+    """Controllers of a list by commas, all of them by default."""
+    if text is None:
+        return tuple(ROWS)
+    return tuple(dict.fromkeys(t.strip() for t in text.split(",") if t.strip()))

@@ -1,0 +1,219 @@
+"""Whether what runs over several floors taught still predicts the runs that kept to one floor.
+
+How far runs scatter, before any physics is fitted to them.
+
+The motion of the body is regressed on what is smooth in that of the wheels, floor by floor and load
+by load: a Fourier series in the direction of travel, yaw, whatever a lag of the camera moves, and
+what turning moves in a marker whose place on the body is not known.
+Every run is predicted by the others. What is left in window k of run r, over the distance d_rk, is
+
+    e_rk = a_r d_rk + s_rk,   var a = v_run,   var s_rk = v_process d_rk
+
+and the two variances follow from its squares within and between runs, which with D_r = sum_k d_rk
+and a^_r = sum_k e_rk / D_r are expected to be
+
+    sum_rk (e_rk - a^_r d_rk)^2 = v_process sum_r (D_r - sum_k d_rk^2 / D_r)
+    sum_r (sum_k e_rk)^2        = v_run sum_r D_r^2 + v_process sum_r D_r
+
+Squares are summed before anything is divided by a distance: where a robot stands or nearly so, the
+poses' own noise over the little distance would count for all.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.runs import Runs
+from slipid.data.windows import Windows
+from slipid.fit.noise import travel
+from slipid.fit.problem import Problem
+from slipid.fit.shared import AXES
+from slipid.fit.variances import Search, Square
+from slipid.model.robot import Robot
+from slipid.predict import open_loop as replay
+from slipid.predict.kinematics import fourier
+from slipid.predict.predictive import Predictive
+from slipid.predict.score import chords, mean_error
+from slipid.predict.slip_model import body_twist, turned
+from slipid.search_space import Space
+
+WORSE = 1.5
+"""Factor by which end-point errors on a floor may grow; a map that is wrong makes it several."""
+FAR = 4.0
+"""Standard errors beyond which no number that runs on one floor tell may move."""
+BETTER = 0.8
+"""Part of the error by a map below which a single floor explains runs better than the map does."""
+SURE = 3.0
+"""Standard errors of paired differences beyond which a growth is not chance."""
+
+
+@dataclass(frozen=True)
+class FloorErrors:
+    """End-point errors of the runs on one floor, over the distance driven, before and after."""
+
+    before: float
+    after: float
+    is_worse: bool
+
+
+def floor_errors(before: Predictive, after: Predictive, data: Runs) -> dict[str, FloorErrors]:
+    """Errors of runs on one floor each under two models, by floor.
+
+    Both learnt from these runs, the second from others, too.
+    """
+    (old, far), (new, _) = end_errors(before, data), end_errors(after, data)
+    return compared([log.surface or "unknown" for log in data.logs], old, new, far)
+
+
+def compared(
+    floors: Sequence[str],
+    old: Float[np.ndarray, " run"],
+    new: Float[np.ndarray, " run"],
+    far: Float[np.ndarray, " run"],
+) -> dict[str, FloorErrors]:
+    """Errors of runs by their floors, old and new, and how far they went [m]."""
+    out = {}
+    for name in dict.fromkeys(floors):
+        mine = np.array([floor == name for floor in floors])
+        grown = new[mine] - old[mine]
+        _, error, _ = mean_error(grown, np.arange(len(grown)))
+        much = new[mine].mean() > WORSE * old[mine].mean()
+        way = max(float(far[mine].sum()), 1e-9)  # runs may only have turned
+        out[name] = FloorErrors(
+            float(old[mine].sum() / way),
+            float(new[mine].sum() / way),
+            bool(much and grown.mean() > SURE * error),
+        )
+    return out
+
+
+def end_errors(
+    model: Predictive, data: Runs
+) -> tuple[Float[np.ndarray, " run"], Float[np.ndarray, " run"]]:
+    """Distance of predicted from measured end, and how far each run went as the crow flies [m]."""
+    error, far = np.zeros(len(data)), np.zeros(len(data))
+    for w in replay.cuts(data, model.robot):
+        tracks, _ = model.ends(w)
+        error[tracks.run] = np.linalg.norm(tracks.gap[:, :2], axis=1)
+        far[tracks.run] = chords(tracks.measured)
+    return error, far
+
+
+class Moved(NamedTuple):
+    """The number that other runs moved most, and by how many of its standard errors before."""
+
+    name: str
+    sigma: float
+
+
+def most_moved(
+    space: Space, before: Search, covariance: Square, after: Search, settled: bool
+) -> Moved:
+    """Of the numbers that runs on one floor tell from motion; infinite where no rest was found.
+
+    Runs that agree move a number by less than the standard error it had without them (Hausman
+    1978, Econometrica 46(6)).
+    """
+    told = ~space.electric & ~space.where(lambda e: e.part == "camera")
+    sigma = np.where(told, np.abs(after - before) / np.sqrt(np.diag(covariance)), 0.0)
+    worst = int(np.argmax(sigma))
+    return Moved(space.names[worst], float(sigma[worst]) if settled else np.inf)
+
+
+def contradiction(
+    found: Mapping[str, FloorErrors], moved: Moved, by_map: float, as_if: Mapping[str, float]
+) -> str | None:
+    """Why runs over several floors are not learnt from, None where they agree with the others.
+
+    Args:
+        found: errors of the runs on one floor each.
+        moved: what they moved most.
+        by_map: error of the runs over several floors [m/s], whose map says where wheels stand.
+        as_if: the same had all wheels stood on one floor all the while, by floor [m/s].
+    """
+    worse = [
+        f"{floor} from {100 * e.before:.1f} to {100 * e.after:.1f} % of the way"
+        for floor, e in found.items()
+        if e.is_worse
+    ]
+    if worse:
+        return f"{_NOT_LEARNT} (end-point errors on {', '.join(worse)}); {_WHY}"
+    if not np.isfinite(moved.sigma):
+        return f"{_NOT_LEARNT} (the fit to all found no rest); {_WHY}"
+    if moved.sigma > FAR:
+        return f"{_NOT_LEARNT} ({moved.name} moves by {moved.sigma:.0f} standard errors); {_WHY}"
+    best = min(as_if, key=lambda floor: as_if[floor])
+    if as_if[best] < BETTER * by_map:
+        told = (
+            f"{1000 * by_map:.1f} mm/s by their map, {1000 * as_if[best]:.1f} as if all on {best}"
+        )
+        return f"{_NOT_LEARNT} (errors of {told}); {_WHY}"
+    return None
+
+
+_NOT_LEARNT = (
+    "the runs over several floors were not learnt from: they contradict those on one floor"
+)
+_WHY = "their map may be wrong or out of place, or the contact law where floors meet"
+
+
+_TINY = 1e-6
+"""Ridge, as part of a feature's own size: of runs too few to be predicted."""
+
+
+def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
+    """Log variance of every noise component: what is typical, or what runs scatter if that is more.
+
+    To a model that is no better than smooth the rest is noise. A floor whose runs are too few to
+    predict one from the others scatters much.
+    """
+    w, robot = problem.windows, problem.robot
+    far, _ = travel(w, robot)
+    left = _left(w, robot, "camera.marker_place" in problem.space.place)
+    variance = dict(zip(problem.noise.names, problem.noise.typical**2, strict=True))
+    for floor in dict.fromkeys(w.surface):
+        mine = np.asarray(w.surface) == floor
+        e, d, whole = left[mine], far[mine], far[mine].sum(axis=1)
+        total, most = e.sum(axis=1), np.maximum(whole, 1e-9)
+        level = total / most[:, None]
+        within = ((e - level[:, None] * d[..., None]) ** 2).sum(axis=(0, 1))
+        process = within / max(float((whole - (d**2).sum(axis=1) / most).sum()), 1e-9)
+        run = ((total**2).sum(axis=0) - process * whole.sum()) / max(float((whole**2).sum()), 1e-9)
+        for k, axis in enumerate(AXES):
+            for kind, found in (("process", process), ("run", run)):
+                name = f"{kind}.{floor}.{axis}"
+                variance[name] = max(variance[name], float(found[k]))
+    return np.log(list(variance.values()))
+
+
+def _left(w: Windows, robot: Robot, place_is_free: bool) -> Float[np.ndarray, "piece window 3"]:
+    """Motion along, across and in yaw that other runs do not predict [m, m, rad]."""
+    shape = robot.geometry
+    back = np.asarray(shape.least()).T * float(shape.wheel_radius)
+    step, late = w.turn @ back, w.faster @ back
+    moved = body_twist(w, robot) * w.dt[..., None]
+    angle, series = np.arctan2(step[..., 1], step[..., 0]), fourier(step)
+    for vector in (step, late, moved):
+        vector[..., :2] = turned(-angle, vector[..., :2])
+    turns = step[..., 2:]
+    swept = [turns * np.stack([np.cos(angle), np.sin(angle)], -1)] if place_is_free else []
+    x = np.concatenate([series, turns, late, *swept], axis=-1)
+    gap = moved - step
+    out = np.empty_like(gap)
+    group = np.array([f"{a}@{b}" for a, b in zip(w.surface, w.load, strict=True)])
+    for name in np.unique(group):
+        mine = np.flatnonzero(group == name)
+        square = np.einsum("pki,pkj->pij", x[mine], x[mine])
+        product = np.einsum("pki,pka->pia", x[mine], gap[mine])
+        ridge = _TINY * np.diag(np.diagonal(square.sum(axis=0)) + 1e-12)
+        for run in np.unique(w.run[mine]):
+            others = w.run[mine] != run
+            solved = np.linalg.solve(
+                square[others].sum(axis=0) + ridge, product[others].sum(axis=0)
+            )
+            of_run = mine[~others]
+            out[of_run] = gap[of_run] - x[of_run] @ solved
+    return out

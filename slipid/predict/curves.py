@@ -1,0 +1,185 @@
+"""Slip of each wheel by a curve of its own current or torque, fitted to the motion of the body.
+
+    xi = J^+ r (w_i (1 - s_i))
+
+Residuals are in displacement, so nothing is divided by a wheel speed.
+"""
+
+import abc
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import final
+
+import numpy as np
+from jaxtyping import Float
+from scipy import sparse
+from scipy.optimize import least_squares, linprog, lsq_linear
+
+from slipid.predict.slip_model import Machine, Twists
+from slipid.predict.steps import Steps, TrainingWindows, TwistModel, least
+
+Slips = Float[np.ndarray, "step drive"]
+Features = Callable[[np.ndarray], np.ndarray]
+"""From the regressor (...,) to features (..., k); slip is their weighted sum."""
+HELD = 1e12
+"""Precision of a coefficient that rests on its bound."""
+RIDGE = 1e-6
+"""Pull of each coefficient of a monotone curve towards zero, in the length of its column.
+
+Too weak to matter where runs tell coefficients apart; where they do not, the smallest are taken
+instead of whichever rounding prefers.
+"""
+
+
+@dataclass(frozen=True)
+class WheelSlip(TwistModel, abc.ABC):
+    """A model that gives the slip of each wheel from what its own motor takes."""
+
+    @abc.abstractmethod
+    def slip(self, steps: Steps, machine: Machine) -> Slips:
+        """Slip of each drive [-] in every step."""
+
+    def twist(self, steps: Steps, machine: Machine) -> Twists:
+        rim = steps.heard.speed * machine.wheel_radius * (1.0 - self.slip(steps, machine))
+        return np.asarray(rim @ machine.back.T)
+
+
+@final
+@dataclass(frozen=True)
+class Curve(WheelSlip):
+    """Slip of each wheel as a function of its own current or torque, linear in coefficients.
+
+        s_i = sum_k beta_k phi_k(x_i)
+
+    Attributes:
+        features: phi.
+        torque: x is M = C_e I + R I^2/wm [N m] instead of the current [A].
+        per_wheel: own coefficients for every wheel.
+        monotone: no coefficient but the first is negative.
+        insensitive: epsilon-insensitive loss instead of least squares, as support vector regression
+            with a linear kernel has it; epsilon is a tenth of a robust std of what slip takes away.
+        smoothing: time constant of a low pass of the current, None without [s].
+        most: largest slip of either sign; where a wheel is dragged along its slip is negative.
+    """
+
+    features: Features
+    torque: bool = False
+    per_wheel: bool = False
+    monotone: bool = False
+    insensitive: bool = False
+    smoothing: float | None = None
+    most: float = np.inf
+
+    def learn(self, w: TrainingWindows, machine: Machine) -> "Curve":
+        rim = w.steps.heard.speed * machine.wheel_radius
+        rows = w.rows(machine.back @ (rim[..., None] * self.regressors(w.steps, machine)), machine)
+        a, b = rows.parts.reshape(-1, rows.parts.shape[-1]), rows.gap.ravel()
+        if self.insensitive:
+            return replace(self, coefficients=insensitive(a, b))
+        if not self.monotone:
+            return replace(self, coefficients=least(a, b))
+        lower = np.where(np.arange(a.shape[1]) > 0, 0.0, -np.inf)
+        ridge = RIDGE * np.diag(np.linalg.norm(a, axis=0))
+        all_rows = np.concatenate([a, ridge]), np.concatenate([b, np.zeros(len(ridge))])
+        return replace(self, coefficients=lsq_linear(*all_rows, (lower, np.inf), method="bvls").x)
+
+    def slip(self, steps: Steps, machine: Machine) -> Slips:
+        return np.clip(self.regressors(steps, machine) @ self.known, -self.most, self.most)
+
+    def regressors(self, steps: Steps, machine: Machine) -> Float[np.ndarray, "step drive k"]:
+        """What slip is linear in."""
+        phi = self.features(regressor(steps, machine, self.torque, self.smoothing))
+        if not self.per_wheel:
+            return phi
+        return np.einsum("sdk,de->sdek", phi, np.eye(phi.shape[1])).reshape(*phi.shape[:2], -1)
+
+    def stiffness(self, w: TrainingWindows, machine: Machine) -> Float[np.ndarray, "k k"]:
+        """A coefficient that rests on its bound does not move with the data."""
+        held = self.monotone & (np.arange(self.numbers) > 0) & (self.known <= 0)
+        return np.diag(held * HELD)
+
+
+def insensitive(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Least sum of max(|a beta - b| - epsilon, 0), epsilon a tenth of a robust std of b.
+
+    Support vector regression (Vapnik 1995) where its penalty on beta does not count, as a linear
+    program.
+    """
+    epsilon = 0.1 * robust_std(b)
+    over = sparse.eye_array(len(b))
+    bound = np.concatenate([b + epsilon, epsilon - b])
+    sides = sparse.block_array([[a, -over], [-a, -over]], format="csr")
+    cost = np.concatenate([np.zeros(a.shape[1]), np.ones(len(b))])
+    limits = [(None, None)] * a.shape[1] + [(0, None)] * len(b)
+    found = linprog(cost, sides, bound, bounds=limits)
+    if not found.success:
+        raise ValueError(f"support vector regression: {found.message}")
+    return np.asarray(found.x[: a.shape[1]])
+
+
+def robust_std(x: Float[np.ndarray, " sample"]) -> float:
+    """Standard deviation by the interquartile range, which is 1.349 of it for what is Gaussian."""
+    return float(np.subtract(*np.percentile(x, (75, 25)))) / 1.349
+
+
+def regressor(
+    steps: Steps, machine: Machine, torque: bool, smoothing: float | None = None
+) -> Float[np.ndarray, "step drive"]:
+    """Current [A] or torque [N m] of every wheel along its motion; zeros where none was logged."""
+    if steps.heard.current is None:
+        return np.zeros_like(steps.heard.turn)
+    values = steps.heard.torque(machine) if torque else steps.heard.along(machine)
+    return values if smoothing is None else steps.smoothed(values, smoothing)
+
+
+@final
+@dataclass(frozen=True)
+class Saturating(WheelSlip):
+    """Janosi-Hanamoto read backwards: M = M_max (1 - exp(-s / kappa)), s on the rising branch.
+
+        s = -kappa log(1 - min(M / M_max, 0.98))
+
+    The coefficients are the logarithms of kappa and M_max. Source: Janosi and Hanamoto 1961.
+    """
+
+    name: str = "saturating"
+
+    def learn(self, w: TrainingWindows, machine: Machine) -> "Saturating":
+        scale = w.dt[:, None] * machine.size
+
+        def gap(shape: np.ndarray) -> np.ndarray:
+            found = w.means(replace(self, coefficients=shape).twist(w.steps, machine))
+            return np.asarray(((found - w.twist) * scale).ravel())
+
+        torque = regressor(w.steps, machine, True)
+        top = float(np.log(max(torque.max(), 1e-3) * 1.5))
+        # the cap makes several minima: with one-sided differences rounding decides between them
+        starts = ([np.log(k), top] for k in (0.05, 0.3, 1.0))
+        tries = [least_squares(gap, x, jac="3-point", max_nfev=200) for x in starts]
+        return replace(self, coefficients=min(tries, key=lambda r: r.cost).x)
+
+    def slip(self, steps: Steps, machine: Machine) -> Slips:
+        kappa, m_max = np.exp(self.known)
+        share = np.minimum(regressor(steps, machine, True) / m_max, 0.98)
+        return np.asarray(-kappa * np.log1p(-share))
+
+
+def powers(*exponents: int) -> Features:
+    """Powers of the regressor."""
+    return lambda x: np.stack([x**k for k in exponents], -1)
+
+
+def above(threshold: float) -> Features:
+    """The deployed form of the 2021 paper: affine above a current, no slip below."""
+    return lambda x: np.stack([np.where(x > threshold, x, 0.0), (x > threshold) * 1.0], -1)
+
+
+def ramps(knots: Sequence[float]) -> Features:
+    """I-spline of degree 1: a constant and rising ramps between knots; monotone if weights >= 0."""
+
+    def phi(x: np.ndarray) -> np.ndarray:
+        rising = [np.clip((x - a) / (b - a), 0, 1) for a, b in pairwise(knots)]
+        return np.stack([np.ones_like(x), *rising], -1)
+
+    return phi

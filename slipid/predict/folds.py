@@ -1,0 +1,238 @@
+"""Every slip model judged on held-out runs: who is left out together, and how they score.
+
+Runs of one heading stay in one fold at every speed and on every floor, so that nothing of a
+left-out heading is seen.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from slipid.data.runs import Runs
+from slipid.fit.optimise import Optimum, optimise
+from slipid.fit.problem import Problem, still_viscosities
+from slipid.predict import open_loop as replay
+from slipid.predict.noisy import with_noise
+from slipid.predict.predictive import Predictive, contact_of
+from slipid.predict.score import setups
+from slipid.predict.slip_models import slip_models
+from slipid.predict.validation import ScoredRun, add_scores, told
+from slipid.search_space import Choice, Space
+from slipid.support.errors import DataError
+from slipid.support.files import Content
+
+Fold = Int[np.ndarray, " run"]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What folds go by: floor with load set-up, direction commanded [deg] and speed [m/s]."""
+
+    floor: str
+    heading_deg: float
+    speed: float
+
+
+def facts_of(data: Runs) -> list[Facts]:
+    """Facts of all runs; directions and speeds are nan where they are not known."""
+    where = setups([log.surface or "unknown" for log in data.logs], [log.load for log in data.logs])
+    way = np.degrees(data.heading).tolist()
+    return [Facts(*one) for one in zip(where, way, data.speed.tolist(), strict=True)]
+
+
+def sectors(facts: Sequence[Facts]) -> Fold:
+    """Fold of every run by the 60 deg its commanded heading lies in, -1 where it has none."""
+    way, known = _headings(facts)
+    return np.where(known, (np.floor((way % 360.0 + 1e-6) / 60.0) % 6).astype(int), -1)
+
+
+def random_headings(facts: Sequence[Facts]) -> Fold:
+    """One of six folds of every run by its heading, dealt every 5 deg, -1 where it has none."""
+    dealt = np.random.default_rng(0).permutation(72) % 6
+    way, known = _headings(facts)
+    return np.where(known, dealt[np.round(way / 5.0).astype(int) % 72], -1)
+
+
+def speeds(facts: Sequence[Facts], most: int | None = None) -> Fold:
+    """Fold of every run by its commanded speed, -1 where its floor and load saw one fold only.
+
+    Where there are more than twice `most` speeds, so many folds have equally many of them. Turns on
+    the spot have no speed to leave out.
+    """
+    speed = np.round([f.speed for f in facts], 3)
+    where, known = np.array([f.floor for f in facts]), np.isfinite(speed) & (speed > 0)
+    every = np.unique(speed[known])
+    edges = every[1:]
+    if most is not None and len(every) > 2 * most:
+        edges = np.quantile(every, np.arange(1, most) / most)
+    fold = np.where(known, np.searchsorted(edges, speed, "right"), -1)
+    for floor in np.unique(where):
+        if len(np.unique(fold[(where == floor) & (fold >= 0)])) < 2:
+            fold[where == floor] = -1
+    return fold
+
+
+def _headings(facts: Sequence[Facts]) -> tuple[Float[np.ndarray, " run"], Bool[np.ndarray, " run"]]:
+    """Commanded headings, zero where there is none [deg], and whether there is one."""
+    way = np.array([f.heading_deg for f in facts], float)
+    known = np.isfinite(way)
+    return np.where(known, way, 0.0), known
+
+
+QUESTIONS: dict[str, Callable[[Sequence[Facts]], Fold]] = {
+    "sectors": sectors,
+    "speeds": speeds,
+    "random": random_headings,
+}
+"""What is left out together: 60-degree sectors of headings, one speed, headings dealt at random."""
+
+
+def nested(data: Runs, question: str, judged: np.ndarray) -> Fold:
+    """Fold of every run while a model tunes itself for a question on the runs that are not judged.
+
+    A sector beside one that is judged would leave a wider gap than is asked about: it is -1, seen
+    always, where two sectors or more are left.
+    """
+    fold = QUESTIONS[question](facts_of(data))
+    if question != "sectors":
+        return fold
+    left_out = np.unique(fold[judged])
+    beside = np.isin(fold, [(left_out + 1) % 6, (left_out - 1) % 6])
+    inner = np.where(beside, -1, fold)
+    rest = np.setdiff1d(inner, [-1, *left_out.tolist()])
+    return inner if len(rest) > 1 else fold
+
+
+def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
+    """Fold of every run; -1 for one that cannot be judged and is always fitted.
+
+    Leaving out its fold would leave nothing of its floor and load set-up. With `parts`, every
+    parts-th fold is left out together.
+
+    Raises:
+        DataError: no such question.
+        ValueError: fewer than two parts.
+    """
+    if question not in QUESTIONS:
+        raise DataError(
+            f"folds '{question}': no such question; expected some of {', '.join(QUESTIONS)}"
+        )
+    if parts is not None and parts < 2:
+        raise ValueError(f"{parts} parts; expected 2 or more")
+    facts = facts_of(data)
+    fold = QUESTIONS[question](facts)
+    if parts is not None:
+        fold = np.where(fold < 0, fold, fold % parts)
+    group = np.array([f.floor for f in facts])
+    for name in np.unique(group):
+        if len(np.unique(fold[group == name])) < 2:
+            fold[group == name] = -1
+    return fold
+
+
+@dataclass(frozen=True)
+class FoldResult:
+    """What the models say of the runs of a fold, and how the fit of the force balance ended.
+
+    Seconds are to `fit` and to `predict`, of every model; numbers are counts of fitted ones, by
+    floor.
+    """
+
+    rows: tuple[ScoredRun, ...]
+    seconds: dict[str, dict[str, float]]
+    numbers: dict[str, dict[str, int]]
+    converged: bool
+    reason: str
+
+    def to_json(self) -> Content:
+        return asdict(self, dict_factory=told)
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """Every model, the force balance first, fitted to some runs of a problem.
+
+    Seconds are to fit, by model.
+    """
+
+    problem: Problem
+    optimum: Optimum
+    models: tuple[Predictive, ...]
+    seconds: dict[str, float]
+
+
+def learn(
+    problem: Problem,
+    choices: Sequence[Choice],
+    data: Runs,
+    question: str,
+    judged: np.ndarray,
+    fit: Callable[..., Optimum] = optimise,
+) -> Learnt:
+    """Every slip model fitted without some runs; arguments as of `judge`.
+
+    Of the runs left out nothing is used but which they are.
+    """
+    fitted = np.setdiff1d(np.arange(len(data)), judged)
+    problem = of_some(problem, choices, data, fitted)
+    keep = np.isin(problem.windows.run, fitted).astype(float)
+    began = time.perf_counter()
+    optimum = fit(problem, keep=keep)
+    contact = contact_of(problem, optimum.state, optimum.covariance, keep)
+    models: list[Predictive] = [contact]
+    seconds = {contact.name: time.perf_counter() - began}
+    together, shape = nested(data, question, judged), problem.robot.geometry
+    for model in slip_models(shape, problem.windows.has_current, together):
+        began = time.perf_counter()
+        models.append(with_noise(model, contact, problem, keep))
+        seconds[model.name] = time.perf_counter() - began
+    return Learnt(problem, optimum, tuple(models), seconds)
+
+
+def of_some(problem: Problem, choices: Sequence[Choice], data: Runs, fitted: np.ndarray) -> Problem:
+    """The problem of a fit to some of its runs: what those cannot tell is held."""
+    held = [*still_viscosities(data, fitted), *choices]
+    if Space(problem.robot, held).names == problem.space.names:
+        return problem
+    return Problem(problem.windows, problem.robot, held)  # they saw a floor at one speed
+
+
+def judge(
+    problem: Problem,
+    choices: Sequence[Choice],
+    data: Runs,
+    question: str,
+    judged: np.ndarray,
+    fit: Callable[..., Optimum] = optimise,
+) -> FoldResult:
+    """One fold: every slip model fitted without some runs, and its scores on them.
+
+    The problem is of all the runs of `data`, made with these choices; `judged` are numbers of runs,
+    left out for one of the `QUESTIONS`; a model that tunes itself does so for that question, on the
+    other runs. `fit` is how the problem is fitted.
+    """
+    learnt = learn(problem, choices, data, question, judged, fit)
+    problem, optimum = learnt.problem, learnt.optimum
+    seconds = {name: {"fit": spent} for name, spent in learnt.seconds.items()}
+    part = data.subset(judged)
+    runs: dict[int, ScoredRun] = {}
+    cuts = replay.cuts(part, learnt.models[0].robot)
+    for model in learnt.models:
+        began = time.perf_counter()
+        for w in cuts:
+            add_scores(runs, part, model.name, *model.ends(w))
+        seconds[model.name]["predict"] = time.perf_counter() - began
+        density = model.log_density(problem)
+        for k, number in enumerate(judged):
+            of_run = float(density[problem.windows.run == number].sum())
+            runs[k].models[model.name] = replace(runs[k].models[model.name], log_density=of_run)
+    return FoldResult(
+        rows=tuple(replace(runs[k], session=name) for k, name in enumerate(part.session)),
+        seconds=seconds,
+        numbers={model.name: model.numbers for model in learnt.models},
+        converged=bool(optimum.converged),
+        reason=optimum.reason,
+    )

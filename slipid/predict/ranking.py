@@ -1,0 +1,268 @@
+"""Which model the left-out runs of a floor prefer, by how much, and whether they can tell.
+
+Does slip against current carry over to a floor it was not fitted on?
+
+One curve s = b0 + b1 |I| for all wheels, fitted to all floors but one and judged on that one,
+beside a constant fitted to the same floors and a curve fitted to the floor itself.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.stats import binom
+
+from slipid.data.runs import Runs
+from slipid.data.windows import Windows
+from slipid.fit.problem import Problem
+from slipid.model.robot import Robot
+from slipid.predict.folds import folds_of, judge
+from slipid.predict.score import Score, clusters, main_load, mean_error
+from slipid.predict.slip_model import body_twist
+from slipid.predict.validation import ScoredRun, by_floor, finite
+from slipid.search_space import Choice
+from slipid.support.errors import DataError
+from slipid.support.files import Content
+from slipid.support.progress import Reporter
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SURE, SMALL = 2.0, 4.0
+"""A difference counts from so many standard errors on, and so many nats over all runs together.
+
+Below four nats models predict alike, and the standard error of their difference is not to be relied
+on: one with an idle number more loses a little in every run.
+Source: Sivula, Magnusson, Matamoros and Vehtari 2020, arXiv:2008.10296.
+"""
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A model on a floor: its score [nats per run], see `ranking`, and means over the runs.
+
+    The difference is to the best, `se` over runs, `se_clustered` over sectors of headings as that
+    of the end-point error; the verdict is `best`, `tied` or `worse`. Coverages are shares of runs
+    that ended in the regions of this probability, the energy score is in m.
+    """
+
+    elpd: float
+    difference: float
+    se: float | None
+    se_clustered: float | None
+    verdict: str
+    endpoint_error: float
+    endpoint_error_se: float | None
+    energy_score: float
+    coverage50: float
+    coverage90: float
+    heading_error_median_deg: float
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The models on a floor, the best of them, and what a reader should take home.
+
+    Clusters are sectors of headings, bands the shares of runs in regions that honest forecasts
+    have, see `_band`.
+    """
+
+    runs: int
+    clusters: int
+    best: str
+    sentence: str
+    band50: tuple[float, float]
+    band90: tuple[float, float]
+    models: dict[str, Ranked]
+
+
+def ranking(runs: Sequence[ScoredRun]) -> dict[str, Ranking]:
+    """Every floor: every model's score, its distance to the best, and who cannot be told from it.
+
+    The score is the expected log predictive density of a run's logged poses [nats per run], every
+    run predicted by a fit that has not seen it. A model is tied with the best where the difference
+    is less than `SURE` clustered standard errors or, over all runs, less than `SMALL` nats.
+    """
+    return {floor: _floor(floor, mine) for floor, mine in by_floor(runs).items()}
+
+
+def _floor(floor: str, runs: Sequence[ScoredRun]) -> Ranking:
+    names, cluster = list(runs[0].models), clusters([run.heading_deg for run in runs])
+    scores = {m: [run.models[m] for run in runs] for m in names}
+    density = {m: np.array([s.log_density for s in scores[m]], float) for m in names}
+    best = max(names, key=lambda m: float(density[m].mean()))
+    models = {m: _ranked(scores[m], density[m] - density[best], m == best, cluster) for m in names}
+    return Ranking(
+        runs=len(runs),
+        clusters=len(np.unique(cluster)),
+        best=best,
+        sentence=_sentence(floor, best, models),
+        band50=_band(len(runs), 0.5),
+        band90=_band(len(runs), 0.9),
+        models=models,
+    )
+
+
+def _ranked(
+    scores: Sequence[Score], behind: np.ndarray, is_best: bool, cluster: np.ndarray
+) -> Ranked:
+    """A model whose runs have these log densities less the best model's."""
+    difference, se, clustered = mean_error(behind, cluster)
+    far, _, far_se = mean_error(np.array([s.endpoint_error for s in scores]), cluster)
+    level = np.array([s.level for s in scores], float)
+    is_clear = abs(difference) >= SURE * clustered and abs(difference) * len(scores) >= SMALL
+    return Ranked(
+        elpd=float(np.mean([s.log_density for s in scores if s.log_density is not None])),
+        difference=difference,
+        se=finite(se),
+        se_clustered=finite(clustered),
+        verdict="best" if is_best else "worse" if is_clear else "tied",
+        endpoint_error=far,
+        endpoint_error_se=finite(far_se),
+        energy_score=float(np.mean([s.energy_score for s in scores])),
+        coverage50=float(np.mean(level <= 0.5)),
+        coverage90=float(np.mean(level <= 0.9)),
+        heading_error_median_deg=float(np.median([s.heading_error_deg for s in scores])),
+    )
+
+
+def _band(runs: int, share: float) -> tuple[float, float]:
+    """Shares of runs in regions of this probability that 99 % of honest forecasts would have."""
+    low, high = (float(binom.ppf(q, runs, share)) / runs for q in (0.005, 0.995))
+    return low, high
+
+
+def _sentence(floor: str, best: str, models: Mapping[str, Ranked]) -> str:
+    order = sorted((m for m in models if m != best), key=lambda m: -models[m].difference)
+    if not order:
+        return f"{floor}: nothing to compare {_name(best)} with"
+    apart = {m: f"{_name(m)} ({_apart(models[m])})" for m in order}
+    tied = [apart.pop(m) for m in order if models[m].verdict == "tied"]
+    if tied:
+        rest = f"; worse: {next(iter(apart.values()))}" if apart else ""
+        return f"{floor}: the data cannot tell {_name(best)} from {' or '.join(tied)}{rest}"
+    return (
+        f"{floor}: {_name(best)} is best; next {_name(order[0])}, {_apart(models[order[0]])} "
+        "nats per run worse"
+    )
+
+
+def _apart(model: Ranked) -> str:
+    se = model.se_clustered
+    return f"{-model.difference:.1f} +- {'?' if se is None else format(se, '.1f')}"
+
+
+def _name(model: str) -> str:
+    return "contact equilibrium" if model == "identified" else model
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Which slip model each floor prefers; `print` says so in a sentence per floor.
+
+    Attributes:
+        floors: by name; each has its `best` model, and every model's score and verdict.
+        question: what was left out together.
+    """
+
+    floors: dict[str, Ranking]
+    question: str
+
+    def __str__(self) -> str:
+        return "\n".join(floor.sentence for floor in self.floors.values())
+
+    def plot(self) -> "Figure":
+        """Every model's distance to the best one, and its end-point error."""
+        from slipid.plots.compare import SHOWN, compare_figure
+
+        floors = {name: asdict(floor) for name, floor in self.floors.items()}
+        return compare_figure(floors, SHOWN[self.question])
+
+
+def compared(
+    problem: Problem,
+    choices: Sequence[Choice],
+    data: Runs,
+    question: str,
+    parts: int,
+    quiet: bool = False,
+) -> Comparison:
+    """Every slip model judged fold by fold; `problem` is of all runs and the choices.
+
+    The other arguments and errors are those of `Fit.compare`.
+    """
+    fold = folds_of(data, question, parts)
+    if (fold < 0).all():
+        raise DataError("no run can be left out; expected several headings or speeds")
+    rows: list[ScoredRun] = []
+    with Reporter(quiet=quiet) as report:
+        for k in sorted(set(fold[fold >= 0].tolist())):
+            report.stage(f"{question}: without part {k + 1} of {fold.max() + 1}")
+            rows += judge(problem, choices, data, question, np.flatnonzero(fold == k)).rows
+    return Comparison(ranking(rows), question)
+
+
+LEAST = 0.2
+"""A wheel counts in a window where it turns at least this part of the fastest one."""
+VARIANTS: dict[str, tuple[float, bool, bool]] = {
+    "all": (LEAST, False, False),
+    "slower wheels too": (0.1, False, False),
+    "fast wheels only": (0.5, False, False),
+    "as built only": (LEAST, True, False),
+    "0 < s <= 1, I > 0.25 A only": (LEAST, False, True),
+}
+"""What may be chosen otherwise: least speed of a wheel, one load set-up, the 2021 paper's filter
+(which cuts the response off and so flatters what it leaves)."""
+
+
+def transfer(w: Windows, robot: Robot) -> dict[str, Content]:
+    """Leave-one-surface-out errors of slip, per variant of what counts as a row; none of one floor.
+
+    Root mean squares over all `rows`, mean of `floors`, and of `each`, of what is left of slip by
+    the curve of the other floors (`pooled`), by their mean slip (`constant`), and by the floor's
+    own curve (`per_surface`); `count` is of rows.
+
+    A row is one wheel in one window: s = 1 - J xi / (r w), xi the body twist from the camera in
+    corrected metres, I the mean magnitude of the wheel's current.
+    """
+    if len(set(w.surface)) < 2:
+        return {}
+    w = w.at_lag(float(robot.camera.lag))
+    forward = np.asarray(robot.geometry.forward()) / float(robot.geometry.wheel_radius)
+    speed = w.turn / w.dt[..., None]
+    slip = 1 - (body_twist(w, robot) @ forward.T) / np.where(speed == 0.0, np.nan, speed)
+    share = np.abs(speed) / np.abs(speed).max(axis=-1, keepdims=True)
+    amps = np.abs(w.current)
+    floor = np.broadcast_to(np.asarray(w.surface)[:, None, None], slip.shape)
+    load = np.broadcast_to(np.asarray(w.load)[:, None, None], slip.shape)
+    main = main_load(w.load)
+    out = {}
+    for name, (least, one_load, cut) in VARIANTS.items():
+        rows = (share >= least) & np.isfinite(slip) & ((load == main) | (not one_load))
+        if cut:
+            rows &= (slip > 0) & (slip <= 1) & (amps > 0.25)
+        if len(set(floor[rows].tolist())) > 1:
+            out[name] = errors_by_floor(slip[rows], amps[rows], floor[rows])
+    return out
+
+
+def errors_by_floor(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Content:
+    """Errors of rows of slip and current [A] on floors by name, see `transfer`."""
+    pooled, constant, own = {}, {}, {}
+    line = np.stack([np.ones_like(amps), amps], axis=-1)
+    for name in sorted(set(floor.tolist())):
+        mine = floor == name
+        others = np.linalg.lstsq(line[~mine], slip[~mine], rcond=None)[0]
+        alone = np.linalg.lstsq(line[mine], slip[mine], rcond=None)[0]
+        pooled[name] = slip[mine] - line[mine] @ others
+        constant[name] = slip[mine] - slip[~mine].mean()
+        own[name] = slip[mine] - line[mine] @ alone
+    gaps = {"pooled": pooled, "constant": constant, "per_surface": own}
+    return {name: _left(gap) for name, gap in gaps.items()} | {"count": len(slip)}
+
+
+def _left(gaps: dict[str, np.ndarray]) -> Content:
+    each = {name: float(np.sqrt(np.mean(gap**2))) for name, gap in gaps.items()}
+    rows = float(np.sqrt(np.mean(np.concatenate(list(gaps.values())) ** 2)))
+    return {"rows": rows, "floors": float(np.mean(list(each.values()))), "each": each}

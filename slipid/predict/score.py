@@ -1,0 +1,151 @@
+"""How good predictions of runs are: the one scorer of every slip model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.stats import f as fisher
+
+from slipid.fit.variances import DEGREES
+
+CLUSTER_DEG = 30.0
+"""Neighbouring headings share their errors (they are correlated by a half at 5 degrees, by nothing
+at 30): runs of one such sector are one observation of the clustered standard error."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Errors of a model's prediction of a run.
+
+    The pose at the end is x, y [m] and yaw [rad]; the end-point error is over the chord, and over
+    the path, which means something on closed paths, too; the length error is relative; the heading
+    error is at most 180 degrees. `level` is the probability of the region whose edge the end lies
+    on, `covered90` whether that is at most 0.9, both None for a model without. The energy score is
+    in m, the log density of the logged poses in nats, None where it was not asked for.
+    """
+
+    predicted_end: Sequence[float]
+    endpoint_error: float
+    endpoint_error_over_path: float
+    length_error: float
+    heading_error_deg: float
+    level: float | None
+    covered90: bool | None
+    energy_score: float
+    log_density: float | None = None
+
+
+def scores(
+    predicted: Float[np.ndarray, "run edge 3"],
+    measured: Float[np.ndarray, "run edge 3"],
+    cov: Float[np.ndarray, "run 2 2"] | None,
+    freedom: float = DEGREES,
+) -> list[Score]:
+    """Scores of predicted paths from the measured start on, one by one.
+
+    Args:
+        predicted, measured: poses x, y [m] and yaw [rad] in one frame.
+        cov: scale matrices of the ends' Student t, None for a model without [m^2].
+        freedom: its degrees of freedom, infinite for a Gaussian.
+    """
+    gap = predicted[:, -1] - measured[:, -1]
+    off = np.linalg.norm(gap[:, :2], axis=1)
+    turn = np.abs(np.degrees(np.angle(np.exp(1j * gap[:, 2]))))
+    level, energy = forecast(gap[:, :2], cov, freedom)
+    whole, ahead = chords(measured), chords(predicted)
+    return [
+        Score(
+            predicted_end=predicted[n, -1].tolist(),
+            endpoint_error=float(off[n]) / max(whole[n], 1e-9),
+            endpoint_error_over_path=float(off[n]) / max(way, 1e-9),
+            length_error=abs(ahead[n] / max(whole[n], 1e-9) - 1.0),
+            heading_error_deg=float(turn[n]),
+            level=None if level is None else float(level[n]),
+            covered90=None if level is None else bool(level[n] <= 0.9),
+            energy_score=float(energy[n]),
+        )
+        for n, way in enumerate(lengths(measured))
+    ]
+
+
+def chords(path: Float[np.ndarray, "run edge 3"]) -> list[float]:
+    """Straight-line displacement of every path [m]."""
+    moved: list[float] = np.linalg.norm((path[:, -1] - path[:, 0])[:, :2], axis=1).tolist()
+    return moved
+
+
+def lengths(path: Float[np.ndarray, "run edge 3"]) -> list[float]:
+    """Length of every path, step by step [m]."""
+    moved: list[float] = np.linalg.norm(np.diff(path[..., :2], axis=1), axis=2).sum(axis=1).tolist()
+    return moved
+
+
+def forecast(
+    gap: Float[np.ndarray, "run 2"],
+    cov: Float[np.ndarray, "run 2 2"] | None,
+    freedom: float = DEGREES,
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """Probability of the region whose edge each end lies on, and the energy score of each [m].
+
+    An end lies in the 90 % region where the first is at most 0.9. The predictive distribution is a
+    Student t with so many degrees of freedom; without one (None) the energy score is the distance
+    itself, as for a point forecast.
+    Source: Gneiting and Raftery 2007, JASA 102, eq. 22.
+    """
+    if cov is None:
+        return None, np.linalg.norm(gap, axis=1)
+    q = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(cov), gap)
+    rng = np.random.default_rng(0)
+    normal = rng.normal(size=(500, 2))
+    if np.isfinite(freedom):
+        level = fisher.cdf(q / 2, 2, freedom)
+        normal /= np.sqrt(rng.chisquare(freedom, (500, 1)) / freedom)
+    else:
+        level = -np.expm1(-q / 2)
+    draws = np.einsum("nij,kj->nki", np.linalg.cholesky(cov), normal)
+    near = np.linalg.norm(draws - gap[:, None], axis=2).mean(axis=1)
+    apart = np.linalg.norm(draws[:, :250] - draws[:, 250:], axis=2).mean(axis=1)
+    return level, near - 0.5 * apart
+
+
+def clusters(heading_deg: Sequence[float | None]) -> Int[np.ndarray, " run"]:
+    """Sector of heading of each run; a run without heading is by itself, with a negative number."""
+    return np.array(
+        [
+            -1 - k if h is None or not np.isfinite(h) else int((h % 360.0 + 1e-6) // CLUSTER_DEG)
+            for k, h in enumerate(heading_deg)
+        ]
+    )
+
+
+def mean_error(
+    value: Float[np.ndarray, " run"], cluster: Int[np.ndarray, " run"]
+) -> tuple[float, float, float]:
+    """Mean, its standard error over runs, and that over clusters of runs.
+
+        se^2 = G / (G - 1) sum_g (sum_{i in g} (x_i - mean))^2 / n^2
+
+    Source: Cameron and Miller 2015, J. Human Resources 50, for a regression on a constant. With one
+    run, or one cluster, an error is not known and is nan.
+    """
+    n = len(value)
+    gap = value - value.mean()
+    sums = np.bincount(np.unique(cluster, return_inverse=True)[1], weights=gap)
+
+    def error(parts: np.ndarray) -> float:
+        g = len(parts)
+        return float(np.sqrt(g / (g - 1) * np.sum(parts**2)) / n) if g > 1 else float("nan")
+
+    return float(value.mean()), error(gap), error(sums)
+
+
+def main_load(loads: Sequence[str]) -> str:
+    """The set-up as built, else the most common."""
+    return "as_built" if "as_built" in loads else max(sorted(set(loads)), key=loads.count)
+
+
+def setups(floors: Sequence[str], loads: Sequence[str]) -> list[str]:
+    """Floor of each run, `floor@load` where its load set-up is not the main one."""
+    main = main_load(loads)
+    return [f if load == main else f"{f}@{load}" for f, load in zip(floors, loads, strict=True)]

@@ -1,0 +1,407 @@
+"""Motion of the body and of the marker that a camera sees: increments, twists, turned vectors.
+
+The interface of every slip model, ours and published ones, and the runs that it predicts.
+
+A slip model is fitted to runs with poses, and then predicts runs from what the robot itself
+measures: wheels, currents, commands, perhaps a gyro. All are given the same steps of the same runs.
+"""
+
+import abc
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.windows import Windows
+from slipid.fit.likelihood import measured, seen
+from slipid.model.geometry import Geometry
+from slipid.model.robot import Robot
+
+Increments = Float[np.ndarray, "piece window 3"]
+_seen, _measured = jax.jit(seen), jax.jit(measured)
+
+
+def as_increments(twist: np.ndarray, w: Windows, robot: Robot) -> Increments:
+    """Marker increments [m, m, rad] of body twists (piece, window, 3)."""
+    session = jnp.asarray([robot.session_index(s) for s in w.session])
+    return np.asarray(_seen(robot, jnp.asarray(twist), jnp.asarray(w.dt), session))
+
+
+def body_twist(w: Windows, robot: Robot) -> np.ndarray:
+    """Measured body twist of every window: yaw and place of the marker taken out, over dt."""
+    moved = np.asarray(_measured(robot, jnp.asarray(w.pose)))
+    yaw = moved[..., 2]
+    yaws = {s: float(robot.camera.yaw(robot.session_index(s))) for s in set(w.session)}
+    psi = np.array([yaws[s] for s in w.session])[:, None]
+    chord = turned(psi, moved[..., :2])
+    place = np.broadcast_to(np.asarray(robot.camera.marker_place), chord.shape)
+    chord -= turned(yaw, place) - place
+    # a chord is the arc times sinc, and points half the turn away from its start
+    arc = turned(-0.5 * yaw, chord) / np.sinc(yaw / (2 * np.pi))[..., None]
+    return np.concatenate([arc, yaw[..., None]], -1) / w.dt[..., None]
+
+
+def turned(angle: np.ndarray | float, v: np.ndarray) -> np.ndarray:
+    """Plane vectors (..., 2), each turned by its angle (...)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], -1)
+
+
+def sideways(v: np.ndarray) -> np.ndarray:
+    """Plane vectors (..., 2), each turned by a quarter to the left."""
+    return np.stack([-v[..., 1], v[..., 0]], -1)
+
+
+Channel = Literal["current", "gyro", "command", "twist"]
+"""What a method may need beside the encoders. `twist`: wheels that determine the body's twist."""
+Aim = Literal["end", "energy"]
+"""What a method predicts of a run: where it ends, or how much electric energy it takes."""
+Numbers = Float[np.ndarray, " step"]
+Twists = Float[np.ndarray, "step 3"]
+"""Body twist of each step: ahead [m/s], to the left [m/s], yaw [rad/s]."""
+TRIES = 4
+"""Settings that a method may try in its inner cross-validation, the same for all of them."""
+WINDOW_S = 0.5
+"""Length of the windows that methods are trained on and that twists are judged on [s]."""
+FEWEST = 5
+"""Runs on a floor, or with a load, below which a method takes its fit to all runs for them."""
+SHAFT_W0 = 3.0
+"""Shaft speed below which the torque of a current is not told by its power [rad/s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """What is known of a robot before anything is fitted.
+
+    A drive is a motor with all the wheels that it turns: one wheel, or a side of a skid steer.
+
+    Attributes:
+        forward: rim speed of each drive [m/s] from the body twist.
+        back: body twist from the drives' rim speeds, by least squares, if nothing slips.
+        wheel_radius, base_radius: [m].
+        gear_ratio: motor turns per wheel turn.
+        resistance, back_emf: of the motor by its datasheet [ohm], [V s/rad].
+        mass: of the robot [kg].
+        determines_twist: whether the drives determine the body's twist; a skid steer's do not.
+    """
+
+    forward: Float[np.ndarray, "drive 3"]
+    back: Float[np.ndarray, "3 drive"]
+    wheel_radius: float
+    base_radius: float
+    gear_ratio: float
+    resistance: float
+    back_emf: float
+    mass: float
+    determines_twist: bool
+
+    @classmethod
+    def of(cls, robot: Robot) -> "Machine":
+        """Of a robot as its config has it."""
+        shape, motor = robot.geometry, robot.motor
+        back = np.asarray(shape.least())
+        return cls(
+            forward=np.linalg.pinv(back),
+            back=back,
+            wheel_radius=float(shape.wheel_radius),
+            base_radius=float(shape.base_radius),
+            gear_ratio=float(motor.gear_ratio),
+            resistance=float(motor.resistance),
+            back_emf=float(motor.back_emf),
+            mass=float(robot.body.mass),
+            determines_twist=bool(shape.determines_twist),
+        )
+
+    def of_shape(self, shape: Geometry) -> "Machine":
+        """The same robot whose encoders are read with other sizes of its wheels and places."""
+        back = np.asarray(shape.least())
+        return replace(self, back=back, wheel_radius=float(shape.wheel_radius))
+
+    @property
+    def size(self) -> Float[np.ndarray, "3"]:
+        """Weights that make a yaw rate comparable with a speed: one, one, base radius [m]."""
+        return np.array([1.0, 1.0, self.base_radius])
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """What the robot's computer hears of a run, in steps of a tenth to half a second.
+
+    Attributes:
+        name: of the run.
+        dt: length of each step [s].
+        turn: rotation of each drive's wheels in the step [rad].
+        current: mean current of each motor [A], signed along its wheel's forward direction where
+            `current_is_signed`, else its magnitude; None where it was not logged.
+        gyro: mean yaw rate [rad/s], or None.
+        command: twist that was commanded, or None.
+        floor: name of the floor if the method is told; None where it has to find out.
+        load: name of the load set-up, which a robot knows.
+    """
+
+    name: str
+    dt: Float[np.ndarray, " step"]
+    turn: Float[np.ndarray, "step drive"]
+    current: Float[np.ndarray, "step drive"] | None = None
+    current_is_signed: bool = False
+    gyro: Float[np.ndarray, " step"] | None = None
+    command: Float[np.ndarray, "step 3"] | None = None
+    floor: str | None = None
+    load: str | None = None
+
+    def __len__(self) -> int:
+        return len(self.dt)
+
+    @property
+    def speed(self) -> Float[np.ndarray, "step drive"]:
+        """Wheel speed of each drive [rad/s]."""
+        return self.turn / self.dt[:, None]
+
+    def rolling(self, machine: Machine) -> Twists:
+        """Body twist if nothing slips: what encoders alone say."""
+        return np.asarray(self.speed * machine.wheel_radius @ machine.back.T)
+
+    def along(self, machine: Machine) -> Float[np.ndarray, "step drive"]:
+        """Current along the wheel's motion [A]: positive where the motor drives.
+
+        Of an unsigned ammeter it is the magnitude, as if the motor always drove.
+
+        Raises:
+            ValueError: no current was logged.
+        """
+        if self.current is None:
+            raise ValueError(f"{self.name}: no current; this method needs one")
+        way = np.sign(self.speed)
+        return np.asarray(self.current * way if self.current_is_signed else self.current)
+
+    def torque(self, machine: Machine) -> Float[np.ndarray, "step drive"]:
+        """M = C_e I + R I^2 w / (w^2 + w0^2) [N m], w the shaft's speed and w0 = `SHAFT_W0`.
+
+        The 2021 paper's torque characterising variable M = U I / w, with U = C_e w + R I, regular
+        at rest. Positive where the motor drives.
+        """
+        amps, shaft = self.along(machine), np.abs(machine.gear_ratio * self.speed)
+        heat = machine.resistance * amps**2 * shaft / (shaft**2 + SHAFT_W0**2)
+        return np.asarray(machine.back_emf * amps + heat)
+
+    def power(self, machine: Machine) -> Numbers:
+        """Electric power of all motors [W], by the currents and the motor's datasheet.
+
+        P = sum_i (R I_i + C_e |w_i|) I_i
+        """
+        amps, shaft = self.along(machine), np.abs(machine.gear_ratio * self.speed)
+        return np.asarray(((machine.resistance * amps + machine.back_emf * shaft) * amps).sum(1))
+
+    def windowed(self, seconds: float = WINDOW_S) -> "Heard":
+        """The same run in longer steps: neighbours joined until they are about so long."""
+        first = groups(self.dt, seconds)
+        dt = np.add.reduceat(self.dt, first)
+
+        def mean(x: np.ndarray | None) -> np.ndarray | None:
+            if x is None:
+                return None
+            weight = self.dt.reshape(-1, *[1] * (x.ndim - 1))
+            return np.asarray(np.add.reduceat(x * weight, first) / dt.reshape(weight[first].shape))
+
+        return replace(
+            self,
+            dt=dt,
+            turn=np.add.reduceat(self.turn, first),
+            current=mean(self.current),
+            gyro=mean(self.gyro),
+            command=mean(self.command),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run with the pose of its body, for training and for the judge.
+
+    Attributes:
+        heard: what the robot measured; its `floor` is None where methods are not told.
+        pose: x, y [m] and heading [rad] of the body at the edges of the steps, in true metres.
+        floor: name of the floor it was driven on.
+        load: name of the load set-up.
+        heading: direction of travel commanded [rad], nan where there is none.
+        speed: commanded [m/s], nan where none was logged.
+    """
+
+    heard: Heard
+    pose: Float[np.ndarray, "edge 3"]
+    floor: str
+    load: str = "as_built"
+    heading: float = float("nan")
+    speed: float = float("nan")
+
+    @property
+    def twist(self) -> Twists:
+        """Body twist of every step by the pose: constant over a step, exact on SE(2)."""
+        return body_increments(self.pose) / self.heard.dt[:, None]
+
+    def windowed(self, seconds: float = WINDOW_S) -> "Run":
+        """The same run in longer steps."""
+        edges = np.append(groups(self.heard.dt, seconds), len(self.heard))
+        return replace(self, heard=self.heard.windowed(seconds), pose=self.pose[edges])
+
+    def told(self, floor: bool) -> "Run":
+        """The same run, its floor told to methods or not."""
+        return replace(self, heard=replace(self.heard, floor=self.floor if floor else None))
+
+
+@dataclass(frozen=True, eq=False)
+class Said:
+    """What a method says of a run.
+
+    Attributes:
+        path: pose at every edge of the steps, seen from the pose at the start [m, m, rad].
+        end_covariance: of the place at the end, seen from the start [m^2]; None of a method that
+            knows no uncertainty.
+        freedom: degrees of freedom of the Student t that it is the scale matrix of; infinite where
+            it is the covariance of a Gaussian.
+        slipping: how sure it is that the robot slips in a step; any rising scale. None where that
+            is to be taken from how far its twist is from that of the encoders.
+        floors: probability of each floor in every step, by name; None of a method that does not
+            tell floors.
+        power: electric power of all motors in every step [W], predicted without the currents; None
+            of a method that does not predict it.
+    """
+
+    path: Float[np.ndarray, "edge 3"]
+    end_covariance: Float[np.ndarray, "2 2"] | None = None
+    freedom: float = np.inf
+    slipping: Float[np.ndarray, " step"] | None = None
+    floors: Mapping[str, Numbers] | None = None
+    power: Numbers | None = None
+
+
+@dataclass(frozen=True)
+class SlipModel(abc.ABC):
+    """Anything that predicts the motion of the body from wheels, before or after it is fitted.
+
+    Attributes:
+        name: of its row.
+        needs: channels without which it does not run.
+        aim: what it predicts, by which its settings are picked.
+    """
+
+    name: str
+    needs: frozenset[Channel] = field(default=frozenset(), kw_only=True)
+    aim: Aim = field(default="end", kw_only=True)
+
+    def candidates(self) -> Sequence["SlipModel"]:
+        """Itself with other settings, at most `TRIES`, from which cross-validation picks one."""
+        return (self,)
+
+    @abc.abstractmethod
+    def fit(self, runs: Sequence[Run], machine: Machine) -> Self:
+        """The method fitted to runs."""
+
+    @abc.abstractmethod
+    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+        """What it says of runs it has not seen, from what was heard alone."""
+
+    @property
+    @abc.abstractmethod
+    def numbers(self) -> int:
+        """How many numbers were fitted."""
+
+
+@dataclass(frozen=True)
+class ByFloor(SlipModel):
+    """A slip model fitted floor by floor where floors are told, else load set-up by load set-up.
+
+    Groups of fewer than `FEWEST` runs have the fit to all runs.
+
+    Attributes:
+        method: unfitted.
+        pooled: whether it takes no notice of floors and loads, and is fitted once to all runs.
+        fitted: to the runs of each group, by its name, the largest group first; under None to all
+            runs.
+    """
+
+    method: SlipModel
+    pooled: bool = False
+    fitted: Mapping[str | None, SlipModel] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, method: SlipModel) -> "ByFloor":
+        return cls(method.name, method, needs=method.needs, aim=method.aim)
+
+    def candidates(self) -> Sequence["ByFloor"]:
+        return [replace(self, method=method) for method in self.method.candidates()]
+
+    def fit(self, runs: Sequence[Run], machine: Machine) -> "ByFloor":
+        groups: dict[str | None, list[Run]] = {}
+        for run in runs:
+            groups.setdefault(self.group_of(run.heard), []).append(run)
+        order = sorted(groups, key=lambda name: -len(groups[name]))
+        few = [name for name in order if len(groups[name]) < FEWEST] if len(order) > 1 else []
+        fitted = {n: self.method.fit(groups[n], machine) for n in order if n not in few}
+        if few:
+            fitted |= dict.fromkeys(few, self.method.fit(runs, machine))
+        return replace(self, fitted=fitted)
+
+    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+        said: dict[int, Said] = {}
+        groups = [self._fitted_group(run) for run in runs]
+        for group in dict.fromkeys(groups):
+            mine = [k for k, name in enumerate(groups) if name == group]
+            of_group = self.fitted[group].predict([runs[k] for k in mine], machine)
+            said.update(zip(mine, of_group, strict=True))
+        return [said[k] for k in range(len(runs))]
+
+    def _fitted_group(self, heard: Heard) -> str | None:
+        """The group of a run; a load set-up that no training run had is taken for the usual one."""
+        group = self.group_of(heard)
+        if group not in self.fitted:
+            if heard.floor is not None:
+                known = ", ".join(map(str, self.fitted))
+                raise ValueError(f"{self.name}: no floor '{heard.floor}'; fitted: {known}")
+            return next(iter(self.fitted))
+        return group
+
+    def group_of(self, heard: Heard) -> str | None:
+        """Name of the runs that this one is fitted with: its floor if that is told, or its load."""
+        if self.pooled:
+            return None
+        return heard.load if heard.floor is None else heard.floor
+
+    @property
+    def numbers(self) -> int:
+        return sum(method.numbers for method in {id(m): m for m in self.fitted.values()}.values())
+
+
+def groups(dt: Float[np.ndarray, " step"], seconds: float) -> np.ndarray:
+    """First step of every group of neighbours that together are about so long [s]."""
+    count = max(1, round(float(dt.sum()) / seconds))
+    number = np.minimum((np.cumsum(dt) - 0.5 * dt) / dt.sum() * count, count - 1).astype(int)
+    return np.flatnonzero(np.diff(number, prepend=-1))
+
+
+def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, "edge 3"]:
+    """Poses from the origin on, of a body that keeps its twist over each step; exact on SE(2)."""
+    heading = np.concatenate([[0.0], np.cumsum(twist[:, 2] * dt)])
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    # a chord is the arc times sinc, and points half the turn away from its start
+    chord = np.sinc(np.diff(heading) / (2 * np.pi)) * dt
+    step = turned(middle, twist[:, :2] * chord[:, None])
+    place = np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
+    return np.column_stack([place, heading])
+
+
+def seen_from_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "edge 3"]:
+    """Poses as they are seen from the first of them."""
+    moved = path - path[0]
+    return np.column_stack([turned(-path[0, 2], moved[:, :2]), moved[:, 2]])
+
+
+def body_increments(pose: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "step 3"]:
+    """Logarithm on SE(2) of each step of a path: twist times time [m, m, rad]."""
+    turn = np.diff(pose[:, 2])
+    middle = 0.5 * (pose[1:, 2] + pose[:-1, 2])
+    arc = turned(-middle, np.diff(pose[:, :2], axis=0)) / np.sinc(turn / (2 * np.pi))[:, None]
+    return np.column_stack([arc, turn])

@@ -1,0 +1,242 @@
+"""The steps of many runs together, and slip models that give a body twist in each of them."""
+
+import abc
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from slipid.predict.slip_model import (
+    WINDOW_S,
+    Heard,
+    Machine,
+    Run,
+    Said,
+    SlipModel,
+    Twists,
+    body_increments,
+    groups,
+    path_of,
+    turned,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The steps of several runs one after the other, so that all are computed in one go.
+
+    Attributes:
+        heard: all steps as if they were one run; its name and floor are those of the first.
+        first: first step of each run.
+        faster: wheel speed at the end of each step less that at its start [rad/s], so that
+            d turn / d lag = -faster; None where the lag of the poses is settled.
+        lag: lag of the poses behind the wheels that was assumed [s].
+    """
+
+    heard: Heard
+    first: Int[np.ndarray, " run"]
+    faster: Float[np.ndarray, "step drive"] | None = None
+    lag: float = 0.0
+
+    @classmethod
+    def of(cls, runs: Sequence[Heard]) -> "Steps":
+        """All steps of runs of one robot.
+
+        Raises:
+            ValueError: the currents of some runs are signed and those of others are not.
+        """
+        if len({run.current_is_signed for run in runs}) > 1:
+            raise ValueError("currents of some runs are signed; expected all signed or none")
+        currents = [run.current for run in runs if run.current is not None]
+        gyros = [run.gyro for run in runs if run.gyro is not None]
+        heard = replace(
+            runs[0],
+            dt=np.concatenate([run.dt for run in runs]),
+            turn=np.concatenate([run.turn for run in runs]),
+            # a channel that one run lacks is a channel that is not there for all of them
+            current=np.concatenate(currents) if len(currents) == len(runs) else None,
+            gyro=np.concatenate(gyros) if len(gyros) == len(runs) else None,
+            command=None,
+        )
+        return cls(heard, np.cumsum([0, *(len(run) for run in runs[:-1])]))
+
+    def at_lag(self, lag: float) -> "Steps":
+        """The same steps at another lag, to first order [s]; as they are where it is settled."""
+        if self.faster is None:
+            return self
+        turn = self.heard.turn - (lag - self.lag) * self.faster
+        return replace(self, heard=replace(self.heard, turn=turn), lag=lag)
+
+    @property
+    def length(self) -> Int[np.ndarray, " run"]:
+        """How many steps each run has."""
+        return np.diff(self.first, append=len(self.heard))
+
+    def said(self, twist: Twists, slipping: Float[np.ndarray, " step"] | None = None) -> list[Said]:
+        """Each run's path from the twists of all steps [m/s, m/s, rad/s], and its slip if known."""
+        parts = zip(self._runs(twist), self._runs(self.heard.dt), strict=True)
+        paths = [path_of(xi, dt) for xi, dt in parts]
+        if slipping is None:
+            return [Said(path) for path in paths]
+        sure = self._runs(slipping)
+        return [Said(path, slipping=own) for path, own in zip(paths, sure, strict=True)]
+
+    def smoothed(
+        self, values: Float[np.ndarray, "step drive"], time_constant: float
+    ) -> Float[np.ndarray, "step drive"]:
+        """First-order low pass of each run, which starts at the run's first value.
+
+        x~_k = a x~_(k-1) + (1 - a) x_k   with   a = exp(-dt / time constant [s])
+        """
+        run = np.repeat(np.arange(len(self.first)), self.length)
+        step = np.arange(len(values)) - self.first[run]
+        shape = len(self.first), int(self.length.max())
+        memory, x = np.ones((*shape, 1)), np.zeros((*shape, values.shape[1]))
+        memory[run, step, 0] = np.exp(-self.heard.dt / time_constant)
+        x[run, step] = values
+        # all runs at once: the only loop is over the steps of the longest of them
+        for k in range(1, shape[1]):
+            x[:, k] += memory[:, k] * (x[:, k - 1] - x[:, k])
+        return x[run, step]
+
+    def ends(self, twist: Twists) -> Float[np.ndarray, "run 3"]:
+        """Pose at each run's end, seen from its start [m, m, rad], of the twists of all steps."""
+        dt = self.heard.dt
+        turn = twist[:, 2] * dt
+        before = np.cumsum(turn) - turn
+        before -= np.repeat(before[self.first], self.length)
+        chord = np.sinc(turn / (2 * np.pi)) * dt
+        step = turned(before + 0.5 * turn, twist[:, :2] * chord[:, None])
+        return np.add.reduceat(np.column_stack([step, turn]), self.first)
+
+    def _runs(self, values: np.ndarray) -> list[np.ndarray]:
+        """Values of all steps, run by run."""
+        return np.split(values, self.first[1:])
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingWindows:
+    """Windows of about half a second of the same steps, with the true twist in each.
+
+    A camera's noise is large over one step, so methods learn from windows; what they learn from is
+    the mean over a window of what they compute in each step.
+
+    Attributes:
+        steps: of all runs.
+        first: first step of each window.
+        dt: length of each window [s].
+        twist: by the poses [m/s, m/s, rad/s].
+        run: number of the run that each window is of.
+    """
+
+    steps: Steps
+    first: Int[np.ndarray, " window"]
+    dt: Float[np.ndarray, " window"]
+    twist: Float[np.ndarray, "window 3"]
+    run: Int[np.ndarray, " window"]
+
+    @classmethod
+    def of(cls, runs: Sequence[Run]) -> "TrainingWindows":
+        steps = Steps.of([run.heard for run in runs])
+        begins = [groups(run.heard.dt, WINDOW_S) for run in runs]
+        edges = [np.append(begin, len(run.heard)) for begin, run in zip(begins, runs, strict=True)]
+        moved = [body_increments(run.pose[edge]) for run, edge in zip(runs, edges, strict=True)]
+        first = np.concatenate([s + begin for s, begin in zip(steps.first, begins, strict=True)])
+        dt = np.add.reduceat(steps.heard.dt, first)
+        run = np.repeat(np.arange(len(runs)), [len(begin) for begin in begins])
+        return cls(steps, first, dt, np.concatenate(moved) / dt[:, None], run)
+
+    @property
+    def signals(self) -> Heard:
+        """What was measured, each window as one step."""
+        heard = self.steps.heard
+        current = None if heard.current is None else self.means(heard.current)
+        turn = np.add.reduceat(heard.turn, self.first)
+        return replace(heard, dt=self.dt, turn=turn, current=current, gyro=None, command=None)
+
+    def means(self, values: Float[np.ndarray, "step *any"]) -> Float[np.ndarray, "window *any"]:
+        """Mean over time of every window."""
+        one = [1] * (values.ndim - 1)
+        total = np.add.reduceat(values * self.steps.heard.dt.reshape(-1, *one), self.first)
+        return np.asarray(total / self.dt.reshape(-1, *one))
+
+    def rows(self, parts: Float[np.ndarray, "step 3 k"], machine: Machine) -> "Rows":
+        """What of the encoders' displacement is too much, as a sum of parts with weights.
+
+        gap = (rolling - twist) dt = sum_k weight_k part_k dt, yaw times the base radius.
+        """
+        gap = self.means(self.steps.heard.rolling(machine)) - self.twist
+        scale = self.dt[:, None] * machine.size
+        return Rows(self.means(parts) * scale[..., None], gap * scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Equations that are linear in a method's coefficients, three for each window.
+
+    Attributes:
+        parts: displacement that each coefficient takes from the encoders [m per unit].
+        gap: displacement to be taken from them [m].
+    """
+
+    parts: Float[np.ndarray, "window 3 k"]
+    gap: Float[np.ndarray, "window 3"]
+
+
+def least(a: Float[np.ndarray, "row k"], b: Float[np.ndarray, " row"]) -> Float[np.ndarray, " k"]:
+    """Least squares with columns of one length; of many solutions the shortest in those lengths."""
+    size = np.linalg.norm(a, axis=0)
+    # a column of nothing but rounding says nothing
+    size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
+    return np.asarray(np.linalg.lstsq(a / size, b, rcond=1e-6)[0] / size)
+
+
+@dataclass(frozen=True)
+class TwistModel(SlipModel, abc.ABC):
+    """A slip model that gives the body twist of every step, from the signals of its run.
+
+    Attributes:
+        coefficients: fitted numbers; None before a fit, and of a model that learns nothing.
+    """
+
+    learns: ClassVar[bool] = True
+    """Whether numbers are fitted."""
+    by_load: ClassVar[bool] = False
+    """Whether `slipid compare` fits every load set-up of a floor by itself."""
+    coefficients: np.ndarray | None = field(default=None, kw_only=True)
+
+    @abc.abstractmethod
+    def learn(self, w: TrainingWindows, machine: Machine) -> Self:
+        """The model fitted to windows."""
+
+    @abc.abstractmethod
+    def twist(self, steps: Steps, machine: Machine) -> Twists:
+        """Body twist of every step [m/s, m/s, rad/s]."""
+
+    def stiffness(self, w: TrainingWindows, machine: Machine) -> Float[np.ndarray, "k k"]:
+        """Precision of the flat coefficients by what holds them besides the windows."""
+        return np.zeros((self.numbers, self.numbers))
+
+    def fit(self, runs: Sequence[Run], machine: Machine) -> "TwistModel":
+        return self.learn(TrainingWindows.of(runs), machine) if self.learns else self
+
+    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+        steps = Steps.of(runs)
+        return steps.said(self.twist(steps, machine))
+
+    @property
+    def numbers(self) -> int:
+        return 0 if self.coefficients is None else self.coefficients.size
+
+    @property
+    def known(self) -> np.ndarray:
+        """The fitted numbers.
+
+        Raises:
+            ValueError: the model is not fitted.
+        """
+        if self.coefficients is None:
+            raise ValueError(f"{self.name}: not fitted")
+        return self.coefficients

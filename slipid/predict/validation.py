@@ -1,0 +1,230 @@
+"""Open-loop prediction of runs a fit has not seen, beside every slip model it was compared with."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.data.runs import Runs
+from slipid.model.robot import Robot
+from slipid.predict import open_loop as replay
+from slipid.predict.floor_models import FloorModels
+from slipid.predict.predictive import Contact
+from slipid.predict.score import Score, chords, lengths, scores, setups
+from slipid.support.errors import DataError
+from slipid.support.files import Content
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCHEMA = "slipid.validation/1"
+
+
+@dataclass(frozen=True)
+class ScoredRun:
+    """A run and the scores of every model on it.
+
+    Heading and speed are as commanded [deg], [m/s], None where not known; the chord is the camera's
+    straight-line displacement [m], the path its way [m], the measured end a pose (x, y [m],
+    yaw [rad]).
+    """
+
+    name: str
+    surface: str
+    load: str
+    heading_deg: float | None
+    speed: float | None
+    chord: float
+    path: float
+    measured_end: Sequence[float]
+    models: dict[str, Score]
+    session: str | None = None
+
+    def to_json(self) -> Content:
+        return asdict(self, dict_factory=told)
+
+    @classmethod
+    def of_json(cls, content: Content) -> "ScoredRun":
+        models = {name: Score(**score) for name, score in content["models"].items()}
+        return cls(**{**content, "models": models})
+
+
+def told(values: Iterable[tuple[str, object]]) -> Content:
+    """Plain values without what was not asked for."""
+    return {k: v for k, v in values if v is not None or k not in ("session", "log_density")}
+
+
+@dataclass(frozen=True)
+class FloorSummary:
+    """Scores of a model over the runs on a floor; attributes as of `Score`."""
+
+    endpoint_error_mean: float
+    endpoint_error_median: float
+    endpoint_error_over_path_mean: float
+    endpoint_error_over_path_median: float
+    length_error_mean: float
+    heading_error_median_deg: float
+    coverage90: float | None
+    energy_score: float
+    runs: int
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Runs that a fit predicted open loop, model by model; `print` shows the mean errors.
+
+    Attributes:
+        runs: with the scores of every model.
+        new: how many of them the fit has not seen.
+    """
+
+    runs: tuple[ScoredRun, ...]
+    new: int = 0
+
+    def __str__(self) -> str:
+        return self.table
+
+    @property
+    def which(self) -> str:
+        """A line on how many runs the fit has not seen."""
+        return f"{self.new} of {len(self.runs)} runs are new to the fit"
+
+    def plot(self) -> "Figure":
+        """End-point errors of every model."""
+        from slipid.plots.compare import ladder_figure
+
+        return ladder_figure(self.to_json(), self.which)
+
+    @property
+    def summary(self) -> dict[str, dict[str, FloorSummary]]:
+        """Means by floor and model; a floor with another load set-up is a floor of its own."""
+        return {
+            name: {m: _mean([run.models[m] for run in runs]) for m in runs[0].models}
+            for name, runs in by_floor(self.runs).items()
+        }
+
+    def to_json(self) -> Content:
+        summary = {
+            floor: {model: asdict(one) for model, one in models.items()}
+            for floor, models in self.summary.items()
+        }
+        runs = [run.to_json() for run in self.runs]
+        return {"schema": SCHEMA, "summary": summary, "runs": runs}
+
+    @property
+    def table(self) -> str:
+        """Mean end-point error in percent, one line per floor, one column per model."""
+        floors = self.summary
+        models = list(next(iter(floors.values())))
+        first = f"{'end-point error, %':18}" + "".join(f"{m:>16}" for m in models)
+        lines = [f"{first}{'runs':>6}"]
+        for floor, by in floors.items():
+            cells = "".join(f"{100 * by[m].endpoint_error_mean:16.2f}" for m in models)
+            lines.append(f"{floor:18}{cells}{by[models[0]].runs:6d}")
+        return "\n".join(lines)
+
+
+def validation(fit: Contact, models: Sequence[FloorModels], data: Runs, new: int = 0) -> Validation:
+    """Prediction of runs of known floors by a fit, beside every slip model fitted on the same runs.
+
+    The fit has not seen `new` of the runs.
+
+    The fit has not seen `new` of the runs.
+
+    As in `folds`, every run is predicted as of a session of its own: what its session
+    shares widens its region by the variance found in fitting, whether or not other runs of that
+    session were fitted. A run begins at its first pose after the wheels moved 10 mm.
+
+    Raises:
+        DataError: a run on a floor or with a load set-up that was not identified.
+    """
+    _known(fit.robot, data)
+    runs: dict[int, ScoredRun] = {}
+    for w in replay.cuts(data, fit.robot):
+        add_scores(runs, data, fit.name, *fit.ends(w))
+        for model in models:
+            tracks = replay.follow(fit.robot, w, model.increments(w, fit.robot))
+            add_scores(runs, data, model.name, tracks, None)
+    return Validation(tuple(runs[k] for k in range(len(data))), new)
+
+
+def _known(robot: Robot, data: Runs) -> None:
+    for log in data.logs:
+        for what, name, known in (
+            ("surface", log.surface, robot.surfaces.labels),
+            ("load set-up", log.load, robot.body.loads),
+        ):
+            if name not in known:
+                raise DataError(
+                    f"{log.name}: {what} '{name}' was not identified; "
+                    f"identified: {', '.join(known)}"
+                )
+
+
+def add_scores(
+    runs: dict[int, ScoredRun],
+    data: Runs,
+    model: str,
+    tracks: replay.Tracks,
+    cov: Float[np.ndarray, "run 2 2"] | None,
+) -> None:
+    """Write the scores of a model's tracks into those of their runs.
+
+    `runs` go by their number in `data`; those that are met for the first time are added. `cov` is
+    of the ends, None for a model without.
+    """
+    found = scores(tracks.predicted, tracks.measured, cov)
+    chord, path = chords(tracks.measured), lengths(tracks.measured)
+    for n, k in enumerate(tracks.run.tolist()):
+        log = data.logs[k]
+        if k not in runs:
+            runs[k] = ScoredRun(
+                name=log.name,
+                surface=str(log.surface),
+                load=log.load,
+                heading_deg=finite(np.degrees(data.heading[k])),
+                speed=finite(data.speed[k]),
+                chord=chord[n],
+                path=path[n],
+                measured_end=tracks.measured[n, -1].tolist(),
+                models={},
+            )
+        runs[k].models[model] = found[n]
+
+
+def finite(x: float) -> float | None:
+    """A number, None for one that is not."""
+    return float(x) if np.isfinite(x) else None
+
+
+def by_floor(runs: Sequence[ScoredRun]) -> dict[str, list[ScoredRun]]:
+    """Runs of every floor, those of other load set-ups by themselves.
+
+    A set-up other than the one as built, else the most common, is written `<floor>@<load>`.
+    """
+    groups: dict[str, list[ScoredRun]] = {}
+    for name, run in zip(
+        setups([r.surface for r in runs], [r.load for r in runs]), runs, strict=True
+    ):
+        groups.setdefault(name, []).append(run)
+    return dict(sorted(groups.items()))
+
+
+def _mean(each: Sequence[Score]) -> FloorSummary:
+    def all_of(name: str) -> np.ndarray:
+        return np.array([getattr(s, name) for s in each if getattr(s, name) is not None], float)
+
+    covered = all_of("covered90")
+    return FloorSummary(
+        endpoint_error_mean=float(np.mean(all_of("endpoint_error"))),
+        endpoint_error_median=float(np.median(all_of("endpoint_error"))),
+        endpoint_error_over_path_mean=float(np.mean(all_of("endpoint_error_over_path"))),
+        endpoint_error_over_path_median=float(np.median(all_of("endpoint_error_over_path"))),
+        length_error_mean=float(np.mean(all_of("length_error"))),
+        heading_error_median_deg=float(np.median(all_of("heading_error_deg"))),
+        coverage90=float(np.mean(covered)) if covered.size else None,
+        energy_score=float(np.mean(all_of("energy_score"))),
+        runs=len(each),
+    )

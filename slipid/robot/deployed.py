@@ -1,0 +1,301 @@
+"""What an estimator and a controller know of an identified robot, as arrays."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.model.contact_law import ContactSurface
+from slipid.model.geometry import Frame, Geometry, at_drives, at_wheels
+from slipid.model.motor import Motor
+from slipid.robot.filter.effects import Told
+from slipid.robot.record import LoadRecord, Numbers, RobotRecord
+from slipid.robot.robot_file import ANEW, check, read_robot, shape_of, write_robot
+from slipid.robot.unseen import with_unseen
+from slipid.support.errors import DataError
+
+
+class RobotArrays(eqx.Module):
+    """An identified robot with one load set-up as arrays: what estimators and controllers hold.
+
+    Compiled code depends on what is static here, the robot's structure, and on no number: robots of
+    one structure share it.
+
+    Attributes:
+        frame: wheel directions; `places`: wheel centres in the body frame [m].
+        forward: J (drive, 3); `inverse`: its pseudo-inverse. A drive is a motor with its encoder
+            and ammeter; all but robots with several wheels on a drive have one for every wheel.
+        motor: of every wheel.
+        floors: stacked, a row per floor in the order of `labels`.
+        rest: load shares at rest.
+        mass: [kg].
+        process: std of what the model misses, growing with the root of the distance, along and
+            across [m/sqrt(m)] and in yaw [rad/sqrt(m)].
+        effect: std of what it misses all the way, [m/m], [m/m], [rad/m]; the spread of the fitted
+            numbers included.
+        told: what the fitted runs tell of that effect, by direction of travel and speed.
+        friction_covariance: of the log frictions, by the spread of the fitted numbers.
+        current_std: of the current that flows from the model's, the ammeter's noise aside [A].
+        current_trend: a + b v, measured currents over the model's at speed v [A, A s/m].
+        highest: wheel speed up to which the fit has seen the robot [rad/s], and the model's largest
+            current up to 0.8 of it [A].
+        wheel_curve: a + b |I|, the slip ratio of each drive, of all floors together (drive, 2).
+        drive_of, around: of the wheels, as of `slipid.model.geometry.Geometry`.
+        unseen: for each floor, whether nobody drove on it.
+    """
+
+    frame: Frame
+    places: Float[Array, "wheel 2"]
+    forward: Float[Array, "drive 3"]
+    inverse: Float[Array, "3 drive"]
+    motor: Motor
+    floors: ContactSurface
+    rest: Float[Array, " wheel"]
+    mass: Float[Array, ""]
+    process: Float[Array, "floor 3"]
+    effect: Float[Array, "floor 3"]
+    told: Told
+    friction_covariance: Float[Array, "floor floor"]
+    current_std: Float[Array, " floor"]
+    current_trend: Float[Array, "2"]
+    highest: Float[Array, "2"]
+    wheel_curve: Float[Array, "drive 2"]
+    drive_of: tuple[int, ...] = eqx.field(static=True)
+    around: tuple[int, ...] = eqx.field(static=True)
+    unseen: tuple[bool, ...] = eqx.field(static=True)
+
+    @property
+    def arrays(self) -> "RobotArrays":
+        """The robot without its record."""
+        return RobotArrays(**{f.name: getattr(self, f.name) for f in fields(RobotArrays)})
+
+    @property
+    def wheels(self) -> int:
+        """Number of wheels."""
+        return len(self.around)
+
+    @property
+    def drives(self) -> int:
+        """Number of drives: as many angles, currents and voltages are measured."""
+        return len(set(self.drive_of)) or self.wheels
+
+    @property
+    def by_wheels(self) -> Float[Array, "3 wheel"]:
+        """Twist per rim speed of every wheel, where those of a drive turn alike."""
+        if not self.drive_of:
+            return self.inverse
+        return self.inverse @ self.on_average(jnp.eye(self.wheels)).T
+
+    def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
+        """What every wheel has of its drive, such as its speed."""
+        return at_wheels(self.drive_of, of_drives)
+
+    def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
+        """What every drive has of all its wheels together, such as their torque."""
+        return at_drives(self.drive_of, of_wheels)
+
+    def on_average(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
+        """Mean of what the wheels of every drive have."""
+        if not self.drive_of:
+            return of_wheels
+        return self.at_drives(of_wheels) / self.at_drives(jnp.ones(self.wheels))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the floors, in the order of every `floor` axis."""
+        return self.floors.labels
+
+
+class DeployedRobot(RobotArrays):
+    """An identified robot, ready to be deployed: what robot.json holds, for one load set-up.
+
+    Attributes:
+        record: every number with its interval, verdict and provenance.
+        load_setup: name of the load set-up.
+    """
+
+    record: RobotRecord = eqx.field(static=True)
+    load_setup: str = eqx.field(static=True)
+
+    @property
+    def steers(self) -> bool:
+        """Whether its wheels can be asked for any twist, each of them alone.
+
+        Else it has an estimator, but no controller: `slipid.robot.controller` asks for motion
+        sideways as well.
+        """
+        shape = shape_of(self.record)
+        return not shape.drive_of and shape.determines_twist
+
+    @classmethod
+    def of(cls, record: RobotRecord, load: str | None = None) -> "DeployedRobot":
+        """The robot of a record, as it drives with a load set-up, the first one by default.
+
+        Raises:
+            ValueError: no such load set-up, or a number that is missing or out of its bounds.
+        """
+        check(record)
+        return _arrays(record, load, {path: n.value for path, n in record.parameters.items()})
+
+    @classmethod
+    def load(cls, path: Path | str, load: str | None = None) -> "DeployedRobot":
+        """The robot of a file that `slipid identify`, `slipid sample` or `save` wrote.
+
+        It drives with a load set-up of this name, the first one by default.
+
+        Raises:
+            DataError: the file is absent, damaged, changed or of a newer version, or has no such
+                load set-up.
+        """
+        record = read_robot(Path(path))
+        try:
+            record.load_index(load)
+        except ValueError as error:
+            raise DataError(f"{path}: {error}") from error
+        try:
+            return cls.of(record, load)
+        except ValueError as error:
+            raise DataError(f"{path}: {error}; {ANEW}") from error
+
+    def save(self, path: Path | str) -> None:
+        """Write robot.json, with all load set-ups.
+
+        Raises:
+            ValueError: arrays were changed since the robot was made, which no file would tell.
+            DataError: nothing can be written there.
+        """
+        same = DeployedRobot.of(self.record, self.load_setup)
+        pairs = zip(jax.tree.leaves(self), jax.tree.leaves(same), strict=True)
+        if not all(np.array_equal(a, b) for a, b in pairs):
+            raise ValueError(
+                "arrays of this robot are not those of its record; expected both alike"
+            )
+        write_robot(Path(path), self.record)
+
+    def on(self, *floors: str) -> "DeployedRobot":
+        """For a place of which it is known that there are only these floors.
+
+        Raises:
+            ValueError: none, one twice, or one that is not identified; names those that are.
+        """
+        known = ", ".join(self.labels)
+        for name in floors:
+            if name not in self.labels:
+                raise ValueError(f"no floor '{name}'; identified: {known}")
+        if len(set(floors)) < max(len(floors), 1):
+            raise ValueError(f"floors {list(floors)}; expected each once of {known}")
+        rows = tuple(self.labels.index(name) for name in floors)
+        return DeployedRobot.of(self.record.on(rows), self.load_setup)
+
+    def with_unseen(self) -> "DeployedRobot":
+        """For a place that may have floors on which nobody drove, `unseen_1` and on.
+
+        An estimator of it takes a strange floor for the one of them that fits the currents best,
+        and says how unsure that is; without them it is taken for a floor that is known. See
+        `slipid.robot.unseen`.
+        """
+        return DeployedRobot.of(with_unseen(self.record), self.load_setup)
+
+
+def recorded(robot: RobotArrays) -> DeployedRobot:
+    """The same robot, once it is sure that it has its record.
+
+    Raises:
+        ValueError: these are arrays alone.
+    """
+    if not isinstance(robot, DeployedRobot):
+        raise ValueError(
+            "arrays of a robot without its record; expected a DeployedRobot, or settings and gains "
+            "to go with the arrays"
+        )
+    return robot
+
+
+def drawn(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
+    """Robots that the posterior holds possible, stacked along a leading axis.
+
+    What runs differ by stays in `DeployedRobot.effect`; the spread of the numbers is in the draws.
+    What is told of effects is so with the robot's own numbers, and the same part of them is left.
+    What the robot was seen with (`highest`, `wheel_curve`) is that of the robot.
+    """
+    record, one = robot.record, []
+    plain = {path: n.value for path, n in record.parameters.items()}
+    for k in picked:
+        values = plain | {path: rows[k] for path, rows in record.draws.items()}
+        one.append(_arrays(record, robot.load_setup, values, spread=False))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
+
+
+def _arrays(
+    record: RobotRecord, load: str | None, values: Mapping[str, Numbers], spread: bool = True
+) -> DeployedRobot:
+    """The arrays of a record at some values of its numbers, by path.
+
+    With `spread` their uncertainty counts as an effect.
+    """
+    place = record.load_index(load)
+    chosen, wheels, floors = record.loads[place], record.wheels, record.floors
+
+    def of(prefix: str, kind: type[eqx.Module]) -> dict[str, Array]:
+        names = [f.name for f in fields(kind) if "parameter" in f.metadata]
+        return {name: _array(values[f"{prefix}.{name}"]) for name in names}
+
+    shape: dict[str, Any] = of("robot", Geometry) | vars(wheels)
+    geometry = Geometry(**shape)
+    rows = [of(f"surface.{floor.name}", ContactSurface) for floor in floors]
+    effect = _array([floor.effect for floor in floors])
+    whole = jnp.sqrt(effect**2 + _array(chosen.spread) ** 2)
+    return DeployedRobot(
+        frame=geometry.frame(),
+        places=jnp.asarray(geometry.place) * geometry.base_radius,
+        forward=geometry.forward(),
+        inverse=geometry.least(),
+        motor=Motor(**of("motor", Motor), gear_ratio=_array(wheels.gear_ratio)),
+        floors=ContactSurface(
+            **{name: jnp.stack([row[name] for row in rows]) for name in rows[0]},
+            labels=record.labels,
+        ),
+        rest=_array(values[f"robot.load_share@{chosen.name}"]),
+        mass=_array(values["robot.mass"]),
+        process=_array([floor.process for floor in floors]),
+        effect=whole if spread else effect,
+        told=_told(chosen, whole),
+        friction_covariance=_friction_covariance(record) * spread,
+        current_std=_array([floor.current_std for floor in floors]),
+        current_trend=_array(record.current_trend),
+        highest=_array([record.highest_speed, chosen.highest_current]),
+        wheel_curve=_array(chosen.wheel_curve),
+        drive_of=wheels.drive_of,
+        around=geometry.around,
+        unseen=tuple(floor.unseen for floor in floors),
+        record=record,
+        load_setup=chosen.name,
+    )
+
+
+def _array(value: Numbers | Sequence[object]) -> Array:
+    return jnp.asarray(value, dtype=float)
+
+
+def _told(load: LoadRecord, whole: Array) -> Told:
+    """What is told of effects, what is left over the whole std of every floor."""
+    if load.told is None:
+        return Told.nothing(len(whole))
+    mean, left = _array(load.told.mean), _array(load.told.left)
+    part = left / jnp.maximum(whole[:, None, None], 1e-12)
+    return Told(jnp.log(_array(load.told.speeds)), jnp.concatenate([mean, part], axis=-1))
+
+
+def _friction_covariance(record: RobotRecord) -> Array:
+    """Covariance of the floors' log frictions over the posterior; of fixed ones zero."""
+    still = (1.0,) * max(record.drawn, 1)
+    paths = [f"surface.{name}.friction" for name in record.labels]
+    logs = np.log(np.array([record.draws.get(path, still) for path in paths], dtype=float))
+    off = logs - logs.mean(axis=1, keepdims=True)
+    return jnp.asarray(off @ off.T / off.shape[1])

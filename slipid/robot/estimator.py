@@ -1,0 +1,225 @@
+"""Slip, surface and pose from wheel speed and current, and odometry that knows no contact.
+
+In `Estimator` wheel readings go through a filter over the floors under the wheels (`floor_filter`)
+to the motion of the body, and that through a filter of the pose (`pose_filter`):
+
+    xi = sum_c p_c xi_c,   pose <- pose * exp(xi dt) * (late news of the floors)
+"""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from slipid.model.se2 import advance, compose
+from slipid.robot.deployed import RobotArrays
+from slipid.robot.filter.floor import Floor
+from slipid.robot.filter.floor_filter import FloorFilter, FloorState, Tick, length
+from slipid.robot.filter.hypotheses import hypotheses_of
+from slipid.robot.filter.pose_filter import PoseFilter, turned_axes
+from slipid.robot.filter.pose_fix import PoseState, placed
+from slipid.robot.filter.wheels import WheelState, read_currents, read_wheels, time_step
+from slipid.robot.interface import AbstractEstimator, Estimate, Pose, Readings, Settings, as_arrays
+
+CURRENT_FROM = 0.4
+"""Current from which the 2021 paper's deployed estimator counts slip [A]."""
+
+
+class EstimatorState(eqx.Module):
+    """What an estimator keeps from step to step.
+
+    Attributes:
+        wheels: how they turn; current: of the motors, filtered [A].
+        floors: what is believed of them; place: pose and covariance.
+        stuck: for how long the body has hardly moved while its wheels turn [s].
+    """
+
+    wheels: WheelState
+    current: Float[Array, " drive"]
+    floors: FloorState
+    place: PoseState
+    stuck: Float[Array, ""]
+
+
+class Estimator(AbstractEstimator[EstimatorState]):
+    """Filter over the floors under the wheels, with pose and covariance.
+
+    Attributes:
+        robot: the identified robot; its `labels` name the floors in the order of
+            `Estimate.surface_probability`.
+        settings: by default as the robot's logs were.
+        floor: map of the place, its surfaces by number in the robot's `labels`; None where there
+            is none.
+    """
+
+    robot: RobotArrays
+    settings: Settings
+    floor: Floor | None = None
+
+    def __init__(
+        self, robot: RobotArrays, settings: Settings | None = None, floor: Floor | None = None
+    ):
+        self.robot, self.floor = robot.arrays, floor
+        self.settings = as_arrays(Settings.of(robot) if settings is None else settings)
+
+    def init(
+        self, pose: Pose = (0.0, 0.0, 0.0), std: tuple[float, float] = (0.0, 0.0)
+    ) -> EstimatorState:
+        """State of a robot at rest at a pose [m, m, rad] that is known so well [m], [rad]."""
+        f, s = self.robot, self.settings
+        return EstimatorState(
+            wheels=WheelState.init(f, s),
+            current=jnp.zeros(f.drives),
+            floors=FloorFilter(f, s).init(),
+            place=PoseFilter(f, s).init(jnp.asarray(pose, dtype=float), std),
+            stuck=jnp.zeros(()),
+        )
+
+    def advance(
+        self, state: EstimatorState, z: Readings, dt: Float[Array, ""]
+    ) -> tuple[EstimatorState, Estimate]:
+        """One time step; see `AbstractEstimator.step`."""
+        f, s, old = self.robot, self.settings, state
+        dt = time_step(dt, s)
+        wheels = read_wheels(f, s, old.wheels, z, dt)
+        w = wheels.speed
+        currents = read_currents(f, s, old.current, z, w, dt)
+        tick = Tick(
+            dt=dt,
+            moves=jnp.max(jnp.abs(f.frame.radius * w)) > s.still_m_s,
+            acceleration=jnp.max(jnp.abs(w - old.wheels.speed)) / jnp.maximum(dt, 1e-3),
+        )
+        gyro = jnp.where(jnp.isfinite(z.gyro) & (jnp.abs(z.gyro) < 50.0), z.gyro, jnp.nan)
+        turn = gyro - old.place.nuisance[-1]
+        by_floor, by_pose, before = FloorFilter(f, s), PoseFilter(f, s), old.place
+        if self.floor is None:
+            floors, motion = by_floor.step(old.floors, w, currents, turn, tick)
+        else:
+            hypotheses = hypotheses_of(f).under
+            root, supports = by_pose.mapped(before, self.floor, hypotheses)
+            mapped = jnp.mean(supports, axis=0)
+            floors, motion = by_floor.step(old.floors, w, currents, turn, tick, mapped)
+            before, left = placed(before, root, supports, motion)
+            supports = by_pose.mapped(before, self.floor, hypotheses)[1]
+            floors = _corrected(floors, left, before, jnp.mean(supports, axis=0))
+        place, twist, left = by_pose.step(before, motion, gyro, z, tick)
+        floors = replace(floors, apart=floors.apart @ left.T)
+        stuck = self._stuck(old.stuck, w, twist, tick)
+        new = EstimatorState(wheels, currents.filtered, floors, place, stuck)
+        unknown = floors.belief[-1]
+        none = jnp.full((f.wheels, 1), unknown)
+        return new, Estimate(
+            pose=place.pose,
+            twist=twist,
+            slip=self._slip(w, twist),
+            wheel_speed=w,
+            current=currents.filtered,
+            surface_probability=jnp.concatenate([motion.under * (1 - unknown), none], axis=1),
+            covariance=place.covariance[:3, :3],
+            stale=jnp.any(wheels.age > s.stale_s),
+            immobilised=stuck > 0.4,
+            out_of_range=self._beyond(w, currents.filtered, unknown),
+            labels=f.labels,
+        )
+
+    def _slip(self, w: Array, twist: Array) -> Array:
+        """Slip ratio of each drive, 0 for one that stands."""
+        f, turns = self.robot, jnp.abs(w) > 1e-3
+        rim = f.frame.radius * jnp.where(turns, w, 1.0)
+        return jnp.where(turns, jnp.clip(1 - f.forward @ twist / rim, -2.0, 2.0), 0.0)
+
+    def _stuck(self, before: Array, w: Array, twist: Array, tick: Tick) -> Array:
+        """For how long the body has hardly moved while its wheels turn [s].
+
+        Source: Ward and Iagnemma 2008, below a fifth of the wheels' speed.
+        """
+        f = self.robot
+        speed = length((f.inverse @ (f.frame.radius * w))[:2])
+        blocked = tick.moves & (speed > 0.02) & (length(twist[:2]) < 0.2 * speed)
+        return jnp.where(blocked, jnp.minimum(before + tick.dt, 1e3), 0.0)
+
+    def _beyond(self, w: Array, amps: Array, unknown: Array) -> Bool[Array, ""]:
+        """Whether speed or currents leave what the fit has seen, or no floor explains them."""
+        highest = self.robot.highest
+        fast = jnp.max(jnp.abs(w)) > 1.3 * highest[0]
+        return fast | (jnp.max(jnp.abs(amps)) > 1.3 * highest[1]) | (unknown > 0.5)
+
+
+def _corrected(floors: FloorState, left: Array, place: PoseState, expected: Array) -> FloorState:
+    """Hypotheses once a map has corrected the pose, `left` in the world's axes."""
+    world = turned_axes(place.pose[2])
+    return replace(floors, apart=floors.apart @ (world.T @ left @ world).T, expected=expected)
+
+
+class OdometryState(eqx.Module):
+    """What wheel-by-wheel odometry keeps from step to step.
+
+    Attributes:
+        pose: x, y [m], heading [rad].
+        wheels: how they turn; current: of the motors, smoothed and without a sign [A].
+    """
+
+    pose: Float[Array, "3"]
+    wheels: WheelState
+    current: Float[Array, " drive"]
+
+
+class Odometry(AbstractEstimator[OdometryState]):
+    """Wheel-by-wheel odometry, w_eff = w (1 - s).
+
+    Attributes:
+        settings: by default as the robot's logs were.
+        curve: whether slip is taken from `DeployedRobot.wheel_curve`, a + b |I| where the smoothed
+            current exceeds `CURRENT_FROM`, as the 2021 paper's robot did; else the encoders are
+            believed.
+    """
+
+    robot: RobotArrays
+    settings: Settings
+    curve: bool = eqx.field(static=True)
+
+    def __init__(self, robot: RobotArrays, settings: Settings | None = None, curve: bool = False):
+        self.robot, self.curve = robot.arrays, curve
+        self.settings = as_arrays(Settings.of(robot) if settings is None else settings)
+
+    def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> OdometryState:
+        """State of a robot at rest at a pose [m, m, rad]."""
+        return OdometryState(
+            pose=jnp.asarray(pose, dtype=float),
+            wheels=WheelState.init(self.robot, self.settings),
+            current=jnp.zeros(self.robot.drives),
+        )
+
+    def advance(
+        self, state: OdometryState, z: Readings, dt: Float[Array, ""]
+    ) -> tuple[OdometryState, Estimate]:
+        """One time step; see `AbstractEstimator.step`. Neither gyro nor pose fixes are used."""
+        f, s, old = self.robot, self.settings, state
+        dt = time_step(dt, s)
+        wheels = read_wheels(f, s, old.wheels, z, dt)
+        w = wheels.speed
+        known = jnp.isfinite(z.current) & (jnp.abs(z.current) < 10.0 * f.highest[1])
+        a = 1 - jnp.exp(-dt / 0.6)  # exponential with 0.97 a row, as on the paper's robot
+        smoothed = old.current + a * (jnp.abs(z.current) - old.current)
+        amps = jnp.where(known, smoothed, old.current)
+        slip = jnp.zeros_like(w)
+        if self.curve:
+            line = f.wheel_curve[:, 0] + f.wheel_curve[:, 1] * amps
+            slip = jnp.where(amps > CURRENT_FROM, jnp.clip(line, 0.0, 0.95), 0.0)
+        twist = f.inverse @ (f.frame.radius * w * (1 - slip))
+        pose = compose(old.pose, advance(twist, dt))
+        unknown = jnp.zeros((f.wheels, len(f.labels) + 1)).at[:, -1].set(1.0)
+        return OdometryState(pose=pose, wheels=wheels, current=amps), Estimate(
+            pose=pose,
+            twist=twist,
+            slip=slip,
+            wheel_speed=w,
+            current=amps,
+            surface_probability=unknown,
+            covariance=jnp.zeros((3, 3)),
+            stale=jnp.any(wheels.age > s.stale_s),
+            immobilised=jnp.zeros((), bool),
+            out_of_range=jnp.max(jnp.abs(w)) > 1.3 * f.highest[0],
+            labels=f.labels,
+        )

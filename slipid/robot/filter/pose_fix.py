@@ -1,0 +1,220 @@
+"""The pose with what is unknown beside it, and what late news make of both and of their history."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from slipid.robot.filter.floor import SPREAD
+from slipid.robot.filter.floor_filter import Motion
+from slipid.robot.interface import Readings
+
+HISTORY = 48
+"""Steps a delayed measurement may reach back."""
+TRUST = 0.25
+"""Part of the evidence for floors that counts for the pose: one map is wrong in many steps."""
+
+
+class PoseState(eqx.Module):
+    """Pose, what else is unknown, and how sure both are.
+
+    Attributes:
+        pose: x, y [m], heading [rad].
+        nuisance: effects of every floor along, across and in yaw beyond what is told of them, in
+            stds left, by how much its log friction is off, the doubt d [1], then the gyro's bias
+            [rad/s].
+        covariance: of pose and nuisance [units of both].
+        toward: direction of travel that counts as taken, see `slipid.robot.filter.effects`.
+        still: for how long the robot has stood [s].
+        noise: covariance that has come into the pose over the history [m, m, rad, each times each].
+        far: way over the history [m].
+        push: d pose / d nuisance per metre of the last way, the gyro's bias left out [m/m, m/m,
+            rad/m].
+        history: last steps, the newest first: age [s], pose [m, m, rad], yaw rate of the contact
+            model [rad/s], noise and way until then.
+    """
+
+    pose: Float[Array, "3"]
+    nuisance: Float[Array, " nuisance"]
+    covariance: Float[Array, "unknown unknown"]
+    toward: Float[Array, "3"]
+    still: Float[Array, ""]
+    noise: Float[Array, "3 3"]
+    far: Float[Array, ""]
+    push: Float[Array, "3 push"]
+    history: Float[Array, "entry 15"]
+
+
+def fixed(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3"]]:
+    """Corrected by a pose fix of some time ago, if there is one, and what it leaves of a gap."""
+    age = jnp.where(jnp.isfinite(z.fix_age) & (z.fix_age >= 0), z.fix_age, 0.0)
+    has = (
+        jnp.all(jnp.isfinite(z.fix))
+        & jnp.all(jnp.abs(z.fix[:2]) < 1e4)
+        & jnp.all(jnp.isfinite(z.fix_std))
+        & jnp.all(z.fix_std > 0)
+        & (age < now.history[-1, 0] + 1e-6)
+    )
+    std = jnp.clip(z.fix_std, 1e-4, 10.0)
+    kept = now.pose, now.nuisance, now.covariance, now.history, jnp.eye(3)
+    found = jax.lax.cond(has, lambda: _corrected(now, z.fix, std, age), lambda: kept)
+    pose, nuisance, covariance, history, left = found
+    new = replace(now, pose=pose, nuisance=nuisance, covariance=covariance, history=history)
+    return new, left
+
+
+def _corrected(
+    now: PoseState, fix: Array, std: Array, age: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Pose, nuisance, covariance and history after a fix of the pose as it was `age` ago [s].
+
+    The last is what is left of how far another pose is from this one. What nuisance has done since
+    then is as on the last way. The noise that came in since then, a covariance of the pose, the fix
+    has not seen: it is set aside. What the pose no longer holds of it, a later fix having seen it,
+    is so much noise of this one.
+    """
+    pose, cov, history = now.pose, now.covariance, now.history
+    then = nearest(history, age)
+    since = now.noise - then[5:14].reshape(3, 3)
+    held = _within(since, _given(cov))
+    aside = jnp.zeros_like(cov).at[:3, :3].set(held)
+    cov = cov - aside
+    gap = fix - then[1:4]
+    gap = gap.at[2].set(jnp.arctan2(jnp.sin(gap[2]), jnp.cos(gap[2])))
+    gone = pose[:2] - then[1:3]
+    look = jnp.zeros((3, cov.shape[0])).at[:, :3].set(jnp.eye(3))
+    look = look.at[0, 2].set(gone[1]).at[1, 2].set(-gone[0])
+    look = look.at[:, 3:-1].set(-now.push * (now.far - then[14]))
+    noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2) + since - held
+    rows = look @ cov
+    total = rows @ look.T + noise
+    # a fix far from what is believed counts less, yet counts
+    far = gap @ _inverse(total) @ gap
+    total = total + noise * jnp.maximum(far / 9.0 - 1.0, 0.0)
+    gain = rows.T @ _inverse(total)
+    change = gain @ gap
+    cov = cov - gain @ rows
+    cov = 0.5 * (cov + cov.T) + aside
+    history = shifted(history, pose, jnp.broadcast_to(change[:3], (len(history), 3)))
+    left = jnp.eye(3) - gain[:3] @ look[:, :3]
+    return pose + change[:3], now.nuisance + change[3:], cov, history, left
+
+
+def placed(
+    now: PoseState,
+    root: Float[Array, "3 3"],
+    supports: Float[Array, "sample hypothesis"],
+    motion: Motion,
+) -> tuple[PoseState, Float[Array, "3 3"]]:
+    """Corrected by what is believed of the floors, where a map has them elsewhere.
+
+    The second is what it leaves of how far another pose is from this one, in the world's axes.
+
+    Args:
+        now: pose and covariance; root: of the pose's covariance, as the poses were drawn.
+        supports: probability of every hypothesis at every pose drawn, see `Floor.supports`.
+        motion: what is believed of the hypotheses, before this step's evidence and after.
+    """
+    share = supports / jnp.maximum(jnp.mean(supports, axis=0), 1e-12)
+    weight = (share @ motion.known) / jnp.maximum(share @ motion.before, 1e-12)
+    weight = weight**TRUST
+    weight = weight / jnp.sum(weight)
+    mean = weight @ SPREAD
+    scatter = (SPREAD - mean).T @ (weight[:, None] * (SPREAD - mean))
+    whole = root @ root.T
+    gain = now.covariance[:, :3] @ _inverse(whole)
+    lost = gain @ (whole - root @ scatter @ root.T) @ gain.T
+    change = gain @ (root @ mean)
+    history = shifted(now.history, now.pose, jnp.broadcast_to(change[:3], (len(now.history), 3)))
+    new = replace(
+        now,
+        pose=now.pose + change[:3],
+        nuisance=now.nuisance + change[3:],
+        covariance=now.covariance - lost,
+        history=history,
+    )
+    return new, root @ scatter @ root.T @ _inverse(whole)
+
+
+def handed_over(old: PoseState, motion: Motion, base: Float[Array, ""]) -> Float[Array, "entry 15"]:
+    """The history once news of the floors has moved the pose: what it knows of before moves too.
+
+    The ways of what was and of what is believed went apart until now, at the rate at which the two
+    differ now. So of a jump J a part was already true a way s ago,
+
+        1 - s (j . J) / |J|^2,   j how much further they go apart per metre of the way
+
+    between none of it and the whole, yaw as rim speed. Else a fix of before the news would have
+    moved the pose by the jump once more.
+    """
+    scale = jnp.stack([jnp.ones(()), jnp.ones(()), base])
+    jump, apart = scale * motion.jump, scale * motion.news
+    rate = apart @ jump / jnp.maximum(jump @ jump, 1e-18)
+    since = (old.far - old.history[:, 14]) / jnp.maximum(motion.course.speed, 1e-6)
+    part = jnp.clip(1 - rate * since, 0.0, 1.0)
+    c, s = jnp.cos(old.pose[2]), jnp.sin(old.pose[2])
+    x, y, yaw = motion.jump
+    world = jnp.stack([c * x - s * y, s * x + c * y, yaw])
+    return shifted(old.history, old.pose, part[:, None] * world)
+
+
+def shifted(
+    history: Float[Array, "entry 15"], pose: Float[Array, "3"], change: Float[Array, "entry 3"]
+) -> Float[Array, "entry 15"]:
+    """History of a pose that was off by so much, a turn about where it is now."""
+    back = history[:, 1:3] - pose[:2]
+    moved = change[:, :2] + change[:, 2:] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
+    return history.at[:, 1:3].add(moved).at[:, 3].add(change[:, 2])
+
+
+def _given(cov: Float[Array, "unknown unknown"]) -> Float[Array, "3 3"]:
+    """Covariance of the pose, were all else known.
+
+    No more than that can be set aside of the pose alone: what is known of the rest has part in the
+    remainder, and with more taken off, the whole would be no covariance.
+    """
+
+    def known(k: Int[Array, ""], c: Array) -> Array:
+        column, var = c[:, k], c[k, k]
+        gain = jnp.where(var > 1e-12, column / jnp.maximum(var, 1e-12), 0.0)
+        return c - jnp.outer(gain, column)
+
+    return jax.lax.fori_loop(3, len(cov), known, cov)[:3, :3]
+
+
+def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """As much of a covariance as another one can hold.
+
+    The largest eigenvalue of their quotient is at most the eighth root of the trace of its eighth
+    power, and at least 1 / 1.15 of that.
+    """
+    m = _inverse(whole) @ part
+    for _ in range(3):
+        m = m @ m
+    most = jnp.maximum(jnp.trace(m), 1e-12) ** 0.125
+    return jnp.where(jnp.isfinite(most), part / jnp.maximum(most, 1.0), 0.0)
+
+
+def recounted(now: PoseState) -> PoseState:
+    """With noise and way counted from the oldest entry of the history.
+
+    They, and ages instead of times, stay small however long a robot drives: 32 bits hold them.
+    """
+    first = now.history[-1, 5:]
+    history = now.history.at[:, 5:].add(-first)
+    return replace(
+        now, history=history, noise=now.noise - first[:9].reshape(3, 3), far=now.far - first[9]
+    )
+
+
+def nearest(history: Array, age: Array | float) -> Array:
+    """Entry nearest to an age: age, pose, yaw rate of the contact model, noise and way."""
+    return history[jnp.argmin(jnp.abs(history[:, 0] - age))]
+
+
+def _inverse(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Inverse of a positive definite matrix by the adjugate."""
+    rows = jnp.stack([jnp.cross(m[1], m[2]), jnp.cross(m[2], m[0]), jnp.cross(m[0], m[1])], axis=1)
+    return rows / jnp.maximum(m[0] @ rows[:, 0], 1e-30)

@@ -1,0 +1,300 @@
+"""JSON values as the types a dataclass declares, refused with their place where they are not.
+
+robot.json: written whole or not at all, and read with one clear sentence for all that is wrong.
+
+`robot.schema.json` beside this package describes the file for other programs.
+"""
+
+import json
+import re
+import sys
+import typing
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, fields, is_dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.model.geometry import Geometry
+from slipid.model.robot import build
+from slipid.parameter import Declaration, Entry, entries
+from slipid.robot.record import UNITS, Numbers, RobotRecord, ToldRecord
+from slipid.support.errors import DataError
+from slipid.support.files import checksum, write_bytes
+
+Kind = TypeVar("Kind")
+_MOST = sys.float_info.max
+_PLAIN = {bool: "true or false", str: "text", int: "a whole number", NoneType: "null"}
+
+
+def typed(kind: type[Kind], value: object, where: str = "") -> Kind:
+    """A JSON value as a dataclass, with every number finite, no key missing and none to spare.
+
+    Args:
+        kind: a dataclass of bool, int, float, str, None, `Literal`, tuples, mappings by str, unions
+            and dataclasses.
+        value: as `json.loads` gives it.
+        where: its place, for messages.
+
+    Raises:
+        ValueError: something is missing, too much, or of another type; says where.
+    """
+    return _as(kind, value, where)
+
+
+def _as(kind: Any, value: object, where: str) -> Any:
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        return _one_of(inner, value, where)
+    if origin is Literal:
+        if not isinstance(value, str) or value not in inner:
+            raise _wrong(where, value, " or ".join(repr(x) for x in inner))
+        return value
+    if origin is tuple:
+        return _items(inner, value, where)
+    if origin is Mapping:
+        if not isinstance(value, dict):
+            raise _wrong(where, value, "an object")
+        return {k: _as(inner[1], v, f"{where}['{k}']") for k, v in value.items()}
+    if is_dataclass(kind):
+        return _object(kind, value, where)
+    if kind is float:
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _MOST:
+            return float(value)
+        raise _wrong(where, value, "a number")
+    if type(value) is not kind:
+        raise _wrong(where, value, _PLAIN[kind])
+    return value
+
+
+def _one_of(kinds: tuple[Any, ...], value: object, where: str) -> Any:
+    if value is None and NoneType in kinds:
+        return None
+    *others, last = (k for k in kinds if k is not NoneType)
+    for k in others:
+        with suppress(ValueError):
+            return _as(k, value, where)
+    return _as(last, value, where)
+
+
+def _items(inner: tuple[Any, ...], value: object, where: str) -> tuple[Any, ...]:
+    endless = len(inner) == 2 and inner[1] is Ellipsis
+    if not isinstance(value, list):
+        raise _wrong(where, value, "a list")
+    if not endless and len(value) != len(inner):
+        raise ValueError(f"{where}: {len(value)} entries; expected {len(inner)}")
+    kinds = [inner[0]] * len(value) if endless else inner
+    return tuple(
+        _as(k, v, f"{where}[{n}]") for n, (k, v) in enumerate(zip(kinds, value, strict=True))
+    )
+
+
+def _object(kind: Any, value: object, where: str) -> Any:
+    if not isinstance(value, dict):
+        raise _wrong(where, value, "an object")
+    hints, before = typing.get_type_hints(kind), f"{where}." if where else ""
+    names = [f.name for f in fields(kind)]
+    for name in names:
+        if name not in value:
+            raise ValueError(f"{before}{name} is missing")
+    for name in value:
+        if name not in names:
+            raise ValueError(f"{before}{name}: no such field; expected {', '.join(names)}")
+    return kind(**{name: _as(hints[name], value[name], f"{before}{name}") for name in names})
+
+
+def _wrong(where: str, value: object, expected: str) -> ValueError:
+    shown = repr(value)
+    shown = shown if len(shown) <= 40 else f"{shown[:37]}..."
+    return ValueError(f"{where}: {shown}; expected {expected}")
+
+
+SCHEMA = "slipid.robot/6"
+ANEW = "copy it again, or write it anew with `slipid identify`"
+
+
+def write_robot(path: Path, record: RobotRecord) -> None:
+    """Write a robot; DataError where nothing can be written."""
+    write_bytes(path, robot_bytes(record))
+
+
+def robot_bytes(record: RobotRecord) -> bytes:
+    """Content of robot.json."""
+    content: dict[str, object] = {"schema": SCHEMA, "units": UNITS, **asdict(record)}
+    content["numbers"] = record.numbers
+    content["checksum"] = checksum(content)
+    return (_text(content) + "\n").encode()
+
+
+def read_robot(path: Path) -> RobotRecord:
+    """Read a robot; errors as of `DeployedRobot.load`."""
+    content = _content(path)
+    said = content.pop("checksum", None)
+    now = checksum(content)
+    content.pop("schema")
+    if content.pop("units", None) != UNITS:
+        raise DataError(f"{path}: other units than {SCHEMA} has; {ANEW}")
+    numbers = content.pop("numbers", None)
+    try:
+        record = typed(RobotRecord, content)
+        check(record)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}; {ANEW}") from error
+    if said != now or numbers != record.numbers:
+        raise DataError(
+            f"{path}: the content does not match its checksum, so it was changed or damaged after "
+            f"it was written; {ANEW}"
+        )
+    return record
+
+
+def _content(path: Path) -> dict[str, object]:
+    """What the file says, of a version that can be read."""
+    try:
+        content = json.loads(
+            path.read_bytes().decode("utf-8"), parse_constant=_refused, object_pairs_hook=_once
+        )
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DataError(f"{path}: {reason}; expected what `slipid identify` writes") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: no valid JSON ({error}); {ANEW}") from error
+    schema = content.get("schema") if isinstance(content, dict) else None
+    if not (isinstance(schema, str) and re.fullmatch(r"slipid\.robot/[1-9][0-9]{0,8}", schema)):
+        raise DataError(
+            f"{path}: no robot of slipid (its schema is not {SCHEMA}); expected the robot.json "
+            "that `slipid identify` writes"
+        )
+    if schema != SCHEMA:
+        newer = int(schema.partition("/")[2]) > int(SCHEMA.partition("/")[2])
+        age, then = ("a newer", "update slipid") if newer else ("an older", ANEW)
+        raise DataError(
+            f"{path}: written by {age} slipid as {schema}, this one reads {SCHEMA}; {then}"
+        )
+    return dict(content)
+
+
+def _refused(word: str) -> None:
+    raise ValueError(f"{word} is no number")
+
+
+def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        raise ValueError("a key stands there twice")
+    return content
+
+
+def _text(value: object, indent: str = "") -> str:
+    """JSON with objects over several lines and everything without objects on one."""
+    inner = indent + " "
+    if isinstance(value, dict) and value:
+        rows = [f"{inner}{json.dumps(k)}: {_text(v, inner)}" for k, v in value.items()]
+        return "{\n" + ",\n".join(rows) + f"\n{indent}}}"
+    if isinstance(value, list | tuple) and any(isinstance(v, dict) for v in value):
+        return "[\n" + ",\n".join(inner + _text(v, inner) for v in value) + f"\n{indent}]"
+    return json.dumps(value, allow_nan=False)
+
+
+def check(record: RobotRecord) -> None:
+    """Refuse a record whose parts do not fit together by a ValueError that says which and how."""
+    wheels = len(record.wheels.place)
+    if not wheels:
+        raise ValueError("wheels.place: no entries; expected one for every wheel")
+    for name in ("drive_angle", "roller_angle", "grips"):
+        _counted(f"wheels.{name}", getattr(record.wheels, name), wheels)
+    shape_of(record)  # which refuses wheels that cannot drive, and drives that turn none
+    for kind, names in (("floors", record.labels), ("loads", [x.name for x in record.loads])):
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"{kind} {list(names)}; expected one or more, each once")
+    for load in record.loads:
+        _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
+        _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, record.wheels.drives)
+        if load.told is not None:
+            _told(f"loads, {load.name}: told", load.told, len(record.floors))
+    _numbers(record)
+
+
+def shape_of(record: RobotRecord) -> Geometry:
+    """The wheels, every number at its start."""
+    plain = Geometry(**vars(record.wheels))
+    return replace(
+        plain, drive_offset=jnp.zeros(plain.wheels), radius_deviation=jnp.zeros(plain.drives)
+    )
+
+
+def _told(where: str, told: ToldRecord, floors: int) -> None:
+    """Refuse a table whose speeds do not rise, or whose rows are not as many as they should be."""
+    speeds = told.speeds
+    if not speeds or speeds[0] <= 0 or any(a >= b for a, b in pairwise(speeds)):
+        raise ValueError(f"{where}.speeds: {list(speeds)}; expected positive ones that rise")
+    around = len(told.mean[0][0]) if told.mean and told.mean[0] else 0
+    for name, table in (("mean", told.mean), ("left", told.left)):
+        _counted(f"{where}.{name}", table, floors)
+        for rows in table:
+            _counted(f"{where}.{name}, of a floor", rows, len(speeds))
+            for row in rows:
+                _counted(f"{where}.{name}, of a speed", row, max(around, 1))
+    if any(x < 0 for rows in told.left for row in rows for axes in row for x in axes):
+        raise ValueError(f"{where}.left: a std below 0")
+
+
+def declared(record: RobotRecord) -> tuple[Entry, ...]:
+    """Every number that a robot of this shape has, in order; the camera is no part of it."""
+    robot = build(shape_of(record), record.labels, [load.name for load in record.loads])
+    return tuple(e for e in entries(robot) if e.part != "camera")
+
+
+def _numbers(record: RobotRecord) -> None:
+    known = {e.path: (e.declaration, e.size) for e in declared(record)}
+    for path in known:
+        if path not in record.parameters:
+            raise ValueError(f"parameters['{path}'] is missing")
+    for path in (*record.parameters, *record.draws):
+        if path not in known:
+            raise ValueError(f"'{path}': no such number of a robot with these floors and loads")
+    for path, number in record.parameters.items():
+        (declaration, size), where = known[path], f"parameters['{path}']"
+        _inside(f"{where}.value", number.value, declaration, size)
+        if number.unit != declaration.unit:
+            raise ValueError(f"{where}.unit: '{number.unit}'; expected '{declaration.unit}'")
+        if number.std is not None:
+            _sized(f"{where}.std", number.std, size)
+        if number.interval90 is not None and (np.ndim(number.interval90) > 1) != (size > 1):
+            raise ValueError(f"{where}.interval90: expected {size} intervals")
+    counts = {len(rows) for rows in record.draws.values()}
+    if len(counts) > 1 or 0 in counts:
+        raise ValueError(f"draws: {sorted(counts)} of different numbers; expected as many of each")
+    for path, rows in record.draws.items():
+        for k, row in enumerate(rows):
+            _inside(f"draws['{path}'][{k}]", row, *known[path])
+
+
+def _counted(name: str, values: tuple[object, ...], count: int) -> None:
+    if len(values) != count:
+        raise ValueError(f"{name}: {len(values)} entries; expected {count}")
+
+
+def _sized(where: str, value: Numbers, size: int) -> None:
+    if np.shape(value) != (() if size == 1 else (size,)):
+        raise ValueError(f"{where}: expected {'one number' if size == 1 else f'{size} numbers'}")
+
+
+def _inside(where: str, value: Numbers, declaration: Declaration, size: int) -> None:
+    """Refuse a value of another size, or one out of its declared bounds."""
+    _sized(where, value, size)
+    x = np.asarray(value)
+    if declaration.shares:
+        if not ((x > 0).all() and abs(x.sum() - 1) < 1e-6):
+            raise ValueError(f"{where} = {value}: expected positive shares that sum to 1")
+    elif declaration.deviation:
+        if not abs(x.sum()) < 1e-6:
+            raise ValueError(f"{where} = {value}: expected numbers that sum to 0")
+    elif not ((x > declaration.lower) & (x < declaration.upper)).all():
+        low, high = declaration.lower, declaration.upper
+        raise ValueError(f"{where} = {value}: expected inside ({low:g}, {high:g})")

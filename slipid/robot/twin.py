@@ -1,0 +1,223 @@
+"""The identified robot as a plant: what closed-loop runs are rehearsed on.
+
+Commands reach the wheels late, a slew and a lag after; wheels on several floors move the body as
+the contact says, and what the fit says the model misses is drawn anew for every run, effects as
+`slipid.robot.filter.effects` has them:
+
+    set <- set + clip(command(t - delay) - set, slew h),   w <- w + (1 - exp(-h / lag)) (set - w)
+    xi = equilibrium(r w; floor under each wheel)
+    pose <- pose * exp(xi h + s h (told + left effect) + sqrt(s h) process)
+
+with s the speed at which the wheels would take the body if none slipped.
+
+Everything is differentiable but for which floor a wheel is on; ticks pass derivatives through.
+Differentiate forwards (`jax.jvp`, `jax.jacfwd`): readings that are no numbers would spoil a pass
+backwards.
+"""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.model import contact
+from slipid.model.robot import GRAVITY
+from slipid.model.se2 import advance, compose
+from slipid.robot.actuation import RING, Habits
+from slipid.robot.closed_loop import PERIOD
+from slipid.robot.deployed import RobotArrays
+from slipid.robot.filter.effects import Course, direction, stays
+from slipid.robot.filter.floor import Floor
+from slipid.robot.interface import Measurement, Pose, Readings
+
+
+class TwinState(eqx.Module):
+    """What is true of a twin.
+
+    Attributes:
+        pose: x, y [m], heading [rad]; twist: of the body [m/s, m/s, rad/s].
+        wanted: wheel speeds that the motors' control is set to [rad/s].
+        speed: of the wheels [rad/s]; angle: of the wheels [rad].
+        effect: what the model misses now on every floor beyond what is told, in stds left.
+        toward: direction of travel that counts as taken, see `slipid.robot.filter.effects`.
+        offset, drift: of the currents, all the way and for a moment [A].
+        bias: of the gyro [rad/s].
+        ring: commands on their way, the newest first [rad/s].
+    """
+
+    pose: Float[Array, "3"]
+    twist: Float[Array, "3"]
+    wanted: Float[Array, " wheel"]
+    speed: Float[Array, " wheel"]
+    angle: Float[Array, " wheel"]
+    effect: Float[Array, "floor 3"]
+    toward: Float[Array, "3"]
+    offset: Float[Array, " wheel"]
+    drift: Float[Array, " wheel"]
+    bias: Float[Array, ""]
+    ring: Float[Array, "command wheel"]
+
+
+class Twin(eqx.Module):
+    """A robot on a floor.
+
+    Attributes:
+        robot: as it is.
+        floor: which surface lies where, by number in `robot.labels`.
+        habits: what no fit tells.
+    """
+
+    robot: RobotArrays = eqx.field(converter=lambda robot: robot.arrays)
+    floor: Floor
+    habits: Habits = eqx.field(static=True, default=Habits())
+
+    def __check_init__(self) -> None:
+        """Refuse a delay that the ring cannot hold."""
+        most = (RING - 1) * PERIOD
+        if not 0 <= self.habits.delay_s <= most:
+            raise ValueError(f"delay_s = {self.habits.delay_s}; expected 0 to {most:g}")
+
+    def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:
+        """Standard normal numbers of a step by its number; 0 is the reading at rest."""
+        count = 3 * (self.robot.wheels + self.habits.substeps + len(self.robot.labels)) + 1
+        return jax.random.normal(jax.random.fold_in(key, number), (count,))
+
+    def init(self, pose: Pose, key: Array) -> TwinState:
+        """State at rest at a pose [m, m, rad], with what this run has of its own."""
+        f, w = self.robot, (self.robot.wheels,)
+        one, two, three = jax.random.split(jax.random.fold_in(key, 2**31 - 1), 3)
+        off = jax.random.normal(two, w) * jnp.mean(f.current_std) / jnp.sqrt(2.0)
+        zero = jnp.zeros(w)
+        return TwinState(
+            pose=jnp.asarray(pose, dtype=float),
+            twist=jnp.zeros(3),
+            wanted=zero,
+            speed=zero,
+            angle=zero,
+            effect=jax.random.normal(one, f.effect.shape),
+            toward=jnp.zeros(3),
+            offset=off,
+            drift=zero,
+            bias=self.habits.gyro_bias * jax.random.normal(three),
+            ring=jnp.zeros((RING, *w)),
+        )
+
+    def step(
+        self, state: TwinState, command: Float[Array, " wheel"], noise: Float[Array, " noise"]
+    ) -> tuple[TwinState, Readings]:
+        """State and readings a period after a command [rad/s]."""
+        old, b, h = state, self.habits, self.habits.substep
+        ring = jnp.concatenate([command[None], old.ring[:-1]])
+        shares = jnp.asarray(b.held())
+        pushes = noise[: 3 * b.substeps].reshape(-1, 3)
+        pose, xi, wanted, w, angle = old.pose, old.twist, old.wanted, old.speed, old.angle
+        for k in range(b.substeps):
+            jump = b.slew * h
+            wanted = wanted + jnp.clip(shares[k] @ ring - wanted, -jump, jump)
+            w = w + b.follow * (wanted - w)
+            pose, xi = self._roll(pose, w, old.effect, pushes[k], h)
+            angle = angle + h * w
+        now = replace(old, pose=pose, twist=xi, wanted=wanted, speed=w, angle=angle, ring=ring)
+        amps, drift = self._amps(now, noise[3 * b.substeps :])
+        turned = (pose[2] - old.pose[2]) / PERIOD
+        effect, toward = self._errs(now, noise[-3 * len(self.robot.labels) :])
+        now = replace(now, drift=drift, effect=effect, toward=toward)
+        return now, self._read(angle, w, amps, turned + old.bias, noise)
+
+    def first(self, state: TwinState, noise: Array) -> Readings:
+        """Readings of a robot at rest."""
+        still = jnp.zeros_like(state.speed)
+        return self._read(state.angle, state.speed, still, state.bias, noise)
+
+    def _roll(
+        self, pose: Array, w: Array, effect: Array, push: Array, h: float
+    ) -> tuple[Array, Array]:
+        """Pose and twist a substep later."""
+        f = self.robot
+        under = self.floor.under(pose, f.places)
+        rim = f.frame.radius * w
+        xi = contact.equilibrium(rim, f.frame, f.floors.at(under), f.rest)
+        course = Course.of(f.inverse @ rim, f.frame.base)
+        mean, part = f.told.at(course)
+        missed, far, share = mean + part * f.effect * effect, course.speed * h, f.rest[:, None]
+        off = far * jnp.sum(share * missed[under], axis=0)
+        off += jnp.sqrt(far + 1e-12) * push * jnp.sqrt(jnp.sum(share * f.process[under] ** 2, 0))
+        return compose(pose, advance(xi + course.axes @ off / h, h)), xi
+
+    def _errs(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
+        """Effects of the floors, and the direction that counts as taken, for the next period."""
+        f, xi = self.robot, now.twist
+        far = (jnp.sqrt(xi[:2] @ xi[:2] + 1e-12) + f.frame.base * jnp.abs(xi[2])) * PERIOD
+        under = self.floor.under(now.pose, f.places)
+        left = jnp.all(under[:, None] != jnp.arange(len(f.labels)), axis=0)
+        way = direction(f.inverse @ (f.frame.radius * now.speed), f.frame.base)
+        toward, keep = stays(now.toward, way, left.astype(float), far)
+        fresh = jnp.sqrt(1 - keep**2 + 1e-15)[:, None] * noise.reshape(-1, 3)
+        return keep[:, None] * now.effect + fresh, toward
+
+    def _amps(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
+        """Signed currents [A], and how far they have drifted from the model's since the last."""
+        f, wheels, xi, w = self.robot, self.robot.wheels, now.twist, now.speed
+        under = self.floor.under(now.pose, f.places)
+        floor = f.floors.at(under)
+        where = xi, f.frame.radius * w, f.frame, floor, f.rest
+        felt = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
+        force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
+        keep = float(np.exp(-PERIOD / self.habits.drift_s))
+        fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
+        drift = keep * now.drift + fresh
+        moves = jnp.tanh(w / 0.2) ** 2  # a motor that stands draws nothing
+        model = f.motor.current(force * f.motor.borne(felt), w)
+        free = (f.inverse @ (f.frame.radius * w))[:2]
+        more = f.current_trend @ jnp.stack([1.0, jnp.sqrt(free @ free + 1e-24)])
+        return model + moves * (jnp.sign(model) * more + now.offset + drift), drift
+
+    def _read(self, angle: Array, w: Array, amps: Array, turn: Array, noise: Array) -> Readings:
+        """Readings; what no sensor of this robot measures is NaN."""
+        b, wheels = self.habits, self.robot.wheels
+        _, by_amps, by_volts, by_turn = jnp.split(
+            noise[3 * b.substeps :], [wheels, 2 * wheels, 3 * wheels]
+        )
+        tick = 2 * np.pi / b.ticks
+        whole = jax.lax.stop_gradient(jnp.floor(angle / tick) * tick - angle)
+        read = amps + self.robot.motor.current_offset + b.ammeter_a * by_amps
+        volts = self.robot.motor.voltage(amps, w) + b.voltmeter_v * by_volts
+        return Measurement(
+            wheel_angle=angle if b.smooth else angle + whole,
+            current=read if b.signed else jnp.abs(read),
+            voltage=volts if b.voltage else None,
+            gyro=turn + b.gyro_noise * by_turn[0] if b.gyro else None,
+        ).filled(wheels)
+
+
+class TwinPlant:
+    """A twin behind `slipid.robot.closed_loop.Plant`; a key gives the same run every time."""
+
+    def __init__(self, twin: Twin, start: Pose, key: Array):
+        self.twin, self.start, self.key = twin, start, key
+        self.reset()
+
+    def reset(self) -> Readings:
+        self._state, self._count = self.twin.init(self.start, self.key), 0
+        return self.twin.first(self._state, self.twin.noise(self.key, 0))
+
+    def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Readings:
+        self._count += 1
+        command, count = jnp.asarray(wheel_speed), jnp.asarray(self._count)
+        self._state, reading = _stepped(self.twin, self._state, command, self.key, count)
+        return reading
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        x, y, heading = np.asarray(self._state.pose).tolist()
+        return x, y, heading
+
+
+@eqx.filter_jit
+def _stepped(
+    twin: Twin, state: TwinState, command: Array, key: Array, count: Array
+) -> tuple[TwinState, Readings]:
+    return twin.step(state, command, twin.noise(key, count))

@@ -1,1 +1,0 @@
-"""The place of a camera above the floor, from a lying board or measured points."""

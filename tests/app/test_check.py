@@ -1,0 +1,49 @@
+"""What a check promises before a fit, and what the fit then keeps."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from slipid.app.check import expected
+from slipid.app.config import FitSection
+from slipid.app.problem import Task, on_runs
+from slipid.data.runs import collect
+from slipid.fit.optimise import optimise
+from slipid.infer.result import summarise
+from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.search_space import Choice
+
+PLAN = grid(setups=(("soft", "as_built"),), headings=8, speeds=(0.1, 0.2))
+CHOICES = (Choice("motor.*", free=False), Choice("camera.scale", free=True))
+ORDER = ("not_identified", "weak", "identified")
+fit = partial(optimise, most_rounds=15)
+
+
+def promised_and_kept(times, creep):
+    """Verdicts before and after the fit of runs with so many times the usual noise."""
+    usual = Sensors()
+    std = {name: (times if "floor" in name else 1) * v for name, v in usual.std.items()}
+    logs = make_logs(truth(PLAN, {"surface.soft.creep": creep}), PLAN, 3, Sensors(std=std))
+    data = collect(logs)
+    task = Task(data, on_runs(blank(PLAN), data, (0.0, 0.0)), CHOICES, FitSection())
+    problem = task.problem()
+    before = expected(task, problem)
+    after = summarise(problem, fit(problem), data, CHOICES)
+    return before.parameters, after.parameters
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("times", "creep"), [(1, 0.45), (12, 0.45), (12, 3.0)])
+def test_nothing_is_promised_that_the_fit_does_not_keep(times, creep):
+    before, after = promised_and_kept(times, creep)
+    assert before.keys() == after.keys()
+    broken = [
+        path
+        for path, e in before.items()
+        if e.verdict == "identified" and after[path].verdict in ORDER[:2]
+    ]
+    assert broken == []
+    promised = [ORDER.index(e.verdict) for e in before.values() if e.verdict in ORDER]
+    if times == 1:  # a promise that says nothing breaks nothing
+        assert np.max(promised) == 2

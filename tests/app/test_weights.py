@@ -1,0 +1,118 @@
+"""What is known of the weight on the wheels becomes the prior of the load shares."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from slipid.app.config import Weights, parsed
+from slipid.app.problem import read_job, share_priors
+from slipid.model.geometry import mecanum, omni
+from slipid.search_space import Space
+from slipid.support.errors import DataError
+from tests.app.test_config import GOOD
+from tests.helpers.broken_logs import write_good
+from tests.helpers.said import Said
+
+SHAPE = omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0)
+SCALES = Weights(kg=[3.0, 5.0, 4.0], std_kg=0.06)
+
+
+def test_scales_are_shares():
+    prior = share_priors({"as_built": SCALES}, SHAPE)["as_built"]
+    assert prior.pattern == "robot.load_share@as_built"
+    assert prior.prior_mean == pytest.approx([0.25, 5 / 12, 1 / 3])
+    assert prior.prior_std == pytest.approx([0.005] * 3)
+
+
+def test_a_mass_at_a_place_keeps_the_balance_of_forces_and_moments():
+    added = Weights(like="as_built", mass_kg=1.5, place_m=(0.03, -0.02), std_kg=0.08)
+    prior = share_priors({"moved": added, "as_built": SCALES}, SHAPE)["moved"]
+    kg = np.asarray(prior.prior_mean) * 13.5
+    place = np.asarray(SHAPE.place) * 0.125
+    more = kg - SCALES.kg
+    assert more.sum() == pytest.approx(1.5)
+    np.testing.assert_allclose(more @ place, 1.5 * np.array([0.03, -0.02]), atol=1e-12)
+    assert prior.prior_std == pytest.approx([0.1 / 13.5] * 3)
+
+
+def test_a_mass_above_a_wheel_of_three_is_on_that_wheel():
+    place = tuple(np.asarray(SHAPE.place)[1] * 0.125)
+    added = Weights(like="as_built", mass_kg=-1.0, place_m=place, std_kg=0.05)
+    prior = share_priors({"as_built": SCALES, "light": added}, SHAPE)["light"]
+    assert np.asarray(prior.prior_mean) * 11 == pytest.approx([3.0, 4.0, 4.0])
+
+
+def test_four_wheels_share_what_is_in_the_middle():
+    shape = mecanum(0.2, 0.15, 0.05)
+    even = Weights(kg=[2.0, 2.0, 3.0, 3.0], std_kg=0.1)
+    added = Weights(like="a", mass_kg=4.0, place_m=(0.0, 0.0), std_kg=0.1)
+    prior = share_priors({"a": even, "b": added}, shape)["b"]
+    assert np.asarray(prior.prior_mean) * 14 == pytest.approx([3.0, 3.0, 4.0, 4.0])
+
+
+WEIGHTS = """
+[weights.as_built]
+kg = [3.0, 5.0, 4.0]
+std_kg = 0.06
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("std_kg = 0.1", "weights.as_built: expected kg, or like, mass_kg and place_m"),
+        ("kg = [3, 5, 4]", "weights.as_built.std_kg: missing"),
+        ('kg = [3, 5, 4]\nlike = "b"\nstd_kg = 1', "at once; expected one of both ways"),
+        ('like = "b"\nmass_kg = 1\nstd_kg = 1', "expected kg, or like, mass_kg and place_m"),
+        ("kg = [3, 5]\nstd_kg = 0.1", "weights.as_built.kg: 2; expected 3 numbers"),
+        ("kg = [3, 5, -4]\nstd_kg = 0.1", "weights.as_built.kg"),
+        (
+            'like = "as_built"\nmass_kg = 1\nplace_m = [0, 0]\nstd_kg = 1',
+            "weights.as_built.like = as_built: expected one of none",
+        ),
+        (
+            'like = "b"\nmass_kg = 1\nplace_m = [0, 0]\nstd_kg = 1',
+            "weights.as_built.like = b: expected one of none",
+        ),
+        (
+            'like = "b"\nmass_kg = 20\nplace_m = [0.5, 0]\nstd_kg = 1\n'
+            "[weights.b]\nkg = [3, 5, 4]\nstd_kg = 1",
+            "would be lifted; expected weight on all",
+        ),
+    ],
+)
+def test_what_makes_no_weight_is_refused(tmp_path, text, expected):
+    write_good(tmp_path)
+    whole = f"{GOOD}\n[weights.as_built]\n{text}\n"
+    with pytest.raises(DataError, match=r"my\.toml: ") as caught:
+        read_job(parsed(tmp_path / "my.toml", whole), tmp_path, Said())
+    assert expected in str(caught.value)
+
+
+def test_weights_are_the_prior_and_those_of_no_run_are_skipped(tmp_path):
+    write_good(tmp_path)
+    text = GOOD + WEIGHTS + WEIGHTS.replace("as_built", "loaded")
+    job = read_job(parsed(tmp_path / "my.toml", text), tmp_path, Said())
+    assert "skipped: weights.loaded: no run that has it" in job.skipped
+    space = Space(job.robot, job.choices)
+    at = space.place["robot.load_share@as_built"]
+    entry = next(e for e in space.free if e.path == "robot.load_share@as_built")
+    mean = np.asarray(entry.declaration.to_si(jnp.asarray(space.prior_mean[at])))
+    assert mean == pytest.approx([0.25, 5 / 12, 1 / 3])
+    assert (space.prior_std[at] < 0.03).all()
+    plain = read_job(parsed(tmp_path / "my.toml", GOOD), tmp_path, Said())
+    assert (Space(plain.robot, plain.choices).prior_std[at] > 0.2).all()
+
+
+def test_runs_of_sections_with_one_session_name_belong_together(tmp_path):
+    write_good(tmp_path)
+    text = GOOD.replace(
+        'format = "robotino2022"', 'format = "robotino2022"\nsession_name = "may 3"'
+    )
+    job = read_job(parsed(tmp_path / "my.toml", text), tmp_path, Said())
+    assert set(job.dataset.session) == {"may 3"}
+    both = text.replace("session_name", 'session = "file"\nsession_name')
+    with pytest.raises(DataError, match="session and session_name at once"):
+        parsed(tmp_path / "my.toml", both)

@@ -1,0 +1,144 @@
+"""Every mistake that was made on purpose is named, with what to do, on three kinds of drive."""
+
+from __future__ import annotations
+
+from functools import cache
+from math import pi
+
+import pytest
+
+from slipid.data.check.causes import explained
+from slipid.data.check.ratios import Ratio, Ratios
+from slipid.data.check.sanity import findings
+from tests.helpers.mistakes import MISTAKES
+from tests.helpers.plain_robot import DRIVES, Drive, as_runs, drive
+
+MASS_KG = 12.0
+ONLY_POSES = ("speed", "command", "twist", "current", "voltage", "gyro")
+
+
+@cache
+def driven(robot: Drive, seed: int = 0):
+    return drive(robot, seed=seed)
+
+
+def alarms(runs, geometry):
+    return [f for f in findings(runs, geometry, MASS_KG) if f.severity != "note"]
+
+
+FEW = [(m, DRIVES[k % 3]) for k, m in enumerate(MISTAKES[::5])]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mistake", "robot"), FEW, ids=lambda x: x.name)
+def test_a_few_are_named(mistake, robot):
+    test_it_is_named(robot, mistake)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mistake", "robot"),
+    [(m, DRIVES[k % len(DRIVES)]) for k, m in enumerate(MISTAKES)],
+    ids=lambda x: x.name,
+)
+def test_every_mistake_is_named_on_one_of_the_drives(mistake, robot):
+    test_it_is_named(robot, mistake)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("robot", DRIVES, ids=lambda d: d.name)
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda m: m.name)
+def test_it_is_named(robot, mistake):
+    found = alarms(*mistake.made(driven(robot), robot))
+    assert {f.kind for f in found} == set(mistake.kinds)
+    assert all(f.severity == "wrong" for f in found)
+    assert any(mistake.says in (f.remedy or "") for f in found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", DRIVES, ids=lambda d: d.name)
+@pytest.mark.parametrize("less", [(), ONLY_POSES])
+def test_sound_runs_raise_no_alarm(robot, less):
+    test_other_sound_runs_raise_none_either(robot, 0, less)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("robot", DRIVES, ids=lambda d: d.name)
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("less", [(), ONLY_POSES, ("speed", "command"), ("twist", "gyro")])
+def test_other_sound_runs_raise_none_either(robot, seed, less):
+    runs = as_runs([raw.less(*less) for raw in driven(robot, seed)])
+    assert alarms(runs, robot.geometry) == []
+
+
+NAMED_BY_POSES = (
+    *("sign of the first wheel", "sign of all wheels", "sign of the heading", "mirrored frame"),
+    *("wheels 1 and 2 exchanged", "pose in mm as m", "pose in m as mm", "yaw in deg as rad"),
+    *("encoder at the wheel", "half the wheel radius", "time in ms as s", "pose constant"),
+    *("pose 2.5 s late", "poses of another run in all", "x and y swapped", "gear forgotten"),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("robot", "name"),
+    [
+        pytest.param(robot, name, marks=[] if k % len(DRIVES) == n else pytest.mark.nightly)
+        for k, name in enumerate(NAMED_BY_POSES)
+        for n, robot in enumerate(DRIVES)
+    ],
+    ids=lambda x: x if isinstance(x, str) else x.name,
+)
+def test_encoders_and_poses_alone_name_it(robot, name):
+    (mistake,) = (m for m in MISTAKES if m.name == name)
+    runs, geometry = mistake.made([raw.less(*ONLY_POSES) for raw in driven(robot)], robot)
+    found = alarms(runs, geometry)
+    assert found
+    assert found[0].severity == "wrong"
+    said = " ".join(str(f) for f in found)
+    assert {f.kind for f in found} & set(mistake.kinds) or mistake.says in said
+
+
+def test_what_is_not_driven_is_a_note():
+    (omni, *_) = DRIVES
+    raws = [raw.less(*ONLY_POSES) for raw in driven(omni)]
+    said = [f for f in findings(as_runs(raws), omni.geometry) if f.severity == "note"]
+    assert any("no command is logged" in f.found for f in said)
+
+
+def test_two_mistakes_are_both_named():
+    (omni, *_) = DRIVES
+    by_name = {m.name: m for m in MISTAKES}
+    raws = by_name["sign of the heading"].runs(
+        by_name["sign of the third wheel"].runs(driven(omni))
+    )
+    assert {f.kind for f in alarms(as_runs(raws), omni.geometry)} == {"wheel_sign", "heading_sign"}
+
+
+def test_a_turned_marker_hides_no_other_unit_of_the_pose():
+    """The way is compared with that of the wheels in the axes that the heading was put right to."""
+    (omni, *_) = DRIVES
+    by_name = {m.name: m for m in MISTAKES}
+    raws = by_name["marker turned by 90 deg"].runs(
+        by_name["pose in mm as m"].runs([raw.less(*ONLY_POSES) for raw in driven(omni)])
+    )
+    assert {f.kind for f in alarms(as_runs(raws), omni.geometry)} == {
+        "heading_offset",
+        "pose_length",
+    }
+
+
+def test_a_heading_in_another_unit_makes_a_gyro_look_too_small():
+    """One cause explains both ratios, and no gyro is told to be wrong."""
+    deg = 180 / pi
+    seen = Ratios(
+        {
+            "travel": Ratio(0.8, 0.3, 0.8, 1.35),
+            "turning": Ratio(0.8 * deg, 0.35, 0.8, 1.35),
+            "gyro": Ratio(1 / deg, 0.75, 1.0, 1.33),
+        },
+        speed_is_angle=False,
+    )
+    found, alone = explained(seen, 0.05, 16.0)
+    assert alone
+    assert [(e.name, e.factor) for e in found] == [("heading", pytest.approx(deg))]

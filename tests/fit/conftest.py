@@ -1,0 +1,17 @@
+"""What several tests of the fit set up."""
+
+from __future__ import annotations
+
+import jax
+import pytest
+
+from slipid.fit import variances
+
+
+@pytest.fixture
+def gaussian(monkeypatch):
+    """Residuals of runs are Gaussian; what was compiled for a Student t serves nobody then."""
+    monkeypatch.setattr(variances, "DEGREES", 1e12)
+    jax.clear_caches()
+    yield
+    jax.clear_caches()

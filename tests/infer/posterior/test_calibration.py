@@ -1,0 +1,102 @@
+"""Intervals and ranks over a few made experiments; `benchmarks/bench_calibration.py` has many."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slipid.infer.posterior import sample as posterior
+from slipid.infer.posterior.blocks import Plan, Record
+from slipid.infer.posterior.coordinates import MOTION
+from tests.helpers import calibration
+from tests.helpers.kept import kept
+
+SEEDS = (4, 7)
+
+
+@pytest.fixture(scope="module")
+def replicates():
+    return {seed: calibration.replicate(seed) for seed in SEEDS}
+
+
+@pytest.mark.nightly
+def test_intervals_hold_the_truth_as_often_as_they_say(replicates):
+    inside = np.concatenate([r.inside for r in replicates.values()])
+    rank = np.concatenate([r.rank for r in replicates.values()])
+    low, high = calibration.band(len(inside), 1)
+    assert low <= inside.mean() <= high
+    # four standard errors of the mean of uniform ranks
+    assert rank.mean() == pytest.approx(0.5, abs=4 / np.sqrt(12 * len(rank)))
+
+
+@pytest.mark.nightly
+def test_a_variance_that_may_be_anything_small_is_not_held_near_the_fit(replicates):
+    """In these experiments the ammeter hides the voltmeter's noise, whose truth is tiny."""
+    place = replicates[SEEDS[0]].names.index("noise.voltage.window")
+    for k in SEEDS:
+        assert replicates[k].rank[place] > 0.02
+        assert replicates[k].draws[..., place].std() > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", kept([1, 3], [1]))
+def test_it_goes_on_from_any_block_as_if_it_had_not_ended(whole, count):
+    """Electric numbers and variances too, though they are drawn after the last block."""
+    fit, plan, blocks, found = whole
+    again = posterior.sample(
+        fit, plan, draws=10, record=Record(done=lambda part: blocks[part][:count])
+    )
+    np.testing.assert_array_equal(again.z, found.z)
+    np.testing.assert_array_equal(again.log_variance, found.log_variance)
+    assert again.accepted == found.accepted
+
+
+@pytest.mark.slow
+def test_electric_numbers_are_drawn_anew_for_a_longer_chain(whole):
+    """Electric draws are of the very draws of the motion they were made with."""
+    fit, plan, blocks, found = whole
+    longer = replace(plan, most=plan.most + 1)
+    anew = posterior.sample(fit, longer, draws=10)
+    again = posterior.sample(fit, longer, draws=10, record=Record(done=lambda part: blocks[part]))
+    np.testing.assert_array_equal(again.z, anew.z)
+    electric = fit.space.electric
+    assert (again.z[..., electric] != found.z[..., electric]).any()
+
+
+@pytest.mark.slow
+def test_electric_draws_that_never_moved_are_not_believed(whole, monkeypatch):
+    fit, plan, blocks, _ = whole
+    diagnose = posterior.diagnosis.diagnose
+    monkeypatch.setattr(
+        posterior.diagnosis,
+        "diagnose",
+        lambda chain, plan: replace(diagnose(chain, plan), converged=True),
+    )
+    record = Record(done=lambda part: blocks[part])
+    assert posterior.sample(fit, plan, draws=10, record=record).converged
+    drawn = posterior.electric_given_motion
+    monkeypatch.setattr(
+        posterior, "electric_given_motion", lambda *given: replace(drawn(*given), still=0.5)
+    )
+    found = posterior.sample(fit, plan, draws=10, record=record)
+    assert not found.converged
+    assert found.reason == "50.0 % of the electric draws, which never moved"
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """An experiment, and blocks and draws of its posterior."""
+    fit, _ = calibration.experiment(12)
+    plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=4)
+    blocks = defaultdict(list)
+    found = posterior.sample(
+        fit,
+        plan,
+        draws=10,
+        record=Record(keep=lambda part, block: blocks[part].append(block)),
+    )
+    assert {part: len(made) for part, made in blocks.items()} == {MOTION: 4}
+    return fit, plan, blocks, found

@@ -1,0 +1,126 @@
+"""Electric numbers drawn given the motion, against what they are drawn from; and the variances."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.stats import norm
+
+from slipid.fit.problem import Problem
+from slipid.infer.posterior.coordinates import ELECTRIC, MOTION, Fitted
+from slipid.infer.posterior.density import Density, electric_given_motion
+from slipid.search_space import Choice
+from tests.helpers.made_windows import made, robot
+
+pytestmark = pytest.mark.slow  # compiles densities
+
+STD = {
+    "process.along": 0.002,
+    "run.along": 0.005,
+    "current.window": 0.003,
+    "current.run": 0.003,
+    "voltage.window": 0.05,
+}
+COPIES = 6000
+FREE = [
+    Choice("*", free=False),
+    Choice("surface.*.creep", free=True),
+    Choice("surface.*.roller_drag", free=True),
+    Choice("surface.*.friction", free=True),
+    Choice("motor.resistance", free=True),
+    Choice("motor.back_emf", free=True),
+]
+
+
+def parts(choices, **std):
+    """Densities of motion and electric numbers where the fit ended, noise of these stds held."""
+    truth = robot()
+    w = made(truth, std=STD)
+    problem = Problem(replace(w, current_var=np.full_like(w.current_var, 1e-6)), truth, choices)
+    log_v = 2 * np.log(
+        [(STD | std).get(f"{c.kind}.{c.what}", c.typical) for c in problem.noise.components]
+    )
+    z = problem.space.vector(truth)
+    covariance = problem.laplace(z, log_v, np.ones(24))
+    fitted = Fitted(z, log_v, covariance)
+    return (*(Density(problem, fitted, part) for part in (MOTION, ELECTRIC)), covariance)
+
+
+def drawn(first, second, covariance, motion, seed=0):
+    """Draws for very many copies of one draw of the motion."""
+    many = np.broadcast_to(motion, (2, COPIES // 2, len(motion)))
+    return electric_given_motion(first, second, covariance, many, seed)
+
+
+def log_prob(second, held, x):
+    """Log density at many vectors, all given the one draw of the motion that is held."""
+    many = type(held)(*(np.repeat(h, len(x), axis=0) for h in held))
+    return second.terms(x, many).sum(axis=1)
+
+
+def gaussian(second, held):
+    """Mode and covariance there, by scipy and by differences of the density itself."""
+
+    def loss(x):
+        return -log_prob(second, held, x[None])[0], -second.slope(x[None], held)[0]
+
+    mode = minimize(loss, second.centre, jac=True, method="BFGS").x
+    h = 1e-3 * np.eye(second.size)
+    many = type(held)(*(np.repeat(k, second.size, axis=0) for k in held))
+    bend = -(second.slope(mode + h, many) - second.slope(mode - h, many)) / 2e-3
+    return mode, np.linalg.inv(0.5 * (bend + bend.T))
+
+
+def test_they_are_the_gaussian_given_the_motion_where_data_tell_much():
+    first, second, covariance = parts(FREE)
+    motion = first.centre + 0.02
+    mode, spread = gaussian(second, first.hold(motion[None]))
+    found = drawn(first, second, covariance, motion)
+    assert found.x.shape == (2, COPIES // 2, second.size)
+    flat, std = found.x.reshape(COPIES, -1), np.sqrt(np.diag(spread))
+    assert found.accepted > 0.6
+    assert found.still == 0.0
+    np.testing.assert_allclose((flat.mean(axis=0) - mode) / std, 0.0, atol=4 / np.sqrt(COPIES))
+    np.testing.assert_allclose(
+        np.cov(flat.T) / std / std[:, None], spread / std / std[:, None], atol=6 / np.sqrt(COPIES)
+    )
+
+
+def test_they_follow_the_motion():
+    """The start is a guess: for motion far from the fit the mode is another, and found."""
+    first, second, covariance = parts(FREE)
+    motion = first.centre + np.where(["drag" in name for name in first.names], 0.5, 0.0)
+    mode, spread = gaussian(second, first.hold(motion[None]))
+    found = drawn(first, second, covariance, motion)
+    std = np.sqrt(np.diag(spread))
+    assert (np.abs(mode - second.centre) / std).max() > 5
+    away = (found.x.reshape(COPIES, -1).mean(axis=0) - mode) / std
+    np.testing.assert_allclose(away, 0.0, atol=4 / np.sqrt(COPIES))
+
+
+def test_a_skewed_one_is_drawn_from_its_own_density():
+    """Against a grid; the Gaussian that is proposed from is far from it."""
+    first, second, covariance = parts(
+        [*FREE[:3], Choice("motor.resistance", free=True)], **{"voltage.window": 3.0}
+    )
+    assert second.names == ("motor.resistance",)
+    motion = first.centre + 0.02
+    held = first.hold(motion[None])
+    found = drawn(first, second, covariance, motion)
+    x = np.sort(found.x.ravel())
+    grid = np.linspace(second.centre[0] - 8, second.centre[0] + 4, 4001)
+    density = log_prob(second, held, grid[:, None])
+    weight = np.exp(density - density.max())
+    below = (np.cumsum(weight) - 0.5 * weight) / weight.sum()
+
+    def apart(x):
+        """Distance of the empirical distribution of sorted draws from the grid's."""
+        return np.abs(np.interp(x, grid, below) - (np.arange(len(x)) + 0.5) / len(x)).max()
+
+    mode, spread = gaussian(second, held)
+    proposed = mode + 1.15 * np.sqrt(spread[0]) * norm.ppf((np.arange(COPIES) + 0.5) / COPIES)
+    assert apart(x) < 1.63 / np.sqrt(COPIES)  # Kolmogorov and Smirnov's, one in a hundred
+    assert apart(proposed) > 4 * 1.63 / np.sqrt(COPIES)

@@ -1,0 +1,64 @@
+"""Another robot's real logs: geometry found on joystick runs predicts squares and circles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from slipid.app.config import read_config
+from slipid.app.logs import read_dataset
+from slipid.app.problem import read_job
+from slipid.fit import likelihood as lk
+from slipid.fit.optimise import optimise
+from slipid.infer.result import summarise
+from slipid.predict import open_loop as replay
+from slipid.support.progress import Reporter
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "omni3.toml"
+NOMINAL = {"wheel_radius": 0.051, "base_radius": 0.195}
+
+
+LEAST_SQUARES = 0.0505
+"""Mean error of least squares of radii, base radius, lag and marker place on the same runs [m]."""
+
+
+def end_errors(robot, data) -> tuple[np.ndarray, np.ndarray]:
+    """Distance between predicted and tracked end of every run [m], and length of its path [m]."""
+    off, way = np.zeros(len(data)), np.zeros(len(data))
+    for w in replay.cuts(data, robot):
+        step = np.asarray(replay.contact_increments(robot, lk.batch(w, robot)))
+        track = replay.follow(robot, w, step)
+        way[track.run] = np.linalg.norm(np.diff(track.measured[..., :2], axis=1), axis=-1).sum(1)
+        off[track.run] = np.linalg.norm(track.gap[:, :2], axis=1)
+    return off, way
+
+
+@pytest.mark.slow
+def test_radii_from_joystick_runs_predict_squares_and_circles(real_data):
+    root = real_data / "omni3_optitrack"
+    if not root.is_dir():
+        pytest.skip(f"no logs of the second robot: {root} is no folder")
+    config = read_config(CONFIG)
+    job = read_job(config, root, Reporter(quiet=True))
+    problem = job.problem()
+    fit = summarise(problem, optimise(problem), job.dataset, job.choices)
+    assert fit.converged
+    for name, nominal in NOMINAL.items():
+        found = fit.parameters[f"robot.{name}"]
+        assert found.ratio < 0.35  # two recordings, which do not agree as well as runs of one do
+        assert not found.interval90[0] < nominal < found.interval90[1]
+    unseen, _ = read_dataset(config, config.content.validate_.logs, root, Reporter(quiet=True))
+    nominal = eqx.tree_at(  # as the metadata says, everything else at its start
+        lambda r: (r.geometry.wheel_radius, r.geometry.base_radius),
+        fit.space.template,
+        tuple(jnp.asarray(v) for v in NOMINAL.values()),
+    )
+    (before, _), (after, way) = end_errors(nominal, unseen), end_errors(fit.robot, unseen)
+    print("end error [m], nominal:", before.round(4), "identified:", after.round(4), "path:", way)
+    assert (after < before).all()
+    assert after.mean() < LEAST_SQUARES
+    assert np.mean(after / way) < 0.5 * np.mean(before / way)

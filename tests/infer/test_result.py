@@ -1,0 +1,527 @@
+"""Verdicts, intervals, flat directions and files of a fit, on made logs with known truth."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import json
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2, lognorm
+from scipy.stats import f as fisher
+
+from slipid.data.runs import collect
+from slipid.data.windows import windows
+from slipid.fit.optimise import Optimum, one_round
+from slipid.fit.problem import Problem, State
+from slipid.fit.variances import DEGREES
+from slipid.infer import fit_file
+from slipid.infer.design.planned_runs import Drive
+from slipid.infer.fit_file import identified_json, load, save, to_json
+from slipid.infer.posterior import diagnosis
+from slipid.infer.result import Fit, summarise
+from slipid.infer.slip_curves import by_encoders, has_steady_command, validity
+from slipid.infer.verdicts.estimates import estimates
+from slipid.infer.verdicts.unidentified import flat_directions, members
+from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.predict.validation import validation
+from slipid.search_space import Choice
+from slipid.support.errors import DataError
+from slipid.support.files import hash_of
+
+pytestmark = pytest.mark.slow  # traces whole fits
+
+DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1,), turns=0)
+TRUTH = truth(DRIVES)
+CHOICES = (
+    Choice("camera.scale", prior_mean=1.117, prior_std=0.002),
+    Choice("camera.lag", prior_mean=0.05, prior_std=0.02),
+    Choice("camera.marker_place", free=True),
+    Choice("robot.mass", fixed=12.0),
+)
+
+
+@functools.cache
+def made(voltage: bool):
+    """A problem, its data, and the Laplace covariance at the truth."""
+    data = collect(make_logs(TRUTH, DRIVES, 1, Sensors(has_voltage=voltage)))
+    problem = Problem(windows(data, 0.04, lag=0.05), blank(DRIVES), list(CHOICES))
+    z = problem.space.vector(TRUTH)
+    state = State(z, 2 * np.log(problem.noise.typical), 7, -1.5, 0.01, "joint")
+    laplace = problem.laplace(z, state.log_variance, np.ones(len(problem.windows)))
+    end = Optimum(state, laplace, True, "it settled", (3.0, -1.5))
+    return problem, data, end
+
+
+@functools.cache
+def fit_of(voltage: bool) -> Fit:
+    problem, data, end = made(voltage)
+    return summarise(problem, end, data, CHOICES)
+
+
+def test_intervals_are_quantiles_of_the_transformed_gaussian():
+    fit = fit_of(True)
+    e = fit.parameters["surface.soft.creep"]  # positive: log-normal
+    at = fit.space.place[e.path]
+    std = np.sqrt(fit.covariance[at, at][0, 0])
+    exact = lognorm(std, scale=e.value).ppf([0.05, 0.95])
+    assert e.interval90 == pytest.approx(exact, rel=1e-12)
+    assert e.std == pytest.approx(e.value * std)
+    lead = fit.parameters["surface.soft.lead"]  # any sign: normal
+    assert lead.interval90[1] - lead.value == pytest.approx(1.6448536 * lead.std)
+
+
+def test_shares_sum_to_one_and_their_intervals_hold_them():
+    e = fit_of(True).parameters["robot.load_share@as_built"]
+    assert sum(e.value) == pytest.approx(1.0)
+    assert e.labels == ("wheel 1", "wheel 2", "wheel 3")
+    assert all(low < v < high for v, (low, high) in zip(e.value, e.interval90, strict=True))
+    # near a Gaussian the width is 2 x 1.645 stds
+    widths = np.array([high - low for low, high in e.interval90])
+    assert widths == pytest.approx(2 * 1.645 * np.array(e.std), rel=0.1)
+
+
+def verdicts(
+    ratio: float,
+    choices: tuple[Choice, ...] = CHOICES,
+    shift: float = 0.0,
+    prior_std: float | None = None,
+    flat: tuple[str, ...] = (),
+):
+    """Estimates when every posterior is `ratio` times its prior, `shift` prior stds from it.
+
+    `prior_std` in the search space is the declared one, or one for all.
+    """
+    from slipid.search_space import Space
+
+    space = Space(blank(DRIVES), choices)
+    if prior_std:
+        space = eqx.tree_at(lambda s: s.prior_std, space, np.full(space.size, prior_std))
+    cov = np.diag((ratio * space.prior_std) ** 2)
+    z = space.prior_mean + shift * space.prior_std
+    return {e.path: e for e in estimates(space, choices, z, cov, has_voltage=True, flat=flat)}
+
+
+@pytest.mark.parametrize(
+    ("ratio", "verdict"),
+    [(0.29, "identified"), (0.31, "weak"), (0.79, "weak"), (0.81, "not_identified")],
+)
+def test_the_verdict_rule(ratio, verdict):
+    found = verdicts(ratio, prior_std=1.0)
+    free = [e for e in found.values() if e.ratio is not None]
+    assert {e.verdict for e in free} == {verdict}
+    assert {round(e.ratio, 9) for e in free} == {ratio}
+
+
+@pytest.mark.parametrize(("std", "verdict"), [(0.33, "identified"), (0.34, "weak")])
+def test_a_positive_number_within_three_stds_of_zero_is_not_identified(std, verdict):
+    # a wide prior, of which a wide interval is a small part; one that takes any sign is not asked
+    found = verdicts(std / 4, prior_std=4.0)
+    assert found["surface.soft.creep"].verdict == verdict
+    assert found["surface.soft.lead"].verdict == "identified"
+
+
+def test_provenance():
+    found = verdicts(0.2, (*CHOICES, Choice("motor.efficiency", fixed=0.8)))
+    assert found["surface.soft.creep"].provenance == "measured"
+    assert found["motor.efficiency"].provenance == "override"
+    assert found["motor.inductance"].provenance == "borrowed"
+    assert (found["motor.inductance"].verdict, found["motor.inductance"].std) == ("fixed", None)
+    # half of the information from the prior is where measuring ends
+    assert verdicts(0.70)["surface.soft.creep"].provenance == "measured"
+    assert verdicts(0.72)["surface.soft.creep"].provenance == "borrowed"
+
+
+def test_a_number_that_runs_to_zero_is_at_its_bound_and_a_contradicted_prior_is_not():
+    found = verdicts(0.1, shift=-4.5)
+    assert found["surface.soft.creep"].verdict == "at_bound"  # exp(-6.75) of its prior mean
+    assert found["surface.soft.lead"].verdict == "identified"  # has no bound
+    assert found["camera.scale"].verdict == "identified"  # 1 % off, against a tight prior
+    assert found["camera.scale"].pull == pytest.approx(-4.5)
+    assert verdicts(0.1, shift=-3.5)["surface.soft.creep"].verdict == "identified"
+
+
+def test_without_voltage_neither_resistance_nor_back_emf_is_identified():
+    fit = fit_of(False)
+    assert fit.channels.voltage is False
+    for path in ("motor.resistance", "motor.back_emf"):
+        e = fit.parameters[path]
+        assert (e.verdict, e.provenance) == ("not_identified", "borrowed")
+    text = " | ".join(fit.messages)
+    assert "motor.resistance: log the motor voltage (or duty and bus voltage)" in text
+    [joint] = [f for f in fit.flat if "motor.back_emf" in f.paths]
+    assert "surface.soft.friction" in joint.paths
+    assert joint.powers == pytest.approx([1.0] * len(joint.paths), abs=0.05)
+    assert "surface.soft.friction/motor.back_emf" in joint.text
+
+
+def test_a_number_known_as_part_of_a_ratio_is_not_identified_however_narrow_neither_in_draws():
+    fit = fit_of(False)
+    [joint] = [f for f in fit.flat if "motor.back_emf" in f.paths]
+    rng = np.random.default_rng(0)
+    narrow = fit.z + 0.01 * fit.space.prior_std * rng.normal(size=(2, 200, fit.space.size))
+    sampled = diagnosis.estimates(fit, narrow)
+    for path in joint.paths:
+        assert sampled[path].ratio < 0.02
+        for e in (fit.parameters[path], sampled[path]):
+            assert e.provenance == "borrowed"
+            assert e.verdict in ("weak", "not_identified")
+    assert {sampled[path].verdict for path in joint.paths} == {"weak", "not_identified"}
+    known = [e.path for e in fit.space.free if e.path not in members(fit.flat)]
+    assert "robot.load_share@as_built" in known
+    assert {sampled[path].verdict for path in known} <= {"identified", "at_bound"}
+    assert {sampled[path].provenance for path in known} == {"measured"}
+    # the same interval by itself would do
+    assert verdicts(0.1)["surface.soft.creep"].verdict == "identified"
+    assert verdicts(0.1, flat=("surface.soft.creep",))["surface.soft.creep"].verdict == "weak"
+
+
+def test_no_prior_however_tight_lends_the_motor_a_verdict_without_voltage():
+    problem, _, end = made(False)
+    tight = end.covariance * 1e-6
+    found = estimates(problem.space, CHOICES, end.state.z, tight, has_voltage=False, flat=())
+    by = {e.path: e.verdict for e in found}
+    assert by["motor.resistance"] == by["motor.back_emf"] == "not_identified"
+    assert by["motor.coulomb_friction"] == "identified"
+
+
+def test_with_voltage_both_are_identified_and_no_flat_direction_holds_them():
+    fit = fit_of(True)
+    for path in ("motor.resistance", "motor.back_emf"):
+        assert fit.parameters[path].verdict == "identified"
+        assert fit.parameters[path].provenance == "measured"
+    assert not [f for f in fit.flat if {"motor.resistance", "motor.back_emf"} & set(f.paths)]
+
+
+def test_a_made_up_flat_direction_comes_out_with_its_powers():
+    problem, _, _ = made(True)
+    space = problem.space
+    std, names = space.prior_std, space.names
+    precision = np.diag(1 / std**2)
+    a, b = names.index("motor.back_emf"), names.index("surface.soft.friction")
+    held = np.zeros(len(names))
+    held[a], held[b] = 2.0, 1.0  # only back_emf^2 * friction is measured
+    precision += 1e6 * np.outer(held, held)
+    for k, name in enumerate(names):
+        if k not in (a, b):
+            precision[k, k] += 1e4 / std[k] ** 2
+        assert name
+    [flat] = flat_directions(space, np.linalg.inv(precision), True, True)
+    assert flat.paths == ("motor.back_emf", "surface.soft.friction")
+    assert flat.powers == pytest.approx((-0.5, 1.0), abs=0.02)
+
+
+def test_curves_rise_hold_their_line_and_end_where_the_data_end():
+    fit = fit_of(True)
+    curve = fit.curves["soft"]
+    torque, slip, low, high = (
+        getattr(curve, k) for k in ("torque_nm", "slip", "slip_lo", "slip_hi")
+    )
+    assert (np.diff(torque) > 0).all()
+    assert (np.diff(slip) >= 0).all()
+    assert slip[0] == 0
+    assert (low <= slip + 1e-9).all()
+    assert (high >= slip - 1e-9).all()
+    assert torque[-1] <= fit.validity["soft"].torque_nm[1]
+    # the law itself, at a slip of the curve
+    floor, w, share = TRUTH.surfaces, curve.wheel_speed, curve.load_share
+    rim, k = 0.04 * w, 30
+    grip = np.tanh(slip[k] * rim / (0.002 + float(floor.creep[0]) * rim))
+    grip += float(floor.slide_viscosity[0]) * slip[k] * rim
+    expected = 0.04 * float(floor.friction[0]) * 12.0 * 9.81 * share * grip
+    assert torque[k] == pytest.approx(expected, rel=2e-3)
+
+
+def test_what_was_driven_is_told_by_the_wheels_where_no_steady_command_was_logged():
+    twist = np.zeros((400, 3))
+    way = np.radians(60.0 * (np.arange(400) % 6))
+    speed = np.where(np.arange(400) < 200, 0.1, 0.3)
+    twist[:, 0], twist[:, 1] = speed * np.cos(way), speed * np.sin(way)
+    twist[:40], twist[40:80, 2] = 0.0, 0.5
+    twist[80] = 0.3 * np.array([0.0, 1.0, 0.0])  # one window is no direction that was driven
+    driven = by_encoders(twist)
+    assert driven.headings_deg == (-120.0, -60.0, 0.0, 60.0, 120.0, 180.0)
+    assert (min(driven.speeds), max(driven.speeds)) == (0.1, 0.3)
+    assert driven.turn_rates == (0.5,)
+    assert by_encoders(np.zeros((5, 3))) == ((), (), ())
+
+
+def test_a_floor_whose_runs_have_no_steady_command_was_seen_as_the_wheels_say():
+    problem, data, _ = made(True)
+    robot = problem.space.tree(problem.space.start)
+    blind = tuple(replace(log, twist_command=None) for log in data.logs)
+    lies = replace(data, heading=data.heading + 0.1)
+    asked, seen = (
+        validity(runs, robot, problem.batch)["soft"] for runs in (lies, replace(lies, logs=blind))
+    )
+    assert set(np.mod(asked.headings_deg, 30.0)) != {0.0}
+    assert set(np.mod(seen.headings_deg, 30.0)) == {0.0}
+
+
+def test_a_command_that_changes_or_rests_tells_nothing_of_a_run():
+    data = made(True)[1]
+    log = replace(data.logs[0], twist_command=np.tile([0.2, 0.0, 0.0], (data.logs[0].samples, 1)))
+    assert has_steady_command(log)
+    assert not has_steady_command(replace(log, twist_command=None))
+    wandering = np.linspace(-1.0, 1.0, log.samples)[:, None] * [0.2, 0.1, 0.0]
+    assert not has_steady_command(replace(log, twist_command=wandering))
+    resting = np.where(np.arange(log.samples)[:, None] % 3 == 0, [0.2, 0.0, 0.0], 0.0)
+    assert not has_steady_command(replace(log, twist_command=resting))
+
+
+def test_a_solver_that_stopped_on_its_way_is_not_called_converged():
+    """At the truth, not at the optimum, of this very noise a step of some stds remains."""
+    problem, data, end = made(True)
+    fit = fit_of(True)
+    assert end.converged  # or so it says
+    assert fit.remaining > 0.3
+    assert not fit.converged
+    assert fit.reason.startswith("the solver stopped")
+    assert any("did not converge" in m for m in fit.messages)
+    # steps with weights kept up to date lead to a point from which none remains
+    state = end.state
+    for _ in range(6):
+        state = one_round(
+            problem,
+            state,
+            np.ones(len(problem.windows)),
+            np.ones(problem.space.size),
+            steps=8,
+            scoring=2,
+        )
+    there = summarise(problem, dataclasses.replace(end, state=state), data, CHOICES)
+    assert there.remaining < 0.1
+    assert there.converged
+
+
+def test_identified_json_is_what_the_contract_says():
+    found = json.loads(json.dumps(identified_json(fit_of(True)), allow_nan=False))
+    assert found["schema"] == "slipid.identified/1"
+    keys = {"value", "unit", "shape", "labels", "std", "interval90", "source", "verdict"}
+    for e in found["parameters"].values():
+        assert set(e) == keys | {"provenance"}
+    shares = found["parameters"]["robot.load_share@as_built"]
+    assert (shares["shape"], len(shares["value"]), len(shares["interval90"])) == ([3], 3, 3)
+    assert found["parameters"]["motor.resistance"]["shape"] == []
+    assert found["surfaces"] == ["soft"]
+    assert set(found["curves"]["soft"]) == {"torque_nm", "slip", "slip_lo", "slip_hi", "at"}
+    assert found["data"]["runs"] == [log.name for log in made(True)[1].logs]
+
+
+def test_the_data_hash_knows_names_and_bytes_but_no_order():
+    runs = [("a", "1"), ("b", "2")]
+    assert hash_of(runs) == hash_of(runs[::-1])
+    assert len({hash_of(runs), hash_of(runs[:1]), hash_of([("a", "2"), ("b", "1")])}) == 3
+
+
+def test_a_saved_fit_comes_back_the_same(tmp_path):
+    fit = dataclasses.replace(fit_of(True), baselines={"constant": {"soft": [0.25]}})
+    names = save(fit, tmp_path)
+    back = load(tmp_path)
+    assert identified_json(back) == identified_json(fit)
+    assert to_json(back) == to_json(fit)
+    for name in ("z", "covariance", "laplace"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(fit, name))
+    first = (tmp_path / "fit.json").read_bytes()
+    assert save(back, tmp_path) == names
+    assert (tmp_path / "fit.json").read_bytes() == first
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
+
+
+class Killed(BaseException):
+    """The process died."""
+
+
+def dies_after(monkeypatch, writes: int) -> None:
+    """The next writing process dies after so many of its files."""
+    done = iter(range(writes))
+    write = fit_file.write_bytes
+
+    def until(path, data):
+        if next(done, None) is None:
+            raise Killed
+        write(path, data)
+
+    monkeypatch.setattr(fit_file, "write_bytes", until)
+
+
+OLD = 4.0
+"""A number by which two fits are told apart, in what is JSON and in what is an array."""
+
+
+def of_two() -> tuple[Fit, Fit]:
+    old = dataclasses.replace(fit_of(True), remaining=OLD, laplace=OLD * fit_of(True).laplace)
+    return old, fit_of(True)
+
+
+@pytest.mark.parametrize("writes", [0, 1, 2, 3])
+def test_a_refit_that_dies_while_it_is_written_never_leaves_parts_of_two(
+    tmp_path, monkeypatch, writes
+):
+    old, new = of_two()
+    save(old, tmp_path)
+    with monkeypatch.context() as patch:
+        dies_after(patch, writes)
+        if writes < 3:
+            with pytest.raises(Killed):
+                save(new, tmp_path)
+        else:
+            save(new, tmp_path)
+    if writes == 2:  # identified.json is still the old one's
+        with pytest.raises(DataError, match="of another fit than"):
+            load(tmp_path)
+        (tmp_path / "identified.json").unlink()
+    back, left = load(tmp_path), new if writes >= 2 else old
+    assert back.remaining == left.remaining
+    np.testing.assert_array_equal(back.laplace, left.laplace)
+    names = save(new, tmp_path)  # and the next one cleans up
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
+    assert load(tmp_path).remaining == new.remaining
+
+
+def test_a_file_of_another_fit_is_noticed(tmp_path):
+    old, new = of_two()
+    names = save(old, tmp_path / "old"), save(new, tmp_path / "new")
+    for mine, other in zip(*names, strict=True):
+        kept = (tmp_path / "new" / other).read_bytes()
+        (tmp_path / "new" / other).write_bytes((tmp_path / "old" / mine).read_bytes())
+        with pytest.raises(DataError, match=r"another fit|damaged|expected the arrays of"):
+            load(tmp_path / "new")
+        (tmp_path / "new" / other).write_bytes(kept)
+    assert load(tmp_path / "new").remaining == new.remaining
+
+
+def test_damage_of_any_file_is_a_message_and_never_a_traceback(tmp_path):
+    names, rng = save(fit_of(True), tmp_path), np.random.default_rng(0)
+    for name in names:
+        whole = (tmp_path / name).read_bytes()
+        for _ in range(40):
+            data = bytearray(whole)
+            at, most = rng.integers(len(data)), int(rng.integers(1, 40))
+            kind = rng.integers(3)
+            if kind == 0:
+                data[at] ^= 1 << rng.integers(8)
+            elif kind == 1:
+                del data[at : at + most]
+            else:
+                data[at:at] = rng.bytes(most)
+            (tmp_path / name).write_bytes(bytes(data))
+            # identified.json is not read back, and white space means nothing
+            with contextlib.suppress(DataError):
+                assert to_json(load(tmp_path)) == to_json(fit_of(True))
+        (tmp_path / name).unlink()
+        if name != "identified.json":
+            with pytest.raises(DataError, match=name):
+                load(tmp_path)
+        (tmp_path / name).write_bytes(whole)
+    load(tmp_path)
+
+
+# sessions ---------------------------------------------------------------------------------------
+
+SHARED = {"along": 0.02, "across": 0.01}
+"""Stds of what runs of one session share [m/m]: thrice and twice as much as a run has alone."""
+
+
+def in_sessions(session, seed):
+    """Runs in these sessions, whose ends are off by what the runs of each share."""
+    rng = np.random.default_rng(seed)
+    drives = [Drive("soft", "as_built", h, 0.1) for h in rng.uniform(0, 2 * np.pi, len(session))]
+    logs = make_logs(TRUTH, drives, seed, Sensors(has_voltage=False))
+    effect = rng.normal(size=(max(session) + 1, 2)) * [*SHARED.values()]
+    moved = []
+    for log, drive, (along, across) in zip(logs, drives, effect[session], strict=True):
+        back = np.linalg.pinv(np.asarray(TRUTH.geometry.forward()))
+        step = log.wheel_angle * float(TRUTH.geometry.wheel_radius) @ back.T
+        seen_at = log.time - float(TRUTH.camera.lag)
+        far = np.interp(seen_at, log.time, np.hypot(*step.T[:2])) / float(TRUTH.camera.scale)
+        way = log.pose[0, 2] + drive.heading
+        turn = np.array([[np.cos(way), np.sin(way)], [-np.sin(way), np.cos(way)]])
+        pose = log.pose.copy()
+        pose[:, :2] += far[:, None] * (np.array([along, across]) @ turn)
+        moved.append(dataclasses.replace(log, pose=pose))
+    return collect(moved, [f"s{k}" for k in session])
+
+
+def test_what_sessions_share_is_stored_with_its_unit():
+    data = in_sessions(np.arange(24) % 6, 1)
+    problem = Problem(windows(data, 0.04, lag=0.056), blank(DRIVES), list(CHOICES))
+    z, log_v = problem.space.vector(TRUTH), 2 * np.log(problem.noise.typical)
+    laplace = problem.laplace(z, log_v, np.ones(len(problem.windows)))
+    end = Optimum(State(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
+    fit = summarise(problem, end, data, CHOICES)
+    kept = to_json(fit)["variances"]
+    for axis, unit in {**dict.fromkeys(SHARED, "m/m"), "yaw": "rad/m"}.items():
+        assert kept[f"session.soft.{axis}"]["unit"] == kept[f"run.soft.{axis}"]["unit"] == unit
+    assert np.linalg.eigvalsh(fit.covariance - fit.laplace).min() > -1e-12
+
+
+@pytest.mark.nightly
+def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
+    """At the truth, so that all that is off is noise: 200 runs, each in a session of its own."""
+    data = in_sessions(np.arange(160) % 40, 1)
+    problem = Problem(windows(data, 0.04, lag=0.056), blank(DRIVES), list(CHOICES))
+    z, sensors = problem.space.vector(TRUTH), Sensors()
+    std = problem.noise.typical.copy()
+    for k, name in enumerate(problem.noise.names):
+        if name.startswith("session.soft."):
+            std[k] = SHARED.get(name.rpartition(".")[2], 1e-9)
+        elif not name.startswith("current."):
+            std[k] = max(sensors.of(name), 1e-9)
+    log_v = 2 * np.log(std)
+    laplace = problem.laplace(z, log_v, np.ones(len(problem.windows)))
+    end = Optimum(State(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
+    save(summarise(problem, end, data, CHOICES), tmp_path)
+    fit = load(tmp_path)
+    assert np.linalg.eigvalsh(fit.covariance - fit.laplace).min() > -1e-12
+    new = in_sessions(np.arange(200), 2)
+    alone = {n: 1e-30 if n.startswith("session.") else v for n, v in fit.variance.items()}
+
+    def covered(covariance, variance):
+        fitted = dataclasses.replace(fit.contact, variance=variance, covariance=covariance)
+        return validation(fitted, (), new).summary["soft"]["identified"].coverage90
+
+    # what it says at least; what is drawn is Gaussian, of which a Student t's region holds more
+    held = chi2.cdf(2 * fisher.ppf(0.9, 2, DEGREES), 2)
+    low, high = binom.ppf(0.005, 200, 0.9), binom.ppf(0.995, 200, held)
+    assert low <= 200 * covered(fit.covariance, dict(fit.variance)) <= high
+    assert covered(fit.laplace, alone) < 0.7
+
+
+def test_numbers_that_are_not_finite_never_reach_a_file(tmp_path):
+    bad = dataclasses.replace(fit_of(True), lag=float("nan"))
+    with pytest.raises(ValueError, match="JSON"):
+        save(bad, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_results_are_refused_with_a_message(tmp_path):
+    with pytest.raises(DataError, match="expected the result of `slipid identify`"):
+        load(tmp_path)
+    *_, arrays = save(fit_of(True), tmp_path)
+    (tmp_path / arrays).write_bytes(b"PK no zip")
+    with pytest.raises(DataError, match="damaged"):
+        load(tmp_path)
+    (tmp_path / "fit.json").write_text('{"schema": "other/1"}')
+    with pytest.raises(DataError, match=r"its schema is other/1; expected slipid\.fit/6"):
+        load(tmp_path)
+    (tmp_path / "fit.json").write_text("{")
+    with pytest.raises(DataError, match="no valid JSON"):
+        load(tmp_path)
+
+
+def test_a_fit_from_its_files_is_the_same_type_and_says_what_it_lacks(tmp_path):
+    fit = fit_of(True)
+    fit.save(tmp_path)
+    again = Fit.load(tmp_path)
+    assert str(again) == str(fit)
+    assert again["surface.soft.creep"] == fit["surface.soft.creep"]
+    with pytest.raises(KeyError, match=r"no parameter 'motor\.nonsense'; there are"):
+        _ = again["motor.nonsense"]
+    assert again.new_runs(fit.data) == 0
+    with pytest.raises(ValueError, match="this fit was loaded from its files"):
+        again.profile("surface.soft.creep", quiet=True)

@@ -1,0 +1,95 @@
+"""Floors that disagree about the loads are named, those that agree up to noise are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import chi2, norm
+
+from slipid.fit.optimise import optimise
+from slipid.fit.problem import Problem
+from slipid.infer.verdicts.disputed import Dispute, disputes, marked
+from slipid.infer.verdicts.estimates import estimates
+from slipid.search_space import Choice
+from tests.helpers.made_windows import made, robot
+
+CHOICES = (
+    Choice("*", free=False),
+    Choice("surface.*.creep", free=True),
+    Choice("robot.load_share@*", free=True),
+    Choice("surface.*.load_bias", free=True),
+)
+STD = {
+    "camera.place": 0.0005,
+    "camera.heading": 0.003,
+    **{f"process.{axis}": 0.002 for axis in ("along", "across", "yaw")},
+    **{f"run.{axis}": 0.003 for axis in ("along", "across", "yaw")},
+}
+
+
+def problem_of(truth, runs=96):
+    w = made(truth, runs=runs, std=STD)
+    return Problem(replace(w, has_current=False, has_voltage=False), robot(), CHOICES)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return problem_of(robot(), runs=24)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [1.0, 4.0])
+def test_sigma_is_that_of_the_likelihood_alone(problem, size):
+    """What floors say is put together with the prior by Bayes' theorem, and taken apart again."""
+    space, rng, pooled = problem.space, np.random.default_rng(1), 0.03**2
+    root = 40 * rng.normal(size=(space.size, space.size))
+    own = root @ root.T + np.eye(space.size)  # information, wide priors of the biases included
+    alone = 0.05 * size * rng.normal(size=space.size)  # what the data would say by themselves
+    at = np.flatnonzero(problem.space.pooled)
+    precision = own.copy()
+    precision[at, at] += 1 / pooled - 1.0
+    # the prior of the biases is around zero, that of all others in what the data say
+    z = np.linalg.solve(precision, own @ alone)
+    one, other = (space.place[f"surface.{floor}.load_bias"] for floor in ("firm", "soft"))
+    gap = alone[one] - alone[other]
+    cov = np.linalg.inv(own)
+    spread = cov[one, one] + cov[other, other] - cov[one, other] - cov[other, one]
+    chance = chi2.sf(gap @ np.linalg.solve(spread, gap), 2)
+    found = disputes(space.with_pooled(np.sqrt(pooled)), z, np.linalg.inv(precision))
+    assert [d.floors for d in found] == [("firm", "soft")] * int(chance < 0.01)
+    if found:
+        assert found[0].sigma == pytest.approx(norm.isf(chance / 2), rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bias", [0.0, 0.12])
+def test_a_floor_with_another_law_is_named(bias):
+    truth = robot()
+    own = jnp.asarray([[0.0, 0.0, 0.0], [bias, -0.5 * bias, -0.5 * bias]])
+    truth = eqx.tree_at(lambda r: r.surfaces.load_bias, truth, own)
+    problem = problem_of(truth)
+    end = optimise(problem)
+    pooled = np.exp(end.state.log_variance[problem.target.pooled])
+    found = disputes(problem.space.with_pooled(np.sqrt(pooled)), end.state.z, end.covariance)
+    assert [d.floors for d in found] == [("firm", "soft")] * (bias > 0)
+
+
+@pytest.mark.slow
+def test_only_loads_that_were_identified_are_disputed(problem):
+    space = problem.space
+    tight = np.diag(np.full(space.size, 1e-4))
+    numbers = {
+        e.path: e for e in estimates(space, CHOICES, space.start, tight, has_voltage=False, flat=())
+    }
+    said = marked(numbers, (Dispute(("firm", "soft"), 3.2),))
+    for path, e in said.items():
+        loads = path.startswith("robot.load_share")
+        assert e.verdict == ("disputed" if loads else numbers[path].verdict)
+    assert marked(numbers, ()) == numbers
+    weak = {path: replace(e, verdict="weak") for path, e in numbers.items()}
+    assert marked(weak, (Dispute(("firm", "soft"), 3.2),)) == weak
+    assert "firm and soft disagree" in Dispute(("firm", "soft"), 3.2).sentence

@@ -1,0 +1,246 @@
+"""What a prediction is worth, and how folds are put together, against plain formulas."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sklearn.metrics import roc_auc_score
+
+from slipid.fit.variances import DEGREES
+from slipid.lab.benchmark.judge import Row, scored
+from slipid.lab.benchmark.summary import Number, Resampled, RowSummary, area, summary
+from slipid.lab.benchmark.tuned import sentence
+from slipid.predict.score import forecast
+from slipid.predict.slip_model import Said, path_of
+from tests.helpers.made_runs import ROBOTINO, made_run, straight
+
+
+def slipping_run(**more):
+    """Drives 0.8 m by its wheels and 0.6 m in truth."""
+    rolling = straight(0.0)
+    return made_run(rolling, 0.75 * rolling, current=np.full((40, 3), 0.5), **more)
+
+
+def said(run, twist, **more):
+    return Said(path_of(twist, run.heard.dt), **more)
+
+
+def test_the_end_is_judged_over_the_chord():
+    run = slipping_run()
+    one = scored(run, said(run, run.heard.rolling(ROBOTINO)), ROBOTINO, "chord")
+    assert one.endpoint_error == pytest.approx(1 / 3)
+    assert one.length_error == pytest.approx(1 / 3)
+    assert one.heading_error_deg == pytest.approx(0.0, abs=1e-9)
+    assert one.twist_error == pytest.approx(0.05)
+
+
+def test_over_the_path_a_circle_counts_its_way():
+    rolling = np.tile([0.2, 0.0, np.pi / 2], (40, 1))
+    run = made_run(rolling)
+    one = scored(run, said(run, 0.5 * rolling), ROBOTINO, "path")
+    assert one.heading_error_deg == pytest.approx(180.0)
+    ahead = np.hypot(*path_of(0.5 * rolling, run.heard.dt)[-1, :2])
+    assert one.endpoint_error == pytest.approx(ahead / 0.8, rel=2e-3)
+
+
+def test_lengths_are_of_what_ends_are_judged_over_and_headings_do_not_wind_up():
+    rolling = np.tile([0.2, 0.0, np.pi / 2], (80, 1))  # two whole turns
+    run = made_run(rolling)
+    one = scored(run, said(run, 0.5 * rolling), ROBOTINO, "path")
+    assert one.length_error == pytest.approx(0.5, rel=1e-3)
+    assert one.heading_error_deg == pytest.approx(0.0, abs=1e-6)
+    turned = said(run, rolling - [0.0, 0.0, np.pi / 3])
+    assert scored(run, turned, ROBOTINO, "path").heading_error_deg == pytest.approx(120.0)
+
+
+def test_who_says_what_encoders_say_sees_no_slip():
+    rng = np.random.default_rng(0)
+    rolling = rng.normal(0.2, 0.1, (40, 3))
+    run = made_run(rolling, 0.5 * rolling)
+    one = scored(run, said(run, run.heard.rolling(ROBOTINO)), ROBOTINO, "chord")
+    assert set(one.scores) == {0.0}
+    assert all(one.slips)
+
+
+def test_the_start_may_lie_anywhere():
+    run = slipping_run()
+    c, s = np.cos(2.0), np.sin(2.0)
+    moved = run.pose @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [1.0, -3.0, 2.0]
+    one, other = (
+        scored(r, said(run, run.twist), ROBOTINO, "chord") for r in (run, replace(run, pose=moved))
+    )
+    assert other.endpoint_error == pytest.approx(one.endpoint_error, abs=1e-12)
+    assert other.endpoint_error < 1e-9
+
+
+def test_slip_is_told_from_the_twist_unless_a_method_says_it():
+    run = slipping_run()
+    right = scored(run, said(run, run.twist), ROBOTINO, "chord")
+    assert all(right.slips)
+    assert right.scores == pytest.approx([0.25] * 8)
+    own = scored(run, said(run, run.twist, slipping=np.full(40, 7.0)), ROBOTINO, "chord")
+    assert own.scores == pytest.approx([7.0] * 8)
+    steady = made_run(straight(0.0), 0.85 * straight(0.0))
+    assert not any(scored(steady, said(steady, steady.twist), ROBOTINO, "chord").slips)
+
+
+def test_turning_counts_with_the_way_of_the_wheels():
+    """A yaw rate is a speed at the base radius beside those ahead and sideways."""
+    rolling = straight(0.0) + np.array([0.0, 0.0, 0.4])
+    run = made_run(rolling, rolling - np.array([0.0, 0.0, 0.3]))
+    one = judged(run, said(run, run.heard.rolling(ROBOTINO)), ROBOTINO, "chord")
+    assert one.twist_error == pytest.approx(0.3 * ROBOTINO.base_radius, rel=1e-6)
+    assert not any(one.slips)  # 0.0375 m/s are less than a fifth of the speed, 0.3 would be more
+    other = judged(run, said(run, run.twist), ROBOTINO, "chord")
+    rim = np.hypot(0.2, 0.4 * ROBOTINO.base_radius)
+    assert other.scores == pytest.approx([0.3 * ROBOTINO.base_radius / rim] * 8, abs=1e-4)
+
+
+def test_a_region_covers_what_lies_inside_it():
+    run = slipping_run()
+    gap = 0.2  # of encoders, ahead
+    for std, inside in ((gap / 2.1, True), (gap / 2.2, False)):
+        cov = np.diag([std**2, 1e-6])
+        told = said(run, run.heard.rolling(ROBOTINO), end_covariance=cov)
+        assert scored(run, told, ROBOTINO, "chord").covered90 is inside
+
+
+def test_floors_are_right_for_a_part_of_the_time():
+    run = slipping_run(floor="gray@moved")
+    gray = np.where(np.arange(40) < 10, 0.2, 0.9)
+    told = said(run, run.twist, floors={"gray": gray, "green": 1 - gray})
+    assert scored(run.told(False), told, ROBOTINO, "chord").floor_right == pytest.approx(0.75)
+    assert scored(run.told(True), told, ROBOTINO, "chord").floor_right is None
+    new = replace(told, floors={"green": 1 - gray, "unknown": gray})
+    assert scored(run.told(False), new, ROBOTINO, "chord").floor_right == pytest.approx(0.75)
+
+
+def test_energy_is_judged_as_a_whole():
+    run = slipping_run()
+    power = run.heard.power(ROBOTINO)
+    swung = power * np.where(np.arange(40) % 2, 1.4, 1.0)
+    told = said(run, run.twist, power=swung)
+    assert scored(run, told, ROBOTINO, "chord").energy_error == pytest.approx(0.2)
+
+
+def test_the_area_is_that_of_scikit_learn():
+    rng = np.random.default_rng(0)
+    score, slips = rng.integers(0, 9, 300).astype(float), rng.random(300) < 0.4
+    weight = rng.integers(0, 4, 300).astype(float)
+    expected = roc_auc_score(slips, score, sample_weight=weight)
+    assert area(score, slips, weight) == pytest.approx(expected)
+
+
+def rows(errors, floor="gray"):
+    """A fold whose runs err by so much."""
+    base = scored(slipping_run(), said(slipping_run(), straight(0.0)), ROBOTINO, "chord")
+    runs = [
+        replace(base, name=f"{floor}{k}", floor=floor, cluster=k, endpoint_error=e)
+        for k, e in enumerate(errors)
+    ]
+    return Row(runs=tuple(runs), numbers=3, fit_s=1.0)
+
+
+def test_means_are_over_runs_and_then_over_floors():
+    own = [rows([0.1, 0.1, 0.1, 0.1]), rows([0.3, 0.5], "green")]
+    found = summary({"slipid": own}, "slipid")["slipid"]
+    assert found.endpoint_error is not None
+    assert found.endpoint_error.value == pytest.approx(0.25)
+    assert found.floors is not None
+    assert found.floors["green"].value == pytest.approx(0.4)
+    assert found.runs == 6
+    assert found.numbers == 3
+
+
+def test_folds_whose_fit_did_not_come_to_rest_are_counted():
+    folds = [rows([0.1, 0.2]), replace(rows([0.3]), converged=False)]
+    assert summary({"slipid": folds}, "slipid")["slipid"].unconverged == 1
+
+
+def test_a_difference_is_paired():
+    rng = np.random.default_rng(0)
+    errors = rng.uniform(0.1, 0.9, 40)
+    own, other = [rows(errors)], [rows(errors + 0.01)]
+    found = summary({"slipid": own, "other": other}, "slipid")
+    behind = found["other"].behind
+    assert behind is not None
+    assert behind == pytest.approx(Number(0.01, 0.01, 0.01))  # runs that scatter do not hide it
+    assert found["slipid"].behind is None
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_true_mean_as_often_as_they_say():
+    rng = np.random.default_rng(1)
+    hits = 0
+    for _ in range(100):
+        found = summary({"slipid": [rows(rng.normal(0.5, 0.1, 30))]}, "slipid")["slipid"]
+        assert found.endpoint_error is not None
+        hits += found.endpoint_error.low <= 0.5 <= found.endpoint_error.high
+    assert 80 <= hits <= 97
+
+
+def test_runs_of_a_cluster_are_drawn_together():
+    runs = [replace(run, cluster=k // 5) for k, run in enumerate(rows(np.zeros(20)).runs)]
+    drawn = Resampled.of(runs).draws
+    assert (drawn[:, ::5] == drawn[:, 4::5]).all()
+    assert (drawn.sum(axis=1) == 20).all()
+    assert len({tuple(row) for row in drawn.tolist()}) > 20
+
+
+def test_runs_of_a_floor_with_one_cluster_are_drawn_one_by_one():
+    runs = [replace(run, cluster=7) for run in rows((0.1, 0.3, 0.2, 0.9)).runs]
+    draws = Resampled.of(runs).mean(np.array([run.endpoint_error for run in runs]))
+    assert draws[0] == pytest.approx(0.375)
+    assert np.std(draws) > 0.05
+
+
+def test_the_force_balances_region_holds_nine_tenths_of_a_student_t():
+    rng = np.random.default_rng(0)
+    scale = np.array([[2.0, 0.5], [0.5, 1.0]])
+    gaussian = rng.multivariate_normal((0.0, 0.0), scale, 20000)
+    ends = gaussian / np.sqrt(rng.chisquare(DEGREES, 20000) / DEGREES)[:, None]
+    for gap, freedom in ((ends, DEGREES), (gaussian, np.inf)):
+        level, _ = forecast(gap[:2000], np.tile(scale, (2000, 1, 1)), freedom)
+        assert (level <= 0.9).mean() == pytest.approx(0.9, abs=0.02)
+
+
+def test_a_row_that_is_absent_in_one_fold_is_absent():
+    folds = {
+        "slipid": [rows([0.1, 0.2]), rows([0.3, 0.4], "green")],
+        "broken": [rows([0.1, 0.2]), Row.of_error(ValueError("no rank\nmore"))],
+        "ojeda_gyro": [Row.lacking(["gyro"]), Row.lacking(["gyro"])],
+    }
+    found = summary(folds, "slipid")
+    assert found["broken"].failed
+    assert found["broken"].absent == "ValueError: no rank"
+    assert found["broken"].endpoint_error is None
+    assert not found["ojeda_gyro"].failed
+    assert found["ojeda_gyro"].absent == "needs a gyro"
+
+
+def test_rows_outlive_their_files():
+    row = rows([0.1, 0.2])
+    assert Row.of_json(row.to_json()) == row
+
+
+def ends(value, low=None, high=None, behind=None):
+    error = Number(value, value - 0.01, value + 0.01)
+    return RowSummary(endpoint_error=error, behind=behind, runs=9)
+
+
+def test_the_reading_says_who_is_ahead():
+    ahead = {"slipid": ends(0.1), "rival": ends(0.05, behind=Number(-0.05, -0.07, -0.03))}
+    assert sentence("carpet", "new_floor", ahead) == (
+        "carpet, new floor: rival is ahead of slipid: 5.0 % against 10.0 %, "
+        "-5.0 points [-7.0, -3.0]"
+    )
+    both = {**ahead, "third": ends(0.06, behind=Number(-0.04, -0.06, -0.02))}
+    assert "new floor: rival (and 1 more) is ahead of slipid:" in sentence("x", "new_floor", both)
+    tied = {"slipid": ends(0.1), "rival": ends(0.09, behind=Number(-0.01, -0.03, 0.01))}
+    assert sentence("x", "sectors", tied).endswith("by 9.0 %; not told apart from rival")
+    many = {f"row{k}": ends(0.1 + 0.01 * k, behind=Number(0.0, -0.1, 0.1)) for k in range(6)}
+    assert sentence("x", "sectors", {"slipid": ends(0.1), **many}).endswith(
+        "not told apart from row0, row1, row2, row3 and 2 more"
+    )
+    behind = {"slipid": ends(0.1), "rival": ends(0.2, behind=Number(0.1, 0.08, 0.12))}
+    assert sentence("x", "sectors", behind).endswith("by 20.0 %, +10.0 points [+8.0, +12.0]")

@@ -1,0 +1,157 @@
+"""The tables and the page of a benchmark, of made content."""
+
+import copy
+
+import pytest
+from typer.testing import CliRunner
+
+from slipid.cli.main import app
+from slipid.lab.benchmark.plots import benchmark_pictures
+from slipid.lab.benchmark.report import COLUMNS, LEGEND, page, show_benchmark
+from slipid.report.page import Page
+
+
+def row(error=None, absent="", failed=False, **more):
+    ends = None if error is None else [error, error - 0.01, error + 0.01]
+    names = "behind length_error heading_error_deg twist_error coverage90 slip_auc "
+    blank = dict.fromkeys((names + "floor_accuracy energy_error floors").split())
+    costs = {"runs": 9, "numbers": 3, "tune_s": 1.0, "fit_s": 0.02, "step_us": 12.3}
+    about = {"settings": [], "unconverged": 0, "absent": absent, "failed": failed}
+    return {"endpoint_error": ends, **blank, **costs, **about, **more}
+
+
+CONTENT = {
+    "sets": {
+        "carpets": {
+            "about": "a robot on carpets",
+            "over": "chord",
+            "runs": 9,
+            "protocols": {
+                "known_floor": {
+                    "encoder": row(0.3, behind=[0.25, 0.2, 0.3]),
+                    "slipid": row(0.05, coverage90=[0.9, 0.8, 1.0]),
+                    "ojeda_gyro": row(absent="needs a gyro"),
+                    "quann_slip": row(absent="ValueError: <no> rank", failed=True),
+                }
+            },
+        }
+    },
+    "protocols": {"known_floor": "new headings on a floor that is told"},
+    "floors": {},
+    "rectangle": None,
+    "reading": ["carpets, known floor: slipid errs by 5.0 %"],
+    "seconds": 12.0,
+    "versions": {"python": "3.11"},
+}
+
+
+def text(content):
+    shown = Page(kept=True)
+    show_benchmark(shown, content)
+    return shown.text
+
+
+def test_the_best_row_comes_first_and_what_is_absent_is_said():
+    lines = text(CONTENT).splitlines()
+    first = next(k for k, line in enumerate(lines) if line.startswith("slipid"))
+    assert lines[first + 1].startswith("encoder")
+    assert "5.0 [4.0, 6.0]" in lines[first]
+    assert "+25.0 [+20.0, +30.0]" in lines[first + 1]
+    assert "ojeda_gyro: needs a gyro" in text(CONTENT)
+    assert "quann_slip: failed: ValueError: <no> rank" in text(CONTENT)
+
+
+def test_the_page_has_every_table_and_picture_and_escapes_what_it_is_told():
+    pictures = benchmark_pictures(CONTENT)
+    assert list(pictures) == ["carpets"]
+    assert pictures["carpets"].startswith(b"\x89PNG")
+    said = page(CONTENT, pictures)
+    assert said.count("<img") == 1
+    for number, *_ in COLUMNS.values():
+        assert number.partition(",")[0].lower() in LEGEND.lower()
+    assert "quann_slip: failed: ValueError: &lt;no&gt; rank" in said
+    assert "<tr class='own'><td>slipid</td>" in said
+    assert said.index("<td>slipid</td>") < said.index("<td>encoder</td>")
+
+
+def test_a_data_set_in_which_nothing_ran_has_no_picture():
+    content = copy.deepcopy(CONTENT)
+    failed = {"slipid": row(absent="gone", failed=True)}
+    content["sets"]["carpets"]["protocols"]["known_floor"] = failed
+    assert benchmark_pictures(content) == {}
+    assert "<img" not in page(content, {})
+
+
+def test_fits_that_did_not_come_to_rest_are_said():
+    content = copy.deepcopy(CONTENT)
+    content["sets"]["carpets"]["protocols"]["known_floor"]["slipid"]["unconverged"] = 2
+    assert "slipid: fits did not come to rest: 2" in text(content)
+    assert "slipid: fits did not come to rest: 2" in page(content, {})
+
+
+def heard(name, absent=""):
+    after = {"seconds": 1.0, "accuracy": [0.7, 0.6, 0.8], "behind": None}
+    return {"name": name, "numbers": 3, "after": [] if absent else [after], "absent": absent}
+
+
+def test_a_classifier_that_failed_is_said_above_the_others():
+    content = copy.deepcopy(CONTENT)
+    rows = [heard("gaussian"), heard("trees", "ValueError: no leaf")]
+    content["floors"] = {"husky": {"about": "a Husky", "runs": 9, "chance": 0.3, "rows": rows}}
+    for said in (text(content), page(content, {})):
+        flat = " ".join(said.split())
+        assert "failed: trees: ValueError: no leaf" in flat
+        assert "70 [60, 80]" in flat
+
+
+def clean():
+    content = copy.deepcopy(CONTENT)
+    del content["sets"]["carpets"]["protocols"]["known_floor"]["quann_slip"]
+    felt = {"about": "a Husky", "runs": 9, "chance": 0.3, "rows": [heard("gaussian")]}
+    return {**content, "unread": {}, "floors": {"husky": felt}}
+
+
+BROKEN = {
+    "data set": {"unread": {"carpets": "OSError: disk on fire"}},
+    "row": {"sets": CONTENT["sets"]},
+    "classifier": {
+        "floors": {"husky": {**clean()["floors"]["husky"], "rows": [heard("trees", "no leaf")]}}
+    },
+    "floors": {"floors": {"husky": {"failed": "no logs"}}},
+    "rectangle": {"rectangle": {"failed": "no MuJoCo"}},
+}
+
+
+@pytest.mark.parametrize("broken", [None, *BROKEN])
+def test_the_exit_code_says_whether_anything_failed(broken, tmp_path, monkeypatch):
+    content = clean() | (BROKEN[broken] if broken else {})
+    monkeypatch.setattr("slipid.lab.benchmark.benchmark.benchmark", lambda *_: content)
+    monkeypatch.setattr("slipid.lab.benchmark.plots.benchmark_pictures", lambda _: {})
+    asked = ["benchmark", "--data", str(tmp_path), "--out", str(tmp_path / "out"), "--quiet"]
+    done = CliRunner().invoke(app, asked)
+    assert done.exit_code == (1 if broken else 0), done.output
+    assert (tmp_path / "out" / "benchmark.html").is_file()
+
+
+@pytest.mark.parametrize("where", ["terminal", "page"])
+def test_the_rectangle_is_ranked_by_closure(where):
+    content = copy.deepcopy(CONTENT)
+
+    def controller(closure, ratio):
+        return {
+            "closure_error_median": closure,
+            "cross_track_rmse": 20.0,
+            "finished_share": 1.0,
+            "runs": 8,
+            "interval90": {"closure_error_median": [closure - 5, closure + 5]},
+            "to_encoder": {"closure_error_median": {"value": ratio, "interval90": [0.4, 0.7]}},
+        }
+
+    rows = {"encoder": controller(200.0, 1.0), "contact": controller(110.0, 0.55)}
+    content["rectangle"] = {"plant": "testsite", "summary": rows}
+    said = text(content) if where == "terminal" else page(content, {})
+    assert "rectangle on the virtual test site, 8 starts" in said
+    assert said.index("110 [105, 115]") < said.index("200 [195, 205]")
+    assert "55 [40, 70]" in said
+    content["rectangle"] = {"failed": "no MuJoCo"}
+    assert "failed: no MuJoCo" in (text(content) if where == "terminal" else page(content, {}))

@@ -1,0 +1,73 @@
+"""The data sets: what is there, what methods hear of it, and what slipid fits."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slipid.app.logs import packaged_path
+from slipid.lab.benchmark.protocols import KINDS, PROTOCOLS
+from slipid.lab.benchmark.sets import SOURCES, read_set, there
+from slipid.support.progress import Reporter
+
+QUIET = Reporter(quiet=True)
+
+
+def source(name):
+    return next(one for one in SOURCES if one.name == name)
+
+
+def test_every_source_has_a_config_and_kinds_that_there_are():
+    assert len({one.name for one in SOURCES}) == len(SOURCES)
+    for one in SOURCES:
+        assert packaged_path(one.config).is_file()
+        assert set(one.kinds) <= {*KINDS, "all"}
+        assert set(one.kinds) <= {p.split for p in PROTOCOLS.values()}
+        assert ("all" in one.kinds) == (one.crossing is not None)
+
+
+def test_what_is_absent_is_absent(tmp_path):
+    assert [one.name for one in SOURCES if there(one, tmp_path)] == ["testsite"]
+    (tmp_path / "drive_skid").mkdir()
+    assert there(source("husky"), tmp_path)
+
+
+@pytest.fixture(scope="module")
+def testsite(tmp_path_factory):
+    return read_set(source("testsite"), Path("nowhere"), tmp_path_factory.mktemp("out"), QUIET)
+
+
+def test_recorded_runs_need_no_data_folder(testsite):
+    assert len(testsite.heard) == len(testsite.job.dataset) == 120
+    assert set(testsite.setups) == {"firm", "soft", "soft@moved"}
+    assert testsite.machine.determines_twist
+    assert {fact.floor for fact in testsite.facts} == {"firm", "soft", "soft@moved"}
+
+
+def test_a_part_of_the_runs_has_every_floor_and_speed(testsite):
+    few = testsite.thinned(30)
+    assert len(few.heard) == len(few.job.dataset) == len(few.facts) == 30
+    assert set(few.setups) == set(testsite.setups)
+    assert {round(fact.speed, 2) for fact in few.facts} == {0.1, 0.2}
+    assert testsite.thinned(500) is testsite
+
+
+@pytest.mark.slow
+def test_currents_are_heard_where_the_fit_does_without(real_data, tmp_path):
+    for name, signed in (("warthog", True), ("husky", False)):
+        data = read_set(source(name), real_data, tmp_path, QUIET)
+        assert data.heard.current is not None
+        assert data.heard.current_is_signed is signed
+        assert data.job.dataset.current is None
+        assert [log.name for log in data.heard.logs] == [log.name for log in data.job.dataset.logs]
+        assert not data.machine.determines_twist
+
+
+@pytest.mark.slow
+def test_a_skid_steers_direction_is_that_of_going_and_turning(real_data, tmp_path):
+    data = read_set(source("warthog"), real_data, tmp_path, QUIET)
+    base = float(data.job.robot.geometry.base_radius)
+    for log, fact in zip(data.heard.logs, data.facts, strict=True):
+        ahead, _, turn = np.median(log.twist_command, axis=0)
+        assert fact.speed == pytest.approx(np.hypot(ahead, base * turn))
+        assert np.tan(np.radians(fact.heading_deg)) == pytest.approx(base * turn / ahead, rel=1e-6)

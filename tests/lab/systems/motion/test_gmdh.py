@@ -1,0 +1,267 @@
+"""Polynomial networks against least squares written out, and what GMDH tells of made floors."""
+
+from dataclasses import replace
+from itertools import pairwise, product
+
+import numpy as np
+import pytest
+
+from slipid.lab.systems.motion.gmdh import (
+    CANDIDATES,
+    MEMORY,
+    GmdhClass,
+    GmdhOne,
+    Networks,
+    first_half,
+    remembered,
+)
+from slipid.lab.systems.motion.polynomial_network import (
+    GAIN,
+    Growth,
+    Layer,
+    PolynomialNetwork,
+    Sums,
+    grown,
+    pruned,
+)
+from slipid.predict.slip_model import Run, path_of
+from tests.helpers.made_runs import ROBOTINO, made_run, straight
+
+EXACT = Growth(1e-12, 20, 5)
+SIZES = np.array([1.0, 1.0, 0.125])
+
+
+def terms(a, b):
+    return np.stack([np.ones_like(a), a, b, a * b, a**2, b**2], axis=1)
+
+
+def rows(seed=0, n=80, inputs=4):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(n, inputs)), rng.normal(size=n), rng.uniform(0.5, 2.0, n)
+
+
+def test_neurons_of_all_pairs_are_weighted_ridge_regressions():
+    x, y, weight = rows()
+    layer = Sums.of(x, y, weight).solved(0.3)
+    assert layer.inputs.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
+    for (a, b), found in zip(layer.inputs, layer.weight, strict=True):
+        root = np.sqrt(weight / weight.sum())[:, None]
+        # ridge as further rows, none for the constant
+        tall = np.vstack([root * terms(x[:, a], x[:, b]), np.sqrt(0.3) * np.eye(6)[1:]])
+        right = np.concatenate([root[:, 0] * y, np.zeros(5)])
+        assert np.allclose(found, np.linalg.lstsq(tall, right, rcond=None)[0])
+
+
+def test_errors_of_neurons_are_those_of_what_they_say():
+    x, y, weight = rows()
+    layer = Sums.of(*rows(1)).solved(0.01)
+    square = (layer.output(x) - y[:, None]) ** 2
+    assert np.allclose(
+        Sums.of(x, y, weight).errors(layer.weight), np.average(square, axis=0, weights=weight)
+    )
+
+
+def test_a_quadratic_of_two_inputs_is_found_exactly_in_one_layer():
+    x, _, weight = rows(n=200)
+    y = 0.3 - x[:, 3] + 2.0 * x[:, 1] * x[:, 3] + 0.5 * x[:, 1] ** 2 - 0.7 * x[:, 3] ** 2
+    network = grown(x, y, weight, np.arange(200) < 100, EXACT)
+    (layer,) = network.layers
+    assert layer.inputs.tolist() == [[1, 3]]
+    assert layer.weight[0] == pytest.approx([0.3, 0.0, -1.0, 2.0, 0.5, -0.7], abs=1e-8)
+    assert network.numbers == 6
+
+
+def test_two_quadratics_of_other_inputs_take_two_layers():
+    # levels of all inputs combined, so that no term of one pair is like a term of the other
+    x = np.array(list(product([-1.2, -0.5, 0.4, 1.3], repeat=4)))
+    x = np.concatenate([x, x])
+    y = x[:, 0] * x[:, 1] + x[:, 0] ** 2 + 0.5 * x[:, 2] - x[:, 2] * x[:, 3]
+    in_a = np.arange(len(x)) < len(x) // 2
+    network = grown(x, y, np.ones(len(x)), in_a, EXACT)
+    assert len(network.layers) == 2
+    assert sorted(map(tuple, network.layers[0].inputs.tolist())) == [(0, 1), (2, 3)]
+    assert np.allclose(network.output(x), y, atol=1e-6)
+    assert network.errors[0] > 0.1
+    short = grown(x, y, np.ones(len(x)), in_a, replace(EXACT, layers=1))
+    assert len(short.layers) == 1
+
+
+def test_growing_ends_where_the_unseen_half_gains_nothing():
+    x, y, weight = rows(3, n=120, inputs=6)
+    y = y + x[:, 0] * x[:, 1] + np.tanh(x[:, 2])
+    in_a = np.arange(120) % 2 == 0
+    growth = Growth(1e-6, 4, 9)
+    network = grown(x, y, weight, in_a, growth)
+    errors = np.array(network.errors)
+    assert 1 < len(network.layers) < 9
+    assert (errors[1:] < (1 - GAIN) * errors[:-1]).all()
+    assert errors[-1] == pytest.approx(
+        np.average((network.output(x) - y)[~in_a] ** 2, weights=weight[~in_a])
+    )
+    # the next layer of all that was kept is no better
+    kept = x
+    for _ in network.layers:
+        half_a, half_b = (Sums.of(kept[h], y[h], weight[h]) for h in (in_a, ~in_a))
+        layer = half_a.solved(growth.ridge)
+        best = np.argsort(half_b.errors(layer.weight))[:4]
+        kept = layer.only(best).output(kept)
+    half_a, half_b = (Sums.of(kept[h], y[h], weight[h]) for h in (in_a, ~in_a))
+    following = half_b.errors(half_a.solved(growth.ridge).weight).min()
+    assert following >= (1 - GAIN) * errors[-1]
+
+
+def test_a_pruned_network_says_the_same():
+    rng = np.random.default_rng(5)
+    sizes = [5, 7, 6, 4]
+    layers = [
+        Layer(rng.integers(0, before, (after, 2)), rng.normal(0.0, 0.3, (after, 6)))
+        for before, after in pairwise(sizes)
+    ]
+    x = rng.normal(size=(9, 5))
+    whole = PolynomialNetwork(layers, [])
+    small = PolynomialNetwork(pruned(layers), [])
+    assert np.allclose(small.output(x), whole.output(x))
+    assert [len(layer.weight) for layer in small.layers[-2:]] <= [2, 1]
+    assert small.numbers < whole.numbers
+
+
+def test_with_an_empty_half_all_rows_do_both():
+    x, y, weight = rows()
+    everyone = np.ones(len(x), dtype=bool)
+    network = grown(x, y, weight, everyone, Growth(1e-3, 5, 1))
+    assert network.errors == grown(x, y, weight, ~everyone, Growth(1e-3, 5, 1)).errors
+    assert np.isfinite(network.errors[0])
+
+
+def test_halves_are_of_whole_runs_of_every_floor():
+    run = np.repeat(np.arange(9), 4)
+    floors = ["gray"] * 4 + ["green"] * 4 + ["table"]
+    in_a = first_half(run, floors)
+    share = in_a.reshape(9, 4).mean(axis=1)
+    assert share[:4].sum() == 2
+    assert share[4:8].sum() == 2
+    assert set(share[:8]) == {0.0, 1.0}
+    # a single run is cut into windows
+    assert in_a[32:].tolist() == [True, False, True, False]
+
+
+def test_older_evidence_fades_and_no_run_remembers_another():
+    run = np.array([0, 0, 0, 1, 1])
+    got = remembered(np.array([[1.0], [1.0], [1.0], [5.0], [0.0]]), run)
+    expected = [1.0, 1.0 + MEMORY, 1.0 + MEMORY + MEMORY**2, 5.0, 5.0 * MEMORY]
+    assert got[:, 0] == pytest.approx(expected)
+
+
+def test_networks_say_nothing_beyond_what_they_were_taught():
+    x = np.random.default_rng(0).uniform([-1, -1, -3], [1, 1, 1], (100, 3))
+    y = np.stack([x[:, 0] * x[:, 1], x[:, 2] ** 2], axis=1)
+    networks = Networks.grown(x, y, np.ones(100), np.arange(100) % 2 == 0, EXACT)
+    assert np.allclose(networks.say(x), y)
+    far = networks.say(np.full((1, 3), 50.0))
+    # the corner where both are largest was not seen, nor squares beyond one on this side
+    assert far[0] == pytest.approx([y[:, 0].max(), x[:, 2].max() ** 2], abs=1e-6)
+
+
+def slipping(angle: float, floor: str, seed: int = 0, steps: int = 40) -> Run:
+    """Runs that slip by their direction on ice, where motors draw little, and not on gray."""
+    ratio = np.array([-0.4 - 0.2 * np.cos(angle), 0.2 * np.sin(angle), 0.1])
+    ratio = ratio if floor == "ice" else np.zeros(3)
+    amps = 0.3 if floor == "ice" else 0.9
+    noise = np.random.default_rng([seed, int(1000 * angle)]).normal(0.0, 0.1, (steps, 3))
+    rolling = straight(angle, steps=steps)
+    return made_run(rolling, rolling + 0.2 * ratio / SIZES, current=amps + noise, floor=floor)
+
+
+ANGLES = np.linspace(0.0, 6.0, 16)
+RUNS = [slipping(angle, floor) for angle in ANGLES for floor in ("gray", "ice")]
+
+
+@pytest.fixture(scope="module")
+def classes() -> GmdhClass:
+    return GmdhClass().fit(RUNS, ROBOTINO)
+
+
+def error(said, run: Run) -> float:
+    return float(np.hypot(*(said.path - path_of(run.twist, run.heard.dt))[-1, :2]))
+
+
+def test_floors_are_told_by_currents_and_slip_is_that_of_the_floor(classes):
+    for floor in ("gray", "ice"):
+        new = slipping(1.1, floor, seed=7).told(False)
+        (said,) = classes.predict([new.heard], ROBOTINO)
+        assert said.floors is not None
+        assert sum(said.floors.values()) == pytest.approx(1.0)
+        assert said.floors[floor][-1] > 0.95
+        assert said.floors[floor][0] < said.floors[floor][-1]
+        assert len(said.floors[floor]) == 40
+        assert error(said, new) < 0.02 * 0.8
+
+
+def test_a_floor_that_is_told_is_used_if_it_was_seen(classes):
+    new = slipping(1.1, "gray", seed=7)
+    wrong = replace(new, heard=replace(new.heard, floor="ice"))
+    unseen = replace(new, heard=replace(new.heard, floor="sand"))
+    said = classes.predict([new.heard, wrong.heard, unseen.heard], ROBOTINO)
+    as_on_ice = slipping(1.1, "ice", seed=7)
+    assert error(said[1], as_on_ice) < 0.02 * 0.8
+    assert error(said[0], new) < 0.02 * 0.8
+    assert error(said[2], new) < 0.02 * 0.8
+    # what it tells of floors is from what it hears, whatever it is told
+    assert said[1].floors["gray"][-1] > 0.95
+
+
+def test_floors_are_told_without_what_comes_later(classes):
+    whole = slipping(1.1, "gray", seed=7).heard
+    other = slipping(1.1, "ice", seed=7).heard
+    mixed = np.concatenate([whole.current[:20], other.current[20:]])
+    first, second = classes.predict([whole, replace(whole, current=mixed)], ROBOTINO)
+    assert np.array_equal(first.floors["ice"][:20], second.floors["ice"][:20])
+    assert second.floors["ice"][-1] > 0.5 > first.floors["ice"][-1]
+
+
+def test_a_floor_that_was_never_seen_with_this_load_is_left_out():
+    loads = {"gray": "moved", "ice": "as_built"}
+    runs = [replace(run, heard=replace(run.heard, load=loads[run.floor])) for run in RUNS]
+    method = GmdhClass().fit(runs, ROBOTINO)
+    # by its currents it is on ice
+    new = slipping(1.1, "ice", seed=7).told(False).heard
+    moved, other = method.predict([replace(new, load="moved"), replace(new, load="new")], ROBOTINO)
+    assert np.array_equal(moved.floors["gray"], np.ones(40))
+    assert other.floors["ice"][-1] > 0.95
+
+
+def test_a_robot_at_rest_learns_nothing_of_its_floor(classes):
+    rest = made_run(np.zeros((40, 3)), current=np.full((40, 3), 0.3)).told(False).heard
+    (said,) = classes.predict([rest], ROBOTINO)
+    assert np.allclose(said.floors["gray"], 0.5)
+    assert np.abs(said.path).max() == 0.0
+
+
+def test_a_single_floor_needs_no_telling():
+    runs = [run for run in RUNS if run.floor == "ice"]
+    method = GmdhClass().fit(runs, ROBOTINO)
+    new = slipping(2.2, "ice", seed=9).told(False)
+    (said,) = method.predict([new.heard], ROBOTINO)
+    assert method.telling is None
+    assert error(said, new) < 0.02 * 0.8
+    assert np.array_equal(said.floors["ice"], np.ones(40))
+    assert 18 <= method.numbers == method.floors["ice"].numbers
+
+
+def test_one_set_of_networks_does_not_ask_for_the_floor(classes):
+    method = GmdhOne().fit(RUNS, ROBOTINO)
+    new = slipping(1.1, "ice", seed=7)
+    told, not_told = method.predict([new.heard, new.told(False).heard], ROBOTINO)
+    assert np.array_equal(told.path, not_told.path)
+    assert told.floors is None
+    assert 0 < method.numbers < classes.numbers
+    encoders = path_of(new.heard.rolling(ROBOTINO), new.heard.dt)
+    assert error(told, new) < 0.4 * error(replace(told, path=encoders), new)
+
+
+@pytest.mark.parametrize("method", [GmdhOne(), GmdhClass()], ids=lambda method: method.name)
+def test_settings_that_are_tried(method):
+    assert [each.growth for each in method.candidates()] == list(CANDIDATES)
+    assert method.numbers == 0
+    with pytest.raises(ValueError, match="before fit"):
+        method.predict([RUNS[0].heard], ROBOTINO)

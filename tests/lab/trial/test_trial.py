@@ -1,0 +1,690 @@
+"""Paths, metrics and the trial command."""
+
+import json
+from dataclasses import asdict, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from slipid.data.floor_map import four_zones, uniform, write_map
+from slipid.deploy.controllers import pilot_of
+from slipid.deploy.floors import floor_map, floor_of
+from slipid.deploy.twin_run import path_of, starts
+from slipid.lab.testsite.driving import PERIOD
+from slipid.lab.trial import trial as tr
+from slipid.lab.trial.controllers import ROWS, check_gains, unused_gains
+from slipid.lab.trial.goswami_padhy import GoswamiPadhy
+from slipid.lab.trial.plants import SitePlant, known_to_site, one_of
+from slipid.lab.trial.summary import Run, columns, not_told_apart, summaries
+from slipid.model.geometry import mecanum, omni
+from slipid.model.robot import build
+from slipid.robot import closed_loop
+from slipid.robot import trajectory as reference
+from slipid.robot.closed_loop import Pilot
+from slipid.robot.controller import Controller, Gains
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.estimator import Estimator, Odometry
+from slipid.robot.filter.floor import Floor
+from slipid.robot.filter.floor_filter import FloorFilter
+from slipid.robot.filter.hypotheses import hypotheses_of
+from slipid.robot.interface import Measurement, Settings
+from slipid.robot.record import GainRecord, GainsRecord, GainValues, Losses
+from slipid.robot.robot_file import typed
+from slipid.support.errors import DataError
+from tests.helpers.floors import surface_at
+from tests.helpers.known_robot import deploy_known
+
+
+@pytest.fixture(scope="module")
+def deployed():
+    robot = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"])
+    return deploy_known(robot, highest_speed=7.5)
+
+
+def test_the_rectangle_is_that_of_the_paper_and_stops_at_its_corners():
+    path = reference.rectangle()
+    rows = np.asarray(path.rows)
+    length = np.hypot(*np.diff(rows[:, :2], axis=0).T).sum()
+    assert length == pytest.approx(2 * (0.9 + 0.4), abs=1e-3)
+    corners = np.asarray([np.asarray(path.at(t)) for t in np.asarray(path.marks)])
+    np.testing.assert_allclose(
+        corners[:, :2], [[0.9, 0], [0.9, -0.4], [0, -0.4], [0, 0]], atol=1e-9
+    )
+    np.testing.assert_allclose(corners[:, 3:], 0.0, atol=1e-9)
+    # rates are the derivatives of places
+    np.testing.assert_allclose(
+        np.gradient(rows[:, :2], reference.STEP, axis=0)[5:-5], rows[5:-5, 3:5], atol=0.011
+    )
+    assert np.hypot(rows[:, 3], rows[:, 4]).max() <= 0.2 + 1e-9
+
+
+@pytest.mark.parametrize("name", reference.PATHS)
+@pytest.mark.parametrize("speed", [0.1, 0.2])
+def test_paths_have_the_rates_of_their_places_and_rest_where_they_began(name, speed):
+    path = reference.PATHS[name](speed)
+    rows = np.asarray(path.rows)
+    rates = np.gradient(rows[:, :3], reference.STEP, axis=0)
+    np.testing.assert_allclose(rates[5:-5], rows[5:-5, 3:], atol=0.02)
+    pace = np.hypot(rows[:, 3], rows[:, 4])
+    assert pace.max() == pytest.approx(speed, rel=1e-4)
+    np.testing.assert_allclose(rows[[0, -1], :2], 0.0, atol=1e-9)
+    np.testing.assert_allclose(rows[[0, -1], 3:], 0.0, atol=1e-9)
+    assert rows[-1, 2] % (2 * np.pi) == pytest.approx(0.0, abs=1e-9)
+    at = np.stack([np.asarray(path.at(t)) for t in np.asarray(path.marks)])
+    np.testing.assert_allclose(at[:, :2], path.corners, atol=1e-6)
+
+
+def test_a_circle_is_round_an_eight_goes_both_ways_round_and_one_path_turns():
+    circle = np.asarray(reference.circle(0.35).rows)[:, :2]
+    np.testing.assert_allclose(np.hypot(circle[:, 0], circle[:, 1] + 0.35), 0.35, atol=1e-4)
+    np.testing.assert_allclose(
+        reference.circle(0.35).corners,
+        [[0.35, -0.35], [0, -0.7], [-0.35, -0.35], [0, 0]],
+        atol=4e-3,
+    )
+    eight = np.asarray(reference.eight(0.25).rows)[:, :2]
+    side = np.sign(eight[:, 1].round(6))
+    np.testing.assert_allclose(
+        np.hypot(eight[:, 0], eight[:, 1] - 0.25 * side)[side != 0], 0.25, atol=1e-4
+    )
+    changes = side[side != 0]
+    assert (changes[0], changes[-1], np.count_nonzero(np.diff(changes))) == (-1, 1, 1)
+    turning = reference.turning()
+    headings = [float(turning.at(t)[2]) for t in np.asarray(turning.marks)]
+    np.testing.assert_allclose(headings, -0.5 * np.pi * np.arange(1, 5), atol=1e-9)
+    still = np.asarray(reference.rectangle().rows)[:, :2]
+    np.testing.assert_allclose(np.asarray(turning.rows)[:, :2], still, atol=1e-12)
+
+
+def test_the_way_that_is_left_of_a_path_ends_with_it():
+    path = reference.rectangle()
+    left = [float(path.left(t)) for t in (0.0, *np.asarray(path.marks), 99.0)]
+    np.testing.assert_allclose(left, [2.6, 1.7, 1.3, 0.4, 0.0, 0.0], atol=1e-6)
+
+
+def test_a_path_moved_to_a_start_has_its_shape():
+    start = (0.3, -0.2, 2.0)
+    path = reference.rectangle()
+    moved = path.moved(start)
+    c, s = np.cos(2.0), np.sin(2.0)
+    back = (np.asarray(moved.rows)[:, :2] - start[:2]) @ np.array([[c, -s], [s, c]])
+    np.testing.assert_allclose(back, np.asarray(path.rows)[:, :2], atol=1e-12)
+    assert np.asarray(moved.rows)[0, 2] == pytest.approx(2.0)
+
+
+def test_a_path_waits_for_a_robot_that_lags_and_not_for_one_that_is_ahead():
+    path = reference.waypoints([(0.0, 0.0), (1.0, 0.0)], pause=0.0)
+    now = jnp.asarray(2.0)
+    here = np.asarray(path.at(2.0))
+    on, rates = path.follow(now, jnp.asarray(here[:3]), 0.05)
+    assert float(on) == pytest.approx(2.05)
+    assert float(rates[3]) == pytest.approx(0.2)
+    far_behind = here[:3] - [0.2, 0.0, 0.0]
+    stays, rates = path.follow(now, jnp.asarray(far_behind), 0.05)
+    assert float(stays) == pytest.approx(2.0)
+    np.testing.assert_allclose(rates[3:], 0.0)
+    ahead, _ = path.follow(now, jnp.asarray(here[:3] + np.array([0.2, 0.0, 0.0])), 0.05)
+    assert float(ahead) == pytest.approx(2.05)
+
+
+def test_a_preview_is_of_the_rates_alone():
+    path = reference.waypoints([(0.0, 0.0), (1.0, 0.0)], pause=0.0)
+    now = jnp.asarray(path.duration - 0.35)  # it brakes for 0.4 s
+    _, plain = path.follow(now, path.at(now)[:3], 0.05)
+    _, early = path.follow(now, path.at(now)[:3], 0.05, 0.2)
+    np.testing.assert_array_equal(early[:3], plain[:3])
+    assert float(plain[3] - early[3]) == pytest.approx(0.5 * 0.2)
+
+
+def test_way_points_are_refused_with_the_reason():
+    with pytest.raises(ValueError, match="two or more places"):
+        reference.waypoints([(0.0, 0.0)])
+    with pytest.raises(ValueError, match="expected both positive"):
+        reference.rectangle(speed=-0.2)
+    with pytest.raises(ValueError, match="twice in a row"):
+        reference.waypoints([(0.0, 0.0), (0.0, 0.0)])
+    with pytest.raises(ValueError, match="each another than the last"):
+        reference.curve([(0.0, 0.0), (0.0, 0.0)])
+    with pytest.raises(ValueError, match="expected both positive"):
+        reference.circle(speed=0.0)
+
+
+class Perfect:
+    """A plant without slip, whose wheels turn as they are told, some periods later."""
+
+    def __init__(self, robot, start, travelled=1.0, late=0):
+        self.robot, self._pose, self.travelled = robot, np.array(start, float), travelled
+        self.angle = np.zeros(3)
+        self.waiting = [np.zeros(3)] * late
+
+    @property
+    def pose(self):
+        return tuple(float(v) for v in self._pose)
+
+    def reset(self):
+        return self.step(np.zeros(3))
+
+    def step(self, wheel_speed):
+        self.waiting = [*self.waiting, np.asarray(wheel_speed)]
+        wheel_speed = self.waiting.pop(0)
+        self.angle = self.angle + np.asarray(wheel_speed) * closed_loop.PERIOD
+        v = np.asarray(self.robot.inverse) @ np.asarray(wheel_speed) * 0.04 * closed_loop.PERIOD
+        v = v * [self.travelled, self.travelled, 1.0]
+        c, s = np.cos(self._pose[2]), np.sin(self._pose[2])
+        self._pose += [c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]]
+        return Measurement(wheel_angle=self.angle, current=np.full(3, 0.5))
+
+
+def pilot(deployed, preview=0.0):
+    gains = replace(Gains(), preview=jnp.asarray(preview))
+    return Pilot(Odometry(deployed), Controller(deployed, gains))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", reference.PATHS)
+def test_encoders_close_every_path_without_slip(deployed, name):
+    start = (0.2, 0.1, -1.0)
+    path = reference.PATHS[name](0.2).moved(start)
+    course = closed_loop.drive(pilot(deployed, 0.05), path, Perfect(deployed, start), start)
+    found = closed_loop.metrics(course)
+    assert found.finished
+    assert found.closure_mm < 5
+    assert found.cross_track_rmse_mm < 10
+    assert abs(found.heading_error_deg) < 0.5
+
+
+@pytest.mark.slow
+def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(deployed):
+    start = (0.2, 0.1, -1.0)
+    path = reference.rectangle().moved(start)
+    course = closed_loop.drive(pilot(deployed), path, Perfect(deployed, start), start)
+    found = closed_loop.metrics(course)
+    assert found.finished
+    assert found.closure_mm < 5
+    assert found.cross_track_rmse_mm < 10
+    assert found.energy_j is None  # this plant does not know
+    assert np.abs(found.along_track_mm).max() < 10
+    assert abs(found.heading_error_deg) < 0.5
+    assert found.path_length_mm == pytest.approx(2600, rel=0.03)
+    np.testing.assert_allclose(found.sides_mm, [900, 400, 900, 400], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
+    start, path = (0.0, 0.0, 0.0), reference.waypoints([(0.0, 0.0), (0.9, 0.0)])
+    far = []
+    for preview in (0.0, 0.2):
+        plant = Perfect(deployed, start, late=4)
+        far.append(closed_loop.drive(pilot(deployed, preview), path, plant, start).pose[:, 0].max())
+    assert far[0] > 0.92  # four periods at 0.2 m/s too far
+    assert far[1] < 0.905
+
+
+@pytest.mark.slow
+def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
+    start = (0.0, 0.0, 0.0)
+    path = reference.rectangle()
+    course = closed_loop.drive(pilot(deployed), path, Perfect(deployed, start, 0.8), start)
+    found = closed_loop.metrics(course)
+    assert found.along_track_mm[0] == pytest.approx(-180, abs=12)
+    assert found.along_track_mm[1] == pytest.approx(-80, abs=12)
+    assert found.closure_mm < 12  # every side is as short as its opposite
+    assert found.cross_track_rmse_mm > 30
+
+
+@pytest.mark.slow
+def test_of_a_curve_the_first_quarter_is_judged(deployed):
+    start = (0.0, 0.0, 0.0)
+    path = reference.circle(0.35)
+    course = closed_loop.drive(pilot(deployed), path, Perfect(deployed, start, 0.8), start)
+    found = closed_loop.metrics(course)
+    assert found.sides_mm[0] == pytest.approx(350 * np.sqrt(2), rel=0.01)
+    run = Run("encoder", start, 0, found, 0.0)
+    assert float(columns([run])["first_side_travelled"][0]) == pytest.approx(0.8, abs=0.03)
+
+
+@pytest.mark.slow
+def test_a_robot_that_does_not_move_has_its_whole_way_left(deployed):
+    path = reference.rectangle()
+    plant = Perfect(deployed, (0.0, 0.0, 0.0), 0.0)
+    course = closed_loop.drive(pilot(deployed), path, plant, (0.0, 0.0, 0.0))
+    assert closed_loop.metrics(course).closure_mm < 5  # its encoders say that it has arrived
+    course = replace(course, own=np.zeros_like(course.own))
+    found = closed_loop.metrics(course)
+    assert not found.finished
+    assert found.closure_mm == pytest.approx(2600, abs=1)
+
+
+def test_the_distance_from_a_path_is_from_its_line():
+    line = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    places = np.array([[0.37, 0.2], [1.3, 0.63], [1.3, 1.4], [0.5, 0.0]])
+    np.testing.assert_allclose(
+        closed_loop._from_line(places, line), [0.2, 0.3, 0.5, 0.0], atol=1e-12
+    )
+
+
+def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
+    tuned = Gains.at(TUNED)
+    robot = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
+    for row in ROWS.values():
+        if row.law is not None:  # it takes a second to make
+            continue
+        found = pilot_of(robot, row).controller.gains
+        expected = tuned if row.tuned else Gains()
+        if row.observer != "contact":
+            expected = replace(expected, preview=jnp.asarray(0.0))
+        assert values(found) == values(expected)
+
+
+def test_a_law_stands_in_place_of_the_pose_loop(deployed):
+    """With gains that are all the same the law of Goswami and Padhy is the pose loop."""
+    gains = Gains.at((1.5, 1.5, 0.0, 0.0, 0.0))
+    loop = Controller(deployed, gains)
+    same, other = (
+        Controller(deployed, gains, law=GoswamiPadhy(jnp.full(3, k))) for k in (1.5, 3.0)
+    )
+    odometry, rng = Odometry(deployed), np.random.default_rng(0)
+    seen = odometry.step(odometry.init(), Measurement(np.zeros(3), np.full(3, 0.1)), 0.05)[1]
+
+    def asked(controller, pose, reference):
+        estimate = replace(seen, pose=jnp.asarray(pose))
+        return np.asarray(controller.step(controller.init(), reference, estimate, 0.05)[1])
+
+    for _ in range(5):
+        pose = rng.normal(size=3)
+        reference = jnp.asarray(np.hstack([pose + 0.01 * rng.normal(size=3), np.full(3, 0.01)]))
+        wheels = asked(loop, pose, reference)
+        assert np.abs(wheels).max() < 1.2  # no limit changes it
+        np.testing.assert_allclose(asked(same, pose, reference), wheels, atol=1e-12)
+        assert np.abs(asked(other, pose, reference) - wheels).max() > 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "shape", [omni([60.0, 180.0, 300.0], 0.125, 0.04), mecanum(0.2, 0.15, 0.05)]
+)
+def test_rows_of_published_laws_are_made_for_the_robot_and_believe_its_encoders(shape):
+    robot = build(shape, ["firm", "soft"])
+    robot = eqx.tree_at(
+        lambda r: (r.geometry.drive_offset, r.geometry.radius_deviation),
+        robot,
+        (0.01 * jnp.arange(shape.wheels), 0.02 * jnp.arange(shape.wheels)),
+    )
+    known = deploy_known(robot, highest_speed=7.5)
+    pilots = {
+        name: pilot_of(known, ROWS[name])
+        for name in ("goswami_padhy", "goswami_padhy_gradient", "indiveri")
+    }
+    for pilot in pilots.values():
+        assert not pilot.estimator.curve
+        assert values(pilot.controller.gains) == values(replace(Gains(), preview=jnp.zeros(())))
+    law = pilots["indiveri"].controller.law
+    np.testing.assert_allclose(law.matrix, known.forward / known.frame.radius, atol=1e-9)
+    assert law.gains.tolist() == [1.5, 1.5]
+    assert float(law.limit) == 13.0
+    swarm, gradient = (np.asarray(p.controller.law.gains) for p in list(pilots.values())[:2])
+    np.testing.assert_allclose(swarm, gradient, atol=1e-3)
+    assert swarm.tolist()[:2] == [5.0, 5.0]  # the edge of what the paper's swarm may take
+    assert 4.0 < swarm[2] < 4.999
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", ["goswami_padhy", "indiveri"])
+def test_published_laws_close_the_rectangle_without_slip(deployed, row):
+    start = (0.2, 0.1, -1.0)
+    path = reference.rectangle().moved(start)
+    pilot = pilot_of(deployed, ROWS[row], Settings())
+    found = closed_loop.metrics(closed_loop.drive(pilot, path, Perfect(deployed, start), start))
+    assert found.finished
+    assert found.closure_mm < 5
+    assert found.cross_track_rmse_mm < 10
+    assert abs(found.heading_error_deg) < 0.5
+
+
+def test_starts_are_spread_and_the_same_for_everyone():
+    floor = uniform("firm", 2.0)
+    every = starts(20, floor, reference.rectangle())
+    assert every == starts(20, floor, reference.rectangle())
+    headings = np.sort([s[2] for s in every])
+    assert np.diff(headings).max() < 2 * 2 * np.pi / 20
+    middles = []
+    for x, y, h in every:
+        c, s = np.cos(h), np.sin(h)
+        middles.append((x + 0.45 * c + 0.2 * s, y + 0.45 * s - 0.2 * c))
+    assert np.abs(middles).max() <= 1.2 + 1e-9
+    assert np.std(middles, axis=0).min() > 0.4
+    for start in starts(20, floor, reference.eight()):  # its middle is where it begins
+        assert np.abs(start[:2]).max() <= 1.2 + 1e-3
+
+
+@pytest.mark.slow
+def test_a_robot_can_be_told_which_floors_there_are(deployed):
+    a, b = deployed.labels
+    only = deployed.on(b)
+    assert only.labels == (b,)
+    assert float(only.floors.friction[0]) == float(deployed.floors.friction[1])
+    assert deployed.on(b, a).on(a).current_std == deployed.current_std[0]
+    rim = jnp.asarray([3.0, -5.0, 2.0])
+    assert only.record.labels == (b,)
+    assert not any(path.startswith(f"surface.{a}") for path in only.record.parameters)
+    alone, _ = FloorFilter(only, Settings()).solve(jnp.zeros((1, 3)), rim)
+    every, _ = FloorFilter(deployed, Settings()).solve(jnp.zeros((8, 3)), rim)
+    np.testing.assert_allclose(alone[0], every[-1], atol=1e-6)
+    with pytest.raises(ValueError, match=f"no floor 'ice'; identified: {a}, {b}"):
+        deployed.on("ice")
+    for wrong in ((), (a, a)):
+        with pytest.raises(ValueError, match=f"expected each once of {a}, {b}"):
+            deployed.on(*wrong)
+
+
+LAB = """schema = "slipid.map/1"
+base = "firm"
+extent_m = [-1, -1, 1, 1]
+cell_m = 0.05
+[[patch]]
+surface = "soft"
+polygon = [[0, -1], [1, -1], [1, 1], [0, 1]]
+"""
+
+
+@pytest.mark.slow
+def test_a_map_file_reaches_an_estimator_and_a_robot_that_has_numpy_alone(tmp_path, deployed):
+    (tmp_path / "lab.toml").write_text(LAB)
+    made = floor_map(tmp_path / "lab.toml", deployed)
+    pose = jnp.array([0.9, 0.0, 0.0])
+    estimator = Estimator(deployed, floor=made)
+    state = estimator.init(pose)
+    state, seen = estimator.step(state, Measurement([0.0] * 3, [0.1] * 3), 0.05)
+    state, seen = estimator.step(state, Measurement([0.3, 0.0, -0.3], [0.1] * 3), 0.05)
+    assert seen.surface.tolist() == ["soft"] * 3
+    made.save(tmp_path / "lab.npz", deployed.labels)
+    for labels, swapped in ((deployed.labels, False), (("soft", "firm"), True)):
+        again = Floor.load(tmp_path / "lab.npz", labels)
+        np.testing.assert_array_equal(again.cells, 1 - made.cells if swapped else made.cells)
+        np.testing.assert_array_equal(again.corner, made.corner)
+        assert float(again.cell) == float(made.cell)
+    unknown = Floor.load(tmp_path / "lab.npz", ("firm",))
+    assert set(np.unique(unknown.cells)) == {-1, 0}
+    unknown.save(tmp_path / "lab.npz", ("firm",))  # what is unknown stays so
+    again = Floor.load(tmp_path / "lab.npz", deployed.labels)
+    np.testing.assert_array_equal(again.cells, unknown.cells)
+
+
+def test_a_map_that_says_nothing_and_a_damaged_one_are_refused(tmp_path, deployed):
+    (tmp_path / "lab.toml").write_text(LAB.replace("firm", "ice").replace("soft", "mud"))
+    with pytest.raises(DataError, match="surfaces ice, mud; expected some of those identified: fi"):
+        floor_map(tmp_path / "lab.toml", deployed)
+    with pytest.raises(DataError, match=r"absent\.npz: .*expected a map that Floor\.save wrote"):
+        Floor.load(tmp_path / "absent.npz", deployed.labels)
+    floor_of(uniform("firm"), deployed.labels).save(tmp_path / "one.npz", deployed.labels)
+    whole = (tmp_path / "one.npz").read_bytes()
+    for cut in (b"", whole[:100], whole[:-30], b"not a map"):
+        (tmp_path / "cut.npz").write_bytes(cut)
+        with pytest.raises(DataError, match="expected a map that"):
+            Floor.load(tmp_path / "cut.npz", deployed.labels)
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    with pytest.raises(DataError, match="expected a map that"):
+        Floor.load(tmp_path / "other.npz", deployed.labels)
+    with pytest.raises(DataError, match=r"cut\.npz.*cannot be written"):
+        floor_of(uniform("firm"), ("firm",)).save(tmp_path / "cut.npz" / "x.npz", ("firm",))
+
+
+def test_a_map_is_looked_up_under_the_wheels(deployed):
+    floor = four_zones(["firm", "soft", "firm", "soft"], middle=(0.0, 0.0))
+    lookup = floor_of(floor, ("firm", "soft"))
+    pose = jnp.asarray([0.02, -0.01, 0.7])
+    under = np.asarray(lookup.under(pose, deployed.places))
+    c, s = np.cos(0.7), np.sin(0.7)
+    turned = np.asarray(deployed.places) @ np.array([[c, s], [-s, c]]) + [0.02, -0.01]
+    names = [("firm", "soft")[k] for k in under]
+    assert names == [surface_at(floor, float(x), float(y)) for x, y in turned]
+    assert len(set(names)) == 2
+
+
+def test_a_map_may_show_a_floor_that_the_fit_does_not_know(deployed):
+    floor = four_zones(["firm", "ice", "firm", "soft"], middle=(0.0, 0.0))
+    lookup = floor_of(floor, deployed.labels)
+    counted = np.asarray(lookup.cells)
+    assert (counted == -1).sum() == (floor.cells == floor.surfaces.index("ice")).sum() > 0
+    row, column = np.round(np.argwhere(counted == -1).mean(axis=0)).astype(int)
+    x, y = np.asarray(lookup.corner) + (np.array([column, row]) + 0.5) * float(lookup.cell)
+    here = jnp.array([x, y, 0.0])
+    hypotheses = hypotheses_of(deployed).under
+    inside = lookup.under(here, deployed.places)
+    supports = lookup.supports(here, jnp.zeros((3, 3)), deployed.places, hypotheses, 2)
+    assert bool(jnp.all(inside == -1))
+    np.testing.assert_allclose(supports, supports[0, 0])  # it says nothing of any hypothesis
+
+
+@pytest.mark.slow
+def test_the_twin_is_another_robot_of_the_posterior_for_every_start():
+    robot = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"])
+    eight = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 8), robot)
+    frictions = jnp.linspace(0.3, 0.9, 8)[:, None] * jnp.ones(2)
+    several = eqx.tree_at(lambda r: r.surfaces.friction, eight, frictions)
+    known = deploy_known(robot, draws=several, highest_speed=7.5)
+    found = {float(one_of(known, seed).floors.friction[0]) for seed in range(12)}
+    assert len(found) > 3
+    assert one_of(known, 3).floors.friction[0] == one_of(known, 3).floors.friction[0]
+
+
+def test_what_a_trial_cannot_do_is_said(tmp_path, deployed):
+    with pytest.raises(DataError, match="expected testsite or twin"):
+        tr._jobs(tmp_path, tr.Wish(plant="moon"))
+    with pytest.raises(DataError, match="no controller 'magic'; expected some of encoder"):
+        tr._jobs(tmp_path, tr.Wish(controllers=("magic",)))
+    with pytest.raises(DataError, match="has no surface 'gray'; it has firm"):
+        known_to_site(uniform("gray"), "as_built", 3)
+    with pytest.raises(DataError, match="no load set-up 'far'; it has as_built"):
+        known_to_site(uniform("firm"), "far", 3)
+    with pytest.raises(DataError, match="has 3 wheels, the fit's 4"):
+        known_to_site(uniform("firm"), "as_built", 4)
+    with pytest.raises(DataError, match="no controller; expected some of encoder"):
+        tr._jobs(tmp_path, tr.Wish(controllers=tr.names_of(",")))
+    assert tr.names_of("contact, encoder,contact") == ("contact", "encoder")
+    with pytest.raises(DataError, match="no path 'square'; expected one of rectangle, circle"):
+        path_of("square", 0.2, deployed)
+    for speed in (0.0, 0.31, float("nan")):
+        with pytest.raises(DataError, match=r"expected above 0 and at most 0\.3 m/s"):
+            path_of("circle", speed, deployed)
+    assert path_of("circle", 0.3, deployed).duration < path_of("circle", 0.1, deployed).duration
+    with pytest.raises(DataError, match=r"robot\.json: not there; `slipid identify` writes it"):
+        tr._jobs(tmp_path, tr.Wish())
+
+
+@pytest.mark.slow
+def test_runs_of_another_path_or_speed_are_driven_anew(tmp_path, deployed):
+    deployed.save(tmp_path / "robot.json")
+
+    def jobs(**wish):
+        return tr._jobs(tmp_path, tr.Wish(plant="twin", controllers=("encoder",), **wish))
+
+    plain = jobs()[0]
+    np.testing.assert_array_equal(plain.path.rows, reference.rectangle().rows)
+    for other in ({"path": "turning"}, {"speed": 0.1}):
+        job = jobs(**other)[0]
+        expected = reference.PATHS[other.get("path", "rectangle")](other.get("speed", 0.2))
+        np.testing.assert_array_equal(job.path.rows, expected.rows)
+        job.kept.save_json("mark", {})
+        assert plain.kept.load_json("mark") is None
+        assert jobs(**other)[0].kept.load_json("mark") == {}
+
+
+def test_a_controller_is_told_another_map_than_the_true_one(tmp_path, deployed, monkeypatch):
+    deployed.save(tmp_path / "robot.json")
+    labels = list(deployed.labels)
+    maps = {"true": labels[:2], "told": labels[1::-1], "strange": [labels[0], "moss"]}
+    for name, (a, b) in maps.items():
+        colours = {a: "#101010", b: "#f0f0f0"}
+        write_map(tmp_path / f"{name}.toml", four_zones([a, b, a, b]), colours)
+
+    def jobs(**more):
+        wish = {"plant": "twin", "controllers": ("contact_map",), "map": tmp_path / "true.toml"}
+        return tr._jobs(tmp_path, tr.Wish(**wish, **more))
+
+    plain, other = jobs()[0], jobs(told_map=tmp_path / "told.toml")[0]
+    assert plain.told is plain.floor
+    assert other.kept.folder != plain.kept.folder
+    middle = np.array([[0.0, 0.5], [0.9, 0.5]])
+
+    def named(floor):
+        return [floor.surfaces[int(k)] for k in floor.at(middle)]
+
+    assert named(other.floor) == named(plain.floor) == labels[:2]
+    assert named(other.told) == labels[1::-1]
+
+    class Told(Exception):
+        pass
+
+    def caught(robot, row, settings, forced, floor):
+        raise Told(floor)
+
+    monkeypatch.setattr(tr, "pilot_of", caught)
+    with pytest.raises(Told) as told:
+        tr.drive(other)
+    (floor,) = told.value.args
+    for k, place in enumerate(middle):
+        under = floor.under(jnp.array([*place, 0.0]), jnp.zeros((1, 2)))
+        assert labels[int(under[0])] == labels[1 - k]
+    with pytest.raises(DataError, match=r"strange\.toml: no surface 'moss'"):
+        jobs(told_map=tmp_path / "strange.toml")
+
+
+def values(gains):
+    return [float(x) for x in jax.tree.leaves(gains)]
+
+
+TUNED = [0.5, 1.5, 2.5, 4.5, 5.5]
+
+
+def tuned_for(load, verdict="better than by hand", ahead=0.0):
+    values = GainValues(*(GainRecord(k, "1", 0.1) for k in (*TUNED[:3], ahead, *TUNED[3:])))
+    losses = Losses(hand=2.0, tuned=1.0)
+    return GainsRecord(values, load, False, "pso", losses, 0.9, 0.01, verdict)
+
+
+def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
+    assert values(Controller(deployed).gains) == values(Gains())
+    assert unused_gains(deployed, forced=False) == ""
+    tuned = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
+    check_gains(tmp_path, tuned)
+    assert values(Controller(tuned).gains) == TUNED
+    assert unused_gains(tuned, forced=False) == ""
+    other = DeployedRobot.of(replace(deployed.record, gains=tuned_for("far")))
+    assert values(Controller(other).gains) == values(Gains())
+    assert "tuned for load set-up far: driving with those set by hand" in unused_gains(other, False)
+    with pytest.raises(
+        DataError, match=r"another load set-up \(far\), not for as_built; leave out"
+    ):
+        check_gains(tmp_path, other)
+    with pytest.raises(DataError, match="it has no tuned gains; leave out --tuned-gains"):
+        check_gains(tmp_path, deployed)
+
+
+def test_tuned_gains_that_are_no_better_are_left_aside_and_that_is_said(deployed):
+    gains = tuned_for("as_built", "no better than by hand")
+    robot = DeployedRobot.of(replace(deployed.record, gains=gains))
+    said = unused_gains(robot, forced=False)
+    assert said.startswith("tuned gains are no better than by hand (loss 1.0 mm, by hand 2.0 mm)")
+    assert "--tuned-gains" in said
+    row = ROWS["contact"]
+    assert values(pilot_of(robot, row).controller.gains) == values(Gains())
+    assert unused_gains(robot, forced=True) == ""
+    assert values(pilot_of(robot, row, forced=True).controller.gains) == TUNED
+
+
+def test_a_file_with_the_gain_that_is_gone_drives_with_the_others_and_that_is_said(deployed):
+    gains = tuned_for("as_built", ahead=0.7)
+    robot = DeployedRobot.of(replace(deployed.record, gains=gains))
+    assert values(pilot_of(robot, ROWS["contact"]).controller.gains) == TUNED
+    assert "tuned gain ahead = 0.7 is not taken" in unused_gains(robot, forced=False)
+
+
+def run_of(name, k, closure, finished=True):
+    """A run whose numbers follow from its closure."""
+    metrics = closed_loop.Metrics(
+        along_track_mm=(-90.0 * (1 + 0.1 * k), 0.0, 0.0, 0.0),
+        sides_mm=(900.0, 400.0, 900.0, 400.0),
+        closure_mm=closure,
+        cross_track_rmse_mm=closure / 2,
+        heading_error_deg=-3.0,
+        path_length_mm=2500.0,
+        energy_j=None if name == "contact" else 10.0,
+        effort=0.1,
+        seconds=19.0,
+        finished=finished,
+    )
+    return Run(name, (0.0, 0.0, 0.1), k, metrics, 1.0)
+
+
+def test_the_best_is_told_apart_by_differences_from_the_same_starts():
+    rng = np.random.default_rng(0)
+    base = rng.uniform(50, 500, 20)  # starts differ by far more than controllers do
+
+    def runs(name, closures, finished=True):
+        return [run_of(name, k, float(c), finished) for k, c in enumerate(closures)]
+
+    one, two = runs("encoder", base), runs("contact", 0.8 * base)
+    assert not_told_apart(one + two) == ("contact",)
+    same = runs("contact", base * rng.uniform(0.7, 1.25, 20))
+    assert set(not_told_apart(one + same)) == {"encoder", "contact"}
+    # one that leaves a run unfinished does not close best, however near it comes
+    stuck = [*two[:-1], run_of("contact", 19, 1.0, finished=False)]
+    assert not_told_apart(one + stuck) == ("encoder",)
+    assert not_told_apart(one) == ("encoder",)
+
+
+def test_the_summary_is_of_medians_over_starts_with_intervals():
+    rng = np.random.default_rng(0)
+
+    def run(name, k, closure):
+        made = run_of(name, k, closure)
+        assert typed(Run, json.loads(json.dumps(asdict(made)))) == made
+        return made
+
+    base = rng.uniform(100, 200, 20)
+    runs = [run("encoder", k, b) for k, b in enumerate(base)]
+    runs += [run("contact", k, 0.4 * b) for k, b in enumerate(base)]
+    found = {name: row.to_json() for name, row in summaries(runs).items()}
+    assert found["encoder"]["closure_error_median"] == pytest.approx(np.median(base))
+    assert found["encoder"]["heading_error_deg"] == 3.0
+    assert "energy_j" in found["encoder"]
+    assert "energy_j" not in found["contact"]
+    assert (found["encoder"]["worse_share"], found["contact"]["worse_share"]) == (0.0, 0.0)
+    worse = [run("contact", k, b + (-1.0 if k < 15 else 1.0)) for k, b in enumerate(base)]
+    assert summaries(runs[:20] + worse)["contact"].worse_share == pytest.approx(0.25)
+    ratio = found["contact"]["to_encoder"]["closure_error_median"]
+    assert ratio["value"] == pytest.approx(0.4)
+    assert ratio["interval90"] == pytest.approx([0.4, 0.4])
+    low, high = found["encoder"]["interval90"]["closure_error_median"]
+    assert low < np.median(base) < high
+
+
+def test_live_readings_are_as_the_sensors_log_them():
+    live = SitePlant(uniform("firm"), "as_built", (0.0, 0.0, 0.0), 1, gyro=False)
+    forward = live.plant.machine.wheel_from_twist @ np.array([0.2, 0.0, 0.0])
+    for _ in range(20):
+        reading = live.step(forward)
+    tick = 2 * np.pi / (2000 * 16)
+    np.testing.assert_allclose(
+        reading.wheel_angle / tick, np.round(reading.wheel_angle / tick), atol=1e-6
+    )
+    assert (reading.current >= 0).all()  # magnitudes
+    assert np.isnan(reading.gyro)
+    assert live.plant.time == pytest.approx(20 * PERIOD)
+    assert live.pose[0] > 0.1  # a delay and a slew, then 0.2 m/s
+
+
+@pytest.mark.slow
+def test_a_plant_that_is_reset_starts_anew():
+    plant = SitePlant(uniform("firm"), "as_built", (0.2, 0.1, 0.3), 1, gyro=True)
+    first = jax.tree.leaves(plant.reset())
+    begin = plant.pose
+    for _ in range(10):
+        plant.step(np.full(3, 3.0))
+    assert plant.pose != begin
+    np.testing.assert_array_equal(np.hstack(jax.tree.leaves(plant.reset())), np.hstack(first))
+    assert plant.pose == begin

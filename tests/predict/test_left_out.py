@@ -1,0 +1,163 @@
+"""Nothing of a left-out run is learnt, and what sessions share widens the regions of such runs."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from slipid.app.config import FitSection
+from slipid.app.problem import Task, on_runs
+from slipid.data.runs import collect
+from slipid.fit.optimise import optimise
+from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.predict import folds, predictive
+from slipid.predict import open_loop as replay
+from slipid.predict.noisy import Noisy
+from slipid.search_space import Choice
+
+PLAN = grid(
+    setups=(("firm", "as_built"), ("soft", "as_built")), headings=6, speeds=(0.1, 0.2), turns=0
+)
+QUESTION = "sectors"
+same = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4)
+CHOICES = (Choice("camera.lag", free=False), Choice("camera.scale", free=True))
+fit = partial(optimise, most_rounds=3)
+pytestmark = pytest.mark.slow
+
+
+def garbage(log, rng):
+    """The log with finite nonsense in every measured channel; what was commanded stays."""
+
+    def noise(x):
+        return rng.normal(scale=3.0, size=x.shape)
+
+    steps = rng.uniform(-0.1, 1.0, log.wheel_angle.shape)
+    return replace(
+        log,
+        wheel_angle=np.cumsum(steps, axis=0),
+        wheel_speed=noise(log.wheel_speed),
+        current=np.abs(noise(log.current)),
+        voltage=noise(log.voltage),
+        pose=noise(log.pose),
+    )
+
+
+def task_of(logs):
+    data = collect(logs)
+    robot = on_runs(blank(PLAN), data, (0.0, 0.0))
+    return Task(data, robot, CHOICES, FitSection(windows_per_piece=3))
+
+
+@pytest.fixture(scope="module")
+def logs():
+    """Runs of which those of one speed look longer than those of the other."""
+    made = make_logs(truth(PLAN), PLAN, 1, Sensors())
+    longer = [1.0 + 0.03 * np.sign(d.speed - 0.15) for d in PLAN]
+    return [replace(log, pose=log.pose * [k, k, 1.0]) for log, k in zip(made, longer, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def judged(logs):
+    """Runs of the sector that is left out: 60 degrees, at both speeds and on both floors."""
+    return np.flatnonzero(folds.folds_of(collect(logs), QUESTION) == 1)
+
+
+@pytest.fixture(scope="module")
+def learnt(logs, judged):
+    task = task_of(logs)
+    return folds.learn(task.problem(), CHOICES, task.dataset, QUESTION, judged, fit)
+
+
+def test_nothing_of_a_left_out_run_is_learnt(logs, judged, learnt):
+    """All of them but one are replaced by nonsense: fits, and what they say of that one, stay.
+
+    Up to rounding: shared effects have coefs for every speed that any run was driven at, and those
+    that no fitted run was near add nothing.
+    """
+    rng = np.random.default_rng(0)
+    witness, spoilt = judged[0], judged[1:]
+    other = task_of([garbage(log, rng) if k in spoilt else log for k, log in enumerate(logs)])
+    again = folds.learn(other.problem(), CHOICES, other.dataset, QUESTION, judged, fit)
+    assert len(spoilt) > 2
+    w = learnt.problem.windows
+    kept = w.pieces(np.flatnonzero(~np.isin(w.run, judged)))
+    std = np.sqrt(np.diag(learnt.optimum.covariance))
+    same(again.optimum.state.z / std, learnt.optimum.state.z / std)
+    same(again.optimum.state.log_variance, learnt.optimum.state.log_variance)
+    same(
+        again.optimum.covariance / std / std[:, None],
+        learnt.optimum.covariance / std / std[:, None],
+    )
+    for now, before in zip(again.models, learnt.models, strict=True):
+        assert now.variance == pytest.approx(before.variance, rel=1e-4), now.name
+        assert any(name.startswith("session.") for name in now.variance)
+        size = np.sqrt(np.diag(before.covariance))
+        both = size * size[:, None]
+        same(now.covariance / both, before.covariance / both, err_msg=now.name)
+        if isinstance(now, Noisy):
+            assert now.model.state.keys() == before.model.state.keys()
+            # of a curve that is straight where it was seen, numbers may be anything
+            one, two = (m.model.twist(kept, m.robot) for m in (now, before))
+            same(one, two, err_msg=now.name)
+
+    def rows(task, found):
+        return judge_as(found, task, judged)[list(judged).index(witness)].to_json()
+
+    one, two = rows(other, again), rows(task_of(logs), learnt)
+    for name, score in one.pop("models").items():
+        expected = two["models"][name]
+        same(score.pop("predicted_end"), expected.pop("predicted_end"), err_msg=name)
+        assert score == pytest.approx(expected, rel=1e-4, abs=1e-6), name
+    del two["models"]
+    same(one.pop("measured_end"), two.pop("measured_end"))
+    for length in ("chord", "path"):
+        assert one.pop(length) == pytest.approx(two.pop(length)), length
+    assert one == two
+
+
+def judge_as(found, task, judged):
+    """Rows of `judge` where all has been learnt."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(folds, "learn", lambda *_: found)
+        return folds.judge(found.problem, CHOICES, task.dataset, QUESTION, judged).rows
+
+
+def test_regions_of_left_out_runs_know_what_sessions_share(logs, judged, learnt, monkeypatch):
+    task = task_of(logs)
+    known = judge_as(learnt, task, judged)
+    for model in learnt.models:
+        of_session = [name.startswith("session.") for name in model.variance]
+        own = dict(
+            zip(
+                model.variance,
+                np.where(of_session, 1e-30, list(model.variance.values())),
+                strict=True,
+            )
+        )
+        bare = replace(model, variance=own)
+        regions = [
+            (model.ends(w)[1], bare.ends(w)[1])
+            for w in replay.cuts(task.dataset.subset(judged), model.robot)
+        ]
+        for wide, plain in [*regions, [m.scale(learnt.problem)[1] for m in (model, bare)]]:
+            growth = np.linalg.eigvalsh(wide - plain)[:, -1]
+            assert (growth > 0.01 * np.linalg.eigvalsh(plain)[:, -1]).all(), model.name
+    nothing = {name: 1e-30 for name in learnt.models[0].variance if name.startswith("session.")}
+    monkeypatch.setattr(predictive, "shared", lambda model, *_: (nothing, model.covariance))
+    held = partial(folds.learn, fit=lambda *_, **__: learnt.optimum)
+    alone = held(task.problem(), CHOICES, task.dataset, QUESTION, judged)
+    problem, state = learnt.problem, learnt.optimum.state
+    of_session = [name.startswith("session.") for name in problem.noise.names]
+    keep = (~np.isin(problem.windows.run, judged)).astype(float)
+    narrow = problem.laplace(state.z, np.where(of_session, -60.0, state.log_variance), keep)
+    assert np.linalg.eigvalsh(learnt.optimum.covariance - narrow).max() > 0
+    for wide, narrow in zip(learnt.models[1:], alone.models[1:], strict=True):
+        assert np.linalg.eigvalsh(wide.covariance - narrow.covariance).max() > 0, wide.name
+    for one, other in zip(known, judge_as(alone, task, judged), strict=True):
+        for name, score in one.models.items():
+            if name == "identified":  # its sessions are in the fit, which is held
+                continue
+            assert score.predicted_end == other.models[name].predicted_end
+            assert score.level < other.models[name].level, name
+            assert score.log_density != other.models[name].log_density, name

@@ -1,0 +1,163 @@
+"""Floors that nobody drove on: what they are made of, and what they are good for."""
+
+from dataclasses import replace
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from slipid.model.geometry import omni
+from slipid.model.robot import build
+from slipid.model.se2 import advance
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.estimator import Estimator, EstimatorState
+from slipid.robot.filter.floor_filter import FloorFilter
+from slipid.robot.filter.hypotheses import hypotheses_of
+from slipid.robot.interface import Readings, Settings
+from slipid.robot.record import ToldRecord
+from slipid.robot.unseen import GRIP, SOFTNESS, with_unseen
+from tests.helpers.known_robot import deploy_known
+from tests.helpers.small_twin import deployed
+
+COUNT = len(SOFTNESS) * len(GRIP)
+SOFT = {"friction": 0.5, "creep": 0.6, "roller_drag": 0.95}
+"""Softer than the floors of the robot as floors are, between two of the unseen ones."""
+OTHER = {"friction": 0.5, "creep": 0.9, "roller_drag": 0.5}
+"""Softer still, with far less drag than floors so soft have."""
+
+
+def value(robot: DeployedRobot, path: str) -> float:
+    number = robot.record.parameters[f"surface.{path}"].value
+    assert isinstance(number, float)
+    return number
+
+
+def test_they_lie_about_the_middle_of_the_floors_that_were_driven_on():
+    known, wider = deployed(process=1.0), deployed(process=1.0).with_unseen()
+    names = wider.labels[2:]
+    assert names == tuple(f"unseen_{k + 1}" for k in range(COUNT))
+    assert wider.labels[:2] == known.labels
+    for quantity in ("creep", "friction", "roller_drag", "scrub"):
+        own = [value(known, f"{name}.{quantity}") for name in known.labels]
+        made = [value(wider, f"{name}.{quantity}") for name in names]
+        assert np.log(made).mean() == pytest.approx(np.log(own).mean())
+    creep = [value(wider, f"{name}.creep") for name in names]
+    drag = [value(wider, f"{name}.roller_drag") for name in names]
+    assert np.argsort(creep, kind="stable").tolist() == np.argsort(drag, kind="stable").tolist()
+    assert max(creep) / min(creep) == pytest.approx(np.exp(4.0))
+    assert max(drag) / min(drag) == pytest.approx(np.exp(0.8 * 4.0))
+    # their motion is surely no better known than that of a floor that was driven on
+    assert (np.asarray(wider.effect[2:]) > np.asarray(wider.effect[:2]).max(axis=0)).all()
+    assert {n.verdict for p, n in wider.record.parameters.items() if "unseen" in p} == {
+        "not_identified"
+    }
+
+
+def test_currents_on_them_are_less_sure_than_on_any_floor_of_the_robot():
+    wider = deployed(current=1.0).with_unseen()
+    known, made = np.asarray(wider.current_std[:2]), np.asarray(wider.current_std[2:])
+    assert made == pytest.approx(1.5 * known.mean())
+    assert made.min() > known.max()
+
+
+def test_nothing_is_told_of_them_but_how_far_off_they_are():
+    made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"])
+    cell = ((0.01, -0.02, 0.3), (0.0, 0.1, 0.0))
+    left = ((0.01, 0.02, 0.3), (0.0, 0.1, 0.0))
+    told = ToldRecord((0.1,), ((cell,), (cell,)), ((left,), (left,)))
+    known = deploy_known(made, told={made.body.loads[0]: told}).record
+    spread = tuple(replace(load, spread=((0.2, 0.4, 0.1),) * 2) for load in known.loads)
+    record = with_unseen(replace(known, loads=spread))
+    (load,) = record.loads
+    assert load.told is not None
+    assert load.told.mean[:2] == told.mean
+    assert load.told.left[:2] == told.left
+    assert load.spread[2:] == pytest.approx(np.tile([0.2, 0.4, 0.1], (COUNT, 1)))
+    assert np.asarray(load.told.mean[2:]) == pytest.approx(np.zeros((COUNT, 1, 2, 3)))
+    both = np.hypot([0.1, 0.1, 0.3], [0.2, 0.4, 0.1])
+    assert np.asarray(load.told.left[2:]) == pytest.approx(np.tile(both, (COUNT, 1, 2, 1)))
+
+
+def test_together_they_are_as_rare_as_a_second_floor_under_the_robot():
+    known, wider = deployed(), deployed().with_unseen()
+    settings = Settings(alike=2.0)
+    prior = np.asarray(FloorFilter(wider, settings).prior())
+    ways = hypotheses_of(wider)
+    before = np.asarray(FloorFilter(known, settings).prior())
+    # the driven floors keep their odds
+    np.testing.assert_allclose(prior[: len(before)] / prior[0], before / before[0])
+    assert prior[ways.uniform[2:]].sum() == pytest.approx(np.exp(-2.0) * prior[ways.uniform[0]])
+
+
+def test_a_robot_has_them_once():
+    record = with_unseen(deployed().record)
+    assert with_unseen(record) is record
+
+
+def test_a_floor_that_has_their_name_already_is_refused():
+    made = deploy_known(build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["unseen_3"]))
+    with pytest.raises(ValueError, match="floor 'unseen_3'"):
+        made.with_unseen()
+
+
+def test_a_robot_comes_to_them_and_from_them_as_a_whole():
+    wider = deployed().with_unseen()
+    by_floor, ways = FloorFilter(wider, Settings()), hypotheses_of(wider)
+    for start in (0, 5):
+        alone = jnp.zeros((len(ways), 1)).at[ways.uniform[start]].set(1.0)
+        now = np.asarray(by_floor._estranged(alone, jnp.asarray(0.5)))[:, 0]
+        assert now.sum() == pytest.approx(1.0)
+        assert (now[ways.uniform[2:]] > 0).all()
+        assert now[ways.uniform[start]] > 0.97
+        # also when wheels come to other floors one by one
+        all_told = np.asarray(by_floor._changed(alone, jnp.asarray(0.5)))[:, 0]
+        assert (all_told[ways.uniform[2:]] > 0).all()
+    # from one floor that was driven on to another it comes wheel by wheel
+    alone = jnp.zeros((len(ways), 1)).at[ways.uniform[0]].set(1.0)
+    assert float(by_floor._estranged(alone, jnp.asarray(0.5))[ways.uniform[1], 0]) == 0.0
+
+
+@cache
+def strange(numbers: tuple[tuple[str, float], ...]) -> DeployedRobot:
+    """The robot on a floor that it does not know."""
+    made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["strange"])
+    surfaces = replace(made.surfaces, **{k: jnp.asarray([v]) for k, v in numbers})
+    return deploy_known(eqx.tree_at(lambda r: r.surfaces, made, surfaces), highest_speed=8.0)
+
+
+def end_after(
+    robot: DeployedRobot, numbers: dict[str, float], way: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the strange floor leads in 4 s, and where the robot believes to be."""
+    truth, settings = strange(tuple(numbers.items())), Settings(current_is_signed=True)
+    w = truth.forward @ jnp.asarray([0.2 * np.cos(way), 0.2 * np.sin(way), 0.0]) / 0.04
+    xi = jnp.zeros((1, 3))
+    for _ in range(4):
+        xi, amps = FloorFilter(truth, settings).solve(xi, w)
+    assert np.isfinite(amps).all()
+    estimator, dt = Estimator(robot, settings), 0.1
+    nothing = Readings.nothing(3)
+
+    @eqx.filter_jit
+    def drive(estimator: Estimator) -> jax.Array:
+        def step(state: EstimatorState, k: jax.Array) -> tuple[EstimatorState, jax.Array]:
+            z = replace(nothing, wheel_angle=k * dt * w, current=amps[0])
+            state, seen = estimator.step(state, z, dt)
+            return state, seen.pose
+
+        return jax.lax.scan(step, estimator.init(), jnp.arange(41.0))[1][-1]
+
+    return np.asarray(advance(xi[0], 4.0)), np.asarray(drive(estimator))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", [0.3, 1.2, 2.5])
+@pytest.mark.parametrize(("numbers", "part"), [(SOFT, 0.7), (OTHER, 0.9)])
+def test_a_strange_floor_is_taken_for_what_its_currents_are_like(numbers, part, way):
+    true, pose = end_after(deployed(), numbers, way)
+    _, wider = end_after(deployed().with_unseen(), numbers, way)
+    before, after = (float(np.hypot(*(p - true)[:2])) for p in (pose, wider))
+    assert after < part * before
