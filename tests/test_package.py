@@ -31,12 +31,11 @@ def test_all_but_extras_runs_without_their_libraries():
     rooms = (
         *(
             "cli.demo",
-            "job.identify",
-            "job.validate",
-            "job.compare",
-            "identify.posterior.diagnosis",
+            "app.identify",
+            "app.compare",
+            "infer.posterior.diagnosis",
         ),
-        *("deploy.deploy", "deploy.trial", "api.fit", "api.driving", "plots.fit"),
+        *("deploy.deploy", "lab.trial.trial", "api.fit", "api.robot", "plots.fit"),
     )
     code = (
         "import sys\nfrom importlib import import_module\n"

@@ -1,1 +1,1 @@
-"""Everything that judges: test site, self test, trial, benchmark, published systems, the 2021 paper."""
+"""What judges: test site, self test, trial, benchmark, published systems, the 2021 paper."""

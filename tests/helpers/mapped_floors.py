@@ -16,7 +16,7 @@ REGION = "[region]\nat_m = [[-1.1, -0.9], [1.1, -0.9], [1.1, 0.9], [-1.1, 0.9]]\
 HEAD = 'schema = "slipid.palette/1"\n'
 IMAGE = Path("floor.png")
 ROBOT = Robot("4X4_50", 0.17, 0.2)
-REFERENCE = Path(__file__).parents[1] / "vision" / "floor" / "test_site_reference.json"
+REFERENCE = Path(__file__).parents[1] / "camera" / "floor" / "test_site_reference.json"
 SITE_POINTS = {
     "tan": [(100, 60), (100, 300)],
     "navy": [(250, 130), (480, 450), (700, 930)],

@@ -111,7 +111,7 @@ def track(
         checkpoint,
         key_of(
             *(source.identity, targets[0].dictionary, sorted(ids), region),
-            *(source_hash("vision"), opencv().__version__),
+            *(source_hash("camera"), opencv().__version__),
         ),
     )
     seen = look_through(source, finder, kept, report)

@@ -29,9 +29,12 @@ OWN_MAP = "slipid_map"
 """slipid's estimator, told the map of the floors."""
 
 
-OF_FITS = ("model", "data", "identify", "job", "parameter", "search_space", "benchmark/own")
+OF_FITS = (
+    *("parameter", "search_space", "model", "data", "fit", "predict", "infer", "app"),
+    "lab/benchmark/own",
+)
 """Packages and modules that slipid's fits depend on."""
-OF_ROWS = ("baselines", "benchmark", "control", "deploy")
+OF_ROWS = ("lab/systems", "lab/paper2021", "lab/benchmark", "robot", "deploy")
 """Packages that all rows depend on beside these."""
 QUICK_RUNS = 60
 """Runs of each data set, where a part is enough."""

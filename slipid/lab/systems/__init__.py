@@ -1,1 +1,1 @@
-"""Published systems to compare with, each with its equations, its source and every liberty taken."""
+"""Published systems to compare with: equations, sources, and every liberty taken."""

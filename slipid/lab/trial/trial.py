@@ -176,7 +176,7 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         ),
         *(part for m in (floor, told) for part in (m.surfaces, m.corner, m.cell, m.cells)),
         # runs of other code are not taken for this one's
-        source_hash("control", "model", "testsite", "data", "deploy", "baselines/steering"),
+        source_hash("robot", "model", "lab/testsite", "data", "deploy", "lab/trial"),
     )
     # trials of other gains or floors lie beside this one, so that going back to them costs nothing
     kept = Checkpoint(out / FOLDER / key[:12] / f"of{wish.starts}", key)

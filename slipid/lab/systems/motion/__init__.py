@@ -1,1 +1,1 @@
-"""Ward and Iagnemma's slip detector: an extended Kalman filter on a robot's dynamics."""
+"""Published systems that predict motion or slip."""
