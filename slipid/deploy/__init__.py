@@ -1,1 +1,1 @@
-"""From a fit to what runs on the robot: the only room that knows identify and control together."""
+"""From a fit or a posterior to the robot's record, and to exported folders."""

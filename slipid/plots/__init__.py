@@ -1,1 +1,1 @@
-"""A picture a file."""
+"""Pictures of results, a file per subject."""

@@ -1,1 +1,1 @@
-"""Slip models side by side on runs that none of them has seen."""
+"""Slip models: one interface, open-loop prediction, scores, ranking."""

@@ -133,8 +133,8 @@ def test_a_kill_leaves_every_part_whole(tmp_path):
 def test_sources_are_of_packages_and_of_single_modules():
     one, other, both = (
         source_hash(*rooms)
-        for rooms in (("parameter",), ("benchmark/own",), ("parameter", "benchmark/own"))
+        for rooms in (("parameter",), ("lab/trial",), ("parameter", "lab/trial"))
     )
-    assert len({one, other, both, source_hash("benchmark")}) == 4
+    assert len({one, other, both, source_hash("lab")}) == 4
     with pytest.raises(FileNotFoundError):
         source_hash("no_such_package")

@@ -1,1 +1,1 @@
-"""Which surface each cell of a floor looks like: colour, light, texture and neighbours."""
+"""Floor maps from pictures: which surface each cell of a floor looks like."""

@@ -1,1 +1,1 @@
-"""What a fit knows and what it does not."""
+"""Verdicts: what a fit knows and what it does not."""

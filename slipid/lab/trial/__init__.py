@@ -1,1 +1,1 @@
-"""Published laws that steer a robot along a path, to drive beside the robot's own controllers."""
+"""Closed-loop trials of controllers, published laws among them."""
