@@ -16,10 +16,13 @@ from jaxtyping import Float
 from scipy import sparse
 from scipy.optimize import least_squares, linprog, lsq_linear
 
-from slipid.predict.slip_model import Machine, Twists
+from slipid.model.motor import REST
+from slipid.predict.slip_model import Machine, RunSignals, Twists
 from slipid.predict.steps import Steps, TrainingWindows, TwistModel, least
 
 Slips = Float[np.ndarray, "step drive"]
+Regressor = Callable[[RunSignals, Machine], Slips]
+"""What the slip of each wheel is a curve of, in every step."""
 Features = Callable[[np.ndarray], np.ndarray]
 """From the regressor (...,) to features (..., k); slip is their weighted sum."""
 HELD = 1e12
@@ -32,6 +35,22 @@ instead of whichever rounding prefers.
 """
 
 
+def current(signals: RunSignals, machine: Machine) -> Slips:
+    """Current of every wheel along its motion [A]; zeros where none was logged."""
+    return np.zeros_like(signals.turn) if signals.current is None else signals.along(machine)
+
+
+def soft_torque(signals: RunSignals, machine: Machine) -> Slips:
+    """Torque of every wheel [N m] as the motor's model has it; zeros where none was logged.
+
+    The sign of a current fades as a wheel comes to rest, I = |I| w / sqrt(w^2 + w0^2), since an
+    unsigned ammeter does not show it.
+    """
+    shaft = np.abs(machine.gear_ratio * signals.speed)
+    amps = current(signals, machine) * shaft / np.sqrt(shaft**2 + REST**2)
+    return replace(signals, current=amps, current_is_signed=False).torque(machine, REST)
+
+
 @dataclass(frozen=True)
 class WheelSlip(TwistModel, abc.ABC):
     """A model that gives the slip of each wheel from what its own motor takes."""
@@ -41,7 +60,7 @@ class WheelSlip(TwistModel, abc.ABC):
         """Slip of each drive [-] in every step."""
 
     def twist(self, steps: Steps, machine: Machine) -> Twists:
-        rim = steps.heard.speed * machine.wheel_radius * (1.0 - self.slip(steps, machine))
+        rim = steps.signals.speed * machine.wheel_radius * (1.0 - self.slip(steps, machine))
         return np.asarray(rim @ machine.back.T)
 
 
@@ -54,17 +73,17 @@ class Curve(WheelSlip):
 
     Attributes:
         features: phi.
-        torque: x is M = C_e I + R I^2/wm [N m] instead of the current [A].
+        regressor: x, the current [A] or a torque [N m].
         per_wheel: own coefficients for every wheel.
         monotone: no coefficient but the first is negative.
         insensitive: epsilon-insensitive loss instead of least squares, as support vector regression
             with a linear kernel has it; epsilon is a tenth of a robust std of what slip takes away.
-        smoothing: time constant of a low pass of the current, None without [s].
+        smoothing: time constant of a low pass of x, None without [s].
         most: largest slip of either sign; where a wheel is dragged along its slip is negative.
     """
 
     features: Features
-    torque: bool = False
+    regressor: Regressor = current
     per_wheel: bool = False
     monotone: bool = False
     insensitive: bool = False
@@ -72,7 +91,7 @@ class Curve(WheelSlip):
     most: float = np.inf
 
     def learn(self, w: TrainingWindows, machine: Machine) -> "Curve":
-        rim = w.steps.heard.speed * machine.wheel_radius
+        rim = w.steps.signals.speed * machine.wheel_radius
         rows = w.rows(machine.back @ (rim[..., None] * self.regressors(w.steps, machine)), machine)
         a, b = rows.parts.reshape(-1, rows.parts.shape[-1]), rows.gap.ravel()
         if self.insensitive:
@@ -89,7 +108,8 @@ class Curve(WheelSlip):
 
     def regressors(self, steps: Steps, machine: Machine) -> Float[np.ndarray, "step drive k"]:
         """What slip is linear in."""
-        phi = self.features(regressor(steps, machine, self.torque, self.smoothing))
+        x = self.regressor(steps.signals, machine)
+        phi = self.features(x if self.smoothing is None else steps.smoothed(x, self.smoothing))
         if not self.per_wheel:
             return phi
         return np.einsum("sdk,de->sdek", phi, np.eye(phi.shape[1])).reshape(*phi.shape[:2], -1)
@@ -123,16 +143,6 @@ def robust_std(x: Float[np.ndarray, " sample"]) -> float:
     return float(np.subtract(*np.percentile(x, (75, 25)))) / 1.349
 
 
-def regressor(
-    steps: Steps, machine: Machine, torque: bool, smoothing: float | None = None
-) -> Float[np.ndarray, "step drive"]:
-    """Current [A] or torque [N m] of every wheel along its motion; zeros where none was logged."""
-    if steps.heard.current is None:
-        return np.zeros_like(steps.heard.turn)
-    values = steps.heard.torque(machine) if torque else steps.heard.along(machine)
-    return values if smoothing is None else steps.smoothed(values, smoothing)
-
-
 @final
 @dataclass(frozen=True)
 class Saturating(WheelSlip):
@@ -152,7 +162,7 @@ class Saturating(WheelSlip):
             found = w.means(replace(self, coefficients=shape).twist(w.steps, machine))
             return np.asarray(((found - w.twist) * scale).ravel())
 
-        torque = regressor(w.steps, machine, True)
+        torque = soft_torque(w.steps.signals, machine)
         top = float(np.log(max(torque.max(), 1e-3) * 1.5))
         # the cap makes several minima: with one-sided differences rounding decides between them
         starts = ([np.log(k), top] for k in (0.05, 0.3, 1.0))
@@ -161,7 +171,7 @@ class Saturating(WheelSlip):
 
     def slip(self, steps: Steps, machine: Machine) -> Slips:
         kappa, m_max = np.exp(self.known)
-        share = np.minimum(regressor(steps, machine, True) / m_max, 0.98)
+        share = np.minimum(soft_torque(steps.signals, machine) / m_max, 0.98)
         return np.asarray(-kappa * np.log1p(-share))
 
 

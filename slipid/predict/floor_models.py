@@ -7,7 +7,7 @@ import numpy as np
 
 from slipid.data.windows import Windows
 from slipid.model.robot import Robot
-from slipid.predict.slip_model import Heard, Increments, Machine, as_increments, body_twist
+from slipid.predict.slip_model import Increments, Machine, RunSignals, as_increments, body_twist
 from slipid.predict.steps import Steps, TrainingWindows, TwistModel
 
 
@@ -99,7 +99,7 @@ class FloorModels:
 def steps_of(w: Windows) -> Steps:
     """The windows as steps, each piece a run of its own; of currents their magnitudes."""
     drives = w.turn.shape[-1]
-    signals = Heard(
+    signals = RunSignals(
         name="windows",
         dt=w.dt.ravel(),
         turn=w.turn.reshape(-1, drives),

@@ -84,7 +84,7 @@ class Encoder(TwistModel):
 
     def twist(self, steps: Steps, machine: Machine) -> Twists:
         at = steps if self.lag is None else steps.at_lag(self.lag)
-        return at.heard.rolling(machine if self.shape is None else machine.of_shape(self.shape))
+        return at.signals.rolling(machine if self.shape is None else machine.of_shape(self.shape))
 
 
 def nominal(shape: Geometry) -> Encoder:
@@ -128,7 +128,7 @@ class Corrected(TwistModel):
         if len(numbers) > count:
             steps = steps.at_lag(float(numbers[count]))
         own = machine if self.shape is None else machine.of_shape(self.shape)
-        return corrected(steps.heard.rolling(own), numbers[:count])
+        return corrected(steps.signals.rolling(own), numbers[:count])
 
 
 def corrected(rolling: Twists, numbers: Float[np.ndarray, " number"]) -> Twists:
@@ -180,13 +180,13 @@ class HeadingLookup(TwistModel):
         return np.kron(table.penalty(weight), np.diag(1 / np.maximum(left, 1e-12)))
 
     def twist(self, steps: Steps, machine: Machine) -> Twists:
-        rolling, series = steps.heard.rolling(machine), self.known
+        rolling, series = steps.signals.rolling(machine), self.known
         change = fourier(rolling) @ series
         change[:, :2] = turned(_direction(rolling), change[:, :2])
         return np.asarray(rolling + change)
 
     def _table(self, w: TrainingWindows, machine: Machine) -> "_Table":
-        rolling = w.means(w.steps.heard.rolling(machine))
+        rolling = w.means(w.steps.signals.rolling(machine))
         gap = (w.twist - rolling) * w.dt[:, None]
         gap[:, :2] = turned(-_direction(rolling), gap[:, :2])
         return _Table(fourier(rolling * w.dt[:, None]), gap, self._fold(w.run))

@@ -70,7 +70,7 @@ WINDOW_S = 0.5
 FEWEST = 5
 """Runs on a floor, or with a load, below which a method takes its fit to all runs for them."""
 SHAFT_W0 = 3.0
-"""Shaft speed below which the torque of a current is not told by its power [rad/s]."""
+"""Shaft speed below which the torque of a current is not known by its power [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +128,8 @@ class Machine:
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
-    """What the robot's computer hears of a run, in steps of a tenth to half a second.
+class RunSignals:
+    """What the robot measures of a run, in steps of a tenth to half a second.
 
     Attributes:
         name: of the run.
@@ -139,7 +139,7 @@ class Heard:
             `current_is_signed`, else its magnitude; None where it was not logged.
         gyro: mean yaw rate [rad/s], or None.
         command: twist that was commanded, or None.
-        floor: name of the floor if the method is told; None where it has to find out.
+        floor: name of the floor; None where a model has to find out.
         load: name of the load set-up, which a robot knows.
     """
 
@@ -178,14 +178,14 @@ class Heard:
         way = np.sign(self.speed)
         return np.asarray(self.current * way if self.current_is_signed else self.current)
 
-    def torque(self, machine: Machine) -> Float[np.ndarray, "step drive"]:
-        """M = C_e I + R I^2 w / (w^2 + w0^2) [N m], w the shaft's speed and w0 = `SHAFT_W0`.
+    def torque(self, machine: Machine, rest: float = SHAFT_W0) -> Float[np.ndarray, "step drive"]:
+        """M = C_e I + R I^2 w / (w^2 + w0^2) [N m], w the shaft's speed and w0 that at `rest`.
 
         The 2021 paper's torque characterising variable M = U I / w, with U = C_e w + R I, regular
         at rest. Positive where the motor drives.
         """
         amps, shaft = self.along(machine), np.abs(machine.gear_ratio * self.speed)
-        heat = machine.resistance * amps**2 * shaft / (shaft**2 + SHAFT_W0**2)
+        heat = machine.resistance * amps**2 * shaft / (shaft**2 + rest**2)
         return np.asarray(machine.back_emf * amps + heat)
 
     def power(self, machine: Machine) -> Numbers:
@@ -196,7 +196,7 @@ class Heard:
         amps, shaft = self.along(machine), np.abs(machine.gear_ratio * self.speed)
         return np.asarray(((machine.resistance * amps + machine.back_emf * shaft) * amps).sum(1))
 
-    def windowed(self, seconds: float = WINDOW_S) -> "Heard":
+    def windowed(self, seconds: float = WINDOW_S) -> "RunSignals":
         """The same run in longer steps: neighbours joined until they are about so long."""
         first = groups(self.dt, seconds)
         dt = np.add.reduceat(self.dt, first)
@@ -222,7 +222,7 @@ class Run:
     """A run with the pose of its body, for training and for the judge.
 
     Attributes:
-        heard: what the robot measured; its `floor` is None where methods are not told.
+        signals: what the robot measured; its `floor` is None where models do not know it.
         pose: x, y [m] and heading [rad] of the body at the edges of the steps, in true metres.
         floor: name of the floor it was driven on.
         load: name of the load set-up.
@@ -230,7 +230,7 @@ class Run:
         speed: commanded [m/s], nan where none was logged.
     """
 
-    heard: Heard
+    signals: RunSignals
     pose: Float[np.ndarray, "edge 3"]
     floor: str
     load: str = "as_built"
@@ -240,21 +240,21 @@ class Run:
     @property
     def twist(self) -> Twists:
         """Body twist of every step by the pose: constant over a step, exact on SE(2)."""
-        return body_increments(self.pose) / self.heard.dt[:, None]
+        return body_increments(self.pose) / self.signals.dt[:, None]
 
     def windowed(self, seconds: float = WINDOW_S) -> "Run":
         """The same run in longer steps."""
-        edges = np.append(groups(self.heard.dt, seconds), len(self.heard))
-        return replace(self, heard=self.heard.windowed(seconds), pose=self.pose[edges])
+        edges = np.append(groups(self.signals.dt, seconds), len(self.signals))
+        return replace(self, signals=self.signals.windowed(seconds), pose=self.pose[edges])
 
-    def told(self, floor: bool) -> "Run":
-        """The same run, its floor told to methods or not."""
-        return replace(self, heard=replace(self.heard, floor=self.floor if floor else None))
+    def with_floor(self, floor: bool) -> "Run":
+        """The same run, its floor known to models or not."""
+        return replace(self, signals=replace(self.signals, floor=self.floor if floor else None))
 
 
 @dataclass(frozen=True, eq=False)
-class Said:
-    """What a method says of a run.
+class PredictedRun:
+    """Prediction of a run by a slip model.
 
     Attributes:
         path: pose at every edge of the steps, seen from the pose at the start [m, m, rad].
@@ -301,8 +301,8 @@ class SlipModel(abc.ABC):
         """The method fitted to runs."""
 
     @abc.abstractmethod
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
-        """What it says of runs it has not seen, from what was heard alone."""
+    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+        """Predictions of runs the model has not seen, from the signals alone."""
 
     @property
     @abc.abstractmethod
@@ -312,7 +312,7 @@ class SlipModel(abc.ABC):
 
 @dataclass(frozen=True)
 class ByFloor(SlipModel):
-    """A slip model fitted floor by floor where floors are told, else load set-up by load set-up.
+    """A slip model fitted floor by floor where floors are known, else load set-up by load set-up.
 
     Groups of fewer than `FEWEST` runs have the fit to all runs.
 
@@ -337,7 +337,7 @@ class ByFloor(SlipModel):
     def fit(self, runs: Sequence[Run], machine: Machine) -> "ByFloor":
         groups: dict[str | None, list[Run]] = {}
         for run in runs:
-            groups.setdefault(self.group_of(run.heard), []).append(run)
+            groups.setdefault(self.group_of(run.signals), []).append(run)
         order = sorted(groups, key=lambda name: -len(groups[name]))
         few = [name for name in order if len(groups[name]) < FEWEST] if len(order) > 1 else []
         fitted = {n: self.method.fit(groups[n], machine) for n in order if n not in few}
@@ -345,30 +345,30 @@ class ByFloor(SlipModel):
             fitted |= dict.fromkeys(few, self.method.fit(runs, machine))
         return replace(self, fitted=fitted)
 
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
-        said: dict[int, Said] = {}
+    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+        found: dict[int, PredictedRun] = {}
         groups = [self._fitted_group(run) for run in runs]
         for group in dict.fromkeys(groups):
             mine = [k for k, name in enumerate(groups) if name == group]
             of_group = self.fitted[group].predict([runs[k] for k in mine], machine)
-            said.update(zip(mine, of_group, strict=True))
-        return [said[k] for k in range(len(runs))]
+            found.update(zip(mine, of_group, strict=True))
+        return [found[k] for k in range(len(runs))]
 
-    def _fitted_group(self, heard: Heard) -> str | None:
+    def _fitted_group(self, signals: RunSignals) -> str | None:
         """The group of a run; a load set-up that no training run had is taken for the usual one."""
-        group = self.group_of(heard)
+        group = self.group_of(signals)
         if group not in self.fitted:
-            if heard.floor is not None:
+            if signals.floor is not None:
                 known = ", ".join(map(str, self.fitted))
-                raise ValueError(f"{self.name}: no floor '{heard.floor}'; fitted: {known}")
+                raise ValueError(f"{self.name}: no floor '{signals.floor}'; fitted: {known}")
             return next(iter(self.fitted))
         return group
 
-    def group_of(self, heard: Heard) -> str | None:
-        """Name of the runs that this one is fitted with: its floor if that is told, or its load."""
+    def group_of(self, signals: RunSignals) -> str | None:
+        """Name of the runs that this one is fitted with: its floor where known, or its load."""
         if self.pooled:
             return None
-        return heard.load if heard.floor is None else heard.floor
+        return signals.load if signals.floor is None else signals.floor
 
     @property
     def numbers(self) -> int:

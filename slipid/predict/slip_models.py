@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from slipid.model.geometry import Geometry
-from slipid.predict.curves import Curve, Saturating, above, powers, ramps
+from slipid.predict.curves import Curve, Saturating, above, powers, ramps, soft_torque
 from slipid.predict.floor_models import FloorModels
 from slipid.predict.kinematics import TERMS, Corrected, Encoder, HeadingLookup, Together, nominal
 from slipid.predict.steps import TwistModel
@@ -38,12 +38,12 @@ def _of_wheels(has_current: bool, together: Together | None) -> list[TwistModel]
     out: list[TwistModel] = [Curve("constant", powers(0))]
     if has_current:
         out += [
-            Curve("linear", powers(1), torque=True),
-            Curve("affine", powers(0, 1), torque=True),
-            Curve("svr", powers(0, 1), torque=True, insensitive=True),
-            Curve("quadratic", powers(0, 1, 2), torque=True),
+            Curve("linear", powers(1), soft_torque),
+            Curve("affine", powers(0, 1), soft_torque),
+            Curve("svr", powers(0, 1), soft_torque, insensitive=True),
+            Curve("quadratic", powers(0, 1, 2), soft_torque),
             Saturating(),
-            Curve("monotone_spline", ramps(KNOTS), torque=True, monotone=True),
+            Curve("monotone_spline", ramps(KNOTS), soft_torque, monotone=True),
             Curve("affine_current", powers(0, 1)),
             Curve("paper", above(PAPER_THRESHOLD), per_wheel=True),
         ]

@@ -10,10 +10,10 @@ from jaxtyping import Float, Int
 
 from slipid.predict.slip_model import (
     WINDOW_S,
-    Heard,
     Machine,
+    PredictedRun,
     Run,
-    Said,
+    RunSignals,
     SlipModel,
     Twists,
     body_increments,
@@ -28,20 +28,20 @@ class Steps:
     """The steps of several runs one after the other, so that all are computed in one go.
 
     Attributes:
-        heard: all steps as if they were one run; its name and floor are those of the first.
+        signals: all steps as if they were one run; its name and floor are those of the first.
         first: first step of each run.
         faster: wheel speed at the end of each step less that at its start [rad/s], so that
             d turn / d lag = -faster; None where the lag of the poses is settled.
         lag: lag of the poses behind the wheels that was assumed [s].
     """
 
-    heard: Heard
+    signals: RunSignals
     first: Int[np.ndarray, " run"]
     faster: Float[np.ndarray, "step drive"] | None = None
     lag: float = 0.0
 
     @classmethod
-    def of(cls, runs: Sequence[Heard]) -> "Steps":
+    def of(cls, runs: Sequence[RunSignals]) -> "Steps":
         """All steps of runs of one robot.
 
         Raises:
@@ -51,7 +51,7 @@ class Steps:
             raise ValueError("currents of some runs are signed; expected all signed or none")
         currents = [run.current for run in runs if run.current is not None]
         gyros = [run.gyro for run in runs if run.gyro is not None]
-        heard = replace(
+        signals = replace(
             runs[0],
             dt=np.concatenate([run.dt for run in runs]),
             turn=np.concatenate([run.turn for run in runs]),
@@ -60,28 +60,30 @@ class Steps:
             gyro=np.concatenate(gyros) if len(gyros) == len(runs) else None,
             command=None,
         )
-        return cls(heard, np.cumsum([0, *(len(run) for run in runs[:-1])]))
+        return cls(signals, np.cumsum([0, *(len(run) for run in runs[:-1])]))
 
     def at_lag(self, lag: float) -> "Steps":
         """The same steps at another lag, to first order [s]; as they are where it is settled."""
         if self.faster is None:
             return self
-        turn = self.heard.turn - (lag - self.lag) * self.faster
-        return replace(self, heard=replace(self.heard, turn=turn), lag=lag)
+        turn = self.signals.turn - (lag - self.lag) * self.faster
+        return replace(self, signals=replace(self.signals, turn=turn), lag=lag)
 
     @property
     def length(self) -> Int[np.ndarray, " run"]:
         """How many steps each run has."""
-        return np.diff(self.first, append=len(self.heard))
+        return np.diff(self.first, append=len(self.signals))
 
-    def said(self, twist: Twists, slipping: Float[np.ndarray, " step"] | None = None) -> list[Said]:
+    def predicted(
+        self, twist: Twists, slipping: Float[np.ndarray, " step"] | None = None
+    ) -> list[PredictedRun]:
         """Each run's path from the twists of all steps [m/s, m/s, rad/s], and its slip if known."""
-        parts = zip(self._runs(twist), self._runs(self.heard.dt), strict=True)
+        parts = zip(self._runs(twist), self._runs(self.signals.dt), strict=True)
         paths = [path_of(xi, dt) for xi, dt in parts]
         if slipping is None:
-            return [Said(path) for path in paths]
+            return [PredictedRun(path) for path in paths]
         sure = self._runs(slipping)
-        return [Said(path, slipping=own) for path, own in zip(paths, sure, strict=True)]
+        return [PredictedRun(path, slipping=own) for path, own in zip(paths, sure, strict=True)]
 
     def smoothed(
         self, values: Float[np.ndarray, "step drive"], time_constant: float
@@ -94,7 +96,7 @@ class Steps:
         step = np.arange(len(values)) - self.first[run]
         shape = len(self.first), int(self.length.max())
         memory, x = np.ones((*shape, 1)), np.zeros((*shape, values.shape[1]))
-        memory[run, step, 0] = np.exp(-self.heard.dt / time_constant)
+        memory[run, step, 0] = np.exp(-self.signals.dt / time_constant)
         x[run, step] = values
         # all runs at once: the only loop is over the steps of the longest of them
         for k in range(1, shape[1]):
@@ -103,7 +105,7 @@ class Steps:
 
     def ends(self, twist: Twists) -> Float[np.ndarray, "run 3"]:
         """Pose at each run's end, seen from its start [m, m, rad], of the twists of all steps."""
-        dt = self.heard.dt
+        dt = self.signals.dt
         turn = twist[:, 2] * dt
         before = np.cumsum(turn) - turn
         before -= np.repeat(before[self.first], self.length)
@@ -139,27 +141,29 @@ class TrainingWindows:
 
     @classmethod
     def of(cls, runs: Sequence[Run]) -> "TrainingWindows":
-        steps = Steps.of([run.heard for run in runs])
-        begins = [groups(run.heard.dt, WINDOW_S) for run in runs]
-        edges = [np.append(begin, len(run.heard)) for begin, run in zip(begins, runs, strict=True)]
+        steps = Steps.of([run.signals for run in runs])
+        begins = [groups(run.signals.dt, WINDOW_S) for run in runs]
+        edges = [
+            np.append(begin, len(run.signals)) for begin, run in zip(begins, runs, strict=True)
+        ]
         moved = [body_increments(run.pose[edge]) for run, edge in zip(runs, edges, strict=True)]
         first = np.concatenate([s + begin for s, begin in zip(steps.first, begins, strict=True)])
-        dt = np.add.reduceat(steps.heard.dt, first)
+        dt = np.add.reduceat(steps.signals.dt, first)
         run = np.repeat(np.arange(len(runs)), [len(begin) for begin in begins])
         return cls(steps, first, dt, np.concatenate(moved) / dt[:, None], run)
 
     @property
-    def signals(self) -> Heard:
+    def signals(self) -> RunSignals:
         """What was measured, each window as one step."""
-        heard = self.steps.heard
-        current = None if heard.current is None else self.means(heard.current)
-        turn = np.add.reduceat(heard.turn, self.first)
-        return replace(heard, dt=self.dt, turn=turn, current=current, gyro=None, command=None)
+        signals = self.steps.signals
+        current = None if signals.current is None else self.means(signals.current)
+        turn = np.add.reduceat(signals.turn, self.first)
+        return replace(signals, dt=self.dt, turn=turn, current=current, gyro=None, command=None)
 
     def means(self, values: Float[np.ndarray, "step *any"]) -> Float[np.ndarray, "window *any"]:
         """Mean over time of every window."""
         one = [1] * (values.ndim - 1)
-        total = np.add.reduceat(values * self.steps.heard.dt.reshape(-1, *one), self.first)
+        total = np.add.reduceat(values * self.steps.signals.dt.reshape(-1, *one), self.first)
         return np.asarray(total / self.dt.reshape(-1, *one))
 
     def rows(self, parts: Float[np.ndarray, "step 3 k"], machine: Machine) -> "Rows":
@@ -167,7 +171,7 @@ class TrainingWindows:
 
         gap = (rolling - twist) dt = sum_k weight_k part_k dt, yaw times the base radius.
         """
-        gap = self.means(self.steps.heard.rolling(machine)) - self.twist
+        gap = self.means(self.steps.signals.rolling(machine)) - self.twist
         scale = self.dt[:, None] * machine.size
         return Rows(self.means(parts) * scale[..., None], gap * scale)
 
@@ -222,9 +226,9 @@ class TwistModel(SlipModel, abc.ABC):
     def fit(self, runs: Sequence[Run], machine: Machine) -> "TwistModel":
         return self.learn(TrainingWindows.of(runs), machine) if self.learns else self
 
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
         steps = Steps.of(runs)
-        return steps.said(self.twist(steps, machine))
+        return steps.predicted(self.twist(steps, machine))
 
     @property
     def numbers(self) -> int:

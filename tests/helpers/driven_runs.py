@@ -52,11 +52,11 @@ def scattered(count: int, gyro: bool, noise: Noise = TRUE) -> list[Run]:
 def pulling(run: Run, law: Law, gain: float, offset: float, noise: float = 0.0) -> Run:
     """The run with currents of the traction, as a motor's constant and friction make of it."""
     dynamics = Dynamics.of(ROBOTINO, law)
-    rim = run.heard.speed * ROBOTINO.wheel_radius
+    rim = run.signals.speed * ROBOTINO.wheel_radius
     slide = rim - (run.twist * ROBOTINO.size) @ dynamics.rims.T
     force = gain * ROBOTINO.mass * np.sign(rim) * dynamics.traction(slide) + offset
     force = force + noise * np.random.default_rng(0).normal(size=force.shape)
     scale = ROBOTINO.gear_ratio * ROBOTINO.back_emf / ROBOTINO.wheel_radius
     # a meter with signs: along the wheel's forward direction
     current = force / scale * np.sign(rim)
-    return replace(run, heard=replace(run.heard, current=current, current_is_signed=True))
+    return replace(run, signals=replace(run.signals, current=current, current_is_signed=True))

@@ -4,7 +4,7 @@ import numpy as np
 
 from slipid.model.geometry import omni, skid_steer
 from slipid.model.robot import build
-from slipid.predict.slip_model import Heard, Machine, Run, path_of
+from slipid.predict.slip_model import Machine, Run, RunSignals, path_of
 
 ROBOTINO = Machine.of(build(omni([60.0, 180.0, 300.0], 0.125, 0.040, 16.0), ("gray",)))
 HUSKY = Machine.of(build(skid_steer(0.256, 0.275, 0.165, 78.71, drive_of=(0, 1, 0, 1)), ("grass",)))
@@ -31,7 +31,7 @@ def made_run(
     twist = rolling if twist is None else twist
     each = np.full(len(rolling), dt)
     speed = rolling @ machine.forward.T / machine.wheel_radius
-    heard = Heard(
+    heard = RunSignals(
         name=name,
         dt=each,
         turn=speed * dt,

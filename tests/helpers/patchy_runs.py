@@ -24,5 +24,5 @@ def patchy(seed: int, gyro: bool = False, overlap: float = 0.02, lost: float = L
 
 def slipping(run: Run) -> np.ndarray:
     """Which steps of a run of 0.1 s slip."""
-    rolling = run.heard.rolling(ROBOTINO)
+    rolling = run.signals.rolling(ROBOTINO)
     return np.linalg.norm(rolling - run.twist, axis=1) > 0.2 * np.linalg.norm(rolling, axis=1)

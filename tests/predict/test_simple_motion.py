@@ -23,8 +23,8 @@ def wild(rng, steps, dt=0.1, **extra):
     rolling, twist = rng.normal(size=(2, steps, 3)) * [0.2, 0.2, 0.5]
     run = made_run(rolling, twist, current=rng.uniform(0, 1, (steps, 3)), dt=dt, **extra)
     uneven = rng.uniform(0.05, 0.2, steps)
-    heard = replace(run.heard, dt=uneven, turn=run.heard.turn / dt * uneven[:, None])
-    return replace(run, heard=heard, pose=path_of(twist, uneven) + np.array([1.0, -2.0, 0.0]))
+    heard = replace(run.signals, dt=uneven, turn=run.signals.turn / dt * uneven[:, None])
+    return replace(run, signals=heard, pose=path_of(twist, uneven) + np.array([1.0, -2.0, 0.0]))
 
 
 # encoders
@@ -33,7 +33,7 @@ def wild(rng, steps, dt=0.1, **extra):
 def test_encoders_say_the_path_of_wheels_that_do_not_slip(rng):
     runs = [made_run(rng.normal(size=(n, 3)) * 0.2) for n in (40, 7, 25)]
     method = Encoder().fit(runs, ROBOTINO)
-    said = method.predict([run.heard for run in runs], ROBOTINO)
+    said = method.predict([run.signals for run in runs], ROBOTINO)
     assert method.numbers == 0
     assert method.name == "encoder"
     for each, run in zip(said, runs, strict=True):
@@ -44,9 +44,9 @@ def test_encoders_say_the_path_of_wheels_that_do_not_slip(rng):
 
 
 def test_runs_are_smoothed_one_by_one_from_their_first_value(rng):
-    runs = [wild(rng, n).heard for n in (30, 5, 12)]
+    runs = [wild(rng, n).signals for n in (30, 5, 12)]
     steps = Steps.of(runs)
-    smoothed = np.split(steps.smoothed(steps.heard.current, 0.3), [30, 35])
+    smoothed = np.split(steps.smoothed(steps.signals.current, 0.3), [30, 35])
     for run, found in zip(runs, smoothed, strict=True):
         expected = run.current[0]
         for k, (x, dt) in enumerate(zip(run.current, run.dt, strict=True)):
@@ -55,7 +55,7 @@ def test_runs_are_smoothed_one_by_one_from_their_first_value(rng):
 
 
 def test_smoothing_in_even_steps_is_the_textbook_filter(rng):
-    run = made_run(straight(0.2), current=rng.uniform(0, 1, (40, 3))).heard
+    run = made_run(straight(0.2), current=rng.uniform(0, 1, (40, 3))).signals
     a, x = np.exp(-0.1 / 0.5), run.current
     expected = lfilter([1 - a], [1, -a], x, axis=0, zi=a * x[:1])[0]
     assert np.allclose(Steps.of([run]).smoothed(x, 0.5), expected)
@@ -63,19 +63,19 @@ def test_smoothing_in_even_steps_is_the_textbook_filter(rng):
 
 def test_ends_are_those_of_the_paths(rng):
     runs = [wild(rng, n) for n in (30, 5, 12)]
-    steps = Steps.of([run.heard for run in runs])
+    steps = Steps.of([run.signals for run in runs])
     ends = steps.ends(np.concatenate([run.twist for run in runs]))
-    paths = [path_of(run.twist, run.heard.dt) for run in runs]
+    paths = [path_of(run.twist, run.signals.dt) for run in runs]
     assert np.allclose(ends, [path[-1] for path in paths])
 
 
 def test_windows_are_those_of_the_runs(rng):
     runs = [wild(rng, n) for n in (30, 3, 12)]
     w, windowed = TrainingWindows.of(runs), [run.windowed() for run in runs]
-    assert np.allclose(w.dt, np.concatenate([run.heard.dt for run in windowed]))
+    assert np.allclose(w.dt, np.concatenate([run.signals.dt for run in windowed]))
     assert np.allclose(w.twist, np.concatenate([run.twist for run in windowed]))
-    rolling = np.concatenate([run.heard.rolling(ROBOTINO) for run in windowed])
-    assert np.allclose(w.means(w.steps.heard.rolling(ROBOTINO)), rolling)
+    rolling = np.concatenate([run.signals.rolling(ROBOTINO) for run in windowed])
+    assert np.allclose(w.means(w.steps.signals.rolling(ROBOTINO)), rolling)
 
 
 def test_rows_are_displacements_with_yaw_at_the_base_radius():
@@ -95,15 +95,15 @@ def test_columns_without_news_get_nothing():
 
 
 def test_a_channel_that_one_run_lacks_is_there_for_none(rng):
-    full = wild(rng, 10, gyro=np.zeros(10)).heard
-    assert Steps.of([full, full]).heard.gyro is not None
-    lacking = Steps.of([full, replace(full, gyro=None, current=None)]).heard
+    full = wild(rng, 10, gyro=np.zeros(10)).signals
+    assert Steps.of([full, full]).signals.gyro is not None
+    lacking = Steps.of([full, replace(full, gyro=None, current=None)]).signals
     assert lacking.gyro is None
     assert lacking.current is None
 
 
 def test_signed_and_unsigned_currents_are_not_mixed(rng):
-    run = wild(rng, 10).heard
+    run = wild(rng, 10).signals
     with pytest.raises(ValueError, match="signed"):
         Steps.of([run, replace(run, current_is_signed=True)])
 
@@ -139,7 +139,7 @@ def test_the_effective_track_comes_back(rng):
     runs = skid_runs(rng, one_track)
     method = Corrected("effective_track").fit(runs[:3], HUSKY)
     assert method.coefficients == pytest.approx([1.2, 0.6, 0.15])
-    said = method.predict([run.heard for run in runs[3:]], HUSKY)
+    said = method.predict([run.signals for run in runs[3:]], HUSKY)
     for each, run in zip(said, runs[3:], strict=True):
         assert np.allclose(each.path, run.pose)
 
@@ -148,7 +148,7 @@ def test_the_effective_track_is_the_joint_least_squares(rng):
     runs = skid_runs(rng, one_track, noise=0.1)
     method = Corrected("effective_track").fit(runs, HUSKY)
     windows = [run.windowed() for run in runs]
-    s, _, d = np.concatenate([run.heard.rolling(HUSKY) for run in windows]).T
+    s, _, d = np.concatenate([run.signals.rolling(HUSKY) for run in windows]).T
     twist = np.concatenate([run.twist for run in windows])
 
     def gap(q):
@@ -164,25 +164,25 @@ def test_instantaneous_centres_come_back_where_sides_differ(rng):
     assert method.coefficients[2] == pytest.approx(0.08)
     plain = Corrected("effective_track").fit(runs[:3], HUSKY)
     for run in runs[3:]:
-        said, less = (m.predict([run.heard], HUSKY)[0] for m in (method, plain))
+        said, less = (m.predict([run.signals], HUSKY)[0] for m in (method, plain))
         assert np.allclose(said.path, run.pose)
         assert np.abs(less.path - run.pose).max() > 0.05
 
 
 def test_kinematics_are_counted_by_floor(rng):
     grass = skid_runs(rng, one_track)
-    ice = [replace(run, floor="ice").told(True) for run in grass]
+    ice = [replace(run, floor="ice").with_floor(True) for run in grass]
     for method, numbers in (
         (Corrected("effective_track"), 3),
         (Corrected("instantaneous_centres"), 5),
     ):
         assert method.fit(grass, HUSKY).numbers == numbers
         assert ByFloor.of(method).fit(grass + ice, HUSKY).numbers == 2 * numbers
-        untold = [run.told(False) for run in grass + ice]
+        untold = [run.with_floor(False) for run in grass + ice]
         assert ByFloor.of(method).fit(untold, HUSKY).numbers == numbers
         assert method.needs == frozenset()
         with pytest.raises(ValueError, match="not fitted"):
-            method.predict([grass[0].heard], HUSKY)
+            method.predict([grass[0].signals], HUSKY)
 
 
 # the table of headings
@@ -207,7 +207,7 @@ def test_headings_that_were_not_driven_are_interpolated():
     method = HeadingLookup(ridge=0.0).fit([by_heading(a) for a in HEADINGS], ROBOTINO)
     assert method.numbers == 39
     between = [by_heading(a + 0.1, speed=0.3) for a in HEADINGS]
-    said = method.predict([run.heard for run in between], ROBOTINO)
+    said = method.predict([run.signals for run in between], ROBOTINO)
     for each, run in zip(said, between, strict=True):
         assert np.allclose(each.path, run.pose, atol=1e-9)
 
@@ -239,7 +239,7 @@ def test_a_heavy_ridge_leaves_what_all_headings_share():
 def test_a_robot_that_stands_still_stays_so():
     still = made_run(np.zeros((10, 3)))
     method = HeadingLookup().fit([still], ROBOTINO)
-    said = method.predict([still.heard, made_run(straight(0.3)).heard], ROBOTINO)
+    said = method.predict([still.signals, made_run(straight(0.3)).signals], ROBOTINO)
     assert np.allclose(said[0].path, 0.0)
     assert np.allclose(said[1].path, made_run(straight(0.3)).pose)
 
@@ -249,4 +249,4 @@ def test_the_table_tries_ridges_and_wants_a_twist():
     assert len({method.ridge for method in tried}) == len(tried) <= TRIES
     assert HeadingLookup().needs == {"twist"}
     with pytest.raises(ValueError, match="not fitted"):
-        HeadingLookup().predict([by_heading(0.1).heard], ROBOTINO)
+        HeadingLookup().predict([by_heading(0.1).signals], ROBOTINO)

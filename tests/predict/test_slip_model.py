@@ -20,11 +20,11 @@ def test_a_path_is_that_of_its_twists():
 def test_windows_keep_the_way_and_the_means():
     run = made_run(straight(0.7), current=np.arange(120.0).reshape(40, 3))
     joined = run.windowed()
-    assert len(joined.heard) == 8
-    assert np.allclose(joined.heard.dt, 0.5)
-    assert np.allclose(joined.heard.turn.sum(axis=0), run.heard.turn.sum(axis=0))
-    assert joined.heard.current is not None
-    assert joined.heard.current[0, 0] == pytest.approx(6.0)
+    assert len(joined.signals) == 8
+    assert np.allclose(joined.signals.dt, 0.5)
+    assert np.allclose(joined.signals.turn.sum(axis=0), run.signals.turn.sum(axis=0))
+    assert joined.signals.current is not None
+    assert joined.signals.current[0, 0] == pytest.approx(6.0)
     assert np.allclose(joined.pose[[0, -1]], run.pose[[0, -1]])
     assert np.allclose(joined.twist, run.twist[:8])
 
@@ -36,18 +36,18 @@ def test_groups_of_a_run_shorter_than_a_window():
 
 def test_encoders_without_slip_say_the_twist():
     run = made_run(straight(0.3) + np.array([0.0, 0.0, 0.2]))
-    assert np.allclose(run.heard.rolling(ROBOTINO), run.twist)
+    assert np.allclose(run.signals.rolling(ROBOTINO), run.twist)
 
 
 def test_a_floor_is_told_only_if_asked():
     run = made_run(straight(0.0), floor="green")
-    assert run.told(False).heard.floor is None
-    assert run.told(True).heard.floor == "green"
+    assert run.with_floor(False).signals.floor is None
+    assert run.with_floor(True).signals.floor == "green"
 
 
 def test_the_power_is_that_of_the_torque():
     amps = np.full((40, 3), 0.8)
-    heard = made_run(straight(0.5), current=amps).heard
+    heard = made_run(straight(0.5), current=amps).signals
     shaft = np.abs(16 * heard.speed)
     mechanical = (heard.torque(ROBOTINO) * shaft).sum(axis=1)
     assert heard.power(ROBOTINO) == pytest.approx(mechanical, rel=0.05)

@@ -156,7 +156,7 @@ def _set(wish: Wish, name: str, protocols: Mapping[str, Mapping[str, RowSummary]
     return {
         "about": data.source.about,
         "over": data.source.over,
-        "runs": len(data.heard) + (0 if data.crossing is None else len(data.crossing)),
+        "runs": len(data.logged) + (0 if data.crossing is None else len(data.crossing)),
         "hash": data.job.data_hash,
         "protocols": {
             protocol: {row: asdict(one) for row, one in found.items()}

@@ -16,8 +16,8 @@ from slipid.predict.score import chords, clusters, lengths, scores
 from slipid.predict.slip_model import (
     WINDOW_S,
     Machine,
+    PredictedRun,
     Run,
-    Said,
     body_increments,
     groups,
     path_of,
@@ -66,15 +66,15 @@ class RunScore:
         return asdict(self)
 
 
-def scored(run: Run, said: Said, machine: Machine, over: Over) -> RunScore:
+def scored(run: Run, said: PredictedRun, machine: Machine, over: Over) -> RunScore:
     """Score of a prediction of a run."""
     true = seen_from_start(run.pose)
     cov = None if said.end_covariance is None else said.end_covariance[None]
     (end,) = scores(said.path[None], true[None], cov, said.freedom)
-    first = groups(run.heard.dt, WINDOW_S)
+    first = groups(run.signals.dt, WINDOW_S)
     off, slip, slips = _windows(run, said, machine, first)
     return RunScore(
-        name=run.heard.name,
+        name=run.signals.name,
         floor=run.floor,
         cluster=int(clusters([float(np.degrees(run.heading))])[0]),
         endpoint_error=end.endpoint_error if over == "chord" else end.endpoint_error_over_path,
@@ -95,15 +95,15 @@ def _length(path: Float[np.ndarray, "edge 3"], over: Over) -> float:
 
 
 def _windows(
-    run: Run, said: Said, machine: Machine, first: np.ndarray
+    run: Run, said: PredictedRun, machine: Machine, first: np.ndarray
 ) -> tuple[float, Float[np.ndarray, " window"], Bool[np.ndarray, " window"]]:
     """Rms twist error [m/s]; how sure the method is of slip, and where there was any."""
-    edges = np.append(first, len(run.heard))
-    dt = np.diff(np.concatenate([[0.0], np.cumsum(run.heard.dt)])[edges])[:, None]
+    edges = np.append(first, len(run.signals))
+    dt = np.diff(np.concatenate([[0.0], np.cumsum(run.signals.dt)])[edges])[:, None]
     true = body_increments(run.pose[edges]) / dt * machine.size
     told = body_increments(said.path[edges]) / dt * machine.size
     # joined as the paths are, so that a method that says what encoders say sees no slip at all
-    by_wheels = path_of(run.heard.rolling(machine), run.heard.dt)
+    by_wheels = path_of(run.signals.rolling(machine), run.signals.dt)
     rolling = body_increments(by_wheels[edges]) / dt * machine.size
     size = np.linalg.norm(rolling, axis=1)
     moves = size > STANDS
@@ -112,13 +112,13 @@ def _windows(
     if said.slipping is None:
         score = np.round(np.linalg.norm(told - rolling, axis=1) / most, 6)
     else:
-        score = np.add.reduceat(said.slipping * run.heard.dt, first) / dt[:, 0]
+        score = np.add.reduceat(said.slipping * run.signals.dt, first) / dt[:, 0]
     off = float(np.sqrt(np.mean(np.sum((told - true) ** 2, axis=1))))
     return off, score[moves], slips[moves]
 
 
-def _floor_right(run: Run, said: Said) -> float | None:
-    if said.floors is None or run.heard.floor is not None or run.floor == "unknown":
+def _floor_right(run: Run, said: PredictedRun) -> float | None:
+    if said.floors is None or run.signals.floor is not None or run.floor == "unknown":
         return None
     names = list(said.floors)
     best = np.argmax(np.stack([said.floors[name] for name in names]), axis=0)
@@ -126,14 +126,14 @@ def _floor_right(run: Run, said: Said) -> float | None:
     # a floor that nobody has seen is rightly called unknown
     true = base_of(run.floor) if base_of(run.floor) in known else "unknown"
     right = np.array([base_of(names[k]) == true for k in best])
-    return float((right * run.heard.dt).sum() / run.heard.dt.sum())
+    return float((right * run.signals.dt).sum() / run.signals.dt.sum())
 
 
-def _energy_error(run: Run, said: Said, machine: Machine) -> float | None:
-    if said.power is None or run.heard.current is None:
+def _energy_error(run: Run, said: PredictedRun, machine: Machine) -> float | None:
+    if said.power is None or run.signals.current is None:
         return None
-    spent = float((run.heard.power(machine) * run.heard.dt).sum())
-    return abs(float((said.power * run.heard.dt).sum()) / max(spent, 1e-9) - 1)
+    spent = float((run.signals.power(machine) * run.signals.dt).sum())
+    return abs(float((said.power * run.signals.dt).sum()) / max(spent, 1e-9) - 1)
 
 
 @dataclass(frozen=True)

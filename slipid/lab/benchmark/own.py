@@ -25,7 +25,7 @@ from slipid.infer.slip_curves import current_trend
 from slipid.lab.benchmark.steps import Cut, body_poses
 from slipid.predict.folds import of_some
 from slipid.predict.predictive import Contact, contact_of
-from slipid.predict.slip_model import Heard, Machine, Said, seen_from_start
+from slipid.predict.slip_model import Machine, PredictedRun, RunSignals, seen_from_start
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
 from slipid.robot.interface import MIXED, NO_FLOOR, Readings, Settings
@@ -115,7 +115,7 @@ def _seen(
     return speed, current_trend(contact.robot, lk.batch(w, contact.robot))
 
 
-def told(own: Own, cut: Cut, machine: Machine) -> list[Said]:
+def told(own: Own, cut: Cut, machine: Machine) -> list[PredictedRun]:
     """What the force balance says of runs whose floors it is told, with the electric power."""
     w = cut.windows
     tracks, cov = own.contact.ends(w)
@@ -123,7 +123,7 @@ def told(own: Own, cut: Cut, machine: Machine) -> list[Said]:
     paths = body_poses(robot, w, tracks.predicted)
     power = _power(own, w, machine) if own.job.dataset.current is not None else None
     return [
-        Said(
+        PredictedRun(
             path=seen_from_start(paths[k]),
             end_covariance=turned_covariance(cov[k], -float(paths[k, 0, 2])),
             freedom=DEGREES,
@@ -162,13 +162,13 @@ class Place:
     map: FloorMap | None = None
 
 
-def estimated(own: Own, cuts: Sequence[Cut], data: Runs, place: Place) -> list[Said]:
+def estimated(own: Own, cuts: Sequence[Cut], data: Runs, place: Place) -> list[PredictedRun]:
     """What the estimator says of runs, in the order of the cuts, which are of these data.
 
     It hears currents only if it was fitted to some.
     """
     runs = [(run, cut.numbers[k]) for cut in cuts for k, run in enumerate(cut.runs)]
-    out: dict[int, Said] = {}
+    out: dict[int, PredictedRun] = {}
     alone = {
         n: data.logs[number].surface if place.told else None for n, (_, number) in enumerate(runs)
     }
@@ -176,7 +176,7 @@ def estimated(own: Own, cuts: Sequence[Cut], data: Runs, place: Place) -> list[S
     for load, only in dict.fromkeys(kinds):
         mine = [n for n, kind in enumerate(kinds) if kind == (load, only)]
         estimator = _estimator(own, load, only, place, runs[mine[0]][0].floor == "unknown")
-        heard = [runs[n][0].heard for n in mine]
+        heard = [runs[n][0].signals for n in mine]
         if own.job.dataset.current is None:
             heard = [replace(one, current=None) for one in heard]
         said = replay(estimator, heard, _starts(runs, mine, place.map))
@@ -233,8 +233,10 @@ def _driven(
     return jax.vmap(one)(start, rows)
 
 
-def replay(estimator: Estimator, runs: Sequence[Heard], start: np.ndarray) -> list[Said]:
-    """Estimates of runs from what was heard of them, from poses (run, 3) on.
+def replay(
+    estimator: Estimator, runs: Sequence[RunSignals], start: np.ndarray
+) -> list[PredictedRun]:
+    """Estimates of runs from their signals, from poses (run, 3) on.
 
     The first row is the wheels' first angle, in which no time passes. Steps longer than `LONGEST_S`
     are driven in equal parts.
@@ -244,7 +246,7 @@ def replay(estimator: Estimator, runs: Sequence[Heard], start: np.ndarray) -> li
     longest = -(-longest // STEPS) * STEPS + 1
     drives = estimator.robot.drives
     known = [k for k, unseen in enumerate(estimator.robot.unseen) if not unseen]
-    out: list[Said] = []
+    out: list[PredictedRun] = []
     for first in range(0, len(runs), TOGETHER):
         some = range(first, min(first + TOGETHER, len(runs)))
         angle = np.full((TOGETHER, longest, drives), np.nan)
@@ -268,7 +270,7 @@ def replay(estimator: Estimator, runs: Sequence[Heard], start: np.ndarray) -> li
             ends = np.cumsum(parts[k])
             path = np.concatenate([begin[n][None], pose[n, ends]])
             under = {estimator.robot.labels[row]: floors[n, ends, row] for row in known}
-            said = Said(
+            said = PredictedRun(
                 path=seen_from_start(path),
                 end_covariance=turned_covariance(cov[n, ends[-1]], -float(begin[n, 2])),
                 floors=under | {NO_FLOOR: 1.0 - sum(under.values())},

@@ -64,10 +64,10 @@ class Rectangle:
         data = data_of(self.wish, SOURCE)
         code = source_hash(*OF_FITS)
         key = key_of(data.job.config.hash, data.job.data_hash, code)
-        everybody = np.arange(len(data.heard))
+        everybody = np.arange(len(data.logged))
         kept = Checkpoint(self.folder, key)
         own = slipid_rows.fit_own(data.job, problem_of(self.wish, SOURCE), everybody, kept)
-        sensors = Sensors(current_is_signed=data.heard.current_is_signed, voltage=True)
+        sensors = Sensors(current_is_signed=data.logged.current_is_signed, voltage=True)
         robot_of(own.contact, own.highest_speed, own.trend, sensors).save(self.folder / ROBOT)
 
     def drive(self, executor: Executor, report: Reporter) -> Content:

@@ -111,14 +111,14 @@ class DataSet:
 
     Attributes:
         source: where they are from.
-        job: as slipid fits them; heard: the same runs, with all that methods hear.
+        job: as slipid fits them; logged: the same runs, with all that was logged.
         facts: what splits go by, run by run.
         crossing: runs over several floors, where there are some; map: of these floors.
     """
 
     source: Source
     job: Job
-    heard: Runs
+    logged: Runs
     facts: tuple[Facts, ...]
     crossing: Runs | None = None
     map: FloorMap | None = None
@@ -130,15 +130,15 @@ class DataSet:
 
     def thinned(self, most: int) -> "DataSet":
         """At most so many runs, evenly taken from every floor and speed."""
-        count = len(self.heard)
+        count = len(self.logged)
         if count <= most:
             return self
         order = np.lexsort([np.round([f.speed for f in self.facts], 3), np.array(self.setups)])
         keep = np.sort(order[np.linspace(0, count - 1, most).round().astype(int)])
-        heard = self.heard.subset(keep)
+        logged = self.logged.subset(keep)
         facts = tuple(self.facts[k] for k in keep)
         return replace(
-            self, job=_job(self.job.config, heard, self.source), heard=heard, facts=facts
+            self, job=_job(self.job.config, logged, self.source), logged=logged, facts=facts
         )
 
     @property
@@ -177,16 +177,16 @@ def read_set(source: Source, data: Path, out: Path, report: Reporter) -> DataSet
             for one in sections
             for part in ("fit", "unseen")
         ]
-    heard, _ = read_dataset(_hearing(config, source.currents), sections, root, report)
-    job = _job(config, heard, source)
-    facts = facts_of(heard, float(job.robot.geometry.base_radius))
+    logged, _ = read_dataset(_hearing(config, source.currents), sections, root, report)
+    job = _job(config, logged, source)
+    facts = facts_of(logged, float(job.robot.geometry.base_radius))
     crossing, floor = None, None
     if source.crossing is not None and any(root.glob(source.crossing[0])):
         glob, map_name = source.crossing
         section = sections[0].model_copy(update={"glob": glob, "map": map_name})
         crossing, _ = read_dataset(config, [section], root, report)
         floor = read_map(packaged_path(map_name))
-    return DataSet(source, job, heard, tuple(facts), crossing, floor)
+    return DataSet(source, job, logged, tuple(facts), crossing, floor)
 
 
 def _hearing(config: Config, currents: Currents | None) -> Config:
@@ -206,10 +206,10 @@ def _hearing(config: Config, currents: Currents | None) -> Config:
     return replace(config, content=config.content.model_copy(update={"layouts": layouts}))
 
 
-def _job(config: Config, heard: Runs, source: Source) -> Job:
+def _job(config: Config, logged: Runs, source: Source) -> Job:
     """What slipid fits of these runs: currents only where its config reads them."""
-    fitted = heard
+    fitted = logged
     if source.currents is not None:
-        logs = [replace(log, current=None, current_fresh=None) for log in heard.logs]
-        fitted = collect(logs, heard.session)
+        logs = [replace(log, current=None, current_fresh=None) for log in logged.logs]
+        fitted = collect(logs, logged.session)
     return job_of(config, fitted, (), Reporter(quiet=True))

@@ -12,7 +12,7 @@ from slipid.data.wheel_signals import integral, interpolate
 from slipid.data.windows import Windows
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
-from slipid.predict.slip_model import Heard, Run, turned
+from slipid.predict.slip_model import Run, RunSignals, turned
 
 POSES_PER_STEP = 3
 """Poses in each step, where there are enough: a step is hardly shorter than the noise of two."""
@@ -57,7 +57,7 @@ def _cut(data: Runs, robot: Robot, w: Windows) -> Cut:
     for piece, k in enumerate(numbers):
         log = data.logs[k]
         edges = w.began[piece] + np.concatenate([[0.0], np.cumsum(w.dt[piece])]) - w.lag
-        heard = Heard(
+        signals = RunSignals(
             name=log.name,
             dt=w.dt[piece],
             turn=w.turn[piece],
@@ -68,7 +68,7 @@ def _cut(data: Runs, robot: Robot, w: Windows) -> Cut:
             command=None if log.twist_command is None else _mean(log, log.twist_command, edges),
         )
         run = Run(
-            heard=heard,
+            signals=signals,
             pose=pose[piece],
             floor=w.surface[piece],
             load=log.load,

@@ -39,7 +39,7 @@ def tuned(method: SlipModel, runs: Sequence[Run], machine: Machine, kind: str) -
     """
     candidates = list(method.candidates())[:TRIES]
     part = inner(runs, kind)
-    pools = isinstance(method, ByFloor) and len({method.group_of(run.heard) for run in runs}) > 1
+    pools = isinstance(method, ByFloor) and len({method.group_of(run.signals) for run in runs}) > 1
     if len(candidates) == 1 and not pools:
         return Tuned(method, "", 1)
     losses = [_loss(candidate, runs, part, machine) for candidate in candidates]
@@ -59,14 +59,14 @@ def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, machine: Mac
     errors: dict[str, list[float]] = {}
     for k in range(INNER):
         fitted = [run for run, p in zip(runs, part, strict=True) if p != k]
-        floors = {run.heard.floor for run in fitted}
+        floors = {run.signals.floor for run in fitted}
         left_out = [
-            run for run, p in zip(runs, part, strict=True) if p == k and run.heard.floor in floors
+            run for run, p in zip(runs, part, strict=True) if p == k and run.signals.floor in floors
         ]
         if not fitted or not left_out:
             continue
         try:
-            said = method.fit(fitted, machine).predict([run.heard for run in left_out], machine)
+            said = method.fit(fitted, machine).predict([run.signals for run in left_out], machine)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             return np.inf
         for run, one in zip(left_out, said, strict=True):

@@ -18,7 +18,7 @@ from slipid.lab.benchmark.sets import SOURCES, DataSet, Source, read_set
 from slipid.lab.benchmark.steps import Cut, cut
 from slipid.lab.benchmark.tuned import tuned
 from slipid.lab.systems.motion.features import common
-from slipid.predict.slip_model import Channel, Machine, Run, Said, SlipModel
+from slipid.predict.slip_model import Channel, Machine, PredictedRun, Run, SlipModel
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.files import Content
@@ -186,9 +186,9 @@ def _scene(piece: Piece) -> Scene:
         own = Row.of_error(error)
         robot = Space(data.job.robot, data.job.choices).template
     per_step = data.source.poses_per_step
-    judged = data.heard.subset(split.judged) if split.kind != "all" else data.crossing
+    judged = data.logged.subset(split.judged) if split.kind != "all" else data.crossing
     assert judged is not None
-    fitted = _in_order(cut(data.heard.subset(split.fitted), robot, per_step), data, split.fitted)
+    fitted = _in_order(cut(data.logged.subset(split.fitted), robot, per_step), data, split.fitted)
     cuts = tuple(cut(judged, robot, per_step))
     if split.kind != "all":
         cuts = tuple(_named(one, data, split.judged) for one in cuts)
@@ -208,7 +208,7 @@ def _named(one: Cut, data: DataSet, numbers: np.ndarray) -> Cut:
 def _in_order(cuts: Sequence[Cut], data: DataSet, numbers: np.ndarray) -> list[Run]:
     """All runs of some cuts, floors told, in the order of the data set."""
     found = {
-        k: run.told(True)
+        k: run.with_floor(True)
         for one in cuts
         for k, run in zip(one.numbers, _named(one, data, numbers).runs, strict=True)
     }
@@ -218,7 +218,7 @@ def _in_order(cuts: Sequence[Cut], data: DataSet, numbers: np.ndarray) -> list[R
 def _row(scene: Scene, protocol: str, name: str) -> Row:
     """What a row is worth in a protocol, or why it is not in the table."""
     asked = PROTOCOLS[protocol]
-    runs = [run.told(asked.told) for run in scene.runs]
+    runs = [run.with_floor(asked.told) for run in scene.runs]
     try:
         if name in (slipid_rows.NAME, OWN_MAP):
             return _own(scene, asked, runs, name)
@@ -238,13 +238,13 @@ def channels_of(runs: Sequence[Run], machine: Machine) -> frozenset[Channel]:
 
 def _published(scene: Scene, asked: Protocol, runs: list[Run], method: SlipModel) -> Row:
     machine = scene.data.machine
-    fitted = [run.told(asked.told) for run in scene.fitted]
+    fitted = [run.with_floor(asked.told) for run in scene.fitted]
     began = time.perf_counter()
     found = tuned(method, fitted, machine, asked.split)
     chosen = time.perf_counter()
     done = found.method.fit(fitted, machine)
     ended = time.perf_counter()
-    said, each = _timed(lambda: done.predict([run.heard for run in runs], machine), runs)
+    said, each = _timed(lambda: done.predict([run.signals for run in runs], machine), runs)
     return Row(
         runs=_judged(scene, runs, said),
         settings=found.settings,
@@ -263,14 +263,14 @@ def _own(scene: Scene, asked: Protocol, runs: list[Run], name: str) -> Row:
     if name == OWN_MAP and scene.data.map is None:
         return Row.lacking(["map"])
 
-    has_gyro = all(run.heard.gyro is not None for run in runs)
+    has_gyro = all(run.signals.gyro is not None for run in runs)
     place = slipid_rows.Place(
         asked.told, asked.strange, scene.data.map if name == OWN_MAP else None
     )
 
     drives = not asked.told or has_gyro
 
-    def predict() -> list[Said]:
+    def predict() -> list[PredictedRun]:
         if drives:
             return slipid_rows.estimated(own, scene.cuts, scene.judged, place)
         machine = scene.data.machine
@@ -287,14 +287,18 @@ def _own(scene: Scene, asked: Protocol, runs: list[Run], name: str) -> Row:
     )
 
 
-def _judged(scene: Scene, runs: Sequence[Run], said: Sequence[Said]) -> tuple[RunScore, ...]:
+def _judged(
+    scene: Scene, runs: Sequence[Run], said: Sequence[PredictedRun]
+) -> tuple[RunScore, ...]:
     machine, over = scene.data.machine, scene.data.source.over
     return tuple(scored(run, one, machine, over) for run, one in zip(runs, said, strict=True))
 
 
-def _timed(predict: Callable[[], list[Said]], runs: Sequence[Run]) -> tuple[list[Said], float]:
+def _timed(
+    predict: Callable[[], list[PredictedRun]], runs: Sequence[Run]
+) -> tuple[list[PredictedRun], float]:
     """What is predicted, and microseconds per step of it."""
     began = time.perf_counter()
     said = predict()
-    steps = sum(len(run.heard) for run in runs)
+    steps = sum(len(run.signals) for run in runs)
     return said, 1e6 * (time.perf_counter() - began) / max(steps, 1)

@@ -18,7 +18,7 @@ only 0 < s <= 1 and I > 0.25 A are kept, which cuts the response that is fitted.
 Tuned: C and epsilon of the support vector regressions.
 
 Liberties:
-    - M is regular at rest (`Heard.torque`); the authors divide by the shaft's speed. Their own
+    - M is regular at rest (`RunSignals.torque`); the authors divide by the shaft's speed. Their own
       numbers take R and C_e of their scripts, the refits those of the robot's config.
     - `paper_code` starts its smoothing at a run's first current. Robots that do not have three
       drives get the mean of the three motors' slips.
@@ -45,7 +45,7 @@ from jaxtyping import Float
 from slipid.lab.paper2021 import table as tables
 from slipid.lab.paper2021.samples import FIGURES_3_AND_4, Samples
 from slipid.predict.curves import Curve, Slips, WheelSlip, above, powers, robust_std
-from slipid.predict.slip_model import Channel, Machine, SlipModel
+from slipid.predict.slip_model import Channel, Machine, RunSignals, SlipModel
 from slipid.predict.steps import Steps, TrainingWindows
 
 NEEDS: frozenset[Channel] = frozenset({"current", "twist"})
@@ -70,7 +70,7 @@ class PaperPrint(WheelSlip):
     def slip(self, steps: Steps, machine: Machine) -> Slips:
         recipe = FIGURES_3_AND_4
         motor = replace(machine, resistance=recipe.resistance, back_emf=recipe.back_emf)
-        torque = steps.heard.torque(motor)
+        torque = steps.signals.torque(motor)
         return np.clip(np.polynomial.polynomial.polyval(torque, tables.TORQUE_SVR), 0.0, 1.0)
 
 
@@ -87,7 +87,7 @@ class PaperCode(WheelSlip):
         return self
 
     def slip(self, steps: Steps, machine: Machine) -> Slips:
-        current = steps.smoothed(steps.heard.along(machine), TIME_CONSTANT)
+        current = steps.smoothed(steps.signals.along(machine), TIME_CONSTANT)
         if current.shape[1] == 3:
             return tables.deployed_slip(current)
         of_each = tables.deployed_slip(np.repeat(current.reshape(-1, 1), 3, axis=1))
@@ -162,7 +162,7 @@ class PaperSvr(WheelSlip):
         return replace(self, coefficients=curve)
 
     def slip(self, steps: Steps, machine: Machine) -> Slips:
-        torque = steps.heard.torque(machine)
+        torque = steps.signals.torque(machine)
         return np.clip(np.polynomial.polynomial.polyval(torque, self.known), 0.0, 1.0)
 
 
@@ -170,7 +170,7 @@ def refits() -> list[Curve]:
     """The forms that were printed and deployed, unfitted, in [-1, 1]."""
     deployed = above(tables.DEPLOYED_THRESHOLD)
     return [
-        Curve("paper_print_refit", powers(0, 1, 2), torque=True, most=1.0, needs=NEEDS),
+        Curve("paper_print_refit", powers(0, 1, 2), RunSignals.torque, most=1.0, needs=NEEDS),
         Curve(
             "paper_code_refit",
             deployed,

@@ -91,7 +91,7 @@ def test_other_runs_over_several_floors_are_other_work_but_no_other_fit(tmp_path
     piece = Piece(Wish(tmp_path / "x", tmp_path / "out"), "testsite", "headings", 0)
     data = data_of(piece.wish, "testsite")
     rows, fit = (benchmark_work.kept_of(piece, fit=fit).key for fit in (False, True))
-    more = replace(data, crossing=data.heard.subset([0]))
+    more = replace(data, crossing=data.logged.subset([0]))
     monkeypatch.setattr(benchmark_work, "data_of", lambda wish, source: more)
     assert benchmark_work.kept_of(piece, fit=False).key != rows
     assert benchmark_work.kept_of(piece, fit=True).key == fit
@@ -101,7 +101,7 @@ def test_quick_work_does_not_overwrite_what_was_kept(tmp_path):
     (tmp_path / "x").mkdir()
     wish = Wish(tmp_path / "x", tmp_path / "out", ("encoder",))
     few = data_of(wish, "testsite").thinned(QUICK_RUNS)
-    assert len(few.heard) < len(data_of(wish, "testsite").heard)
+    assert len(few.logged) < len(data_of(wish, "testsite").logged)
     whole, quick = (
         Piece(replace(wish, quick=quick), "testsite", "headings", 0) for quick in (False, True)
     )

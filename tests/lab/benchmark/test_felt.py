@@ -43,7 +43,7 @@ from slipid.lab.benchmark.floors.result import Answer, FeltRow, after_seconds, c
 from slipid.lab.benchmark.floors.slipid_row import SlipidFloors, kinds
 from slipid.lab.benchmark.work import Wish
 from slipid.lab.systems.floors.interface import FloorMethod, floors_of
-from slipid.predict.slip_model import Said
+from slipid.predict.slip_model import PredictedRun
 from slipid.support.errors import DataError
 from slipid.support.files import json_text
 from tests.helpers.made_felt import HZ, ahead, made_felt, made_felts
@@ -475,9 +475,9 @@ def test_a_robotino_run_is_heard_without_its_pose():
     amps = np.tile([-0.5, 1.0, 2.0], (40, 1))
     run = made_run(straight(0.3), current=amps, signed=True, floor="gray@moved")
     felt = felt_of(run)
-    assert (felt.floor, felt.name) == ("gray", run.heard.name)
+    assert (felt.floor, felt.name) == ("gray", run.signals.name)
     assert felt.dt.sum() == pytest.approx(4.0)
-    assert np.array_equal(felt.speed, run.heard.speed)
+    assert np.array_equal(felt.speed, run.signals.speed)
     assert felt.current[0].tolist() == [0.5, 1.0, 2.0]
     with pytest.raises(ValueError, match="no current"):
         felt_of(made_run(straight(0.3)))
@@ -485,7 +485,7 @@ def test_a_robotino_run_is_heard_without_its_pose():
 
 def test_what_the_estimator_calls_unknown_is_left_out_of_the_comparison():
     floors = {"gray": np.array([0.3]), "green": np.array([0.1]), "unknown": np.array([0.6])}
-    labels, beliefs = beliefs_of(Said(np.zeros((2, 3)), floors=floors))
+    labels, beliefs = beliefs_of(PredictedRun(np.zeros((2, 3)), floors=floors))
     assert labels == ("gray", "green")
     assert beliefs == pytest.approx(np.array([[0.75, 0.25]]))
 

@@ -11,7 +11,7 @@ from slipid.lab.benchmark.judge import Row, scored
 from slipid.lab.benchmark.summary import Number, Resampled, RowSummary, area, summary
 from slipid.lab.benchmark.tuned import sentence
 from slipid.predict.score import forecast
-from slipid.predict.slip_model import Said, path_of
+from slipid.predict.slip_model import PredictedRun, path_of
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 
@@ -22,12 +22,12 @@ def slipping_run(**more):
 
 
 def said(run, twist, **more):
-    return Said(path_of(twist, run.heard.dt), **more)
+    return PredictedRun(path_of(twist, run.signals.dt), **more)
 
 
 def test_the_end_is_judged_over_the_chord():
     run = slipping_run()
-    one = scored(run, said(run, run.heard.rolling(ROBOTINO)), ROBOTINO, "chord")
+    one = scored(run, said(run, run.signals.rolling(ROBOTINO)), ROBOTINO, "chord")
     assert one.endpoint_error == pytest.approx(1 / 3)
     assert one.length_error == pytest.approx(1 / 3)
     assert one.heading_error_deg == pytest.approx(0.0, abs=1e-9)
@@ -39,7 +39,7 @@ def test_over_the_path_a_circle_counts_its_way():
     run = made_run(rolling)
     one = scored(run, said(run, 0.5 * rolling), ROBOTINO, "path")
     assert one.heading_error_deg == pytest.approx(180.0)
-    ahead = np.hypot(*path_of(0.5 * rolling, run.heard.dt)[-1, :2])
+    ahead = np.hypot(*path_of(0.5 * rolling, run.signals.dt)[-1, :2])
     assert one.endpoint_error == pytest.approx(ahead / 0.8, rel=2e-3)
 
 
@@ -57,7 +57,7 @@ def test_who_says_what_encoders_say_sees_no_slip():
     rng = np.random.default_rng(0)
     rolling = rng.normal(0.2, 0.1, (40, 3))
     run = made_run(rolling, 0.5 * rolling)
-    one = scored(run, said(run, run.heard.rolling(ROBOTINO)), ROBOTINO, "chord")
+    one = scored(run, said(run, run.signals.rolling(ROBOTINO)), ROBOTINO, "chord")
     assert set(one.scores) == {0.0}
     assert all(one.slips)
 
@@ -101,7 +101,7 @@ def test_a_region_covers_what_lies_inside_it():
     gap = 0.2  # of encoders, ahead
     for std, inside in ((gap / 2.1, True), (gap / 2.2, False)):
         cov = np.diag([std**2, 1e-6])
-        told = said(run, run.heard.rolling(ROBOTINO), end_covariance=cov)
+        told = said(run, run.signals.rolling(ROBOTINO), end_covariance=cov)
         assert scored(run, told, ROBOTINO, "chord").covered90 is inside
 
 
@@ -109,15 +109,15 @@ def test_floors_are_right_for_a_part_of_the_time():
     run = slipping_run(floor="gray@moved")
     gray = np.where(np.arange(40) < 10, 0.2, 0.9)
     told = said(run, run.twist, floors={"gray": gray, "green": 1 - gray})
-    assert scored(run.told(False), told, ROBOTINO, "chord").floor_right == pytest.approx(0.75)
-    assert scored(run.told(True), told, ROBOTINO, "chord").floor_right is None
+    assert scored(run.with_floor(False), told, ROBOTINO, "chord").floor_right == pytest.approx(0.75)
+    assert scored(run.with_floor(True), told, ROBOTINO, "chord").floor_right is None
     new = replace(told, floors={"green": 1 - gray, "unknown": gray})
-    assert scored(run.told(False), new, ROBOTINO, "chord").floor_right == pytest.approx(0.75)
+    assert scored(run.with_floor(False), new, ROBOTINO, "chord").floor_right == pytest.approx(0.75)
 
 
 def test_energy_is_judged_as_a_whole():
     run = slipping_run()
-    power = run.heard.power(ROBOTINO)
+    power = run.signals.power(ROBOTINO)
     swung = power * np.where(np.arange(40) % 2, 1.4, 1.0)
     told = said(run, run.twist, power=swung)
     assert scored(run, told, ROBOTINO, "chord").energy_error == pytest.approx(0.2)

@@ -11,7 +11,7 @@ from slipid.fit.variances import DEGREES
 from slipid.lab.benchmark import own as slipid_rows
 from slipid.lab.benchmark.own import Own, Place, estimated, replay, told
 from slipid.lab.benchmark.steps import cut
-from slipid.predict.slip_model import Machine, Said
+from slipid.predict.slip_model import Machine, PredictedRun
 from slipid.robot.estimator import Estimator
 from slipid.robot.interface import MIXED, Settings
 from tests.helpers.small_twin import deployed
@@ -62,7 +62,7 @@ def driven(made, monkeypatch):
 
     def caught(estimator, heard, start):
         calls.append((estimator, heard))
-        return [Said(np.zeros((len(one) + 1, 3))) for one in heard]
+        return [PredictedRun(np.zeros((len(one) + 1, 3))) for one in heard]
 
     monkeypatch.setattr(slipid_rows, "replay", caught)
     return calls
@@ -113,7 +113,7 @@ def test_an_estimator_hears_currents_only_if_it_was_fitted_to_some(made, driven)
 def test_what_is_not_on_a_floor_of_the_robot_is_unknown(made, monkeypatch):
     monkeypatch.setattr(slipid_rows, "TOGETHER", 1)
     robot = deployed().with_unseen()
-    heard = cut(made.runs, made.robot)[0].runs[0].heard
+    heard = cut(made.runs, made.robot)[0].runs[0].signals
     (said,) = replay(Estimator(robot, Settings.of(robot)), [heard], np.zeros((1, 3)))
     assert said.floors is not None
     assert list(said.floors) == ["firm", "soft", "unknown"]

@@ -9,7 +9,7 @@ from slipid.lab.benchmark.protocols import PROTOCOLS, base_of, facts_of_run, inn
 from slipid.lab.benchmark.tuned import _loss, tuned
 from slipid.lab.systems.motion.quann import QuannEnergy
 from slipid.predict.folds import Facts
-from slipid.predict.slip_model import FEWEST, ByFloor, Machine, Said, SlipModel, path_of
+from slipid.predict.slip_model import FEWEST, ByFloor, Machine, PredictedRun, SlipModel, path_of
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 
@@ -128,11 +128,11 @@ class Scaled(SlipModel):
         return [replace(self, factor=f) for f in (1.0, 0.85, 0.5)]
 
     def fit(self, runs, machine: Machine):
-        return replace(self, seen=tuple(run.heard.name for run in runs))
+        return replace(self, seen=tuple(run.signals.name for run in runs))
 
     def predict(self, runs, machine: Machine):
         assert not {run.name for run in runs} & set(self.seen)
-        return [Said(path_of(self.factor * r.rolling(machine), r.dt)) for r in runs]
+        return [PredictedRun(path_of(self.factor * r.rolling(machine), r.dt)) for r in runs]
 
     @property
     def numbers(self):
@@ -162,14 +162,14 @@ class Hungry(Scaled):
 
 
 def test_a_method_by_floor_may_do_better_with_one_fit_for_all():
-    training = [run.told(True) for run in runs(slip=0.5)]
+    training = [run.with_floor(True) for run in runs(slip=0.5)]
     assert len({run.floor for run in training}) > 1
     found = tuned(ByFloor.of(Hungry()), training, ROBOTINO, "headings")
     assert (found.settings, found.tried) == ("one fit to all runs", 2)
     done = found.method.fit(training, ROBOTINO)
     assert isinstance(done, ByFloor)
     assert list(done.fitted) == [None]
-    untold = [run.told(False) for run in training]
+    untold = [run.with_floor(False) for run in training]
     assert tuned(ByFloor.of(Hungry()), untold, ROBOTINO, "headings").tried == 1
     # what is as good with floors apart keeps them apart
     assert tuned(ByFloor.of(Scaled()), training, ROBOTINO, "headings").settings == "factor = 0.5"
@@ -183,13 +183,13 @@ def test_floors_count_alike_whatever_number_of_runs_they_have():
 
 
 def test_runs_whose_floor_was_left_out_altogether_do_not_count():
-    few = [run.told(True) for run in runs(slip=0.5)[:20]]
+    few = [run.with_floor(True) for run in runs(slip=0.5)[:20]]
     held = np.array([0] * 6 + [-1] * 12 + [0] * 2)  # both runs on the second floor
     method = ByFloor.of(Scaled())
     assert few[-1].floor not in {run.floor for run in few[:18]}
     assert _loss(method, few, held, ROBOTINO) == pytest.approx(0.0)
     # told of no floor, it is judged by them
-    untold = [run.told(False) for run in few]
+    untold = [run.with_floor(False) for run in few]
     assert _loss(method, untold, held, ROBOTINO) > 0.05
 
 
@@ -211,18 +211,18 @@ class Mean(Scaled):
     """Encoders, times what they are off by in the mean."""
 
     def fit(self, runs, machine: Machine):
-        slip = np.mean([r.twist[0, :2] @ r.heard.rolling(machine)[0, :2] for r in runs])
-        size = np.mean([(r.heard.rolling(machine)[0, :2] ** 2).sum() for r in runs])
+        slip = np.mean([r.twist[0, :2] @ r.signals.rolling(machine)[0, :2] for r in runs])
+        size = np.mean([(r.signals.rolling(machine)[0, :2] ** 2).sum() for r in runs])
         return replace(self, factor=float(slip / size))
 
 
 def test_a_method_by_floor_has_one_fit_for_all_where_nothing_is_told():
     told = ByFloor.of(Mean()).fit(runs(slip=0.5), ROBOTINO)
-    untold = ByFloor.of(Mean()).fit([run.told(False) for run in runs(slip=0.5)], ROBOTINO)
+    untold = ByFloor.of(Mean()).fit([run.with_floor(False) for run in runs(slip=0.5)], ROBOTINO)
     way = made_run(straight(0.1), name="new")
 
     def far(method, floor):
-        heard = replace(way.heard, floor=floor)
+        heard = replace(way.signals, floor=floor)
         return method.predict([heard], ROBOTINO)[0].path[-1, 0] / way.pose[-1, 0]
 
     assert far(told, "gray") == pytest.approx(1.0)
@@ -264,7 +264,7 @@ def test_what_predicts_energy_is_tuned_by_it():
     training = [
         made_run(way, 0.5 * way, current=np.full((40, 3), 1.0), name=f"run{k}") for k in range(9)
     ]
-    watts = float(training[0].heard.power(ROBOTINO).mean())
+    watts = float(training[0].signals.power(ROBOTINO).mean())
     assert watts == pytest.approx(10.0, rel=0.1)
     assert tuned(Powered(), training, ROBOTINO, "headings").settings == "watts = 90.0"
     found = tuned(Powered(aim="energy"), training, ROBOTINO, "headings")
@@ -273,18 +273,18 @@ def test_what_predicts_energy_is_tuned_by_it():
 
 
 def test_where_floors_are_not_told_each_load_has_a_fit_and_a_strange_one_that_of_the_usual():
-    every = [run.told(False) for run in runs(slip=0.5)]
+    every = [run.with_floor(False) for run in runs(slip=0.5)]
     names = {"gray": "own", "green": "moved"}
 
     def loaded(run, load):
-        return replace(run, heard=replace(run.heard, load=load))
+        return replace(run, signals=replace(run.signals, load=load))
 
     training = [loaded(run, names[run.floor]) for run in every][1:]
     done = ByFloor.of(Mean()).fit(training, ROBOTINO)
     assert list(done.fitted) == ["moved", "own"]
 
     def end(load):
-        return done.predict([loaded(every[0], load).heard], ROBOTINO)[0].path[-1]
+        return done.predict([loaded(every[0], load).signals], ROBOTINO)[0].path[-1]
 
     assert not np.allclose(end("own"), end("moved"))
     assert np.allclose(end("never seen"), end("moved"))

@@ -38,7 +38,7 @@ def testsite(tmp_path_factory):
 
 
 def test_recorded_runs_need_no_data_folder(testsite):
-    assert len(testsite.heard) == len(testsite.job.dataset) == 120
+    assert len(testsite.logged) == len(testsite.job.dataset) == 120
     assert set(testsite.setups) == {"firm", "soft", "soft@moved"}
     assert testsite.machine.determines_twist
     assert {fact.floor for fact in testsite.facts} == {"firm", "soft", "soft@moved"}
@@ -46,7 +46,7 @@ def test_recorded_runs_need_no_data_folder(testsite):
 
 def test_a_part_of_the_runs_has_every_floor_and_speed(testsite):
     few = testsite.thinned(30)
-    assert len(few.heard) == len(few.job.dataset) == len(few.facts) == 30
+    assert len(few.logged) == len(few.job.dataset) == len(few.facts) == 30
     assert set(few.setups) == set(testsite.setups)
     assert {round(fact.speed, 2) for fact in few.facts} == {0.1, 0.2}
     assert testsite.thinned(500) is testsite
@@ -56,10 +56,10 @@ def test_a_part_of_the_runs_has_every_floor_and_speed(testsite):
 def test_currents_are_heard_where_the_fit_does_without(real_data, tmp_path):
     for name, signed in (("warthog", True), ("husky", False)):
         data = read_set(source(name), real_data, tmp_path, QUIET)
-        assert data.heard.current is not None
-        assert data.heard.current_is_signed is signed
+        assert data.logged.current is not None
+        assert data.logged.current_is_signed is signed
         assert data.job.dataset.current is None
-        assert [log.name for log in data.heard.logs] == [log.name for log in data.job.dataset.logs]
+        assert [log.name for log in data.logged.logs] == [log.name for log in data.job.dataset.logs]
         assert not data.machine.determines_twist
 
 
@@ -67,7 +67,7 @@ def test_currents_are_heard_where_the_fit_does_without(real_data, tmp_path):
 def test_a_skid_steers_direction_is_that_of_going_and_turning(real_data, tmp_path):
     data = read_set(source("warthog"), real_data, tmp_path, QUIET)
     base = float(data.job.robot.geometry.base_radius)
-    for log, fact in zip(data.heard.logs, data.facts, strict=True):
+    for log, fact in zip(data.logged.logs, data.facts, strict=True):
         ahead, _, turn = np.median(log.twist_command, axis=0)
         assert fact.speed == pytest.approx(np.hypot(ahead, base * turn))
         assert np.tan(np.radians(fact.heading_deg)) == pytest.approx(base * turn / ahead, rel=1e-6)

@@ -21,7 +21,7 @@ def test_every_run_is_there_once_in_equally_many_steps(made):
     cuts = cut(made.runs, made.robot)
     numbers = [k for one in cuts for k in one.numbers]
     assert sorted(numbers) == list(range(len(made.runs)))
-    steps = {len(run.heard) for one in cuts for run in one.runs}
+    steps = {len(run.signals) for one in cuts for run in one.runs}
     assert len(steps) <= 2
     assert all(n & (n - 1) == 0 for n in steps)
 
@@ -31,11 +31,11 @@ def test_it_moves_as_the_robot_that_drove_it(made):
         for k, run in zip(one.numbers, one.runs, strict=True):
             log = made.runs.logs[k]
             assert log.surface == run.floor
-            assert run.heard.floor is None
-            steady = run.heard.speed[len(run.heard) // 2 :].mean(axis=0)
+            assert run.signals.floor is None
+            steady = run.signals.speed[len(run.signals) // 2 :].mean(axis=0)
             command = steady * 0.04 @ np.asarray(made.robot.geometry.least()).T
             expected = move(made.robot, str(log.surface), command[None]).twist[0]
-            found = run.twist[len(run.heard) // 2 :].mean(axis=0)
+            found = run.twist[len(run.signals) // 2 :].mean(axis=0)
             assert found[:2] == pytest.approx(expected[:2], abs=0.015)
 
 
@@ -50,7 +50,7 @@ def test_the_load_is_heard_and_gyro_and_command_are_means_over_each_step(made):
         for log in made.runs.logs
     ]
     one = cut(collect(logs), made.robot)[0]
-    heard = one.runs[0].heard
+    heard = one.runs[0].signals
     assert heard.load == one.runs[0].load == "heavy"
     assert heard.command is not None
     assert heard.command == pytest.approx(np.tile([0.1, 0.2, 0.3], (len(heard), 1)))

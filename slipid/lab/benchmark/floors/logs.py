@@ -44,7 +44,7 @@ from slipid.lab.systems.floors.gaussian import Gaussian
 from slipid.lab.systems.floors.interface import Felt, FloorMethod
 from slipid.model.geometry import skid_steer
 from slipid.model.robot import Robot, build
-from slipid.predict.slip_model import Machine, Run, Said
+from slipid.predict.slip_model import Machine, PredictedRun, Run
 from slipid.support.errors import bad_data
 
 RADIUS = 0.165
@@ -205,7 +205,7 @@ def felt_of(run: Run) -> Felt:
     Raises:
         ValueError: it has no currents.
     """
-    heard = run.heard
+    heard = run.signals
     if heard.current is None:
         raise ValueError(f"{heard.name}: no current; floors are felt by it")
     return Felt(
@@ -219,13 +219,13 @@ def felt_of(run: Run) -> Felt:
 
 
 def _fitted(data: DataSet, split: Split, own: Own) -> list[Felt]:
-    cuts = cut(data.heard.subset(split.fitted), own.contact.robot, data.source.poses_per_step)
+    cuts = cut(data.logged.subset(split.fitted), own.contact.robot, data.source.poses_per_step)
     runs = {k: run for one in cuts for k, run in zip(one.numbers, one.runs, strict=True)}
     return [felt_of(runs[k]) for k in sorted(runs)]
 
 
 def _judged(data: DataSet, split: Split, own: Own) -> list[Cut]:
-    return cut(data.heard.subset(split.judged), own.contact.robot, data.source.poses_per_step)
+    return cut(data.logged.subset(split.judged), own.contact.robot, data.source.poses_per_step)
 
 
 def _own(
@@ -233,7 +233,7 @@ def _own(
 ) -> ScoredClassifier:
     """What the estimator says of the runs that were left out."""
     began = time.perf_counter()
-    said = estimated(own, cuts, data.heard.subset(split.judged), Place())
+    said = estimated(own, cuts, data.logged.subset(split.judged), Place())
     took = time.perf_counter() - began
     answers: list[Answer] = []
     for felt, one in zip(felts, said, strict=True):
@@ -244,7 +244,7 @@ def _own(
     return ScoredClassifier(row, tuple(answers))
 
 
-def beliefs_of(said: Said) -> tuple[tuple[str, ...], np.ndarray]:
+def beliefs_of(said: PredictedRun) -> tuple[tuple[str, ...], np.ndarray]:
     """Floors, and their probabilities given that it is one of them."""
     assert said.floors is not None
     labels = tuple(name for name in said.floors if name != "unknown")

@@ -33,10 +33,10 @@ from jaxtyping import Bool, Float, Int
 from slipid.predict.slip_model import (
     WINDOW_S,
     Channel,
-    Heard,
     Machine,
+    PredictedRun,
     Run,
-    Said,
+    RunSignals,
     Twists,
     groups,
     path_of,
@@ -68,18 +68,18 @@ class Windows:
         run: number of the run that each window is of.
     """
 
-    heard: Sequence[Heard]
+    signals: Sequence[RunSignals]
     rolling: Twists
     size: Float[np.ndarray, " window"]
     run: Int[np.ndarray, " window"]
 
     @classmethod
-    def of(cls, runs: Sequence[Heard], machine: Machine) -> "Windows":
+    def of(cls, runs: Sequence[RunSignals], machine: Machine) -> "Windows":
         """Of runs in their own steps."""
         return cls.joined([run.windowed() for run in runs], machine)
 
     @classmethod
-    def joined(cls, joined: Sequence[Heard], machine: Machine) -> "Windows":
+    def joined(cls, joined: Sequence[RunSignals], machine: Machine) -> "Windows":
         """Of runs whose steps are windows already."""
         rolling = _stacked([run.rolling(machine) for run in joined])
         size = np.sqrt(((rolling * machine.size) ** 2).sum(axis=1))
@@ -96,11 +96,11 @@ class Windows:
 
     def speed(self) -> Float[np.ndarray, "window drive"]:
         """Wheel speed of each drive [rad/s]."""
-        return _stacked([run.speed for run in self.heard])
+        return _stacked([run.speed for run in self.signals])
 
     def amperes(self) -> Float[np.ndarray, "window drive"]:
         """Magnitude of each drive's current [A]."""
-        return np.abs(_stacked([_logged(run.current, run, "current") for run in self.heard]))
+        return np.abs(_stacked([_logged(run.current, run, "current") for run in self.signals]))
 
     def inputs(self, machine: Machine, channels: frozenset[Channel]) -> Inputs:
         """All inputs, with those of the channels named.
@@ -114,9 +114,9 @@ class Windows:
         if "current" in channels:
             columns.append(self.amperes())
         if "command" in channels:
-            columns.append(_stacked([_logged(run.command, run, "command") for run in self.heard]))
+            columns.append(_stacked([_logged(run.command, run, "command") for run in self.signals]))
         if "gyro" in channels:
-            gyro = _stacked([_logged(run.gyro, run, "gyro")[:, None] for run in self.heard])[:, 0]
+            gyro = _stacked([_logged(run.gyro, run, "gyro")[:, None] for run in self.signals])[:, 0]
             slip = (gyro - self.rolling[:, 2]) * machine.base_radius / self.size.clip(min=REST)
             columns.append(np.stack([gyro, slip], axis=1))
         return np.concatenate(columns, axis=1)
@@ -148,7 +148,7 @@ class Lessons:
             ValueError: the wheels turn in no window of them.
         """
         joined, channels = [run.windowed() for run in runs], common(runs)
-        windows = Windows.joined([run.heard for run in joined], machine)
+        windows = Windows.joined([run.signals for run in joined], machine)
         moves = windows.moves
         if not moves.any():
             raise ValueError("no window of the runs has turning wheels; nothing to learn from")
@@ -195,7 +195,7 @@ def common(runs: Sequence[Run]) -> frozenset[Channel]:
     """Channels beside the encoders that all runs have."""
     every: tuple[Channel, ...] = ("current", "gyro", "command")
     return frozenset(
-        name for name in every if all(getattr(run.heard, name) is not None for run in runs)
+        name for name in every if all(getattr(run.signals, name) is not None for run in runs)
     )
 
 
@@ -206,21 +206,21 @@ def weight_of(size: Float[np.ndarray, " window"]) -> Float[np.ndarray, " window"
 
 
 def with_slip(
-    runs: Sequence[Heard], windows: Windows, ratio: Ratios, machine: Machine
-) -> list[Said]:
+    runs: Sequence[RunSignals], windows: Windows, ratio: Ratios, machine: Machine
+) -> list[PredictedRun]:
     """Paths of runs at their own steps: the encoders', with the slip that is said of each window.
 
     A window's slip velocity holds for all of its steps.
     """
     slip = at_steps(ratio * windows.size[:, None] / machine.size, windows, runs)
     return [
-        Said(path_of(run.rolling(machine) + of_run, run.dt))
+        PredictedRun(path_of(run.rolling(machine) + of_run, run.dt))
         for run, of_run in zip(runs, slip, strict=True)
     ]
 
 
 def at_steps(
-    values: Float[np.ndarray, "window value"], windows: Windows, runs: Sequence[Heard]
+    values: Float[np.ndarray, "window value"], windows: Windows, runs: Sequence[RunSignals]
 ) -> list[Float[np.ndarray, "_ value"]]:
     """The values of each window, at every step that lies in it; an array for each run."""
     ends = np.searchsorted(windows.run, np.arange(len(runs) + 1))
@@ -235,7 +235,7 @@ def _stacked(parts: Sequence[Float[np.ndarray, "_ column"]]) -> Float[np.ndarray
 
 
 def _logged(
-    values: Float[np.ndarray, "window *of"] | None, run: Heard, channel: Channel
+    values: Float[np.ndarray, "window *of"] | None, run: RunSignals, channel: Channel
 ) -> Float[np.ndarray, "window *of"]:
     if values is None:
         raise ValueError(f"{run.name}: no {channel}, but there was one in the runs learned from")

@@ -39,7 +39,7 @@ from jaxtyping import Bool, Float, Int
 
 from slipid.lab.systems.motion.features import Inputs, Lessons, Scale, Windows, at_steps, with_slip
 from slipid.lab.systems.motion.polynomial_network import Growth, PolynomialNetwork, grown
-from slipid.predict.slip_model import Channel, Heard, Machine, Run, Said, SlipModel
+from slipid.predict.slip_model import Channel, Machine, PredictedRun, Run, RunSignals, SlipModel
 
 KEPT = 20
 LEAST = 0.05
@@ -112,7 +112,7 @@ class GmdhOne(SlipModel):
         networks = Networks.grown(seen.inputs, seen.ratio, seen.weight, in_a, self.growth)
         return replace(self, channels=seen.channels, networks=networks)
 
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
         if self.networks is None:
             raise ValueError(f"{self.name}: predict before fit")
         windows = Windows.of(runs, machine)
@@ -165,10 +165,10 @@ class GmdhClass(SlipModel):
         if len(names) > 1:
             alike = (on / on.sum(axis=0)).sum(axis=1)
             telling = Networks.grown(seen.inputs, on.astype(float), alike, in_a, self.growth)
-        loads = [frozenset(run.heard.load for run in runs if run.floor == name) for name in names]
+        loads = [frozenset(run.signals.load for run in runs if run.floor == name) for name in names]
         return replace(self, channels=seen.channels, floors=floors, loads=loads, telling=telling)
 
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
         if not self.floors:
             raise ValueError(f"{self.name}: predict before fit")
         windows, names = Windows.of(runs, machine), list(self.floors)
@@ -186,7 +186,7 @@ class GmdhClass(SlipModel):
         ]
 
     def _belief(
-        self, windows: Windows, inputs: Inputs, runs: Sequence[Heard]
+        self, windows: Windows, inputs: Inputs, runs: Sequence[RunSignals]
     ) -> Float[np.ndarray, "window floor"]:
         """Probability of each floor by all of a run that was heard up to each window.
 

@@ -48,7 +48,7 @@ from typing import final
 import numpy as np
 
 from slipid.lab.systems.motion.features import Lessons, Regressor, Scale, Windows, with_slip
-from slipid.predict.slip_model import Channel, Heard, Machine, Run, Said, SlipModel
+from slipid.predict.slip_model import Channel, Machine, PredictedRun, Run, RunSignals, SlipModel
 
 FEWEST = 20
 """Windows in a leaf at least."""
@@ -116,7 +116,7 @@ class BoostedTrees(SlipModel):
             )
         return replace(self, channels=seen.channels, each=each, windows=int(kept.sum()))
 
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
         from threadpoolctl import threadpool_limits
 
         if not self.each:
@@ -201,7 +201,7 @@ class NeuralNetwork(SlipModel):
             self, channels=seen.channels, inputs=inputs, outputs=outputs, network=network
         )
 
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
         if self.network is None or self.inputs is None or self.outputs is None:
             raise ValueError(f"{self.name}: predict before fit")
         windows = Windows.of(runs, machine)

@@ -49,10 +49,10 @@ from jaxtyping import Bool, Float
 
 from slipid.predict.slip_model import (
     Channel,
-    Heard,
     Machine,
+    PredictedRun,
     Run,
-    Said,
+    RunSignals,
     SlipModel,
     Twists,
     seen_from_start,
@@ -139,34 +139,34 @@ class Ojeda(SlipModel):
             lines[floor] = self._line([run for run in runs if run.floor == floor], hard, machine)
         return replace(self, hard=hard, lines=lines)
 
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
         if self.hard is None:
             raise ValueError(f"{self.name}: not fitted")
         scene = self._scene(runs, self.hard, machine)
         line = np.stack([self.lines.get(run.floor, self.lines[None]) for run in runs])
         twist = scene.twist(np.repeat(line, scene.steps.length, axis=0), machine)
-        return scene.steps.said(twist, self.hard.sigmas(scene.current))
+        return scene.steps.predicted(twist, self.hard.sigmas(scene.current))
 
     @property
     def numbers(self) -> int:
         return 2 * len(self.lines) + 2 * (self.hard is not None)
 
     def _hard(self, runs: Sequence[Run], machine: Machine) -> Hard:
-        steps = Steps.of([run.heard for run in runs])
-        current = steps.smoothed(steps.heard.along(machine), self.time_constant).mean(axis=1)
-        moves = np.abs(steps.heard.speed).mean(axis=1) * machine.wheel_radius > MOVING
+        steps = Steps.of([run.signals for run in runs])
+        current = steps.smoothed(steps.signals.along(machine), self.time_constant).mean(axis=1)
+        moves = np.abs(steps.signals.speed).mean(axis=1) * machine.wheel_radius > MOVING
         seen = current[moves] if moves.any() else current
         return Hard(float(seen.mean()), max(float(seen.std()), 1e-6))
 
-    def _scene(self, runs: Sequence[Heard], hard: Hard, machine: Machine) -> Scene:
+    def _scene(self, runs: Sequence[RunSignals], hard: Hard, machine: Machine) -> Scene:
         steps = Steps.of(runs)
-        rim = steps.heard.speed * machine.wheel_radius
-        current = steps.smoothed(steps.heard.along(machine), self.time_constant)
+        rim = steps.signals.speed * machine.wheel_radius
+        current = steps.smoothed(steps.signals.along(machine), self.time_constant)
         return Scene(steps, rim, current, hard.sigmas(current) > SIGMAS)
 
     def _line(self, runs: Sequence[Run], hard: Hard, machine: Machine) -> Line:
         """k0 [m/s] and k1 [m/s/A] of some runs; zero where no slip was flagged."""
-        scene = self._scene([run.heard for run in runs], hard, machine)
+        scene = self._scene([run.signals for run in runs], hard, machine)
         if not scene.flagged.any():
             return np.zeros(2)
         if self.tuning == "sporadic":
@@ -179,10 +179,10 @@ class Ojeda(SlipModel):
 
 def hard_runs(runs: Sequence[Run], machine: Machine) -> list[Run]:
     """Those on the floor where encoders err least; of one floor, the quarter that errs least."""
-    steps = Steps.of([run.heard for run in runs])
-    rolling = steps.heard.rolling(machine)
+    steps = Steps.of([run.signals for run in runs])
+    rolling = steps.signals.rolling(machine)
     gap = np.linalg.norm((steps.ends(rolling) - true_ends(runs)) * machine.size, axis=1)
-    way = np.linalg.norm(rolling * machine.size, axis=1) * steps.heard.dt
+    way = np.linalg.norm(rolling * machine.size, axis=1) * steps.signals.dt
     error = gap / np.maximum(np.add.reduceat(way, steps.first), 1e-9)
     floors = np.array([run.floor for run in runs])
     names = list(dict.fromkeys(floors.tolist()))
@@ -237,7 +237,7 @@ def sporadic(scene: Scene, runs: Sequence[Run], machine: Machine) -> Line:
 
 def by_gyro(scene: Scene, w: TrainingWindows, middle: float, machine: Machine) -> Line:
     """By the yaw rate alone; the middle is the hard floor's mean current [A]."""
-    heard = scene.steps.heard
+    heard = scene.steps.signals
     if heard.gyro is None:
         raise ValueError(f"{heard.name}: no gyro; this method needs one")
     parts = w.means(machine.back[2] @ scene.features(middle)) * w.dt[:, None]

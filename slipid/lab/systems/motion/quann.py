@@ -63,10 +63,10 @@ from slipid.lab.systems.motion.gaussian_process import Kernel, Process, Rows
 from slipid.predict.slip_model import (
     Aim,
     Channel,
-    Heard,
     Machine,
+    PredictedRun,
     Run,
-    Said,
+    RunSignals,
     SlipModel,
     Twists,
     path_of,
@@ -100,9 +100,9 @@ class QuannEnergy(SlipModel):
         return [replace(self, length=length) for length in (0.1, 0.2, 0.5)]
 
     def fit(self, runs: Sequence[Run], machine: Machine) -> "QuannEnergy":
-        windows = Windows.of([run.heard for run in runs], machine)
+        windows = Windows.of([run.signals for run in runs], machine)
         way, motion = rate(windows.rolling), motions(windows.rolling)
-        energy = np.concatenate([run.power(machine) for run in windows.heard]) / way
+        energy = np.concatenate([run.power(machine) for run in windows.signals]) / way
         terms = law_terms(motion)
         law = np.linalg.lstsq(terms * way[:, None], energy * way, rcond=1e-6)[0]
         left = (energy - terms @ law)[:, None]
@@ -111,7 +111,7 @@ class QuannEnergy(SlipModel):
         process = Process.of(rows, kernel)
         return replace(self, law=law, fastest=motion.max(axis=0), process=process)
 
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
         if self.process is None or self.law is None or self.fastest is None:
             raise ValueError(f"{self.name}: predict before fit")
         windows = Windows.of(runs, machine)
@@ -121,7 +121,7 @@ class QuannEnergy(SlipModel):
         rolling = [run.rolling(machine) for run in runs]
         of_steps = at_steps(energy[:, None], windows, runs)
         return [
-            Said(path_of(twist, run.dt), power=energy_of_run[:, 0] * rate(twist))
+            PredictedRun(path_of(twist, run.dt), power=energy_of_run[:, 0] * rate(twist))
             for run, twist, energy_of_run in zip(runs, rolling, of_steps, strict=True)
         ]
 
@@ -148,7 +148,7 @@ def law_terms(motion: Float[np.ndarray, "row 2"]) -> Float[np.ndarray, "row 4"]:
 
 def places(windows: Windows, machine: Machine) -> Float[np.ndarray, "window 2"]:
     """Place in the middle of each window by the encoders, seen from the run's start [m]."""
-    paths = [path_of(run.rolling(machine), run.dt)[:, :2] for run in windows.heard]
+    paths = [path_of(run.rolling(machine), run.dt)[:, :2] for run in windows.signals]
     return np.concatenate([0.5 * (path[1:] + path[:-1]) for path in paths])
 
 
@@ -201,7 +201,7 @@ class QuannSlip(SlipModel):
         whole = Process.of(rows, kernel)
         return replace(self, scale=scale, process=whole, inflation=inflation)
 
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
         if self.process is None or self.scale is None:
             raise ValueError(f"{self.name}: predict before fit")
         windows = Windows.of(runs, machine)
@@ -249,10 +249,10 @@ def end_squares(
     fitted: QuannSlip, runs: Sequence[Run], machine: Machine
 ) -> Float[np.ndarray, " run"]:
     """Square of the error at the end of each run, in units of its covariance, per dimension."""
-    said = fitted.predict([run.heard for run in runs], machine)
+    said = fitted.predict([run.signals for run in runs], machine)
     error = np.stack(
         [
-            (of_run.path - path_of(run.twist, run.heard.dt))[-1, :2]
+            (of_run.path - path_of(run.twist, run.signals.dt))[-1, :2]
             for of_run, run in zip(said, runs, strict=True)
         ]
     )

@@ -50,11 +50,11 @@ from jaxtyping import Float
 from slipid.lab.systems.motion.reina_indicators import Example, Indicators, Limits, Signals, Sugeno
 from slipid.predict.slip_model import (
     Channel,
-    Heard,
     Machine,
     Numbers,
+    PredictedRun,
     Run,
-    Said,
+    RunSignals,
     SlipModel,
     path_of,
 )
@@ -85,13 +85,13 @@ class _Detector(SlipModel):
         trained = limited._trained(examples)
         return replace(trained, slip=trained._mean_slip(examples))
 
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
         said = []
         for heard in runs:
             score = self.score(Signals.of(heard, machine, self.smoothing))
             kept = 1.0 - self.slip * (score >= self._flagged)
             path = path_of(heard.rolling(machine) * kept[:, None], heard.dt)
-            said.append(Said(path, slipping=score))
+            said.append(PredictedRun(path, slipping=score))
         return said
 
     def score(self, signals: Signals) -> Numbers:

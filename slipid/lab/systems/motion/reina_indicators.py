@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.predict.slip_model import WINDOW_S, Heard, Machine, Numbers, Run, groups
+from slipid.predict.slip_model import WINDOW_S, Machine, Numbers, Run, RunSignals, groups
 
 _PULL = 1.0
 """How many samples the answer of a logical OR counts as, in every rule."""
@@ -101,7 +101,7 @@ class Signals:
     moving: Bool[np.ndarray, " step"]
 
     @classmethod
-    def of(cls, heard: Heard, machine: Machine, seconds: float) -> "Signals":
+    def of(cls, heard: RunSignals, machine: Machine, seconds: float) -> "Signals":
         """Of a run, smoothed over so long."""
         mean = smoothing(heard.dt, seconds)
         speed, amps = mean @ heard.speed, mean @ heard.along(machine)
@@ -201,15 +201,15 @@ class Example:
     def of(cls, run: Run, machine: Machine, seconds: float) -> "Example":
         """Of a run whose signals are smoothed over so long."""
         joined = run.windowed()
-        rolling = joined.heard.rolling(machine) * machine.size
+        rolling = joined.signals.rolling(machine) * machine.size
         slip = rolling - joined.twist * machine.size
         size = np.linalg.norm(rolling, axis=1)
         slips = np.where(size > _REST, np.linalg.norm(slip, axis=1) > SLIPS * size, np.nan)
-        first = groups(run.heard.dt, WINDOW_S)
+        first = groups(run.signals.dt, WINDOW_S)
         return cls(
-            signals=Signals.of(run.heard, machine, seconds),
+            signals=Signals.of(run.signals, machine, seconds),
             first=first,
-            slips=np.repeat(slips, np.diff(first, append=len(run.heard))),
+            slips=np.repeat(slips, np.diff(first, append=len(run.signals))),
             against=(slip * rolling).sum(axis=1),
             square=size**2,
         )
@@ -226,7 +226,7 @@ def smoothing(dt: Numbers, seconds: float) -> Float[np.ndarray, "step step"]:
 def _deviation(
     rim: Float[np.ndarray, "step drive"],
     mean: Float[np.ndarray, "step step"],
-    heard: Heard,
+    heard: RunSignals,
     machine: Machine,
 ) -> Numbers:
     """Largest relative deviation of a wheel from the shape of the commanded twist."""

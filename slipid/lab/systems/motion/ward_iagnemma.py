@@ -79,7 +79,7 @@ from slipid.lab.systems.motion.ward_iagnemma_dynamics import (
     Step,
 )
 from slipid.lab.systems.motion.ward_iagnemma_filter import Filter, Noise
-from slipid.predict.slip_model import Heard, Machine, Run, Said, SlipModel, path_of
+from slipid.predict.slip_model import Machine, PredictedRun, Run, RunSignals, SlipModel, path_of
 
 _STEADY = 10.0
 """Time after which speeds are taken for steady [s]."""
@@ -124,7 +124,7 @@ class Windows:
         """Of at most `_FIT_RUNS` runs, drawn with a fixed seed."""
         drawn = np.random.default_rng(0).permutation(len(runs))[:_FIT_RUNS]
         joined = [runs[k].windowed() for k in np.sort(drawn)]
-        padded = Padded.of([run.heard for run in joined], machine)
+        padded = Padded.of([run.signals for run in joined], machine)
         run, step = np.nonzero(padded.dt > 0.0)
         true = np.concatenate([run.twist * machine.size for run in joined])
         return cls(
@@ -261,14 +261,14 @@ class WardIagnemma(SlipModel):
         noise = fitted_noise(windows, Dynamics.of(machine, law), machine.mass)
         return replace(self, law=law, noise=noise)
 
-    def predict(self, runs: Sequence[Heard], machine: Machine) -> list[Said]:
+    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
         padded = Padded.of(runs, machine)
         tracked = self.filter(machine).track(padded)
         size, fastest = (np.linalg.norm(q, axis=2) for q in (tracked.speeds, padded.rolling))
         kept = np.where(fastest > REST, size / np.where(fastest > REST, fastest, 1.0), 1.0)
         slipping = np.clip(1.0 - kept, 0.0, 1.0)
         return [
-            Said(
+            PredictedRun(
                 path_of(tracked.speeds[k, : len(run)] / machine.size, run.dt),
                 end_covariance=tracked.covariance[k, :2, :2],
                 slipping=slipping[k, : len(run)],

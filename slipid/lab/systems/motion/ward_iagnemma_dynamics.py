@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.predict.slip_model import Heard, Machine
+from slipid.predict.slip_model import Machine, RunSignals
 
 Drives = Float[np.ndarray, "run drive"]
 Speeds = Float[np.ndarray, "run 3"]
@@ -210,7 +210,7 @@ class Padded:
     pull: Float[np.ndarray, "run step drive"]
 
     @classmethod
-    def of(cls, runs: Sequence[Heard], machine: Machine) -> "Padded":
+    def of(cls, runs: Sequence[RunSignals], machine: Machine) -> "Padded":
         """Of runs of any lengths."""
         shape, drives = (len(runs), max(len(run) for run in runs)), len(machine.forward)
         padded = cls(
@@ -230,7 +230,7 @@ class Padded:
         return padded
 
 
-def pulls(run: Heard, machine: Machine) -> Float[np.ndarray, "step drive"]:
+def pulls(run: RunSignals, machine: Machine) -> Float[np.ndarray, "step drive"]:
     """Force n C_e I / r along each drive's motion [N]; nan where it tells nothing."""
     rim = np.abs(run.speed * machine.wheel_radius)
     if run.current is None:

@@ -182,13 +182,13 @@ def classes() -> GmdhClass:
 
 
 def error(said, run: Run) -> float:
-    return float(np.hypot(*(said.path - path_of(run.twist, run.heard.dt))[-1, :2]))
+    return float(np.hypot(*(said.path - path_of(run.twist, run.signals.dt))[-1, :2]))
 
 
 def test_floors_are_told_by_currents_and_slip_is_that_of_the_floor(classes):
     for floor in ("gray", "ice"):
-        new = slipping(1.1, floor, seed=7).told(False)
-        (said,) = classes.predict([new.heard], ROBOTINO)
+        new = slipping(1.1, floor, seed=7).with_floor(False)
+        (said,) = classes.predict([new.signals], ROBOTINO)
         assert said.floors is not None
         assert sum(said.floors.values()) == pytest.approx(1.0)
         assert said.floors[floor][-1] > 0.95
@@ -199,9 +199,9 @@ def test_floors_are_told_by_currents_and_slip_is_that_of_the_floor(classes):
 
 def test_a_floor_that_is_told_is_used_if_it_was_seen(classes):
     new = slipping(1.1, "gray", seed=7)
-    wrong = replace(new, heard=replace(new.heard, floor="ice"))
-    unseen = replace(new, heard=replace(new.heard, floor="sand"))
-    said = classes.predict([new.heard, wrong.heard, unseen.heard], ROBOTINO)
+    wrong = replace(new, signals=replace(new.signals, floor="ice"))
+    unseen = replace(new, signals=replace(new.signals, floor="sand"))
+    said = classes.predict([new.signals, wrong.signals, unseen.signals], ROBOTINO)
     as_on_ice = slipping(1.1, "ice", seed=7)
     assert error(said[1], as_on_ice) < 0.02 * 0.8
     assert error(said[0], new) < 0.02 * 0.8
@@ -211,8 +211,8 @@ def test_a_floor_that_is_told_is_used_if_it_was_seen(classes):
 
 
 def test_floors_are_told_without_what_comes_later(classes):
-    whole = slipping(1.1, "gray", seed=7).heard
-    other = slipping(1.1, "ice", seed=7).heard
+    whole = slipping(1.1, "gray", seed=7).signals
+    other = slipping(1.1, "ice", seed=7).signals
     mixed = np.concatenate([whole.current[:20], other.current[20:]])
     first, second = classes.predict([whole, replace(whole, current=mixed)], ROBOTINO)
     assert np.array_equal(first.floors["ice"][:20], second.floors["ice"][:20])
@@ -221,17 +221,17 @@ def test_floors_are_told_without_what_comes_later(classes):
 
 def test_a_floor_that_was_never_seen_with_this_load_is_left_out():
     loads = {"gray": "moved", "ice": "as_built"}
-    runs = [replace(run, heard=replace(run.heard, load=loads[run.floor])) for run in RUNS]
+    runs = [replace(run, signals=replace(run.signals, load=loads[run.floor])) for run in RUNS]
     method = GmdhClass().fit(runs, ROBOTINO)
     # by its currents it is on ice
-    new = slipping(1.1, "ice", seed=7).told(False).heard
+    new = slipping(1.1, "ice", seed=7).with_floor(False).signals
     moved, other = method.predict([replace(new, load="moved"), replace(new, load="new")], ROBOTINO)
     assert np.array_equal(moved.floors["gray"], np.ones(40))
     assert other.floors["ice"][-1] > 0.95
 
 
 def test_a_robot_at_rest_learns_nothing_of_its_floor(classes):
-    rest = made_run(np.zeros((40, 3)), current=np.full((40, 3), 0.3)).told(False).heard
+    rest = made_run(np.zeros((40, 3)), current=np.full((40, 3), 0.3)).with_floor(False).signals
     (said,) = classes.predict([rest], ROBOTINO)
     assert np.allclose(said.floors["gray"], 0.5)
     assert np.abs(said.path).max() == 0.0
@@ -240,8 +240,8 @@ def test_a_robot_at_rest_learns_nothing_of_its_floor(classes):
 def test_a_single_floor_needs_no_telling():
     runs = [run for run in RUNS if run.floor == "ice"]
     method = GmdhClass().fit(runs, ROBOTINO)
-    new = slipping(2.2, "ice", seed=9).told(False)
-    (said,) = method.predict([new.heard], ROBOTINO)
+    new = slipping(2.2, "ice", seed=9).with_floor(False)
+    (said,) = method.predict([new.signals], ROBOTINO)
     assert method.telling is None
     assert error(said, new) < 0.02 * 0.8
     assert np.array_equal(said.floors["ice"], np.ones(40))
@@ -251,11 +251,11 @@ def test_a_single_floor_needs_no_telling():
 def test_one_set_of_networks_does_not_ask_for_the_floor(classes):
     method = GmdhOne().fit(RUNS, ROBOTINO)
     new = slipping(1.1, "ice", seed=7)
-    told, not_told = method.predict([new.heard, new.told(False).heard], ROBOTINO)
+    told, not_told = method.predict([new.signals, new.with_floor(False).signals], ROBOTINO)
     assert np.array_equal(told.path, not_told.path)
     assert told.floors is None
     assert 0 < method.numbers < classes.numbers
-    encoders = path_of(new.heard.rolling(ROBOTINO), new.heard.dt)
+    encoders = path_of(new.signals.rolling(ROBOTINO), new.signals.dt)
     assert error(told, new) < 0.4 * error(replace(told, path=encoders), new)
 
 
@@ -264,4 +264,4 @@ def test_settings_that_are_tried(method):
     assert [each.growth for each in method.candidates()] == list(CANDIDATES)
     assert method.numbers == 0
     with pytest.raises(ValueError, match="before fit"):
-        method.predict([RUNS[0].heard], ROBOTINO)
+        method.predict([RUNS[0].signals], ROBOTINO)

@@ -32,14 +32,14 @@ def test_inputs_of_a_window_are_those_of_its_motion():
     amps = np.tile([-1.0, 2.0, 3.0], (40, 1))
     rolling = straight(0.4) * [0.8, 0.8, 1.0] + np.array([0.0, 0.0, 0.96])
     run = made_run(rolling, current=amps, gyro=np.full(40, 0.3))
-    windows = Windows.of([run.heard], ROBOTINO)
+    windows = Windows.of([run.signals], ROBOTINO)
     inputs = windows.inputs(ROBOTINO, common([run]))
     # 0.16 m/s ahead and 0.12 m/s of turning make a size of 0.2 m/s
     twist = [0.16 * np.cos(0.4), 0.16 * np.sin(0.4), 0.96]
     direction = [0.8 * np.cos(0.4), 0.8 * np.sin(0.4), 0.6]
     harmonic = [0.64 * np.cos(0.8), 0.64 * np.sin(0.8)]
     gyro = [0.3, (0.3 - 0.96) * 0.125 / 0.2]
-    parts = (twist, run.heard.speed[0], direction, harmonic, [1.0, 2.0, 3.0], twist, gyro)
+    parts = (twist, run.signals.speed[0], direction, harmonic, [1.0, 2.0, 3.0], twist, gyro)
     expected = np.concatenate(parts)
     assert inputs.shape == (8, len(expected))
     assert np.allclose(inputs, expected)
@@ -47,17 +47,17 @@ def test_inputs_of_a_window_are_those_of_its_motion():
 
 def test_a_robot_that_turns_on_the_spot_has_a_size_and_a_direction():
     run = made_run(np.tile([0.0, 0.0, -0.8], (20, 1)))
-    windows = Windows.of([run.heard], ROBOTINO)
+    windows = Windows.of([run.signals], ROBOTINO)
     assert np.allclose(windows.size, 0.1)
     assert np.allclose(windows.direction(ROBOTINO), [0.0, 0.0, -1.0])
 
 
 def test_channels_that_one_run_lacks_are_left_out():
     whole = made_run(straight(0.0), current=np.ones((40, 3)), gyro=np.zeros(40))
-    lacking = replace(whole, heard=replace(whole.heard, gyro=None))
+    lacking = replace(whole, signals=replace(whole.signals, gyro=None))
     assert common([whole]) == {"current", "gyro", "command"}
     assert common([whole, lacking]) == {"current", "command"}
-    windows = Windows.of([lacking.heard], ROBOTINO)
+    windows = Windows.of([lacking.signals], ROBOTINO)
     with pytest.raises(ValueError, match="no gyro"):
         windows.inputs(ROBOTINO, common([whole]))
 
@@ -86,15 +86,15 @@ def test_weights_rise_with_the_square_and_then_are_level():
 
 def test_a_path_with_the_slip_that_was_made_is_the_true_one():
     runs = [slipping(0.5, [-0.3, 0.1, 0.25]), slipping(2.0, [0.2, 0.0, -0.1], steps=23)]
-    heard = [run.heard for run in runs]
+    heard = [run.signals for run in runs]
     windows = Windows.of(heard, ROBOTINO)
     ratio = np.array([[-0.3, 0.1, 0.25], [0.2, 0.0, -0.1]])[windows.run]
     for said, run in zip(with_slip(heard, windows, ratio, ROBOTINO), runs, strict=True):
-        assert np.allclose(said.path, path_of(run.twist, run.heard.dt))
+        assert np.allclose(said.path, path_of(run.twist, run.signals.dt))
 
 
 def test_values_of_windows_are_those_of_their_steps():
-    runs = [made_run(straight(0.0, steps=steps)).heard for steps in (10, 7)]
+    runs = [made_run(straight(0.0, steps=steps)).signals for steps in (10, 7)]
     first, second = at_steps(np.array([[1.0], [2.0], [3.0]]), Windows.of(runs, ROBOTINO), runs)
     assert first[:, 0].tolist() == [1.0] * 5 + [2.0] * 5
     assert second[:, 0].tolist() == [3.0] * 7
@@ -116,11 +116,11 @@ def test_boosted_trees_come_as_near_to_two_levels_as_their_rate_lets_them():
         slipping(angle, [ratio, 0.0, 0.0]) for angle, ratio in ((0.0, -0.2), (np.pi, 0.4))
     )
     method = BoostedTrees(boosting=Boosting(0.1, 4, 20)).fit([there] * 8 + [back] * 8, ROBOTINO)
-    said = method.predict([there.heard, back.heard], ROBOTINO)
+    said = method.predict([there.signals, back.signals], ROBOTINO)
     # every tree takes a tenth of what is left away from the mean of the two
     left = 0.9**20
     for of_run, run, ratio in zip(said, (there, back), (-0.2, 0.4), strict=True):
-        speed = run.heard.rolling(ROBOTINO)[0, 0] + 0.2 * (ratio * (1 - left) + 0.1 * left)
+        speed = run.signals.rolling(ROBOTINO)[0, 0] + 0.2 * (ratio * (1 - left) + 0.1 * left)
         assert of_run.path[-1, 0] == pytest.approx(speed * 4.0, rel=1e-6)
     # four leaves and three thresholds of twenty trees for each component
     assert method.numbers == 3 * 20 * 7
@@ -144,8 +144,8 @@ def test_a_neural_network_learns_how_slip_turns_with_the_direction():
     method = NeuralNetwork().fit([run(angle) for angle in np.linspace(0, 6.2, 60)], ROBOTINO)
     for angle in (0.33, 2.9, 5.0):
         new = run(angle)
-        (said,) = method.predict([new.heard], ROBOTINO)
-        error = said.path[-1] - path_of(new.twist, new.heard.dt)[-1]
+        (said,) = method.predict([new.signals], ROBOTINO)
+        error = said.path[-1] - path_of(new.twist, new.signals.dt)[-1]
         assert np.hypot(*error[:2]) < 0.02 * 0.8
         assert abs(error[2]) < 0.05
 
@@ -167,7 +167,7 @@ def test_a_network_says_nothing_beyond_what_it_was_taught():
     runs = [slipping(angle, [0.2 * np.cos(angle), 0.0, 0.0]) for angle in np.linspace(0, 6, 40)]
     method = NeuralNetwork().fit(runs, ROBOTINO)
     fast = made_run(straight(0.0, speed=5.0))
-    (said,) = method.predict([fast.heard], ROBOTINO)
+    (said,) = method.predict([fast.signals], ROBOTINO)
     ratio = said.path[-1, 0] / 20.0 - 1
     assert abs(ratio) <= 0.2 + 1e-9
 
@@ -181,7 +181,7 @@ def test_learned_slip_of_a_skid_steer_without_currents_is_that_of_each_floor(met
         for _ in range(5)
     ]
     fitted = ByFloor.of(method).fit(runs, HUSKY)
-    said = fitted.predict([runs[0].heard, runs[-1].heard], HUSKY)
+    said = fitted.predict([runs[0].signals, runs[-1].signals], HUSKY)
     for of_run, run in zip(said, (runs[0], runs[-1]), strict=True):
         assert np.allclose(of_run.path, run.pose, atol=0.02)
 
@@ -189,9 +189,9 @@ def test_learned_slip_of_a_skid_steer_without_currents_is_that_of_each_floor(met
 @pytest.mark.parametrize("method", LEARNERS, ids=lambda method: method.name)
 def test_learned_methods_say_the_same_again_and_rest_where_wheels_rest(method):
     runs = [slipping(angle, [0.2, -0.1, 0.3]) for angle in np.linspace(0, 6, 12)]
-    at_rest = made_run(np.zeros((40, 3))).heard
+    at_rest = made_run(np.zeros((40, 3))).signals
     one, other = (
-        method.fit(runs, ROBOTINO).predict([at_rest, runs[0].heard], ROBOTINO) for _ in "ab"
+        method.fit(runs, ROBOTINO).predict([at_rest, runs[0].signals], ROBOTINO) for _ in "ab"
     )
     assert np.array_equal(one[1].path, other[1].path)
     assert np.abs(one[0].path).max() == 0.0

@@ -42,7 +42,7 @@ def two_floors(rng, line, count=12, **extra):
 
 
 def path_error(method, runs, machine=ROBOTINO):
-    said = method.predict([run.heard for run in runs], machine)
+    said = method.predict([run.signals for run in runs], machine)
     return max(np.abs(s.path - run.pose).max() for s, run in zip(said, runs, strict=True))
 
 
@@ -130,7 +130,7 @@ def test_the_pose_known_all_the_time_is_forgotten_and_that_known_now_and_then_is
 
 def with_level(current):
     """Steps that take so much current in all wheels [A]."""
-    return made_run(straight(0.3), current=np.tile(np.reshape(current, (-1, 1)), (1, 3))).heard
+    return made_run(straight(0.3), current=np.tile(np.reshape(current, (-1, 1)), (1, 3))).signals
 
 
 def test_slip_is_flagged_three_stds_above_the_hard_floors_mean():
@@ -149,7 +149,7 @@ def test_slip_is_flagged_three_stds_above_the_hard_floors_mean():
 def test_one_wheel_alone_does_not_flag_slip():
     method = replace(CONTINUOUS, hard=Hard(0.3, 0.1), lines={None: np.array([0.05, 0.0])})
     one = made_run(straight(0.3), current=np.tile([1.1, 0.3, 0.3], (40, 1)))
-    assert np.allclose(method.predict([one.heard], ROBOTINO)[0].path, one.pose)
+    assert np.allclose(method.predict([one.signals], ROBOTINO)[0].path, one.pose)
 
 
 def test_flags_wait_for_the_low_pass():
@@ -167,7 +167,7 @@ def test_the_hard_floor_is_where_encoders_err_least(rng):
     hard, soft = two_floors(rng, (0.02, 0.05), count=3)
     assert hard_runs(soft + hard, ROBOTINO) == hard
     fitted = CONTINUOUS.fit(soft + hard, ROBOTINO)
-    means = np.concatenate([run.heard.current.mean(axis=1) for run in hard])
+    means = np.concatenate([run.signals.current.mean(axis=1) for run in hard])
     assert fitted.hard.mean == pytest.approx(means.mean())
     assert fitted.hard.std == pytest.approx(means.std())
 
@@ -205,8 +205,8 @@ def test_floors_that_are_not_known_get_the_numbers_of_all_runs(rng):
     assert fitted.lines["sand"] == pytest.approx([0.04, 0.06], rel=1e-3)
     offset, gain = fitted.lines[None]
     assert 0.02 + 0.05 * 1.2 < offset + gain * 1.2 < 0.04 + 0.06 * 1.2
-    untold, strange = (replace(sand[0].heard, floor=floor) for floor in (None, "ice"))
-    own, *others = fitted.predict([sand[0].heard, untold, strange], ROBOTINO)
+    untold, strange = (replace(sand[0].signals, floor=floor) for floor in (None, "ice"))
+    own, *others = fitted.predict([sand[0].signals, untold, strange], ROBOTINO)
     assert np.array_equal(others[0].path, others[1].path)
     assert np.abs(own.path - others[0].path).max() > 0.01
 
@@ -216,7 +216,7 @@ def test_runs_on_one_floor_have_one_pair_of_numbers(rng):
     assert CONTINUOUS.fit(soft, ROBOTINO).numbers == 4
     assert CONTINUOUS.numbers == 0
     by_floor = ByFloor.of(CONTINUOUS).fit(soft, ROBOTINO)
-    assert len(by_floor.predict([run.heard for run in soft], ROBOTINO)) == len(soft)
+    assert len(by_floor.predict([run.signals for run in soft], ROBOTINO)) == len(soft)
 
 
 def test_a_wheel_is_never_turned_backwards():
@@ -228,8 +228,8 @@ def test_a_wheel_is_never_turned_backwards():
 def test_runs_of_all_lengths_are_predicted_as_one_by_one(rng):
     hard, soft = two_floors(rng, (0.02, 0.05), count=4)
     fitted = CONTINUOUS.fit(hard + soft, ROBOTINO)
-    short = [run.windowed().heard for run in soft]
-    runs = [soft[0].heard, short[1], hard[2].heard]
+    short = [run.windowed().signals for run in soft]
+    runs = [soft[0].signals, short[1], hard[2].signals]
     for said, run in zip(fitted.predict(runs, ROBOTINO), runs, strict=True):
         alone = fitted.predict([run], ROBOTINO)[0]
         assert np.allclose(said.path, alone.path)
@@ -241,11 +241,11 @@ def test_signed_currents_count_along_the_wheels_way(rng):
     hard, soft = two_floors(rng, (0.02, 0.05))
     fitted = CONTINUOUS.fit(hard + soft, ROBOTINO)
     run = soft[0]
-    way = np.sign(run.heard.speed)
-    signed = replace(run.heard, current=run.heard.current * way, current_is_signed=True)
-    first, second = (fitted.predict([heard], ROBOTINO)[0] for heard in (run.heard, signed))
+    way = np.sign(run.signals.speed)
+    signed = replace(run.signals, current=run.signals.current * way, current_is_signed=True)
+    first, second = (fitted.predict([heard], ROBOTINO)[0] for heard in (run.signals, signed))
     assert np.allclose(first.path, second.path)
-    assert np.allclose(Steps.of([signed]).heard.along(ROBOTINO), run.heard.current)
+    assert np.allclose(Steps.of([signed]).signals.along(ROBOTINO), run.signals.current)
 
 
 def test_rows_differ_in_what_they_need():
@@ -265,8 +265,8 @@ def test_rows_differ_in_what_they_need():
 def test_without_what_it_needs_it_says_so(rng):
     _, soft = two_floors(rng, (0.02, 0.05))
     with pytest.raises(ValueError, match="not fitted"):
-        CONTINUOUS.predict([soft[0].heard], ROBOTINO)
+        CONTINUOUS.predict([soft[0].signals], ROBOTINO)
     hard, _ = two_floors(rng, (0.02, 0.05))
-    deaf = [replace(run, heard=replace(run.heard, gyro=None)) for run in hard + soft]
+    deaf = [replace(run, signals=replace(run.signals, gyro=None)) for run in hard + soft]
     with pytest.raises(ValueError, match="no gyro"):
         GYRO.fit(deaf, ROBOTINO)

@@ -41,8 +41,8 @@ def slipping(rng, curve, *, angle=None, low=0.2, high=0.8, dt=0.1, machine=ROBOT
     drives = len(machine.forward)
     current = rng.uniform(low, high, (40 // hold + 1, drives)).repeat(hold, axis=0)[:40]
     run = made_run(rolling, current=current, machine=machine, dt=dt)
-    rim = run.heard.speed * machine.wheel_radius
-    twist = (rim * (1 - curve(run.heard))) @ machine.back.T + noise * rng.normal(size=(40, 3))
+    rim = run.signals.speed * machine.wheel_radius
+    twist = (rim * (1 - curve(run.signals))) @ machine.back.T + noise * rng.normal(size=(40, 3))
     return made_run(rolling, twist, current=current, machine=machine, dt=dt)
 
 
@@ -51,14 +51,14 @@ def torque(heard):
 
 
 def path_error(method, runs, machine=ROBOTINO):
-    said = method.predict([run.heard for run in runs], machine)
+    said = method.predict([run.signals for run in runs], machine)
     return max(np.abs(s.path - run.pose).max() for s, run in zip(said, runs, strict=True))
 
 
 def said_slip(method, heard, machine=ROBOTINO):
     """Slip of each drive in the first step, back from the path that is said."""
     path = method.predict([heard], machine)[0].path
-    run = replace(made_run(straight(0.0)), heard=heard, pose=path)
+    run = replace(made_run(straight(0.0)), signals=heard, pose=path)
     return 1 - run.twist @ machine.forward.T / (heard.speed * machine.wheel_radius)
 
 
@@ -67,7 +67,7 @@ def said_slip(method, heard, machine=ROBOTINO):
 
 def test_the_printed_curve_by_hand():
     amps = np.tile([0.3, 0.5, 0.7], (40, 1))
-    heard = made_run(straight(0.4), current=amps).heard
+    heard = made_run(straight(0.4), current=amps).signals
     shaft = np.abs(heard.speed[0]) * 16
     m = 0.0501 * amps[0] + 5.3361 * amps[0] ** 2 * shaft / (shaft**2 + SHAFT_W0**2)
     expected = -0.072 + 4.888 * m - 5.456 * m**2
@@ -84,7 +84,7 @@ def test_printed_slip_is_held_between_none_and_all():
     assert -0.072 + 4.888 * 0.448 - 5.456 * 0.448**2 > 1.0
     idle = made_run(turning, current=np.full((40, 3), 0.05))
     stalled = made_run(turning, current=np.full((40, 3), peak))
-    idle_said, stalled_said = PaperPrint().predict([idle.heard, stalled.heard], ROBOTINO)
+    idle_said, stalled_said = PaperPrint().predict([idle.signals, stalled.signals], ROBOTINO)
     assert np.allclose(idle_said.path, idle.pose)
     assert np.allclose(stalled_said.path, 0.0)
 
@@ -94,15 +94,15 @@ def test_nothing_printed_or_deployed_depends_on_the_runs(rng):
     for method in (PaperPrint(), PaperCode()):
         fitted = ByFloor.of(method).fit([run], ROBOTINO)
         assert fitted.numbers == 0
-        plain = method.predict([run.heard], ROBOTINO)[0].path
-        assert np.array_equal(fitted.predict([run.heard], ROBOTINO)[0].path, plain)
+        plain = method.predict([run.signals], ROBOTINO)[0].path
+        assert np.array_equal(fitted.predict([run.signals], ROBOTINO)[0].path, plain)
 
 
 # as run
 
 
 def test_the_deployed_lines_by_hand():
-    heard = made_run(straight(0.4), current=np.tile([0.5, 0.6, 0.39], (40, 1))).heard
+    heard = made_run(straight(0.4), current=np.tile([0.5, 0.6, 0.39], (40, 1))).signals
     expected = [1 - (-0.639 * 0.5 + 0.988), 1 - (-0.4559 * 0.6 + 0.9678), 0.0]
     assert said_slip(PaperCode(), heard) == pytest.approx(np.tile(expected, (40, 1)))
 
@@ -111,7 +111,7 @@ def test_the_deployed_lines_by_hand():
 def test_deployed_currents_are_smoothed_over_the_authors_samples(samples):
     current = np.full((40, 3), 1.0)
     current[0] = 0.0
-    heard = made_run(straight(0.4), current=current, dt=0.031 * samples).heard
+    heard = made_run(straight(0.4), current=current, dt=0.031 * samples).signals
     smoothed = 1 - 0.97 ** (samples * np.arange(40))
     expected = np.where(smoothed > 0.4, 1 - (-0.639 * smoothed + 0.988), 0.0)
     assert said_slip(PaperCode(), heard)[:, 0] == pytest.approx(expected)
@@ -119,11 +119,11 @@ def test_deployed_currents_are_smoothed_over_the_authors_samples(samples):
 
 def test_four_drives_get_the_mean_of_the_three_motors():
     amps = np.array([0.5, 0.6, 0.7, 0.3])
-    heard = made_run(straight(0.3), current=np.tile(amps, (40, 1)), machine=FOUR).heard
+    heard = made_run(straight(0.3), current=np.tile(amps, (40, 1)), machine=FOUR).signals
     grip = np.mean([-0.639, -0.4559, -0.6294]) * amps + np.mean([0.988, 0.9678, 0.9913])
     slip = np.where(amps > 0.4, 1 - grip, 0.0)
     run = made_run(straight(0.3), machine=FOUR)
-    twist = (run.heard.speed * FOUR.wheel_radius * (1 - slip)) @ FOUR.back.T
+    twist = (run.signals.speed * FOUR.wheel_radius * (1 - slip)) @ FOUR.back.T
     expected = made_run(straight(0.3), twist, machine=FOUR).pose
     assert np.allclose(PaperCode().predict([heard], FOUR)[0].path, expected)
 
@@ -149,11 +149,11 @@ def test_the_refit_is_least_squares_in_displacement(rng):
     runs = [slipping(rng, lambda heard: 0.4 * heard.current, noise=0.05, dt=0.5) for _ in range(12)]
     rows, gaps = [], []
     for run in runs:
-        rim = run.heard.speed * ROBOTINO.wheel_radius
+        rim = run.signals.speed * ROBOTINO.wheel_radius
         for k in range(40):
-            m = torque(run.heard)[k]
+            m = torque(run.signals)[k]
             lost = np.stack([ROBOTINO.back @ (rim[k] * m**power) for power in range(3)], axis=1)
-            gap = run.heard.rolling(ROBOTINO)[k] - run.twist[k]
+            gap = run.signals.rolling(ROBOTINO)[k] - run.twist[k]
             rows.append(lost * [[1.0], [1.0], [0.125]])
             gaps.append(gap * [1.0, 1.0, 0.125])
     oracle = LinearRegression(fit_intercept=False).fit(np.concatenate(rows), np.concatenate(gaps))
@@ -186,7 +186,7 @@ def test_a_motor_that_never_draws_enough_is_not_corrected(rng):
 
 
 def test_a_refit_never_turns_a_wheel_backwards():
-    heard = made_run(straight(0.4), current=np.full((40, 3), 2.0)).heard
+    heard = made_run(straight(0.4), current=np.full((40, 3), 2.0)).signals
     for slip, held in ((3.0, 1.0), (-3.0, -1.0)):
         method = replace(PRINT_REFIT, coefficients=np.array([slip, 0.0, 0.0]))
         path = method.predict([heard], ROBOTINO)[0].path
@@ -200,13 +200,13 @@ def test_the_recipe_keeps_what_the_authors_kept():
     slip = np.array([0.3, -0.2, 1.2])
     current = np.array([0.3, 0.5, 0.5])
     drifting = made_run(straight(0.4), current=np.tile(current, (40, 1)))
-    rim = drifting.heard.speed * ROBOTINO.wheel_radius
+    rim = drifting.signals.speed * ROBOTINO.wheel_radius
     twist = (rim * (1 - slip)) @ ROBOTINO.back.T
     run = made_run(straight(0.4), twist, current=np.tile(current, (40, 1)))
     found = recipe_samples(TrainingWindows.of([run]), ROBOTINO)
     assert np.allclose(found.slip, np.full(8, 0.3))
-    assert np.allclose(found.torque, run.heard.torque(ROBOTINO)[0, 0])
-    idle = replace(run, heard=replace(run.heard, current=np.full((40, 3), 0.25)))
+    assert np.allclose(found.torque, run.signals.torque(ROBOTINO)[0, 0])
+    idle = replace(run, signals=replace(run.signals, current=np.full((40, 3), 0.25)))
     assert len(recipe_samples(TrainingWindows.of([idle]), ROBOTINO)) == 0
 
 
@@ -254,8 +254,8 @@ def test_regressions_fall_back_to_encoders_where_the_recipe_leaves_nothing(rng):
     for degree in (1, 2):
         method = PaperSvr("paper_svr", degree).fit([run], ROBOTINO)
         assert method.coefficients.tolist() == [0.0] * (degree + 1)
-        path = method.predict([run.heard], ROBOTINO)[0].path
-        assert np.allclose(path, made_run(run.heard.rolling(ROBOTINO)).pose)
+        path = method.predict([run.signals], ROBOTINO)[0].path
+        assert np.allclose(path, made_run(run.signals.rolling(ROBOTINO)).pose)
 
 
 def test_one_torque_alone_makes_no_curve_but_a_level(rng):
@@ -271,7 +271,9 @@ def test_one_torque_alone_makes_no_curve_but_a_level(rng):
 def test_regressed_slip_is_held_between_none_and_all():
     run = made_run(straight(0.4), current=np.full((40, 3), 0.5))
     for curve, share in (((-0.5, 0.0), 1.0), ((1.5, 0.0), 0.0), ((0.5, 0.0), 0.5)):
-        path = PaperSvr("svr", coefficients=np.array(curve)).predict([run.heard], ROBOTINO)[0].path
+        path = (
+            PaperSvr("svr", coefficients=np.array(curve)).predict([run.signals], ROBOTINO)[0].path
+        )
         assert np.allclose(path, share * run.pose)
 
 
@@ -302,4 +304,4 @@ def test_every_row_wants_currents_and_a_twist_and_has_a_name_of_its_own():
 @pytest.mark.parametrize("method", [PRINT_REFIT, CODE_REFIT, PaperSvr("svr")])
 def test_what_is_fitted_does_not_predict_before(method):
     with pytest.raises(ValueError, match="not fitted"):
-        method.predict([made_run(straight(0.1), current=np.ones((40, 3))).heard], ROBOTINO)
+        method.predict([made_run(straight(0.1), current=np.ones((40, 3))).signals], ROBOTINO)

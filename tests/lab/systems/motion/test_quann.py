@@ -17,7 +17,7 @@ from slipid.lab.systems.motion.quann import (
     places,
     slip_inputs,
 )
-from slipid.predict.slip_model import Heard, Run, path_of
+from slipid.predict.slip_model import Run, RunSignals, path_of
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 SIZES = np.array([1.0, 1.0, 0.125])
@@ -114,8 +114,8 @@ def test_slip_is_learned_from_currents_and_direction():
     method = QuannSlip().fit(runs, ROBOTINO)
     for k in range(3):
         new = slipping(1.3 + k, 100 + k)
-        (said,) = method.predict([new.heard], ROBOTINO)
-        error = said.path[-1] - path_of(new.twist, new.heard.dt)[-1]
+        (said,) = method.predict([new.signals], ROBOTINO)
+        error = said.path[-1] - path_of(new.twist, new.signals.dt)[-1]
         assert np.hypot(*error[:2]) < 0.02 * 0.8
     assert method.numbers == 1 + (2 + 9) + 3 * 40 * 8  # runs of eight windows
     assert [each.anisotropic for each in method.candidates()] == [True, False]
@@ -125,10 +125,10 @@ def test_slip_is_learned_from_currents_and_direction():
 
 def test_inputs_of_slip_are_magnitudes_and_a_direction():
     run = slipping(2.0, 3)
-    windows = Windows.of([run.heard], ROBOTINO)
+    windows = Windows.of([run.signals], ROBOTINO)
     row = slip_inputs(windows, ROBOTINO)[0]
-    assert np.allclose(row[:3], np.abs(run.heard.current[0]))
-    assert np.allclose(row[3:6], np.abs(run.heard.speed[0]))
+    assert np.allclose(row[:3], np.abs(run.signals.current[0]))
+    assert np.allclose(row[3:6], np.abs(run.signals.speed[0]))
     assert np.allclose(row[6:], [np.cos(2.0), np.sin(2.0), 0.0])
 
 
@@ -137,8 +137,10 @@ def test_covariances_of_ends_are_as_large_as_errors_of_new_runs():
     angles = np.random.default_rng(4).uniform(0, 6.28, 220)
     runs = [slipping(angle, k, scatter=0.1) for k, angle in enumerate(angles)]
     method = QuannSlip().fit(runs[:100], ROBOTINO)
-    said = method.predict([run.heard for run in runs[100:]], ROBOTINO)
-    errors = [s.path - path_of(r.twist, r.heard.dt) for s, r in zip(said, runs[100:], strict=True)]
+    said = method.predict([run.signals for run in runs[100:]], ROBOTINO)
+    errors = [
+        s.path - path_of(r.twist, r.signals.dt) for s, r in zip(said, runs[100:], strict=True)
+    ]
     ends = np.array([error[-1, :2] for error in errors])
     square = [e @ np.linalg.solve(s.end_covariance, e) for s, e in zip(said, ends, strict=True)]
     assert np.mean(square) == pytest.approx(2.0, rel=0.3)
@@ -149,7 +151,7 @@ def test_covariances_of_ends_are_as_large_as_errors_of_new_runs():
 def test_a_covariance_is_that_of_the_slip_in_metres_and_radians():
     runs = [slipping(angle, k, scatter=0.1) for k, angle in enumerate(np.linspace(0, 6.2, 16))]
     method = QuannSlip().fit(runs, ROBOTINO)
-    new = slipping(1.0, 77).heard
+    new = slipping(1.0, 77).signals
     (said,) = method.predict([new], ROBOTINO)
     inputs = slip_inputs(Windows.of([new], ROBOTINO), ROBOTINO)
     std = method.process.predict(method.scale.scaled(inputs)).std[0] * 0.2 / SIZES
@@ -176,7 +178,7 @@ def test_every_run_is_in_one_part():
 def test_a_single_run_is_enough_and_rest_is_certain_to_a_millimetre():
     run = slipping(0.3, 0)
     method = QuannSlip(anisotropic=False).fit([run], ROBOTINO)
-    rest = made_run(np.zeros((40, 3)), current=np.zeros((40, 3))).heard
+    rest = made_run(np.zeros((40, 3)), current=np.zeros((40, 3))).signals
     (said,) = method.predict([rest], ROBOTINO)
     assert np.abs(said.path).max() == 0.0
     assert np.allclose(said.end_covariance, 1e-6 * np.eye(2))
@@ -186,17 +188,17 @@ LAW = np.array([20.0, 30.0, 80.0, 15.0])
 """Energy per way: constant, with speed, with its square, with the yaw rate."""
 
 
-def drawing(twist: np.ndarray, energy_factor: np.ndarray | float = 1.0) -> Heard:
+def drawing(twist: np.ndarray, energy_factor: np.ndarray | float = 1.0) -> RunSignals:
     """A run whose motors draw so much that its energy is by `LAW` times a factor."""
     run = made_run(twist)
     speed = np.hypot(twist[:, 0], twist[:, 1])
     energy = LAW[0] + LAW[1] * speed + LAW[2] * speed**2 + LAW[3] * np.abs(twist[:, 2])
     power = energy_factor * energy * np.maximum(speed, 0.02) / 3
-    shaft = np.abs(ROBOTINO.gear_ratio * run.heard.speed)
+    shaft = np.abs(ROBOTINO.gear_ratio * run.signals.speed)
     # R I^2 + C_e w I = a third of it, for each motor
     emf, ohm = ROBOTINO.back_emf * shaft, ROBOTINO.resistance
     amps = (-emf + np.sqrt(emf**2 + 4 * ohm * power[:, None])) / (2 * ohm)
-    return replace(run, heard=replace(run.heard, current=amps))
+    return replace(run, signals=replace(run.signals, current=amps))
 
 
 def moving(seed: int) -> np.ndarray:
@@ -214,11 +216,11 @@ def test_a_law_of_energy_is_found_and_predicts_power_without_currents():
     assert method.law == pytest.approx(LAW, rel=1e-3)
     assert method.numbers == 4 + 2 + 60 * 8  # runs of eight windows
     for seed in (100, 101, 102):
-        new = drawing(moving(seed)).heard
+        new = drawing(moving(seed)).signals
         (said,) = method.predict([replace(new, current=None)], ROBOTINO)
         assert said.power == pytest.approx(new.power(ROBOTINO), rel=0.01)
         assert np.allclose(said.path, path_of(new.rolling(ROBOTINO), new.dt))
-    (rest,) = method.predict([made_run(np.zeros((40, 3))).heard], ROBOTINO)
+    (rest,) = method.predict([made_run(np.zeros((40, 3))).signals], ROBOTINO)
     assert rest.power == pytest.approx(np.full(40, 20.0 * 0.02), rel=0.05)
 
 
@@ -226,8 +228,8 @@ def test_a_law_leaves_the_least_squares_of_power():
     factors = np.random.default_rng(6).uniform(0.5, 1.5, 40)
     runs = [drawing(moving(seed), factor) for seed, factor in enumerate(factors)]
     method = QuannEnergy().fit(runs, ROBOTINO)
-    windows = Windows.of([run.heard for run in runs], ROBOTINO)
-    power = np.concatenate([run.power(ROBOTINO) for run in windows.heard])
+    windows = Windows.of([run.signals for run in runs], ROBOTINO)
+    power = np.concatenate([run.power(ROBOTINO) for run in windows.signals])
     speed = np.hypot(windows.rolling[:, 0], windows.rolling[:, 1])
     terms = np.stack([speed**0, speed, speed**2, np.abs(windows.rolling[:, 2])], axis=1)
     terms = terms * np.maximum(speed, 0.02)[:, None]
@@ -235,7 +237,7 @@ def test_a_law_leaves_the_least_squares_of_power():
 
 
 def test_places_are_in_the_middle_of_windows_and_seen_from_the_start():
-    runs = [made_run(straight(0.0)).heard, made_run(straight(np.pi / 2)).heard]
+    runs = [made_run(straight(0.0)).signals, made_run(straight(np.pi / 2)).signals]
     found = places(Windows.of(runs, ROBOTINO), ROBOTINO)
     assert np.allclose(found[:2], [[0.05, 0.0], [0.15, 0.0]])
     assert np.allclose(found[8:10], [[0.0, 0.05], [0.0, 0.15]])
@@ -244,7 +246,7 @@ def test_places_are_in_the_middle_of_windows_and_seen_from_the_start():
 def test_beyond_the_speeds_seen_energy_is_that_of_the_fastest():
     runs = [drawing(straight(0.0, speed)) for speed in np.linspace(0.05, 0.2, 30)]
     method = QuannEnergy().fit(runs, ROBOTINO)
-    fast = made_run(straight(0.0, 0.8, 5) + np.array([0.0, 0.0, 0.5])).heard
+    fast = made_run(straight(0.0, 0.8, 5) + np.array([0.0, 0.0, 0.5])).signals
     (said,) = method.predict([fast], ROBOTINO)
     assert said.power == pytest.approx((20.0 + 30.0 * 0.2 + 80.0 * 0.04) * 0.8, rel=0.02)
 
@@ -256,7 +258,7 @@ def test_a_map_knows_places_that_cost_more():
         return drawing(straight(0.0, speed, 60), np.where(ahead > 0.4, 2.0, 1.0))
 
     method = QuannEnergy(length=0.2).fit([crossing(v) for v in np.linspace(0.1, 0.3, 15)], ROBOTINO)
-    new = crossing(0.17).heard
+    new = crossing(0.17).signals
     (said,) = method.predict([new], ROBOTINO)
     true = new.power(ROBOTINO)
     assert said.power[:20].mean() == pytest.approx(true[:20].mean(), rel=0.1)
@@ -268,4 +270,4 @@ def test_a_map_knows_places_that_cost_more():
 def test_nothing_is_predicted_before_a_fit(method):
     assert method.numbers == 0
     with pytest.raises(ValueError, match="before fit"):
-        method.predict([made_run(straight(0.0)).heard], ROBOTINO)
+        method.predict([made_run(straight(0.0)).signals], ROBOTINO)

@@ -19,7 +19,7 @@ def test_linear_traction_makes_it_the_linear_kalman_filter():
     noise = Noise(rolling=0.0, drift=(0.0, 0.0, 0.004), gyro=0.03, bias=0.05)
     wheels, gyro, dt, radius = rng.normal(size=40), rng.normal(size=40), 0.1, 0.125
     rolling = np.outer(wheels, [0.0, 0.0, 1.0])
-    heard = made_run(rolling, gyro=gyro, dt=dt).heard
+    heard = made_run(rolling, gyro=gyro, dt=dt).signals
     own = Filter(Dynamics.of(ROBOTINO, law), noise, 10.0, hears_current=False, wander=0.0)
     tracked = own.track(Padded.of([heard], ROBOTINO))
 
@@ -81,7 +81,7 @@ def test_resistance_that_pushes_or_exceeds_traction_is_pulled_back():
 
 
 def test_the_force_of_a_current_is_that_of_gear_motor_and_wheel():
-    heard = made_run(straight(0.0), current=np.tile([0.5, 0.2, 0.7], (40, 1))).heard
+    heard = made_run(straight(0.0), current=np.tile([0.5, 0.2, 0.7], (40, 1))).signals
     force = pulls(heard, ROBOTINO)[0]
     assert force[[0, 2]] == pytest.approx(np.array([0.5, 0.7]) * 16 * 0.05 / 0.04)
     assert np.isnan(force[1])
@@ -91,7 +91,7 @@ def test_the_force_of_a_current_is_that_of_gear_motor_and_wheel():
 def test_the_spread_of_the_end_is_that_of_paths_with_other_twists():
     """Turning fast: by differences of the end with noise in the twist of each of two steps."""
     noise = Noise(rolling=0.0, drift=(0.01, 0.02, 0.03))
-    heard = made_run(np.tile([0.3, -0.2, 2.0], (2, 1)), dt=0.2).heard
+    heard = made_run(np.tile([0.3, -0.2, 2.0], (2, 1)), dt=0.2).signals
     dynamics = Dynamics.of(ROBOTINO, FLOOR)
     own = Filter(dynamics, noise, 10.0, hears_current=False, wander=0.0)
     runs = Padded.of([heard], ROBOTINO)

@@ -51,7 +51,7 @@ def test_the_noise_of_currents_is_that_of_the_means_of_runs():
         run = pulling(driven(FLOOR, k), FLOOR, 1.0, rng.normal())
         runs.append(run)
     noise = WardIagnemma.with_current().fit(runs, ROBOTINO).noise
-    counts = [np.isfinite(pulls(run.heard.windowed(), ROBOTINO)).sum() for run in runs]
+    counts = [np.isfinite(pulls(run.signals.windowed(), ROBOTINO)).sum() for run in runs]
     assert noise.force == pytest.approx(np.sqrt(np.mean(counts) / 3), rel=0.35)
 
 

@@ -17,10 +17,10 @@ from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 def test_a_robot_that_stands_keeps_standing():
     still = made_run(np.zeros((40, 3)), current=np.full((40, 3), 0.5), gyro=np.full(40, 0.02))
     for method in (WardIagnemma(), WardIagnemma.with_current()):
-        said = method.predict([still.heard], ROBOTINO)[0]
+        said = method.predict([still.signals], ROBOTINO)[0]
         assert said.path[:, :2] == pytest.approx(np.zeros((41, 2)), abs=1e-6)
         assert said.slipping == pytest.approx(np.zeros(40))
-    without = replace(still.heard, gyro=None)
+    without = replace(still.signals, gyro=None)
     assert WardIagnemma().predict([without], ROBOTINO)[0].path == pytest.approx(np.zeros((41, 3)))
 
 
@@ -28,8 +28,8 @@ def test_wheels_that_spin_on_the_spot_are_told():
     run = made_run(straight(0.0), current=np.ones((40, 3)))
     stuck = WardIagnemma(law=Law(rolling=2.0), noise=Noise(rolling=1e-6))
     rolls = WardIagnemma(law=Law(rise=200.0, rolling=1e-3), noise=Noise(rolling=1e-6))
-    assert (stuck.predict([run.heard], ROBOTINO)[0].slipping[3:] > 0.8).all()
-    assert (rolls.predict([run.heard], ROBOTINO)[0].slipping < 0.05).all()
+    assert (stuck.predict([run.signals], ROBOTINO)[0].slipping[3:] > 0.8).all()
+    assert (rolls.predict([run.signals], ROBOTINO)[0].slipping < 0.05).all()
 
 
 @pytest.mark.slow
@@ -37,13 +37,13 @@ def test_wheels_that_spin_on_the_spot_are_told():
 def test_what_was_driven_by_the_law_is_foretold(machine):
     runs = [driven(FLOOR, k, machine) for k in range(14)]
     fitted = WardIagnemma().fit(runs[:10], machine)
-    foretold = fitted.predict([run.heard for run in runs[10:]], machine)
+    foretold = fitted.predict([run.signals for run in runs[10:]], machine)
     # after the wheels change, the robot's mass needs some steps to follow
     settled = np.r_[10:20, 30:40]
     for run, said in zip(runs[10:], foretold, strict=True):
-        twist = body_increments(said.path) / run.heard.dt[:, None]
+        twist = body_increments(said.path) / run.signals.dt[:, None]
         off = np.abs((twist - run.twist) * machine.size)[settled]
-        slip = np.abs((run.heard.rolling(machine) - run.twist) * machine.size)[settled]
+        slip = np.abs((run.signals.rolling(machine) - run.twist) * machine.size)[settled]
         assert off.max() < 0.05 * slip.max()
 
 
@@ -52,7 +52,7 @@ def test_what_was_driven_by_the_law_is_foretold(machine):
 def test_nine_ends_of_ten_lie_in_their_regions(gyro):
     runs = scattered(400, gyro)
     method = WardIagnemma(law=FLOOR, noise=TRUE)
-    said = method.predict([run.heard for run in runs], ROBOTINO)
+    said = method.predict([run.signals for run in runs], ROBOTINO)
     off = np.array(
         [one.path[-1, :2] - run.pose[-1, :2] for one, run in zip(said, runs, strict=True)]
     )
@@ -67,7 +67,7 @@ def test_the_gyro_makes_the_end_surer():
     noise = Noise(0.03, (0.003, 0.004, 0.02), 0.001, 0.001)
     method = WardIagnemma(law=FLOOR, noise=noise)
     for run in scattered(3, True):
-        sure, unsure = method.predict([run.heard, replace(run.heard, gyro=None)], ROBOTINO)
+        sure, unsure = method.predict([run.signals, replace(run.signals, gyro=None)], ROBOTINO)
         assert np.linalg.det(sure.end_covariance) < 0.2 * np.linalg.det(unsure.end_covariance)
 
 
@@ -77,14 +77,14 @@ def test_currents_tell_runs_that_resist_more():
     run = pulling(driven(heavier, 5), FLOOR, 1.0, 0.0)
     method = replace(WardIagnemma.with_current(), law=FLOOR, noise=noise)
     deaf = replace(method, needs=frozenset())
-    ends = [m.predict([run.heard], ROBOTINO)[0].path[-1, :2] for m in (method, deaf)]
+    ends = [m.predict([run.signals], ROBOTINO)[0].path[-1, :2] for m in (method, deaf)]
     off = [np.linalg.norm(end - run.pose[-1, :2]) for end in ends]
     assert off[0] < 0.3 * off[1]
 
 
 def test_runs_do_not_tell_on_those_beside_them():
-    short = driven(FLOOR, 1).heard
-    long = made_run(straight(1.0, 0.2, 70), gyro=np.zeros(70), current=np.ones((70, 3))).heard
+    short = driven(FLOOR, 1).signals
+    long = made_run(straight(1.0, 0.2, 70), gyro=np.zeros(70), current=np.ones((70, 3))).signals
     method = WardIagnemma(law=FLOOR)
     both, alone = method.predict([long, short], ROBOTINO)[1], method.predict([short], ROBOTINO)[0]
     assert both.path == pytest.approx(alone.path, abs=1e-7)
@@ -92,7 +92,7 @@ def test_runs_do_not_tell_on_those_beside_them():
 
 
 def test_rho_that_wanders_makes_the_end_less_sure():
-    heard = made_run(straight(0.2)).heard
+    heard = made_run(straight(0.2)).signals
     noise = Noise(0.02, (1e-4, 1e-4, 1e-4))
     spread = [
         np.trace(
@@ -108,8 +108,8 @@ def test_rho_that_wanders_makes_the_end_less_sure():
 
 def test_a_skid_steer_that_turns_with_a_gyro_and_by_floor():
     runs = [driven(FLOOR, k, HUSKY) for k in range(8)]
-    heard = [replace(r.heard, gyro=r.twist[:, 2]) for r in runs]
-    runs = [replace(r, heard=h) for r, h in zip(runs, heard, strict=True)]
+    heard = [replace(r.signals, gyro=r.twist[:, 2]) for r in runs]
+    runs = [replace(r, signals=h) for r, h in zip(runs, heard, strict=True)]
     fitted = ByFloor.of(WardIagnemma()).fit(runs, HUSKY)
     for run, said in zip(runs, fitted.predict(heard, HUSKY), strict=True):
         assert said.path[-1, 2] == pytest.approx(run.pose[-1, 2], abs=0.02)
@@ -126,5 +126,5 @@ def test_settings_to_try_and_numbers_fitted():
         assert {(m.name, m.needs) for m in tried} == {(one.name, one.needs)}
     assert (method.numbers, replace(method, with_drag=False).numbers, heard.numbers) == (8, 7, 11)
     run = driven(FLOOR, 0)
-    run = replace(run, heard=replace(run.heard, gyro=run.twist[:, 2]))
+    run = replace(run, signals=replace(run.signals, gyro=run.twist[:, 2]))
     assert method.fit([run], ROBOTINO).numbers == 10
