@@ -155,7 +155,7 @@ def main():
     fit = job.config.content.fit
     read = time.perf_counter()
     problem = job.problem()
-    optimum = optimise(problem, most_rounds=fit.rounds, tolerance=fit.tolerance)
+    optimum = optimise(problem, most_rounds=quick(fit.rounds, 2), tolerance=fit.tolerance)
     done = time.perf_counter()
     took = {
         "runs": len(job.dataset),
