@@ -1,1 +1,5 @@
+<<<<<<< ours
 """Configs, and what each command does."""
+=======
+"""What a config asks for."""
+>>>>>>> theirs

@@ -52,7 +52,7 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     job = read_job(read_config(out / "config.toml"), folder, report)
     _same_logs(fit, job)
     report.stage("compiling")
-    fit = replace(fit, data=job.dataset, problem=job.problem(fit.robot))
+    fit = replace(fit, problem=job.problem(fit.robot), data=job.dataset)
     # all that a chain depends on; how long it may become is not of it
     told = FORMAT, fit.data_hash, replace(plan, most=10**9), draws, sorted(fit.variance.items())
     kept = Checkpoint(out / FOLDER, key_of(*told, np.asarray(fit.z), np.asarray(fit.covariance)))
