@@ -1,5 +1,1 @@
-<<<<<<< ours
 """Configs, and what each command does."""
-=======
-"""What a config asks for."""
->>>>>>> theirs

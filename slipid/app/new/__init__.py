@@ -1,1 +1,1 @@
-"""A config for a robot that nobody has described yet: asked for, or proposed from its logs."""
+"""A look into log files: what their columns hold, proposed as a config with open questions."""
