@@ -246,6 +246,17 @@ def test_saturation_keeps_the_direction():
         assert got @ wanted > 0
 
 
+@pytest.mark.parametrize("amps", [(0.0, 0.0, 0.0), (2.0, 0.0, -1.0)])
+def test_a_command_needs_no_more_than_the_supply_has_left(amps):
+    f, limits = robot(), Limits(voltage=6.0, acceleration=1e4)
+    wanted, motor = np.array([10.0, -9.0, 2.0]), f.motor
+    got = np.asarray(limited(jnp.asarray(wanted), jnp.zeros(3), jnp.asarray(amps), f, limits, DT))
+    np.testing.assert_allclose(got / wanted, got[0] / wanted[0], rtol=1e-12)
+    needs = np.abs(got) * float(motor.gear_ratio * motor.back_emf)
+    left = 6.0 - float(motor.resistance) * np.abs(amps)
+    assert np.max(needs / left) == pytest.approx(1.0)
+
+
 @cache
 def watch(s=None):
     est = Estimator(robot(), s)
