@@ -12,7 +12,7 @@ from slipid.app.config import geometry, read_config
 from slipid.app.problem import read_job
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import generic_text, robotino_text, write_good
-from tests.helpers.said import Said
+from tests.helpers.said import KeptMessages
 
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("*.toml"))
 
@@ -147,8 +147,8 @@ def test_absent_and_unreadable_files(tmp_path):
 # from config and folder to a job ----------------------------------------------------------------
 
 
-def job_of(folder: Path, text: str, said: Said | None = None):
-    return read_job(read_config(written(folder, text)), folder, said or Said())
+def job_of(folder: Path, text: str, said: KeptMessages | None = None):
+    return read_job(read_config(written(folder, text)), folder, said or KeptMessages())
 
 
 def test_a_job_reads_floors_from_folders_and_takes_the_mass(tmp_path):
@@ -208,7 +208,7 @@ def test_a_set_without_files_is_skipped_with_a_line(tmp_path):
     write_good(tmp_path)
     more = '[[logs]]\nglob = "wheel_load/*/*.csv"\nformat = "robotino2022"\nload = "moved"\n'
     settings = '"robot.load_share@moved" = { free = false }\n"surface.blue.creep" = { start = 0.2 }'
-    said = Said()
+    said = KeptMessages()
     job = job_of(tmp_path, GOOD.replace("[parameters]", f"{more}\n[parameters]\n{settings}"), said)
     lines = said.lines
     assert len(job.dataset) == 1
@@ -252,7 +252,7 @@ def test_short_runs_can_be_left_out(tmp_path):
     write_good(tmp_path)
     short = tmp_path / "one_surface/gray/exp08.csv"
     short.write_text(robotino_text(rows=30), encoding="utf-8")
-    said = Said()
+    said = KeptMessages()
     job = job_of(tmp_path, GOOD.replace("[parameters]", "min_rows = 50\n[parameters]"), said)
     assert len(job.dataset) == 1
     assert said.lines == ["skipped: 1 runs shorter than their min_rows"]

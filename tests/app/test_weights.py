@@ -13,7 +13,7 @@ from slipid.search_space import Space
 from slipid.support.errors import DataError
 from tests.app.test_config import GOOD
 from tests.helpers.broken_logs import write_good
-from tests.helpers.said import Said
+from tests.helpers.said import KeptMessages
 
 SHAPE = omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0)
 SCALES = Weights(kg=[3.0, 5.0, 4.0], std_kg=0.06)
@@ -87,14 +87,14 @@ def test_what_makes_no_weight_is_refused(tmp_path, text, expected):
     write_good(tmp_path)
     whole = f"{GOOD}\n[weights.as_built]\n{text}\n"
     with pytest.raises(DataError, match=r"my\.toml: ") as caught:
-        read_job(parsed(tmp_path / "my.toml", whole), tmp_path, Said())
+        read_job(parsed(tmp_path / "my.toml", whole), tmp_path, KeptMessages())
     assert expected in str(caught.value)
 
 
 def test_weights_are_the_prior_and_those_of_no_run_are_skipped(tmp_path):
     write_good(tmp_path)
     text = GOOD + WEIGHTS + WEIGHTS.replace("as_built", "loaded")
-    job = read_job(parsed(tmp_path / "my.toml", text), tmp_path, Said())
+    job = read_job(parsed(tmp_path / "my.toml", text), tmp_path, KeptMessages())
     assert "skipped: weights.loaded: no run that has it" in job.skipped
     space = Space(job.robot, job.choices)
     at = space.place["robot.load_share@as_built"]
@@ -102,7 +102,7 @@ def test_weights_are_the_prior_and_those_of_no_run_are_skipped(tmp_path):
     mean = np.asarray(entry.declaration.to_si(jnp.asarray(space.prior_mean[at])))
     assert mean == pytest.approx([0.25, 5 / 12, 1 / 3])
     assert (space.prior_std[at] < 0.03).all()
-    plain = read_job(parsed(tmp_path / "my.toml", GOOD), tmp_path, Said())
+    plain = read_job(parsed(tmp_path / "my.toml", GOOD), tmp_path, KeptMessages())
     assert (Space(plain.robot, plain.choices).prior_std[at] > 0.2).all()
 
 
@@ -111,7 +111,7 @@ def test_runs_of_sections_with_one_session_name_belong_together(tmp_path):
     text = GOOD.replace(
         'format = "robotino2022"', 'format = "robotino2022"\nsession_name = "may 3"'
     )
-    job = read_job(parsed(tmp_path / "my.toml", text), tmp_path, Said())
+    job = read_job(parsed(tmp_path / "my.toml", text), tmp_path, KeptMessages())
     assert set(job.dataset.session) == {"may 3"}
     both = text.replace("session_name", 'session = "file"\nsession_name')
     with pytest.raises(DataError, match="session and session_name at once"):

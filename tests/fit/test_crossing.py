@@ -38,7 +38,7 @@ from tests.app.test_config import GOOD, written
 from tests.helpers.broken_logs import ROBOTINO, robotino_text, write_good
 from tests.helpers.made_logs import write_logs
 from tests.helpers.made_windows import made, robot
-from tests.helpers.said import Said
+from tests.helpers.said import KeptMessages
 
 NUMBERS = ("friction", "creep", "roller_drag")
 CHOICES = [
@@ -361,7 +361,7 @@ def folder(tmp_path):
 
 
 def mixed_job(folder: Path, text: str, said=None):
-    said = said or Said()
+    said = said or KeptMessages()
     return with_mixed(read_job(read_config(written(folder, text)), folder, said), folder, said)
 
 
@@ -376,7 +376,7 @@ def test_runs_with_a_map_are_kept_apart(folder):
 
 
 def test_a_set_with_a_map_and_no_files_is_skipped(folder):
-    said = Said()
+    said = KeptMessages()
     job = mixed_job(folder, GOOD.replace("[parameters]", SITE.replace("site/", "far/")), said)
     assert job.mixed == ()
     assert len(said.lines) == 1

@@ -11,7 +11,7 @@ from slipid.app.new.config_text import new_config
 from slipid.app.new.propose import propose
 from slipid.app.new.robot_questions import RobotOptions
 from tests.helpers.made_tables import RADIUS, TRACK
-from tests.helpers.said import PredictedRun
+from tests.helpers.said import KeptMessages
 
 ROBOT = {
     "drive": "differential",
@@ -34,6 +34,6 @@ def layout_in(config, name: str = "mine"):
 def read(config, root: Path):
     """Runs as `slipid check` reads them."""
     there = parsed(Path("mine.toml"), config.text)
-    data, skipped = read_dataset(there, there.content.logs, root, PredictedRun())
+    data, skipped = read_dataset(there, there.content.logs, root, KeptMessages())
     assert not skipped
     return data

@@ -5,7 +5,7 @@ from __future__ import annotations
 from slipid.support.progress import Reporter
 
 
-class PredictedRun(Reporter):
+class KeptMessages(Reporter):
     """Keeps sentences; stages and bars go nowhere.
 
     Attributes:

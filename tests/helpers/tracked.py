@@ -11,7 +11,7 @@ from slipid.camera.tracking.track import Track, track_of
 from slipid.support.checkpoint import Checkpoint
 from tests.helpers.made_sources import InMemory
 from tests.helpers.made_videos import Body, Printed, Stage
-from tests.helpers.said import PredictedRun
+from tests.helpers.said import KeptMessages
 
 STAGE = Stage()
 
@@ -28,7 +28,7 @@ def tracked(stage: Stage, pictures, tmp_path, *targets: Target, fps: float = 30.
     ids = frozenset(number for target in targets for number in target.ids)
     finder = Finder(MarkerDetector(targets[0].dictionary), ids)
     source = InMemory.even(pictures, fps)
-    seen = look_through(source, finder, Checkpoint(tmp_path / "kept", "key"), PredictedRun())
+    seen = look_through(source, finder, Checkpoint(tmp_path / "kept", "key"), KeptMessages())
     return [track_of(stage.camera, target, seen) for target in targets]
 
 

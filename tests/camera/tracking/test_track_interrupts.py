@@ -20,7 +20,7 @@ from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.helpers.made_sources import write_video
 from tests.helpers.made_videos import Body, Printed
-from tests.helpers.said import Said
+from tests.helpers.said import KeptMessages
 from tests.helpers.track_command import COUNT, LONE, OTHER, ROBOT, STAGE, Made, made_in, track
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -105,7 +105,7 @@ def test_poses_that_cannot_be_written_are_kept(made, tmp_path, monkeypatch):
     source = open_source(str(made.video("robot", ROBOT)))
     target = tracking.LoneMarker(0.131, 0.25, 0).target(source)
     monkeypatch.setattr(sightings, "KEPT_S", 0.0)
-    done = tracking.track(source, STAGE.camera, (target,), tmp_path / "kept", Said())
+    done = tracking.track(source, STAGE.camera, (target,), tmp_path / "kept", KeptMessages())
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(DataError, match="cannot be written"):
         done.write(tmp_path / "file" / "p.csv")
@@ -119,7 +119,7 @@ def test_a_marker_that_comes_late_is_found_among_others(tmp_path):
     late = Body(lambda t: np.array([9.0, 0, 0]) if t < 3.5 else ROBOT.pose_at(t), (Printed(id=1),))
     still = STAGE.film([OTHER], 1)
     video = write_video(tmp_path / "a.avi", [*still * 104, *STAGE.film([OTHER, late], 110)[104:]])
-    source, said = open_source(str(video)), Said()
+    source, said = open_source(str(video)), KeptMessages()
     target = tracking.LoneMarker(0.131, 0.25, 1).target(source)
     done = tracking.track(source, STAGE.camera, (target,), tmp_path / "kept", said)
     assert done.tracks[0].good[106:].all()

@@ -8,7 +8,7 @@ from math import pi
 import pytest
 
 from slipid.data.check.causes import explained
-from slipid.data.check.ratios import Ratio, Ratios
+from slipid.data.check.ratios import ScaleRatio, ScaleRatios
 from slipid.data.check.sanity import findings
 from tests.helpers.mistakes import MISTAKES
 from tests.helpers.plain_robot import DRIVES, Drive, as_runs, drive
@@ -131,11 +131,11 @@ def test_a_turned_marker_hides_no_other_unit_of_the_pose():
 def test_a_heading_in_another_unit_makes_a_gyro_look_too_small():
     """One cause explains both ratios, and no gyro is told to be wrong."""
     deg = 180 / pi
-    seen = Ratios(
+    seen = ScaleRatios(
         {
-            "travel": Ratio(0.8, 0.3, 0.8, 1.35),
-            "turning": Ratio(0.8 * deg, 0.35, 0.8, 1.35),
-            "gyro": Ratio(1 / deg, 0.75, 1.0, 1.33),
+            "travel": ScaleRatio(0.8, 0.3, 0.8, 1.35),
+            "turning": ScaleRatio(0.8 * deg, 0.35, 0.8, 1.35),
+            "gyro": ScaleRatio(1 / deg, 0.75, 1.0, 1.33),
         },
         speed_is_angle=False,
     )

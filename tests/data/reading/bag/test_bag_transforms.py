@@ -10,14 +10,22 @@ import pytest
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.bag.topics import read_bag
 from slipid.support.errors import DataError
-from tests.helpers.made_bags import STORAGES, SUFFIX, Said, in_order, transform, vector, write_bag
+from tests.helpers.made_bags import (
+    STORAGES,
+    SUFFIX,
+    MadeMessage,
+    in_order,
+    transform,
+    vector,
+    write_bag,
+)
 
 TIME = 100.0 + np.arange(0.0, 5.0, 0.02)
 TF = "tf2_msgs/msg/TFMessage"
 
 
 def said(topic, *transforms, received):
-    return Said(topic, TF, {"transforms": list(transforms)}, received)
+    return MadeMessage(topic, TF, {"transforms": list(transforms)}, received)
 
 
 def pose_of(path, frame, child, topic="/tf"):
