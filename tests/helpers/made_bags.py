@@ -25,7 +25,7 @@ ROBOTINO = {
 
 
 @dataclass(frozen=True)
-class MadeMessage:
+class Message:
     """A message: its topic and type, its fields by name, and when it was received [s]."""
 
     topic: str
@@ -102,7 +102,7 @@ def writer_of(path: Path, storage: str, **options: Any):
 def write_bag(
     path: Path,
     storage: str,
-    said: Iterable[MadeMessage],
+    said: Iterable[Message],
     definitions: Mapping[str, str] | None = None,
     empty: Mapping[str, str] | None = None,
     **options: Any,
@@ -143,10 +143,10 @@ def header(stamp: float, frame: str = "") -> dict[str, Any]:
     return {"stamp": stamp, "frame_id": frame}
 
 
-def joint_states(topic, time, joints, delay=0.002, **arrays) -> list[MadeMessage]:
+def joint_states(topic, time, joints, delay=0.002, **arrays) -> list[Message]:
     """JointStates: `position`, `velocity` and `effort` by sample and joint."""
     return [
-        MadeMessage(
+        Message(
             topic,
             JOINT_STATE,
             {
@@ -188,6 +188,6 @@ def transform(stamp, parent, child, x, y, heading, z=0.0) -> dict[str, Any]:
     }
 
 
-def in_order(*parts: Iterable[MadeMessage]) -> list[MadeMessage]:
+def in_order(*parts: Iterable[Message]) -> list[Message]:
     """Messages of several topics in the order of receipt."""
     return sorted((one for part in parts for one in part), key=lambda one: one.received)

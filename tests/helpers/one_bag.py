@@ -9,7 +9,7 @@ import numpy as np
 
 from slipid.data.reading.bag.layout import BagLayout, declared_bag_layout
 from slipid.data.reading.bag.topics import BagRun, read_bag
-from tests.helpers.made_bags import SUFFIX, MadeMessage, in_order, write_bag
+from tests.helpers.made_bags import SUFFIX, Message, in_order, write_bag
 
 TIME = 1.7e9 + np.arange(0.0, 4.0, 0.01)
 ANGLE = np.column_stack([3.0 * np.sin(TIME - TIME[0]), np.linspace(0.0, 9.0, len(TIME))])
@@ -26,5 +26,5 @@ def read(path: Path, **given: Any) -> BagRun:
     return run
 
 
-def bag(tmp_path: Path, storage: str, *said: list[MadeMessage], **options: Any) -> Path:
+def bag(tmp_path: Path, storage: str, *said: list[Message], **options: Any) -> Path:
     return write_bag(tmp_path / f"bag{SUFFIX[storage]}", storage, in_order(*said), **options)

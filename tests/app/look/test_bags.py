@@ -15,7 +15,7 @@ from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.bag.topics import read_bag
 from tests.helpers.made_bags import (
     ROBOTINO,
-    MadeMessage,
+    Message,
     in_order,
     joint_states,
     pose_fields,
@@ -35,7 +35,7 @@ def messages(pose: str = POSE, effort: bool = False, more: tuple[str, ...] = ())
     arrays = {"position": angle, "velocity": angle} | ({"effort": angle} if effort else {})
     states = joint_states("/joint_states", TIME, [*JOINTS, *more], **arrays)
     poses = [
-        MadeMessage(
+        Message(
             "/where",
             pose,
             pose_fields(pose, float(t), 0.1 * float(t - TIME[0]), 0.0, 0.0),
@@ -44,7 +44,7 @@ def messages(pose: str = POSE, effort: bool = False, more: tuple[str, ...] = ())
         for t in TIME[::5]
     ]
     twist = [
-        MadeMessage("/cmd_vel", "geometry_msgs/msg/Twist", {"linear": vector(1)}, t)
+        Message("/cmd_vel", "geometry_msgs/msg/Twist", {"linear": vector(1)}, t)
         for t in TIME[::10].tolist()
     ]
     return in_order(states, poses, twist)
@@ -95,7 +95,7 @@ def test_effort_odometry_and_other_joints_are_asked_for(tmp_path):
 def test_motor_readings_have_ticks_and_currents(tmp_path):
     fields = {"velocities": [1, 2, 3], "positions": [4, 5, 6], "currents": [0.1, 0.2, 0.3]}
     kind = "robotino_msgs/msg/MotorReadings"
-    said = [MadeMessage("/motors", kind, {"stamp": float(t), **fields}, float(t)) for t in TIME]
+    said = [Message("/motors", kind, {"stamp": float(t), **fields}, float(t)) for t in TIME]
     write_bag(tmp_path / "run1", "mcap", said, ROBOTINO)
     config = proposed(tmp_path)
     there = tomllib.loads(config.text)
@@ -108,7 +108,7 @@ def test_motor_readings_have_ticks_and_currents(tmp_path):
 
 def test_frames_of_transforms_are_asked_for(tmp_path):
     tf = [
-        MadeMessage(
+        Message(
             "/tf",
             "tf2_msgs/msg/TFMessage",
             {"transforms": [transform(t, "map", "base", 0, 0, 0)]},
@@ -141,11 +141,11 @@ def _drive_with_pauses(fields_per_wheel: int = 4):
     angle = np.cumsum(moving * 0.02)[:, None] * np.ones(len(JOINTS))
     states = joint_states("/joint_states", TIME, JOINTS, position=angle)
     pose = [
-        MadeMessage("/where", POSE, pose_fields(POSE, float(t), 0.1 * float(x), 0.0, 0.0), float(t))
+        Message("/where", POSE, pose_fields(POSE, float(t), 0.1 * float(x), 0.0, 0.0), float(t))
         for t, x in zip(TIME, angle[:, 0], strict=True)
     ]
     many = {"currents": [0.5] * fields_per_wheel, "voltages": [6.0] * fields_per_wheel}
-    motors = [MadeMessage("/motors", "base_msgs/msg/MotorState", many, float(t)) for t in TIME]
+    motors = [Message("/motors", "base_msgs/msg/MotorState", many, float(t)) for t in TIME]
     return in_order(states, pose, motors)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.helpers.made_bags import (
     STORAGES,
-    MadeMessage,
+    Message,
     header,
     joint_states,
     turned,
@@ -27,7 +27,7 @@ CUSTOM = {
 
 def states(time):
     return [
-        MadeMessage(
+        Message(
             "/state",
             "my_msgs/msg/State",
             {
@@ -85,11 +85,11 @@ def test_definitions_in_a_folder(tmp_path, package):
 
 def test_plain_arrays_and_numbers(tmp_path):
     arrays = [
-        MadeMessage("/amps", "std_msgs/msg/Float64MultiArray", {"data": [k, -k]}, t)
+        Message("/amps", "std_msgs/msg/Float64MultiArray", {"data": [k, -k]}, t)
         for k, t in enumerate(TIME.tolist())
     ]
     one = [
-        MadeMessage("/volts", "std_msgs/msg/Int32", {"data": 100 * k}, t)
+        Message("/volts", "std_msgs/msg/Int32", {"data": 100 * k}, t)
         for k, t in enumerate(TIME.tolist())
     ]
     topics = {
@@ -105,7 +105,7 @@ def test_plain_arrays_and_numbers(tmp_path):
 def test_a_pose_inside_a_message_of_ones_own(tmp_path):
     text = {"my_msgs/msg/Seen": "std_msgs/Header header\ngeometry_msgs/Pose robot\nfloat32 x\n"}
     said = [
-        MadeMessage(
+        Message(
             "/seen",
             "my_msgs/msg/Seen",
             {
@@ -132,7 +132,7 @@ def test_standard_types_need_no_definition_in_the_bag(tmp_path):
 @pytest.mark.slow
 def test_messages_with_ever_new_texts_are_read_too(tmp_path):
     said = [
-        MadeMessage(
+        Message(
             "/joint_states",
             "sensor_msgs/msg/JointState",
             {"header": header(t, f"frame{k:04d}"), "name": ["left"], "position": [1.0 * k]},
@@ -148,9 +148,7 @@ def test_messages_with_ever_new_texts_are_read_too(tmp_path):
 def test_a_topic_for_each_motor(tmp_path):
     straight = TIME - TIME[0]
     said = [
-        MadeMessage(
-            f"/amps{j}", "std_msgs/msg/Float64", {"data": j + k * float(s)}, float(TIME[0] + s)
-        )
+        Message(f"/amps{j}", "std_msgs/msg/Float64", {"data": j + k * float(s)}, float(TIME[0] + s))
         for j, (k, times) in enumerate([(1.0, straight[::2]), (-3.0, straight)])
         for s in times
     ]

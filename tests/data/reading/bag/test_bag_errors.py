@@ -9,7 +9,7 @@ from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.bag.topics import read_bag
 from slipid.support.errors import DataError
 from tests.helpers.made_bags import (
-    MadeMessage,
+    Message,
     header,
     in_order,
     joint_states,
@@ -33,7 +33,7 @@ def wheels(time=TIME, topic="/joint_states", **arrays):
 def poses(time=TIME, x=None):
     x = time - START if x is None else x
     return [
-        MadeMessage("/pose", POSE, pose_fields(POSE, t, float(x[k]), 0, 0), t)
+        Message("/pose", POSE, pose_fields(POSE, t, float(x[k]), 0, 0), t)
         for k, t in enumerate(time.tolist())
     ]
 
@@ -41,13 +41,13 @@ def poses(time=TIME, x=None):
 def imu(time=TIME, stamps=None):
     stamps = time if stamps is None else stamps
     return [
-        MadeMessage("/imu", IMU, {"header": header(float(s)), "angular_velocity": vector(z=1)}, t)
+        Message("/imu", IMU, {"header": header(float(s)), "angular_velocity": vector(z=1)}, t)
         for t, s in zip(time.tolist(), stamps, strict=True)
     ]
 
 
 def commands(time=TIME):
-    return [MadeMessage("/cmd_vel", "geometry_msgs/msg/Twist", {}, t) for t in time.tolist()]
+    return [Message("/cmd_vel", "geometry_msgs/msg/Twist", {}, t) for t in time.tolist()]
 
 
 def refused(tmp_path, said, topics, *words, joints=("wheel_left", "wheel_right"), **given):
@@ -169,7 +169,7 @@ def test_types_and_fields_that_do_not_fit(tmp_path, channel, spec, words):
 
 def test_odometry_is_no_command(tmp_path):
     name = "nav_msgs/msg/Odometry"
-    said = [MadeMessage("/odom", name, pose_fields(name, t, 0, 0, 0), t) for t in TIME.tolist()]
+    said = [Message("/odom", name, pose_fields(name, t, 0, 0, 0), t) for t in TIME.tolist()]
     words = ("the measured twist", "the commanded twist")
     refused(tmp_path, said, {"twist_command": {"topic": "/odom"}}, *words)
 
@@ -209,7 +209,7 @@ def test_channels_that_disagree_on_the_number_of_wheels(tmp_path):
     said = in_order(
         wheels(),
         [
-            MadeMessage("/amps", "std_msgs/msg/Float32MultiArray", {"data": [1.0, 2.0, 3.0]}, t)
+            Message("/amps", "std_msgs/msg/Float32MultiArray", {"data": [1.0, 2.0, 3.0]}, t)
             for t in TIME.tolist()
         ],
     )
@@ -222,7 +222,7 @@ def test_channels_that_disagree_on_the_number_of_wheels(tmp_path):
 
 def test_an_array_that_changes_its_length(tmp_path):
     said = [
-        MadeMessage("/amps", "std_msgs/msg/Float32MultiArray", {"data": [1.0] * (2 + (k == 17))}, t)
+        Message("/amps", "std_msgs/msg/Float32MultiArray", {"data": [1.0] * (2 + (k == 17))}, t)
         for k, t in enumerate(TIME.tolist())
     ]
     topics = {"current": {"topic": "/amps", "unit": "A"}}
@@ -251,7 +251,7 @@ def test_all_poses_without_numbers(tmp_path):
 
 def test_a_quaternion_that_is_not_filled_in(tmp_path):
     said = [
-        MadeMessage("/pose", POSE, {"header": header(t), "pose": {"position": vector(t)}}, t)
+        Message("/pose", POSE, {"header": header(t), "pose": {"position": vector(t)}}, t)
         for t in TIME.tolist()
     ]
     refused(tmp_path, said, {"pose": {"topic": "/pose"}}, "quaternion of length 0", "filled in?")
@@ -321,9 +321,7 @@ def test_two_clocks_that_have_nothing_in_common(tmp_path):
 
 def test_a_definition_that_is_nowhere(tmp_path):
     text = {"my_msgs/msg/Amps": "my_msgs/Inner inner\n", "my_msgs/msg/Inner": "float32 x\n"}
-    said = [
-        MadeMessage("/amps", "my_msgs/msg/Amps", {"inner": {"x": 1.0}}, t) for t in TIME.tolist()
-    ]
+    said = [Message("/amps", "my_msgs/msg/Amps", {"inner": {"x": 1.0}}, t) for t in TIME.tolist()]
     path = without_definitions(write_bag(tmp_path / "bag", "sqlite3", said, text))
     topics = {"current": {"topic": "/amps", "field": "inner.x", "unit": "A"}}
     with pytest.raises(

@@ -8,7 +8,7 @@ import pytest
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.bag.topics import read_bag
 from slipid.support.errors import DataError
-from tests.helpers.made_bags import STORAGES, SUFFIX, MadeMessage, in_order, joint_states, write_bag
+from tests.helpers.made_bags import STORAGES, SUFFIX, Message, in_order, joint_states, write_bag
 
 START = 1.7e9
 TIME = START + np.arange(0.0, 30.0, 0.02)
@@ -38,7 +38,7 @@ def spans(found, name="wheel_angle"):
 
 
 def markers(name, values):
-    return [MadeMessage("/run", f"std_msgs/msg/{name}", {"data": v}, START + t) for t, v in values]
+    return [Message("/run", f"std_msgs/msg/{name}", {"data": v}, START + t) for t, v in values]
 
 
 @pytest.mark.parametrize("storage", STORAGES)
@@ -71,7 +71,7 @@ def test_a_text_may_name_the_floor(tmp_path):
 def test_fields_of_a_marker_name_floor_and_load(tmp_path):
     text = {"my_msgs/msg/Run": "std_msgs/Header header\nuint8 trial\nstring floor\nstring load\n"}
     said = [
-        MadeMessage(
+        Message(
             "/run",
             "my_msgs/msg/Run",
             {"header": {"stamp": START + t}, "trial": n, "floor": floor, "load": "moved"},

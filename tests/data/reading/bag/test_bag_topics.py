@@ -10,7 +10,7 @@ from tests.helpers.made_bags import (
     ROBOTINO,
     STORAGES,
     SUFFIX,
-    MadeMessage,
+    Message,
     in_order,
     joint_states,
     transform,
@@ -26,7 +26,7 @@ ANGLE = np.zeros((len(TIME), 2))
 @pytest.fixture
 def said():
     motors = [
-        MadeMessage(
+        Message(
             "/motors",
             "robotino_msgs/msg/MotorReadings",
             {"stamp": t, "velocities": [1, 2, 3], "positions": [4, 5, 6], "currents": [7, 8, 9]},
@@ -35,7 +35,7 @@ def said():
         for t in TIME[100:200].tolist()
     ]
     tf = [
-        MadeMessage(
+        Message(
             "/tf",
             "tf2_msgs/msg/TFMessage",
             {"transforms": [transform(t, "map", "base", 0, 0, 0)]},
@@ -43,9 +43,7 @@ def said():
         )
         for t in TIME.tolist()
     ]
-    commands = [
-        MadeMessage("/cmd", "geometry_msgs/msg/Twist", {"linear": vector(1)}, TIME[0] + 2.0)
-    ]
+    commands = [Message("/cmd", "geometry_msgs/msg/Twist", {"linear": vector(1)}, TIME[0] + 2.0)]
     states = joint_states("/joint_states", TIME, ["l", "r"], position=ANGLE, velocity=ANGLE)
     return in_order(states, motors, tf, commands)
 

@@ -13,7 +13,7 @@ from slipid.support.errors import DataError
 from tests.helpers.made_bags import (
     STORAGES,
     SUFFIX,
-    MadeMessage,
+    Message,
     in_order,
     transform,
     vector,
@@ -25,7 +25,7 @@ TF = "tf2_msgs/msg/TFMessage"
 
 
 def said(topic, *transforms, received):
-    return MadeMessage(topic, TF, {"transforms": list(transforms)}, received)
+    return Message(topic, TF, {"transforms": list(transforms)}, received)
 
 
 def pose_of(path, frame, child, topic="/tf"):

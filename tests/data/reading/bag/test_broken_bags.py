@@ -11,7 +11,7 @@ from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.bag.topics import read_bag, topics_of
 from slipid.support.errors import DataError
 from tests.helpers.kept import kept
-from tests.helpers.made_bags import MadeMessage, in_order, joint_states, transform, write_bag
+from tests.helpers.made_bags import Message, in_order, joint_states, transform, write_bag
 
 TIME = 1.7e9 + np.arange(0.0, 3.0, 0.01)
 ANGLE = np.column_stack([TIME - TIME[0], TIME[0] - TIME])
@@ -29,7 +29,7 @@ LAYOUT = declared_bag_layout(
 
 def messages():
     tf = [
-        MadeMessage(
+        Message(
             "/tf",
             "tf2_msgs/msg/TFMessage",
             {"transforms": [transform(t, "map", "base", t, 0, 0)]},
@@ -57,7 +57,7 @@ def filler():
     """Two megabytes, so that an MCAP file has more than one chunk."""
     pixels = np.zeros(300_000, dtype=np.uint8)
     return [
-        MadeMessage("/camera", "sensor_msgs/msg/Image", {"data": pixels}, TIME[-1] + k)
+        Message("/camera", "sensor_msgs/msg/Image", {"data": pixels}, TIME[-1] + k)
         for k in range(8)
     ]
 
