@@ -18,16 +18,17 @@ from jaxtyping import Float
 from slipid.deploy.record_of import directions, moved_per_metre, spread_of
 from slipid.fit.shared import AXES, Directions, Pace
 from slipid.predict.predictive import Contact
-from slipid.robot.record import Axes, ToldRecord
+from slipid.robot.record import Axes
+from slipid.robot.record import EffectRecord
 
 DIRECTIONS = 72
 """Of the table; half of the kernel's length apart."""
 _Grid = Float[np.ndarray, "floor speed direction 3"]
 
 
-def told_by_load(
+def effects_by_load(
     contact: Contact, center: Float[np.ndarray, " free"], draws: Float[np.ndarray, "draw free"]
-) -> dict[str, ToldRecord]:
+) -> dict[str, EffectRecord]:
     """What is told of effects by load set-up; nothing where no runs share any.
 
     Args:
@@ -46,7 +47,7 @@ def told_by_load(
 
 def _table(
     contact: Contact, center: np.ndarray, draws: np.ndarray, load: str, log_speed: np.ndarray
-) -> ToldRecord:
+) -> EffectRecord:
     count, labels = len(log_speed), contact.robot.surfaces.labels
     angle = np.linspace(0.0, 2 * np.pi, DIRECTIONS, endpoint=False)
     paces = tuple(Pace(float(s), load) for s in log_speed for _ in angle)
@@ -69,7 +70,7 @@ def _table(
             _of(contact, "run", floor) + grown * (given + spread_of(off) ** 2)
         ).reshape(shape[1:])
     speeds = tuple(_short(np.exp(s)) for s in log_speed)
-    return ToldRecord(speeds, _rows(mean), _rows(left))
+    return EffectRecord(speeds, _rows(mean), _rows(left))
 
 
 def _of(contact: Contact, kind: str, floor: str) -> Float[np.ndarray, "3"]:

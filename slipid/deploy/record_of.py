@@ -21,15 +21,15 @@ from slipid.parameter import entries
 from slipid.robot import record
 
 
-def record_of(
+def robot_record(
     robot: Robot,
-    numbers: Mapping[str, record.Number],
+    numbers: Mapping[str, record.RecordedNumber],
     std: Mapping[str, float],
     draws: Robot,
     highest_speed: float,
     current_trend: record.Pair,
     seen: Mapping[str, Validity],
-    told: Mapping[str, record.ToldRecord] | None = None,
+    told: Mapping[str, record.EffectRecord] | None = None,
 ) -> record.RobotRecord:
     """The record of a robot, but for what is known of where its numbers come from.
 
@@ -101,14 +101,14 @@ def _axes(row: Sequence[float] | np.ndarray) -> record.Axes:
 
 
 def _load(
-    robot: Robot, name: str, top: float, draws: Robot, told: record.ToldRecord | None
+    robot: Robot, name: str, top: float, draws: Robot, told: record.EffectRecord | None
 ) -> record.LoadRecord:
     """What depends on how the robot is loaded."""
     shape, k = robot.geometry, jnp.asarray(robot.load_index(name))
     frame, ways = shape.frame(), directions(36)
     if not shape.determines_twist:
         ways = jnp.concatenate([ways, _turns(frame)])
-    wheels, rest = _Wheels.of(robot), robot.body.load_share[k]
+    wheels, rest = _WheelArrays.of(robot), robot.body.load_share[k]
     floors, motor, mass = robot.surfaces, robot.motor, robot.body.mass
     speed, amps, slip = _circle(wheels, floors, rest, motor, mass, jnp.asarray(top), ways)
     curve = np.asarray(_wheel_curve(speed, amps, slip))
@@ -132,7 +132,7 @@ def _turns(frame: Frame) -> Float[Array, "way 3"]:
     return jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / frame.base
 
 
-class _Wheels(eqx.Module):
+class _WheelArrays(eqx.Module):
     """The wheels as arrays, wherever they are: what is compiled for some serves all as many."""
 
     frame: Frame
@@ -140,7 +140,7 @@ class _Wheels(eqx.Module):
     drive_of: tuple[int, ...] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, robot: Robot) -> "_Wheels":
+    def of(cls, robot: Robot) -> "_WheelArrays":
         shape = robot.geometry
         return cls(shape.frame(), shape.forward(), shape.drive_of)
 
@@ -151,7 +151,7 @@ class _Wheels(eqx.Module):
 
 @eqx.filter_jit
 def _circle(
-    wheels: _Wheels,
+    wheels: _WheelArrays,
     surfaces: ContactSurface,
     rest: Float[Array, " wheel"],
     motor: Motor,
@@ -222,12 +222,12 @@ def moved_per_metre(
     For ways to move at 1 m/s, of robots that are stacked.
     """
     rest = draws.body.load_share[:, load]
-    return _moved(jax.vmap(_Wheels.of)(draws), draws.surfaces, rest, speed, way)
+    return _moved(jax.vmap(_WheelArrays.of)(draws), draws.surfaces, rest, speed, way)
 
 
 @eqx.filter_jit
 def _moved(
-    wheels: _Wheels,
+    wheels: _WheelArrays,
     surfaces: ContactSurface,
     rest: Float[Array, "draw wheel"],
     speed: Array,
@@ -235,7 +235,7 @@ def _moved(
 ) -> Array:
     """As `moved_per_metre`."""
 
-    def one(wheels: _Wheels, surfaces: ContactSurface, rest: Array) -> Array:
+    def one(wheels: _WheelArrays, surfaces: ContactSurface, rest: Array) -> Array:
         rim, frame = wheels.rim(speed * way @ wheels.forward.T), wheels.frame
         xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
             surfaces

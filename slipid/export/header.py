@@ -7,11 +7,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 
-from slipid.export.rows import DOUBTED, doubted
+from slipid.export.rows import WARNED_VERDICTS
+from slipid.export.rows import paths_with_verdict
 from slipid.export.text import listed, one_line, wrapped
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.record import Source, Verdict
-from slipid.robot.robot_file import declared
+from slipid.robot.robot_file import declared_numbers
 
 SOURCES: Mapping[Source, str] = {
     "laplace": "a fit to logs (Laplace approximation)",
@@ -52,7 +53,7 @@ def facts(robot: DeployedRobot) -> list[str]:
 
 def warnings(robot: DeployedRobot) -> tuple[str, ...]:
     """A sentence for each verdict of which a user must be warned, where a number has it."""
-    found = {verdict: doubted(robot, verdict) for verdict in DOUBTED}
+    found = {verdict: paths_with_verdict(robot, verdict) for verdict in WARNED_VERDICTS}
     return tuple(f"{WARNINGS[v]}: {listed(paths)}." for v, paths in found.items() if paths)
 
 
@@ -64,7 +65,7 @@ def _sentences(robot: DeployedRobot) -> Iterator[str]:
     loads = listed([load.name for load in record.loads])
     yield f"Load set-up: {one_line(robot.load_setup)}, of those known: {loads}."
     yield f"Floors: {listed(robot.labels)}."
-    numbers = declared(record)
+    numbers = declared_numbers(record)
     counts = Counter(record.parameters[e.path].verdict for e in numbers)
     said = ", ".join(f"{n} {v.replace('_', ' ')}" for v, n in counts.most_common())
     yield f"Verdicts: {said}."

@@ -11,8 +11,11 @@ import numpy as np
 from slipid.export.text import one_line
 from slipid.parameter import Entry
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.record import Number, Pair, Provenance, Verdict
-from slipid.robot.robot_file import declared
+from slipid.robot.record import RecordedNumber
+from slipid.robot.record import Pair
+from slipid.robot.record import Provenance
+from slipid.robot.record import Verdict
+from slipid.robot.robot_file import declared_numbers
 
 VERDICTS: Mapping[Verdict, str] = {
     "identified": "the logs decide it; use it",
@@ -29,12 +32,12 @@ PROVENANCES: Mapping[Provenance, str] = {
     "borrowed": "what was assumed before decides: a default, a data sheet, a prior",
     "override": "it was held at a chosen value",
 }
-DOUBTED: tuple[Verdict, ...] = ("not_identified", "at_bound", "disputed")
+WARNED_VERDICTS: tuple[Verdict, ...] = ("not_identified", "at_bound", "disputed")
 """Verdicts of numbers of which a user must be warned."""
 
 
 @dataclass(frozen=True)
-class Row:
+class NumberRow:
     """One number of a robot.
 
     Attributes:
@@ -59,44 +62,44 @@ class Row:
         return f"{self.path}, {self.entry}" if self.entry else self.path
 
     @property
-    def said(self) -> str:
+    def verdict_text(self) -> str:
         """The verdict as people read it."""
-        return said(self.verdict)
+        return verdict_text(self.verdict)
 
 
-def said(verdict: Verdict) -> str:
+def verdict_text(verdict: Verdict) -> str:
     """A verdict as people read it, in capitals where they must be warned."""
     words = verdict.replace("_", " ")
-    return words.upper() if verdict in DOUBTED else words
+    return words.upper() if verdict in WARNED_VERDICTS else words
 
 
-def values_of(number: Number) -> tuple[float, ...]:
+def values_of(number: RecordedNumber) -> tuple[float, ...]:
     """Its values, one or as many as wheels."""
     return number.value if isinstance(number.value, tuple) else (number.value,)
 
 
-def rows_of(robot: DeployedRobot) -> tuple[Row, ...]:
+def number_rows(robot: DeployedRobot) -> tuple[NumberRow, ...]:
     """Every number of a robot, those per wheel one by one."""
     known = robot.record.parameters
-    numbers = declared(robot.record)
+    numbers = declared_numbers(robot.record)
     return tuple(row for e in numbers for row in _of_entry(e, known[e.path]))
 
 
-def doubted(robot: DeployedRobot, verdict: Verdict) -> tuple[str, ...]:
+def paths_with_verdict(robot: DeployedRobot, verdict: Verdict) -> tuple[str, ...]:
     """Paths of the numbers with a verdict."""
     known = robot.record.parameters
-    numbers = declared(robot.record)
+    numbers = declared_numbers(robot.record)
     return tuple(e.path for e in numbers if known[e.path].verdict == verdict)
 
 
-def _of_entry(e: Entry, number: Number) -> tuple[Row, ...]:
+def _of_entry(e: Entry, number: RecordedNumber) -> tuple[NumberRow, ...]:
     ends = np.reshape([] if number.interval90 is None else number.interval90, (-1, 2))
     d, rows = e.declaration, []
     for k, value in enumerate(values_of(number)):
         pair = (float(ends[k][0]), float(ends[k][1])) if len(ends) else None
         name = f"wheel {k + 1}" if isinstance(number.value, tuple) else ""
         about, sure = (d.symbol, d.doc, d.unit), (number.verdict, number.provenance)
-        rows.append(Row(e.path, name, *about, value, pair, *sure))
+        rows.append(NumberRow(e.path, name, *about, value, pair, *sure))
     return tuple(rows)
 
 
@@ -109,7 +112,7 @@ LIMITS: Mapping[str, tuple[str, str]] = {
 """Unit and meaning of every field of `slipid.robot.controller.Limits`."""
 
 
-def origin(robot: DeployedRobot) -> str:
+def gains_origin(robot: DeployedRobot) -> str:
     """Where the gains of a robot come from, and that limits were not identified, as sentences."""
     limits = "Limits are the defaults of slipid: put in those of your motors and supply."
     tuned = robot.record.gains

@@ -12,7 +12,7 @@ RING = 6
 
 
 @dataclass(frozen=True)
-class Habits:
+class ActuatorModel:
     """How wheels follow their commands and what sensors are like.
 
     Attributes:

@@ -26,10 +26,13 @@ from jaxtyping import Array, Float
 from slipid.model import contact
 from slipid.model.robot import GRAVITY
 from slipid.model.se2 import advance, compose
-from slipid.robot.actuation import RING, Habits
+from slipid.robot.actuation import RING
+from slipid.robot.actuation import ActuatorModel
 from slipid.robot.closed_loop import PERIOD
 from slipid.robot.deployed import RobotArrays
-from slipid.robot.filter.effects import Course, direction, stays
+from slipid.robot.filter.effects import RolledMotion
+from slipid.robot.filter.effects import travel_direction
+from slipid.robot.filter.effects import effect_correlation
 from slipid.robot.filter.floor import Floor
 from slipid.robot.interface import Measurement, Pose, Readings
 
@@ -72,7 +75,7 @@ class Twin(eqx.Module):
 
     robot: RobotArrays = eqx.field(converter=lambda robot: robot.arrays)
     floor: Floor
-    habits: Habits = eqx.field(static=True, default=Habits())
+    habits: ActuatorModel = eqx.field(static=True, default=ActuatorModel())
 
     def __check_init__(self) -> None:
         """Refuse a delay that the ring cannot hold."""
@@ -140,7 +143,7 @@ class Twin(eqx.Module):
         under = self.floor.under(pose, f.places)
         rim = f.frame.radius * w
         xi = contact.equilibrium(rim, f.frame, f.floors.at(under), f.rest)
-        course = Course.of(f.inverse @ rim, f.frame.base)
+        course = RolledMotion.of(f.inverse @ rim, f.frame.base)
         mean, part = f.told.at(course)
         missed, far, share = mean + part * f.effect * effect, course.speed * h, f.rest[:, None]
         off = far * jnp.sum(share * missed[under], axis=0)
@@ -153,8 +156,8 @@ class Twin(eqx.Module):
         far = (jnp.sqrt(xi[:2] @ xi[:2] + 1e-12) + f.frame.base * jnp.abs(xi[2])) * PERIOD
         under = self.floor.under(now.pose, f.places)
         left = jnp.all(under[:, None] != jnp.arange(len(f.labels)), axis=0)
-        way = direction(f.inverse @ (f.frame.radius * now.speed), f.frame.base)
-        toward, keep = stays(now.toward, way, left.astype(float), far)
+        way = travel_direction(f.inverse @ (f.frame.radius * now.speed), f.frame.base)
+        toward, keep = effect_correlation(now.toward, way, left.astype(float), far)
         fresh = jnp.sqrt(1 - keep**2 + 1e-15)[:, None] * noise.reshape(-1, 3)
         return keep[:, None] * now.effect + fresh, toward
 

@@ -11,18 +11,16 @@ from jax.extend.core import Primitive
 
 from slipid.export.c99.builder import Builder
 from slipid.export.c99.elementwise import Rule, Shaped, binary
-from slipid.export.c99.ir import (
-    Array,
-    At,
-    Cell,
-    NoFormError,
-    Number,
-    Value,
-    Variable,
-    cells_of,
-    longest,
-    varies,
-)
+from slipid.export.c99.ir import Array
+from slipid.export.c99.ir import At
+from slipid.export.c99.ir import Cell
+from slipid.export.c99.ir import NoFormError
+from slipid.export.c99.ir import Constant
+from slipid.export.c99.ir import Value
+from slipid.export.c99.ir import Variable
+from slipid.export.c99.ir import cells_of
+from slipid.export.c99.ir import longest
+from slipid.export.c99.ir import varies
 from slipid.export.c99.jaxpr import Params
 from slipid.export.c99.sources import along, contiguous, rearranged
 
@@ -145,7 +143,7 @@ def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     for at in np.ndindex(*shape):
         place = dict(zip(rest, at, strict=True))
         row = places[tuple(place[d] for d in batch if d != axis)]
-        starts: list[Cell] = [Number(0, "int")] * len(whole.shape)
+        starts: list[Cell] = [Constant(0, "int")] * len(whole.shape)
         for k, d in enumerate(numbers.start_index_map):
             starts[d] = row[k]
         base = _offset(builder, starts, whole, sizes, lanes)

@@ -14,18 +14,16 @@ import numpy as np
 
 from slipid.export.c99.builder import Builder
 from slipid.export.c99.elementwise import Rule, Shaped
-from slipid.export.c99.ir import (
-    Array,
-    At,
-    Cell,
-    Cells,
-    NoFormError,
-    Number,
-    Value,
-    cells_of,
-    kind_of_value,
-    varies,
-)
+from slipid.export.c99.ir import Array
+from slipid.export.c99.ir import At
+from slipid.export.c99.ir import Cell
+from slipid.export.c99.ir import Cells
+from slipid.export.c99.ir import NoFormError
+from slipid.export.c99.ir import Constant
+from slipid.export.c99.ir import Value
+from slipid.export.c99.ir import cells_of
+from slipid.export.c99.ir import kind_of_value
+from slipid.export.c99.ir import varies
 from slipid.export.c99.jaxpr import Params
 from slipid.export.c99.sources import along
 from slipid.export.fields import Kind, kind_of
@@ -182,15 +180,15 @@ def _dot_one(
     terms: list[str] = []
     cells: list[Cell] = []
     for a, b in zip(left, right, strict=True):
-        factors = [c for c in (a, b) if not (isinstance(c, Number) and c.value == 1)]
-        if any(isinstance(c, Number) and c.value == 0 for c in factors):
+        factors = [c for c in (a, b) if not (isinstance(c, Constant) and c.value == 1)]
+        if any(isinstance(c, Constant) and c.value == 0 for c in factors):
             continue
         if not factors:
-            factors = [Number(1.0, kind)]
+            factors = [Constant(1.0, kind)]
         terms.append(" * ".join(f"{{{len(cells) + k}}}" for k in range(len(factors))))
         cells.extend(factors)
     if not terms:
-        return Number(0.0, kind)
+        return Constant(0.0, kind)
     laned = lanes if any(varies(c) for c in cells) else 0
     if not summed:
         if terms == ["{0}"]:

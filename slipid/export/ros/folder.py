@@ -8,9 +8,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from slipid.export.header import header
 from slipid.export.ros import localization, node
 from slipid.export.ros import localization as noise
-from slipid.export.ros.drive import Drive, drive_of
-from slipid.export.ros.localization import DISTANCE_M, PERIOD_S, Errs, diagonal, errs_of, top_speed
-from slipid.export.ros.readme import Folder, readme
+from slipid.export.ros.drive import DriveController
+from slipid.export.ros.drive import drive_controller_of
+from slipid.export.ros.localization import DISTANCE_M
+from slipid.export.ros.localization import PERIOD_S
+from slipid.export.ros.localization import OdometryErrors
+from slipid.export.ros.localization import diagonal
+from slipid.export.ros.localization import odometry_errors
+from slipid.export.ros.localization import top_speed
+from slipid.export.ros.readme import ReadmeContent
+from slipid.export.ros.readme import readme
 from slipid.export.ros.yaml_text import Parameter, comment, declaration, nodes
 from slipid.export.text import identifiers, short
 from slipid.robot.deployed import DeployedRobot
@@ -38,7 +45,7 @@ def ros2_files(robot: DeployedRobot) -> dict[str, str]:
 
     There is no drive controller where none of ros2_controllers has the robot's kinematics.
     """
-    drive, errs = drive_of(robot), errs_of(robot)
+    drive, errs = drive_controller_of(robot), odometry_errors(robot)
     own = tuple(e.without_slip() for e in errs)
     worst, parameters = noise.worst(errs), node.node_parameters(robot)
     odometry = f"/{drive.controller.name}/{drive.controller.odometry}" if drive else "/odom"
@@ -63,11 +70,11 @@ def ros2_files(robot: DeployedRobot) -> dict[str, str]:
     uses = {name: use for name, use in USES.items() if name in bodies} | dict.fromkeys(
         floors, _FLOOR
     )
-    return {"README.md": readme(Folder(robot, drive, errs, worst, uses)), **files}
+    return {"README.md": readme(ReadmeContent(robot, drive, errs, worst, uses)), **files}
 
 
 def _of_floors(
-    robot: DeployedRobot, drive: Drive | None, errs: tuple[Errs, ...]
+    robot: DeployedRobot, drive: DriveController | None, errs: tuple[OdometryErrors, ...]
 ) -> Iterator[tuple[str, Sequence[str]]]:
     """A file per floor with what differs on it."""
     names = identifiers(robot.labels, "floor")
@@ -80,7 +87,7 @@ def _of_floors(
         yield f"floors/{name}.yaml", nodes(parts)
 
 
-def _covariances(robot: DeployedRobot, drive: Drive, e: Errs) -> tuple[Parameter, ...]:
+def _covariances(robot: DeployedRobot, drive: DriveController, e: OdometryErrors) -> tuple[Parameter, ...]:
     """The diagonals of a drive controller on a floor, with how they came about."""
     speed = top_speed(robot)
     own, slip = (", ".join(map(short, axes)) for axes in (e.effect, e.slip))

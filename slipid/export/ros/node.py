@@ -12,13 +12,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.export.ros.yaml_text import Check, Parameter
-from slipid.export.rows import LIMITS, origin, said
+from slipid.export.rows import LIMITS
+from slipid.export.rows import gains_origin
+from slipid.export.rows import verdict_text
 from slipid.export.text import identifiers, interval, listed
 from slipid.parameter import Declaration, Entry, entries
 from slipid.robot.controller import Gains, Limits
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.record import Number
-from slipid.robot.robot_file import declared
+from slipid.robot.record import RecordedNumber
+from slipid.robot.robot_file import declared_numbers
 
 NODE = "slipid"
 _ZERO = Check("gt_eq<>", (0.0,))
@@ -61,7 +63,7 @@ def _numbers(robot: DeployedRobot) -> Iterator[Parameter]:
             return f"{part}.{floors[e.surface]}.{last}"
         return quantity if e.load is None else f"{quantity}.{loads[e.load]}"
 
-    found = [(name(e), e) for e in declared(robot.record)]
+    found = [(name(e), e) for e in declared_numbers(robot.record)]
     order = {group: k for k, group in enumerate(dict.fromkeys(_group(n) for n, _ in found))}
     for called, e in sorted(found, key=lambda pair: order[_group(pair[0])]):
         number = robot.record.parameters[e.path]
@@ -72,7 +74,7 @@ def _group(name: str) -> str:
     return name.rpartition(".")[0]
 
 
-def _about(e: Entry, number: Number) -> str:
+def _about(e: Entry, number: RecordedNumber) -> str:
     d = e.declaration
     ends = number.interval90
     pairs = [] if ends is None else np.reshape(ends, (-1, 2)).tolist()

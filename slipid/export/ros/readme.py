@@ -6,15 +6,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from slipid.export.header import in_markdown
-from slipid.export.ros.drive import MOST, Drive, joint
-from slipid.export.ros.localization import DISTANCE_M, PERIOD_S, Errs, top_speed
-from slipid.export.rows import DOUBTED, PROVENANCES, VERDICTS, origin, rows_of
+from slipid.export.ros.drive import MOST
+from slipid.export.ros.drive import DriveController
+from slipid.export.ros.drive import joint
+from slipid.export.ros.localization import DISTANCE_M
+from slipid.export.ros.localization import PERIOD_S
+from slipid.export.ros.localization import OdometryErrors
+from slipid.export.ros.localization import top_speed
+from slipid.export.rows import WARNED_VERDICTS
+from slipid.export.rows import PROVENANCES
+from slipid.export.rows import VERDICTS
+from slipid.export.rows import gains_origin
+from slipid.export.rows import number_rows
 from slipid.export.text import identifiers, interval, short, table
 from slipid.robot.deployed import DeployedRobot
 
 
 @dataclass(frozen=True)
-class Folder:
+class ReadmeContent:
     """What the README is about.
 
     Attributes:
@@ -24,23 +33,23 @@ class Folder:
     """
 
     robot: DeployedRobot
-    drive: Drive | None
-    errs: tuple[Errs, ...]
-    worst: Errs
+    drive: DriveController | None
+    errs: tuple[OdometryErrors, ...]
+    worst: OdometryErrors
     files: Mapping[str, str]
 
 
-def readme(folder: Folder) -> str:
+def readme(folder: ReadmeContent) -> str:
     """The whole text."""
     parts = (_head, _files, _wheels, _odometry, _floors_and_loads, _numbers, _left_out)
     return "\n".join(line for part in parts for line in part(folder)) + "\n"
 
 
-def _head(folder: Folder) -> Iterator[str]:
+def _head(folder: ReadmeContent) -> Iterator[str]:
     yield from ("# A robot identified by slipid, for ROS 2", "", *in_markdown(folder.robot))
 
 
-def _files(folder: Folder) -> Iterator[str]:
+def _files(folder: ReadmeContent) -> Iterator[str]:
     yield from ("## Files", "")
     yield from table(("file", "use"), [(f"`{name}`", use) for name, use in folder.files.items()])
     yield ""
@@ -62,7 +71,7 @@ def _files(folder: Folder) -> Iterator[str]:
     yield ""
 
 
-def _wheels(folder: Folder) -> Iterator[str]:
+def _wheels(folder: ReadmeContent) -> Iterator[str]:
     """Order, places and directions."""
     robot, drive = folder.robot, folder.drive
     yield from ("## Wheels", "")
@@ -92,7 +101,7 @@ def _wheels(folder: Folder) -> Iterator[str]:
         yield ""
 
 
-def _odometry(folder: Folder) -> Iterator[str]:
+def _odometry(folder: ReadmeContent) -> Iterator[str]:
     """Stds on every floor."""
     yield from ("## Odometry", "")
     robot, speed = folder.robot, top_speed(folder.robot)
@@ -107,7 +116,7 @@ def _odometry(folder: Folder) -> Iterator[str]:
     yield "Standard deviations: x and y [m], heading [rad]; velocities [m/s], [rad/s]."
     yield from ("", *table(head, lines), "")
     yield _DRIFT.format(speed=short(speed), period=short(PERIOD_S), way=short(DISTANCE_M))
-    yield from ("", origin(robot), "")
+    yield from ("", gains_origin(robot), "")
 
 
 def _stds(variances: Sequence[float]) -> str:
@@ -115,7 +124,7 @@ def _stds(variances: Sequence[float]) -> str:
     return f"{x}, {yaw}"
 
 
-def _floors_and_loads(folder: Folder) -> Iterator[str]:
+def _floors_and_loads(folder: ReadmeContent) -> Iterator[str]:
     """Labels and the names that parameters have for them."""
     yield from ("## Floors and load set-ups", "")
     record = folder.robot.record
@@ -129,13 +138,13 @@ def _floors_and_loads(folder: Folder) -> Iterator[str]:
     yield from (*table(("", "in robot.json", "in parameters"), lines), "")
 
 
-def _numbers(folder: Folder) -> Iterator[str]:
+def _numbers(folder: ReadmeContent) -> Iterator[str]:
     """Every number, with its origin."""
     yield from ("## Numbers", "")
     yield "Where each comes from; `slipid.yaml` has them to the last digit."
     lines = []
-    for row in rows_of(folder.robot):
-        sure = f"**{row.said}**" if row.verdict in DOUBTED else row.said
+    for row in number_rows(folder.robot):
+        sure = f"**{row.said}**" if row.verdict in WARNED_VERDICTS else row.said
         known = (short(row.value), row.unit, interval(row.interval90), sure, row.provenance)
         lines.append((f"`{row.path}`", row.entry, row.about, *known))
     head = ("robot.json", "", "", "value", "unit", "90 % interval", "verdict", "provenance")
@@ -146,7 +155,7 @@ def _numbers(folder: Folder) -> Iterator[str]:
     yield ""
 
 
-def _left_out(folder: Folder) -> Iterator[str]:
+def _left_out(folder: ReadmeContent) -> Iterator[str]:
     yield from ("## What is left out", "", _ONLY)
 
 

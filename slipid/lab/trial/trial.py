@@ -11,15 +11,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.data.floor_map import FloorMap, read_map
-from slipid.deploy.controllers import pilot_of
-from slipid.deploy.deploy import habits_of, read_robot
+from slipid.deploy.controllers import control_loop_of
+from slipid.deploy.deploy import actuator_model_of
+from slipid.deploy.deploy import read_robot
 from slipid.deploy.floors import floor_of
-from slipid.deploy.twin_run import REST_S, known_to_fit, path_of, site, starts, twin
+from slipid.deploy.twin_run import REST_S
+from slipid.deploy.twin_run import require_known_surfaces
+from slipid.deploy.twin_run import path_of
+from slipid.deploy.twin_run import twin_floor
+from slipid.deploy.twin_run import starts
+from slipid.deploy.twin_run import twin_plant
 from slipid.lab.trial.controllers import ROWS, applying, check_gains, unused_gains
 from slipid.lab.trial.plants import SitePlant, known_to_site, one_of
 from slipid.lab.trial.summary import Run, not_told_apart, summaries
 from slipid.robot import closed_loop, trajectory
-from slipid.robot.actuation import Habits
+from slipid.robot.actuation import ActuatorModel
 from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import Settings
@@ -34,7 +40,7 @@ from slipid.support.progress import Reporter
 SCHEMA = "slipid.trial/1"
 FOLDER = "trial"
 """Finished runs, below OUT."""
-PLANTS = ("testsite", "twin")
+PLANTS = ("testsite", "twin_plant")
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +57,7 @@ class Job:
     told: FloorMap
     robot: DeployedRobot
     settings: Settings
-    habits: Habits
+    habits: ActuatorModel
     forced: bool
     kept: Checkpoint
 
@@ -61,7 +67,7 @@ class Wish:
     """What is asked of a trial.
 
     Attributes:
-        plant: `testsite` (MuJoCo) or `twin` (the identified model itself, another draw of its
+        plant: `testsite` (MuJoCo) or `twin_plant` (the identified model itself, another draw of its
             numbers for every start).
         map: file of a floor map; None for patches of the identified floors.
         told_map: file of the map that controllers with a map are told; None for the true one.
@@ -151,16 +157,16 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         raise DataError(f"no controller{said}; expected some of {', '.join(ROWS)}")
     robot = jax.tree.map(np.asarray, read_robot(out, wish.load))
     path = path_of(wish.path, wish.speed, robot)
-    floor = site(robot) if wish.map is None else read_map(wish.map)
+    floor = twin_floor(robot) if wish.map is None else read_map(wish.map)
     told = floor if wish.told_map is None else read_map(wish.told_map)
-    settings, habits = Settings.of(robot), habits_of(robot, gyro=False)
+    settings, habits = Settings.of(robot), actuator_model_of(robot, gyro=False)
     if wish.plant == "testsite":  # it has the sensors it has, whatever the logs had
         known_to_site(floor, robot.load_setup, robot.wheels)
-        settings, habits = replace(settings, current_is_signed=False), Habits()
+        settings, habits = replace(settings, current_is_signed=False), ActuatorModel()
     else:
-        known_to_fit(floor, robot, str(wish.map))
+        require_known_surfaces(floor, robot, str(wish.map))
     if wish.told_map is not None:
-        known_to_fit(told, robot, str(wish.told_map))
+        require_known_surfaces(told, robot, str(wish.told_map))
     if wish.tuned_gains:
         check_gains(out, robot)
     key = key_of(
@@ -206,20 +212,20 @@ def drive(job: Job) -> None:
     robot = jax.tree.map(jnp.asarray, job.robot)
     path = job.path.moved(job.start).waiting(REST_S)
     plant: closed_loop.Plant
-    if job.plant == "twin":
+    if job.plant == "twin_plant":
         truth = one_of(robot, job.seed)
-        plant = twin(truth, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro))
+        plant = twin_plant(truth, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro))
     else:
         plant = SitePlant(job.floor, robot.load_setup, job.start, job.seed, row.gyro)
     there = floor_of(job.told, robot.labels)
-    pilot = pilot_of(robot, row, job.settings, job.forced, there)
-    course = closed_loop.drive(pilot, path, plant, job.start)
+    pilot = control_loop_of(robot, row, job.settings, job.forced, there)
+    course = closed_loop.run_closed_loop(pilot, path, plant, job.start)
     off = course.pose[-1] - course.believed[-1]
     run = Run(
         controller=job.row,
         start=job.start,
         seed=job.seed,
-        metrics=closed_loop.metrics(course),
+        metrics=closed_loop.path_metrics(course),
         believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
     )
     # the path first: a run that has metrics is done

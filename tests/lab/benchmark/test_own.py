@@ -13,7 +13,8 @@ from slipid.lab.benchmark.own import Own, Place, estimated, replay, told
 from slipid.lab.benchmark.steps import cut
 from slipid.predict.slip_model import Machine, PredictedRun
 from slipid.robot.estimator import Estimator
-from slipid.robot.interface import MIXED, Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY
+from slipid.robot.interface import Settings
 from tests.helpers.small_twin import deployed
 
 
@@ -92,13 +93,13 @@ def test_an_estimator_has_the_floors_that_it_may_meet(made, driven):
 
 def test_only_a_robot_that_may_stand_on_several_floors_looks_for_them(made, driven):
     labels(Place(), made, driven)
-    assert driven[0][0].settings.alike != MIXED
+    assert driven[0][0].settings.alike != MIXED_FLOORS_PENALTY
     cuts = [
         replace(one, runs=tuple(replace(run, floor="unknown") for run in one.runs))
         for one in cut(made.runs, made.robot)
     ]
     estimated(own_of(made), cuts, made.runs, Place())
-    assert driven[1][0].settings.alike == MIXED
+    assert driven[1][0].settings.alike == MIXED_FLOORS_PENALTY
 
 
 def test_an_estimator_hears_currents_only_if_it_was_fitted_to_some(made, driven):
