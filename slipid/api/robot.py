@@ -9,19 +9,18 @@ from pathlib import Path
 
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import control_loop_of
-from slipid.deploy.deploy import NO_CONTROLLER
-from slipid.deploy.deploy import actuator_model_of
-from slipid.deploy.export import FORMS
-from slipid.deploy.export import Exported
-from slipid.deploy.export import ExportOptions
+from slipid.deploy.deploy import NO_CONTROLLER, actuator_model_of
+from slipid.deploy.export import FORMS, Exported, ExportOptions
 from slipid.deploy.export import export as run
 from slipid.deploy.floors import floor_of
-from slipid.deploy.twin_run import REST_S
-from slipid.deploy.twin_run import require_known_surfaces
-from slipid.deploy.twin_run import path_of
-from slipid.deploy.twin_run import twin_floor
-from slipid.deploy.twin_run import starts
-from slipid.deploy.twin_run import twin_plant
+from slipid.deploy.twin_run import (
+    REST_S,
+    path_of,
+    require_known_surfaces,
+    starts,
+    twin_floor,
+    twin_plant,
+)
 from slipid.lab.trial.controllers import ROWS
 from slipid.robot import closed_loop
 from slipid.robot.deployed import DeployedRobot

@@ -49,8 +49,7 @@ def export(
     The folder has a README, and the checksum of every file. With --check nothing is written, and
     exit code 2 says that a byte was changed.
     """
-    from slipid.deploy.export import ExportOptions
-    from slipid.deploy.export import robot_at
+    from slipid.deploy.export import ExportOptions, robot_at
     from slipid.deploy.export import export as run
     from slipid.export.folder import check_folder
     from slipid.lab.trial.controllers import ROWS

@@ -14,22 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.deploy.effects import effects_by_load
-from slipid.deploy.record_of import plain
-from slipid.deploy.record_of import robot_record
+from slipid.deploy.robot_record import effects_by_load, plain, robot_record
 from slipid.infer.posterior.diagnosis import Posterior
 from slipid.infer.result import Fit, draws
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.model.robot import Robot
 from slipid.parameter import entries
 from slipid.predict.predictive import Contact
-from slipid.robot.actuation import ActuatorModel
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import MIXED_FLOORS_PENALTY
-from slipid.robot.record import RecordedNumber
-from slipid.robot.record import LogSensors
-from slipid.robot.record import Source
+from slipid.robot.record import LogSensors, RecordedNumber, Source
 from slipid.robot.robot_file import typed
+from slipid.robot.twin import ActuatorModel
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
 from slipid.support.errors import DataError
@@ -175,7 +171,7 @@ def given_numbers(robot: Robot) -> Mapping[str, RecordedNumber]:
             interval90=None,
             verdict="fixed",
             provenance="override",
-            source="given_numbers",
+            source="given",
         )
         for e in entries(robot)
     }

@@ -12,32 +12,26 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.floor_map import FloorMap, read_map
-from slipid.deploy.controllers import CONTROLLERS
-from slipid.deploy.controllers import ControllerRow
-from slipid.deploy.controllers import control_loop_of
-from slipid.deploy.deploy import ROBOT
-from slipid.deploy.deploy import actuator_model_of
-from slipid.deploy.deploy import read_robot
-from slipid.deploy.deploy import require_steering
+from slipid.deploy.controllers import CONTROLLERS, ControllerRow, control_loop_of
+from slipid.deploy.deploy import ROBOT, actuator_model_of, read_robot, require_steering
 from slipid.deploy.floors import floor_of
-from slipid.deploy.twin_run import REST_S
-from slipid.deploy.twin_run import require_known_surfaces
-from slipid.deploy.twin_run import path_of
-from slipid.deploy.twin_run import twin_floor
-from slipid.deploy.twin_run import starts
-from slipid.deploy.twin_run import twin_plant
+from slipid.deploy.twin_run import (
+    REST_S,
+    path_of,
+    require_known_surfaces,
+    starts,
+    twin_floor,
+    twin_plant,
+)
 from slipid.export.c99.folder import Recording, c_files
 from slipid.export.c99.lower import UnsupportedError
+from slipid.export.description import readme, warnings
 from slipid.export.folder import check_folder, check_writable, write_folder
-from slipid.export.header import readme, warnings
 from slipid.export.ros.folder import ros2_files
 from slipid.export.stablehlo import load_program, stablehlo_files
 from slipid.export.table import table_files
 from slipid.robot import trajectory
-from slipid.robot.closed_loop import PERIOD
-from slipid.robot.closed_loop import ControlLoop
-from slipid.robot.closed_loop import Plant
-from slipid.robot.closed_loop import run_closed_loop
+from slipid.robot.closed_loop import PERIOD, ControlLoop, Plant, run_closed_loop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import Measurement, Readings
 from slipid.robot.robot_file import robot_bytes
@@ -110,7 +104,11 @@ def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedR
     """
     is_file = source.suffix == ".json"
     path = source if is_file else source / ROBOT
-    robot = require_steering(path, DeployedRobot.load(path, load)) if is_file else read_robot(source, load)
+    robot = (
+        require_steering(path, DeployedRobot.load(path, load))
+        if is_file
+        else read_robot(source, load)
+    )
     try:
         return robot.on(*floors) if floors else robot
     except ValueError as error:
@@ -177,7 +175,9 @@ def _form(
         return stablehlo_files(pilot)
     if form == "c":
         try:
-            text = c_files(robot, pilot, path, record_example(robot, pilot, path, wish, place, gyro))
+            text = c_files(
+                robot, pilot, path, record_example(robot, pilot, path, wish, place, gyro)
+            )
         except UnsupportedError as error:
             raise DataError(f"controller {wish.controller}: {error}") from error
     else:

@@ -7,10 +7,9 @@ import numpy as np
 from slipid.data.floor_map import FloorMap, patchwork
 from slipid.deploy.floors import floor_of
 from slipid.robot import trajectory
-from slipid.robot.actuation import ActuatorModel
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.trajectory import Path
-from slipid.robot.twin import Twin, TwinPlant
+from slipid.robot.twin import ActuatorModel, Twin, TwinPlant
 from slipid.support.errors import DataError
 
 SITE_SEED, STARTS_SEED = 7, 2021

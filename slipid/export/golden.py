@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from slipid.robot.closed_loop import PERIOD
-from slipid.robot.closed_loop import ControlLoop
+from slipid.robot.closed_loop import PERIOD, ControlLoop
 from slipid.robot.interface import Readings
 
 STEPS = 48

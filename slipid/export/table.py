@@ -11,13 +11,16 @@ from dataclasses import asdict, dataclass
 
 from jaxtyping import Array, Float
 
-from slipid.export.header import header, in_markdown
-from slipid.export.rows import WARNED_VERDICTS
-from slipid.export.rows import LIMITS
-from slipid.export.rows import VERDICTS
-from slipid.export.rows import gains_origin
-from slipid.export.rows import number_rows
-from slipid.export.rows import verdict_text
+from slipid.export.description import (
+    LIMITS,
+    VERDICTS,
+    WARNED_VERDICTS,
+    gains_origin,
+    header,
+    in_markdown,
+    number_rows,
+    verdict_text,
+)
 from slipid.export.text import interval, one_line, short, table
 from slipid.parameter import entries
 from slipid.robot.controller import Gains, Limits

@@ -10,13 +10,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.robot.controller import Controller, ControllerState
-from slipid.robot.interface import AbstractEstimator
-from slipid.robot.interface import StateEstimate
-from slipid.robot.interface import Measurement
-from slipid.robot.interface import Numbers
-from slipid.robot.interface import Pose
-from slipid.robot.interface import Readings
-from slipid.robot.interface import State
+from slipid.robot.interface import (
+    AbstractEstimator,
+    Measurement,
+    Numbers,
+    Pose,
+    Readings,
+    State,
+    StateEstimate,
+)
 from slipid.robot.trajectory import Path
 
 PERIOD = 0.05
@@ -71,7 +73,9 @@ class ControlLoop(eqx.Module, Generic[State]):
         here = jnp.where(jnp.isfinite(estimate.pose), estimate.pose, 1e3)
         time, reference = path.follow(state.time, here, dt, self.controller.gains.preview)
         held, command = self.controller.step(state.held, reference, estimate, dt)
-        return ControlLoopState(seen, held, time), ControlLoopOutput(command, estimate, time, held.given_up)
+        return ControlLoopState(seen, held, time), ControlLoopOutput(
+            command, estimate, time, held.given_up
+        )
 
 
 @runtime_checkable
@@ -122,7 +126,9 @@ _step = eqx.filter_jit(ControlLoop.step)
 """The step with its numbers as arguments: compiled once for all pilots and starts alike."""
 
 
-def run_closed_loop(pilot: ControlLoop[State], path: Path, plant: Plant, start: Pose) -> ClosedLoopRun:
+def run_closed_loop(
+    pilot: ControlLoop[State], path: Path, plant: Plant, start: Pose
+) -> ClosedLoopRun:
     """Run a pilot on a plant at rest until its path is over.
 
     It also ends when the pilot gives up. The path is as it lies for the start, where the pilot

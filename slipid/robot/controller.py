@@ -24,13 +24,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.parameter import parameter
-from slipid.robot.deployed import RobotArrays
-from slipid.robot.deployed import with_record
-from slipid.robot.interface import UNTIMED_S
-from slipid.robot.interface import StateEstimate
-from slipid.robot.interface import Numbers
-from slipid.robot.interface import Scalar
-from slipid.robot.interface import as_arrays
+from slipid.robot.deployed import RobotArrays, with_record
+from slipid.robot.interface import UNTIMED_S, Numbers, Scalar, StateEstimate, as_arrays
 
 Correction = Literal["none", "torque", "paper_print", "paper_code"]
 Law = Callable[[Float[Array, "6"], Float[Array, "3"]], Float[Array, "3"]]

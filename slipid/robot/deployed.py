@@ -16,11 +16,7 @@ from slipid.model.geometry import Frame, Geometry, at_drives, at_wheels
 from slipid.model.motor import Motor
 from slipid.robot.filter.effects import EffectTable
 from slipid.robot.record import LoadRecord, Numbers, RobotRecord
-from slipid.robot.robot_file import REWRITE_HINT
-from slipid.robot.robot_file import check_record
-from slipid.robot.robot_file import read_robot
-from slipid.robot.robot_file import geometry_of
-from slipid.robot.robot_file import write_robot
+from slipid.robot.robot_file import check_record, geometry_of, read_robot, write_robot
 from slipid.robot.unseen import with_unseen
 from slipid.support.errors import DataError
 

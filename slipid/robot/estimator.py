@@ -15,22 +15,19 @@ from jaxtyping import Array, Bool, Float
 from slipid.model.se2 import advance, compose
 from slipid.robot.deployed import RobotArrays
 from slipid.robot.filter.floor import Floor
-from slipid.robot.filter.floor_filter import FloorFilter
-from slipid.robot.filter.floor_filter import FloorState
-from slipid.robot.filter.floor_filter import TimeStep
-from slipid.robot.filter.floor_filter import length
+from slipid.robot.filter.floor_filter import FloorFilter, FloorState, TimeStep, length
 from slipid.robot.filter.hypotheses import hypotheses_of
-from slipid.robot.filter.pose_filter import PoseFilter
-from slipid.robot.filter.pose_filter import axes_rotation
-from slipid.robot.filter.pose_fix import PoseState
-from slipid.robot.filter.pose_fix import apply_map
+from slipid.robot.filter.pose_filter import PoseFilter, axes_rotation
+from slipid.robot.filter.pose_fix import PoseState, apply_map
 from slipid.robot.filter.wheels import WheelState, read_currents, read_wheels, time_step
-from slipid.robot.interface import AbstractEstimator
-from slipid.robot.interface import StateEstimate
-from slipid.robot.interface import Pose
-from slipid.robot.interface import Readings
-from slipid.robot.interface import Settings
-from slipid.robot.interface import as_arrays
+from slipid.robot.interface import (
+    AbstractEstimator,
+    Pose,
+    Readings,
+    Settings,
+    StateEstimate,
+    as_arrays,
+)
 
 CURRENT_FROM = 0.4
 """Current from which the 2021 paper's deployed estimator counts slip [A]."""

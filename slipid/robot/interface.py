@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from slipid.robot.deployed import RobotArrays
-from slipid.robot.deployed import with_record
+from slipid.robot.deployed import RobotArrays, with_record
 
 Numbers = Array | np.ndarray
 Pose = Float[Numbers, "3"] | tuple[float, float, float]
@@ -202,7 +201,9 @@ class AbstractEstimator(eqx.Module, Generic[State]):
         """State of a robot at rest at a pose [m, m, rad]."""
 
     @abstractmethod
-    def advance(self, state: State, z: Readings, dt: Float[Array, ""]) -> tuple[State, StateEstimate]:
+    def advance(
+        self, state: State, z: Readings, dt: Float[Array, ""]
+    ) -> tuple[State, StateEstimate]:
         """As `step`, from readings."""
 
     def step(

@@ -23,10 +23,7 @@ import numpy as np
 from slipid.model.geometry import Geometry
 from slipid.model.robot import build
 from slipid.parameter import Declaration, Entry, entries
-from slipid.robot.record import UNITS
-from slipid.robot.record import Numbers
-from slipid.robot.record import RobotRecord
-from slipid.robot.record import EffectRecord
+from slipid.robot.record import UNITS, EffectRecord, Numbers, RobotRecord
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_bytes
 

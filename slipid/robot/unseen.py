@@ -14,12 +14,7 @@ from itertools import product
 
 import numpy as np
 
-from slipid.robot.record import Axes
-from slipid.robot.record import FloorRecord
-from slipid.robot.record import LoadRecord
-from slipid.robot.record import RecordedNumber
-from slipid.robot.record import Numbers
-from slipid.robot.record import RobotRecord
+from slipid.robot.record import Axes, FloorRecord, LoadRecord, Numbers, RecordedNumber, RobotRecord
 
 SOFTNESS = (-2.0, -1.0, 0.0, 1.0, 2.0)
 """Log of the creep over that of the middle floor; its declared spread over floors is 1.5."""

@@ -129,14 +129,10 @@ def driven(robot, row, path, steps=STEPS):
     from slipid.deploy.controllers import control_loop_of
     from slipid.deploy.deploy import actuator_model_of
     from slipid.deploy.floors import floor_of
-    from slipid.deploy.twin_run import twin_floor
-    from slipid.deploy.twin_run import starts
+    from slipid.deploy.twin_run import starts, twin_floor
     from slipid.lab.trial.controllers import ROWS as TRIAL
     from slipid.lab.trial.plants import one_of
-    from slipid.robot.closed_loop import PERIOD
-    from slipid.robot.closed_loop import ClosedLoopRun
-    from slipid.robot.closed_loop import ControlLoop
-    from slipid.robot.closed_loop import path_metrics
+    from slipid.robot.closed_loop import PERIOD, ClosedLoopRun, ControlLoop, path_metrics
     from slipid.robot.filter.floor import Floor
     from slipid.robot.interface import Settings
     from tests.helpers.rolled_out import rollout

@@ -35,8 +35,7 @@ from slipid.predict.folds import facts_of, sectors
 from slipid.predict.predictive import Contact, contact_of
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
-from slipid.robot.interface import MIXED_FLOORS_PENALTY
-from slipid.robot.interface import Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK
 from tests.helpers import replayed

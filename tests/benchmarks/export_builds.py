@@ -24,17 +24,14 @@ import numpy as np
 import pytest
 
 from slipid.deploy.controllers import control_loop_of
-from slipid.deploy.deploy import actuator_model_of
-from slipid.deploy.deploy import read_robot
+from slipid.deploy.deploy import actuator_model_of, read_robot
 from slipid.deploy.floors import floor_of
-from slipid.deploy.twin_run import twin_floor
-from slipid.deploy.twin_run import starts
+from slipid.deploy.twin_run import starts, twin_floor
 from slipid.export.c99.code import Code
 from slipid.lab.trial.controllers import ROWS
 from slipid.model.geometry import omni
 from slipid.robot import trajectory
-from slipid.robot.closed_loop import PERIOD
-from slipid.robot.closed_loop import ControlLoop
+from slipid.robot.closed_loop import PERIOD, ControlLoop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.twin import Twin
 from tests.benchmarks.quick import quick
@@ -132,7 +129,9 @@ class Plants:
 
     def __init__(self, robot: DeployedRobot, path: trajectory.Path, count: int):
         ground = twin_floor(robot)
-        self.twin = Twin(robot, floor_of(ground, robot.labels), actuator_model_of(robot, gyro=False))
+        self.twin = Twin(
+            robot, floor_of(ground, robot.labels), actuator_model_of(robot, gyro=False)
+        )
         self.starts = jnp.asarray(starts(count, ground, path))
         self.keys = jax.vmap(jax.random.key)(jnp.arange(count))
         noise = self.twin.noise

@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 
 from slipid.deploy.deploy import DRAWS, deploy, read_robot, write_robot
-from slipid.deploy.effects import DIRECTIONS
+from slipid.deploy.robot_record import DIRECTIONS
 from slipid.fit.shared import Directions, Pace
 from slipid.infer.fit_file import load
 from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.interface import MIXED_FLOORS_PENALTY
-from slipid.robot.interface import Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.support.errors import DataError
 from slipid.support.files import write_json
 from tests.helpers.shared import DRIVES, invoke

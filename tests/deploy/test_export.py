@@ -13,13 +13,8 @@ import numpy as np
 import pytest
 
 from slipid.deploy.controllers import control_loop_of
-from slipid.deploy.export import FORMS
-from slipid.deploy.export import ExportOptions
-from slipid.deploy.export import export
-from slipid.deploy.export import robot_at
-from slipid.deploy.twin_run import REST_S
-from slipid.deploy.twin_run import twin_floor
-from slipid.deploy.twin_run import starts
+from slipid.deploy.export import FORMS, ExportOptions, export, robot_at
+from slipid.deploy.twin_run import REST_S, starts, twin_floor
 from slipid.export.c99.folder import c_files
 from slipid.export.folder import check_folder
 from slipid.lab.trial.controllers import ROWS
@@ -180,7 +175,10 @@ def test_a_robot_is_found_in_a_folder_or_a_file_with_some_of_its_floors(tmp_path
         (ExportOptions(("c", "ros")), "no form 'ros', did you mean ros2"),
         (ExportOptions(()), "no form"),
         (ExportOptions(controller="contacts"), "no controller 'contacts', did you mean contact"),
-        (ExportOptions(controller="contact_map"), "told the map of its floors; name one with --map"),
+        (
+            ExportOptions(controller="contact_map"),
+            "told the map of its floors; name one with --map",
+        ),
         (ExportOptions(map=Path("site.toml")), "told no map; leave out --map"),
         (ExportOptions(path="square"), "no path 'square'"),
         (ExportOptions(speed=9.0), "speed 9 m/s"),

@@ -127,11 +127,8 @@ def test_a_docstring_says_what_each_attribute_is():
 
 @pytest.mark.slow
 def test_the_loop_closes_in_c_as_it_does_in_the_library(tmp_path):
-    from slipid.deploy.export import ExampleStart
-    from slipid.deploy.export import ExportOptions
-    from slipid.deploy.export import record_example
-    from slipid.deploy.twin_run import twin_floor
-    from slipid.deploy.twin_run import starts
+    from slipid.deploy.export import ExampleStart, ExportOptions, record_example
+    from slipid.deploy.twin_run import starts, twin_floor
 
     made = code("contact")
     path = rectangle(length=0.4, width=0.2)

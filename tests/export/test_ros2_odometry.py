@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from slipid.export.ros.folder import ros2_files
-from slipid.export.ros.localization import DISTANCE_M
-from slipid.export.ros.localization import PERIOD_S
-from slipid.export.ros.localization import OdometryErrors
-from slipid.export.ros.localization import odometry_errors
-from slipid.export.ros.localization import top_speed
+from slipid.export.ros.localization import (
+    DISTANCE_M,
+    PERIOD_S,
+    OdometryErrors,
+    odometry_errors,
+    top_speed,
+)
 from slipid.export.text import identifiers
 from slipid.model import contact
 from slipid.model.geometry import general, mecanum, omni
@@ -149,7 +151,9 @@ def test_a_robot_that_no_controller_fits_gets_none(shape):
     "errs",
     [
         OdometryErrors("goes off ahead", (0.05, 0.02, 0.01), (0.03, 0.02, 0.03), (0.04, 0.0, 0.0)),
-        OdometryErrors("turns all the way", (0.01, 0.02, 0.01), (0.01, 0.03, 0.1), (0.01, 0.02, 0.1)),
+        OdometryErrors(
+            "turns all the way", (0.01, 0.02, 0.01), (0.01, 0.03, 0.1), (0.01, 0.02, 0.1)
+        ),
         OdometryErrors("turns anew", (0.01, 0.02, 0.2), (0.01, 0.02, 0.01), (0.0, 0.0, 0.0)),
     ],
     ids=lambda errs: errs.floor,

@@ -31,8 +31,7 @@ from slipid.fit.variances import _cut, whitened
 from slipid.infer.fit_file import load
 from slipid.lab.selftest.logs import Sensors, grid, make_logs, truth
 from slipid.model import se2
-from slipid.robot.interface import MIXED_FLOORS_PENALTY
-from slipid.robot.interface import Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.search_space import Choice
 from slipid.support.errors import DataError
 from tests.app.test_config import GOOD, written

@@ -7,14 +7,10 @@ from collections.abc import Mapping
 import jax
 
 from slipid.deploy.deploy import given_numbers
-from slipid.deploy.record_of import robot_record
+from slipid.deploy.robot_record import robot_record
 from slipid.model.robot import Robot
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.record import GainRecord
-from slipid.robot.record import GainsRecord
-from slipid.robot.record import GainValues
-from slipid.robot.record import Losses
-from slipid.robot.record import EffectRecord
+from slipid.robot.record import EffectRecord, GainRecord, GainsRecord, GainValues, Losses
 
 GAINS = GainsRecord(
     values=GainValues(*(GainRecord(0.1 * k, "1", 0.01) for k in range(6))),

@@ -21,9 +21,7 @@ from slipid.data.log import Log
 from slipid.data.runs import Runs, first_row
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
-from slipid.robot.interface import AbstractEstimator
-from slipid.robot.interface import StateEstimate
-from slipid.robot.interface import Readings
+from slipid.robot.interface import AbstractEstimator, Readings, StateEstimate
 
 TOGETHER = 32
 """Runs replayed in one call."""

@@ -6,10 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.robot.closed_loop import PERIOD
-from slipid.robot.closed_loop import ControlLoop
-from slipid.robot.closed_loop import ControlLoopOutput
-from slipid.robot.closed_loop import ControlLoopState
+from slipid.robot.closed_loop import PERIOD, ControlLoop, ControlLoopOutput, ControlLoopState
 from slipid.robot.interface import Pose, Readings, State
 from slipid.robot.trajectory import Path
 from slipid.robot.twin import Twin, TwinState
@@ -35,7 +32,9 @@ def rollout(
 
     def step(
         carry: tuple[TwinState, ControlLoopState[State], Readings], drawn: Array
-    ) -> tuple[tuple[TwinState, ControlLoopState[State], Readings], tuple[Array, ControlLoopOutput]]:
+    ) -> tuple[
+        tuple[TwinState, ControlLoopState[State], Readings], tuple[Array, ControlLoopOutput]
+    ]:
         before, held, reading = carry
         held, out = pilot.step(path, held, reading, PERIOD)
         state, reading = twin.step(before, out.command, drawn)

@@ -10,8 +10,7 @@ import pytest
 
 from slipid.model.geometry import omni
 from slipid.model.robot import build
-from slipid.robot.closed_loop import ControlLoop
-from slipid.robot.closed_loop import run_closed_loop
+from slipid.robot.closed_loop import ControlLoop, run_closed_loop
 from slipid.robot.controller import Controller, Gains, Limits
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, Odometry

@@ -14,22 +14,14 @@ from scipy.stats import chi2
 
 from slipid.model import contact
 from slipid.model.se2 import advance, compose
-from slipid.robot.actuation import ActuatorModel
 from slipid.robot.estimator import Estimator
-from slipid.robot.filter.effects import SETTLES
-from slipid.robot.filter.effects import TURN
-from slipid.robot.filter.effects import effect_correlation
+from slipid.robot.filter.effects import SETTLES, TURN, effect_correlation
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import FloorFilter
-from slipid.robot.filter.pose_filter import PoseFilter
-from slipid.robot.filter.pose_filter import _scalar_update
-from slipid.robot.filter.pose_fix import _given
-from slipid.robot.filter.pose_fix import apply_fix
-from slipid.robot.interface import MIXED_FLOORS_PENALTY
-from slipid.robot.interface import Measurement
-from slipid.robot.interface import Readings
-from slipid.robot.interface import Settings
-from slipid.robot.twin import Twin
+from slipid.robot.filter.pose_filter import PoseFilter, _scalar_update
+from slipid.robot.filter.pose_fix import _given, apply_fix
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Measurement, Readings, Settings
+from slipid.robot.twin import ActuatorModel, Twin
 from tests.helpers.kept import kept
 from tests.helpers.small_twin import deployed, floor
 from tests.helpers.stepped import stepped
@@ -255,7 +247,9 @@ def test_a_reading_moves_what_learns_and_leaves_the_rest_with_the_right_covarian
     cov, look = mix @ mix.T / count, rng.normal(size=count)
     noise, learns = 0.3, np.isin(np.arange(count), [2, count - 1]).astype(float)
     state, var = replace(state, covariance=jnp.asarray(cov)), look @ cov @ look + noise
-    now = _scalar_update(state, jnp.asarray(look), jnp.asarray(0.7), jnp.asarray(var), jnp.asarray(learns))
+    now = _scalar_update(
+        state, jnp.asarray(look), jnp.asarray(0.7), jnp.asarray(var), jnp.asarray(learns)
+    )
     change = np.concatenate([now.pose - state.pose, now.nuisance - state.nuisance])
     np.testing.assert_array_equal(change[learns == 0], 0.0)
     assert np.abs(change[learns == 1]).min() > 0

@@ -11,9 +11,7 @@ import pytest
 
 from slipid.fit import shared
 from slipid.robot.estimator import Estimator
-from slipid.robot.filter.effects import FORGETS
-from slipid.robot.filter.effects import RolledMotion
-from slipid.robot.filter.effects import EffectTable
+from slipid.robot.filter.effects import FORGETS, EffectTable, RolledMotion
 from slipid.robot.interface import Measurement, Settings
 from tests.helpers.small_twin import deployed
 from tests.helpers.stepped import stepped

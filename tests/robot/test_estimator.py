@@ -18,11 +18,7 @@ from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.robot import closed_loop
 from slipid.robot.closed_loop import ControlLoop
-from slipid.robot.controller import LONGEST_I
-from slipid.robot.controller import Controller
-from slipid.robot.controller import Gains
-from slipid.robot.controller import Limits
-from slipid.robot.controller import limit_command
+from slipid.robot.controller import LONGEST_I, Controller, Gains, Limits, limit_command
 from slipid.robot.estimator import Estimator, Odometry
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import FloorFilter
@@ -254,7 +250,9 @@ def test_saturation_keeps_the_direction():
 def test_a_command_needs_no_more_than_the_supply_has_left(amps):
     f, limits = robot(), Limits(voltage=6.0, acceleration=1e4)
     wanted, motor = np.array([10.0, -9.0, 2.0]), f.motor
-    got = np.asarray(limit_command(jnp.asarray(wanted), jnp.zeros(3), jnp.asarray(amps), f, limits, DT))
+    got = np.asarray(
+        limit_command(jnp.asarray(wanted), jnp.zeros(3), jnp.asarray(amps), f, limits, DT)
+    )
     np.testing.assert_allclose(got / wanted, got[0] / wanted[0], rtol=1e-12)
     needs = np.abs(got) * float(motor.gear_ratio * motor.back_emf)
     left = 6.0 - float(motor.resistance) * np.abs(amps)

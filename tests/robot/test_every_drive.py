@@ -10,7 +10,7 @@ import pytest
 
 from slipid.api.robot import drive
 from slipid.deploy.deploy import require_steering
-from slipid.deploy.record_of import moved_per_metre, spread_of
+from slipid.deploy.robot_record import moved_per_metre, spread_of
 from slipid.lab.selftest.logs import Sensors, make_logs
 from slipid.model.robot import build
 from slipid.robot.deployed import DeployedRobot

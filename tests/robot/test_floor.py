@@ -11,22 +11,17 @@ import numpy as np
 import pytest
 
 from slipid.robot import trajectory
-from slipid.robot.actuation import ActuatorModel
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.controller import Controller, Gains
 from slipid.robot.estimator import Estimator
 from slipid.robot.filter.floor import LEAK, SPREAD
-from slipid.robot.filter.floor_filter import FloorFilter
-from slipid.robot.filter.floor_filter import TimeStep
-from slipid.robot.filter.floor_filter import _followed
+from slipid.robot.filter.floor_filter import FloorFilter, TimeStep, _followed
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.filter.pose_filter import PoseFilter
 from slipid.robot.filter.pose_fix import apply_map
 from slipid.robot.filter.wheels import MotorCurrents
-from slipid.robot.interface import MIXED_FLOORS_PENALTY
-from slipid.robot.interface import Measurement
-from slipid.robot.interface import Settings
-from slipid.robot.twin import Twin
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Measurement, Settings
+from slipid.robot.twin import ActuatorModel, Twin
 from tests.helpers.rolled_out import rollout
 from tests.helpers.small_twin import deployed, floor
 

@@ -12,8 +12,7 @@ from slipid.model.robot import build, motor_current, twist
 from slipid.robot.estimator import Estimator
 from slipid.robot.filter.floor_filter import FloorFilter
 from slipid.robot.filter.hypotheses import hypotheses_of
-from slipid.robot.filter.wheels import MotorCurrents
-from slipid.robot.filter.wheels import read_currents
+from slipid.robot.filter.wheels import MotorCurrents, read_currents
 from slipid.robot.interface import Measurement, Settings
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.small_twin import deployed

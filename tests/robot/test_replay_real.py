@@ -21,12 +21,11 @@ from slipid.lab.trial.controllers import ROWS
 from slipid.model.geometry import omni
 from slipid.model.robot import Robot, build
 from slipid.robot import trajectory as reference
-from slipid.robot.actuation import ActuatorModel
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
 from slipid.robot.filter.floor import Floor
 from slipid.robot.interface import Settings
-from slipid.robot.twin import Twin
+from slipid.robot.twin import ActuatorModel, Twin
 from slipid.search_space import Choice, Space
 from tests.helpers import replayed
 from tests.helpers.known_robot import deploy_known

@@ -18,15 +18,13 @@ import numpy as np
 import pytest
 
 from slipid.deploy.deploy import given_numbers
-from slipid.deploy.record_of import robot_record
+from slipid.deploy.robot_record import robot_record
 from slipid.model.geometry import omni
 from slipid.model.robot import Validity, build
 from slipid.parameter import entries
 from slipid.robot.controller import Gains
-from slipid.robot.deployed import DeployedRobot
-from slipid.robot.deployed import posterior_robots
-from slipid.robot.record import GainValues
-from slipid.robot.record import EffectRecord
+from slipid.robot.deployed import DeployedRobot, posterior_robots
+from slipid.robot.record import EffectRecord, GainValues
 from slipid.support.errors import DataError
 from slipid.support.files import checksum
 from tests.helpers.known_robot import GAINS, USED, deploy_known

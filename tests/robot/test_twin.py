@@ -6,15 +6,11 @@ import numpy as np
 import pytest
 
 from slipid.model import contact
-from slipid.robot.actuation import RING
-from slipid.robot.actuation import ActuatorModel
-from slipid.robot.closed_loop import ControlLoop
-from slipid.robot.closed_loop import Plant
-from slipid.robot.closed_loop import run_closed_loop
+from slipid.robot.closed_loop import ControlLoop, Plant, run_closed_loop
 from slipid.robot.controller import Controller, Gains
 from slipid.robot.estimator import Odometry
 from slipid.robot.trajectory import waypoints
-from slipid.robot.twin import Twin, TwinPlant
+from slipid.robot.twin import RING, ActuatorModel, Twin, TwinPlant
 from tests.helpers.rolled_out import rollout
 from tests.helpers.small_twin import deployed, floor, stacked
 

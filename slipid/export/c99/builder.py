@@ -9,14 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slipid.export.c99.ir import Array
-from slipid.export.c99.ir import At
-from slipid.export.c99.ir import CodeBlock
-from slipid.export.c99.ir import Cell
-from slipid.export.c99.ir import Memory
-from slipid.export.c99.ir import Nested
-from slipid.export.c99.ir import Statement
-from slipid.export.c99.ir import Variable
+from slipid.export.c99.ir import Array, At, Cell, CodeBlock, Memory, Nested, Statement, Variable
 from slipid.export.fields import DTYPES, Kind
 
 CALLS = ("r_atan2", "r_cos", "r_exp", "r_log", "r_pow", "r_rem", "r_sin", "r_floor")
@@ -104,7 +97,9 @@ class Builder:
             Statement(None, template, (cell,), memory, times, source=self.source)
         )
 
-    def append(self, lanes: int = 0, nested: Nested | None = None, calls: bool = False) -> CodeBlock:
+    def append(
+        self, lanes: int = 0, nested: Nested | None = None, calls: bool = False
+    ) -> CodeBlock:
         """A new block behind all others."""
         return self.put(CodeBlock(self, 0, lanes, calls, nested=nested))
 

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from slipid.export.c99.builder import Names
 from slipid.export.c99.function import Argument, Function, function, traced
 from slipid.export.c99.text import TYPES, WIDTH, folded, table
+from slipid.export.description import header
 from slipid.export.fields import Struct
-from slipid.export.header import header
 from slipid.export.text import identifiers, listed, wrapped
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.deployed import DeployedRobot
@@ -36,7 +36,9 @@ class Code:
         functions: all that are generated.
     """
 
-    def __init__(self, robot: DeployedRobot, pilot: ControlLoop[eqx.Module], path: Path | None = None):
+    def __init__(
+        self, robot: DeployedRobot, pilot: ControlLoop[eqx.Module], path: Path | None = None
+    ):
         """Trace and lower all functions.
 
         Raises:

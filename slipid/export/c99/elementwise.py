@@ -9,16 +9,18 @@ from math import prod
 import jax
 
 from slipid.export.c99.builder import Builder
-from slipid.export.c99.ir import Array
-from slipid.export.c99.ir import Cell
-from slipid.export.c99.ir import NoFormError
-from slipid.export.c99.ir import Constant
-from slipid.export.c99.ir import Value
-from slipid.export.c99.ir import Variable
-from slipid.export.c99.ir import cells_of
-from slipid.export.c99.ir import kind_of_value
-from slipid.export.c99.ir import longest
-from slipid.export.c99.ir import varies
+from slipid.export.c99.ir import (
+    Array,
+    Cell,
+    Constant,
+    NoFormError,
+    Value,
+    Variable,
+    cells_of,
+    kind_of_value,
+    longest,
+    varies,
+)
 from slipid.export.c99.jaxpr import Params
 from slipid.export.c99.sources import UNROLLED, along
 from slipid.export.fields import Kind, kind_of

@@ -11,8 +11,7 @@ from slipid.export.c99.builder import Builder, Names
 from slipid.export.c99.ir import Array, Memory, Value, in_memory
 from slipid.export.c99.jaxpr import Traced
 from slipid.export.c99.lower import apart, lowered, store
-from slipid.export.c99.text import FunctionBody
-from slipid.export.c99.text import folded
+from slipid.export.c99.text import FunctionBody, folded
 from slipid.export.fields import Field, Struct
 
 

@@ -14,20 +14,22 @@ from jax.extend.core import Literal as JaxLiteral
 from slipid.export.c99 import elementwise, moves, sums
 from slipid.export.c99.builder import Builder
 from slipid.export.c99.elementwise import BINARY, UNARY, Rule, Shaped
-from slipid.export.c99.ir import Array
-from slipid.export.c99.ir import At
-from slipid.export.c99.ir import CodeBlock
-from slipid.export.c99.ir import Cell
-from slipid.export.c99.ir import Memory
-from slipid.export.c99.ir import Nested
-from slipid.export.c99.ir import NoFormError
-from slipid.export.c99.ir import Statement
-from slipid.export.c99.ir import Value
-from slipid.export.c99.ir import cells_of
-from slipid.export.c99.ir import in_memory
-from slipid.export.c99.ir import kind_of_value
-from slipid.export.c99.ir import longest
-from slipid.export.c99.ir import varies
+from slipid.export.c99.ir import (
+    Array,
+    At,
+    Cell,
+    CodeBlock,
+    Memory,
+    Nested,
+    NoFormError,
+    Statement,
+    Value,
+    cells_of,
+    in_memory,
+    kind_of_value,
+    longest,
+    varies,
+)
 from slipid.export.c99.jaxpr import Params, ScanParameters, Traced, branches, called, source_line
 from slipid.export.c99.moves import MOVES, SOURCES, moved
 from slipid.export.c99.sources import along, rearranged

@@ -11,16 +11,18 @@ from jax.extend.core import Primitive
 
 from slipid.export.c99.builder import Builder
 from slipid.export.c99.elementwise import Rule, Shaped, binary
-from slipid.export.c99.ir import Array
-from slipid.export.c99.ir import At
-from slipid.export.c99.ir import Cell
-from slipid.export.c99.ir import NoFormError
-from slipid.export.c99.ir import Constant
-from slipid.export.c99.ir import Value
-from slipid.export.c99.ir import Variable
-from slipid.export.c99.ir import cells_of
-from slipid.export.c99.ir import longest
-from slipid.export.c99.ir import varies
+from slipid.export.c99.ir import (
+    Array,
+    At,
+    Cell,
+    Constant,
+    NoFormError,
+    Value,
+    Variable,
+    cells_of,
+    longest,
+    varies,
+)
 from slipid.export.c99.jaxpr import Params
 from slipid.export.c99.sources import along, contiguous, rearranged
 

@@ -11,20 +11,22 @@ from math import prod
 import numpy as np
 
 from slipid.export.c99.builder import Builder
-from slipid.export.c99.ir import LANES
-from slipid.export.c99.ir import Array
-from slipid.export.c99.ir import At
-from slipid.export.c99.ir import Cell
-from slipid.export.c99.ir import Cells
-from slipid.export.c99.ir import Memory
-from slipid.export.c99.ir import Constant
-from slipid.export.c99.ir import Value
-from slipid.export.c99.ir import Variable
-from slipid.export.c99.ir import cells_of
-from slipid.export.c99.ir import in_memory
-from slipid.export.c99.ir import kind_of_value
-from slipid.export.c99.ir import longest
-from slipid.export.c99.ir import varies
+from slipid.export.c99.ir import (
+    LANES,
+    Array,
+    At,
+    Cell,
+    Cells,
+    Constant,
+    Memory,
+    Value,
+    Variable,
+    cells_of,
+    in_memory,
+    kind_of_value,
+    longest,
+    varies,
+)
 from slipid.export.fields import kind_of
 
 UNROLLED = 64

@@ -14,16 +14,18 @@ import numpy as np
 
 from slipid.export.c99.builder import Builder
 from slipid.export.c99.elementwise import Rule, Shaped
-from slipid.export.c99.ir import Array
-from slipid.export.c99.ir import At
-from slipid.export.c99.ir import Cell
-from slipid.export.c99.ir import Cells
-from slipid.export.c99.ir import NoFormError
-from slipid.export.c99.ir import Constant
-from slipid.export.c99.ir import Value
-from slipid.export.c99.ir import cells_of
-from slipid.export.c99.ir import kind_of_value
-from slipid.export.c99.ir import varies
+from slipid.export.c99.ir import (
+    Array,
+    At,
+    Cell,
+    Cells,
+    Constant,
+    NoFormError,
+    Value,
+    cells_of,
+    kind_of_value,
+    varies,
+)
 from slipid.export.c99.jaxpr import Params
 from slipid.export.c99.sources import along
 from slipid.export.fields import Kind, kind_of

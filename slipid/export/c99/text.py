@@ -12,14 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slipid.export.c99.builder import Builder
-from slipid.export.c99.ir import At
-from slipid.export.c99.ir import CodeBlock
-from slipid.export.c99.ir import Cell
-from slipid.export.c99.ir import Memory
-from slipid.export.c99.ir import Nested
-from slipid.export.c99.ir import Constant
-from slipid.export.c99.ir import Statement
-from slipid.export.c99.ir import Variable
+from slipid.export.c99.ir import At, Cell, CodeBlock, Constant, Memory, Nested, Statement, Variable
 from slipid.export.fields import DTYPES, Kind
 
 

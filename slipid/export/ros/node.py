@@ -11,10 +11,8 @@ from dataclasses import asdict
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.export.description import LIMITS
 from slipid.export.ros.yaml_text import Check, Parameter
-from slipid.export.rows import LIMITS
-from slipid.export.rows import gains_origin
-from slipid.export.rows import verdict_text
 from slipid.export.text import identifiers, interval, listed
 from slipid.parameter import Declaration, Entry, entries
 from slipid.robot.controller import Gains, Limits

@@ -28,10 +28,7 @@ from slipid.predict.predictive import Contact, contact_of
 from slipid.predict.slip_model import Machine, PredictedRun, RunSignals, seen_from_start
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
-from slipid.robot.interface import MIXED_FLOORS_PENALTY
-from slipid.robot.interface import NO_FLOOR
-from slipid.robot.interface import Readings
-from slipid.robot.interface import Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, NO_FLOOR, Readings, Settings
 from slipid.robot.record import LogSensors
 from slipid.support.checkpoint import Checkpoint
 
@@ -76,7 +73,9 @@ class Own:
     def deployed(self) -> DeployedRobot:
         """The robot as it is deployed, on all floors of the data set."""
         signed = self.job.dataset.current_is_signed
-        return robot_of_force_balance(self.contact, self.highest_speed, self.trend, LogSensors(signed))
+        return robot_of_force_balance(
+            self.contact, self.highest_speed, self.trend, LogSensors(signed)
+        )
 
 
 def fit_own(job: Job, problem: Problem, fitted: np.ndarray, kept: Checkpoint) -> Own:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.deploy.deploy import ROBOT
-from slipid.deploy.deploy import robot_of_force_balance
+from slipid.deploy.deploy import ROBOT, robot_of_force_balance
 from slipid.lab.benchmark import own as slipid_rows
 from slipid.lab.benchmark.judge import Row
 from slipid.lab.benchmark.work import OF_FITS, Wish, data_of, problem_of
@@ -69,7 +68,9 @@ class Rectangle:
         kept = Checkpoint(self.folder, key)
         own = slipid_rows.fit_own(data.job, problem_of(self.wish, SOURCE), everybody, kept)
         sensors = LogSensors(current_is_signed=data.logged.current_is_signed, voltage=True)
-        robot_of_force_balance(own.contact, own.highest_speed, own.trend, sensors).save(self.folder / ROBOT)
+        robot_of_force_balance(own.contact, own.highest_speed, own.trend, sensors).save(
+            self.folder / ROBOT
+        )
 
     def drive(self, executor: Executor, report: Reporter) -> Content:
         """Drive all controllers on the virtual test site, or where MuJoCo is missing on the twin.

@@ -8,16 +8,14 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.deploy.controllers import CONTROLLERS
-from slipid.deploy.controllers import PAPER_WHEELS
-from slipid.deploy.controllers import ControllerRow
+from slipid.deploy.controllers import CONTROLLERS, PAPER_WHEELS, ControllerRow
 from slipid.lab.trial.goswami_padhy import GoswamiPadhy, Rehearsal, by_gradient, by_swarm
 from slipid.lab.trial.indiveri import Indiveri, inverse_kinematics
-from slipid.robot.actuation import ActuatorModel
 from slipid.robot.closed_loop import PERIOD
 from slipid.robot.controller import Gains, Law, Limits
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.trajectory import STEP, rectangle
+from slipid.robot.twin import ActuatorModel
 from slipid.support.errors import DataError
 
 BESIDE = ((0.05, 0.0, 0.2), (0.0, 0.05, -0.2), (-0.05, 0.0, 0.2), (0.0, -0.05, -0.2))

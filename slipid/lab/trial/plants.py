@@ -11,8 +11,7 @@ from slipid.lab.testsite.driving import PERIOD, Rims
 from slipid.lab.testsite.ground import GROUNDS
 from slipid.lab.testsite.plant import Plant
 from slipid.lab.testsite.site import Sensors, Site
-from slipid.robot.deployed import DeployedRobot
-from slipid.robot.deployed import posterior_robots
+from slipid.robot.deployed import DeployedRobot, posterior_robots
 from slipid.robot.interface import Measurement
 from slipid.support.errors import DataError
 

@@ -12,24 +12,25 @@ import numpy as np
 
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import control_loop_of
-from slipid.deploy.deploy import actuator_model_of
-from slipid.deploy.deploy import read_robot
+from slipid.deploy.deploy import actuator_model_of, read_robot
 from slipid.deploy.floors import floor_of
-from slipid.deploy.twin_run import REST_S
-from slipid.deploy.twin_run import require_known_surfaces
-from slipid.deploy.twin_run import path_of
-from slipid.deploy.twin_run import twin_floor
-from slipid.deploy.twin_run import starts
-from slipid.deploy.twin_run import twin_plant
+from slipid.deploy.twin_run import (
+    REST_S,
+    path_of,
+    require_known_surfaces,
+    starts,
+    twin_floor,
+    twin_plant,
+)
 from slipid.lab.trial.controllers import ROWS, applying, check_gains, unused_gains
 from slipid.lab.trial.plants import SitePlant, known_to_site, one_of
 from slipid.lab.trial.summary import Run, not_told_apart, summaries
 from slipid.robot import closed_loop, trajectory
-from slipid.robot.actuation import ActuatorModel
 from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import Settings
 from slipid.robot.robot_file import typed
+from slipid.robot.twin import ActuatorModel
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.errors import DataError
 from slipid.support.executor import results
@@ -40,7 +41,7 @@ from slipid.support.progress import Reporter
 SCHEMA = "slipid.trial/1"
 FOLDER = "trial"
 """Finished runs, below OUT."""
-PLANTS = ("testsite", "twin_plant")
+PLANTS = ("testsite", "twin")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,7 @@ class Wish:
     """What is asked of a trial.
 
     Attributes:
-        plant: `testsite` (MuJoCo) or `twin_plant` (the identified model itself, another draw of its
+        plant: `testsite` (MuJoCo) or `twin` (the identified model itself, another draw of its
             numbers for every start).
         map: file of a floor map; None for patches of the identified floors.
         told_map: file of the map that controllers with a map are told; None for the true one.
@@ -212,9 +213,11 @@ def drive(job: Job) -> None:
     robot = jax.tree.map(jnp.asarray, job.robot)
     path = job.path.moved(job.start).waiting(REST_S)
     plant: closed_loop.Plant
-    if job.plant == "twin_plant":
+    if job.plant == "twin":
         truth = one_of(robot, job.seed)
-        plant = twin_plant(truth, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro))
+        plant = twin_plant(
+            truth, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro)
+        )
     else:
         plant = SitePlant(job.floor, robot.load_setup, job.start, job.seed, row.gyro)
     there = floor_of(job.told, robot.labels)

@@ -3,8 +3,8 @@
 An effect is a motion along, across and in yaw per metre that wheels without slip would go. It
 belongs to a floor and to a direction of travel u, the unit vector of the twist without slip, yaw as
 rim speed. What the fitted runs tell of it, a mean and a std that is left, is a table over
-directions and speeds (`EffectTable`). An effect e counts in stds left; it correlates less and less as the
-direction changes, and once the robot has left the floor:
+directions and speeds (`EffectTable`). An effect e counts in stds left; it correlates less and less
+as the direction changes, and once the robot has left the floor:
 
     k = exp(-(1 - a^2) |u - v|^2 / (2 TURN^2) - left far / AWAY),   a = exp(-far / SETTLES)
     e <- k e + sqrt(1 - k^2) noise,   v <- u + a (v - u)

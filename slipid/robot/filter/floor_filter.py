@@ -323,7 +323,9 @@ class FloorFilter(eqx.Module):
         return jnp.einsum("c,cwf->wf", known, hypotheses_of(self.robot).on.astype(float))
 
 
-def effects_by_hypothesis(robot: RobotArrays, of_floor: Float[Array, "floor 3"]) -> Float[Array, "hypothesis 3"]:
+def effects_by_hypothesis(
+    robot: RobotArrays, of_floor: Float[Array, "floor 3"]
+) -> Float[Array, "hypothesis 3"]:
     """What is told of the body under every hypothesis: of all wheels on one floor, no more."""
     ways = hypotheses_of(robot)
     return jnp.zeros((len(ways), 3)).at[ways.uniform].set(of_floor)

@@ -20,19 +20,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from slipid.model.se2 import advance, compose
 from slipid.robot.deployed import RobotArrays
-from slipid.robot.filter.effects import travel_direction
-from slipid.robot.filter.effects import effect_correlation
+from slipid.robot.filter.effects import effect_correlation, travel_direction
 from slipid.robot.filter.floor import Floor
-from slipid.robot.filter.floor_filter import INERTIA_ACCELERATION
-from slipid.robot.filter.floor_filter import BodyMotion
-from slipid.robot.filter.floor_filter import TimeStep
-from slipid.robot.filter.floor_filter import length
-from slipid.robot.filter.pose_fix import HISTORY
-from slipid.robot.filter.pose_fix import PoseState
-from slipid.robot.filter.pose_fix import apply_fix
-from slipid.robot.filter.pose_fix import history_after_jump
-from slipid.robot.filter.pose_fix import nearest
-from slipid.robot.filter.pose_fix import rebased
+from slipid.robot.filter.floor_filter import INERTIA_ACCELERATION, BodyMotion, TimeStep, length
+from slipid.robot.filter.pose_fix import (
+    HISTORY,
+    PoseState,
+    apply_fix,
+    history_after_jump,
+    nearest,
+    rebased,
+)
 from slipid.robot.interface import Readings, Settings
 
 CREEP_SPEED = 0.05
@@ -175,7 +173,9 @@ class PoseFilter(eqx.Module):
             return free  # code that is exported for one robot goes without the search
         return jnp.where(delay == 0.0, free, nearest(now.history, delay)[4])
 
-    def _turns(self, now: PoseState, way: _StepMotion, gyro: Array, free: Array, tick: TimeStep) -> PoseState:
+    def _turns(
+        self, now: PoseState, way: _StepMotion, gyro: Array, free: Array, tick: TimeStep
+    ) -> PoseState:
         """Compare a gyro with the contact model while the robot moves.
 
         The gyro reads the model's yaw rate, what pushes it off, and its own bias, so that it tells
@@ -193,7 +193,9 @@ class PoseFilter(eqx.Module):
         told = (way.speed > CREEP_SPEED) & jnp.isfinite(gyro) & (tick.dt > 0)
         gap = jnp.where(told, gyro - now.nuisance[-1] - self._then(now, free), 0.0)
         walk = (way.share @ self.robot.process[:, 2] ** 2) * way.speed / dt
-        noise = (self.settings.gyro_std**2 + walk) * (1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2)
+        noise = (self.settings.gyro_std**2 + walk) * (
+            1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2
+        )
         var = look @ cov @ look + noise
         var = var * jnp.maximum(gap**2 / (9.0 * var), 1.0)
         learns = told * jnp.zeros(len(cov)).at[jnp.array([2, -1])].set(1.0)

@@ -138,7 +138,9 @@ def apply_map(
     return new, root @ scatter @ root.T @ _inverse(whole)
 
 
-def history_after_jump(old: PoseState, motion: BodyMotion, base: Float[Array, ""]) -> Float[Array, "entry 15"]:
+def history_after_jump(
+    old: PoseState, motion: BodyMotion, base: Float[Array, ""]
+) -> Float[Array, "entry 15"]:
     """The history once news of the floors has moved the pose: what it knows of before moves too.
 
     The ways of what was and of what is believed went apart until now, at the rate at which the two

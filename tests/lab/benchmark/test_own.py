@@ -13,8 +13,7 @@ from slipid.lab.benchmark.own import Own, Place, estimated, replay, told
 from slipid.lab.benchmark.steps import cut
 from slipid.predict.slip_model import Machine, PredictedRun
 from slipid.robot.estimator import Estimator
-from slipid.robot.interface import MIXED_FLOORS_PENALTY
-from slipid.robot.interface import Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from tests.helpers.small_twin import deployed
 
 

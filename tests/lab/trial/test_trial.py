@@ -188,7 +188,9 @@ def pilot(deployed, preview=0.0):
 def test_encoders_close_every_path_without_slip(deployed, name):
     start = (0.2, 0.1, -1.0)
     path = reference.PATHS[name](0.2).moved(start)
-    course = closed_loop.run_closed_loop(pilot(deployed, 0.05), path, Perfect(deployed, start), start)
+    course = closed_loop.run_closed_loop(
+        pilot(deployed, 0.05), path, Perfect(deployed, start), start
+    )
     found = closed_loop.path_metrics(course)
     assert found.finished
     assert found.closure_mm < 5
@@ -218,7 +220,11 @@ def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
     far = []
     for preview in (0.0, 0.2):
         plant = Perfect(deployed, start, late=4)
-        far.append(closed_loop.run_closed_loop(pilot(deployed, preview), path, plant, start).pose[:, 0].max())
+        far.append(
+            closed_loop.run_closed_loop(pilot(deployed, preview), path, plant, start)
+            .pose[:, 0]
+            .max()
+        )
     assert far[0] > 0.92  # four periods at 0.2 m/s too far
     assert far[1] < 0.905
 
@@ -227,7 +233,9 @@ def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
 def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
     start = (0.0, 0.0, 0.0)
     path = reference.rectangle()
-    course = closed_loop.run_closed_loop(pilot(deployed), path, Perfect(deployed, start, 0.8), start)
+    course = closed_loop.run_closed_loop(
+        pilot(deployed), path, Perfect(deployed, start, 0.8), start
+    )
     found = closed_loop.path_metrics(course)
     assert found.along_track_mm[0] == pytest.approx(-180, abs=12)
     assert found.along_track_mm[1] == pytest.approx(-80, abs=12)
@@ -239,7 +247,9 @@ def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
 def test_of_a_curve_the_first_quarter_is_judged(deployed):
     start = (0.0, 0.0, 0.0)
     path = reference.circle(0.35)
-    course = closed_loop.run_closed_loop(pilot(deployed), path, Perfect(deployed, start, 0.8), start)
+    course = closed_loop.run_closed_loop(
+        pilot(deployed), path, Perfect(deployed, start, 0.8), start
+    )
     found = closed_loop.path_metrics(course)
     assert found.sides_mm[0] == pytest.approx(350 * np.sqrt(2), rel=0.01)
     run = Run("encoder", start, 0, found, 0.0)
@@ -337,7 +347,9 @@ def test_published_laws_close_the_rectangle_without_slip(deployed, row):
     start = (0.2, 0.1, -1.0)
     path = reference.rectangle().moved(start)
     pilot = control_loop_of(deployed, ROWS[row], Settings())
-    found = closed_loop.path_metrics(closed_loop.run_closed_loop(pilot, path, Perfect(deployed, start), start))
+    found = closed_loop.path_metrics(
+        closed_loop.run_closed_loop(pilot, path, Perfect(deployed, start), start)
+    )
     assert found.finished
     assert found.closure_mm < 5
     assert found.cross_track_rmse_mm < 10

@@ -66,7 +66,9 @@ def deployed(robot: Robot) -> DeployedRobot:
     )
     record = RobotRecord(
         wheels=Wheels(**{f.name: getattr(shape, f.name) for f in fields(Wheels)}),
-        parameters={path: n for path, n in given_numbers(robot).items() if not path.startswith("camera.")},
+        parameters={
+            path: n for path, n in given_numbers(robot).items() if not path.startswith("camera.")
+        },
         floors=tuple(
             FloorRecord(name=name, process=none, effect=none, current_std=1.0, seen=None)
             for name in robot.surfaces.labels
