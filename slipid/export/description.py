@@ -64,11 +64,6 @@ class NumberRow:
         """Path and entry together."""
         return f"{self.path}, {self.entry}" if self.entry else self.path
 
-    @property
-    def verdict_text(self) -> str:
-        """The verdict as people read it."""
-        return verdict_text(self.verdict)
-
 
 def verdict_text(verdict: Verdict) -> str:
     """A verdict as people read it, in capitals where they must be warned."""

@@ -98,7 +98,7 @@ def _gains(robot: DeployedRobot) -> Iterator[TableRow]:
 
 def _matrices(robot: DeployedRobot) -> Iterator[TableRow]:
     known = robot.record.parameters
-    made_of = [f"{path} ({said(known[path].verdict)})" for path in _GEOMETRY]
+    made_of = [f"{path} ({verdict_text(known[path].verdict)})" for path in _GEOMETRY]
     sure = ("derived", f"from {', '.join(made_of)}")
     for k in range(robot.wheels):
         for axis, (name, unit) in enumerate(_TWIST):
@@ -154,7 +154,7 @@ def _markdown(robot: DeployedRobot, lines: tuple[TableRow, ...]) -> str:
         head = ("name", "", "symbol", "rounded", "value", "unit", "90 % interval", "verdict")
         text += [f"## {title}", "", *table((*head, "provenance", "meaning"), rows), ""]
     text += ["## Verdicts", ""]
-    text += [f"- *{said(v)}*: {about}." for v, about in VERDICTS.items()]
+    text += [f"- *{verdict_text(v)}*: {about}." for v, about in VERDICTS.items()]
     return "\n".join(text) + "\n"
 
 

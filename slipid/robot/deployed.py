@@ -161,7 +161,7 @@ class DeployedRobot(RobotArrays):
         try:
             return cls.of(record, load)
         except ValueError as error:
-            raise DataError(f"{path}: {error}; {ANEW}") from error
+            raise DataError(f"{path}: {error}; {REWRITE_HINT}") from error
 
     def save(self, path: Path | str) -> None:
         """Write robot.json, with all load set-ups.

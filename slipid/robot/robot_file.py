@@ -138,17 +138,17 @@ def read_robot(path: Path) -> RobotRecord:
     now = checksum(content)
     content.pop("schema")
     if content.pop("units", None) != UNITS:
-        raise DataError(f"{path}: other units than {SCHEMA} has; {ANEW}")
+        raise DataError(f"{path}: other units than {SCHEMA} has; {REWRITE_HINT}")
     numbers = content.pop("numbers", None)
     try:
         record = typed(RobotRecord, content)
         check_record(record)
     except ValueError as error:
-        raise DataError(f"{path}: {error}; {ANEW}") from error
+        raise DataError(f"{path}: {error}; {REWRITE_HINT}") from error
     if said != now or numbers != record.numbers:
         raise DataError(
             f"{path}: the content does not match its checksum, so it was changed or damaged after "
-            f"it was written; {ANEW}"
+            f"it was written; {REWRITE_HINT}"
         )
     return record
 
@@ -163,7 +163,7 @@ def _content(path: Path) -> dict[str, object]:
         reason = error.strerror or str(error)
         raise DataError(f"{path}: {reason}; expected what `slipid identify` writes") from error
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: no valid JSON ({error}); {ANEW}") from error
+        raise DataError(f"{path}: no valid JSON ({error}); {REWRITE_HINT}") from error
     schema = content.get("schema") if isinstance(content, dict) else None
     if not (isinstance(schema, str) and re.fullmatch(r"slipid\.robot/[1-9][0-9]{0,8}", schema)):
         raise DataError(

@@ -18,6 +18,7 @@ from slipid.export.description import (
     header,
     in_markdown,
     number_rows,
+    verdict_text,
 )
 from slipid.export.ros import localization, node
 from slipid.export.ros import localization as noise
@@ -157,7 +158,8 @@ def _numbers(folder: ReadmeContent) -> Iterator[str]:
     yield "Where each comes from; `slipid.yaml` has them to the last digit."
     lines = []
     for row in number_rows(folder.robot):
-        sure = f"**{row.said}**" if row.verdict in WARNED_VERDICTS else row.said
+        text = verdict_text(row.verdict)
+        sure = f"**{text}**" if row.verdict in WARNED_VERDICTS else text
         known = (short(row.value), row.unit, interval(row.interval90), sure, row.provenance)
         lines.append((f"`{row.path}`", row.entry, row.about, *known))
     head = ("robot.json", "", "", "value", "unit", "90 % interval", "verdict", "provenance")

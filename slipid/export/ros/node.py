@@ -78,7 +78,9 @@ def _about(e: Entry, number: RecordedNumber) -> str:
     pairs = [] if ends is None else np.reshape(ends, (-1, 2)).tolist()
     each = "; ".join(interval((low, high)) for low, high in pairs)
     known = f", 90 % interval {each}" if each else ""
-    return f"{d.doc} {d.symbol} [{d.unit}]; {said(number.verdict)}, {number.provenance}{known}"
+    return (
+        f"{d.doc} {d.symbol} [{d.unit}]; {verdict_text(number.verdict)}, {number.provenance}{known}"
+    )
 
 
 def _checks(e: Entry) -> Iterator[Check]:
@@ -137,7 +139,7 @@ def _controls(robot: DeployedRobot) -> Iterator[Parameter]:
     for e in entries(gains):
         about = f"{e.declaration.doc} {e.declaration.symbol} [{e.declaration.unit}]"
         if e.path == "place":
-            about = f"{about}. {origin(robot)}"
+            about = f"{about}. {gains_origin(robot)}"
         yield Parameter(f"gains.{e.path}", float(e.get(gains)), about, (), read_only=False)
     for name, value in asdict(Limits()).items():
         checks = (Check("gt<>", (0.0,)),)
