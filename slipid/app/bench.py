@@ -27,7 +27,7 @@ from slipid.infer.bench.verdict import BenchFit, bench_fit
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.files import Content, writable, write_bytes, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
@@ -177,7 +177,8 @@ def _choices(config: Config, label: str) -> tuple[Choice, ...]:
         plain, at, _ = pattern.partition("@")
         if not fnmatch.filter(paths, plain):
             raise DataError(
-                f"{config.path}: parameters.'{pattern}': no such parameter{near(plain, paths)}; "
+                f"{config.path}: parameters.'{pattern}': no such parameter"
+                f"{did_you_mean(plain, paths)}; "
                 f"expected one of {', '.join(paths)}"
             )
         if at and not fnmatch.fnmatchcase(label, pattern.partition("@")[2]):

@@ -18,7 +18,7 @@ from slipid.lab.benchmark.summary import RowSummary, summary
 from slipid.lab.benchmark.tuned import reading
 from slipid.lab.benchmark.work import OWN_MAP, QUICK_KIND, Piece, Wish, data_of
 from slipid.support.checkpoint import versions
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.executor import results
 from slipid.support.files import Content, writable, write_json
 from slipid.support.jax_setup import setup_jax
@@ -131,7 +131,7 @@ def _known(wish: Wish) -> None:
     for name in wish.only:
         if name not in every:
             raise DataError(
-                f"no row '{name}'{near(name, every)}; expected some of {', '.join(every)}"
+                f"no row '{name}'{did_you_mean(name, every)}; expected some of {', '.join(every)}"
             )
 
 

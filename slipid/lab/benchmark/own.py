@@ -108,7 +108,7 @@ def _seen(
     problem: Problem, contact: Contact, keep: Float[np.ndarray, " piece"]
 ) -> tuple[float, tuple[float, float]]:
     """Highest wheel speed [rad/s] and trend of currents in the pieces that count."""
-    w = problem.windows.pieces(np.flatnonzero(keep > 0))
+    w = problem.windows.segments(np.flatnonzero(keep > 0))
     speed = float(np.abs(w.turn / w.dt[..., None]).max())
     if not w.has_current:
         return speed, (0.0, 0.0)

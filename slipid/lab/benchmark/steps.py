@@ -56,7 +56,7 @@ def _cut(data: Runs, robot: Robot, w: Windows) -> Cut:
     runs = []
     for piece, k in enumerate(numbers):
         log = data.logs[k]
-        edges = w.began[piece] + np.concatenate([[0.0], np.cumsum(w.dt[piece])]) - w.lag
+        edges = w.start[piece] + np.concatenate([[0.0], np.cumsum(w.dt[piece])]) - w.lag
         signals = RunSignals(
             name=log.name,
             dt=w.dt[piece],

@@ -14,7 +14,7 @@ from slipid.lab.benchmark.judge import Row
 from slipid.lab.benchmark.rectangle import Rectangle
 from slipid.lab.benchmark.work import QUICK_RUNS, Piece, Wish, data_of, keys_of, source_of, split_of
 from slipid.support.errors import DataError
-from slipid.support.executor import Here
+from slipid.support.executor import InProcess
 from slipid.support.progress import Reporter
 
 
@@ -114,7 +114,7 @@ def test_quick_work_does_not_overwrite_what_was_kept(tmp_path):
 
 def test_an_unknown_row_is_named_with_the_choices(tmp_path):
     with pytest.raises(DataError, match=r"no row 'encodr'.*did you mean.*encoder"):
-        benchmark(Wish(tmp_path, tmp_path / "out", ("encodr",)), Here(), Reporter(quiet=True))
+        benchmark(Wish(tmp_path, tmp_path / "out", ("encodr",)), InProcess(), Reporter(quiet=True))
 
 
 def test_a_missing_folder_is_named(tmp_path):
@@ -151,7 +151,9 @@ def test_a_data_set_that_cannot_be_read_stops_no_other(tmp_path, monkeypatch):
     (folder / "run.csv").write_text("this is no log")
     monkeypatch.setattr("slipid.lab.benchmark.benchmark.SOURCES", [source_of("robotino2022")])
     found = benchmark(
-        Wish(tmp_path / "data", tmp_path / "out", ("quann_slip",)), Here(), Reporter(quiet=True)
+        Wish(tmp_path / "data", tmp_path / "out", ("quann_slip",)),
+        InProcess(),
+        Reporter(quiet=True),
     )
     assert list(found["unread"]) == ["robotino2022"]
     assert found["sets"] == {}
@@ -167,4 +169,4 @@ def test_a_robot_that_cannot_be_identified_drives_no_rectangle(tmp_path, monkeyp
 
     monkeypatch.setattr("slipid.lab.benchmark.rectangle.data_of", broken)
     assert rectangle.run() == "rectangle"
-    assert rectangle.drive(Here(), Reporter(quiet=True)) == {"failed": "OSError: disk on fire"}
+    assert rectangle.drive(InProcess(), Reporter(quiet=True)) == {"failed": "OSError: disk on fire"}

@@ -56,7 +56,7 @@ def test_the_load_is_heard_and_gyro_and_command_are_means_over_each_step(made):
     assert heard.command == pytest.approx(np.tile([0.1, 0.2, 0.3], (len(heard), 1)))
     # in the time of the wheels, which the camera lags
     lag = float(made.robot.camera.lag)
-    middle = one.windows.began[0] + np.cumsum(heard.dt) - 0.5 * heard.dt - lag
+    middle = one.windows.start[0] + np.cumsum(heard.dt) - 0.5 * heard.dt - lag
     assert heard.gyro is not None
     assert heard.gyro[1:] == pytest.approx(3.0 * middle[1:], abs=0.01)
 
