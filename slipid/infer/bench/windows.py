@@ -89,7 +89,9 @@ def electrical(records: Sequence[BenchRecord], zero: float) -> BenchWindows | No
             return None
         at = _WindowPlaces(r, ELECTRICAL_S)
 
-        def half(row: "_HalfKernel", r: BenchRecord = r, measured: np.ndarray = measured) -> HalfSignals:
+        def half(
+            row: "_HalfKernel", r: BenchRecord = r, measured: np.ndarray = measured
+        ) -> HalfSignals:
             current, speed = row.mean(r.current), row.mean(r.speed)
             along = np.ones(len(speed)) if r.signed else np.sign(row.longer(r.speed))
             sign = np.tanh((row.longer(r.current) - zero * along) / BRUSH_CURRENT)
