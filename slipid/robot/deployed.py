@@ -16,7 +16,7 @@ from slipid.model.geometry import Frame, Geometry, at_drives, at_wheels
 from slipid.model.motor import Motor
 from slipid.robot.filter.effects import EffectTable
 from slipid.robot.record import LoadRecord, Numbers, RobotRecord
-from slipid.robot.robot_file import check_record, geometry_of, read_robot, write_robot
+from slipid.robot.robot_file import REWRITE_HINT, check_record, geometry_of, read_robot, write_robot
 from slipid.robot.unseen import with_unseen
 from slipid.support.errors import DataError
 

@@ -11,7 +11,7 @@ from dataclasses import asdict
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.export.description import LIMITS
+from slipid.export.description import LIMITS, gains_origin, verdict_text
 from slipid.export.ros.yaml_text import Check, Parameter
 from slipid.export.text import identifiers, interval, listed
 from slipid.parameter import Declaration, Entry, entries
