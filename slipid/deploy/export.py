@@ -147,13 +147,13 @@ def export(
     check_writable(out)
     path = path_of(wish.path, wish.speed, robot)
     place = _place(robot, path, wish.map)
-    pilot = control_loop_of(robot, row, floor=floor_of(place.floor, robot.labels))
-    path = path.moved(place.believed).waiting(REST_S)
+    loop = control_loop_of(robot, row, floor=floor_of(place.floor, robot.labels))
+    path = path.moved(place.believed).after_rest(REST_S)
     content: dict[str, bytes] = {"robot.json": robot_bytes(robot.record)}
     forms = tuple(form for form in FORMS if form in wish.forms)
     for form in forms:
         report.stage(f"writing {form}")
-        files = _form(form, robot, pilot, path, wish, place, row.gyro)
+        files = _form(form, robot, loop, path, wish, place, row.gyro)
         content |= {f"{form}/{name}": data for name, data in files.items()}
     content["README.md"] = readme(robot, forms, wish.controller).encode()
     write_folder(out, content)
@@ -167,19 +167,17 @@ def export(
 def _form(
     form: str,
     robot: DeployedRobot,
-    pilot: ControlLoop[eqx.Module],
+    loop: ControlLoop[eqx.Module],
     path: trajectory.Path,
     wish: ExportOptions,
     place: ExampleStart,
     gyro: bool,
 ) -> dict[str, bytes]:
     if form == "stablehlo":
-        return stablehlo_files(pilot)
+        return stablehlo_files(loop)
     if form == "c":
         try:
-            text = c_files(
-                robot, pilot, path, record_example(robot, pilot, path, wish, place, gyro)
-            )
+            text = c_files(robot, loop, path, record_example(robot, loop, path, wish, place, gyro))
         except UnsupportedError as error:
             raise DataError(f"controller {wish.controller}: {error}") from error
     else:
@@ -211,7 +209,7 @@ class _RecordingPlant:
 
 def record_example(
     robot: DeployedRobot,
-    pilot: ControlLoop[eqx.Module],
+    loop: ControlLoop[eqx.Module],
     path: trajectory.Path,
     wish: ExportOptions,
     place: ExampleStart,
@@ -220,10 +218,10 @@ def record_example(
     """A run of a path, as it lies for the robot's start, on the twin."""
     habits = actuator_model_of(robot, gyro=gyro)
     plant = _RecordingPlant(twin_plant(robot, place.floor, place.true, 0, habits), robot.wheels)
-    course = run_closed_loop(pilot, path, plant, place.believed)
+    course = run_closed_loop(loop, path, plant, place.believed)
     given = [
         np.concatenate([[PERIOD], *(np.ravel(x) for x in jax.tree.leaves(reading))])
         for reading in plant.readings[: len(course.command)]
     ]
     about = f"the identified model as a plant, with delays and noise, along the path {wish.path}"
-    return Recording(about, place.believed, np.array(given), course.command, course.own)
+    return Recording(about, place.believed, np.array(given), course.command, course.path_time)

@@ -31,12 +31,12 @@ class Golden:
     command: Float[np.ndarray, "step wheel"]
 
 
-def golden(pilot: ControlLoop[eqx.Module]) -> Golden:
+def golden(loop: ControlLoop[eqx.Module]) -> Golden:
     """A drive in which every sensor speaks up, and is silent, once."""
-    run = jax.jit(lambda *given: _step(pilot, *given))
-    begin = pilot.init()
-    state, rows = (begin.seen, begin.held), []
-    for z, reference, dt in _drive(pilot):
+    run = jax.jit(lambda *given: _step(loop, *given))
+    begin = loop.init()
+    state, rows = (begin.estimator, begin.controller), []
+    for z, reference, dt in _drive(loop):
         state, said, command = run(state, z, reference, dt)
         rows.append((_flat((z, reference, dt)), _flat(said), np.asarray(command)))
     given, estimates, commands = zip(*rows, strict=True)
@@ -44,16 +44,16 @@ def golden(pilot: ControlLoop[eqx.Module]) -> Golden:
 
 
 def _step(
-    pilot: ControlLoop[eqx.Module], state: tuple, z: Readings, reference: jax.Array, dt: jax.Array
+    loop: ControlLoop[eqx.Module], state: tuple, z: Readings, reference: jax.Array, dt: jax.Array
 ) -> tuple:
-    seen, said = pilot.estimator.step(state[0], z, dt)
-    held, command = pilot.controller.step(state[1], reference, said, dt)
+    seen, said = loop.estimator.step(state[0], z, dt)
+    held, command = loop.controller.step(state[1], reference, said, dt)
     return (seen, held), said, command
 
 
-def _drive(pilot: ControlLoop[eqx.Module]) -> Iterator[tuple[Readings, jax.Array, float]]:
+def _drive(loop: ControlLoop[eqx.Module]) -> Iterator[tuple[Readings, jax.Array, float]]:
     """Readings, references and time steps: a late and a lost one, and wheels silent for long."""
-    robot = pilot.controller.robot
+    robot = loop.controller.robot
     angle, count = np.zeros(robot.wheels), robot.wheels
     for step in range(STEPS):
         t = step * PERIOD

@@ -1,4 +1,4 @@
-"""A pilot's step as StableHLO: for programs that run XLA and know nothing of slipid.
+"""A control loop's step as StableHLO: for programs that run XLA and know nothing of slipid.
 
 Arrays go in and come out in the order that `step.json` lists, with names, shapes and units.
 """
@@ -89,18 +89,18 @@ class Program:
     batch: export.Exported
 
 
-def stablehlo_files(pilot: ControlLoop[eqx.Module]) -> dict[str, bytes]:
+def stablehlo_files(loop: ControlLoop[eqx.Module]) -> dict[str, bytes]:
     """Content of the files by their names: the step of one robot and of many, and what goes in."""
-    begin = pilot.init()
-    state = begin.seen, begin.held
-    nothing, zero = Readings.nothing(pilot.controller.robot.wheels), jnp.zeros(())
+    begin = loop.init()
+    state = begin.estimator, begin.controller
+    nothing, zero = Readings.nothing(loop.controller.robot.wheels), jnp.zeros(())
     like = (state, nothing, jnp.zeros(6), zero)
     structure = jax.tree.structure(like)
 
     def step(*flat: Array) -> list[Array]:
         (seen, held), z, reference, dt = jax.tree.unflatten(structure, flat)
-        seen, said = pilot.estimator.step(seen, z, dt)
-        held, command = pilot.controller.step(held, reference, said, dt)
+        seen, said = loop.estimator.step(seen, z, dt)
+        held, command = loop.controller.step(held, reference, said, dt)
         return jax.tree.leaves((seen, held, said, command))
 
     flat = [jnp.asarray(x) for x in jax.tree.leaves(like)]
@@ -109,14 +109,14 @@ def stablehlo_files(pilot: ControlLoop[eqx.Module]) -> dict[str, bytes]:
     many = [jax.ShapeDtypeStruct((count, *x.shape), x.dtype) for x in flat]
     one = export.export(jax.jit(step), platforms=PLATFORMS)(*shapes)
     batch = export.export(jax.jit(jax.vmap(step)), platforms=PLATFORMS)(*many)
-    kept = golden(pilot)
+    kept = golden(loop)
     buffer = io.BytesIO()
     arrays: dict[str, Any] = {
         f"start{k}": np.asarray(x) for k, x in enumerate(jax.tree.leaves(state))
     }
     arrays |= vars(kept)
     np.savez_compressed(buffer, **arrays)
-    about = {"schema": SCHEMA, **asdict(_signature(pilot))}
+    about = {"schema": SCHEMA, **asdict(_signature(loop))}
     return {
         "step.stablehlo": bytes(one.serialize()),
         "step_batch.stablehlo": bytes(batch.serialize()),
@@ -126,18 +126,18 @@ def stablehlo_files(pilot: ControlLoop[eqx.Module]) -> dict[str, bytes]:
     }
 
 
-def _signature(pilot: ControlLoop[eqx.Module]) -> Signature:
-    begin = pilot.init()
-    wheels = pilot.controller.robot.wheels
+def _signature(loop: ControlLoop[eqx.Module]) -> Signature:
+    begin = loop.init()
+    wheels = loop.controller.robot.wheels
     nothing = Readings.nothing(wheels)
-    said = pilot.estimator.step(begin.seen, nothing, 0.0)[1]
+    said = loop.estimator.step(begin.estimator, nothing, 0.0)[1]
     rest = (
         Leaf("reference", "real", (6,), "pose and rates in the world [m, m, rad and per s]"),
         Leaf("dt", "real", (), "since the last step [s]"),
     )
     command = Leaf("command", "real", (wheels,), "wheel speeds [rad/s]")
     return Signature(
-        (*_leaves("estimator", begin.seen), *_leaves("controller", begin.held)),
+        (*_leaves("estimator", begin.estimator), *_leaves("controller", begin.controller)),
         (*_leaves("reading", nothing, Measurement), *rest),
         (*_leaves("estimate", said), command),
     )

@@ -44,9 +44,9 @@ from tests.benchmarks.export_builds import (
     PLAIN,
     Fleet,
     code,
+    control_loop,
     driven,
     needs,
-    pilot,
     ran,
     three_floors,
 )
@@ -111,7 +111,7 @@ def test_step(tmp_path, row, kind):
 
 def numbers() -> str:
     """The robot's numbers as macros and tables, for the step written by hand."""
-    p, s = pilot("slip_odometry"), Settings.of(three_floors())
+    p, s = control_loop("slip_odometry"), Settings.of(three_floors())
     f, k, most = p.controller.robot, p.controller.gains, Limits()
     given = {
         "RADIUS": f.frame.radius,

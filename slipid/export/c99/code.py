@@ -1,4 +1,4 @@
-"""Header and source of a pilot in C99, generated from the very steps that are tested here."""
+"""Header and source of a control loop in C99, generated from the very steps that are tested here."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ TYPE = {**TYPES, "real": "slipid_real"}
 
 
 class Code:
-    """The C code of a pilot, and of a path if it follows one.
+    """The C code of a control loop, and of a path if it follows one.
 
     Attributes:
-        robot: for the record of its numbers; pilot: its estimator and controller.
+        robot: for the record of its numbers; loop: its estimator and controller.
         path: as it lies for a robot that starts at 0.
         estimator, controller: structs of what they keep.
         reading, estimate: structs of what goes in and what comes out.
@@ -37,20 +37,22 @@ class Code:
     """
 
     def __init__(
-        self, robot: DeployedRobot, pilot: ControlLoop[eqx.Module], path: Path | None = None
+        self, robot: DeployedRobot, loop: ControlLoop[eqx.Module], path: Path | None = None
     ):
         """Trace and lower all functions.
 
         Raises:
             UnsupportedError: a step uses a primitive without a form in C.
         """
-        self.robot, self.pilot, self.path = robot, pilot, path
+        self.robot, self.loop, self.path = robot, loop, path
         self._names = Names()
-        begin, nothing = pilot.init(), Readings.nothing(robot.wheels)
+        begin, nothing = loop.init(), Readings.nothing(robot.wheels)
         zero = jnp.zeros(())
-        believed = pilot.estimator.step(begin.seen, nothing, zero)[1]
-        self.estimator = Struct.of("slipid_estimator", "What the estimator keeps.", begin.seen)
-        self.controller = Struct.of("slipid_controller", "What the controller keeps.", begin.held)
+        believed = loop.estimator.step(begin.estimator, nothing, zero)[1]
+        self.estimator = Struct.of("slipid_estimator", "What the estimator keeps.", begin.estimator)
+        self.controller = Struct.of(
+            "slipid_controller", "What the controller keeps.", begin.controller
+        )
         self.reading = Struct.of(
             "slipid_reading",
             "What the sensors give; NaN where there is none.",
@@ -58,13 +60,13 @@ class Code:
             Measurement,
         )
         self.estimate = Struct.of("slipid_estimate", "What is believed.", believed)
-        self.functions = list(self._functions(begin.seen, begin.held, nothing, believed))
+        self.functions = list(self._functions(begin.estimator, begin.controller, nothing, believed))
 
     def _functions(
         self, seen: eqx.Module, held: eqx.Module, nothing: Readings, believed: eqx.Module
     ) -> Iterator[Function]:
-        pilot, one = self.pilot, jnp.zeros(())
-        wheels = pilot.controller.robot.wheels
+        loop, one = self.loop, jnp.zeros(())
+        wheels = loop.controller.robot.wheels
         pose, dt = Argument.plain("pose", (3,)), Argument.plain("dt", ())
         fresh = (
             Argument.of("estimator", self.estimator, False, True),
@@ -76,7 +78,7 @@ class Code:
             "Start estimator and controller of a robot that stands at a pose: x, y [m], heading "
             "[rad].",
             (*fresh, pose),
-            traced(lambda p: (pilot.init(p).seen, pilot.init(p).held), jnp.zeros(3)),
+            traced(lambda p: (loop.init(p).estimator, loop.init(p).controller), jnp.zeros(3)),
         )
         yield function(
             self._names,
@@ -95,7 +97,7 @@ class Code:
                 dt,
                 Argument.of("estimate", self.estimate, False, True),
             ),
-            traced(pilot.estimator.step, seen, nothing, one),
+            traced(loop.estimator.step, seen, nothing, one),
         )
         yield function(
             self._names,
@@ -109,13 +111,13 @@ class Code:
                 dt,
                 Argument.plain("command", (wheels,), False, True),
             ),
-            traced(pilot.controller.step, held, jnp.zeros(6), believed, one),
+            traced(loop.controller.step, held, jnp.zeros(6), believed, one),
         )
         if self.path is not None:
             yield self._follow(self.path)
 
     def _follow(self, path: Path) -> Function:
-        preview = self.pilot.controller.gains.preview
+        preview = self.loop.controller.gains.preview
         begin = ", ".join(f"{float(x):g}" for x in path.rows[0, :3])
 
         def follow(time: jnp.ndarray, pose: jnp.ndarray, dt: jnp.ndarray) -> object:
@@ -169,7 +171,7 @@ class Code:
             "HEAD": "\n".join(_comment(*header(robot))),
             "ROBOT": robot.record.numbers,
             "DEFINES": "\n".join(defines),
-            "ABOUT": "\n".join(line for part in about(self.pilot) for line in _comment(part)),
+            "ABOUT": "\n".join(line for part in about(self.loop) for line in _comment(part)),
             "SINGLE": "\n".join(single),
             "STRUCTS": "\n".join(line for s in self.structs for line in _struct(s)),
             "FUNCTIONS": "\n".join(declared),
@@ -196,9 +198,9 @@ class Code:
         return filled("slipid.c", values)
 
 
-def about(pilot: ControlLoop[eqx.Module]) -> Iterator[str]:
+def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
     """Sentences on axes, wheels, sensors and floors for readers of the header."""
-    robot = pilot.controller.robot
+    robot = loop.controller.robot
     yield (
         "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: those in "
         "which the start pose is given. A twist is in the body's axes."
@@ -210,7 +212,7 @@ def about(pilot: ControlLoop[eqx.Module]) -> Iterator[str]:
             f"Wheel {k} stands at x = {x:.4f} m, y = {y:.4f} m; turning at a positive speed it "
             f"pushes the body towards {drives:.1f} deg."
         )
-    settings = pilot.estimator.settings
+    settings = loop.estimator.settings
     signs = "with their signs" if settings.current_is_signed else "without a sign (a sign is lost)"
     yield f"Currents are taken {signs}. A wheel unheard for {float(settings.stale_s):g} s is stale."
     yield "Floors, as columns count them: " + listed([*robot.labels, "none of them"]) + "."

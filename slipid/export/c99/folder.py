@@ -23,7 +23,7 @@ from slipid.robot.trajectory import Path
 
 def golden_header(code: Code) -> str:
     """Text of golden.h: the steps as tables, and how structs are filled and read."""
-    kept = golden(code.pilot)
+    kept = golden(code.loop)
     names = [f.name for f in code.estimate.fields for _ in range(f.size)]
     scale = np.maximum(np.abs(kept.said).max(axis=0), 1e-3)
     rows = [
@@ -133,21 +133,21 @@ def _kib(numbers: int) -> str:
 
 def c_files(
     robot: DeployedRobot,
-    pilot: ControlLoop[eqx.Module],
+    loop: ControlLoop[eqx.Module],
     path: Path,
     recording: Recording | None = None,
 ) -> dict[str, str]:
     """Text of the files by their paths in the folder.
 
     Args:
-        robot: for the record of its numbers; pilot: its estimator and controller.
+        robot: for the record of its numbers; loop: its estimator and controller.
         path: that the example follows.
         recording: a run of it, as a test of the example.
 
     Raises:
         UnsupportedError: a step uses a primitive that has no form in C.
     """
-    code = Code(robot, pilot, path)
+    code = Code(robot, loop, path)
     named = {"VERSION": made_with()}
     files = {
         "src/slipid.h": code.header(),

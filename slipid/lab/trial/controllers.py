@@ -53,7 +53,7 @@ def _rehearsed(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
     times, rows = np.arange(0.0, float(path.marks[1]), PERIOD), np.asarray(path.rows)
     own = STEP * np.arange(len(rows))
     reference = np.stack([np.interp(times, own, column) for column in rows.T], axis=1)
-    task = Rehearsal(reference, np.array(BESIDE), habits.held(), habits.follow, PERIOD)
+    task = Rehearsal(reference, np.array(BESIDE), habits.command_shares(), habits.lag_gain, PERIOD)
     return tuple((by_swarm(task) if by == "swarm" else by_gradient(task)).tolist())
 
 

@@ -211,7 +211,7 @@ def drive(job: Job) -> None:
     setup_jax(quiet=True)
     row = ROWS[job.row]
     robot = jax.tree.map(jnp.asarray, job.robot)
-    path = job.path.moved(job.start).waiting(REST_S)
+    path = job.path.moved(job.start).after_rest(REST_S)
     plant: closed_loop.Plant
     if job.plant == "twin":
         truth = one_of(robot, job.seed)
@@ -221,9 +221,9 @@ def drive(job: Job) -> None:
     else:
         plant = SitePlant(job.floor, robot.load_setup, job.start, job.seed, row.gyro)
     there = floor_of(job.told, robot.labels)
-    pilot = control_loop_of(robot, row, job.settings, job.forced, there)
-    course = closed_loop.run_closed_loop(pilot, path, plant, job.start)
-    off = course.pose[-1] - course.believed[-1]
+    loop = control_loop_of(robot, row, job.settings, job.forced, there)
+    course = closed_loop.run_closed_loop(loop, path, plant, job.start)
+    off = course.pose[-1] - course.estimated_pose[-1]
     run = Run(
         controller=job.row,
         start=job.start,
@@ -232,7 +232,7 @@ def drive(job: Job) -> None:
         believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
     )
     # the path first: a run that has metrics is done
-    poses = {"time": course.time, "pose": course.pose, "believed": course.believed}
+    poses = {"time": course.time, "pose": course.pose, "believed": course.estimated_pose}
     job.kept.save(job.name, poses)
     job.kept.save_json(job.name, asdict(run))
 
