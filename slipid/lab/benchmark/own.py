@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.app.problem import Job
+from slipid.app.problem import ConfigFitTask
 from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
 from slipid.deploy.deploy import robot_of
@@ -57,7 +57,7 @@ class Own:
     """
 
     contact: Contact
-    job: Job
+    job: ConfigFitTask
     seen: tuple[int, ...]
     highest_speed: float
     trend: tuple[float, float]
@@ -76,7 +76,7 @@ class Own:
         return robot_of(self.contact, self.highest_speed, self.trend, Sensors(signed))
 
 
-def fit_own(job: Job, problem: Problem, fitted: np.ndarray, kept: Checkpoint) -> Own:
+def fit_own(job: ConfigFitTask, problem: Problem, fitted: np.ndarray, kept: Checkpoint) -> Own:
     """The force balance fitted to some runs of a job.
 
     What was kept of this very fit is not done again. Fits of one `job.problem()` share what was
