@@ -107,7 +107,7 @@ def simulate_runs(
         raise ValueError(
             f"no parameter '{wrong[0]}'; there are: {', '.join(known.true_numbers(robot))}"
         )
-    logs = simulate_logs(robot, drives, seed, known.LogSensors(has_voltage=voltage))
+    logs = simulate_logs(robot, drives, seed, known.SimulatedSensors(has_voltage=voltage))
     return SimulatedRuns(
         collect(logs if current else [replace(log, current=None) for log in logs]), robot
     )

@@ -82,7 +82,7 @@ def with_noise(
     of freedom of the model's own numbers are taken off.
     """
     robot = contact.robot
-    seen = problem.windows.at_lag(float(robot.camera.lag)).pieces(np.flatnonzero(keep > 0))
+    seen = problem.windows.at_lag(float(robot.camera.lag)).segments(np.flatnonzero(keep > 0))
     model = model.fit(seen, robot)
     before = _before(model, seen, robot)
     common = contact.covariance[np.ix_(contact.camera, contact.camera)]

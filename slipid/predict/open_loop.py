@@ -70,9 +70,9 @@ def whole_runs(data: Runs, robot: Robot, steps: Sequence[int]) -> list[Windows]:
         runs = np.flatnonzero(np.asarray(steps) == count)
         for first in range(0, len(runs), TOGETHER):
             some = runs[first : first + TOGETHER]
-            w = windows(data.subset(some), radius, lag, per_piece=count, longest=np.inf)
+            w = windows(data.subset(some), radius, lag, per_segment=count, longest=np.inf)
             filled = np.minimum(np.arange(TOGETHER), len(w) - 1)
-            out.append(replace(w, run=some[w.run]).pieces(filled))
+            out.append(replace(w, run=some[w.run]).segments(filled))
     return out
 
 

@@ -12,7 +12,7 @@ from slipid.data.runs import collect
 from slipid.fit.optimise import optimise
 from slipid.infer.result import summarise
 from slipid.lab.selftest.logs import (
-    LogSensors,
+    SimulatedSensors,
     heading_grid,
     nominal_robot,
     simulate_logs,
@@ -28,10 +28,10 @@ fit = partial(optimise, most_rounds=15)
 
 def promised_and_kept(times, creep):
     """Verdicts before and after the fit of runs with so many times the usual noise."""
-    usual = LogSensors()
+    usual = SimulatedSensors()
     std = {name: (times if "floor" in name else 1) * v for name, v in usual.std.items()}
     logs = simulate_logs(
-        true_robot(PLAN, {"surface.soft.creep": creep}), PLAN, 3, LogSensors(std=std)
+        true_robot(PLAN, {"surface.soft.creep": creep}), PLAN, 3, SimulatedSensors(std=std)
     )
     data = collect(logs)
     task = FitTask(

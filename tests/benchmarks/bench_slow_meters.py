@@ -11,7 +11,7 @@ that no number is more than 3.5 of its stds off.
 import pytest
 
 from slipid.data.runs import collect
-from slipid.lab.selftest.logs import LogSensors, simulate_logs
+from slipid.lab.selftest.logs import SimulatedSensors, simulate_logs
 from tests.benchmarks.quick import QUICK, quick
 from tests.helpers.kinds import SHAPES, fitted, known, plan, wanted
 from tests.helpers.slow_meters import held
@@ -19,7 +19,7 @@ from tests.helpers.slow_meters import held
 EVERY = quick((1, 4, 16), (4,))
 """Rows from one reading of the meters to the next."""
 SEEDS = quick((0, 1, 2), (0,))
-FINE = LogSensors(ripple=0.005, current_step=0.002, voltage_step=0.005, signed=True)
+FINE = SimulatedSensors(ripple=0.005, current_step=0.002, voltage_step=0.005, signed=True)
 
 
 @pytest.mark.parametrize("kind", quick(["differential", "skid"], ["differential"]))

@@ -29,9 +29,9 @@ from slipid.fit.optimise import optimise
 from slipid.fit.problem import Problem
 from slipid.fit.variances import _cut, whitened
 from slipid.infer.fit_file import load
-from slipid.lab.selftest.logs import LogSensors, heading_grid, simulate_logs, true_robot
+from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.model import se2
-from slipid.robot.interface import MIXED, Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.search_space import Choice
 from slipid.support.errors import DataError
 from tests.app.test_config import GOOD, written
@@ -64,10 +64,10 @@ def still(lag, runs, per_run):
         surface=("unknown",) * runs,
         load=("as_built",) * runs,
         session=("elsewhere",) * runs,
-        began=np.zeros(runs),
+        start=np.zeros(runs),
         dt=np.full((runs, per_run), 0.25),
         turn=zero,
-        faster=zero,
+        speed_change=zero,
         pose=np.zeros((runs, per_run + 1, 3)),
         current=zero,
         voltage=zero,
@@ -284,7 +284,9 @@ def test_wheels_stand_where_the_camera_says_less_the_marker():
 def driven():
     drives = heading_grid(setups=(("soft", "as_built"), ("firm", "as_built")), headings=2, turns=0)
     true = true_robot(drives)
-    logs = [replace(log, surface=None) for log in simulate_logs(true, drives, 1, LogSensors())]
+    logs = [
+        replace(log, surface=None) for log in simulate_logs(true, drives, 1, SimulatedSensors())
+    ]
     return true, collect(logs)
 
 
@@ -302,7 +304,7 @@ def test_windows_in_which_no_wheel_changes_floors(driven):
     for run, window in np.argwhere(some.counts):
         w = some.windows
         edges = w.pose[run : run + 1, window : window + 2]
-        alone = replace(w.pieces(np.array([run])), pose=edges)
+        alone = replace(w.segments(np.array([run])), pose=edges)
         x = cut.wheel_places(true, alone)[0, ..., 0]
         assert ((x > 0) == (some.floor[run, window] == true.surface_index("firm"))).all()
     w = whole.windows
@@ -318,7 +320,7 @@ def test_windows_of_a_run_stand_in_a_row_and_two_maps_go_together(driven):
     one = cut.crossing([(data, floor)], true)
     assert one.counts.shape[1] <= cut.MOST_WINDOWS
     for k in range(len(data)):
-        row = one.windows.pieces(np.array([k]))
+        row = one.windows.segments(np.array([k]))
         poses = data.pose[data.rows(k)]
         at = [np.flatnonzero((poses == place).all(axis=1))[0] for place in row.pose[0]]
         there = np.flatnonzero(one.counts[k])[-1] + 2  # beyond it the last window is repeated
@@ -425,10 +427,13 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path):
     drives = heading_grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
     true = true_robot(drives)
     write_logs(
-        simulate_logs(true, drives, 1, LogSensors()), true, tmp_path / "logs", tmp_path / "t"
+        simulate_logs(true, drives, 1, SimulatedSensors()), true, tmp_path / "logs", tmp_path / "t"
     )
     write_logs(
-        simulate_logs(true, drives[:4], 2, LogSensors()), true, tmp_path / "site", tmp_path / "t"
+        simulate_logs(true, drives[:4], 2, SimulatedSensors()),
+        true,
+        tmp_path / "site",
+        tmp_path / "t",
     )
     (tmp_path / "site/as_built/soft").rename(tmp_path / "logs/site")
     (tmp_path / "site.toml").write_text(MAP.replace("gray", "soft"), encoding="utf-8")
@@ -463,7 +468,7 @@ def deployed(out):
     """The fit drives its twin; what is done is not done again."""
     fit = load(out)
     robot = read_robot(out)
-    assert Settings.of(robot).alike == MIXED
+    assert Settings.of(robot).alike == MIXED_FLOORS_PENALTY
     assert fit.current_trend != (0.0, 0.0)
     np.testing.assert_array_equal(robot.current_trend, fit.current_trend)
     wish = ("trial", out, "--plant", "twin", "--starts", 2, "--jobs", 1)
@@ -496,10 +501,12 @@ def test_runs_with_a_wrong_map_are_refused(tmp_path):
     )
     true = true_robot(drives)
     write_logs(
-        simulate_logs(true, drives, 1, LogSensors()), true, tmp_path / "logs", tmp_path / "t"
+        simulate_logs(true, drives, 1, SimulatedSensors()), true, tmp_path / "logs", tmp_path / "t"
     )
     soft = [d for d in drives if d.surface == "soft"]
-    write_logs(simulate_logs(true, soft, 2, LogSensors()), true, tmp_path / "site", tmp_path / "t")
+    write_logs(
+        simulate_logs(true, soft, 2, SimulatedSensors()), true, tmp_path / "site", tmp_path / "t"
+    )
     (tmp_path / "site/as_built/soft").rename(tmp_path / "logs/site")
     (tmp_path / "site.toml").write_text(MAP.replace("gray", "firm"), encoding="utf-8")
     section = '[[logs]]\nglob = "site/*.csv"\nformat = "demo"\nmap = "site.toml"\n[parameters]'

@@ -10,9 +10,9 @@ from slipid.data.runs import Runs, collect
 from slipid.data.windows import windows
 from slipid.fit.optimise import optimise
 from slipid.fit.problem import Problem
-from slipid.infer.design.planned_runs import Drive
+from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.result import Fit, summarise
-from slipid.lab.selftest.logs import LogSensors, heading_grid, simulate_logs, turning_grid
+from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, turning_grid
 from slipid.model.geometry import Geometry, differential, mecanum, omni, skid_steer
 from slipid.model.robot import Robot, build
 from slipid.parameter import entries
@@ -43,12 +43,12 @@ def experiment(kind: str, seed: int = 0, headings: int = 12) -> Experiment:
     drives = plan(shape, headings)
     truth = known(shape, drives)
     # wheels that are dragged along brake, which magnitudes of currents do not tell
-    fine = LogSensors(ripple=0.005, current_step=0.002, voltage_step=0.005, signed=True)
+    fine = SimulatedSensors(ripple=0.005, current_step=0.002, voltage_step=0.005, signed=True)
     data = collect(simulate_logs(truth, drives, seed, fine))
     return Experiment(truth, data, wanted(truth, data))
 
 
-def known(shape: Geometry, drives: Sequence[Drive]) -> Robot:
+def known(shape: Geometry, drives: Sequence[PlannedRun]) -> Robot:
     """A robot of this shape whose every number is known, in the sessions that are driven."""
     robot = build(shape, list(FLOORS), ("as_built",), sorted({d.session for d in drives}))
     choices = [Choice(path, fixed=value) for path, value in numbers(robot).items()]
@@ -64,7 +64,7 @@ def fitted(truth: Robot, data: Runs, choices: Sequence[Choice]) -> Fit:
     return summarise(problem, optimise(problem), data, choices)
 
 
-def plan(shape: Geometry, headings: int) -> tuple[Drive, ...]:
+def plan(shape: Geometry, headings: int) -> tuple[PlannedRun, ...]:
     setups = [(floor, "as_built") for floor in FLOORS]
     if shape.determines_twist:
         return heading_grid(setups, headings, (0.15, 0.3), turns=4)

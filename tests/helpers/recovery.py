@@ -14,7 +14,7 @@ from slipid.fit.problem import Problem
 from slipid.infer.slip_curves import curves, slip_on
 from slipid.infer.verdicts.estimates import by_ratio, from_zero
 from slipid.lab.selftest.logs import (
-    LogSensors,
+    SimulatedSensors,
     heading_grid,
     nominal_robot,
     simulate_logs,
@@ -56,13 +56,13 @@ def problem(voltage=True):
 
 @functools.cache
 def dataset(seed, voltage=True):
-    return collect(simulate_logs(TRUTH, PLAN, seed, LogSensors(has_voltage=voltage)))
+    return collect(simulate_logs(TRUTH, PLAN, seed, SimulatedSensors(has_voltage=voltage)))
 
 
 @functools.cache
 def design():
     """Which coordinates this plan identifies: expected information at the truth."""
-    this, sensors = problem(), LogSensors()
+    this, sensors = problem(), SimulatedSensors()
     rows = 40  # of a window
     white = {
         "window": sensors.ripple / np.sqrt(rows),

@@ -20,7 +20,7 @@ from slipid.fit.optimise import Optimum, one_round
 from slipid.fit.problem import Problem, State
 from slipid.fit.variances import DEGREES
 from slipid.infer import fit_file
-from slipid.infer.design.planned_runs import Drive
+from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.fit_file import identified_json, load, save, to_json
 from slipid.infer.posterior import diagnosis
 from slipid.infer.result import Fit, summarise
@@ -28,7 +28,7 @@ from slipid.infer.slip_curves import by_encoders, has_steady_command, validity
 from slipid.infer.verdicts.estimates import estimates
 from slipid.infer.verdicts.unidentified import flat_directions, members
 from slipid.lab.selftest.logs import (
-    LogSensors,
+    SimulatedSensors,
     heading_grid,
     nominal_robot,
     simulate_logs,
@@ -54,7 +54,7 @@ CHOICES = (
 @functools.cache
 def made(voltage: bool):
     """A problem, its data, and the Laplace covariance at the truth."""
-    data = collect(simulate_logs(TRUTH, DRIVES, 1, LogSensors(has_voltage=voltage)))
+    data = collect(simulate_logs(TRUTH, DRIVES, 1, SimulatedSensors(has_voltage=voltage)))
     problem = Problem(windows(data, 0.04, lag=0.05), nominal_robot(DRIVES), list(CHOICES))
     z = problem.space.vector(TRUTH)
     state = State(z, 2 * np.log(problem.noise.typical), 7, -1.5, 0.01, "joint")
@@ -436,8 +436,10 @@ SHARED = {"along": 0.02, "across": 0.01}
 def in_sessions(session, seed):
     """Runs in these sessions, whose ends are off by what the runs of each share."""
     rng = np.random.default_rng(seed)
-    drives = [Drive("soft", "as_built", h, 0.1) for h in rng.uniform(0, 2 * np.pi, len(session))]
-    logs = simulate_logs(TRUTH, drives, seed, LogSensors(has_voltage=False))
+    drives = [
+        PlannedRun("soft", "as_built", h, 0.1) for h in rng.uniform(0, 2 * np.pi, len(session))
+    ]
+    logs = simulate_logs(TRUTH, drives, seed, SimulatedSensors(has_voltage=False))
     effect = rng.normal(size=(max(session) + 1, 2)) * [*SHARED.values()]
     moved = []
     for log, drive, (along, across) in zip(logs, drives, effect[session], strict=True):
@@ -471,7 +473,7 @@ def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
     """At the truth, so that all that is off is noise: 200 runs, each in a session of its own."""
     data = in_sessions(np.arange(160) % 40, 1)
     problem = Problem(windows(data, 0.04, lag=0.056), nominal_robot(DRIVES), list(CHOICES))
-    z, sensors = problem.space.vector(TRUTH), LogSensors()
+    z, sensors = problem.space.vector(TRUTH), SimulatedSensors()
     std = problem.noise.typical.copy()
     for k, name in enumerate(problem.noise.names):
         if name.startswith("session.soft."):

@@ -14,10 +14,10 @@ from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.fit.optimise import Optimum
 from slipid.fit.problem import Problem, State
-from slipid.infer.design.planned_runs import Drive
+from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.result import Fit, summarise
 from slipid.lab.selftest.logs import (
-    LogSensors,
+    SimulatedSensors,
     heading_grid,
     nominal_robot,
     simulate_logs,
@@ -28,8 +28,8 @@ from slipid.plots import fit as plots
 from slipid.plots import fit as plots_robot
 from slipid.plots.compare import WORDS, ladder_figure
 from slipid.plots.drawing import figure, save
+from slipid.plots.measured_windows import by_heading, measured_windows
 from slipid.plots.motion import heading_figure
-from slipid.plots.seen import by_heading, seen
 from slipid.plots.wheels import current_figure, driving_torque, wheel_curve
 from slipid.predict.slip_models import slip_models
 from slipid.search_space import Choice
@@ -38,8 +38,8 @@ pytestmark = pytest.mark.slow  # traces whole fits
 
 DRIVES = heading_grid(setups=(("soft", "as_built"), ("firm", "as_built")), headings=8, turns=0)
 ROBOT = true_robot(DRIVES)
-QUIET = LogSensors(
-    std=dict.fromkeys(LogSensors().std, 0.0), ripple=0.0, voltage_noise=0.0, wobble=0.0
+QUIET = SimulatedSensors(
+    std=dict.fromkeys(SimulatedSensors().std, 0.0), ripple=0.0, voltage_noise=0.0, wobble=0.0
 )
 
 
@@ -50,7 +50,7 @@ def data():
 
 @functools.cache
 def pieces():
-    return seen(ROBOT, data(), 4)
+    return measured_windows(ROBOT, data(), 4)
 
 
 @functools.cache
@@ -157,9 +157,11 @@ def test_without_currents_or_directions_those_pictures_are_left_out():
 
 
 def test_turning_pieces_have_no_direction():
-    drives = (Drive("soft", "as_built", 0.3, 0.2, turn=0.8),)
+    drives = (PlannedRun("soft", "as_built", 0.3, 0.2, turn=0.8),)
     robot = true_robot(drives)
-    assert not seen(robot, collect(simulate_logs(robot, drives, 0, QUIET)), 4).straight.any()
+    assert not measured_windows(
+        robot, collect(simulate_logs(robot, drives, 0, QUIET)), 4
+    ).straight.any()
 
 
 def test_loads_are_written_at_their_wheels():

@@ -21,8 +21,8 @@ from slipid.fit.likelihood import batch
 from slipid.fit.problem import Problem
 from slipid.fit.sessions import Linear, shared
 from slipid.fit.variances import DEGREES
-from slipid.infer.design.planned_runs import Drive
-from slipid.lab.selftest.logs import LogSensors, heading_grid, simulate_logs, true_robot
+from slipid.infer.design.planned_runs import PlannedRun
+from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.predict import open_loop as replay
 from slipid.predict.folds import folds_of, nested
 from slipid.predict.noisy import slopes, with_noise
@@ -308,13 +308,13 @@ PLAN = heading_grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3
 
 @pytest.fixture(scope="module")
 def logs():
-    return simulate_logs(true_robot(PLAN), PLAN, 1, LogSensors())
+    return simulate_logs(true_robot(PLAN), PLAN, 1, SimulatedSensors())
 
 
 @pytest.mark.slow
 def test_a_turn_on_the_spot_has_no_speed_to_leave_out(logs):
     spin = simulate_logs(
-        true_robot(PLAN), [Drive("soft", "as_built", 0.0, 0.0, 0.5)], 1, LogSensors()
+        true_robot(PLAN), [PlannedRun("soft", "as_built", 0.0, 0.0, 0.5)], 1, SimulatedSensors()
     )
     fold = folds_of(collect([*logs, *spin]), "speeds")
     assert sorted(set(fold[:-1])) == [0, 1]

@@ -11,7 +11,7 @@ from slipid.app.problem import FitTask, robot_for_runs
 from slipid.data.runs import collect
 from slipid.fit.optimise import optimise
 from slipid.lab.selftest.logs import (
-    LogSensors,
+    SimulatedSensors,
     heading_grid,
     nominal_robot,
     simulate_logs,
@@ -58,7 +58,7 @@ def task_of(logs):
 @pytest.fixture(scope="module")
 def logs():
     """Runs of which those of one speed look longer than those of the other."""
-    made = simulate_logs(true_robot(PLAN), PLAN, 1, LogSensors())
+    made = simulate_logs(true_robot(PLAN), PLAN, 1, SimulatedSensors())
     longer = [1.0 + 0.03 * np.sign(d.speed - 0.15) for d in PLAN]
     return [replace(log, pose=log.pose * [k, k, 1.0]) for log, k in zip(made, longer, strict=True)]
 
@@ -87,7 +87,7 @@ def test_nothing_of_a_left_out_run_is_learnt(logs, judged, learnt):
     again = folds.learn(other.problem(), CHOICES, other.dataset, QUESTION, judged, fit)
     assert len(spoilt) > 2
     w = learnt.problem.windows
-    kept = w.pieces(np.flatnonzero(~np.isin(w.run, judged)))
+    kept = w.segments(np.flatnonzero(~np.isin(w.run, judged)))
     std = np.sqrt(np.diag(learnt.optimum.covariance))
     same(again.optimum.state.z / std, learnt.optimum.state.z / std)
     same(again.optimum.state.log_variance, learnt.optimum.state.log_variance)

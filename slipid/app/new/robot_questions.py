@@ -12,7 +12,7 @@ from slipid.app.config import (
     Wheels,
     geometry,
 )
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 
 Asker = Callable[[str, str, str], str]
 """Asks people: what is asked, what stands there if they say nothing, and what was wrong with the
@@ -152,7 +152,9 @@ def _drive(text: str, _: RobotAnswers) -> str:
     if word == "motor":
         raise ValueError("a motor on a bench needs no config; expected its log: slipid motor FILE")
     if word not in DRIVES:
-        raise ValueError(f"no such drive{near(word, DRIVES)}; expected one of {', '.join(DRIVES)}")
+        raise ValueError(
+            f"no such drive{did_you_mean(word, DRIVES)}; expected one of {', '.join(DRIVES)}"
+        )
     return word
 
 

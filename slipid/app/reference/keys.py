@@ -23,7 +23,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from slipid.app.config import BenchMotors, Config, ParameterSection, geometry
-from slipid.infer.bench.motor import Bench, BenchMotor
+from slipid.infer.bench.motor import BenchMotor, BenchRoot
 from slipid.model.geometry import omni
 from slipid.model.robot import Robot
 from slipid.parameter import Declaration, Entry, entries
@@ -133,7 +133,7 @@ def parameter_rows(config: Config | None = None) -> list[ParameterRow]:
         return [_row(entry, whole, {}) for entry in entries(whole)]
     content = config.content
     if isinstance(content.robot, BenchMotors):
-        bench = Bench(BenchMotor())
+        bench = BenchRoot(BenchMotor())
         return [_row(entry, bench, content.parameters) for entry in entries(bench)]
     floors = [FLOOR if s.surface == "folder" else s.surface for s in content.logs if s.map is None]
     loads = tuple(dict.fromkeys(section.load for section in content.logs))
@@ -143,7 +143,9 @@ def parameter_rows(config: Config | None = None) -> list[ParameterRow]:
     return [_row(entry, whole, content.parameters) for entry in entries(whole)]
 
 
-def _row(entry: Entry, robot: Robot | Bench, settings: dict[str, ParameterSection]) -> ParameterRow:
+def _row(
+    entry: Entry, robot: Robot | BenchRoot, settings: dict[str, ParameterSection]
+) -> ParameterRow:
     one = entry.declaration
     value = np.atleast_1d(np.asarray(entry.get(robot), float))
     start = f"{value[0]:.4g}" if np.ptp(value) == 0 else ", ".join(f"{v:.4g}" for v in value)

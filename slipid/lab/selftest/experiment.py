@@ -17,7 +17,7 @@ from slipid.data.runs import collect
 from slipid.fit.problem import Problem
 from slipid.infer.verdicts.estimates import derived
 from slipid.lab.selftest import replicates as test
-from slipid.lab.selftest.logs import LogSensors, heading_grid, simulate_logs, turning_grid
+from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, turning_grid
 from slipid.lab.selftest.replicates import NumberRecovery, Replicate
 from slipid.model.robot import build
 from slipid.support.checkpoint import Checkpoint, key_of
@@ -95,7 +95,9 @@ def planned_task(config: Config, report: Reporter) -> ConfigFitTask:
     has_current = all("current" in c for c in channels)
     has_voltage = all("voltage" in c or {"duty", "bus_voltage"} <= c for c in channels)
     is_signed = all(layout.current_is_signed for layout in layouts)
-    logs = simulate_logs(robot, drives, 0, LogSensors(has_voltage=has_voltage, signed=is_signed))
+    logs = simulate_logs(
+        robot, drives, 0, SimulatedSensors(has_voltage=has_voltage, signed=is_signed)
+    )
     if not has_current:
         logs = [replace(log, current=None) for log in logs]
     report.line(f"no logs given: {len(logs)} runs of [selftest] on {', '.join(wanted.surfaces)}")

@@ -11,7 +11,7 @@ from slipid.lab.testsite.driving import PERIOD, RimSpeeds
 from slipid.lab.testsite.plant import SimulatedRobot
 from slipid.lab.testsite.site import Site, SiteSensors
 from slipid.lab.testsite.surfaces import SURFACES
-from slipid.robot.deployed import DeployedRobot, drawn
+from slipid.robot.deployed import DeployedRobot, posterior_robots
 from slipid.robot.interface import Measurement
 from slipid.support.errors import DataError
 
@@ -98,4 +98,4 @@ def drawn_robot(robot: DeployedRobot, seed: int) -> DeployedRobot:
     if count == 0:
         return robot
     picked = int(np.random.default_rng(seed).integers(count))
-    return jax.tree.map(lambda x: x[0], drawn(robot, (picked,)))
+    return jax.tree.map(lambda x: x[0], posterior_robots(robot, (picked,)))

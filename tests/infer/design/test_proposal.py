@@ -20,7 +20,7 @@ from slipid.infer.design.planner import Planner
 from slipid.infer.fit_file import load, save
 from slipid.infer.result import summarise
 from slipid.lab.selftest.logs import (
-    LogSensors,
+    SimulatedSensors,
     heading_grid,
     nominal_robot,
     simulate_logs,
@@ -39,7 +39,7 @@ BASE = 0.125
 def folder(tmp_path_factory):
     """A fit that ended at the truth, of straight runs without voltage."""
     robot = true_robot(DRIVES)
-    data = collect(simulate_logs(robot, DRIVES, 0, LogSensors(has_voltage=False)))
+    data = collect(simulate_logs(robot, DRIVES, 0, SimulatedSensors(has_voltage=False)))
     choices = [
         Choice("camera.scale", prior_mean=1.117, prior_std=0.002),
         Choice("camera.session_yaw@*", free=True),

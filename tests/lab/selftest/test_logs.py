@@ -13,8 +13,14 @@ from slipid.data.runs import collect, default_session
 from slipid.data.windows import windows
 from slipid.fit.likelihood import batch
 from slipid.fit.noise import noise
-from slipid.infer.design.planned_runs import Drive
-from slipid.lab.selftest.logs import TRUTH, LogSensors, heading_grid, simulate_logs, true_robot
+from slipid.infer.design.planned_runs import PlannedRun
+from slipid.lab.selftest.logs import (
+    TRUTH,
+    SimulatedSensors,
+    heading_grid,
+    simulate_logs,
+    true_robot,
+)
 from tests.helpers.made_logs import LAYOUT, write_logs
 from tests.helpers.made_windows import electric_noise, residuals
 from tests.helpers.one_log import read_log
@@ -22,7 +28,7 @@ from tests.helpers.one_log import read_log
 SETUPS = (("firm", "as_built"), ("soft", "as_built"), ("soft", "moved"))
 PLAN = heading_grid(SETUPS, headings=4, turns=2)
 ROBOT = true_robot(PLAN)
-STILL = dict.fromkeys(LogSensors().std, 0.0)
+STILL = dict.fromkeys(SimulatedSensors().std, 0.0)
 
 
 @jax.jit
@@ -82,7 +88,7 @@ def test_sessions_are_those_a_dataset_finds(logs):
 
 @pytest.mark.slow
 def test_without_noise_the_likelihood_has_no_residual():
-    fine = LogSensors(
+    fine = SimulatedSensors(
         std=STILL,
         ripple=0.0,
         voltage_noise=0.0,
@@ -109,8 +115,8 @@ def test_without_noise_the_likelihood_has_no_residual():
 @pytest.mark.slow
 def test_scatter_of_increments_is_the_likelihoods_covariance():
     """Whitened with the true variances, residuals at the truth have unit variance."""
-    sensors = LogSensors()
-    one = [Drive("soft", "as_built", h, 0.1) for h in np.linspace(0.1, 6, len(PLAN))]
+    sensors = SimulatedSensors()
+    one = [PlannedRun("soft", "as_built", h, 0.1) for h in np.linspace(0.1, 6, len(PLAN))]
     cut, gap = at_truth(ROBOT, one, 11, sensors)
     n = noise(cut, ROBOT)
     v = np.array([sensors.of(m) ** 2 if of_motion(m) else 0.0 for m in n.names])

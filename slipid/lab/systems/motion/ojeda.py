@@ -72,7 +72,7 @@ PRIOR = 1e6
 
 
 @dataclass(frozen=True)
-class Hard:
+class HardFloor:
     """Mean and std over time of the wheels' mean smoothed current on the hard floor [A]."""
 
     mean: float
@@ -84,7 +84,7 @@ class Hard:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class FlaggedSteps:
     """What is computed of some runs before the two numbers come in.
 
     Attributes:
@@ -125,7 +125,7 @@ class Ojeda(SlipModel):
     tuning: Tuning = "continuous"
     needs: frozenset[Channel] = field(default=frozenset({"current"}), kw_only=True)
     time_constant: float = 0.3
-    hard: Hard | None = None
+    hard: HardFloor | None = None
     lines: Mapping[str | None, Float[np.ndarray, "2"]] = field(default_factory=dict)
 
     def candidates(self) -> Sequence["Ojeda"]:
@@ -151,20 +151,20 @@ class Ojeda(SlipModel):
     def numbers(self) -> int:
         return 2 * len(self.lines) + 2 * (self.hard is not None)
 
-    def _hard(self, runs: Sequence[Run], machine: Machine) -> Hard:
+    def _hard(self, runs: Sequence[Run], machine: Machine) -> HardFloor:
         steps = Steps.of([run.signals for run in runs])
         current = steps.smoothed(steps.signals.along(machine), self.time_constant).mean(axis=1)
         moves = np.abs(steps.signals.speed).mean(axis=1) * machine.wheel_radius > MOVING
         seen = current[moves] if moves.any() else current
-        return Hard(float(seen.mean()), max(float(seen.std()), 1e-6))
+        return HardFloor(float(seen.mean()), max(float(seen.std()), 1e-6))
 
-    def _scene(self, runs: Sequence[RunSignals], hard: Hard, machine: Machine) -> Scene:
+    def _scene(self, runs: Sequence[RunSignals], hard: HardFloor, machine: Machine) -> FlaggedSteps:
         steps = Steps.of(runs)
         rim = steps.signals.speed * machine.wheel_radius
         current = steps.smoothed(steps.signals.along(machine), self.time_constant)
-        return Scene(steps, rim, current, hard.sigmas(current) > SIGMAS)
+        return FlaggedSteps(steps, rim, current, hard.sigmas(current) > SIGMAS)
 
-    def _line(self, runs: Sequence[Run], hard: Hard, machine: Machine) -> Line:
+    def _line(self, runs: Sequence[Run], hard: HardFloor, machine: Machine) -> Line:
         """k0 [m/s] and k1 [m/s/A] of some runs; zero where no slip was flagged."""
         scene = self._scene([run.signals for run in runs], hard, machine)
         if not scene.flagged.any():
@@ -198,7 +198,7 @@ def true_ends(runs: Sequence[Run]) -> Float[np.ndarray, "run 3"]:
     return np.stack([seen_from_start(run.pose)[-1] for run in runs])
 
 
-def continuous(scene: Scene, w: TrainingWindows, machine: Machine) -> Line:
+def continuous(scene: FlaggedSteps, w: TrainingWindows, machine: Machine) -> Line:
     """By the pose at all times; only windows with slip flagged count."""
     rows = w.rows(machine.back @ scene.features(), machine)
     told = rows.parts.any(axis=(1, 2))
@@ -223,7 +223,7 @@ def forgetful(
     return np.linalg.solve(a.T @ a + prior, a.T @ b)
 
 
-def sporadic(scene: Scene, runs: Sequence[Run], machine: Machine) -> Line:
+def sporadic(scene: FlaggedSteps, runs: Sequence[Run], machine: Machine) -> Line:
     """By the place at the end of each run."""
     from scipy.optimize import least_squares
 
@@ -235,7 +235,7 @@ def sporadic(scene: Scene, runs: Sequence[Run], machine: Machine) -> Line:
     return np.asarray(least_squares(gap, np.zeros(2), x_scale="jac").x)
 
 
-def by_gyro(scene: Scene, w: TrainingWindows, middle: float, machine: Machine) -> Line:
+def by_gyro(scene: FlaggedSteps, w: TrainingWindows, middle: float, machine: Machine) -> Line:
     """By the yaw rate alone; the middle is the hard floor's mean current [A]."""
     heard = scene.steps.signals
     if heard.gyro is None:
