@@ -10,7 +10,7 @@ from slipid.app.identify import optimised, summarised
 from slipid.app.problem import Task, on_runs, said_of
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
-from slipid.fit.problem import still_viscosities
+from slipid.fit.problem import fixed_viscosities
 from slipid.infer.result import Fit
 from slipid.model.robot import Robot
 from slipid.search_space import Choice
@@ -84,7 +84,7 @@ def task_of(
 ) -> Task:
     """What is to be fitted; arguments as of `fit`."""
     full = on_runs(robot, runs, image_centre)
-    choices = [*still_viscosities(runs), *said_of(full, float(full.body.mass))]
+    choices = [*fixed_viscosities(runs), *said_of(full, float(full.body.mass))]
     choices += [Choice(path, free=True) for path in free]
     for path, prior in priors.items():
         choices.append(Choice(path, prior_mean=_plain(prior.mean), prior_std=_plain(prior.std)))

@@ -21,7 +21,7 @@ from slipid.infer.result import Fit, draws
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.model.robot import Robot
 from slipid.parameter import entries
-from slipid.predict.predictive import Contact
+from slipid.predict.predictive import ForceBalance
 from slipid.robot.actuation import Habits
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import MIXED
@@ -132,7 +132,7 @@ def _number(e: Estimate) -> Number:
 
 
 def robot_of(
-    contact: Contact,
+    contact: ForceBalance,
     highest_speed: float,
     current_trend: tuple[float, float] = (0.0, 0.0),
     sensors: Sensors | None = None,

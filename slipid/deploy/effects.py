@@ -4,7 +4,7 @@ The motion per metre along, across and in yaw, of wheels that would not slip, is
 
     contact(z) - told(z),   told(z) = mean + slope (z - z_fit)
 
-as forecasts have it (`slipid.fit.shared`). The mean of the table is what that is beyond
+as forecasts have it (`slipid.fit.shared_effects`). The mean of the table is what that is beyond
 the contact model with the robot's numbers; what is left is the covariance of the effects given the
 numbers, grown as forecasts are, and the scatter of this very sum over draws of the numbers: where
 runs were near, another number is made up for by another effect.
@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.deploy.record_of import directions, moved_per_metre, spread_of
-from slipid.fit.shared import AXES, Directions, Pace
-from slipid.predict.predictive import Contact
+from slipid.fit.shared_effects import AXES, SpeedAndLoad, TravelConditions
+from slipid.predict.predictive import ForceBalance
 from slipid.robot.record import Axes, ToldRecord
 
 DIRECTIONS = 72
@@ -26,7 +26,7 @@ _Grid = Float[np.ndarray, "floor speed direction 3"]
 
 
 def told_by_load(
-    contact: Contact, center: Float[np.ndarray, " free"], draws: Float[np.ndarray, "draw free"]
+    contact: ForceBalance, center: Float[np.ndarray, " free"], draws: Float[np.ndarray, "draw free"]
 ) -> dict[str, ToldRecord]:
     """What is told of effects by load set-up; nothing where no runs share any.
 
@@ -45,12 +45,12 @@ def told_by_load(
 
 
 def _table(
-    contact: Contact, center: np.ndarray, draws: np.ndarray, load: str, log_speed: np.ndarray
+    contact: ForceBalance, center: np.ndarray, draws: np.ndarray, load: str, log_speed: np.ndarray
 ) -> ToldRecord:
     count, labels = len(log_speed), contact.robot.surfaces.labels
     angle = np.linspace(0.0, 2 * np.pi, DIRECTIONS, endpoint=False)
-    paces = tuple(Pace(float(s), load) for s in log_speed for _ in angle)
-    way = Directions(np.tile(angle, count), paces, contact.robot.geometry.mirror())
+    paces = tuple(SpeedAndLoad(float(s), load) for s in log_speed for _ in angle)
+    way = TravelConditions(np.tile(angle, count), paces, contact.robot.geometry.mirror())
     robots = jax.vmap(contact.space.tree)(jnp.asarray(draws))
     k = jnp.asarray(contact.robot.load_index(load))
     moved = [moved_per_metre(robots, k, jnp.exp(s), directions(DIRECTIONS)) for s in log_speed]
@@ -72,7 +72,7 @@ def _table(
     return ToldRecord(speeds, _rows(mean), _rows(left))
 
 
-def _of(contact: Contact, kind: str, floor: str) -> Float[np.ndarray, "3"]:
+def _of(contact: ForceBalance, kind: str, floor: str) -> Float[np.ndarray, "3"]:
     """Variances of what a run has of its own, or of what a session shares, by axis."""
     return np.array([contact.variance.get(f"{kind}.{floor}.{axis}", 0.0) for axis in AXES])
 

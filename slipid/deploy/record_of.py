@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.fit.noise import SHARED
-from slipid.fit.shared import AXES
+from slipid.fit.shared_effects import AXES
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Frame, at_drives, at_wheels
+from slipid.model.geometry import WheelFrame, at_drives, at_wheels
 from slipid.model.motor import Motor
 from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.parameter import entries
@@ -127,7 +127,7 @@ def directions(count: int) -> Float[Array, "way 3"]:
     return jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
 
 
-def _turns(frame: Frame) -> Float[Array, "way 3"]:
+def _turns(frame: WheelFrame) -> Float[Array, "way 3"]:
     """Twists on the spot, to the left and to the right, with a rim speed of 1 m/s or so."""
     return jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / frame.base
 
@@ -135,7 +135,7 @@ def _turns(frame: Frame) -> Float[Array, "way 3"]:
 class _Wheels(eqx.Module):
     """The wheels as arrays, wherever they are: what is compiled for some serves all as many."""
 
-    frame: Frame
+    frame: WheelFrame
     forward: Float[Array, "*draw drive 3"]
     drive_of: tuple[int, ...] = eqx.field(static=True)
 
@@ -170,7 +170,7 @@ def _circle(
         xi = contact.equilibrium(rim, frame, floor, rest)
         force = floor.friction * mass * GRAVITY * frame.radius
         where = xi, rim, frame, floor, rest
-        felt = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
+        felt = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
         amps = motor.current(at_drives(wheels.drive_of, force * motor.borne(felt)), w)
         lost = turned - wheels.forward @ xi
         return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
@@ -196,7 +196,9 @@ def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
     return jax.vmap(wheel, 1)(*flat)
 
 
-def _spread(robot: Robot, frame: Frame, draws: Robot, load: Array) -> Float[np.ndarray, "floor 3"]:
+def _spread(
+    robot: Robot, frame: WheelFrame, draws: Robot, load: Array
+) -> Float[np.ndarray, "floor 3"]:
     """Std over posterior draws of the motion per metre, a row per floor (along, across, yaw).
 
     On average over all directions; of wheels that do not drive sideways the largest, turns on the

@@ -11,7 +11,7 @@ from slipid.fit.variances import DEGREES
 from slipid.lab.benchmark import own as slipid_rows
 from slipid.lab.benchmark.own import Own, Place, estimated, replay, told
 from slipid.lab.benchmark.steps import cut
-from slipid.predict.slip_model import Machine, PredictedRun
+from slipid.predict.slip_model import PredictedRun, RobotSpec
 from slipid.robot.estimator import Estimator
 from slipid.robot.interface import MIXED, Settings
 from tests.helpers.small_twin import deployed
@@ -43,8 +43,8 @@ def own_of(made, current=True) -> Own:
 
 def test_where_the_floor_is_told_the_region_is_that_of_a_student_t(made):
     one = cut(made.runs, made.robot)[0]
-    machine = Machine.of(made.robot)
-    said = told(own_of(made, current=False), one, machine)
+    spec = RobotSpec.of(made.robot)
+    said = told(own_of(made, current=False), one, spec)
     assert len(said) == len(one.runs)
     for run in said:
         assert run.end_covariance is not None

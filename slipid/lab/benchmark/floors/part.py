@@ -26,7 +26,7 @@ from slipid.lab.benchmark.work import OF_FITS, OF_ROWS, Wish, data_of
 from slipid.lab.systems.floors.cosine_energy import CosineEnergy, tree_rows
 from slipid.lab.systems.floors.gaussian import Gaussian
 from slipid.lab.systems.floors.interface import FloorMethod
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.files import Content, hash_of
 from slipid.support.jax_setup import setup_jax
@@ -55,9 +55,9 @@ def felt_benchmark(data: Path, quick: bool = False, only: tuple[str, ...] = ()) 
         DataError: the folder's files cannot be read.
     """
     felts = read_felt(data / FOLDER, RADIUS)
-    machine = Machine.of(husky().on(["any"]))
+    spec = RobotSpec.of(husky().on(["any"]))
     methods = [method for method in felt_rows() if not only or method.name in only]
-    return felt_table(methods, felts, machine, ABOUT, Asked.quick() if quick else Asked())
+    return felt_table(methods, felts, spec, ABOUT, Asked.quick() if quick else Asked())
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from slipid.lab.benchmark.floors.result import Answer, FeltRow, FeltTable, after
 from slipid.lab.benchmark.judge import Row
 from slipid.lab.benchmark.tuned import settings_of
 from slipid.lab.systems.floors.interface import Beliefs, Felt, FloorMethod
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 
 SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """After which classifiers are asked [s]."""
@@ -63,11 +63,11 @@ def folds_of(felts: Sequence[Felt], count: int) -> Numbers:
 
 
 def answers_of(
-    method: FloorMethod, felts: Sequence[Felt], machine: Machine, seconds: Sequence[float]
+    method: FloorMethod, felts: Sequence[Felt], spec: RobotSpec, seconds: Sequence[float]
 ) -> list[Answer]:
     """What a fitted classifier says of the stretches of runs."""
     stretches = [part for felt in felts for part in felt.pieces(max(seconds))]
-    said = method.probability(stretches, machine)
+    said = method.probability(stretches, spec)
     return [
         answer
         for stretch, beliefs in zip(stretches, said, strict=True)
@@ -102,7 +102,7 @@ class Tuned:
     seconds: float
 
 
-def tuned(method: FloorMethod, felts: Sequence[Felt], machine: Machine, asked: Asked) -> Tuned:
+def tuned(method: FloorMethod, felts: Sequence[Felt], spec: RobotSpec, asked: Asked) -> Tuned:
     """The candidate that names the right floor most often in an inner cross-validation.
 
     By the mean over all times that are asked; the first of those that are as good.
@@ -115,8 +115,8 @@ def tuned(method: FloorMethod, felts: Sequence[Felt], machine: Machine, asked: A
     for candidate in candidates:
         said: list[Answer] = []
         for k in range(asked.inner):
-            done = candidate.fit(_some(felts, fold != k), machine)
-            said += answers_of(done, _some(felts, fold == k), machine, asked.seconds)
+            done = candidate.fit(_some(felts, fold != k), spec)
+            said += answers_of(done, _some(felts, fold == k), spec, asked.seconds)
         each = [
             np.mean([a.said == a.floor for a in said if a.seconds == long])
             for long in sorted({a.seconds for a in said})
@@ -140,7 +140,7 @@ class ScoredClassifier:
 
 
 def judged(
-    method: FloorMethod, felts: Sequence[Felt], machine: Machine, asked: Asked
+    method: FloorMethod, felts: Sequence[Felt], spec: RobotSpec, asked: Asked
 ) -> ScoredClassifier:
     """A classifier fitted and asked, fold by fold."""
     fold = folds_of(felts, asked.folds)
@@ -149,11 +149,11 @@ def judged(
     for k in range(asked.judged):
         fitted = _some(felts, fold != k)
         left_out = [felt.pieces(asked.first_s)[0] for felt in _some(felts, fold == k)]
-        found = tuned(method, fitted, machine, asked)
+        found = tuned(method, fitted, spec, asked)
         began = time.perf_counter()
-        done = found.method.fit(fitted, machine)
+        done = found.method.fit(fitted, spec)
         ended = time.perf_counter()
-        answers += answers_of(done, left_out, machine, asked.seconds)
+        answers += answers_of(done, left_out, spec, asked.seconds)
         heard_s += time.perf_counter() - ended
         rows += sum(len(felt) for felt in left_out)
         settings.append(found.settings)
@@ -182,14 +182,14 @@ def attempted(name: str, work: Callable[[], ScoredClassifier]) -> ScoredClassifi
 def felt_table(
     methods: Sequence[FloorMethod],
     felts: Sequence[Felt],
-    machine: Machine,
+    spec: RobotSpec,
     about: str,
     asked: Asked = Asked(),
     reference: str = "slipid",
 ) -> FeltTable:
     """All classifiers on the same runs; `reference` is the one that others are compared with."""
     done = {
-        method.name: attempted(method.name, partial(judged, method, felts, machine, asked))
+        method.name: attempted(method.name, partial(judged, method, felts, spec, asked))
         for method in methods
     }
     return table_of(done, felts, about, asked, reference)

@@ -50,9 +50,9 @@ from jaxtyping import Float
 from slipid.lab.systems.motion.reina_indicators import Example, Indicators, Limits, Signals, Sugeno
 from slipid.predict.slip_model import (
     Channel,
-    Machine,
     Numbers,
     PredictedRun,
+    RobotSpec,
     Run,
     RunSignals,
     SlipModel,
@@ -79,18 +79,18 @@ class _Detector(SlipModel):
     limits: Limits = field(default_factory=Limits)
     slip: float = 0.0
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "_Detector":
-        examples = [Example.of(run, machine, self.smoothing) for run in runs]
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "_Detector":
+        examples = [Example.of(run, spec, self.smoothing) for run in runs]
         limited = replace(self, limits=Limits.of(examples, self.quantile))
         trained = limited._trained(examples)
         return replace(trained, slip=trained._mean_slip(examples))
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         said = []
         for heard in runs:
-            score = self.score(Signals.of(heard, machine, self.smoothing))
+            score = self.score(Signals.of(heard, spec, self.smoothing))
             kept = 1.0 - self.slip * (score >= self._flagged)
-            path = path_of(heard.rolling(machine) * kept[:, None], heard.dt)
+            path = path_of(heard.rolling(spec) * kept[:, None], heard.dt)
             said.append(PredictedRun(path, slipping=score))
         return said
 
