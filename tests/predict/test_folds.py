@@ -28,7 +28,7 @@ from slipid.predict.fitted_slip_model import fit_with_noise, slopes
 from slipid.predict.folds import folds_of, nested
 from slipid.predict.predictive import ForceBalance, by_name, log_student
 from slipid.predict.ranking import ranking, transfer
-from slipid.predict.score import Score, mean_error
+from slipid.predict.score import Score, forecast, mean_error
 from slipid.predict.slip_models import slip_models
 from slipid.predict.validation import ScoredRun
 from slipid.search_space import Choice
@@ -69,7 +69,7 @@ def test_the_density_is_that_of_scipy():
 def test_regions_and_energy_scores_are_those_of_many_draws():
     cov, gap = np.array([[0.04, 0.01], [0.01, 0.02]]), np.array([[0.0, 0.0], [0.3, -0.1]])
     draws = multivariate_t(shape=cov, df=DEGREES).rvs(20_000, random_state=1)
-    level, score = replay.scores(gap, np.array([cov, cov]))
+    level, score = forecast(gap, np.array([cov, cov]))
     far = np.einsum("ni,ij,nj->n", gap, np.linalg.inv(cov), gap)
     inside = np.einsum("ni,ij,nj->n", draws, np.linalg.inv(cov), draws) <= far[1]
     np.testing.assert_allclose(level, [0.0, inside.mean()], atol=0.01)
@@ -77,7 +77,7 @@ def test_regions_and_energy_scores_are_those_of_many_draws():
     apart = np.linalg.norm(draws[::2] - draws[1::2], axis=1).mean()
     # of a few hundred draws; half of the distance between two draws is 0.14
     np.testing.assert_allclose(score, np.array(near) - 0.5 * apart, atol=0.03)
-    level, score = replay.scores(gap, None)
+    level, score = forecast(gap, None)
     assert level is None
     np.testing.assert_allclose(score, np.linalg.norm(gap, axis=1))
 
