@@ -20,14 +20,14 @@ from slipid.data.reading.motor_layout import GivenColumns, motor_layout
 from slipid.data.reading.reader import read_logs
 from slipid.data.reading.table_format import format_of
 from slipid.data.runs import counted_once
-from slipid.infer.bench.doubts import refuse
 from slipid.infer.bench.fit import fit_motor
-from slipid.infer.bench.motor import Bench, BenchMotor, Record
+from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot
+from slipid.infer.bench.record_checks import check_records
 from slipid.infer.bench.verdict import BenchFit, bench_fit
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.files import Content, writable, write_bytes, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
@@ -41,7 +41,7 @@ class BenchJob:
     doubted, as it was named, or something was said of the resistance.
     """
 
-    records: Mapping[str, tuple[Record, ...]]
+    records: Mapping[str, tuple[BenchRecord, ...]]
     choices: Mapping[str, tuple[Choice, ...]]
     skipped: tuple[str, ...] = ()
     taken: tuple[str, ...] = ()
@@ -51,7 +51,7 @@ class BenchJob:
         """Refuse what cannot be, and fit the rest."""
         setup_jax(quiet=True)
         for label, records in self.records.items():
-            refuse(records, label, self.units_said)
+            check_records(records, label, self.units_said)
         fits = []
         for label, records in self.records.items():
             report.stage(f"fitting motor {label}".strip())
@@ -67,7 +67,7 @@ def read_bench_job(config: Config, root: Path, report: Reporter) -> BenchJob:
     found, skipped = of_config.files_of(config, config.content.logs, root)
     if not found:
         raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
-    parts: list[list[Record]] = []
+    parts: list[list[BenchRecord]] = []
     for section, paths in found:
         layout = of_config.layout_of(config, section)
         for path in paths:
@@ -110,7 +110,7 @@ def read_one(
     return BenchJob(records, dict.fromkeys(labels, ()), (), taken, said)
 
 
-def records_of(log: Log, layout: SensorLayout) -> list[Record]:
+def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
     """Record of each motor of a log, at its shaft."""
     if log.current is None:
         raise DataError(f"{log.name}: no current; expected a column of it for each motor")
@@ -126,7 +126,7 @@ def records_of(log: Log, layout: SensorLayout) -> list[Record]:
         # the halves of a window are independent only where every row is a reading of its own
         read = _read(log, k)
         out.append(
-            Record(
+            BenchRecord(
                 name=log.name,
                 sha256=log.sha256,
                 time=log.time[read],
@@ -161,7 +161,7 @@ def _labels(names: Sequence[str], motors: int, where: str) -> tuple[str, ...]:
     return tuple(names) or (("",) if motors == 1 else tuple(str(k + 1) for k in range(motors)))
 
 
-def _with_voltage(parts: list[list[Record]]) -> tuple[list[list[Record]], list[str]]:
+def _with_voltage(parts: list[list[BenchRecord]]) -> tuple[list[list[BenchRecord]], list[str]]:
     """Logs with a voltage, if there are any, and a line about the others."""
     have = [p for p in parts if p[0].voltage is not None]
     if not have or len(have) == len(parts):
@@ -171,13 +171,14 @@ def _with_voltage(parts: list[list[Record]]) -> tuple[list[list[Record]], list[s
 
 def _choices(config: Config, label: str) -> tuple[Choice, ...]:
     """What the config wants of a motor's numbers; DataError where it names none."""
-    paths = [e.path for e in entries(Bench(BenchMotor()))]
+    paths = [e.path for e in entries(BenchRoot(BenchMotor()))]
     choices = []
     for pattern, setting in config.content.parameters.items():
         plain, at, _ = pattern.partition("@")
         if not fnmatch.filter(paths, plain):
             raise DataError(
-                f"{config.path}: parameters.'{pattern}': no such parameter{near(plain, paths)}; "
+                f"{config.path}: parameters.'{pattern}': no such parameter"
+                f"{did_you_mean(plain, paths)}; "
                 f"expected one of {', '.join(paths)}"
             )
         if at and not fnmatch.fnmatchcase(label, pattern.partition("@")[2]):
@@ -185,7 +186,7 @@ def _choices(config: Config, label: str) -> tuple[Choice, ...]:
         gauss = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)
         choice = Choice(plain, setting.start, setting.fixed, setting.free, *gauss)
         try:
-            Space(Bench(BenchMotor()), [choice])
+            Space(BenchRoot(BenchMotor()), [choice])
         except ValueError as error:
             raise DataError(f"{config.path}: parameters.'{pattern}': {error}") from error
         choices.append(choice)
@@ -249,7 +250,7 @@ def check_bench(
     return fit, content
 
 
-def _seen(name: str, r: Record) -> Content:
+def _seen(name: str, r: BenchRecord) -> Content:
     """What one log holds of one motor."""
 
     def span(x: np.ndarray | None) -> list[float] | None:

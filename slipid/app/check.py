@@ -22,7 +22,7 @@ from slipid.data.runs import Runs
 from slipid.fit.problem import CREEPS, Problem
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
-from slipid.infer.verdicts.unidentified import Flat, flat_directions, members, sentences
+from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
 from slipid.predict.agreement import scatter
 from slipid.support.errors import DataError
 from slipid.support.files import Content, write_json
@@ -231,7 +231,7 @@ def expected(job: Task, problem: Problem) -> Expected:
     creep = space.where(lambda e: e.quantity == "surface.creep")
     parameters: dict[str, Estimate] = {}
     ratios: dict[str, Estimate] = {}
-    open_: tuple[Flat, ...] = ()
+    open_: tuple[FlatDirection, ...] = ()
     most = -np.inf
     starts = (space.start, *(np.where(creep, np.log(c), space.start) for c in CREEPS))
     covariances = [problem.laplace(z, log_v, keep) for z in starts]

@@ -13,7 +13,7 @@ from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.presets import PRESETS, declared_layout, preset
 from slipid.data.reading.reader import AnyLayout, find_logs, read_logs, session_of, without_beside
 from slipid.data.runs import Runs, collect, counted_once
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.files import write_bytes
 from slipid.support.progress import Reporter
 
@@ -88,7 +88,7 @@ def layout_of(config: Config, section: Logs) -> AnyLayout:
         return declared_layout({k: v for k, v in declared.items() if k != "kind"}, where)
     if section.format not in PRESETS:
         names = [*own, *PRESETS]
-        hint = near(section.format, names)
+        hint = did_you_mean(section.format, names)
         raise DataError(
             f"{config.path}: logs.format '{section.format}': no such layout{hint}; "
             f"expected one of {', '.join(names)}"

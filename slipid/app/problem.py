@@ -28,7 +28,7 @@ from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.files import hash_of
 from slipid.support.progress import Reporter
 
@@ -133,7 +133,7 @@ class Task:
             self.dataset,
             float(robot.geometry.wheel_radius),
             lag=float(robot.camera.lag),
-            per_piece=self.settings.windows_per_piece,
+            per_segment=self.settings.windows_per_piece,
             longest=self.settings.longest_window_s,
         )
 
@@ -320,7 +320,8 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
                 skipped.append(f"skipped: parameters '{pattern}': no run that has it")
                 continue
             raise DataError(
-                f"{config.path}: parameters.'{pattern}': no such parameter{near(pattern, paths)}; "
+                f"{config.path}: parameters.'{pattern}': no such parameter"
+                f"{did_you_mean(pattern, paths)}; "
                 f"expected one of {', '.join(paths)}"
             )
         gauss = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)

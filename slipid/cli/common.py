@@ -40,10 +40,10 @@ Words = ParamSpec("Words")
 
 def executor_of(jobs: int | None) -> "Executor":
     """So many processes, by default one for every core; this one where that is one."""
-    from slipid.support.executor import Here, Processes
+    from slipid.support.executor import InProcess, Processes
 
     count = jobs or os.cpu_count() or 1
-    return Here() if count == 1 else Processes(count)
+    return InProcess() if count == 1 else Processes(count)
 
 
 def guarded(command: Callable[Words, int]) -> Callable[Words, None]:

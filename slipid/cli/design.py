@@ -55,13 +55,13 @@ def design(
     Writes design.json, design.png and design_commands.csv to OUT.
     """
     from slipid.infer.design import proposal
-    from slipid.infer.design.wish import Wish
+    from slipid.infer.design.scope import DesignOptions
     from slipid.infer.fit_file import load as load_fit
     from slipid.report.answers import show_design
     from slipid.support.jax_setup import setup_jax
 
     ways = headings, speeds, turns, distance
-    wanted = Wish(parameter or (), predict or (), runs, *ways, floor or (), load or ())
+    wanted = DesignOptions(parameter or (), predict or (), runs, *ways, floor or (), load or ())
     with Reporter(quiet=quiet) as report:
         setup_jax(quiet=True)
         fit = load_fit(out)

@@ -28,7 +28,7 @@ from slipid.robot.closed_loop import PERIOD, Pilot, Plant, drive
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import Measurement, Readings
 from slipid.robot.robot_file import robot_bytes
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.progress import Reporter
 
 FORMS = ("c", "ros2", "stablehlo", "table")
@@ -121,9 +121,11 @@ def export(
         raise DataError(f"no form; expected one or more of {', '.join(FORMS)}")
     for name in wish.forms:
         if name not in FORMS:
-            raise DataError(f"no form '{name}'{near(name, FORMS)}; expected {', '.join(FORMS)}")
+            raise DataError(
+                f"no form '{name}'{did_you_mean(name, FORMS)}; expected {', '.join(FORMS)}"
+            )
     if wish.controller not in rows:
-        close = near(wish.controller, rows)
+        close = did_you_mean(wish.controller, rows)
         choices = ", ".join(rows)
         raise DataError(f"no controller '{wish.controller}'{close}; expected one of {choices}")
     row = rows[wish.controller]

@@ -30,7 +30,7 @@ SMOOTH = 0.03
 FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
 """Variance added to every residual: rounding of the logs [m^2, A^2, V^2]."""
 
-_AS_THEY_ARE = ("dt", "turn", "faster", "pose", "current", "voltage", "current_var", "lag")
+_AS_THEY_ARE = ("dt", "turn", "speed_change", "pose", "current", "voltage", "current_var", "lag")
 
 
 def with_slope(of: Callable[[Array], Array], z: Array | np.ndarray) -> tuple[Array, Array]:
@@ -51,7 +51,7 @@ class Batch(eqx.Module):
     session: Int[Array, " piece"]
     dt: Float[Array, "piece window"]
     turn: PerDrive
-    faster: PerDrive
+    speed_change: PerDrive
     pose: Float[Array, "piece edge 3"]
     current: PerDrive
     voltage: PerDrive
@@ -109,7 +109,7 @@ class Predicted(eqx.Module):
 
 def wheel_speed(robot: Robot, b: Batch) -> PerDrive:
     """Mean wheel speed of every drive and window at the robot's camera lag [rad/s]."""
-    return (b.turn - (robot.camera.lag - b.lag) * b.faster) / b.dt[..., None]
+    return (b.turn - (robot.camera.lag - b.lag) * b.speed_change) / b.dt[..., None]
 
 
 def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:

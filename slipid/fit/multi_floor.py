@@ -77,7 +77,7 @@ def multi_floor_runs(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Mul
     at, there = _padded(rows)
     w = _joined([c.windows for c in cut], run)
     whole = replace(
-        w.pieces(at[:, 0]),
+        w.segments(at[:, 0]),
         pose=np.concatenate([w.pose[at[:, :1], 0], w.pose[at, 1]], axis=1),
         **{name: getattr(w, name)[at, 0] for name in _PER_WINDOW},
     )
@@ -85,7 +85,7 @@ def multi_floor_runs(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Mul
     return MultiFloorRuns(whole, floor[at, 0], counts[at, 0] & there, names)
 
 
-_PER_WINDOW = ("dt", "turn", "faster", "current", "voltage", "current_var", "voltage_var")
+_PER_WINDOW = ("dt", "turn", "speed_change", "current", "voltage", "current_var", "voltage_var")
 
 
 def _windows_on(data: Runs, floor: FloorMap, robot: Robot) -> MultiFloorRuns:
@@ -110,7 +110,7 @@ def _short(data: Runs, radius: float, lag: float) -> Windows:
     for k in range(len(data)):
         t = data.time[data.rows(k)]
         length = np.clip((t[-1] - t[0]) / MOST_WINDOWS, SHORTEST, LONGEST)
-        each.append(windows(data.subset([k]), radius, lag, per_piece=1, longest=float(length)))
+        each.append(windows(data.subset([k]), radius, lag, per_segment=1, longest=float(length)))
     return _joined(each, np.repeat(np.arange(len(each)), [len(w) for w in each]))
 
 
@@ -154,7 +154,7 @@ def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "piece time whee
 
 def _steady(w: Windows, radius: float) -> Bool[np.ndarray, " piece"]:
     """Windows in which wheels turn, about evenly, and no camera frames are missing."""
-    rim, jump = radius * w.turn[:, 0] / w.dt, radius * w.faster[:, 0] / w.dt
+    rim, jump = radius * w.turn[:, 0] / w.dt, radius * w.speed_change[:, 0] / w.dt
     moves = np.abs(rim).max(axis=1) >= LEAST_SPEED
     even = np.abs(jump).max(axis=1) <= MOST_ACCELERATION
     return np.asarray(moves & even & (w.dt[:, 0] < 2 * LONGEST))

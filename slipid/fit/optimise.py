@@ -196,7 +196,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
 def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
     """Search vector with R and C_e by regression of the voltage where it is logged."""
     z = problem.space.start.copy()
-    w = problem.windows.pieces(np.flatnonzero(keep > 0))
+    w = problem.windows.segments(np.flatnonzero(keep > 0))
     if not (w.has_voltage and w.has_current):
         return z
     speed = (w.turn / w.dt[..., None]).ravel()

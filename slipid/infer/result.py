@@ -30,7 +30,7 @@ from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.disputed import Dispute, disputes, marked
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.profile import Profile, profile
-from slipid.infer.verdicts.unidentified import Flat, flat_directions, members, sentences
+from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
 from slipid.model.robot import Robot, Validity
 from slipid.predict.predictive import ForceBalance, force_balance_of
 from slipid.predict.ranking import Comparison, compared
@@ -157,7 +157,7 @@ class Fit:
         """
         from slipid.plots.fit import picture
 
-        return picture(self, known(self.data), name)
+        return picture(self, required(self.data), name)
 
     def profile(self, path: str, quiet: bool = False) -> Profile:
         """Profile likelihood of one free number: every other one is fitted again at each point.
@@ -167,7 +167,7 @@ class Fit:
         """
         with Reporter(quiet=quiet) as report:
             report.stage(f"profile of {path}")
-            return profile(known(self.problem), known(self.optimum), path)
+            return profile(required(self.problem), required(self.optimum), path)
 
     def validate(self, runs: Runs) -> Validation:
         """Open-loop prediction of runs, by the fit and by every simpler model that it learnt.
@@ -219,7 +219,7 @@ class Fit:
         Raises:
             DataError: no such question.
         """
-        problem, data = known(self.problem), known(self.data)
+        problem, data = required(self.problem), required(self.data)
         return compared(problem, self.choices, data, question, parts, quiet)
 
     def design(self, *parameters: str, runs: int = 12) -> "Design":
@@ -228,9 +228,10 @@ class Fit:
         Raises:
             DataError: no such number, or fixed.
         """
-        from slipid.infer.design import proposal, wish
+        from slipid.infer.design import proposal
+        from slipid.infer.design.scope import DesignOptions
 
-        return proposal.design(self, wish.Wish(parameters=parameters, runs=runs))
+        return proposal.design(self, DesignOptions(parameters=parameters, runs=runs))
 
     def deploy(self) -> "DeployedRobot":
         """What runs on the robot, with the intervals of the fit's own curvature.
@@ -295,7 +296,7 @@ class Fit:
         return disputes(self.judged, self.z, self.covariance)
 
     @cached_property
-    def flat(self) -> tuple[Flat, ...]:
+    def flat(self) -> tuple[FlatDirection, ...]:
         """Directions the likelihood leaves open; what sessions share blurs numbers, opens none."""
         has = self.channels
         sideways = self.robot.geometry.determines_twist
@@ -337,7 +338,7 @@ class Fit:
         return draws(self.z, self.covariance, count, seed)
 
 
-def known(evidence: Evidence | None) -> Evidence:
+def required(evidence: Evidence | None) -> Evidence:
     """What a fit was made of; ValueError where it was loaded from files, which do not hold it."""
     if evidence is None:
         raise ValueError(

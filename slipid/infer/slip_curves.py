@@ -42,7 +42,7 @@ class SlipCurve:
 
 
 @jax.jit
-def seen(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
+def wheel_states(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
     """Wheel speeds [rad/s], torques [N m] and slips of every window (piece, window, wheel).
 
     The slip is the sliding speed over the wheel's activity, rim and roller speed together, so that
@@ -87,7 +87,7 @@ def curves(
     Taken at the median speed of the wheels that turned and an even load.
     """
     robot = space.tree(jnp.asarray(z))
-    speed, torque = (np.abs(np.asarray(x)) for x in seen(robot, b)[:2])
+    speed, torque = (np.abs(np.asarray(x)) for x in wheel_states(robot, b)[:2])
     labels, floor = robot.surfaces.labels, np.asarray(b.surface)
     share = 1.0 / speed.shape[-1]
     median = []
@@ -119,7 +119,7 @@ def slip_on(robot: Robot, floor: str, curve: SlipCurve) -> Float[np.ndarray, " t
 
 def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
     """What each floor was seen with."""
-    speed, torque, slip = (np.asarray(x) for x in seen(robot, b))
+    speed, torque, slip = (np.asarray(x) for x in wheel_states(robot, b))
     back = np.asarray(robot.geometry.least()) * float(robot.geometry.wheel_radius)
     # by the encoders: what was driven, not how it slipped
     twist = np.asarray(lk.wheel_speed(robot, b)) @ back.T
@@ -131,7 +131,7 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
         mine = floor == k
         most = [float(np.abs(x[mine]).max()) for x in (speed, torque, slip, yaw)]
         if 2 * sum(has_steady_command(data.logs[i]) for i in runs) > len(runs):
-            driven = Driven(
+            driven = DrivenRange(
                 distinct(np.degrees(data.heading[runs]), 1),
                 distinct(data.speed[runs], 3),
                 distinct(data.turn[runs], 2),
@@ -153,7 +153,7 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
     return out
 
 
-class Driven(NamedTuple):
+class DrivenRange(NamedTuple):
     """Headings [deg], speeds [m/s] and turn rates [rad/s] that were driven, each once, rising."""
 
     headings_deg: tuple[float, ...]
@@ -170,7 +170,7 @@ def has_steady_command(log: Log) -> bool:
     return usual > 0.0 and float((gap < _STEADY * usual).mean()) > 0.5
 
 
-def by_encoders(twist: Float[np.ndarray, "window 3"]) -> Driven:
+def by_encoders(twist: Float[np.ndarray, "window 3"]) -> DrivenRange:
     """What windows drove by their wheels: roughly, of windows that moved, what is no exception."""
     speed = np.linalg.norm(twist[:, :2], axis=1)
     ahead = speed > _MOVED * speed.max(initial=0.0)
@@ -183,7 +183,7 @@ def by_encoders(twist: Float[np.ndarray, "window 3"]) -> Driven:
     parts = (0.1, 0.5, 0.9)
     speeds = np.quantile(speed[ahead], parts) if ahead.any() else np.zeros(0)
     rates = np.quantile(twist[on, 2], parts) if on.any() else np.zeros(0)
-    return Driven(distinct(signed, 1), distinct(speeds, 3), distinct(rates, 2))
+    return DrivenRange(distinct(signed, 1), distinct(speeds, 3), distinct(rates, 2))
 
 
 def distinct(x: np.ndarray, digits: int) -> tuple[float, ...]:

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 
-from slipid.infer.design.planned_runs import Drive
+from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.design.proposal import Design
 from slipid.plots import drawing
 from slipid.support.files import Content
@@ -55,7 +55,11 @@ def _title(found: Design) -> str:
 
 
 def _commands(
-    ax: Axes, found: Design, setup: tuple[str, str], mine: Counter[Drive], order: dict[Drive, int]
+    ax: Axes,
+    found: Design,
+    setup: tuple[str, str],
+    mine: Counter[PlannedRun],
+    order: dict[PlannedRun, int],
 ) -> None:
     """Commanded velocities of one floor and load."""
     floor, load = setup
@@ -76,7 +80,7 @@ def _commands(
     ax.set(xlabel="ahead [m/s]", ylabel="left [m/s]")
 
 
-def _arrow(ax: Axes, d: Drive, base: float, beyond: float) -> tuple[float, float]:
+def _arrow(ax: Axes, d: PlannedRun, base: float, beyond: float) -> tuple[float, float]:
     """Arrow to the commanded velocity, bent where it turns, an arc on the spot.
 
     Returns:
@@ -99,7 +103,7 @@ def _arrow(ax: Axes, d: Drive, base: float, beyond: float) -> tuple[float, float
     return float(place[0]), float(place[1])
 
 
-def _colour(d: Drive) -> str:
+def _colour(d: PlannedRun) -> str:
     if not d.turn:
         return drawing.BLUE
     return drawing.ORANGE if d.turn > 0 else drawing.GREEN

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from slipid.data.runs import Runs
 from slipid.model.robot import Robot
 from slipid.plots import drawing
-from slipid.plots.seen import Seen, by_heading
+from slipid.plots.measured_windows import MeasuredWindows, by_heading
 from slipid.predict import open_loop as replay
 from slipid.predict.kinematics import Encoder
 from slipid.predict.predictive import ForceBalance
@@ -28,7 +28,7 @@ LEAST_OCTANTS = 5
 """Eighths of the circle in which a floor must have been driven for a picture by heading."""
 
 
-def heading_figure(robot: Robot, seen: Seen) -> Figure | None:
+def heading_figure(robot: Robot, seen: MeasuredWindows) -> Figure | None:
     """Slip and drift against the direction of travel, a column per floor and load set-up.
 
     None where no floor was driven straight in most directions.
@@ -58,7 +58,7 @@ def heading_figure(robot: Robot, seen: Seen) -> Figure | None:
     return made
 
 
-def _speeds(seen: Seen) -> list[float]:
+def _speeds(seen: MeasuredWindows) -> list[float]:
     """The speeds driven, at most `MOST_SPEEDS`, each a tenth away from the next."""
     found: list[float] = []
     values, counts = np.unique(seen.speed[seen.straight], return_counts=True)
@@ -68,7 +68,9 @@ def _speeds(seen: Seen) -> list[float]:
     return sorted(found[:MOST_SPEEDS])
 
 
-def _headings(robot: Robot, seen: Seen, g: int, speeds: list[float], axes: Sequence[Axes]) -> None:
+def _headings(
+    robot: Robot, seen: MeasuredWindows, g: int, speeds: list[float], axes: Sequence[Axes]
+) -> None:
     surface, load = seen.groups[g]
     mine = seen.straight & (seen.group == g)
     nearest = np.argmin(np.abs(seen.speed[:, None] - np.asarray(speeds)), axis=1)

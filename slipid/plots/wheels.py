@@ -11,8 +11,8 @@ from slipid.infer.result import Fit
 from slipid.model import contact_law as law
 from slipid.model.robot import GRAVITY, Robot
 from slipid.plots import drawing
+from slipid.plots.measured_windows import MeasuredWindows
 from slipid.plots.motion import named
-from slipid.plots.seen import Seen
 
 DRIFTS = "#35B779"
 """Colour of a wheel that rolls sideways as fast as it turns, as in the colour scale of the dots."""
@@ -22,7 +22,7 @@ TURNS = 0.3
 """A wheel that turns slower than this part of the fastest one says little of its slip."""
 
 
-def curve_figure(fit: Fit, seen: Seen) -> Figure:
+def curve_figure(fit: Fit, seen: MeasuredWindows) -> Figure:
     """Slip over torque of every floor with its 90 % band, over what was seen of every wheel."""
     floors = list(dict.fromkeys(floor for floor, _ in seen.groups))
     measured = seen.amps is not None
@@ -46,7 +46,7 @@ def curve_figure(fit: Fit, seen: Seen) -> Figure:
     return made
 
 
-def _cloud(ax: Axes, robot: Robot, seen: Seen, floor: str) -> PathCollection | None:
+def _cloud(ax: Axes, robot: Robot, seen: MeasuredWindows, floor: str) -> PathCollection | None:
     """Measured slip of every driven wheel over its torque, scaled to an even load."""
     mine = np.array([seen.groups[g][0] == floor for g in seen.group])
     fastest = np.abs(seen.wheel_speed).max(axis=1, keepdims=True)
@@ -61,7 +61,7 @@ def _cloud(ax: Axes, robot: Robot, seen: Seen, floor: str) -> PathCollection | N
     return ax.scatter(x, y, 7, colour, lw=0, alpha=0.6, cmap="viridis_r", vmin=0.0, vmax=2.0)
 
 
-def driving_torque(robot: Robot, seen: Seen) -> np.ndarray:
+def driving_torque(robot: Robot, seen: MeasuredWindows) -> np.ndarray:
     """Torque along a wheel's turning [N m]: from the current, or predicted where none is logged.
 
     Wheels that share a drive share its torque.
@@ -131,7 +131,7 @@ def wheel_curve(
     return np.asarray(frame.radius * weight * felt)
 
 
-def current_figure(seen: Seen) -> Figure | None:
+def current_figure(seen: MeasuredWindows) -> Figure | None:
     """Measured current against predicted traction, a row per wheel, a column per floor and load."""
     if seen.amps is None:
         return None
@@ -163,7 +163,9 @@ def current_figure(seen: Seen) -> Figure | None:
     return made
 
 
-def _amps(ax: Axes, seen: Seen, mine: np.ndarray, wheel: int, top: float) -> PathCollection:
+def _amps(
+    ax: Axes, seen: MeasuredWindows, mine: np.ndarray, wheel: int, top: float
+) -> PathCollection:
     assert seen.amps is not None
     # a wheel at rest is held by its gear, which the motor model does not claim to know
     speed, fastest = seen.wheel_speed[:, wheel], np.abs(seen.wheel_speed).max(axis=1)

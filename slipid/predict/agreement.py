@@ -197,7 +197,7 @@ def _unpredicted_motion(
     """Motion along, across and in yaw that other runs do not predict [m, m, rad]."""
     shape = robot.geometry
     back = np.asarray(shape.least()).T * float(shape.wheel_radius)
-    step, late = w.turn @ back, w.faster @ back
+    step, late = w.turn @ back, w.speed_change @ back
     moved = body_twist(w, robot) * w.dt[..., None]
     angle, series = np.arctan2(step[..., 1], step[..., 0]), fourier(step)
     for vector in (step, late, moved):

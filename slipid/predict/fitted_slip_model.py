@@ -89,7 +89,7 @@ def fit_with_noise(
     of freedom of the model's own numbers are taken off.
     """
     robot = contact.robot
-    seen = problem.windows.at_lag(float(robot.camera.lag)).pieces(np.flatnonzero(keep > 0))
+    seen = problem.windows.at_lag(float(robot.camera.lag)).segments(np.flatnonzero(keep > 0))
     model = model.fit(seen, robot)
     before = _prior_precision(model, seen, robot)
     common = contact.covariance[np.ix_(contact.camera, contact.camera)]

@@ -110,7 +110,7 @@ class Corrected(TwistModel):
         from scipy.optimize import least_squares
 
         count, lag = TERMS[self.name], w.steps.lag
-        start = np.zeros(count + (w.steps.faster is not None))
+        start = np.zeros(count + (w.steps.speed_change is not None))
         start[:2], start[count:] = 1.0, lag
         low, high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
         low[count:], high[count:] = lag - LONGEST_LAG, lag + LONGEST_LAG

@@ -20,7 +20,7 @@ from slipid.fit.noise import travel
 from slipid.fit.session_effects import by_axis
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
-from slipid.predict.slip_model import sideways, turned
+from slipid.predict.slip_model import turned, turned_left
 from slipid.search_space import Space
 
 STEP = 0.5
@@ -70,9 +70,9 @@ def whole_runs(data: Runs, robot: Robot, steps: Sequence[int]) -> list[Windows]:
         runs = np.flatnonzero(np.asarray(steps) == count)
         for first in range(0, len(runs), TOGETHER):
             some = runs[first : first + TOGETHER]
-            w = windows(data.subset(some), radius, lag, per_piece=count, longest=np.inf)
+            w = windows(data.subset(some), radius, lag, per_segment=count, longest=np.inf)
             filled = np.minimum(np.arange(TOGETHER), len(w) - 1)
-            out.append(replace(w, run=some[w.run]).pieces(filled))
+            out.append(replace(w, run=some[w.run]).segments(filled))
     return out
 
 
@@ -161,16 +161,16 @@ def end_covariance(
     far, u = travel(w, robot)
     p = tracks.predicted
     cov = of_parameters.copy()
-    lever = sideways(p[:, -1:, :2] - p[:, 1:, :2])  # what a turn at each step moves
+    lever = turned_left(p[:, -1:, :2] - p[:, 1:, :2])  # what a turn at each step moves
     way = p[:, :-1, 2]
-    along, across = turned(way, u), turned(way, sideways(u))
+    along, across = turned(way, u), turned(way, turned_left(u))
     process, run = (by_axis(variance, k, w) for k in ("process", "run"))
     axes = np.stack((along, across, lever))
     cov += np.einsum("na,nk,anki,ankj->nij", process, far, axes, axes)
     whole = np.einsum("nk,anki->nai", far, axes)
     effect = shared + run[:, :, None] * np.eye(len(axes))
     cov += np.einsum("nab,nai,nbj->nij", effect, whole, whole)
-    turn = sideways(p[:, -1, :2] - p[:, 0, :2])
+    turn = turned_left(p[:, -1, :2] - p[:, 0, :2])
     cov += variance["camera.heading"] * turn[:, :, None] * turn[:, None, :]
     cov += 2 * variance["camera.place"] * float(robot.camera.scale) ** 2 * np.eye(2)
     return cov

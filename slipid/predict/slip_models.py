@@ -61,7 +61,7 @@ class FloorModels:
         keys = np.array([self.series(s, load) for s, load in zip(w.surface, w.load, strict=True)])
         for key in dict.fromkeys(keys.tolist()):
             mine = keys == key
-            steps = steps_of(w.pieces(np.flatnonzero(mine)))
+            steps = steps_of(w.segments(np.flatnonzero(mine)))
             model = self.fitted.get(key, self.model)
             out[mine] = model.twist(steps, spec).reshape(out[mine].shape)
         return out
@@ -99,7 +99,7 @@ class FloorModels:
         """Windows by the key of the model that is fitted to them."""
         setups = [f"{s}@{load}" for s, load in zip(w.surface, w.load, strict=True)]
         keys = np.array(setups if self.model.by_load else w.surface)
-        return {k: w.pieces(np.flatnonzero(keys == k)) for k in dict.fromkeys(keys.tolist())}
+        return {k: w.segments(np.flatnonzero(keys == k)) for k in dict.fromkeys(keys.tolist())}
 
 
 def steps_of(w: Windows) -> Steps:
@@ -112,7 +112,7 @@ def steps_of(w: Windows) -> Steps:
         current=np.abs(w.current).reshape(-1, drives) if w.has_current else None,
     )
     first = np.arange(len(w)) * w.dt.shape[1]
-    return Steps(signals, first, w.faster.reshape(-1, drives), w.lag)
+    return Steps(signals, first, w.speed_change.reshape(-1, drives), w.lag)
 
 
 def training_windows(w: Windows, robot: Robot) -> TrainingWindows:

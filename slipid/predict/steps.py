@@ -30,14 +30,14 @@ class Steps:
     Attributes:
         signals: all steps as if they were one run; its name and floor are those of the first.
         first: first step of each run.
-        faster: wheel speed at the end of each step less that at its start [rad/s], so that
-            d turn / d lag = -faster; None where the lag of the poses is settled.
+        speed_change: wheel speed at the end of each step less that at its start [rad/s], so that
+            d turn / d lag = -speed_change; None where the lag of the poses is settled.
         lag: lag of the poses behind the wheels that was assumed [s].
     """
 
     signals: RunSignals
     first: Int[np.ndarray, " run"]
-    faster: Float[np.ndarray, "step drive"] | None = None
+    speed_change: Float[np.ndarray, "step drive"] | None = None
     lag: float = 0.0
 
     @classmethod
@@ -64,9 +64,9 @@ class Steps:
 
     def at_lag(self, lag: float) -> "Steps":
         """The same steps at another lag, to first order [s]; as they are where it is settled."""
-        if self.faster is None:
+        if self.speed_change is None:
             return self
-        turn = self.signals.turn - (lag - self.lag) * self.faster
+        turn = self.signals.turn - (lag - self.lag) * self.speed_change
         return replace(self, signals=replace(self.signals, turn=turn), lag=lag)
 
     @property

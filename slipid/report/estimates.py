@@ -180,7 +180,7 @@ def show_validation(page: Page, found: Content) -> None:
 
 
 @dataclass(frozen=True)
-class Row:
+class TruthRow:
     """Truth against estimate of one number."""
 
     path: str
@@ -197,7 +197,7 @@ class Row:
         return self.interval[0] <= self.truth <= self.interval[1]
 
 
-def compared(fit: "Fit", truth: Content) -> list[Row]:
+def compared(fit: "Fit", truth: Content) -> list[TruthRow]:
     """Every number that was fitted beside its truth, as far as truth.json has one."""
     rows = []
     for e in fit.parameters.values():
@@ -207,7 +207,7 @@ def compared(fit: "Fit", truth: Content) -> list[Row]:
         truths = true if isinstance(true, list) else [true]
         for one, (label, value, interval) in zip(truths, rows_of(e), strict=True):
             low, high = interval or (value, value)
-            rows.append(Row(e.path, label, e.unit, float(one), value, (low, high), e.verdict))
+            rows.append(TruthRow(e.path, label, e.unit, float(one), value, (low, high), e.verdict))
     return rows
 
 

@@ -98,7 +98,7 @@ def fitted(job: Job, runs: np.ndarray) -> ForceBalance:
 def deployed(job: Job, contact: ForceBalance, runs: np.ndarray) -> DeployedRobot:
     """From a fit; `runs` on one floor are those it was fitted to."""
     windows = job.problem().windows
-    seen = windows.pieces(np.flatnonzero(np.isin(windows.run, runs)))
+    seen = windows.segments(np.flatnonzero(np.isin(windows.run, runs)))
     trend = current_trend(contact.robot, batch(seen, contact.robot))
     return robot_of(contact, TOP, trend, load="as_built")
 

@@ -20,7 +20,7 @@ from slipid.lab.testsite.driving import drive
 from slipid.plots.motion import path_figure
 from slipid.report.estimates import compared
 from slipid.support.errors import DataError
-from slipid.support.executor import Here
+from slipid.support.executor import InProcess
 from slipid.support.progress import Reporter
 from tests.helpers.golden_rows import of_identified, of_validation
 from tests.helpers.recording import pack
@@ -64,12 +64,12 @@ def test_the_recording_is_what_its_config_drives():
 
 def test_a_plant_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(DataError, match="no plant 'gazebo'; expected recorded or mujoco"):
-        demo.run(tmp_path, "gazebo", None, Here(), Reporter(quiet=True))
+        demo.run(tmp_path, "gazebo", None, InProcess(), Reporter(quiet=True))
 
 
 def test_a_seed_for_what_is_recorded_is_refused(tmp_path):
     with pytest.raises(DataError, match="expected --plant mujoco with it"):
-        demo.run(tmp_path, "recorded", 3, Here(), Reporter(quiet=True))
+        demo.run(tmp_path, "recorded", 3, InProcess(), Reporter(quiet=True))
 
 
 @pytest.mark.slow
@@ -111,17 +111,17 @@ def test_driving_anew_drives_what_ships(tmp_path, monkeypatch):
         "slipid.lab.testsite.simulate.simulate",
         lambda made, out, executor, report: seen.update({out.name: made}),
     )
-    drive_anew(tmp_path, 0, Here(), Reporter(quiet=True))
+    drive_anew(tmp_path, 0, InProcess(), Reporter(quiet=True))
     shipped = {p: plan(Path("x"), packaged_config(f"testsite_{p}.toml")) for p in PARTS}
     assert {p: made.hash for p, made in seen.items()} == {p: m.hash for p, m in shipped.items()}
-    drive_anew(tmp_path, 3, Here(), Reporter(quiet=True))
+    drive_anew(tmp_path, 3, InProcess(), Reporter(quiet=True))
     assert [seen[p].content.seed for p in PARTS] == [6, 7]
 
 
 @pytest.mark.slow
 def test_the_demo_finds_the_motor_weighs_the_robot_and_beats_the_encoders(tmp_path, golden):
     """Bars for logs whose physics slipid's model does not share; left-out headings."""
-    done, found, truth = demo.run(tmp_path, "recorded", None, Here(), Reporter(quiet=True))
+    done, found, truth = demo.run(tmp_path, "recorded", None, InProcess(), Reporter(quiet=True))
     rows = compared(done.fit, truth)
     assert done.fit.converged
     errors = {(r.path, r.label): r.value - r.truth for r in rows}

@@ -64,10 +64,10 @@ def still(lag, runs, per_run):
         surface=("unknown",) * runs,
         load=("as_built",) * runs,
         session=("elsewhere",) * runs,
-        began=np.zeros(runs),
+        start=np.zeros(runs),
         dt=np.full((runs, per_run), 0.25),
         turn=zero,
-        faster=zero,
+        speed_change=zero,
         pose=np.zeros((runs, per_run + 1, 3)),
         current=zero,
         voltage=zero,
@@ -304,7 +304,7 @@ def test_windows_in_which_no_wheel_changes_floors(driven):
     for run, window in np.argwhere(some.counts):
         w = some.windows
         edges = w.pose[run : run + 1, window : window + 2]
-        alone = replace(w.pieces(np.array([run])), pose=edges)
+        alone = replace(w.segments(np.array([run])), pose=edges)
         x = cut.wheel_places(true, alone)[0, ..., 0]
         assert ((x > 0) == (some.floor[run, window] == true.surface_index("firm"))).all()
     w = whole.windows
@@ -320,7 +320,7 @@ def test_windows_of_a_run_stand_in_a_row_and_two_maps_go_together(driven):
     one = cut.multi_floor_runs([(data, floor)], true)
     assert one.counts.shape[1] <= cut.MOST_WINDOWS
     for k in range(len(data)):
-        row = one.windows.pieces(np.array([k]))
+        row = one.windows.segments(np.array([k]))
         poses = data.pose[data.rows(k)]
         at = [np.flatnonzero((poses == place).all(axis=1))[0] for place in row.pose[0]]
         there = np.flatnonzero(one.counts[k])[-1] + 2  # beyond it the last window is repeated

@@ -248,7 +248,7 @@ def test_too_few_rounds_are_said(surface_problem):
 def test_left_out_runs_are_as_good_as_absent(truth, surface_problem):
     keep = np.ones(48)
     keep[::4] = 0.0
-    part = surface_problem.windows.pieces(np.flatnonzero(keep))
+    part = surface_problem.windows.segments(np.flatnonzero(keep))
     masked = optimise(surface_problem, keep=keep, start=begin(surface_problem), **PRECISE)
     alone = surface_problem.of(part)
     subset = optimise(alone, start=begin(alone), **PRECISE)

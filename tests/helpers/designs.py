@@ -18,7 +18,13 @@ from slipid.fit import noise as of_noise
 from slipid.fit.optimise import optimise
 from slipid.fit.problem import FitState, Problem
 from slipid.infer.design import fisher as info
-from slipid.infer.design.planned_runs import HEADINGS, Drive, candidates, paper_grid, steady_windows
+from slipid.infer.design.planned_runs import (
+    HEADINGS,
+    PlannedRun,
+    candidates,
+    paper_grid,
+    steady_windows,
+)
 from slipid.infer.design.planner import Planner, parameter_goal, prediction_goal, weighed
 from slipid.infer.result import Channels
 from slipid.lab.selftest.logs import Sensors, blank, make_logs, truth
@@ -30,7 +36,7 @@ SETUP = ("soft", "as_built")
 LOAD = "robot.load_share@as_built"
 DISTANCE = 0.7
 SENSORS = Sensors(has_voltage=False)
-ANY = Drive(*SETUP, 0.0, 0.2)
+ANY = PlannedRun(*SETUP, 0.0, 0.2)
 TRUTH = truth([ANY])
 CHOICES = [
     Choice("camera.scale", prior_mean=1.117, prior_std=0.002),
@@ -41,7 +47,7 @@ CHOICES = [
     Choice("motor.back_emf", fixed=0.0514),
 ]
 PREDICTED = [
-    Drive(*SETUP, float(np.radians(a)), v, 0.0, DISTANCE) for v in (0.1, 0.2) for a in HEADINGS
+    PlannedRun(*SETUP, float(np.radians(a)), v, 0.0, DISTANCE) for v in (0.1, 0.2) for a in HEADINGS
 ]
 
 
@@ -60,7 +66,7 @@ def planner():
 class Plans:
     """Both plans with what is expected of them: std of load shares and of predictions."""
 
-    drives: dict[str, list[Drive]]
+    drives: dict[str, list[PlannedRun]]
     expected: dict[str, tuple[float, float]]
 
 

@@ -10,7 +10,7 @@ from slipid.data.runs import Runs, collect
 from slipid.data.windows import windows
 from slipid.fit.optimise import optimise
 from slipid.fit.problem import Problem
-from slipid.infer.design.planned_runs import Drive
+from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.result import Fit, summarise
 from slipid.lab.selftest.logs import Sensors, grid, make_logs, turning_grid
 from slipid.model.geometry import Geometry, differential, mecanum, omni, skid_steer
@@ -48,7 +48,7 @@ def experiment(kind: str, seed: int = 0, headings: int = 12) -> Experiment:
     return Experiment(truth, data, wanted(truth, data))
 
 
-def known(shape: Geometry, drives: Sequence[Drive]) -> Robot:
+def known(shape: Geometry, drives: Sequence[PlannedRun]) -> Robot:
     """A robot of this shape whose every number is known, in the sessions that are driven."""
     robot = build(shape, list(FLOORS), ("as_built",), sorted({d.session for d in drives}))
     choices = [Choice(path, fixed=value) for path, value in numbers(robot).items()]
@@ -64,7 +64,7 @@ def fitted(truth: Robot, data: Runs, choices: Sequence[Choice]) -> Fit:
     return summarise(problem, optimise(problem), data, choices)
 
 
-def plan(shape: Geometry, headings: int) -> tuple[Drive, ...]:
+def plan(shape: Geometry, headings: int) -> tuple[PlannedRun, ...]:
     setups = [(floor, "as_built") for floor in FLOORS]
     if shape.determines_twist:
         return grid(setups, headings, (0.15, 0.3), turns=4)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.infer.bench.motor import Record
+from slipid.infer.bench.motor import BenchRecord
 from slipid.lab.testsite.motors import Drive, Motor, SpeedLoop
 
 FLYWHEEL, ROTOR = 1e-4, 7.1e-6
@@ -77,7 +77,7 @@ def logged(
     seed: int = 0,
     noise: tuple[float, float, float] = (0.05, 0.05, 1.0),
     quantum: tuple[float, float, float] = (0.02, 0.02, 1.0),
-) -> Record:
+) -> BenchRecord:
     """Rows at a rate, with noise, offsets and rounding of voltage, current and speed."""
     rng = np.random.default_rng(seed)
     step = round(1 / rate / (rows[1, 0] - rows[0, 0]))
@@ -86,7 +86,7 @@ def logged(
     seen = rows[:, 1:] + offset + np.array(noise) * rng.normal(size=(len(rows), 3))
     q = np.array(quantum)
     seen = np.where(q > 0, np.round(seen / np.where(q > 0, q, 1)) * q, seen)
-    return Record(
+    return BenchRecord(
         name="made",
         sha256="",
         time=rows[:, 0],
@@ -102,7 +102,7 @@ def truth(inertia: float, drop: float = 0.0) -> dict[str, float]:
     return {f"motor.{name}": value for name, value in known.items()}
 
 
-def write(record: Record, path: Path, header: str = "t,U,I,w") -> Path:
+def write(record: BenchRecord, path: Path, header: str = "t,U,I,w") -> Path:
     """The record as a CSV file in SI units."""
     table = np.stack([record.time, record.voltage, record.current, record.speed], axis=1)
     np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.7g")

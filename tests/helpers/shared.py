@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from slipid.app.logs import packaged_config
 from slipid.cli.main import app
-from slipid.lab.selftest.logs import Drive, Sensors, grid, make_logs, truth
+from slipid.lab.selftest.logs import PlannedRun, Sensors, grid, make_logs, truth
 from tests.helpers.made_logs import write_logs
 
 DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
@@ -50,7 +50,7 @@ def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], Said
     return folder, Said(**json.loads(said.read_text(encoding="utf-8")))
 
 
-def identify(folder: Path, drives: Sequence[Drive] = DRIVES) -> Said:
+def identify(folder: Path, drives: Sequence[PlannedRun] = DRIVES) -> Said:
     """A config, made logs, unseen logs, and the result of identify on them."""
     for name, some, seed in (("logs", drives, 1), ("unseen", UNSEEN, 2)):
         robot = truth(some)

@@ -20,7 +20,7 @@ from slipid.fit.optimise import Optimum, one_round
 from slipid.fit.problem import FitState, Problem
 from slipid.fit.variances import DEGREES
 from slipid.infer import fit_file
-from slipid.infer.design.planned_runs import Drive
+from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.fit_file import identified_json, load, save, to_json
 from slipid.infer.posterior import diagnosis
 from slipid.infer.result import Fit, summarise
@@ -430,7 +430,9 @@ SHARED = {"along": 0.02, "across": 0.01}
 def in_sessions(session, seed):
     """Runs in these sessions, whose ends are off by what the runs of each share."""
     rng = np.random.default_rng(seed)
-    drives = [Drive("soft", "as_built", h, 0.1) for h in rng.uniform(0, 2 * np.pi, len(session))]
+    drives = [
+        PlannedRun("soft", "as_built", h, 0.1) for h in rng.uniform(0, 2 * np.pi, len(session))
+    ]
     logs = make_logs(TRUTH, drives, seed, Sensors(has_voltage=False))
     effect = rng.normal(size=(max(session) + 1, 2)) * [*SHARED.values()]
     moved = []

@@ -14,7 +14,7 @@ from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.fit.optimise import Optimum
 from slipid.fit.problem import FitState, Problem
-from slipid.infer.design.planned_runs import Drive
+from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.result import Fit, summarise
 from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
 from slipid.model.geometry import differential, omni
@@ -22,8 +22,8 @@ from slipid.plots import fit as plots
 from slipid.plots import fit as plots_robot
 from slipid.plots.compare import WORDS, ladder_figure
 from slipid.plots.drawing import figure, save
+from slipid.plots.measured_windows import by_heading, measured_windows
 from slipid.plots.motion import heading_figure
-from slipid.plots.seen import by_heading, seen
 from slipid.plots.wheels import current_figure, driving_torque, wheel_curve
 from slipid.predict.slip_models import slip_models
 from slipid.search_space import Choice
@@ -42,7 +42,7 @@ def data():
 
 @functools.cache
 def pieces():
-    return seen(ROBOT, data(), 4)
+    return measured_windows(ROBOT, data(), 4)
 
 
 @functools.cache
@@ -149,9 +149,11 @@ def test_without_currents_or_directions_those_pictures_are_left_out():
 
 
 def test_turning_pieces_have_no_direction():
-    drives = (Drive("soft", "as_built", 0.3, 0.2, turn=0.8),)
+    drives = (PlannedRun("soft", "as_built", 0.3, 0.2, turn=0.8),)
     robot = truth(drives)
-    assert not seen(robot, collect(make_logs(robot, drives, 0, QUIET)), 4).straight.any()
+    assert not measured_windows(
+        robot, collect(make_logs(robot, drives, 0, QUIET)), 4
+    ).straight.any()
 
 
 def test_loads_are_written_at_their_wheels():

@@ -21,7 +21,7 @@ from slipid.fit.likelihood import batch
 from slipid.fit.problem import Problem
 from slipid.fit.session_effects import LinearModel, with_session_effects
 from slipid.fit.variances import DEGREES
-from slipid.infer.design.planned_runs import Drive
+from slipid.infer.design.planned_runs import PlannedRun
 from slipid.lab.selftest.logs import Sensors, grid, make_logs, truth
 from slipid.predict import open_loop as replay
 from slipid.predict.fitted_slip_model import fit_with_noise, slopes
@@ -315,7 +315,7 @@ def logs():
 
 @pytest.mark.slow
 def test_a_turn_on_the_spot_has_no_speed_to_leave_out(logs):
-    spin = make_logs(truth(PLAN), [Drive("soft", "as_built", 0.0, 0.0, 0.5)], 1, Sensors())
+    spin = make_logs(truth(PLAN), [PlannedRun("soft", "as_built", 0.0, 0.0, 0.5)], 1, Sensors())
     fold = folds_of(collect([*logs, *spin]), "speeds")
     assert sorted(set(fold[:-1])) == [0, 1]
     assert fold[-1] == -1

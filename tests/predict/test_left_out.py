@@ -81,7 +81,7 @@ def test_nothing_of_a_left_out_run_is_learnt(logs, judged, learnt):
     again = folds.fit_fold(other.problem(), CHOICES, other.dataset, QUESTION, judged, fit)
     assert len(spoilt) > 2
     w = learnt.problem.windows
-    kept = w.pieces(np.flatnonzero(~np.isin(w.run, judged)))
+    kept = w.segments(np.flatnonzero(~np.isin(w.run, judged)))
     std = np.sqrt(np.diag(learnt.optimum.covariance))
     same(again.optimum.state.z / std, learnt.optimum.state.z / std)
     same(again.optimum.state.log_variance, learnt.optimum.state.log_variance)

@@ -140,11 +140,11 @@ def test_the_lookup_is_tuned_on_runs_left_out_as_they_will_be():
     error, size = {}, {}
     for name, together in {"sectors": sector, "at random": None}.items():
         model = FloorModels(HeadingLookup(ridge=None, together=together))
-        found = [model.fit(w.pieces(np.flatnonzero(sector != k)), ROBOT) for k in range(6)]
+        found = [model.fit(w.segments(np.flatnonzero(sector != k)), ROBOT) for k in range(6)]
         size[name] = sum(np.abs(v[1:]).sum() for model in found for v in model.state.values())
         error[name] = 0.0
         for k, fitted in enumerate(found):
-            other = w.pieces(np.flatnonzero(sector == k))
+            other = w.segments(np.flatnonzero(sector == k))
             gap = replay.tracks_from_increments(ROBOT, other, fitted.increments(other, ROBOT)).gap
             error[name] += np.hypot(*gap.T[:2]).mean()
     assert error["sectors"] < 0.95 * error["at random"]
@@ -185,7 +185,7 @@ def test_without_currents_only_models_that_need_none_are_there():
 @pytest.mark.parametrize("name", ["affine", "saturating", "heading_lookup"])
 def test_a_floor_that_was_not_fitted_is_refused(name):
     w = windows()
-    mine = w.pieces(np.flatnonzero(np.asarray(w.surface) == "firm"))
+    mine = w.segments(np.flatnonzero(np.asarray(w.surface) == "firm"))
     fitted = ALL[name].fit(driven(mine, ALL["encoder"]), ROBOT)
     with pytest.raises(ValueError, match="no surface 'soft'; identified: firm"):
         fitted.increments(w, ROBOT)

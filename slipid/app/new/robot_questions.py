@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from slipid.app.config import Box, Differential, General, Omni, Wheels, geometry
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 
 Asker = Callable[[str, str, str], str]
 """Asks people: what is asked, what stands there if they say nothing, and what was wrong with the
@@ -145,7 +145,9 @@ def _drive(text: str, _: RobotAnswers) -> str:
     if word == "motor":
         raise ValueError("a motor on a bench needs no config; expected its log: slipid motor FILE")
     if word not in DRIVES:
-        raise ValueError(f"no such drive{near(word, DRIVES)}; expected one of {', '.join(DRIVES)}")
+        raise ValueError(
+            f"no such drive{did_you_mean(word, DRIVES)}; expected one of {', '.join(DRIVES)}"
+        )
     return word
 
 

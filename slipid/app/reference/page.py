@@ -11,7 +11,7 @@ from slipid.data.reading.bag.layout import BagLayout, RunRule, TopicChannel
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, SEVERAL, Channel, Layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.units import KNOWN
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 
 _DRIVES: tuple[tuple[type[c.Wheels], str, dict[str, object]], ...] = (
     (c.Omni, "omni", {"base_radius_m": 0.2, "wheel_azimuths_deg": [60, 180, 300]}),
@@ -56,7 +56,7 @@ def reference(what: str | None = None, config: "c.Config | None" = None) -> str:
         return "\n\n".join(parts) + "\n"
     found = [chapter for chapter in CHAPTERS if chapter.name == what]
     if not found:
-        raise DataError(f"'{what}'{near(what, names)}; expected one of {', '.join(names)}")
+        raise DataError(f"'{what}'{did_you_mean(what, names)}; expected one of {', '.join(names)}")
     return found[0].text(config) + "\n"
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from slipid.app.config import Config, Motor, Setting, geometry
-from slipid.infer.bench.motor import Bench, BenchMotor
+from slipid.infer.bench.motor import BenchMotor, BenchRoot
 from slipid.model.geometry import omni
 from slipid.model.robot import Robot
 from slipid.parameter import Declaration, Entry, entries
@@ -124,7 +124,7 @@ def parameter_rows(config: Config | None = None) -> list[ParameterRow]:
         return [_row(entry, whole, {}) for entry in entries(whole)]
     content = config.content
     if isinstance(content.robot, Motor):
-        bench = Bench(BenchMotor())
+        bench = BenchRoot(BenchMotor())
         return [_row(entry, bench, content.parameters) for entry in entries(bench)]
     floors = [FLOOR if s.surface == "folder" else s.surface for s in content.logs if s.map is None]
     loads = tuple(dict.fromkeys(section.load for section in content.logs))
@@ -134,7 +134,7 @@ def parameter_rows(config: Config | None = None) -> list[ParameterRow]:
     return [_row(entry, whole, content.parameters) for entry in entries(whole)]
 
 
-def _row(entry: Entry, robot: Robot | Bench, settings: dict[str, Setting]) -> ParameterRow:
+def _row(entry: Entry, robot: Robot | BenchRoot, settings: dict[str, Setting]) -> ParameterRow:
     one = entry.declaration
     value = np.atleast_1d(np.asarray(entry.get(robot), float))
     start = f"{value[0]:.4g}" if np.ptp(value) == 0 else ", ".join(f"{v:.4g}" for v in value)

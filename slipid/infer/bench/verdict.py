@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Int
 
 from slipid.infer.bench.fit import MotorFit
-from slipid.infer.bench.moments import Sums, cell_length, celled
-from slipid.infer.bench.windows import Windows
+from slipid.infer.bench.moments import MomentSums, cell_length, celled
+from slipid.infer.bench.windows import BenchWindows
 from slipid.infer.fit_file import SCHEMA, number_json
 from slipid.infer.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
-from slipid.infer.verdicts.unidentified import Flat, flat_directions, members, sentences
+from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
 from slipid.infer.verdicts.wording import VOLTAGE
 from slipid.support.files import Content, hash_of
 
@@ -60,7 +60,7 @@ def misfits(fit: MotorFit) -> tuple[Misfit, ...]:
     return tuple(m for m in found if m is not None)
 
 
-def _worst(fit: MotorFit, channel: str, unit: str, w: Windows, s: Sums) -> Misfit | None:
+def _worst(fit: MotorFit, channel: str, unit: str, w: BenchWindows, s: MomentSums) -> Misfit | None:
     """Largest mean of a bin, in its stds, over speed, current and time."""
     size = MATTERS * float(np.ptp(w.both.left))
     best: Misfit | None = None
@@ -83,8 +83,8 @@ def _worst(fit: MotorFit, channel: str, unit: str, w: Windows, s: Sums) -> Misfi
 
 def _mean(
     fit: MotorFit,
-    w: Windows,
-    s: Sums,
+    w: BenchWindows,
+    s: MomentSums,
     even: Int[np.ndarray, " some"],
     odd: Int[np.ndarray, " some"],
 ) -> tuple[float, float]:
@@ -220,7 +220,7 @@ def _labelled(path: str, label: str) -> str:
     return f"{path}@{label}" if label else path
 
 
-def _flat(f: MotorFit) -> tuple[Flat, ...]:
+def _flat(f: MotorFit) -> tuple[FlatDirection, ...]:
     """Directions that stay open, with what a bench can do about them."""
     found = flat_directions(f.space, f.covariance, has_current=True, has_voltage=f.has_voltage)
     return tuple(replace(one, remedy=_cure(one.paths, f.has_voltage)) for one in found)

@@ -24,23 +24,23 @@ ENDLESS = 1e3
 """Times that every candidate is driven where "endless" is meant: what is left then stays."""
 
 
-class Rows(NamedTuple):
+class RunJacobians(NamedTuple):
     """Whitened Jacobians of runs: J of the motion, E and C of currents (k is 0 without them)."""
 
     motion: Float[np.ndarray, "run m motion"]
     electric: Float[np.ndarray, "run k electric"]
     carried: Float[np.ndarray, "run k motion"]
 
-    def pick(self, index: Sequence[int] | np.ndarray) -> "Rows":
+    def pick(self, index: Sequence[int] | np.ndarray) -> "RunJacobians":
         """Some runs, in the order given; a run may come several times."""
-        return Rows(*(part[np.asarray(index, int)] for part in self))
+        return RunJacobians(*(part[np.asarray(index, int)] for part in self))
 
-    def joined(self, *others: "Rows") -> "Rows":
-        return Rows(*map(np.concatenate, zip(self, *others, strict=True)))
+    def joined(self, *others: "RunJacobians") -> "RunJacobians":
+        return RunJacobians(*map(np.concatenate, zip(self, *others, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
-class Knowledge:
+class Information:
     """Information on all numbers, M, O and X, and which of them are electric."""
 
     is_electric: Bool[np.ndarray, " free"]
@@ -48,11 +48,11 @@ class Knowledge:
     own: Float[np.ndarray, "electric electric"]
     cross: Float[np.ndarray, "electric motion"]
 
-    def plus(self, rows: Rows, times: float = 1.0) -> "Knowledge":
+    def plus(self, rows: RunJacobians, times: float = 1.0) -> "Information":
         """After these runs as well, each so many times; -1 takes them away."""
         # not -1: where a part has no numbers, numpy cannot tell how many rows it has
         j, e, c = (x.reshape(x.shape[0] * x.shape[1], x.shape[2]) for x in rows)
-        return Knowledge(
+        return Information(
             self.is_electric,
             self.motion + times * (j.T @ j),
             self.own + times * (e.T @ e),
@@ -80,7 +80,7 @@ class Knowledge:
         return float(np.einsum("ki,ij,kj->", goal, self.covariance, goal))
 
     def after_each(
-        self, rows: Rows, goal: Float[np.ndarray, "k free"]
+        self, rows: RunJacobians, goal: Float[np.ndarray, "k free"]
     ) -> Float[np.ndarray, " run"]:
         """Criterion after one more run, for every candidate.
 
@@ -104,21 +104,21 @@ class Knowledge:
         return np.asarray(before + rest - gain)
 
 
-def known(
+def information_of(
     covariance: Float[np.ndarray, "free free"], is_electric: Bool[np.ndarray, " free"]
-) -> Knowledge:
+) -> Information:
     """Knowledge with this covariance."""
     e, m = np.flatnonzero(is_electric), np.flatnonzero(~is_electric)
     of_motion = covariance[np.ix_(m, m)]
     motion = _inverse(of_motion)
     lean = -covariance[np.ix_(e, m)] @ motion
     own = _inverse(covariance[np.ix_(e, e)] - lean @ of_motion @ lean.T)
-    return Knowledge(np.asarray(is_electric, bool), motion, own, own @ lean)
+    return Information(np.asarray(is_electric, bool), motion, own, own @ lean)
 
 
-def path(
-    start: Knowledge,
-    rows: Rows,
+def criterion_path(
+    start: Information,
+    rows: RunJacobians,
     goal: np.ndarray,
     order: Sequence[int] | np.ndarray,
     at: Sequence[int] | None = None,
@@ -133,7 +133,7 @@ def path(
 
 
 def greedy(
-    start: Knowledge, rows: Rows, goal: np.ndarray, most: int, target: float = 0.0
+    start: Information, rows: RunJacobians, goal: np.ndarray, most: int, target: float = 0.0
 ) -> tuple[list[int], list[float]]:
     """At most so many runs, each the one that lowers the criterion most; any may come again.
 
@@ -149,7 +149,9 @@ def greedy(
     return chosen, found
 
 
-def exchanged(start: Knowledge, rows: Rows, goal: np.ndarray, chosen: Sequence[int]) -> list[int]:
+def exchanged(
+    start: Information, rows: RunJacobians, goal: np.ndarray, chosen: Sequence[int]
+) -> list[int]:
     """The runs after each was once exchanged for the best in its place, the most useful first."""
     kept = list(chosen)
     for k in range(len(kept)):

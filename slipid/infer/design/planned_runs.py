@@ -27,7 +27,7 @@ Setup = tuple[str, str]
 
 
 @dataclass(frozen=True)
-class Drive:
+class PlannedRun:
     """One run: a constant command on one floor with one load set-up.
 
     The heading of the motion is in the body frame [rad]; speed [m/s], turn [rad/s]; the distance is
@@ -64,7 +64,7 @@ def candidates(
     base_radius: float,
     headings_deg: Sequence[float] = HEADINGS,
     turns: Sequence[float] | None = None,
-) -> tuple[Drive, ...]:
+) -> tuple[PlannedRun, ...]:
     """Every heading at every speed of a floor, straight and turning, and turns on the spot.
 
     Speeds [m/s] and distances [m] are of each floor. Turning rates [rad/s] are by default none and
@@ -79,13 +79,13 @@ def candidates(
             ways = np.radians(headings_deg)
             if speed > 0:
                 found = product(ways, rates)
-                out += [Drive(surface, load, float(a), speed, t, far) for a, t in found]
+                out += [PlannedRun(surface, load, float(a), speed, t, far) for a, t in found]
             spin = (speed / base_radius, -speed / base_radius) if turns is None else turns
-            out += [Drive(surface, load, 0.0, 0.0, t, far) for t in spin if t != 0]
+            out += [PlannedRun(surface, load, 0.0, 0.0, t, far) for t in spin if t != 0]
     return tuple(dict.fromkeys(out))
 
 
-def paper_grid(setups: Iterable[Setup], distance: Mapping[str, float]) -> tuple[Drive, ...]:
+def paper_grid(setups: Iterable[Setup], distance: Mapping[str, float]) -> tuple[PlannedRun, ...]:
     """The 36 settings of the 2021 paper, each on every set-up before the next.
 
     Along x and y at 100 to 400 mm/s, on the diagonals at 100 to 300 mm/s in x and in y, on the spot
@@ -96,31 +96,31 @@ def paper_grid(setups: Iterable[Setup], distance: Mapping[str, float]) -> tuple[
     ahead = [float(np.hypot(v, v)) for v in (0.1, 0.2, 0.3)]
     settings += [(a, v, 0.0) for v in ahead for a in (45.0, 225.0, 135.0, 315.0)]
     return tuple(
-        Drive(f, load, float(np.radians(a)), speed, float(np.radians(turn)), distance[f])
+        PlannedRun(f, load, float(np.radians(a)), speed, float(np.radians(turn)), distance[f])
         for (a, speed, turn), (f, load) in product(settings, setups)
     )
 
 
 def heading_grid(
     setups: Iterable[Setup], speeds: Mapping[str, Sequence[float]], distance: Mapping[str, float]
-) -> tuple[Drive, ...]:
+) -> tuple[PlannedRun, ...]:
     """Straight runs in headings every 5 degrees at every speed, as the 2022 logs were driven."""
     headings = np.radians(np.arange(0.0, 360.0, 5.0))
     return tuple(
-        Drive(f, load, float(heading), speed, 0.0, distance[f])
+        PlannedRun(f, load, float(heading), speed, 0.0, distance[f])
         for heading, (f, load) in product(headings, setups)
         for speed in speeds[f]
         if speed > 0
     )
 
 
-def drivable(drives: Iterable[Drive], robot: Robot) -> tuple[Drive, ...]:
+def drivable(drives: Iterable[PlannedRun], robot: Robot) -> tuple[PlannedRun, ...]:
     """Those whose commanded twist the wheels can give: not sideways for ordinary wheels."""
     j = np.asarray(robot.geometry.forward())
     reach = np.linalg.pinv(j, rcond=1e-6) @ j
     base = np.array([1.0, 1.0, float(robot.geometry.base_radius)])
 
-    def fits(d: Drive) -> bool:
+    def fits(d: PlannedRun) -> bool:
         lost = (reach @ d.command - d.command) * base
         return bool(np.linalg.norm(lost) < 0.05 * np.linalg.norm(d.command * base))
 
@@ -128,7 +128,7 @@ def drivable(drives: Iterable[Drive], robot: Robot) -> tuple[Drive, ...]:
 
 
 def steady_windows(
-    drives: Sequence[Drive],
+    drives: Sequence[PlannedRun],
     robot: Robot,
     channels: Channels,
     session: str = SESSION,
@@ -150,10 +150,10 @@ def steady_windows(
         surface=tuple(d.surface for d in drives),
         load=tuple(d.load for d in drives),
         session=(session,) * n,
-        began=np.zeros(n),
+        start=np.zeros(n),
         dt=dt,
         turn=dt[..., None] * rate[:, None],
-        faster=blank,
+        speed_change=blank,
         pose=np.zeros((n, per_piece + 1, 3)),
         current=blank,
         voltage=blank,

@@ -17,8 +17,8 @@ from slipid.fit.problem import Problem
 from slipid.fit.session_effects import by_axis
 from slipid.fit.shared_effects import AXES
 from slipid.fit.variances import whitened
-from slipid.infer.design.fisher import Knowledge, Rows, known
-from slipid.infer.design.planned_runs import SESSION, Drive, Setup, steady_windows
+from slipid.infer.design.fisher import Information, RunJacobians, information_of
+from slipid.infer.design.planned_runs import SESSION, PlannedRun, Setup, steady_windows
 from slipid.infer.result import Channels, Fit
 from slipid.model.robot import Robot
 from slipid.parameter import entries
@@ -52,7 +52,7 @@ class Planner:
         self.variance = dict(variance)
         paths = [e.path for e in entries(self.robot)]
         choices = [c for c in choices if any(fnmatchcase(p, c.pattern) for p in paths)]
-        first = Drive(robot.surfaces.labels[0], robot.body.loads[0], 0.0, 0.1)
+        first = PlannedRun(robot.surfaces.labels[0], robot.body.loads[0], 0.0, 0.1)
         self._problem = Problem(self._windows([first] * _TOGETHER), self.robot, choices).apart()
         self.space = self._problem.space
         self.z = self.space.vector(self.robot)
@@ -74,16 +74,16 @@ class Planner:
     def of(cls, fit: Fit) -> "Planner":
         return cls(fit.robot, fit.choices, fit.variance, fit.channels)
 
-    def _windows(self, drives: Sequence[Drive], session: str = SESSION) -> Windows:
+    def _windows(self, drives: Sequence[PlannedRun], session: str = SESSION) -> Windows:
         return steady_windows(drives, self.robot, self.channels, session)
 
-    def nothing(self) -> Knowledge:
+    def nothing(self) -> Information:
         """Before any run: the prior; of a single session the marker's yaw is the common one."""
         single = self.space.where(lambda e: e.session is not None)
         std = np.where(single, 1e-6, self.space.prior_std)
         return self._known(np.diag(std**2))
 
-    def after(self, fit: Fit) -> Knowledge:
+    def after(self, fit: Fit) -> Information:
         """After a fit; what it learnt of its own sessions' marker is of no more use."""
         place = {name: k for k, name in enumerate(fit.space.names)}
         mine = [k for k, name in enumerate(self.space.names) if name in place]
@@ -92,16 +92,16 @@ class Planner:
         covariance[np.ix_(mine, mine)] = fit.covariance[np.ix_(theirs, theirs)]
         return self._known(covariance)
 
-    def _known(self, covariance: Float[np.ndarray, "free free"]) -> Knowledge:
-        return known(block_diag(covariance, np.eye(self.effects)), self.is_electric)
+    def _known(self, covariance: Float[np.ndarray, "free free"]) -> Information:
+        return information_of(block_diag(covariance, np.eye(self.effects)), self.is_electric)
 
-    def rows(self, drives: Sequence[Drive]) -> Rows:
+    def rows(self, drives: Sequence[PlannedRun]) -> RunJacobians:
         """What each run would tell."""
         starts = range(0, len(drives), _TOGETHER)
         first, *others = (self._rows(drives[k : k + _TOGETHER]) for k in starts)
         return first.joined(*others)
 
-    def _rows(self, drives: Sequence[Drive]) -> Rows:
+    def _rows(self, drives: Sequence[PlannedRun]) -> RunJacobians:
         # always as many at once, so that one compiled function serves
         filled = [*drives, *[drives[-1]] * (_TOGETHER - len(drives))]
         windows = self._windows(filled)
@@ -119,13 +119,13 @@ class Planner:
         motion = np.asarray(halves.pop("motion"))[: len(drives)]
         others = [np.asarray(h)[: len(drives)] for h in halves.values()]
         electric = np.concatenate([motion[:, :0], *others], axis=1)
-        return Rows(
+        return RunJacobians(
             motion[..., ~self.is_electric],
             electric[..., self.is_electric],
             electric[..., ~self.is_electric],
         )
 
-    def ends(self, drives: Sequence[Drive]) -> Float[np.ndarray, "run 2 number"]:
+    def ends(self, drives: Sequence[PlannedRun]) -> Float[np.ndarray, "run 2 number"]:
         """Derivative of each run's end point, over its distance, by the numbers.
 
         What is of one session, the marker's deviation too, is no part of a prediction.
@@ -154,7 +154,7 @@ class Goal:
         floor, load = setup
         return floor in (self.floors or {floor}) and load in (self.loads or {load})
 
-    def std(self, knowledge: Knowledge) -> float:
+    def std(self, knowledge: Information) -> float:
         return float(np.sqrt(max(knowledge.criterion(self.rows), 0.0)))
 
 
@@ -173,7 +173,7 @@ def parameter_goal(planner: Planner, path: str) -> Goal:
     )
 
 
-def prediction_goal(planner: Planner, name: str, drives: Sequence[Drive]) -> Goal:
+def prediction_goal(planner: Planner, name: str, drives: Sequence[PlannedRun]) -> Goal:
     """Root mean square end-point error of runs that comes from the parameters, over distance."""
     rows = planner.ends(drives)
     return Goal(
@@ -185,7 +185,7 @@ def prediction_goal(planner: Planner, name: str, drives: Sequence[Drive]) -> Goa
     )
 
 
-def weighed(goals: Sequence[Goal], now: Knowledge, weight: Sequence[float]) -> np.ndarray:
+def weighed(goals: Sequence[Goal], now: Information, weight: Sequence[float]) -> np.ndarray:
     """G of the criterion sum_g weight_g (std_g / std_g now)^2, which is 1 now."""
     share = np.asarray(weight, float) / np.sum(weight)
     parts = [np.sqrt(w) / g.std(now) * g.rows for g, w in zip(goals, share, strict=True)]

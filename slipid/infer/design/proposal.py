@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slipid.infer.design import fisher as info
-from slipid.infer.design.planned_runs import Drive, drivable, heading_grid, paper_grid
+from slipid.infer.design.planned_runs import PlannedRun, drivable, heading_grid, paper_grid
 from slipid.infer.design.planner import Goal, Planner, parameter_goal, prediction_goal, weighed
-from slipid.infer.design.wish import Scope, Wish
+from slipid.infer.design.scope import DesignOptions, Scope
 from slipid.infer.result import Fit
 from slipid.infer.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.model.robot import Validity
@@ -48,7 +48,7 @@ class Design:
     """
 
     content: Content
-    drives: tuple[Drive, ...]
+    drives: tuple[PlannedRun, ...]
     base_radius: float
     seen: Mapping[str, Validity]
     reached: bool
@@ -64,7 +64,7 @@ class Design:
         return design_figure(self)
 
 
-def design(fit: Fit, wish: Wish) -> Design:
+def design(fit: Fit, wish: DesignOptions) -> Design:
     """Runs that shrink what is wanted most, and how many they save against grids.
 
     Raises:
@@ -107,7 +107,7 @@ def design(fit: Fit, wish: Wish) -> Design:
         goal = weighed(goals, now, [weights[g] for g in goals])
         chosen, _ = info.greedy(now, rows, goal, wish.runs)
         chosen = info.exchanged(now, rows, goal, chosen)
-        content["criterion"] = info.path(now, rows, goal, chosen)
+        content["criterion"] = info.criterion_path(now, rows, goal, chosen)
         content["runs_saved"] = _saved(scope, planner, goals, goal, offered, rows)
     drives = tuple(offered[k] for k in chosen)
     after = now
@@ -132,7 +132,7 @@ def design(fit: Fit, wish: Wish) -> Design:
     return Design(content, drives, scope.base, fit.validity, not (asked and lost) and bool(goals))
 
 
-def _goals(fit: Fit, wish: Wish, scope: Scope, planner: Planner) -> dict[Goal, float]:
+def _goals(fit: Fit, wish: DesignOptions, scope: Scope, planner: Planner) -> dict[Goal, float]:
     found = [parameter_goal(planner, path) for path in _paths(fit, wish.parameters)]
     found += [
         prediction_goal(planner, f"prediction {text}", scope.predicted(text))
@@ -164,7 +164,7 @@ def _paths(fit: Fit, patterns: Sequence[str]) -> list[str]:
 
 
 def _out_of_reach(
-    fit: Fit, goal: Goal, now: info.Knowledge, last: info.Knowledge, count: int
+    fit: Fit, goal: Goal, now: info.Information, last: info.Information, count: int
 ) -> str | None:
     """Why no candidate shrinks a goal, None where one does."""
     # a prior elsewhere must not lend them a scale
@@ -177,7 +177,7 @@ def _out_of_reach(
     return f"no candidate run shrinks {goal.name}: {why}"
 
 
-def _extrapolated(fit: Fit, drives: Sequence[Drive]) -> list[str]:
+def _extrapolated(fit: Fit, drives: Sequence[PlannedRun]) -> list[str]:
     """Where proposed runs leave what the fit has seen: its form is not known to hold there."""
     out = []
     for floor, seen in fit.validity.items():
@@ -203,8 +203,8 @@ def _saved(
     planner: Planner,
     goals: Sequence[Goal],
     goal: np.ndarray,
-    offered: Sequence[Drive],
-    rows: info.Rows,
+    offered: Sequence[PlannedRun],
+    rows: info.RunJacobians,
 ) -> Content:
     """How many runs, chosen one after another from nothing, tell as much as whole grids.
 
@@ -228,9 +228,9 @@ def _saved(
 def _against(
     planner: Planner,
     goal: np.ndarray,
-    grid: tuple[Drive, ...],
-    offered: Sequence[Drive],
-    rows: info.Rows,
+    grid: tuple[PlannedRun, ...],
+    offered: Sequence[PlannedRun],
+    rows: info.RunJacobians,
     base: float,
 ) -> Content:
     of_grid, start = planner.rows(grid), planner.nothing()
@@ -240,8 +240,10 @@ def _against(
     count, reached = len(chosen), found[-1] <= target
     at = sorted({*np.geomspace(1, len(grid), POINTS).round().astype(int).tolist(), count})
     orders = [np.random.default_rng(k).permutation(len(grid)) for k in range(ORDERS)]
-    random = np.mean([info.path(start, of_grid, goal, order, at) for order in orders], axis=0)
-    in_order = info.path(start, of_grid, goal, np.arange(len(grid)), at)
+    random = np.mean(
+        [info.criterion_path(start, of_grid, goal, order, at) for order in orders], axis=0
+    )
+    in_order = info.criterion_path(start, of_grid, goal, np.arange(len(grid)), at)
     return {
         "grid_runs": len(grid),
         "greedy_runs": count if reached else None,

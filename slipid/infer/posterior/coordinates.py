@@ -13,7 +13,7 @@ from slipid.fit import likelihood as lk
 from slipid.fit.problem import Problem, effects_given, twists
 from slipid.fit.shared_effects import EffectPosterior, SharedEffects
 from slipid.fit.variances import DEGREES, Blocks, Square, Vector, expected, inverse_root
-from slipid.infer.result import Fit, known
+from slipid.infer.result import Fit, required
 from slipid.model.robot import Robot
 
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
@@ -37,7 +37,7 @@ class Fitted:
     @classmethod
     def of(cls, fit: Fit) -> "Fitted":
         """The end of a fit, with the variances in the order of its problem."""
-        names = known(fit.problem).noise.names
+        names = required(fit.problem).noise.names
         return cls(fit.z, np.log([fit.variance[name] for name in names]), fit.covariance)
 
 

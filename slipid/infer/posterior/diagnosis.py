@@ -16,7 +16,7 @@ from jaxtyping import Float
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.fit_file import curves_json, identified_json, number_json
 from slipid.infer.posterior.blocks import Chain, Plan
-from slipid.infer.result import Fit, known
+from slipid.infer.result import Fit, required
 from slipid.infer.verdicts import estimates as verdicts
 from slipid.infer.verdicts.disputed import marked
 from slipid.infer.verdicts.unidentified import members
@@ -207,7 +207,7 @@ def estimates(
         unsaid = e.path in verdicts.NEEDS_VOLTAGE and not fit.channels.voltage
         forced = old.verdict if unsaid or old.verdict == "at_bound" else None
         from_zero = verdicts.from_zero(d, z.std(axis=0))
-        verdict, provenance = verdicts.said(ratio, from_zero, forced, e.path in open_)
+        verdict, provenance = verdicts.verdict_of(ratio, from_zero, forced, e.path in open_)
         pull = (z.mean(axis=0) - fit.space.prior_mean[at]) / prior_std[at]
         out[e.path] = replace(
             old,
@@ -232,7 +232,7 @@ def identified(found: Posterior) -> Content:
     ratios = verdicts.derived(fit.space, flat.mean(axis=0), np.cov(flat.T), fit.channels.voltage)
     content["derived"] = {e.path: number_json(_drawn(e, fit, flat)) for e in ratios}
     some = flat[:: max(1, len(flat) // 400)]
-    curves = curves_of.curves(fit.space, flat.mean(axis=0), some, known(fit.problem).batch)
+    curves = curves_of.curves(fit.space, flat.mean(axis=0), some, required(fit.problem).batch)
     return content | {"curves": curves_json(curves), "messages": list(found.messages)}
 
 

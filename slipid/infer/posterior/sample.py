@@ -26,11 +26,19 @@ from slipid.fit.hierarchy import effect_information, pooled_stds
 from slipid.fit.problem import Problem, linear
 from slipid.fit.variances import DEGREES, VARIANCE_SPREAD, information
 from slipid.infer.posterior import diagnosis, ensemble
-from slipid.infer.posterior.blocks import Block, Chain, Plan, Record, Target, packed, unpacked
+from slipid.infer.posterior.blocks import (
+    BlockStore,
+    Chain,
+    ChainBlock,
+    LogDensity,
+    Plan,
+    packed,
+    unpacked,
+)
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted, effects_at
 from slipid.infer.posterior.density import Density, electric_given_motion
 from slipid.infer.posterior.diagnosis import Posterior
-from slipid.infer.result import Fit, known
+from slipid.infer.result import Fit, required
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.files import write_bytes
@@ -51,8 +59,8 @@ def sampled(
     It goes on from the blocks that an earlier call has kept, and keeps new ones.
     """
 
-    def done(part: str) -> list[Block]:
-        blocks: list[Block] = []
+    def done(part: str) -> list[ChainBlock]:
+        blocks: list[ChainBlock] = []
         if kept is None:
             return blocks
         while (arrays := kept.load(f"{part}-{len(blocks):04d}")) is not None:
@@ -61,7 +69,7 @@ def sampled(
             report.line(f"going on from block {len(blocks)} ({part}) of {kept.folder}")
         return blocks
 
-    def keep(part: str, block: Block) -> None:
+    def keep(part: str, block: ChainBlock) -> None:
         if kept is not None:
             kept.save(f"{part}-{block.number:04d}", packed(block))
         _tell(block, plan, report)
@@ -69,10 +77,10 @@ def sampled(
     def steps(part: str, count: int) -> None:
         report.stage(f"sampling {part}")
 
-    return sample(fit, plan, draws, Record(done, keep, steps))
+    return sample(fit, plan, draws, BlockStore(done, keep, steps))
 
 
-def _tell(block: Block, plan: Plan, report: Reporter) -> None:
+def _tell(block: ChainBlock, plan: Plan, report: Reporter) -> None:
     """Progress of a chain; the time left is what it takes at most."""
     count = block.number + 1
     warm = "warm-up, " if count <= plan.warm_up[-1] else ""
@@ -84,15 +92,15 @@ def _tell(block: Block, plan: Plan, report: Reporter) -> None:
     report.advance(count, plan.most, what)
 
 
-def sample(fit: Fit, plan: Plan, draws: int = 400, record: Record | None = None) -> Posterior:
+def sample(fit: Fit, plan: Plan, draws: int = 400, record: BlockStore | None = None) -> Posterior:
     """Posterior around a fit, so many draws of each ensemble."""
-    problem, fitted = known(fit.problem), Fitted.of(fit)
+    problem, fitted = required(fit.problem), Fitted.of(fit)
     assert problem.several is None, "runs on one floor each"
-    record = record or Record()
+    record = record or BlockStore()
     parts = (EVERYTHING,) if problem.target.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
     at = first.coordinates
-    target = Target(first.terms, first.slope, at.group, first.centre, first.covariance)
+    target = LogDensity(first.terms, first.slope, at.group, first.centre, first.covariance)
     blocks = ensemble.extended(target, plan, parts[0], record)
     chain = ensemble.chain(blocks, plan)
     found = diagnosis.diagnose(chain, plan)
@@ -127,7 +135,7 @@ def sample(fit: Fit, plan: Plan, draws: int = 400, record: Record | None = None)
 
 
 def thinned(
-    chain: Chain, blocks: Sequence[Block], draws: int
+    chain: Chain, blocks: Sequence[ChainBlock], draws: int
 ) -> tuple[Float[np.ndarray, "ensemble draw size"], Float[np.ndarray, "ensemble draw"]]:
     """Draws spread evenly over steps and walkers; some repeat where there are too few."""
     log_prob = np.concatenate([b.log_prob for b in blocks], axis=1)
@@ -174,7 +182,7 @@ _AXES = ("x", "y", "yaw")
 
 def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
     """All groups of the file, with these attributes of the whole beside schema and data."""
-    fit, problem = found.fit, known(found.fit.problem)
+    fit, problem = found.fit, required(found.fit.problem)
     w, robot, runs = problem.windows, problem.robot, [name for name, _ in fit.runs]
     values, dims, units = _numbers(problem.space, found)
     noise, noise_dims = _noise(problem, found)

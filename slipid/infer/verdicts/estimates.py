@@ -30,7 +30,7 @@ LARGEST = 600.0
 """Largest exponent at an end of an interval: of what nothing is known it would be infinite."""
 
 
-class Ratio(NamedTuple):
+class ParameterRatio(NamedTuple):
     """A quotient of two positive numbers that may be known where neither of them is.
 
     The numerator is a quantity, of every floor where floors have their own, the denominator a path.
@@ -43,11 +43,19 @@ class Ratio(NamedTuple):
 
 
 RATIOS = (
-    Ratio("motor.resistance", "motor.back_emf", "ohm*rad/(V*s)", "needs the voltage, as both do"),
-    Ratio("surface.friction", "motor.back_emf", "rad/(V*s)", "the torque scale currents fix"),
-    Ratio("motor.coulomb_friction", "motor.back_emf", "A", "current at crawling speed"),
-    Ratio("motor.viscous_friction", "motor.back_emf", "A*s/rad", "current per wheel speed"),
-    Ratio("camera.scale", "robot.wheel_radius", "1/m", "all that motion without slip tells"),
+    ParameterRatio(
+        "motor.resistance", "motor.back_emf", "ohm*rad/(V*s)", "needs the voltage, as both do"
+    ),
+    ParameterRatio(
+        "surface.friction", "motor.back_emf", "rad/(V*s)", "the torque scale currents fix"
+    ),
+    ParameterRatio("motor.coulomb_friction", "motor.back_emf", "A", "current at crawling speed"),
+    ParameterRatio(
+        "motor.viscous_friction", "motor.back_emf", "A*s/rad", "current per wheel speed"
+    ),
+    ParameterRatio(
+        "camera.scale", "robot.wheel_radius", "1/m", "all that motion without slip tells"
+    ),
 )
 """Quotients with a verdict of their own, where both numbers are free.
 
@@ -171,7 +179,7 @@ def _free(
         forced = "not_identified"
     elif _at_bound(d, value, pull, prior_std):
         forced = "at_bound"
-    verdict, provenance = said(ratio, from_zero(d, std_z), forced, is_flat)
+    verdict, provenance = verdict_of(ratio, from_zero(d, std_z), forced, is_flat)
     return Estimate(
         path=entry.path,
         unit=d.unit,
@@ -211,7 +219,9 @@ def by_ratio(ratio: float, from_zero: float = np.inf) -> str:
     return "weak" if ratio < WEAK else "not_identified"
 
 
-def said(ratio: float, from_zero: float, forced: str | None, is_flat: bool) -> tuple[str, str]:
+def verdict_of(
+    ratio: float, from_zero: float, forced: str | None, is_flat: bool
+) -> tuple[str, str]:
     """Verdict and provenance of a number, after a fit as after sampling.
 
     Below 1/sqrt(2) the data hold more information than the prior. A number that moves along a
@@ -246,7 +256,12 @@ def derived(space: Space, z: Search, covariance: Square, has_voltage: bool) -> t
 
 
 def _quotient(
-    space: Space, wanted: Ratio, over: str, z: np.ndarray, covariance: np.ndarray, has_voltage: bool
+    space: Space,
+    wanted: ParameterRatio,
+    over: str,
+    z: np.ndarray,
+    covariance: np.ndarray,
+    has_voltage: bool,
 ) -> Estimate:
     c = np.zeros(len(z))
     c[space.place[over]], c[space.place[wanted.under]] = 1.0, -1.0
@@ -255,7 +270,7 @@ def _quotient(
     prior_std = float(np.sqrt(np.sum((c * space.prior_std) ** 2)))
     value, ratio = float(np.exp(log_value)), std / prior_std
     forced = "not_identified" if over == NEEDS_VOLTAGE[0] and not has_voltage else None
-    verdict, provenance = said(ratio, 1 / std, forced, is_flat=False)
+    verdict, provenance = verdict_of(ratio, 1 / std, forced, is_flat=False)
     low, high = (float(np.exp(min(log_value + k * std, LARGEST))) for k in (-Z95, Z95))
     return Estimate(
         path=f"{over}/{wanted.under}",

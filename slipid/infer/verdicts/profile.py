@@ -112,7 +112,7 @@ def profile(
     """
     entry = profiled(problem.space, path)
     at = problem.space.place[path].start
-    walk = _Walk(problem, optimum, at, tell)
+    walk = _Refits(problem, optimum, at, tell)
     points = sorted([*walk.side(-1.0), *walk.side(1.0), (walk.start, walk.lowest)])
     z = np.array([p[0] for p in points])
     posterior = np.array([p[1] for p in points])
@@ -149,7 +149,7 @@ def profile(
     )
 
 
-class _Walk:
+class _Refits:
     """Refits along one coordinate, each from where its neighbour ended."""
 
     def __init__(

@@ -38,7 +38,7 @@ _PART = 0.3
 
 
 @dataclass(frozen=True)
-class Flat:
+class FlatDirection:
     """A direction in which the data do not hold the parameters.
 
     Each of the paths is multiplied by t to its power, for any t; what has no bounds moves by this
@@ -57,7 +57,7 @@ class Flat:
         return f"{self.formula}: {self.remedy}"
 
 
-class _Told:
+class _Precision:
     """Information P in prior-scaled coordinates; currents may tell some given the motion."""
 
     def __init__(self, given: Square, electric: np.ndarray | None = None):
@@ -88,7 +88,7 @@ def flat_directions(
     has_voltage: bool,
     validity: Mapping[str, Validity] | None = None,
     sideways: bool = True,
-) -> tuple[Flat, ...]:
+) -> tuple[FlatDirection, ...]:
     """Directions in which the data narrow the prior by less than a fifth.
 
     Numbers of which the data say nothing come first, each by itself: they would mix into the
@@ -103,7 +103,7 @@ def flat_directions(
     scale = [k for k in kept if axes[k].entry.quantity in TORQUE_SCALE]
     std = space.prior_std
     given = np.linalg.inv(covariance) * (std[:, None] * std)
-    told = _Told(given, space.electric if has_current else None)
+    told = _Precision(given, space.electric if has_current else None)
     out = []
     for picked, u in _sparse(told, kept, scale, 1 / std):
         main = _named(told, [axes[k] for k in picked], picked, u, std[picked])
@@ -112,7 +112,7 @@ def flat_directions(
         power = step / step[np.argmax(np.abs(step))]
         moving, rest = [axis.entry for axis in mine], len(picked) - len(mine)
         out.append(
-            Flat(
+            FlatDirection(
                 paths=tuple(e.path for e in moving),
                 powers=tuple(round(float(p), 2) for p in power),
                 others=rest,
@@ -123,7 +123,7 @@ def flat_directions(
     return tuple(out)
 
 
-def members(found: Iterable[Flat]) -> frozenset[str]:
+def members(found: Iterable[FlatDirection]) -> frozenset[str]:
     """Paths of the numbers that move along flat directions."""
     return frozenset(path for f in found for path in f.paths)
 
@@ -132,7 +132,7 @@ def _known(entry: Entry) -> bool:
     return entry.session is not None or entry.declaration.deviation
 
 
-def sentences(found: Iterable[Flat]) -> tuple[str, ...]:
+def sentences(found: Iterable[FlatDirection]) -> tuple[str, ...]:
     """One sentence per direction; numbers by themselves that one remedy would tell share one."""
     alone: dict[str, list[str]] = {}
     together = []
@@ -145,7 +145,7 @@ def sentences(found: Iterable[Flat]) -> tuple[str, ...]:
 
 
 def _sparse(
-    told: _Told, among: list[int], symmetry: list[int], move: Search
+    told: _Precision, among: list[int], symmetry: list[int], move: Search
 ) -> list[tuple[list[int], Float[np.ndarray, " some"]]]:
     """Basis of the flat directions, each a unit vector that needs every coordinate it names.
 
@@ -177,7 +177,7 @@ def _sparse(
 
 
 def _without_one(
-    told: _Told, picked: list[int], u: np.ndarray, limit: float
+    told: _Precision, picked: list[int], u: np.ndarray, limit: float
 ) -> tuple[list[int], np.ndarray] | None:
     """A flat direction with a coordinate less, None where every one is needed."""
     for drop in np.argsort(np.abs(u)):
@@ -190,7 +190,7 @@ def _without_one(
 
 
 def _named(
-    told: _Told, axes: list[Axis], picked: list[int], u: np.ndarray, std: np.ndarray
+    told: _Precision, axes: list[Axis], picked: list[int], u: np.ndarray, std: np.ndarray
 ) -> np.ndarray:
     """Which numbers of a direction are worth naming.
 
@@ -205,7 +205,7 @@ def _named(
 
 
 def _rounded(
-    told: _Told, picked: list[int], u: np.ndarray, std: np.ndarray, main: np.ndarray
+    told: _Precision, picked: list[int], u: np.ndarray, std: np.ndarray, main: np.ndarray
 ) -> np.ndarray:
     """Step of one prior std, with the powers of those named in halves if it is still flat."""
     step = u * std

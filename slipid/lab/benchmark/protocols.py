@@ -26,7 +26,7 @@ ALL = -1
 Labels = Int[np.ndarray, " run"]
 
 
-class Protocol(NamedTuple):
+class BenchmarkProtocol(NamedTuple):
     """A question.
 
     Attributes:
@@ -43,13 +43,15 @@ class Protocol(NamedTuple):
     strange: bool = False
 
 
-PROTOCOLS: dict[str, Protocol] = {
-    "known_floor": Protocol("headings", True, "new headings on a floor that is told"),
-    "unknown_floor": Protocol("headings", False, "new headings, the floor is not told"),
-    "sectors": Protocol("sectors", True, "left-out sectors of 60 degrees, the floor is told"),
-    "speeds": Protocol("speeds", True, "a left-out speed, the floor is told"),
-    "new_floor": Protocol("floors", False, "a floor that no method has seen", True),
-    "two_floors": Protocol("all", False, "runs from one floor to another, not told where"),
+PROTOCOLS: dict[str, BenchmarkProtocol] = {
+    "known_floor": BenchmarkProtocol("headings", True, "new headings on a floor that is told"),
+    "unknown_floor": BenchmarkProtocol("headings", False, "new headings, the floor is not told"),
+    "sectors": BenchmarkProtocol(
+        "sectors", True, "left-out sectors of 60 degrees, the floor is told"
+    ),
+    "speeds": BenchmarkProtocol("speeds", True, "a left-out speed, the floor is told"),
+    "new_floor": BenchmarkProtocol("floors", False, "a floor that no method has seen", True),
+    "two_floors": BenchmarkProtocol("all", False, "runs from one floor to another, not told where"),
 }
 
 

@@ -43,7 +43,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.lab.paper2021 import table as tables
-from slipid.lab.paper2021.samples import FIGURES_3_AND_4, Samples
+from slipid.lab.paper2021.samples import FIGURES_3_AND_4, SlipSamples
 from slipid.predict.curves import CurveModel, Slips, WheelSlip, above, powers, robust_std
 from slipid.predict.slip_model import Channel, RobotSpec, RunSignals, SlipModel
 from slipid.predict.steps import Steps, TrainingWindows
@@ -94,7 +94,7 @@ class PaperCode(WheelSlip):
         return np.asarray(of_each.mean(axis=1).reshape(current.shape))
 
 
-def recipe_samples(w: TrainingWindows, spec: RobotSpec) -> Samples:
+def recipe_samples(w: TrainingWindows, spec: RobotSpec) -> SlipSamples:
     """All wheels and windows that the authors' cuts leave, at most `MOST` of them by lot."""
     signals = w.signals
     rim = signals.speed * spec.wheel_radius
@@ -106,7 +106,7 @@ def recipe_samples(w: TrainingWindows, spec: RobotSpec) -> Samples:
     kept = (slip > 0.0) & (slip <= 1.0) & (amps > FIGURES_3_AND_4.min_current)
     lot = np.random.default_rng(0).permutation(int(kept.sum()))[:MOST]
     torque = signals.torque(spec)
-    return Samples(amps[kept][lot], torque[kept][lot], slip[kept][lot])
+    return SlipSamples(amps[kept][lot], torque[kept][lot], slip[kept][lot])
 
 
 def insensitive_curve(

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from slipid.data.log import Log
 from slipid.data.wheel_signals import interpolate
 from slipid.fit.shared_effects import AXES
-from slipid.infer.design.planned_runs import Drive
+from slipid.infer.design.planned_runs import PlannedRun
 from slipid.model.geometry import omni
 from slipid.model.robot import Robot, build, motor_current, twist
 from slipid.model.se2 import compose, path
@@ -65,7 +65,7 @@ TRUTH: dict[str, float | tuple[float, ...]] = {
 """Numbers of the default robot [SI], the rest as declared; of the size found on real logs."""
 
 
-def blank(drives: Sequence[Drive]) -> Robot:
+def blank(drives: Sequence[PlannedRun]) -> Robot:
     """Robotino at declared starts that knows the floors, loads and sessions of a plan."""
     return build(
         omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0),
@@ -76,7 +76,7 @@ def blank(drives: Sequence[Drive]) -> Robot:
 
 
 def truth(
-    drives: Sequence[Drive], values: Mapping[str, float | Sequence[float]] | None = None
+    drives: Sequence[PlannedRun], values: Mapping[str, float | Sequence[float]] | None = None
 ) -> Robot:
     """Robotino with the numbers of `TRUTH`, or others; what the plan does not need is left out."""
     robot = blank(drives)
@@ -90,16 +90,16 @@ def grid(
     headings: int = 12,
     speeds: Sequence[float] = (0.1, 0.2),
     turns: int = 2,
-) -> tuple[Drive, ...]:
+) -> tuple[PlannedRun, ...]:
     """Every heading at every speed on every (floor, load), and `turns` curved runs of each."""
     drives = []
     for surface, load in setups:
         for speed in speeds:
             ways = 2 * np.pi * np.arange(headings) / headings
-            drives += [Drive(surface, load, float(way), speed) for way in ways]
+            drives += [PlannedRun(surface, load, float(way), speed) for way in ways]
             ways = 2 * np.pi * (np.arange(turns) + 0.5) / max(turns, 1)
             drives += [
-                Drive(surface, load, float(way), speed, turn=(-1) ** k * 4.0 * speed)
+                PlannedRun(surface, load, float(way), speed, turn=(-1) ** k * 4.0 * speed)
                 for k, way in enumerate(ways)
             ]
     return tuple(drives)
@@ -107,7 +107,7 @@ def grid(
 
 def turning_grid(
     setups: Sequence[tuple[str, str]], ways: int, speeds: Sequence[float], base_radius: float
-) -> tuple[Drive, ...]:
+) -> tuple[PlannedRun, ...]:
     """Runs of wheels that do not drive sideways, on every (floor, load).
 
     Between straight ahead and turning on the spot `ways` of each speed, evenly around the circle of
@@ -120,7 +120,7 @@ def turning_grid(
                 # rounded: the cosine of a right angle is not quite zero
                 ahead, turn = (round(speed * float(f(way)), 9) for f in (np.cos, np.sin))
                 back = 0.0 if ahead >= 0 else np.pi
-                drives.append(Drive(surface, load, back, abs(ahead), turn=turn / base_radius))
+                drives.append(PlannedRun(surface, load, back, abs(ahead), turn=turn / base_radius))
     return tuple(drives)
 
 
@@ -172,7 +172,7 @@ class Sensors:
 
 
 def make_logs(
-    robot: Robot, drives: Sequence[Drive], seed: int, sensors: Sensors | None = None
+    robot: Robot, drives: Sequence[PlannedRun], seed: int, sensors: Sensors | None = None
 ) -> list[Log]:
     """Logs of a plan, in memory, of a robot that knows the plan's floors, loads and sessions."""
     return _Maker(robot, drives, sensors or Sensors(), np.random.default_rng(seed)).logs()
@@ -183,7 +183,7 @@ class _Maker:
     """Makes the logs of all drives at once; arrays are (run, row or step, ...)."""
 
     robot: Robot
-    drives: Sequence[Drive]
+    drives: Sequence[PlannedRun]
     sensors: Sensors
     random: np.random.Generator
 

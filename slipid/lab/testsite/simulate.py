@@ -24,7 +24,7 @@ from slipid.lab.testsite.plant import engine
 from slipid.lab.testsite.site import Camera, Site
 from slipid.lab.testsite.studio import Studio, film
 from slipid.support.errors import DataError
-from slipid.support.executor import Here, Processes, results
+from slipid.support.executor import InProcess, Processes, results
 from slipid.support.files import Content, read_json, write_arrays, write_bytes, write_json
 from slipid.support.progress import Reporter
 
@@ -168,7 +168,7 @@ def _film(jobs: Sequence[Job], camera: Camera, executor: Executor, report: Repor
     write_json(jobs[0].out / "video" / "camera.json", camera.as_dict())
     report.stage(f"filming {len(todo)} of {len(jobs)} runs")
     # not in this process, even alone: what draws has to be chosen before MuJoCo is there
-    with Processes(1) if isinstance(executor, Here) else nullcontext(executor) as apart:
+    with Processes(1) if isinstance(executor, InProcess) else nullcontext(executor) as apart:
         results(apart, film_and_write, todo, report)
 
 

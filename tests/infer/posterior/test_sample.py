@@ -12,7 +12,7 @@ from scipy.stats import norm
 from slipid.fit.hierarchy import effect_information
 from slipid.fit.noise import POOLED
 from slipid.fit.problem import Problem
-from slipid.infer.posterior.blocks import Block
+from slipid.infer.posterior.blocks import ChainBlock
 from slipid.infer.posterior.coordinates import Fitted, effects_at
 from slipid.infer.posterior.sample import drawn_variances, thinned
 from slipid.infer.posterior.transport_map import gaussian
@@ -132,7 +132,7 @@ def test_thinned_draws_are_spread_over_steps_and_walkers_and_keep_their_log_dens
     random = np.zeros((2, 624), np.uint32), np.zeros((2, 3))
     map = gaussian(np.zeros(1), np.eye(1), np.zeros(1, int))
     blocks = [
-        Block(k, part, 0.5 * part[..., 0], random, np.zeros(2), map, np.array([0.1]))
+        ChainBlock(k, part, 0.5 * part[..., 0], random, np.zeros(2), map, np.array([0.1]))
         for k, part in enumerate(np.split(chain, 3, axis=1))
     ]
     x, log_prob = thinned(chain, blocks, 40)

@@ -17,7 +17,7 @@ from slipid.fit.problem import Problem
 from slipid.infer.verdicts import unidentified as flat_module
 from slipid.infer.verdicts import wording
 from slipid.infer.verdicts.estimates import RATIOS, derived, estimates
-from slipid.infer.verdicts.profile import RISE, _Walk, profile, profiled
+from slipid.infer.verdicts.profile import RISE, _Refits, profile, profiled
 from slipid.infer.verdicts.unidentified import NOTICED, flat_directions, sentences
 from slipid.infer.verdicts.wording import VOLTAGE, remedy
 from slipid.model.robot import Validity
@@ -42,7 +42,7 @@ def space_of(*patterns: str) -> Space:
 
 
 def told(p):
-    return flat_module._Told(p)
+    return flat_module._Precision(p)
 
 
 def information(size, flat, held=400.0):
@@ -384,8 +384,8 @@ def test_a_profile_goes_back_where_it_stepped_over_the_end_of_a_flat_stretch(mon
         return 50.0 * max((start - state.z[at]) / std - 1.5, 0.0) ** 2
 
     monkeypatch.setattr("slipid.infer.verdicts.profile.optimise", optimised)
-    monkeypatch.setattr(_Walk, "loss", loss)
-    walk = _Walk(this, end, at, lambda points, rise: None)
+    monkeypatch.setattr(_Refits, "loss", loss)
+    walk = _Refits(this, end, at, lambda points, rise: None)
     z, rise = np.array(sorted(walk.side(-1.0), reverse=True)).T
     z, rise = (start - z) / std, rise - 0.5 * ((z - this.space.prior_mean[at]) / std) ** 2
     k = np.flatnonzero(rise - rise[0] > RISE)[0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slipid.lab.benchmark.protocols import PROTOCOLS, base_of, facts_of_run, inner, splits
-from slipid.lab.benchmark.tuned import _loss, tuned
+from slipid.lab.benchmark.tuning import _loss, tuned
 from slipid.lab.systems.motion.quann import QuannEnergy
 from slipid.predict.folds import FoldKey
 from slipid.predict.slip_model import FEWEST, ByFloor, PredictedRun, RobotSpec, SlipModel, path_of

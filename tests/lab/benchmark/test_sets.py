@@ -7,7 +7,7 @@ import pytest
 
 from slipid.app.logs import packaged_path
 from slipid.lab.benchmark.protocols import KINDS, PROTOCOLS
-from slipid.lab.benchmark.sets import SOURCES, read_set, there
+from slipid.lab.benchmark.sets import SOURCES, is_available, read_set
 from slipid.support.progress import Reporter
 
 QUIET = Reporter(quiet=True)
@@ -27,9 +27,9 @@ def test_every_source_has_a_config_and_kinds_that_there_are():
 
 
 def test_what_is_absent_is_absent(tmp_path):
-    assert [one.name for one in SOURCES if there(one, tmp_path)] == ["testsite"]
+    assert [one.name for one in SOURCES if is_available(one, tmp_path)] == ["testsite"]
     (tmp_path / "drive_skid").mkdir()
-    assert there(source("husky"), tmp_path)
+    assert is_available(source("husky"), tmp_path)
 
 
 @pytest.fixture(scope="module")

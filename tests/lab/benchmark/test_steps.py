@@ -7,8 +7,8 @@ import pytest
 
 from slipid.api.runs import made_runs, move
 from slipid.data.runs import collect
-from slipid.lab.benchmark.own import turned_covariance
-from slipid.lab.benchmark.steps import cut
+from slipid.lab.benchmark.slipid_rows import turned_covariance
+from slipid.lab.benchmark.steps import run_batches
 from slipid.predict.slip_model import relative_to_start
 
 
@@ -18,7 +18,7 @@ def made():
 
 
 def test_every_run_is_there_once_in_equally_many_steps(made):
-    cuts = cut(made.runs, made.robot)
+    cuts = run_batches(made.runs, made.robot)
     numbers = [k for one in cuts for k in one.numbers]
     assert sorted(numbers) == list(range(len(made.runs)))
     steps = {len(run.signals) for one in cuts for run in one.runs}
@@ -27,7 +27,7 @@ def test_every_run_is_there_once_in_equally_many_steps(made):
 
 
 def test_it_moves_as_the_robot_that_drove_it(made):
-    for one in cut(made.runs, made.robot):
+    for one in run_batches(made.runs, made.robot):
         for k, run in zip(one.numbers, one.runs, strict=True):
             log = made.runs.logs[k]
             assert log.surface == run.floor
@@ -49,14 +49,14 @@ def test_the_load_is_heard_and_gyro_and_command_are_means_over_each_step(made):
         )
         for log in made.runs.logs
     ]
-    one = cut(collect(logs), made.robot)[0]
+    one = run_batches(collect(logs), made.robot)[0]
     heard = one.runs[0].signals
     assert heard.load == one.runs[0].load == "heavy"
     assert heard.command is not None
     assert heard.command == pytest.approx(np.tile([0.1, 0.2, 0.3], (len(heard), 1)))
     # in the time of the wheels, which the camera lags
     lag = float(made.robot.camera.lag)
-    middle = one.windows.began[0] + np.cumsum(heard.dt) - 0.5 * heard.dt - lag
+    middle = one.windows.start[0] + np.cumsum(heard.dt) - 0.5 * heard.dt - lag
     assert heard.gyro is not None
     assert heard.gyro[1:] == pytest.approx(3.0 * middle[1:], abs=0.01)
 

@@ -13,7 +13,7 @@ from slipid.data.runs import collect, default_session
 from slipid.data.windows import windows
 from slipid.fit.likelihood import batch
 from slipid.fit.noise import noise
-from slipid.infer.design.planned_runs import Drive
+from slipid.infer.design.planned_runs import PlannedRun
 from slipid.lab.selftest.logs import TRUTH, Sensors, grid, make_logs, truth
 from tests.helpers.made_logs import LAYOUT, write_logs
 from tests.helpers.made_windows import electric_noise, residuals
@@ -110,7 +110,7 @@ def test_without_noise_the_likelihood_has_no_residual():
 def test_scatter_of_increments_is_the_likelihoods_covariance():
     """Whitened with the true variances, residuals at the truth have unit variance."""
     sensors = Sensors()
-    one = [Drive("soft", "as_built", h, 0.1) for h in np.linspace(0.1, 6, len(PLAN))]
+    one = [PlannedRun("soft", "as_built", h, 0.1) for h in np.linspace(0.1, 6, len(PLAN))]
     cut, gap = at_truth(ROBOT, one, 11, sensors)
     n = noise(cut, ROBOT)
     v = np.array([sensors.of(m) ** 2 if of_motion(m) else 0.0 for m in n.names])

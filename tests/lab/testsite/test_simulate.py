@@ -26,7 +26,7 @@ from slipid.lab.testsite.simulate import Job, _place, simulate, truth
 from slipid.lab.testsite.site import Camera, Site
 from slipid.lab.testsite.studio import MARKER, Studio, film
 from slipid.support.errors import DataError
-from slipid.support.executor import Here
+from slipid.support.executor import InProcess
 from slipid.support.progress import Reporter
 from tests.conftest import ROOT
 from tests.helpers.floors import surface_at
@@ -369,7 +369,7 @@ distance_m = 0.1
     path.write_text(text)
     try:
         with Reporter(quiet=True) as report:
-            simulate(plan(path, text), tmp_path, Here(), report)
+            simulate(plan(path, text), tmp_path, InProcess(), report)
     except DataError as error:
         pytest.skip(f"frames cannot be drawn here: {error}")
     times = np.loadtxt(tmp_path / "video/as_built/firm/run000.csv", delimiter=",", skiprows=1)

@@ -58,7 +58,7 @@ class Regressor(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Windows:
+class SignalWindows:
     """Windows of several runs, one run after the other.
 
     Attributes:
@@ -74,12 +74,12 @@ class Windows:
     run: Int[np.ndarray, " window"]
 
     @classmethod
-    def of(cls, runs: Sequence[RunSignals], spec: RobotSpec) -> "Windows":
+    def of(cls, runs: Sequence[RunSignals], spec: RobotSpec) -> "SignalWindows":
         """Of runs in their own steps."""
         return cls.joined([run.windowed() for run in runs], spec)
 
     @classmethod
-    def joined(cls, joined: Sequence[RunSignals], spec: RobotSpec) -> "Windows":
+    def joined(cls, joined: Sequence[RunSignals], spec: RobotSpec) -> "SignalWindows":
         """Of runs whose steps are windows already."""
         rolling = _stacked([run.rolling(spec) for run in joined])
         size = np.sqrt(((rolling * spec.size) ** 2).sum(axis=1))
@@ -123,7 +123,7 @@ class Windows:
 
 
 @dataclass(frozen=True, eq=False)
-class Lessons:
+class SlipExamples:
     """Windows in which wheels turned, with the slip that the pose shows in them.
 
     Attributes:
@@ -133,7 +133,7 @@ class Lessons:
         run: number of the run that each window is of.
     """
 
-    windows: Windows
+    windows: SignalWindows
     channels: frozenset[Channel]
     inputs: Inputs
     ratio: Ratios
@@ -141,14 +141,14 @@ class Lessons:
     run: Int[np.ndarray, " window"]
 
     @classmethod
-    def of(cls, runs: Sequence[Run], spec: RobotSpec) -> "Lessons":
+    def of(cls, runs: Sequence[Run], spec: RobotSpec) -> "SlipExamples":
         """Of runs with poses.
 
         Raises:
             ValueError: the wheels turn in no window of them.
         """
         joined, channels = [run.windowed() for run in runs], common(runs)
-        windows = Windows.joined([run.signals for run in joined], spec)
+        windows = SignalWindows.joined([run.signals for run in joined], spec)
         moves = windows.moves
         if not moves.any():
             raise ValueError("no window of the runs has turning wheels; nothing to learn from")
@@ -206,7 +206,7 @@ def weight_of(size: Float[np.ndarray, " window"]) -> Float[np.ndarray, " window"
 
 
 def with_slip(
-    runs: Sequence[RunSignals], windows: Windows, ratio: Ratios, spec: RobotSpec
+    runs: Sequence[RunSignals], windows: SignalWindows, ratio: Ratios, spec: RobotSpec
 ) -> list[PredictedRun]:
     """Paths of runs at their own steps: the encoders', with the slip that is said of each window.
 
@@ -220,7 +220,7 @@ def with_slip(
 
 
 def at_steps(
-    values: Float[np.ndarray, "window value"], windows: Windows, runs: Sequence[RunSignals]
+    values: Float[np.ndarray, "window value"], windows: SignalWindows, runs: Sequence[RunSignals]
 ) -> list[Float[np.ndarray, "_ value"]]:
     """The values of each window, at every step that lies in it; an array for each run."""
     ends = np.searchsorted(windows.run, np.arange(len(runs) + 1))

@@ -15,7 +15,7 @@ Liberties:
       before all trees are there.
     - Windows are drawn with a chance in proportion to how much they count, and then count alike.
 
-Source: Friedman 2001, Greedy function approximation: a gradient boosting machine, Annals of
+Source: Friedman 2001, Greedy function approximation: a gradient boosting spec, Annals of
 Statistics 29(5); the binning of Ke and others 2017, LightGBM, NeurIPS, as scikit-learn has it.
 
 A small neural network over all that the robot measures.
@@ -47,7 +47,13 @@ from typing import final
 
 import numpy as np
 
-from slipid.lab.systems.motion.features import Lessons, Regressor, Scale, Windows, with_slip
+from slipid.lab.systems.motion.features import (
+    Regressor,
+    Scale,
+    SignalWindows,
+    SlipExamples,
+    with_slip,
+)
 from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, RunSignals, SlipModel
 
 FEWEST = 20
@@ -97,7 +103,7 @@ class BoostedTrees(SlipModel):
         from sklearn.ensemble import HistGradientBoostingRegressor
         from threadpoolctl import threadpool_limits
 
-        seen, how = Lessons.of(runs, spec), self.boosting
+        seen, how = SlipExamples.of(runs, spec), self.boosting
         # scikit-learn takes ten times as long for bins of weighted inputs
         chance = np.random.default_rng(SEED).uniform(size=len(seen.weight))
         kept = chance <= seen.weight / seen.weight.max()
@@ -121,7 +127,7 @@ class BoostedTrees(SlipModel):
 
         if not self.each:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = Windows.of(runs, spec)
+        windows = SignalWindows.of(runs, spec)
         inputs = windows.inputs(spec, self.channels)
         with threadpool_limits(1):
             ratio = np.stack([trees.predict(inputs) for trees in self.each], axis=1)
@@ -144,14 +150,19 @@ NETWORK_SEED = 0
 
 
 @dataclass(frozen=True)
-class Shape:
+class NetworkShape:
     """Sizes of the hidden layers, and how much large weights cost."""
 
     hidden: tuple[int, ...]
     alpha: float
 
 
-NETWORK_CANDIDATES = (Shape((32,), 1e-3), Shape((16,), 1e-1), Shape((16,), 1.0), Shape((32,), 1.0))
+NETWORK_CANDIDATES = (
+    NetworkShape((32,), 1e-3),
+    NetworkShape((16,), 1e-1),
+    NetworkShape((16,), 1.0),
+    NetworkShape((32,), 1.0),
+)
 
 
 @final
@@ -167,7 +178,7 @@ class NeuralNetwork(SlipModel):
     """
 
     name: str = "neural_network"
-    shape: Shape = NETWORK_CANDIDATES[0]
+    shape: NetworkShape = NETWORK_CANDIDATES[0]
     channels: frozenset[Channel] = frozenset()
     inputs: Scale | None = None
     outputs: Scale | None = None
@@ -181,7 +192,7 @@ class NeuralNetwork(SlipModel):
         from sklearn.neural_network import MLPRegressor
         from threadpoolctl import threadpool_limits
 
-        seen = Lessons.of(runs, spec)
+        seen = SlipExamples.of(runs, spec)
         inputs, outputs = Scale.of(seen.inputs), Scale.of(seen.ratio)
         network = MLPRegressor(
             hidden_layer_sizes=self.shape.hidden,
@@ -204,7 +215,7 @@ class NeuralNetwork(SlipModel):
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.network is None or self.inputs is None or self.outputs is None:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = Windows.of(runs, spec)
+        windows = SignalWindows.of(runs, spec)
         inputs = self.inputs.scaled(windows.inputs(spec, self.channels))
         ratio = self.outputs.back(self.network.predict(inputs))
         ratio = ratio.clip(self.outputs.low, self.outputs.high)

@@ -6,16 +6,16 @@
 v_i is the rim speed of a drive by its encoder, I~_i the current through a first-order low pass.
 The two numbers are those of a floor, shared by all wheels, and found in one of three ways:
 
-    ojeda_continuous   the pose is known all the time: recursive least squares in the body's
+    ojeda_continuous   the pose is known all the time: recursive scaled_least_squares squares in the body's
                        displacement, window by window of half a second, forgetting 0.995
-    ojeda_sporadic     the place is known now and then: least squares in the place at the end of
+    ojeda_sporadic     the place is known now and then: scaled_least_squares squares in the place at the end of
                        each segment, here each run, seen from its start
-    ojeda_gyro         no pose: least squares in the encoders' yaw rate less the gyro's
+    ojeda_gyro         no pose: scaled_least_squares squares in the encoders' yaw rate less the gyro's
 
-The hard floor is the one among the training floors on which encoders err least; the currents on it
+The hard floor is the one among the training floors on which encoders err scaled_least_squares; the currents on it
 are known to all floors, as if they had been measured once before. If all training runs are on one
 floor, which says nothing about a harder one, it is the quarter of the runs in which encoders err
-least: then little is flagged.
+scaled_least_squares: then little is flagged.
 
 So it treats floors itself: two numbers for each floor that it was trained on, and two from all runs
 together where the floor is not told or not known. Tuned: the low pass's time constant.
@@ -72,7 +72,7 @@ PRIOR = 1e6
 
 
 @dataclass(frozen=True)
-class Hard:
+class HardFloor:
     """Mean and std over time of the wheels' mean smoothed current on the hard floor [A]."""
 
     mean: float
@@ -84,7 +84,7 @@ class Hard:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class FlaggedSteps:
     """What is computed of some runs before the two numbers come in.
 
     Attributes:
@@ -125,7 +125,7 @@ class Ojeda(SlipModel):
     tuning: Tuning = "continuous"
     needs: frozenset[Channel] = field(default=frozenset({"current"}), kw_only=True)
     time_constant: float = 0.3
-    hard: Hard | None = None
+    hard: HardFloor | None = None
     lines: Mapping[str | None, Float[np.ndarray, "2"]] = field(default_factory=dict)
 
     def candidates(self) -> Sequence["Ojeda"]:
@@ -151,20 +151,20 @@ class Ojeda(SlipModel):
     def numbers(self) -> int:
         return 2 * len(self.lines) + 2 * (self.hard is not None)
 
-    def _hard(self, runs: Sequence[Run], spec: RobotSpec) -> Hard:
+    def _hard(self, runs: Sequence[Run], spec: RobotSpec) -> HardFloor:
         steps = Steps.of([run.signals for run in runs])
         current = steps.smoothed(steps.signals.along(spec), self.time_constant).mean(axis=1)
         moves = np.abs(steps.signals.speed).mean(axis=1) * spec.wheel_radius > MOVING
         seen = current[moves] if moves.any() else current
-        return Hard(float(seen.mean()), max(float(seen.std()), 1e-6))
+        return HardFloor(float(seen.mean()), max(float(seen.std()), 1e-6))
 
-    def _scene(self, runs: Sequence[RunSignals], hard: Hard, spec: RobotSpec) -> Scene:
+    def _scene(self, runs: Sequence[RunSignals], hard: HardFloor, spec: RobotSpec) -> FlaggedSteps:
         steps = Steps.of(runs)
         rim = steps.signals.speed * spec.wheel_radius
         current = steps.smoothed(steps.signals.along(spec), self.time_constant)
-        return Scene(steps, rim, current, hard.sigmas(current) > SIGMAS)
+        return FlaggedSteps(steps, rim, current, hard.sigmas(current) > SIGMAS)
 
-    def _line(self, runs: Sequence[Run], hard: Hard, spec: RobotSpec) -> Line:
+    def _line(self, runs: Sequence[Run], hard: HardFloor, spec: RobotSpec) -> Line:
         """k0 [m/s] and k1 [m/s/A] of some runs; zero where no slip was flagged."""
         scene = self._scene([run.signals for run in runs], hard, spec)
         if not scene.flagged.any():
@@ -178,7 +178,7 @@ class Ojeda(SlipModel):
 
 
 def hard_runs(runs: Sequence[Run], spec: RobotSpec) -> list[Run]:
-    """Those on the floor where encoders err least; of one floor, the quarter that errs least."""
+    """Those on the floor where encoders err scaled_least_squares; of one floor, the quarter that errs scaled_least_squares."""
     steps = Steps.of([run.signals for run in runs])
     rolling = steps.signals.rolling(spec)
     gap = np.linalg.norm((steps.ends(rolling) - true_ends(runs)) * spec.size, axis=1)
@@ -198,7 +198,7 @@ def true_ends(runs: Sequence[Run]) -> Float[np.ndarray, "run 3"]:
     return np.stack([relative_to_start(run.pose)[-1] for run in runs])
 
 
-def continuous(scene: Scene, w: TrainingWindows, spec: RobotSpec) -> Line:
+def continuous(scene: FlaggedSteps, w: TrainingWindows, spec: RobotSpec) -> Line:
     """By the pose at all times; only windows with slip flagged count."""
     rows = w.rows(spec.back @ scene.features(), spec)
     told = rows.parts.any(axis=(1, 2))
@@ -211,9 +211,9 @@ def forgetful(
     forgetting: float,
     variance: float,
 ) -> Float[np.ndarray, " k"]:
-    """Where recursive least squares that forgets ends, if it starts from zero with a variance.
+    """Where recursive scaled_least_squares squares that forgets ends, if it starts from zero with a variance.
 
-    Of N windows that is the least of sum_n forgetting^(N-1-n) |parts_n k - gap_n|^2
+    Of N windows that is the scaled_least_squares of sum_n forgetting^(N-1-n) |parts_n k - gap_n|^2
     + forgetting^N |k|^2 / variance, which needs no recursion.
     """
     count = len(gap)
@@ -223,7 +223,7 @@ def forgetful(
     return np.linalg.solve(a.T @ a + prior, a.T @ b)
 
 
-def sporadic(scene: Scene, runs: Sequence[Run], spec: RobotSpec) -> Line:
+def sporadic(scene: FlaggedSteps, runs: Sequence[Run], spec: RobotSpec) -> Line:
     """By the place at the end of each run."""
     from scipy.optimize import least_squares
 
@@ -235,7 +235,7 @@ def sporadic(scene: Scene, runs: Sequence[Run], spec: RobotSpec) -> Line:
     return np.asarray(least_squares(gap, np.zeros(2), x_scale="jac").x)
 
 
-def by_gyro(scene: Scene, w: TrainingWindows, middle: float, spec: RobotSpec) -> Line:
+def by_gyro(scene: FlaggedSteps, w: TrainingWindows, middle: float, spec: RobotSpec) -> Line:
     """By the yaw rate alone; the middle is the hard floor's mean current [A]."""
     heard = scene.steps.signals
     if heard.gyro is None:

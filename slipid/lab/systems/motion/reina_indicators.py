@@ -83,7 +83,7 @@ _DRIVING = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Signals:
+class SmoothedSignals:
     """What the indicators are made of, smoothed, in every step of a run.
 
     Attributes:
@@ -101,7 +101,7 @@ class Signals:
     moving: Bool[np.ndarray, " step"]
 
     @classmethod
-    def of(cls, heard: RunSignals, spec: RobotSpec, seconds: float) -> "Signals":
+    def of(cls, heard: RunSignals, spec: RobotSpec, seconds: float) -> "SmoothedSignals":
         """Of a run, smoothed over so long."""
         mean = smoothing(heard.dt, seconds)
         speed, amps = mean @ heard.speed, mean @ heard.along(spec)
@@ -122,7 +122,7 @@ class Signals:
 
 
 @dataclass(frozen=True)
-class Limits:
+class SlipThresholds:
     """What signals are without slip.
 
     Attributes:
@@ -137,7 +137,7 @@ class Limits:
     highest: float = 1.0
 
     @classmethod
-    def of(cls, examples: "Sequence[Example]", quantile: float) -> "Limits":
+    def of(cls, examples: "Sequence[LabelledRun]", quantile: float) -> "SlipThresholds":
         """By quantiles of the steps that do not slip."""
         signals = [example.signals for example in examples]
         slips = np.concatenate([example.slips for example in examples])
@@ -169,7 +169,7 @@ class Indicators:
     gyro: Numbers | None
 
     @classmethod
-    def of(cls, signals: Signals, limits: Limits) -> "Indicators":
+    def of(cls, signals: SmoothedSignals, limits: SlipThresholds) -> "Indicators":
         """Of a run's signals."""
         turning = signals.turning if np.isfinite(limits.turning) else None
         return cls(
@@ -180,7 +180,7 @@ class Indicators:
 
 
 @dataclass(frozen=True, eq=False)
-class Example:
+class LabelledRun:
     """A training run: its signals, and how much it slipped in each window.
 
     Attributes:
@@ -191,14 +191,14 @@ class Example:
         square: what they say, times itself [m^2/s^2].
     """
 
-    signals: Signals
+    signals: SmoothedSignals
     first: np.ndarray
     slips: Numbers
     against: Float[np.ndarray, " window"]
     square: Float[np.ndarray, " window"]
 
     @classmethod
-    def of(cls, run: Run, spec: RobotSpec, seconds: float) -> "Example":
+    def of(cls, run: Run, spec: RobotSpec, seconds: float) -> "LabelledRun":
         """Of a run whose signals are smoothed over so long."""
         joined = run.windowed()
         rolling = joined.signals.rolling(spec) * spec.size
@@ -207,7 +207,7 @@ class Example:
         slips = np.where(size > _REST, np.linalg.norm(slip, axis=1) > SLIPS * size, np.nan)
         first = groups(run.signals.dt, WINDOW_S)
         return cls(
-            signals=Signals.of(run.signals, spec, seconds),
+            signals=SmoothedSignals.of(run.signals, spec, seconds),
             first=first,
             slips=np.repeat(slips, np.diff(first, append=len(run.signals))),
             against=(slip * rolling).sum(axis=1),

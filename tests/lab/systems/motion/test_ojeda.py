@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.lab.systems.motion.ojeda import Hard, Ojeda, forgetful, hard_runs, ojeda_rows
+from slipid.lab.systems.motion.ojeda import HardFloor, Ojeda, forgetful, hard_runs, ojeda_rows
 from slipid.predict.slip_model import TRIES, ByFloor
 from slipid.predict.steps import Steps
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
@@ -135,7 +135,7 @@ def with_level(current):
 
 def test_slip_is_flagged_three_stds_above_the_hard_floors_mean():
     line = {None: np.array([0.05, 0.0])}
-    method = replace(CONTINUOUS, hard=Hard(0.3, 0.1), lines=line)
+    method = replace(CONTINUOUS, hard=HardFloor(0.3, 0.1), lines=line)
     below, above = with_level(np.full(40, 0.59)), with_level(np.full(40, 0.61))
     said = method.predict([below, above], ROBOTINO)
     assert np.allclose(said[0].path, made_run(straight(0.3)).pose)
@@ -147,14 +147,14 @@ def test_slip_is_flagged_three_stds_above_the_hard_floors_mean():
 
 
 def test_one_wheel_alone_does_not_flag_slip():
-    method = replace(CONTINUOUS, hard=Hard(0.3, 0.1), lines={None: np.array([0.05, 0.0])})
+    method = replace(CONTINUOUS, hard=HardFloor(0.3, 0.1), lines={None: np.array([0.05, 0.0])})
     one = made_run(straight(0.3), current=np.tile([1.1, 0.3, 0.3], (40, 1)))
     assert np.allclose(method.predict([one.signals], ROBOTINO)[0].path, one.pose)
 
 
 def test_flags_wait_for_the_low_pass():
     method = replace(
-        CONTINUOUS, hard=Hard(0.0, 0.1), lines={None: np.array([9.0, 0.0])}, time_constant=1.0
+        CONTINUOUS, hard=HardFloor(0.0, 0.1), lines={None: np.array([9.0, 0.0])}, time_constant=1.0
     )
     path = method.predict([with_level(np.append(0.0, np.ones(39)))], ROBOTINO)[0].path
     # 1 - exp(-k 0.1 s / 1 s) passes 0.3 in the fourth step after the jump; then all wheels stand
@@ -220,7 +220,7 @@ def test_runs_on_one_floor_have_one_pair_of_numbers(rng):
 
 
 def test_a_wheel_is_never_turned_backwards():
-    method = replace(CONTINUOUS, hard=Hard(0.3, 0.01), lines={None: np.array([9.0, 0.0])})
+    method = replace(CONTINUOUS, hard=HardFloor(0.3, 0.01), lines={None: np.array([9.0, 0.0])})
     run = with_level(np.full(40, 1.0))
     assert np.allclose(method.predict([run], ROBOTINO)[0].path, 0.0)
 

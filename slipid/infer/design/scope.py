@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from slipid.infer.design.planned_runs import HEADINGS, Drive, Setup, candidates, drivable
+from slipid.infer.design.planned_runs import HEADINGS, PlannedRun, Setup, candidates, drivable
 from slipid.infer.result import Fit
 from slipid.support.errors import DataError
 
@@ -14,7 +14,7 @@ MOST_SPEEDS = 4
 
 
 @dataclass(frozen=True)
-class Wish:
+class DesignOptions:
     """What a user asks for, in words of the command line; what is absent is as the fit has seen.
 
     Attributes:
@@ -58,7 +58,7 @@ class Scope:
     """
 
     fit: Fit
-    wish: Wish
+    wish: DesignOptions
 
     def __post_init__(self) -> None:
         far = self.wish.distance
@@ -110,7 +110,7 @@ class Scope:
             return dict.fromkeys(self.fit.validity, self.wish.distance)
         return {floor: round(seen.distance, 2) for floor, seen in self.fit.validity.items()}
 
-    def candidates(self) -> tuple[Drive, ...]:
+    def candidates(self) -> tuple[PlannedRun, ...]:
         speeds = _numbers("speeds", self.wish.speeds, least=0.0)
         turns = _numbers("turns", self.wish.turns)
         found = candidates(
@@ -127,7 +127,7 @@ class Scope:
             "rate, that the robot can drive",
         )
 
-    def predicted(self, text: str) -> tuple[Drive, ...]:
+    def predicted(self, text: str) -> tuple[PlannedRun, ...]:
         """Runs of a prediction `floor[@load][:speed[:heading]]`."""
         head, *rest = text.split(":")
         floor, _, load = head.partition("@")
@@ -148,21 +148,21 @@ class Scope:
         runs = self._straight([(floor, load)], numbers[:1], numbers[1:] or HEADINGS)
         return self._drivable(runs, f"--predict {text}: these wheels cannot drive in that heading")
 
-    def all_predicted(self) -> tuple[Drive, ...]:
+    def all_predicted(self) -> tuple[PlannedRun, ...]:
         runs = self._straight(self.driven, [], HEADINGS)
         return self._drivable(runs, "predictions: these wheels cannot drive in that heading")
 
     def _straight(
         self, setups: Sequence[Setup], speeds: Sequence[float], headings_deg: Sequence[float]
-    ) -> list[Drive]:
+    ) -> list[PlannedRun]:
         return [
-            Drive(floor, load, float(heading), speed, 0.0, self.distance[floor])
+            PlannedRun(floor, load, float(heading), speed, 0.0, self.distance[floor])
             for floor, load in setups
             for speed in speeds or self.driven_speeds[floor]
             for heading in np.radians(headings_deg)
         ]
 
-    def _drivable(self, runs: Sequence[Drive], otherwise: str) -> tuple[Drive, ...]:
+    def _drivable(self, runs: Sequence[PlannedRun], otherwise: str) -> tuple[PlannedRun, ...]:
         kept = drivable(runs, self.fit.robot)
         if not kept:
             raise DataError(otherwise)

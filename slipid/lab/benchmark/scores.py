@@ -137,7 +137,7 @@ def _energy_error(run: Run, said: PredictedRun, spec: RobotSpec) -> float | None
 
 
 @dataclass(frozen=True)
-class Row:
+class FoldScore:
     """A method in one fold of one protocol.
 
     Attributes:
@@ -166,17 +166,17 @@ class Row:
         return asdict(self)
 
     @classmethod
-    def of_json(cls, content: dict[str, Any]) -> "Row":
+    def of_json(cls, content: dict[str, Any]) -> "FoldScore":
         return cls(**{**content, "runs": tuple(RunScore(**run) for run in content["runs"])})
 
     @classmethod
-    def lacking(cls, channels: Iterable[str]) -> "Row":
+    def lacking(cls, channels: Iterable[str]) -> "FoldScore":
         """Of a method that needs what was not logged."""
         words = {"twist": "wheels that drive sideways", "command": "a commanded twist"}
         named = [words.get(name, f"a {name}") for name in sorted(channels)]
         return cls(absent=f"needs {' and '.join(named)}")
 
     @classmethod
-    def of_error(cls, error: Exception) -> "Row":
+    def of_error(cls, error: Exception) -> "FoldScore":
         """Of a method that ended in an error."""
         return cls(absent=f"{type(error).__name__}: {error}".splitlines()[0][:300], failed=True)

@@ -22,7 +22,7 @@ from slipid.fit.optimise import optimise
 from slipid.fit.problem import FitState, Problem
 from slipid.fit.variances import DEGREES
 from slipid.infer.slip_curves import current_trend
-from slipid.lab.benchmark.steps import Cut, body_poses
+from slipid.lab.benchmark.steps import RunBatch, body_poses
 from slipid.predict.folds import problem_of_runs
 from slipid.predict.predictive import ForceBalance, force_balance_of
 from slipid.predict.slip_model import PredictedRun, RobotSpec, RunSignals, relative_to_start
@@ -44,7 +44,7 @@ LONGEST_S = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Own:
+class SlipidFit:
     """slipid fitted to some runs of a data set.
 
     Attributes:
@@ -76,7 +76,7 @@ class Own:
         return robot_of(self.contact, self.highest_speed, self.trend, Sensors(signed))
 
 
-def fit_own(job: Job, problem: Problem, fitted: np.ndarray, kept: Checkpoint) -> Own:
+def fit_slipid(job: Job, problem: Problem, fitted: np.ndarray, kept: Checkpoint) -> SlipidFit:
     """The force balance fitted to some runs of a job.
 
     What was kept of this very fit is not done again. Fits of one `job.problem()` share what was
@@ -101,21 +101,21 @@ def fit_own(job: Job, problem: Problem, fitted: np.ndarray, kept: Checkpoint) ->
     speed, trend = _seen(problem, contact, keep)
     seen = {job.dataset.logs[k].surface for k in fitted.tolist()}
     rows = tuple(k for k, name in enumerate(contact.robot.surfaces.labels) if name in seen)
-    return Own(contact, job, rows, speed, trend, float(seconds), bool(converged))
+    return SlipidFit(contact, job, rows, speed, trend, float(seconds), bool(converged))
 
 
 def _seen(
     problem: Problem, contact: ForceBalance, keep: Float[np.ndarray, " piece"]
 ) -> tuple[float, tuple[float, float]]:
     """Highest wheel speed [rad/s] and trend of currents in the pieces that count."""
-    w = problem.windows.pieces(np.flatnonzero(keep > 0))
+    w = problem.windows.segments(np.flatnonzero(keep > 0))
     speed = float(np.abs(w.turn / w.dt[..., None]).max())
     if not w.has_current:
         return speed, (0.0, 0.0)
     return speed, current_trend(contact.robot, lk.batch(w, contact.robot))
 
 
-def told(own: Own, cut: Cut, spec: RobotSpec) -> list[PredictedRun]:
+def forecast(own: SlipidFit, cut: RunBatch, spec: RobotSpec) -> list[PredictedRun]:
     """What the force balance says of runs whose floors it is told, with the electric power."""
     w = cut.windows
     tracks, cov = own.contact.ends(w)
@@ -133,7 +133,7 @@ def told(own: Own, cut: Cut, spec: RobotSpec) -> list[PredictedRun]:
     ]
 
 
-def _power(own: Own, w: Any, spec: RobotSpec) -> np.ndarray:
+def _power(own: SlipidFit, w: Any, spec: RobotSpec) -> np.ndarray:
     """Electric power of all motors by the currents that the force balance predicts [W]."""
     robot = own.contact.robot
     b = lk.batch(w, robot)
@@ -148,7 +148,7 @@ def _currents(robot: Any, b: lk.Batch) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class FloorKnowledge:
     """What an estimator knows of where it drives.
 
     Attributes:
@@ -162,7 +162,9 @@ class Place:
     map: FloorMap | None = None
 
 
-def estimated(own: Own, cuts: Sequence[Cut], data: Runs, place: Place) -> list[PredictedRun]:
+def estimator_runs(
+    own: SlipidFit, cuts: Sequence[RunBatch], data: Runs, place: FloorKnowledge
+) -> list[PredictedRun]:
     """What the estimator says of runs, in the order of the cuts, which are of these data.
 
     It hears currents only if it was fitted to some.
@@ -184,7 +186,9 @@ def estimated(own: Own, cuts: Sequence[Cut], data: Runs, place: Place) -> list[P
     return [out[n] for n in range(len(runs))]
 
 
-def _estimator(own: Own, load: str, only: str | None, place: Place, several: bool) -> Estimator:
+def _estimator(
+    own: SlipidFit, load: str, only: str | None, place: FloorKnowledge, several: bool
+) -> Estimator:
     """The estimator of a fit, for all floors that were fitted, or only one."""
     whole = own.deployed
     # a floor that nobody has seen has no numbers
@@ -205,7 +209,7 @@ def _starts(runs: Sequence[Any], mine: Sequence[int], floor: FloorMap | None) ->
     return np.stack([runs[n][0].pose[0] for n in mine])
 
 
-class _Rows(eqx.Module):
+class _ReplayRows(eqx.Module):
     """What an estimator hears, row by row of every run; NaN where there is nothing."""
 
     angle: Float[Array, "run row drive"]
@@ -216,18 +220,18 @@ class _Rows(eqx.Module):
 
 @eqx.filter_jit
 def _driven(
-    estimator: Estimator, start: Float[Array, "run 3"], rows: _Rows
+    estimator: Estimator, start: Float[Array, "run 3"], rows: _ReplayRows
 ) -> tuple[Array, Array, Array]:
     """Poses, covariances of the place and probabilities of floors under the robot, row by row."""
     nothing = Readings.nothing(estimator.robot.drives)
 
-    def step(state: Any, row: _Rows) -> Any:
+    def step(state: Any, row: _ReplayRows) -> Any:
         z = replace(nothing, wheel_angle=row.angle, current=row.current, gyro=row.gyro)
         state, seen = estimator.step(state, z, row.dt)
         floors = jnp.mean(seen.surface_probability, axis=0)
         return state, (seen.pose, seen.covariance[:2, :2], floors)
 
-    def one(pose: Array, of_run: _Rows) -> Any:
+    def one(pose: Array, of_run: _ReplayRows) -> Any:
         return jax.lax.scan(step, estimator.init(pose), of_run)[1]
 
     return jax.vmap(one)(start, rows)
@@ -264,7 +268,7 @@ def replay(
                 current[n, rows] = np.repeat(run.current, part, axis=0)
             if run.gyro is not None:
                 gyro[n, rows] = np.repeat(run.gyro, part)
-        heard = _Rows(*(jnp.asarray(x) for x in (angle, current, gyro, dt)))
+        heard = _ReplayRows(*(jnp.asarray(x) for x in (angle, current, gyro, dt)))
         pose, cov, floors = (np.asarray(x) for x in _driven(estimator, jnp.asarray(begin), heard))
         for n, k in enumerate(some):
             ends = np.cumsum(parts[k])

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slipid.lab.benchmark.judge import scored
-from slipid.lab.benchmark.own import NAME
 from slipid.lab.benchmark.protocols import INNER, inner
-from slipid.lab.benchmark.summary import Number, RowSummary
+from slipid.lab.benchmark.scores import scored
+from slipid.lab.benchmark.slipid_rows import NAME
+from slipid.lab.benchmark.summary import MeanInterval, RowSummary
 from slipid.predict.slip_model import TRIES, ByFloor, RobotSpec, Run, SlipModel
 
 WORST = 2.0
@@ -129,10 +129,10 @@ def sentence(name: str, protocol: str, found: Mapping[str, RowSummary]) -> str:
     return f"{said}, {_points(behind)}" if behind is not None else said
 
 
-def _percent(x: Number) -> str:
+def _percent(x: MeanInterval) -> str:
     return f"{100 * x.value:.1f} %"
 
 
-def _points(x: Number) -> str:
+def _points(x: MeanInterval) -> str:
     """A difference in points of percent, with its interval."""
     return f"{100 * x.value:+.1f} points [{100 * x.low:+.1f}, {100 * x.high:+.1f}]"
