@@ -52,7 +52,7 @@ def turned(angle: np.ndarray | float, v: np.ndarray) -> np.ndarray:
     return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], -1)
 
 
-def sideways(v: np.ndarray) -> np.ndarray:
+def turned_left(v: np.ndarray) -> np.ndarray:
     """Plane vectors (..., 2), each turned by a quarter to the left."""
     return np.stack([-v[..., 1], v[..., 0]], -1)
 

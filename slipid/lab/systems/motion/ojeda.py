@@ -6,16 +6,16 @@
 v_i is the rim speed of a drive by its encoder, I~_i the current through a first-order low pass.
 The two numbers are those of a floor, shared by all wheels, and found in one of three ways:
 
-    ojeda_continuous   the pose is known all the time: recursive scaled_least_squares squares in the body's
+    ojeda_continuous   the pose is known all the time: recursive least squares in the body's
                        displacement, window by window of half a second, forgetting 0.995
-    ojeda_sporadic     the place is known now and then: scaled_least_squares squares in the place at the end of
+    ojeda_sporadic     the place is known now and then: least squares in the place at the end of
                        each segment, here each run, seen from its start
-    ojeda_gyro         no pose: scaled_least_squares squares in the encoders' yaw rate less the gyro's
+    ojeda_gyro         no pose: least squares in the encoders' yaw rate less the gyro's
 
-The hard floor is the one among the training floors on which encoders err scaled_least_squares; the currents on it
+The hard floor is the one among the training floors on which encoders err least; the currents on it
 are known to all floors, as if they had been measured once before. If all training runs are on one
 floor, which says nothing about a harder one, it is the quarter of the runs in which encoders err
-scaled_least_squares: then little is flagged.
+least: then little is flagged.
 
 So it treats floors itself: two numbers for each floor that it was trained on, and two from all runs
 together where the floor is not told or not known. Tuned: the low pass's time constant.
@@ -178,7 +178,7 @@ class Ojeda(SlipModel):
 
 
 def hard_runs(runs: Sequence[Run], spec: RobotSpec) -> list[Run]:
-    """Those on the floor where encoders err scaled_least_squares; of one floor, the quarter that errs scaled_least_squares."""
+    """Those on the floor where encoders err least; of one floor, the quarter that errs least."""
     steps = Steps.of([run.signals for run in runs])
     rolling = steps.signals.rolling(spec)
     gap = np.linalg.norm((steps.ends(rolling) - true_ends(runs)) * spec.size, axis=1)
@@ -211,9 +211,9 @@ def forgetful(
     forgetting: float,
     variance: float,
 ) -> Float[np.ndarray, " k"]:
-    """Where recursive scaled_least_squares squares that forgets ends, if it starts from zero with a variance.
+    """Where recursive least squares that forgets ends, if it starts from zero with a variance.
 
-    Of N windows that is the scaled_least_squares of sum_n forgetting^(N-1-n) |parts_n k - gap_n|^2
+    Of N windows that is the least of sum_n forgetting^(N-1-n) |parts_n k - gap_n|^2
     + forgetting^N |k|^2 / variance, which needs no recursion.
     """
     count = len(gap)
