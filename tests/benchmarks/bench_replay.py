@@ -26,7 +26,7 @@ import pytest
 
 from slipid.app.config import parsed
 from slipid.app.problem import Job, read_job, with_mixed
-from slipid.deploy.deploy import robot_of
+from slipid.deploy.deploy import robot_of_force_balance
 from slipid.deploy.floors import floor_of
 from slipid.fit.likelihood import batch
 from slipid.fit.optimise import optimise
@@ -35,7 +35,7 @@ from slipid.predict.folds import fold_keys, sectors
 from slipid.predict.predictive import ForceBalance, force_balance_of
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
-from slipid.robot.interface import MIXED, Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK
 from tests.helpers import replayed
@@ -100,7 +100,7 @@ def deployed(job: Job, contact: ForceBalance, runs: np.ndarray) -> DeployedRobot
     windows = job.problem().windows
     seen = windows.segments(np.flatnonzero(np.isin(windows.run, runs)))
     trend = current_trend(contact.robot, batch(seen, contact.robot))
-    return robot_of(contact, TOP, trend, load="as_built")
+    return robot_of_force_balance(contact, TOP, trend, load="as_built")
 
 
 def show(rows: list[Judged]) -> None:
@@ -161,8 +161,8 @@ def test_two_floors(job: Job) -> None:
     ]
     for title, settings, there, mapped in (
         ("any of four", Settings(), known.labels, None),
-        ("these two", Settings(alike=MIXED), PAIR, None),
-        ("their map", Settings(alike=MIXED), PAIR, floor_of(floor, PAIR)),
+        ("these two", Settings(alike=MIXED_FLOORS_PENALTY), PAIR, None),
+        ("their map", Settings(alike=MIXED_FLOORS_PENALTY), PAIR, floor_of(floor, PAIR)),
     ):
         est = Estimator(known.on(*there), settings, mapped)
         said, labels = replayed.replay(est, data.logs, np.array(begin)), est.robot.labels

@@ -41,8 +41,8 @@ def shares(found):
 
 def ends(robot):
     """Whether each case came to this end, by name of the end."""
-    from slipid.deploy.controllers import pilot_of
-    from slipid.deploy.deploy import habits_of
+    from slipid.deploy.controllers import control_loop_of
+    from slipid.deploy.deploy import actuator_model_of
     from slipid.lab.trial.controllers import ROWS
     from slipid.lab.trial.plants import one_of
     from slipid.robot import trajectory
@@ -69,8 +69,8 @@ def ends(robot):
     keys = jax.random.split(jax.random.key(SEED), CASES)
     line = trajectory.waypoints([(0.0, 0.0), (0.4, 0.0)], speed=0.1)
     paths = [line.moved((0.0, 0.0, float(a))) for a in heading]
-    habits = habits_of(robot, gyro=False)
-    pilot = pilot_of(robot, ROWS["contact"], Settings.of(robot))
+    habits = actuator_model_of(robot, gyro=False)
+    pilot = control_loop_of(robot, ROWS["contact"], Settings.of(robot))
 
     @eqx.filter_jit
     def one(truth, kept, path, place, key):

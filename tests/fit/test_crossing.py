@@ -31,7 +31,7 @@ from slipid.fit.variances import _cut, whitened
 from slipid.infer.fit_file import load
 from slipid.lab.selftest.logs import Sensors, grid, make_logs, truth
 from slipid.model import se2
-from slipid.robot.interface import MIXED, Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.search_space import Choice
 from slipid.support.errors import DataError
 from tests.app.test_config import GOOD, written
@@ -461,7 +461,7 @@ def deployed(out):
     """The fit drives its twin; what is done is not done again."""
     fit = load(out)
     robot = read_robot(out)
-    assert Settings.of(robot).alike == MIXED
+    assert Settings.of(robot).alike == MIXED_FLOORS_PENALTY
     assert fit.current_trend != (0.0, 0.0)
     np.testing.assert_array_equal(robot.current_trend, fit.current_trend)
     wish = ("trial", out, "--plant", "twin", "--starts", 2, "--jobs", 1)

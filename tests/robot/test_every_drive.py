@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from slipid.api.robot import drive
-from slipid.deploy.deploy import steered
-from slipid.deploy.record_of import moved_per_metre, spread_of
+from slipid.deploy.deploy import require_steering
+from slipid.deploy.robot_record import moved_per_metre, spread_of
 from slipid.lab.selftest.logs import Sensors, make_logs
 from slipid.model.robot import build
 from slipid.robot.deployed import DeployedRobot
@@ -129,6 +129,6 @@ def test_it_has_no_controller(driven, tmp_path):
     robot, _ = driven
     assert not robot.steers
     with pytest.raises(DataError, match=r"it has an estimator .* but no controller"):
-        steered(tmp_path, robot)
+        require_steering(tmp_path, robot)
     with pytest.raises(ValueError, match=r"it has an estimator .* but no controller"):
         drive(robot)

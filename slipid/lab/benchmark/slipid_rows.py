@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from slipid.app.problem import Job
 from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
-from slipid.deploy.deploy import robot_of
+from slipid.deploy.deploy import robot_of_force_balance
 from slipid.deploy.floors import floor_of
 from slipid.fit import likelihood as lk
 from slipid.fit.optimise import optimise
@@ -28,8 +28,8 @@ from slipid.predict.predictive import ForceBalance, force_balance_of
 from slipid.predict.slip_model import PredictedRun, RobotSpec, RunSignals, relative_to_start
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
-from slipid.robot.interface import MIXED, NO_FLOOR, Readings, Settings
-from slipid.robot.record import Sensors
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, NO_FLOOR, Readings, Settings
+from slipid.robot.record import LogSensors
 from slipid.support.checkpoint import Checkpoint
 
 NAME = "slipid"
@@ -73,7 +73,9 @@ class SlipidFit:
     def deployed(self) -> DeployedRobot:
         """The robot as it is deployed, on all floors of the data set."""
         signed = self.job.dataset.current_is_signed
-        return robot_of(self.contact, self.highest_speed, self.trend, Sensors(signed))
+        return robot_of_force_balance(
+            self.contact, self.highest_speed, self.trend, LogSensors(signed)
+        )
 
 
 def fit_slipid(job: Job, problem: Problem, fitted: np.ndarray, kept: Checkpoint) -> SlipidFit:
@@ -198,7 +200,7 @@ def _estimator(
         robot = robot.with_unseen()
     settings = Settings.of(robot)
     if several or place.map is not None:
-        settings = replace(settings, alike=MIXED)
+        settings = replace(settings, alike=MIXED_FLOORS_PENALTY)
     known = None if place.map is None else floor_of(place.map, robot.labels)
     return Estimator(robot, settings, known)
 

@@ -8,14 +8,14 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.deploy.controllers import OWN_ROWS, PAPER_WHEELS, ControllerRow
+from slipid.deploy.controllers import CONTROLLERS, PAPER_WHEELS, ControllerRow
 from slipid.lab.trial.goswami_padhy import GoswamiPadhy, Rehearsal, by_gradient, by_swarm
 from slipid.lab.trial.indiveri import Indiveri, inverse_kinematics
-from slipid.robot.actuation import Habits
 from slipid.robot.closed_loop import PERIOD
 from slipid.robot.controller import Gains, Law, Limits
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.trajectory import STEP, rectangle
+from slipid.robot.twin import ActuatorModel
 from slipid.support.errors import DataError
 
 BESIDE = ((0.05, 0.0, 0.2), (0.0, 0.05, -0.2), (-0.05, 0.0, 0.2), (0.0, -0.05, -0.2))
@@ -49,7 +49,7 @@ def _rehearsed(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
 
     The ideal robot is late as every robot's twin is, so that gains are the same for all of them.
     """
-    path, habits = rectangle(), Habits()
+    path, habits = rectangle(), ActuatorModel()
     times, rows = np.arange(0.0, float(path.marks[1]), PERIOD), np.asarray(path.rows)
     own = STEP * np.arange(len(rows))
     reference = np.stack([np.interp(times, own, column) for column in rows.T], axis=1)
@@ -58,7 +58,7 @@ def _rehearsed(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
 
 
 ROWS: Mapping[str, ControllerRow] = {
-    **OWN_ROWS,
+    **CONTROLLERS,
     "goswami_padhy": ControllerRow(
         "encoder", "law of Goswami and Padhy, gains by a swarm", law=_goswami_padhy
     ),

@@ -11,7 +11,7 @@ from slipid.lab.testsite.driving import PERIOD, Rims
 from slipid.lab.testsite.ground import GROUNDS
 from slipid.lab.testsite.plant import Plant
 from slipid.lab.testsite.site import Sensors, Site
-from slipid.robot.deployed import DeployedRobot, drawn
+from slipid.robot.deployed import DeployedRobot, posterior_robots
 from slipid.robot.interface import Measurement
 from slipid.support.errors import DataError
 
@@ -98,4 +98,4 @@ def one_of(robot: DeployedRobot, seed: int) -> DeployedRobot:
     if count == 0:
         return robot
     picked = int(np.random.default_rng(seed).integers(count))
-    return jax.tree.map(lambda x: x[0], drawn(robot, (picked,)))
+    return jax.tree.map(lambda x: x[0], posterior_robots(robot, (picked,)))

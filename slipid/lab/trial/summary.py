@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float
 
-from slipid.robot.closed_loop import Metrics
+from slipid.robot.closed_loop import PathMetrics
 
 Interval = tuple[float, float]
 """90 %, by bootstrap over starts."""
@@ -25,7 +25,7 @@ class Run:
     controller: str
     start: tuple[float, float, float]
     seed: int
-    metrics: Metrics
+    metrics: PathMetrics
     believed_error_mm: float
 
     def to_json(self) -> dict[str, object]:

@@ -11,19 +11,26 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.data.floor_map import FloorMap, read_map
-from slipid.deploy.controllers import pilot_of
-from slipid.deploy.deploy import habits_of, read_robot
+from slipid.deploy.controllers import control_loop_of
+from slipid.deploy.deploy import actuator_model_of, read_robot
 from slipid.deploy.floors import floor_of
-from slipid.deploy.twin_run import REST_S, known_to_fit, path_of, site, starts, twin
+from slipid.deploy.twin_run import (
+    REST_S,
+    path_of,
+    require_known_surfaces,
+    starts,
+    twin_floor,
+    twin_plant,
+)
 from slipid.lab.trial.controllers import ROWS, applying, check_gains, unused_gains
 from slipid.lab.trial.plants import SitePlant, known_to_site, one_of
 from slipid.lab.trial.summary import Run, not_told_apart, summaries
 from slipid.robot import closed_loop, trajectory
-from slipid.robot.actuation import Habits
 from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import Settings
 from slipid.robot.robot_file import typed
+from slipid.robot.twin import ActuatorModel
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.errors import DataError
 from slipid.support.executor import results
@@ -51,7 +58,7 @@ class Job:
     told: FloorMap
     robot: DeployedRobot
     settings: Settings
-    habits: Habits
+    habits: ActuatorModel
     forced: bool
     kept: Checkpoint
 
@@ -151,16 +158,16 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         raise DataError(f"no controller{said}; expected some of {', '.join(ROWS)}")
     robot = jax.tree.map(np.asarray, read_robot(out, wish.load))
     path = path_of(wish.path, wish.speed, robot)
-    floor = site(robot) if wish.map is None else read_map(wish.map)
+    floor = twin_floor(robot) if wish.map is None else read_map(wish.map)
     told = floor if wish.told_map is None else read_map(wish.told_map)
-    settings, habits = Settings.of(robot), habits_of(robot, gyro=False)
+    settings, habits = Settings.of(robot), actuator_model_of(robot, gyro=False)
     if wish.plant == "testsite":  # it has the sensors it has, whatever the logs had
         known_to_site(floor, robot.load_setup, robot.wheels)
-        settings, habits = replace(settings, current_is_signed=False), Habits()
+        settings, habits = replace(settings, current_is_signed=False), ActuatorModel()
     else:
-        known_to_fit(floor, robot, str(wish.map))
+        require_known_surfaces(floor, robot, str(wish.map))
     if wish.told_map is not None:
-        known_to_fit(told, robot, str(wish.told_map))
+        require_known_surfaces(told, robot, str(wish.told_map))
     if wish.tuned_gains:
         check_gains(out, robot)
     key = key_of(
@@ -208,18 +215,20 @@ def drive(job: Job) -> None:
     plant: closed_loop.Plant
     if job.plant == "twin":
         truth = one_of(robot, job.seed)
-        plant = twin(truth, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro))
+        plant = twin_plant(
+            truth, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro)
+        )
     else:
         plant = SitePlant(job.floor, robot.load_setup, job.start, job.seed, row.gyro)
     there = floor_of(job.told, robot.labels)
-    pilot = pilot_of(robot, row, job.settings, job.forced, there)
-    course = closed_loop.drive(pilot, path, plant, job.start)
+    pilot = control_loop_of(robot, row, job.settings, job.forced, there)
+    course = closed_loop.run_closed_loop(pilot, path, plant, job.start)
     off = course.pose[-1] - course.believed[-1]
     run = Run(
         controller=job.row,
         start=job.start,
         seed=job.seed,
-        metrics=closed_loop.metrics(course),
+        metrics=closed_loop.path_metrics(course),
         believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
     )
     # the path first: a run that has metrics is done

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slipid.data.floor_map import four_zones, uniform, write_map
-from slipid.deploy.controllers import pilot_of
+from slipid.deploy.controllers import control_loop_of
 from slipid.deploy.floors import floor_map, floor_of
 from slipid.deploy.twin_run import path_of, starts
 from slipid.lab.testsite.driving import PERIOD
@@ -23,7 +23,7 @@ from slipid.model.geometry import mecanum, omni
 from slipid.model.robot import build
 from slipid.robot import closed_loop
 from slipid.robot import trajectory as reference
-from slipid.robot.closed_loop import Pilot
+from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.controller import Controller, Gains
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, Odometry
@@ -180,7 +180,7 @@ class Perfect:
 
 def pilot(deployed, preview=0.0):
     gains = replace(Gains(), preview=jnp.asarray(preview))
-    return Pilot(Odometry(deployed), Controller(deployed, gains))
+    return ControlLoop(Odometry(deployed), Controller(deployed, gains))
 
 
 @pytest.mark.slow
@@ -188,8 +188,10 @@ def pilot(deployed, preview=0.0):
 def test_encoders_close_every_path_without_slip(deployed, name):
     start = (0.2, 0.1, -1.0)
     path = reference.PATHS[name](0.2).moved(start)
-    course = closed_loop.drive(pilot(deployed, 0.05), path, Perfect(deployed, start), start)
-    found = closed_loop.metrics(course)
+    course = closed_loop.run_closed_loop(
+        pilot(deployed, 0.05), path, Perfect(deployed, start), start
+    )
+    found = closed_loop.path_metrics(course)
     assert found.finished
     assert found.closure_mm < 5
     assert found.cross_track_rmse_mm < 10
@@ -200,8 +202,8 @@ def test_encoders_close_every_path_without_slip(deployed, name):
 def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(deployed):
     start = (0.2, 0.1, -1.0)
     path = reference.rectangle().moved(start)
-    course = closed_loop.drive(pilot(deployed), path, Perfect(deployed, start), start)
-    found = closed_loop.metrics(course)
+    course = closed_loop.run_closed_loop(pilot(deployed), path, Perfect(deployed, start), start)
+    found = closed_loop.path_metrics(course)
     assert found.finished
     assert found.closure_mm < 5
     assert found.cross_track_rmse_mm < 10
@@ -218,7 +220,11 @@ def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
     far = []
     for preview in (0.0, 0.2):
         plant = Perfect(deployed, start, late=4)
-        far.append(closed_loop.drive(pilot(deployed, preview), path, plant, start).pose[:, 0].max())
+        far.append(
+            closed_loop.run_closed_loop(pilot(deployed, preview), path, plant, start)
+            .pose[:, 0]
+            .max()
+        )
     assert far[0] > 0.92  # four periods at 0.2 m/s too far
     assert far[1] < 0.905
 
@@ -227,8 +233,10 @@ def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
 def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
     start = (0.0, 0.0, 0.0)
     path = reference.rectangle()
-    course = closed_loop.drive(pilot(deployed), path, Perfect(deployed, start, 0.8), start)
-    found = closed_loop.metrics(course)
+    course = closed_loop.run_closed_loop(
+        pilot(deployed), path, Perfect(deployed, start, 0.8), start
+    )
+    found = closed_loop.path_metrics(course)
     assert found.along_track_mm[0] == pytest.approx(-180, abs=12)
     assert found.along_track_mm[1] == pytest.approx(-80, abs=12)
     assert found.closure_mm < 12  # every side is as short as its opposite
@@ -239,8 +247,10 @@ def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
 def test_of_a_curve_the_first_quarter_is_judged(deployed):
     start = (0.0, 0.0, 0.0)
     path = reference.circle(0.35)
-    course = closed_loop.drive(pilot(deployed), path, Perfect(deployed, start, 0.8), start)
-    found = closed_loop.metrics(course)
+    course = closed_loop.run_closed_loop(
+        pilot(deployed), path, Perfect(deployed, start, 0.8), start
+    )
+    found = closed_loop.path_metrics(course)
     assert found.sides_mm[0] == pytest.approx(350 * np.sqrt(2), rel=0.01)
     run = Run("encoder", start, 0, found, 0.0)
     assert float(columns([run])["first_side_travelled"][0]) == pytest.approx(0.8, abs=0.03)
@@ -250,10 +260,10 @@ def test_of_a_curve_the_first_quarter_is_judged(deployed):
 def test_a_robot_that_does_not_move_has_its_whole_way_left(deployed):
     path = reference.rectangle()
     plant = Perfect(deployed, (0.0, 0.0, 0.0), 0.0)
-    course = closed_loop.drive(pilot(deployed), path, plant, (0.0, 0.0, 0.0))
-    assert closed_loop.metrics(course).closure_mm < 5  # its encoders say that it has arrived
+    course = closed_loop.run_closed_loop(pilot(deployed), path, plant, (0.0, 0.0, 0.0))
+    assert closed_loop.path_metrics(course).closure_mm < 5  # its encoders say that it has arrived
     course = replace(course, own=np.zeros_like(course.own))
-    found = closed_loop.metrics(course)
+    found = closed_loop.path_metrics(course)
     assert not found.finished
     assert found.closure_mm == pytest.approx(2600, abs=1)
 
@@ -272,7 +282,7 @@ def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
     for row in ROWS.values():
         if row.law is not None:  # it takes a second to make
             continue
-        found = pilot_of(robot, row).controller.gains
+        found = control_loop_of(robot, row).controller.gains
         expected = tuned if row.tuned else Gains()
         if row.observer != "contact":
             expected = replace(expected, preview=jnp.asarray(0.0))
@@ -315,7 +325,7 @@ def test_rows_of_published_laws_are_made_for_the_robot_and_believe_its_encoders(
     )
     known = deploy_known(robot, highest_speed=7.5)
     pilots = {
-        name: pilot_of(known, ROWS[name])
+        name: control_loop_of(known, ROWS[name])
         for name in ("goswami_padhy", "goswami_padhy_gradient", "indiveri")
     }
     for pilot in pilots.values():
@@ -336,8 +346,10 @@ def test_rows_of_published_laws_are_made_for_the_robot_and_believe_its_encoders(
 def test_published_laws_close_the_rectangle_without_slip(deployed, row):
     start = (0.2, 0.1, -1.0)
     path = reference.rectangle().moved(start)
-    pilot = pilot_of(deployed, ROWS[row], Settings())
-    found = closed_loop.metrics(closed_loop.drive(pilot, path, Perfect(deployed, start), start))
+    pilot = control_loop_of(deployed, ROWS[row], Settings())
+    found = closed_loop.path_metrics(
+        closed_loop.run_closed_loop(pilot, path, Perfect(deployed, start), start)
+    )
     assert found.finished
     assert found.closure_mm < 5
     assert found.cross_track_rmse_mm < 10
@@ -542,7 +554,7 @@ def test_a_controller_is_told_another_map_than_the_true_one(tmp_path, deployed, 
     def caught(robot, row, settings, forced, floor):
         raise Told(floor)
 
-    monkeypatch.setattr(tr, "pilot_of", caught)
+    monkeypatch.setattr(tr, "control_loop_of", caught)
     with pytest.raises(Told) as told:
         tr.drive(other)
     (floor,) = told.value.args
@@ -591,21 +603,21 @@ def test_tuned_gains_that_are_no_better_are_left_aside_and_that_is_said(deployed
     assert said.startswith("tuned gains are no better than by hand (loss 1.0 mm, by hand 2.0 mm)")
     assert "--tuned-gains" in said
     row = ROWS["contact"]
-    assert values(pilot_of(robot, row).controller.gains) == values(Gains())
+    assert values(control_loop_of(robot, row).controller.gains) == values(Gains())
     assert unused_gains(robot, forced=True) == ""
-    assert values(pilot_of(robot, row, forced=True).controller.gains) == TUNED
+    assert values(control_loop_of(robot, row, forced=True).controller.gains) == TUNED
 
 
 def test_a_file_with_the_gain_that_is_gone_drives_with_the_others_and_that_is_said(deployed):
     gains = tuned_for("as_built", ahead=0.7)
     robot = DeployedRobot.of(replace(deployed.record, gains=gains))
-    assert values(pilot_of(robot, ROWS["contact"]).controller.gains) == TUNED
+    assert values(control_loop_of(robot, ROWS["contact"]).controller.gains) == TUNED
     assert "tuned gain ahead = 0.7 is not taken" in unused_gains(robot, forced=False)
 
 
 def run_of(name, k, closure, finished=True):
     """A run whose numbers follow from its closure."""
-    metrics = closed_loop.Metrics(
+    metrics = closed_loop.PathMetrics(
         along_track_mm=(-90.0 * (1 + 0.1 * k), 0.0, 0.0, 0.0),
         sides_mm=(900.0, 400.0, 900.0, 400.0),
         closure_mm=closure,

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from slipid.deploy.deploy import given
+from slipid.deploy.deploy import given_numbers
 from slipid.lab.benchmark.floors.fitting import (
     MeteredMotor,
     currents_off,
@@ -66,7 +66,9 @@ def deployed(robot: Robot) -> DeployedRobot:
     )
     record = RobotRecord(
         wheels=Wheels(**{f.name: getattr(shape, f.name) for f in fields(Wheels)}),
-        parameters={path: n for path, n in given(robot).items() if not path.startswith("camera.")},
+        parameters={
+            path: n for path, n in given_numbers(robot).items() if not path.startswith("camera.")
+        },
         floors=tuple(
             FloorRecord(name=name, process=none, effect=none, current_std=1.0, seen=None)
             for name in robot.surfaces.labels

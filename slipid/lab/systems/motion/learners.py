@@ -15,7 +15,7 @@ Liberties:
       before all trees are there.
     - Windows are drawn with a chance in proportion to how much they count, and then count alike.
 
-Source: Friedman 2001, Greedy function approximation: a gradient boosting machine, Annals of
+Source: Friedman 2001, Greedy function approximation: a gradient boosting spec, Annals of
 Statistics 29(5); the binning of Ke and others 2017, LightGBM, NeurIPS, as scikit-learn has it.
 
 A small neural network over all that the robot measures.
