@@ -184,7 +184,7 @@ def _circle(
         xi = contact.equilibrium(rim, frame, floor, rest)
         force = floor.friction * mass * GRAVITY * frame.radius
         where = xi, rim, frame, floor, rest
-        felt = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
+        felt = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
         amps = motor.current(at_drives(wheels.drive_of, force * motor.borne(felt)), w)
         lost = turned - wheels.forward @ xi
         return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
