@@ -10,7 +10,7 @@ from slipid.app.identify import optimised, summarised
 from slipid.app.problem import FitTask, robot_for_runs, stated_sizes
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
-from slipid.fit.problem import still_viscosities
+from slipid.fit.problem import fixed_viscosities
 from slipid.infer.result import Fit
 from slipid.model.robot import Robot
 from slipid.search_space import Choice
@@ -84,7 +84,7 @@ def fit_task_of(
 ) -> FitTask:
     """What is to be fitted; arguments as of `fit`."""
     full = robot_for_runs(robot, runs, image_centre)
-    choices = [*still_viscosities(runs), *stated_sizes(full, float(full.body.mass))]
+    choices = [*fixed_viscosities(runs), *stated_sizes(full, float(full.body.mass))]
     choices += [Choice(path, free=True) for path in free]
     for path, prior in priors.items():
         choices.append(

@@ -16,7 +16,7 @@ from slipid.app.problem import ConfigFitTask, read_fit_task
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
 from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.infer.fit_file import load
 from slipid.infer.result import Fit
 from slipid.model.robot import Robot
@@ -113,7 +113,7 @@ def _folds(
     """Every fold of every question, and the robot fitted to all runs."""
     wanted = task.settings
 
-    def tell(state: State) -> None:
+    def tell(state: FitState) -> None:
         report.note(f"{state.stage}, round {state.round}")
 
     fit = partial(optimise, most_rounds=wanted.rounds, tolerance=wanted.tolerance, tell=tell)

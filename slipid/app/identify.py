@@ -15,14 +15,14 @@ from slipid.app.check import refuse_if_wrong, sanity
 from slipid.app.config import read_config
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
 from slipid.app.trust import TrustReport, trust_report
-from slipid.fit.crossing import crossing
-from slipid.fit.crossing_fit import across
+from slipid.fit.multi_floor import multi_floor_runs
+from slipid.fit.multi_floor_fit import fit_multi_floor
 from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.infer.fit_file import save
 from slipid.infer.result import Fit, summarise
 from slipid.infer.verdicts.profile import Profile, profile, profiled
-from slipid.predict.agreement import contradiction, floor_errors, most_moved
+from slipid.predict.agreement import contradiction, floor_errors, largest_shift
 from slipid.predict.slip_models import slip_models
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.errors import DataError
@@ -178,7 +178,7 @@ def optimised(
 def _optimised(
     task: FitTask,
     problem: Problem,
-    before: tuple[State | None, list[float]],
+    before: tuple[FitState | None, list[float]],
     kept: Checkpoint | None,
     report: Reporter,
 ) -> Optimum:
@@ -187,7 +187,7 @@ def _optimised(
     start, history = before
     first: list[float] = []
 
-    def tell(state: State) -> None:
+    def tell(state: FitState) -> None:
         report.stage(state.stage)
         what = f"round {state.round}, loss {state.loss:.2f}, moved {state.moved:.3g} std"
         if state.stage != "joint":  # the staged start ends after a given number of rounds
@@ -212,13 +212,13 @@ def _optimised(
     return replace(optimum, history=tuple(history))
 
 
-def _restored(kept: Checkpoint | None, report: Reporter) -> tuple[State | None, list[float]]:
+def _restored(kept: Checkpoint | None, report: Reporter) -> tuple[FitState | None, list[float]]:
     """Where the fit stood when it was left, and its losses so far."""
     found = None if kept is None else kept.load(CHECKPOINT)
     if found is None or kept is None:
         return None, []
     history = found.pop("history").tolist()
-    start = State.of(found)
+    start = FitState.of(found)
     report.line(f"going on from round {start.round} of {kept.folder / CHECKPOINT}.npz")
     return start, history
 
@@ -238,13 +238,13 @@ def _with_mixed_runs(
 ) -> Fit:
     """The fit of runs on one floor and on several, or of the former where they contradict."""
     report.stage("runs over several floors")
-    several = crossing(task.mixed, fit.robot)
+    several = multi_floor_runs(task.mixed, fit.robot)
 
-    def tell(state: State) -> None:
+    def tell(state: FitState) -> None:
         report.note(f"round {state.round}, loss {state.loss:.2f}, moved {state.moved:.3g} std")
 
     limits = task.settings
-    found = across(problem, optimum, several, tell, limits.rounds, limits.tolerance)
+    found = fit_multi_floor(problem, optimum, several, tell, limits.rounds, limits.tolerance)
     new = summarise(found.problem, found.optimum, task.dataset, task.choices, task.settings.seed)
     floors = floor_errors(fit.contact, new.contact, task.dataset)
     after = found.after and found.after._asdict()
@@ -260,7 +260,7 @@ def _with_mixed_runs(
     report.line(_mixed_sentence(about))
     alone = {name: e.speed for name, e in found.as_if.items()}
     end = found.optimum
-    moved = most_moved(fit.space, fit.z, fit.covariance, end.state.z, end.converged)
+    moved = largest_shift(fit.space, fit.z, fit.covariance, end.state.z, end.converged)
     said = contradiction(floors, moved, found.learnt.speed, alone)
     if said is None:
         return replace(new, mixed=about)

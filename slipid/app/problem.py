@@ -30,7 +30,7 @@ from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
-from slipid.fit.problem import Problem, still_viscosities
+from slipid.fit.problem import Problem, fixed_viscosities
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.parameter import entries
@@ -236,7 +236,7 @@ def fit_task(
     # what the user says comes later and wins
     given = any(fnmatch.fnmatchcase("camera.lag", p) for p in config.content.parameters)
     lag = [] if given else lag_from_motion(dataset)
-    known = [*lag, *without_rollers(shape), *still_viscosities(dataset)]
+    known = [*lag, *without_rollers(shape), *fixed_viscosities(dataset)]
     trusted = config.content.fit.lengths_from
     choices = [*known, *choices]
     if trusted is not None and {*FREE_LENGTH.values()} <= {

@@ -9,8 +9,8 @@ from slipid.data.runs import Runs
 from slipid.infer.result import Fit
 from slipid.infer.verdicts.disputed import EndPoints, Trust, verdict_of_trust
 from slipid.predict import open_loop as replay
-from slipid.predict.floor_models import FloorModels
 from slipid.predict.kinematics import Encoder
+from slipid.predict.slip_models import FloorModels
 from slipid.predict.validation import ScoredRun, add_scores
 from slipid.support.errors import DataError
 from slipid.support.files import Content
@@ -58,11 +58,11 @@ def trust_report(fit: Fit, data: Runs) -> TrustReport:
     some = data.subset(_picked(data))
     runs: dict[int, ScoredRun] = {}
     try:
-        cuts = replay.cuts(some, fit.robot)
+        cuts = replay.replay_windows(some, fit.robot)
     except DataError:  # a fitted lag can be so long that a short run shows nothing
         cuts = []
     for w in cuts:
-        plain = replay.follow(fit.robot, w, ENCODER.increments(w, fit.robot))
+        plain = replay.tracks_from_increments(fit.robot, w, ENCODER.increments(w, fit.robot))
         for name, tracks in ((fit.contact.name, fit.contact.tracks(w)), (ENCODER.name, plain)):
             add_scores(runs, some, name, tracks, None)
     errors: dict[str, list[list[float]]] = {}

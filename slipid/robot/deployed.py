@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Frame, Geometry, at_drives, at_wheels
+from slipid.model.geometry import Geometry, WheelFrame, at_drives, at_wheels
 from slipid.model.motor import Motor
 from slipid.robot.filter.effects import EffectTable
 from slipid.robot.record import LoadRecord, Numbers, RobotRecord
@@ -50,7 +50,7 @@ class RobotArrays(eqx.Module):
         unseen: for each floor, whether nobody drove on it.
     """
 
-    frame: Frame
+    frame: WheelFrame
     places: Float[Array, "wheel 2"]
     forward: Float[Array, "drive 3"]
     inverse: Float[Array, "3 drive"]

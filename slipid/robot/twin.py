@@ -223,7 +223,7 @@ class Twin(eqx.Module):
         under = self.floor.under(now.pose, f.places)
         floor = f.floors.at(under)
         where = xi, f.frame.radius * w, f.frame, floor, f.rest
-        felt = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
+        felt = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
         force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
         keep = float(np.exp(-PERIOD / self.habits.drift_s))
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]

@@ -11,7 +11,7 @@ from slipid.app import identify, sample
 from slipid.app.config import FitSection
 from slipid.app.problem import RECUT_LAG_S, FitTask
 from slipid.fit.optimise import Optimum
-from slipid.fit.problem import State
+from slipid.fit.problem import FitState
 from slipid.model.robot import build
 from slipid.search_space import Choice
 from slipid.support.progress import Reporter
@@ -52,7 +52,7 @@ def test_a_fit_goes_on_with_windows_at_the_lag_it_found(task, monkeypatch):
         z = np.array(problem.space.start)
         z[problem.space.place["camera.lag"]] += 0.12 - EXPECTED
         shared = np.ones((len(problem.windows), 3))
-        state = State(z, np.zeros(len(problem.noise.names)), 9, 1.0, 0.001, "joint", shared)
+        state = FitState(z, np.zeros(len(problem.noise.names)), 9, 1.0, 0.001, "joint", shared)
         return Optimum(state, np.eye(len(z)), True, "settled", (1.0,))
 
     monkeypatch.setattr(identify, "_optimised", fit)

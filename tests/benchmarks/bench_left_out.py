@@ -23,7 +23,7 @@ from slipid.app.config import read_config
 from slipid.app.problem import ConfigFitTask, read_fit_task
 from slipid.data.runs import Runs
 from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, still_viscosities
+from slipid.fit.problem import Problem, fixed_viscosities
 from slipid.infer.result import draws
 from slipid.model.robot import build
 from slipid.predict.folds import judge
@@ -76,7 +76,7 @@ def some(job: ConfigFitTask, runs: np.ndarray) -> tuple[Runs, Problem]:
         for c in job.choices
         if not (c.pattern.startswith("surface.") and c.pattern.split(".")[1] not in floors)
     ]
-    part = replace(job, dataset=data, robot=robot, choices=tuple(still_viscosities(data) + choices))
+    part = replace(job, dataset=data, robot=robot, choices=tuple(fixed_viscosities(data) + choices))
     return data, part.problem()
 
 

@@ -31,8 +31,8 @@ from slipid.deploy.floors import floor_of
 from slipid.fit.likelihood import batch
 from slipid.fit.optimise import optimise
 from slipid.infer.slip_curves import current_trend
-from slipid.predict.folds import facts_of, sectors
-from slipid.predict.predictive import Contact, contact_of
+from slipid.predict.folds import fold_keys, sectors
+from slipid.predict.predictive import ForceBalance, force_balance_of
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
 from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
@@ -87,15 +87,15 @@ def kept(name: str, make: Callable[[], Made]) -> Made:
     return found
 
 
-def fitted(job: ConfigFitTask, runs: np.ndarray) -> Contact:
+def fitted(job: ConfigFitTask, runs: np.ndarray) -> ForceBalance:
     """Fit of some of the runs on one floor."""
     problem = job.problem()
     keep = np.isin(problem.windows.run, runs).astype(float)
     optimum = optimise(problem, keep=keep)
-    return contact_of(problem, optimum.state, optimum.covariance, keep)
+    return force_balance_of(problem, optimum.state, optimum.covariance, keep)
 
 
-def deployed(job: ConfigFitTask, contact: Contact, runs: np.ndarray) -> DeployedRobot:
+def deployed(job: ConfigFitTask, contact: ForceBalance, runs: np.ndarray) -> DeployedRobot:
     """From a fit; `runs` on one floor are those it was fitted to."""
     windows = job.problem().windows
     seen = windows.segments(np.flatnonzero(np.isin(windows.run, runs)))
@@ -131,7 +131,7 @@ def show(rows: list[Judged]) -> None:
 
 def test_one_floor(job: ConfigFitTask) -> None:
     data = job.dataset
-    fold = sectors(facts_of(data)) % 3
+    fold = sectors(fold_keys(data)) % 3
     built = np.array([log.load == "as_built" for log in data.logs])
     rows: list[Judged] = []
     for k in range(3):

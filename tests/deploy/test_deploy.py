@@ -12,7 +12,7 @@ import pytest
 
 from slipid.deploy.deploy import DRAWS, deploy, read_robot, write_robot
 from slipid.deploy.robot_record import DIRECTIONS
-from slipid.fit.shared import Directions, Pace
+from slipid.fit.shared_effects import SpeedAndLoad, TravelConditions
 from slipid.infer.fit_file import load
 from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
@@ -70,9 +70,9 @@ def test_what_it_is_told_of_effects_is_what_forecasts_know(fitted):
     told = robot.record.loads[0].told
     for n, speed in enumerate(told.speeds):
         for k in (0, 17, 50):
-            pace = (Pace(float(np.log(speed)), robot.load_setup),)
+            pace = (SpeedAndLoad(float(np.log(speed)), robot.load_setup),)
             mirror = contact.robot.geometry.mirror()
-            way = Directions(np.array([2 * np.pi * k / DIRECTIONS]), pace, mirror)
+            way = TravelConditions(np.array([2 * np.pi * k / DIRECTIONS]), pace, mirror)
             known = contact.shared[robot.labels[0]].told(way)
             np.testing.assert_allclose(told.mean[0][n][k], -known.mean[0], rtol=2e-3, atol=1e-6)
             # the numbers are not known either

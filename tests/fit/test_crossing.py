@@ -22,9 +22,9 @@ from slipid.data.floor_map import from_polygons, uniform
 from slipid.data.runs import collect
 from slipid.data.windows import Windows
 from slipid.deploy.deploy import read_robot
-from slipid.fit import crossing as cut
 from slipid.fit import likelihood as lk
-from slipid.fit.crossing_fit import across
+from slipid.fit import multi_floor as cut
+from slipid.fit.multi_floor_fit import fit_multi_floor
 from slipid.fit.optimise import optimise
 from slipid.fit.problem import Problem
 from slipid.fit.variances import _cut, whitened
@@ -112,7 +112,7 @@ def crossed(truth_, runs, seed, offset=OFFSET):
     noise = CURRENT * rng.normal(size=amps.shape) + offset * rng.normal(size=(runs, 1, 3))
     w = replace(w, pose=pose, current=np.asarray(amps) + noise)
     runs_ = tuple((f"site/run{k}.csv", f"{k:x}") for k in range(runs))
-    return cut.Crossing(w, floor, rng.uniform(size=shape) > 0.2, runs_)
+    return cut.MultiFloorRuns(w, floor, rng.uniform(size=shape) > 0.2, runs_)
 
 
 STD = {"camera.place": PLACE, "camera.heading": HEADING, "current.window": CURRENT}
@@ -130,7 +130,7 @@ def fitted():
 @pytest.fixture(scope="module")
 def learnt(fitted):
     true, problem, optimum = fitted
-    return across(problem, optimum, crossed(true, 12, 1), lambda state: None)
+    return fit_multi_floor(problem, optimum, crossed(true, 12, 1), lambda state: None)
 
 
 def ratio(space, z, covariance):
@@ -184,7 +184,7 @@ def test_what_a_run_is_off_all_along_counts_once_not_once_a_window(fitted):
     for offset in (1e-4, OFFSET):
         log_v = np.array(state.log_variance)
         log_v[at] = 2 * np.log(offset)
-        half = whitened(whole.noise.blocks, jacobian, log_v, whole.every)[cut.CURRENT]
+        half = whitened(whole.noise.blocks, jacobian, log_v, whole.every)[cut.MULTI_FLOOR_CURRENT]
         k = whole.space.place["motor.back_emf"]
         told.append(float((half[..., k] ** 2).sum()))
     assert told[1] < 0.3 * told[0]
@@ -204,7 +204,7 @@ def test_windows_that_do_not_count_say_nothing(fitted):
         turn=np.where(dead[..., None], 0.3, several.windows.turn),
     )
     other = problem.crossed(replace(several, windows=moved))
-    for k in (cut.MOTION, cut.CURRENT):
+    for k in (cut.MULTI_FLOOR_MOTION, cut.MULTI_FLOOR_CURRENT):
         (r, slope), (r2, slope2) = (
             (p.linear(*where)[0][k], p.linear(*where)[1][k]) for p in (whole, other)
         )
@@ -242,7 +242,9 @@ def test_pieces_left_out_change_nothing(fitted):
 @pytest.mark.slow
 def test_a_single_run_judges_nothing(fitted):
     true, problem, optimum = fitted
-    found = across(problem, optimum, crossed(true, 1, 3), lambda state: None, most_rounds=2)
+    found = fit_multi_floor(
+        problem, optimum, crossed(true, 1, 3), lambda state: None, most_rounds=2
+    )
     assert found.after is None
     assert len(found.problem.every) == len(problem.windows) + 1
 
@@ -297,8 +299,8 @@ RIGHT = [[0.0, -9.0], [9.0, -9.0], [9.0, 9.0], [0.0, 9.0]]
 def test_windows_in_which_no_wheel_changes_floors(driven):
     true, data = driven
     half = from_polygons("soft", [("firm", RIGHT)], (-3.0, -3.0, 3.0, 3.0))
-    whole = cut.crossing([(data, uniform("soft", 3.0))], true)
-    some = cut.crossing([(data, half)], true)
+    whole = cut.multi_floor_runs([(data, uniform("soft", 3.0))], true)
+    some = cut.multi_floor_runs([(data, half)], true)
     assert set(whole.floor.ravel()) == {true.surface_index("soft")}
     assert 0 < some.counts.sum() < whole.counts.sum()
     for run, window in np.argwhere(some.counts):
@@ -317,7 +319,7 @@ def test_windows_in_which_no_wheel_changes_floors(driven):
 def test_windows_of_a_run_stand_in_a_row_and_two_maps_go_together(driven):
     true, data = driven
     floor = uniform("soft", 3.0)
-    one = cut.crossing([(data, floor)], true)
+    one = cut.multi_floor_runs([(data, floor)], true)
     assert one.counts.shape[1] <= cut.MOST_WINDOWS
     for k in range(len(data)):
         row = one.windows.segments(np.array([k]))
@@ -328,7 +330,7 @@ def test_windows_of_a_run_stand_in_a_row_and_two_maps_go_together(driven):
         live = one.counts[k]
         steps = np.diff(row.pose[0], axis=0)[live]
         assert (np.abs(steps).max(axis=1) > 0).all()
-    both = cut.crossing([(data, floor), (data.subset([0]), floor)], true)
+    both = cut.multi_floor_runs([(data, floor), (data.subset([0]), floor)], true)
     assert both.runs == (*one.runs, one.runs[0])
     assert both.windows.run.tolist() == [*one.windows.run.tolist(), len(data)]
     np.testing.assert_array_equal(both.windows.turn[-1], one.windows.turn[0])
@@ -339,7 +341,7 @@ def test_runs_without_a_window_are_refused(driven, monkeypatch):
     true, data = driven
     monkeypatch.setattr(cut, "LEAST_SPEED", 9.0)
     with pytest.raises(DataError, match=r"no window in which .*expected larger patches"):
-        cut.crossing([(data, uniform("soft", 3.0))], true)
+        cut.multi_floor_runs([(data, uniform("soft", 3.0))], true)
 
 
 # configs ----------------------------------------------------------------------------------------

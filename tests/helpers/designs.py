@@ -16,7 +16,7 @@ from slipid.data.windows import windows
 from slipid.fit import likelihood as lk
 from slipid.fit import noise as of_noise
 from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.infer.design import fisher as info
 from slipid.infer.design.planned_runs import (
     HEADINGS,
@@ -104,7 +104,7 @@ def fit_windows(drives, seed):
     made = simulate_windows(TRUTH, clean, rng, {**std, "current": std["current.soft.window"]})
     this = problem(len(drives)).of(made)
     log_v = np.log([std[n] ** 2 for n in this.noise.names])
-    begin = State(this.space.vector(TRUTH), log_v, 0, np.inf, np.inf, "joint")
+    begin = FitState(this.space.vector(TRUTH), log_v, 0, np.inf, np.inf, "joint")
     end = optimise(this, start=begin, most_rounds=15)
     return end.state.z, end.converged
 

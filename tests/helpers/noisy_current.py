@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.lab.selftest.replicates import simulate_windows
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
@@ -89,7 +89,7 @@ def experiment(seed: int, ammeter: float, signed: bool = True) -> Problem:
 def fitted(this: Problem) -> Found:
     """The fit of an experiment."""
     log_v = 2 * np.log(this.noise.typical)
-    end = optimise(this, start=State(this.space.start, log_v, 0, np.inf, np.inf, "joint"))
+    end = optimise(this, start=FitState(this.space.start, log_v, 0, np.inf, np.inf, "joint"))
     at = np.array([this.space.place[path].start for path in MOTOR])
     error = end.state.z[at] - np.log(list(MOTOR.values()))
     return Found(error, np.sqrt(np.diag(end.covariance))[at], end.converged)

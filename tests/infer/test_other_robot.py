@@ -29,9 +29,9 @@ LEAST_SQUARES = 0.0505
 def end_errors(robot, data) -> tuple[np.ndarray, np.ndarray]:
     """Distance between predicted and tracked end of every run [m], and length of its path [m]."""
     off, way = np.zeros(len(data)), np.zeros(len(data))
-    for w in replay.cuts(data, robot):
+    for w in replay.replay_windows(data, robot):
         step = np.asarray(replay.contact_increments(robot, lk.batch(w, robot)))
-        track = replay.follow(robot, w, step)
+        track = replay.tracks_from_increments(robot, w, step)
         way[track.run] = np.linalg.norm(np.diff(track.measured[..., :2], axis=1), axis=-1).sum(1)
         off[track.run] = np.linalg.norm(track.gap[:, :2], axis=1)
     return off, way

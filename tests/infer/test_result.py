@@ -17,7 +17,7 @@ from scipy.stats import f as fisher
 from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.fit.optimise import Optimum, one_round
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.fit.variances import DEGREES
 from slipid.infer import fit_file
 from slipid.infer.design.planned_runs import PlannedRun
@@ -57,7 +57,7 @@ def made(voltage: bool):
     data = collect(simulate_logs(TRUTH, DRIVES, 1, SimulatedSensors(has_voltage=voltage)))
     problem = Problem(windows(data, 0.04, lag=0.05), nominal_robot(DRIVES), list(CHOICES))
     z = problem.space.vector(TRUTH)
-    state = State(z, 2 * np.log(problem.noise.typical), 7, -1.5, 0.01, "joint")
+    state = FitState(z, 2 * np.log(problem.noise.typical), 7, -1.5, 0.01, "joint")
     laplace = problem.laplace(z, state.log_variance, np.ones(len(problem.windows)))
     end = Optimum(state, laplace, True, "it settled", (3.0, -1.5))
     return problem, data, end
@@ -460,7 +460,7 @@ def test_what_sessions_share_is_stored_with_its_unit():
     problem = Problem(windows(data, 0.04, lag=0.056), nominal_robot(DRIVES), list(CHOICES))
     z, log_v = problem.space.vector(TRUTH), 2 * np.log(problem.noise.typical)
     laplace = problem.laplace(z, log_v, np.ones(len(problem.windows)))
-    end = Optimum(State(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
+    end = Optimum(FitState(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
     fit = summarise(problem, end, data, CHOICES)
     kept = to_json(fit)["variances"]
     for axis, unit in {**dict.fromkeys(SHARED, "m/m"), "yaw": "rad/m"}.items():
@@ -482,7 +482,7 @@ def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
             std[k] = max(sensors.of(name), 1e-9)
     log_v = 2 * np.log(std)
     laplace = problem.laplace(z, log_v, np.ones(len(problem.windows)))
-    end = Optimum(State(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
+    end = Optimum(FitState(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
     save(summarise(problem, end, data, CHOICES), tmp_path)
     fit = load(tmp_path)
     assert np.linalg.eigvalsh(fit.covariance - fit.laplace).min() > -1e-12

@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.fit.optimise import Optimum
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.result import Fit, summarise
 from slipid.lab.selftest.logs import (
@@ -65,7 +65,7 @@ def fit() -> Fit:
     _, jacobian = problem.linear(jnp.asarray(z), problem.electric(z, log_v))
     keep = jnp.ones(len(problem.windows))
     info = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep))
-    state = State(z, log_v, 7, -1.5, 0.01, "joint")
+    state = FitState(z, log_v, 7, -1.5, 0.01, "joint")
     return summarise(
         problem, Optimum(state, np.linalg.inv(info), True, "settled", (0.0,)), data(), choices
     )

@@ -14,8 +14,8 @@ from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.runs import Runs, collect
 from slipid.lab.benchmark.protocols import facts_of
 from slipid.lab.benchmark.steps import POSES_PER_STEP
-from slipid.predict.folds import Facts
-from slipid.predict.slip_model import Machine
+from slipid.predict.folds import FoldKey
+from slipid.predict.slip_model import RobotSpec
 from slipid.search_space import Space
 from slipid.support.files import hash_of
 from slipid.support.progress import Reporter
@@ -119,14 +119,14 @@ class DataSet:
     source: LogSource
     job: ConfigFitTask
     logged: Runs
-    facts: tuple[Facts, ...]
+    facts: tuple[FoldKey, ...]
     crossing: Runs | None = None
     map: FloorMap | None = None
 
     @property
-    def machine(self) -> Machine:
+    def spec(self) -> RobotSpec:
         """The robot as its config has it."""
-        return Machine.of(Space(self.job.robot, self.job.choices).template)
+        return RobotSpec.of(Space(self.job.robot, self.job.choices).template)
 
     def thinned(self, most: int) -> "DataSet":
         """At most so many runs, evenly taken from every floor and speed."""

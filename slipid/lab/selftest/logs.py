@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from slipid.data.log import Log
 from slipid.data.wheel_signals import interpolate
-from slipid.fit.shared import AXES
+from slipid.fit.shared_effects import AXES
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.model.geometry import omni
 from slipid.model.robot import Robot, build, motor_current, twist

@@ -29,8 +29,8 @@ from slipid.data.windows import Windows
 from slipid.fit import likelihood as lk
 from slipid.fit.noise import SHARED, axes, noise, travel
 from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, State
-from slipid.fit.shared import AXES, shared_of
+from slipid.fit.problem import FitState, Problem
+from slipid.fit.shared_effects import AXES, effects_by_floor
 from slipid.infer.result import draws
 from slipid.infer.slip_curves import curves, slip_on
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
@@ -124,7 +124,7 @@ def _shared(
     ]
     log_v = jnp.asarray(2 * np.log(np.maximum(named, 1e-30)))
     out = np.zeros((len(w), len(AXES)))
-    for of in shared_of(w, truth, components)[0]:
+    for of in effects_by_floor(w, truth, components)[0]:
         root = np.asarray(of.root(log_v))
         drawn = np.einsum("anq,aq->na", root, rng.normal(size=root.shape[::2]))
         out[np.asarray(of.pieces)] = drawn
@@ -242,7 +242,7 @@ def replicates(
         report.line(f"{len(found)} of {count} replicates are in {kept.folder / FILE}.json already")
     report.stage("replicates")
 
-    def tell(state: State) -> None:
+    def tell(state: FitState) -> None:
         report.note(f"{state.stage}, round {state.round}")
 
     for k in range(len(found), count):

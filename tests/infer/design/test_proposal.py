@@ -15,7 +15,7 @@ from slipid.cli.main import app
 from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.fit.optimise import Optimum
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.infer.design.planner import Planner
 from slipid.infer.fit_file import load, save
 from slipid.infer.result import summarise
@@ -49,7 +49,7 @@ def folder(tmp_path_factory):
     z, log_v = problem.space.vector(robot), 2 * np.log(problem.noise.typical)
     _, jacobian = problem.linear(jnp.asarray(z), problem.electric(z, log_v))
     info = problem.precision(jacobian, jnp.asarray(log_v), jnp.ones(len(problem.windows)))
-    state = State(z, log_v, 7, -1.5, 0.01, "joint")
+    state = FitState(z, log_v, 7, -1.5, 0.01, "joint")
     end = Optimum(state, np.linalg.inv(np.asarray(info)), True, "settled", (0.0,))
     out = tmp_path_factory.mktemp("fit")
     save(summarise(problem, end, data, choices), out)

@@ -9,7 +9,7 @@ from slipid.api.runs import simulate_runs, steady_motion
 from slipid.data.runs import collect
 from slipid.lab.benchmark.slipid_rows import turned_covariance
 from slipid.lab.benchmark.steps import run_batches
-from slipid.predict.slip_model import seen_from_start
+from slipid.predict.slip_model import relative_to_start
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +63,6 @@ def test_the_load_is_heard_and_gyro_and_command_are_means_over_each_step(made):
 
 def test_a_start_anywhere_is_the_origin():
     path = np.array([[1.0, 2.0, np.pi / 2], [1.0, 3.0, np.pi]])
-    assert seen_from_start(path) == pytest.approx(np.array([[0, 0, 0], [1, 0, np.pi / 2]]))
+    assert relative_to_start(path) == pytest.approx(np.array([[0, 0, 0], [1, 0, np.pi / 2]]))
     turned = turned_covariance(np.diag([4.0, 1.0]), -np.pi / 2)
     assert turned == pytest.approx(np.diag([1.0, 4.0]))

@@ -23,7 +23,7 @@ from slipid.fit import likelihood as lk
 from slipid.fit import noise as of_noise
 from slipid.fit.optimise import Optimum
 from slipid.fit.problem import Problem
-from slipid.fit.shared import AXES
+from slipid.fit.shared_effects import AXES
 from slipid.lab.selftest import replicates as selftest
 from slipid.lab.selftest.experiment import number_summary, summary
 from slipid.lab.selftest.replicates import (
