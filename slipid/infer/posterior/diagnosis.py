@@ -195,7 +195,7 @@ def estimates(
     geometric mean. Directions that the fit found open stay so.
     """
     flat, open_ = draws.reshape(-1, fit.space.size), members(fit.flat)
-    out, prior_std = dict(fit.parameters), fit.judged.prior_std
+    out, prior_std = dict(fit.parameters), fit.verdict_space.prior_std
     for e in fit.space.free:
         at, d, old = fit.space.place[e.path], e.declaration, fit.parameters[e.path]
         z = flat[:, at]
