@@ -124,7 +124,7 @@ def curves(
 
 
 def slip_on(robot: Robot, floor: str, curve: SlipCurve) -> Float[np.ndarray, " torque"]:
-    """Return the slip that a robot's contact law gives at the torques, speed and load of a curve."""
+    """Return the slip of a robot's contact law at the torques, speed and load of a curve."""
     at = jnp.full(len(robot.surfaces.labels), curve.wheel_speed)
     torque = torque_of_slip(robot, at, curve.load_share)[robot.surface_index(floor)]
     return np.interp(curve.torque_nm, np.asarray(torque), _SLIP)

@@ -33,7 +33,7 @@ TORQUE_SCALE = (
 )
 """Numbers that a common factor scales without any change of the currents."""
 _NO_EFFECT = 1.02
-"""Information below which data are uninformative: these directions come first, with exact powers."""
+"""Information of uninformative data: such directions come first, with exact powers."""
 _PART = 0.3
 """Smallest prior-scaled step, or power, of a named number relative to the largest one."""
 
