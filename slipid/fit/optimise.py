@@ -12,12 +12,20 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from slipid.fit import likelihood as lk
-from slipid.fit.crossing import MOTION, Several
 from slipid.fit.hierarchy import effect_variances, pooled
+from slipid.fit.multi_floor import MULTI_FLOOR_MOTION, MultiFloorBatch
 from slipid.fit.noise import SHARED
-from slipid.fit.problem import CREEPS, Problem, State, effects_of, less, linear, log_jacobian
-from slipid.fit.shared import Tie, freed
-from slipid.fit.variances import Blocks, Search, Square, Target, scored, spread_of
+from slipid.fit.problem import (
+    CREEPS,
+    FitState,
+    Problem,
+    effects_given,
+    linear,
+    log_jacobian,
+    without_effects,
+)
+from slipid.fit.shared_effects import EffectPosterior, marginal_residuals
+from slipid.fit.variances import Blocks, Objective, Search, Square, fitted_covariance, scoring_step
 from slipid.model.robot import Robot
 
 _REFUSED = 12
@@ -28,7 +36,7 @@ _REFUSED = 12
 class Optimum:
     """End of a fit: Laplace covariance, why it stopped, for people, and the loss of every round."""
 
-    state: State
+    state: FitState
     covariance: Square
     converged: bool
     reason: str
@@ -38,10 +46,10 @@ class Optimum:
 def optimise(
     problem: Problem,
     keep: np.ndarray | None = None,
-    start: State | None = None,
+    start: FitState | None = None,
     most_rounds: int = 30,
     tolerance: float = 0.02,
-    tell: Callable[[State], None] = lambda state: None,
+    tell: Callable[[FitState], None] = lambda state: None,
     free: np.ndarray | None = None,
     variances: bool = True,
 ) -> Optimum:
@@ -78,12 +86,12 @@ def optimise(
 
 def one_round(
     problem: Problem,
-    state: State,
+    state: FitState,
     keep: Float[np.ndarray, " piece"],
     mask: Search,
     steps: int,
     scoring: int,
-) -> State:
+) -> FitState:
     """Weights, structure, variances: one turn of each.
 
     At most so many steps of the structure, and so many scoring steps of the variances; the mask is
@@ -94,7 +102,7 @@ def one_round(
     residual, _, felt = linear(target, jnp.asarray(state.z), electric)
     before = state.shared(len(problem.windows))
     seen = problem.seen(residual, log_v, keep, before)
-    held = Held(
+    held = LeastSquaresInputs(
         target=target,
         z=jnp.asarray(state.z),
         mask=jnp.asarray(mask),
@@ -105,18 +113,21 @@ def one_round(
         felt=felt,
         slope=log_jacobian(target, state.z, electric, keep)[1],
     )
-    z = np.asarray(levenberg(held, Steps(steps)))
+    z = np.asarray(levenberg(held, LimitedLevenberg(steps)))
     electric = problem.electric(z, log_v)
     whole, jacobian, felt = linear(target, jnp.asarray(z), electric)
-    effect = effects_of(seen.tied, seen.whitening.root["motion"], whole["motion"])
+    effect = effects_given(seen.tied, seen.whitening.root["motion"], whole["motion"])
     # weights follow effects and effects follow weights: half way, or they can swing for ever
     effect = 0.5 * (effect + before) if state.round else effect
-    residual, told = less(target, whole, effect), problem.through_voltage(z, log_v, felt)
+    residual, told = (
+        without_effects(target, whole, effect),
+        problem.voltage_information(z, log_v, felt),
+    )
     if scoring:
-        spread = spread_of(target, jacobian, log_v, jnp.asarray(keep))
+        spread = fitted_covariance(target, jacobian, log_v, jnp.asarray(keep))
     for _ in range(scoring):
-        log_v = scored(target, residual, spread, log_v, jnp.asarray(keep), told)
-        last, told = told, problem.through_voltage(z, log_v, felt)
+        log_v = scoring_step(target, residual, spread, log_v, jnp.asarray(keep), told)
+        last, told = told, problem.voltage_information(z, log_v, felt)
         if last is not None and told is not None:  # in units of the noise just found
             scale = jnp.sqrt(told.share / last.share)
             residual = residual | {"voltage": told.residual}
@@ -135,7 +146,7 @@ def one_round(
     std = np.sqrt(np.diag(covariance))
     moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
     moved = max(moved, float(np.max(np.abs(np.asarray(log_v) - state.log_variance)) / 3))
-    return State(
+    return FitState(
         z=z,
         log_variance=np.asarray(log_v),
         round=state.round + 1,
@@ -146,7 +157,7 @@ def one_round(
     )
 
 
-def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], None]) -> State:
+def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], None]) -> FitState:
     """Motor by regression, then every floor by itself from several starts, best start per floor.
 
     Floors share nothing while the shared numbers are held, so one masked fit of all floors is a fit
@@ -167,7 +178,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
     for attempt, value in enumerate(CREEPS):
         stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
         start = np.where(creep, np.log(value), first)
-        state = State(start, log_v, 0, np.inf, np.inf, stage)
+        state = FitState(start, log_v, 0, np.inf, np.inf, stage)
         for steps in (15, 6, 6):  # the damping has to grow from 1 to the size of the problem first
             state = one_round(apart, state, keep, mask, steps=steps, scoring=0)
             tell(state)
@@ -179,13 +190,13 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[State], Non
             if mine < best[number]:
                 best[number] = mine
                 z = np.where(of_floor == label, state.z, z)
-    return State(z, log_v, 0, np.inf, np.inf, "joint")
+    return FitState(z, log_v, 0, np.inf, np.inf, "joint")
 
 
 def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
     """Search vector with R and C_e by regression of the voltage where it is logged."""
     z = problem.space.start.copy()
-    w = problem.windows.pieces(np.flatnonzero(keep > 0))
+    w = problem.windows.segments(np.flatnonzero(keep > 0))
     if not (w.has_voltage and w.has_current):
         return z
     speed = (w.turn / w.dt[..., None]).ravel()
@@ -199,7 +210,7 @@ def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
     return z
 
 
-class Held(eqx.Module):
+class LeastSquaresInputs(eqx.Module):
     """What is held while the structural numbers move from z.
 
     The mask is 1 for coordinates that may move; root whitens residuals, tied is what runs share
@@ -208,18 +219,18 @@ class Held(eqx.Module):
     slope that of log |d residuals / d data| by the search vector.
     """
 
-    target: Target
+    target: Objective
     z: Float[Array, " free"]
     mask: Float[Array, " free"]
     root: Blocks
-    tied: tuple[Tie, ...]
+    tied: tuple[EffectPosterior, ...]
     prior_std: Float[Array, " free"]
     electric: lk.ElectricNoise
-    felt: lk.Felt
+    felt: lk.MotorForce
     slope: Float[Array, " free"]
 
 
-class Steps(optx.LevenbergMarquardt):
+class LimitedLevenberg(optx.LevenbergMarquardt):
     """Levenberg-Marquardt that ends after so many steps that were taken.
 
     One that is refused shrinks the next, and to stop among refused ones would look like having
@@ -233,7 +244,13 @@ class Steps(optx.LevenbergMarquardt):
         self.most = jnp.asarray(most)
 
     def terminate(
-        self, fn: Any, y: Array, args: Held, options: Any, state: Any, tags: frozenset[object]
+        self,
+        fn: Any,
+        y: Array,
+        args: LeastSquaresInputs,
+        options: Any,
+        state: Any,
+        tags: frozenset[object],
     ) -> tuple[Array, optx.RESULTS]:
         done, result = super().terminate(fn, y, args, options, state, tags)
         taken = state.num_accepted_steps - 1 >= self.most
@@ -241,28 +258,30 @@ class Steps(optx.LevenbergMarquardt):
 
 
 @eqx.filter_jit
-def levenberg(held: Held, solver: Steps) -> Float[Array, " free"]:
+def levenberg(held: LeastSquaresInputs, solver: LimitedLevenberg) -> Float[Array, " free"]:
     """Search vector after the solver's steps with fixed whitening."""
     start = jnp.zeros_like(held.z)
     found = optx.least_squares(_stacked, solver, start, held, max_steps=None, throw=False)
     return _at(held, found.value)
 
 
-def _several(of: Several, robot: Robot, given: Robot) -> Blocks:
+def _several(of: MultiFloorBatch, robot: Robot, given: Robot) -> Blocks:
     """Residuals of runs over several floors: their currents move electric numbers only.
 
     Friction moves the equilibrium that currents come from, so that it is found for them, too.
     """
-    motion = {MOTION: of.residuals(robot, lk.predict(robot, of.batch))[MOTION]}
+    motion = {
+        MULTI_FLOOR_MOTION: of.residuals(robot, lk.predict(robot, of.batch))[MULTI_FLOOR_MOTION]
+    }
     return of.residuals(given, lk.predict(given, of.batch)) | motion
 
 
-def _at(held: Held, y: Array) -> Array:
+def _at(held: LeastSquaresInputs, y: Array) -> Array:
     """Search vector of a step in prior stds."""
     return held.z + held.mask * held.prior_std * y
 
 
-def _stacked(y: Array, held: Held) -> Array:
+def _stacked(y: Array, held: LeastSquaresInputs) -> Array:
     """Whitened residuals of all blocks and of the prior."""
     target, space = held.target, held.target.space
     z = _at(held, y)
@@ -274,7 +293,9 @@ def _stacked(y: Array, held: Held) -> Array:
     if target.several is not None:
         blocks |= _several(target.several, robot, given)
     white = {k: jnp.einsum("nij,nj->ni", held.root[k], r) for k, r in blocks.items()}
-    parts = [freed(held.tied, w) if k == "motion" else w.ravel() for k, w in white.items()]
+    parts = [
+        marginal_residuals(held.tied, w) if k == "motion" else w.ravel() for k, w in white.items()
+    ]
     # the slope of the log Jacobian adds slope . z to the log posterior
     mean = space.prior_mean + held.prior_std**2 * held.slope
     return jnp.concatenate([*parts, (z - mean) / held.prior_std])

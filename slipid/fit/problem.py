@@ -16,18 +16,24 @@ from slipid.data.runs import Runs
 from slipid.data.windows import Windows
 from slipid.fit import likelihood as lk
 from slipid.fit import variances
-from slipid.fit.crossing import CURRENT, Crossing, Several
+from slipid.fit.multi_floor import MULTI_FLOOR_CURRENT, MultiFloorBatch, MultiFloorRuns
 from slipid.fit.noise import POOLED, SHARED, electric_noise, noise
-from slipid.fit.shared import Tie, freed, shared_effects, shared_of, ties
+from slipid.fit.shared_effects import (
+    EffectPosterior,
+    effect_posteriors,
+    effects_by_floor,
+    marginal_residuals,
+    mean_effects,
+)
 from slipid.fit.variances import (
     VARIANCE_SPREAD,
     Blocks,
+    Objective,
     Search,
-    Target,
-    ThroughVoltage,
     Vector,
+    VoltageInformation,
     Whitening,
-    through_voltage,
+    voltage_information,
 )
 from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
@@ -37,7 +43,7 @@ CREEPS = (0.05, 0.4, 1.0)
 
 
 @dataclass(frozen=True)
-class State:
+class FitState:
     """Where a fit stands; enough to go on from.
 
     The effect is what runs were found to share, along, across and in yaw. The loss is minus log
@@ -63,7 +69,7 @@ class State:
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @classmethod
-    def of(cls, kept: Mapping[str, np.ndarray]) -> "State":
+    def of(cls, kept: Mapping[str, np.ndarray]) -> "FitState":
         """The state whose `arrays` a checkpoint has kept."""
         plain: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in kept.items()}
         return cls(**plain)
@@ -92,28 +98,28 @@ class Problem:
         other._read(windows, self.several)
         return other
 
-    def crossed(self, several: Crossing) -> "Problem":
+    def crossed(self, several: MultiFloorRuns) -> "Problem":
         """The same problem with runs over several floors."""
         other = copy.copy(self)
         other.compiled = {}
         other._read(self.windows, several)
         return other
 
-    def _read(self, windows: Windows, several: Crossing | None) -> None:
+    def _read(self, windows: Windows, several: MultiFloorRuns | None) -> None:
         self.windows, self.several = windows, several
         self.noise = noise(windows, self.robot, several)
-        shared, self.paces = shared_of(windows, self.robot, self.noise)
+        shared, self.paces = effects_by_floor(windows, self.robot, self.noise)
         kinds = np.array([c.kind for c in self.noise.components])
-        self.target = Target(
+        self.target = Objective(
             space=self.space,
             batch=lk.batch(windows, self.robot),
-            several=None if several is None else Several.of(several, self.robot),
+            several=None if several is None else MultiFloorBatch.of(several, self.robot),
             blocks=self.noise.blocks,
             shared=shared,
             typical=jnp.asarray(2 * np.log(self.noise.typical)),
             scored=~np.isin(kinds, ("run", "pooled", *SHARED)),
             pooled=self.noise.names.index(POOLED),
-            joint=not windows.has_current and CURRENT not in self.noise.blocks,
+            joint=not windows.has_current and MULTI_FLOOR_CURRENT not in self.noise.blocks,
         )
 
     @property
@@ -123,7 +129,7 @@ class Problem:
             len(self.windows) + (0 if self.several is None else len(self.several.counts))
         )
 
-    def restated(self, state: State, of: "Problem") -> State:
+    def restated(self, state: FitState, of: "Problem") -> FitState:
         """A state of another problem with the same numbers as one of this problem."""
         known = dict(zip(of.noise.names, state.log_variance, strict=True))
         log_v = [known.get(c.name, 2 * np.log(c.typical)) for c in self.noise.components]
@@ -161,16 +167,23 @@ class Problem:
         told = variances.precision(self.target, jacobian, log_v, keep, alone)
         return np.linalg.inv(np.asarray(told))
 
-    def seen(self, residual: Blocks, log_v: Vector, keep: Vector, effect: Vector) -> "Seen":
+    def seen(
+        self, residual: Blocks, log_v: Vector, keep: Vector, effect: Vector
+    ) -> "WeighedResiduals":
         """Residuals weighed: outliers are so only for what they do not share with other runs.
 
         The effect is what they were found to share (piece, 3).
         """
         where = jnp.asarray(log_v), jnp.asarray(keep), jnp.asarray(effect)
-        return _seen(self.target, residual, *where)
+        return _weighed(self.target, residual, *where)
 
     def loss(
-        self, z: Vector, log_v: Vector, keep: Vector, seen: "Seen", electric: lk.ElectricNoise
+        self,
+        z: Vector,
+        log_v: Vector,
+        keep: Vector,
+        seen: "WeighedResiduals",
+        electric: lk.ElectricNoise,
     ) -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
         nll = float(seen.loss)
@@ -185,14 +198,16 @@ class Problem:
         """What voltages are predicted with at this resistance and these variances."""
         return _electric(self.target, z, log_v)
 
-    def through_voltage(self, z: Vector, log_v: Vector, felt: Array) -> ThroughVoltage | None:
+    def voltage_information(
+        self, z: Vector, log_v: Vector, felt: Array
+    ) -> VoltageInformation | None:
         """What voltages tell of variances given the traction, None where none are logged."""
         if "voltage" not in self.noise.blocks:
             return None
-        return through_voltage(self.target, z, log_v, felt)
+        return voltage_information(self.target, z, log_v, felt)
 
 
-class Seen(NamedTuple):
+class WeighedResiduals(NamedTuple):
     """Residuals of a problem at given variances, and what runs share.
 
     Attributes:
@@ -202,24 +217,28 @@ class Seen(NamedTuple):
     """
 
     whitening: Whitening
-    tied: tuple[Tie, ...]
+    tied: tuple[EffectPosterior, ...]
     loss: Array
 
 
 @eqx.filter_jit
-def _seen(target: Target, residual: Blocks, log_v: Array, keep: Array, effect: Array) -> Seen:
-    found = variances.whitening(target.blocks, less(target, residual, effect), log_v, keep)
+def _weighed(
+    target: Objective, residual: Blocks, log_v: Array, keep: Array, effect: Array
+) -> WeighedResiduals:
+    found = variances.whitening(
+        target.blocks, without_effects(target, residual, effect), log_v, keep
+    )
     root = found.root["motion"]
-    tied = ties(target.shared, log_v, root)
-    coefs = freed(tied, jnp.einsum("nij,nj->ni", root, residual["motion"]))[
+    tied = effect_posteriors(target.shared, log_v, root)
+    coefs = marginal_residuals(tied, jnp.einsum("nij,nj->ni", root, residual["motion"]))[
         residual["motion"].size :
     ]
     log_det = sum(jnp.sum(jnp.log(jnp.diagonal(tie.factor))) for tie in tied)
-    return Seen(found, tied, found.loss + 0.5 * jnp.sum(coefs**2) + log_det)
+    return WeighedResiduals(found, tied, found.loss + 0.5 * jnp.sum(coefs**2) + log_det)
 
 
 @eqx.filter_jit
-def less(target: Target, residual: Blocks, effect: Array) -> Blocks:
+def without_effects(target: Objective, residual: Blocks, effect: Array) -> Blocks:
     """Residual blocks less effects that runs share (piece, 3)."""
     motion = residual["motion"]
     for of in target.shared:
@@ -229,13 +248,15 @@ def less(target: Target, residual: Blocks, effect: Array) -> Blocks:
 
 
 @eqx.filter_jit
-def effects_of(tied: tuple[Tie, ...], root: Array, motion: Array) -> Array:
+def effects_given(tied: tuple[EffectPosterior, ...], root: Array, motion: Array) -> Array:
     """Conditional mean of the effects that runs share (piece, 3) given residuals of the motion."""
-    return shared_effects(tied, jnp.einsum("nij,nj->ni", root, motion))
+    return mean_effects(tied, jnp.einsum("nij,nj->ni", root, motion))
 
 
 @eqx.filter_jit
-def linear(target: Target, z: Vector, electric: lk.ElectricNoise) -> tuple[Blocks, Blocks, Array]:
+def linear(
+    target: Objective, z: Vector, electric: lk.ElectricNoise
+) -> tuple[Blocks, Blocks, Array]:
     """Residual blocks, their Jacobians, and the traction of every wheel's motor."""
 
     def blocks(x: Array) -> tuple[Blocks, tuple[Blocks, Array]]:
@@ -252,13 +273,13 @@ def linear(target: Target, z: Vector, electric: lk.ElectricNoise) -> tuple[Block
 
 
 @eqx.filter_jit
-def _electric(target: Target, z: Vector, log_v: Vector) -> lk.ElectricNoise:
+def _electric(target: Objective, z: Vector, log_v: Vector) -> lk.ElectricNoise:
     return electric_noise(target.blocks, log_v, target.space.tree(z).motor.resistance)
 
 
 @eqx.filter_jit
 def log_jacobian(
-    target: Target, z: Vector, electric: lk.ElectricNoise, keep: Vector
+    target: Objective, z: Vector, electric: lk.ElectricNoise, keep: Vector
 ) -> tuple[Array, Array]:
     """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
 
@@ -278,7 +299,7 @@ def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
     return lk.with_slope(lambda x: lk.predict(space.tree(x), batch).twist, z)
 
 
-def still_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:
+def fixed_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:
     """Viscous terms held near zero on every floor that was driven at one speed only.
 
     With one speed they cannot be told from creep, and what they take from it is wrong at every

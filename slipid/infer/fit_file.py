@@ -15,14 +15,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.fit.shared import FoundShared, Pace
+from slipid.fit.shared_effects import EffectTable, SpeedAndLoad
 from slipid.infer.result import Channels, Fit
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, Validity, build
 from slipid.parameter import entries
-from slipid.search_space import Choice, Space, put
+from slipid.search_space import Choice, Space, with_values
 from slipid.support.errors import DataError
 from slipid.support.files import Content, checksum, json_text, read_json, write_bytes
 
@@ -213,8 +213,8 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         baselines=content["baselines"],
         current_trend=(content["current_trend"][0], content["current_trend"][1]),
         shared={
-            floor: FoundShared(
-                tuple(Pace(**pace) for pace in paces),
+            floor: EffectTable(
+                tuple(SpeedAndLoad(**pace) for pace in paces),
                 **{name: arrays[f"shared/{floor}/{name}"] for name in _SHARED},
             )
             for floor, paces in content["shared"].items()
@@ -259,5 +259,5 @@ def _robot_of(kept: Content) -> Robot:
     )
     names = kept["surfaces"], kept["loads"], kept["sessions"]
     robot = build(geometry, *names, centre=tuple(kept["centre"]))
-    restored: Robot = put(robot, {e: kept["values"][e.path] for e in entries(robot)})
+    restored: Robot = with_values(robot, {e: kept["values"][e.path] for e in entries(robot)})
     return restored

@@ -18,8 +18,13 @@ from slipid.data.runs import Runs
 from slipid.fit.noise import POOLED
 from slipid.fit.optimise import Optimum
 from slipid.fit.problem import Problem, log_jacobian
-from slipid.fit.shared import FoundShared, Tie, freed, freed_slopes
-from slipid.fit.variances import MOTIONS, Search, Square
+from slipid.fit.shared_effects import (
+    EffectPosterior,
+    EffectTable,
+    marginal_residuals,
+    marginal_slopes,
+)
+from slipid.fit.variances import MOTION_BLOCKS, Search, Square
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.disputed import Dispute, disputes, marked
@@ -27,7 +32,7 @@ from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.profile import Profile, profile
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
 from slipid.model.robot import Robot, Validity
-from slipid.predict.predictive import Contact, contact_of
+from slipid.predict.predictive import ForceBalance, force_balance_of
 from slipid.predict.ranking import Comparison, compared
 from slipid.predict.slip_models import restored
 from slipid.predict.validation import Validation, validation
@@ -119,7 +124,7 @@ class Fit:
     current_trend: tuple[float, float] = (0.0, 0.0)
     mixed: Mapping[str, Any] | None = None
     refused: Mapping[str, Any] | None = None
-    shared: Mapping[str, FoundShared] = field(default_factory=dict)
+    shared: Mapping[str, EffectTable] = field(default_factory=dict)
     extrapolation: Mapping[str, float] = field(default_factory=dict)
     data: Runs | None = None
     problem: Problem | None = None
@@ -262,10 +267,10 @@ class Fit:
         return fit_file.load(Path(folder))
 
     @cached_property
-    def contact(self) -> Contact:
+    def contact(self) -> ForceBalance:
         """The fit as a slip model that predicts runs."""
         shared, extrapolation = self.shared, self.extrapolation
-        return Contact(
+        return ForceBalance(
             self.robot, self.variance, self.covariance, self.space, self.z, shared, extrapolation
         )
 
@@ -359,7 +364,7 @@ def summarise(
         seed: seed of the draws behind the curves' bands.
     """
     z, log_v = optimum.state.z, optimum.state.log_variance
-    contact = contact_of(problem, optimum.state, optimum.covariance, problem.every)
+    contact = force_balance_of(problem, optimum.state, optimum.covariance, problem.every)
     remaining, name = _remaining(problem, optimum)
     settled = remaining < REMAINING
     stuck = f"the solver stopped {remaining:.2g} stds of {name} away from where its own step leads"
@@ -428,7 +433,7 @@ def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
         half = jnp.einsum("nij,njp->nip", root, jacobian[k])
         if k == "motion":
             white, half = _freed(seen.tied, white, half)
-        flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k in MOTIONS else own)
+        flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k in MOTION_BLOCKS else own)
         gradient = gradient + flat.T @ np.asarray(white).ravel()
         info = info + flat.T @ flat
     std = np.sqrt(np.diag(optimum.covariance))
@@ -438,8 +443,8 @@ def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
 
 
 @jax.jit
-def _freed(tied: tuple[Tie, ...], white: Array, half: Array) -> tuple[Array, Array]:
-    return freed(tied, white), freed_slopes(tied, half)
+def _freed(tied: tuple[EffectPosterior, ...], white: Array, half: Array) -> tuple[Array, Array]:
+    return marginal_residuals(tied, white), marginal_slopes(tied, half)
 
 
 def draws(z: Search, covariance: Square, count: int, seed: int) -> Float[np.ndarray, "draw free"]:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from slipid.model.contact_balance import Balance, Stance, stand, total
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Frame
+from slipid.model.geometry import WheelFrame
 from slipid.model.se2 import Columns, Planar, solve3
 
 _CHORD_STEPS = 30
@@ -41,7 +41,7 @@ class ContactProblem(eqx.Module):
     """
 
     rim: Float[Array, " wheel"]
-    frame: Frame
+    frame: WheelFrame
     surface: ContactSurface
     rest: Float[Array, " wheel"]
     start: Float[Array, "3"]
@@ -72,7 +72,7 @@ def _damped(balance: Balance, xi: Planar) -> Planar:
 
 @jax.custom_jvp
 @jax.jit
-def _root(problem: ContactProblem) -> Float[Array, "3"]:
+def _solve(problem: ContactProblem) -> Float[Array, "3"]:
     balance = problem.balance()
 
     def chord(xi: Array, _: None) -> tuple[Array, None]:
@@ -87,7 +87,7 @@ def _root(problem: ContactProblem) -> Float[Array, "3"]:
 
 @jax.custom_jvp
 @jax.jit
-def _root_near(problem: ContactProblem) -> Float[Array, "3"]:
+def _solve_near(problem: ContactProblem) -> Float[Array, "3"]:
     balance = problem.balance()
 
     def far(state: tuple[Array, Array, Array]) -> Array:
@@ -104,18 +104,20 @@ def _root_near(problem: ContactProblem) -> Float[Array, "3"]:
     return jnp.where(jnp.max(jnp.abs(step)) > _NEAR, jnp.nan, xi)
 
 
-One = tuple[ContactProblem]
+OneProblem = tuple[ContactProblem]
 
 
-def _implicit(root: Callable[[ContactProblem], Array]) -> Callable[[One, One], tuple[Array, Array]]:
+def _implicit_derivative(
+    root: Callable[[ContactProblem], Array],
+) -> Callable[[OneProblem, OneProblem], tuple[Array, Array]]:
     """Derivative of a root of the balance by what it depends on."""
 
-    def rule(primals: One, tangents: One) -> tuple[Array, Array]:
+    def rule(primals: OneProblem, tangents: OneProblem) -> tuple[Array, Array]:
         xi = root(*primals)
         return xi, moved(xi, primals, tangents)
 
     @jax.jit
-    def moved(xi: Array, primals: One, tangents: One) -> Array:
+    def moved(xi: Array, primals: OneProblem, tangents: OneProblem) -> Array:
         at = Planar(*xi)
         _, force = jax.jvp(lambda problem: problem.balance().force(at), primals, tangents)
         return -jnp.stack(solve3(primals[0].balance().jacobian(at), force))
@@ -123,11 +125,11 @@ def _implicit(root: Callable[[ContactProblem], Array]) -> Callable[[One, One], t
     return rule
 
 
-_root.defjvp(_implicit(_root))
-_root_near.defjvp(_implicit(_root_near))
+_solve.defjvp(_implicit_derivative(_solve))
+_solve_near.defjvp(_implicit_derivative(_solve_near))
 
 
-def guess(rim: Float[Array, " wheel"], frame: Frame) -> Float[Array, "3"]:
+def initial_twist(rim: Float[Array, " wheel"], frame: WheelFrame) -> Float[Array, "3"]:
     """Start of the root finder: the twist without slip, a little slower (least squares)."""
     j = frame.hold
     m = Columns(*(Planar(*column) for column in j.T @ j + 1e-6 * jnp.eye(3)))
@@ -136,7 +138,7 @@ def guess(rim: Float[Array, " wheel"], frame: Frame) -> Float[Array, "3"]:
 
 def equilibrium(
     rim: Float[Array, " wheel"],
-    frame: Frame,
+    frame: WheelFrame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
     near: Float[Array, "3"] | None = None,
@@ -153,15 +155,15 @@ def equilibrium(
 
     Source: the balance at the head of `slipid.model.contact_law`.
     """
-    start = jax.lax.stop_gradient(guess(rim, frame) if near is None else near)
+    start = jax.lax.stop_gradient(initial_twist(rim, frame) if near is None else near)
     problem = ContactProblem(rim, frame, surface, rest, start)
-    return _root(problem) if near is None else _root_near(problem)
+    return _solve(problem) if near is None else _solve_near(problem)
 
 
 def traction(
     xi: Float[Array, "3"],
     rim: Float[Array, " wheel"],
-    frame: Frame,
+    frame: WheelFrame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
 ) -> Float[Array, " wheel"]:
@@ -169,10 +171,10 @@ def traction(
     return Balance(rim, stand(frame, surface, rest)).felt(Planar(*xi))
 
 
-def rolled(
+def rolling_drag(
     xi: Float[Array, "3"],
     rim: Float[Array, " wheel"],
-    frame: Frame,
+    frame: WheelFrame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
 ) -> Float[Array, " wheel"]:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from slipid.model import contact_law as law
 from slipid.model.contact_law import ContactSurface, WheelForces
-from slipid.model.geometry import Frame
+from slipid.model.geometry import WheelFrame
 from slipid.model.se2 import Columns, Planar, dot, solve3
 
 _LEAST_LOAD = 1e-3
@@ -34,7 +34,7 @@ class Stance(eqx.Module):
         sunk: drag of the rollers of each wheel under an even load.
     """
 
-    frame: Frame
+    frame: WheelFrame
     hold: Planar
     roll: Planar
     shift: Float[Array, "2 wheel *one"]
@@ -45,13 +45,13 @@ class Stance(eqx.Module):
     sunk: Float[Array, "wheel *batch"]
 
 
-def stand(frame: Frame, surface: ContactSurface, rest: Float[Array, " wheel"]) -> Stance:
+def stand(frame: WheelFrame, surface: ContactSurface, rest: Float[Array, " wheel"]) -> Stance:
     """A robot on one floor (leaves are numbers) or on one per wheel (wheel, *batch)."""
     floor, friction = replace(surface, friction=jnp.ones(())), surface.friction
     if jnp.ndim(friction) > 0:
         ones = (1,) * (jnp.ndim(friction) - 1)
         frame, rest = jax.tree.map(lambda a: a.reshape(*a.shape, *ones), (frame, rest))
-    rest = law.seen_load(rest, surface.load_bias)
+    rest = law.apparent_load(rest, surface.load_bias)
     if jnp.ndim(friction) > 0:
         friction = jnp.mean(surface.friction, axis=0)
         floor = replace(
@@ -152,7 +152,7 @@ class Balance(eqx.Module):
     def rolled(self, xi: Planar) -> Float[Array, "wheel *batch"]:
         """Drag of wheels that roll along their drive, if it is that of rollers; motors bear it."""
         _, roll = self._speeds(xi)
-        return self.on.sunk * law.rolled(self.rim, roll, self.on.frame.pull)
+        return self.on.sunk * law.rolling_fraction(self.rim, roll, self.on.frame.pull)
 
     def size(self, force: Planar) -> Float[Array, "*batch"]:
         """Square of a force, its moment over the base radius."""

@@ -223,7 +223,7 @@ def wheel_traction(
     return Friction(slide, onset, floor.creep, 1.0, floor.slide_viscosity, beside)
 
 
-def rolled(rim: Array, roll: Array, pull: Array) -> Array:
+def rolling_fraction(rim: Array, roll: Array, pull: Array) -> Array:
     """Part of a wheel's motion that is along its drive, (r w / c) |r w / c|: how it drags there."""
     along = rim * pull * jax.lax.rsqrt(rim**2 + roll**2 + 1e-12)
     return along * jnp.abs(along)
@@ -244,7 +244,7 @@ def at_load(floor: ContactSurface, relative: Array) -> ContactSurface:
     )
 
 
-def seen_load(rest: Float[Array, "wheel *one"], bias: Array) -> Float[Array, "wheel *batch"]:
+def apparent_load(rest: Float[Array, "wheel *one"], bias: Array) -> Float[Array, "wheel *batch"]:
     """Load shares at rest as floors see them, for their load biases (wheel, *batch) or 0."""
     seen = rest * jnp.exp(bias)
     return seen / sum(seen[1:], start=seen[0])

@@ -66,10 +66,10 @@ class MeasuredWindows:
     unsigned: bool
 
 
-def measured_windows(robot: Robot, data: Runs, per_piece: int) -> MeasuredWindows:
-    """Pieces of at most `per_piece` windows of 1.5 s, beside what the robot predicts."""
+def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWindows:
+    """Return segments of at most `per_segment` windows of 1.5 s, beside what the robot predicts."""
     radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
-    w = windows(data, radius, lag, per_piece=per_piece, longest=1.5)
+    w = windows(data, radius, lag, per_segment=per_segment, longest=1.5)
     b, dt = lk.batch(w, robot), w.dt[..., None]
     shape = robot.geometry
     torque = np.asarray(shape.at_drives(curves.wheel_states(robot, b)[1]))

@@ -16,7 +16,7 @@ from slipid.fit import likelihood as lk
 from slipid.fit import noise as of_noise
 from slipid.fit import variances
 from slipid.fit.problem import Problem, linear
-from slipid.fit.variances import DEGREES, inverse_root, scored, spread_of
+from slipid.fit.variances import DEGREES, fitted_covariance, inverse_root, scoring_step
 from slipid.infer.slip_curves import current_trend
 from slipid.search_space import Choice
 from tests.helpers.dense import of_shared
@@ -81,7 +81,7 @@ def test_the_frame_of_the_world_does_not_matter(truth):
     turned = w.pose.copy()
     turned[..., :2] = w.pose[..., :2] @ np.array([[c, s], [-s, c]]) + [3.0, -2.0]
     turned[..., 2] += 0.7
-    one, two = (lk.measured(truth, jnp.asarray(pose)) for pose in (w.pose, turned))
+    one, two = (lk.measured_increments(truth, jnp.asarray(pose)) for pose in (w.pose, turned))
     np.testing.assert_allclose(one, two, atol=1e-12)
 
 
@@ -149,7 +149,7 @@ def test_log_jacobian_is_the_determinant_of_residuals_by_data(truth):
         pose, one = jnp.asarray(w.pose[k]), only_piece(b, k)
 
         def of_poses(later, first=pose[:1]):
-            return lk.measured(bent, jnp.concatenate([first, later])[None]).ravel()
+            return lk.measured_increments(bent, jnp.concatenate([first, later])[None]).ravel()
 
         def of_volts(volt, one=one):
             still = jnp.zeros((*one.current.shape, 2))
@@ -174,7 +174,9 @@ def test_camera_noise_enters_as_the_poses_do(truth, which, block):
     w = made(truth, std=NOISE)
     base = of_noise.noise(w, truth).blocks["motion"].base[:, which]
     for k in range(0, len(w), 5):
-        g = jax.jacfwd(lambda pose: lk.measured(truth, pose[None])[0])(jnp.asarray(w.pose[k]))
+        g = jax.jacfwd(lambda pose: lk.measured_increments(truth, pose[None])[0])(
+            jnp.asarray(w.pose[k])
+        )
         g = np.asarray(g).reshape(6, 3, 3)
         g = g[..., :2].reshape(6, 6) if block == "place" else g[..., 2]
         # process noise bends the path a little, so that turns differ from those of the poses
@@ -341,7 +343,9 @@ def test_runs_that_are_left_out_change_nothing(truth):
         )
         info = problem.precision(jacobian, log_v, keep)
         at = jnp.asarray(log_v), jnp.asarray(keep)
-        step = scored(problem.target, blocks, spread_of(problem.target, jacobian, *at), *at, None)
+        step = scoring_step(
+            problem.target, blocks, fitted_covariance(problem.target, jacobian, *at), *at, None
+        )
         seen = problem.seen(blocks, log_v, keep, np.zeros((24, 3)))
         results.append((np.asarray(info), np.asarray(step), float(seen.loss)))
     for one, two in zip(*results, strict=True):
@@ -391,7 +395,7 @@ def alternate(problem, jacobian, y, rounds=60):
         spread = np.einsum("nip,pq,njq->nij", jacobian, np.linalg.inv(info), jacobian)
         before = log_v
         told = {"motion": jnp.asarray(spread)}
-        log_v = np.asarray(scored(target, r, told, jnp.asarray(log_v), keep, None))
+        log_v = np.asarray(scoring_step(target, r, told, jnp.asarray(log_v), keep, None))
     assert np.abs(log_v - before).max() < 1e-6
     return log_v
 
@@ -462,7 +466,9 @@ def test_scores_of_variances_have_no_bias_where_degrees_of_freedom_are_given_bac
     def step(residual):
         around = {"motion": jnp.asarray(spread if careful else 0 * spread)}
         seen = {"motion": jnp.asarray(residual)}
-        return np.asarray(scored(target, seen, around, jnp.asarray(log_v), keep, None)) - log_v
+        return (
+            np.asarray(scoring_step(target, seen, around, jnp.asarray(log_v), keep, None)) - log_v
+        )
 
     # what is left of data by the best structural numbers: the covariance, summed over its columns
     flat = jacobian.reshape(480, -1)
@@ -505,9 +511,9 @@ def test_scoring_steps_end_where_the_loss_is_level_in_electric_noise(truth, amme
     blocks, _, felt = linear(target, z, problem.electric(z, log_v))
     certain = {k: jnp.zeros((*r.shape, r.shape[1])) for k, r in blocks.items()}
     for _ in range(60):
-        told = problem.through_voltage(z, log_v, felt)
+        told = problem.voltage_information(z, log_v, felt)
         blocks = blocks | {"voltage": told.residual}
-        log_v = np.asarray(scored(target, blocks, certain, jnp.asarray(log_v), keep, told))
+        log_v = np.asarray(scoring_step(target, blocks, certain, jnp.asarray(log_v), keep, told))
 
     def loss(step):
         electric = problem.electric(z, log_v + step)

@@ -32,9 +32,9 @@ class Rival:
             each, (self.b.surface, self.b.load, self.b.session)
         )
         self.dt = np.asarray(self.b.dt).ravel()
-        self.turn, self.faster, self.amps = (
+        self.turn, self.speed_change, self.amps = (
             np.asarray(x).reshape(-1, x.shape[2])
-            for x in (self.b.turn, self.b.faster, self.b.current)
+            for x in (self.b.turn, self.b.speed_change, self.b.current)
         )
 
     def frame(self, v):
@@ -59,7 +59,7 @@ class Rival:
         """Body twists, and what they came from."""
         hold, roll, pull, shift = self.frame(v)
         late = v["camera", "lag"] - float(self.b.lag)
-        speed = (self.turn - late * self.faster) / self.dt[:, None]
+        speed = (self.turn - late * self.speed_change) / self.dt[:, None]
         rim = v["geometry", "wheel_radius"] * speed
         s = {k[1]: x[self.floor] for k, x in v.items() if k[0] == "surfaces"}
         rest = v["body", "load_share"][self.load] * np.exp(s.pop("load_bias"))

@@ -21,7 +21,7 @@ from slipid.data.log import Log
 from slipid.data.runs import Runs, first_row
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
-from slipid.robot.interface import AbstractEstimator, Estimate, Readings
+from slipid.robot.interface import AbstractEstimator, Readings, StateEstimate
 
 TOGETHER = 32
 """Runs replayed in one call."""
@@ -38,7 +38,7 @@ def heard(estimator: AbstractEstimator, angle: Any, current: Any) -> Readings:
 
 def replay(
     estimator: AbstractEstimator, logs: Sequence[Log], begin: np.ndarray | None = None
-) -> list[Estimate]:
+) -> list[StateEstimate]:
     """Estimates of every row of each run; it starts at rest at a pose (run, 3), or the origin."""
     begin = np.zeros((len(logs), 3)) if begin is None else begin
 

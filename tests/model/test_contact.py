@@ -428,9 +428,9 @@ def test_drag_of_a_wheel_goes_with_that_power_of_its_load(power):
 
 def test_a_load_bias_is_a_load_that_the_floor_alone_sees():
     rest, bias = jnp.array([0.25, 0.3, 0.45]), jnp.array([0.2, -0.3, 0.1])
-    np.testing.assert_array_equal(law.seen_load(rest, jnp.zeros(3)), rest)
-    np.testing.assert_array_equal(law.seen_load(rest, jnp.asarray(0.0)), rest)
-    seen = law.seen_load(rest, bias)
+    np.testing.assert_array_equal(law.apparent_load(rest, jnp.zeros(3)), rest)
+    np.testing.assert_array_equal(law.apparent_load(rest, jnp.asarray(0.0)), rest)
+    seen = law.apparent_load(rest, bias)
     assert float(seen.sum()) == pytest.approx(1.0, abs=1e-15)
     np.testing.assert_allclose(seen / seen[0], rest / rest[0] * np.exp(bias - bias[0]), rtol=1e-14)
     frame, rim = ROBOTINO.frame(), jnp.array([0.1, 0.03, -0.12])
@@ -633,10 +633,10 @@ def test_a_wheel_drags_along_its_drive_as_far_as_it_rolls_that_way():
     frame, floor = ROBOTINO.frame(), FLOORS["gray"]
     xi = jnp.asarray([0.3, -0.1, 0.2])
     rim = frame.hold @ xi
-    found = contact.rolled(xi, rim, frame, floor, jnp.asarray([0.2, 0.5, 0.3]))
+    found = contact.rolling_drag(xi, rim, frame, floor, jnp.asarray([0.2, 0.5, 0.3]))
     share = np.asarray(rim) / np.hypot(np.asarray(rim), np.asarray(frame.roll @ xi))
     np.testing.assert_allclose(found, 0.31 / 3 * share * np.abs(share), rtol=1e-6)
-    back = contact.rolled(-xi, -rim, frame, floor, EVEN)
+    back = contact.rolling_drag(-xi, -rim, frame, floor, EVEN)
     np.testing.assert_allclose(back, -found, rtol=1e-6)
 
 
@@ -644,4 +644,4 @@ def test_only_wheels_with_rollers_drag_along_their_drive_as_rollers_do():
     xi = jnp.asarray([0.3, 0.0, 0.2])
     rim = SKID.forward() @ xi
     rest = jnp.full(4, 0.25)
-    assert not np.any(contact.rolled(xi, rim, SKID.frame(), FLOORS["gray"], rest))
+    assert not np.any(contact.rolling_drag(xi, rim, SKID.frame(), FLOORS["gray"], rest))

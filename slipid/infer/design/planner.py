@@ -14,8 +14,8 @@ from slipid.data.windows import Windows
 from slipid.fit import likelihood as lk
 from slipid.fit.noise import effects
 from slipid.fit.problem import Problem
-from slipid.fit.sessions import by_axis
-from slipid.fit.shared import AXES
+from slipid.fit.session_effects import by_axis
+from slipid.fit.shared_effects import AXES
 from slipid.fit.variances import whitened
 from slipid.infer.design.fisher import Information, RunJacobians, information_of
 from slipid.infer.design.planned_runs import SESSION, PlannedRun, Setup, steady_windows

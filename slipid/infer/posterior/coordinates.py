@@ -10,8 +10,8 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float, Int
 
 from slipid.fit import likelihood as lk
-from slipid.fit.problem import Problem, effects_of, twists
-from slipid.fit.shared import FloorShared, Tie
+from slipid.fit.problem import Problem, effects_given, twists
+from slipid.fit.shared_effects import EffectPosterior, SharedEffects
 from slipid.fit.variances import DEGREES, Blocks, Square, Vector, expected, inverse_root
 from slipid.infer.result import Fit, required
 from slipid.model.robot import Robot
@@ -88,7 +88,7 @@ def effects_at(problem: Problem, residual: Blocks, log_v: Vector) -> Float[np.nd
     for _ in range(_TURNS):
         seen = problem.seen(residual, log_v, keep, effect)
         root = seen.whitening.root["motion"]
-        effect = np.asarray(effects_of(seen.tied, root, residual["motion"]))
+        effect = np.asarray(effects_given(seen.tied, root, residual["motion"]))
     return effect
 
 
@@ -112,8 +112,8 @@ class Anchor(eqx.Module):
     root: dict[str, Array]
     scale: dict[str, Array]
     log_det: dict[str, Array]
-    shared: tuple[FloorShared, ...]
-    tied: tuple[Tie, ...]
+    shared: tuple[SharedEffects, ...]
+    tied: tuple[EffectPosterior, ...]
     twist: Float[Array, "piece window 3"]
     twist_slope: Float[Array, "piece window 3 free"]
     electric: lk.ElectricNoise

@@ -6,8 +6,8 @@ least squares,
 
     log p(x | data) = -1/2 |y(x)|^2 - 1/2 |(x - mean) / std|^2 + f log |d residuals / d data|
 
-with |y|^2 that of `slipid.fit.shared.freed`, and f what a Student t tells of its centre
-over what a Gaussian does, as it is in y. Floors share some coordinates and have the
+with |y|^2 that of `slipid.fit.shared_effects.marginal_residuals`, and f what a Student t tells of
+its centre over what a Gaussian does, as it is in y. Floors share some coordinates and have the
 others to themselves, so that the log posterior is a sum
 
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
@@ -34,7 +34,7 @@ from jaxtyping import Array, Float
 
 from slipid.fit import likelihood as lk
 from slipid.fit.problem import Problem
-from slipid.fit.shared import Tie, shared_effects
+from slipid.fit.shared_effects import EffectPosterior, mean_effects
 from slipid.fit.variances import Square, expected
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Coordinates, Fitted
 from slipid.model.robot import Robot
@@ -181,7 +181,7 @@ class Density:
         if "motion" not in seen.residuals:
             return seen
         motion = seen.residuals["motion"]
-        effect = shared_effects(anchor.tied, anchor.white("motion", motion))
+        effect = mean_effects(anchor.tied, anchor.white("motion", motion))
         for of in anchor.shared:
             off = jnp.einsum("nma,na->nm", of.effect, effect[of.pieces])
             motion = motion.at[of.pieces].add(-off)
@@ -213,7 +213,7 @@ class Density:
         return HeldMotion(z, anchor.predict(self.problem.space.tree(z), z).felt)
 
 
-def _explained(tie: Tie, white: Float[Array, "piece m"]) -> Array:
+def _explained(tie: EffectPosterior, white: Float[Array, "piece m"]) -> Array:
     """How much smaller |y|^2 is than that of whitened residuals, by shared effects of a floor."""
     told = jnp.einsum("nma,nm->an", tie.span, white[tie.pieces])
     along = jnp.einsum("anq,an->aq", tie.root, told).ravel()

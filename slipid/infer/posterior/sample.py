@@ -156,7 +156,7 @@ def drawn_variances(
     log_v, keep = fitted.log_variance, np.ones(len(problem.windows))
     electric = problem.electric(fitted.z, log_v)
     residual, jacobian, felt = linear(problem.target, fitted.z, electric)
-    through = problem.through_voltage(fitted.z, log_v, felt)
+    through = problem.voltage_information(fitted.z, log_v, felt)
     effect = effects_at(problem, residual, log_v)
     weight = problem.seen(residual, log_v, keep, effect).whitening.weight["motion"]
     motion = residual["motion"], jacobian["motion"]
@@ -274,7 +274,9 @@ def _data(
     """
     w = problem.windows
     middle = problem.space.tree(jnp.asarray(found.z.mean(axis=(0, 1))))
-    measured = {"increment": np.asarray(jax.jit(lk.measured)(middle, problem.batch.pose))}
+    measured = {
+        "increment": np.asarray(jax.jit(lk.measured_increments)(middle, problem.batch.pose))
+    }
     dims = {"increment": ["piece", "window", "direction"]}
     gaps = {"increment": new["motion"]}
     if w.has_current:

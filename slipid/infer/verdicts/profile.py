@@ -22,8 +22,8 @@ from scipy.interpolate import PchipInterpolator
 from scipy.stats import chi2
 
 from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, State
-from slipid.fit.variances import MOTIONS
+from slipid.fit.problem import FitState, Problem
+from slipid.fit.variances import MOTION_BLOCKS
 from slipid.infer.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.parameter import Entry
 from slipid.search_space import Space
@@ -176,12 +176,12 @@ class _Refits:
         self.electric = problem.electric(optimum.state.z, optimum.state.log_variance)
         self.lowest = self.loss(optimum.state)
 
-    def loss(self, state: State) -> float:
+    def loss(self, state: FitState) -> float:
         """Return minus the log posterior at fixed noise, of the motion alone for its numbers."""
         problem, log_v = self.problem, state.log_variance
         blocks, _ = problem.linear(jnp.asarray(state.z), self.electric)
         if self.of_motion:
-            blocks = {k: r for k, r in blocks.items() if k in MOTIONS}
+            blocks = {k: r for k, r in blocks.items() if k in MOTION_BLOCKS}
         keep = problem.every
         moving = problem.target.joint or self.of_motion
         effect = (state if moving else self.fitted).shared(len(problem.windows))

@@ -17,7 +17,7 @@ from slipid.fit import likelihood as lk
 from slipid.fit import noise as of_noise
 from slipid.fit.noise import POOLED
 from slipid.fit.problem import Problem
-from slipid.fit.shared import AXES
+from slipid.fit.shared_effects import AXES
 from slipid.fit.variances import DEGREES
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.infer.posterior.density import Density
