@@ -55,7 +55,7 @@ def disputes(space: Space, z: Search, covariance: Square) -> tuple[Dispute, ...]
 
     The space has the prior that biases were found to have (`Space.with_pooled`).
     """
-    bias = {e.surface: space.place[e.path] for e in space.free if e.declaration.deviation}
+    bias = {e.surface: space.slices[e.path] for e in space.free if e.declaration.deviation}
     if len(bias) < 2:
         return ()
     at = np.concatenate([np.arange(p.start, p.stop) for p in bias.values()])
