@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from slipid.app import logs as of_config
-from slipid.app.config import Config, Motor
+from slipid.app.config import BenchMotors, Config
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
 from slipid.data.reading.checks import MIN_ROWS
@@ -34,7 +34,7 @@ from slipid.support.progress import Reporter
 
 
 @dataclass(frozen=True, eq=False)
-class BenchJob:
+class BenchTask:
     """Records of every motor by its label ("" of a single one), and what is wanted of its numbers.
 
     `skipped` and `taken` are lines for people; `units_said`: the unit of the current is not
@@ -59,7 +59,7 @@ class BenchJob:
         return bench_fit(fits)
 
 
-def read_bench_job(config: Config, root: Path, report: Reporter) -> BenchJob:
+def read_bench_task(config: Config, root: Path, report: Reporter) -> BenchTask:
     """Every log of the motors that a config names; DataError where config or logs are wrong."""
     report.stage("reading logs")
     if not root.is_dir():
@@ -78,7 +78,7 @@ def read_bench_job(config: Config, root: Path, report: Reporter) -> BenchJob:
     if len(counts) > 1:
         raise DataError(f"{config.path}: logs of {min(counts)} and of {max(counts)} motors")
     robot = config.content.robot
-    names = robot.names if isinstance(robot, Motor) else []
+    names = robot.names if isinstance(robot, BenchMotors) else []
     labels = _labels(names, counts.pop(), str(config.path))
     parts, left = _with_voltage(parts)
     records = {label: tuple(p[k] for p in parts) for k, label in enumerate(labels)}
@@ -89,12 +89,12 @@ def read_bench_job(config: Config, root: Path, report: Reporter) -> BenchJob:
     said = any(
         fnmatch.fnmatch("motor.resistance", c.pattern) for cs in choices.values() for c in cs
     )
-    return BenchJob(records, choices, lines, (), said)
+    return BenchTask(records, choices, lines, (), said)
 
 
-def read_one(
+def read_motor_log(
     path: Path, given: Mapping[str, GivenColumns], delimiter: str | None, signed: bool
-) -> BenchJob:
+) -> BenchTask:
     """Motors of a single file, with given columns, the others by their names."""
     layout = motor_layout(format_of(path, delimiter), given, signed)
     logs = counted_once(read_logs(path, layout, path.parent, None, "bench").logs)
@@ -107,7 +107,7 @@ def read_one(
         for channel, c in layout.channels.items()
     )
     said = "current" in given and given["current"].unit is not None
-    return BenchJob(records, dict.fromkeys(labels, ()), (), taken, said)
+    return BenchTask(records, dict.fromkeys(labels, ()), (), taken, said)
 
 
 def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
@@ -198,8 +198,8 @@ def identify_bench(
 ) -> tuple[BenchFit, tuple[str, ...]]:
     """Fit the motors of a config and write identified.json; names of the files."""
     began = time.monotonic()
-    job = read_bench_job(config, data, report)
-    fit = job.fit(report)
+    task = read_bench_task(config, data, report)
+    fit = task.fit(report)
     writable(out)
     content = fit.to_json()
     write_json(out / "identified.json", content)
@@ -212,8 +212,8 @@ def identify_bench(
         "data": {
             "folder": str(data),
             "hash": content["data"]["hash"],
-            "logs": {r.name: r.sha256 for rs in job.records.values() for r in rs},
-            "skipped": job.skipped,
+            "logs": {r.name: r.sha256 for rs in task.records.values() for r in rs},
+            "skipped": task.skipped,
         },
         "versions": versions(),
     }
@@ -228,14 +228,14 @@ def check_bench(
 
     A fit of a motor takes less than a second: its verdicts are given, and not its numbers.
     """
-    job = read_bench_job(config, data, report)
-    fit = job.fit(report)
+    task = read_bench_task(config, data, report)
+    fit = task.fit(report)
     content: Content = {
         "schema": "slipid.check/1",
         "drive": "motor",
         "logs": [
-            _seen(f"{r.name}@{label}" if label else r.name, r)
-            for label, rs in job.records.items()
+            _record_summary(f"{r.name}@{label}" if label else r.name, r)
+            for label, rs in task.records.items()
             for r in rs
         ],
         "parameters": {
@@ -243,14 +243,14 @@ def check_bench(
             for path, e in fit.parameters.items()
         },
         "messages": list(fit.messages),
-        "skipped": list(job.skipped),
+        "skipped": list(task.skipped),
     }
     if out is not None:
         write_json(out / "check.json", content)
     return fit, content
 
 
-def _seen(name: str, r: BenchRecord) -> Content:
+def _record_summary(name: str, r: BenchRecord) -> Content:
     """What one log holds of one motor."""
 
     def span(x: np.ndarray | None) -> list[float] | None:

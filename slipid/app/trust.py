@@ -21,7 +21,7 @@ MOST_RUNS = 24
 
 
 @dataclass(frozen=True)
-class Judgement:
+class TrustReport:
     """A verdict and the errors it rests on.
 
     Attributes:
@@ -53,7 +53,7 @@ class Judgement:
         }
 
 
-def judgement(fit: Fit, data: Runs) -> Judgement:
+def trust_report(fit: Fit, data: Runs) -> TrustReport:
     """Verdict on a fit by the runs it was made of, replayed from their first pose on."""
     some = data.subset(_picked(data))
     runs: dict[int, ScoredRun] = {}
@@ -73,7 +73,7 @@ def judgement(fit: Fit, data: Runs) -> Judgement:
         name: EndPoints(*np.mean(each, axis=0).tolist()) for name, each in sorted(errors.items())
     }
     trust = verdict_of_trust(floors, fit.converged, fit.parameters.values())
-    return Judgement(trust, floors, len(runs))
+    return TrustReport(trust, floors, len(runs))
 
 
 def _picked(data: Runs) -> list[int]:

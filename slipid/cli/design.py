@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, on_wheels
+from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.infer.design.proposal import Design
 
 
-@on_wheels
+@for_robots
 def design(
     out: OutFolder,
     parameter: Annotated[

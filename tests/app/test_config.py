@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slipid.app.config import geometry, read_config
-from slipid.app.problem import read_job
+from slipid.app.problem import read_fit_task
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import generic_text, robotino_text, write_good
 from tests.helpers.said import KeptMessages
@@ -148,7 +148,7 @@ def test_absent_and_unreadable_files(tmp_path):
 
 
 def job_of(folder: Path, text: str, said: KeptMessages | None = None):
-    return read_job(read_config(written(folder, text)), folder, said or KeptMessages())
+    return read_fit_task(read_config(written(folder, text)), folder, said or KeptMessages())
 
 
 def test_a_job_reads_floors_from_folders_and_takes_the_mass(tmp_path):

@@ -18,7 +18,7 @@ import pytest
 from scipy.special import gammaln
 
 from slipid.app.config import read_config
-from slipid.app.problem import read_job
+from slipid.app.problem import read_fit_task
 from slipid.fit.optimise import Optimum, optimise
 from slipid.fit.problem import Problem, without_effects
 from slipid.predict import open_loop
@@ -56,7 +56,7 @@ def test_degrees(degrees: float, real_data: Path, monkeypatch: pytest.MonkeyPatc
         if name.startswith("slipid.") and name != OWN and hasattr(module, "DEGREES"):
             monkeypatch.setattr(module, "DEGREES", degrees)
     jax.clear_caches()  # compiled functions have the degrees in them
-    job = read_job(read_config(CONFIG), real_data / "robotino2022", Reporter())
+    job = read_fit_task(read_config(CONFIG), real_data / "robotino2022", Reporter())
     problem, data = job.problem(), job.dataset
     end = optimise(problem)
     found = likelihood(problem, end, degrees)

@@ -131,7 +131,7 @@ def driven(robot, row, path, steps=STEPS):
     from slipid.deploy.floors import floor_of
     from slipid.deploy.twin_run import starts, twin_floor
     from slipid.lab.trial.controllers import ROWS as TRIAL
-    from slipid.lab.trial.plants import one_of
+    from slipid.lab.trial.plants import drawn_robot
     from slipid.robot.closed_loop import PERIOD, ClosedLoopRun, ControlLoop, path_metrics
     from slipid.robot.filter.floor import Floor
     from slipid.robot.interface import Settings
@@ -161,7 +161,7 @@ def driven(robot, row, path, steps=STEPS):
     ground = twin_floor(robot)
     floor, seeds = floor_of(ground, robot.labels), range(SEED, SEED + STARTS)
     stack = partial(jax.tree.map, lambda *x: jnp.stack(x))
-    truths = stack(*[one_of(robot, seed) for seed in seeds])
+    truths = stack(*[drawn_robot(robot, seed) for seed in seeds])
     believed = stack(*[floor_of(flawed(ground, row.flaw, s), robot.labels) for s in seeds])
     places = starts(STARTS, ground, path)
     paths = [path.moved(place).waiting(1.0) for place in places]

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from slipid.app.config import read_config
 from slipid.app.logs import packaged_config
-from slipid.app.problem import read_job, with_mixed
+from slipid.app.problem import read_fit_task, with_mixed
 from slipid.cli.main import app
 from slipid.data.floor_map import from_polygons, uniform
 from slipid.data.runs import collect
@@ -29,7 +29,7 @@ from slipid.fit.optimise import optimise
 from slipid.fit.problem import Problem
 from slipid.fit.variances import _cut, whitened
 from slipid.infer.fit_file import load
-from slipid.lab.selftest.logs import Sensors, grid, make_logs, truth
+from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.model import se2
 from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.search_space import Choice
@@ -288,9 +288,11 @@ def test_wheels_stand_where_the_camera_says_less_the_marker():
 
 @pytest.fixture(scope="module")
 def driven():
-    drives = grid(setups=(("soft", "as_built"), ("firm", "as_built")), headings=2, turns=0)
-    true = truth(drives)
-    logs = [replace(log, surface=None) for log in make_logs(true, drives, 1, Sensors())]
+    drives = heading_grid(setups=(("soft", "as_built"), ("firm", "as_built")), headings=2, turns=0)
+    true = true_robot(drives)
+    logs = [
+        replace(log, surface=None) for log in simulate_logs(true, drives, 1, SimulatedSensors())
+    ]
     return true, collect(logs)
 
 
@@ -368,7 +370,7 @@ def folder(tmp_path):
 
 def mixed_job(folder: Path, text: str, said=None):
     said = said or KeptMessages()
-    return with_mixed(read_job(read_config(written(folder, text)), folder, said), folder, said)
+    return with_mixed(read_fit_task(read_config(written(folder, text)), folder, said), folder, said)
 
 
 def test_runs_with_a_map_are_kept_apart(folder):
@@ -428,10 +430,17 @@ def invoke(*words):
 
 @pytest.mark.slow
 def test_identify_learns_from_them_and_later_commands_know(tmp_path):
-    drives = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
-    true = truth(drives)
-    write_logs(make_logs(true, drives, 1, Sensors()), true, tmp_path / "logs", tmp_path / "t")
-    write_logs(make_logs(true, drives[:4], 2, Sensors()), true, tmp_path / "site", tmp_path / "t")
+    drives = heading_grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
+    true = true_robot(drives)
+    write_logs(
+        simulate_logs(true, drives, 1, SimulatedSensors()), true, tmp_path / "logs", tmp_path / "t"
+    )
+    write_logs(
+        simulate_logs(true, drives[:4], 2, SimulatedSensors()),
+        true,
+        tmp_path / "site",
+        tmp_path / "t",
+    )
     (tmp_path / "site/as_built/soft").rename(tmp_path / "logs/site")
     (tmp_path / "site.toml").write_text(MAP.replace("gray", "soft"), encoding="utf-8")
     section = '[[logs]]\nglob = "site/*.csv"\nformat = "demo"\nmap = "site.toml"\n[parameters]'
@@ -493,13 +502,17 @@ def deployed(out):
 @pytest.mark.nightly
 def test_runs_with_a_wrong_map_are_refused(tmp_path):
     """They were driven on `soft`, and their map says `firm`."""
-    drives = grid(
+    drives = heading_grid(
         setups=(("soft", "as_built"), ("firm", "as_built")), headings=6, speeds=(0.1, 0.3), turns=0
     )
-    true = truth(drives)
-    write_logs(make_logs(true, drives, 1, Sensors()), true, tmp_path / "logs", tmp_path / "t")
+    true = true_robot(drives)
+    write_logs(
+        simulate_logs(true, drives, 1, SimulatedSensors()), true, tmp_path / "logs", tmp_path / "t"
+    )
     soft = [d for d in drives if d.surface == "soft"]
-    write_logs(make_logs(true, soft, 2, Sensors()), true, tmp_path / "site", tmp_path / "t")
+    write_logs(
+        simulate_logs(true, soft, 2, SimulatedSensors()), true, tmp_path / "site", tmp_path / "t"
+    )
     (tmp_path / "site/as_built/soft").rename(tmp_path / "logs/site")
     (tmp_path / "site.toml").write_text(MAP.replace("gray", "firm"), encoding="utf-8")
     section = '[[logs]]\nglob = "site/*.csv"\nformat = "demo"\nmap = "site.toml"\n[parameters]'

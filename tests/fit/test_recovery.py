@@ -10,7 +10,7 @@ from slipid.data.windows import windows
 from slipid.fit.optimise import optimise
 from slipid.fit.problem import FitState, linear
 from slipid.infer.result import summarise
-from slipid.lab.selftest.logs import blank, truth
+from slipid.lab.selftest.logs import nominal_robot, true_robot
 from tests.helpers import recovery
 
 SEEDS = (0, 1, 2)
@@ -146,7 +146,7 @@ def test_windows_of_one_shape_share_what_is_compiled():
 
 
 def test_blank_robot_knows_names_and_no_numbers():
-    a, b = blank(recovery.PLAN), truth(recovery.PLAN)
+    a, b = nominal_robot(recovery.PLAN), true_robot(recovery.PLAN)
     assert a.surfaces.labels == b.surfaces.labels == ("firm", "soft")
     assert a.body.loads == ("as_built", "moved")
     assert float(a.motor.resistance) != pytest.approx(5.5)

@@ -15,7 +15,7 @@ import numpy as np
 
 from slipid.fit.optimise import optimise
 from slipid.fit.problem import FitState, Problem
-from slipid.lab.selftest.replicates import measure
+from slipid.lab.selftest.replicates import simulate_windows
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
@@ -83,7 +83,7 @@ def experiment(seed: int, ammeter: float, signed: bool = True) -> Problem:
     """Windows of a made experiment, with so much noise of a window's mean current [A]."""
     common, rng = problem(signed), np.random.default_rng(seed)
     driven = replace(common.windows, current_var=np.full_like(common.windows.current, ammeter**2))
-    return common.of(measure(truth(), driven, rng, STD))
+    return common.of(simulate_windows(truth(), driven, rng, STD))
 
 
 def fitted(this: Problem) -> Found:

@@ -11,7 +11,7 @@ import pytest
 
 from slipid.app.config import read_config
 from slipid.app.logs import read_dataset
-from slipid.app.problem import read_job
+from slipid.app.problem import read_fit_task
 from slipid.fit import likelihood as lk
 from slipid.fit.optimise import optimise
 from slipid.infer.result import summarise
@@ -43,7 +43,7 @@ def test_radii_from_joystick_runs_predict_squares_and_circles(real_data):
     if not root.is_dir():
         pytest.skip(f"no logs of the second robot: {root} is no folder")
     config = read_config(CONFIG)
-    job = read_job(config, root, Reporter(quiet=True))
+    job = read_fit_task(config, root, Reporter(quiet=True))
     problem = job.problem()
     fit = summarise(problem, optimise(problem), job.dataset, job.choices)
     assert fit.converged

@@ -22,7 +22,7 @@ from slipid.fit.problem import Problem
 from slipid.fit.session_effects import LinearModel, with_session_effects
 from slipid.fit.variances import DEGREES
 from slipid.infer.design.planned_runs import PlannedRun
-from slipid.lab.selftest.logs import Sensors, grid, make_logs, truth
+from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.predict import open_loop as replay
 from slipid.predict.fitted_slip_model import fit_with_noise, slopes
 from slipid.predict.folds import folds_of, nested
@@ -305,17 +305,19 @@ def test_a_curve_carries_over_where_floors_share_it_and_nowhere_else(other):
 
 # folds, checkpoints, command --------------------------------------------------------------------
 
-PLAN = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
+PLAN = heading_grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
 
 
 @pytest.fixture(scope="module")
 def logs():
-    return make_logs(truth(PLAN), PLAN, 1, Sensors())
+    return simulate_logs(true_robot(PLAN), PLAN, 1, SimulatedSensors())
 
 
 @pytest.mark.slow
 def test_a_turn_on_the_spot_has_no_speed_to_leave_out(logs):
-    spin = make_logs(truth(PLAN), [PlannedRun("soft", "as_built", 0.0, 0.0, 0.5)], 1, Sensors())
+    spin = simulate_logs(
+        true_robot(PLAN), [PlannedRun("soft", "as_built", 0.0, 0.0, 0.5)], 1, SimulatedSensors()
+    )
     fold = folds_of(collect([*logs, *spin]), "speeds")
     assert sorted(set(fold[:-1])) == [0, 1]
     assert fold[-1] == -1
@@ -378,7 +380,7 @@ def test_a_fold_is_kept_whole_and_only_for_the_job_it_is_of(tmp_path):
 
 @pytest.mark.slow
 def test_compare_goes_on_where_it_was_and_ends_the_same(tmp_path, logs):
-    write_logs(logs, truth(PLAN), tmp_path / "logs", tmp_path / "truth")
+    write_logs(logs, true_robot(PLAN), tmp_path / "logs", tmp_path / "true_robot")
     (tmp_path / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
     out = tmp_path / "out"
     words = ("compare", tmp_path / "my.toml", "--data", tmp_path / "logs", "--out", out)

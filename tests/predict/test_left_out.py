@@ -7,16 +7,22 @@ import numpy as np
 import pytest
 
 from slipid.app.config import FitSection
-from slipid.app.problem import Task, on_runs
+from slipid.app.problem import FitTask, robot_for_runs
 from slipid.data.runs import collect
 from slipid.fit.optimise import optimise
-from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.lab.selftest.logs import (
+    SimulatedSensors,
+    heading_grid,
+    nominal_robot,
+    simulate_logs,
+    true_robot,
+)
 from slipid.predict import folds, predictive
 from slipid.predict import open_loop as replay
 from slipid.predict.fitted_slip_model import FittedSlipModel
 from slipid.search_space import Choice
 
-PLAN = grid(
+PLAN = heading_grid(
     setups=(("firm", "as_built"), ("soft", "as_built")), headings=6, speeds=(0.1, 0.2), turns=0
 )
 QUESTION = "sectors"
@@ -45,14 +51,14 @@ def garbage(log, rng):
 
 def task_of(logs):
     data = collect(logs)
-    robot = on_runs(blank(PLAN), data, (0.0, 0.0))
-    return Task(data, robot, CHOICES, FitSection(windows_per_piece=3))
+    robot = robot_for_runs(nominal_robot(PLAN), data, (0.0, 0.0))
+    return FitTask(data, robot, CHOICES, FitSection(windows_per_piece=3))
 
 
 @pytest.fixture(scope="module")
 def logs():
     """Runs of which those of one speed look longer than those of the other."""
-    made = make_logs(truth(PLAN), PLAN, 1, Sensors())
+    made = simulate_logs(true_robot(PLAN), PLAN, 1, SimulatedSensors())
     longer = [1.0 + 0.03 * np.sign(d.speed - 0.15) for d in PLAN]
     return [replace(log, pose=log.pose * [k, k, 1.0]) for log, k in zip(made, longer, strict=True)]
 

@@ -83,7 +83,7 @@ class RectangleTask:
         plant = "testsite" if find_spec("mujoco") is not None else "twin"
         asked = [name for name in CONTROLLERS if not self.wish.only or name in self.wish.only]
         try:
-            wish = trial.Wish(plant, controllers=tuple(asked), starts=STARTS)
+            wish = trial.TrialOptions(plant, controllers=tuple(asked), starts=STARTS)
             return trial.trial(self.folder, wish, executor, report).content
         except Exception as error:  # all else is written all the same
             return {"failed": FoldScore.of_error(error).absent}

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.app.problem import Job
+from slipid.app.problem import ConfigFitTask
 from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
 from slipid.deploy.deploy import robot_of_force_balance
@@ -57,7 +57,7 @@ class SlipidFit:
     """
 
     contact: ForceBalance
-    job: Job
+    job: ConfigFitTask
     seen: tuple[int, ...]
     highest_speed: float
     trend: tuple[float, float]
@@ -78,7 +78,9 @@ class SlipidFit:
         )
 
 
-def fit_slipid(job: Job, problem: Problem, fitted: np.ndarray, kept: Checkpoint) -> SlipidFit:
+def fit_slipid(
+    job: ConfigFitTask, problem: Problem, fitted: np.ndarray, kept: Checkpoint
+) -> SlipidFit:
     """The force balance fitted to some runs of a job.
 
     What was kept of this very fit is not done again. Fits of one `job.problem()` share what was

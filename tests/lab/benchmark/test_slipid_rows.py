@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from slipid.api.runs import made_runs
+from slipid.api.runs import simulate_runs
 from slipid.fit.variances import DEGREES
 from slipid.lab.benchmark import slipid_rows
 from slipid.lab.benchmark.slipid_rows import (
@@ -25,7 +25,7 @@ from tests.helpers.small_twin import deployed
 
 @pytest.fixture(scope="module")
 def made():
-    return made_runs(("firm", "soft"), headings=3, turns=0, seed=3)
+    return simulate_runs(("firm", "soft"), headings=3, turns=0, seed=3)
 
 
 def own_of(made, current=True) -> SlipidFit:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.api.runs import made_runs, move
+from slipid.api.runs import simulate_runs, steady_motion
 from slipid.data.runs import collect
 from slipid.lab.benchmark.slipid_rows import turned_covariance
 from slipid.lab.benchmark.steps import run_batches
@@ -14,7 +14,7 @@ from slipid.predict.slip_model import relative_to_start
 
 @pytest.fixture(scope="module")
 def made():
-    return made_runs(("firm", "soft"), headings=4, turns=0, seed=3)
+    return simulate_runs(("firm", "soft"), headings=4, turns=0, seed=3)
 
 
 def test_every_run_is_there_once_in_equally_many_steps(made):
@@ -34,7 +34,7 @@ def test_it_moves_as_the_robot_that_drove_it(made):
             assert run.signals.floor is None
             steady = run.signals.speed[len(run.signals) // 2 :].mean(axis=0)
             command = steady * 0.04 @ np.asarray(made.robot.geometry.pseudo_inverse()).T
-            expected = move(made.robot, str(log.surface), command[None]).twist[0]
+            expected = steady_motion(made.robot, str(log.surface), command[None]).twist[0]
             found = run.twist[len(run.signals) // 2 :].mean(axis=0)
             assert found[:2] == pytest.approx(expected[:2], abs=0.015)
 
