@@ -165,7 +165,7 @@ def _steady(
         way, stands = jnp.sign(speed), jnp.abs(speed) < 1e-6
         xi = twist(robot, frame, speed, floor, load)
         torque = wheel_torque(robot, frame, xi, speed, floor, load)
-        rim = jnp.where(stands, jnp.nan, frame.radius * frame.pull * speed)
+        rim = jnp.where(stands, jnp.nan, frame.radius * frame.drive_share * speed)
         current = motor_current(robot, frame, xi, driven, floor, load) * jnp.sign(driven)
         return xi, speed, 1 - frame.hold @ xi / rim, torque * way, current
 

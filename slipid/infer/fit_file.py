@@ -176,7 +176,10 @@ def to_json(fit: Fit) -> Content:
         | ({} if fit.mixed is None else {"mixed": dict(fit.mixed)})
         | ({} if fit.refused is None else {"refused": dict(fit.refused)}),
         "current_trend": list(fit.current_trend),
-        "shared": {floor: [asdict(p) for p in found.paces] for floor, found in fit.shared.items()},
+        "shared": {
+            floor: [asdict(p) for p in found.speeds_and_loads]
+            for floor, found in fit.shared.items()
+        },
         "extrapolation": dict(fit.extrapolation),
         "baselines": dict(fit.baselines),
         "data": {"hash": fit.data_hash, "runs": [list(r) for r in fit.runs]},

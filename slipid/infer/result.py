@@ -364,7 +364,7 @@ def summarise(
         seed: seed of the draws behind the curves' bands.
     """
     z, log_v = optimum.state.z, optimum.state.log_variance
-    contact = force_balance_of(problem, optimum.state, optimum.covariance, problem.every)
+    contact = force_balance_of(problem, optimum.state, optimum.covariance, problem.full_weight)
     remaining, name = _remaining(problem, optimum)
     settled = remaining < REMAINING
     stuck = f"the solver stopped {remaining:.2g} stds of {name} away from where its own step leads"
@@ -376,13 +376,13 @@ def summarise(
         choices=tuple(choices),
         z=np.asarray(z),
         covariance=contact.covariance,
-        laplace=problem.laplace(z, log_v, problem.every, alone=True),
+        laplace=problem.laplace(z, log_v, problem.full_weight, alone=True),
         shared=contact.shared,
         extrapolation=contact.extrapolation,
         variance=contact.variance,
         variance_unit={name: unit[name] for name in contact.variance},
         runs=tuple((log.name, log.sha256) for log in data.logs)
-        + (() if problem.several is None else problem.several.runs),
+        + (() if problem.multi_floor is None else problem.multi_floor.runs),
         channels=Channels(
             current=bool(windows.has_current),
             voltage=bool(windows.has_voltage),
@@ -417,22 +417,22 @@ def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
     the slope of log |d residuals / d data|; where currents were logged, their rows move the
     electric numbers only.
     """
-    state, every = optimum.state, problem.every
+    state, every = optimum.state, problem.full_weight
     z, log_v = state.z, state.log_variance
     electric = problem.electric(z, log_v)
     residual, jacobian = problem.linear(z, electric)
-    seen = problem.seen(residual, log_v, every, state.shared(len(problem.windows)))
+    seen = problem.weighed(residual, log_v, every, state.shared(len(problem.windows)))
     roots = seen.whitening.root
     own = problem.space.electric.astype(float)
-    prior = np.asarray(problem.target.prior_std(log_v)) ** -2
-    _, slope = log_jacobian(problem.target, z, electric, every)
+    prior = np.asarray(problem.objective.prior_std(log_v)) ** -2
+    _, slope = log_jacobian(problem.objective, z, electric, every)
     gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
     info = np.diag(prior)
     for k, root in roots.items():
         white = jnp.einsum("nij,nj->ni", root, residual[k])
         half = jnp.einsum("nij,njp->nip", root, jacobian[k])
         if k == "motion":
-            white, half = _freed(seen.tied, white, half)
+            white, half = _freed(seen.effects, white, half)
         flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k in MOTION_BLOCKS else own)
         gradient = gradient + flat.T @ np.asarray(white).ravel()
         info = info + flat.T @ flat

@@ -65,7 +65,7 @@ def wheel_states(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
         rim = frame.radius * w
         active = jnp.sqrt(rim**2 + (frame.roll @ xi) ** 2 + 1e-12)
         torque = model.wheel_torque(robot, frame, xi, w, surface, load)
-        return torque, (rim * frame.pull - frame.hold @ xi) / active
+        return torque, (rim * frame.drive_share - frame.hold @ xi) / active
 
     return speed, *jax.vmap(jax.vmap(one, (0, None, None)))(speed, b.surface, b.load)
 
@@ -133,7 +133,7 @@ def slip_on(robot: Robot, floor: str, curve: SlipCurve) -> Float[np.ndarray, " t
 def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
     """Return the ranges of speed, torque, slip and motion that the runs on each floor cover."""
     speed, torque, slip = (np.asarray(x) for x in wheel_states(robot, b))
-    back = np.asarray(robot.geometry.least()) * float(robot.geometry.wheel_radius)
+    back = np.asarray(robot.geometry.pseudo_inverse()) * float(robot.geometry.wheel_radius)
     # the encoders show the driven motion, without slip
     twist = np.asarray(lk.wheel_speed(robot, b)) @ back.T
     yaw = twist[..., 2]
@@ -213,7 +213,7 @@ def current_trend(robot: Robot, b: lk.Batch) -> tuple[float, float]:
 
     The residual is measured less predicted current along the predicted one, on all floors.
     """
-    predicted = lk.predicted_current(robot, b, lk.predict(robot, b).felt)
+    predicted = lk.predicted_current(robot, b, lk.predict(robot, b).motor_force)
     residual = np.asarray((b.current - predicted) * jnp.sign(predicted))
     speed = np.broadcast_to((travel(b, robot)[0] / b.dt)[..., None], residual.shape).ravel()
     rows = np.stack([np.ones_like(speed), speed], axis=1)

@@ -57,7 +57,7 @@ def test_a_fit_writes_its_robot(fitted):
     assert record.floors[0].process[0] == pytest.approx(fit.variance["process.soft.along"] ** 0.5)
     assert Settings.of(robot).current_is_signed == fit.channels.signed
     assert Settings.of(robot).alike == Settings().alike != MIXED_FLOORS_PENALTY
-    free = {path for path in fit.space.place if not path.startswith("camera.")}
+    free = {path for path in fit.space.slices if not path.startswith("camera.")}
     assert set(record.draws) == free
     again = deploy(fit)
     assert again.record == record
@@ -73,7 +73,7 @@ def test_what_it_is_told_of_effects_is_what_forecasts_know(fitted):
             pace = (SpeedAndLoad(float(np.log(speed)), robot.load_setup),)
             mirror = contact.robot.geometry.mirror()
             way = TravelConditions(np.array([2 * np.pi * k / DIRECTIONS]), pace, mirror)
-            known = contact.shared[robot.labels[0]].told(way)
+            known = contact.shared[robot.labels[0]].forecast(way)
             np.testing.assert_allclose(told.mean[0][n][k], -known.mean[0], rtol=2e-3, atol=1e-6)
             # the numbers are not known either
             least = np.sqrt(np.diag(known.covariance[0]))

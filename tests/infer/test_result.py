@@ -72,7 +72,7 @@ def fit_of(voltage: bool) -> Fit:
 def test_intervals_are_quantiles_of_the_transformed_gaussian():
     fit = fit_of(True)
     e = fit.parameters["surface.soft.creep"]  # positive: log-normal
-    at = fit.space.place[e.path]
+    at = fit.space.slices[e.path]
     std = np.sqrt(fit.covariance[at, at][0, 0])
     exact = lognorm(std, scale=e.value).ppf([0.05, 0.95])
     assert e.interval90 == pytest.approx(exact, rel=1e-12)

@@ -247,7 +247,7 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
         ("motor.inductance", electrical, ROWS_ELECTRICAL, "L_a / R"),
         ("motor.rotor_inertia", mechanical, ROWS_MECHANICAL, "J R / C_e^2"),
     ):
-        if path in f.space.place and constant < least * rows:
+        if path in f.space.slices and constant < least * rows:
             about = f"about {_time(constant)}" if constant > 0.05 * rows else "far shorter"
             slow[path] = (
                 f"{path} is not identified at this rate: its time constant {name} is {about}, "
@@ -304,7 +304,7 @@ def _remarks(f: MotorFit) -> list[str]:
             f"residuals remember {f.remember:.2g} s: the intervals count {f.stretches:.0f} "
             "stretches of that length, not the rows"
         )
-    if "motor.rotor_inertia" in f.space.place:
+    if "motor.rotor_inertia" in f.space.slices:
         said.append("motor.rotor_inertia is that of the rotor with everything that turned with it")
     return said
 

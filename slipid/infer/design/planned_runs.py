@@ -191,7 +191,7 @@ def _sensed(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
     path = chain(jnp.zeros((b.dt.shape[0], 3)), p.increment)
     middle = 0.5 * (path[:, :1, :2] + path[:, -1:, :2])
     pose = jax.vmap(jax.vmap(robot.camera.logged))(path.at[..., :2].add(-middle))
-    amps = lk.predicted_current(robot, b, p.felt)
+    amps = lk.predicted_current(robot, b, p.motor_force)
     speed = lk.wheel_speed(robot, b)
     flow = amps - robot.motor.current_offset
     volts = robot.motor.voltage(flow if b.signed else flow * jnp.tanh(speed / 0.2), speed)

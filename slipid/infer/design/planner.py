@@ -53,10 +53,12 @@ class Planner:
         paths = [e.path for e in entries(self.robot)]
         choices = [c for c in choices if any(fnmatchcase(p, c.pattern) for p in paths)]
         first = PlannedRun(robot.surfaces.labels[0], robot.body.loads[0], 0.0, 0.1)
-        self._problem = Problem(self._windows([first] * _TOGETHER), self.robot, choices).apart()
+        self._problem = Problem(
+            self._windows([first] * _TOGETHER), self.robot, choices
+        ).without_shared_effects()
         self.space = self._problem.space
         self.z = self.space.vector(self.robot)
-        electric = self._problem.space.electric & (not self._problem.target.joint)
+        electric = self._problem.space.electric & (not self._problem.objective.joint)
         of_floor = [[f"session.{x}.{a}" for a in AXES] for x in robot.surfaces.labels]
         self._differ = np.array([any(map(self.variance.get, names)) for names in of_floor])
         self.effects = len(AXES) * int(self._differ.sum())
@@ -167,7 +169,7 @@ class Goal:
 def parameter_goal(planner: Planner, path: str) -> Goal:
     """Return the goal of a parameter's std, the root mean square over the entries of a vector."""
     entry = next(e for e in planner.space.free if e.path == path)
-    at = planner.space.place[path]
+    at = planner.space.slices[path]
     rows = np.zeros((entry.size, len(planner.is_electric)))
     rows[:, at] = jax.jacfwd(entry.declaration.to_si)(jnp.asarray(planner.z[at]))
     return Goal(

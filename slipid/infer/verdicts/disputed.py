@@ -54,7 +54,7 @@ def disputes(space: Space, z: Search, covariance: Square) -> tuple[Dispute, ...]
 
     The prior of the biases in the space has the fitted std (`Space.with_pooled`).
     """
-    bias = {e.surface: space.place[e.path] for e in space.free if e.declaration.deviation}
+    bias = {e.surface: space.slices[e.path] for e in space.free if e.declaration.deviation}
     if len(bias) < 2:
         return ()
     at = np.concatenate([np.arange(p.start, p.stop) for p in bias.values()])

@@ -130,7 +130,7 @@ def estimates(
     tree = space.tree(z)
     return tuple(
         _free(space, e, tree, z, covariance, has_voltage, e.path in flat)
-        if e.path in space.place
+        if e.path in space.slices
         else _fixed(e, tree, choices)
         for e in space.all
     )
@@ -167,13 +167,13 @@ def _free(
     has_voltage: bool,
     is_flat: bool,
 ) -> Estimate:
-    at, d = space.place[entry.path], entry.declaration
+    at, d = space.slices[entry.path], entry.declaration
     mean, block = np.asarray(z)[at], covariance[at, at]
     prior_mean, prior_std = space.prior_mean[at], space.prior_std[at]
     value = np.atleast_1d(np.asarray(entry.get(tree), float))
     std_z = np.sqrt(np.diag(block))
     center = np.asarray(d.to_si(prior_mean))
-    if d.tied:
+    if d.constrained:
         rng = np.random.default_rng(0)
         spread = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
         draws = np.asarray(d.to_si(spread))
@@ -267,7 +267,7 @@ def derived(space: Space, z: Search, covariance: Square, has_voltage: bool) -> t
         _quotient(space, wanted, over.path, z, covariance, has_voltage)
         for wanted in RATIOS
         for over in space.free
-        if over.quantity == wanted.over and wanted.under in space.place
+        if over.quantity == wanted.over and wanted.under in space.slices
     )
 
 
@@ -280,7 +280,7 @@ def _quotient(
     has_voltage: bool,
 ) -> Estimate:
     c = np.zeros(len(z))
-    c[space.place[over]], c[space.place[wanted.under]] = 1.0, -1.0
+    c[space.slices[over]], c[space.slices[wanted.under]] = 1.0, -1.0
     log_value, log_prior = c @ z, c @ space.prior_mean
     std = float(np.sqrt(c @ covariance @ c))
     prior_std = float(np.sqrt(np.sum((c * space.prior_std) ** 2)))

@@ -113,7 +113,7 @@ def profile(
     and the rise there.
     """
     entry = profiled(problem.space, path)
-    at = problem.space.place[path].start
+    at = problem.space.slices[path].start
     refits = _Refits(problem, optimum, at, progress)
     points = sorted([*refits.side(-1.0), *refits.side(1.0), (refits.start, refits.lowest)])
     z = np.array([p[0] for p in points])
@@ -144,7 +144,7 @@ def profile(
         estimate=si(refits.start),
         interval90=(interval[0], interval[1]),
         ends=(ends[0], ends[1]),
-        given="" if problem.target.joint or refits.of_motion else "the motion as fitted",
+        given="" if problem.objective.joint or refits.of_motion else "the motion as fitted",
         settled=refits.settled,
         sentence=_sentence(entry, interval, ends, problem.windows.has_voltage)
         + ("" if refits.settled else "; some refits did not settle: it may be wider"),
@@ -160,7 +160,7 @@ class _Refits:
         self.problem, self.at, self.progress = problem, at, progress
         self.free, self.of_motion = np.ones(problem.space.size), False
         covariance = optimum.covariance
-        if not problem.target.joint:
+        if not problem.objective.joint:
             electric = problem.space.electric
             self.of_motion = not electric[at]
             mine = electric == electric[at]
@@ -182,10 +182,10 @@ class _Refits:
         blocks, _ = problem.linear(jnp.asarray(state.z), self.electric)
         if self.of_motion:
             blocks = {k: r for k, r in blocks.items() if k in MOTION_BLOCKS}
-        keep = problem.every
-        moving = problem.target.joint or self.of_motion
+        keep = problem.full_weight
+        moving = problem.objective.joint or self.of_motion
         effect = (state if moving else self.fitted).shared(len(problem.windows))
-        seen = problem.seen(blocks, log_v, keep, effect)
+        seen = problem.weighed(blocks, log_v, keep, effect)
         return problem.loss(state.z, log_v, keep, seen, self.electric)
 
     def side(self, sign: float) -> list[tuple[float, float]]:

@@ -271,7 +271,7 @@ def test_what_currents_and_voltages_tell(voltage):
     assert both.value == pytest.approx(5.5 / float(TRUTH.motor.back_emf))
     assert both.verdict == ("identified" if voltage else "not_identified")
     assert both.provenance == ("measured" if voltage else "borrowed")
-    r, c = (space.place[f"motor.{n}"].start for n in ("resistance", "back_emf"))
+    r, c = (space.slices[f"motor.{n}"].start for n in ("resistance", "back_emf"))
     std = np.sqrt(cov[r, r] + cov[c, c] - 2 * cov[r, c])
     assert both.std == pytest.approx(both.value * std)
     low, high = both.interval90
@@ -281,7 +281,7 @@ def test_what_currents_and_voltages_tell(voltage):
 
 def test_a_number_without_bounds_may_be_larger_than_any_exponent():
     space = space_of("surface.soft.lead")
-    at = space.place["surface.soft.lead"]
+    at = space.slices["surface.soft.lead"]
     z = np.array(space.start)
     z[at] = 1e4
     [e] = [one for one in estimates(space, (), z, np.eye(len(z)), True, ()) if one.std is not None]
@@ -348,7 +348,7 @@ def test_a_profile_refits_all_others():
     """Holding a number elsewhere costs less than moving it alone."""
     this, end = fitted()
     p = profile(this, end, "motor.back_emf")
-    k = this.space.place["motor.back_emf"].start
+    k = this.space.slices["motor.back_emf"].start
     z = end.state.z.copy()
     z[k] = np.log(p.value[-1])
     log_v, every = end.state.log_variance, np.ones(len(this.windows))
@@ -356,7 +356,7 @@ def test_a_profile_refits_all_others():
 
     def loss(z):
         blocks, _ = this.linear(z, electric)
-        seen = this.seen(blocks, log_v, every, end.state.effect)
+        seen = this.weighed(blocks, log_v, every, end.state.effect)
         return this.loss(z, log_v, every, seen, electric)
 
     assert p.posterior[-1] < 0.9 * (loss(z) - loss(end.state.z))
@@ -376,7 +376,7 @@ def test_a_profile_without_a_lower_end_says_bound():
 def test_a_profile_goes_back_where_it_stepped_over_the_end_of_a_flat_stretch(monkeypatch):
     """Level for a prior's std and a half, then a wall: points close in on it."""
     this, end = fitted()
-    at = this.space.place["motor.inductance"].start
+    at = this.space.slices["motor.inductance"].start
     start, std = end.state.z[at], this.space.prior_std[at]
 
     def optimised(problem, start, **_):
