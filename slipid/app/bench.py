@@ -27,8 +27,9 @@ from slipid.infer.bench.verdict import BenchFit, bench_fit
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
+from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
-from slipid.support.files import Content, writable, write_bytes, write_json
+from slipid.support.files import writable, write_bytes, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 

@@ -10,7 +10,7 @@ from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.report.page import Page
-    from slipid.support.files import Content
+    from slipid.support.content import Content
 
 
 MOST_BEYOND = 0.05

@@ -9,7 +9,7 @@ from slipid.support.progress import Reporter
 if TYPE_CHECKING:
     from slipid.lab.testsite.config import SimulationPlan
     from slipid.report.page import Page
-    from slipid.support.files import Content
+    from slipid.support.content import Content
 
 
 @guarded

@@ -7,7 +7,7 @@ from slipid.cli.common import DataFolder, Json, OutFolder, Quiet, emit, for_robo
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
-    from slipid.support.files import Content
+    from slipid.support.content import Content
 
 
 @for_robots
