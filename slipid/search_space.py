@@ -94,7 +94,7 @@ class Space(eqx.Module):
         return eqx.tree_at(lambda space: space.prior_std, self, prior_std)
 
     @property
-    def place(self) -> dict[str, slice]:
+    def slices(self) -> dict[str, slice]:
         """Where the coordinates of every free number are, by path."""
         ends = np.cumsum([0, *(e.coordinates for e in self.free)]).tolist()
         return {e.path: slice(a, b) for e, a, b in zip(self.free, ends, ends[1:], strict=False)}
@@ -125,9 +125,9 @@ class Space(eqx.Module):
 
     def tree(self, z: Float[Array, " free"] | Float[np.ndarray, " free"]) -> Any:
         """Tree of SI values at a search-space vector; jit-able."""
-        z, place = z if isinstance(z, jax.core.Tracer) else np.asarray(z, float), self.place
+        z, slices = z if isinstance(z, jax.core.Tracer) else np.asarray(z, float), self.slices
         return with_values(
-            self.template, {e: e.declaration.to_si(z[place[e.path]]) for e in self.free}
+            self.template, {e: e.declaration.to_si(z[slices[e.path]]) for e in self.free}
         )
 
     def vector(self, tree: Any) -> np.ndarray:

@@ -22,7 +22,7 @@ from slipid.lab.selftest.logs import simulate_logs
 from slipid.model.robot import Robot, motor_current, twist, wheel_torque
 from slipid.report.estimates import show_check
 from slipid.report.page import text_of
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +165,7 @@ def _steady(
         way, stands = jnp.sign(speed), jnp.abs(speed) < 1e-6
         xi = twist(robot, frame, speed, floor, load)
         torque = wheel_torque(robot, frame, xi, speed, floor, load)
-        rim = jnp.where(stands, jnp.nan, frame.radius * frame.pull * speed)
+        rim = jnp.where(stands, jnp.nan, frame.radius * frame.drive_share * speed)
         current = motor_current(robot, frame, xi, driven, floor, load) * jnp.sign(driven)
         return xi, speed, 1 - frame.hold @ xi / rim, torque * way, current
 

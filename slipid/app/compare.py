@@ -24,8 +24,9 @@ from slipid.predict.folds import Fold, folds_of, judge
 from slipid.predict.ranking import ranking, transfer
 from slipid.predict.validation import ScoredRun, Validation
 from slipid.support.checkpoint import Checkpoint, key_of, versions
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content, writable, write_json
+from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 

@@ -16,8 +16,9 @@ from slipid.data.reading.reader import find_logs
 from slipid.deploy.floors import FloorLookup
 from slipid.infer.fit_file import load
 from slipid.model.robot import Robot
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content, write_bytes
+from slipid.support.files import write_bytes
 from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.floors/1"

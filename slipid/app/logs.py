@@ -12,8 +12,9 @@ from slipid.data.reading.presets import PRESETS, declared_layout, preset
 from slipid.data.reading.reader import AnyLayout, find_logs, read_logs, session_of, without_beside
 from slipid.data.runs import Runs, collect, counted_once
 from slipid.support.checkpoint import versions
+from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
-from slipid.support.files import Content, write_bytes, write_json
+from slipid.support.files import write_bytes, write_json
 from slipid.support.progress import Reporter
 
 

@@ -15,8 +15,9 @@ from slipid.infer.posterior.diagnosis import Posterior, identified
 from slipid.infer.posterior.sample import sampled
 from slipid.infer.result import Fit
 from slipid.support.checkpoint import Checkpoint, key_of, versions
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content, read_json, write_json
+from slipid.support.files import read_json, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 

@@ -12,8 +12,8 @@ from slipid.predict import open_loop as replay
 from slipid.predict.kinematics import Encoder
 from slipid.predict.slip_models import FloorModels
 from slipid.predict.validation import ScoredRun, add_scores
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 
 ENCODER = FloorModels(Encoder())
 MOST_RUNS = 24

@@ -184,8 +184,10 @@ def _circle(
         xi = contact.equilibrium(rim, frame, floor, rest)
         force = floor.friction * mass * GRAVITY * frame.radius
         where = xi, rim, frame, floor, rest
-        felt = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
-        amps = motor.current(at_drives(wheels.drive_of, force * motor.borne(felt)), w)
+        motor_force = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
+        amps = motor.current(
+            at_drives(wheels.drive_of, force * motor.opposing_force(motor_force)), w
+        )
         lost = turned - wheels.forward @ xi
         return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
 
@@ -277,7 +279,7 @@ def effects_by_load(
         contact: the fit as a model that forecasts.
         center: search vector of the deployed numbers; draws: of their posterior.
     """
-    paces = [pace for found in contact.shared.values() for pace in found.paces]
+    paces = [pace for found in contact.shared.values() for pace in found.speeds_and_loads]
     if not paces:
         return {}
     speeds = sorted({pace.log_speed for pace in paces})
@@ -302,7 +304,7 @@ def _table(
     mean, left = np.zeros(shape), np.zeros(shape)
     for n, floor in enumerate(labels):
         found = contact.shared[floor]
-        told = found.told(way)
+        told = found.forecast(way)
         grown = contact.extrapolation.get(f"{floor}@{load}", 1.0)
         given = np.diagonal(told.covariance, axis1=1, axis2=2) + _of(contact, "session", floor)
         off = predicted[:, n] - np.einsum("nap,kp->kna", told.slope, draws - center)

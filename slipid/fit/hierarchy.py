@@ -49,7 +49,7 @@ class _AxisEffects(NamedTuple):
     """
 
     number: int
-    pieces: Int[np.ndarray, " run"]
+    segments: Int[np.ndarray, " run"]
     left: Float[np.ndarray, " run"]
     fixed: Float[np.ndarray, "run run"]
     noise: Float[np.ndarray, " run"]
@@ -58,7 +58,7 @@ class _AxisEffects(NamedTuple):
 
 
 def effect_variances(
-    target: Objective,
+    objective: Objective,
     motion: tuple[Array, Array],
     weight: Array,
     covariance: Square,
@@ -72,14 +72,14 @@ def effect_variances(
         covariance: of the search vector.
     """
     out = np.array(log_v)
-    for axis in _axes(target, motion, weight, covariance, log_v):
-        typical = np.asarray(target.typical)[axis.numbers]
+    for axis in _axes(objective, motion, weight, covariance, log_v):
+        typical = np.asarray(objective.typical)[axis.numbers]
         out[axis.numbers] = _scoring_steps(axis, out[axis.numbers], typical)
     return out
 
 
 def effect_information(
-    target: Objective,
+    objective: Objective,
     motion: tuple[Array, Array],
     weight: Array,
     covariance: Square,
@@ -87,7 +87,7 @@ def effect_information(
 ) -> Float[np.ndarray, "variance variance"]:
     """Expected information of the same log variances, zero for the others."""
     out = np.zeros((len(log_v), len(log_v)))
-    for axis in _axes(target, motion, weight, covariance, log_v):
+    for axis in _axes(objective, motion, weight, covariance, log_v):
         v = np.exp(log_v)[axis.numbers]
         inverse = np.linalg.inv(_covariance(axis, v))
         grown = [k * (inverse @ b) for k, b in zip(v, axis.bases, strict=True)]
@@ -104,7 +104,7 @@ class TravelDirections(NamedTuple):
 
 
 def extrapolation(
-    target: Objective,
+    objective: Objective,
     motion: tuple[Array, Array],
     keep: Float[np.ndarray, " piece"],
     covariance: Square,
@@ -124,7 +124,7 @@ def extrapolation(
     Sources: Sundararajan and Keerthi 2001, Neural Computation 13(5), eq. for leaving out; Bachoc
     2013, Computational Statistics and Data Analysis 66, on wrong models.
     """
-    axes = _axes(target, motion, jnp.asarray(keep), covariance, log_v)
+    axes = _axes(objective, motion, jnp.asarray(keep), covariance, log_v)
     left = _held_out_effects(axes, log_v, courses.direction)
     names = np.asarray(courses.setup)
     return {
@@ -153,14 +153,14 @@ def _held_out_effects(
     found = _HeldOutEffects(*(np.full((len(direction), len(AXES)), np.nan) for _ in range(3)))
     for axis in axes:
         v = np.exp(log_v)[axis.numbers]
-        inverse, groups = np.linalg.inv(_covariance(axis, v)), _sectors(direction[axis.pieces])
+        inverse, groups = np.linalg.inv(_covariance(axis, v)), _sectors(direction[axis.segments])
         if len(groups) < 3:
             continue
         white = inverse @ axis.left
         own = axis.noise + v[0] * np.diag(axis.bases[0])
         for mine in groups:
             spread = np.linalg.inv(inverse[np.ix_(mine, mine)])
-            at = axis.pieces[mine], axis.number
+            at = axis.segments[mine], axis.number
             found.gap[at], found.spread[at] = spread @ white[mine], np.diag(spread)
             found.own[at] = np.minimum(own[mine], np.diag(spread))
     return found
@@ -207,21 +207,21 @@ def _sectors(direction: Float[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]
 
 
 def _axes(
-    target: Objective,
+    objective: Objective,
     motion: tuple[Array, Array],
     weight: Array,
     covariance: Square,
     log_v: Float[np.ndarray, " variance"],
 ) -> Iterator[_AxisEffects]:
-    space = target.space
+    space = objective.space
     of_floor = space.where(lambda e: e.surface is not None)
     wide = np.where(of_floor[:, None] | of_floor, 0.0, covariance)
-    wide[of_floor, of_floor] = np.asarray(target.prior_std(log_v))[of_floor] ** 2
-    scale = np.asarray(target.blocks["motion"].covariance(jnp.asarray(log_v)))
+    wide[of_floor, of_floor] = np.asarray(objective.prior_std(log_v))[of_floor] ** 2
+    scale = np.asarray(objective.blocks["motion"].covariance(jnp.asarray(log_v)))
     gap, slope, counted = np.asarray(motion[0]), np.asarray(motion[1]), np.asarray(weight)
-    for floor in target.shared:
-        kept = counted[np.asarray(floor.pieces)] > 0
-        mine = np.asarray(floor.pieces)[kept]
+    for floor in objective.shared:
+        kept = counted[np.asarray(floor.segments)] > 0
+        mine = np.asarray(floor.segments)[kept]
         if len(mine) < 2:
             continue
         run, effect = np.exp(log_v)[np.asarray(floor.numbers)[0]], np.asarray(floor.effect)[kept]
@@ -229,8 +229,8 @@ def _axes(
         for k in range(len(AXES)):
             alone = noise[:, k] / counted[mine]
             fixed = np.diag(alone) + by[:, k] @ wide @ by[:, k].T
-            pieces = _variance_bases(floor, k, kept, counted[mine])
-            numbers, bases = [n for n, _ in pieces], [c for _, c in pieces]
+            segments = _variance_bases(floor, k, kept, counted[mine])
+            numbers, bases = [n for n, _ in segments], [c for _, c in segments]
             yield _AxisEffects(k, mine, left[:, k], fixed, alone, numbers, bases)
 
 
@@ -299,10 +299,10 @@ def _scoring_steps(axis: _AxisEffects, log_v: np.ndarray, typical: np.ndarray) -
 
 
 def pooled(
-    precision: Square, z: Search, target: Objective, log_v: Float[np.ndarray, " variance"]
+    precision: Square, z: Search, objective: Objective, log_v: Float[np.ndarray, " variance"]
 ) -> float:
     """Log of the mean variance of the load biases of floors; arguments as of `pooled_stds`."""
-    found = pooled_stds(precision, z, target, log_v)
+    found = pooled_stds(precision, z, objective, log_v)
     return float(np.log(found.weight @ found.std**2))
 
 
@@ -314,7 +314,7 @@ class PooledStds(NamedTuple):
 
 
 def pooled_stds(
-    precision: Square, z: Search, target: Objective, log_v: Float[np.ndarray, " variance"]
+    precision: Square, z: Search, objective: Objective, log_v: Float[np.ndarray, " variance"]
 ) -> PooledStds:
     """Stds of the load biases with a half-normal prior, on a grid.
 
@@ -322,14 +322,14 @@ def pooled_stds(
 
     Source: Gelman 2006, Bayesian Analysis 1(3), on half-normal priors of group stds.
     """
-    at = np.flatnonzero(target.space.pooled)
-    now = np.exp(-log_v[target.pooled])
+    at = np.flatnonzero(objective.space.pooled)
+    now = np.exp(-log_v[objective.pooled])
     told = np.asarray(precision).copy()
     away = np.zeros(len(told))
-    away[at] = (z - target.space.prior_mean)[at]
+    away[at] = (z - objective.space.prior_mean)[at]
     pull = told @ away
     told[at, at] -= now
-    typical = np.exp(0.5 * float(target.typical[target.pooled]))
+    typical = np.exp(0.5 * float(objective.typical[objective.pooled]))
     log = []
     for part in _GRID:
         with_prior = told.copy()

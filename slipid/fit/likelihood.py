@@ -104,7 +104,7 @@ class Predicted(eqx.Module):
 
     increment: Marker
     twist: Marker
-    felt: MotorForce
+    motor_force: MotorForce
 
 
 def wheel_speed(robot: Robot, b: Batch) -> PerDrive:
@@ -121,8 +121,8 @@ def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
         xi = model.twist(robot, frame, w, surface, load, near)
         return xi, shape.at_drives(model.motor_forces(robot, frame, xi, w, surface, load).T).T
 
-    twist, felt = each_window(window, b, wheel_speed(robot, b), near)
-    return Predicted(marker_increments(robot, twist, b.dt, b.session), twist, felt)
+    twist, motor_force = each_window(window, b, wheel_speed(robot, b), near)
+    return Predicted(marker_increments(robot, twist, b.dt, b.session), twist, motor_force)
 
 
 def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | None = None) -> Any:
@@ -131,20 +131,20 @@ def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | No
     All windows are one axis meanwhile: two, one inside the other, take JAX half as long again to
     trace.
     """
-    pieces, windows = b.dt.shape
+    segments, windows = b.dt.shape
 
     def flat(x: Array) -> Array:
-        return x.reshape(pieces * windows, *x.shape[2:])
+        return x.reshape(segments * windows, *x.shape[2:])
 
-    def of_piece(x: Array) -> Array:
-        return jnp.repeat(x, windows, axis=0, total_repeat_length=pieces * windows)
+    def of_segment(x: Array) -> Array:
+        return jnp.repeat(x, windows, axis=0, total_repeat_length=segments * windows)
 
-    surface = flat(b.surface) if b.surface.ndim > 1 else of_piece(b.surface)
+    surface = flat(b.surface) if b.surface.ndim > 1 else of_segment(b.surface)
     at = None if near is None else flat(near)
     found = jax.vmap(of, (0, None if near is None else 0, 0, 0))(
-        flat(w), at, surface, of_piece(b.load)
+        flat(w), at, surface, of_segment(b.load)
     )
-    return jax.tree.map(lambda x: x.reshape(pieces, windows, *x.shape[1:]), found)
+    return jax.tree.map(lambda x: x.reshape(segments, windows, *x.shape[1:]), found)
 
 
 def marker_increments(
@@ -153,17 +153,19 @@ def marker_increments(
     """Marker increments of every window for given body twists."""
 
     def window(xi: Array, dt: Array, session: Array) -> Array:
-        return robot.camera.seen(se2.advance(xi, dt), session)
+        return robot.camera.marker_increment(se2.advance(xi, dt), session)
 
     return jax.vmap(jax.vmap(window, (0, 0, None)))(twist, dt, session)
 
 
-def predicted_current(robot: Robot, b: Batch, felt: MotorForce) -> PerDrive:
+def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDrive:
     """Motor current of every window [A] given what motors work against, or its size."""
     friction = robot.surfaces.friction[b.surface]  # of the wheels on average, as `felt` has it
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
     weight = friction * robot.body.mass * model.GRAVITY
-    torque = robot.geometry.wheel_radius * weight[..., None] * robot.motor.borne(felt)
+    torque = (
+        robot.geometry.wheel_radius * weight[..., None] * robot.motor.opposing_force(motor_force)
+    )
     amps = robot.motor.current(torque, wheel_speed(robot, b))
     if b.signed:
         return amps + robot.motor.current_offset
@@ -173,13 +175,13 @@ def predicted_current(robot: Robot, b: Batch, felt: MotorForce) -> PerDrive:
 def measured_increments(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Marker:
     """Marker increments in the frame of each window's start, in corrected metres."""
 
-    def piece(edges: Float[Array, "edge 3"]) -> Float[Array, "window 3"]:
+    def segment(edges: Float[Array, "edge 3"]) -> Float[Array, "window 3"]:
         p = jax.vmap(robot.camera.corrected)(edges)
         c, s = jnp.cos(p[:-1, 2]), jnp.sin(p[:-1, 2])
         d = p[1:] - p[:-1]
         return jnp.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], d[:, 2]], axis=-1)
 
-    return jax.vmap(piece)(pose)
+    return jax.vmap(segment)(pose)
 
 
 def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "piece m"]:
@@ -188,7 +190,7 @@ def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "piece
 
 
 def electric_residuals(
-    robot: Robot, b: Batch, felt: MotorForce, noise: ElectricNoise
+    robot: Robot, b: Batch, motor_force: MotorForce, noise: ElectricNoise
 ) -> dict[str, Array]:
     """Predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
 
@@ -197,7 +199,7 @@ def electric_residuals(
     """
     if not b.has_current:
         return {}
-    predicted = predicted_current(robot, b, felt)
+    predicted = predicted_current(robot, b, motor_force)
     out = {"current": _flat(predicted - b.current)}
     if b.has_voltage:
         amps = predicted + _true_current_share(b, noise)[0] * (b.current - predicted)

@@ -185,7 +185,7 @@ class MultiFloorBatch(eqx.Module):
         gap = lk.motion_residual(robot, b, p)
         out = {MULTI_FLOOR_MOTION: gap * jnp.repeat(self.counts, 3, axis=1)}
         if b.has_current:
-            amps = lk.predicted_current(robot, b, p.felt) - b.current
+            amps = lk.predicted_current(robot, b, p.motor_force) - b.current
             out[MULTI_FLOOR_CURRENT] = (amps * self.counts[..., None]).reshape(len(gap), -1)
         return out
 
@@ -196,10 +196,10 @@ class MultiFloorBatch(eqx.Module):
 
 
 @eqx.filter_jit
-def residuals_at(space: Space, several: MultiFloorBatch, z: Array) -> dict[str, Array]:
+def residuals_at(space: Space, multi_floor: MultiFloorBatch, z: Array) -> dict[str, Array]:
     """Residuals of runs over several floors at a search vector."""
     robot = space.tree(z)
-    return several.residuals(robot, lk.predict(robot, several.batch))
+    return multi_floor.residuals(robot, lk.predict(robot, multi_floor.batch))
 
 
 class WindowErrors(NamedTuple):
@@ -214,10 +214,11 @@ class WindowErrors(NamedTuple):
 
 
 def window_errors(
-    several: MultiFloorBatch, judged: Sequence[tuple[dict[str, Array], Float[np.ndarray, " piece"]]]
+    multi_floor: MultiFloorBatch,
+    judged: Sequence[tuple[dict[str, Array], Float[np.ndarray, " piece"]]],
 ) -> WindowErrors:
     """Of residuals by block, each with the weight of every piece in it, 1 or 0."""
-    counts, dt = np.asarray(several.counts), np.asarray(several.batch.dt)
+    counts, dt = np.asarray(multi_floor.counts), np.asarray(multi_floor.batch.dt)
     motion, current, total = np.zeros(3), 0.0, 0.0
     for residual, weight in judged:
         count = counts * weight[:, None]
@@ -228,7 +229,7 @@ def window_errors(
             amps = np.asarray(residual[MULTI_FLOOR_CURRENT]).reshape(*dt.shape, -1)
             current += (count * (amps**2).mean(axis=2)).sum()
     x, y, yaw = motion / total
-    has_current = several.batch.has_current
+    has_current = multi_floor.batch.has_current
     return WindowErrors(
         speed=float(np.sqrt(x + y)),
         yaw_rate=float(np.sqrt(yaw)),

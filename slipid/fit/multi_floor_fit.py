@@ -49,7 +49,7 @@ class MultiFloorFit:
 def fit_multi_floor(
     problem: Problem,
     optimum: Optimum,
-    several: MultiFloorRuns,
+    multi_floor: MultiFloorRuns,
     tell: Callable[[FitState], None],
     most_rounds: int = 30,
     tolerance: float = 0.02,
@@ -58,19 +58,24 @@ def fit_multi_floor(
 
     `tell` is called after every round of the fit to all runs; the limits are those of `optimise`.
     """
-    whole = problem.crossed(several)
-    start = replace(whole.restated(optimum.state, problem), round=0)
-    on_one, number = len(problem.windows), np.unique(several.windows.run, return_inverse=True)[1]
+    whole = problem.with_multi_floor(multi_floor)
+    start = replace(whole.carried_over(optimum.state, problem), round=0)
+    on_one, number = (
+        len(problem.windows),
+        np.unique(multi_floor.windows.run, return_inverse=True)[1],
+    )
     odd = number % 2 == 1
-    target, every = whole.target, np.ones(len(odd))
-    assert target.several is not None, "runs over several floors"
+    objective, every = whole.objective, np.ones(len(odd))
+    assert objective.multi_floor is not None, "runs over several floors"
 
     def off(
-        several: MultiFloorBatch, *judged: tuple[FitState, Float[np.ndarray, " run"]]
+        multi_floor: MultiFloorBatch, *judged: tuple[FitState, Float[np.ndarray, " run"]]
     ) -> WindowErrors:
         """Errors, each run by the state that judges it with weight 1 and the others with 0."""
-        found = [(residuals_at(target.space, several, jnp.asarray(s.z)), w) for s, w in judged]
-        return window_errors(several, found)
+        found = [
+            (residuals_at(objective.space, multi_floor, jnp.asarray(s.z)), w) for s, w in judged
+        ]
+        return window_errors(multi_floor, found)
 
     learnt = optimise(whole, start=start, tell=tell, most_rounds=most_rounds, tolerance=tolerance)
     after = None
@@ -80,16 +85,16 @@ def fit_multi_floor(
             keep = np.concatenate([np.ones(on_one), ~half])
             other = optimise(whole, keep=keep, start=start, most_rounds=_ROUNDS)
             parts.append((other.state, half.astype(float)))
-        after = off(target.several, *parts)
+        after = off(objective.multi_floor, *parts)
     end = (learnt.state, every)
     return MultiFloorFit(
         problem=whole,
         optimum=learnt,
-        before=off(target.several, (start, every)),
+        before=off(objective.multi_floor, (start, every)),
         after=after,
-        learnt=off(target.several, end),
+        learnt=off(objective.multi_floor, end),
         as_if={
-            floor: off(target.several.as_if_on(k), end)
+            floor: off(objective.multi_floor.as_if_on(k), end)
             for k, floor in enumerate(whole.robot.surfaces.labels)
         },
     )

@@ -37,7 +37,7 @@ class Components(eqx.Module):
     base: Float[Array, "piece component m m"]
     which: Int[Array, "piece component"]
     known: Float[Array, "piece m"]
-    pieces: Int[Array, " piece"]
+    segments: Int[Array, " piece"]
     count: Float[Array, " piece"]
 
     def covariance(
@@ -109,7 +109,7 @@ POOLED = "pooled.load_bias"
 """Name of the variance of the load biases of floors."""
 
 
-def noise(windows: Windows, robot: Robot, crossing: MultiFloorRuns | None = None) -> NoiseModel:
+def noise(windows: Windows, robot: Robot, multi_floor: MultiFloorRuns | None = None) -> NoiseModel:
     """Variance components for these windows, with distances and directions from the encoders.
 
     Pieces of runs over several floors are numbered after those of the windows.
@@ -122,15 +122,15 @@ def noise(windows: Windows, robot: Robot, crossing: MultiFloorRuns | None = None
     for floor in floors:
         table += [Component("process", what, floor, u, v) for what, u, v in _MOTION]
         table += [Component("run", what, floor, u, v) for what, u, v in _EFFECT]
-    several = [floor for floor in floors if len(sessions_on(windows, floor)) > 1]
+    several_sessions = [floor for floor in floors if len(sessions_on(windows, floor)) > 1]
     for kind, part in SHARED.items():
-        for floor in several if kind == "session" else floors:
+        for floor in several_sessions if kind == "session" else floors:
             table += [Component(kind, what, floor, u, part * v) for what, u, v in _EFFECT]
     table.append(Component("pooled", "load_bias", None, "1", 0.05))
     on = _floors(windows, robot)
     blocks = {"motion": _motion_components(windows, robot, 2 + 6 * on)}
-    if crossing is not None:
-        table += _multi_floor_components(crossing, robot, len(windows), len(table), blocks)
+    if multi_floor is not None:
+        table += _multi_floor_components(multi_floor, robot, len(windows), len(table), blocks)
     if windows.has_current:
         start = len(table)
         for floor in floors:
@@ -165,22 +165,28 @@ def electric_noise(
 
 
 def _multi_floor_components(
-    crossing: MultiFloorRuns, robot: Robot, pieces: int, start: int, blocks: dict[str, Components]
+    multi_floor: MultiFloorRuns,
+    robot: Robot,
+    segments: int,
+    start: int,
+    blocks: dict[str, Components],
 ) -> list[Component]:
     """Variances of runs over several floors, whose covariance pieces go into the blocks.
 
     `pieces` is how many pieces come before theirs, `start` how many variances.
     """
-    w, none = crossing.windows, np.zeros((len(crossing.windows), 1), int)
+    w, none = multi_floor.windows, np.zeros((len(multi_floor.windows), 1), int)
     table = [
         Component("crossing", what, None, unit, typical) for what, unit, typical in _MULTI_FLOOR
     ]
     motion = _motion_components(w, robot, none + start)
-    blocks[MULTI_FLOOR_MOTION] = _counted(motion, np.repeat(crossing.counts, 3, axis=1), pieces)
+    blocks[MULTI_FLOOR_MOTION] = _counted(
+        motion, np.repeat(multi_floor.counts, 3, axis=1), segments
+    )
     if w.has_current:
         current = _current_components(w, none + start + len(table))
-        live = np.repeat(crossing.counts, w.turn.shape[2], axis=1)
-        blocks[MULTI_FLOOR_CURRENT] = _counted(current, live, pieces)
+        live = np.repeat(multi_floor.counts, w.turn.shape[2], axis=1)
+        blocks[MULTI_FLOOR_CURRENT] = _counted(current, live, segments)
         table += [Component("crossing", f"current.{k}", None, "A", 0.05) for k in ("window", "run")]
     return table
 
@@ -192,7 +198,7 @@ def _counted(of: Components, live: Bool[np.ndarray, "piece m"], first: int) -> C
         base=jnp.where(both, of.base, 0.0),
         which=of.which,
         known=jnp.where(live, of.known, 1.0),
-        pieces=of.pieces + first,
+        segments=of.segments + first,
         count=jnp.asarray(live.sum(axis=1), float),
     )
 
@@ -206,7 +212,7 @@ def _components(
         base=jnp.asarray(base),
         which=jnp.asarray(which),
         known=jnp.asarray(np.full((n, m), FLOOR[block]) + more),
-        pieces=jnp.arange(n),
+        segments=jnp.arange(n),
         count=jnp.full(n, float(m)),
     )
 
@@ -215,7 +221,7 @@ def encoder_increments(
     windows: Windows | Batch, robot: Robot
 ) -> Float[np.ndarray, "piece window 3"]:
     """Movement of the body in each window by the encoders, in its own frame [m, m, rad]."""
-    j = np.asarray(robot.geometry.least())
+    j = np.asarray(robot.geometry.pseudo_inverse())
     return np.asarray(windows.turn) * float(robot.geometry.wheel_radius) @ j.T
 
 

@@ -65,7 +65,7 @@ def optimise(
         free: 1 for coordinates that may move from the start, 0 for those held there (free,).
         variances: whether to fit those of the noise, too.
     """
-    keep = problem.every if keep is None else np.asarray(keep, float)
+    keep = problem.full_weight if keep is None else np.asarray(keep, float)
     state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
     mask = np.ones(problem.space.size) if free is None else np.asarray(free, float)
     history: list[float] = []
@@ -97,37 +97,37 @@ def one_round(
     At most so many steps of the structure, and so many scoring steps of the variances; the mask is
     1 for coordinates that may move, 0 for those held.
     """
-    target, log_v = problem.target, jnp.asarray(state.log_variance)
+    objective, log_v = problem.objective, jnp.asarray(state.log_variance)
     electric = problem.electric(state.z, log_v)
-    residual, _, felt = linear(target, jnp.asarray(state.z), electric)
+    residual, _, motor_force = linear(objective, jnp.asarray(state.z), electric)
     before = state.shared(len(problem.windows))
-    seen = problem.seen(residual, log_v, keep, before)
+    seen = problem.weighed(residual, log_v, keep, before)
     held = LeastSquaresInputs(
-        target=target,
+        objective=objective,
         z=jnp.asarray(state.z),
         mask=jnp.asarray(mask),
         root=seen.whitening.root,
-        tied=seen.tied,
-        prior_std=target.prior_std(log_v),
+        effects=seen.effects,
+        prior_std=objective.prior_std(log_v),
         electric=electric,
-        felt=felt,
-        slope=log_jacobian(target, state.z, electric, keep)[1],
+        motor_force=motor_force,
+        slope=log_jacobian(objective, state.z, electric, keep)[1],
     )
     z = np.asarray(levenberg(held, LimitedLevenberg(steps)))
     electric = problem.electric(z, log_v)
-    whole, jacobian, felt = linear(target, jnp.asarray(z), electric)
-    effect = effects_given(seen.tied, seen.whitening.root["motion"], whole["motion"])
+    whole, jacobian, motor_force = linear(objective, jnp.asarray(z), electric)
+    effect = effects_given(seen.effects, seen.whitening.root["motion"], whole["motion"])
     # weights follow effects and effects follow weights: half way, or they can swing for ever
     effect = 0.5 * (effect + before) if state.round else effect
     residual, told = (
-        without_effects(target, whole, effect),
-        problem.voltage_information(z, log_v, felt),
+        without_effects(objective, whole, effect),
+        problem.voltage_information(z, log_v, motor_force),
     )
     if scoring:
-        spread = fitted_covariance(target, jacobian, log_v, jnp.asarray(keep))
+        spread = fitted_covariance(objective, jacobian, log_v, jnp.asarray(keep))
     for _ in range(scoring):
-        log_v = scoring_step(target, residual, spread, log_v, jnp.asarray(keep), told)
-        last, told = told, problem.voltage_information(z, log_v, felt)
+        log_v = scoring_step(objective, residual, spread, log_v, jnp.asarray(keep), told)
+        last, told = told, problem.voltage_information(z, log_v, motor_force)
         if last is not None and told is not None:  # in units of the noise just found
             scale = jnp.sqrt(told.share / last.share)
             residual = residual | {"voltage": told.residual}
@@ -140,8 +140,8 @@ def one_round(
     covariance = np.linalg.inv(information)
     if scoring:
         weight, motion = seen.whitening.weight["motion"], (whole["motion"], jacobian["motion"])
-        found = effect_variances(target, motion, weight, covariance, np.asarray(log_v))
-        found[target.pooled] = pooled(information, z, target, np.asarray(log_v))
+        found = effect_variances(objective, motion, weight, covariance, np.asarray(log_v))
+        found[objective.pooled] = pooled(information, z, objective, np.asarray(log_v))
         log_v = jnp.asarray(found)
     std = np.sqrt(np.diag(covariance))
     moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
@@ -150,7 +150,7 @@ def one_round(
         z=z,
         log_variance=np.asarray(log_v),
         round=state.round + 1,
-        loss=problem.loss(z, log_v, keep, problem.seen(whole, log_v, keep, effect), electric),
+        loss=problem.loss(z, log_v, keep, problem.weighed(whole, log_v, keep, effect), electric),
         moved=moved,
         stage=state.stage,
         effect=np.asarray(effect),
@@ -171,7 +171,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
     wide = [usual.get(c.kind, 3.0) for c in problem.noise.components]
     log_v = 2 * np.log(problem.noise.typical) + 2 * np.log(wide)
     first = _motor_start(problem, keep)
-    apart = problem.apart()
+    independent = problem.without_shared_effects()
     best, z = np.full(len(labels), np.inf), first.copy()
     floors = np.asarray(problem.batch.surface)
     of_floor = np.repeat([e.surface or "" for e in space.free], [e.coordinates for e in space.free])
@@ -180,10 +180,12 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
         start = np.where(creep, np.log(value), first)
         state = FitState(start, log_v, 0, np.inf, np.inf, stage)
         for steps in (15, 6, 6):  # the damping has to grow from 1 to the size of the problem first
-            state = one_round(apart, state, keep, mask, steps=steps, scoring=0)
+            state = one_round(independent, state, keep, mask, steps=steps, scoring=0)
             tell(state)
-        residual, _ = apart.linear(state.z, problem.electric(state.z, state.log_variance))
-        weight = problem.whitening(residual, state.log_variance, problem.every).weight["motion"]
+        residual, _ = independent.linear(state.z, problem.electric(state.z, state.log_variance))
+        weight = problem.whitening(residual, state.log_variance, problem.full_weight).weight[
+            "motion"
+        ]
         cost = -np.log(np.asarray(weight))  # as good as the loss, but for factor and constant
         for number, label in enumerate(labels):
             mine = float(np.sum(cost[(floors == number) & (keep[: len(floors)] > 0)]))
@@ -203,7 +205,7 @@ def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
     amps = w.current.ravel() if w.current_is_signed else (w.current.ravel() * np.sign(speed))
     wm = speed * float(problem.robot.motor.gear_ratio)
     a, *_ = np.linalg.lstsq(np.stack([amps, wm], -1), w.voltage.ravel(), rcond=None)
-    place = problem.space.place
+    place = problem.space.slices
     for path, value in (("motor.resistance", a[0]), ("motor.back_emf", a[1])):
         if path in place and value > 0:
             z[place[path]] = np.log(value)
@@ -219,14 +221,14 @@ class LeastSquaresInputs(eqx.Module):
     slope that of log |d residuals / d data| by the search vector.
     """
 
-    target: Objective
+    objective: Objective
     z: Float[Array, " free"]
     mask: Float[Array, " free"]
     root: Blocks
-    tied: tuple[EffectPosterior, ...]
+    effects: tuple[EffectPosterior, ...]
     prior_std: Float[Array, " free"]
     electric: lk.ElectricNoise
-    felt: lk.MotorForce
+    motor_force: lk.MotorForce
     slope: Float[Array, " free"]
 
 
@@ -265,7 +267,7 @@ def levenberg(held: LeastSquaresInputs, solver: LimitedLevenberg) -> Float[Array
     return _at(held, found.value)
 
 
-def _several(of: MultiFloorBatch, robot: Robot, given: Robot) -> Blocks:
+def _multi_floor_residuals(of: MultiFloorBatch, robot: Robot, given: Robot) -> Blocks:
     """Residuals of runs over several floors: their currents move electric numbers only.
 
     Friction moves the equilibrium that currents come from, so that it is found for them, too.
@@ -283,18 +285,19 @@ def _at(held: LeastSquaresInputs, y: Array) -> Array:
 
 def _stacked(y: Array, held: LeastSquaresInputs) -> Array:
     """Whitened residuals of all blocks and of the prior."""
-    target, space = held.target, held.target.space
+    objective, space = held.objective, held.objective.space
     z = _at(held, y)
     robot, given = space.tree(z), space.tree(jnp.where(space.electric, z, held.z))
-    motion = lk.motion_residual(robot, target.batch, lk.predict(robot, target.batch))
+    motion = lk.motion_residual(robot, objective.batch, lk.predict(robot, objective.batch))
     # currents and voltages given the motion of the round's start
-    electric = lk.electric_residuals(given, target.batch, held.felt, held.electric)
+    electric = lk.electric_residuals(given, objective.batch, held.motor_force, held.electric)
     blocks = {"motion": motion} | electric
-    if target.several is not None:
-        blocks |= _several(target.several, robot, given)
+    if objective.multi_floor is not None:
+        blocks |= _multi_floor_residuals(objective.multi_floor, robot, given)
     white = {k: jnp.einsum("nij,nj->ni", held.root[k], r) for k, r in blocks.items()}
     parts = [
-        marginal_residuals(held.tied, w) if k == "motion" else w.ravel() for k, w in white.items()
+        marginal_residuals(held.effects, w) if k == "motion" else w.ravel()
+        for k, w in white.items()
     ]
     # the slope of the log Jacobian adds slope . z to the log posterior
     mean = space.prior_mean + held.prior_std**2 * held.slope

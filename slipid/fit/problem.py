@@ -59,9 +59,9 @@ class FitState:
     stage: str
     effect: Float[np.ndarray, "piece 3"] | None = None
 
-    def shared(self, pieces: int) -> Float[np.ndarray, "piece 3"]:
+    def shared(self, segments: int) -> Float[np.ndarray, "piece 3"]:
         """The effects, zero where none were found yet."""
-        return np.zeros((pieces, 3)) if self.effect is None else self.effect
+        return np.zeros((segments, 3)) if self.effect is None else self.effect
 
     @property
     def arrays(self) -> dict[str, Any]:
@@ -95,25 +95,27 @@ class Problem:
     def of(self, windows: Windows) -> "Problem":
         """The same problem for other windows; those of the same shapes share what is compiled."""
         other = copy.copy(self)
-        other._read(windows, self.several)
+        other._read(windows, self.multi_floor)
         return other
 
-    def crossed(self, several: MultiFloorRuns) -> "Problem":
+    def with_multi_floor(self, multi_floor: MultiFloorRuns) -> "Problem":
         """The same problem with runs over several floors."""
         other = copy.copy(self)
         other.compiled = {}
-        other._read(self.windows, several)
+        other._read(self.windows, multi_floor)
         return other
 
-    def _read(self, windows: Windows, several: MultiFloorRuns | None) -> None:
-        self.windows, self.several = windows, several
-        self.noise = noise(windows, self.robot, several)
-        shared, self.paces = effects_by_floor(windows, self.robot, self.noise)
+    def _read(self, windows: Windows, multi_floor: MultiFloorRuns | None) -> None:
+        self.windows, self.multi_floor = windows, multi_floor
+        self.noise = noise(windows, self.robot, multi_floor)
+        shared, self.speeds_and_loads = effects_by_floor(windows, self.robot, self.noise)
         kinds = np.array([c.kind for c in self.noise.components])
-        self.target = Objective(
+        self.objective = Objective(
             space=self.space,
             batch=lk.batch(windows, self.robot),
-            several=None if several is None else MultiFloorBatch.of(several, self.robot),
+            multi_floor=None
+            if multi_floor is None
+            else MultiFloorBatch.of(multi_floor, self.robot),
             blocks=self.noise.blocks,
             shared=shared,
             typical=jnp.asarray(2 * np.log(self.noise.typical)),
@@ -123,31 +125,31 @@ class Problem:
         )
 
     @property
-    def every(self) -> Float[np.ndarray, " piece"]:
+    def full_weight(self) -> Float[np.ndarray, " piece"]:
         """Weights with which every piece counts, those of runs over several floors last."""
         return np.ones(
-            len(self.windows) + (0 if self.several is None else len(self.several.counts))
+            len(self.windows) + (0 if self.multi_floor is None else len(self.multi_floor.counts))
         )
 
-    def restated(self, state: FitState, of: "Problem") -> FitState:
+    def carried_over(self, state: FitState, of: "Problem") -> FitState:
         """A state of another problem with the same numbers as one of this problem."""
         known = dict(zip(of.noise.names, state.log_variance, strict=True))
         log_v = [known.get(c.name, 2 * np.log(c.typical)) for c in self.noise.components]
         return replace(state, log_variance=np.array(log_v), moved=np.inf)
 
-    def apart(self) -> "Problem":
+    def without_shared_effects(self) -> "Problem":
         """The same problem as if runs shared nothing."""
         other = copy.copy(self)
-        other.target = replace(self.target, shared=())
+        other.objective = replace(self.objective, shared=())
         return other
 
     @property
     def batch(self) -> lk.Batch:
-        return self.target.batch
+        return self.objective.batch
 
     def linear(self, z: Vector, electric: lk.ElectricNoise) -> tuple[Blocks, Blocks]:
         """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
-        return linear(self.target, z, electric)[:2]
+        return linear(self.objective, z, electric)[:2]
 
     def covariance(self, block: str, log_v: Vector) -> Array:
         """Covariance of the residuals of a block (piece, m, m)."""
@@ -157,17 +159,17 @@ class Problem:
         return variances.whitening(self.noise.blocks, residual, log_v, keep)
 
     def precision(self, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
-        return variances.precision(self.target, jacobian, log_v, keep)
+        return variances.precision(self.objective, jacobian, log_v, keep)
 
     def laplace(
         self, z: Vector, log_v: Vector, keep: Vector, alone: bool = False
     ) -> Float[np.ndarray, "free free"]:
         """Covariance of the search vector: inverse information, prior included."""
         jacobian = self.linear(z, self.electric(z, log_v))[1]
-        told = variances.precision(self.target, jacobian, log_v, keep, alone)
+        told = variances.precision(self.objective, jacobian, log_v, keep, alone)
         return np.linalg.inv(np.asarray(told))
 
-    def seen(
+    def weighed(
         self, residual: Blocks, log_v: Vector, keep: Vector, effect: Vector
     ) -> "WeighedResiduals":
         """Residuals weighed: outliers are so only for what they do not share with other runs.
@@ -175,7 +177,7 @@ class Problem:
         The effect is what they were found to share (piece, 3).
         """
         where = jnp.asarray(log_v), jnp.asarray(keep), jnp.asarray(effect)
-        return _weighed(self.target, residual, *where)
+        return _weighed(self.objective, residual, *where)
 
     def loss(
         self,
@@ -187,24 +189,24 @@ class Problem:
     ) -> float:
         """Minus log posterior of structure and variances given the residuals, less constants."""
         nll = float(seen.loss)
-        nll -= float(log_jacobian(self.target, z, electric, keep)[0])
-        prior_std = np.asarray(self.target.prior_std(log_v))
+        nll -= float(log_jacobian(self.objective, z, electric, keep)[0])
+        prior_std = np.asarray(self.objective.prior_std(log_v))
         pull = (np.asarray(z) - self.space.prior_mean) / prior_std
         nll += float(np.log(prior_std).sum())
-        spread = (np.asarray(log_v) - np.asarray(self.target.typical)) / VARIANCE_SPREAD
+        spread = (np.asarray(log_v) - np.asarray(self.objective.typical)) / VARIANCE_SPREAD
         return nll + 0.5 * float(np.sum(pull**2)) + 0.5 * float(np.sum(spread**2))
 
     def electric(self, z: Vector, log_v: Vector) -> lk.ElectricNoise:
         """What voltages are predicted with at this resistance and these variances."""
-        return _electric(self.target, z, log_v)
+        return _electric(self.objective, z, log_v)
 
     def voltage_information(
-        self, z: Vector, log_v: Vector, felt: Array
+        self, z: Vector, log_v: Vector, motor_force: Array
     ) -> VoltageInformation | None:
         """What voltages tell of variances given the traction, None where none are logged."""
         if "voltage" not in self.noise.blocks:
             return None
-        return voltage_information(self.target, z, log_v, felt)
+        return voltage_information(self.objective, z, log_v, motor_force)
 
 
 class WeighedResiduals(NamedTuple):
@@ -217,77 +219,77 @@ class WeighedResiduals(NamedTuple):
     """
 
     whitening: Whitening
-    tied: tuple[EffectPosterior, ...]
+    effects: tuple[EffectPosterior, ...]
     loss: Array
 
 
 @eqx.filter_jit
 def _weighed(
-    target: Objective, residual: Blocks, log_v: Array, keep: Array, effect: Array
+    objective: Objective, residual: Blocks, log_v: Array, keep: Array, effect: Array
 ) -> WeighedResiduals:
     found = variances.whitening(
-        target.blocks, without_effects(target, residual, effect), log_v, keep
+        objective.blocks, without_effects(objective, residual, effect), log_v, keep
     )
     root = found.root["motion"]
-    tied = effect_posteriors(target.shared, log_v, root)
-    coefs = marginal_residuals(tied, jnp.einsum("nij,nj->ni", root, residual["motion"]))[
+    posteriors = effect_posteriors(objective.shared, log_v, root)
+    coefs = marginal_residuals(posteriors, jnp.einsum("nij,nj->ni", root, residual["motion"]))[
         residual["motion"].size :
     ]
-    log_det = sum(jnp.sum(jnp.log(jnp.diagonal(tie.factor))) for tie in tied)
-    return WeighedResiduals(found, tied, found.loss + 0.5 * jnp.sum(coefs**2) + log_det)
+    log_det = sum(jnp.sum(jnp.log(jnp.diagonal(tie.factor))) for tie in posteriors)
+    return WeighedResiduals(found, posteriors, found.loss + 0.5 * jnp.sum(coefs**2) + log_det)
 
 
 @eqx.filter_jit
-def without_effects(target: Objective, residual: Blocks, effect: Array) -> Blocks:
+def without_effects(objective: Objective, residual: Blocks, effect: Array) -> Blocks:
     """Residual blocks less effects that runs share (piece, 3)."""
     motion = residual["motion"]
-    for of in target.shared:
-        off = jnp.einsum("nma,na->nm", of.effect, effect[of.pieces])
-        motion = motion.at[of.pieces].add(-off)
+    for of in objective.shared:
+        off = jnp.einsum("nma,na->nm", of.effect, effect[of.segments])
+        motion = motion.at[of.segments].add(-off)
     return residual | {"motion": motion}
 
 
 @eqx.filter_jit
-def effects_given(tied: tuple[EffectPosterior, ...], root: Array, motion: Array) -> Array:
+def effects_given(posteriors: tuple[EffectPosterior, ...], root: Array, motion: Array) -> Array:
     """Conditional mean of the effects that runs share (piece, 3) given residuals of the motion."""
-    return mean_effects(tied, jnp.einsum("nij,nj->ni", root, motion))
+    return mean_effects(posteriors, jnp.einsum("nij,nj->ni", root, motion))
 
 
 @eqx.filter_jit
 def linear(
-    target: Objective, z: Vector, electric: lk.ElectricNoise
+    objective: Objective, z: Vector, electric: lk.ElectricNoise
 ) -> tuple[Blocks, Blocks, Array]:
     """Residual blocks, their Jacobians, and the traction of every wheel's motor."""
 
     def blocks(x: Array) -> tuple[Blocks, tuple[Blocks, Array]]:
-        robot = target.space.tree(x)
-        p = lk.predict(robot, target.batch)
-        motion = {"motion": lk.motion_residual(robot, target.batch, p)}
-        out = motion | lk.electric_residuals(robot, target.batch, p.felt, electric)
-        if (of := target.several) is not None:
+        robot = objective.space.tree(x)
+        p = lk.predict(robot, objective.batch)
+        motion = {"motion": lk.motion_residual(robot, objective.batch, p)}
+        out = motion | lk.electric_residuals(robot, objective.batch, p.motor_force, electric)
+        if (of := objective.multi_floor) is not None:
             out |= of.residuals(robot, lk.predict(robot, of.batch))
-        return out, (out, p.felt)
+        return out, (out, p.motor_force)
 
-    jacobian, (out, felt) = jax.jacfwd(blocks, has_aux=True)(z)
-    return out, jacobian, felt
+    jacobian, (out, motor_force) = jax.jacfwd(blocks, has_aux=True)(z)
+    return out, jacobian, motor_force
 
 
 @eqx.filter_jit
-def _electric(target: Objective, z: Vector, log_v: Vector) -> lk.ElectricNoise:
-    return electric_noise(target.blocks, log_v, target.space.tree(z).motor.resistance)
+def _electric(objective: Objective, z: Vector, log_v: Vector) -> lk.ElectricNoise:
+    return electric_noise(objective.blocks, log_v, objective.space.tree(z).motor.resistance)
 
 
 @eqx.filter_jit
 def log_jacobian(
-    target: Objective, z: Vector, electric: lk.ElectricNoise, keep: Vector
+    objective: Objective, z: Vector, electric: lk.ElectricNoise, keep: Vector
 ) -> tuple[Array, Array]:
     """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
 
     def total(x: Array) -> Array:
-        robot = target.space.tree(x)
-        each = sum(lk.log_jacobians(robot, target.batch, electric))
-        if target.several is not None:
-            each = jnp.concatenate([each, target.several.log_jacobian(robot)])
+        robot = objective.space.tree(x)
+        each = sum(lk.log_jacobians(robot, objective.batch, electric))
+        if objective.multi_floor is not None:
+            each = jnp.concatenate([each, objective.multi_floor.log_jacobian(robot)])
         return jnp.asarray(keep) @ each
 
     return jax.value_and_grad(total)(z)

@@ -63,9 +63,9 @@ def with_session_effects(
     pulls = weighted * (_weights(model, np.zeros_like(model.run)) * keep)[:, None, None]
     of_session = by_axis(variance, "session", w)
     meat = np.zeros_like(model.covariance)
-    of_piece = floors_and_sessions(w)
-    for pair in dict.fromkeys(of_piece):
-        mine = np.array([other == pair for other in of_piece]) & (keep > 0)
+    of_segment = floors_and_sessions(w)
+    for pair in dict.fromkeys(of_segment):
+        mine = np.array([other == pair for other in of_segment]) & (keep > 0)
         if mine.any():
             u = pulls[mine].sum(axis=0)
             meat += u.T @ (of_session[mine][0][:, None] * u)

@@ -71,7 +71,7 @@ class TravelConditions:
     """
 
     direction: Float[np.ndarray, " piece"]
-    pace: tuple[SpeedAndLoad, ...]
+    speed_and_load: tuple[SpeedAndLoad, ...]
     mirror: float | None
 
     @staticmethod
@@ -89,10 +89,10 @@ class TravelConditions:
             robot.geometry.mirror(),
         )
 
-    def of_pieces(self, mine: Int[np.ndarray, " some"]) -> "TravelConditions":
+    def subset(self, mine: Int[np.ndarray, " some"]) -> "TravelConditions":
         """Those of some pieces."""
         return TravelConditions(
-            self.direction[mine], tuple(self.pace[k] for k in mine), self.mirror
+            self.direction[mine], tuple(self.speed_and_load[k] for k in mine), self.mirror
         )
 
     def around(self) -> Float[np.ndarray, "3 piece harmonic"]:
@@ -113,20 +113,27 @@ class TravelConditions:
         ]
         return np.stack(root) * np.isfinite(self.direction)[:, None]
 
-    def basis(self, paces: tuple[SpeedAndLoad, ...]) -> Float[np.ndarray, "3 piece coef"]:
+    def basis(
+        self, speeds_and_loads: tuple[SpeedAndLoad, ...]
+    ) -> Float[np.ndarray, "3 piece coef"]:
         """Root of the kernel: effects of unit coefs, from paces that were seen.
 
         Its rows are as long as those of `around`, less where the pace is another.
         """
-        if not paces:
-            return np.zeros((len(AXES), len(self.pace), 0))
-        seen = np.array([[a.near(b) for b in paces] for a in paces])
-        root = np.linalg.cholesky(seen + 1e-9 * np.eye(len(paces)))
-        met = {pace: np.array([pace.near(b) for b in paces]) for pace in set(self.pace)}
-        share = {pace: np.linalg.solve(root, row) for pace, row in met.items()}
-        of_pace = np.array([share[pace] for pace in self.pace]).reshape(-1, len(paces))
+        if not speeds_and_loads:
+            return np.zeros((len(AXES), len(self.speed_and_load), 0))
+        seen = np.array([[a.near(b) for b in speeds_and_loads] for a in speeds_and_loads])
+        root = np.linalg.cholesky(seen + 1e-9 * np.eye(len(speeds_and_loads)))
+        met = {
+            speed_and_load: np.array([speed_and_load.near(b) for b in speeds_and_loads])
+            for speed_and_load in set(self.speed_and_load)
+        }
+        share = {speed_and_load: np.linalg.solve(root, row) for speed_and_load, row in met.items()}
+        of_pace = np.array(
+            [share[speed_and_load] for speed_and_load in self.speed_and_load]
+        ).reshape(-1, len(speeds_and_loads))
         whole = np.einsum("pc,apd->apcd", of_pace, self.around())
-        return np.asarray(whole.reshape(len(AXES), len(self.pace), -1))
+        return np.asarray(whole.reshape(len(AXES), len(self.speed_and_load), -1))
 
 
 class SharedEffects(eqx.Module):
@@ -139,7 +146,7 @@ class SharedEffects(eqx.Module):
         numbers: of the variances of own, neighbours' and session's effects, -1 where there is none.
     """
 
-    pieces: Int[Array, " run"]
+    segments: Int[Array, " run"]
     effect: Float[Array, "run m 3"]
     near: Float[Array, "3 run condition"]
     session: Float[Array, "run session"]
@@ -152,20 +159,20 @@ class SharedEffects(eqx.Module):
         return jnp.concatenate(parts, axis=-1)
 
 
-Paces = dict[str, tuple[SpeedAndLoad, ...]]
+SpeedsAndLoads = dict[str, tuple[SpeedAndLoad, ...]]
 """Those that each floor was driven at."""
 
 
 def effects_by_floor(
     w: Windows, robot: Robot, noise: NoiseModel
-) -> tuple[tuple[SharedEffects, ...], Paces]:
+) -> tuple[tuple[SharedEffects, ...], SpeedsAndLoads]:
     """What runs share on every floor, and the paces it was driven at."""
-    every, moved, place = TravelConditions.of(w, robot), effects(w, robot), noise.names.index
-    floors, found, paces = np.asarray(w.surface), [], {}
+    conditions, moved, place = TravelConditions.of(w, robot), effects(w, robot), noise.names.index
+    floors, found, speeds_and_loads = np.asarray(w.surface), [], {}
     for floor in robot.surfaces.labels:
         mine = np.flatnonzero(floors == floor)
-        here = every.of_pieces(mine)
-        paces[floor] = tuple(dict.fromkeys(here.pace))
+        here = conditions.subset(mine)
+        speeds_and_loads[floor] = tuple(dict.fromkeys(here.speed_and_load))
         names = sessions_on(w, floor)
         session = np.array([w.session[k] for k in mine])[:, None] == np.asarray(names)
         kinds = [
@@ -174,14 +181,14 @@ def effects_by_floor(
         number = [[place(n) if n in noise.names else -1 for n in row] for row in kinds]
         found.append(
             SharedEffects(
-                pieces=jnp.asarray(mine),
+                segments=jnp.asarray(mine),
                 effect=jnp.asarray(moved[mine]),
-                near=jnp.asarray(here.basis(paces[floor])),
+                near=jnp.asarray(here.basis(speeds_and_loads[floor])),
                 session=jnp.asarray(session[:, : len(names) if len(names) > 1 else 0], float),
                 numbers=jnp.asarray(number),
             )
         )
-    return tuple(found), paces
+    return tuple(found), speeds_and_loads
 
 
 class EffectPosterior(eqx.Module):
@@ -192,14 +199,14 @@ class EffectPosterior(eqx.Module):
         root: S; factor: Cholesky factor of C.
     """
 
-    pieces: Int[Array, " run"]
+    segments: Int[Array, " run"]
     span: Float[Array, "run m 3"]
     root: Float[Array, "3 run coef"]
     factor: Float[Array, "coefs coefs"]
 
     def coefs(self, white: Float[Array, "piece m"]) -> Float[Array, " coefs"]:
         """Conditional mean u^ of the coefs given whitened residuals of all pieces."""
-        told = jnp.einsum("nma,nm->an", self.span, white[self.pieces])
+        told = jnp.einsum("nma,nm->an", self.span, white[self.segments])
         return cho_solve((self.factor, True), jnp.einsum("anq,an->aq", self.root, told).ravel())
 
     def effects(self, coefs: Float[Array, " coefs"]) -> Float[Array, "run 3"]:
@@ -216,67 +223,71 @@ def effect_posteriors(
     """Shared effects of every floor for given whitening roots of all pieces."""
 
     def tie(of: SharedEffects) -> EffectPosterior:
-        span = jnp.einsum("nij,nja->nia", white[of.pieces], of.effect)
+        span = jnp.einsum("nij,nja->nia", white[of.segments], of.effect)
         gram = jnp.einsum("nia,nib->abn", span, span)
         root = of.root(log_v)
         weighed = jnp.einsum("abn,bnk->abnk", gram, root)
         size = root.shape[0] * root.shape[2]
         inner = jnp.einsum("anq,abnk->aqbk", root, weighed).reshape(size, size)
-        return EffectPosterior(of.pieces, span, root, jnp.linalg.cholesky(jnp.eye(size) + inner))
+        return EffectPosterior(of.segments, span, root, jnp.linalg.cholesky(jnp.eye(size) + inner))
 
     return tuple(tie(of) for of in shared)
 
 
 def marginal_residuals(
-    tied: tuple[EffectPosterior, ...], white: Float[Array, "piece m"]
+    posteriors: tuple[EffectPosterior, ...], white: Float[Array, "piece m"]
 ) -> Float[Array, " rows"]:
     """Whitened residuals less shared effects at their conditional mean, and the coefs' own.
 
     Its square is the quadratic form of the marginal likelihood.
     """
-    coefs = [tie.coefs(white) for tie in tied]
-    for tie, u in zip(tied, coefs, strict=True):
+    coefs = [tie.coefs(white) for tie in posteriors]
+    for tie, u in zip(posteriors, coefs, strict=True):
         moved = jnp.einsum("nma,na->nm", tie.span, tie.effects(u))
-        white = white.at[tie.pieces].add(-moved)
+        white = white.at[tie.segments].add(-moved)
     return jnp.concatenate([white.ravel(), *coefs])
 
 
 @eqx.filter_jit
 def mean_effects(
-    tied: tuple[EffectPosterior, ...], white: Float[Array, "piece m"]
+    posteriors: tuple[EffectPosterior, ...], white: Float[Array, "piece m"]
 ) -> Float[Array, "piece 3"]:
     """Conditional mean of the effects that runs share, for every piece."""
     out = jnp.zeros((len(white), len(AXES)))
-    for tie in tied:
-        out = out.at[tie.pieces].set(tie.effects(tie.coefs(white)))
+    for tie in posteriors:
+        out = out.at[tie.segments].set(tie.effects(tie.coefs(white)))
     return out
 
 
 @eqx.filter_jit
-def effect_covariances(tied: tuple[EffectPosterior, ...], count: int) -> Float[Array, "piece 3 3"]:
+def effect_covariances(
+    posteriors: tuple[EffectPosterior, ...], count: int
+) -> Float[Array, "piece 3 3"]:
     """Covariance of the shared effects of every piece, given the numbers of the model."""
     out = jnp.zeros((count, len(AXES), len(AXES)))
-    for tie in tied:
+    for tie in posteriors:
         axes, runs, _ = tie.root.shape
         rows = jnp.einsum("ab,anq->nabq", jnp.eye(axes), tie.root).reshape(runs * axes, -1)
         half = jax.scipy.linalg.solve_triangular(tie.factor, rows.T, lower=True)
         half = half.reshape(-1, runs, axes)
-        out = out.at[tie.pieces].set(jnp.einsum("kna,knb->nab", half, half))
+        out = out.at[tie.segments].set(jnp.einsum("kna,knb->nab", half, half))
     return out
 
 
 def marginal_slopes(
-    tied: tuple[EffectPosterior, ...], white: Float[Array, "piece m free"]
+    posteriors: tuple[EffectPosterior, ...], white: Float[Array, "piece m free"]
 ) -> Float[Array, "rows free"]:
     """`marginal_residuals` of every column."""
-    return jax.vmap(lambda column: marginal_residuals(tied, column), in_axes=-1, out_axes=-1)(white)
+    return jax.vmap(lambda column: marginal_residuals(posteriors, column), in_axes=-1, out_axes=-1)(
+        white
+    )
 
 
 def mean_effect_slopes(
-    tied: tuple[EffectPosterior, ...], white: Float[Array, "piece m free"]
+    posteriors: tuple[EffectPosterior, ...], white: Float[Array, "piece m free"]
 ) -> Float[Array, "piece 3 free"]:
     """`mean_effects` of every column."""
-    return jax.vmap(lambda column: mean_effects(tied, column), in_axes=-1, out_axes=-1)(white)
+    return jax.vmap(lambda column: mean_effects(posteriors, column), in_axes=-1, out_axes=-1)(white)
 
 
 class EffectForecast(NamedTuple):
@@ -298,15 +309,15 @@ class EffectTable:
         covariance: of the coefs given the numbers.
     """
 
-    paces: tuple[SpeedAndLoad, ...]
+    speeds_and_loads: tuple[SpeedAndLoad, ...]
     std: Float[np.ndarray, "3"]
     coefs: Float[np.ndarray, "3 coef"]
     by_number: Float[np.ndarray, "3 coef free"]
     covariance: Float[np.ndarray, "3 coef 3 coef"]
 
-    def told(self, way: TravelConditions) -> EffectForecast:
+    def forecast(self, way: TravelConditions) -> EffectForecast:
         """Of new runs on this floor."""
-        basis, around = way.basis(self.paces), way.around()
+        basis, around = way.basis(self.speeds_and_loads), way.around()
         of = self.std[:, None, None] * basis
         whole = np.where(np.isfinite(way.direction), (around**2).sum(axis=-1), 1.0)
         rest = (self.std[:, None] ** 2 * np.maximum(whole - (basis**2).sum(axis=-1), 0.0)).T
@@ -326,12 +337,12 @@ def forecast_effects(
     out = EffectForecast(np.zeros((n, axes)), np.zeros((n, axes, free)), np.zeros((n, axes, axes)))
     if not found:
         return out
-    every, floors = TravelConditions.of(w, robot), np.asarray(w.surface)
+    conditions, floors = TravelConditions.of(w, robot), np.asarray(w.surface)
     for floor, one in found.items():
         mine = np.flatnonzero(floors == floor)
         if not len(mine):
             continue
-        here = every.of_pieces(mine)
-        for whole, part in zip(out, one.told(here), strict=True):
+        here = conditions.subset(mine)
+        for whole, part in zip(out, one.forecast(here), strict=True):
             whole[mine] = part
     return out

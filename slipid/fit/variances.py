@@ -58,7 +58,7 @@ class Objective(eqx.Module):
 
     space: Space
     batch: lk.Batch
-    several: MultiFloorBatch | None
+    multi_floor: MultiFloorBatch | None
     blocks: dict[str, Components]
     shared: tuple[SharedEffects, ...]
     typical: Float[Array, " variance"]
@@ -104,15 +104,15 @@ class VoltageInformation(NamedTuple):
 
 @eqx.filter_jit
 def voltage_information(
-    target: Objective, z: Vector, log_v: Vector, felt: Array
+    objective: Objective, z: Vector, log_v: Vector, motor_force: Array
 ) -> VoltageInformation:
     """What voltages tell of variances given the traction of every wheel's motor."""
-    robot, b = target.space.tree(z), target.batch
-    noise = electric_noise(target.blocks, log_v, robot.motor.resistance)
+    robot, b = objective.space.tree(z), objective.batch
+    noise = electric_noise(objective.blocks, log_v, robot.motor.resistance)
 
     def scaled(scatter: Array) -> tuple[Array, Array]:
         at = lk.ElectricNoise(noise.voltage_std, scatter, noise.resistance)
-        return lk.electric_residuals(robot, b, felt, at)["voltage"], lk.voltage_spread(b, at)
+        return lk.electric_residuals(robot, b, motor_force, at)["voltage"], lk.voltage_spread(b, at)
 
     # every residual depends on its own scatter only
     (r, spread), (more, wider) = jax.jvp(scaled, (noise.scatter,), (jnp.ones_like(noise.scatter),))
@@ -131,7 +131,7 @@ def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> 
     roots, weights, loss = {}, {}, jnp.zeros(())
     for k, r in residual.items():
         inverse = inverse_root(noises[k].covariance(log_v))
-        m, kept = noises[k].count, jnp.asarray(keep)[noises[k].pieces]
+        m, kept = noises[k].count, jnp.asarray(keep)[noises[k].segments]
         q = jnp.sum(jnp.einsum("nij,nj->ni", inverse, r) ** 2, axis=-1)
         weights[k] = (DEGREES + m) / (DEGREES + q) * kept
         roots[k] = jnp.sqrt(weights[k])[:, None, None] * inverse
@@ -145,7 +145,7 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> B
     """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
     out = {}
     for k, jac in jacobian.items():
-        factor = jnp.asarray(keep)[noises[k].pieces] * expected(noises[k].count)
+        factor = jnp.asarray(keep)[noises[k].segments] * expected(noises[k].count)
         root = inverse_root(noises[k].covariance(log_v)) * jnp.sqrt(factor)[:, None, None]
         out[k] = jnp.einsum("nij,njp->nip", root, jac)
     return out
@@ -153,33 +153,35 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> B
 
 @eqx.filter_jit
 def precision(
-    target: Objective, jacobian: Blocks, log_v: Vector, keep: Vector, alone: bool = False
+    objective: Objective, jacobian: Blocks, log_v: Vector, keep: Vector, alone: bool = False
 ) -> Array:
     """Expected information of the search vector, prior included (free, free).
 
     What runs share is marginalised; `alone` counts every run as if it shared nothing.
     """
-    prior = jnp.diag(1 / target.prior_std(log_v) ** 2)
+    prior = jnp.diag(1 / objective.prior_std(log_v) ** 2)
     total, of_motion = prior, prior
-    for k, half in whitened(target.blocks, jacobian, log_v, keep).items():
+    for k, half in whitened(objective.blocks, jacobian, log_v, keep).items():
         flat = half.reshape(-1, half.shape[-1])
         if k == "motion" and not alone:
-            tied = expected_posteriors(target, log_v, keep)
-            flat = marginal_slopes(tied, half)
+            posteriors = expected_posteriors(objective, log_v, keep)
+            flat = marginal_slopes(posteriors, half)
         total += flat.T @ flat
         of_motion += flat.T @ flat if k in MOTION_BLOCKS else 0.0
-    return total if target.joint else _cut(total, of_motion, jnp.asarray(target.space.electric))
+    return (
+        total if objective.joint else _cut(total, of_motion, jnp.asarray(objective.space.electric))
+    )
 
 
 def expected_posteriors(
-    target: Objective, log_v: Vector, keep: Vector
+    objective: Objective, log_v: Vector, keep: Vector
 ) -> tuple[EffectPosterior, ...]:
     """What runs share, given residuals whitened by `whitened`."""
-    block = target.blocks["motion"]
+    block = objective.blocks["motion"]
     roots = inverse_root(block.covariance(jnp.asarray(log_v)))
-    factor = expected(block.count) * jnp.asarray(keep)[block.pieces]
+    factor = expected(block.count) * jnp.asarray(keep)[block.segments]
     return effect_posteriors(
-        target.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None]
+        objective.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None]
     )
 
 
@@ -208,31 +210,31 @@ def _schur_term(information: Array, e: Array) -> Array:
 
 
 @eqx.filter_jit
-def fitted_covariance(target: Objective, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
+def fitted_covariance(objective: Objective, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
     """Covariance of the residuals from fitted numbers and from what runs share (piece, m, m).
 
     The Jacobian is of the structural numbers; what runs share follows them.
     """
-    cov = jnp.linalg.inv(precision(target, jacobian, log_v, keep))
-    tied = expected_posteriors(target, log_v, keep)
-    half = whitened(target.blocks, jacobian, log_v, keep)["motion"]
-    followed = mean_effect_slopes(tied, half)
+    cov = jnp.linalg.inv(precision(objective, jacobian, log_v, keep))
+    posteriors = expected_posteriors(objective, log_v, keep)
+    half = whitened(objective.blocks, jacobian, log_v, keep)["motion"]
+    followed = mean_effect_slopes(posteriors, half)
     motion = jacobian["motion"]
-    for of in target.shared:
-        off = jnp.einsum("nma,nap->nmp", of.effect, followed[of.pieces])
-        motion = motion.at[of.pieces].add(-off)
+    for of in objective.shared:
+        off = jnp.einsum("nma,nap->nmp", of.effect, followed[of.segments])
+        motion = motion.at[of.segments].add(-off)
     slopes = jacobian | {"motion": motion}
     spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in slopes.items()}
-    around = effect_covariances(tied, len(motion))
-    for of in target.shared:
-        more = jnp.einsum("nma,nab,nlb->nml", of.effect, around[of.pieces], of.effect)
-        spread["motion"] = spread["motion"].at[of.pieces].add(more)
+    around = effect_covariances(posteriors, len(motion))
+    for of in objective.shared:
+        more = jnp.einsum("nma,nab,nlb->nml", of.effect, around[of.segments], of.effect)
+        spread["motion"] = spread["motion"].at[of.segments].add(more)
     return spread
 
 
 @eqx.filter_jit
 def scoring_step(
-    target: Objective,
+    objective: Objective,
     residual: Blocks,
     spread: Blocks,
     log_v: Array,
@@ -245,15 +247,15 @@ def scoring_step(
     covariance from what was fitted to them (piece, m, m); the degrees of freedom it stands for are
     not the variances' to have.
     """
-    _, weights, _ = whitening(target.blocks, residual, log_v, keep)
+    _, weights, _ = whitening(objective.blocks, residual, log_v, keep)
     score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])
     for k, r in residual.items():
-        noise, mine = target.blocks[k], _own_share(k, voltage)
+        noise, mine = objective.blocks[k], _own_share(k, voltage)
         root = inverse_root(noise.covariance(log_v))
         inverse = jnp.einsum("nji,njk->nik", root, root)
         base, which = _scaled_base(noise.base, mine), noise.which
         v = jnp.exp(log_v)[which]
-        vr, kept = jnp.einsum("nij,nj->ni", inverse, r), keep[noise.pieces]
+        vr, kept = jnp.einsum("nij,nj->ni", inverse, r), keep[noise.segments]
         fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
         trace = jnp.einsum("nij,ncij->nc", inverse, base)
         spent = jnp.einsum("nij,njk,nkl->nil", inverse, spread[k], inverse)
@@ -270,11 +272,11 @@ def scoring_step(
         ):
             # a logarithm that falls bends the more: its slope is in proportion to the variance
             steeper = steeper.at[which].add(-slope)
-    score -= (log_v - target.typical) / VARIANCE_SPREAD**2
-    info = information(target.blocks, log_v, keep, voltage)
+    score -= (log_v - objective.typical) / VARIANCE_SPREAD**2
+    info = information(objective.blocks, log_v, keep, voltage)
     info += jnp.diag(jnp.maximum(steeper, 0.0))
     step = jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
-    return log_v + jnp.where(target.scored, step, 0.0)
+    return log_v + jnp.where(objective.scored, step, 0.0)
 
 
 @eqx.filter_jit
@@ -290,7 +292,7 @@ def information(
         v = jnp.exp(log_v)[which]
         cross = 0.5 * jnp.einsum("ncij,ndji->ncd", vb, vb)
         cross *= v[:, :, None] * v[:, None, :]
-        kept = jnp.asarray(keep)[noise.pieces, None, None]
+        kept = jnp.asarray(keep)[noise.segments, None, None]
         info = info.at[which[:, :, None], which[:, None, :]].add(kept * cross)
     return (
         info
@@ -304,7 +306,7 @@ def _scatter_information(
 ) -> Array:
     """Expected information of the log variances that voltages have of the scatter of currents."""
     grown = jnp.exp(log_v)[noise.which][..., None] * noise.single
-    kept = jnp.asarray(keep)[noise.pieces]
+    kept = jnp.asarray(keep)[noise.segments]
     cross = jnp.einsum("n,ni,nci,ndi->ncd", kept, voltage.information, grown, grown)
     info = jnp.zeros((log_v.shape[0],) * 2)
     return info.at[noise.which[:, :, None], noise.which[:, None, :]].add(cross)

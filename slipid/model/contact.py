@@ -133,7 +133,7 @@ def initial_twist(rim: Float[Array, " wheel"], frame: WheelFrame) -> Float[Array
     """Start of the root finder: the twist without slip, a little slower (least squares)."""
     j = frame.hold
     m = Columns(*(Planar(*column) for column in j.T @ j + 1e-6 * jnp.eye(3)))
-    return 0.8 * jnp.stack(solve3(m, Planar(*(j.T @ (rim * frame.pull)))))
+    return 0.8 * jnp.stack(solve3(m, Planar(*(j.T @ (rim * frame.drive_share)))))
 
 
 def equilibrium(
@@ -168,7 +168,7 @@ def traction(
     rest: Float[Array, " wheel"],
 ) -> Float[Array, " wheel"]:
     """Traction along the drive of each wheel that its motor works against at a twist [mu m g]."""
-    return Balance(rim, stand(frame, surface, rest)).felt(Planar(*xi))
+    return Balance(rim, stand(frame, surface, rest)).motor_force(Planar(*xi))
 
 
 def rolling_drag(
@@ -182,7 +182,7 @@ def rolling_drag(
 
     The motor bears it, in units of `Motor.rolling_drag`, and the body does not feel it.
     """
-    return Balance(rim, stand(frame, surface, rest)).rolled(Planar(*xi))
+    return Balance(rim, stand(frame, surface, rest)).rolling_drag(Planar(*xi))
 
 
 def settle(
@@ -220,5 +220,5 @@ def settle(
     sound = jnp.isfinite(found.x + found.y + found.yaw)
     free = Planar(*(total(row[:, None] * rim) for row in plain))
     twist = jnp.stack(jax.tree.map(lambda x, p: jnp.where(sound, x, p), found, free))
-    felt = jnp.where(nearer, balance.felt(xi), balance.felt(near))
-    return twist, jnp.where(jnp.isfinite(felt), felt, 0.0)
+    motor_force = jnp.where(nearer, balance.motor_force(xi), balance.motor_force(near))
+    return twist, jnp.where(jnp.isfinite(motor_force), motor_force, 0.0)

@@ -147,13 +147,13 @@ class Geometry(eqx.Module):
         That of a drive with several wheels is their mean.
         """
         frame = self.frame()
-        of_wheels = frame.hold / frame.pull[:, None]
+        of_wheels = frame.hold / frame.drive_share[:, None]
         if not self.drive_of:
             return of_wheels
         share = np.eye(self.drives)[list(self.drive_of)]
         return jnp.asarray((share / share.sum(axis=0)).T) @ of_wheels
 
-    def least(self) -> Float[Array, "3 drive"]:
+    def pseudo_inverse(self) -> Float[Array, "3 drive"]:
         """J^+: the smallest body twist that comes nearest to rim speeds [m/s], of any drives.
 
         Wheels that all point ahead do not tell motion sideways: it is taken for none.
@@ -196,8 +196,8 @@ class WheelFrame(eqx.Module):
 
     hold: Float[Array, "wheel 3"]
     roll: Float[Array, "wheel 3"]
-    pull: Float[Array, " wheel"]
-    slip_through: Float[Array, " wheel"]
+    drive_share: Float[Array, " wheel"]
+    roller_share: Float[Array, " wheel"]
     grip: Float[Array, " wheel"]
     shift: Float[Array, "wheel 2"]
     radius: Float[Array, ""]
@@ -227,8 +227,8 @@ def _wheel_frame(
     return WheelFrame(
         hold=row(hold),
         roll=row(free),
-        pull=larger * jnp.sin(roller),
-        slip_through=larger * jnp.cos(roller),
+        drive_share=larger * jnp.sin(roller),
+        roller_share=larger * jnp.cos(roller),
         grip=jnp.asarray(grips, dtype=float),
         shift=jnp.linalg.pinv(lever)[:, 1:],
         radius=radius,

@@ -228,5 +228,7 @@ def motor_current(
     """
     shape = robot.geometry
     force = jnp.mean(robot.surfaces.friction[surface]) * robot.body.mass * GRAVITY
-    borne = robot.motor.borne(motor_forces(robot, frame, xi, shape.at_wheels(speed), surface, load))
-    return robot.motor.current(frame.radius * force * shape.at_drives(borne), speed)
+    opposing = robot.motor.opposing_force(
+        motor_forces(robot, frame, xi, shape.at_wheels(speed), surface, load)
+    )
+    return robot.motor.current(frame.radius * force * shape.at_drives(opposing), speed)

@@ -174,7 +174,7 @@ def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
     """
     w, robot = problem.windows, problem.robot
     far, _ = travel(w, robot)
-    left = _unpredicted_motion(w, robot, "camera.marker_place" in problem.space.place)
+    left = _unpredicted_motion(w, robot, "camera.marker_place" in problem.space.slices)
     variance = dict(zip(problem.noise.names, problem.noise.typical**2, strict=True))
     for floor in dict.fromkeys(w.surface):
         mine = np.asarray(w.surface) == floor
@@ -196,7 +196,7 @@ def _unpredicted_motion(
 ) -> Float[np.ndarray, "piece window 3"]:
     """Motion along, across and in yaw that other runs do not predict [m, m, rad]."""
     shape = robot.geometry
-    back = np.asarray(shape.least()).T * float(shape.wheel_radius)
+    back = np.asarray(shape.pseudo_inverse()).T * float(shape.wheel_radius)
     step, late = w.turn @ back, w.speed_change @ back
     moved = body_twist(w, robot) * w.dt[..., None]
     angle, series = np.arctan2(step[..., 1], step[..., 0]), fourier(step)

@@ -97,7 +97,7 @@ def fit_with_noise(
     gap, slope = plain.linear(problem)
     log_v, count = jnp.asarray(contact.log_variance(problem)), jnp.asarray(keep, float)
     own_effects = np.array([c.kind == "run" for c in problem.noise.components])
-    target = replace(problem.target, scored=problem.target.scored | own_effects)
+    target = replace(problem.objective, scored=problem.objective.scored | own_effects)
     for _ in range(MOST_TURNS):
         last = log_v
         scale = np.asarray(problem.covariance("motion", log_v))

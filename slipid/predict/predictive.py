@@ -175,12 +175,12 @@ class ForceBalance(PredictiveModel):
                 out[name] *= max(grown, default=1.0)
         return out
 
-    def told(self, w: Windows) -> EffectForecast:
+    def expected_effects(self, w: Windows) -> EffectForecast:
         """What neighbours among the fitted runs tell of runs."""
         return forecast_effects(self.shared, w, self.robot, self.space.size)
 
     def effect_covariance(self, w: Windows) -> Float[np.ndarray, "piece 3 3"]:
-        shared = super().effect_covariance(w) + self.told(w).covariance
+        shared = super().effect_covariance(w) + self.expected_effects(w).covariance
         return self.growth(w)[:, None, None] * shared
 
     def growth(self, w: Windows) -> Float[np.ndarray, " piece"]:
@@ -202,14 +202,14 @@ class ForceBalance(PredictiveModel):
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
         electric = problem.electric(self.z, self.log_variance(problem))
         blocks, jac = problem.linear(self.z, electric)
-        told, e = self.told(problem.windows), effects(problem.windows, problem.robot)
+        told, e = self.expected_effects(problem.windows), effects(problem.windows, problem.robot)
         gap = np.asarray(blocks["motion"]) - np.einsum("nma,na->nm", e, told.mean)
         slope = np.asarray(jac["motion"]) - np.einsum("nma,nap->nmp", e, told.slope)
         return gap, slope
 
     def tracks(self, w: Windows) -> replay.Tracks:
         """Of whole runs, as the force balance and what neighbours tell have them."""
-        return self._tracks(w, self._moved(w, self.told(w)))
+        return self._tracks(w, self._moved(w, self.expected_effects(w)))
 
     def _moved(self, w: Windows, told: EffectForecast) -> Float[np.ndarray, "piece window 3"]:
         """By what neighbours tell that the force balance moves too far."""
@@ -222,7 +222,7 @@ class ForceBalance(PredictiveModel):
         return replay.tracks_from_increments(self.robot, w, increments)
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
-        b, told, e = lk.batch(w, self.robot), self.told(w), effects(w, self.robot)
+        b, told, e = lk.batch(w, self.robot), self.expected_effects(w), effects(w, self.robot)
         moved = self._moved(w, told)
         tracks = self._tracks(w, moved)
         by_number = np.einsum("nma,nap->nmp", e, told.slope).reshape(*moved.shape, -1)
@@ -246,7 +246,7 @@ def force_balance_of(
     w = problem.windows
     direction = TravelConditions.of(w, problem.robot).direction
     courses = TravelDirections(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
-    grown = extrapolation(problem.target, motion, keep[: len(w)], covariance, log_v, courses)
+    grown = extrapolation(problem.objective, motion, keep[: len(w)], covariance, log_v, courses)
     return ForceBalance(
         robot,
         variance,
@@ -264,14 +264,14 @@ def effect_tables(
     """What neighbouring runs on every floor share, by a fit of the kept pieces."""
     log_v, free = jnp.asarray(state.log_variance), problem.space.size
     residual, jacobian = problem.linear(state.z, problem.electric(state.z, log_v))
-    seen = problem.seen(residual, log_v, keep, state.shared(len(problem.windows)))
+    seen = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
     white = jnp.einsum("nij,nj->ni", seen.whitening.root["motion"], residual["motion"])
-    half = whitened(problem.target.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]
-    expected = expected_posteriors(problem.target, log_v, jnp.asarray(keep))
+    half = whitened(problem.objective.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]
+    expected = expected_posteriors(problem.objective, log_v, jnp.asarray(keep))
     std = np.exp(0.5 * np.asarray(log_v))
     out = {}
     for floor, of, tie, to in zip(
-        problem.robot.surfaces.labels, problem.target.shared, seen.tied, expected, strict=True
+        problem.robot.surfaces.labels, problem.objective.shared, seen.effects, expected, strict=True
     ):
         near = of.near.shape[-1]
         count = near + of.session.shape[1]
@@ -279,7 +279,7 @@ def effect_tables(
         covariance = (inverse.T @ inverse).reshape(3, count, 3, count)
         slope = jax.vmap(to.coefs, in_axes=-1, out_axes=-1)(half)
         out[floor] = EffectTable(
-            paces=problem.paces[floor],
+            speeds_and_loads=problem.speeds_and_loads[floor],
             std=std[np.asarray(of.numbers)[1]],
             coefs=np.asarray(tie.coefs(white)).reshape(3, count)[:, :near],
             by_number=np.asarray(slope).reshape(3, count, free)[:, :near],

@@ -104,7 +104,7 @@ class RobotSpec:
     def of(cls, robot: Robot) -> "RobotSpec":
         """Of a robot as its config has it."""
         shape, motor = robot.geometry, robot.motor
-        back = np.asarray(shape.least())
+        back = np.asarray(shape.pseudo_inverse())
         return cls(
             forward=np.linalg.pinv(back),
             back=back,
@@ -119,7 +119,7 @@ class RobotSpec:
 
     def of_shape(self, shape: Geometry) -> "RobotSpec":
         """The same robot whose encoders are read with other sizes of its wheels and places."""
-        back = np.asarray(shape.least())
+        back = np.asarray(shape.pseudo_inverse())
         return replace(self, back=back, wheel_radius=float(shape.wheel_radius))
 
     @property

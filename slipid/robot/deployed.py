@@ -255,7 +255,7 @@ def _arrays(
         frame=geometry.frame(),
         places=jnp.asarray(geometry.place) * geometry.base_radius,
         forward=geometry.forward(),
-        inverse=geometry.least(),
+        inverse=geometry.pseudo_inverse(),
         motor=Motor(**of("motor", Motor), gear_ratio=_array(wheels.gear_ratio)),
         floors=ContactSurface(
             **{name: jnp.stack([row[name] for row in rows]) for name in rows[0]},

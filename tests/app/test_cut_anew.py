@@ -50,7 +50,7 @@ def test_a_fit_goes_on_with_windows_at_the_lag_it_found(task, monkeypatch):
         """Finds a lag of 0.12 s, whatever the windows are."""
         fitted.append((problem.windows.lag, before[0]))
         z = np.array(problem.space.start)
-        z[problem.space.place["camera.lag"]] += 0.12 - EXPECTED
+        z[problem.space.slices["camera.lag"]] += 0.12 - EXPECTED
         shared = np.ones((len(problem.windows), 3))
         state = FitState(z, np.zeros(len(problem.noise.names)), 9, 1.0, 0.001, "joint", shared)
         return Optimum(state, np.eye(len(z)), True, "settled", (1.0,))

@@ -97,7 +97,7 @@ def test_weights_are_the_prior_and_those_of_no_run_are_skipped(tmp_path):
     job = read_fit_task(parsed(tmp_path / "my.toml", text), tmp_path, KeptMessages())
     assert "skipped: weights.loaded: no run that has it" in job.skipped
     space = Space(job.robot, job.choices)
-    at = space.place["robot.load_share@as_built"]
+    at = space.slices["robot.load_share@as_built"]
     entry = next(e for e in space.free if e.path == "robot.load_share@as_built")
     mean = np.asarray(entry.declaration.to_si(jnp.asarray(space.prior_mean[at])))
     assert mean == pytest.approx([0.25, 5 / 12, 1 / 3])

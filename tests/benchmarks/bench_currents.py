@@ -47,7 +47,7 @@ def densities(job: ConfigFitTask) -> np.ndarray:
         density = log_student(gap, np.asarray(problem.covariance("current", at[1])))
         out[fold == k] = density[fold == k]
     if "motor.rolling_drag" in problem.space.names:
-        where = problem.space.place["motor.rolling_drag"]
+        where = problem.space.slices["motor.rolling_drag"]
         std = np.sqrt(np.diag(end.covariance))[where]
         print(f"\ndrag along the drive {end.state.z[where]} +- {std}, in that of the rollers")
     return out

@@ -38,9 +38,9 @@ def likelihood(problem: Problem, end: Optimum, degrees: float) -> dict[str, floa
     keep, at = np.ones(len(problem.windows)), (end.state.z, end.state.log_variance)
     residual, _ = problem.linear(at[0], problem.electric(*at))
     effect = end.state.shared(len(keep))
-    seen = problem.seen(residual, at[1], keep, effect)
+    seen = problem.weighed(residual, at[1], keep, effect)
     out = {}
-    for block, r in without_effects(problem.target, residual, effect).items():
+    for block, r in without_effects(problem.objective, residual, effect).items():
         one = {block: r}
         loss = float(problem.whitening(one, at[1], keep).loss)
         m = r.shape[1]

@@ -171,7 +171,7 @@ def print_shares(
     z, out = optimum.state.z, {}
     for load in loads:
         entry = next(e for e in problem.space.free if e.path == f"robot.load_share@{load}")
-        at = problem.space.place[entry.path]
+        at = problem.space.slices[entry.path]
         some_z = draws(z, optimum.covariance, 4000, 0)[:, at]
         drawn = np.asarray(jax.vmap(entry.declaration.to_si)(some_z))
         low, high = np.quantile(drawn, (0.05, 0.95), axis=0)

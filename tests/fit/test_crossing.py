@@ -96,7 +96,7 @@ def crossed(truth_, runs, seed, offset=OFFSET):
     @jax.jit
     def seen(b):
         p = lk.predict(truth_, b)
-        return p.increment, lk.predicted_current(truth_, b, p.felt)
+        return p.increment, lk.predicted_current(truth_, b, p.motor_force)
 
     increment, amps = seen(lk.batch(w, truth_, floor))
 
@@ -137,7 +137,7 @@ def ratio(space, z, covariance):
     """Log of the ratio of both frictions, and its std."""
     c = np.zeros(space.size)
     for floor, sign in (("firm", 1.0), ("soft", -1.0)):
-        c[space.place[f"surface.{floor}.friction"]] = sign
+        c[space.slices[f"surface.{floor}.friction"]] = sign
     return float(c @ z), float(np.sqrt(c @ covariance @ c))
 
 
@@ -176,16 +176,18 @@ def test_the_noise_of_currents_and_the_offsets_of_runs_are_told_apart(learnt):
 def test_what_a_run_is_off_all_along_counts_once_not_once_a_window(fitted):
     """Information of currents falls to that of a mean over runs as their offsets grow."""
     true, problem, optimum = fitted
-    whole = problem.crossed(crossed(true, 12, 1))
-    state = whole.restated(optimum.state, problem)
+    whole = problem.with_multi_floor(crossed(true, 12, 1))
+    state = whole.carried_over(optimum.state, problem)
     jacobian = whole.linear(state.z, whole.electric(state.z, state.log_variance))[1]
     at = whole.noise.names.index("crossing.current.run")
     told = []
     for offset in (1e-4, OFFSET):
         log_v = np.array(state.log_variance)
         log_v[at] = 2 * np.log(offset)
-        half = whitened(whole.noise.blocks, jacobian, log_v, whole.every)[cut.MULTI_FLOOR_CURRENT]
-        k = whole.space.place["motor.back_emf"]
+        half = whitened(whole.noise.blocks, jacobian, log_v, whole.full_weight)[
+            cut.MULTI_FLOOR_CURRENT
+        ]
+        k = whole.space.slices["motor.back_emf"]
         told.append(float((half[..., k] ** 2).sum()))
     assert told[1] < 0.3 * told[0]
 
@@ -194,8 +196,8 @@ def test_what_a_run_is_off_all_along_counts_once_not_once_a_window(fitted):
 def test_windows_that_do_not_count_say_nothing(fitted):
     true, problem, optimum = fitted
     several = crossed(true, 6, 5)
-    whole = problem.crossed(several)
-    state = whole.restated(optimum.state, problem)
+    whole = problem.with_multi_floor(several)
+    state = whole.carried_over(optimum.state, problem)
     where = state.z, whole.electric(state.z, state.log_variance)
     dead = ~several.counts
     moved = replace(
@@ -203,7 +205,7 @@ def test_windows_that_do_not_count_say_nothing(fitted):
         current=np.where(dead[..., None], 7.0, several.windows.current),
         turn=np.where(dead[..., None], 0.3, several.windows.turn),
     )
-    other = problem.crossed(replace(several, windows=moved))
+    other = problem.with_multi_floor(replace(several, windows=moved))
     for k in (cut.MULTI_FLOOR_MOTION, cut.MULTI_FLOOR_CURRENT):
         (r, slope), (r2, slope2) = (
             (p.linear(*where)[0][k], p.linear(*where)[1][k]) for p in (whole, other)
@@ -230,11 +232,13 @@ def test_pieces_left_out_change_nothing(fitted):
     losses = []
     for shift in (0.0, 0.4):
         current = several.windows.current + shift * (1 - np.arange(6) % 2)[:, None, None]
-        whole = problem.crossed(replace(several, windows=replace(several.windows, current=current)))
-        state = whole.restated(optimum.state, problem)
+        whole = problem.with_multi_floor(
+            replace(several, windows=replace(several.windows, current=current))
+        )
+        state = whole.carried_over(optimum.state, problem)
         electric = whole.electric(state.z, state.log_variance)
         blocks, _ = whole.linear(state.z, electric)
-        seen = whole.seen(blocks, state.log_variance, keep, state.shared(len(problem.windows)))
+        seen = whole.weighed(blocks, state.log_variance, keep, state.shared(len(problem.windows)))
         losses.append(whole.loss(state.z, state.log_variance, keep, seen, electric))
     assert losses[0] == losses[1]
 
@@ -246,7 +250,7 @@ def test_a_single_run_judges_nothing(fitted):
         problem, optimum, crossed(true, 1, 3), lambda state: None, most_rounds=2
     )
     assert found.after is None
-    assert len(found.problem.every) == len(problem.windows) + 1
+    assert len(found.problem.full_weight) == len(problem.windows) + 1
 
 
 def test_electric_numbers_that_move_motion_are_marginalised_first():

@@ -96,8 +96,8 @@ def test_a_fit_ends_where_the_loss_is_level(truth, path):
         blocks, _ = problem.linear(jnp.asarray(z), volt)
         effect = best.state.effect
         for _ in range(8):  # what runs share follows the numbers
-            seen = problem.seen(blocks, best.state.log_variance, keep, effect)
-            effect = effects_given(seen.tied, seen.whitening.root["motion"], blocks["motion"])
+            seen = problem.weighed(blocks, best.state.log_variance, keep, effect)
+            effect = effects_given(seen.effects, seen.whitening.root["motion"], blocks["motion"])
         return problem.loss(z, best.state.log_variance, keep, seen, volt)
 
     z = best.state.z
@@ -177,7 +177,7 @@ def test_camera_scale_is_that_of_weighted_least_squares(truth):
     y = r + scale * x  # what the robot predicts
     log_v = best.state.log_variance
     v = np.asarray(problem.covariance("motion", log_v))
-    own = np.asarray(without_effects(problem.target, {"motion": r}, best.state.effect)["motion"])
+    own = np.asarray(without_effects(problem.objective, {"motion": r}, best.state.effect)["motion"])
     q = np.einsum("ni,nij,nj->n", own, np.linalg.inv(v), own)
     scaled = v * ((DEGREES + q) / (DEGREES + 6))[:, None, None]
     both = np.linalg.inv(block_diag(*scaled) + of_shared(problem, log_v))
@@ -211,7 +211,7 @@ def test_the_optimum_is_one(surface_problem, surface_fit):
 
     def loss(z):
         blocks = surface_problem.linear(z, volt)[0]
-        seen = surface_problem.seen(blocks, log_v, np.ones(48), best.state.effect)
+        seen = surface_problem.weighed(blocks, log_v, np.ones(48), best.state.effect)
         return surface_problem.loss(z, log_v, np.ones(48), seen, volt)
 
     lowest = loss(best.state.z)
@@ -295,7 +295,7 @@ def test_a_problem_is_forgotten_after_use_and_those_like_it_compile_nothing(trut
         return made_of
 
     first = fit(0)
-    kept = weakref.ref(first), weakref.ref(first.target), weakref.ref(first.space)
+    kept = weakref.ref(first), weakref.ref(first.objective), weakref.ref(first.space)
     del first
     gc.collect()
     assert [ref() for ref in kept] == [None] * 3

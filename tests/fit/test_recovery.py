@@ -114,7 +114,7 @@ def test_without_voltage_no_number_is_silent(path):
 @pytest.mark.slow
 def test_without_voltage_the_resistance_is_its_prior():
     problem, fit = without_voltage()
-    at = problem.space.place["motor.resistance"].start
+    at = problem.space.slices["motor.resistance"].start
     assert fit.z[at] == pytest.approx(problem.space.prior_mean[at], abs=1e-3)
     assert np.sqrt(fit.covariance[at, at]) == pytest.approx(problem.space.prior_std[at], rel=1e-6)
 
@@ -124,8 +124,8 @@ def test_motion_does_not_need_the_voltage():
     problem, fit = without_voltage()
     full = recovered(0)
     for path in ("surface.soft.creep", "surface.soft.lead", "robot.load_share@moved"):
-        mine = problem.space.place[path]
-        there = recovery.problem().space.place[path]
+        mine = problem.space.slices[path]
+        there = recovery.problem().space.slices[path]
         gap = (fit.z[mine] - full.z[there]) / full.std[there]
         assert np.abs(gap).max() < 0.2
 

@@ -106,7 +106,7 @@ def test_new_paces_keep_the_variance_of_the_process(mirror):
     seen, other = SpeedAndLoad(-2.0, "a"), SpeedAndLoad(-1.4, "b")
     turn, count = np.array([0.0, 0.05, 1.0, np.nan]), 3 * 31
     of = EffectTable(
-        paces=(seen,),
+        speeds_and_loads=(seen,),
         std=np.array([0.1, 0.2, 0.3]),
         coefs=np.zeros((3, 31)),
         by_number=np.zeros((3, 31, 1)),
@@ -114,7 +114,7 @@ def test_new_paces_keep_the_variance_of_the_process(mirror):
     )
     near = np.exp(-2 * (np.sin(turn) / LENGTH) ** 2)
     for pace in (seen, other):
-        told = of.told(TravelConditions(turn, (pace,) * 4, mirror))
+        told = of.forecast(TravelConditions(turn, (pace,) * 4, mirror))
         for k, sign in enumerate((1, -1, -1)):
             whole = 1.0 if mirror is None else 1 + sign * OTHER_SIDE * near
             expected = of.std[k] ** 2 * np.where(np.isfinite(turn), whole, 1.0)
@@ -132,15 +132,15 @@ def test_the_loss_is_the_marginal_likelihood_of_all_runs(problem):
     blocks, _ = motion(problem, log_v)
     found = []
     for step in (np.zeros(len(log_v)), np.linspace(-0.5, 0.7, len(log_v))):
-        seen = problem.seen(blocks, log_v + step, keep, none)
+        seen = problem.weighed(blocks, log_v + step, keep, none)
         root = np.asarray(seen.whitening.root["motion"])
         own = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
         whole = block_diag(*own) + of_shared(problem, log_v + step)
         flat = np.asarray(blocks["motion"]).ravel()
         white = jnp.einsum("nij,nj->ni", root, blocks["motion"])
-        square = float(jnp.sum(marginal_residuals(seen.tied, white) ** 2))
+        square = float(jnp.sum(marginal_residuals(seen.effects, white) ** 2))
         assert square == pytest.approx(flat @ np.linalg.solve(whole, flat), rel=1e-9)
-        factors = sum(float(jnp.log(jnp.diagonal(t.factor)).sum()) for t in seen.tied)
+        factors = sum(float(jnp.log(jnp.diagonal(t.factor)).sum()) for t in seen.effects)
         exact = 0.5 * (np.linalg.slogdet(whole)[1] - np.linalg.slogdet(block_diag(*own))[1])
         assert factors == pytest.approx(exact, rel=1e-9)
         found.append(square)
@@ -151,13 +151,13 @@ def test_the_loss_is_the_marginal_likelihood_of_all_runs(problem):
 def test_effects_found_are_their_conditional_mean(problem):
     log_v, keep = log_variance(problem), np.ones(RUNS)
     blocks, _ = motion(problem, log_v)
-    seen = problem.seen(blocks, log_v, keep, np.zeros((RUNS, 3)))
+    seen = problem.weighed(blocks, log_v, keep, np.zeros((RUNS, 3)))
     root = np.asarray(seen.whitening.root["motion"])
     own = block_diag(*np.linalg.inv(np.swapaxes(root, 1, 2) @ root))
     flat, whole = np.asarray(blocks["motion"]).ravel(), of_shared(problem, log_v)
     expected = whole @ np.linalg.solve(own + whole, flat)
-    effect = effects_given(seen.tied, seen.whitening.root["motion"], blocks["motion"])
-    left = without_effects(problem.target, blocks, effect)["motion"]
+    effect = effects_given(seen.effects, seen.whitening.root["motion"], blocks["motion"])
+    left = without_effects(problem.objective, blocks, effect)["motion"]
     np.testing.assert_allclose(flat - np.asarray(left).ravel(), expected, atol=1e-12)
 
 
@@ -167,14 +167,16 @@ def test_the_spread_of_residuals_is_that_of_numbers_and_effects_together(problem
     log_v, keep = log_variance(problem), np.ones(RUNS)
     _, jacobian = motion(problem, log_v)
     told = np.asarray(
-        fitted_covariance(problem.target, jacobian, jnp.asarray(log_v), jnp.asarray(keep))["motion"]
+        fitted_covariance(problem.objective, jacobian, jnp.asarray(log_v), jnp.asarray(keep))[
+            "motion"
+        ]
     )
     j = np.asarray(jacobian["motion"])
     n, m, free = j.shape
     factor = (8.0 + m) / (8.0 + m + 2.0)
     own = block_diag(*(np.asarray(problem.covariance("motion", log_v)) / factor))
     # residuals less effects: J z - E e, with prior covariances of both
-    prior = np.asarray(problem.target.prior_std(log_v)) ** 2
+    prior = np.asarray(problem.objective.prior_std(log_v)) ** 2
     flat = j.reshape(n * m, free)
     signal = (flat * prior) @ flat.T + of_shared(problem, log_v)
     posterior = signal - signal @ np.linalg.solve(own + signal, signal)
@@ -198,7 +200,7 @@ def test_what_neighbours_tell_is_that_of_the_dense_gaussian(problem):
     state = replace(end.state, log_variance=log_v)
     model = force_balance_of(problem, state, end.covariance, keep)
     blocks, _ = motion(problem, log_v, state.z)
-    seen = problem.seen(blocks, log_v, keep, state.effect)
+    seen = problem.weighed(blocks, log_v, keep, state.effect)
     root = np.asarray(seen.whitening.root["motion"])
     whole = of_shared(problem, log_v)
     flat = np.asarray(blocks["motion"]).ravel()
@@ -308,10 +310,10 @@ def test_every_axis_has_the_covariance_of_its_own_effects(problem):
     blocks, jacobian = motion(problem, log_v)
     moved = blocks["motion"], jacobian["motion"]
     covariance = np.diag(problem.space.prior_std**2)
-    axes = list(hierarchy._axes(problem.target, moved, jnp.ones(RUNS), covariance, log_v))
-    assert len(axes) == 3 * len(problem.target.shared)
+    axes = list(hierarchy._axes(problem.objective, moved, jnp.ones(RUNS), covariance, log_v))
+    assert len(axes) == 3 * len(problem.objective.shared)
     for k, axis in enumerate(axes):
-        root = problem.target.shared[k // 3].root(jnp.asarray(log_v))[axis.number]
+        root = problem.objective.shared[k // 3].root(jnp.asarray(log_v))[axis.number]
         v = np.exp(log_v)[axis.numbers]
         found = sum(v[j] * axis.bases[j] for j in range(1, len(v)))  # but what each has alone
         np.testing.assert_allclose(found, root @ root.T, rtol=1e-9, atol=1e-12)
@@ -353,8 +355,8 @@ def test_sectors_are_cut_where_no_runs_are_parted():
 
 def test_what_floors_differ_by_has_the_pooled_std_a_priori(problem):
     log_v = log_variance(problem)
-    log_v[problem.target.pooled] = 2 * np.log(0.03)
-    std = np.asarray(problem.target.prior_std(log_v))
+    log_v[problem.objective.pooled] = 2 * np.log(0.03)
+    std = np.asarray(problem.objective.prior_std(log_v))
     pooled = problem.space.pooled
     assert 0 < pooled.sum() < len(std)
     np.testing.assert_allclose(std[pooled], 0.03, rtol=1e-12)
@@ -370,13 +372,13 @@ def test_the_pooled_variance_weighs_every_std_by_its_evidence(problem):
     at = np.flatnonzero(problem.space.pooled)
     told = root @ root.T + np.eye(free)
     precision = told.copy()
-    precision[at, at] += np.exp(-log_v[problem.target.pooled])
+    precision[at, at] += np.exp(-log_v[problem.objective.pooled])
     best = np.linalg.solve(precision, told @ rng.normal(size=free) * 0.05)
     best[np.setdiff1d(np.arange(free), at)] = 0.0
-    found = hierarchy.pooled(precision, best, problem.target, log_v)
+    found = hierarchy.pooled(precision, best, problem.objective, log_v)
     # the likelihood that has this posterior: information told, and where it is highest
     centre = precision @ np.where(problem.space.pooled, best, 0.0)
-    typical = np.exp(0.5 * float(problem.target.typical[problem.target.pooled]))
+    typical = np.exp(0.5 * float(problem.objective.typical[problem.objective.pooled]))
     std = np.linspace(0.1, 4.0, 4000) * typical
     log = np.empty(len(std))
     for k, s in enumerate(std):

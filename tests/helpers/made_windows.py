@@ -94,4 +94,4 @@ def residuals(robot, b, noise):
     """Every block of residuals, `motion` first; the noise is what voltages are predicted with."""
     p = lk.predict(robot, b)
     motion = {"motion": lk.motion_residual(robot, b, p)}
-    return motion | lk.electric_residuals(robot, b, p.felt, noise)
+    return motion | lk.electric_residuals(robot, b, p.motor_force, noise)

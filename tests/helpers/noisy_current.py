@@ -90,6 +90,6 @@ def fitted(this: Problem) -> Found:
     """The fit of an experiment."""
     log_v = 2 * np.log(this.noise.typical)
     end = optimise(this, start=FitState(this.space.start, log_v, 0, np.inf, np.inf, "joint"))
-    at = np.array([this.space.place[path].start for path in MOTOR])
+    at = np.array([this.space.slices[path].start for path in MOTOR])
     error = end.state.z[at] - np.log(list(MOTOR.values()))
     return Found(error, np.sqrt(np.diag(end.covariance))[at], end.converged)

@@ -83,7 +83,7 @@ def said_identified(space, std):
     """Which coordinates the verdict of Laplace stds calls identified."""
     said = np.zeros(space.size, bool)
     for e in space.free:
-        at = space.place[e.path]
+        at = space.slices[e.path]
         for k in range(at.start, at.stop):
             ratio, apart = std[k] / space.prior_std[k], from_zero(e.declaration, std[k : k + 1])
             said[k] = by_ratio(ratio, apart) == "identified"

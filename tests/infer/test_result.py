@@ -72,7 +72,7 @@ def fit_of(voltage: bool) -> Fit:
 def test_intervals_are_quantiles_of_the_transformed_gaussian():
     fit = fit_of(True)
     e = fit.parameters["surface.soft.creep"]  # positive: log-normal
-    at = fit.space.place[e.path]
+    at = fit.space.slices[e.path]
     std = np.sqrt(fit.covariance[at, at][0, 0])
     exact = lognorm(std, scale=e.value).ppf([0.05, 0.95])
     assert e.interval90 == pytest.approx(exact, rel=1e-12)
@@ -378,7 +378,7 @@ def test_a_refit_that_dies_while_it_is_written_never_leaves_parts_of_two(
         else:
             save(new, tmp_path)
     if writes == 2:  # identified.json is still the old one's
-        with pytest.raises(DataError, match="of another fit than"):
+        with pytest.raises(DataError, match="belongs to another fit than"):
             load(tmp_path)
         (tmp_path / "identified.json").unlink()
     back, left = load(tmp_path), new if writes >= 2 else old

@@ -116,11 +116,11 @@ class Forces(NamedTuple):
 
 def forces_of(xi, rim, frame, floor, rest):
     at, balance = Planar(*xi), Balance(rim, stand(frame, floor, rest))
-    roll = frame.roll @ xi - rim * frame.slip_through
+    roll = frame.roll @ xi - rim * frame.roller_share
     drag = balance.wheels(frame.hold @ xi, roll).drag.force()
     x, y, moment = balance.force(at)
     residual = jnp.stack([x, y, moment / frame.base])
-    return Forces(balance.felt(at), -balance.load(at) * drag, balance.share(at), residual)
+    return Forces(balance.motor_force(at), -balance.load(at) * drag, balance.share(at), residual)
 
 
 @eqx.filter_jit
@@ -195,7 +195,7 @@ def test_another_root_finder_finds_the_same_twist():
         found = optx.least_squares(balance, solver, start / scale, max_steps=2000, throw=False)
         return scale * found.value, balance(found.value, None)
 
-    start = jnp.asarray(np.asarray(rim) @ np.asarray(ROBOTINO.least()).T)
+    start = jnp.asarray(np.asarray(rim) @ np.asarray(ROBOTINO.pseudo_inverse()).T)
     theirs, left = jax.jit(oracle)(start, rim, floors, rest)
     done = np.abs(np.asarray(left)).max(axis=1) < 1e-10
     assert done.mean() > 0.9
@@ -453,12 +453,14 @@ def test_energy_is_lost_at_every_wheel_and_the_motors_pay_for_it(name):
         (gap(xi, rim, frame, floors, rest) < 1e-9) & (np.asarray(felt.load) > 0).all(axis=1)
     )
     assert solved.mean() > 0.98
-    pull, through = np.asarray(frame.pull), np.asarray(frame.slip_through)
+    drive_share, through = np.asarray(frame.drive_share), np.asarray(frame.roller_share)
     along = np.asarray(xi) @ np.asarray(frame.hold).T
     roll = np.asarray(xi) @ np.asarray(frame.roll).T
     traction, drag, rim = np.asarray(felt.traction), np.asarray(felt.drag), np.asarray(rim)
-    held = (traction - drag * through) / pull  # along the direction the rollers do not give way in
-    sliding = held * (rim * pull - along)
+    held = (
+        traction - drag * through
+    ) / drive_share  # along the direction the rollers do not give way in
+    sliding = held * (rim * drive_share - along)
     rollers = -drag * (roll - rim * through)
     active = np.hypot(rim, roll - rim * through)
     seen = np.asarray(rest) * np.exp(np.asarray(floors.load_bias))

@@ -90,7 +90,7 @@ def test_what_moves_most_is_told_of_motion_and_not_of_the_camera():
     covariance = np.diag(np.full(space.size, 0.01))
     before, after = np.zeros(space.size), np.full(space.size, 5.0)
     after[space.where(lambda e: e.quantity == "surface.creep")] = 1.0
-    after[space.place["surface.soft.creep"]] = 1.5
+    after[space.slices["surface.soft.creep"]] = 1.5
     found = largest_shift(space, before, covariance, after, settled=True)
     assert found.name == "surface.soft.creep"
     assert found.sigma == pytest.approx(15.0)

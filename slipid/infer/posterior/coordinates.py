@@ -86,9 +86,9 @@ def effects_at(problem: Problem, residual: Blocks, log_v: Vector) -> Float[np.nd
     keep = np.ones(len(problem.windows))
     effect = np.zeros((len(keep), 3))
     for _ in range(_TURNS):
-        seen = problem.seen(residual, log_v, keep, effect)
+        seen = problem.weighed(residual, log_v, keep, effect)
         root = seen.whitening.root["motion"]
-        effect = np.asarray(effects_given(seen.tied, root, residual["motion"]))
+        effect = np.asarray(effects_given(seen.effects, root, residual["motion"]))
     return effect
 
 
@@ -130,7 +130,7 @@ class Anchor(eqx.Module):
         residual, _ = problem.linear(fitted.z, electric)
         effect = effects_at(problem, residual, log_v)
         part = {k: expected(r.shape[-1]) for k, r in residual.items()}
-        seen = problem.seen(residual, log_v, keep * part["motion"], effect)
+        seen = problem.weighed(residual, log_v, keep * part["motion"], effect)
         plain = {k: inverse_root(c.covariance(log_v)) for k, c in problem.noise.blocks.items()}
         diagonal = {k: jnp.diagonal(r, axis1=-2, axis2=-1) for k, r in plain.items()}
         twist, slope = twists(problem.space, problem.batch, fitted.z)
@@ -138,12 +138,12 @@ class Anchor(eqx.Module):
         return Anchor(
             batch=problem.batch,
             z=jnp.asarray(fitted.z),
-            prior_std=problem.target.prior_std(log_v),
+            prior_std=problem.objective.prior_std(log_v),
             root=plain,
             scale={k: jnp.sqrt(w * part[k] / part["motion"]) for k, w in weight.items()},
             log_det={k: -2 * jnp.sum(jnp.log(d), axis=-1) for k, d in diagonal.items()},
-            shared=problem.target.shared,
-            tied=seen.tied,
+            shared=problem.objective.shared,
+            tied=seen.effects,
             twist=twist,
             twist_slope=slope,
             electric=electric,

@@ -148,7 +148,7 @@ def _power(own: SlipidFit, w: Any, spec: RobotSpec) -> np.ndarray:
 
 @jax.jit
 def _currents(robot: Any, b: lk.Batch) -> Array:
-    return lk.predicted_current(robot, b, lk.predict(robot, b).felt)
+    return lk.predicted_current(robot, b, lk.predict(robot, b).motor_force)
 
 
 @dataclass(frozen=True, eq=False)

@@ -250,7 +250,7 @@ class _LogSimulator:
     ) -> Float[np.ndarray, "run row 3"]:
         """Body poses with process noise and run effects, centred on the origin of the camera."""
         s, shape, rng = self.sensors, self.robot.geometry, self.random
-        back = np.asarray(shape.least())
+        back = np.asarray(shape.pseudo_inverse())
         step = speed * dt[..., None] * float(shape.wheel_radius) @ back.T
         far = np.linalg.norm(step[..., :2], axis=-1)[..., None]
         u = np.where(far > 0, step[..., :2] / np.maximum(far, 1e-12), [1.0, 0.0])

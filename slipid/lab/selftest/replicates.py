@@ -85,7 +85,7 @@ def simulate_windows(
 @jax.jit
 def _predicted(robot: Robot, b: lk.Batch, pose: Array) -> tuple[Array, Array, Array]:
     p = lk.predict(robot, b)
-    return p.increment, lk.predicted_current(robot, b, p.felt), corrected(robot, pose)[:, 0]
+    return p.increment, lk.predicted_current(robot, b, p.motor_force), corrected(robot, pose)[:, 0]
 
 
 @jax.jit
@@ -127,7 +127,7 @@ def _shared(
     for of in effects_by_floor(w, truth, components)[0]:
         root = np.asarray(of.root(log_v))
         drawn = np.einsum("anq,aq->na", root, rng.normal(size=root.shape[::2]))
-        out[np.asarray(of.pieces)] = drawn
+        out[np.asarray(of.segments)] = drawn
     return out
 
 
@@ -212,7 +212,7 @@ def plausible(
         except ValueError as error:
             raise DataError(f"{where}: {error}") from error
         for e in mine:
-            at = space.place[e.path]
+            at = space.slices[e.path]
             center[at], scatter[at] = start[at], 0.0
     return center, scatter
 
@@ -269,7 +269,7 @@ def recovery(
     flat = members(flat_directions(space, covariance, problem.windows.has_current, volt))
     judged = {e.path for e in space.free if e.session is None}
     numbers = {
-        e.path: _number(e, values[e.path], off[space.place[e.path]])
+        e.path: _number(e, values[e.path], off[space.slices[e.path]])
         for e in estimates(space, choices, z, covariance, volt, flat)
         if e.path in judged
     }
@@ -325,7 +325,7 @@ def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, 
         return np.asarray(chain(start, jnp.asarray(increment)))[:, -1, :2]
 
     true = ends(contact_increments(truth, lk.batch(w, truth)))
-    back = np.asarray(truth.geometry.least())
+    back = np.asarray(truth.geometry.pseudo_inverse())
     twist = (w.turn / w.dt[..., None]) @ (back * float(truth.geometry.wheel_radius)).T
     said = {
         "identified": ends(contact_increments(found, lk.batch(w, found))),
