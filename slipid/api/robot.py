@@ -28,7 +28,7 @@ from slipid.support.progress import Reporter
 
 
 @dataclass(frozen=True, eq=False)
-class ClosedLoopDrive:
+class DriveResult:
     """One closed-loop run; `print` says what became of the path.
 
     Attributes:
@@ -59,7 +59,7 @@ def drive(
     speed: float = 0.2,
     start: int = 0,
     seed: int = 0,
-) -> ClosedLoopDrive:
+) -> DriveResult:
     """Drive the 2021 paper's rectangle, or another path, on the twin of a robot.
 
     The twin is the model itself, with delays and noise.
@@ -90,7 +90,7 @@ def drive(
     plant = twin_plant(robot, floor, begin, seed, actuator_model_of(robot, gyro=row.gyro))
     loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
     driven = closed_loop.run_closed_loop(loop, course.moved(begin).after_rest(REST_S), plant, begin)
-    return ClosedLoopDrive(driven, floor, closed_loop.path_metrics(driven))
+    return DriveResult(driven, floor, closed_loop.path_metrics(driven))
 
 
 def export(

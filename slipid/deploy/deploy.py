@@ -20,7 +20,7 @@ from slipid.infer.result import Fit, draws
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.model.robot import Robot
 from slipid.parameter import entries
-from slipid.predict.predictive import Contact
+from slipid.predict.predictive import ForceBalance
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import MIXED_FLOORS_PENALTY
 from slipid.robot.record import LogSensors, RecordedNumber, Source
@@ -131,7 +131,7 @@ def _number(e: Estimate) -> RecordedNumber:
 
 
 def robot_of_force_balance(
-    contact: Contact,
+    contact: ForceBalance,
     highest_speed: float,
     current_trend: tuple[float, float] = (0.0, 0.0),
     sensors: LogSensors | None = None,

@@ -6,7 +6,7 @@ The motion per metre along, across and in yaw, of wheels that would not slip, is
 
     contact(z) - told(z),   told(z) = mean + slope (z - z_fit)
 
-as forecasts have it (`slipid.fit.shared`). The mean of the table is what that is beyond
+as forecasts have it (`slipid.fit.shared_effects`). The mean of the table is what that is beyond
 the contact model with the robot's numbers; what is left is the covariance of the effects given the
 numbers, grown as forecasts are, and the scatter of this very sum over draws of the numbers: where
 runs were near, another number is made up for by another effect.
@@ -23,14 +23,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.fit.noise import SHARED
-from slipid.fit.shared import AXES, Directions, Pace
+from slipid.fit.shared_effects import AXES, SpeedAndLoad, TravelConditions
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Frame, at_drives, at_wheels
+from slipid.model.geometry import WheelFrame, at_drives, at_wheels
 from slipid.model.motor import Motor
 from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.parameter import entries
-from slipid.predict.predictive import Contact
+from slipid.predict.predictive import ForceBalance
 from slipid.robot import record
 from slipid.robot.record import Axes, EffectRecord
 
@@ -141,7 +141,7 @@ def directions(count: int) -> Float[Array, "way 3"]:
     return jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
 
 
-def _turns(frame: Frame) -> Float[Array, "way 3"]:
+def _turns(frame: WheelFrame) -> Float[Array, "way 3"]:
     """Twists on the spot, to the left and to the right, with a rim speed of 1 m/s or so."""
     return jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / frame.base
 
@@ -149,7 +149,7 @@ def _turns(frame: Frame) -> Float[Array, "way 3"]:
 class _WheelArrays(eqx.Module):
     """The wheels as arrays, wherever they are: what is compiled for some serves all as many."""
 
-    frame: Frame
+    frame: WheelFrame
     forward: Float[Array, "*draw drive 3"]
     drive_of: tuple[int, ...] = eqx.field(static=True)
 
@@ -184,8 +184,10 @@ def _circle(
         xi = contact.equilibrium(rim, frame, floor, rest)
         force = floor.friction * mass * GRAVITY * frame.radius
         where = xi, rim, frame, floor, rest
-        felt = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
-        amps = motor.current(at_drives(wheels.drive_of, force * motor.borne(felt)), w)
+        motor_force = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
+        amps = motor.current(
+            at_drives(wheels.drive_of, force * motor.opposing_force(motor_force)), w
+        )
         lost = turned - wheels.forward @ xi
         return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
 
@@ -210,7 +212,9 @@ def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
     return jax.vmap(wheel, 1)(*flat)
 
 
-def _spread(robot: Robot, frame: Frame, draws: Robot, load: Array) -> Float[np.ndarray, "floor 3"]:
+def _spread(
+    robot: Robot, frame: WheelFrame, draws: Robot, load: Array
+) -> Float[np.ndarray, "floor 3"]:
     """Std over posterior draws of the motion per metre, a row per floor (along, across, yaw).
 
     On average over all directions; of wheels that do not drive sideways the largest, turns on the
@@ -267,7 +271,7 @@ _Grid = Float[np.ndarray, "floor speed direction 3"]
 
 
 def effects_by_load(
-    contact: Contact, center: Float[np.ndarray, " free"], draws: Float[np.ndarray, "draw free"]
+    contact: ForceBalance, center: Float[np.ndarray, " free"], draws: Float[np.ndarray, "draw free"]
 ) -> dict[str, EffectRecord]:
     """What is told of effects by load set-up; nothing where no runs share any.
 
@@ -275,7 +279,7 @@ def effects_by_load(
         contact: the fit as a model that forecasts.
         center: search vector of the deployed numbers; draws: of their posterior.
     """
-    paces = [pace for found in contact.shared.values() for pace in found.paces]
+    paces = [pace for found in contact.shared.values() for pace in found.speeds_and_loads]
     if not paces:
         return {}
     speeds = sorted({pace.log_speed for pace in paces})
@@ -286,12 +290,12 @@ def effects_by_load(
 
 
 def _table(
-    contact: Contact, center: np.ndarray, draws: np.ndarray, load: str, log_speed: np.ndarray
+    contact: ForceBalance, center: np.ndarray, draws: np.ndarray, load: str, log_speed: np.ndarray
 ) -> EffectRecord:
     count, labels = len(log_speed), contact.robot.surfaces.labels
     angle = np.linspace(0.0, 2 * np.pi, DIRECTIONS, endpoint=False)
-    paces = tuple(Pace(float(s), load) for s in log_speed for _ in angle)
-    way = Directions(np.tile(angle, count), paces, contact.robot.geometry.mirror())
+    paces = tuple(SpeedAndLoad(float(s), load) for s in log_speed for _ in angle)
+    way = TravelConditions(np.tile(angle, count), paces, contact.robot.geometry.mirror())
     robots = jax.vmap(contact.space.tree)(jnp.asarray(draws))
     k = jnp.asarray(contact.robot.load_index(load))
     moved = [moved_per_metre(robots, k, jnp.exp(s), directions(DIRECTIONS)) for s in log_speed]
@@ -300,7 +304,7 @@ def _table(
     mean, left = np.zeros(shape), np.zeros(shape)
     for n, floor in enumerate(labels):
         found = contact.shared[floor]
-        told = found.told(way)
+        told = found.forecast(way)
         grown = contact.extrapolation.get(f"{floor}@{load}", 1.0)
         given = np.diagonal(told.covariance, axis1=1, axis2=2) + _of(contact, "session", floor)
         off = predicted[:, n] - np.einsum("nap,kp->kna", told.slope, draws - center)
@@ -313,7 +317,7 @@ def _table(
     return EffectRecord(speeds, _rows(mean), _rows(left))
 
 
-def _of(contact: Contact, kind: str, floor: str) -> Float[np.ndarray, "3"]:
+def _of(contact: ForceBalance, kind: str, floor: str) -> Float[np.ndarray, "3"]:
     """Variances of what a run has of its own, or of what a session shares, by axis."""
     return np.array([contact.variance.get(f"{kind}.{floor}.{axis}", 0.0) for axis in AXES])
 

@@ -38,7 +38,7 @@ OBSERVE_S = 0.4
 LONGEST_I = 0.06
 """Largest velocity that the integral term may add [m/s]."""
 STUCK_S = 0.5
-"""Time without the demanded motion after which a robot is stuck, and with it until it is free [s]."""
+"""Time without the demanded motion until a robot is stuck, and with it until it is free [s]."""
 STUCK_SHARE, STUCK_FROM = 0.2, 0.1
 """A robot is blocked below this share of the demanded speed, for demands above this speed [m/s]."""
 TURN_S, GO_S = 0.6, 1.2

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Frame, Geometry, at_drives, at_wheels
+from slipid.model.geometry import Geometry, WheelFrame, at_drives, at_wheels
 from slipid.model.motor import Motor
 from slipid.robot.filter.effects import EffectTable
 from slipid.robot.record import LoadRecord, Numbers, RobotRecord
@@ -54,7 +54,7 @@ class RobotArrays(eqx.Module):
         unseen: for each floor, whether no run drove on it.
     """
 
-    frame: Frame
+    frame: WheelFrame
     places: Float[Array, "wheel 2"]
     forward: Float[Array, "drive 3"]
     inverse: Float[Array, "3 drive"]
@@ -178,7 +178,7 @@ class DeployedRobot(RobotArrays):
         pairs = zip(jax.tree.leaves(self), jax.tree.leaves(same), strict=True)
         if not all(np.array_equal(a, b) for a, b in pairs):
             raise ValueError(
-                "arrays of this robot differ from those of its record, so a file cannot hold them"
+                "arrays of this robot are not those of its record, so a file cannot hold them"
             )
         write_robot(Path(path), self.record)
 
@@ -260,7 +260,7 @@ def _arrays(
         frame=geometry.frame(),
         places=jnp.asarray(geometry.place) * geometry.base_radius,
         forward=geometry.forward(),
-        inverse=geometry.least(),
+        inverse=geometry.pseudo_inverse(),
         motor=Motor(**of("motor", Motor), gear_ratio=_array(wheels.gear_ratio)),
         floors=ContactSurface(
             **{name: jnp.stack([row[name] for row in rows]) for name in rows[0]},
@@ -289,7 +289,7 @@ def _array(value: Numbers | Sequence[object]) -> Array:
 
 
 def _effect_table(load: LoadRecord, whole: Array) -> EffectTable:
-    """Return the effect table of a load set-up, its stds divided by the whole std of every floor."""
+    """Return the effect table of a load set-up, its stds relative to the whole std of a floor."""
     if load.told is None:
         return EffectTable.empty(len(whole))
     mean, left = _array(load.told.mean), _array(load.told.left)

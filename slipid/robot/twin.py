@@ -230,13 +230,13 @@ class Twin(eqx.Module):
         under = self.floor.under(now.pose, f.places)
         floor = f.floors.at(under)
         where = xi, f.frame.radius * w, f.frame, floor, f.rest
-        forces = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
+        motor_force = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
         force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
         keep = float(np.exp(-PERIOD / self.actuators.drift_s))
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
         drift = keep * now.drift + fresh
         moves = jnp.tanh(w / 0.2) ** 2  # a standing motor draws no current
-        model = f.motor.current(force * f.motor.borne(forces), w)
+        model = f.motor.current(force * f.motor.opposing_force(motor_force), w)
         free = (f.inverse @ (f.frame.radius * w))[:2]
         more = f.current_trend @ jnp.stack([1.0, jnp.sqrt(free @ free + 1e-24)])
         return model + moves * (jnp.sign(model) * more + now.offset + drift), drift

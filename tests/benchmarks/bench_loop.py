@@ -131,7 +131,7 @@ def driven(robot, row, path, steps=STEPS):
     from slipid.deploy.floors import floor_of
     from slipid.deploy.twin_run import starts, twin_floor
     from slipid.lab.trial.controllers import ROWS as TRIAL
-    from slipid.lab.trial.plants import one_of
+    from slipid.lab.trial.plants import drawn_robot
     from slipid.robot.closed_loop import PERIOD, ClosedLoopRun, ControlLoop, path_metrics
     from slipid.robot.filter.floor import Floor
     from slipid.robot.interface import Settings
@@ -148,8 +148,8 @@ def driven(robot, row, path, steps=STEPS):
             share = jnp.where(jnp.all(there, axis=1), 1.0, 1e-9)
             return jnp.broadcast_to(share, (32, len(hypotheses)))
 
-    class ToldFloors(ControlLoop):
-        """A control loop that learns from its fix which floors are under its wheels, and no more."""
+    class FloorsByFix(ControlLoop):
+        """A control loop that learns only from its fix which floors are under its wheels."""
 
         def step(self, path, state, measurement, dt):
             at, known = measurement.fix, self.estimator.floor
@@ -161,7 +161,7 @@ def driven(robot, row, path, steps=STEPS):
     ground = twin_floor(robot)
     floor, seeds = floor_of(ground, robot.labels), range(SEED, SEED + STARTS)
     stack = partial(jax.tree.map, lambda *x: jnp.stack(x))
-    truths = stack(*[one_of(robot, seed) for seed in seeds])
+    truths = stack(*[drawn_robot(robot, seed) for seed in seeds])
     believed = stack(*[floor_of(flawed(ground, row.flaw, s), robot.labels) for s in seeds])
     places = starts(STARTS, ground, path)
     paths = [path.moved(place).after_rest(1.0) for place in places]
@@ -175,7 +175,7 @@ def driven(robot, row, path, steps=STEPS):
             known = truth if row.numbers else robot
             control_loop = control_loop_of(known, TRIAL[row.name], Settings.of(robot), floor=there)
             if row.floors:
-                control_loop = ToldFloors(control_loop.estimator, control_loop.controller)
+                control_loop = FloorsByFix(control_loop.estimator, control_loop.controller)
             plant = TellingTwin(truth, floor, habits, fix_std=std)
             return rollout(control_loop, path, plant, place, key, steps)
 

@@ -44,7 +44,7 @@ def ends(robot):
     from slipid.deploy.controllers import control_loop_of
     from slipid.deploy.deploy import actuator_model_of
     from slipid.lab.trial.controllers import ROWS
-    from slipid.lab.trial.plants import one_of
+    from slipid.lab.trial.plants import drawn_robot
     from slipid.robot import trajectory
     from slipid.robot.closed_loop import PERIOD
     from slipid.robot.filter.floor import Floor
@@ -61,7 +61,9 @@ def ends(robot):
             return self.kept
 
     rng = np.random.default_rng(SEED)
-    truths = jax.tree.map(lambda *x: jnp.stack(x), *[one_of(robot, SEED + k) for k in range(CASES)])
+    truths = jax.tree.map(
+        lambda *x: jnp.stack(x), *[drawn_robot(robot, SEED + k) for k in range(CASES)]
+    )
     under = jnp.asarray(rng.integers(len(robot.labels), size=(CASES, robot.wheels)))
     gap, way = rng.uniform(0.05, 0.3, CASES), rng.uniform(-np.pi, np.pi, CASES)
     turn, heading = rng.uniform(-0.8, 0.8, CASES), rng.uniform(-np.pi, np.pi, CASES)

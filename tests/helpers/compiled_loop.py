@@ -1,4 +1,4 @@
-"""A control loop's step compiled for a robot's computer, on flat arrays: what its time is measured with.
+"""A control loop's step compiled for a robot's computer, on flat arrays, to measure its time.
 
 One leaf costs a compiled call least to dispatch.
 """
@@ -75,13 +75,13 @@ class Flat(Generic[Tree]):
 
 
 class CompiledLoop(Generic[State]):
-    """A control loop's step on numpy arrays, cheapest to call: (state, measurement, dt) to both arrays.
+    """A control loop's step on numpy arrays: (state, measurement, dt) to both arrays.
 
-    The robot's numbers and the path become constants of the compiled code, and one flat array goes
-    in and one comes out; handing over the control loop's leaves at every call costs 100 us, and making the
-    named types 10. `states`, `measurements` and `outputs` say where the numbers lie. Where
-    `jax_cpu_enable_async_dispatch` is off before JAX starts, nothing waits for another thread
-    (8 us less, more on a busy machine).
+    It is the cheapest to call. The robot's numbers and the path become constants of the compiled
+    code, and one flat array goes in and one comes out; passing the loop's leaves at every call
+    costs 100 us, and making the named types 10. `states`, `measurements` and
+    `outputs` describe the arrays. With `jax_cpu_enable_async_dispatch` off before JAX starts,
+    nothing waits for another thread (8 us less, more on a busy machine).
 
     Attributes:
         states, measurements, outputs: order of the numbers of each flat array.

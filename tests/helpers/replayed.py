@@ -182,7 +182,7 @@ def _ends(
 def _encoders(robot: Robot, log: Log) -> np.ndarray:
     """Path of wheels that do not slip, from the origin (row, 3)."""
     step = np.diff(log.wheel_angle, axis=0) * float(robot.geometry.wheel_radius)
-    step = step @ np.asarray(robot.geometry.least()).T
+    step = step @ np.asarray(robot.geometry.pseudo_inverse()).T
     out = np.zeros((log.samples, 3))
     for k, (x, y, turn) in enumerate(step):
         middle = out[k, 2] + 0.5 * turn

@@ -1,4 +1,4 @@
-"""Header and source of a control loop in C99, generated from the very steps that are tested here."""
+"""Header and source of a control loop in C99, generated from the steps that the tests cover."""
 
 from __future__ import annotations
 

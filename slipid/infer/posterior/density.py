@@ -6,8 +6,8 @@ least squares,
 
     log p(x | data) = -1/2 |y(x)|^2 - 1/2 |(x - mean) / std|^2 + f log |d residuals / d data|
 
-with |y|^2 that of `slipid.fit.shared.freed`, and f what a Student t tells of its centre
-over what a Gaussian does, as it is in y. Floors share some coordinates and have the
+with |y|^2 that of `slipid.fit.shared_effects.marginal_residuals`, and f what a Student t tells of
+its centre over what a Gaussian does, as it is in y. Floors share some coordinates and have the
 others to themselves, so that the log posterior is a sum
 
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
@@ -34,7 +34,7 @@ from jaxtyping import Array, Float
 
 from slipid.fit import likelihood as lk
 from slipid.fit.problem import Problem
-from slipid.fit.shared import Tie, shared_effects
+from slipid.fit.shared_effects import EffectPosterior, mean_effects
 from slipid.fit.variances import Square, expected
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Coordinates, Fitted
 from slipid.model.robot import Robot
@@ -46,7 +46,7 @@ class HeldMotion(NamedTuple):
     """What the electric part holds of the motion of each walker: search vector and traction."""
 
     z: Float[Array, "*walker free"]
-    felt: Float[Array, "*walker piece window wheel 2"]
+    motor_force: Float[Array, "*walker piece window wheel 2"]
 
 
 class _Residuals(NamedTuple):
@@ -181,10 +181,10 @@ class Density:
         if "motion" not in seen.residuals:
             return seen
         motion = seen.residuals["motion"]
-        effect = shared_effects(anchor.tied, anchor.white("motion", motion))
+        effect = mean_effects(anchor.tied, anchor.white("motion", motion))
         for of in anchor.shared:
-            off = jnp.einsum("nma,na->nm", of.effect, effect[of.pieces])
-            motion = motion.at[of.pieces].add(-off)
+            off = jnp.einsum("nma,na->nm", of.effect, effect[of.segments])
+            motion = motion.at[of.segments].add(-off)
         return _Residuals(seen.residuals | {"motion": motion}, seen.robot)
 
     def _residuals(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> _Residuals:
@@ -193,14 +193,14 @@ class Density:
             assert held is not None, "what the electric part holds of the motion"
             robot = self.problem.space.tree(held.z.at[at.structure].set(x))
             return _Residuals(
-                lk.electric_residuals(robot, b, held.felt, anchor.noise(robot)), robot
+                lk.electric_residuals(robot, b, held.motor_force, anchor.noise(robot)), robot
             )
         z = self.full(anchor, x)
         robot = self.problem.space.tree(z)
         p = anchor.predict(robot, z)
         out = {"motion": lk.motion_residual(robot, b, p)}
         if self.part == EVERYTHING:
-            out |= lk.electric_residuals(robot, b, p.felt, anchor.noise(robot))
+            out |= lk.electric_residuals(robot, b, p.motor_force, anchor.noise(robot))
         # or the root finder is computed again for every consumer
         return _Residuals(jax.lax.optimization_barrier(out), robot)
 
@@ -210,12 +210,12 @@ class Density:
 
     def _held(self, anchor: Anchor, x: Array, _: None) -> HeldMotion:
         z = self.full(anchor, x)
-        return HeldMotion(z, anchor.predict(self.problem.space.tree(z), z).felt)
+        return HeldMotion(z, anchor.predict(self.problem.space.tree(z), z).motor_force)
 
 
-def _explained(tie: Tie, white: Float[Array, "piece m"]) -> Array:
+def _explained(tie: EffectPosterior, white: Float[Array, "piece m"]) -> Array:
     """How much smaller |y|^2 is than that of whitened residuals, by shared effects of a floor."""
-    told = jnp.einsum("nma,nm->an", tie.span, white[tie.pieces])
+    told = jnp.einsum("nma,nm->an", tie.span, white[tie.segments])
     along = jnp.einsum("anq,an->aq", tie.root, told).ravel()
     return jnp.sum(solve_triangular(tie.factor, along, lower=True) ** 2)
 

@@ -95,9 +95,9 @@ def _tell(block: ChainBlock, plan: Plan, report: Reporter) -> None:
 def sample(fit: Fit, plan: Plan, draws: int = 400, record: BlockStore | None = None) -> Posterior:
     """Posterior around a fit, so many draws of each ensemble."""
     problem, fitted = required(fit.problem), Fitted.of(fit)
-    assert problem.several is None, "runs on one floor each"
+    assert problem.multi_floor is None, "runs on one floor each"
     record = record or BlockStore()
-    parts = (EVERYTHING,) if problem.target.joint else (MOTION, ELECTRIC)
+    parts = (EVERYTHING,) if problem.objective.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
     at = first.coordinates
     target = LogDensity(first.terms, first.slope, at.group, first.centre, first.covariance)
@@ -155,22 +155,22 @@ def drawn_variances(
     """
     log_v, keep = fitted.log_variance, np.ones(len(problem.windows))
     electric = problem.electric(fitted.z, log_v)
-    residual, jacobian, felt = linear(problem.target, fitted.z, electric)
-    through = problem.through_voltage(fitted.z, log_v, felt)
+    residual, jacobian, motor_force = linear(problem.objective, fitted.z, electric)
+    through = problem.voltage_information(fitted.z, log_v, motor_force)
     effect = effects_at(problem, residual, log_v)
-    weight = problem.seen(residual, log_v, keep, effect).whitening.weight["motion"]
+    weight = problem.weighed(residual, log_v, keep, effect).whitening.weight["motion"]
     motion = residual["motion"], jacobian["motion"]
     told = np.array(information(problem.noise.blocks, log_v, keep, through))
-    of_blocks = np.asarray(problem.target.scored)
+    of_blocks = np.asarray(problem.objective.scored)
     told *= of_blocks[:, None] & of_blocks
-    told += effect_information(problem.target, motion, weight, fitted.covariance, log_v)
+    told += effect_information(problem.objective, motion, weight, fitted.covariance, log_v)
     told[np.diag_indices_from(told)] += np.where(of_blocks, 0.0, 1 / VARIANCE_SPREAD**2)
     root = np.linalg.cholesky(np.linalg.inv(told))
     rng = np.random.default_rng([seed, 1])
     out = log_v + rng.standard_normal((*shape, len(log_v))) @ root.T
     precision = np.linalg.inv(fitted.covariance)
-    pooled = pooled_stds(precision, fitted.z, problem.target, log_v)
-    out[..., problem.target.pooled] = 2 * np.log(rng.choice(pooled.std, shape, p=pooled.weight))
+    pooled = pooled_stds(precision, fitted.z, problem.objective, log_v)
+    out[..., problem.objective.pooled] = 2 * np.log(rng.choice(pooled.std, shape, p=pooled.weight))
     return np.asarray(out)
 
 
@@ -274,7 +274,9 @@ def _data(
     """
     w = problem.windows
     middle = problem.space.tree(jnp.asarray(found.z.mean(axis=(0, 1))))
-    measured = {"increment": np.asarray(jax.jit(lk.measured)(middle, problem.batch.pose))}
+    measured = {
+        "increment": np.asarray(jax.jit(lk.measured_increments)(middle, problem.batch.pose))
+    }
     dims = {"increment": ["piece", "window", "direction"]}
     gaps = {"increment": new["motion"]}
     if w.has_current:

@@ -14,7 +14,8 @@ from slipid.lab.benchmark.work import OF_FITS, BenchmarkOptions, data_of, proble
 from slipid.lab.trial import trial
 from slipid.robot.record import LogSensors
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
-from slipid.support.files import Content, read_json, write_json
+from slipid.support.content import Content
+from slipid.support.files import read_json, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -83,7 +84,7 @@ class RectangleTask:
         plant = "testsite" if find_spec("mujoco") is not None else "twin"
         asked = [name for name in CONTROLLERS if not self.wish.only or name in self.wish.only]
         try:
-            wish = trial.Wish(plant, controllers=tuple(asked), starts=STARTS)
+            wish = trial.TrialOptions(plant, controllers=tuple(asked), starts=STARTS)
             return trial.trial(self.folder, wish, executor, report).content
         except Exception as error:  # all else is written all the same
             return {"failed": FoldScore.of_error(error).absent}

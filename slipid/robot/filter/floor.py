@@ -80,9 +80,10 @@ class Floor(eqx.Module):
         Raises:
             DataError: the file cannot be written.
         """
-        arrays = {name: np.asarray(array) for name, array in vars(self).items()}
+        parts = (labels, self.cells, self.corner, self.cell)
+        names, cells, corner, cell = map(np.asarray, parts)
         out = BytesIO()
-        np.savez_compressed(out, labels=np.array(labels), **arrays)
+        np.savez_compressed(out, labels=names, cells=cells, corner=corner, cell=cell)
         write_bytes(Path(path), out.getvalue())
 
     @classmethod

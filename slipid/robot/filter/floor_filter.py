@@ -201,9 +201,9 @@ class FloorFilter(eqx.Module):
         on = stand(f.frame, f.floors.at(hypotheses_of(f).under.T), f.rest)
         rim = f.frame.radius * f.at_wheels(w)
         twist, pull = settle(near.T, rim, on, f.by_wheels)
-        drag = Balance(rim[:, None], on).rolled(Planar(*twist))
-        borne = f.motor.borne(jnp.stack([pull, drag], axis=-1))
-        force = on.friction * f.mass * GRAVITY * borne
+        drag = Balance(rim[:, None], on).rolling_drag(Planar(*twist))
+        opposing = f.motor.opposing_force(jnp.stack([pull, drag], axis=-1))
+        force = on.friction * f.mass * GRAVITY * opposing
         torque = f.at_drives((force * f.frame.radius).T)
         amps = f.motor.current(torque, jnp.broadcast_to(w, torque.shape))
         more = f.current_trend @ jnp.stack([1.0, length((f.inverse @ (f.frame.radius * w))[:2])])

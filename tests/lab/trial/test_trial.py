@@ -17,8 +17,8 @@ from slipid.lab.testsite.driving import PERIOD
 from slipid.lab.trial import trial as tr
 from slipid.lab.trial.controllers import ROWS, check_gains, unused_gains
 from slipid.lab.trial.goswami_padhy import GoswamiPadhy
-from slipid.lab.trial.plants import SitePlant, known_to_site, one_of
-from slipid.lab.trial.summary import Run, columns, not_told_apart, summaries
+from slipid.lab.trial.plants import SitePlant, drawn_robot, refuse_unknown_to_site
+from slipid.lab.trial.summary import TrialRun, best_controllers, columns, summaries
 from slipid.model.geometry import mecanum, omni
 from slipid.model.robot import build
 from slipid.robot import closed_loop
@@ -59,6 +59,15 @@ def test_the_rectangle_is_that_of_the_paper_and_stops_at_its_corners():
         np.gradient(rows[:, :2], reference.STEP, axis=0)[5:-5], rows[5:-5, 3:5], atol=0.011
     )
     assert np.hypot(rows[:, 3], rows[:, 4]).max() <= 0.2 + 1e-9
+
+
+def test_a_way_too_short_for_its_speed_is_half_speeding_up_and_half_braking():
+    path = reference.waypoints([(0.0, 0.0), (0.02, 0.0)], speed=0.5, acceleration=0.5, pause=0.1)
+    place, rate = np.asarray(path.rows)[:, [0, 3]].T
+    assert rate.max() == pytest.approx(0.1, rel=1e-6)  # the root of 0.02 * 0.5
+    assert np.abs(np.diff(rate)).max() <= 0.5 * reference.STEP + 1e-12
+    np.testing.assert_allclose(np.diff(place)[:-1], (rate[:-1] + rate[1:])[:-1] * 0.01, atol=1e-9)
+    np.testing.assert_allclose([place[-1], rate[-1]], [0.02, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", reference.PATHS)
@@ -254,7 +263,7 @@ def test_of_a_curve_the_first_quarter_is_judged(deployed):
     )
     found = closed_loop.path_metrics(course)
     assert found.sides_mm[0] == pytest.approx(350 * np.sqrt(2), rel=0.01)
-    run = Run("encoder", start, 0, found, 0.0)
+    run = TrialRun("encoder", start, 0, found, 0.0)
     assert float(columns([run])["first_side_travelled"][0]) == pytest.approx(0.8, abs=0.03)
 
 
@@ -482,25 +491,25 @@ def test_the_twin_is_another_robot_of_the_posterior_for_every_start():
     frictions = jnp.linspace(0.3, 0.9, 8)[:, None] * jnp.ones(2)
     several = eqx.tree_at(lambda r: r.surfaces.friction, eight, frictions)
     known = deploy_known(robot, draws=several, highest_speed=7.5)
-    found = {float(one_of(known, seed).floors.friction[0]) for seed in range(12)}
+    found = {float(drawn_robot(known, seed).floors.friction[0]) for seed in range(12)}
     assert len(found) > 3
-    assert one_of(known, 3).floors.friction[0] == one_of(known, 3).floors.friction[0]
+    assert drawn_robot(known, 3).floors.friction[0] == drawn_robot(known, 3).floors.friction[0]
 
 
 def test_what_a_trial_cannot_do_is_said(tmp_path, deployed):
     with pytest.raises(DataError, match="expected testsite or twin"):
-        tr._jobs(tmp_path, tr.Wish(plant="moon"))
+        tr._tasks(tmp_path, tr.TrialOptions(plant="moon"))
     with pytest.raises(DataError, match="no controller 'magic'; expected some of encoder"):
-        tr._jobs(tmp_path, tr.Wish(controllers=("magic",)))
+        tr._tasks(tmp_path, tr.TrialOptions(controllers=("magic",)))
     with pytest.raises(DataError, match="has no surface 'gray'; it has firm"):
-        known_to_site(uniform("gray"), "as_built", 3)
+        refuse_unknown_to_site(uniform("gray"), "as_built", 3)
     with pytest.raises(DataError, match="no load set-up 'far'; it has as_built"):
-        known_to_site(uniform("firm"), "far", 3)
+        refuse_unknown_to_site(uniform("firm"), "far", 3)
     with pytest.raises(DataError, match="has 3 wheels, the fit's 4"):
-        known_to_site(uniform("firm"), "as_built", 4)
+        refuse_unknown_to_site(uniform("firm"), "as_built", 4)
     with pytest.raises(DataError, match="no controller; expected some of encoder"):
-        tr._jobs(tmp_path, tr.Wish(controllers=tr.names_of(",")))
-    assert tr.names_of("contact, encoder,contact") == ("contact", "encoder")
+        tr._tasks(tmp_path, tr.TrialOptions(controllers=tr.controller_names(",")))
+    assert tr.controller_names("contact, encoder,contact") == ("contact", "encoder")
     with pytest.raises(DataError, match="no path 'square'; expected one of rectangle, circle"):
         path_of("square", 0.2, deployed)
     for speed in (0.0, 0.31, float("nan")):
@@ -508,7 +517,7 @@ def test_what_a_trial_cannot_do_is_said(tmp_path, deployed):
             path_of("circle", speed, deployed)
     assert path_of("circle", 0.3, deployed).duration < path_of("circle", 0.1, deployed).duration
     with pytest.raises(DataError, match=r"robot\.json: not there; `slipid identify` writes it"):
-        tr._jobs(tmp_path, tr.Wish())
+        tr._tasks(tmp_path, tr.TrialOptions())
 
 
 @pytest.mark.slow
@@ -516,7 +525,7 @@ def test_runs_of_another_path_or_speed_are_driven_anew(tmp_path, deployed):
     deployed.save(tmp_path / "robot.json")
 
     def jobs(**wish):
-        return tr._jobs(tmp_path, tr.Wish(plant="twin", controllers=("encoder",), **wish))
+        return tr._tasks(tmp_path, tr.TrialOptions(plant="twin", controllers=("encoder",), **wish))
 
     plain = jobs()[0]
     np.testing.assert_array_equal(plain.path.rows, reference.rectangle().rows)
@@ -539,7 +548,7 @@ def test_a_controller_is_told_another_map_than_the_true_one(tmp_path, deployed, 
 
     def jobs(**more):
         wish = {"plant": "twin", "controllers": ("contact_map",), "map": tmp_path / "true.toml"}
-        return tr._jobs(tmp_path, tr.Wish(**wish, **more))
+        return tr._tasks(tmp_path, tr.TrialOptions(**wish, **more))
 
     plain, other = jobs()[0], jobs(told_map=tmp_path / "told.toml")[0]
     assert plain.told is plain.floor
@@ -633,7 +642,7 @@ def run_of(name, k, closure, finished=True):
         seconds=19.0,
         finished=finished,
     )
-    return Run(name, (0.0, 0.0, 0.1), k, metrics, 1.0)
+    return TrialRun(name, (0.0, 0.0, 0.1), k, metrics, 1.0)
 
 
 def test_the_best_is_told_apart_by_differences_from_the_same_starts():
@@ -644,13 +653,13 @@ def test_the_best_is_told_apart_by_differences_from_the_same_starts():
         return [run_of(name, k, float(c), finished) for k, c in enumerate(closures)]
 
     one, two = runs("encoder", base), runs("contact", 0.8 * base)
-    assert not_told_apart(one + two) == ("contact",)
+    assert best_controllers(one + two) == ("contact",)
     same = runs("contact", base * rng.uniform(0.7, 1.25, 20))
-    assert set(not_told_apart(one + same)) == {"encoder", "contact"}
+    assert set(best_controllers(one + same)) == {"encoder", "contact"}
     # one that leaves a run unfinished does not close best, however near it comes
     stuck = [*two[:-1], run_of("contact", 19, 1.0, finished=False)]
-    assert not_told_apart(one + stuck) == ("encoder",)
-    assert not_told_apart(one) == ("encoder",)
+    assert best_controllers(one + stuck) == ("encoder",)
+    assert best_controllers(one) == ("encoder",)
 
 
 def test_the_summary_is_of_medians_over_starts_with_intervals():
@@ -658,7 +667,7 @@ def test_the_summary_is_of_medians_over_starts_with_intervals():
 
     def run(name, k, closure):
         made = run_of(name, k, closure)
-        assert typed(Run, json.loads(json.dumps(asdict(made)))) == made
+        assert typed(TrialRun, json.loads(json.dumps(asdict(made)))) == made
         return made
 
     base = rng.uniform(100, 200, 20)
