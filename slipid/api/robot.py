@@ -120,5 +120,5 @@ def export(
             lie there.
     """
     file = None if map is None else Path(map)
-    wish = ExportOptions(tuple(to), controller, path, speed, map=file)
-    return run(robot, Path(folder), wish, Reporter(quiet=True), ROWS)
+    options = ExportOptions(tuple(to), controller, path, speed, map=file)
+    return run(robot, Path(folder), options, Reporter(quiet=True), ROWS)

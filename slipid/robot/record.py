@@ -4,10 +4,12 @@ Field names are the keys of robot.json. Units are those of `UNITS`; numbers of t
 their own.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Literal
+
+import numpy as np
 
 from slipid.model.robot import Validity
 from slipid.support.files import checksum
@@ -70,6 +72,24 @@ class RecordedNumber:
     verdict: Verdict
     provenance: Provenance
     source: Source
+
+    @classmethod
+    def without_std(
+        cls, value: Numbers, unit: str, verdict: Verdict, provenance: Provenance
+    ) -> "RecordedNumber":
+        """Return a number that no run was fitted to."""
+        return cls(value, unit, None, None, verdict, provenance, "given")
+
+
+def plain(value: np.ndarray) -> Numbers:
+    """Return a float, or a tuple of floats."""
+    return float(value.reshape(())) if value.size == 1 else tuple(float(v) for v in value)
+
+
+def axes_of(row: Iterable[float] | np.ndarray) -> Axes:
+    """Return three numbers as a tuple of floats."""
+    along, across, yaw = (float(x) for x in row)
+    return along, across, yaw
 
 
 @dataclass(frozen=True)

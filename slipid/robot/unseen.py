@@ -8,13 +8,21 @@ without either they count for little, being rare. Their numbers are not identifi
 on them is uncertain by a tenth of the path length and 0.3 rad per metre.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
-from slipid.robot.record import Axes, FloorRecord, LoadRecord, Numbers, RecordedNumber, RobotRecord
+from slipid.robot.record import (
+    Axes,
+    FloorRecord,
+    LoadRecord,
+    Numbers,
+    RecordedNumber,
+    RobotRecord,
+    axes_of,
+    plain,
+)
 
 SOFTNESS = (-2.0, -1.0, 0.0, 1.0, 2.0)
 """Log of the creep relative to the middle floor; its declared spread over floors is 1.5."""
@@ -55,7 +63,7 @@ def with_unseen(record: RobotRecord) -> RobotRecord:
             )
     process = np.mean([floor.process for floor in record.floors], axis=0)
     current_std = CURRENT_FACTOR * float(np.mean([floor.current_std for floor in record.floors]))
-    one = FloorRecord("", _axes(process), EFFECT, current_std, seen=None, unseen=True)
+    one = FloorRecord("", axes_of(process), EFFECT, current_std, seen=None, unseen=True)
     floors = tuple(replace(one, name=name) for name in names)
     return replace(
         record,
@@ -76,15 +84,8 @@ def _middle(record: RobotRecord) -> dict[str, RecordedNumber]:
         each = np.array([record.parameters[f"surface.{n}.{quantity}"].value for n in record.labels])
         signed = quantity in _SIGNED
         middle = each.mean(axis=0) if signed else np.exp(np.log(each).mean(axis=0))
-        value: Numbers = tuple(middle.tolist()) if middle.ndim else float(middle)
-        middle_floor[quantity] = RecordedNumber(
-            value=value,
-            unit=number.unit,
-            std=None,
-            interval90=None,
-            verdict="not_identified",
-            provenance="borrowed",
-            source="given",
+        middle_floor[quantity] = RecordedNumber.without_std(
+            plain(middle), number.unit, "not_identified", "borrowed"
         )
     return middle_floor
 
@@ -95,11 +96,11 @@ def _scaled(value: Numbers, factor: float) -> Numbers:
 
 def _load(load: LoadRecord, count: int) -> LoadRecord:
     """Return a load set-up extended by floors whose effects are unknown."""
-    spread = _axes(np.mean(load.spread, axis=0))
+    spread = axes_of(np.mean(load.spread, axis=0))
     one = replace(load, spread=load.spread + (spread,) * count)
     if load.told is None:
         return one
-    zero, left = (0.0, 0.0, 0.0), _axes(np.hypot(EFFECT, spread))
+    zero, left = (0.0, 0.0, 0.0), axes_of(np.hypot(EFFECT, spread))
     around, speeds = len(load.told.mean[0][0]), len(load.told.speeds)
 
     def more(axes: Axes) -> tuple[tuple[tuple[Axes, ...], ...], ...]:
@@ -107,8 +108,3 @@ def _load(load: LoadRecord, count: int) -> LoadRecord:
 
     mean, rest = load.told.mean + more(zero), load.told.left + more(left)
     return replace(one, told=replace(load.told, mean=mean, left=rest))
-
-
-def _axes(values: Sequence[float] | np.ndarray) -> Axes:
-    along, across, yaw = (float(x) for x in values)
-    return along, across, yaw

@@ -29,11 +29,14 @@ class Code:
     """The C code of a control loop, and of a path if it follows one.
 
     Attributes:
-        robot: for the record of its numbers; loop: its estimator and controller.
-        path: as it lies for a robot that starts at 0.
-        estimator, controller: structs of what they keep.
-        reading, estimate: structs of what goes in and what comes out.
-        functions: all that are generated.
+        robot: robot with the record of its numbers.
+        loop: estimator and controller.
+        path: path placed for a robot that starts at 0.
+        estimator: struct of the estimator's state.
+        controller: struct of the controller's state.
+        reading: struct of the inputs.
+        estimate: struct of the outputs.
+        functions: all generated functions.
     """
 
     def __init__(
@@ -48,7 +51,7 @@ class Code:
         self._names = Names()
         begin, nothing = loop.init(), Readings.nothing(robot.wheels)
         zero = jnp.zeros(())
-        believed = loop.estimator.step(begin.estimator, nothing, zero)[1]
+        estimate = loop.estimator.step(begin.estimator, nothing, zero)[1]
         self.estimator = Struct.of("slipid_estimator", "What the estimator keeps.", begin.estimator)
         self.controller = Struct.of(
             "slipid_controller", "What the controller keeps.", begin.controller
@@ -59,11 +62,15 @@ class Code:
             nothing,
             Measurement,
         )
-        self.estimate = Struct.of("slipid_estimate", "What is believed.", believed)
-        self.functions = list(self._functions(begin.estimator, begin.controller, nothing, believed))
+        self.estimate = Struct.of("slipid_estimate", "What is believed.", estimate)
+        self.functions = list(self._functions(begin.estimator, begin.controller, nothing, estimate))
 
     def _functions(
-        self, seen: eqx.Module, held: eqx.Module, nothing: Readings, believed: eqx.Module
+        self,
+        estimator: eqx.Module,
+        controller: eqx.Module,
+        nothing: Readings,
+        estimate: eqx.Module,
     ) -> Iterator[Function]:
         loop, one = self.loop, jnp.zeros(())
         wheels = loop.controller.robot.wheels
@@ -97,7 +104,7 @@ class Code:
                 dt,
                 Argument.of("estimate", self.estimate, False, True),
             ),
-            traced(loop.estimator.step, seen, nothing, one),
+            traced(loop.estimator.step, estimator, nothing, one),
         )
         yield function(
             self._names,
@@ -111,7 +118,7 @@ class Code:
                 dt,
                 Argument.plain("command", (wheels,), False, True),
             ),
-            traced(loop.controller.step, held, jnp.zeros(6), believed, one),
+            traced(loop.controller.step, controller, jnp.zeros(6), estimate, one),
         )
         if self.path is not None:
             yield self._follow(self.path)
@@ -146,19 +153,19 @@ class Code:
 
     @property
     def kept(self) -> int:
-        """Numbers in a state."""
+        """Count of the numbers in a state."""
         return sum(f.size for s in (self.estimator, self.controller) for f in s.fields) + 1
 
     @property
     def scratch(self) -> int:
-        """Numbers in arrays that a step has on the stack."""
+        """Count of the numbers in arrays that a step has on the stack."""
         return max(f.scratch for f in self.functions)
 
     def header(self) -> str:
-        """Text of slipid.h."""
+        """Return the text of slipid.h."""
         robot = self.robot
-        named = identifiers(robot.labels, "floor")
-        floors = [f"SLIPID_FLOOR_{name.upper()} {k}" for k, name in enumerate(named)]
+        names = identifiers(robot.labels, "floor")
+        floors = [f"SLIPID_FLOOR_{name.upper()} {k}" for k, name in enumerate(names)]
         sizes = [f"SLIPID_WHEELS {robot.wheels}", f"SLIPID_FLOORS {len(robot.labels)}"]
         defines = [f"#define {d}" for d in (*sizes, *floors, *self._duration())]
         single = [f"#define {name} {name}_float" for name in self._names_of_functions]
@@ -186,7 +193,7 @@ class Code:
         return [] if self.path is None else [f"SLIPID_PATH_SECONDS {self.path.duration!r}"]
 
     def source(self) -> str:
-        """Text of slipid.c."""
+        """Return the text of slipid.c."""
         reads = frozenset[str]().union(*(f.reads for f in self.functions))
         tables = [m for m in self._names.tables.values() if m.name in reads]
         values = {
@@ -199,7 +206,7 @@ class Code:
 
 
 def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
-    """Sentences on axes, wheels, sensors and floors for readers of the header."""
+    """Yield sentences on axes, wheels, sensors and floors for readers of the header."""
     robot = loop.controller.robot
     yield (
         "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: those in "
@@ -216,23 +223,23 @@ def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
     signs = "with their signs" if settings.current_is_signed else "without a sign (a sign is lost)"
     yield f"Currents are taken {signs}. A wheel unheard for {float(settings.stale_s):g} s is stale."
     yield "Floors, as columns count them: " + listed([*robot.labels, "none of them"]) + "."
-    ways = hypotheses_of(robot).under.tolist()
-    each = "; ".join(f"{k}: {' '.join(map(str, way))}" for k, way in enumerate(ways))
+    rows = hypotheses_of(robot).under.tolist()
+    each = "; ".join(f"{k}: {' '.join(map(str, row))}" for k, row in enumerate(rows))
     yield f"Hypotheses of the floors, as rows count them, with the floor under each wheel: {each}."
 
 
 def template(name: str) -> str:
-    """Text of a file of this folder's templates."""
+    """Return the text of a file in this folder's templates."""
     return (files(__package__) / "templates" / name).read_text()
 
 
 def filled(name: str, values: dict[str, str]) -> str:
-    """A template with values for every @NAME@."""
+    """Return a template with values for every @NAME@."""
     return re.sub(r"@([A-Z]+)@", lambda match: values[match.group(1)], template(name))
 
 
 def _comment(*parts: str) -> list[str]:
-    """A comment of C."""
+    """Return a comment of C."""
     lines = [line.replace("*/", "* /") for part in parts for line in wrapped(part)]
     return (
         [f"/* {lines[0]}", *(f"   {line}" for line in lines[1:-1]), f"   {lines[-1]} */"]
@@ -246,9 +253,9 @@ def _struct(struct: Struct) -> Sequence[str]:
     for field in struct.fields:
         size = f"[{field.size}]" if field.shape else ""
         shape = "" if len(field.shape) < 2 else f", {' x '.join(map(str, field.shape))} by rows"
-        declared, said = f"  {TYPE[field.kind]} {field.name}{size};", f"{field.comment}{shape}"
-        if len(declared) + len(said) + 7 <= WIDTH:
-            lines.append(f"{declared} /* {said} */")
+        declared, comment = f"  {TYPE[field.kind]} {field.name}{size};", f"{field.comment}{shape}"
+        if len(declared) + len(comment) + 7 <= WIDTH:
+            lines.append(f"{declared} /* {comment} */")
         else:
-            lines += [*(f"  {line}" for line in _comment(said)), declared]
+            lines += [*(f"  {line}" for line in _comment(comment)), declared]
     return [*lines, f"}} {struct.name};", ""]
