@@ -144,8 +144,8 @@ def _of_lag(lag: PoseLag) -> Iterator[Finding]:
     late = "after" if lag.seconds > 0 else "before"
     yield Finding(
         "lag",
-        f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: so {lag.left:.2f} of "
-        f"the motion is left unexplained, without {lag.left_at_zero:.2f}",
+        f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: so {lag.unexplained:.2f} of "
+        f"the motion is left unexplained, without {lag.unexplained_at_zero:.2f}",
         f"shift the poses' times by {-lag.seconds:+.1f} s, or start 'camera.lag' in [parameters] "
         f"at {lag.seconds:.1f}",
         "wrong" if abs(lag.seconds) > TOO_LATE_S else "suspicious",
