@@ -14,7 +14,7 @@ from slipid.app.config import read_config
 from slipid.app.logs import layout_of
 from slipid.app.problem import Job, Task, read_job
 from slipid.data.align.clock import Clock
-from slipid.data.check.columns import Finding, worst_first, wrong
+from slipid.data.check.findings import Finding, worst_first, wrong
 from slipid.data.check.sanity import findings
 from slipid.data.log import Log
 from slipid.data.reading.reader import AnyLayout
