@@ -46,7 +46,7 @@ class FloorMap:
         return x, y, x + columns * self.cell, y + rows * self.cell
 
     def at(self, xy: Float[np.ndarray, "*batch 2"]) -> Int[np.ndarray, "*batch"]:
-        """Return the number of the surface at places [m]; outside the map that of the nearest cell."""
+        """Return the number of the surface at places [m]; outside the map that of its edge."""
         steps = np.floor((np.asarray(xy) - self.corner) / self.cell).astype(np.intp)
         rows, columns = self.cells.shape
         row, column = steps[..., 1].clip(0, rows - 1), steps[..., 0].clip(0, columns - 1)

@@ -261,7 +261,9 @@ def test_poses_of_another_run_are_refused_with_what_to_do(tmp_path):
     )
     assert found.logs == ()
     (said,) = found.aside
-    assert re.search(r"set aside: .*run.poses.csv: .*does not tell its clock.*starts, stops", said)
+    assert re.search(
+        r"set aside: .*run.poses.csv: .*does not determine its clock.*starts, stops", said
+    )
 
 
 def test_a_log_that_counts_from_1970_has_its_poses_where_they_belong(tmp_path):

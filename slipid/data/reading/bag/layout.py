@@ -9,7 +9,7 @@ from pydantic import AliasChoices, BeforeValidator, Field, StrictBool, StrictFlo
 from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.bag.shape import steps_of
-from slipid.data.reading.layout import CHANNELS, PER_WHEEL, SensorLayout, several, unknown
+from slipid.data.reading.layout import CHANNELS, PER_WHEEL, TURNS, SensorLayout, several, unknown
 from slipid.data.reading.units import factor
 from slipid.support.errors import DataError
 from slipid.support.toml_file import CLOSED, NotNegative, Positive, checked
@@ -19,8 +19,6 @@ GROUPS = {
     "twist_command": ("twist_command_x", "twist_command_y", "twist_command_yaw"),
 }
 """Channels that one message holds together, by the name that a layout gives them."""
-TURNS = ("wheel_angle", "wheel_ticks", "motor_angle", "wheel_speed", "motor_speed")
-"""Channels that tell whether a wheel moves, the best first."""
 EFFORT = '"A" (current), "N*m" (motor_torque or wheel_torque), "V" (voltage) or "1" (duty)'
 """What drivers put into the effort of a JointState."""
 

@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.bag.layout import TURNS, BagLayout, RunRule
+from slipid.data.reading.bag.layout import BagLayout, RunRule
 from slipid.data.reading.bag.opened import OpenBag
 from slipid.data.reading.bag.plan import message_of
 from slipid.data.reading.bag.shape import STAMPS, MessageShape, shape_of, steps_of
 from slipid.data.reading.bag.streams import topic_error
+from slipid.data.reading.layout import TURNS
 from slipid.data.reading.signal import Signal
 from slipid.support.errors import bad_data, did_you_mean
 
