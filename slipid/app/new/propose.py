@@ -17,7 +17,7 @@ from slipid.app.new.sketches import file_sketch, radius_hint
 from slipid.app.new.study import Known, Study
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
-from slipid.data.reading.bag.runs import PAUSE_S, parts_between_pauses
+from slipid.data.reading.bag.runs import PAUSE_S, runs_between_pauses
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.motor_layout import motor_layout
 from slipid.data.reading.presets import PRESETS
@@ -161,7 +161,7 @@ def _bags_tried(sketch: Sketch, first: Path) -> Sketch:
     if tried.problem:
         questions = (*bag.questions, f"the reader says: {tried.problem}")
         return replace(sketch, bags=(replace(bag, questions=questions),))
-    count = max((parts_between_pauses(log, PAUSE_S) for log in tried.logs), default=1)
+    count = max((runs_between_pauses(log, PAUSE_S) for log in tried.logs), default=1)
     if count < 2:
         return sketch
     comment = f"cut where no wheel moves for longer: {count} runs in the first bag"

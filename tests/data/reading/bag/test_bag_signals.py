@@ -10,7 +10,7 @@ import pytest
 from tests.helpers.made_bags import (
     ROBOTINO,
     STORAGES,
-    Message,
+    MessageType,
     header,
     joint_states,
     pose_fields,
@@ -59,7 +59,7 @@ def test_joint_states_come_back(tmp_path, storage):
 def test_poses_come_back(tmp_path, storage, name):
     heading = np.linspace(2.0, 9.0, len(TIME))  # beyond the half turn
     said = [
-        Message("/pose", name, pose_fields(name, t, x, -x, h), t + 0.01)
+        MessageType("/pose", name, pose_fields(name, t, x, -x, h), t + 0.01)
         for t, x, h in zip(TIME.tolist(), ANGLE[:, 0].tolist(), heading.tolist(), strict=True)
     ]
     run = read(bag(tmp_path, storage, said), topics={"pose": {"topic": "/pose"}})
@@ -74,23 +74,23 @@ def test_poses_come_back(tmp_path, storage, name):
 def test_other_sensors_come_back_at_their_own_times(tmp_path, storage):
     slow, fast = TIME[::10], TIME[::2]
     imu = [
-        Message("/imu", "sensor_msgs/msg/Imu", imu_fields(t, k), t)
+        MessageType("/imu", "sensor_msgs/msg/Imu", imu_fields(t, k), t)
         for k, t in enumerate(fast.tolist())
     ]
     battery = [
-        Message(
+        MessageType(
             "/battery", "sensor_msgs/msg/BatteryState", {"header": header(t), "voltage": 12.5}, t
         )
         for t in slow.tolist()
     ]
     plain = [
-        Message(
+        MessageType(
             "/cmd", "geometry_msgs/msg/Twist", {"linear": vector(1, 2), "angular": vector(z=3)}, t
         )
         for t in slow.tolist()
     ]
     motors = [
-        Message("/motors", "robotino_msgs/msg/MotorReadings", readings(t, k), t + 0.5)
+        MessageType("/motors", "robotino_msgs/msg/MotorReadings", readings(t, k), t + 0.5)
         for k, t in enumerate(slow.tolist())
     ]
     topics = {
@@ -171,11 +171,18 @@ def test_the_hash_is_what_sha256sum_prints(tmp_path):
 
 
 def test_a_big_endian_message(tmp_path):
-    from slipid.data.reading.bag.definitions import Many, Message, MessageField, NumberType, Text
+    from slipid.data.reading.bag.definitions import (
+        ArrayType,
+        MessageField,
+        MessageType,
+        NumberType,
+        TextType,
+    )
     from slipid.data.reading.bag.shape import shape_of, steps_of
 
-    kind = Message(
-        "x/msg/Y", (MessageField("s", Text()), MessageField("v", Many(NumberType("f8"), None)))
+    kind = MessageType(
+        "x/msg/Y",
+        (MessageField("s", TextType()), MessageField("v", ArrayType(NumberType("f8"), None))),
     )
     text = b"\0\0\0\x03ab\0\0"  # and one byte up to the next length
     raw = b"\0\0\0\0" + text + b"\0\0\0\x01" + b"\0\0\0\0" + np.array([2.5], ">f8").tobytes()
