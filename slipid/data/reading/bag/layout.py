@@ -33,8 +33,8 @@ class TopicChannel:
     Attributes:
         topics: the topic; several where each holds some of the wheels.
         fields: paths of the numbers in a message, such as `motors[0].current`; an array without an
-        index counts with all its elements. For a pose or a twist the field that holds it. Known
-        message types need none.
+            index counts with all its elements. For a pose or a twist the field that holds it. Known
+            message types need none.
         unit: unit of the numbers; known message types need none, except for the effort of joints.
         scale: a sign or a correction, one number for all columns or one for each.
         offset: added after the scale, in `unit`.
@@ -70,8 +70,7 @@ class RunRule:
         surface, load: path of the field that names the floor, or the load set-up.
         pause_s: time without motion of any wheel after which a new run starts [s].
         table: CSV file with columns start and end [s], perhaps surface, load, name and bag,
-            relative
-        to the folder of the bag.
+            relative to the folder of the bag.
         from_start: whether its times count from the first sample of the bag; else as stamps do.
     """
 
@@ -102,7 +101,7 @@ class BagLayout(SensorLayout):
         joints: names of the drives' joints, in the order of the drives.
         runs: rule that separates runs; without it a bag is one run.
         stamp: time that counts: the one in the messages (where they have one), or the one at which
-        the recorder received them.
+            the recorder received them.
         max_disorder: largest delay of messages of a topic that are sorted [s].
         drop_nan: whether messages with NaN are left out; else they are refused.
         definitions: folder of .msg files, for message types whose definition the bag lacks.

@@ -60,8 +60,7 @@ def plan(bag: OpenBag, layout: BagLayout) -> tuple[ChannelPlan, ...]:
 
     Raises:
         DataError: a topic is missing or empty, its messages do not fit the channel, or no
-            definition
-        of them is found.
+            definition of them is found.
     """
     return tuple(_planned(bag, layout, name, spec) for name, spec in layout.topics.items())
 
@@ -87,7 +86,7 @@ def _planned(bag: OpenBag, layout: BagLayout, channel: str, spec: TopicChannel) 
             if "joints are named" in error.found:
                 shapes = first_shapes(bag, name, message, 10)
                 there = [joint for one in shapes for joint in one.texts(steps_of("name"))]
-                expected += f" (there are: {listed(dict.fromkeys(there))})"
+                expected += f" (there are: {first_names(dict.fromkeys(there))})"
             raise topic_error(bag.path, name, error.found, expected) from None
         unit = meaning.unit
         wanted.append(TopicPick(name, message, meaning.pick))
@@ -143,8 +142,8 @@ def _one_of(bag: OpenBag, layout: BagLayout, channel: str) -> str:
 
     fitting = [topic.name for topic in bag.topics.values() if serves(topic)]
     if fitting:
-        return f"one of {listed(fitting)}, which hold such messages"
-    return f"one of {listed(bag.topics)}"
+        return f"one of {first_names(fitting)}, which hold such messages"
+    return f"one of {first_names(bag.topics)}"
 
 
 def first_shapes(

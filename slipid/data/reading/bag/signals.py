@@ -152,7 +152,7 @@ def side_by_side(
         layout: layout of the bag.
         notes: list to which notes are appended.
         by_name: whether the streams have the same columns, of which each is taken from the first
-        stream with numbers in it; else all columns of all streams are used.
+            stream with numbers in it; else all columns of all streams are used.
 
     Raises:
         DataError: as `whole_signal`, or no time is common to the columns.
@@ -273,7 +273,7 @@ def _check_joints(plan: ChannelPlan, streams: Sequence[Stream]) -> None:
     for j, joint in enumerate(picks[0].joints):
         if joint not in there:
             found = f"no joint '{joint}'{did_you_mean(joint, there)}"
-            raise streams[0].error(found, f"one of the names that are there: {listed(there)}")
+            raise streams[0].error(found, f"one of the names that are there: {first_names(there)}")
         if all(stream.absent[:, j].all() for stream in streams):
             found = f"{picks[0].array} of joint '{joint}' is empty in every message"
             expected = "numbers in it; is another field meant: position, velocity or effort?"

@@ -69,7 +69,7 @@ class Topic:
         joints: names in the first messages of a JointState.
         frames: parent and child of each transform in the first messages, as `map -> base_link`.
         serves: channels, or groups of them, that a layout may take from it without a field or a
-        unit; the effort of joints is not among them, since its meaning is unknown.
+            unit; the effort of joints is not among them, since its meaning is unknown.
         problem: reason why its messages could not be examined, or None.
     """
 
@@ -155,7 +155,7 @@ class BagRun:
         name_suffix: suffix of the bag's name: empty for the only run, else `#03` or `#name`.
         sha256: hash of the bag's files.
         signals: signals by channel, in the units of `CHANNELS`; a pose as pose_x, pose_y and
-        pose_heading (without wrap-around), a twist as twist_command_x, _y and _yaw.
+            pose_heading (without wrap-around), a twist as twist_command_x, _y and _yaw.
         surface: name of the floor in the bag or the table of runs, else None.
         load: name of the load set-up, likewise.
         notes: repairs and omissions, one sentence each.
@@ -178,8 +178,7 @@ def read_bag(path: Path, layout: BagLayout) -> tuple[BagRun, ...]:
 
     Raises:
         DataError: the bag is damaged, or does not match the layout; the message names the topic,
-            what
-        is there, and the next step.
+            what is there, and the next step.
     """
     with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
         # hashing releases the interpreter lock, so on two cores it takes no extra time

@@ -69,8 +69,7 @@ class TransformSeries:
 
 
 def composed(links: Sequence[ChainLink], moving: Mapping[Edge, TransformSeries]) -> TransformSeries:
-    """Return the pose of a chain's last frame in its first, at the times of its densest transform.
-    transform.
+    """Return the pose of the last frame of a chain in the first, at its densest times.
 
     Times that some other transform does not span are left out.
     """
@@ -130,7 +129,7 @@ def chain_of(
         if name not in frames:
             found, expected = (
                 f"no frame '{name}'{did_you_mean(name, frames)}",
-                f"one of {listed(frames)}",
+                f"one of {first_names(frames)}",
             )
             raise topic_error(bag.path, where, found, expected)
     found = f"no transforms lead from '{frame}' to '{child}'"
