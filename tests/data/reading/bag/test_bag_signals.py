@@ -10,7 +10,7 @@ import pytest
 from tests.helpers.made_bags import (
     ROBOTINO,
     STORAGES,
-    MessageType,
+    Message,
     header,
     joint_states,
     pose_fields,
@@ -59,7 +59,7 @@ def test_joint_states_come_back(tmp_path, storage):
 def test_poses_come_back(tmp_path, storage, name):
     heading = np.linspace(2.0, 9.0, len(TIME))  # beyond the half turn
     said = [
-        MessageType("/pose", name, pose_fields(name, t, x, -x, h), t + 0.01)
+        Message("/pose", name, pose_fields(name, t, x, -x, h), t + 0.01)
         for t, x, h in zip(TIME.tolist(), ANGLE[:, 0].tolist(), heading.tolist(), strict=True)
     ]
     run = read(bag(tmp_path, storage, said), topics={"pose": {"topic": "/pose"}})
@@ -74,23 +74,23 @@ def test_poses_come_back(tmp_path, storage, name):
 def test_other_sensors_come_back_at_their_own_times(tmp_path, storage):
     slow, fast = TIME[::10], TIME[::2]
     imu = [
-        MessageType("/imu", "sensor_msgs/msg/Imu", imu_fields(t, k), t)
+        Message("/imu", "sensor_msgs/msg/Imu", imu_fields(t, k), t)
         for k, t in enumerate(fast.tolist())
     ]
     battery = [
-        MessageType(
+        Message(
             "/battery", "sensor_msgs/msg/BatteryState", {"header": header(t), "voltage": 12.5}, t
         )
         for t in slow.tolist()
     ]
     plain = [
-        MessageType(
+        Message(
             "/cmd", "geometry_msgs/msg/Twist", {"linear": vector(1, 2), "angular": vector(z=3)}, t
         )
         for t in slow.tolist()
     ]
     motors = [
-        MessageType("/motors", "robotino_msgs/msg/MotorReadings", readings(t, k), t + 0.5)
+        Message("/motors", "robotino_msgs/msg/MotorReadings", readings(t, k), t + 0.5)
         for k, t in enumerate(slow.tolist())
     ]
     topics = {
