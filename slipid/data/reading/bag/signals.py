@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.data.reading.bag.layout import GROUPS, BagLayout
+from slipid.data.reading.bag.meanings import first_names
 from slipid.data.reading.bag.plan import ChannelPlan
 from slipid.data.reading.bag.shape import Edge, JointPick, TransformPick
 from slipid.data.reading.bag.streams import Stream
