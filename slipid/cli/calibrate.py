@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import Json, Quiet, emit, guarded
+from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
     from slipid.camera.calibration.board import Board
     from slipid.camera.calibration.calibrate import FloorFound, LensFound
     from slipid.report.page import Page
-    from slipid.support.files import Content
 
 SIZE_STD = 0.001
 """How well a printed board or a tape is known, relative."""
@@ -214,7 +214,7 @@ def _write(lens: "LensFound", place: "FloorFound | None", out: Path, json: str |
     return 1 if report.get("poor") else 0
 
 
-def _show(page: "Page", report: "Content", lens_too: bool = True) -> None:
+def _show(page: "Page", report: Content, lens_too: bool = True) -> None:
     """Print what was found, and what is not as it should be."""
     from slipid.camera.calibration.report import described
 

@@ -20,7 +20,7 @@ from slipid.infer.result import Fit, required
 from slipid.infer.verdicts import estimates as verdicts
 from slipid.infer.verdicts.disputed import marked
 from slipid.infer.verdicts.unidentified import members
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
