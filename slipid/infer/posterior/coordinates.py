@@ -159,7 +159,7 @@ class Anchor(eqx.Module):
         )
 
     def predict(self, robot: Robot, z: Array) -> lk.Predicted:
-        """Return the prediction of a robot, solved from the fit's twists or, if that fails, anew."""
+        """Return a robot's prediction, solved from the fit's twists or, if that fails, anew."""
         b = self.batch
         start = self.twist + self.twist_slope @ (z - self.z)
         p = lk.predict(robot, b, jax.lax.stop_gradient(start))

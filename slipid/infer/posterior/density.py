@@ -172,7 +172,7 @@ class Density:
         return out
 
     def residuals(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
-        """Return blocks of residuals without shared effects, for many vectors (draw, segment, m)."""
+        """Return residuals without shared effects, for many vectors (draw, segment, m)."""
         return self.of_all(Density._residual_blocks, x)
 
     def _residual_blocks(
